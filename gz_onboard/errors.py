@@ -1,0 +1,23 @@
+"""The one error that a user's input can cause, and the help that goes with it."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class InputError(Exception):
+    """A command line, file or parameter that cannot be used.
+
+    The message names the place (file, line, key), the value and its unit where it has one, and what would
+    be right. The command line prints it without a traceback and exits with status 2.
+    """
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """`` (did you mean 'x'?)`` for the known name nearest to `name`, or an empty string."""
+    names = list(known)
+    match = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
+    if not match:  # the same letters in another case, or a part of a name
+        match = [n for n in names if name.lower() in n.lower() or n.lower() in name.lower()][:1]
+    return f" (did you mean {match[0]!r}?)" if match else ""

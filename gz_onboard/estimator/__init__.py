@@ -1,0 +1,1 @@
+"""State of charge, road state, slow learners and the range forecast. No I/O, no clock."""

@@ -1,0 +1,1 @@
+"""Offline work on recorded rides; never imported on board."""
