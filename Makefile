@@ -1,0 +1,38 @@
+# What each target does: make help. All of them set up what they need themselves.
+
+RIDE ?= $(firstword $(wildcard replay_logs/*.blf))
+SPEED ?= 1
+PYTHON_IN_VENV := .venv/bin/python
+
+.PHONY: help setup run test lint format bench clean
+.DEFAULT_GOAL := help
+
+help:  ## this list
+	@sed -n 's/^\([a-z]*\):.*##/\1:/p' $(MAKEFILE_LIST) | awk -F: '{printf "make %-8s%s\n", $$1, $$2}'
+
+setup: .venv/.ready  ## virtual environment .venv with the pinned dependencies
+
+.venv/.ready: pyproject.toml .ci/constraints.txt .ci/setup
+	@.ci/setup venv
+
+run: setup  ## a recorded ride through the daemon on a CAN bus, with the live range (RIDE=file, SPEED=factor)
+	@replay_logs/run-demo "$(RIDE)" "$(SPEED)"
+
+test: setup  ## every test, on the host, on a real vcan and under systemd
+	@.ci/test
+
+lint: setup  ## ruff and mypy
+	$(PYTHON_IN_VENV) -m ruff check .
+	$(PYTHON_IN_VENV) -m ruff format --check .
+	$(PYTHON_IN_VENV) -m mypy
+
+format: setup  ## let ruff format the code
+	$(PYTHON_IN_VENV) -m ruff check --fix .
+	$(PYTHON_IN_VENV) -m ruff format .
+
+bench: setup  ## cost per frame, start-up, memory, beside the obvious pipeline of the same libraries
+	$(PYTHON_IN_VENV) benchmarks/bench.py
+
+clean:  ## remove what the other targets made, except runs/
+	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
