@@ -1,0 +1,130 @@
+"""Imports point one way, and what runs on the scooter stays light."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "gz_onboard"
+
+# The parts of the package, lowest first. A part imports itself and those in the lines above its own.
+LAYERS = [
+    ["__init__", "errors", "events", "notify"],
+    ["toml"],
+    ["bus", "physics"],
+    ["vehicle"],
+    ["estimator"],
+    ["simulation"],
+    ["lab", "dashboard"],
+    ["daemon"],
+    ["cli", "__main__"],
+]
+LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
+
+# Lower, and yet nothing that these need know.
+FORBIDDEN = {
+    ("estimator", "bus"): "events are all that the estimator sees of a bus",
+    ("daemon", "lab"): "the daemon carries no offline tools",
+    ("daemon", "simulation"): "the daemon carries no offline tools",
+}
+
+ON_BOARD = ("bus", "physics", "estimator", "daemon", "events", "errors", "notify", "toml", "vehicle")
+HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow"}
+# Imported only when asked for: the reference filter behind --filter filterpy.
+ON_REQUEST = {"estimator/ekf_filterpy.py"}
+
+MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
+
+
+def part_of(module: Path) -> str:
+    return module.parts[0].removesuffix(".py")
+
+
+def imports(nodes: Iterator[ast.AST] | list[ast.stmt], module: Path) -> Iterator[str]:
+    """The absolute names that these nodes import; for ``from a import b`` both ``a`` and ``a.b``."""
+    package = ["gz_onboard", *module.parent.parts]
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            origin = ".".join([*base, *([node.module] if node.module else [])])
+            yield origin
+            yield from (f"{origin}.{alias.name}" for alias in node.names)
+
+
+def at_import_time(body: list[ast.stmt]) -> Iterator[ast.AST]:
+    """The statements that run when the module is imported, thus not those of functions."""
+    for node in body:
+        yield node
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            yield from at_import_time(node.orelse)
+        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            for field in ("body", "orelse", "finalbody"):
+                yield from at_import_time(getattr(node, field, []))
+            for handler in getattr(node, "handlers", []):
+                yield from at_import_time(handler.body)
+
+
+def test_there_is_something_to_check():
+    assert {"bus", "physics", "estimator", "daemon", "cli"} <= {part_of(m) for m in MODULES}
+
+
+@pytest.mark.parametrize("module", MODULES, ids=str)
+def test_imports_point_one_way(module):
+    part = part_of(module)
+    assert part in LEVEL, f"gz_onboard/{part} has no place in LAYERS yet"
+    tree = ast.parse((PACKAGE / module).read_text(encoding="utf-8"))
+    for name in imports(ast.walk(tree), module):
+        if not name.startswith("gz_onboard."):
+            continue
+        other = name.split(".")[1]
+        if other == part or other not in LEVEL:  # a name that gz_onboard/__init__.py defines
+            continue
+        assert LEVEL[other] < LEVEL[part], f"gz_onboard/{module} imports {name}, which is not below it"
+        assert (part, other) not in FORBIDDEN, f"gz_onboard/{module} imports {name}: {FORBIDDEN[part, other]}"
+
+
+@pytest.mark.parametrize(
+    "module", [m for m in MODULES if part_of(m) in ON_BOARD and m.as_posix() not in ON_REQUEST], ids=str
+)
+def test_on_board_modules_import_nothing_heavy(module):
+    body = ast.parse((PACKAGE / module).read_text(encoding="utf-8")).body
+    heavy = HEAVY.intersection(name.split(".")[0] for name in imports(at_import_time(body), module))
+    assert not heavy, f"gz_onboard/{module} imports {', '.join(sorted(heavy))} when it is imported"
+
+
+@pytest.mark.parametrize("name", ["gz_onboard.daemon", "gz_onboard.cli"])  # `gz-onboard run` starts by way of the cli
+def test_the_daemon_loads_nothing_heavy(name):
+    # None in sys.modules keeps a module out; nothing of it is loaded.
+    code = f"import sys, {name}; print(*{{m.partition('.')[0] for m, loaded in sys.modules.items() if loaded}})"
+    run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    loaded = set(run.stdout.split())
+    assert "gz_onboard" in loaded
+    assert not HEAVY & loaded
+
+
+def test_the_checks_see_what_they_look_for():
+    source = """
+import gz_onboard.lab
+from .. import daemon
+from gz_onboard.estimator import ekf
+if TYPE_CHECKING:
+    import pandas
+try:
+    import numpy.linalg
+except ImportError:
+    import scipy
+def later():
+    import matplotlib
+"""
+    tree = ast.parse(source)
+    found = set(imports(ast.walk(tree), Path("bus/codec.py")))
+    assert {"gz_onboard.lab", "gz_onboard.daemon", "gz_onboard.estimator.ekf", "matplotlib", "pandas"} <= found
+    assert HEAVY & set(imports(at_import_time(tree.body), Path("bus/codec.py"))) == {"scipy"}
+    assert "numpy.linalg" in set(imports(at_import_time(tree.body), Path("bus/codec.py")))
