@@ -6,6 +6,8 @@ fifth of building a dataclass.
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+from enum import IntEnum, IntFlag
 from typing import TypeAlias
 
 Frame: TypeAlias = tuple[int, int, bytes, int]
@@ -24,3 +26,116 @@ Event: TypeAlias = tuple[float, int, tuple[float | None, ...]]
 
 A group is one mapped message: ``Codec.groups[group]`` names the roles that the values belong to, in order.
 None stands for a value that was not available, implausible or dropped."""
+
+
+@dataclass(frozen=True)
+class Group:
+    """One mapped message: its events carry the values of these roles, in this order."""
+
+    message: str
+    roles: tuple[str, ...]
+    period: float | None  # s
+
+
+STALE_PERIODS = 10
+"""A signal is stale after this many of its periods."""
+
+# What a signal can stand for, and its unit: SI, but temperatures in degrees Celsius and positions in degrees.
+ROLES: dict[str, str] = {
+    "pack_voltage": "V",
+    "pack_current": "A",  # positive when discharging
+    "inverter_voltage": "V",
+    "inverter_current": "A",  # DC side, positive when driving
+    "auxiliary_current": "A",  # at pack voltage, positive when consuming
+    "cell_temperature": "degC",
+    "ambient_temperature": "degC",
+    "motor_temperature": "degC",
+    "inverter_temperature": "degC",
+    "motor_speed": "rad/s",  # positive forward
+    "motor_torque": "N·m",  # positive when driving
+    "motor_current": "A",  # RMS, positive when driving
+    "wheel_speed_front": "rad/s",
+    "wheel_speed_rear": "rad/s",
+    "vehicle_speed": "m/s",
+    "odometer": "m",
+    "accel_x": "m/s^2",  # specific force, forward
+    "accel_y": "m/s^2",  # left
+    "accel_z": "m/s^2",  # up: +9.81 at rest
+    "rate_x": "rad/s",  # positive leaning right
+    "rate_y": "rad/s",  # positive nose down
+    "rate_z": "rad/s",  # positive turning left
+    "gps_speed": "m/s",
+    "gps_course": "rad",  # clockwise from north
+    "gps_altitude": "m",
+    "gps_fix": "1",  # 0 none, 1 dead reckoning, 2 2D, 3 3D
+    "latitude": "deg",
+    "longitude": "deg",
+    "bms_state_of_charge": "1",
+    "charge_plug": "1",
+    "throttle": "1",
+    "brake_switch": "1",
+}
+
+
+class State(IntEnum):
+    """How far the published range can be trusted."""
+
+    STARTING = 0  # no estimate yet
+    VALID = 1
+    DEGRADED = 2  # an input is missing: the interval is wider, `Reason` says why
+    INVALID = 3  # no number is published
+
+
+class Reason(IntFlag):
+    """Why the estimate is not what it could be. The bits of RANGE_Status in dbc/range.dbc, in this order."""
+
+    NO_PACK_VOLTAGE = 1 << 0  # the inverter's voltage stands in, or none
+    NO_PACK_CURRENT = 1 << 1  # the inverter's current and the auxiliary load stand in, or the model
+    NO_INVERTER_CURRENT = 1 << 2  # nothing to check the pack current with
+    NO_CELL_TEMPERATURE = 1 << 3  # the last known, then the ambient's, stands in
+    NO_SPEED = 1 << 4
+    NO_IMU = 1 << 5  # no lean; grade from altitude only
+    NO_GPS = 1 << 6
+    NO_AMBIENT_TEMPERATURE = 1 << 7
+    CURRENT_MISMATCH = 1 << 8  # the two current sensors disagree
+    VOLTAGE_MISMATCH = 1 << 9  # the cell model does not follow the voltage
+    PRIOR_RIDING = 1 << 10  # too little ridden: the consumption expected is mostly the prior
+    SOC_UNCERTAIN = 1 << 11  # its standard deviation is above 5 %
+    FRAMES_DROPPED = 1 << 12  # frames were dropped by a check within the last second
+    FRAMES_LOST = 1 << 13  # the kernel or the bus lost frames within the last second
+    BUS_DOWN = 1 << 14
+    LOG_FAILED = 1 << 15  # the log cannot be written
+
+
+@dataclass(slots=True)
+class Estimate:
+    """What is known at one time. None stands for what is not known; it is never published as a number."""
+
+    time: float  # s, on the codec's timeline
+    state: State = State.STARTING
+    reasons: Reason = field(default=Reason(0))
+    soc: float | None = None  # 0..1
+    soc_sd: float | None = None
+    v1: float | None = None  # V, of a cell
+    innovation: float | None = None  # V, of a cell: measured less predicted
+    innovation_rms: float | None = None  # V, of a cell, over the last 10 s or so
+    pack_voltage: float | None = None  # V
+    pack_current: float | None = None  # A
+    cell_temperature: float | None = None  # degC
+    speed: float | None = None  # m/s
+    acceleration: float | None = None  # m/s²
+    grade: float | None = None  # sine of the road's angle
+    lean: float | None = None  # rad, positive to the right
+    yaw_rate: float | None = None  # rad/s, positive to the left
+    heading: float | None = None  # rad, clockwise from north
+    distance: float = 0.0  # m, since the start
+    range: float | None = None  # m
+    range_p10: float | None = None  # m
+    range_p90: float | None = None  # m
+    energy_left: float | None = None  # J
+    energy_left_sd: float | None = None  # J
+    consumption_recent: float | None = None  # J/m, measured
+    consumption_expected: float | None = None  # J/m
+    consumption_expected_sd: float | None = None  # J/m
+    consumption_factor: float | None = None  # learned: measured over modelled
+    consumption_factor_sd: float | None = None

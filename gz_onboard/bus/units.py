@@ -1,0 +1,45 @@
+"""Units of signals in DBC files, and their conversion to the SI units of the roles."""
+
+from __future__ import annotations
+
+from math import pi
+
+from gz_onboard.events import ROLES
+
+# (unit in a DBC, SI unit) -> factor, offset
+_CONVERSIONS: dict[tuple[str, str], tuple[float, float]] = {
+    ("mV", "V"): (1e-3, 0.0),
+    ("mA", "A"): (1e-3, 0.0),
+    ("K", "degC"): (1.0, -273.15),
+    ("degF", "degC"): (5 / 9, -160 / 9),
+    ("rpm", "rad/s"): (2 * pi / 60, 0.0),
+    ("rev/s", "rad/s"): (2 * pi, 0.0),
+    ("deg/s", "rad/s"): (pi / 180, 0.0),
+    ("deg", "rad"): (pi / 180, 0.0),
+    ("km/h", "m/s"): (1 / 3.6, 0.0),
+    ("mph", "m/s"): (0.44704, 0.0),
+    ("km", "m"): (1e3, 0.0),
+    ("g", "m/s^2"): (9.80665, 0.0),
+    ("%", "1"): (0.01, 0.0),
+}
+
+# Spellings seen in DBC files -> ours
+_SPELLINGS = {
+    "r/min": "rpm", "1/min": "rpm", "RPM": "rpm", "r/s": "rev/s", "rps": "rev/s", "°/s": "deg/s", "dps": "deg/s",
+    "°": "deg", "degree": "deg", "degrees": "deg", "°C": "degC", "C": "degC", "ºC": "degC", "deg C": "degC",
+    "Celsius": "degC", "Nm": "N·m", "N.m": "N·m", "N*m": "N·m", "kph": "km/h", "kmh": "km/h", "m/s2": "m/s^2",
+    "m/s²": "m/s^2", "meters": "m", "Volt": "V", "Amp": "A", "Percent": "%", "": "1", "-": "1",
+}  # fmt: skip
+
+
+def known_units(role: str) -> list[str]:
+    """The units from which `role` can be read."""
+    return [ROLES[role], *(unit for unit, si in _CONVERSIONS if si == ROLES[role])]
+
+
+def to_si(unit: str, role: str) -> tuple[float, float] | None:
+    """(factor, offset) from `unit` to the SI unit of `role`; None if it cannot be one of the role's units."""
+    unit = _SPELLINGS.get(unit, unit)
+    if unit == ROLES[role]:
+        return 1.0, 0.0
+    return _CONVERSIONS.get((unit, ROLES[role]))

@@ -1,0 +1,386 @@
+"""Events in, estimates out: the filter, the road, the forecast, and what to do when a sensor is missing.
+
+No I/O and no clock: time arrives with the events, so the same events give the same estimates, to the last bit.
+All state of the on-board software that matters lives here; `snapshot` and `restore` carry it over a restart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import exp, sqrt
+from typing import Any
+
+from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
+from gz_onboard.estimator.forecast import Forecast, Forecaster
+from gz_onboard.estimator.road import Road
+from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
+from gz_onboard.events import STALE_PERIODS, Estimate, Event, Group, Reason, State
+from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.model import Model
+
+SNAPSHOT_VERSION = 1
+PACE = ("pack_voltage", "inverter_voltage", "motor_speed")  # the message of the first that is mapped sets the pace
+STEP_AT_LEAST = 0.25  # s: without the message that sets the pace, a step is made after so long
+FORECAST_PERIOD = 1.0  # s
+ERROR_TIME = 60.0  # s: over so long the cell model errs the same way; its error does not average out faster
+OFFSET_TIME = 3600.0  # s: so long the current sensor's offset stays the same
+RESISTANCE_SD = 0.12  # relative: R0 of this pack at this place and temperature
+RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
+GATE = 5.0  # sd: a voltage further off is a glitch, unless it persists
+GATE_COUNT = 20  # so many in a row are no glitch
+CURRENT_SD = {"pack": 0.0, "inverter": 0.5, "model": 3.0, "none": 15.0}  # A, beside the sensor's own offset
+MISMATCH = 3.0  # A between the two current sensors, over ten seconds or so
+
+
+class Estimator:
+    """The estimator of one vehicle."""
+
+    def __init__(
+        self, groups: Sequence[Group], battery: Battery, model: Model, make: FilterMaker = ScalarFilter
+    ) -> None:
+        self.battery = battery
+        self.model = model
+        self.road = Road()
+        self.forecaster = Forecaster(model, battery)
+        self.filter: SocFilter | None = None
+        self.signals = Signals(
+            (role, STALE_PERIODS * group.period if group.period else DEFAULT_STALE)
+            for group in groups
+            for role in group.roles
+        )
+        self._make = make
+        self._slots = [[self.signals[role] for role in group.roles] for group in groups]
+        pace = [i for role in PACE for i, group in enumerate(groups) if role in group.roles]
+        self._pace = pace[0] if pace else -1
+        self._mapped = {role for group in groups for role in group.roles}
+        self._time: float | None = None  # s, of the last step
+        self._deadline = float("-inf")
+        self._current: float | None = None  # A of the pack, at the last step
+        self._off_gate = 0
+        self._innovation: float | None = None
+        self._innovation_square = 0.0
+        self._mismatch = 0.0  # A, low-passed
+        self._cell_temperature: float | None = None
+        self._pack: tuple[float | None, float | None, str] = (None, None, "none")
+        self._forecast: Forecast | None = None
+        self._forecast_time = float("-inf")
+        self._saved: Mapping[str, Any] | None = None
+        self._saved_age: float | None = None
+        p = model.parameters
+        self._offset_sd = p.sd("pack_current_offset")
+        self._offset = p["pack_current_offset"]
+        self._gain = p["pack_current_gain"]
+        gain_sd = p.sd("pack_current_gain")
+        self._voltage_offset = p["pack_voltage_offset"]
+        self._voltage_sd = p.sd("pack_voltage_offset") / battery.cells_series
+        self._model_sd = p.sd("cell_voltage_error")
+        self._rest_sd = sqrt(p.sd("rest_voltage_error") ** 2 + battery.ocv_sd**2)
+        self._charge_sd = sqrt((p.sd("cell_capacity") / p["cell_capacity"]) ** 2 + gain_sd**2)
+        self._radius, self._gear = p["wheel_radius"], p["gear_ratio"]
+
+    # --- events -----------------------------------------------------------------------------------------------
+
+    def handle(self, event: Event) -> None:
+        """Take in one event; the pace-setting message (pack voltage and current) also makes a step."""
+        time, group, values = event
+        for signal, value in zip(self._slots[group], values):  # noqa: B905 - hot, equal by construction
+            if value is not None:
+                signal.value = value
+                signal.time = time
+                signal.total += value
+                signal.count += 1
+        if group == self._pace or time >= self._deadline:
+            self._step(time)
+
+    def _step(self, now: float) -> None:
+        dt = 0.0 if self._time is None else now - self._time
+        if dt < 0.02 and self._time is not None:
+            return
+        self._time = now
+        self._deadline = now + STEP_AT_LEAST
+        signals = self.signals
+        self.road.step(now, min(dt, 1.0), signals, self._radius, self._gear)
+        voltage, current, source = self._measured(now)
+        self._pack = voltage, current, source
+        temperature = self._temperature(now, dt)
+        self._battery_step(dt, voltage, current, source, temperature)
+        self._ride(now, dt, voltage, current)
+        signals.next_step()
+        if now - self._forecast_time >= FORECAST_PERIOD - 0.05:
+            self._make_forecast(now, temperature)
+
+    def _measured(self, now: float) -> tuple[float | None, float | None, str]:
+        """(pack voltage [V], pack current [A], where the current comes from), by the best sensor that works."""
+        signals = self.signals
+        voltage = signals.pack_voltage.mean(now)
+        inverter_voltage = signals.inverter_voltage.mean(now)
+        current = signals.pack_current.mean(now)
+        inverter = signals.inverter_current.mean(now)
+        any_voltage = voltage if voltage is not None else inverter_voltage
+        auxiliary = signals.auxiliary_current.mean(now)
+        if auxiliary is None:
+            auxiliary = self.model.parameters["auxiliary_power"] / (any_voltage or 50.0)
+        if current is not None:
+            current = (current - self._offset) / self._gain
+            if inverter is not None:
+                self._mismatch += 0.01 * (current - inverter - auxiliary - self._mismatch)
+        if voltage is not None:
+            voltage -= self._voltage_offset
+        elif inverter_voltage is not None:
+            voltage = inverter_voltage
+        if current is not None:
+            return voltage, current, "pack"
+        if inverter is not None:
+            return voltage, inverter + auxiliary, "inverter"
+        if self.road.speed is not None and voltage:
+            return voltage, self._model_power(now) / voltage, "model"
+        return voltage, None, "none"
+
+    def _model_power(self, now: float) -> float:
+        road = self.road
+        quantities = self.forecaster.quantities(
+            road.speed or 0.0, road.acceleration or 0.0, self._ambient(now)[0], road.altitude or 0.0, 40.0
+        )
+        quantities["grade"] = road.grade or 0.0
+        return float(sum(self.model.power(quantities).values()))
+
+    def _ambient(self, now: float) -> tuple[float, float]:
+        """(ambient temperature, sd) [degC]."""
+        ambient = self.signals.ambient_temperature.get(now)
+        if ambient is not None:
+            return ambient, 1.0
+        if self._cell_temperature is not None and self.signals.cell_temperature.fresh(now):
+            return self._cell_temperature - 3.0, 6.0
+        return 20.0, 10.0
+
+    def _temperature(self, now: float, dt: float) -> float:
+        """The cells' temperature [degC]: measured; else the last one, drifting to the ambient; else the ambient."""
+        measured = self.signals.cell_temperature.get(now)
+        if measured is not None:
+            self._cell_temperature = measured
+            return measured
+        ambient = self._ambient(now)[0]
+        if self._cell_temperature is None:
+            return ambient
+        self._cell_temperature += (ambient - self._cell_temperature) * min(dt / 7200.0, 1.0)
+        return self._cell_temperature
+
+    # --- battery ----------------------------------------------------------------------------------------------
+
+    def _battery_step(
+        self, dt: float, voltage: float | None, current: float | None, source: str, temperature: float
+    ) -> None:
+        battery = self.battery
+        filter_ = self.filter
+        if filter_ is None:
+            if voltage is not None:
+                self._start(voltage, current or 0.0, temperature)
+            self._current = current
+            return
+        if dt > 0:
+            before = self._current if self._current is not None else current
+            mean = ((before or 0.0) + (current or 0.0)) / 2
+            charge = 3600 * battery.pack_capacity(temperature)
+            sd = sqrt(self._offset_sd**2 + CURRENT_SD[source] ** 2)
+            q = (sd / charge) ** 2 * 2 * OFFSET_TIME * dt + self._charge_sd**2 * abs(mean * dt / charge)
+            if dt > 1.0:  # a pause: nobody knows what flowed, the last current is believed for a second
+                mean /= dt
+                q += (CURRENT_SD["none"] * (dt - 1.0) / charge) ** 2
+            filter_.predict(dt, mean / battery.cells_parallel, temperature, (q, 1e-8 * dt))
+            if filter_.soc < -0.05 or filter_.soc > 1.05:
+                filter_.soc = min(max(filter_.soc, -0.05), 1.05)
+        self._current = current
+        if voltage is None or current is None:
+            self._innovation = None
+            return
+        cell_voltage = battery.cell_voltage(voltage, current)
+        cell_current = current / battery.cells_parallel
+        known = self.signals.cell_temperature.stale_after > 0 and self._cell_temperature is not None
+        r0 = battery.r0.at(filter_.soc, temperature)[0]
+        resistance_sd = RESISTANCE_SD if known else RESISTANCE_SD_COLD
+        current_sd = CURRENT_SD[source] / battery.cells_parallel
+        slow = (
+            self._model_sd**2 + self._voltage_sd**2 + (resistance_sd * r0 * cell_current) ** 2 + (r0 * current_sd) ** 2
+        )
+        error, own = filter_.innovation(cell_voltage, cell_current, temperature)
+        self._innovation = error
+        self._innovation_square += (error * error - self._innovation_square) * min(dt / 10.0, 1.0)
+        if error * error > GATE * GATE * (own + slow):
+            self._off_gate += 1
+            if self._off_gate < GATE_COUNT:
+                return
+        else:
+            self._off_gate = 0
+        # What errs the same way for ERROR_TIME is worth one sample in that time, not one each step.
+        filter_.update(cell_voltage, cell_current, temperature, slow * max(2 * ERROR_TIME / max(dt, 0.02), 1.0))
+
+    def _start(self, voltage: float, current: float, temperature: float) -> None:
+        """The first SOC: from the voltage, taken as at rest, with what is not known about that in its variance."""
+        battery = self.battery
+        cell_current = current / battery.cells_parallel
+        cell_voltage = battery.cell_voltage(voltage, current)
+        soc = 0.5
+        for _ in range(5):  # R0 depends on SOC
+            soc = battery.soc_at(cell_voltage + battery.r0.at(soc, temperature)[0] * cell_current)
+        soc = min(max(soc, -0.02), 1.02)
+        r0, r1 = battery.r0.at(soc, temperature)[0], battery.r1.at(soc, temperature)[0]
+        v1_sd = 0.005 + 0.5 * r1 * abs(cell_current)
+        filter_ = self._make(battery, soc, 0.0, (0.25, 0.0, v1_sd**2))
+        variance = self._rest_sd**2 + self._voltage_sd**2 + (RESISTANCE_SD * r0 * cell_current) ** 2
+        filter_.update(cell_voltage, cell_current, temperature, variance)
+        filter_.soc, filter_.v1 = soc, 0.0
+        self.filter = filter_
+        if self._saved:
+            self._resume(self._saved, filter_)
+            self._saved = None
+
+    def _resume(self, saved: Mapping[str, Any], rest: SocFilter) -> None:
+        """Join the saved SOC with that of the rest voltage, unless the pack was charged or used meanwhile."""
+        age = self._saved_age
+        variance = saved["covariance"][0] + (0.002 if age is None else 1e-8 * age + 1e-6)
+        difference = rest.soc - saved["soc"]
+        p00, p01, p11 = rest.covariance
+        if difference * difference > 16 * (variance + p00):
+            return
+        if age is not None and age < 600:  # the RC pair has not settled: go on from where it was
+            r1 = self.battery.r1.at(saved["soc"], 20.0)[0]
+            decay = exp(-age / (r1 * self.battery.c1.at(saved["soc"], 20.0)[0]))
+            _, c01, c11 = saved["covariance"]
+            rest.soc, rest.v1 = saved["soc"], saved["v1"] * decay
+            rest.covariance = variance, c01 * decay, c11 * decay**2 + 1e-6
+            return
+        gain = p00 / (p00 + variance)  # the saved SOC as a measurement of the first state
+        rest.soc -= gain * difference
+        rest.v1 -= p01 / (p00 + variance) * difference
+        rest.covariance = p00 * (1 - gain), p01 * (1 - gain), p11 - p01 * p01 / (p00 + variance)
+
+    # --- riding and range -------------------------------------------------------------------------------------
+
+    def _ride(self, now: float, dt: float, voltage: float | None, current: float | None) -> None:
+        speed = self.road.speed
+        if speed is None or voltage is None or current is None or not 0 < dt <= 1.0 or self._pack[2] == "model":
+            self.forecaster.pause()
+            return
+        motor = self.signals.motor_temperature.get(now)
+        self.forecaster.ride(
+            dt, speed, self.road.grade, voltage * current, self._ambient(now)[0], self.road.altitude or 0.0,
+            40.0 if motor is None else motor,
+        )  # fmt: skip
+
+    def _make_forecast(self, now: float, temperature: float) -> None:
+        filter_ = self.filter
+        if filter_ is None:
+            return
+        self._forecast_time = now
+        soc_sd = sqrt(filter_.covariance[0])
+        temperature_sd = 1.0 if self.signals.cell_temperature.fresh(now) else 8.0
+        self._forecast = self.forecaster.forecast(
+            filter_.soc, soc_sd, temperature, temperature_sd, self._ambient(now)[0], self.road.altitude or 0.0
+        )
+
+    # --- results ----------------------------------------------------------------------------------------------
+
+    def estimate(self, now: float) -> Estimate:
+        """What is known at `now` [s]; cheap, and changes nothing."""
+        estimate = Estimate(time=now, reasons=self._reasons(now))
+        road, filter_, forecast = self.road, self.filter, self._forecast
+        estimate.distance = road.distance
+        silent = self._time is None or now - self._time > 2.0
+        if not silent:
+            estimate.speed, estimate.acceleration, estimate.grade = road.speed, road.acceleration, road.grade
+            estimate.lean, estimate.yaw_rate, estimate.heading = road.lean, road.yaw_rate, road.heading
+            estimate.pack_voltage, estimate.pack_current = self._pack[0], self._pack[1]
+            estimate.innovation = self._innovation
+        estimate.cell_temperature = self._cell_temperature
+        if filter_ is None:
+            estimate.state = State.INVALID if now > 10 else State.STARTING
+            return estimate
+        estimate.soc = min(max(filter_.soc, 0.0), 1.0)
+        estimate.soc_sd = sqrt(filter_.covariance[0])
+        estimate.v1 = filter_.v1
+        estimate.innovation_rms = sqrt(self._innovation_square)
+        if estimate.soc_sd > 0.05:
+            estimate.reasons |= Reason.SOC_UNCERTAIN
+        if forecast:
+            estimate.range, estimate.range_p10, estimate.range_p90 = forecast.range, forecast.p10, forecast.p90
+            estimate.energy_left, estimate.energy_left_sd = forecast.energy, forecast.energy_sd
+            estimate.consumption_expected, estimate.consumption_expected_sd = (
+                forecast.consumption,
+                forecast.consumption_sd,
+            )
+            estimate.consumption_recent = forecast.recent
+            riding = self.forecaster.riding
+            estimate.consumption_factor = exp(riding.log_factor)
+            estimate.consumption_factor_sd = estimate.consumption_factor * sqrt(riding.log_factor_variance)
+            if forecast.mostly_prior:
+                estimate.reasons |= Reason.PRIOR_RIDING
+        weighty = estimate.reasons & ~(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)
+        estimate.state = State.DEGRADED if weighty else State.VALID
+        both = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT
+        if silent and estimate.reasons & both == both:
+            estimate.state = State.INVALID
+        return estimate
+
+    def _reasons(self, now: float) -> Reason:
+        fresh = {role: self.signals[role].fresh(now) for role in self._mapped}
+        get = fresh.get
+        reasons = Reason(0)
+        if not get("pack_voltage"):
+            reasons |= Reason.NO_PACK_VOLTAGE
+        if not get("pack_current"):
+            reasons |= Reason.NO_PACK_CURRENT
+        if not get("inverter_current"):
+            reasons |= Reason.NO_INVERTER_CURRENT
+        if not get("cell_temperature"):
+            reasons |= Reason.NO_CELL_TEMPERATURE
+        if not get("ambient_temperature"):
+            reasons |= Reason.NO_AMBIENT_TEMPERATURE
+        if not any(
+            get(role) for role in ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed", "gps_speed")
+        ):
+            reasons |= Reason.NO_SPEED
+        if not (get("rate_x") and get("rate_z") and get("accel_x")):
+            reasons |= Reason.NO_IMU
+        if not get("gps_speed") and not get("latitude"):
+            reasons |= Reason.NO_GPS
+        if abs(self._mismatch) > MISMATCH:
+            reasons |= Reason.CURRENT_MISMATCH
+        if self._off_gate or self._innovation_square > 0.08**2:
+            reasons |= Reason.VOLTAGE_MISMATCH
+        return reasons
+
+    # --- saving -----------------------------------------------------------------------------------------------
+
+    def snapshot(self, key: str) -> dict[str, Any] | None:
+        """What is to be kept over a restart, for the vehicle `key`; None while there is nothing to keep."""
+        if self.filter is None:
+            return None
+        return {
+            "version": SNAPSHOT_VERSION,
+            "key": key,
+            "soc": self.filter.soc,
+            "v1": self.filter.v1,
+            "covariance": list(self.filter.covariance),
+            "cell_temperature": self._cell_temperature,
+            "gyro_bias": [self.road.bias_x, self.road.bias_z],
+            "riding": self.forecaster.snapshot(),
+        }
+
+    def restore(self, saved: Mapping[str, Any], key: str, age: float | None) -> None:
+        """Go on from a snapshot that is `age` [s] old (None: not known). ValueError if it does not fit, whole."""
+        if not isinstance(saved, Mapping) or saved.get("version") != SNAPSHOT_VERSION:
+            raise ValueError(f"is of version {saved.get('version') if isinstance(saved, Mapping) else saved!r}")
+        if saved.get("key") != key:
+            raise ValueError(f"is of {saved.get('key')!r}, this is {key!r}")
+        try:
+            soc, v1 = float(saved["soc"]), float(saved["v1"])
+            p00, p01, p11 = (float(x) for x in saved["covariance"])
+            bias_x, bias_z = (float(x) for x in saved["gyro_bias"])
+            if not (-0.1 < soc < 1.1 and abs(v1) < 1 and 0 < p00 < 1 and 0 < p11 < 1 and p01 * p01 <= p00 * p11):
+                raise ValueError("holds implausible numbers")
+            self.forecaster.restore(saved["riding"])
+        except (KeyError, TypeError, OverflowError) as error:
+            raise ValueError(f"is damaged: {error!r}") from error
+        self.road.bias_x, self.road.bias_z = bias_x, bias_z
+        self._saved = {"soc": soc, "v1": v1, "covariance": (p00, p01, p11)}
+        self._saved_age = age

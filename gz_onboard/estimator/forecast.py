@@ -1,0 +1,260 @@
+"""How far the energy that is left will go.
+
+What is known of the riding is kept in segments of `SEGMENT` metres: what the pack delivered, and what the forward
+model says the same riding takes, with and without the hills that happened to be there. From them:
+
+- the consumption factor, measured over modelled, learned slowly: one number that carries what the parameters have
+  wrong for this vehicle, rider and season;
+- the consumption to be expected: the model's on the riding of the last kilometres, on the flat, times that
+  factor. Before anything is ridden, the model's on a prior riding; it counts like `PRIOR_LENGTH` metres;
+- its spread: how unlike each other segments are, how long they stay alike, and how much riding drifts.
+
+The range is the energy that can be drawn before the cut-off at the power to be expected, over that consumption,
+with a log-normal distribution.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import exp, log, sqrt
+from typing import Any
+
+from gz_onboard.physics.battery import Battery, drawable
+from gz_onboard.physics.model import Model, air_density
+
+SEGMENT = 250.0  # m
+PRIOR_LENGTH = 3000.0  # m: the prior riding counts like that much of real riding
+MEMORY = 12000.0  # m: what is further back counts for less than 1/e
+ALIKE = 1500.0  # m: over so much way segments are alike
+DRIFT = 0.07  # relative sd: the rest of the way is not the way so far (other road, traffic, wind)
+FACTOR_SD = 0.15  # relative sd of the model before any riding
+FACTOR_WALK = 0.004  # relative sd that the factor may change by over a segment
+SEGMENT_SD = 0.25  # relative: measured against modelled energy of one segment
+PRIOR_SCATTER = 0.25  # relative sd of segments of a riding not yet known
+DECILE = 1.2815515655446004
+
+# A prior riding: (share of time, speed [m/s], acceleration [m/s²]), as in the urban part of the WMTC: 12 m/s at
+# most, a stop or two each kilometre, a fifth of the time at rest.
+PRIOR_RIDING = (
+    (0.18, 0.0, 0.0), (0.10, 4.0, 0.8), (0.08, 9.0, 0.6), (0.08, 4.0, -1.1), (0.06, 9.0, -1.0), (0.20, 7.0, 0.0),
+    (0.30, 11.0, 0.0),
+)  # fmt: skip
+
+
+@dataclass(slots=True)
+class Segment:
+    """A piece of the way. Energies in J at the pack's terminals."""
+
+    distance: float = 0.0  # m
+    duration: float = 0.0  # s
+    measured: float = 0.0
+    modelled: float = 0.0
+    flat: float = 0.0  # modelled, without hills and without change of speed from end to end
+
+
+@dataclass
+class Riding:
+    """What is known of the riding: state of the forecast."""
+
+    segments: deque[Segment] = field(default_factory=lambda: deque(maxlen=200))
+    current: Segment = field(default_factory=Segment)
+    log_factor: float = 0.0
+    log_factor_variance: float = FACTOR_SD**2
+    seconds: float = 0.0  # s in the second that is being gathered
+    way: float = 0.0  # m in it
+    energy: float = 0.0  # J in it
+    climb: float = 0.0  # m in it
+    speed_before: float | None = None  # m/s, at its start
+
+
+@dataclass
+class Past:
+    """Sums over the closed segments, each weighted by how far back it is."""
+
+    flat: float = 0.0  # J
+    duration: float = 0.0  # s
+    distance: float = 0.0  # m
+    squares: float = 0.0  # J²/m: of the consumptions, by distance
+    recent: float = 0.0  # J, measured over the last kilometre
+    recent_distance: float = 0.0  # m
+    whole: float = 0.0  # m, unweighted
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Range and what it stands on; SI units."""
+
+    range: float
+    p10: float
+    p90: float
+    energy: float
+    energy_sd: float
+    consumption: float  # J/m
+    consumption_sd: float
+    recent: float | None  # J/m, measured over the last kilometre or so
+    mostly_prior: bool
+
+
+class Forecaster:
+    """Learns from the riding and forecasts the range."""
+
+    def __init__(self, model: Model, battery: Battery) -> None:
+        self.model = model
+        self.battery = battery
+        self.riding = Riding()
+        self._past = Past()
+        self._prior_at: tuple[tuple[float, float], float] = (float("nan"), 0.0), 0.0
+        parameters = model.parameters
+        self._capacity_sd = parameters.sd("cell_capacity") / parameters["cell_capacity"]
+
+    # --- learning ---------------------------------------------------------------------------------------------
+
+    def ride(self, dt: float, speed: float, grade: float | None, power: float, ambient: float, altitude: float,
+             motor_temperature: float) -> None:  # fmt: skip
+        """Take in `dt` [s] of riding: speed [m/s], grade (sine), power at the pack [W], ambient and motor [degC]."""
+        r = self.riding
+        if r.speed_before is None:
+            r.speed_before = speed
+        r.seconds += dt
+        r.way += speed * dt
+        r.energy += power * dt
+        r.climb += (grade or 0.0) * speed * dt
+        if r.seconds < 1.0:
+            return
+        mean = r.way / r.seconds
+        acceleration = (speed - r.speed_before) / r.seconds
+        q = self.quantities(mean, acceleration, ambient, altitude, motor_temperature)
+        segment = r.current
+        segment.distance += abs(r.way)
+        segment.duration += r.seconds
+        segment.measured += r.energy
+        segment.flat += sum(self.model.power(q).values()) * r.seconds
+        if abs(r.way) > 0.1:
+            q["grade"] = max(min(r.climb / abs(r.way), 0.3), -0.3)
+        segment.modelled += sum(self.model.power(q).values()) * r.seconds
+        r.seconds = r.way = r.energy = r.climb = 0.0
+        r.speed_before = speed
+        if segment.distance >= SEGMENT:
+            self._close(segment)
+
+    def pause(self) -> None:
+        """Something was not known for a while: leave the second that was being gathered."""
+        r = self.riding
+        r.seconds = r.way = r.energy = r.climb = 0.0
+        r.speed_before = None
+
+    def quantities(
+        self, speed: float, acceleration: float, ambient: float, altitude: float, motor: float
+    ) -> dict[str, Any]:
+        """What the model reads, on a level road without wind; temperatures in degC."""
+        return {
+            "speed": speed, "acceleration": acceleration, "grade": 0.0, "grade_cosine": 1.0, "headwind": 0.0,
+            "mass": self.model.mass, "air_density": air_density(ambient, altitude), "motor_temperature": motor,
+        }  # fmt: skip
+
+    def _close(self, segment: Segment) -> None:
+        r = self.riding
+        r.segments.append(segment)
+        r.current = Segment()
+        self._sum_past()
+        # One step of a Kalman filter on the logarithm of the factor; a segment of climbing or rolling tells little.
+        r.log_factor_variance += FACTOR_WALK**2
+        if segment.modelled > 0.3 * segment.flat > 0 and segment.measured > 0:
+            noise = SEGMENT_SD * segment.flat / segment.modelled
+            variance = noise * noise * 2 * ALIKE / SEGMENT  # neighbours tell the same story
+            gain = r.log_factor_variance / (r.log_factor_variance + variance)
+            r.log_factor += gain * (log(segment.measured / segment.modelled) - r.log_factor)
+            r.log_factor_variance *= 1 - gain
+
+    # --- forecasting ------------------------------------------------------------------------------------------
+
+    def forecast(self, soc: float, soc_sd: float, cell_temperature: float, temperature_sd: float,
+                 ambient: float, altitude: float) -> Forecast:  # fmt: skip
+        """The range from this state of the battery, with the riding known so far."""
+        r, past, now = self.riding, self._past, self.riding.current
+        prior_power, prior_speed = self._prior(round(ambient), round(altitude, -2))
+        prior = prior_power / prior_speed
+        fade = exp(-now.distance / MEMORY)
+        way = PRIOR_LENGTH + fade * past.distance + now.distance
+        modelled = (PRIOR_LENGTH * prior + fade * past.flat + now.flat) / way
+        speed = way / (PRIOR_LENGTH / prior_speed + fade * past.duration + now.duration)
+        consumption = exp(r.log_factor) * modelled
+        power = consumption * speed
+
+        left = drawable(self.battery, soc, cell_temperature, power)
+        colder = drawable(self.battery, soc, cell_temperature - temperature_sd, power)
+        energy_sd = sqrt(
+            (soc_sd * left.slope) ** 2 + (left.energy - colder.energy) ** 2 + (self._capacity_sd * left.energy) ** 2
+        )
+        range_ = left.energy / consumption
+        squares = (PRIOR_LENGTH * prior**2 * (1 + PRIOR_SCATTER**2) + fade * past.squares) / (
+            PRIOR_LENGTH + fade * past.distance
+        )
+        mean = (PRIOR_LENGTH * prior + fade * past.flat) / (PRIOR_LENGTH + fade * past.distance)
+        scatter = max(squares / mean**2 - 1, 0.1**2)
+        variance = scatter * ALIKE * (1 / max(range_, ALIKE) + 1 / max(way, ALIKE)) + DRIFT**2 + r.log_factor_variance
+        sd = sqrt(variance)
+        if left.energy > energy_sd:
+            spread = sqrt(variance + (energy_sd / left.energy) ** 2)
+            p10, p90 = range_ * exp(-DECILE * spread), range_ * exp(DECILE * spread)
+        else:  # near empty the energy's error rules, and that is not relative
+            p10, p90 = 0.0, (left.energy + DECILE * energy_sd) * exp(DECILE * sd) / consumption
+        recent_way = past.recent_distance + now.distance
+        return Forecast(
+            range=range_,
+            p10=p10,
+            p90=p90,
+            energy=left.energy,
+            energy_sd=energy_sd,
+            consumption=consumption,
+            consumption_sd=consumption * sd,
+            recent=(past.recent + now.measured) / recent_way if recent_way >= 500 else None,
+            mostly_prior=past.whole + now.distance < PRIOR_LENGTH,
+        )
+
+    def _sum_past(self) -> None:
+        """Recompute what is known of the closed segments; called when one is added."""
+        past = Past()
+        for segment in reversed(self.riding.segments):
+            share = exp(-past.whole / MEMORY)
+            past.whole += segment.distance
+            past.flat += share * segment.flat
+            past.duration += share * segment.duration
+            past.distance += share * segment.distance
+            past.squares += share * segment.flat**2 / segment.distance
+            if past.recent_distance < 1000:
+                past.recent += segment.measured
+                past.recent_distance += segment.distance
+        self._past = past
+
+    def _prior(self, ambient: float, altitude: float) -> tuple[float, float]:
+        """(power [W], speed [m/s]) of the prior riding."""
+        if self._prior_at[0] != (ambient, altitude):
+            power = 0.0
+            for share, speed, acceleration in PRIOR_RIDING:
+                q = self.quantities(speed, acceleration, ambient, altitude, 40.0)
+                power += share * sum(self.model.power(q).values())
+            self._prior_at = (ambient, altitude), power
+        return self._prior_at[1], sum(share * speed for share, speed, _ in PRIOR_RIDING)
+
+    # --- saving -----------------------------------------------------------------------------------------------
+
+    def snapshot(self) -> dict[str, Any]:
+        """What is to be kept over a restart."""
+        r = self.riding
+        rows = [[s.distance, s.duration, s.measured, s.modelled, s.flat] for s in r.segments]
+        return {"segments": rows, "log_factor": r.log_factor, "log_factor_variance": r.log_factor_variance}
+
+    def restore(self, saved: Mapping[str, Any]) -> None:
+        """Take what `snapshot` gave; raises KeyError, TypeError or ValueError if it is not that."""
+        segments = [Segment(*(float(x) for x in row)) for row in saved["segments"]]
+        riding = Riding(log_factor=float(saved["log_factor"]), log_factor_variance=float(saved["log_factor_variance"]))
+        riding.segments.extend(segments)
+        if not all(s.distance > 0 and s.duration > 0 and abs(s.flat) < 1e9 for s in segments) or not (
+            abs(riding.log_factor) < 3 and 0 < riding.log_factor_variance < 1
+        ):
+            raise ValueError("implausible riding")
+        self.riding = riding
+        self._sum_past()

@@ -1,0 +1,128 @@
+"""How the vehicle moves: speed, acceleration, grade, lean, yaw rate, heading; each optional, from what there is.
+
+Lean from the roll rate, drawn to the lean of the steady turn tan φ = -V·ψ'/g (Cossalter 2006, sec. 4.1; yaw is
+positive to the left, lean to the right). Grade from the accelerometer less the wheel's acceleration, its offset
+(mounting, pitch) found by an observer that follows the GPS altitude over distance; without an accelerometer the
+same observer finds all of the grade, more slowly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import asin, atan, atan2, cos, pi, sin
+
+from gz_onboard.estimator.signals import Signals
+
+G = 9.80665  # m/s²
+SPEED_TIME = 0.3  # s: the speed's low pass, whose lag gives the acceleration
+LEAN_TIME = 2.0  # s: how fast the lean is drawn to that of the steady turn
+GRADE_TIME = 2.0  # s: low pass of the accelerometer's grade
+ALTITUDE_LENGTH = 150.0  # m: how fast the observer follows the altitude; 8 σ of GPS altitude average out
+BIAS_TIME = 5.0  # s of standing to know the offset of a rate sensor
+MOVING = 0.5  # m/s
+
+
+@dataclass(slots=True)
+class Road:
+    """State and result of the road filter."""
+
+    speed: float | None = None  # m/s
+    acceleration: float | None = None  # m/s²
+    grade: float | None = None  # sine of the road's angle
+    lean: float | None = None  # rad, positive to the right
+    yaw_rate: float | None = None  # rad/s, positive to the left
+    heading: float | None = None  # rad, clockwise from north
+    altitude: float | None = None  # m, as the observer has it
+    distance: float = 0.0  # m
+    bias_x: float = 0.0  # rad/s, of the roll rate
+    bias_z: float = 0.0  # rad/s, of the yaw rate
+    slow_speed: float = 0.0  # m/s, low-passed
+    accelerometer_grade: float = 0.0
+    grade_offset: float = 0.0
+
+    def step(self, now: float, dt: float, signals: Signals, wheel_radius: float, gear_ratio: float) -> None:
+        """Go `dt` [s] ahead to `now` [s]."""
+        self._speed(now, dt, signals, wheel_radius, gear_ratio)
+        self._turn(now, dt, signals)
+        self._slope(now, dt, signals)
+
+    def _speed(self, now: float, dt: float, signals: Signals, radius: float, gear: float) -> None:
+        motor = signals.motor_speed.mean(now)
+        rear, front = signals.wheel_speed_rear.mean(now), signals.wheel_speed_front.mean(now)
+        speed: float | None = None
+        if motor is not None:
+            speed = motor * gear * radius
+        elif rear is not None:
+            speed = rear * radius
+        elif front is not None:
+            speed = front * radius
+        else:
+            speed = signals.vehicle_speed.mean(now)
+            if speed is None:
+                speed = signals.gps_speed.get(now)
+        if speed is None:
+            self.speed = self.acceleration = None
+            return
+        if self.speed is None:
+            self.slow_speed = speed
+        self.speed = speed
+        self.slow_speed += (speed - self.slow_speed) * min(dt / SPEED_TIME, 1.0)
+        self.acceleration = (speed - self.slow_speed) / SPEED_TIME
+        self.distance += abs(speed) * dt
+
+    def _turn(self, now: float, dt: float, signals: Signals) -> None:
+        roll, yaw = signals.rate_x.mean(now), signals.rate_z.mean(now)
+        speed = self.speed
+        if roll is None or yaw is None or speed is None:
+            self.lean = self.yaw_rate = None
+        else:
+            if abs(speed) < 0.05 and abs(roll - self.bias_x) < 0.05 and abs(yaw - self.bias_z) < 0.05:
+                share = min(dt / BIAS_TIME, 1.0)
+                self.bias_x += (roll - self.bias_x) * share
+                self.bias_z += (yaw - self.bias_z) * share
+            lean = self.lean or 0.0
+            self.yaw_rate = (yaw - self.bias_z) / max(cos(lean), 0.5)
+            lean += (roll - self.bias_x) * dt
+            if abs(speed) > 2:
+                steady = -atan(speed * self.yaw_rate / G)
+            else:
+                sideways = signals.accel_y.mean(now)
+                steady = asin(min(max(sideways / G, -1.0), 1.0)) if sideways is not None else 0.0
+            self.lean = lean + (steady - lean) * min(dt / LEAN_TIME, 1.0)
+        course, gps_speed = signals.gps_course.get(now), signals.gps_speed.get(now)
+        if self.heading is not None and self.yaw_rate is not None:
+            self.heading -= self.yaw_rate * dt
+        if course is not None and gps_speed is not None and gps_speed > 2:
+            if self.heading is None:
+                self.heading = course
+            turn = course - self.heading
+            self.heading += atan2(sin(turn), cos(turn)) * min(dt / 1.0, 1.0)
+        elif self.yaw_rate is None:
+            self.heading = None
+        if self.heading is not None:
+            self.heading %= 2 * pi
+
+    def _slope(self, now: float, dt: float, signals: Signals) -> None:
+        forward = signals.accel_x.mean(now)
+        altitude = signals.gps_altitude.get(now)
+        if signals.gps_fix.fresh(now) and signals.gps_fix.value < 3:
+            altitude = None
+        if self.speed is None or (forward is None and altitude is None and self.altitude is None):
+            self.grade = None
+            return
+        if forward is not None and self.acceleration is not None:
+            sine = (forward - self.acceleration) / G
+            self.accelerometer_grade += (sine - self.accelerometer_grade) * min(dt / GRADE_TIME, 1.0)
+        else:
+            self.accelerometer_grade = 0.0
+        way = abs(self.speed) * dt
+        if self.altitude is not None:
+            self.altitude += (self.accelerometer_grade + self.grade_offset) * way
+        if altitude is not None:
+            if self.altitude is None:
+                self.altitude = altitude
+            error = altitude - self.altitude
+            share = min(way / ALTITUDE_LENGTH, 0.5)  # critically damped over distance
+            self.altitude += 2 * share * error
+            self.grade_offset += share * error / ALTITUDE_LENGTH
+        self.grade = min(max(self.accelerometer_grade + self.grade_offset, -0.3), 0.3)

@@ -1,0 +1,61 @@
+"""The last value of each role, and its mean since the last step of the estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from gz_onboard.events import ROLES
+
+DEFAULT_STALE = 2.0  # s, for messages of unknown period
+
+
+class Signal:
+    """One role."""
+
+    __slots__ = ("count", "stale_after", "time", "total", "value")
+
+    def __init__(self) -> None:
+        self.value = 0.0
+        self.time = float("-inf")  # s, of the last value
+        self.total = 0.0
+        self.count = 0
+        self.stale_after = 0.0  # s; 0: the vehicle has no such signal
+
+    def fresh(self, now: float) -> bool:
+        """Whether it has a value that is not stale at `now` [s]."""
+        return now - self.time <= self.stale_after
+
+    def get(self, now: float) -> float | None:
+        """Its last value, or None if that is stale."""
+        return self.value if now - self.time <= self.stale_after else None
+
+    def mean(self, now: float) -> float | None:
+        """Its mean since the last step; if nothing came, its last value; None if that is stale."""
+        if self.count:
+            return self.total / self.count
+        return self.value if now - self.time <= self.stale_after else None
+
+
+class Signals:
+    """All roles as attributes by name; those that the vehicle does not have are always stale."""
+
+    def __init__(self, stale_after: Iterable[tuple[str, float]]) -> None:
+        self._all = {role: Signal() for role in ROLES}
+        for role, seconds in stale_after:
+            self._all[role].stale_after = seconds
+        self._mapped = [signal for signal in self._all.values() if signal.stale_after]
+
+    def __getattr__(self, role: str) -> Signal:
+        try:
+            return self.__dict__["_all"][role]  # type: ignore[no-any-return]
+        except KeyError:
+            raise AttributeError(role) from None
+
+    def __getitem__(self, role: str) -> Signal:
+        return self._all[role]
+
+    def next_step(self) -> None:
+        """Start new means."""
+        for signal in self._mapped:
+            signal.total = 0.0
+            signal.count = 0

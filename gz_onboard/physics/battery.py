@@ -1,0 +1,239 @@
+"""The battery as a first-order equivalent circuit (Lord 2016, eqs. 2.20-2.24), one representative cell.
+
+    dSOC/dt = -I/(3600·Ah)      dV1/dt = -V1/(R1·C1) + I/C1      V = V_oc(SOC) - R0·I - V1
+
+with I the cell's current, positive when discharging. R0, R1 and C1 are tables over SOC and temperature, linear in
+between; outside them the nearest edge counts, except that V_oc goes on along its last slope, so that an estimate
+that strays beyond full or empty is still told its way back.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from itertools import pairwise
+from math import exp, sqrt
+from typing import TYPE_CHECKING
+
+from gz_onboard.physics.parameters import Parameters
+
+if TYPE_CHECKING:
+    from gz_onboard.toml import Table
+
+Row = tuple[float, ...]
+
+
+def _linear(xs: Row, ys: Row, x: float) -> float:
+    """Linear interpolation, constant beyond the ends."""
+    if x <= xs[0]:
+        return ys[0]
+    if x >= xs[-1]:
+        return ys[-1]
+    i = bisect_right(xs, x) - 1
+    return ys[i] + (x - xs[i]) * (ys[i + 1] - ys[i]) / (xs[i + 1] - xs[i])
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Values over SOC (columns) and temperature [degC] (rows)."""
+
+    soc: Row
+    temperature: Row
+    value: tuple[Row, ...]
+
+    def at(self, soc: float, temperature: float) -> tuple[float, float]:
+        """(value, its slope over SOC); beyond the mesh its edge, with slope zero."""
+        xs, ts = self.soc, self.temperature
+        if len(ts) == 1:
+            return self._row(self.value[0], soc)
+        j = min(max(bisect_right(ts, temperature) - 1, 0), len(ts) - 2)
+        w = min(max((temperature - ts[j]) / (ts[j + 1] - ts[j]), 0.0), 1.0)
+        cold, warm = self.value[j], self.value[j + 1]
+        i = bisect_right(xs, soc) - 1
+        if i < 0:
+            return cold[0] + w * (warm[0] - cold[0]), 0.0
+        if i >= len(xs) - 1:
+            return cold[-1] + w * (warm[-1] - cold[-1]), 0.0
+        left = cold[i] + w * (warm[i] - cold[i])
+        right = cold[i + 1] + w * (warm[i + 1] - cold[i + 1])
+        slope = (right - left) / (xs[i + 1] - xs[i])
+        return left + slope * (soc - xs[i]), slope
+
+    def _row(self, row: Row, soc: float) -> tuple[float, float]:
+        xs = self.soc
+        i = bisect_right(xs, soc) - 1
+        if i < 0:
+            return row[0], 0.0
+        if i >= len(xs) - 1:
+            return row[-1], 0.0
+        slope = (row[i + 1] - row[i]) / (xs[i + 1] - xs[i])
+        return row[i] + slope * (soc - xs[i]), slope
+
+
+@dataclass(frozen=True)
+class Battery:
+    """A pack of `cells_series` by `cells_parallel` cells."""
+
+    cells_series: int
+    cells_parallel: int
+    capacity: float  # A·h of a cell at 25 degC
+    capacity_temperature: Row  # degC
+    capacity_share: Row  # of the capacity at 25 degC
+    cutoff_voltage: float  # V of a cell
+    series_resistance: float  # ohm, of the pack beside its cells
+    ocv_soc: Row
+    ocv_value: Row  # V
+    ocv_sd: float  # V
+    r0: Mesh  # ohm
+    r1: Mesh  # ohm
+    c1: Mesh  # F
+
+    def cell_capacity(self, temperature: float) -> float:
+        """Capacity of a cell [A·h] at `temperature` [degC]: the charge between SOC 0 and 1."""
+        return self.capacity * _linear(self.capacity_temperature, self.capacity_share, temperature)
+
+    def pack_capacity(self, temperature: float) -> float:
+        """Capacity of the pack [A·h] at `temperature` [degC]."""
+        return self.cell_capacity(temperature) * self.cells_parallel
+
+    def ocv(self, soc: float) -> tuple[float, float]:
+        """(open-circuit voltage of a cell [V], its slope [V])."""
+        xs, ys = self.ocv_soc, self.ocv_value
+        i = min(max(bisect_right(xs, soc) - 1, 0), len(xs) - 2)
+        slope = (ys[i + 1] - ys[i]) / (xs[i + 1] - xs[i])
+        return ys[i] + slope * (soc - xs[i]), slope
+
+    def soc_at(self, ocv: float) -> float:
+        """The SOC at which the open-circuit voltage of a cell is `ocv` [V]."""
+        xs, ys = self.ocv_soc, self.ocv_value
+        i = min(max(bisect_right(ys, ocv) - 1, 0), len(xs) - 2)
+        return xs[i] + (ocv - ys[i]) * (xs[i + 1] - xs[i]) / (ys[i + 1] - ys[i])
+
+    def cell_voltage(self, pack_voltage: float, pack_current: float) -> float:
+        """Voltage of the mean cell [V] out of pack voltage [V] and current [A]."""
+        return (pack_voltage + self.series_resistance * pack_current) / self.cells_series
+
+    def relax(self, dt: float, v1: float, current: float, r1: float, c1: float) -> tuple[float, float]:
+        """(V1 after `dt` [s] of constant cell current [A], the factor that V1 decayed by): eq. 2.22, exact."""
+        decay = exp(-dt / (r1 * c1))
+        return decay * v1 + r1 * (1 - decay) * current, decay
+
+    def settled_current(self, power: float, soc: float, temperature: float) -> float | None:
+        """Pack current [A] that delivers `power` [W] once the RC pair has settled; None if the pack cannot."""
+        n, m = self.cells_series, self.cells_parallel
+        source = n * self.ocv(soc)[0]
+        cell = self.r0.at(soc, temperature)[0] + self.r1.at(soc, temperature)[0]
+        resistance = n * cell / m + self.series_resistance
+        root = source * source - 4 * resistance * power
+        if root < 0:
+            return None
+        return 2 * power / (source + sqrt(root))
+
+
+@dataclass(frozen=True)
+class Drawable:
+    """What a pack still delivers until its cells reach the cut-off voltage."""
+
+    energy: float  # J, at the pack's terminals
+    soc_left: float
+    slope: float  # J: how much more energy there would be for more SOC
+
+
+# Gauss-Legendre nodes and weights on [0, 1], of order 8
+_NODES = (0.019855072, 0.101666761, 0.237233795, 0.408282679, 0.591717321, 0.762766205, 0.898333239, 0.980144928)
+_WEIGHTS = (0.050614268, 0.111190517, 0.156853323, 0.181341892, 0.181341892, 0.156853323, 0.111190517, 0.050614268)
+
+
+def drawable(battery: Battery, soc: float, temperature: float, power: float) -> Drawable:
+    """What a pack at `soc` and `temperature` [degC] delivers at a constant `power` [W] until the cut-off.
+
+    At constant power P the charge Q·dSOC passes in dt = Q·dSOC/I, so the energy is P·Q·∫ dSOC/I(SOC), from the
+    SOC at which the terminal voltage meets the cut-off. The RC pair is taken as settled (V1 = R1·I): discharging
+    takes an hour, its time constant is a minute.
+    """
+    low, high = -0.05, soc
+    charge = battery.pack_capacity(temperature) * 3600
+    cutoff = battery.cutoff_voltage * battery.cells_series
+    current = battery.settled_current(power, soc, temperature)
+    if current is None or power < cutoff * current:
+        return Drawable(0.0, soc, charge * cutoff)
+    slope = charge * power / current
+    for _ in range(14):  # to 6e-5 of SOC
+        middle = (low + high) / 2
+        current = battery.settled_current(power, middle, temperature)
+        if current is None or power < cutoff * current:
+            low = middle
+        else:
+            high = middle
+    width = soc - high
+    total = 0.0
+    for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+        current = battery.settled_current(power, high + width * node, temperature)
+        total += weight / current if current else 0.0
+    return Drawable(power * charge * width * total, high, slope)
+
+
+def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
+    """The battery in the vehicle file; InputError for tables that do not make sense."""
+    table = vehicle.table("battery")
+    table.only(["cells_series", "cells_parallel", "ocv", "capacity", "r0", "r1", "c1"])
+    ocv = table.table("ocv")
+    ocv.only(["soc", "value", "unit", "sd", "source", "status"])
+    ocv.text("unit", choices=["V"])
+    soc, volts = _axis(ocv, "soc", -0.01, 1.01), _axis(ocv, "value", 0.5, 5.0)
+    if len(soc) != len(volts):
+        raise ocv.error(f"has {len(volts)} numbers for {len(soc)} of soc", "value")
+    temperatures: Row
+    capacities: Row
+    temperatures, capacities = (25.0,), (1.0,)
+    if "capacity" in table.values:
+        capacity = table.table("capacity")
+        capacity.only(["temperature", "value", "unit", "sd_relative", "source", "status"])
+        capacity.text("unit", choices=["A·h"])
+        temperatures, capacities = _axis(capacity, "temperature", -60, 100), capacity.numbers("value")
+        if len(temperatures) != len(capacities) or min(capacities) <= 0:
+            raise capacity.error(f"must be {len(temperatures)} positive numbers, one for each temperature", "value")
+        at_25 = _linear(temperatures, capacities, 25.0)
+        capacities = tuple(value / at_25 for value in capacities)
+    return Battery(
+        cells_series=round(table.number("cells_series", low=1, high=1000)),
+        cells_parallel=round(table.number("cells_parallel", low=1, high=1000)),
+        capacity=parameters["cell_capacity"],
+        capacity_temperature=temperatures,
+        capacity_share=capacities,
+        cutoff_voltage=parameters["cell_cutoff_voltage"],
+        series_resistance=parameters["pack_series_resistance"],
+        ocv_soc=soc,
+        ocv_value=volts,
+        ocv_sd=ocv.number("sd", 0.005, low=1e-4, high=0.5),
+        r0=_mesh(table.table("r0"), "ohm"),
+        r1=_mesh(table.table("r1"), "ohm"),
+        c1=_mesh(table.table("c1"), "F"),
+    )
+
+
+def _axis(table: Table, key: str, low: float, high: float) -> Row:
+    row = table.numbers(key)
+    for a, b in pairwise(row):
+        if not a < b:
+            raise table.error(f"must increase, but {b:g} follows {a:g}", key)
+    if len(row) < 2 or row[0] < low or row[-1] > high:
+        raise table.error(f"must be two numbers or more within {low:g} to {high:g}", key)
+    return row
+
+
+def _mesh(table: Table, unit: str) -> Mesh:
+    table.only(["soc", "temperature", "value", "unit", "sd_relative", "source", "status"])
+    table.text("unit", choices=[unit])
+    soc = _axis(table, "soc", -0.01, 1.01)
+    temperature = table.numbers("temperature")
+    rows = table.values.get("value")
+    if not isinstance(rows, list) or len(rows) != len(temperature):
+        raise table.error(f"must be {len(temperature)} rows, one for each temperature", "value")
+    if any(not a < b for a, b in pairwise(temperature)):
+        raise table.error("must increase", "temperature")
+    for row in rows:
+        good = isinstance(row, list) and len(row) == len(soc)
+        if not good or not all(isinstance(v, int | float) and v > 0 for v in row):
+            raise table.error(f"each row must be {len(soc)} positive numbers, one for each soc", "value")
+    return Mesh(soc, temperature, tuple(tuple(float(v) for v in row) for row in rows))

@@ -1,0 +1,154 @@
+"""What an effect is: one physical cause, in one file of ``physics/effects``.
+
+An effect file has
+- a docstring: what it is, its equation, its source;
+- ``PORT``: where it acts (one of `Port`);
+- ``PARAMETERS``: a tuple of `Parameter`;
+- ``term(quantity, ..., *, parameter, ...)``: the equation. Its positional arguments are the quantities that it
+  reads (names from `QUANTITIES`), its keyword arguments are its parameters, or
+  those of the vehicle (`VEHICLE_PARAMETERS`). Pure; floats and numpy arrays alike,
+  so it uses operators and ``abs`` only.
+
+Sign conventions
+    speed, motor torque, motor current   positive forward, driving
+    battery current                      positive discharging
+    forces at the wheel                  positive against the vehicle's motion (what the motor has to overcome)
+    powers and losses                    positive consuming
+    grade                                positive uphill
+    headwind                             positive against the vehicle
+    lean                                 positive to the right; yaw rate positive to the left (as the IMU)
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import pkgutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from gz_onboard.errors import InputError, nearest
+
+
+class Port(Enum):
+    """Where an effect acts, with the unit of its term."""
+
+    WHEEL_FORCE = "N"  # road load at the driven wheel's contact, against the motion
+    MOTOR_LOSS = "W"  # heat in the motor: between shaft and inverter
+    INVERTER_LOSS = "W (inverter)"  # heat in the inverter: between motor and DC link
+    DC_POWER = "W (DC link)"  # power drawn from the pack beside the inverter
+
+
+QUANTITIES: dict[str, str] = {
+    "speed": "m/s",
+    "acceleration": "m/s^2",
+    "grade": "sine of the road's angle",
+    "grade_cosine": "cosine of the road's angle",
+    "mass": "kg, vehicle and payload",
+    "air_density": "kg/m^3",
+    "headwind": "m/s",
+    "motor_speed": "rad/s",
+    "motor_current": "A, RMS, as torque over torque constant",
+    "motor_temperature": "degC",
+}
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A parameter of an effect: what it is and what it can be."""
+
+    name: str
+    unit: str
+    prior: float
+    prior_sd: float
+    low: float
+    high: float
+    source: str
+
+    def __post_init__(self) -> None:
+        if not self.low <= self.prior <= self.high:
+            raise ValueError(f"{self.name}: prior {self.prior} is outside {self.low} to {self.high} {self.unit}")
+
+
+VEHICLE_PARAMETERS = (
+    Parameter("vehicle_mass", "kg", 105, 5, 20, 500, "GenZe 2.0 data sheet"),
+    Parameter("payload_mass", "kg", 80, 12, 0, 300, "rider and what he carries"),
+    Parameter("wheel_radius", "m", 0.245, 0.005, 0.1, 0.5, "effective rolling radius of the driven wheel"),
+    Parameter("wheelbase", "m", 1.32, 0.02, 0.5, 3, "GenZe 2.0 data sheet"),
+    Parameter("cg_to_rear", "m", 0.57, 0.08, 0.1, 2, "rear axle to centre of gravity"),
+    Parameter("cg_height", "m", 0.63, 0.08, 0.1, 2, "centre of gravity over the road"),
+    Parameter("wheel_inertia_front", "kg·m²", 0.11, 0.03, 0, 5, "wheel and tyre"),
+    Parameter("wheel_inertia_rear", "kg·m²", 0.34, 0.08, 0, 5, "wheel, tyre and hub motor"),
+    Parameter("gear_ratio", "1", 1.0, 0.01, 0.02, 5, "wheel speed over motor speed; 1 for a hub motor"),
+    Parameter("torque_constant", "N·m/A", 0.47, 0.02, 0.01, 10, "Lord 2016, table 2.5"),
+    Parameter("regeneration_torque_limit", "N·m", 19, 3, 0, 500, "the most that the motor brakes with, at its shaft"),
+)
+
+
+@dataclass(frozen=True)
+class Effect:
+    """An effect as loaded from its file."""
+
+    name: str
+    port: Port
+    parameters: tuple[Parameter, ...]
+    quantities: tuple[str, ...]
+    keywords: tuple[str, ...]  # parameters that the term takes: its own and the vehicle's
+    term: Callable[..., Any]
+    doc: str
+
+
+@cache
+def known_effects() -> tuple[str, ...]:
+    """The names of the effects that come with the package."""
+    from gz_onboard.physics import effects
+
+    return tuple(sorted(module.name for module in pkgutil.iter_modules(effects.__path__)))
+
+
+def load_effect(name: str, folder: Path | None = None) -> Effect:
+    """The effect `name`, from `folder` if it has one of that name, else the package's own."""
+    if folder and (folder / f"{name}.py").is_file():
+        return _effect(name, _import_file(name, folder / f"{name}.py"))
+    if name not in known_effects():
+        raise InputError(f"no effect is called {name!r}{nearest(name, known_effects())}")
+    return _effect(name, importlib.import_module(f"gz_onboard.physics.effects.{name}"))
+
+
+def _import_file(name: str, file: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"gz_onboard_user_effects.{name}", file)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise InputError(f"{file}: {type(error).__name__}: {error}") from error
+    return module
+
+
+def _effect(name: str, module: ModuleType) -> Effect:
+    file = module.__file__
+    for attribute in ("PORT", "PARAMETERS", "term"):
+        if not hasattr(module, attribute):
+            raise InputError(f"{file}: an effect needs {attribute}")
+    quantities: list[str] = []
+    parameters: list[str] = []
+    for argument in inspect.signature(module.term).parameters.values():
+        (parameters if argument.kind is argument.KEYWORD_ONLY else quantities).append(argument.name)
+    for quantity in quantities:
+        if quantity not in QUANTITIES:
+            raise InputError(f"{file}: no quantity is called {quantity!r}{nearest(quantity, QUANTITIES)}")
+    declared = [parameter.name for parameter in module.PARAMETERS]
+    shared = [parameter.name for parameter in VEHICLE_PARAMETERS]
+    if set(declared) - set(parameters) or set(parameters) - {*declared, *shared}:
+        raise InputError(f"{file}: PARAMETERS declares {declared}, term takes {parameters}")
+    doc = inspect.getdoc(module) or ""
+    return Effect(name, module.PORT, tuple(module.PARAMETERS), tuple(quantities), tuple(parameters), module.term, doc)

@@ -1,0 +1,20 @@
+"""Aerodynamic drag, F = ½·ρ·C_d·A·(V + V_w)·|V + V_w| (Lord 2016, eq. 3.1, with the sign kept in a tailwind)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gz_onboard.physics.effect import Parameter, Port
+
+PORT = Port.WHEEL_FORCE
+PARAMETERS = (
+    Parameter(
+        "drag_area", "m²", 0.55, 0.15, 0.1, 1.5, "scooter with upright rider: Cossalter 2006, table 3.1, CdA 0.5-0.7"
+    ),
+)
+
+
+def term(speed: Any, headwind: Any, air_density: Any, *, drag_area: float) -> Any:
+    """Force [N] against the motion."""
+    flow = speed + headwind
+    return 0.5 * air_density * drag_area * flow * abs(flow)

@@ -1,0 +1,17 @@
+"""Auxiliary load behind the DC-DC converter: lamps, dashboard, control (Lord 2016, eq. 2.19)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gz_onboard.physics.effect import Parameter, Port
+
+PORT = Port.DC_POWER
+PARAMETERS = (
+    Parameter("auxiliary_power", "W", 45.0, 15.0, 0.0, 500.0, "LED lamps, dashboard and control of a scooter"),
+)
+
+
+def term(*, auxiliary_power: float) -> Any:
+    """Power [W] drawn from the pack."""
+    return auxiliary_power

@@ -1,0 +1,15 @@
+"""Weight along the road, F = m·g·sin θ (Lord 2016, eq. 3.2). Gives back downhill what it took uphill."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gz_onboard.physics.effect import Parameter, Port
+
+PORT = Port.WHEEL_FORCE
+PARAMETERS: tuple[Parameter, ...] = ()
+
+
+def term(mass: Any, grade: Any) -> Any:
+    """Force [N] against the motion."""
+    return mass * 9.80665 * grade

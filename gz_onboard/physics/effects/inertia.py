@@ -1,0 +1,18 @@
+"""Inertia of the vehicle and of what rotates, F = (m + J/r²)·dV/dt (Lord 2016, eqs. 2.11, 3.3)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gz_onboard.physics.effect import Parameter, Port
+
+PORT = Port.WHEEL_FORCE
+PARAMETERS: tuple[Parameter, ...] = ()
+
+
+def term(
+    acceleration: Any, mass: Any, *, wheel_inertia_front: float, wheel_inertia_rear: float, wheel_radius: float
+) -> Any:
+    """Force [N] against the motion."""
+    rotating = (wheel_inertia_front + wheel_inertia_rear) / wheel_radius**2
+    return (mass + rotating) * acceleration

@@ -1,0 +1,29 @@
+"""Inverter loss, P = c0 + c1·|i_m| + c2·i_m²: gate drive, switching and conduction (Lord 2016, eqs. 2.1-2.6)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gz_onboard.physics.effect import Parameter, Port
+
+PORT = Port.INVERTER_LOSS
+PARAMETERS = (
+    Parameter("inverter_loss_constant", "W", 10.0, 6.0, 0.0, 100.0, "control and gate supply of a 48 V inverter"),
+    Parameter("inverter_loss_linear", "W/A", 0.3, 0.2, 0.0, 5.0, "switching loss: grows with current"),
+    Parameter("inverter_loss_quadratic", "W/A²", 3e-3, 2e-3, 0.0, 0.1, "conduction: MOSFET on-resistance"),
+)
+
+
+def term(
+    motor_current: Any,
+    *,
+    inverter_loss_constant: float,
+    inverter_loss_linear: float,
+    inverter_loss_quadratic: float,
+) -> Any:
+    """Heat [W]."""
+    return (
+        inverter_loss_constant
+        + inverter_loss_linear * abs(motor_current)
+        + inverter_loss_quadratic * motor_current * motor_current
+    )

@@ -1,0 +1,29 @@
+"""Copper loss of the motor, P = r(T)·i_m², r(T) = r_25·(1 + 0.00393·(T − 25)), i_m on the inverter's own scale."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gz_onboard.physics.effect import Parameter, Port
+
+PORT = Port.MOTOR_LOSS
+PARAMETERS = (
+    Parameter("motor_copper_resistance", "ohm", 0.03, 0.015, 1e-3, 0.5, "hub motors of 1.5-3 kW at 52 V; at 25 degC"),
+    Parameter("motor_copper_temperature_coefficient", "1/K", 0.00393, 1e-4, 0.0, 0.01, "IEC 60034-1"),
+)
+
+
+def term(
+    motor_current: Any,
+    motor_temperature: Any,
+    *,
+    motor_copper_resistance: float,
+    motor_copper_temperature_coefficient: float,
+) -> Any:
+    """Heat [W]."""
+    return (
+        motor_copper_resistance
+        * (1 + motor_copper_temperature_coefficient * (motor_temperature - 25))
+        * motor_current
+        * motor_current
+    )

@@ -1,0 +1,30 @@
+"""Rolling resistance, F = m·g·cos θ·(c0 + c1·V): Lord 2016, eq. 3.9, has c1 alone; road load is A + B·V + C·V².
+
+Smooth around standstill: the constant term fades below 0.1 m/s, where a scooter that stands is held, not driven.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gz_onboard.physics.effect import Parameter, Port
+
+PORT = Port.WHEEL_FORCE
+PARAMETERS = (
+    Parameter("rolling_resistance_constant", "1", 0.015, 0.005, 0.0, 0.06, "scooter tyres: Cossalter 2006, sec. 2.3"),
+    Parameter("rolling_resistance_speed", "s/m", 2e-4, 2e-4, 0.0, 3e-3, "SAE J2452: rises by a few percent per m/s"),
+)
+STANDSTILL = 0.1  # m/s
+
+
+def term(
+    speed: Any,
+    mass: Any,
+    grade_cosine: Any,
+    *,
+    rolling_resistance_constant: float,
+    rolling_resistance_speed: float,
+) -> Any:
+    """Force [N] against the motion."""
+    direction = speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5
+    return mass * 9.80665 * grade_cosine * (rolling_resistance_constant * direction + rolling_resistance_speed * speed)

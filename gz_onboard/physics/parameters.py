@@ -1,0 +1,103 @@
+"""Parameters of a vehicle: read from its file with value, unit, standard deviation, status and source.
+
+    [parameters]
+    drag_area = { value = 0.52, unit = "m^2", sd = 0.03, status = "measured", source = "coast-downs, 8 runs" }
+
+``status`` is measured, data sheet or guess. What the file leaves out takes the prior of its effect, as a guess.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from gz_onboard.physics.effect import VEHICLE_PARAMETERS, Effect, Parameter, known_effects, load_effect
+
+if TYPE_CHECKING:
+    from gz_onboard.toml import Table
+
+STATUS = ("measured", "data sheet", "guess")
+
+BATTERY_PARAMETERS = (
+    Parameter("cell_capacity", "A·h", 2.8, 0.05, 0.1, 500, "18650 cell, Lord 2016, sec. 2.2"),
+    Parameter("cell_cutoff_voltage", "V", 2.8, 0.05, 2.0, 3.5, "where the vehicle gives up"),
+    Parameter("pack_series_resistance", "ohm", 0.01, 0.005, 0.0, 0.5, "bus bars, fuse and BMS beside the cells"),
+    Parameter("pack_current_offset", "A", 0.0, 0.3, -5, 5, "what the current sensor shows at no current"),
+    Parameter("pack_current_gain", "1", 1.0, 0.01, 0.5, 2, "what the current sensor shows over what flows"),
+    Parameter("pack_current_noise", "A", 0.1, 0.05, 0, 10, "sd of a sample"),
+    Parameter("pack_voltage_noise", "V", 0.02, 0.01, 0, 1, "sd of a sample"),
+    Parameter("pack_voltage_offset", "V", 0.0, 0.1, -3, 3, "what the voltage sensor shows too much"),
+    Parameter("cell_voltage_error", "V", 0.0, 0.012, 0, 0, "sd: what one RC pair cannot follow, slow as minutes"),
+    Parameter("rest_voltage_error", "V", 0.0, 0.008, 0, 0, "sd: rest voltage against OCV: relaxation, hysteresis"),
+    Parameter("pack_heat_capacity", "J/K", 9000, 3000, 100, 1e6, "168 cells of 47 g at 0.95 J/(g·K), and the case"),
+    Parameter("pack_conductance", "W/K", 3.0, 1.5, 0.01, 200, "still air to a closed pack"),
+)
+
+
+@dataclass(frozen=True)
+class Value:
+    """What is known of a parameter."""
+
+    value: float
+    sd: float
+    unit: str
+    status: str
+    source: str
+
+
+class Parameters(Mapping[str, float]):
+    """The values by name; `known` tells unit, standard deviation and source of each."""
+
+    def __init__(self, known: Mapping[str, Value]) -> None:
+        self.known = dict(known)
+
+    def __getitem__(self, name: str) -> float:
+        return self.known[name].value
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.known)
+
+    def __len__(self) -> int:
+        return len(self.known)
+
+    def sd(self, name: str) -> float:
+        """The standard deviation of `name`, in its unit."""
+        return self.known[name].sd
+
+    def replaced(self, **values: float) -> Parameters:
+        """The same with other values, which their givers are taken to know well (a tenth of the sd)."""
+        changed = {
+            name: Value(value, 0.1 * self.known[name].sd, self.known[name].unit, "data sheet", "as entered")
+            for name, value in values.items()
+        }
+        return Parameters({**self.known, **changed})
+
+
+def declared_parameters(effects: Iterable[Effect] = ()) -> dict[str, Parameter]:
+    """Every parameter that a vehicle file may set: the vehicle's, the battery's, and those of all effects."""
+    own = [load_effect(name) for name in known_effects()]
+    every = [*VEHICLE_PARAMETERS, *BATTERY_PARAMETERS, *(p for e in (*own, *effects) for p in e.parameters)]
+    return {parameter.name: parameter for parameter in every}
+
+
+def read_parameters(vehicle: Table, effects: Iterable[Effect] = ()) -> Parameters:
+    """The parameters in the vehicle file; what it does not set is the prior. InputError naming line and value."""
+    declared = declared_parameters(effects)
+    table = vehicle.table("parameters")
+    table.only(declared)
+    known = {p.name: Value(p.prior, p.prior_sd, p.unit, "guess", f"prior: {p.source}") for p in declared.values()}
+    for name in table.values:
+        parameter = declared[name]
+        entry = table.table(name)
+        entry.only(["value", "unit", "sd", "status", "source"])
+        unit = entry.text("unit")
+        if unit != parameter.unit:
+            raise entry.error(f"unit {unit!r} is wrong: {name} is in {parameter.unit!r}", "unit")
+        value = entry.number("value")
+        if not parameter.low <= value <= parameter.high:
+            raise entry.error(f"{value:g} {unit} is outside {parameter.low:g} to {parameter.high:g} {unit}", "value")
+        known[name] = Value(
+            value, entry.number("sd", low=0), unit, entry.text("status", choices=STATUS), entry.text("source")
+        )
+    return Parameters(known)

@@ -1,0 +1,63 @@
+"""A vehicle: what its TOML file says of its bus, its parameters, its battery and its model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from gz_onboard.bus.mapping import Mapping, read_mapping
+from gz_onboard.errors import InputError, nearest
+from gz_onboard.physics.battery import Battery, read_battery
+from gz_onboard.physics.model import Model, read_model
+from gz_onboard.physics.parameters import Parameters, read_parameters
+from gz_onboard.toml import Table
+
+OWN = Path(__file__).resolve().parent / "vehicles"
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """Everything that is known of one vehicle before it moves."""
+
+    name: str
+    file: Path
+    mapping: Mapping
+    parameters: Parameters
+    battery: Battery | None
+    model: Model
+
+    @property
+    def key(self) -> str:
+        """What a saved state must agree with to be of use: the vehicle, its cells and its model list."""
+        pack = f"{self.battery.cells_series}s{self.battery.cells_parallel}p" if self.battery else "no battery"
+        return "|".join([self.name, pack, *(effect.name for effect in self.model.effects)])
+
+
+def find_vehicle(name: str) -> Path:
+    """The vehicle file `name`: a path, or the name of one of the package's own."""
+    if Path(name).is_file():
+        return Path(name)
+    own = sorted(file.stem for file in OWN.glob("*.toml"))
+    if name in own:
+        return OWN / f"{name}.toml"
+    raise InputError(f"{name}: no such vehicle file; the package's own are {', '.join(own)}{nearest(name, own)}")
+
+
+def read_vehicle(name: str, payload: float | None = None) -> Vehicle:
+    """The vehicle `name` (file or one of the package's own), with the rider's mass [kg] if it is known."""
+    table = Table.read(find_vehicle(name))
+    table.only(["schema", "name", "dbc", "bus", "roles", "model", "parameters", "battery"])
+    if table.number("schema") != 1:
+        raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
+    effects = read_model(table)
+    parameters = read_parameters(table, effects)
+    if payload is not None:
+        parameters = parameters.replaced(payload_mass=payload)
+    return Vehicle(
+        name=table.text("name"),
+        file=table.file,
+        mapping=read_mapping(table),
+        parameters=parameters,
+        battery=read_battery(table, parameters) if "battery" in table.values else None,
+        model=Model(effects, parameters),
+    )
