@@ -1,0 +1,28 @@
+"""python-can, imported so that it stays small: use ``from gz_onboard.bus._can import can`` on board.
+
+Where asammdf is installed, ``import can`` loads it for its MF4 reader, and with it pandas: 86 MB and 0.9 s that
+a daemon which never reads an MF4 file would pay at each start.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+
+def _import_without_asammdf() -> None:
+    """Import python-can with asammdf hidden from it, unless either is there already."""
+    if "can" in sys.modules or "asammdf" in sys.modules:
+        return
+    sys.modules["asammdf"] = None  # type: ignore[assignment]  # an import then raises ModuleNotFoundError
+    try:
+        importlib.import_module("can")
+    finally:
+        del sys.modules["asammdf"]
+
+
+_import_without_asammdf()
+
+import can  # noqa: E402
+
+__all__ = ["can"]

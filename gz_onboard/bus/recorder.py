@@ -1,0 +1,341 @@
+"""Writing logs: MCAP files with the raw frames in blocks and JSON channels for everything else.
+
+`LogFile` writes one file and lets errors through; `Recorder` keeps a directory of them, rotates and deletes them,
+and never raises for a full disk or a broken one. Neither has a clock: times come with the frames and samples.
+What stands in a file: docs/log-format.md.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import IO, Any
+
+from mcap.writer import CompressionType, Writer
+
+from gz_onboard import __version__
+from gz_onboard.bus import framelog
+from gz_onboard.errors import InputError
+from gz_onboard.events import Frame
+
+BLOCK_FRAMES = 512
+BLOCK_NS = 1_000_000_000
+"""A block holds at most this many frames and this much time: a reader that looks for a time relies on it."""
+
+_CHUNK_BYTES = 256 * 1024
+_NAME = re.compile(r"(\d{8}T\d{6}Z)_(.+?)(?:~(\d+))?\.mcap")
+
+
+class LogFile:
+    """One MCAP file of frames and samples. An I/O error is raised as OSError.
+
+    stream: opened for binary writing; closed by `close`. start_ns: the time of the first entry.
+    metadata: text by key, kept in the file's metadata record ``gz_onboard``; attachments: files by name, such as
+    the DBC files that the frames can be decoded by.
+    """
+
+    def __init__(
+        self,
+        stream: IO[bytes],
+        start_ns: int,
+        metadata: Mapping[str, str] | None = None,
+        attachments: Mapping[str, bytes] | None = None,
+    ) -> None:
+        self.start_ns = start_ns
+        self.unsynced_frames = 0
+        self.flushed = False
+        self._stream = stream
+        self._pending: list[Frame] = []
+        self._channels: dict[str, int] = {}
+        self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer.start(profile="", library=f"gz-onboard {__version__}")
+        self._writer.add_metadata("gz_onboard", {"version": __version__, **(metadata or {})})
+        for name, data in (attachments or {}).items():
+            self._writer.add_attachment(start_ns, start_ns, name, "text/plain", data)
+        schema = self._writer.register_schema(framelog.SCHEMA_NAME, framelog.ENCODING, framelog.SCHEMA_TEXT.encode())
+        self._frames_channel = self._writer.register_channel(framelog.TOPIC, framelog.ENCODING, schema)
+
+    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
+        """Declare a topic of JSON objects; its schema is named by the JSON schema's ``title``, or the topic."""
+        schema = self._writer.register_schema(
+            str(json_schema.get("title", topic)), "jsonschema", json.dumps(json_schema, separators=(",", ":")).encode()
+        )
+        self._channels[topic] = self._writer.register_channel(topic, "json", schema, dict(metadata or {}))
+
+    def frames(self, batch: Sequence[Frame]) -> None:
+        """Log raw frames; they are written once there is a block of them, or at the next `flush`."""
+        pending = self._pending
+        pending += batch
+        self.unsynced_frames += len(batch)
+        while pending and (len(pending) >= BLOCK_FRAMES or abs(pending[-1][0] - pending[0][0]) >= BLOCK_NS):
+            self._write_block(_block_length(pending))
+
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
+        """Log one JSON object on a declared topic; not-a-number and infinities become null."""
+        try:
+            text = json.dumps(values, allow_nan=False, separators=(",", ":"))
+        except ValueError:
+            text = json.dumps(_without_nan(values), separators=(",", ":"))
+        self._writer.add_message(self._channels[topic], time_ns, text.encode(), time_ns)
+
+    def flush(self, *, to_disk: bool = False) -> None:
+        """Write all that there is, so that it can be read though the file is cut off; to_disk: fsync as well."""
+        while self._pending:
+            self._write_block(_block_length(self._pending))
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        if to_disk:
+            os.fdatasync(self._stream.fileno())
+        self.unsynced_frames = 0
+        self.flushed = True
+
+    def size(self) -> int:
+        """Bytes written so far, without what still waits for a chunk to be full."""
+        return self._stream.tell()
+
+    def close(self) -> None:
+        """Write the rest and the summary that lets readers jump to a time."""
+        try:
+            self.flush()
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+        finally:
+            self._stream.close()
+
+    def abandon(self) -> None:
+        """Close without writing anything more, after an error."""
+        with contextlib.suppress(OSError):
+            self._stream.close()
+
+    def _write_block(self, count: int) -> None:
+        block = self._pending[:count]
+        self._writer.add_message(
+            self._frames_channel, block[0][0], framelog.encode_block(block), publish_time=block[-1][0]
+        )
+        del self._pending[:count]
+
+
+class Recorder:
+    """Logs into a directory of MCAP files named by their start in UTC and the vehicle, never raising for I/O errors.
+
+    An error closes the file and is counted in `errors` (its text in `last_error`); recording goes on with a new
+    file `retry_s` later, and `lost_frames` counts the frames that no file holds. A file is closed at
+    `max_file_bytes` or `max_age_s`. Before a new one is begun, the oldest of the files named as ours are deleted
+    until all together, with the new one, stay below `max_total_bytes`; other files are not touched.
+    Raises InputError for limits that cannot be kept.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        vehicle: str,
+        metadata: Mapping[str, str] | None = None,
+        attachments: Mapping[str, bytes] | None = None,
+        *,
+        sync_s: float = 1.6,
+        max_file_bytes: int = 64 << 20,
+        max_age_s: float = 3600.0,
+        max_total_bytes: int = 1 << 30,
+        retry_s: float = 10.0,
+    ) -> None:
+        if not 0 < max_file_bytes <= max_total_bytes:
+            raise InputError(
+                f"log: a file of up to {max_file_bytes} bytes does not fit into {max_total_bytes} bytes in all;"
+                " make the total larger or the files smaller"
+            )
+        self.path: Path | None = None
+        self.paths: list[Path] = []
+        self.errors = 0
+        self.last_error = ""
+        self.lost_frames = 0
+        self._directory = directory
+        self._vehicle = re.sub(r"[^\w.+-]+", "-", vehicle) or "vehicle"
+        self._metadata = {"vehicle": vehicle, **(metadata or {})}
+        self._attachments = dict(attachments or {})
+        self._channels: dict[str, tuple[Mapping[str, Any], Mapping[str, str]]] = {}
+        self._sync_ns = round(sync_s * 1e9)
+        self._retry_ns = round(retry_s * 1e9)
+        self._max_age_ns = round(max_age_s * 1e9)
+        self._max_file_bytes = max_file_bytes
+        self._max_total_bytes = max_total_bytes
+        self._file: LogFile | None = None
+        self._synced_ns: int | None = None
+        self._failed_ns: int | None = None
+
+    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
+        """Declare a topic of JSON objects (a JSON schema of type object), for this file and all later ones."""
+        self._channels[topic] = (json_schema, dict(metadata or {}))
+        if self._file is not None:
+            self._file.channel(topic, *self._channels[topic])
+
+    def frames(self, batch: Sequence[Frame]) -> None:
+        """Log raw frames, in the order received."""
+        if not batch:
+            return
+        now_ns = batch[-1][0]
+        file = self._open_file(batch[0][0])
+        if file is None:
+            self.lost_frames += len(batch)
+            return
+        try:
+            file.frames(batch)
+        except OSError as error:
+            self._fail(error, now_ns)
+
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
+        """Log one JSON object on a topic declared by `channel`; raises KeyError for any other topic."""
+        self._channels[topic]
+        file = self._open_file(time_ns)
+        if file is None:
+            return
+        try:
+            file.sample(topic, time_ns, values)
+        except OSError as error:
+            self._fail(error, time_ns)
+
+    def sync(self, now_ns: int) -> None:
+        """Bring everything onto the disk, once in `sync_s`; call it in each round of the main loop."""
+        file = self._file
+        if file is None:
+            return
+        if self._synced_ns is None:
+            self._synced_ns = now_ns
+        if abs(now_ns - self._synced_ns) < self._sync_ns:
+            return
+        self._synced_ns = now_ns
+        try:
+            file.flush(to_disk=True)
+            if file.size() >= self._max_file_bytes or abs(now_ns - file.start_ns) >= self._max_age_ns:
+                self._close_file(file)
+        except OSError as error:
+            self._fail(error, now_ns)
+
+    def close(self) -> None:
+        """Close the file; frames and samples logged later begin a new one."""
+        if self._file is not None:
+            try:
+                self._close_file(self._file)
+            except OSError as error:
+                self._fail(error, self._file.start_ns)
+
+    def _close_file(self, file: LogFile) -> None:
+        file.close()
+        self._file = None
+
+    def _open_file(self, start_ns: int) -> LogFile | None:
+        """The file in use, or a new one, or None while an error is waited out."""
+        if self._file is not None:
+            return self._file
+        if self._failed_ns is not None and abs(start_ns - self._failed_ns) < self._retry_ns:
+            return None
+        self._synced_ns = None
+        try:
+            self._directory.mkdir(parents=True, exist_ok=True)
+            self._make_room()
+            path, stream = self._create(start_ns)
+        except OSError as error:
+            self._note(error, start_ns)
+            return None
+        self.path = path
+        try:
+            file = LogFile(stream, start_ns, self._metadata, self._attachments)
+            for topic, (schema, metadata) in self._channels.items():
+                file.channel(topic, schema, metadata)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                stream.close()
+            self._note(error, start_ns)
+            self._discard(path)
+            return None
+        self._failed_ns = None
+        self.paths.append(path)
+        self._file = file
+        return file
+
+    def _create(self, start_ns: int) -> tuple[Path, IO[bytes]]:
+        start = datetime.fromtimestamp(start_ns // 1_000_000_000, UTC).strftime("%Y%m%dT%H%M%SZ")
+        number = 1
+        while True:
+            suffix = "" if number == 1 else f"~{number}"
+            path = self._directory / f"{start}_{self._vehicle}{suffix}.mcap"
+            try:
+                stream = path.open("xb")
+            except FileExistsError:
+                number += 1
+                continue
+            _sync_directory(self._directory)  # else the name may be gone after a power cut, whatever the file holds
+            return path, stream
+
+    def _make_room(self) -> None:
+        """Delete our oldest files until a new one of full size fits under the total."""
+        found = [(match, path) for path in self._directory.iterdir() if (match := _NAME.fullmatch(path.name))]
+        own = [(match[1], int(match[3] or 1), path) for match, path in found if path.is_file()]
+        sizes = {path: path.stat().st_size for _, _, path in own}
+        total = sum(sizes.values())
+        for _, _, path in sorted(own):
+            if total + self._max_file_bytes <= self._max_total_bytes:
+                return
+            path.unlink()
+            total -= sizes[path]
+
+    def _fail(self, error: OSError, now_ns: int) -> None:
+        file = self._file
+        self._file = None
+        self._note(error, now_ns)
+        if file is not None:
+            self.lost_frames += file.unsynced_frames
+            file.abandon()
+            if not file.flushed and self.path is not None:
+                self._discard(self.path)
+
+    def _note(self, error: OSError, now_ns: int) -> None:
+        self.errors += 1
+        self.last_error = str(error)
+        self._failed_ns = now_ns
+
+    def _discard(self, path: Path) -> None:
+        """Remove a file that never came to hold anything: on a full disk each attempt would leave one."""
+        with contextlib.suppress(OSError):
+            path.unlink()
+        if path in self.paths:
+            self.paths.remove(path)
+        self.path = self.paths[-1] if self.paths else None
+
+
+def object_schema(title: str, units: Mapping[str, str]) -> dict[str, Any]:
+    """A JSON schema for an object of numbers, each with its unit; null stands for not available."""
+    properties = {name: {"type": ["number", "null"], "description": unit} for name, unit in units.items()}
+    return {"title": title, "type": "object", "properties": properties}
+
+
+def _block_length(pending: Sequence[Frame]) -> int:
+    """How many of the pending frames go into the next block: within a second of the first, in either direction."""
+    candidates = pending[:BLOCK_FRAMES]
+    first = candidates[0][0]
+    if abs(candidates[-1][0] - first) < BLOCK_NS:
+        return len(candidates)
+    return next(i for i, frame in enumerate(candidates) if abs(frame[0] - first) >= BLOCK_NS)
+
+
+def _without_nan(value: object) -> object:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    return value
+
+
+def _sync_directory(directory: Path) -> None:
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
