@@ -2,7 +2,9 @@
 
 RIDE ?= $(firstword $(wildcard replay_logs/*.blf))
 SPEED ?= 1
+SECONDS ?= 60
 PYTHON_IN_VENV := .venv/bin/python
+DEMO = replay_logs/demo.py "$(RIDE)" --speed $(SPEED) --seconds $(SECONDS)
 
 .PHONY: help setup run test lint format bench clean
 .DEFAULT_GOAL := help
@@ -15,8 +17,13 @@ setup: .venv/.ready  ## virtual environment .venv with the pinned dependencies
 .venv/.ready: pyproject.toml .ci/constraints.txt .ci/setup
 	@.ci/setup venv
 
-run: setup  ## a recorded ride through the daemon on a CAN bus, with the live range (RIDE=file, SPEED=factor)
-	@replay_logs/run-demo "$(RIDE)" "$(SPEED)"
+run: setup  ## a recorded ride through the daemon on a CAN bus, with the live range (RIDE=file SPEED=factor SECONDS=n)
+	@if .ci/setup vcan; then \
+	    $(PYTHON_IN_VENV) tests/vcan-guest -- $(PYTHON_IN_VENV) $(DEMO); \
+	else \
+	    echo; echo "!!! No real vcan on this machine (reason above): an in-process virtual bus instead."; echo; \
+	    $(PYTHON_IN_VENV) $(DEMO) --interface virtual; \
+	fi
 
 test: setup  ## every test, on the host, on a real vcan and under systemd
 	@.ci/test

@@ -1,0 +1,137 @@
+"""A recorded ride through the daemon, on a bus: what `make run` shows.
+
+On a vcan the daemon, the replay and the dashboard are three processes that share nothing but the bus. On
+python-can's `virtual` interface, which ends where the process ends, they are three threads of this one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import can
+import cantools
+
+ROOT = Path(__file__).resolve().parents[1]
+RANGE_DBC = ROOT / "dbc" / "range.dbc"
+BIN = Path(sys.executable).parent
+READY_WITHIN = 30.0  # s
+STOPPED_WITHIN = 15.0  # s
+
+
+def main() -> int:
+    """Play the ride, then show what it left behind."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("ride", type=Path)
+    parser.add_argument("--interface", default="socketcan", choices=["socketcan", "virtual"])
+    parser.add_argument("--channel", default="vcan0")
+    parser.add_argument("--vehicle", default="reference")
+    parser.add_argument("--speed", type=float, default=1.0, help="of the replay; 1 is the ride's own timing")
+    parser.add_argument("--seconds", type=float, default=60.0, help="end the replay after this long")
+    args = parser.parse_args()
+    if not args.ride.is_file():
+        parser.error(f"no such ride: {args.ride}")
+
+    directory = ROOT / "runs" / time.strftime("%Y%m%dT%H%M%S")
+    directory.mkdir(parents=True)
+    bus = ["--interface", args.interface, "--channel", args.channel]
+    own_directories = ["--log-dir", str(directory), "--state-dir", str(directory)]
+    daemon = ["run", "--vehicle", args.vehicle, *bus, *own_directories]
+    replay = ["replay", str(args.ride), *bus, "--speed", str(args.speed)]
+    dashboard = ["dashboard", *bus]
+
+    where = "in-process virtual bus" if args.interface == "virtual" else f"{args.channel} of Linux {os.uname().release}"
+    print(f"=== {args.ride.name} on the {where}, for at most {args.seconds:g} s", flush=True)
+    frames = directory / "range.log"
+    play = play_in_threads if args.interface == "virtual" else play_in_processes
+    with recording(args.interface, args.channel, frames) as first_frame:
+        status = play(daemon, replay, dashboard, first_frame.wait, args.seconds)
+    if status:
+        print(f"demo: the daemon ended with status {status}", file=sys.stderr)
+        return status
+
+    show_decoded(frames)
+    (log,) = directory.glob("*.mcap")
+    overview = directory / "overview.png"
+    subprocess.run([BIN / "gz-onboard", "plot", log, overview], check=True)
+    print("\n=== What the ride left behind")
+    for what, path in ("log", log), ("overview", overview), ("range frames", frames):
+        print(f"{what:13} {path.relative_to(ROOT)}")
+    return 0
+
+
+@contextlib.contextmanager
+def recording(interface: str, channel: str, file: Path) -> Iterator[threading.Event]:
+    """Record the range frames, and nothing else, as candump does; yields the event of the first one."""
+    messages = cantools.database.load_file(RANGE_DBC).messages
+    filters = [
+        can.typechecking.CanFilter(can_id=m.frame_id, can_mask=0x7FF, extended=m.is_extended_frame) for m in messages
+    ]
+    first_frame = threading.Event()
+    with can.Bus(interface=interface, channel=channel, can_filters=filters) as bus:
+        writer = can.CanutilsLogWriter(file, channel=channel)
+        notifier = can.Notifier(bus, [writer, lambda _: first_frame.set()])
+        try:
+            yield first_frame
+        finally:
+            notifier.stop()
+            writer.stop()
+
+
+def play_in_processes(
+    daemon: list[str], replay: list[str], dashboard: list[str], ready: Callable[[float], bool], seconds: float
+) -> int:
+    """Run the three commands as processes; the daemon's exit status."""
+    command = str(BIN / "gz-onboard")
+    with contextlib.ExitStack() as stack:
+        daemon_process = stack.enter_context(subprocess.Popen([command, *daemon]))
+        stack.callback(daemon_process.terminate)
+        if not ready(READY_WITHIN):
+            return daemon_process.poll() or 1
+        dashboard_process = stack.enter_context(subprocess.Popen([command, *dashboard]))
+        stack.callback(dashboard_process.terminate)
+        with contextlib.suppress(subprocess.TimeoutExpired):  # a ride may be longer than the demonstration
+            subprocess.run([command, *replay], timeout=seconds, check=True)
+        dashboard_process.terminate()
+        dashboard_process.wait(STOPPED_WITHIN)
+        daemon_process.terminate()
+        return daemon_process.wait(STOPPED_WITHIN)
+
+
+def play_in_threads(
+    daemon: list[str], replay: list[str], dashboard: list[str], ready: Callable[[float], bool], seconds: float
+) -> int:
+    """Run the three commands in this process, the daemon in the main thread, where signals arrive."""
+    from gz_onboard import cli
+
+    def the_rest() -> None:
+        if ready(READY_WITHIN):
+            threading.Thread(target=cli.main, args=(dashboard,), daemon=True).start()
+            playing = threading.Thread(target=cli.main, args=(replay,), daemon=True)
+            playing.start()
+            playing.join(seconds)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=the_rest, daemon=True).start()
+    return cli.main(daemon)
+
+
+def show_decoded(frames: Path) -> None:
+    """Print the last frame of each kind, decoded by the cantools command."""
+    last = {line.split()[2].partition("#")[0]: line for line in frames.read_text().splitlines()}
+    print(f"\n=== The last range frames on the bus: cantools decode {RANGE_DBC.relative_to(ROOT)} <{frames.name}")
+    decode = [str(BIN / "cantools"), "decode", str(RANGE_DBC)]
+    text = subprocess.run(decode, input="\n".join(last.values()), check=True, capture_output=True, text=True).stdout
+    print(text.strip())
+
+
+if __name__ == "__main__":
+    sys.exit(main())
