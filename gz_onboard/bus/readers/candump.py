@@ -1,0 +1,115 @@
+"""candump -L text logs."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from gz_onboard.bus.readers.common import ChannelNumbers, Contents, Damage, text_pieces
+from gz_onboard.errors import InputError
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
+
+_CANDUMP_LINE = re.compile(
+    r"\((?P<s>\d+)(?:\.(?P<fraction>\d{1,9}))?\)\s+(?P<channel>\S+)\s+(?P<id>[0-9A-Fa-f]{1,8})#"
+    r"(?:#(?P<fd>[0-9A-Fa-f](?:[0-9A-Fa-f]{2}){0,64})|[Rr](?P<remote>[0-8]?)|(?P<data>(?:[0-9A-Fa-f]{2}){0,8}))"
+    r"(?:\s+(?P<direction>[RrTt]))?"
+)
+_SCALE = {digits + 1: 10 ** (9 - digits) for digits in range(1, 10)}
+"""Length of the fraction with the closing bracket -> ns in a unit of its last digit."""
+_FD_LENGTHS = frozenset((*range(9), 12, 16, 20, 24, 32, 48, 64))
+
+
+class _Identifiers(dict[str, int]):
+    """Text of an identifier in a candump -> identifier with flags: more than 3 digits mean 29 bits."""
+
+    def __missing__(self, text: str) -> int:
+        value = int(text, 16)
+        if len(text) > 3:
+            value = value if value & ERR_FLAG else (value & 0x1FFF_FFFF) | EFF_FLAG
+        elif value > 0x7FF:
+            raise ValueError(f"identifier {text} has more than 11 bits")
+        self[text] = value
+        return value
+
+
+def read(path: Path, data: Contents, damage: Damage, _start: int | None, _end: int | None) -> Iterator[list[Frame]]:
+    """The frames of a candump log; lines that are none are noted as damage."""
+    identifiers = _Identifiers()
+    channels = ChannelNumbers()
+    line = 1
+    any_frame = False
+    for text in text_pieces(data):
+        batch = _candump_fast(text, identifiers, channels)
+        if batch is None:
+            batch = _candump_lines(text, line, identifiers, channels, damage)
+            if damage.count and not batch and not any_frame:
+                raise InputError(f"{path}, {damage.place}: {damage.reason}; no line before it is one either")
+        if batch:
+            any_frame = True
+            yield batch
+        line += text.count("\n")
+
+
+def _candump_fast(text: str, identifiers: _Identifiers, channels: ChannelNumbers) -> list[Frame] | None:
+    """The frames of whole lines, or None if any line is out of the ordinary."""
+    tokens = text.split()
+    lines = len(tokens) // 3
+    # As many brackets, line ends and triples of words: every line is of the ordinary form, or int() below fails.
+    if 3 * lines != len(tokens) or not lines == text.count("(") == text.count(")") == text.count("\n"):
+        return None
+    frames: list[Frame] = []
+    append, scale, unhex = frames.append, _SCALE, bytes.fromhex
+    try:
+        for stamp, name, frame in zip(tokens[0::3], tokens[1::3], tokens[2::3], strict=True):
+            seconds, _, fraction = stamp.partition(".")
+            identifier, _, digits = frame.partition("#")
+            if len(digits) > 16:
+                return None
+            append(
+                (
+                    int(seconds[1:]) * 1_000_000_000 + int(fraction[:-1]) * scale[len(fraction)],
+                    identifiers[identifier],
+                    unhex(digits),
+                    channels[name],
+                )
+            )
+    except (ValueError, LookupError):
+        return None
+    return frames
+
+
+def _candump_lines(
+    text: str, first: int, identifiers: _Identifiers, channels: ChannelNumbers, damage: Damage
+) -> list[Frame]:
+    """The frames of lines of any form; lines that are none are noted as damage. first: number of the first line."""
+    frames = []
+    for number, line in enumerate(map(str.strip, text.split("\n")), first):
+        if not line:
+            continue
+        match = _CANDUMP_LINE.fullmatch(line)
+        try:
+            if not match:
+                raise ValueError("not a line of a candump log")
+            frames.append(_candump_frame(match, identifiers, channels))
+        except ValueError as error:
+            damage.add(f"line {number}", f"{error}: {line[:60]!r}")
+    return frames
+
+
+def _candump_frame(match: re.Match[str], identifiers: _Identifiers, channels: ChannelNumbers) -> Frame:
+    identifier = identifiers[match["id"]]
+    if match["fd"]:
+        data = bytes.fromhex(match["fd"][1:])
+        if len(data) not in _FD_LENGTHS:
+            raise ValueError(f"no CAN FD frame has {len(data)} bytes")
+    elif match["remote"] is not None:
+        identifier |= RTR_FLAG
+        data = bytes(int(match["remote"] or 0))
+    else:
+        data = bytes.fromhex(match["data"])
+    channel = channels[match["channel"]]
+    if (match["direction"] or "").upper() == "T":
+        channel |= TRANSMITTED
+    time_ns = int(match["s"]) * 1_000_000_000 + int((match["fraction"] or "0").ljust(9, "0"))
+    return time_ns, identifier, data, channel

@@ -1,0 +1,154 @@
+"""The formats that python-can reads: ASC, CSV and TRC, and MF4 where asammdf is installed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO, cast
+
+from gz_onboard.bus.readers.common import BATCH, ChannelNumbers, Contents, Damage, Reader, text_pieces
+from gz_onboard.errors import InputError
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
+
+if TYPE_CHECKING:
+    import can
+
+
+class _LineFeed:
+    """Lines for python-can's text readers, counted; `resume` lets a reader go on after one that it choked on."""
+
+    def __init__(self, data: Contents) -> None:
+        self._lines = (line for piece in text_pieces(data) for line in piece.splitlines(keepends=True))
+        self._again = False
+        self.number = 0
+        self.line = ""
+        self.name = ""
+
+    def __iter__(self) -> _LineFeed:
+        return self
+
+    def __next__(self) -> str:
+        if self._again:
+            self._again = False
+            return "\n"
+        self.line = next(self._lines)
+        self.number += 1
+        return self.line
+
+    def resume(self) -> None:
+        """The reader will look for a header first: give it an empty line that it may drop."""
+        self._again = True
+
+    def close(self) -> None:
+        pass
+
+
+def text_reader(suffix: str) -> Reader:
+    """The reader of one of the text formats .asc, .csv, .trc."""
+
+    def read(path: Path, data: Contents, damage: Damage, _start: int | None, _end: int | None) -> Iterator[list[Frame]]:
+        from gz_onboard.bus._can import can
+
+        readers: dict[str, Callable[[TextIO], can.io.generic.MessageReader]] = {
+            ".asc": can.ASCReader,
+            ".csv": can.CSVReader,
+            ".trc": can.TRCReader,
+        }
+        feed = _LineFeed(data)
+        reader = readers[suffix](cast("TextIO", feed))
+        channels = ChannelNumbers()
+        any_frame = False
+        messages = iter(reader)
+        batch: list[Frame] = []
+        while True:
+            try:
+                message = next(messages, None)
+                if message is None:
+                    break
+                batch.append(frame_of(message, channels))
+            except (ValueError, LookupError, TypeError, AttributeError, NotImplementedError) as error:
+                damage.add(f"line {feed.number}", f"{str(error) or type(error).__name__}: {feed.line.strip()[:60]!r}")
+                if not any_frame and damage.count >= BATCH:
+                    break
+                feed.resume()
+                messages = iter(reader)
+                continue
+            any_frame = True
+            if len(batch) >= BATCH:
+                yield batch
+                batch = []
+        if not any_frame and feed.number:
+            if damage.count:
+                raise InputError(f"{path}, {damage.place}: not a line of the format {suffix}: {damage.reason}")
+            if not _looks_like(suffix, data):
+                raise InputError(f"{path}, line 1: not a log in the format {suffix}: it has no header of that format")
+        if batch:
+            yield batch
+
+    return read
+
+
+def _looks_like(suffix: str, data: Contents) -> bool:
+    """Whether a text without a frame in it has at least a header of its format."""
+    head = str(data[:200], "latin-1").lstrip().lower()
+    return head.startswith({".asc": ("date", "base", "//"), ".csv": ("timestamp",), ".trc": (";",)}[suffix])
+
+
+def read_mf4(path: Path, data: Contents, damage: Damage, _start: int | None, _end: int | None) -> Iterator[list[Frame]]:
+    """The frames of an MF4 file; needs asammdf."""
+    import importlib
+    import io
+
+    from gz_onboard.bus._can import can
+
+    try:
+        importlib.import_module("asammdf")
+    except ImportError:
+        raise InputError(f"{path}: reading .mf4 needs asammdf: pip install 'gz-onboard[mf4]'") from None
+    if vars(can.io.mf4)["asammdf"] is None:  # python-can was imported without it, see _can.py
+        importlib.reload(can.io.mf4)
+    channels = ChannelNumbers()
+    batch: list[Frame] = []
+    any_frame = False
+    try:
+        reader = can.io.mf4.MF4Reader(io.BytesIO(bytes(data)))
+        for message in reader:
+            batch.append(frame_of(message, channels))
+            if len(batch) >= BATCH:
+                yield batch
+                any_frame = True
+                batch = []
+    except Exception as error:  # asammdf raises all sorts of exceptions for a broken file
+        if not any_frame and not batch:
+            raise InputError(f"{path}: not a readable MF4 file: {error}") from None
+        damage.add("after the last frame read", str(error))
+    if batch:
+        yield batch
+
+
+def frame_of(message: can.Message, channels: dict[str, int] | None = None) -> Frame:
+    """A python-can message as a frame; channels numbers the named channels (a name that it lacks raises KeyError).
+
+    The time is rounded to a microsecond: the message's is a float of seconds, which has no more since 1970.
+    """
+    identifier = message.arbitration_id
+    if message.is_extended_id:
+        identifier |= EFF_FLAG
+    if message.is_error_frame:
+        identifier |= ERR_FLAG
+    if message.is_remote_frame:
+        identifier |= RTR_FLAG
+        data = bytes(min(message.dlc, 8))
+    else:
+        data = bytes(message.data)
+    channel: Any = message.channel
+    if channel is None:
+        channel = 0
+    elif isinstance(channel, str):
+        channel = (channels if channels is not None else {})[channel]
+    return (
+        round(message.timestamp * 1e6) * 1000,
+        identifier,
+        data,
+        channel & 0x7F if message.is_rx else channel & 0x7F | TRANSMITTED,
+    )
