@@ -32,6 +32,10 @@ class Vehicle:
         pack = f"{self.battery.cells_series}s{self.battery.cells_parallel}p" if self.battery else "no battery"
         return "|".join([self.name, pack, *(effect.name for effect in self.model.effects)])
 
+    def error(self, message: str) -> InputError:
+        """The error to raise about this vehicle's file."""
+        return InputError(f"{self.file}: {message}")
+
 
 def find_vehicle(name: str) -> Path:
     """The vehicle file `name`: a path, or the name of one of the package's own."""

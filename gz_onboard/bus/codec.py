@@ -103,6 +103,12 @@ class Codec:
         """The inverse of `seconds`."""
         return (self._origin_ns or 0) + round(time * 1e9)
 
+    def clock_set(self, delta_ns: int) -> None:
+        """The clock that stamps the frames was set by `delta_ns`; the timeline goes on."""
+        if self._origin_ns is not None:
+            self._origin_ns += delta_ns
+            self._last_ns += delta_ns
+
     def _retime(self, time_ns: int) -> bool:
         """Take a time that does not follow the last one: True if the frame is to be used.
 
@@ -140,11 +146,6 @@ class Codec:
         self.faults[key] = self.faults.get(key, 0) + 1
 
     # --- what is known of a message ---------------------------------------------------------------------------
-
-    @property
-    def identifiers(self) -> list[int]:
-        """The identifiers (with flags) that the database knows, for the kernel's filters."""
-        return [m.frame_id | (EFF_FLAG if m.is_extended_frame else 0) for m in self.mapping.database.messages]
 
     def values(self, identifier: int, data: bytes) -> dict[str, Any]:
         """Every signal of a frame in the units of the DBC, None where not available or not decodable."""
@@ -247,6 +248,13 @@ class Codec:
             return False
         self.lost[message] = self.lost.get(message, 0) + lost
         return True
+
+
+def known_identifiers(mapping: Mapping) -> list[int] | None:
+    """The identifiers (with flags) that the database knows, for the kernel's filters; None if it goes by PGN."""
+    if mapping.j1939:
+        return None
+    return [m.frame_id | (EFF_FLAG if m.is_extended_frame else 0) for m in mapping.database.messages]
 
 
 def raw_range(signal: Signal, not_available: bool) -> tuple[float, float]:

@@ -168,6 +168,11 @@ class Recorder:
         self._synced_ns: int | None = None
         self._failed_ns: int | None = None
 
+    @property
+    def failing(self) -> bool:
+        """Whether the last attempt to write failed, and none has succeeded since."""
+        return self._failed_ns is not None
+
     def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
         """Declare a topic of JSON objects (a JSON schema of type object), for this file and all later ones."""
         self._channels[topic] = (json_schema, dict(metadata or {}))

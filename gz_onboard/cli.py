@@ -1,0 +1,73 @@
+"""The one command, ``gz-onboard``; each subcommand is a module, imported only when it is called."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+from collections.abc import Sequence
+from typing import NoReturn
+
+from gz_onboard import __version__
+from gz_onboard.errors import InputError, nearest
+
+COMMANDS = {
+    "run": ("gz_onboard.daemon", "estimate the range from a live bus and publish it (the daemon)"),
+    "dashboard": ("gz_onboard.dashboard.terminal", "show the range from the frames that the daemon sends"),
+    "replay": ("gz_onboard.bus.replay", "put a recorded log onto a bus, in its own timing"),
+    "estimate": ("gz_onboard.lab.estimate", "estimate recorded rides without a bus, as fast as it goes"),
+    "export": ("gz_onboard.bus.export", "turn a log into candump, BLF, ASC, Parquet, CSV, ..."),
+    "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride"),
+}
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse that names the nearest right option or command."""
+
+    def error(self, message: str) -> NoReturn:
+        wrong = message.partition("invalid choice: ")[2].partition(" (")[0].strip("'")
+        if wrong:
+            message += nearest(wrong, COMMANDS)
+        elif message.startswith("unrecognized arguments: "):
+            wrong = next((word for word in message.split()[2:] if word.startswith("-")), "")
+            message += nearest(wrong.partition("=")[0], self.known_options()) if wrong else ""
+        super().error(message)
+
+    def known_options(self) -> list[str]:
+        """The options of this command and of its subcommands."""
+        options: list[str] = []
+        for action in self._actions:
+            options += action.option_strings
+            if isinstance(action, argparse._SubParsersAction):
+                for parser in action.choices.values():
+                    options += parser.known_options()
+        return options
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line `argv`; gives the exit status: 0 good, 1 failed, 2 wrong use or input, 130 interrupted."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    parser = _Parser(prog="gz-onboard", description="The range a scooter's rider can trust.")
+    parser.add_argument("--version", action="version", version=f"gz-onboard {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
+    called = next((word for word in argv if not word.startswith("-")), "")
+    for name, (module, text) in COMMANDS.items():
+        command = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
+        if name == called:  # the others would only cost their import
+            importlib.import_module(module).add_arguments(command)
+    arguments = parser.parse_args(argv)
+    try:
+        status: int = importlib.import_module(COMMANDS[arguments.command][0]).run(arguments)
+        return status
+    except InputError as error:
+        print(f"gz-onboard {arguments.command}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # the reader of our output went away
+        sys.stderr.close()
+        return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

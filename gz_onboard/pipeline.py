@@ -1,0 +1,229 @@
+"""Codec, estimator, publisher and recorder in one row: the same for a live bus, a replayed log and an offline estimate.
+
+Time is that of the frames. Estimates are made on a grid of 0.1 s of that time, so it does not matter in what
+portions the frames arrive.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
+from math import isfinite
+from pathlib import Path
+from typing import Any, Protocol
+
+from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE, Codec
+from gz_onboard.bus.publisher import Counts, Publisher
+from gz_onboard.estimator.ekf import filter_maker
+from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
+from gz_onboard.vehicle import Vehicle
+
+TICK_NS = 100_000_000  # status at 10 Hz
+TICKS_PER_RANGE = 10  # range at 1 Hz
+ESTIMATE_TOPIC = "/estimate"
+STATUS_TOPIC = "/status"
+DROPPING = (LENGTH, CRC, COUNTER, TIME, UNDECODABLE)  # reasons that drop a frame
+
+ESTIMATE_UNITS = {
+    "time": "s since the first frame", "soc": "1", "soc_sd": "1", "v1": "V of a cell", "innovation": "V of a cell",
+    "innovation_rms": "V of a cell", "pack_voltage": "V", "pack_current": "A, positive discharging",
+    "cell_temperature": "degC", "speed": "m/s", "acceleration": "m/s^2", "grade": "sine, positive uphill",
+    "lean": "rad, positive right", "yaw_rate": "rad/s, positive left", "heading": "rad, clockwise from north",
+    "distance": "m", "range": "m", "range_p10": "m", "range_p90": "m", "energy_left": "J", "energy_left_sd": "J",
+    "consumption_recent": "J/m", "consumption_expected": "J/m", "consumption_expected_sd": "J/m",
+    "consumption_factor": "1, measured over modelled", "consumption_factor_sd": "1",
+}  # fmt: skip
+
+
+class Log(Protocol):
+    """What the pipeline writes to; `gz_onboard.bus.recorder` has them."""
+
+    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
+        """Declare a topic of JSON objects."""
+
+    def frames(self, batch: Sequence[Frame]) -> None:
+        """Log raw frames."""
+
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
+        """Log one JSON object."""
+
+
+class Pipeline:
+    """One vehicle's way from frames to estimates.
+
+    log: where to write, if anywhere; log_frames, log_signals: also the raw frames, and each message's latest
+    signals once a second. observer: called with each estimate made, ten times a second of the frames' time.
+    """
+
+    def __init__(self, vehicle: Vehicle, *, filter_name: str = "scalar", log: Log | None = None, log_frames: bool = True,
+                 log_signals: bool = True, observer: Callable[[Estimate], None] | None = None) -> None:  # fmt: skip
+        if vehicle.battery is None:
+            raise vehicle.error("has no [battery]: without one no range can be estimated")
+        self.vehicle = vehicle
+        self.codec = Codec(vehicle.mapping)
+        self.estimator = Estimator(self.codec.groups, vehicle.battery, vehicle.model, filter_maker(filter_name))
+        self.publisher = Publisher()
+        self.kernel_lost = 0  # frames; set by the daemon
+        self.extra_reasons = Reason(0)  # set by the daemon: bus down, log failed
+        self.last: Estimate | None = None
+        self._log = log
+        self._log_frames = log_frames
+        self._log_signals = log_signals
+        self._observer = observer
+        self._next_ns: int | None = None
+        self._ticks = 0
+        self._dropped_before = self._lost_before = 0
+        self._recent = Reason(0)
+        self._topics: dict[int, str] = {}
+        if log:
+            _declare(log, self.codec, log_signals)
+
+    def advance(self, frames: Sequence[Frame], until_ns: int) -> list[Frame]:
+        """Take in `frames`, in the order of their times, up to `until_ns`; gives the frames to be sent."""
+        if self._next_ns is None:
+            if not frames:
+                return []
+            self._next_ns = frames[0][0] + TICK_NS
+        out: list[Frame] = []
+        if not -10 * TICK_NS <= until_ns - self._next_ns <= 50 * TICK_NS:  # a pause, or the clock was set
+            self._take(frames)
+            self._next_ns = until_ns
+            frames = ()
+        done = 0
+        while self._next_ns <= until_ns:
+            end = bisect_left(frames, (self._next_ns,), done)
+            if end > done:
+                self._take(frames[done:end])
+                done = end
+            out += self._tick(self._next_ns)
+            self._next_ns += TICK_NS
+        if done < len(frames):
+            self._take(frames[done:])
+        return out
+
+    def clock_set(self, delta_ns: int) -> None:
+        """The clock that stamps the frames was set by `delta_ns`: go on with the timeline as if it had not been."""
+        self.codec.clock_set(delta_ns)
+        if self._next_ns is not None:
+            self._next_ns += delta_ns
+
+    def _take(self, frames: Sequence[Frame]) -> None:
+        handle = self.estimator.handle
+        for event in self.codec.decode(frames):
+            handle(event)
+        if self._log and self._log_frames:
+            self._log.frames(frames)
+
+    def _tick(self, time_ns: int) -> list[Frame]:
+        codec = self.codec
+        whole_second = self._ticks % TICKS_PER_RANGE == 0
+        self._ticks += 1
+        if whole_second:
+            self._count_faults()
+        estimate = self.estimator.estimate(codec.seconds(time_ns))
+        estimate.reasons |= self._recent | self.extra_reasons
+        if self.extra_reasons & Reason.BUS_DOWN and estimate.state is State.VALID:
+            estimate.state = State.DEGRADED
+        self.last = estimate
+        if self._observer:
+            self._observer(estimate)
+        sent = self.publisher.status(estimate, time_ns)
+        if whole_second:
+            sent += self.publisher.range(estimate, self.counts(), time_ns)
+        if self._log:
+            if self._log_frames:
+                self._log.frames(sent)
+            if whole_second:
+                self._sample(self._log, time_ns, estimate)
+        return sent
+
+    def _count_faults(self) -> None:
+        counts = self.counts()
+        self._recent = Reason.FRAMES_DROPPED if counts.dropped > self._dropped_before else Reason(0)
+        if counts.lost > self._lost_before:
+            self._recent |= Reason.FRAMES_LOST
+        self._dropped_before, self._lost_before = counts.dropped, counts.lost
+
+    def counts(self) -> Counts:
+        """What was counted since the start."""
+        codec = self.codec
+        return Counts(
+            dropped=sum(n for (_, reason), n in codec.faults.items() if reason in DROPPING),
+            implausible=sum(n for (_, reason), n in codec.faults.items() if reason == RANGE),
+            lost=self.kernel_lost + sum(codec.lost.values()),
+            unknown=len(codec.unknown),
+        )
+
+    def _sample(self, log: Log, time_ns: int, estimate: Estimate) -> None:
+        log.sample(ESTIMATE_TOPIC, time_ns, estimate_row(estimate))
+        log.sample(STATUS_TOPIC, time_ns, self.status())
+        if not self._log_signals:
+            return
+        codec, topics = self.codec, self._topics
+        for identifier, (seen_ns, data) in codec.latest.items():
+            if time_ns - seen_ns < TICKS_PER_RANGE * TICK_NS:  # not again what was logged before
+                topic = topics.get(identifier)
+                if topic is None:
+                    topic = topics[identifier] = f"/can/{codec.message_name(identifier)}"
+                log.sample(topic, seen_ns, codec.values(identifier, data))
+
+    def status(self) -> dict[str, object]:
+        """What was received, dropped and lost since the start, by message and reason."""
+        codec = self.codec
+        faults: dict[str, dict[str, int]] = {}
+        for (message, reason), count in sorted(codec.faults.items()):
+            faults.setdefault(reason, {})[message or "any"] = count
+        return {
+            "received": codec.received,
+            "error_frames": codec.error_frames,
+            "kernel_lost": self.kernel_lost,
+            "faults": faults,
+            "lost": dict(sorted(codec.lost.items())),
+            "unknown": {f"{i & ~EFF_FLAG:X}": n for i, n in sorted(codec.unknown.items())[:32]},
+            "reasons": reason_names(self.last.reasons) if self.last else [],
+        }
+
+
+def reason_names(reasons: Reason) -> list[str]:
+    """The names of the reasons in a set."""
+    return [str(reason.name) for reason in Reason if reason & reasons]
+
+
+def estimate_row(estimate: Estimate) -> dict[str, object]:
+    """An estimate as it stands in logs: SI units, state and reasons by name, None for what is not known."""
+    row: dict[str, object] = {}
+    for name in _FIELDS:
+        value = getattr(estimate, name)
+        row[name] = value if value is None or isfinite(value) else None
+    row["state"] = estimate.state.name
+    row["reasons"] = " ".join(reason_names(estimate.reasons))
+    return row
+
+
+_FIELDS = tuple(field.name for field in fields(Estimate))
+
+
+def _declare(log: Log, codec: Codec, signals: bool) -> None:
+    number = ["number", "null"]
+    properties: dict[str, Any] = {
+        name: {"type": number, "description": ESTIMATE_UNITS[name]} for name in _FIELDS if name in ESTIMATE_UNITS
+    }
+    properties |= {"state": {"type": "string"}, "reasons": {"type": "string"}}
+    log.channel(ESTIMATE_TOPIC, {"title": "gz_onboard.Estimate", "type": "object", "properties": properties})
+    counts = {name: {"type": "integer"} for name in ("received", "error_frames", "kernel_lost")}
+    maps = {name: {"type": "object"} for name in ("faults", "lost", "unknown")}
+    reasons = {"reasons": {"type": "array", "items": {"type": "string"}}}
+    log.channel(STATUS_TOPIC, {"title": "gz_onboard.Status", "type": "object", "properties": counts | maps | reasons})
+    for message in codec.mapping.database.messages if signals else ():
+        properties = {s.name: {"type": number, "description": s.unit or ""} for s in message.signals}
+        log.channel(f"/can/{message.name}", {"title": message.name, "type": "object", "properties": properties})
+
+
+def dbc_texts(vehicle: Vehicle) -> dict[str, bytes]:
+    """The DBC files that a log of this vehicle can be decoded by, by name."""
+    from gz_onboard.bus.mapping import find_dbc
+
+    files: list[Path] = [*vehicle.mapping.dbc_files, find_dbc("range.dbc")]
+    return {file.name: file.read_bytes() for file in files}
