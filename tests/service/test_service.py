@@ -1,0 +1,152 @@
+"""The daemon as a service on vcan0: what systemd/README.md promises."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.service.support import (
+    ROOT,
+    UNIT,
+    Listener,
+    bus_down,
+    journal,
+    link,
+    main_pid,
+    output,
+    show,
+    systemctl,
+    wait_for,
+    wait_for_another,
+)
+
+SOC = "RANGE_StateOfCharge"
+SIGMA = "RANGE_StateOfChargeSigma"
+
+
+def first_soc(listener: Listener) -> dict[str, float]:
+    """The first status frame whose state of charge is available."""
+    for _ in range(100):
+        status = listener.next(SOC)
+        if status[SOC] <= 100 and status[SIGMA] <= 25.4:
+            return status
+    pytest.fail(f"no state of charge within 100 status frames; the last: {status}\n{journal()}")
+
+
+def test_unit_is_valid(installed):
+    assert output("systemd-analyze", "verify", f"/etc/systemd/system/{UNIT}") == ""
+
+
+def test_networkd_takes_the_network_files():
+    for file in (ROOT / "systemd").glob("80-*"):
+        shutil.copy(file, "/etc/systemd/network")
+    # One that is wrong, so that we know that a complaint would be seen.
+    Path("/etc/systemd/network/90-broken.network").write_text("[Match]\nName=none\n[CAN]\nBitRat=500K\n")
+    output("ip", "link", "delete", "vcan0")
+    try:
+        systemctl("start", "systemd-networkd")
+        wait_for(lambda: "LOWER_UP" in link("vcan0"), 10, "vcan0 made and brought up by systemd-networkd")
+        complaints = [line for line in journal("systemd-networkd").splitlines() if "ignoring" in line]
+        assert any("90-broken.network" in line for line in complaints)
+        assert not any("/80-" in line for line in complaints)
+    finally:
+        systemctl("stop", "systemd-networkd.socket", "systemd-networkd")
+        if not link("vcan0"):
+            output("ip", "link", "add", "dev", "vcan0", "type", "vcan")
+        output("ip", "link", "set", "vcan0", "up")
+
+
+def test_starts_when_the_interface_appears(installed):
+    output("ip", "link", "delete", "vcan0")
+    try:
+        systemctl("enable", UNIT)
+        time.sleep(1)
+        assert show("ActiveState") == "inactive"
+        output("ip", "link", "add", "dev", "vcan0", "type", "vcan")
+        output("ip", "link", "set", "vcan0", "up")
+        wait_for(lambda: show("ActiveState") == "active", 20, "active after vcan0 appeared")
+    finally:
+        systemctl("disable", UNIT)
+        systemctl("stop", UNIT)
+
+
+def test_ready_and_stopped_in_order(service):
+    assert show("ActiveState") == "active"
+    assert show("StatusText")
+    started = time.monotonic()
+    systemctl("stop", UNIT)
+    assert time.monotonic() - started < 10
+    assert show("Result") == "success"
+    assert list(Path("/var/log/gz-onboard").glob("*.mcap"))
+    assert list(Path("/var/lib/gz-onboard").iterdir())
+
+
+def test_has_no_rights(service):
+    lines = Path(f"/proc/{main_pid()}/status").read_text().splitlines()
+    fields = dict(line.split(":\t", 1) for line in lines if ":\t" in line)
+    assert fields["Uid"].split()[0] != "0"
+    assert int(fields["CapEff"], 16) == 0
+    assert fields["NoNewPrivs"] == "1"
+
+
+def test_state_of_charge_on_the_bus_during_a_ride(service, listener, ride):
+    status = first_soc(listener)
+    assert 0 < status[SOC] <= 100
+    assert 0 < status[SIGMA] <= 25.4
+
+
+def test_killed_it_goes_on_where_it_was(service, listener, ride):
+    first_soc(listener)
+    time.sleep(12)  # the state is saved every few seconds
+    before = listener.next(SOC)
+    pid = main_pid()
+    os.kill(pid, signal.SIGKILL)
+    wait_for_another(pid, 20)
+    assert show("NRestarts") == "1"
+    after = first_soc(listener)
+    assert after[SOC] == pytest.approx(before[SOC], abs=0.3)
+    assert after[SIGMA] == pytest.approx(before[SIGMA], abs=0.3)
+
+
+def test_hung_it_is_started_again(service, listener):
+    pid = main_pid()
+    os.kill(pid, signal.SIGSTOP)
+    time.sleep(4)
+    assert main_pid() == pid  # not before its time
+    wait_for_another(pid, 40)
+    assert "Watchdog timeout" in journal()
+    listener.next(SOC)
+
+
+def test_feeds_the_watchdog(service):
+    pid = main_pid()
+    time.sleep(13)
+    assert main_pid() == pid
+    assert show("NRestarts") == "0"
+
+
+def test_outlives_a_bus_that_goes_down(service, listener):
+    listener.next(SOC)
+    pid = main_pid()
+    with bus_down():
+        time.sleep(12)  # longer than the watchdog's patience
+        assert show("ActiveState") == "active"
+    listener.reopen()
+    listener.next(SOC)
+    assert main_pid() == pid
+    assert show("NRestarts") == "0"
+
+
+def test_starts_on_a_bus_that_is_down(installed, listener):
+    try:
+        with bus_down():
+            systemctl("start", UNIT)
+        listener.reopen()
+        listener.next(SOC)
+    finally:
+        systemctl("stop", UNIT)
