@@ -10,11 +10,13 @@ CAN FD frame of up to 8 bytes is not told from a classic one.
 
 from __future__ import annotations
 
+import json
 import logging
 import mmap
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from gz_onboard.bus.readers import blf, candump, mcap, pycan
 from gz_onboard.bus.readers.common import Contents, Damage, Reader, unpacked
@@ -96,6 +98,29 @@ def read_metadata(path: str | Path) -> dict[str, str]:
     if log_suffix(path) != ".mcap":
         return {}
     return mcap.metadata(path, unpacked(path, _load(path), Damage()))
+
+
+def json_channels(path: str | Path) -> dict[str, tuple[bytes, dict[str, str]]]:
+    """Schema (a JSON text) and metadata of each topic of samples in one of our own logs; of other formats none."""
+    path = Path(path)
+    if log_suffix(path) != ".mcap":
+        return {}
+    return mcap.json_channels(path, unpacked(path, _load(path), Damage()))
+
+
+def read_samples(
+    path: str | Path, start_ns: int | None = None, end_ns: int | None = None
+) -> Iterator[tuple[str, int, dict[str, Any]]]:
+    """Topic, time [ns] and values of the samples in one of our own logs, as they stand in it; others have none.
+
+    Damage is passed over: `read_frames` tells of it.
+    """
+    path = Path(path)
+    if log_suffix(path) != ".mcap":
+        return
+    data = unpacked(path, _load(path), Damage())
+    for topic, time_ns, text in mcap.samples(path, data, Damage(), start_ns, end_ns):
+        yield topic, time_ns, json.loads(text)
 
 
 def _warn(damage: LogDamage) -> None:

@@ -53,6 +53,8 @@ def read(path: Path, data: Contents, damage: Damage, _start: int | None, _end: i
 
 def _candump_fast(text: str, identifiers: _Identifiers, channels: ChannelNumbers) -> list[Frame] | None:
     """The frames of whole lines, or None if any line is out of the ordinary."""
+    if text.endswith(" R\n"):  # "received": the ordinary case of the logs that tell the direction
+        text = text.replace(" R\n", "\n")
     tokens = text.split()
     lines = len(tokens) // 3
     # As many brackets, line ends and triples of words: every line is of the ordinary form, or int() below fails.

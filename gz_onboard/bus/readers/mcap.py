@@ -21,9 +21,11 @@ _MCAP_MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQLL")  # start, end, size and CRC of the unpacked records, length of the compression's name
 _MESSAGE = struct.Struct("<HLQQ")  # channel, sequence, log time, publish time
+_U16 = struct.Struct("<H")
 _U32 = struct.Struct("<L")
 _U64 = struct.Struct("<Q")
-_FOOTER, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _ATTACHMENT, _METADATA, _DATA_END = 0x02, 0x04, 0x05, 0x06, 0x09, 0x0C, 0x0F
+_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP = 0x02, 0x03, 0x04, 0x05, 0x06
+_ATTACHMENT, _METADATA, _DATA_END = 0x09, 0x0C, 0x0F
 _ZSTD_CHUNK = b"\x04\x00\x00\x00zstd"
 _MARGIN_NS = 1_000_000_000  # a block is stamped with its first frame and holds at most this much time
 
@@ -76,15 +78,66 @@ def attachments(path: Path, data: Contents) -> dict[str, bytes]:
 def metadata(path: Path, data: Contents) -> dict[str, str]:
     """The entries of the metadata record ``gz_onboard``."""
     entries: dict[str, str] = {}
-    for opcode, start, end in _records(path, data, Damage()):
+    for opcode, start, _ in _records(path, data, Damage()):
         if opcode != _METADATA:
             continue
         name, position = _string(data, start)
-        position += 4
-        while name == "gz_onboard" and position < end:
-            key, position = _string(data, position)
-            entries[key], position = _string(data, position)
+        if name == "gz_onboard":
+            entries = _string_map(data, position)
     return entries
+
+
+def json_channels(path: Path, data: Contents) -> dict[str, tuple[bytes, dict[str, str]]]:
+    """Schema (a JSON text) and metadata of each topic of JSON objects."""
+    schemas: dict[int, bytes] = {}
+    found = {}
+    for opcode, content in _unpacked_records(path, data, Damage()):
+        if opcode == _SCHEMA:
+            _, position = _string(content, 2)
+            _, position = _string(content, position)
+            schemas[_U16.unpack_from(content)[0]] = content[position + 4 :]
+        elif opcode == _CHANNEL:
+            topic, position = _string(content, 4)
+            encoding, position = _string(content, position)
+            schema = schemas.get(_U16.unpack_from(content, 2)[0], b"{}")
+            if encoding == "json":
+                found[topic] = (schema, _string_map(content, position))
+    return found
+
+
+def samples(
+    path: Path, data: Contents, damage: Damage, start: int | None, end: int | None
+) -> Iterator[tuple[str, int, bytes]]:
+    """Topic, time [ns] and JSON text of the messages of the JSON topics."""
+    topics: dict[int, str] = {}
+    for opcode, content in _unpacked_records(path, data, damage):
+        if opcode == _MESSAGE_OP:
+            channel, _, time_ns, _ = _MESSAGE.unpack_from(content)
+            if channel in topics and (start is None or time_ns >= start) and (end is None or time_ns < end):
+                yield topics[channel], time_ns, content[_MESSAGE.size :]
+        elif opcode == _CHANNEL:
+            topic, position = _string(content, 4)
+            encoding, _ = _string(content, position)
+            if encoding == "json":
+                topics[_U16.unpack_from(content)[0]] = topic
+
+
+def _unpacked_records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, bytes]]:
+    """Opcode and content of all records, those in chunks among them."""
+    for opcode, start, end in _records(path, data, damage):
+        if opcode != _CHUNK_OP:
+            yield opcode, data[start:end]
+            continue
+        try:
+            records = _unpack(data, start, end)
+        except (ValueError, struct.error) as error:
+            damage.add(f"byte {start}", f"a chunk is broken ({error})")
+            continue
+        position = 0
+        while position < len(records):
+            inner, length = _RECORD.unpack_from(records, position)
+            position += _RECORD.size + length
+            yield inner, records[position - length : position]
 
 
 def _records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, int, int]]:
@@ -129,12 +182,23 @@ def _string(data: Contents, position: int) -> tuple[str, int]:
     return str(data[position + 4 : end], "utf-8", "replace"), end
 
 
+def _string_map(data: Contents, position: int) -> dict[str, str]:
+    """A map of strings, with its length in bytes before it."""
+    end = position + 4 + _U32.unpack_from(data, position)[0]
+    position += 4
+    entries = {}
+    while position < end:
+        key, position = _string(data, position)
+        entries[key], position = _string(data, position)
+    return entries
+
+
 def _channel(data: Contents, position: int, channels: set[int], topics: set[str]) -> None:
     topic, following = _string(data, position + 4)
     encoding, _ = _string(data, following)
     topics.add(topic)
     if encoding == framelog.ENCODING:
-        channels.add(struct.unpack_from("<H", data, position)[0])
+        channels.add(_U16.unpack_from(data, position)[0])
 
 
 def _unpack(data: Contents, position: int, limit: int) -> bytes:
@@ -166,7 +230,7 @@ def _blocks(records: bytes, channels: set[int], topics: set[str]) -> Iterator[by
         opcode, length = _RECORD.unpack_from(records, position)
         position += _RECORD.size
         if opcode == _MESSAGE_OP:
-            if struct.unpack_from("<H", records, position)[0] in channels:
+            if _U16.unpack_from(records, position)[0] in channels:
                 yield records[position + _MESSAGE.size : position + length]
         elif opcode == _CHANNEL:
             _channel(records, position, channels, topics)

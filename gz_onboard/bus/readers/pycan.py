@@ -96,17 +96,11 @@ def _looks_like(suffix: str, data: Contents) -> bool:
 
 def read_mf4(path: Path, data: Contents, damage: Damage, _start: int | None, _end: int | None) -> Iterator[list[Frame]]:
     """The frames of an MF4 file; needs asammdf."""
-    import importlib
     import io
 
     from gz_onboard.bus._can import can
 
-    try:
-        importlib.import_module("asammdf")
-    except ImportError:
-        raise InputError(f"{path}: reading .mf4 needs asammdf: pip install 'gz-onboard[mf4]'") from None
-    if vars(can.io.mf4)["asammdf"] is None:  # python-can was imported without it, see _can.py
-        importlib.reload(can.io.mf4)
+    with_asammdf(path)
     channels = ChannelNumbers()
     batch: list[Frame] = []
     any_frame = False
@@ -124,6 +118,20 @@ def read_mf4(path: Path, data: Contents, damage: Damage, _start: int | None, _en
         damage.add("after the last frame read", str(error))
     if batch:
         yield batch
+
+
+def with_asammdf(path: Path) -> None:
+    """Give python-can the asammdf that it was imported without; InputError if it is not installed."""
+    import importlib
+
+    from gz_onboard.bus._can import can
+
+    try:
+        importlib.import_module("asammdf")
+    except ImportError:
+        raise InputError(f"{path}: .mf4 needs asammdf: pip install 'gz-onboard[mf4]'") from None
+    if vars(can.io.mf4)["asammdf"] is None:
+        importlib.reload(can.io.mf4)
 
 
 def frame_of(message: can.Message, channels: dict[str, int] | None = None) -> Frame:
@@ -151,4 +159,24 @@ def frame_of(message: can.Message, channels: dict[str, int] | None = None) -> Fr
         identifier,
         data,
         channel & 0x7F if message.is_rx else channel & 0x7F | TRANSMITTED,
+    )
+
+
+def message_of(frame: Frame, *, with_time: bool = True) -> can.Message:
+    """A frame as a python-can message, the inverse of `frame_of`; more than 8 bytes make it a CAN FD frame."""
+    from gz_onboard.bus._can import can
+
+    time_ns, identifier, data, channel = frame
+    remote = bool(identifier & RTR_FLAG)
+    return can.Message(
+        timestamp=time_ns * 1e-9 if with_time else 0.0,
+        arbitration_id=identifier & 0x1FFF_FFFF,
+        is_extended_id=bool(identifier & EFF_FLAG),
+        is_remote_frame=remote,
+        is_error_frame=bool(identifier & ERR_FLAG),
+        is_fd=len(data) > 8,
+        is_rx=not channel & TRANSMITTED,
+        dlc=len(data),
+        data=None if remote else data,
+        channel=channel & ~TRANSMITTED,
     )

@@ -1,0 +1,282 @@
+"""``gz-onboard replay``: puts a recorded log onto a bus, in its own timing.
+
+Each frame has its place on an absolute schedule against the monotonic clock, so delays do not add up: a frame that
+is late is sent at once, and the ones after it are on time again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import socket
+import struct
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gz_onboard.bus.logs import LogDamage, log_suffix, read_frames
+from gz_onboard.errors import InputError, nearest
+from gz_onboard.events import ERR_FLAG, TRANSMITTED, Frame
+
+if TYPE_CHECKING:
+    import can
+
+Send = Callable[[Frame], bool]
+"""Puts one frame on the bus; False if it could not."""
+
+_CLASSIC = struct.Struct("=IB3x8s")  # struct can_frame
+_FD = struct.Struct("=IBB2x64s")  # struct canfd_frame
+_SOL_CAN_RAW, _CAN_RAW_FILTER, _CAN_RAW_FD_FRAMES = 101, 1, 5
+_FULL_WAIT_S = 0.001
+_FULL_ATTEMPTS = 1000
+_EARLY_NS = 50_000
+"""Nearer than this a frame is sent now: sleeping takes as long."""
+_LOOP_GAP_NS = 1_000_000
+_PROGRESS_NS = 500_000_000
+
+
+@dataclass
+class Summary:
+    """What was sent: numbers of frames, time it took [s], and how late the latest frame was [s]."""
+
+    sent: int = 0
+    failed: int = 0
+    skipped: int = 0
+    loops: int = 0
+    duration_s: float = 0.0
+    worst_lateness_s: float = 0.0
+
+    def __str__(self) -> str:
+        text = f"{self.sent} frames in {self.duration_s:.1f} s, at worst {self.worst_lateness_s * 1e3:.1f} ms late"
+        if self.loops > 1:
+            text += f", {self.loops} rounds"
+        if self.failed:
+            text += f"; {self.failed} frames could not be sent"
+        if self.skipped:
+            text += f"; {self.skipped} frames left out"
+        return text
+
+
+def replay(
+    batches: Iterable[Sequence[Frame]],
+    send: Send,
+    speed: float = 1.0,
+    summary: Summary | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Summary:
+    """Send the frames at the times at which they stand in the log, `speed` times as fast; 0: without waiting.
+
+    progress is called about twice a second with the seconds of log sent. A `summary` that is given is added to,
+    and is up to date when KeyboardInterrupt ends the replay.
+    """
+    summary = summary or Summary()
+    begin_ns = time.monotonic_ns()
+    before_s = summary.duration_s
+    first_ns: int | None = None
+    told_ns = begin_ns
+    now_ns = begin_ns
+    worst_ns = round(summary.worst_lateness_s * 1e9)
+    summary.loops += 1
+    try:
+        for batch in batches:
+            for frame in batch:
+                if first_ns is None:
+                    first_ns = frame[0]
+                if speed:
+                    due_ns = begin_ns + round((frame[0] - first_ns) / speed)
+                    if due_ns - now_ns > _EARLY_NS:
+                        now_ns = time.monotonic_ns()
+                        while due_ns - now_ns > _EARLY_NS:
+                            # In short sleeps, so that Ctrl-C is heard and progress shown in a long gap.
+                            time.sleep(min(due_ns - now_ns, _PROGRESS_NS) * 1e-9)
+                            now_ns = time.monotonic_ns()
+                    elif now_ns - due_ns > worst_ns:
+                        worst_ns = now_ns - due_ns
+                if send(frame):
+                    summary.sent += 1
+                else:
+                    summary.failed += 1
+                now_ns = time.monotonic_ns()
+                if progress and now_ns - told_ns > _PROGRESS_NS:
+                    told_ns = now_ns
+                    progress((frame[0] - first_ns) * 1e-9)
+    finally:
+        summary.duration_s = before_s + (time.monotonic_ns() - begin_ns) * 1e-9
+        summary.worst_lateness_s = worst_ns * 1e-9
+    return summary
+
+
+def socket_sender(raw: socket.socket) -> Send:
+    """Sends through a raw CAN socket. A full queue is waited for; a bus that is down loses frames, as a bus does."""
+    raw.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, b"")  # nothing is received here, so nothing need be queued
+    raw.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, 1)
+
+    def send(frame: Frame) -> bool:
+        _, identifier, data, _ = frame
+        if len(data) <= 8:
+            packed = _CLASSIC.pack(identifier, len(data), data)
+        else:
+            packed = _FD.pack(identifier, len(data), 0, data)
+        for _ in range(_FULL_ATTEMPTS):
+            try:
+                raw.send(packed)
+                return True
+            except OSError as error:
+                if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
+                    return False
+            time.sleep(_FULL_WAIT_S)
+        return False
+
+    return send
+
+
+def bus_sender(bus: can.BusABC) -> Send:
+    """Sends through any of python-can's interfaces."""
+    from gz_onboard.bus._can import can
+    from gz_onboard.bus.readers.pycan import message_of
+
+    def send(frame: Frame) -> bool:
+        for _ in range(_FULL_ATTEMPTS):
+            try:
+                bus.send(message_of(frame, with_time=False))
+                return True
+            except (can.CanError, OSError) as error:
+                if getattr(error, "error_code", getattr(error, "errno", None)) not in (errno.ENOBUFS, errno.EAGAIN):
+                    return False
+            time.sleep(_FULL_WAIT_S)
+        return False
+
+    return send
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``gz-onboard replay``."""
+    parser.add_argument("file", type=Path, help="log: .mcap .blf .log .asc .trc .csv .mf4, each also with .gz")
+    parser.add_argument("--interface", default="socketcan", help="python-can's interface (default: %(default)s)")
+    parser.add_argument(
+        "--channel",
+        default="vcan0",
+        help="where to send (default: %(default)s); several by commas: the log's channels 0, 1, ... in this order",
+    )
+    parser.add_argument("--speed", type=float, default=1.0, help="times as fast; 0: as fast as possible")
+    parser.add_argument("--loop", action="store_true", help="begin again at the end, until interrupted")
+    parser.add_argument("--from", dest="start", type=float, default=0.0, metavar="S", help="seconds into the log")
+    parser.add_argument("--to", dest="end", type=float, metavar="S", help="seconds into the log")
+    parser.add_argument(
+        "--all", action="store_true", help="of our own logs also the frames that were sent, not received, back then"
+    )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run ``gz-onboard replay``: 0, or 130 when interrupted. Raises InputError for what cannot be used."""
+    if not 0 <= args.speed < float("inf"):
+        raise InputError(f"--speed {args.speed:g}: must be 0 (as fast as possible) or a positive factor")
+    start_ns, end_ns = log_section(args.file, args.start, args.end)
+    received_only = log_suffix(args.file) == ".mcap" and not args.all
+    names = [name for name in args.channel.split(",") if name]
+    buses = _open_buses(args.interface, names)
+    summary = Summary()
+    damages: list[LogDamage] = []
+    code = 0
+    try:
+        senders = [_sender(bus) for bus in buses]
+        send = senders[0] if len(senders) == 1 else _by_channel(senders)
+        while True:
+            batches = read_frames(args.file, start_ns, end_ns, damages.append)
+            replay(_sendable(batches, received_only, len(senders), summary), send, args.speed, summary, _progress())
+            if not summary.sent and not summary.failed:
+                raise InputError(f"{args.file}: no frames to send in the chosen part")
+            if not args.loop:
+                break
+            time.sleep(_LOOP_GAP_NS * 1e-9)
+    except KeyboardInterrupt:
+        code = 130
+    finally:
+        for bus in buses:
+            bus.shutdown()
+    if sys.stderr.isatty():
+        print("\r\x1b[K", end="", file=sys.stderr)
+    for damage in damages[:1]:
+        print(damage, file=sys.stderr)
+    print(f"replayed {args.file}: {summary}")
+    return code
+
+
+def log_section(path: Path, start_s: float, end_s: float | None) -> tuple[int | None, int | None]:
+    """--from and --to [s from the first frame] as times [ns] for `read_frames`; InputError if they are none."""
+    if not start_s >= 0:
+        raise InputError(f"--from {start_s:g} s: must not be before the start of the log")
+    if end_s is not None and not end_s > start_s:
+        raise InputError(f"--to {end_s:g} s: must be after --from {start_s:g} s")
+    if not start_s and end_s is None:
+        return None, None
+    first = next(read_frames(path, on_damage=lambda _: None), None)
+    if first is None:
+        raise InputError(f"{path}: no frames in this log")
+    first_ns = first[0][0]
+    return first_ns + round(start_s * 1e9), None if end_s is None else first_ns + round(end_s * 1e9)
+
+
+def _sendable(
+    batches: Iterable[list[Frame]], received_only: bool, channels: int, summary: Summary
+) -> Iterable[list[Frame]]:
+    """Without error frames, which no host can send, and what is not for the channels at hand."""
+    for batch in batches:
+        kept = [
+            frame
+            for frame in batch
+            if not frame[1] & ERR_FLAG
+            and not (received_only and frame[3] & TRANSMITTED)
+            and (channels == 1 or frame[3] & ~TRANSMITTED < channels)
+        ]
+        summary.skipped += len(batch) - len(kept)
+        yield kept
+
+
+def _by_channel(senders: list[Send]) -> Send:
+    def send(frame: Frame) -> bool:
+        return senders[frame[3] & ~TRANSMITTED](frame)
+
+    return send
+
+
+def _sender(bus: can.BusABC) -> Send:
+    raw = getattr(bus, "socket", None)
+    if isinstance(raw, socket.socket) and raw.family == getattr(socket, "AF_CAN", None):
+        return socket_sender(raw)
+    return bus_sender(bus)
+
+
+def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
+    from gz_onboard.bus._can import can
+
+    if interface not in can.VALID_INTERFACES:
+        known = sorted(can.VALID_INTERFACES)
+        raise InputError(f"--interface {interface}: unknown{nearest(interface, known)}; known are {', '.join(known)}")
+    buses: list[can.BusABC] = []
+    for name in names:
+        try:
+            buses.append(can.Bus(channel=name, interface=interface))
+        except (OSError, can.CanError, ImportError, ValueError) as error:
+            for bus in buses:
+                bus.shutdown()
+            there = sorted(name for _, name in socket.if_nameindex()) if interface == "socketcan" else []
+            raise InputError(
+                f"--channel {name}: cannot be opened by {interface}: {error}{nearest(name, there)}"
+            ) from None
+    if not buses:
+        raise InputError("--channel: no channel is named")
+    return buses
+
+
+def _progress() -> Callable[[float], None] | None:
+    if not sys.stderr.isatty():
+        return None
+
+    def show(seconds: float) -> None:
+        print(f"\r\x1b[K{int(seconds) // 60}:{seconds % 60:04.1f} of the log sent", end="", file=sys.stderr, flush=True)
+
+    return show
