@@ -189,6 +189,7 @@ def run(arguments: argparse.Namespace) -> int:
     logging.basicConfig(
         level=logging.INFO, format="%(message)s" if "JOURNAL_STREAM" in os.environ else "%(asctime)s %(message)s"
     )
+    logging.getLogger("can").setLevel(logging.WARNING)
     if not 0.005 <= arguments.tick <= TICK_NS * 1e-9:
         raise InputError(f"--tick {arguments.tick:g}: must be 0.005 to {TICK_NS * 1e-9:g} s")
     vehicle = read_vehicle(arguments.vehicle, arguments.payload)

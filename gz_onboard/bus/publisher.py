@@ -80,7 +80,7 @@ class Publisher:
         counter = self._counters[name]
         self._counters[name] = (counter + 1) % 15
         complete = {**values, f"RANGE_{part}Counter": counter, f"RANGE_{part}CRC": 0}
-        data = bytearray(message.encode(_raw(message, complete), scaling=False, padding=True))
+        data = bytearray(message.encode(_raw(message, complete), scaling=False, padding=True, strict=False))
         data[-1] = crc8_sae_j1850(bytes(data[:-1]))
         return time_ns, message.frame_id, bytes(data), channel | TRANSMITTED
 
