@@ -60,6 +60,7 @@ class LogFile:
             self._writer.add_attachment(start_ns, start_ns, name, "text/plain", data)
         schema = self._writer.register_schema(framelog.SCHEMA_NAME, framelog.ENCODING, framelog.SCHEMA_TEXT.encode())
         self._frames_channel = self._writer.register_channel(framelog.TOPIC, framelog.ENCODING, schema)
+        stream.flush()  # a file cut off before the first chunk is a valid beginning
 
     def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
         """Declare a topic of JSON objects; its schema is named by the JSON schema's ``title``, or the topic."""
@@ -125,7 +126,7 @@ class Recorder:
     """Logs into a directory of MCAP files named by their start in UTC and the vehicle, never raising for I/O errors.
 
     An error closes the file and is counted in `errors` (its text in `last_error`); recording goes on with a new
-    file `retry_s` later, and `lost_frames` counts the frames that no file holds. A file is closed at
+    file `retry_s` later, and `lost_frames` counts the frames not known to be in a file. A file is closed at
     `max_file_bytes` or `max_age_s`. Before a new one is begun, the oldest of the files named as ours are deleted
     until all together, with the new one, stay below `max_total_bytes`; other files are not touched.
     Raises InputError for limits that cannot be kept.
