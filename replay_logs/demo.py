@@ -10,15 +10,17 @@ import argparse
 import contextlib
 import os
 import signal
+import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import can
-import cantools
+from cantools.database import Database, load_file
 
 ROOT = Path(__file__).resolve().parents[1]
 RANGE_DBC = ROOT / "dbc" / "range.dbc"
@@ -52,8 +54,8 @@ def main() -> int:
     print(f"=== {args.ride.name} on the {where}, for at most {args.seconds:g} s", flush=True)
     frames = directory / "range.log"
     play = play_in_threads if args.interface == "virtual" else play_in_processes
-    with recording(args.interface, args.channel, frames) as first_frame:
-        status = play(daemon, replay, dashboard, first_frame.wait, args.seconds)
+    with recording(args.interface, args.channel, frames), listening_for_ready() as wait_until_ready:
+        status = play(daemon, replay, dashboard, wait_until_ready, args.seconds)
     if status:
         print(f"demo: the daemon ended with status {status}", file=sys.stderr)
         return status
@@ -69,32 +71,47 @@ def main() -> int:
 
 
 @contextlib.contextmanager
-def recording(interface: str, channel: str, file: Path) -> Iterator[threading.Event]:
-    """Record the range frames, and nothing else, as candump does; yields the event of the first one."""
-    messages = cantools.database.load_file(RANGE_DBC).messages
-    filters = [
-        can.typechecking.CanFilter(can_id=m.frame_id, can_mask=0x7FF, extended=m.is_extended_frame) for m in messages
-    ]
-    first_frame = threading.Event()
+def recording(interface: str, channel: str, file: Path) -> Iterator[None]:
+    """Record the range frames, and nothing else, as candump does."""
+    database = load_file(RANGE_DBC)
+    assert isinstance(database, Database)
+    filters = [can.typechecking.CanFilter(can_id=m.frame_id, can_mask=0x7FF) for m in database.messages]
     with can.Bus(interface=interface, channel=channel, can_filters=filters) as bus:
         writer = can.CanutilsLogWriter(file, channel=channel)
-        notifier = can.Notifier(bus, [writer, lambda _: first_frame.set()])
+        notifier = can.Notifier(bus, [writer])
         try:
-            yield first_frame
+            yield
         finally:
             notifier.stop()
             writer.stop()
 
 
+@contextlib.contextmanager
+def listening_for_ready() -> Iterator[Callable[[], bool]]:
+    """What systemd does for a service: hear the daemon say that it is ready. Yields the function that waits for it."""
+    with tempfile.TemporaryDirectory() as directory, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server:
+        os.environ["NOTIFY_SOCKET"] = f"{directory}/notify"
+        server.bind(os.environ["NOTIFY_SOCKET"])
+        server.settimeout(READY_WITHIN)
+
+        def wait() -> bool:
+            with contextlib.suppress(TimeoutError):
+                return server.recv(4096).startswith(b"READY=1")
+            return False
+
+        yield wait
+        del os.environ["NOTIFY_SOCKET"]
+
+
 def play_in_processes(
-    daemon: list[str], replay: list[str], dashboard: list[str], ready: Callable[[float], bool], seconds: float
+    daemon: list[str], replay: list[str], dashboard: list[str], wait_until_ready: Callable[[], bool], seconds: float
 ) -> int:
     """Run the three commands as processes; the daemon's exit status."""
     command = str(BIN / "gz-onboard")
     with contextlib.ExitStack() as stack:
         daemon_process = stack.enter_context(subprocess.Popen([command, *daemon]))
         stack.callback(daemon_process.terminate)
-        if not ready(READY_WITHIN):
+        if not wait_until_ready():
             return daemon_process.poll() or 1
         dashboard_process = stack.enter_context(subprocess.Popen([command, *dashboard]))
         stack.callback(dashboard_process.terminate)
@@ -107,13 +124,13 @@ def play_in_processes(
 
 
 def play_in_threads(
-    daemon: list[str], replay: list[str], dashboard: list[str], ready: Callable[[float], bool], seconds: float
+    daemon: list[str], replay: list[str], dashboard: list[str], wait_until_ready: Callable[[], bool], seconds: float
 ) -> int:
     """Run the three commands in this process, the daemon in the main thread, where signals arrive."""
     from gz_onboard import cli
 
     def the_rest() -> None:
-        if ready(READY_WITHIN):
+        if wait_until_ready():
             threading.Thread(target=cli.main, args=(dashboard,), daemon=True).start()
             playing = threading.Thread(target=cli.main, args=(replay,), daemon=True)
             playing.start()
