@@ -86,13 +86,16 @@ def _candump_lines(
 ) -> list[Frame]:
     """The frames of lines of any form; lines that are none are noted as damage. first: number of the first line."""
     frames = []
-    for number, line in enumerate(map(str.strip, text.split("\n")), first):
+    lines = text.split("\n")
+    for number, line in enumerate(map(str.strip, lines), first):
         if not line:
             continue
         match = _CANDUMP_LINE.fullmatch(line)
         try:
             if not match:
                 raise ValueError("not a line of a candump log")
+            if number == first + len(lines) - 1 and len(match["data"] or "") < 16:
+                raise ValueError("the last line has no end, so data may be missing")
             frames.append(_candump_frame(match, identifiers, channels))
         except ValueError as error:
             damage.add(f"line {number}", f"{error}: {line[:60]!r}")

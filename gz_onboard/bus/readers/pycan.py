@@ -65,6 +65,8 @@ def text_reader(suffix: str) -> Reader:
                 message = next(messages, None)
                 if message is None:
                     break
+                if len(message.data) != message.dlc and not (message.is_remote_frame or message.is_error_frame):
+                    raise ValueError(f"{len(message.data)} bytes of data where there should be {message.dlc}")
                 batch.append(frame_of(message, channels))
             except (ValueError, LookupError, TypeError, AttributeError, NotImplementedError) as error:
                 damage.add(f"line {feed.number}", f"{str(error) or type(error).__name__}: {feed.line.strip()[:60]!r}")
