@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import os
 import signal
 import socket
@@ -42,6 +43,8 @@ def main() -> int:
     if not args.ride.is_file():
         parser.error(f"no such ride: {args.ride}")
 
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(line_buffering=True)  # in the order of what the other processes write
     directory = ROOT / "runs" / time.strftime("%Y%m%dT%H%M%S")
     directory.mkdir(parents=True)
     bus = ["--interface", args.interface, "--channel", args.channel]
@@ -51,13 +54,13 @@ def main() -> int:
     dashboard = ["dashboard", *bus]
 
     where = "in-process virtual bus" if args.interface == "virtual" else f"{args.channel} of Linux {os.uname().release}"
-    print(f"=== {args.ride.name} on the {where}, for at most {args.seconds:g} s", flush=True)
+    print(f"=== {args.ride.name} on the {where}, for at most {args.seconds:g} s")
     frames = directory / "range.log"
     play = play_in_threads if args.interface == "virtual" else play_in_processes
     with recording(args.interface, args.channel, frames), listening_for_ready() as wait_until_ready:
         status = play(daemon, replay, dashboard, wait_until_ready, args.seconds)
     if status:
-        print(f"demo: the daemon ended with status {status}", file=sys.stderr)
+        print(f"demo: ended with status {status}", file=sys.stderr)
         return status
 
     show_decoded(frames)
@@ -117,6 +120,9 @@ def play_in_processes(
         stack.callback(dashboard_process.terminate)
         with contextlib.suppress(subprocess.TimeoutExpired):  # a ride may be longer than the demonstration
             subprocess.run([command, *replay], timeout=seconds, check=True)
+        if dashboard_process.poll() is not None:
+            print("demo: the dashboard ended before the ride did", file=sys.stderr)
+            return 1
         dashboard_process.terminate()
         dashboard_process.wait(STOPPED_WITHIN)
         daemon_process.terminate()
