@@ -1,0 +1,259 @@
+from __future__ import annotations
+
+import argparse
+import csv
+import gzip
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import cantools
+import pytest
+from mcap.reader import make_reader
+
+from gz_onboard.bus import export as command
+from gz_onboard.bus.logs import read_frames, read_samples
+from gz_onboard.bus.recorder import LogFile, object_schema
+from gz_onboard.bus.writers import write_candump
+from gz_onboard.errors import InputError
+from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame
+
+START = 1_750_000_000_000_000_000
+
+DBC = """VERSION ""
+
+BU_: BMS
+
+BO_ 256 Pack: 8 BMS
+ SG_ Voltage : 0|16@1+ (0.01,0) [0|600] "V" BMS
+ SG_ Current : 16|16@1- (0.05,0) [-1600|1600] "A" BMS
+ SG_ Mode : 32|3@1+ (1,0) [0|7] "" BMS
+ SG_ Temperature : 40|8@1+ (1,-40) [-40|210] "degC" BMS
+
+BO_ 2147484160 Muxed: 3 BMS
+ SG_ Page M : 0|8@1+ (1,0) [0|1] "" BMS
+ SG_ First m0 : 8|8@1+ (1,0) [0|255] "V" BMS
+ SG_ Second m1 : 8|16@1+ (1,0) [0|65535] "V" BMS
+
+BO_ 300 Never: 1 BMS
+ SG_ Silent : 0|8@1+ (1,0) [0|255] "" BMS
+
+CM_ SG_ 256 Voltage "at the contactor";
+"""
+MUXED = 512 | EFF_FLAG
+
+
+def recorded() -> list[Frame]:
+    """Frames that decode, some with codes for not available, one of a wrong length, some unknown."""
+    frames: list[Frame] = []
+    for i in range(200):
+        t = START + i * 10_000_001
+        temperature = 255 if i % 10 == 0 else 60
+        current = -32768 if i % 20 == 0 else -i
+        data = (5000 + i).to_bytes(2, "little") + current.to_bytes(2, "little", signed=True)
+        frames.append((t, 256, data + bytes([3, temperature, 0, 0]), 0))
+        if i % 2:
+            frames.append((t + 1_000_000, MUXED, bytes([i % 4 // 2, i, 0]), 0))
+        if i % 50 == 0:
+            frames.append((t + 2_000_000, 0x7FF, b"?", 1))
+    frames.append((START + 3 * 10**9, 256, b"short", 0))
+    frames.append((START + 3 * 10**9 + 1, 256, bytes(8), TRANSMITTED))
+    return frames
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    path = tmp_path / "ride.mcap"
+    file = LogFile(path.open("wb"), START, {"vehicle": "ref"}, {"dbc/a.dbc": DBC.encode()})
+    file.channel("/estimate", object_schema("Estimate", {"range": "km"}), {"k": "v"})
+    frames = recorded()
+    for i in range(0, len(frames), 25):
+        file.frames(frames[i : i + 25])
+        file.sample("/estimate", frames[i][0], {"range": float(i)})
+    file.close()
+    return path
+
+
+def run(*arguments: str | Path) -> int:
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    return command.run(parser.parse_args([str(argument) for argument in arguments]))
+
+
+def read(path: Path) -> list[Frame]:
+    return [frame for batch in read_frames(path) for frame in batch]
+
+
+def expected() -> dict[str, list[tuple[int, dict[str, Any]]]]:
+    """What cantools itself makes of the frames, the codes for not available taken out by hand."""
+    database: Any = cantools.database.load_string(DBC)
+    found: dict[str, list[tuple[int, dict[str, Any]]]] = {"Pack": [], "Muxed": []}
+    for t, identifier, data, _ in recorded():
+        if identifier == 256 and len(data) == 8:
+            values: Any = database.decode_message("Pack", data)
+            if values["Temperature"] == 215:
+                values["Temperature"] = None
+            if values["Current"] == pytest.approx(-1638.4):
+                values["Current"] = None
+            row = {"Voltage[V]": values["Voltage"], "Current[A]": values["Current"]}
+            found["Pack"].append((t, {**row, "Mode": values["Mode"], "Temperature[degC]": values["Temperature"]}))
+        elif identifier == MUXED:
+            values = database.decode_message("Muxed", data)
+            row = {"Page": values["Page"], "First[V]": values.get("First"), "Second[V]": values.get("Second")}
+            found["Muxed"].append((t, row))
+    return found
+
+
+@pytest.mark.parametrize("suffix", [".blf", ".log", ".log.gz"])
+def test_frames_come_back_at_the_resolution_of_the_format(tmp_path: Path, log: Path, suffix: str) -> None:
+    out = tmp_path / f"out{suffix}"
+    assert run(log, out) == 0
+    unit = 1 if suffix == ".blf" else 1000
+    assert read(out) == [(t // unit * unit, i, d, c) for t, i, d, c in recorded()]
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".trc", ".csv", ".mf4"])
+def test_frames_come_back_through_python_cans_formats(tmp_path: Path, log: Path, suffix: str) -> None:
+    if suffix == ".mf4":
+        pytest.importorskip("asammdf")
+    out = tmp_path / f"out{suffix}"
+    assert run(log, out) == 0
+    there = read(out)
+    assert [(i, d) for _, i, d, _ in there] == [(i, d) for _, i, d, _ in recorded()]
+    steps = [(a[0] - there[0][0]) - (b[0] - START) for a, b in zip(there, recorded(), strict=True)]
+    assert max(map(abs, steps)) <= 2_000
+
+
+def test_a_candump_goes_through_our_log_unchanged(tmp_path: Path, log: Path) -> None:
+    first = tmp_path / "first.log"
+    run(log, first)
+    between = tmp_path / "between.mcap"
+    (tmp_path / "a.dbc").write_text(DBC)
+    assert run(first, between, "--dbc", tmp_path / "a.dbc") == 0
+    second = tmp_path / "second.log"
+    assert run(between, second) == 0
+    assert second.read_text() == first.read_text()
+
+
+def test_tables_have_a_row_for_each_frame_and_null_for_what_was_not_available(tmp_path: Path, log: Path) -> None:
+    import pyarrow.parquet as pq
+
+    assert run(log, tmp_path / "tables") == 0
+    for message, rows in expected().items():
+        table = pq.read_table(tmp_path / "tables" / f"{message}.parquet")
+        assert table.column("time").cast("int64").to_pylist() == [t for t, _ in rows]
+        for name in rows[0][1]:
+            assert table.column(name).to_pylist() == [values[name] for _, values in rows]
+    assert sorted(p.name for p in (tmp_path / "tables").iterdir()) == ["Muxed.parquet", "Pack.parquet"]
+
+
+def test_tables_as_csv_say_the_same(tmp_path: Path, log: Path) -> None:
+    assert run(log, tmp_path / "tables", "--table-format", "csv") == 0
+    for message, rows in expected().items():
+        with (tmp_path / "tables" / f"{message}.csv").open(newline="") as stream:
+            there = list(csv.DictReader(stream))
+        assert [row.pop("time[s]").replace(".", "") for row in there] == [str(t) for t, _ in rows]
+        as_numbers = [{name: float(text) if text else None for name, text in row.items()} for row in there]
+        assert as_numbers == [values for _, values in rows]
+
+
+@pytest.mark.parametrize("name", ["out.parquet", "out.csv", "out.csv.gz"])
+def test_one_long_table_has_a_row_for_each_value(tmp_path: Path, log: Path, name: str) -> None:
+    out = tmp_path / name
+    assert run(log, out, "--signals") == 0
+    if name.endswith(".parquet"):
+        import pyarrow.parquet as pq
+
+        table = pq.read_table(out)
+        stamps = table.column("time").cast("int64").to_pylist()
+        columns = [table.column(c).to_pylist() for c in ("message", "signal", "value")]
+        there = list(zip(stamps, *columns, strict=True))
+    else:
+        data = out.read_bytes()
+        text = (gzip.decompress(data) if name.endswith(".gz") else data).decode()
+        there = [
+            (int(row["time[s]"].replace(".", "")), row["message"], row["signal"], _float(row["value"] or None))
+            for row in csv.DictReader(text.splitlines())
+        ]
+    wanted = [(t, m, s, _float(v)) for m, rows in expected().items() for t, values in rows for s, v in values.items()]
+    assert sorted(there, key=str) == sorted(wanted, key=str)
+
+
+def _float(value: Any) -> float | None:
+    return None if value is None else float(value)
+
+
+def test_an_mcap_has_a_channel_for_each_message_and_all_that_was_there(tmp_path: Path, log: Path) -> None:
+    out = tmp_path / "out.mcap"
+    assert run(log, out) == 0
+    with out.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        found: dict[str, list[tuple[int, Any]]] = {}
+        for schema, channel, message in reader.iter_messages():
+            if channel.message_encoding == "json":
+                assert schema is not None
+                assert schema.encoding == "jsonschema"
+                properties = json.loads(schema.data)["properties"]
+                values = json.loads(message.data)
+                assert set(values) <= set(properties)
+                found.setdefault(channel.topic, []).append((message.log_time, values))
+    assert found["/can/Pack"] == expected()["Pack"]
+    assert found["/can/Muxed"] == expected()["Muxed"]
+    assert found["/estimate"] == [(t, v) for topic, t, v in read_samples(log) if topic == "/estimate"]
+    assert read(out) == recorded()
+    assert Counter(topic for topic, _, _ in read_samples(out))["/can/Pack"] == 201
+
+
+def test_the_comment_of_a_signal_stands_in_the_schema(tmp_path: Path, log: Path) -> None:
+    run(log, tmp_path / "out.mcap")
+    with (tmp_path / "out.mcap").open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    schema = next(json.loads(s.data) for s in summary.schemas.values() if s.name == "Pack")
+    assert schema["properties"]["Voltage[V]"]["description"] == "V, at the contactor"
+
+
+def test_a_part_by_seconds_from_the_start(tmp_path: Path, log: Path) -> None:
+    run(log, tmp_path / "out.blf", "--from", "0.5", "--to", "1")
+    wanted = [frame for frame in recorded() if START + 500_000_000 <= frame[0] < START + 1_000_000_000]
+    assert read(tmp_path / "out.blf") == wanted
+    run(log, tmp_path / "out.mcap", "--from", "0.5", "--to", "1")
+    times = [t for _, t, _ in read_samples(tmp_path / "out.mcap")]
+    assert times
+    assert all(START + 500_000_000 <= t < START + 1_000_000_000 for t in times)
+
+
+def test_what_was_left_out_is_counted(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(log, tmp_path / "out.parquet")
+    assert "301 frames; 4 frames are in no DBC file, 1 do not fit theirs" in capsys.readouterr().out
+
+
+def test_damage_is_told(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log.write_bytes(log.read_bytes()[:-2500])
+    run(log, tmp_path / "out.blf")
+    assert "damaged log" in capsys.readouterr().out
+
+
+def test_a_log_without_dbc_files_asks_for_them(tmp_path: Path) -> None:
+    path = tmp_path / "a.log"
+    with path.open("w") as stream:
+        write_candump(stream, [recorded()])
+    with pytest.raises(InputError, match="--dbc"):
+        run(path, tmp_path / "out.parquet")
+    (tmp_path / "a.dbc").write_text(DBC)
+    assert run(path, tmp_path / "out.parquet", "--dbc", tmp_path / "a.dbc") == 0
+
+
+@pytest.mark.parametrize(
+    ("out", "said"),
+    [("out.bfl", "did you mean '.blf'"), ("out.blf.gz", "only .* can be written with .gz"), ("ride.mcap", "the log")],
+)
+def test_outputs_that_cannot_be_written_are_named(tmp_path: Path, log: Path, out: str, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        run(log, tmp_path / out)
+
+
+def test_a_missing_directory_is_named(tmp_path: Path, log: Path) -> None:
+    with pytest.raises(InputError, match=r"nowhere.*cannot be written"):
+        run(log, tmp_path / "nowhere" / "out.blf")

@@ -1,0 +1,256 @@
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import can
+import pytest
+
+from gz_onboard.bus import replay as command
+from gz_onboard.bus.readers.pycan import frame_of
+from gz_onboard.bus.recorder import LogFile
+from gz_onboard.bus.replay import Summary, bus_sender, replay
+from gz_onboard.bus.writers import write_candump
+from gz_onboard.errors import InputError
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
+
+START = 1_750_000_000_000_000_000
+
+
+def frames(count: int, step_ns: int = 5_000_000) -> list[Frame]:
+    return [(START + i * step_ns, 0x100 + i % 20, i.to_bytes(4, "little"), 0) for i in range(count)]
+
+
+def log(tmp_path: Path, content: list[Frame]) -> Path:
+    path = tmp_path / "a.log"
+    with path.open("w") as stream:
+        write_candump(stream, [content])
+    return path
+
+
+def run(*arguments: str | Path) -> int:
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    return command.run(parser.parse_args([str(argument) for argument in arguments]))
+
+
+class Listener:
+    """Collects what is sent on one of python-can's in-process buses."""
+
+    def __init__(self, channel: str) -> None:
+        self.bus = can.Bus(interface="virtual", channel=channel)
+        self.received: list[Frame] = []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._listen)
+        self._thread.start()
+
+    def _listen(self) -> None:
+        while not self._stop.is_set():
+            message = self.bus.recv(0.05)
+            if message:
+                self.received.append(frame_of(message, {str(message.channel): 0}))
+
+    def close(self) -> list[Frame]:
+        time.sleep(0.1)
+        self._stop.set()
+        self._thread.join()
+        self.bus.shutdown()
+        return self.received
+
+
+@pytest.fixture
+def listener(request: pytest.FixtureRequest) -> Iterator[Listener]:
+    made = Listener(request.node.name)
+    yield made
+    made.close()
+
+
+def payload(received: list[Frame]) -> list[tuple[int, bytes]]:
+    return [(identifier, data) for _, identifier, data, _ in received]
+
+
+def test_every_frame_arrives_in_order(tmp_path: Path, listener: Listener, request: pytest.FixtureRequest) -> None:
+    sent: list[Frame] = [
+        *frames(500),
+        (START + 3 * 10**9, 0x18F00400 | EFF_FLAG, bytes(8), 0),
+        (START + 3 * 10**9, 0x123 | RTR_FLAG, bytes(4), 0),
+    ]
+    path = log(tmp_path, sent)
+    assert run(path, "--interface", "virtual", "--channel", request.node.name, "--speed", "0") == 0
+    assert payload(listener.close()) == payload(sent)
+
+
+def test_frames_keep_their_timing_and_delays_do_not_add_up() -> None:
+    content = frames(100)
+    arrived: list[int] = []
+
+    def send(_frame: Frame) -> bool:
+        arrived.append(time.monotonic_ns())
+        if len(arrived) == 20:
+            time.sleep(0.05)  # a bus that is busy for a while
+        return True
+
+    summary = replay([content[:50], content[50:]], send)
+    assert summary.sent == 100
+    errors = [(a - arrived[0]) - (f[0] - START) for a, f in zip(arrived, content, strict=True)]
+    assert min(errors) > -1_000_000
+    assert summary.worst_lateness_s > 0.03  # the frames behind the delay, sent at once
+    assert sorted(errors[60:])[20] < 5_000_000  # and then on time again
+    assert 0.49 < summary.duration_s < 0.7
+
+
+@pytest.mark.parametrize(("speed", "seconds"), [(4.0, 0.25), (0.0, 0.0)])
+def test_speed_divides_the_time_and_zero_means_no_waiting(speed: float, seconds: float) -> None:
+    begin = time.monotonic()
+    replay([frames(201)], lambda _: True, speed)
+    assert seconds * 0.99 <= time.monotonic() - begin < seconds + 0.15
+
+
+def test_time_that_goes_back_does_not_stop_the_replay() -> None:
+    content = [*frames(10), *frames(10)]
+    assert replay([content], lambda _: True).sent == 20
+
+
+def test_a_part_is_chosen_in_seconds_from_the_start(
+    tmp_path: Path, listener: Listener, request: pytest.FixtureRequest
+) -> None:
+    content = frames(1000)  # 5 s
+    path = log(tmp_path, content)
+    arguments = ["--interface", "virtual", "--channel", request.node.name, "--speed", "0"]
+    assert run(path, *arguments, "--from", "1", "--to", "2.5") == 0
+    assert payload(listener.close()) == payload(content[200:500])
+
+
+def test_what_we_sent_ourselves_is_replayed_only_when_asked_for(
+    tmp_path: Path, listener: Listener, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
+) -> None:
+    content = [(t, i, d, TRANSMITTED if n % 4 == 0 else 0) for n, (t, i, d, _) in enumerate(frames(100))]
+    path = tmp_path / "a.mcap"
+    file = LogFile(path.open("wb"), START)
+    file.frames(content)
+    file.close()
+    arguments = ["--interface", "virtual", "--channel", request.node.name, "--speed", "0"]
+    assert run(path, *arguments) == 0
+    assert "75 frames" in capsys.readouterr().out
+    assert run(path, *arguments, "--all") == 0
+    assert payload(listener.close()) == [*payload([f for f in content if not f[3]]), *payload(content)]
+
+
+def test_channels_of_the_log_go_to_channels_of_the_bus(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    content = [(t, i, d, n % 3) for n, (t, i, d, _) in enumerate(frames(90))]
+    path = log(tmp_path, content)
+    name = request.node.name
+    listeners = [Listener(f"{name}{i}") for i in range(2)]
+    arguments = ["--interface", "virtual", "--speed", "0", "--channel", f"{name}0,{name}1"]
+    assert run(path, *arguments) == 0
+    for i, one in enumerate(listeners):
+        assert payload(one.close()) == payload([frame for frame in content if frame[3] == i])
+
+
+def test_error_frames_are_left_out_and_counted(
+    tmp_path: Path, request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = log(tmp_path, [*frames(5), (START + 10**9, 0x44 | ERR_FLAG, bytes(8), 0)])
+    run(path, "--interface", "virtual", "--channel", request.node.name, "--speed", "0")
+    assert "5 frames in" in (text := capsys.readouterr().out)
+    assert "1 frames left out" in text
+
+
+def test_looping_ends_cleanly_on_an_interrupt(tmp_path: Path) -> None:
+    path = log(tmp_path, frames(20))
+    code = (
+        "import argparse, sys; from gz_onboard.bus import replay as r; p = argparse.ArgumentParser();"
+        " r.add_arguments(p); sys.exit(r.run(p.parse_args(sys.argv[1:])))"
+    )
+    arguments = [str(path), "--interface", "virtual", "--channel", "x", "--loop", "--speed", "2"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    time.sleep(2.0)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=10)
+    assert process.returncode == 130
+    assert "rounds" in out
+    assert "Traceback" not in err
+
+
+def test_a_full_queue_is_waited_for() -> None:
+    class Busy:
+        attempts = 0
+
+        def send(self, _message: can.Message) -> None:
+            self.attempts += 1
+            if self.attempts % 3:
+                raise can.CanOperationError("full", error_code=105)
+
+    bus = Busy()
+    summary = replay([frames(10)], bus_sender(bus), 0)  # type: ignore[arg-type]
+    assert (summary.sent, summary.failed, bus.attempts) == (10, 0, 30)
+
+
+def test_a_bus_that_is_down_loses_frames_and_they_are_counted() -> None:
+    class Down:
+        def send(self, _message: can.Message) -> None:
+            raise can.CanOperationError("down", error_code=100)
+
+    summary = replay([frames(10)], bus_sender(Down()), 0)  # type: ignore[arg-type]
+    assert (summary.sent, summary.failed) == (0, 10)
+    assert "10 frames could not be sent" in str(summary)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--speed", "-1"], "--speed -1"),
+        (["--speed", "nan"], "--speed nan"),
+        (["--from", "-1"], "--from -1 s"),
+        (["--from", "3", "--to", "2"], "--to 2 s"),
+        (["--from", "1000"], "no frames to send"),
+        (["--interface", "virtul"], "did you mean 'virtual'"),
+    ],
+)
+def test_bad_arguments_are_named(tmp_path: Path, arguments: list[str], said: str) -> None:
+    path = log(tmp_path, frames(10))
+    with pytest.raises(InputError, match=said):
+        run(path, "--interface", "virtual", "--channel", "bad", *arguments)
+
+
+def test_a_missing_channel_is_named(tmp_path: Path) -> None:
+    path = log(tmp_path, frames(10))
+    with pytest.raises(InputError, match="--channel nosuchcan0"):
+        run(path, "--interface", "socketcan", "--channel", "nosuchcan0")
+
+
+def _vcan() -> str | None:
+    """A virtual CAN interface that is up, if this machine has one."""
+    for _, name in socket.if_nameindex():
+        if name.startswith("vcan") and os.access(f"/sys/class/net/{name}/flags", os.R_OK):
+            return name
+    return None
+
+
+@pytest.mark.skipif(_vcan() is None, reason="this machine has no vcan interface")
+def test_a_real_socket_carries_every_kind_of_frame(tmp_path: Path) -> None:
+    name = _vcan()
+    assert name
+    sent: list[Frame] = [*frames(300), (START, 0x1FFF_FFFF | EFF_FLAG, bytes(8), 0), (START, 1 | RTR_FLAG, bytes(3), 0)]
+    path = log(tmp_path, sent)
+    with can.Bus(interface="socketcan", channel=name) as bus:
+        assert run(path, "--channel", name, "--speed", "0") == 0
+        received = []
+        while message := bus.recv(0.5):
+            received.append(frame_of(message, {name: 0}))
+    assert payload(received) == payload(sent)
+
+
+def test_summary_tells_what_matters() -> None:
+    text = str(Summary(sent=5, duration_s=1.25, worst_lateness_s=0.0123, loops=2))
+    assert text == "5 frames in 1.2 s, at worst 12.3 ms late, 2 rounds"
