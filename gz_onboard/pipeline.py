@@ -17,6 +17,7 @@ from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE,
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.estimator.ekf import filter_maker
 from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.estimator.forecast import PRIOR_RIDING
 from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
 from gz_onboard.vehicle import Vehicle
 
@@ -63,7 +64,9 @@ class Pipeline:
             raise vehicle.error("has no [battery]: without one no range can be estimated")
         self.vehicle = vehicle
         self.codec = Codec(vehicle.mapping)
-        self.estimator = Estimator(self.codec.groups, vehicle.battery, vehicle.model, filter_maker(filter_name))
+        self.estimator = Estimator(
+            self.codec.groups, vehicle.battery, vehicle.model, vehicle.riding or PRIOR_RIDING, filter_maker(filter_name)
+        )
         self.publisher = Publisher()
         self.kernel_lost = 0  # frames; set by the daemon
         self.extra_reasons = Reason(0)  # set by the daemon: bus down, log failed

@@ -25,6 +25,7 @@ class Vehicle:
     parameters: Parameters
     battery: Battery | None
     model: Model
+    riding: tuple[tuple[float, float, float], ...] | None  # to be expected before anything is ridden
 
     @property
     def key(self) -> str:
@@ -50,7 +51,7 @@ def find_vehicle(name: str) -> Path:
 def read_vehicle(name: str, payload: float | None = None) -> Vehicle:
     """The vehicle `name` (file or one of the package's own), with the rider's mass [kg] if it is known."""
     table = Table.read(find_vehicle(name))
-    table.only(["schema", "name", "dbc", "bus", "roles", "model", "parameters", "battery"])
+    table.only(["schema", "name", "dbc", "bus", "roles", "model", "parameters", "battery", "forecast"])
     if table.number("schema") != 1:
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
     effects = read_model(table)
@@ -64,4 +65,23 @@ def read_vehicle(name: str, payload: float | None = None) -> Vehicle:
         parameters=parameters,
         battery=read_battery(table, parameters) if "battery" in table.values else None,
         model=Model(effects, parameters),
+        riding=_read_riding(table.table("forecast")),
     )
+
+
+def _read_riding(table: Table) -> tuple[tuple[float, float, float], ...] | None:
+    """``riding = [[share of time, speed in m/s, acceleration in m/s²], ...]``; None if it is not there."""
+    table.only(["riding", "source"])
+    rows = table.values.get("riding")
+    if rows is None:
+        return None
+    try:
+        riding = tuple((float(share), float(speed), float(acceleration)) for share, speed, acceleration in rows)
+    except (TypeError, ValueError) as error:
+        raise table.error("must be rows of [share of time, speed in m/s, acceleration in m/s²]", "riding") from error
+    shares, moving = sum(row[0] for row in riding), sum(row[0] * row[1] for row in riding)
+    if not (all(row[0] >= 0 and row[1] >= 0 for row in riding) and 0.98 < shares < 1.02 and moving > 0.5):
+        raise table.error(
+            f"shares must be positive and add up to 1 (they do to {shares:.3f}), and it must move", "riding"
+        )
+    return riding

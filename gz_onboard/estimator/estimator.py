@@ -11,7 +11,7 @@ from math import exp, sqrt
 from typing import Any
 
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
-from gz_onboard.estimator.forecast import Forecast, Forecaster
+from gz_onboard.estimator.forecast import PRIOR_RIDING, Forecast, Forecaster, PriorRiding
 from gz_onboard.estimator.road import Road
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.events import STALE_PERIODS, Estimate, Event, Group, Reason, State
@@ -22,7 +22,8 @@ SNAPSHOT_VERSION = 1
 PACE = ("pack_voltage", "inverter_voltage", "motor_speed")  # the message of the first that is mapped sets the pace
 STEP_AT_LEAST = 0.25  # s: without the message that sets the pace, a step is made after so long
 FORECAST_PERIOD = 1.0  # s
-ERROR_TIME = 60.0  # s: over so long the cell model errs the same way; its error does not average out faster
+ERROR_TIME = 600.0  # s: over so long the cell model errs the same way; its error does not average out faster
+EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
 OFFSET_TIME = 3600.0  # s: so long the current sensor's offset stays the same
 RESISTANCE_SD = 0.12  # relative: R0 of this pack at this place and temperature
 RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
@@ -36,12 +37,17 @@ class Estimator:
     """The estimator of one vehicle."""
 
     def __init__(
-        self, groups: Sequence[Group], battery: Battery, model: Model, make: FilterMaker = ScalarFilter
+        self,
+        groups: Sequence[Group],
+        battery: Battery,
+        model: Model,
+        riding: PriorRiding = PRIOR_RIDING,
+        make: FilterMaker = ScalarFilter,
     ) -> None:
         self.battery = battery
         self.model = model
         self.road = Road()
-        self.forecaster = Forecaster(model, battery)
+        self.forecaster = Forecaster(model, battery, riding)
         self.filter: SocFilter | None = None
         self.signals = Signals(
             (role, STALE_PERIODS * group.period if group.period else DEFAULT_STALE)
@@ -58,7 +64,7 @@ class Estimator:
         self._current: float | None = None  # A of the pack, at the last step
         self._off_gate = 0
         self._innovation: float | None = None
-        self._innovation_square = 0.0
+        self._innovation_square = self._error_square = 0.0
         self._mismatch = 0.0  # A, low-passed
         self._cell_temperature: float | None = None
         self._pack: tuple[float | None, float | None, str] = (None, None, "none")
@@ -74,8 +80,10 @@ class Estimator:
         self._voltage_offset = p["pack_voltage_offset"]
         self._voltage_sd = p.sd("pack_voltage_offset") / battery.cells_series
         self._model_sd = p.sd("cell_voltage_error")
+        self._empty_sd = p.sd("cell_voltage_error_empty")
         self._rest_sd = sqrt(p.sd("rest_voltage_error") ** 2 + battery.ocv_sd**2)
-        self._charge_sd = sqrt((p.sd("cell_capacity") / p["cell_capacity"]) ** 2 + gain_sd**2)
+        self._cell_scatter = p.sd("cell_capacity") / p["cell_capacity"]
+        self._charge_sd = sqrt(self._cell_scatter**2 + gain_sd**2)
         self._radius, self._gear = p["wheel_radius"], p["gear_ratio"]
 
     # --- events -----------------------------------------------------------------------------------------------
@@ -199,11 +207,17 @@ class Estimator:
         r0 = battery.r0.at(filter_.soc, temperature)[0]
         resistance_sd = RESISTANCE_SD if known else RESISTANCE_SD_COLD
         current_sd = CURRENT_SD[source] / battery.cells_parallel
-        slow = (
-            self._model_sd**2 + self._voltage_sd**2 + (resistance_sd * r0 * cell_current) ** 2 + (r0 * current_sd) ** 2
-        )
+        empty = min(max((EMPTY_BELOW - filter_.soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
+        model_sd = self._model_sd + empty * (self._empty_sd - self._model_sd)
+        # The pack's cells are not the bench's: where SOC lies on their curve is known to their capacity's scatter.
+        axis_sd = self._cell_scatter * (1 - filter_.soc) * battery.ocv(filter_.soc)[1]
+        resistance = (resistance_sd * r0 * cell_current) ** 2 + (r0 * current_sd) ** 2
+        slow = model_sd**2 + self._voltage_sd**2 + axis_sd**2 + resistance
         error, own = filter_.innovation(cell_voltage, cell_current, temperature)
         self._innovation = error
+        # A model that errs more than its file says is believed less (Mehra 1970: covariance matching).
+        slow = max(slow, self._error_square)
+        self._error_square += (error * error - self._error_square) * min(dt / ERROR_TIME, 1.0)
         self._innovation_square += (error * error - self._innovation_square) * min(dt / 10.0, 1.0)
         if error * error > GATE * GATE * (own + slow):
             self._off_gate += 1
@@ -310,8 +324,8 @@ class Estimator:
             )
             estimate.consumption_recent = forecast.recent
             riding = self.forecaster.riding
-            estimate.consumption_factor = exp(riding.log_factor)
-            estimate.consumption_factor_sd = estimate.consumption_factor * sqrt(riding.log_factor_variance)
+            estimate.consumption_factor = riding.factor
+            estimate.consumption_factor_sd = sqrt(riding.factor_variance)
             if forecast.mostly_prior:
                 estimate.reasons |= Reason.PRIOR_RIDING
         weighty = estimate.reasons & ~(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)

@@ -1,12 +1,12 @@
 """How far the energy that is left will go.
 
 What is known of the riding is kept in segments of `SEGMENT` metres: what the pack delivered, and what the forward
-model says the same riding takes, with and without the hills that happened to be there. From them:
+model says the same riding takes, as it was and less the climb that it ended with. From them:
 
 - the consumption factor, measured over modelled, learned slowly: one number that carries what the parameters have
   wrong for this vehicle, rider and season;
-- the consumption to be expected: the model's on the riding of the last kilometres, on the flat, times that
-  factor. Before anything is ridden, the model's on a prior riding; it counts like `PRIOR_LENGTH` metres;
+- the consumption to be expected: the model's on the riding of the last kilometres, on its hills but back at the height
+  where it began, times that factor. Before anything is ridden, the model's on a prior riding; it counts like `PRIOR_LENGTH` metres;
 - its spread: how unlike each other segments are, how long they stay alike, and how much riding drifts.
 
 The range is the energy that can be drawn before the cut-off at the power to be expected, over that consumption,
@@ -16,9 +16,9 @@ with a log-normal distribution.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from math import exp, log, sqrt
+from math import exp, sqrt
 from typing import Any
 
 from gz_onboard.physics.battery import Battery, drawable
@@ -29,18 +29,22 @@ PRIOR_LENGTH = 3000.0  # m: the prior riding counts like that much of real ridin
 MEMORY = 12000.0  # m: what is further back counts for less than 1/e
 ALIKE = 1500.0  # m: over so much way segments are alike
 DRIFT = 0.07  # relative sd: the rest of the way is not the way so far (other road, traffic, wind)
-FACTOR_SD = 0.15  # relative sd of the model before any riding
-FACTOR_WALK = 0.004  # relative sd that the factor may change by over a segment
-SEGMENT_SD = 0.25  # relative: measured against modelled energy of one segment
+FACTOR_SD = 0.10  # of the model before any riding: eight commissioning rides differ by 7 %
+FACTOR_WALK = 0.01  # sd of its change over a segment: wind, tyres, traffic
+SEGMENT_SD = 0.18  # relative: measured against modelled energy of one segment, of the eight commissioning rides
+PRIOR_FORM = 2.5  # mean square of the power over the square of its mean, of the eight commissioning rides
 PRIOR_SCATTER = 0.25  # relative sd of segments of a riding not yet known
+G = 9.80665  # m/s²
 DECILE = 1.2815515655446004
 
-# A prior riding: (share of time, speed [m/s], acceleration [m/s²]), as in the urban part of the WMTC: 12 m/s at
-# most, a stop or two each kilometre, a fifth of the time at rest.
-PRIOR_RIDING = (
+PriorRiding = Sequence[tuple[float, float, float]]
+"""(share of time, speed [m/s], acceleration [m/s²]): operating points of a riding."""
+
+PRIOR_RIDING: PriorRiding = (
     (0.18, 0.0, 0.0), (0.10, 4.0, 0.8), (0.08, 9.0, 0.6), (0.08, 4.0, -1.1), (0.06, 9.0, -1.0), (0.20, 7.0, 0.0),
     (0.30, 11.0, 0.0),
 )  # fmt: skip
+"""For vehicles whose file has none: town, as in the first part of the WMTC."""
 
 
 @dataclass(slots=True)
@@ -50,8 +54,9 @@ class Segment:
     distance: float = 0.0  # m
     duration: float = 0.0  # s
     measured: float = 0.0
+    squares: float = 0.0  # W²·s, of the measured power
     modelled: float = 0.0
-    flat: float = 0.0  # modelled, without hills and without change of speed from end to end
+    level: float = 0.0  # modelled, less the potential energy of its net climb: the hills it had, but back at its height
 
 
 @dataclass
@@ -60,11 +65,12 @@ class Riding:
 
     segments: deque[Segment] = field(default_factory=lambda: deque(maxlen=200))
     current: Segment = field(default_factory=Segment)
-    log_factor: float = 0.0
-    log_factor_variance: float = FACTOR_SD**2
+    factor: float = 1.0
+    factor_variance: float = FACTOR_SD**2
     seconds: float = 0.0  # s in the second that is being gathered
     way: float = 0.0  # m in it
     energy: float = 0.0  # J in it
+    squares: float = 0.0  # W²·s in it
     climb: float = 0.0  # m in it
     speed_before: float | None = None  # m/s, at its start
 
@@ -73,10 +79,12 @@ class Riding:
 class Past:
     """Sums over the closed segments, each weighted by how far back it is."""
 
-    flat: float = 0.0  # J
+    level: float = 0.0  # J
     duration: float = 0.0  # s
     distance: float = 0.0  # m
     squares: float = 0.0  # J²/m: of the consumptions, by distance
+    measured: float = 0.0  # J
+    power_squares: float = 0.0  # W²·s
     recent: float = 0.0  # J, measured over the last kilometre
     recent_distance: float = 0.0  # m
     whole: float = 0.0  # m, unweighted
@@ -100,9 +108,10 @@ class Forecast:
 class Forecaster:
     """Learns from the riding and forecasts the range."""
 
-    def __init__(self, model: Model, battery: Battery) -> None:
+    def __init__(self, model: Model, battery: Battery, prior: PriorRiding = PRIOR_RIDING) -> None:
         self.model = model
         self.battery = battery
+        self.prior = prior
         self.riding = Riding()
         self._past = Past()
         self._prior_at: tuple[tuple[float, float], float] = (float("nan"), 0.0), 0.0
@@ -120,21 +129,24 @@ class Forecaster:
         r.seconds += dt
         r.way += speed * dt
         r.energy += power * dt
+        r.squares += power * power * dt
         r.climb += (grade or 0.0) * speed * dt
         if r.seconds < 1.0:
             return
         mean = r.way / r.seconds
         acceleration = (speed - r.speed_before) / r.seconds
         q = self.quantities(mean, acceleration, ambient, altitude, motor_temperature)
+        if abs(r.way) > 0.1:
+            q["grade"] = max(min(r.climb / abs(r.way), 0.3), -0.3)
         segment = r.current
         segment.distance += abs(r.way)
         segment.duration += r.seconds
         segment.measured += r.energy
-        segment.flat += sum(self.model.power(q).values()) * r.seconds
-        if abs(r.way) > 0.1:
-            q["grade"] = max(min(r.climb / abs(r.way), 0.3), -0.3)
-        segment.modelled += sum(self.model.power(q).values()) * r.seconds
-        r.seconds = r.way = r.energy = r.climb = 0.0
+        segment.squares += r.squares
+        energy = sum(self.model.power(q).values()) * r.seconds
+        segment.modelled += energy
+        segment.level += energy - self.model.mass * G * r.climb
+        r.seconds = r.way = r.energy = r.squares = r.climb = 0.0
         r.speed_before = speed
         if segment.distance >= SEGMENT:
             self._close(segment)
@@ -142,7 +154,7 @@ class Forecaster:
     def pause(self) -> None:
         """Something was not known for a while: leave the second that was being gathered."""
         r = self.riding
-        r.seconds = r.way = r.energy = r.climb = 0.0
+        r.seconds = r.way = r.energy = r.squares = r.climb = 0.0
         r.speed_before = None
 
     def quantities(
@@ -159,14 +171,15 @@ class Forecaster:
         r.segments.append(segment)
         r.current = Segment()
         self._sum_past()
-        # One step of a Kalman filter on the logarithm of the factor; a segment of climbing or rolling tells little.
-        r.log_factor_variance += FACTOR_WALK**2
-        if segment.modelled > 0.3 * segment.flat > 0 and segment.measured > 0:
-            noise = SEGMENT_SD * segment.flat / segment.modelled
-            variance = noise * noise * 2 * ALIKE / SEGMENT  # neighbours tell the same story
-            gain = r.log_factor_variance / (r.log_factor_variance + variance)
-            r.log_factor += gain * (log(segment.measured / segment.modelled) - r.log_factor)
-            r.log_factor_variance *= 1 - gain
+        # A Kalman filter on the factor. Its error is one of energy (a hill or a gust not seen), so a segment that
+        # takes little tells little.
+        r.factor_variance += FACTOR_WALK**2
+        if segment.modelled > 0:
+            noise = SEGMENT_SD * self._past.level / self._past.distance * segment.distance / segment.modelled
+            gain = r.factor_variance / (r.factor_variance + noise * noise)
+            r.factor += gain * (segment.measured / segment.modelled - r.factor)
+            r.factor = min(max(r.factor, 0.3), 3.0)
+            r.factor_variance *= 1 - gain
 
     # --- forecasting ------------------------------------------------------------------------------------------
 
@@ -178,13 +191,18 @@ class Forecaster:
         prior = prior_power / prior_speed
         fade = exp(-now.distance / MEMORY)
         way = PRIOR_LENGTH + fade * past.distance + now.distance
-        modelled = (PRIOR_LENGTH * prior + fade * past.flat + now.flat) / way
+        modelled = (PRIOR_LENGTH * prior + fade * past.level + now.level) / way
         speed = way / (PRIOR_LENGTH / prior_speed + fade * past.duration + now.duration)
-        consumption = exp(r.log_factor) * modelled
+        consumption = r.factor * modelled
         power = consumption * speed
 
-        left = drawable(self.battery, soc, cell_temperature, power)
-        colder = drawable(self.battery, soc, cell_temperature - temperature_sd, power)
+        prior_time = PRIOR_LENGTH / prior_speed
+        mean = prior_power * prior_time + past.measured
+        form = (PRIOR_FORM * prior_power**2 * prior_time + past.power_squares) * (prior_time + past.duration) / mean**2
+        form = min(max(form, 1.0), 6.0)
+
+        left = drawable(self.battery, soc, cell_temperature, power, form)
+        colder = drawable(self.battery, soc, cell_temperature - temperature_sd, power, form)
         energy_sd = sqrt(
             (soc_sd * left.slope) ** 2 + (left.energy - colder.energy) ** 2 + (self._capacity_sd * left.energy) ** 2
         )
@@ -192,9 +210,13 @@ class Forecaster:
         squares = (PRIOR_LENGTH * prior**2 * (1 + PRIOR_SCATTER**2) + fade * past.squares) / (
             PRIOR_LENGTH + fade * past.distance
         )
-        mean = (PRIOR_LENGTH * prior + fade * past.flat) / (PRIOR_LENGTH + fade * past.distance)
+        mean = (PRIOR_LENGTH * prior + fade * past.level) / (PRIOR_LENGTH + fade * past.distance)
         scatter = max(squares / mean**2 - 1, 0.1**2)
-        variance = scatter * ALIKE * (1 / max(range_, ALIKE) + 1 / max(way, ALIKE)) + DRIFT**2 + r.log_factor_variance
+        variance = (
+            scatter * ALIKE * (1 / max(range_, ALIKE) + 1 / max(way, ALIKE))
+            + DRIFT**2
+            + r.factor_variance / r.factor**2
+        )
         sd = sqrt(variance)
         if left.energy > energy_sd:
             spread = sqrt(variance + (energy_sd / left.energy) ** 2)
@@ -220,10 +242,12 @@ class Forecaster:
         for segment in reversed(self.riding.segments):
             share = exp(-past.whole / MEMORY)
             past.whole += segment.distance
-            past.flat += share * segment.flat
+            past.level += share * segment.level
             past.duration += share * segment.duration
+            past.measured += share * segment.measured
+            past.power_squares += share * segment.squares
             past.distance += share * segment.distance
-            past.squares += share * segment.flat**2 / segment.distance
+            past.squares += share * segment.level**2 / segment.distance
             if past.recent_distance < 1000:
                 past.recent += segment.measured
                 past.recent_distance += segment.distance
@@ -233,27 +257,27 @@ class Forecaster:
         """(power [W], speed [m/s]) of the prior riding."""
         if self._prior_at[0] != (ambient, altitude):
             power = 0.0
-            for share, speed, acceleration in PRIOR_RIDING:
+            for share, speed, acceleration in self.prior:
                 q = self.quantities(speed, acceleration, ambient, altitude, 40.0)
                 power += share * sum(self.model.power(q).values())
             self._prior_at = (ambient, altitude), power
-        return self._prior_at[1], sum(share * speed for share, speed, _ in PRIOR_RIDING)
+        return self._prior_at[1], sum(share * speed for share, speed, _ in self.prior)
 
     # --- saving -----------------------------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
         """What is to be kept over a restart."""
         r = self.riding
-        rows = [[s.distance, s.duration, s.measured, s.modelled, s.flat] for s in r.segments]
-        return {"segments": rows, "log_factor": r.log_factor, "log_factor_variance": r.log_factor_variance}
+        rows = [[s.distance, s.duration, s.measured, s.squares, s.modelled, s.level] for s in r.segments]
+        return {"segments": rows, "factor": r.factor, "factor_variance": r.factor_variance}
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Take what `snapshot` gave; raises KeyError, TypeError or ValueError if it is not that."""
         segments = [Segment(*(float(x) for x in row)) for row in saved["segments"]]
-        riding = Riding(log_factor=float(saved["log_factor"]), log_factor_variance=float(saved["log_factor_variance"]))
+        riding = Riding(factor=float(saved["factor"]), factor_variance=float(saved["factor_variance"]))
         riding.segments.extend(segments)
-        if not all(s.distance > 0 and s.duration > 0 and abs(s.flat) < 1e9 for s in segments) or not (
-            abs(riding.log_factor) < 3 and 0 < riding.log_factor_variance < 1
+        if not all(s.distance > 0 and s.duration > 0 and abs(s.level) < 1e9 for s in segments) or not (
+            0.3 <= riding.factor <= 3 and 0 < riding.factor_variance < 1
         ):
             raise ValueError("implausible riding")
         self.riding = riding

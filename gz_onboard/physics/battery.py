@@ -118,12 +118,16 @@ class Battery:
         decay = exp(-dt / (r1 * c1))
         return decay * v1 + r1 * (1 - decay) * current, decay
 
-    def settled_current(self, power: float, soc: float, temperature: float) -> float | None:
-        """Pack current [A] that delivers `power` [W] once the RC pair has settled; None if the pack cannot."""
+    def settled_current(self, power: float, soc: float, temperature: float, form: float = 1.0) -> float | None:
+        """Mean pack current [A] that delivers a mean `power` [W] once the RC pair has settled; None if none can.
+
+        `form` is the mean square of the current over the square of its mean: in traffic the current comes in
+        bursts, which heat R0 more than a steady one; the RC pair smooths them.
+        """
         n, m = self.cells_series, self.cells_parallel
         source = n * self.ocv(soc)[0]
-        cell = self.r0.at(soc, temperature)[0] + self.r1.at(soc, temperature)[0]
-        resistance = n * cell / m + self.series_resistance
+        cell = form * self.r0.at(soc, temperature)[0] + self.r1.at(soc, temperature)[0]
+        resistance = n * cell / m + form * self.series_resistance
         root = source * source - 4 * resistance * power
         if root < 0:
             return None
@@ -144,11 +148,12 @@ _NODES = (0.019855072, 0.101666761, 0.237233795, 0.408282679, 0.591717321, 0.762
 _WEIGHTS = (0.050614268, 0.111190517, 0.156853323, 0.181341892, 0.181341892, 0.156853323, 0.111190517, 0.050614268)
 
 
-def drawable(battery: Battery, soc: float, temperature: float, power: float) -> Drawable:
-    """What a pack at `soc` and `temperature` [degC] delivers at a constant `power` [W] until the cut-off.
+def drawable(battery: Battery, soc: float, temperature: float, power: float, form: float = 1.0) -> Drawable:
+    """What a pack at `soc` and `temperature` [degC] delivers at a mean `power` [W] until the cut-off.
 
     At constant power P the charge Q·dSOC passes in dt = Q·dSOC/I, so the energy is P·Q·∫ dSOC/I(SOC), from the
-    SOC at which the terminal voltage meets the cut-off. The RC pair is taken as settled (V1 = R1·I): discharging
+    SOC at which the terminal voltage at the mean load meets the cut-off: bursts are held back by the vehicle before.
+    `form`: see `Battery.settled_current`. The RC pair is taken as settled (V1 = R1·I): discharging
     takes an hour, its time constant is a minute.
     """
     low, high = -0.05, soc
@@ -168,7 +173,7 @@ def drawable(battery: Battery, soc: float, temperature: float, power: float) -> 
     width = soc - high
     total = 0.0
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
-        current = battery.settled_current(power, high + width * node, temperature)
+        current = battery.settled_current(power, high + width * node, temperature, form)
         total += weight / current if current else 0.0
     return Drawable(power * charge * width * total, high, slope)
 

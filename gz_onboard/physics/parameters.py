@@ -29,6 +29,7 @@ BATTERY_PARAMETERS = (
     Parameter("pack_voltage_noise", "V", 0.02, 0.01, 0, 1, "sd of a sample"),
     Parameter("pack_voltage_offset", "V", 0.0, 0.1, -3, 3, "what the voltage sensor shows too much"),
     Parameter("cell_voltage_error", "V", 0.0, 0.012, 0, 0, "sd: what one RC pair cannot follow, slow as minutes"),
+    Parameter("cell_voltage_error_empty", "V", 0.0, 0.06, 0, 0, "sd: the same at 5 % SOC and below"),
     Parameter("rest_voltage_error", "V", 0.0, 0.008, 0, 0, "sd: rest voltage against OCV: relaxation, hysteresis"),
     Parameter("pack_heat_capacity", "J/K", 9000, 3000, 100, 1e6, "168 cells of 47 g at 0.95 J/(g·K), and the case"),
     Parameter("pack_conductance", "W/K", 3.0, 1.5, 0.01, 200, "still air to a closed pack"),
