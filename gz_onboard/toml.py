@@ -11,6 +11,16 @@ from typing import Any
 
 from gz_onboard.errors import InputError, nearest
 
+_HEADER = re.compile(r"^[ \t]*\[\[?[ \t]*[A-Za-z_\"']", re.M)  # not a row of a list of numbers
+
+
+def _quoted(name: str) -> str:
+    return rf"[\"']?{re.escape(name)}[\"']?"
+
+
+def _dotted(path: list[str]) -> str:
+    return r"[ \t]*\.[ \t]*".join(map(_quoted, path))
+
 
 class Table:
     """A TOML table that knows where it stands, so that every complaint can say so."""
@@ -40,20 +50,32 @@ class Table:
         return InputError(f"{place}: {inside}: {message}" if inside else f"{place}: {message}")
 
     def _line(self, key: str) -> int | None:
-        """The line on which `key` of this table stands, as far as a search can tell."""
-        header = 0
-        if self.name:
-            found = re.search(rf"^\s*\[+\s*{re.escape(self.name)}\s*\]+", self._text, re.M)
-            if not found:  # an inline table: the last part of its name is a key
-                parent, _, last = self.name.rpartition(".")
-                return Table(self.values, self.file, self._text, parent)._line(last) if last != self.name else None
-            header = found.end()
-            if not key:
-                return self._text.count("\n", 0, found.start()) + 1
-        found = re.compile(rf"^\s*(\[[^\]\n]*\.)?[\"']?{re.escape(key)}[\"']?\s*[=.\]]", re.M).search(
-            self._text, header
-        )
-        return self._text.count("\n", 0, found.start()) + 1 + found.group().count("\n", 0, 1) if found else None
+        """The line on which `key` of this table stands, or else the table; None if a search cannot tell."""
+        path = [part for part in (*self.name.split("."), key) if part]
+        if path and (header := self._header(path)):
+            return self._number(header.start())
+        fallback = None
+        for depth in range(len(path) - 1, -1, -1):  # the key may stand in an inline table or behind dots
+            header = self._header(path[:depth]) if depth else None
+            if depth and not header:
+                continue
+            begin = header.end() if header else 0
+            following = _HEADER.search(self._text, begin)
+            found = re.compile(rf"^[ \t]*{_quoted(path[depth])}[ \t]*[=.]", re.M).search(
+                self._text, begin, following.start() if following else len(self._text)
+            )
+            if found:
+                return self._number(found.start())
+            fallback = fallback or header
+        inner = re.search(rf"^[ \t]*\[+[ \t]*{_dotted(path)}[ \t]*\.", self._text, re.M)
+        found = inner or fallback
+        return self._number(found.start()) if found else None
+
+    def _header(self, path: list[str]) -> re.Match[str] | None:
+        return re.search(rf"^[ \t]*\[+[ \t]*{_dotted(path)}[ \t]*\]", self._text, re.M)
+
+    def _number(self, position: int) -> int:
+        return self._text.count("\n", 0, position) + 1
 
     def only(self, known: Collection[str]) -> None:
         """Refuse keys that are not in `known`."""
@@ -92,6 +114,6 @@ class Table:
         if not isinstance(value, list) or not value:
             raise self.error("is missing" if value is None else "must be a list of numbers", key)
         for number in value:
-            if isinstance(number, bool) or not isinstance(number, int | float) or math.isnan(number):
+            if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
                 raise self.error(f"must hold numbers only, holds {number!r}", key)
         return tuple(float(number) for number in value)

@@ -16,7 +16,7 @@ def _crc8_tables(polynomial: int, size: int) -> list[list[int]]:
     tables = [table]
     for _ in range(size - 1):
         tables.append([table[crc] for crc in tables[-1]])
-    return tables
+    return tables[:size]
 
 
 @functools.cache

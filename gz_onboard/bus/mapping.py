@@ -19,7 +19,10 @@ motor_speed = { message = "INV_Motion", signal = "INV_MotorSpeed" }
 
 from __future__ import annotations
 
+import logging
+import re
 from dataclasses import dataclass, field
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -82,21 +85,62 @@ def find_dbc(name: str, beside: Path | None = None) -> Path:
 
 
 def load_database(files: list[Path]) -> Database:
-    """One cantools database out of several DBC files; InputError naming the file that is not a valid one."""
-    from cantools.database.can import Database
-    from cantools.database.errors import Error
+    """One cantools database out of several DBC files.
 
+    InputError naming file and line for what is not a valid DBC file, and for messages that cannot be told apart.
+    """
+    from cantools.database.can import Database
+
+    logging.getLogger("cantools").setLevel(logging.ERROR)  # its warnings are of what is an error here
     database = Database()
+    origin: dict[str, tuple[Path, str]] = {}  # by name and by identifier
     for file in files:
+        text = _read_text(file)
+        before = len(database.messages)
         try:
-            database.add_dbc_file(str(file))
-        except (Error, ValueError, KeyError, OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{file}: not a valid DBC file: {error}") from error
-        except Exception as error:  # textparser's own; it names line and column
-            if type(error).__module__.startswith("textparser"):
-                raise InputError(f"{file}: not a valid DBC file: {error}") from error
-            raise
+            database.add_dbc_string(text)
+        except Exception as error:  # cantools and textparser raise a dozen types on what is not valid
+            raise _invalid(file, text, str(error)) from error
+        for message in database.messages[before:]:
+            identifier = f"identifier {message.frame_id:#x}{' (29 bits)' if message.is_extended_frame else ''}"
+            for key in (f"name {message.name!r}", identifier):
+                if key in origin:
+                    other, name = origin[key]
+                    where = f"{other}:{_message_line(_read_text(other), name)}"
+                    raise _invalid(file, text, f"{key} of message {message.name} is also that of {name} in {where}")
+                origin[key] = file, message.name
+            for signal in message.signals:
+                if not signal.conversion.scale or not isfinite(signal.conversion.scale):
+                    problem = f"signal {signal.name} has a scale of {signal.conversion.scale} in message {message.name}"
+                    raise _invalid(file, text, problem)
     return database
+
+
+def _read_text(file: Path) -> str:
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read: {error.strerror}") from error
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return data.decode("cp1252", errors="replace")  # what most DBC editors write
+
+
+def _invalid(file: Path, text: str, problem: str) -> InputError:
+    """The error about a DBC file, with the line that it tells of or on which the message stands that it names."""
+    told = re.search(r"line (\d+)", problem)
+    named = re.search(r"message (\w+)", problem)
+    line = told[1] if told else _message_line(text, named[1]) if named else None
+    if wide := re.search(r"Standard frame id (0x[0-9a-f]+) is more than 11 bits", problem):
+        problem += f" A DBC writes a 29-bit identifier with bit 31 set: {int(wide[1], 16) | 1 << 31}."
+    return InputError(f"{file}{f':{line}' if line else ''}: not a valid DBC file: {problem}")
+
+
+def _message_line(text: str, name: str) -> int | None:
+    """The line on which the last message of this name stands."""
+    found = list(re.finditer(rf"^\s*BO_ +\d+ +{re.escape(name)}\s*:", text, re.M))
+    return text.count("\n", 0, found[-1].end()) + 1 if found else None
 
 
 def read_mapping(vehicle: Table) -> Mapping:
@@ -119,15 +163,22 @@ def read_mapping(vehicle: Table) -> Mapping:
         message = _message(database, messages, name, name)
         options = messages.table(name)
         options.only(["crc", "counter", "period"])
-        for key in options.values.keys() & {"crc", "counter"}:
-            _signal(message, options, key, options.text(key))
+        for key in ("crc", "counter"):
+            if key in options.values:
+                _signal(message, options, key, options.text(key))
         crc = options.text("crc", "") or None
         if crc:
             _check_crc(message, options, crc)
-        protection[name] = Protection(crc, options.text("counter", "") or None)
+        counter = options.text("counter", "") or None
+        if counter:
+            _check_counter(message, options, counter)
+        protection[name] = Protection(crc, counter)
         if "period" in options.values:
             periods[name] = options.number("period", low=1e-4, high=3600)
 
+    j1939 = bus.text("identifiers", "exact", ["exact", "j1939"]) == "j1939"
+    if j1939:
+        _check_groups(database, bus)
     roles = vehicle.table("roles")
     roles.only(ROLES)
     sources = tuple(_source(database, roles, role) for role in roles.values)
@@ -138,7 +189,7 @@ def read_mapping(vehicle: Table) -> Mapping:
         protection=protection,
         periods=periods,
         not_available=bus.text("not_available", "all-ones", ["all-ones", "none"]) == "all-ones",
-        j1939=bus.text("identifiers", "exact", ["exact", "j1939"]) == "j1939",
+        j1939=j1939,
         roles=tuple(source.role for source in sources),
     )
 
@@ -169,11 +220,13 @@ def _source(database: Database, roles: Table, role: str) -> Source:
     if si is None:
         raise where.error(
             f"{name!r} has unit {unit!r}, from which {role} [{ROLES[role]}] cannot be had; "
-            f"give unit = one of {', '.join(known_units(role))}",
+            f"give unit = one of {', '.join(known_units(role))}{nearest(unit, known_units(role)) if unit else ''}",
             key,
         )
-    scale = options.number("scale", 1.0) if options else 1.0
-    shift = options.number("offset", 0.0) if options else 0.0
+    scale = options.number("scale", 1.0, -1e9, 1e9) if options else 1.0
+    shift = options.number("offset", 0.0, -1e9, 1e9) if options else 0.0
+    if not scale and options:
+        raise options.error("must not be 0", "scale")
     conversion = signal.conversion
     factor = float(conversion.scale) * si[0] * scale
     return Source(role, message.name, signal.name, factor, (float(conversion.offset) * si[0] + si[1]) * scale + shift)
@@ -196,4 +249,29 @@ def _signal(message: Message, where: Table, key: str, name: str) -> Signal:
 def _check_crc(message: Message, where: Table, name: str) -> None:
     signal = message.get_signal_by_name(name)
     if signal.length != 8 or signal.start // 8 != message.length - 1:
-        raise where.error(f"{name!r} must be the last byte of {message.name}", "crc")
+        raise where.error(f"{name!r} must be the last byte of {message.name}, all 8 bits of it", "crc")
+
+
+def _check_counter(message: Message, where: Table, name: str) -> None:
+    signal = message.get_signal_by_name(name)
+    if signal.is_signed or signal.conversion.is_float or signal.multiplexer_ids is not None or signal.length < 2:
+        raise where.error(f"{name!r} must be an unsigned integer of 2 bits or more, in every {message.name}", "counter")
+
+
+def _check_groups(database: Database, where: Table) -> None:
+    seen: dict[int, str] = {}
+    for message in database.messages:
+        if message.is_extended_frame:
+            other = seen.setdefault(pgn(message.frame_id), message.name)
+            if other != message.name:
+                raise where.error(
+                    f"{other} and {message.name} have the same parameter group number {pgn(message.frame_id)}: "
+                    'one can be told from the other only by identifiers = "exact"',
+                    "identifiers",
+                )
+
+
+def pgn(identifier: int) -> int:
+    """The parameter group number of a 29-bit identifier (SAE J1939-21): destinations do not belong to it."""
+    group = identifier >> 8 & 0x3FFFF
+    return group if group & 0xFF00 >= 0xF000 else group & 0x3FF00

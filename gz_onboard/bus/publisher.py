@@ -41,7 +41,7 @@ class Publisher:
         """The frames of every second."""
         e = estimate
         known = e.state in (State.VALID, State.DEGRADED)
-        frames = {
+        frames: dict[str, dict[str, float | None]] = {
             "RANGE_Estimate": {
                 "RANGE_Remaining": _scaled(e.range, 1e-3) if known else None,
                 "RANGE_RemainingP10": _scaled(e.range_p10, 1e-3) if known else None,
