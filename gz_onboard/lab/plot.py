@@ -219,7 +219,7 @@ def _innovation(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
     rms = _column(rows, "innovation_rms", 1000)
     axis.fill_between(x, [-v for v in rms], rms, color=_PURPLE, alpha=0.2, linewidth=0, label="± RMS of 10 s")
     axis.plot(x, _column(rows, "innovation", 1000), color=_PURPLE, linewidth=0.8, label="innovation")
-    axis.axhline(0, color=_MUTED, linewidth=0.6)
+    axis.axhline(0, color=_MUTED, linewidth=0.6, zorder=1)
     _label(axis, "innovation\n[mV of a cell]", _PURPLE)
     _legend(axis)
 
@@ -228,7 +228,7 @@ def _motion(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
     other = _second(axis, "grade [%], lean [°]", _MUTED)
     other.plot(x, _column(rows, "lean", 57.29578), color=_ORANGE, linewidth=0.6, alpha=0.75, label="lean")
     other.plot(x, _column(rows, "grade", 100), color=_GREEN, linewidth=1.0, label="grade")
-    other.axhline(0, color=_MUTED, linewidth=0.6)
+    other.axhline(0, color=_MUTED, linewidth=0.6, zorder=1)
     axis.plot(x, _column(rows, "speed", 3.6), color=_BLUE, linewidth=1.1, label="speed")
     _label(axis, "speed [km/h]", _BLUE)
     _legend(axis, other)
