@@ -137,10 +137,8 @@ def play_in_threads(
 
     def the_rest() -> None:
         if wait_until_ready():
-            threading.Thread(target=cli.main, args=(dashboard,), daemon=True).start()
-            playing = threading.Thread(target=cli.main, args=(replay,), daemon=True)
-            playing.start()
-            playing.join(seconds)
+            threading.Thread(target=cli.main, args=(replay,), daemon=True).start()
+            cli.main([*dashboard, "--duration", str(seconds)])  # no signal can end it in a thread
         os.kill(os.getpid(), signal.SIGTERM)
 
     threading.Thread(target=the_rest, daemon=True).start()
