@@ -294,10 +294,10 @@ def test_a_cut_gzip_is_read_up_to_the_cut(tmp_path: Path, suffix: str) -> None:
 
 @pytest.mark.parametrize("suffix", [".mcap", ".blf"])
 @given(st.integers(0, 10**9), st.binary(min_size=1, max_size=300))
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=30)
 def test_rubbish_in_the_middle_loses_what_it_hits_and_is_told(suffix: str, place: int, rubbish: bytes) -> None:
     with TemporaryDirectory() as directory:
-        frames = ordinary(30_000)
+        frames = ordinary(20_000)
         path = written(Path(directory), frames, suffix)
         data = bytearray(path.read_bytes())
         body = 2000 if suffix == ".mcap" else 144  # behind the header, attachments and the first chunk's beginning
@@ -308,10 +308,8 @@ def test_rubbish_in_the_middle_loses_what_it_hits_and_is_told(suffix: str, place
         there, damages = read(path)
         if there != frames:
             assert damages or rubbish == before
-        left = set(frames)
-        if suffix == ".mcap":  # each chunk has a checksum
-            assert left.issuperset(there)
-            assert len(there) > 26_000
+        assert set(frames).issuperset(there)
+        assert len(there) > 13_000
 
 
 def test_broken_lines_are_skipped_counted_and_the_first_one_named(tmp_path: Path) -> None:

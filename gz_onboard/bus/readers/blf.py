@@ -32,6 +32,8 @@ def read(path: Path, data: Contents, damage: Damage, _start: int | None, _end: i
     header = _FILE.unpack_from(data)
     start_ns = _file_start(header[14:22])
     position = header[1]
+    promised = header[12]
+    objects = 0
     tail = b""
     while position < len(data):
         signature, size, kind = _container(data, position)
@@ -47,14 +49,19 @@ def read(path: Path, data: Contents, damage: Damage, _start: int | None, _end: i
             content, whole = _unpack(data, position, min(end, len(data)))
             if end > len(data) or not whole:
                 damage.add(f"byte {position}", "a container is cut off or broken")
-            frames, tail = _objects(tail + content, start_ns, damage, position)
+            frames, tail, count = _objects(tail + content, start_ns, damage, position)
+            objects += count
             if not whole:
                 tail = b""
             for i in range(0, len(frames), BATCH):
                 yield frames[i : i + BATCH]
+        else:  # or a container whose type is damaged: what follows does not go on where the one before ended
+            tail = b""
         position = end + size % 4
     if tail:
         damage.add(f"byte {len(data)}", "the last object is cut off")
+    if objects < promised and not damage.count:
+        damage.add("in the middle", f"{promised - objects} of {promised} objects are missing")
 
 
 def _container(data: Contents, position: int) -> tuple[bytes, int, int]:
@@ -84,25 +91,26 @@ def _unpack(data: Contents, position: int, end: int) -> tuple[bytes, bool]:
     if method == 0:
         return packed, len(packed) >= size
     unpacker = zlib.decompressobj()
-    content = b""
     try:
-        for i in range(0, len(packed), 4096):  # in pieces, so that what stands before an error is not lost
-            content += unpacker.decompress(packed[i : i + 4096])
-    except zlib.error:
-        return content, False
-    return content, unpacker.eof
+        content = unpacker.decompress(packed)
+    except zlib.error:  # what was unpacked before the error was found may be wrong
+        return b"", False
+    return content, unpacker.eof and len(unpacker.unused_data) < 4
 
 
-def _objects(data: bytes, start_ns: int, damage: Damage, place: int) -> tuple[list[Frame], bytes]:
-    """The frames of a container's content, and what is left over of an object that goes on in the next one."""
+def _objects(data: bytes, start_ns: int, damage: Damage, place: int) -> tuple[list[Frame], bytes, int]:
+    """The frames of a container's content, what is left over of an object that goes on in the next one, and how many
+    objects there were.
+    """
     frames, position = _alike(data, start_ns)
+    count = len(frames)
     while position + 8 <= len(data):
         found = data.find(b"LOBJ", position, position + 8)  # objects may be padded
         if found < 0:
             damage.add(f"byte {place}", "no object where one should begin in this container")
             found = data.find(b"LOBJ", position)
             if found < 0:
-                return frames, b""
+                return frames, b"", count
         position = found
         if position + _OBJECT.size > len(data):
             break
@@ -121,7 +129,8 @@ def _objects(data: bytes, start_ns: int, damage: Damage, place: int) -> tuple[li
         if frame:
             frames.append(frame)
         position += size
-    return frames, data[position:]
+        count += 1
+    return frames, data[position:], count
 
 
 def _alike(data: bytes, start_ns: int) -> tuple[list[Frame], int]:
