@@ -127,7 +127,9 @@ def main() -> None:
         rms = sqrt(sum(x.innovation**2 for x in s) / len(s))
         print(f"| {name} | {s[-1].time / 60:.0f} | {100 * s[0].reference:.1f} to {100 * s[-1].reference:.1f} % "
               f"| {100 * (worst.soc - worst.reference):+.2f} % | {sigma:.2f} | {1000 * rms:.1f} |")  # fmt: skip
-    print("\n| ride | at SOC | really ridden, km | ours (P10 to P90) | error | 25 km mean, 15 % reserve | 25 km mean, to 0 % |")
+    print(
+        "\n| ride | at SOC | really ridden, km | ours (P10 to P90) | error | 25 km mean, 15 % reserve | 25 km mean, to 0 % |"
+    )
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name, s in results:
         if "full" not in name:

@@ -63,7 +63,7 @@ class Daemon:
                 next_tick -= pause
             self.round()
             now = time.monotonic()
-            if watchdog and now - fed >= watchdog / 2:
+            if watchdog and now - fed >= watchdog:
                 fed = now
                 notify.alive()
             self._say(now)

@@ -85,10 +85,9 @@ class Pipeline:
 
     def advance(self, frames: Sequence[Frame], until_ns: int) -> list[Frame]:
         """Take in `frames`, in the order of their times, up to `until_ns`; gives the frames to be sent."""
-        if self._next_ns is None:
-            if not frames:
-                return []
-            self._next_ns = frames[0][0] + TICK_NS
+        if self._next_ns is None or (frames and not self.codec.started):
+            # A silent bus is told that we are there and have nothing; the grid begins with the first frame.
+            self._next_ns = (frames[0][0] if frames else until_ns) + TICK_NS
         out: list[Frame] = []
         if not -10 * TICK_NS <= until_ns - self._next_ns <= 50 * TICK_NS:  # a pause, or the clock was set
             self._take(frames)

@@ -47,6 +47,7 @@ class Channel:
         self.send_failures = 0
         self.openings = 0
         self._identifiers = identifiers
+        self._wanted = None if identifiers is None else {*identifiers, *(ERR_FLAG | bit for bit in (0, EFF_FLAG))}
         self._options = options
         self._wall = wall
         self._bus: Any = None
@@ -67,7 +68,7 @@ class Channel:
 
     def _open(self) -> None:
         filters: list[dict[str, Any]] | None = None
-        if self._identifiers is not None:
+        if self._identifiers is not None and self.interface == "socketcan":
             filters = [
                 {
                     "can_id": i & 0x1FFFFFFF,
@@ -159,6 +160,9 @@ class Channel:
             identifier |= EFF_FLAG if message.is_extended_id else 0
             identifier |= RTR_FLAG if message.is_remote_frame else 0
             identifier |= ERR_FLAG if message.is_error_frame else 0
+            # Filtered here: with filters of its own python-can's recv(0) says "nothing" at each frame it rejects.
+            if self._wanted is not None and identifier & ~RTR_FLAG not in self._wanted:
+                continue
             # Only the kernel's stamps are of one clock; other interfaces have clocks of their own.
             frames.append((self._wall(), identifier, bytes(message.data), self.index))
 

@@ -106,6 +106,11 @@ class Codec:
         self._events.clear()
         return events
 
+    @property
+    def started(self) -> bool:
+        """Whether any frame has come."""
+        return self._origin_ns is not None
+
     def seconds(self, time_ns: int) -> float:
         """`time_ns` on the timeline of the events."""
         return 0.0 if self._origin_ns is None else (time_ns - self._origin_ns) * 1e-9

@@ -30,6 +30,18 @@ RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
 GATE = 5.0  # sd: a voltage further off is a glitch, unless it persists
 GATE_COUNT = 20  # so many in a row are no glitch
 CURRENT_SD = {"pack": 0.0, "inverter": 0.5, "model": 3.0, "none": 15.0}  # A, beside the sensor's own offset
+UNCHECKED_CURRENT_SD = 0.2  # A, beside the offset's, while no second sensor confirms the first
+INVERTER_VOLTAGE_SD = 0.15  # V: the cable between pack and inverter
+# What is missing makes the consumption to come less certain; relative sd, judged by what each is worth on the rides.
+LOSS_SD = {
+    Reason.NO_SPEED: 0.10,
+    Reason.NO_IMU: 0.03,
+    Reason.NO_GPS: 0.03,
+    Reason.NO_AMBIENT_TEMPERATURE: 0.04,
+    Reason.NO_CELL_TEMPERATURE: 0.02,
+    Reason.NO_PACK_CURRENT: 0.03,
+    Reason.NO_PACK_VOLTAGE: 0.02,
+}
 MISMATCH = 3.0  # A between the two current sensors, over ten seconds or so
 
 
@@ -111,7 +123,7 @@ class Estimator:
         voltage, current, source = self._measured(now)
         self._pack = voltage, current, source
         temperature = self._temperature(now, dt)
-        self._battery_step(dt, voltage, current, source, temperature)
+        self._battery_step(now, dt, voltage, current, source, temperature)
         self._ride(now, dt, voltage, current)
         signals.next_step()
         if now - self._forecast_time >= FORECAST_PERIOD - 0.05:
@@ -176,7 +188,7 @@ class Estimator:
     # --- battery ----------------------------------------------------------------------------------------------
 
     def _battery_step(
-        self, dt: float, voltage: float | None, current: float | None, source: str, temperature: float
+        self, now: float, dt: float, voltage: float | None, current: float | None, source: str, temperature: float
     ) -> None:
         battery = self.battery
         filter_ = self.filter
@@ -189,7 +201,8 @@ class Estimator:
             before = self._current if self._current is not None else current
             mean = ((before or 0.0) + (current or 0.0)) / 2
             charge = 3600 * battery.pack_capacity(temperature)
-            sd = sqrt(self._offset_sd**2 + CURRENT_SD[source] ** 2)
+            unchecked = 0.0 if self.signals.inverter_current.fresh(now) else UNCHECKED_CURRENT_SD
+            sd = sqrt(self._offset_sd**2 + CURRENT_SD[source] ** 2 + unchecked**2)
             q = (sd / charge) ** 2 * 2 * OFFSET_TIME * dt + self._charge_sd**2 * abs(mean * dt / charge)
             if dt > 1.0:  # a pause: nobody knows what flowed, the last current is believed for a second
                 mean /= dt
@@ -203,16 +216,17 @@ class Estimator:
             return
         cell_voltage = battery.cell_voltage(voltage, current)
         cell_current = current / battery.cells_parallel
-        known = self.signals.cell_temperature.stale_after > 0 and self._cell_temperature is not None
         r0 = battery.r0.at(filter_.soc, temperature)[0]
-        resistance_sd = RESISTANCE_SD if known else RESISTANCE_SD_COLD
+        resistance_sd = RESISTANCE_SD if self.signals.cell_temperature.fresh(now) else RESISTANCE_SD_COLD
+        by_inverter = not self.signals.pack_voltage.fresh(now)
+        voltage_sd = INVERTER_VOLTAGE_SD / battery.cells_series if by_inverter else self._voltage_sd
         current_sd = CURRENT_SD[source] / battery.cells_parallel
         empty = min(max((EMPTY_BELOW - filter_.soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
         model_sd = self._model_sd + empty * (self._empty_sd - self._model_sd)
         # The pack's cells are not the bench's: where SOC lies on their curve is known to their capacity's scatter.
         axis_sd = self._cell_scatter * (1 - filter_.soc) * battery.ocv(filter_.soc)[1]
         resistance = (resistance_sd * r0 * cell_current) ** 2 + (r0 * current_sd) ** 2
-        slow = model_sd**2 + self._voltage_sd**2 + axis_sd**2 + resistance
+        slow = model_sd**2 + voltage_sd**2 + axis_sd**2 + resistance
         error, own = filter_.innovation(cell_voltage, cell_current, temperature)
         self._innovation = error
         # A model that errs more than its file says is believed less (Mehra 1970: covariance matching).
@@ -245,10 +259,10 @@ class Estimator:
         filter_.soc, filter_.v1 = soc, 0.0
         self.filter = filter_
         if self._saved:
-            self._resume(self._saved, filter_)
+            self._resume(self._saved, filter_, temperature)
             self._saved = None
 
-    def _resume(self, saved: Mapping[str, Any], rest: SocFilter) -> None:
+    def _resume(self, saved: Mapping[str, Any], rest: SocFilter, temperature: float) -> None:
         """Join the saved SOC with that of the rest voltage, unless the pack was charged or used meanwhile."""
         age = self._saved_age
         variance = saved["covariance"][0] + (0.002 if age is None else 1e-8 * age + 1e-6)
@@ -257,8 +271,8 @@ class Estimator:
         if difference * difference > 16 * (variance + p00):
             return
         if age is not None and age < 600:  # the RC pair has not settled: go on from where it was
-            r1 = self.battery.r1.at(saved["soc"], 20.0)[0]
-            decay = exp(-age / (r1 * self.battery.c1.at(saved["soc"], 20.0)[0]))
+            r1 = self.battery.r1.at(saved["soc"], temperature)[0]
+            decay = exp(-age / (r1 * self.battery.c1.at(saved["soc"], temperature)[0]))
             _, c01, c11 = saved["covariance"]
             rest.soc, rest.v1 = saved["soc"], saved["v1"] * decay
             rest.covariance = variance, c01 * decay, c11 * decay**2 + 1e-6
@@ -289,8 +303,9 @@ class Estimator:
         soc_sd = sqrt(filter_.covariance[0])
         temperature_sd = 1.0 if self.signals.cell_temperature.fresh(now) else 8.0
         self._forecast = self.forecaster.forecast(
-            filter_.soc, soc_sd, temperature, temperature_sd, self._ambient(now)[0], self.road.altitude or 0.0
-        )
+            filter_.soc, soc_sd, temperature, temperature_sd, self._ambient(now)[0], self.road.altitude or 0.0,
+            sum(sd * sd for reason, sd in LOSS_SD.items() if reason & self._reasons(now)),
+        )  # fmt: skip
 
     # --- results ----------------------------------------------------------------------------------------------
 
@@ -396,5 +411,8 @@ class Estimator:
         except (KeyError, TypeError, OverflowError) as error:
             raise ValueError(f"is damaged: {error!r}") from error
         self.road.bias_x, self.road.bias_z = bias_x, bias_z
+        cells = saved.get("cell_temperature")
+        if isinstance(cells, int | float) and -50 < cells < 120 and age is not None and age < 3600:
+            self._cell_temperature = float(cells)
         self._saved = {"soc": soc, "v1": v1, "covariance": (p00, p01, p11)}
         self._saved_age = age

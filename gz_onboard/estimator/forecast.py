@@ -5,8 +5,9 @@ model says the same riding takes, as it was and less the climb that it ended wit
 
 - the consumption factor, measured over modelled, learned slowly: one number that carries what the parameters have
   wrong for this vehicle, rider and season;
-- the consumption to be expected: the model's on the riding of the last kilometres, on its hills but back at the height
-  where it began, times that factor. Before anything is ridden, the model's on a prior riding; it counts like `PRIOR_LENGTH` metres;
+- the consumption to be expected: the model's on the riding of the last kilometres, on its hills but back at the
+  height where it began, times that factor. Before anything is ridden, the model's on a prior riding; it counts like
+  `PRIOR_LENGTH` metres;
 - its spread: how unlike each other segments are, how long they stay alike, and how much riding drifts.
 
 The range is the energy that can be drawn before the cut-off at the power to be expected, over that consumption,
@@ -27,8 +28,8 @@ from gz_onboard.physics.model import Model, air_density
 SEGMENT = 250.0  # m
 PRIOR_LENGTH = 3000.0  # m: the prior riding counts like that much of real riding
 MEMORY = 12000.0  # m: what is further back counts for less than 1/e
-ALIKE = 1500.0  # m: over so much way segments are alike
-DRIFT = 0.07  # relative sd: the rest of the way is not the way so far (other road, traffic, wind)
+ALIKE = 300.0  # m: over so much way segments are alike; those of the eight commissioning rides are not at 250 m
+DRIFT = 0.055  # relative sd: the rest of the way is not the way so far; the eight rides differ by that
 FACTOR_SD = 0.10  # of the model before any riding: eight commissioning rides differ by 7 %
 FACTOR_WALK = 0.01  # sd of its change over a segment: wind, tyres, traffic
 SEGMENT_SD = 0.18  # relative: measured against modelled energy of one segment, of the eight commissioning rides
@@ -183,9 +184,13 @@ class Forecaster:
 
     # --- forecasting ------------------------------------------------------------------------------------------
 
-    def forecast(self, soc: float, soc_sd: float, cell_temperature: float, temperature_sd: float,
-                 ambient: float, altitude: float) -> Forecast:  # fmt: skip
-        """The range from this state of the battery, with the riding known so far."""
+    def forecast(self, soc: float, soc_sd: float, cell_temperature: float, temperature_sd: float, ambient: float,
+                 altitude: float, loss_variance: float = 0.0) -> Forecast:  # fmt: skip
+        """The range from this state of the battery, with the riding known so far.
+
+        Temperatures and their sd in degC, altitude in m; `loss_variance`: relative variance that missing sensors
+        add to the consumption.
+        """
         r, past, now = self.riding, self._past, self.riding.current
         prior_power, prior_speed = self._prior(round(ambient), round(altitude, -2))
         prior = prior_power / prior_speed
@@ -213,7 +218,8 @@ class Forecaster:
         mean = (PRIOR_LENGTH * prior + fade * past.level) / (PRIOR_LENGTH + fade * past.distance)
         scatter = max(squares / mean**2 - 1, 0.1**2)
         variance = (
-            scatter * ALIKE * (1 / max(range_, ALIKE) + 1 / max(way, ALIKE))
+            loss_variance
+            + scatter * ALIKE * (1 / max(range_, ALIKE) + 1 / max(way, ALIKE))
             + DRIFT**2
             + r.factor_variance / r.factor**2
         )

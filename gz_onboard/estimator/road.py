@@ -17,7 +17,8 @@ G = 9.80665  # m/s²
 SPEED_TIME = 0.3  # s: the speed's low pass, whose lag gives the acceleration
 LEAN_TIME = 2.0  # s: how fast the lean is drawn to that of the steady turn
 GRADE_TIME = 2.0  # s: low pass of the accelerometer's grade
-ALTITUDE_LENGTH = 150.0  # m: how fast the observer follows the altitude; 8 σ of GPS altitude average out
+ALTITUDE_LENGTH = 150.0  # m: how fast the observer follows the altitude where it seeks an offset only
+ALTITUDE_LENGTH_ALONE = 60.0  # m: the same where the altitude is all there is
 BIAS_TIME = 5.0  # s of standing to know the offset of a rate sensor
 MOVING = 0.5  # m/s
 
@@ -122,7 +123,8 @@ class Road:
             if self.altitude is None:
                 self.altitude = altitude
             error = altitude - self.altitude
-            share = min(way / ALTITUDE_LENGTH, 0.5)  # critically damped over distance
+            length = ALTITUDE_LENGTH_ALONE if forward is None else ALTITUDE_LENGTH
+            share = min(way / length, 0.5)  # critically damped over distance
             self.altitude += 2 * share * error
-            self.grade_offset += share * error / ALTITUDE_LENGTH
+            self.grade_offset += share * error / length
         self.grade = min(max(self.accelerometer_grade + self.grade_offset, -0.3), 0.3)

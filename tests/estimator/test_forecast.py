@@ -1,0 +1,150 @@
+"""The forecast, on ridings whose truth is known."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from gz_onboard.estimator.forecast import PRIOR_LENGTH, Forecaster
+from gz_onboard.vehicle import read_vehicle
+
+VEHICLE = read_vehicle("reference", 75.0)
+
+
+def forecaster():
+    return Forecaster(VEHICLE.model, VEHICLE.battery, VEHICLE.riding)
+
+
+def ride(f, kilometres, *, factor=1.0, seed=0, grade=lambda x: 0.0, stop_every=600.0, dt=0.1):
+    """Town riding that takes `factor` times what the model says; gives the energy and way really used."""
+    rng = np.random.default_rng(seed)
+    x = v = energy = 0.0
+    target = 10.0
+    while x < kilometres * 1000:
+        if x % stop_every > stop_every - 60:
+            target = 0.3
+        elif v < 0.5:
+            target = rng.uniform(6, 13)
+        a = float(np.clip(0.5 * (target - v), -1.2, 0.9))
+        q = f.quantities(v, a, 20.0, 0.0, 40.0)
+        q["grade"] = grade(x)
+        power = factor * sum(f.model.power(q).values())
+        energy += power * dt
+        f.ride(dt, v, grade(x), power, 20.0, 0.0, 40.0)
+        x += v * dt
+        v += a * dt
+    return energy, x
+
+
+def forecast(f, soc=0.7):
+    return f.forecast(soc, 0.01, 25.0, 1.0, 20.0, 0.0)
+
+
+def test_before_riding_it_stands_on_the_prior():
+    result = forecast(forecaster())
+    assert result.mostly_prior
+    assert result.p10 < result.range < result.p90
+    assert 20 < result.consumption / 3.6 < 40
+    assert result.recent is None
+
+
+@pytest.mark.parametrize("factor", [0.85, 1.0, 1.2])
+def test_learns_what_the_model_has_wrong(factor):
+    f = forecaster()
+    energy, way = ride(f, 25, factor=factor)
+    result = forecast(f)
+    assert f.riding.factor == pytest.approx(factor, rel=0.04)
+    assert result.consumption == pytest.approx(energy / way, rel=0.06)
+    assert not result.mostly_prior
+
+
+def test_the_interval_narrows_with_riding():
+    f = forecaster()
+    before = forecast(f)
+    ride(f, 15)
+    after = forecast(f)
+    assert (after.p90 - after.p10) / after.range < 0.8 * (before.p90 - before.p10) / before.range
+
+
+def test_a_climb_is_not_taken_for_consumption():
+    """Kilometres uphill: measured consumption triples, what is to be expected stays."""
+    level, climbing = forecaster(), forecaster()
+    ride(level, 8)
+    energy, way = ride(climbing, 8, grade=lambda x: 0.03)
+    assert energy / way > 1.6 * forecast(level).consumption
+    assert forecast(climbing).consumption == pytest.approx(forecast(level).consumption, rel=0.25)
+
+
+def test_uncertainty_of_soc_widens_the_interval():
+    f = forecaster()
+    narrow, wide = f.forecast(0.5, 0.005, 25.0, 1.0, 20.0, 0.0), f.forecast(0.5, 0.05, 25.0, 1.0, 20.0, 0.0)
+    assert wide.energy_sd > 3 * narrow.energy_sd
+    assert wide.p90 - wide.p10 > narrow.p90 - narrow.p10
+
+
+def test_cold_takes_range():
+    f = forecaster()
+    assert f.forecast(0.3, 0.01, -10.0, 1.0, 20.0, 0.0).range < 0.9 * f.forecast(0.3, 0.01, 25.0, 1.0, 20.0, 0.0).range
+
+
+def test_empty_is_zero_with_an_upper_bound():
+    result = forecast(forecaster(), soc=0.0)
+    assert result.range == 0.0
+    assert result.p10 == 0.0
+    assert 0 < result.p90 < 3000
+
+
+def test_snapshot_goes_on_as_if_nothing_had_been():
+    a, b = forecaster(), forecaster()
+    ride(a, 6)
+    b.restore(json.loads(json.dumps(a.snapshot())))
+    assert forecast(b).range == pytest.approx(forecast(a).range, rel=0.02)
+    ride(a, 3, seed=1)
+    ride(b, 3, seed=1)
+    assert forecast(b).range == pytest.approx(forecast(a).range, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [{"factor": 50.0}, {"factor_variance": -1.0}, {"segments": [[0, 0, 0, 0, 0, 0]]}, {"segments": [["x"] * 6]},
+     {"segments": [[1.0]]}, {"factor": float("nan")}],
+)  # fmt: skip
+def test_a_damaged_snapshot_is_refused_and_changes_nothing(damage):
+    f = forecaster()
+    ride(f, 4)
+    before = forecast(f)
+    with pytest.raises((KeyError, TypeError, ValueError)):
+        f.restore({**f.snapshot(), **damage})
+    assert forecast(f) == before
+
+
+def test_coverage_of_the_interval():
+    """An 80 % interval holds about 80 % of the time: riders, winds and traffic drawn at random, of another code.
+
+    The factor differs by rider (6 %) and walks with the day; the way ahead differs from the way behind.
+    """
+    rng = np.random.default_rng(5)
+    inside = []
+    for seed in range(40):
+        f = forecaster()
+        rider = rng.normal(1.0, 0.06)
+        stops = rng.uniform(250, 900)
+        ride(f, 6, factor=rider, seed=seed, stop_every=stops, dt=0.5)
+        result = f.forecast(0.8, 0.01, 25.0, 1.0, 20.0, 0.0)
+        other = forecaster()
+        energy, way = ride(other, 10, factor=rider * rng.normal(1.0, 0.05), seed=1000 + seed,
+                           stop_every=float(np.clip(stops * rng.normal(1, 0.2), 200, 1200)), dt=0.5)  # fmt: skip
+        true = result.energy / (energy / way)
+        inside.append(result.p10 <= true <= result.p90)
+    assert 0.65 <= np.mean(inside) <= 0.98
+
+
+def test_prior_length_is_what_it_says():
+    """After so much riding of another kind, prior and riding weigh the same."""
+    f = forecaster()
+    prior = forecast(f).consumption
+    f.riding.factor_variance = 1e-12  # the factor is known: what moves is the riding alone
+    energy, way = ride(f, PRIOR_LENGTH / 1000, stop_every=250.0)
+    assert forecast(f).consumption == pytest.approx((prior + energy / way) / 2, rel=0.08)

@@ -1,0 +1,110 @@
+"""The road state, on motions whose truth is known."""
+
+from __future__ import annotations
+
+from math import atan, pi, radians, sin, tan
+
+import numpy as np
+import pytest
+
+from gz_onboard.estimator.road import G, Road
+from gz_onboard.estimator.signals import Signals
+from gz_onboard.events import ROLES
+
+RADIUS = 0.2438
+
+
+def drive(seconds, motion, *, without=(), seed=0, dt=0.1):
+    """Run the filter over `motion`(t) -> true speed, grade, lean, yaw rate (left), altitude; with noisy sensors."""
+    rng = np.random.default_rng(seed)
+    signals = Signals((role, 2.0) for role in ROLES if role not in without)
+    road = Road()
+    heading, rows, before = 0.0, [], motion(0.0)
+    for step in range(1, round(seconds / dt) + 1):
+        t = step * dt
+        speed, grade, lean, yaw, altitude = motion(t)
+        heading = (heading - yaw * dt) % (2 * pi)
+        values = {
+            "motor_speed": speed / RADIUS,
+            "accel_x": (speed - before[0]) / dt + G * grade + 0.05 + 0.1 * rng.standard_normal(),
+            "accel_y": G * sin(lean) + 0.05 * rng.standard_normal(),
+            "rate_x": (lean - before[2]) / dt + radians(0.2) + 0.005 * rng.standard_normal(),
+            "rate_z": yaw * np.cos(lean) - radians(0.15) + 0.005 * rng.standard_normal(),
+            "gps_speed": speed, "gps_course": heading, "gps_fix": 3.0,
+            "gps_altitude": altitude + 1.5 * rng.standard_normal(),
+        }  # fmt: skip
+        for role, value in values.items():
+            if role not in without:
+                signal = signals[role]
+                signal.value, signal.time, signal.total, signal.count = value, t, value, 1
+        road.step(t, dt, signals, RADIUS, 1.0)
+        signals.next_step()
+        before = (speed, grade, lean, yaw, altitude)
+        rows.append((t, road.speed, road.grade, road.lean, road.yaw_rate, road.heading, grade, lean, yaw, heading))
+    return road, rows
+
+
+def turning(t):
+    """Half a minute at rest, then curves left and right at 9 m/s."""
+    if t < 30:
+        return 0.0, 0.0, 0.0, 0.0, 100.0
+    speed = min(9.0, 1.5 * (t - 30))
+    yaw = 0.35 * sin((t - 40) / 4) if t > 40 else 0.0
+    return speed, 0.0, -atan(speed * yaw / G), yaw, 100.0
+
+
+def test_lean_and_yaw_in_curves():
+    _, rows = drive(180, turning)
+    late = [r for r in rows if r[0] > 50]
+    assert np.std([r[3] - r[7] for r in late]) < radians(2)
+    assert abs(np.mean([r[3] - r[7] for r in late])) < radians(1)
+    assert np.std([r[4] - r[8] for r in late]) < radians(1)
+    left = max(late, key=lambda r: r[8])
+    assert left[3] < -radians(10)  # turning left leans left, and right is positive
+
+
+def test_heading_goes_clockwise():
+    _, rows = drive(180, turning)
+    late = [r for r in rows if r[0] > 60]
+    errors = [(r[5] - r[9] + pi) % (2 * pi) - pi for r in late]
+    assert np.std(errors) < radians(4)
+
+
+def hill(t):
+    speed = 8.0
+    grade = 0.05 * sin(speed * t / 150)
+    return speed, grade, 0.0, 0.0, 100 + 0.05 * 150 * (1 - np.cos(speed * t / 150))
+
+
+@pytest.mark.parametrize(
+    ("without", "worst"), [((), 0.012), (("accel_x",), 0.025), (("gps_altitude", "gps_fix"), 0.012)]
+)
+def test_grade_of_hills(without, worst):
+    _, rows = drive(600, hill, without=without)
+    errors = [r[2] - r[6] for r in rows if r[0] > 200]
+    assert np.std(errors) < worst
+
+
+def test_without_any_source_a_quantity_is_none():
+    road, _ = drive(30, turning, without=("rate_x", "rate_z", "accel_x", "gps_altitude", "gps_course", "gps_speed"))
+    assert road.lean is None
+    assert road.yaw_rate is None
+    assert road.grade is None
+    assert road.heading is None
+    assert road.speed == pytest.approx(0.0)
+
+
+def test_speed_by_whatever_there_is():
+    for missing in (("motor_speed",), ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed")):
+        road, _ = drive(60, hill, without=missing)
+        assert road.speed == pytest.approx(8.0)
+    everything = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed", "gps_speed")
+    road, _ = drive(60, hill, without=everything)
+    assert road.speed is None
+    assert road.acceleration is None
+
+
+def test_distance_and_steady_turn_sign():
+    road, _ = drive(100, hill)
+    assert road.distance == pytest.approx(800, rel=0.01)
+    assert tan(-atan(9 * 0.35 / G)) < 0
