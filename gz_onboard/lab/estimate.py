@@ -192,7 +192,7 @@ def feed(pipeline: Pipeline, batches: Iterable[Sequence[Frame]], progress: Progr
 
 
 def _without_jumps(batch: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
-    """Parts of `batch` in which time neither stands back nor leaps by more than a gap."""
+    """Parts of `batch` in which time neither goes back nor leaps by more than a gap, and none longer than that."""
     if not batch:
         return
     if 0 <= batch[-1][0] - batch[0][0] <= _GAP_NS:  # nearly all; single odd stamps within are the codec's business
@@ -200,7 +200,8 @@ def _without_jumps(batch: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
         return
     begin = 0
     for i in range(1, len(batch)):
-        if not -TICK_NS <= batch[i][0] - batch[i - 1][0] <= _GAP_NS:
+        leap = not -TICK_NS <= batch[i][0] - batch[i - 1][0] <= _GAP_NS
+        if leap or batch[i][0] - batch[begin][0] > _GAP_NS:  # on a slow bus a batch takes many seconds
             yield batch[begin:i]
             begin = i
     yield batch[begin:]

@@ -1,0 +1,413 @@
+from __future__ import annotations
+
+import fcntl
+import io
+import math
+import os
+import pty
+import re
+import select
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gz_onboard import cli
+from gz_onboard.bus._can import can
+from gz_onboard.bus.publisher import Counts, Publisher
+from gz_onboard.dashboard import terminal
+from gz_onboard.dashboard.terminal import Style, View
+from gz_onboard.events import Estimate, Frame, Reason, State
+
+REASONS = Reason.NO_IMU | Reason.PRIOR_RIDING
+ESTIMATE = Estimate(
+    time=1.0, state=State.DEGRADED, reasons=REASONS, soc=0.624, soc_sd=0.012, range=34_210.0, range_p10=26_540.0,
+    range_p90=44_340.0, energy_left=895 * 3600.0, consumption_recent=24.6 * 3.6, consumption_expected=26.2 * 3.6,
+)  # fmt: skip
+COUNTS = Counts(dropped=7, implausible=3, lost=24, unknown=2)
+PLAIN = Style(colour=False, unicode=True)
+
+
+def second(publisher: Publisher, estimate: Estimate = ESTIMATE) -> list[Frame]:
+    """What the daemon sends in a second."""
+    frames = publisher.range(estimate, COUNTS, 0)
+    for _ in range(10):
+        frames += publisher.status(estimate, 0)
+    return frames
+
+
+def seen(estimate: Estimate = ESTIMATE, now: float = 100.0) -> View:
+    view = View()
+    for frame in second(Publisher(), estimate):
+        view.take(frame, now)
+    return view
+
+
+def picture(view: View, now: float, width: int = 80) -> str:
+    return "\n".join(terminal.rendered(line, PLAIN) for line in terminal.screen(view, now, "vcan0", width))
+
+
+def numbers(text: str) -> list[str]:
+    """The quantities in a picture; that the interval is one of 80 % is none."""
+    return re.findall(r"\d (?:km|Wh|%)", text.replace("80 %: ", ""))
+
+
+def test_it_shows_what_the_daemon_sends():
+    text = picture(seen(), 100.0)
+    for shown in ("34.2 km", "26.5 km to 44.3 km", "62.4 ± 1.2 %", "895 Wh", "26.2 Wh/km expected", "24.6 Wh/km over",
+                  "degraded", "no IMU: No lean", "prior riding", "0.0 s old, 13 received, 0 lost, 0 bad",
+                  "7 dropped, 3 implausible, 24 lost, 2 unknown"):  # fmt: skip
+        assert shown in text
+    assert "Stale" not in text
+    line = terminal.summary_line(seen(), 100.0)
+    assert line == (
+        "range 34.2 km (26.5 km to 44.3 km); SOC 62.4 % ± 1.2 %; 895 Wh left; 24.6 Wh/km recent, "
+        "26.2 Wh/km expected; degraded; because: no IMU, prior riding"
+    )
+
+
+def test_the_bar_stands_where_the_numbers_are():
+    bar = next(line for line in picture(seen(), 100.0, 54).splitlines() if "●" in line)
+    assert len(bar) == 52
+    for mark, km in (bar.index("━"), 26.54), (bar.index("●"), 34.21), (bar.rindex("━"), 44.34):
+        assert (mark - 2) / 49 * 50 == pytest.approx(km, abs=1.1)
+
+
+def test_an_old_number_is_never_shown_as_if_fresh():
+    view = seen(now=100.0)
+    assert "62.4" in picture(view, 100.9)
+    after = picture(view, 101.1)  # ten periods of RANGE_Status
+    assert "62.4" not in after
+    assert "RANGE_Status: last came 1 s ago" in after
+    assert "34.2 km" in after
+    for late in 110.1, 1e4, 1e9:
+        text = picture(view, late)
+        assert not numbers(text)
+        assert "not known" in text
+        assert all(f"{name}: last came" in text for name in view.messages)
+        assert set(re.findall(r"[\d.]+ km", terminal.summary_line(view, late))) == set()
+
+
+def test_a_late_number_is_grey():
+    grey, fresh = "\x1b[2m34.2 km", "\x1b[1;33m34.2 km"
+    drawn = {}
+    for now in 100.5, 104.0:
+        lines = terminal.screen(seen(), now, "vcan0", 80)
+        drawn[now] = "\n".join(terminal.rendered(line, Style(colour=True, unicode=True)) for line in lines)
+    assert fresh in drawn[100.5]
+    assert grey in drawn[104.0]
+
+
+def test_nothing_yet():
+    text = picture(View(), 5.0)
+    assert "none yet" in text
+    assert text.count("never came") == 4
+    assert not numbers(text)
+
+
+@pytest.mark.parametrize("state", [State.STARTING, State.INVALID])
+def test_without_an_estimate_there_are_dashes(state):
+    text = picture(seen(Estimate(time=1.0, state=state)), 100.0)
+    assert not numbers(text)
+    assert state.name.lower() in text
+
+
+def test_a_broken_frame_is_counted_and_not_shown():
+    publisher, view = Publisher(), View()
+    frame = publisher.range(ESTIMATE, COUNTS, 0)[0]
+    time_ns, identifier, data, channel = frame
+    for broken in (bytes([data[0] ^ 1]) + data[1:], data[:7], data + b"\0", b"", data[:-1] + bytes([data[-1] ^ 0x80])):
+        view.take((time_ns, identifier, broken, channel), 1.0)
+    assert view.messages["RANGE_Estimate"].bad == 5
+    assert view.value("RANGE_Remaining", 1.0) is None
+    view.take(frame, 1.0)
+    assert view.value("RANGE_Remaining", 1.0) == pytest.approx(34.21)
+    assert "5 bad" in picture(view, 1.0)
+    assert "5 bad range frames" in terminal.summary_line(view, 1.0)
+
+
+def test_counters():
+    publisher, view = Publisher(), View()
+    frames = [publisher.status(ESTIMATE, 0)[0] for _ in range(40)]
+    now = 0.0
+    for i, frame in enumerate(frames):
+        now += 0.1
+        if i not in (14, 15, 33):  # across the wrap too
+            view.take(frame, now)
+    entry = view.messages["RANGE_Status"]
+    assert (entry.received, entry.lost, entry.bad) == (37, 3, 0)
+    for _ in range(30):  # a sender that hangs and repeats its last frame
+        now += 0.1
+        view.take(frames[-1], now)
+    assert entry.bad >= 9
+    assert entry.bad + entry.received == 67
+    # It is stale in between; taken again only as after a pause, when the daemon may have been started anew.
+    assert view.value("RANGE_StateOfCharge", entry.time + 1.05) is None
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.one_of(st.integers(0x5FE, 0x605), st.integers(0, 2**32 - 1)), st.binary(max_size=12), st.floats(0, 20)
+        ),
+        max_size=40,
+    ),
+    st.booleans(),
+)
+def test_nothing_on_the_bus_breaks_it(frames, checksum):
+    from gz_onboard.bus.checksum import crc8_sae_j1850
+
+    view, now = View(), 0.0
+    for identifier, data, pause in frames:
+        now += pause
+        if checksum and data:  # random, and yet passing the check
+            view.take((0, identifier, data[:-1] + bytes([crc8_sae_j1850(data[:-1])]), 0), now)
+        view.take((0, identifier, data, 0), now)
+        for width in 10, 80, 300:
+            for line in picture(view, now, width).splitlines():
+                assert len(line) <= max(width, 24)
+        terminal.summary_line(view, now)
+
+
+@given(st.floats(0, 660))
+def test_the_scale_is_a_round_number_just_beyond(value):
+    end = terminal._scale_end(value)
+    assert value <= end <= max(2 * value, 1)
+
+
+@given(st.floats(0, 1), st.floats(0, 0.3), st.floats(0, 700e3), st.integers(24, 120))
+def test_every_line_fits(soc, sd, metres, width):
+    estimate = Estimate(time=1.0, state=State.VALID, reasons=Reason(0xFFFF), soc=soc, soc_sd=sd, range=metres,
+                        range_p10=metres * 0.7, range_p90=metres * 1.4, energy_left=metres * 90)  # fmt: skip
+    for line in picture(seen(estimate), 100.0, width).splitlines():
+        assert len(line) <= min(width, 78)
+
+
+def test_without_colour_and_unicode():
+    lines = terminal.screen(seen(), 100.0, "vcan0", 80)
+    text = "\n".join(terminal.rendered(line, Style(colour=False, unicode=False)) for line in lines)
+    assert text.isascii()
+    assert "\x1b" not in text
+    assert "62.4 +- 1.2 %" in text
+
+
+# --- the command, on python-can's in-process bus ------------------------------------------------------------------
+
+
+@pytest.fixture
+def sender():
+    with can.Bus(interface="virtual", channel="dashboard", preserve_timestamps=False) as bus:
+        yield bus
+
+
+def send(bus, frames):
+    for _, identifier, data, _ in frames:
+        bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
+
+
+def test_once(capsys):
+    import threading
+
+    def sending():
+        publisher = Publisher()
+        with can.Bus(interface="virtual", channel="once") as bus:
+            while not stop.wait(0.05):
+                send(bus, second(publisher))
+
+    stop = threading.Event()
+    thread = threading.Thread(target=sending)
+    thread.start()
+    try:
+        status = cli.main(["dashboard", "--interface", "virtual", "--channel", "once", "--once"])
+    finally:
+        stop.set()
+        thread.join()
+    text = capsys.readouterr().out
+    assert status == 0
+    assert "34.2 km" in text
+    assert "\x1b" not in text
+
+
+def test_once_without_frames(capsys):
+    started = time.monotonic()
+    arguments = ["dashboard", "--interface", "virtual", "--channel", "none", "--once", "--duration", "0.3"]
+    assert cli.main(arguments) == 1
+    assert 0.2 < time.monotonic() - started < 2
+    assert "none yet" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [(["--duration", "0"], "--duration 0"), (["--interface", "nonesuch"], "--interface nonesuch"),
+     (["--interface", "virtual", "--onse"], "--once")],
+)  # fmt: skip
+def test_wrong_use_is_told(arguments, told, capsys):
+    try:
+        status = cli.main(["dashboard", *arguments])
+    except SystemExit as error:
+        status = int(str(error.code))
+    assert status == 2
+    assert told in capsys.readouterr().err
+
+
+# A process of its own with a daemon's frames on a virtual bus, which does not leave its process.
+CHILD = """
+import sys, threading, time
+from gz_onboard import cli
+from gz_onboard.bus._can import can
+from tests.dashboard.test_terminal import second, send
+from gz_onboard.bus.publisher import Publisher
+
+def sending():
+    publisher = Publisher()
+    with can.Bus(interface="virtual", channel="x") as bus:
+        end = time.monotonic() + float(sys.argv[1])
+        while time.monotonic() < end:
+            bus.send(can.Message(arbitration_id=0x600, data=bytes(12), is_fd=True, is_extended_id=False))
+            send(bus, [(0, 0x602, b"nonsense", 0), (0, 0x601, b"", 0), (0, 0x123, b"x", 0)])
+            send(bus, second(publisher))
+            time.sleep(0.1)
+        time.sleep(60)
+
+threading.Thread(target=sending, daemon=True).start()
+sys.exit(cli.main(["dashboard", "--interface", "virtual", "--channel", "x", *sys.argv[2:]]))
+"""
+
+
+def start(*arguments, out, sending=60.0, **environment):
+    environment = {**os.environ, "TERM": "xterm", "PYTHONPATH": str(Path(__file__).resolve().parents[2]), **environment}
+    return subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(sending), *arguments], stdin=out, stdout=out, stderr=subprocess.PIPE,
+        env=environment, start_new_session=True,
+    )  # fmt: skip
+
+
+class Terminal:
+    """A pseudo-terminal that keeps what was written to it."""
+
+    def __init__(self, rows=24, columns=80):
+        self.master, self.slave = pty.openpty()
+        fcntl.ioctl(self.slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
+        self.before = termios.tcgetattr(self.slave)
+        self.text = ""
+
+    def read(self, seconds):
+        if select.select([self.master], [], [], seconds)[0]:
+            self.text += os.read(self.master, 65536).decode("utf-8", "replace")
+
+    def until(self, pattern, within=20.0):
+        end = time.monotonic() + within
+        while not re.search(pattern, self.text):
+            assert time.monotonic() < end, f"no {pattern} in ...{self.text[-2000:]!r}"
+            self.read(0.2)
+
+    def close(self):
+        os.close(self.master)
+        os.close(self.slave)
+
+
+@pytest.fixture
+def tty():
+    opened = Terminal()
+    yield opened
+    opened.close()
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_on_a_terminal_and_left_as_it_was(tty, number):
+    child = start(out=tty.slave)
+    tty.until(r"34\.2 km")
+    tty.until("[1-9] bad")
+    assert tty.text.startswith("\x1b[?1049h\x1b[?25l")  # the other screen, no cursor
+    assert "\x1b[1;33m" in tty.text
+    frames = tty.text.count("\x1b[H")
+    tty.read(1.0)
+    child.send_signal(number)
+    tty.until(r"\x1b\[\?25h\x1b\[\?1049l")
+    assert child.wait(10) == 0
+    for _ in range(5):
+        tty.read(0.1)
+    assert frames >= 1
+    rest = tty.text.split("\x1b[?1049l")[1]
+    assert "34.2 km" in rest  # the last picture stays
+    assert termios.tcgetattr(tty.slave) == tty.before
+    assert child.stderr.read() == b""
+    child.stderr.close()
+
+
+def test_no_picture_is_larger_than_the_terminal():
+    small = Terminal(rows=8, columns=40)
+    child = start("--duration", "2", out=small.slave)
+    small.until(r"\x1b\[\?1049l")
+    assert child.wait(10) == 0
+    pictures = small.text.split("\x1b[?1049l")[0].split("\x1b[H")[1:]
+    assert len(pictures) >= 5
+    for drawn in pictures:
+        lines = re.split(r"\r*\n", re.sub(r"\x1b\[[?\d;]*[A-Za-z]", "", drawn))
+        assert len(lines) <= 8
+        assert max(map(len, lines)) <= 40
+    child.stderr.close()
+    small.close()
+
+
+def test_no_color_and_a_daemon_that_goes_silent(tty):
+    child = start("--duration", "4", out=tty.slave, sending=0.3, NO_COLOR="1")
+    tty.until(r"RANGE_Status: last came \d s ago", within=30)
+    assert child.wait(20) == 0
+    assert not re.search(r"\x1b\[[\d;]*[1-9][\d;]*m", tty.text)
+    child.stderr.close()
+
+
+def test_lines_where_there_is_no_terminal(tmp_path):
+    with (tmp_path / "out").open("w+") as out:
+        child = start("--duration", "3.5", out=out, PYTHONIOENCODING="ascii")
+        assert child.wait(30) == 0
+        assert child.stderr.read() == b""
+        child.stderr.close()
+        out.seek(0)
+        lines = out.read().splitlines()
+    assert len(lines) == 3
+    assert "\x1b" not in "".join(lines)
+    assert all(re.match(r"\d\d:\d\d:\d\d range ", line) for line in lines)
+    assert "range 34.2 km (26.5 km to 44.3 km)" in lines[-1]
+
+
+def test_a_dumb_terminal_gets_lines(tty):
+    child = start("--duration", "2.5", out=tty.slave, TERM="dumb")
+    tty.until(r"range 34\.2 km")
+    assert child.wait(10) == 0
+    assert "\x1b" not in tty.text
+    child.stderr.close()
+
+
+def test_in_a_thread_it_leaves_terminal_and_signals_alone(monkeypatch):
+    import threading
+
+    class Tty(io.StringIO):
+        def isatty(self):
+            return True
+
+    out = Tty()
+    monkeypatch.setattr(sys, "stdout", out)
+    before = signal.getsignal(signal.SIGINT)
+    arguments = ["dashboard", "--interface", "virtual", "--channel", "thread", "--duration", "1.2"]
+    thread = threading.Thread(target=cli.main, args=(arguments,))
+    thread.start()
+    thread.join(10)
+    assert not thread.is_alive()
+    assert "\x1b" not in out.getvalue()
+    assert "state not known" in out.getvalue()
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_ages_read_well():
+    assert terminal._duration(3.2) == "3 s"
+    assert terminal._duration(600) == "10 min"
+    assert View().age(1.0) == math.inf

@@ -1,0 +1,271 @@
+from __future__ import annotations
+
+import gzip
+import json
+import os
+import shutil
+import subprocess
+import sys
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gz_onboard import cli
+from gz_onboard.bus.logs import read_attachments, read_frames, read_metadata, read_samples
+from gz_onboard.bus.mapping import find_dbc, load_database
+from gz_onboard.events import EFF_FLAG, Estimate
+from gz_onboard.lab import estimate
+from gz_onboard.pipeline import Pipeline
+from gz_onboard.vehicle import read_vehicle
+
+LOGS = Path(__file__).resolve().parents[2] / "replay_logs"
+COASTDOWN, RIDE = LOGS / "coastdown.blf", LOGS / "city_34C.blf"
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return list(chain.from_iterable(read_frames(COASTDOWN)))
+
+
+@pytest.fixture(scope="module")
+def vehicle():
+    return read_vehicle("reference")
+
+
+def run(*arguments):
+    return cli.main(["estimate", *map(str, arguments)])
+
+
+def candump(file, frames):
+    text = "".join(
+        f"({t // 10**9}.{t // 1000 % 10**6:06}) can0 {i & ~EFF_FLAG:0{8 if i & EFF_FLAG else 3}X}#{d.hex().upper()}\n"
+        for t, i, d, _ in frames
+    )
+    opened = gzip.open if file.suffix == ".gz" else open
+    with opened(file, "wt") as stream:
+        stream.write(text)
+    return file
+
+
+def estimates(log):
+    return [(time, values) for topic, time, values in read_samples(log) if topic == "/estimate"]
+
+
+def test_the_summary_of_a_ride_agrees_with_its_frames(tmp_path, capsys):
+    assert run(RIDE, "--output", tmp_path, "--json", "--no-plot") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert (document["version"], document["failed"]) == (estimate.SUMMARY_VERSION, [])
+    (ride,) = document["rides"]
+    assert set(ride) == set(estimate.KEYS)
+
+    # The same quantities from the frames themselves, by cantools.
+    database = load_database([find_dbc("vehicle.dbc")])
+    pack = database.get_message_by_name("BMS_Pack")
+    every = list(chain.from_iterable(read_frames(RIDE)))
+    energy = recovered = 0.0
+    last = None
+    for time_ns, identifier, data, _ in every:
+        if identifier != pack.frame_id:
+            continue
+        values: Any = pack.decode(data, decode_choices=False)
+        if last is not None:
+            joule = values["BMS_PackVoltage"] * values["BMS_PackCurrent"] * (time_ns - last) * 1e-9
+            energy += joule
+            recovered -= min(joule, 0.0)
+        last = time_ns
+    assert ride["frames"] == len(every)
+    assert ride["start_ns"] == every[0][0]
+    assert ride["duration_s"] == pytest.approx((every[-1][0] - every[0][0]) * 1e-9, abs=0.11)
+    assert ride["energy_wh"] == pytest.approx(energy / 3600, rel=0.03)
+    assert ride["energy_recovered_wh"] == pytest.approx(recovered / 3600, rel=0.1)
+    assert ride["consumption_wh_km"] == pytest.approx(ride["energy_wh"] / ride["distance_km"])
+    assert sum(ride["states"].values()) == pytest.approx(ride["duration_s"], abs=0.2)
+
+    logged = [values for _, values in estimates(ride["log"])]
+    assert len(logged) == pytest.approx(ride["duration_s"], abs=2)
+    assert ride["soc_start"] == pytest.approx(logged[0]["soc"], abs=0.01)
+    assert ride["soc_end"] == pytest.approx(logged[-1]["soc"], abs=0.002)
+    assert ride["distance_km"] == pytest.approx(logged[-1]["distance"] / 1000, abs=0.02)
+    assert ride["range_end_p10_km"] < ride["range_end_km"] < ride["range_end_p90_km"]
+    assert 0 < ride["innovation_rms_v"] < ride["innovation_max_v"] < 0.2
+
+
+def test_the_same_log_gives_the_same_bytes(tmp_path):
+    made = []
+    for seed in "1", "2":  # what goes by hash would come out in another order
+        folder = tmp_path / seed
+        command = [
+            sys.executable,
+            "-m",
+            "gz_onboard",
+            "estimate",
+            COASTDOWN,
+            "--signals",
+            "--frames",
+            "--output",
+            folder,
+        ]
+        subprocess.run(command, check=True, env={**os.environ, "PYTHONHASHSEED": seed, "TZ": f"UTC+{seed}"},
+                       capture_output=True)  # fmt: skip
+        made.append({file.name: file.read_bytes() for file in sorted(folder.iterdir())})
+    assert set(made[0]) == {"coastdown.estimate.mcap", "coastdown.estimate.png"}
+    assert made[0] == made[1]
+
+
+def test_what_goes_into_the_log(tmp_path, frames):
+    candump(tmp_path / "a.log", frames[:6000])
+    assert run(tmp_path / "a.log", "--output", tmp_path, "--no-plot", "--payload", 75) == 0
+    log = tmp_path / "a.estimate.mcap"
+    assert {topic for topic, _, _ in read_samples(log)} == {"/estimate", "/status"}
+    assert not list(chain.from_iterable(read_frames(log)))
+    metadata = read_metadata(log)
+    assert (metadata["source"], metadata["filter"], metadata["payload_kg"]) == ("a.log", "scalar", "75")
+    assert "range.dbc" in read_attachments(log)
+
+    assert run(tmp_path / "a.log", "--output", tmp_path, "--no-plot", "--frames", "--signals") == 0
+    topics = {topic for topic, _, _ in read_samples(log)}
+    assert {"/can/BMS_Pack", "/can/INV_Motion"} <= topics
+    written = [(t, i, d) for t, i, d, _ in chain.from_iterable(read_frames(log)) if not 0x600 <= i <= 0x603]
+    read = [(t, i, d) for t, i, d, _ in chain.from_iterable(read_frames(tmp_path / "a.log"))]
+    assert sorted(written) == sorted(read)
+
+
+def test_a_log_of_ours_gives_the_same_estimates_again(tmp_path):
+    assert run(COASTDOWN, "--output", tmp_path, "--no-plot", "--frames") == 0
+    first = tmp_path / "coastdown.estimate.mcap"
+    shutil.copy(first, tmp_path / "again.mcap")  # it holds range frames too: they are no frames of the vehicle
+    assert run(tmp_path / "again.mcap", "--output", tmp_path, "--no-plot") == 0
+    assert estimates(tmp_path / "again.estimate.mcap") == estimates(first)
+    status = [values for topic, _, values in read_samples(tmp_path / "again.estimate.mcap") if topic == "/status"]
+    assert status[-1]["unknown"] == {}
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_broken_log_does_not_stop_the_others(tmp_path, frames, capsys, jobs):
+    good = [candump(tmp_path / "good.log", frames[:4000]), candump(tmp_path / "zipped.log.gz", frames[:4000])]
+    empty, other, text = tmp_path / "empty.blf", tmp_path / "other.log", tmp_path / "text.blf"
+    empty.touch()
+    candump(other, [(t, 0x7A0 + n % 5, d, c) for n, (t, _, d, c) in enumerate(frames[:500])])
+    text.write_text("LOGically not a BLF file\n" * 20)
+    missing = tmp_path / "missing.blf"
+    bad = [empty, other, text, missing]
+    out = tmp_path / "out"
+    assert run(*bad, *good, "--output", out, "--jobs", jobs, "--json", out / "s.json", "--no-plot") == 1
+    said = capsys.readouterr()
+    document = json.loads((out / "s.json").read_text())
+    assert [ride["file"] for ride in document["rides"]] == list(map(str, good))
+    assert [failure["file"] for failure in document["failed"]] == list(map(str, bad))
+    for failure, file in zip(document["failed"], bad, strict=True):
+        assert str(file) in failure["error"]
+        assert failure["error"] in said.err
+    assert "knows none of its 500 frames (identifiers 7A0" in document["failed"][1]["error"]
+    assert sorted(f.name for f in out.iterdir()) == ["good.estimate.mcap", "s.json", "zipped.estimate.mcap"]
+    one, two = (estimates(out / f"{name}.estimate.mcap") for name in ("good", "zipped"))
+    assert one == two
+
+
+def test_a_cut_log_is_estimated_as_far_as_it_goes(tmp_path, capsys):
+    cut = tmp_path / "cut.blf"
+    cut.write_bytes(COASTDOWN.read_bytes()[:200_000])
+    assert run(cut, "--output", tmp_path, "--no-plot") == 0
+    assert "cut.blf" in capsys.readouterr().err
+    assert 20 < len(estimates(tmp_path / "cut.estimate.mcap")) < 50
+
+
+def test_rides_of_the_same_name_in_several_folders(tmp_path, frames):
+    for folder in "a", "b":
+        (tmp_path / folder).mkdir()
+        candump(tmp_path / folder / "ride.log", frames[:2000])
+    assert run(tmp_path / "a" / "ride.log", tmp_path / "b" / "ride.log", "--output", tmp_path, "--no-plot") == 0
+    assert {f.name for f in tmp_path.glob("*.mcap")} == {"a-ride.estimate.mcap", "b-ride.estimate.mcap"}
+    (tmp_path / "a" / "ride.csv").touch()
+    assert run(tmp_path / "a" / "ride.log", tmp_path / "a" / "ride.csv", "--output", tmp_path) == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["--vehicle", "referense"], "did you mean 'reference'"),
+        (["--jobs", "0"], "--jobs 0"),
+        (["--json", "x.blf"], "the name of a log"),
+        (["--output", "/dev/null/x"], "cannot be written"),
+        (["--json", "/dev/null/x", "--no-plot"], "cannot be written"),
+    ],
+)
+def test_what_cannot_be_done_is_told(tmp_path, monkeypatch, capsys, frames, arguments, told):
+    monkeypatch.chdir(tmp_path)
+    candump(tmp_path / "a.log", frames[:300])
+    assert run("a.log", *arguments) != 0
+    assert told in capsys.readouterr().err
+
+
+def test_a_slow_bus_is_estimated_ten_times_a_second(vehicle, frames):
+    slow = frames[::12]  # 45 frames/s: a reader's batch takes 20 s
+    tally = estimate.Tally()
+    pipeline = Pipeline(vehicle, observer=tally)
+    estimate.feed(pipeline, [slow[:1000], slow[1000:]])
+    assert sum(tally.ticks.values()) == pytest.approx((slow[-1][0] - slow[0][0]) / 1e8, abs=2)
+
+
+def test_a_gap_is_ridden_through_and_a_pause_is_not(vehicle, frames):
+    def states(gap_s):
+        made: list[Estimate] = []
+        pipeline = Pipeline(vehicle, observer=made.append)
+        later = [(t + round(gap_s * 1e9), i, d, c) for t, i, d, c in frames[6000:9000]]
+        estimate.feed(pipeline, [frames[:6000], later])
+        return made
+
+    without, gap, pause = states(0), states(30), states(3600)
+    assert len(gap) == len(without) + 300
+    assert {e.state.name for e in gap} > {e.state.name for e in without}  # silence shows
+    assert len(pause) <= len(without) + 2
+    for made in without, gap, pause:
+        assert all(b.time > a.time for a, b in pairwise(made))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    jumps=st.lists(
+        st.tuples(st.integers(0, 1500), st.integers(-(10**12), 10**13), st.sampled_from([1, 2, 40, 5000])), max_size=4
+    ),
+    size=st.integers(1, 1200),
+)
+def test_no_jump_of_the_clock_stops_it(jumps, size):
+    moved = list(HEAD)
+    for place, jump, length in jumps:
+        moved[place : place + length] = [(t + jump, i, d, c) for t, i, d, c in moved[place : place + length]]
+    made: list[Estimate] = []
+    counted: list[int] = []
+    pipeline = Pipeline(REFERENCE, observer=made.append)
+    estimate.feed(pipeline, [moved[i : i + size] for i in range(0, len(moved), size)], counted.append)
+    assert sum(counted) == len(moved) == pipeline.codec.received
+    assert len(made) < 3000
+    for e in made:
+        assert e.range is None or 0 <= e.range < 1e6
+        assert e.soc is None or 0 <= e.soc <= 1
+
+
+HEAD = list(chain.from_iterable(read_frames(COASTDOWN)))[:1500]
+REFERENCE = read_vehicle("reference")
+
+
+def test_progress_is_told_from_all_processes(tmp_path, frames, monkeypatch):
+    logs = [candump(tmp_path / f"{n}.log", frames[:3000]) for n in range(3)]
+    tasks = [estimate.Task(log, tmp_path / log.stem, "reference", plot=False) for log in logs]
+    for jobs in 1, 2:
+        told: list[int] = []
+        results = list(estimate._results(tasks, jobs, told.append))
+        assert all(isinstance(result, dict) for _, result in results)
+        assert sum(told) <= 9000
+        assert sum(told) >= 3000
+
+
+def test_the_expected_number_of_frames_is_about_right(tmp_path, frames):
+    assert estimate._expected(COASTDOWN) == len(frames)
+    assert estimate._expected(candump(tmp_path / "a.log", frames)) == pytest.approx(len(frames), rel=0.1)
+    assert estimate._expected(candump(tmp_path / "a.log.gz", frames[:9])) is None
+    assert estimate._expected(tmp_path / "none.blf") is None

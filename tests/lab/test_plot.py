@@ -1,0 +1,147 @@
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gz_onboard import cli
+from gz_onboard.errors import InputError
+from gz_onboard.events import Reason
+from gz_onboard.lab import plot
+
+LOGS = Path(__file__).resolve().parents[2] / "replay_logs"
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("plot")
+    assert cli.main(["estimate", str(LOGS / "coastdown.blf"), "--output", str(folder), "--no-plot"]) == 0
+    return folder / "coastdown.estimate.mcap"
+
+
+def pixels(file):
+    from matplotlib.image import imread
+
+    return imread(file)
+
+
+@pytest.mark.parametrize("over", ["time", "distance"])
+def test_the_overview(log, tmp_path, over):
+    picture = tmp_path / "x.png"
+    assert cli.main(["plot", str(log), str(picture), "--over", over]) == 0
+    image = pixels(picture)
+    assert image.shape[0] > 900
+    assert image.shape[1] > 1000
+    assert 0.02 < (image[..., :3].min(axis=2) < 0.9).mean() < 0.6  # neither empty nor black
+
+
+def test_the_panels_show_what_the_log_says(log):
+    rows, times, status = plot.read_ride(log)
+    figure = plot.draw(rows, times, status, ("title", "subtitle"))
+    lines = {line.get_label(): line for axis in figure.axes for line in axis.get_lines()}
+    for label, name, factor in (
+        ("range", "range", 1e-3),
+        ("state of charge", "soc", 100),
+        ("pack current", "pack_current", 1),
+        ("expected", "consumption_expected", 1 / 3.6),
+    ):
+        assert np.asarray(lines[label].get_ydata()) == pytest.approx([row[name] * factor for row in rows])
+    assert np.max(lines["speed"].get_ydata()) == pytest.approx(max(row["speed"] for row in rows) * 3.6)
+    strip = figure.axes[6]
+    shown = [label.get_text() for label in strip.get_yticklabels()]
+    assert shown[0] == "state"
+    assert set(shown[1:]) == {plot.reason_words(Reason[name]) for row in rows for name in row["reasons"].split()}
+    figure.savefig(io.BytesIO(), format="png", dpi=30)
+
+
+def test_by_default_the_picture_is_beside_the_log(log, capsys):
+    assert cli.main(["plot", str(log)]) == 0
+    assert capsys.readouterr().out.strip() == str(log.with_suffix(".png"))
+    assert log.with_suffix(".png").exists()
+
+
+def test_a_cut_log_is_drawn_as_far_as_it_goes(tmp_path, log):
+    long = LOGS / "city_34C.blf"
+    assert cli.main(["estimate", str(long), "--output", str(tmp_path), "--no-plot", "--frames"]) == 0
+    whole = tmp_path / "city_34C.estimate.mcap"
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    rows, _, _ = plot.read_ride(cut)
+    everything, _, _ = plot.read_ride(whole)
+    assert 100 < len(rows) < len(everything)
+    assert rows == everything[: len(rows)]
+    assert cli.main(["plot", str(cut), str(tmp_path / "cut.png")]) == 0
+
+
+def test_what_cannot_be_drawn_is_told(tmp_path, log, capsys):
+    (tmp_path / "text.mcap").write_text("no")
+    for arguments, told in [
+        (["none.mcap"], "none.mcap"),
+        ([str(tmp_path / "text.mcap")], "not an MCAP file"),
+        ([str(LOGS / "coastdown.blf")], "holds no estimates"),
+        ([str(log), str(tmp_path / "x.jpg")], "has to end in .png"),
+        ([str(log), "/dev/null/x.png"], "cannot be written"),
+    ]:
+        assert cli.main(["plot", *arguments]) == 2
+        assert told in capsys.readouterr().err
+
+
+def test_nothing_known_can_be_drawn_too():
+    names = ("soc", "soc_sd", "range", "range_p10", "range_p90", "energy_left", "pack_voltage", "pack_current", "speed")
+    row = {**dict.fromkeys(names), "time": 0.1, "distance": 0.0, "state": "STARTING", "reasons": "NO_IMU NO_GPS"}
+    figure = plot.draw([row], [0], {}, ("", ""))
+    figure.savefig(io.BytesIO(), format="png", dpi=30)
+
+
+def test_an_empty_log_is_told(tmp_path):
+    from gz_onboard.bus.recorder import LogFile
+
+    with pytest.raises(InputError, match="holds no estimates"):
+        LogFile((tmp_path / "e.mcap").open("wb"), 0).close()
+        plot.plot_log(tmp_path / "e.mcap", tmp_path / "e.png")
+
+
+@given(st.floats(5, 30), st.floats(20, 200), st.floats(1e5, 1e7), st.integers(2, 400))
+def test_the_naive_range_of_steady_riding_is_energy_over_consumption(speed, consumption, left, seconds):
+    power = speed * consumption
+    rows = [
+        {
+            "time": float(t),
+            "distance": t * speed,
+            "pack_voltage": 50.0,
+            "pack_current": power / 50.0,
+            "energy_left": left,
+        }
+        for t in range(seconds)
+    ]
+    for row, naive in zip(rows, plot.naive_range(rows), strict=True):
+        if row["distance"] < plot.NAIVE_FROM:
+            assert naive is None
+        else:
+            assert naive == pytest.approx(left / consumption)
+
+
+def test_the_naive_range_forgets_what_is_more_than_25_km_ago():
+    rows: list[plot.Row] = []
+    distance = 0.0
+    for t in range(12_000):  # 20 km at 160 J/m, then 100 km at 80 J/m
+        rows.append({"time": float(t), "distance": distance, "pack_voltage": 50.0,
+                     "pack_current": 10 * (160 if distance <= 20_000 else 80) / 50, "energy_left": 8e6})  # fmt: skip
+        distance += 10
+    naive = plot.naive_range(rows)
+    assert naive[1900] == pytest.approx(50_000, rel=0.01)
+    assert naive[3000] is not None
+    assert 50_000 < naive[3000] < 100_000
+    assert naive[5000] == naive[-1] == pytest.approx(100_000, rel=0.001)
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=60))
+def test_spans_cover_what_is_true(true):
+    x = [float(i) for i in range(len(true))]
+    spans = plot._spans(x, true)
+    inside = [any(begin <= place < begin + length for begin, length in spans) for place in x[:-1]]
+    assert inside == true[:-1]

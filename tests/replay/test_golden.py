@@ -1,0 +1,111 @@
+"""Every recorded ride through the whole pipeline, against its golden results."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import fields
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gz_onboard.bus.logs import read_frames
+from gz_onboard.events import Estimate
+from gz_onboard.pipeline import estimate_row
+from tests.replay import golden, regenerate
+
+LOGS = golden.logs()
+SHORTEST = min(LOGS, key=lambda log: log.stat().st_size)
+
+
+def test_there_are_rides_and_each_has_a_golden_file():
+    assert len(LOGS) >= 3
+    assert {golden.golden_file(log) for log in LOGS} == set(golden.GOLDEN.glob("*.csv"))
+
+
+def test_every_field_of_an_estimate_has_a_tolerance():
+    assert set(golden.TOLERANCE) == {field.name for field in fields(Estimate)}
+
+
+@pytest.mark.parametrize("log", LOGS, ids=lambda log: log.stem)
+def test_golden(log):
+    before, now = golden.read(golden.golden_file(log)), golden.run(log)
+    found = golden.differences(before, now, golden.TOLERANCE)
+    if found:
+        pytest.fail(
+            f"{log.stem} is not what it was. If the change is wanted: python -m tests.replay.regenerate\n"
+            + golden.told(found, len(now)),
+            pytrace=False,
+        )
+
+
+def test_both_filters_agree_over_a_whole_ride():
+    frames = list(read_frames(SHORTEST))
+    scalar, filterpy = golden.estimates(frames), golden.estimates(frames, "filterpy")
+    assert len(scalar) == len(filterpy) > 500
+    for ours, reference in zip(scalar, filterpy, strict=True):
+        row, expected = estimate_row(ours), estimate_row(reference)
+        for name, value in expected.items():
+            if isinstance(value, float) and value:
+                assert row[name] == pytest.approx(value, rel=1e-9, abs=1e-9), f"{name} at {ours.time}"
+            else:
+                assert row[name] == value, f"{name} at {ours.time}"
+
+
+def test_the_portions_in_which_frames_arrive_do_not_matter():
+    whole = list(itertools.chain.from_iterable(read_frames(SHORTEST)))[:8000]
+    expected = golden.estimates([whole])
+
+    @settings(max_examples=8, deadline=None)
+    @given(cuts=st.lists(st.integers(0, len(whole)), max_size=300))
+    def check(cuts):
+        portions = [whole[a:b] for a, b in itertools.pairwise([0, *sorted(cuts), len(whole)])]
+        assert golden.estimates(portions) == expected
+
+    assert len(expected) > 100
+    check()
+
+
+# --- the tools themselves -----------------------------------------------------------------------------------------
+
+
+def row(**values):
+    return {"time": "1", "soc": "0.5", "state": "VALID", "range": "1000", **values}
+
+
+def test_a_difference_is_told_with_its_field_and_size():
+    before, now = [row(), row(), row()], [row(), row(range="1001.5"), row(state="DEGRADED", soc="")]
+    found = golden.differences(before, now, golden.TOLERANCE)
+    assert [(d.field, d.golden, d.now) for d in found] == [
+        ("range", "1000", "1001.5"), ("soc", "0.5", ""), ("state", "VALID", "DEGRADED"),
+    ]  # fmt: skip
+    text = golden.told(found, len(now))
+    assert "range: 1 of 3 rows differ by more than 0.5" in text
+    assert "+1.5" in text
+    assert "DEGRADED" in text
+
+
+def test_rows_and_fields_that_come_or_go_are_differences():
+    assert golden.differences([], [row()], golden.TOLERANCE)
+    assert golden.differences([row()], [row(), row()], golden.TOLERANCE)
+    assert golden.differences([row()], [row(new="1")], golden.TOLERANCE)
+    assert golden.differences([row(soc="nan")], [row()], golden.TOLERANCE)
+    assert not golden.differences([row(range="1000.4")], [row()], golden.TOLERANCE)
+
+
+def test_regenerate_writes_what_then_agrees_and_tells_what_moved(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(golden, "GOLDEN", tmp_path)
+    name = SHORTEST.stem
+    assert regenerate.main([name]) == 1  # nothing there before
+    assert regenerate.main([name, "--check"]) == 0
+    file = tmp_path / f"{name}.csv"
+    rows = [dict(each) for each in golden.read(file)]
+    rows[2]["soc"] = "0.123"
+    golden.write(file, rows)
+    capsys.readouterr()
+    assert regenerate.main([name, "--check"]) == 1
+    assert "0.123" in capsys.readouterr().out
+    assert golden.read(file)[2]["soc"] == "0.123"  # --check writes nothing
+    with pytest.raises(SystemExit):
+        regenerate.main(["coastdwn"])
+    assert "did you mean 'coastdown'?" in capsys.readouterr().err
