@@ -35,29 +35,27 @@ def read(path: Path, data: Contents, damage: Damage, _start: int | None, _end: i
     promised = header[12]
     objects = 0
     tail = b""
-    while position < len(data):
+    while 0 <= position < len(data):
         signature, size, kind = _container(data, position)
-        if signature != b"LOBJ" or size < 32:
-            damage.add(f"byte {position}", "no object begins here")
-            position = data.find(b"LOBJ", position + 1)
-            tail = b""
-            if position < 0:
-                return
-            continue
-        end = position + size
+        following = position + size + size % 4
         if kind == _CONTAINER:
-            content, whole = _unpack(data, position, min(end, len(data)))
-            if end > len(data) or not whole:
+            content, whole = _unpack(data, position, min(position + size, len(data)))
+            if not whole:
                 damage.add(f"byte {position}", "a container is cut off or broken")
             frames, tail, count = _objects(tail + content, start_ns, damage, position)
             objects += count
-            if not whole:
-                tail = b""
             for i in range(0, len(frames), BATCH):
                 yield frames[i : i + BATCH]
-        else:  # or a container whose type is damaged: what follows does not go on where the one before ended
+        else:  # nothing that holds frames, if it is an object at all
+            another = data[following : following + 4] == b"LOBJ" or len(data) <= following < len(data) + 4
+            whole = signature == b"LOBJ" and size >= _OBJECT.size and another
+            if not whole:
+                damage.add(f"byte {position}", "no object begins here")
             tail = b""
-        position = end + size % 4
+        if not whole:  # nor is its size to be trusted
+            tail = b""
+            following = data.find(b"LOBJ", position + 4)
+        position = following
     if tail:
         damage.add(f"byte {len(data)}", "the last object is cut off")
     if objects < promised and not damage.count:
@@ -65,8 +63,8 @@ def read(path: Path, data: Contents, damage: Damage, _start: int | None, _end: i
 
 
 def _container(data: Contents, position: int) -> tuple[bytes, int, int]:
-    """Signature, size and type of the object at the position; an empty signature if there is not enough of it."""
-    if position + _OBJECT.size > len(data):
+    """Signature, size and type of the object at the position; an empty signature and no type if there is none."""
+    if position + _OBJECT.size > len(data) or data[position : position + 4] != b"LOBJ":
         return b"", 0, 0
     signature, _, _, size, kind = _OBJECT.unpack_from(data, position)
     return signature, size, kind
