@@ -104,7 +104,9 @@ class Table:
         value = self.values.get(key, default)
         if isinstance(value, bool) or not isinstance(value, int | float):
             raise self.error("is missing" if value is None else f"must be a number, is {value!r}", key)
-        if not low <= value <= high:  # NaN fails too
+        if not math.isfinite(value):
+            raise self.error(f"must be a finite number, is {value}", key)
+        if not low <= value <= high:
             raise self.error(f"{value:g} is outside {low:g} to {high:g}", key)
         return float(value)
 

@@ -34,7 +34,7 @@ UNDECODABLE = "undecodable"
 REASONS = (LENGTH, CRC, COUNTER, NOT_AVAILABLE, RANGE, TIME, UNDECODABLE)
 
 _BACK_NS = 50_000_000  # frames of two channels may overtake each other by a little
-_AHEAD_NS = 10_000_000_000
+_AHEAD_NS = 30_000_000_000
 _CONFIRM = 3  # so many frames in a row agree on a new time before it is believed
 _MOST_IDENTIFIERS = 4096  # are remembered: a babbling node must not fill the memory
 

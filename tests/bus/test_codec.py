@@ -1,0 +1,635 @@
+from __future__ import annotations
+
+import math
+import struct
+from functools import cache
+from pathlib import Path
+
+import pytest
+from cantools.database.can import Database
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from gz_onboard.bus.checksum import crc8_sae_j1850
+from gz_onboard.bus.codec import (
+    COUNTER,
+    CRC,
+    LENGTH,
+    NOT_AVAILABLE,
+    RANGE,
+    REASONS,
+    TIME,
+    UNDECODABLE,
+    Codec,
+    known_identifiers,
+)
+from gz_onboard.bus.mapping import Mapping, Source, find_dbc, load_database, read_mapping
+from gz_onboard.bus.units import to_si
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, ROLES, RTR_FLAG, Event
+from gz_onboard.toml import Table
+from gz_onboard.vehicle import read_vehicle
+
+MS = 1_000_000
+S = 1_000_000_000
+EPOCH = 1_700_000_000 * S
+
+
+@cache
+def reference() -> Mapping:
+    return read_vehicle("reference").mapping
+
+
+def mapping_of(folder: Path, dbc: str, roles: str, bus: str = "") -> Mapping:
+    (folder / "v.dbc").write_text(f'VERSION "1"\nNS_ :\nBS_:\nBU_: A\n{dbc}\n', encoding="utf-8")
+    (folder / "v.toml").write_text(f'dbc = ["v.dbc"]\n[bus]\n{bus}\n[roles]\n{roles}\n', encoding="utf-8")
+    return read_mapping(Table.read(folder / "v.toml"))
+
+
+def protected(message: str, counter: int, **signals: float) -> bytes:
+    """Data of a message of the reference scooter with its counter and checksum; other signals are 0."""
+    definition = reference().database.get_message_by_name(message)
+    values = {signal.name: 0.0 for signal in definition.signals} | signals
+    values[f"{message}Counter"] = counter
+    data = bytearray(definition.encode(values, strict=False))
+    data[-1] = crc8_sae_j1850(bytes(data[:-1]))
+    return bytes(data)
+
+
+def pack(counter: int, time_ns: int, **signals: float) -> tuple[int, int, bytes, int]:
+    return time_ns, 0x200, protected("BMS_Pack", counter, **signals), 0
+
+
+def temperatures(time_ns: int, ambient: float = 20.0) -> tuple[int, int, bytes, int]:
+    return time_ns, 1056, struct.pack("<hhhh", round(ambient * 10), 0, 0, 0), 0
+
+
+def value_of(codec: Codec, event: Event, role: str):
+    return dict(zip(codec.groups[event[1]].roles, event[2], strict=True))[role]
+
+
+# --- layouts: the same as cantools ----------------------------------------------------------------------------
+
+
+def mapping_of_all(database: Database, message_name: str) -> Mapping:
+    """Each signal of a message plays some role, in the unit of the DBC."""
+    message = database.get_message_by_name(message_name)
+    sources = tuple(
+        Source(role, message_name, s.name, float(s.conversion.scale), float(s.conversion.offset))
+        for role, s in zip(ROLES, message.signals, strict=False)
+    )
+    assert len(sources) == len(message.signals)
+    return Mapping(database, (), sources, {}, {})
+
+
+def expected(message, signal, raw):
+    """By the words of the documentation, in floating point and without the codec's tables of limits."""
+    if signal.length >= 8 and raw == (-(2 ** (signal.length - 1)) if signal.is_signed else 2**signal.length - 1):
+        return None
+    value = raw * signal.scale + signal.offset
+    if signal.minimum is not None and signal.maximum is not None and signal.minimum < signal.maximum:
+        slack = 1e-3 * abs(signal.scale)
+        if not signal.minimum - slack <= value <= signal.maximum + slack:
+            return None
+    return value
+
+
+def assert_like_cantools(codec: Codec, message, data: bytes, time_ns: int) -> None:
+    (event,) = codec.decode([(time_ns, message.frame_id, data, 0)])
+    raw = message.decode(data, decode_choices=False, scaling=False)
+    assert len(event[2]) == len(message.signals)
+    for signal, value in zip(message.signals, event[2], strict=True):
+        want = expected(message, signal, raw[signal.name])
+        if want is None:
+            assert value is None, (signal, raw[signal.name])
+        else:
+            assert value == pytest.approx(want, rel=1e-12, abs=1e-12), (signal, raw[signal.name])
+
+
+INCOMING = load_database([find_dbc("vehicle.dbc"), find_dbc("hbm.dbc")])
+
+
+@pytest.mark.parametrize("name", [message.name for message in INCOMING.messages])
+@given(frames=st.lists(st.binary(min_size=8, max_size=8), min_size=1, max_size=5))
+def test_every_message_of_the_reference_scooter_is_decoded_as_by_cantools(name, frames):
+    message = INCOMING.get_message_by_name(name)
+    codec = Codec(mapping_of_all(INCOMING, name))
+    for i, data in enumerate([*frames, bytes(8), b"\xff" * 8]):
+        assert_like_cantools(codec, message, data, i * MS)
+
+
+@st.composite
+def layouts(draw: st.DrawFn) -> str:
+    """The DBC of a message of up to ten signals anywhere in it."""
+    length = draw(st.sampled_from([1, 2, 3, 5, 7, 8, 8, 8, 12, 64]))
+    used: set[int] = set()
+    lines = []
+    one_order = draw(st.sampled_from([0, 1, None]))
+    for i in range(draw(st.integers(1, 10))):
+        order = draw(st.integers(0, 1)) if one_order is None else one_order
+        size = draw(st.one_of(st.sampled_from([8, 16, 32]), st.integers(1, 64)))
+        start = draw(st.integers(0, 8 * length - 1))
+        if order:  # little-endian: bits count up
+            bits = [*range(start, start + size)]
+        else:  # big-endian: down within the byte, then on to the next byte
+            first = start // 8 * 8 + 7 - start % 8
+            bits = [b // 8 * 8 + 7 - b % 8 for b in range(first, first + size)]
+        if max(bits) >= 8 * length or used.intersection(bits):
+            continue
+        used.update(bits)
+        sign = draw(st.sampled_from("+-"))
+        scale = draw(st.sampled_from([1, 0.5, 0.1, 0.001, -0.01, 3, 1e-7]))
+        offset = draw(st.sampled_from([0, -40, 0.5, 1000]))
+        low, high = draw(st.sampled_from([(0, 0), (0, 100), (-40, 214.5), (-1e6, 1e6), (200, 100)]))
+        lines.append(f' SG_ S{i} : {start}|{size}@{order}{sign} ({scale},{offset}) [{low}|{high}] "" A')
+    lines = lines or [' SG_ S : 0|1@1+ (1,0) [0|1] "" A']
+    return "\n".join(['VERSION "1"', "NS_ :", "BS_:", "BU_: A", f"BO_ 256 M: {length} A", *lines, ""])
+
+
+@settings(deadline=None, max_examples=200, suppress_health_check=[HealthCheck.too_slow])
+@given(layouts(), st.data())
+def test_any_layout_is_decoded_as_by_cantools(dbc, data):
+    database = Database()
+    database.add_dbc_string(dbc)
+    message = database.get_message_by_name("M")
+    codec = Codec(mapping_of_all(database, "M"))
+    n = message.length
+    frames = data.draw(st.lists(st.binary(min_size=n, max_size=n), min_size=1, max_size=5))
+    for i, frame in enumerate([*frames, bytes(n), b"\xff" * n, b"\x80" + bytes(n - 1), bytes(n - 1) + b"\x80"]):
+        assert_like_cantools(codec, message, frame, i * MS)
+
+
+def test_limits_are_kept_to_the_last_step():
+    codec = Codec(reference())
+    for i, (volts, good) in enumerate([(0.0, True), (100.0, True), (100.01, False), (655.34, False)]):
+        (event,) = codec.decode([pack(i, EPOCH + i * 100 * MS, BMS_PackVoltage=volts)])
+        assert value_of(codec, event, "pack_voltage") == (pytest.approx(volts) if good else None)
+        assert value_of(codec, event, "pack_current") == 0.0
+    assert codec.faults == {("BMS_Pack.BMS_PackVoltage", RANGE): 2}
+
+
+# --- not available --------------------------------------------------------------------------------------------
+
+
+def test_codes_for_not_available_are_no_numbers():
+    codec = Codec(reference())
+    (event,) = codec.decode([pack(0, EPOCH, BMS_PackVoltage=655.35, BMS_PackCurrent=-327.68, BMS_StateOfCharge=50)])
+    assert value_of(codec, event, "pack_voltage") is None
+    assert value_of(codec, event, "pack_current") is None
+    assert value_of(codec, event, "bms_state_of_charge") == pytest.approx(0.5)
+    assert codec.faults == {
+        ("BMS_Pack.BMS_PackVoltage", NOT_AVAILABLE): 1,
+        ("BMS_Pack.BMS_PackCurrent", NOT_AVAILABLE): 1,
+    }
+
+
+DBC_SHORT = """BO_ 256 M: 8 A
+ SG_ Byte : 0|8@1+ (1,-40) [0|0] "degC" A
+ SG_ Bits : 8|7@1+ (1,0) [0|0] "" A
+ SG_ Word : 16|16@1- (0.1,0) [0|0] "A" A
+"""
+ROLES_SHORT = 'cell_temperature = "Byte"\nthrottle = "Bits"\npack_current = "Word"'
+
+
+def test_without_such_codes_all_ones_are_a_number(tmp_path):
+    data = b"\xff\x7f\x00\x80\x00\x00\x00\x00"
+    with_codes = Codec(mapping_of(tmp_path, DBC_SHORT, ROLES_SHORT))
+    without = Codec(mapping_of(tmp_path, DBC_SHORT, ROLES_SHORT, 'not_available = "none"'))
+    assert with_codes.decode([(0, 256, data, 0)])[0][2] == (None, 127.0, None)  # 7 bits are too few for a code
+    assert without.decode([(0, 256, data, 0)])[0][2] == pytest.approx((215.0, 127.0, -3276.8))
+
+
+# --- protection -----------------------------------------------------------------------------------------------
+
+
+@given(st.integers(0, 55), st.integers(0, 14), st.integers(0, 65000))
+def test_a_flipped_bit_drops_the_frame(bit, counter, raw):
+    codec = Codec(reference())
+    data = bytearray(protected("BMS_Pack", counter, BMS_PackVoltage=raw / 1000))
+    data[bit // 8] ^= 1 << bit % 8
+    assert codec.decode([(EPOCH, 0x200, bytes(data), 0)]) == []
+    assert codec.faults == {("BMS_Pack", CRC): 1}
+    assert codec.latest == {}
+
+
+def test_counters_count_and_wrap():
+    codec = Codec(reference())
+    events = codec.decode([pack(i % 15, EPOCH + i * 100 * MS) for i in range(40)])
+    assert len(events) == 40
+    assert not codec.faults and not codec.lost
+
+
+def test_a_small_step_is_frames_lost_and_a_repeated_or_far_counter_is_wrong():
+    codec = Codec(reference())
+    counters = [3, 4, 4, 7, 14, 0, 8, 9]
+    events = codec.decode([pack(c, EPOCH + i * 100 * MS) for i, c in enumerate(counters)])
+    # 4 -> 4 repeated; 4 -> 7: two lost; 7 -> 14: six lost; 0 -> 8: too far; 8 -> 9 follows
+    assert [round(time * 10) for time, _, _ in events] == [0, 1, 3, 4, 5, 7]
+    assert codec.faults == {("BMS_Pack", COUNTER): 2}
+    assert codec.lost == {"BMS_Pack": 8}
+
+
+def test_after_a_pause_any_counter_is_good_but_not_one_that_cannot_be():
+    codec = Codec(reference())
+    frames = [pack(5, EPOCH), pack(5, EPOCH + 1100 * MS), pack(15, EPOCH + 2300 * MS), pack(6, EPOCH + 2400 * MS)]
+    assert len(codec.decode(frames)) == 3
+    assert codec.faults == {("BMS_Pack", COUNTER): 1}
+    assert not codec.lost
+
+
+@given(st.lists(st.integers(0, 15), min_size=1, max_size=60))
+def test_counters_by_their_rule(counters):
+    codec = Codec(reference())
+    last: int | None = None
+    lost = wrong = 0
+    for i, c in enumerate(counters):
+        events = codec.decode([pack(c, EPOCH + i * 100 * MS)])
+        step = 1 if last is None else (c - last) % 15
+        good = c <= 14 and 1 <= step <= 7
+        if c <= 14:
+            last = c
+        assert len(events) == good
+        lost += step - 1 if good else 0
+        wrong += not good
+    if counters.count(15) < 9:  # ten periods of nothing good are a pause
+        assert codec.lost.get("BMS_Pack", 0) == lost
+        assert codec.faults.get(("BMS_Pack", COUNTER), 0) == wrong
+
+
+# --- lengths, remote and error frames, unknown identifiers -----------------------------------------------------
+
+
+@pytest.mark.parametrize("length", [n for n in range(65) if n != 8])
+def test_a_wrong_length_drops_the_frame(length):
+    codec = Codec(reference())
+    for identifier in (0x101, 0x200, 0x411):  # plain, protected, without a role
+        assert codec.decode([(EPOCH, identifier, bytes(length), 0)]) == []
+    assert codec.faults == {("INV_Power", LENGTH): 1, ("BMS_Pack", LENGTH): 1, ("HBM_Chassis", LENGTH): 1}
+    assert codec.latest == {}
+
+
+def test_remote_and_error_frames_are_no_data():
+    codec = Codec(reference())
+    frames = [(EPOCH, 0x101 | RTR_FLAG, bytes(8), 0), (EPOCH, 0x4 | ERR_FLAG, bytes(8), 0)]
+    assert codec.decode(frames * 3) == []
+    assert codec.error_frames == 3
+    assert codec.unknown == {0x101 | RTR_FLAG: 3}
+    assert not codec.faults
+
+
+def test_an_11_bit_identifier_is_not_the_29_bit_one():
+    codec = Codec(reference())
+    assert codec.decode([(EPOCH, 0x101 | EFF_FLAG, bytes(8), 0)]) == []
+    assert codec.unknown == {0x101 | EFF_FLAG: 1}
+
+
+def test_a_babbling_node_does_not_fill_the_memory():
+    codec = Codec(reference())
+    count = 20_000
+    frames = [(EPOCH, EFF_FLAG | i, b"", 0) for i in range(count)]
+    assert codec.decode(frames) == []
+    assert codec.decode([temperatures(EPOCH + MS)])
+    assert len(codec.unknown) < 5000
+    assert sum(codec.unknown.values()) + codec.unknown_others == count
+    assert len(codec._handlers) < 5000
+    assert len(codec.latest) == 1
+
+
+def test_latest_and_values_hold_only_what_is_good():
+    codec = Codec(reference())
+    good = pack(0, EPOCH, BMS_PackVoltage=50.0, BMS_PackCurrent=-327.68, BMS_StateOfCharge=120.0)
+    bad = (EPOCH + 100 * MS, 0x200, bytes(8), 0)
+    codec.decode([good, bad])
+    assert codec.latest == {0x200: (EPOCH, good[2])}
+    values = codec.values(0x200, good[2])
+    assert values["BMS_PackVoltage"] == pytest.approx(50.0)
+    assert values["BMS_PackCurrent"] is None
+    assert values["BMS_StateOfCharge"] is None
+    assert codec.message_name(0x200) == "BMS_Pack"
+    assert codec.values(0x200, b"") == {}
+    assert codec.values(0x7FF, bytes(8)) == {}
+
+
+# --- time -----------------------------------------------------------------------------------------------------
+
+
+def test_times_are_seconds_since_the_first_frame():
+    codec = Codec(reference())
+    events = codec.decode([temperatures(EPOCH), temperatures(EPOCH + 1500 * MS)])
+    assert [time for time, _, _ in events] == [0.0, 1.5]
+    assert codec.seconds(EPOCH + S) == 1.0
+    assert codec.nanoseconds(1.0) == EPOCH + S
+
+
+@pytest.mark.parametrize("start", [0, 1, -5 * S, 1_049 * MS, EPOCH, 2**62])
+def test_a_log_may_begin_at_any_time(start):
+    codec = Codec(reference())
+    events = codec.decode([temperatures(start), temperatures(start + 100 * MS)])
+    assert [time for time, _, _ in events] == pytest.approx([0.0, 0.1])
+    assert not codec.faults
+
+
+def test_two_channels_may_overtake_each_other_a_little():
+    codec = Codec(reference())
+    offsets = [0, 30, 10, 40, 20, 60, 15]
+    events = codec.decode([temperatures(EPOCH + ms * MS) for ms in offsets])
+    assert [round(time * 1e3) for time, _, _ in events] == offsets
+    assert not codec.faults
+
+
+def test_time_does_not_creep_backwards():
+    codec = Codec(reference())
+    events = codec.decode([temperatures(EPOCH + S - i * 40 * MS) for i in range(3)])
+    assert len(events) == 2  # the third is 80 ms behind the first
+    assert codec.faults == {("", TIME): 1}
+
+
+@pytest.mark.parametrize("odd", [-EPOCH, -S, 31 * S, 2**62])
+def test_single_odd_stamps_are_dropped_however_many(odd):
+    codec = Codec(reference())
+    frames = []
+    for i in range(50):
+        frames.append(temperatures(EPOCH + i * 100 * MS))
+        if i % 5 == 2:
+            frames.append(temperatures(EPOCH + i * 100 * MS + odd))
+    events = codec.decode(frames)
+    assert [time for time, _, _ in events] == pytest.approx([i * 0.1 for i in range(50)])
+    assert codec.faults == {("", TIME): 10}
+
+
+def test_wild_stamps_never_agree_on_a_time():
+    codec = Codec(reference())
+    codec.decode([temperatures(EPOCH)])
+    assert codec.decode([temperatures(EPOCH + (i * i + 20) * 60 * S) for i in range(1, 20)]) == []
+    (event,) = codec.decode([temperatures(EPOCH + S)])
+    assert event[0] == 1.0
+
+
+def test_a_clock_set_back_does_not_turn_the_timeline_back():
+    codec = Codec(reference())
+    frames = [temperatures(EPOCH + i * 100 * MS) for i in range(10)]
+    frames += [temperatures(EPOCH - 3600 * S + i * 100 * MS) for i in range(10)]
+    times = [time for time, _, _ in codec.decode(frames)]
+    assert len(times) == 18  # two to make sure
+    assert times == sorted(times)
+    assert times[-1] == pytest.approx(0.9 + 0.7)
+    assert codec.faults == {("", TIME): 2}
+
+
+def test_a_gap_is_a_gap():
+    codec = Codec(reference())
+    frames = [temperatures(EPOCH), *(temperatures(EPOCH + 600 * S + i * 100 * MS) for i in range(4))]
+    assert [time for time, _, _ in codec.decode(frames)] == pytest.approx([0.0, 600.2, 600.3])
+
+
+def test_clock_set_goes_on_with_the_timeline():
+    codec = Codec(reference())
+    codec.clock_set(S)  # before the first frame there is nothing to go on with
+    codec.decode([temperatures(EPOCH)])
+    codec.clock_set(-86400 * S)
+    (event,) = codec.decode([temperatures(EPOCH - 86400 * S + 100 * MS)])
+    assert event[0] == pytest.approx(0.1)
+    assert not codec.faults
+
+
+# --- SAE J1939 -------------------------------------------------------------------------------------------------
+
+J1939 = f"""BO_ {0x0CF00400 | 1 << 31} EEC1: 8 A
+ SG_ EngineSpeed : 24|16@1+ (0.125,0) [0|8031.875] "rpm" A
+
+BO_ {0x18EA0000 | 1 << 31} Request: 3 A
+ SG_ Group : 0|24@1+ (1,0) [0|0] "" A
+
+BO_ 256 Plain: 8 A
+ SG_ Volts : 0|16@1+ (0.1,0) [0|1000] "V" A
+"""
+
+
+def test_j1939_goes_by_the_parameter_group(tmp_path):
+    roles = 'motor_speed = "EngineSpeed"\nthrottle = "Group"\npack_voltage = "Volts"'
+    mapping = mapping_of(tmp_path, J1939, roles, 'identifiers = "j1939"')
+    codec = Codec(mapping)
+    speed = bytes([0xFF, 0xFF, 0xFF, 0x40, 0x1F, 0xFF, 0xFF, 0xFF])  # 8000 * 0.125 = 1000 rpm
+    for identifier in (0x0CF00400, 0x18F00431):  # other priority, other sender
+        (event,) = codec.decode([(0, identifier | EFF_FLAG, speed, 0)])
+        assert value_of(codec, event, "motor_speed") == pytest.approx(1000 * 2 * math.pi / 60)
+        assert codec.message_name(identifier | EFF_FLAG) == "EEC1"
+        assert codec.values(identifier | EFF_FLAG, speed) == {"EngineSpeed": 1000.0}
+    for identifier in (0x18EA0021, 0x18EAFF21):  # PDU1: the destination is no part of the group
+        (event,) = codec.decode([(0, identifier | EFF_FLAG, b"\x05\x00\x00", 0)])
+        assert value_of(codec, event, "throttle") == 5.0
+    (event,) = codec.decode([(0, 256, b"\x64\x00" + bytes(6), 0)])
+    assert value_of(codec, event, "pack_voltage") == pytest.approx(10.0)
+    for identifier in (0x0CF00500 | EFF_FLAG, 0x0CF00400 | EFF_FLAG | RTR_FLAG, 0x400):
+        assert codec.decode([(0, identifier, speed, 0)]) == []
+    assert len(codec.unknown) == 3
+    assert known_identifiers(mapping) is None
+
+
+def test_j1939_senders_without_end_do_not_fill_the_memory(tmp_path):
+    codec = Codec(mapping_of(tmp_path, J1939, 'throttle = "Group"', 'identifiers = "j1939"'))
+    count = 20_000
+    codec.decode([(0, 0x18EA0000 | EFF_FLAG | i % 65536, bytes(3), 0) for i in range(count)])
+    assert len(codec._handlers) < 5000 and len(codec.latest) < 5000
+    assert len(codec.latest) + codec.unknown_others == count
+
+
+def test_known_identifiers_are_those_of_the_database(tmp_path):
+    mapping = mapping_of(tmp_path, J1939, 'throttle = "Group"')
+    assert set(known_identifiers(mapping) or []) == {0x0CF00400 | EFF_FLAG, 0x18EA0000 | EFF_FLAG, 256}
+
+
+# --- multiplexed and floating-point signals, which cantools decodes ----------------------------------------------
+
+FLOATS = """BO_ 256 Floats: 8 A
+ SG_ Single : 0|32@1- (0.5,1) [-100|100] "V" A
+ SG_ Bare : 32|32@1- (1,0) [0|0] "A" A
+
+BO_ 257 Double: 8 A
+ SG_ Twice : 7|64@0- (1,0) [0|0] "degC" A
+
+SIG_VALTYPE_ 256 Single : 1;
+SIG_VALTYPE_ 256 Bare : 1;
+SIG_VALTYPE_ 257 Twice : 2;
+"""
+FLOAT_ROLES = 'pack_voltage = "Single"\npack_current = "Bare"\ncell_temperature = "Twice"'
+
+
+def test_floats(tmp_path):
+    codec = Codec(mapping_of(tmp_path, FLOATS, FLOAT_ROLES))
+    cases = [
+        (10.0, -2.5, (6.0, -2.5)),
+        (math.nan, 1.0, (None, 1.0)),
+        (198.0, 2.0**100, (100.0, 2.0**100)),
+        (199.0, math.inf, (None, None)),
+        (-math.inf, math.nan, (None, None)),
+    ]
+    for single, bare, want in cases:
+        data = struct.pack("<ff", single, bare)
+        (event,) = codec.decode([(0, 256, data, 0)])
+        assert event[2] == want
+        assert all(v is None or math.isfinite(v) for v in codec.values(256, data).values())
+    assert codec.faults == {
+        ("Floats.Single", NOT_AVAILABLE): 1,
+        ("Floats.Single", RANGE): 2,
+        ("Floats.Bare", RANGE): 1,
+        ("Floats.Bare", NOT_AVAILABLE): 1,
+    }
+    assert codec.decode([(0, 257, struct.pack(">d", 25.25), 0)])[0][2] == (25.25,)
+    assert codec.decode([(0, 257, struct.pack(">d", math.nan), 0)])[0][2] == (None,)
+    assert codec.decode([(0, 257, struct.pack(">d", 1.7e308), 0)])[0][2] == (None,)
+    assert codec.decode([(0, 256, b"1234567", 0)]) == []
+
+
+MULTIPLEXED = """BO_ 256 Mux: 8 A
+ SG_ Page M : 0|4@1+ (1,0) [0|15] "" A
+ SG_ Volts m0 : 8|16@1+ (0.01,0) [0|100] "V" A
+ SG_ Amps m0 : 24|16@1- (0.1,0) [-300|300] "A" A
+ SG_ Celsius m1 : 8|8@1+ (1,-40) [-40|214] "degC" A
+ SG_ Count : 48|4@1+ (1,0) [0|14] "" A
+ SG_ Check : 56|8@1+ (1,0) [0|255] "" A
+"""
+MUX_ROLES = 'pack_voltage = "Volts"\npack_current = "Amps"\ncell_temperature = "Celsius"'
+MUX_BUS = '[bus.messages.Mux]\ncrc = "Check"\ncounter = "Count"\nperiod = 0.1'
+
+
+def mux(page: int, counter: int, words: bytes) -> bytes:
+    data = bytes([page]) + words.ljust(5, b"\0") + bytes([counter])
+    return data + bytes([crc8_sae_j1850(data)])
+
+
+def test_multiplexed_signals(tmp_path):
+    codec = Codec(mapping_of(tmp_path, MULTIPLEXED, MUX_ROLES, MUX_BUS))
+    decode = lambda i, data: codec.decode([(i * 100 * MS, 256, data, 0)])  # noqa: E731
+    assert decode(0, mux(0, 0, struct.pack("<Hh", 5000, -123)))[0][2] == pytest.approx((50.0, -12.3, None))
+    assert decode(1, mux(1, 1, b"\x41"))[0][2] == (None, None, 25.0)
+    assert decode(2, mux(0, 2, struct.pack("<Hh", 65535, 5000)))[0][2] == (None, None, None)
+    assert codec.faults == {("Mux.Volts", NOT_AVAILABLE): 1, ("Mux.Amps", RANGE): 1}
+    codec.faults.clear()
+    assert decode(3, mux(7, 3, b"")) == []  # a page that the DBC does not have
+    assert codec.faults == {("Mux", UNDECODABLE): 1}
+
+
+def test_multiplexed_messages_are_protected_too(tmp_path):
+    codec = Codec(mapping_of(tmp_path, MULTIPLEXED, MUX_ROLES, MUX_BUS))
+    good = mux(0, 3, struct.pack("<Hh", 5000, 0))
+    assert len(codec.decode([(0, 256, good, 0)])) == 1
+    assert codec.decode([(0, 256, good, 0)]) == []
+    assert codec.decode([(0, 256, good[:-1] + b"\0", 0)]) == []
+    assert codec.faults == {("Mux", COUNTER): 1, ("Mux", CRC): 1}
+
+
+# --- never an exception, never a wrong number ---------------------------------------------------------------------
+
+KNOWN = sorted(m.frame_id for m in reference().database.messages)
+identifiers = st.one_of(
+    st.sampled_from(KNOWN),
+    st.sampled_from(KNOWN).flatmap(lambda i: st.sampled_from([i | EFF_FLAG, i | RTR_FLAG, i | ERR_FLAG])),
+    st.integers(0, 2**32 - 1),
+)
+payloads = st.one_of(
+    st.binary(min_size=8, max_size=8),
+    st.binary(max_size=64),
+    st.binary(min_size=7, max_size=7).map(lambda d: d + bytes([crc8_sae_j1850(d)])),
+    st.sampled_from([b"\xff" * 8, bytes(8), b"\x00\x80" * 4, b"\xff\x7f" * 4]),
+)
+steps = st.one_of(st.integers(0, 200 * MS), st.integers(-S, S), st.integers(-(2**62), 2**62), st.just(None))
+
+
+@st.composite
+def recordings(draw: st.DrawFn) -> list[tuple[int, int, bytes, int]]:
+    time = draw(st.sampled_from([0, EPOCH, 2**62]))
+    frames = []
+    for step, identifier, data in draw(st.lists(st.tuples(steps, identifiers, payloads), max_size=60)):
+        time = 0 if step is None else max(-(2**63), min(time + step, 2**63 - 1))
+        frames.append((time, identifier, data, draw(st.integers(0, 1))))
+    return frames
+
+
+def limits_of(mapping: Mapping, source: Source) -> tuple[float, float]:
+    """The limits that the DBC gives to a signal, in the unit of its role."""
+    signal = mapping.database.get_message_by_name(source.message).get_signal_by_name(source.signal)
+    factor, offset = to_si(signal.unit or "", source.role) or (math.nan, math.nan)
+    assert signal.minimum is not None and signal.maximum is not None
+    low, high = sorted((signal.minimum * factor + offset, signal.maximum * factor + offset))
+    slack = 1e-9 * max(abs(low), abs(high))
+    return low - slack, high + slack
+
+
+def accounted(codec: Codec) -> int:
+    frame_faults = sum(n for (_, reason), n in codec.faults.items() if reason not in (NOT_AVAILABLE, RANGE))
+    return frame_faults + sum(codec.unknown.values()) + codec.unknown_others + codec.error_frames
+
+
+@settings(max_examples=300, deadline=None)
+@given(recordings())
+def test_whatever_the_bus_brings(frames):
+    mapping = reference()
+    codec = Codec(mapping)
+    by_role = {source.role: limits_of(mapping, source) for source in mapping.sources}
+    roleless = {m.frame_id for m in mapping.database.messages} - {
+        mapping.database.get_message_by_name(s.message).frame_id for s in mapping.sources
+    }
+    for n, frame in enumerate(frames, 1):
+        before = accounted(codec)
+        events = codec.decode([frame])
+        counted = accounted(codec) - before
+        quiet = frame[1] in roleless and len(frame[2]) == 8 and not counted
+        assert len(events) + counted + quiet == 1
+        assert codec.received == n
+        for time, group, values in events:
+            assert math.isfinite(time)
+            assert len(values) == len(codec.groups[group].roles)
+            absent = [role for role, v in zip(codec.groups[group].roles, values, strict=True) if v is None]
+            for role, value in zip(codec.groups[group].roles, values, strict=True):
+                if value is not None:
+                    low, high = by_role[role]
+                    assert low <= value <= high, (role, value)
+            assert not absent or any(r in (NOT_AVAILABLE, RANGE) for _, r in codec.faults)
+        assert all(v is None or math.isfinite(v) for v in codec.values(frame[1], frame[2]).values())
+    assert {reason for _, reason in codec.faults} <= set(REASONS)
+
+
+@settings(max_examples=150, deadline=None)
+@given(recordings())
+def test_portions_do_not_matter(frames):
+    one, many = Codec(reference()), Codec(reference())
+    assert one.decode(frames) == [event for frame in frames for event in many.decode([frame])]
+    assert (one.faults, one.lost, one.unknown, one.latest) == (many.faults, many.lost, many.unknown, many.latest)
+
+
+@pytest.fixture(scope="module")
+def odd_mapping(tmp_path_factory):
+    """Floats, multiplexers and parameter groups together."""
+    floats = FLOATS.replace("256", "300").replace("257", "301")
+    dbc = "\n".join([J1939.replace("BO_ 256 ", "BO_ 302 "), MULTIPLEXED, floats])
+    roles = """
+pack_voltage = { message = "Mux", signal = "Volts" }
+pack_current = "Amps"
+cell_temperature = "Celsius"
+inverter_voltage = "Single"
+inverter_current = "Bare"
+motor_temperature = "Twice"
+motor_speed = "EngineSpeed"
+"""
+    return mapping_of(tmp_path_factory.mktemp("odd"), dbc, roles, 'identifiers = "j1939"\n' + MUX_BUS)
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.lists(
+        st.tuples(
+            st.sampled_from([256, 300, 301, 302, 0x0CF00400 | EFF_FLAG, 0x18F00401 | EFF_FLAG, 0x10EA1122 | EFF_FLAG]),
+            st.one_of(payloads, st.tuples(st.integers(0, 2), st.integers(0, 14)).map(lambda p: mux(*p, b"\x10"))),
+        ),
+        max_size=30,
+    )
+)
+def test_whatever_comes_to_cantools(odd_mapping, frames):
+    codec = Codec(odd_mapping)
+    for i, (identifier, data) in enumerate(frames):
+        before = accounted(codec)
+        events = codec.decode([(i * MS, identifier, data, 0)])
+        quiet = identifier in (302, 0x10EA1122 | EFF_FLAG)
+        assert len(events) + accounted(codec) - before == 1 or quiet
+        for _, _, values in events:
+            assert all(v is None or math.isfinite(v) for v in values)

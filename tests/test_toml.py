@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gz_onboard.errors import InputError
+from gz_onboard.toml import Table
+
+TEXT = """\
+name = "x"
+list = [
+  [1.0, 2.0],
+  [3.0, 4.0],
+]
+number = 3
+# value = 7
+
+[a]
+value = 1
+unit = "V"
+
+[a.inner]
+unit = "A"
+
+[b]
+inline = { value = 2, unit = "m" }
+dotted.value = 3
+"quoted key" = 4
+
+[c.d]
+value = "text"
+
+[many]
+numbers = [1, 2.5]
+bad = [1, "2"]
+infinite = [1.0, inf]
+empty = []
+"""
+
+
+@pytest.fixture
+def table(tmp_path):
+    file = tmp_path / "t.toml"
+    file.write_text(TEXT, encoding="utf-8")
+    return Table.read(file)
+
+
+def line_of(error: InputError) -> int | None:
+    part = str(error).split(".toml")[1]
+    return int(part[1:].split(":")[0]) if part[1:2].isdigit() else None
+
+
+@pytest.mark.parametrize(
+    ("path", "key", "line"),
+    [
+        ("", "name", 1),
+        ("", "list", 2),
+        ("", "number", 6),
+        ("", "absent", None),
+        ("", "value", None),  # stands in other tables only
+        ("", "a", 9),
+        ("a", "", 9),
+        ("a", "value", 10),
+        ("a", "absent", 9),
+        ("a", "inner", 13),
+        ("a.inner", "unit", 14),
+        ("a.inner", "value", 13),  # not the value of [a]
+        ("b", "inline", 17),
+        ("b.inline", "value", 17),
+        ("b.inline", "", 17),
+        ("b.dotted", "value", 18),
+        ("b", "quoted key", 19),
+        ("c", "d", 21),
+        ("c", "", 21),
+        ("c.d", "value", 22),
+        ("none.at.all", "value", None),
+    ],
+)
+def test_a_complaint_names_the_line(table, path, key, line):
+    for part in filter(None, path.split(".")):
+        table = table.table(part)
+    error = table.error("is wrong", key)
+    assert line_of(error) == line
+    assert str(error).endswith(f": {'.'.join(filter(None, [path, key]))}: is wrong".replace(": : ", ": "))
+
+
+@pytest.mark.parametrize(
+    ("ask", "parts"),
+    [
+        (lambda t: t.text("number"), [":6:", "number", "must be a string", "3"]),
+        (lambda t: t.text("absent"), ["absent", "is missing"]),
+        (lambda t: t.text("name", choices=["xx", "abc"]), [":1:", "'x'", "xx, abc", "did you mean 'xx'"]),
+        (lambda t: t.number("name"), [":1:", "name", "must be a number", "'x'"]),
+        (lambda t: t.number("absent"), ["absent", "is missing"]),
+        (lambda t: t.number("number", low=4, high=9), [":6:", "3 is outside 4 to 9"]),
+        (lambda t: t.table("name"), [":1:", "must be a table", "'x'"]),
+        (lambda t: t.numbers("name"), [":1:", "list of numbers"]),
+        (lambda t: t.numbers("absent"), ["absent", "is missing"]),
+        (lambda t: t.table("many").numbers("bad"), [":26:", "many.bad", "numbers only", "'2'"]),
+        (lambda t: t.table("many").numbers("infinite"), [":27:", "many.infinite", "numbers only", "inf"]),
+        (lambda t: t.table("many").numbers("empty"), [":28:", "many.empty", "list of numbers"]),
+        (lambda t: t.table("a").only(["value", "units"]), [":11:", "a.unit", "unknown key", "did you mean 'units'"]),
+    ],
+)
+def test_what_is_wrong_is_said(table, ask, parts):
+    with pytest.raises(InputError) as caught:
+        ask(table)
+    assert str(table.file) in str(caught.value)
+    for part in parts:
+        assert part in str(caught.value)
+
+
+def test_what_is_right_is_given(table):
+    assert table.text("name") == "x"
+    assert table.text("absent", "default") == "default"
+    assert table.number("number") == 3.0
+    assert table.number("absent", 4.0) == 4.0
+    assert table.table("many").numbers("numbers") == (1.0, 2.5)
+    assert table.table("absent").values == {}
+    table.table("a").only(["value", "unit", "inner", "more"])
+
+
+@pytest.mark.parametrize("value", ["nan", "inf", "-inf", "true"])
+def test_no_number_that_is_none(tmp_path, value):
+    (tmp_path / "t.toml").write_text(f"x = {value}")
+    with pytest.raises(InputError, match=r"t\.toml:1: x: "):
+        Table.read(tmp_path / "t.toml").number("x")
+
+
+@pytest.mark.parametrize(
+    ("content", "parts"),
+    [
+        (b"a = 1\nb = \n", ["not valid TOML", "line 2"]),
+        (b"a = 1\na = 2\n", ["not valid TOML", "line 2"]),
+        (b"a = '\xff'\n", ["not valid TOML"]),
+    ],
+)
+def test_a_file_that_is_not_toml(tmp_path, content, parts):
+    (tmp_path / "t.toml").write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        Table.read(tmp_path / "t.toml")
+    for part in ["t.toml", *parts]:
+        assert part in str(caught.value)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(InputError, match=r"none\.toml: No such file"):
+        Table.read(tmp_path / "none.toml")
+
+
+keys = st.from_regex(r"[a-z]{1,6}", fullmatch=True)
+
+
+@given(st.lists(st.tuples(keys, st.lists(keys, unique=True, max_size=5)), max_size=5, unique_by=lambda t: t[0]))
+def test_the_line_of_any_key(tmp_path_factory, tables):
+    lines, where = [], {}
+    for name, entries in tables:
+        lines.append(f"[{name}]")
+        for key in entries:
+            lines.append(f"{key} = 1")
+            where[name, key] = len(lines)
+    file = tmp_path_factory.mktemp("toml") / "t.toml"
+    file.write_text("\n".join(lines))
+    table = Table.read(file)
+    for (name, key), line in where.items():
+        assert line_of(table.table(name).error("x", key)) == line

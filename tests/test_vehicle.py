@@ -1,0 +1,123 @@
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from gz_onboard.errors import InputError
+from gz_onboard.vehicle import OWN, find_vehicle, read_vehicle
+
+REFERENCE = (OWN / "reference.toml").read_text(encoding="utf-8")
+
+
+def changed(folder: Path, old: str, new: str) -> tuple[Path, int]:
+    """The reference vehicle's file with one change, and the line of the change."""
+    assert old in REFERENCE
+    file = folder / "mine.toml"
+    file.write_text(REFERENCE.replace(old, new, 1), encoding="utf-8")
+    return file, REFERENCE.count("\n", 0, REFERENCE.index(old)) + 1
+
+
+@pytest.mark.parametrize("name", sorted(file.stem for file in OWN.glob("*.toml")))
+def test_the_packages_own_vehicles_are_whole(name):
+    vehicle = read_vehicle(name)
+    assert vehicle.battery is not None
+    assert {"pack_voltage", "pack_current"} <= set(vehicle.mapping.roles)
+    assert all(value.source and value.status for value in vehicle.parameters.known.values())
+    assert vehicle.name in vehicle.key
+
+
+def test_the_key_tells_what_a_saved_state_belongs_to(tmp_path):
+    ours = read_vehicle("reference").key
+    for old, new in [('"grade_force", ', ""), ("cells_series = 14", "cells_series = 13"), ("-scooter", "-2")]:
+        assert read_vehicle(str(changed(tmp_path, old, new)[0])).key != ours
+    assert read_vehicle(str(changed(tmp_path, "value = 0.556", "value = 0.557")[0])).key == ours
+
+
+def test_the_payload_may_be_given():
+    assert read_vehicle("reference", payload=95.0).parameters["payload_mass"] == 95.0
+    assert read_vehicle("reference", payload=95.0).model.mass == read_vehicle("reference").model.mass + 15.0
+
+
+def test_a_vehicle_without_a_battery_has_none(tmp_path):
+    file = tmp_path / "v.toml"
+    file.write_text(REFERENCE[: REFERENCE.index("[battery]")])
+    assert read_vehicle(str(file)).battery is None
+
+
+def test_a_vehicle_that_is_not_there():
+    with pytest.raises(InputError, match=r"refrence: no such vehicle file.*reference.*did you mean 'reference'"):
+        find_vehicle("refrence")
+
+
+# line: where the error must point to, counted from the change
+@pytest.mark.parametrize(
+    ("old", "new", "line", "parts"),
+    [
+        ("schema = 1", "schema = 2", 0, ["schema", "is 2", "reads 1"]),
+        ("schema = 1\n", "", None, ["schema", "is missing"]),
+        ('name = "reference-scooter"\n', "", None, ["name", "is missing"]),
+        ("schema = 1", "schema = 1\nspeed = 3", 1, ["speed", "unknown key", "known are battery, bus"]),
+        ("[parameters]", "[parameter]", 0, ["parameter", "unknown key", "did you mean 'parameters'"]),
+        ("drag_area = {", "drag_aria = {", 0, ["parameters.drag_aria", "unknown key", "did you mean 'drag_area'"]),
+        (
+            'drag_area = { value = 0.556, unit = "m²"',
+            'drag_area = { value = 0.556, unit = "m"',
+            0,
+            ["parameters.drag_area.unit", "'m'", "'m²'"],
+        ),
+        (
+            "drag_area = { value = 0.556",
+            "drag_area = { value = 556",
+            0,
+            ["parameters.drag_area.value", "556 m² is outside", " m²"],
+        ),
+        (
+            "drag_area = { value = 0.556",
+            "drag_area = { value = nan",
+            0,
+            ["parameters.drag_area.value", "finite", "nan"],
+        ),
+        ("drag_area = { value = 0.556", 'drag_area = { value = "0.5"', 0, ["drag_area.value", "must be a number"]),
+        ("drag_area = { value", "drag_area = { valeu", 0, ["drag_area.valeu", "unknown key", "did you mean 'value'"]),
+        ("sd = 0.035", "sd = -1", 0, ["parameters.drag_area.sd", "-1 is outside"]),
+        (
+            'sd = 0.035, status = "measured"',
+            'sd = 0.035, status = "mesured"',
+            0,
+            ["drag_area.status", "'mesured'", "did you mean 'measured'"],
+        ),
+        ('"aerodynamic_drag"', '"areodynamic_drag"', -1, ["model.effects", "did you mean 'aerodynamic_drag'"]),
+        ("[model]\n", '[model]\neffects_folder = "none"\n', 1, ["model.effects_folder", "no folder", "none"]),
+        ("cells_series = 14", "cells_series = 0", 0, ["battery.cells_series", "0 is outside 1 to"]),
+        ("cells_series = 14", "cell_series = 14", 0, ["battery.cell_series", "did you mean 'cells_series'"]),
+        ("cells_series = 14", "", -1, ["battery.cells_series", "is missing"]),
+        (
+            "[battery.ocv]\nsoc = [0.000, 0.005",
+            "[battery.ocv]\nsoc = [0.000, 0.000",
+            1,
+            ["battery.ocv.soc", "increase"],
+        ),
+        ("value = [2.5874, 2.7423", "value = [2.9, 2.7423", 0, ["ocv.value", "must increase, but 2.7423 follows 2.9"]),
+        ("value = [2.5874, ", "value = [", 0, ["battery.ocv.value", "28 numbers for 29 of soc"]),
+        ("4.1744, 4.1931]", "4.1744, 5.1]", 0, ["battery.ocv.value", "within 0.5 to 5"]),
+        ('unit = "A·h"\nsd_relative', 'unit = "Ah"\nsd_relative', 0, ["battery.capacity.unit", "'Ah'", "A·h"]),
+        ("[battery.c1]", "[battery.c2]", 0, ["battery.c2", "unknown key", "did you mean 'c1'"]),
+        ("  [0.27690, ", "  [", -1, ["battery.r0.value", "14 positive numbers"]),
+        ("  [0.27690, ", "  [-0.27690, ", -1, ["battery.r0.value", "14 positive numbers"]),
+        ('pack_voltage = "BMS_PackVoltage"', 'pack_voltage = "BMS_PackVolts"', 0, ["did you mean 'BMS_PackVoltage'"]),
+    ],
+)
+def test_a_file_that_does_not_fit(tmp_path, old, new, line, parts):
+    file, number = changed(tmp_path, old, new)
+    with pytest.raises(InputError) as caught:
+        read_vehicle(str(file))
+    message = str(caught.value)
+    for part in [str(file), *parts]:
+        assert part in message
+    told = re.search(r"mine\.toml:(\d+):", message)
+    if line is None:
+        assert not told
+    else:
+        assert told and int(told[1]) == number + line, message

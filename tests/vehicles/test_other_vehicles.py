@@ -1,0 +1,352 @@
+"""Other vehicles than the reference scooter: a DBC and a TOML each, no code.
+
+Their layouts are tested on frames made here; on the frames that such vehicles really sent where GZ_ONBOARD_DATA
+names a folder that holds them (real/tlmoto_motostudent_kiro, real/can_logs).
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import os
+import struct
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import pytest
+
+from gz_onboard.bus.codec import LENGTH, NOT_AVAILABLE, RANGE, UNDECODABLE, Codec
+from gz_onboard.bus.logs import LogDamage, read_frames
+from gz_onboard.bus.mapping import load_database, pgn, read_mapping
+from gz_onboard.events import EFF_FLAG, ROLES, Estimate, Event, Frame, Reason, State
+from gz_onboard.pipeline import Pipeline
+from gz_onboard.toml import Table
+from gz_onboard.vehicle import Vehicle, read_vehicle
+
+HERE = Path(__file__).parent
+MS = 1_000_000
+RPM = 2 * math.pi / 60
+
+
+def vehicle(name: str) -> Vehicle:
+    return read_vehicle(str(HERE / name / f"{name}.toml"))
+
+
+def real(*names: str) -> Path:
+    folder = os.environ.get("GZ_ONBOARD_DATA")
+    if not folder:
+        pytest.skip("GZ_ONBOARD_DATA names no folder with real/: no frames of other vehicles")
+    path = Path(folder, "real", *names)
+    if not path.exists():
+        pytest.skip(f"{path} is missing: no frames of this vehicle")
+    return path
+
+
+def values(codec: Codec, events: Iterable[Event]) -> dict[str, list[tuple[float, float | None]]]:
+    """(time [s], value) by role."""
+    found: dict[str, list[tuple[float, float | None]]] = {}
+    for time, group, numbers in events:
+        for role, value in zip(codec.groups[group].roles, numbers, strict=True):
+            found.setdefault(role, []).append((time, value))
+    return found
+
+
+# --- an electric race motorcycle ------------------------------------------------------------------------------------
+
+
+def tlmoto_frames(time_ns: int, rpm: float, volts: float, amps: float) -> list[Frame]:
+    """What its controller sends every 200 ms, with CANopen's SYNC in between."""
+    torque = volts * amps * 0.9 / (rpm * RPM) if rpm else 0.0
+    data = [
+        (13, struct.pack("<HHhh", 100, 649, 60, round(volts * 16))),
+        (14, struct.pack("<HbhhB", round(volts * 16), 45, round(amps * 16), round(torque * 16), 0)),
+        (128, b"\xff\xff\xff\xff\x7f\x00\x00\x00"),
+        (15, struct.pack("<iHH", round(rpm), 500, 16384)),
+    ]
+    return [(time_ns + i * MS, identifier, payload, 0) for i, (identifier, payload) in enumerate(data)]
+
+
+def test_tlmoto_frames_of_its_layout():
+    codec = Codec(vehicle("tlmoto").mapping)
+    found = values(codec, codec.decode(tlmoto_frames(1_049 * MS, 1200, 115.625, 41.25)))
+    assert {role: row[0][1] for role, row in found.items()} == {
+        "pack_voltage": 115.625,
+        "motor_temperature": 60.0,
+        "inverter_voltage": 115.625,
+        "inverter_temperature": 45.0,
+        "pack_current": 41.25,
+        "motor_torque": pytest.approx(34.16, abs=1 / 32),
+        "motor_speed": pytest.approx(1200 * RPM),
+        "throttle": pytest.approx(0.5, abs=1e-4),
+    }
+    assert codec.unknown == {128: 1}
+
+
+def test_tlmoto_cells_are_in_its_dbc():
+    codec = Codec(vehicle("tlmoto").mapping)
+    data = bytes([0, 0xCA, 0xD1, 0xD1, 0xD0, 0xD1, 0, 0])
+    assert codec.decode([(0, 51, data, 0)]) == []  # cell voltages play no role yet, but stand in the log
+    cells = list(codec.values(51, data).values())
+    assert cells[0] is None  # not read by the BMS: 2.00 V is no voltage of a cell in use
+    assert cells[1:] == pytest.approx([4.02, 4.09, 4.09, 4.08, 4.09])
+
+
+def test_tlmoto_goes_the_whole_way():
+    pipeline = Pipeline(vehicle("tlmoto"))
+    sent = []
+    for i in range(600):
+        amps = 60.0 if i > 50 else 0.0
+        frames = tlmoto_frames(i * 200 * MS, 2500 if i > 50 else 0, 116.0 - 0.033 * amps, amps)
+        sent += pipeline.advance(frames, frames[-1][0])
+    estimate = pipeline.last
+    assert estimate is not None and estimate.state is State.DEGRADED
+    assert estimate.reasons & Reason.NO_IMU and not estimate.reasons & Reason.NO_PACK_CURRENT
+    assert estimate.soc is not None and 0.5 < estimate.soc < 0.9
+    assert estimate.range is not None and estimate.range_p10 is not None and estimate.range_p90 is not None
+    assert 0 < estimate.range_p10 < estimate.range < estimate.range_p90
+    assert estimate.speed == pytest.approx(2500 * 0.0203 / 3.6, rel=0.02)  # GPS speed over motor speed
+    assert {identifier for _, identifier, _, _ in sent} == {0x600, 0x601, 0x602, 0x603}
+    assert pipeline.counts().dropped == pipeline.counts().implausible == 0
+
+
+# column of the CSV: (role, unit of the column in the unit of the role, half a last digit)
+TLMOTO_TRUTH = {
+    "v_cap_V": ("inverter_voltage", 1.0, 1e-4),
+    "t_heatsink_C": ("inverter_temperature", 1.0, 1e-4),
+    "i_batt_A": ("pack_current", 1.0, 1e-4),
+    "torque_Nm": ("motor_torque", 1.0, 1e-4),
+    "motor_rpm": ("motor_speed", RPM, 1e-4),
+    "throttle_frac": ("throttle", 1.0, 1e-4),
+    "t_motor_C": ("motor_temperature", 1.0, 1e-4),
+    "v_batt_V": ("pack_voltage", 1.0, 1e-4),
+}
+# session: frames, events, signals out of range (the voltage as the contactors open)
+TLMOTO_SESSIONS = {
+    "kiro4": (30775, 11631, {("CTRL_Supply.CTRL_BatteryVoltage", RANGE): 1}),
+    "primeira_saida": (11151, 4693, {}),
+    "sakisaida2": (18598, 8467, {}),
+}
+
+
+@pytest.mark.parametrize("session", TLMOTO_SESSIONS)
+def test_tlmoto_real_frames_against_what_others_decoded(session):
+    folder = real("tlmoto_motostudent_kiro")
+    codec = Codec(vehicle("tlmoto").mapping)
+    frames = [frame for batch in read_frames(folder / f"{session}.candump.log") for frame in batch]
+    events = codec.decode(frames)
+    count, expected_events, faults = TLMOTO_SESSIONS[session]
+    assert (codec.received, len(events), codec.faults) == (count, expected_events, faults)
+    assert set(codec.unknown) == {0x0C, 0x32, 0x7B, 0x80}  # 12: voltages of the motor; 50, 123: nobody knows
+    start = frames[0][0] * 1e-9
+    decoded = values(codec, events)
+    with (folder / f"{session}.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for column, (role, unit, digit) in TLMOTO_TRUTH.items():
+        times = [start + time for time, _ in decoded[role]]
+        compared = wrong = 0
+        for row in rows:
+            time = float(row["t_s"])
+            i = bisect_left(times, time - 0.005)
+            near = [
+                value
+                for t, (_, value) in zip(times[i : i + 3], decoded[role][i : i + 3], strict=True)
+                if t - time < 0.005
+            ]
+            if near:
+                compared += 1
+                truth = float(row[column]) * unit
+                wrong += not any(value is not None and abs(value - truth) <= digit for value in near)
+        assert compared > 0.9 * len(rows)
+        assert wrong <= faults.get(("CTRL_Supply.CTRL_BatteryVoltage", RANGE), 0) * (role == "pack_voltage"), column
+
+
+@pytest.mark.parametrize("session", TLMOTO_SESSIONS)
+def test_tlmoto_real_cell_voltages_against_what_others_decoded(session):
+    folder = real("tlmoto_motostudent_kiro")
+    codec = Codec(vehicle("tlmoto").mapping)
+    cells = {
+        (identifier - 50, round(time_ns / MS)): list(codec.values(identifier, data).values())
+        for batch in read_frames(folder / f"{session}.candump.log")
+        for time_ns, identifier, data, _ in batch
+        if 51 <= identifier <= 55
+    }
+    with (folder / f"{session}_cells.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    compared = 0
+    for row in rows:
+        for i, value in enumerate(cells[int(row["pack"]), round(float(row["t_s"]) * 1000)], 1):
+            truth = float(row[f"v_cell{i}_V"])
+            assert value == (pytest.approx(truth, abs=1e-6) if 2.495 < truth < 4.305 else None)
+            compared += value is not None
+    assert compared > 5 * len(rows) / 2
+
+
+@pytest.mark.parametrize("session", TLMOTO_SESSIONS)
+def test_tlmoto_real_frames_go_the_whole_way(session):
+    path = real("tlmoto_motostudent_kiro", f"{session}.candump.log")
+    estimates: list[Estimate] = []
+    pipeline = Pipeline(vehicle("tlmoto"), observer=estimates.append)
+    for batch in read_frames(path):
+        pipeline.advance(batch, batch[-1][0])
+    assert pipeline.counts().dropped == 0
+    published = [e for e in estimates if e.state in (State.VALID, State.DEGRADED)]
+    assert len(published) > 0.5 * len(estimates)
+    for e in published:
+        assert e.soc is not None and -0.05 <= e.soc <= 1.05
+        assert e.range is not None and e.range_p10 is not None and e.range_p90 is not None
+        assert 0 <= e.range_p10 <= e.range <= e.range_p90 < 1e6
+        assert e.speed is None or abs(e.speed) < 45
+
+
+# --- a car's satellite receiver with valid bits -------------------------------------------------------------------
+
+
+def test_car_frames_of_its_layout():
+    codec = Codec(vehicle("car").mapping)
+    speed = 1 | 12_345 << 1
+    frames = [
+        (0, 7, speed.to_bytes(5, "little"), 0),
+        (0, 7, (speed - 1).to_bytes(5, "little"), 0),  # the same number, not valid
+        (0, 1, bytes([3 | 9 << 3]), 0),
+        (0, 1, bytes([5 | 9 << 3]), 0),  # a fix of the time only
+        (0, 3, (1 | 138_000_000 << 1 | 190_000_000 << 29).to_bytes(8, "little"), 0),
+        (0, 4, (1 | 60_500 << 1).to_bytes(4, "little"), 0),
+        (0, 9, (1 | 590 << 1 | 1028 << 31).to_bytes(8, "little"), 0),
+    ]
+    found = values(codec, codec.decode(frames))
+    assert {role: [value for _, value in row] for role, row in found.items()} == {
+        "gps_speed": [pytest.approx(12.345)],
+        "gps_fix": [3.0, None],
+        "latitude": [pytest.approx(48.0)],
+        "longitude": [pytest.approx(10.0)],
+        "gps_altitude": [pytest.approx(50.0)],
+        "accel_z": [pytest.approx(9.75)],
+        "rate_z": [pytest.approx(math.radians(1.0))],
+    }
+    assert codec.faults == {("Speed", UNDECODABLE): 1, ("Status.FixType", RANGE): 1}
+
+
+CAR_SIGNALS = {
+    "gps_fix": ("gnss_status", "FixType", 1.0),
+    "latitude": ("gnss_pos", "Latitude", 1.0),
+    "longitude": ("gnss_pos", "Longitude", 1.0),
+    "gps_altitude": ("gnss_altitude", "Altitude", 1.0),
+    "gps_speed": ("gnss_speed", "Speed", 1.0),
+    "accel_z": ("gnss_imu", "AccelerationX", 1.0),
+    "rate_z": ("gnss_imu", "AngularRateX", math.pi / 180),
+}
+
+
+@pytest.mark.parametrize("drive", ["css_car_gps_imu_obd2_3", "css_car_gps_imu_obd2_4"])
+def test_car_real_frames_as_by_cantools_with_the_makers_dbc(tmp_path, drive):
+    folder = real("can_logs")
+    makers = folder / "dbc" / "canmod-gps.dbc"
+    database = load_database([makers])
+    by_id = {message.frame_id: message for message in database.messages}
+    roles = "\n".join(f'{role} = "{signal}"' for role, (_, signal, _) in CAR_SIGNALS.items())
+    (tmp_path / "m.toml").write_text(f"dbc = ['{makers}']\n[bus]\nnot_available = 'none'\n[roles]\n{roles}\n")
+    ours, theirs = Codec(vehicle("car").mapping), Codec(read_mapping(Table.read(tmp_path / "m.toml")))
+    truth: dict[str, list[float]] = {}
+    count = 0
+    for batch in read_frames(folder / f"{drive}.log.gz"):
+        count += len(batch)
+        left, right = values(ours, ours.decode(batch)), values(theirs, theirs.decode(batch))
+        truth.clear()
+        for _, identifier, data, _ in batch:
+            if message := by_id.get(identifier):
+                decoded = message.decode_simple(data, decode_choices=False)
+                for role, (name, signal, factor) in CAR_SIGNALS.items():
+                    if message.name == name:
+                        truth.setdefault(role, []).append(float(decoded[signal]) * factor)  # type: ignore[arg-type]
+        for role, numbers in truth.items():
+            assert [value for _, value in left[role]] == pytest.approx(numbers, rel=1e-12, abs=1e-12)
+            assert [value for _, value in right[role]] == pytest.approx(numbers, rel=1e-12, abs=1e-12)
+        assert left.keys() == right.keys() == truth.keys()
+    assert ours.received == theirs.received == count > 70_000
+    assert not ours.faults and not theirs.faults
+    assert set(theirs.unknown) == {0x7E8, 0x17F00010 | EFF_FLAG}  # answers to a scan tool; nobody knows
+
+
+# --- trucks: SAE J1939, by parameter group -------------------------------------------------------------------------
+
+
+def test_truck_frames_of_its_layout():
+    codec = Codec(vehicle("truck").mapping)
+    frames = [
+        (0, 0x0CF00400 | EFF_FLAG, bytes.fromhex("607D84481400F084"), 0),
+        (0, 0x18F00431 | EFF_FLAG, bytes.fromhex("607D84FFFF00F084"), 0),  # not available, from another sender
+        (0, 0x0CF00400 | EFF_FLAG, bytes.fromhex("607D8400FE00F084"), 0),  # the code for an error
+        (0, 0x18FEF100 | EFF_FLAG, bytes.fromhex("F7005AFFFFFFFFFF"), 0),
+        (0, 0x18FEF100 | EFF_FLAG, bytes.fromhex("F7005A"), 0),
+        (0, 0x18F00E00 | EFF_FLAG, bytes.fromhex("821639C4FFFFFFFF"), 0),
+    ]
+    found = values(codec, codec.decode(frames))
+    assert [value for _, value in found["motor_speed"]] == [pytest.approx(0x1448 / 8 * RPM), None, None]
+    assert [value for _, value in found["vehicle_speed"]] == [pytest.approx(90 / 3.6)]
+    assert codec.faults == {
+        ("EEC1.EngineSpeed", NOT_AVAILABLE): 1,
+        ("EEC1.EngineSpeed", RANGE): 1,
+        ("CCVS1", LENGTH): 1,
+    }
+    assert codec.unknown == {0x18F00E00 | EFF_FLAG: 1}
+
+
+@pytest.mark.parametrize(
+    ("drive", "count", "speeds"), [("css_truck_j1939_imu", 57_849, 12_719), ("css_truck_j1939_full", 150_411, 3_993)]
+)
+def test_truck_real_frames_as_by_cantools_with_another_dbc(drive, count, speeds):
+    folder = real("can_logs")
+    database = load_database([folder / "dbc" / "CSS-Electronics-SAE-J1939-DEMO.dbc"])
+    messages = {pgn(message.frame_id): message for message in database.messages}
+    codec = Codec(vehicle("truck").mapping)
+    compared: Counter[str] = Counter()
+    for batch in read_frames(folder / f"{drive}.log.gz"):
+        found = values(codec, codec.decode(batch))
+        for role, group, signal, factor in [
+            ("motor_speed", 61444, "EngineSpeed", RPM),
+            ("vehicle_speed", 65265, "WheelBasedVehicleSpeed", 1 / 3.6),
+        ]:
+            data = [data for _, identifier, data, _ in batch if identifier & EFF_FLAG and pgn(identifier) == group]
+            decoded = [float(messages[group].decode_simple(d)[signal]) for d in data]  # type: ignore[arg-type]
+            limit = messages[group].get_signal_by_name(signal).maximum
+            truth = [value * factor if value <= limit else None for value in decoded]  # type: ignore[operator]
+            assert [value for _, value in found.get(role, [])] == pytest.approx(truth)
+            compared[role] += len(truth)
+    assert codec.received == count
+    assert compared["motor_speed"] == speeds
+    assert all(reason == NOT_AVAILABLE for _, reason in codec.faults)
+
+
+# --- whole-second stamps and an empty line -------------------------------------------------------------------------
+
+
+def test_real_frames_with_stamps_of_whole_seconds(tmp_path):
+    log = real("can_logs", "savvycan_example_candump_1s_stamps.log")
+    damages: list[LogDamage] = []
+    frames = [frame for batch in read_frames(log, on_damage=damages.append) for frame in batch]
+    assert damages == []  # an empty line is no damage
+    lines = [line for line in log.read_text().splitlines() if line.strip()]
+    assert len(frames) == len(lines)
+    # The signals of this car are not known: every byte of its three busiest messages plays some role.
+    busiest = [identifier for identifier, _ in Counter(f[1] for f in frames if len(f[2]) == 8).most_common(3)]
+    parts = ['VERSION "1"', "NS_ :", "BS_:", "BU_: A"]
+    for identifier in busiest:
+        parts.append(f"BO_ {identifier} M{identifier}: 8 A")
+        parts += [f' SG_ S{identifier}_{i} : {8 * i}|8@1+ (1,0) [0|255] "" A' for i in range(8)]
+    (tmp_path / "v.dbc").write_text("\n".join(parts) + "\n")
+    roles = list(ROLES)[:24]
+    text = "dbc = ['v.dbc']\n[bus]\nnot_available = 'none'\n[roles]\n"
+    for n, role in enumerate(roles):
+        text += f'{role} = {{ signal = "S{busiest[n // 8]}_{n % 8}", unit = "{ROLES[role]}" }}\n'
+    (tmp_path / "v.toml").write_text(text)
+    codec = Codec(read_mapping(Table.read(tmp_path / "v.toml")))
+    events = codec.decode(frames)
+    wanted = [frame for frame in frames if frame[1] in busiest]
+    assert [tuple(int(v) for v in numbers if v is not None) for _, _, numbers in events] == [
+        tuple(f[2]) for f in wanted
+    ]
+    assert [time for time, _, _ in events] == [(f[0] - frames[0][0]) / 1e9 for f in wanted]
+    assert not codec.faults
+    assert sum(codec.unknown.values()) == len(frames) - len(wanted)
