@@ -17,7 +17,6 @@ from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE,
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.estimator.ekf import filter_maker
 from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.estimator.forecast import PRIOR_RIDING
 from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
 from gz_onboard.vehicle import Vehicle
 
@@ -65,7 +64,7 @@ class Pipeline:
         self.vehicle = vehicle
         self.codec = Codec(vehicle.mapping)
         self.estimator = Estimator(
-            self.codec.groups, vehicle.battery, vehicle.model, vehicle.riding or PRIOR_RIDING, filter_maker(filter_name)
+            self.codec.groups, vehicle.battery, vehicle.model, vehicle.riding, filter_maker(filter_name)
         )
         self.publisher = Publisher()
         self.kernel_lost = 0  # frames; set by the daemon

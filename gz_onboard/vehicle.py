@@ -10,6 +10,7 @@ from gz_onboard.errors import InputError, nearest
 from gz_onboard.physics.battery import Battery, read_battery
 from gz_onboard.physics.model import Model, read_model
 from gz_onboard.physics.parameters import Parameters, read_parameters
+from gz_onboard.physics.riding import PriorRiding, read_riding
 from gz_onboard.toml import Table
 
 OWN = Path(__file__).resolve().parent / "vehicles"
@@ -25,7 +26,7 @@ class Vehicle:
     parameters: Parameters
     battery: Battery | None
     model: Model
-    riding: tuple[tuple[float, float, float], ...] | None  # to be expected before anything is ridden
+    riding: PriorRiding
 
     @property
     def key(self) -> str:
@@ -65,23 +66,5 @@ def read_vehicle(name: str, payload: float | None = None) -> Vehicle:
         parameters=parameters,
         battery=read_battery(table, parameters) if "battery" in table.values else None,
         model=Model(effects, parameters),
-        riding=_read_riding(table.table("forecast")),
+        riding=read_riding(table),
     )
-
-
-def _read_riding(table: Table) -> tuple[tuple[float, float, float], ...] | None:
-    """``riding = [[share of time, speed in m/s, acceleration in m/s²], ...]``; None if it is not there."""
-    table.only(["riding", "source"])
-    rows = table.values.get("riding")
-    if rows is None:
-        return None
-    try:
-        riding = tuple((float(share), float(speed), float(acceleration)) for share, speed, acceleration in rows)
-    except (TypeError, ValueError) as error:
-        raise table.error("must be rows of [share of time, speed in m/s, acceleration in m/s²]", "riding") from error
-    shares, moving = sum(row[0] for row in riding), sum(row[0] * row[1] for row in riding)
-    if not (all(row[0] >= 0 and row[1] >= 0 for row in riding) and 0.98 < shares < 1.02 and moving > 0.5):
-        raise table.error(
-            f"shares must be positive and add up to 1 (they do to {shares:.3f}), and it must move", "riding"
-        )
-    return riding

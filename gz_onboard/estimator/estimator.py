@@ -11,12 +11,13 @@ from math import exp, sqrt
 from typing import Any
 
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
-from gz_onboard.estimator.forecast import PRIOR_RIDING, Forecast, Forecaster, PriorRiding
+from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.road import Road
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.events import STALE_PERIODS, Estimate, Event, Group, Reason, State
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.model import Model
+from gz_onboard.physics.riding import PriorRiding
 
 SNAPSHOT_VERSION = 1
 PACE = ("pack_voltage", "inverter_voltage", "motor_speed")  # the message of the first that is mapped sets the pace
@@ -53,7 +54,7 @@ class Estimator:
         groups: Sequence[Group],
         battery: Battery,
         model: Model,
-        riding: PriorRiding = PRIOR_RIDING,
+        riding: PriorRiding,
         make: FilterMaker = ScalarFilter,
     ) -> None:
         self.battery = battery

@@ -17,35 +17,26 @@ with a log-normal distribution.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import exp, sqrt
 from typing import Any
 
 from gz_onboard.physics.battery import Battery, drawable
 from gz_onboard.physics.model import Model, air_density
+from gz_onboard.physics.riding import PriorRiding
 
 SEGMENT = 250.0  # m
 PRIOR_LENGTH = 3000.0  # m: the prior riding counts like that much of real riding
 MEMORY = 12000.0  # m: what is further back counts for less than 1/e
 ALIKE = 300.0  # m: over so much way segments are alike; those of the eight commissioning rides are not at 250 m
 DRIFT = 0.055  # relative sd: the rest of the way is not the way so far; the eight rides differ by that
-FACTOR_SD = 0.10  # of the model before any riding: eight commissioning rides differ by 7 %
 FACTOR_WALK = 0.01  # sd of its change over a segment: wind, tyres, traffic
 SEGMENT_SD = 0.18  # relative: measured against modelled energy of one segment, of the eight commissioning rides
 PRIOR_FORM = 2.5  # mean square of the power over the square of its mean, of the eight commissioning rides
 PRIOR_SCATTER = 0.25  # relative sd of segments of a riding not yet known
 G = 9.80665  # m/s²
 DECILE = 1.2815515655446004
-
-PriorRiding = Sequence[tuple[float, float, float]]
-"""(share of time, speed [m/s], acceleration [m/s²]): operating points of a riding."""
-
-PRIOR_RIDING: PriorRiding = (
-    (0.18, 0.0, 0.0), (0.10, 4.0, 0.8), (0.08, 9.0, 0.6), (0.08, 4.0, -1.1), (0.06, 9.0, -1.0), (0.20, 7.0, 0.0),
-    (0.30, 11.0, 0.0),
-)  # fmt: skip
-"""For vehicles whose file has none: town, as in the first part of the WMTC."""
 
 
 @dataclass(slots=True)
@@ -67,7 +58,7 @@ class Riding:
     segments: deque[Segment] = field(default_factory=lambda: deque(maxlen=200))
     current: Segment = field(default_factory=Segment)
     factor: float = 1.0
-    factor_variance: float = FACTOR_SD**2
+    factor_variance: float = 0.15**2
     seconds: float = 0.0  # s in the second that is being gathered
     way: float = 0.0  # m in it
     energy: float = 0.0  # J in it
@@ -109,11 +100,11 @@ class Forecast:
 class Forecaster:
     """Learns from the riding and forecasts the range."""
 
-    def __init__(self, model: Model, battery: Battery, prior: PriorRiding = PRIOR_RIDING) -> None:
+    def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
         self.model = model
         self.battery = battery
         self.prior = prior
-        self.riding = Riding()
+        self.riding = Riding(factor=prior.factor, factor_variance=prior.factor_sd**2)
         self._past = Past()
         self._prior_at: tuple[tuple[float, float], float] = (float("nan"), 0.0), 0.0
         parameters = model.parameters
@@ -263,11 +254,11 @@ class Forecaster:
         """(power [W], speed [m/s]) of the prior riding."""
         if self._prior_at[0] != (ambient, altitude):
             power = 0.0
-            for share, speed, acceleration in self.prior:
+            for share, speed, acceleration in self.prior.points:
                 q = self.quantities(speed, acceleration, ambient, altitude, 40.0)
                 power += share * sum(self.model.power(q).values())
-            self._prior_at = (ambient, altitude), power
-        return self._prior_at[1], sum(share * speed for share, speed, _ in self.prior)
+            self._prior_at = (ambient, altitude), power * self.prior.unevenness
+        return self._prior_at[1], self.prior.speed
 
     # --- saving -----------------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from gz_onboard.estimator.signals import Signals
 G = 9.80665  # m/s²
 SPEED_TIME = 0.3  # s: the speed's low pass, whose lag gives the acceleration
 LEAN_TIME = 2.0  # s: how fast the lean is drawn to that of the steady turn
-GRADE_TIME = 2.0  # s: low pass of the accelerometer's grade
+GRADE_TIME = 5.0  # s: low pass of the accelerometer's grade; at 2 s its noise adds 4 % to the energy modelled
 ALTITUDE_LENGTH = 150.0  # m: how fast the observer follows the altitude where it seeks an offset only
 ALTITUDE_LENGTH_ALONE = 60.0  # m: the same where the altitude is all there is
 BIAS_TIME = 5.0  # s of standing to know the offset of a rate sensor

@@ -33,8 +33,8 @@ def vehicle(tmp_path: Path, old: str, new: str):
         (r'"aerodynamic_drag"', '"aerodynamic_darg"', ["aerodynamic_darg", "did you mean 'aerodynamic_drag'"]),
         (r"^schema = 1", "schema = 7", ["schema", "7", "reads 1"]),
         (r"^\[forecast\]", "[forcast]", ["forcast", "did you mean 'forecast'"]),
-        (r"\[0.172, 0.0, 0.0\]", "[0.972, 0.0, 0.0]", ["riding", "add up to 1"]),
-        (r"\[0.172, 0.0, 0.0\]", "[0.172, 0.0]", ["riding", "share of time"]),
+        (r"\[0.200, 0.0, 0.0\]", "[0.972, 0.0, 0.0]", ["riding", "add up to 1"]),
+        (r"\[0.200, 0.0, 0.0\]", "[0.200, 0.0]", ["riding", "share of time"]),
     ],
 )
 def test_refused_with_place_and_reason(tmp_path, old, new, parts):

@@ -1,0 +1,60 @@
+"""The riding to be expected before anything is ridden."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gz_onboard.toml import Table
+
+
+@dataclass(frozen=True)
+class PriorRiding:
+    """A riding as operating points, and what the model makes of it.
+
+    points: (share of time, speed [m/s], acceleration [m/s²]). unevenness: what hills and what lies between the
+    points add to the energy modelled. factor, factor_sd: energy measured over modelled, and how that differs from
+    ride to ride.
+    """
+
+    points: tuple[tuple[float, float, float], ...] = (
+        (0.18, 0.0, 0.0), (0.10, 4.0, 0.8), (0.08, 9.0, 0.6), (0.08, 4.0, -1.1), (0.06, 9.0, -1.0), (0.20, 7.0, 0.0),
+        (0.30, 11.0, 0.0),
+    )  # fmt: skip
+    unevenness: float = 1.1
+    factor: float = 1.0
+    factor_sd: float = 0.15
+
+    @property
+    def speed(self) -> float:
+        """Mean speed [m/s], stops included."""
+        return sum(share * speed for share, speed, _ in self.points)
+
+
+def read_riding(vehicle: Table) -> PriorRiding:
+    """The table ``[forecast]`` of a vehicle file; without one, town riding as in the first part of the WMTC."""
+    table = vehicle.table("forecast")
+    table.only(["riding", "unevenness", "factor", "factor_sd", "source"])
+    town = PriorRiding()
+    if "riding" not in table.values:
+        points = town.points
+    else:
+        try:
+            points = tuple((float(a), float(b), float(c)) for a, b, c in table.values["riding"])
+        except (TypeError, ValueError) as error:
+            message = "must be rows of [share of time, speed in m/s, acceleration in m/s²]"
+            raise table.error(message, "riding") from error
+        shares = sum(share for share, _, _ in points)
+        if not (all(share >= 0 and speed >= 0 for share, speed, _ in points) and 0.98 < shares < 1.02):
+            raise table.error(
+                f"shares and speeds must not be negative, shares add up to 1 (now {shares:.3f})", "riding"
+            )
+        if sum(share * speed for share, speed, _ in points) < 0.5:
+            raise table.error("must move", "riding")
+    return PriorRiding(
+        points,
+        table.number("unevenness", town.unevenness, 1.0, 2.0),
+        table.number("factor", town.factor, 0.3, 3.0),
+        table.number("factor_sd", town.factor_sd, 0.001, 1.0),
+    )
