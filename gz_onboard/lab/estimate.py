@@ -25,6 +25,7 @@ from multiprocessing import Value
 from pathlib import Path
 from typing import Any
 
+from gz_onboard.bus import _can  # noqa: F401 - before cantools, which would import it with asammdf and pandas
 from gz_onboard.bus.logs import LogDamage, log_suffix, read_frames
 from gz_onboard.bus.publisher import WH, WH_PER_KM, Counts, Publisher
 from gz_onboard.bus.recorder import LogFile
