@@ -1,7 +1,7 @@
 """How far the energy that is left will go.
 
 What is known of the riding is kept in segments of `SEGMENT` metres: what the pack delivered, and what the forward
-model says the same riding takes, as it was and less the climb that it ended with. From them:
+model says the same riding takes, as it was and less what height and speed have stored. From them:
 
 - the consumption factor, measured over modelled, learned slowly: one number that carries what the parameters have
   wrong for this vehicle, rider and season;
@@ -48,7 +48,7 @@ class Segment:
     measured: float = 0.0
     squares: float = 0.0  # W²·s, of the measured power
     modelled: float = 0.0
-    level: float = 0.0  # modelled, less the potential energy of its net climb: the hills it had, but back at its height
+    level: float = 0.0  # modelled, less what height and speed have stored: its hills and stops, but back where it began
 
 
 @dataclass
@@ -137,7 +137,8 @@ class Forecaster:
         segment.squares += r.squares
         energy = sum(self.model.power(q).values()) * r.seconds
         segment.modelled += energy
-        segment.level += energy - self.model.mass * G * r.climb
+        stored = G * r.climb + (speed * speed - r.speed_before * r.speed_before) / 2
+        segment.level += energy - self.model.mass * stored
         r.seconds = r.way = r.energy = r.squares = r.climb = 0.0
         r.speed_before = speed
         if segment.distance >= SEGMENT:
