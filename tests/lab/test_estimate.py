@@ -4,8 +4,10 @@ import gzip
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
@@ -269,3 +271,18 @@ def test_the_expected_number_of_frames_is_about_right(tmp_path, frames):
     assert estimate._expected(candump(tmp_path / "a.log", frames)) == pytest.approx(len(frames), rel=0.1)
     assert estimate._expected(candump(tmp_path / "a.log.gz", frames[:9])) is None
     assert estimate._expected(tmp_path / "none.blf") is None
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_ctrl_c_leaves_nothing_half_written(tmp_path, jobs):
+    command = [sys.executable, "-m", "gz_onboard", "estimate", RIDE, LOGS / "city_14C.blf", "--jobs", jobs, "--output",
+               tmp_path]  # fmt: skip
+    child = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True)
+    end = time.monotonic() + 30
+    while not list(tmp_path.glob("*.part")) and time.monotonic() < end:
+        time.sleep(0.01)
+    os.killpg(child.pid, signal.SIGINT)  # as a terminal does: to all the processes
+    _, said = child.communicate(timeout=30)
+    assert child.returncode == 130
+    assert b"Traceback" not in said
+    assert not list(tmp_path.glob("*.part"))
