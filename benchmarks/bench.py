@@ -1,0 +1,355 @@
+"""What gz-onboard costs, beside the obvious pipeline of the same libraries (plain.py). See docs/benchmarks.md.
+
+All times are CPU time of the measured process alone, user and system together, read from its own CPU clock; medians
+over windows or repeats. On a kernel with CAN the frames go over a vcan, elsewhere over stand_in.py's sockets.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import os
+import re
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+
+HERE = Path(__file__).resolve().parent
+RIDES = HERE.parent / "replay_logs"
+RIDE, RIDE_2, SHORT_RIDE = RIDES / "city_14C.blf", RIDES / "city_34C.blf", RIDES / "coastdown.blf"
+SATURATED = 4000.0  # frames/s of 8 bytes and 11-bit identifiers at 500 kbit/s
+FILLERS = (0x300, 0x400, 0x401, 0x410, 0x411, 0x412)  # the fast messages without a counter that is checked
+WINDOW = 5.0  # s
+WARM_UP = 3.0  # s
+TIMEOUT = 60.0  # s
+FRAME = struct.Struct("=IB3x8s")
+Send = Sequence[tuple[float, bytes]]  # (time since the start [s], struct can_frame)
+
+
+@dataclass
+class Live:
+    """A live pipeline, measured while frames arrive."""
+
+    start_cpu: float  # s until ready
+    cpu_per_second: float  # s, median over windows
+    rate: float  # frames/s sent meanwhile
+    received: int
+    sent: int
+    memory: float  # MB resident at the end
+    log_bytes: int
+
+    @property
+    def micros(self) -> float:
+        """µs per frame received."""
+        return self.cpu_per_second / self.rate * 1e6 * self.sent / max(self.received, 1)
+
+
+# --- live ---------------------------------------------------------------------------------------------------------
+
+
+def has_can() -> bool:
+    """Whether this kernel has CAN sockets and a vcan0 that is up."""
+    try:
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as sock:
+            sock.bind(("vcan0",))
+        return True
+    except (OSError, AttributeError):
+        return False
+
+
+def recorded(seconds: float) -> Send:
+    """The beginning of a recorded ride in its own timing."""
+    from gz_onboard.bus.logs import read_frames
+
+    frames: list[tuple[float, bytes]] = []
+    start = None
+    for batch in read_frames(RIDE):
+        for time_ns, identifier, data, _ in batch:
+            start = time_ns if start is None else start
+            frames.append(((time_ns - start) * 1e-9, FRAME.pack(identifier, len(data), data)))
+        if frames[-1][0] > seconds:
+            break
+    return [frame for frame in frames if frame[0] <= seconds]
+
+
+def saturated(seconds: float) -> Send:
+    """The same, each fast message without checked counter repeated so often that the bus is full."""
+    ride = recorded(seconds)
+    fillers = [f for f in ride if int.from_bytes(f[1][:4], "little") in FILLERS]
+    copies = round((SATURATED * seconds - len(ride)) / len(fillers))
+    period = seconds * len(FILLERS) / len(fillers)  # about that of one of them
+    more = [(t + period * (i + 1) / (copies + 1), frame) for t, frame in fillers for i in range(copies)]
+    return sorted([*ride, *more])
+
+
+def cpu(pid: int) -> float:
+    """CPU time of a process [s], all its threads, from its CPU clock (clock_getcpuclockid(3))."""
+    return time.clock_gettime((~pid << 3) | 2)
+
+
+def resident(pid: int) -> float:
+    """Resident memory of a process [MB]."""
+    text = Path(f"/proc/{pid}/status").read_text()
+    return int(re.search(r"VmRSS:\s+(\d+)", text)[1]) * 1024 / 1e6  # type: ignore[index]
+
+
+@contextlib.contextmanager
+def bus() -> Iterator[tuple[list[str], socket.socket]]:
+    """What to put before `MODULE ARGUMENT...` to run a program on the bus, and the socket to send on."""
+    if has_can():
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as sender:
+            sender.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")  # do not read what is answered
+            sender.bind(("vcan0",))
+            yield [sys.executable, "-m"], sender
+        return
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+            other.bind(("127.0.0.1", 0))
+            port = other.getsockname()[1]
+        sender.bind(("127.0.0.1", 0))
+        sender.connect(("127.0.0.1", port))
+        yield [sys.executable, str(HERE / "stand_in.py"), str(port), str(sender.getsockname()[1])], sender
+
+
+@contextlib.contextmanager
+def started(which: str, directory: Path) -> Iterator[tuple[subprocess.Popen[str], socket.socket, float]]:
+    """One of the pipelines once it is ready: its process, the socket to send on, its CPU time [s] until then."""
+    ours = ["gz_onboard", "run", "--channel", "vcan0", "--log-dir", str(directory), "--state-dir", str(directory)]
+    plain = ["plain", "live", "vcan0", str(directory / "plain.mcap")]
+    notify = directory / "notify"
+    environment = os.environ | {"NOTIFY_SOCKET": str(notify), "PYTHONPATH": str(HERE)}
+    with bus() as (prefix, sender), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
+        ready.bind(str(notify))
+        ready.settimeout(TIMEOUT)
+        process = subprocess.Popen(
+            [*prefix, *(ours if which == "ours" else plain)], env=environment, text=True, stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        try:
+            assert process.stdout
+            line = ready.recv(4096) if which == "ours" else process.stdout.readline().encode()
+            if not line.lower().startswith(b"ready"):
+                raise RuntimeError(f"{which} did not start: {line!r}")
+            yield process, sender, cpu(process.pid)
+        finally:
+            process.kill()
+            process.wait()
+
+
+def run_live(which: str, frames: Send) -> Live:
+    """Send `frames` in their timing to one of the pipelines and measure it meanwhile."""
+    with (
+        tempfile.TemporaryDirectory() as name,
+        started(which, Path(name)) as (process, sender, start_cpu),
+    ):
+        time.sleep(0.5)
+        used: list[tuple[float, float]] = []
+        begin = time.perf_counter()
+        mark = WARM_UP
+        for at, frame in frames:
+            pause = at - (time.perf_counter() - begin)
+            if pause > 0:
+                time.sleep(pause)
+            with contextlib.suppress(ConnectionError):
+                sender.send(frame)
+            if at >= mark:
+                used.append((time.perf_counter(), cpu(process.pid)))
+                mark += WINDOW
+        windows = [(c1 - c0) / (t1 - t0) for (t0, c0), (t1, c1) in pairwise(used)]
+        time.sleep(0.5)
+        memory = resident(process.pid)
+        process.send_signal(signal.SIGTERM)
+        output = process.communicate(timeout=TIMEOUT)[0]
+        received = re.search(r"received (\d+) frames", output)
+        if not received:
+            raise RuntimeError(f"{which}: {output}")
+        log_bytes = sum(path.stat().st_size for path in Path(name).glob("*.mcap"))
+    return Live(
+        start_cpu, median(windows), len(frames) / frames[-1][0], int(received[1]), len(frames), memory, log_bytes
+    )
+
+
+def start_up(which: str, repeats: int) -> float:
+    """CPU time [s] until ready, median."""
+    values = []
+    for _ in range(repeats):
+        with tempfile.TemporaryDirectory() as name, started(which, Path(name)) as (_process, _sender, used):
+            values.append(used)
+    return median(values)
+
+
+# --- offline ------------------------------------------------------------------------------------------------------
+
+
+def offline_ours(rides: Sequence[Path], *options: str) -> tuple[float, float]:
+    """CPU time [s] of the whole process and the length of the rides [s]."""
+    with tempfile.TemporaryDirectory() as name:
+        before = os.times()
+        text = subprocess.run(
+            [sys.executable, "-m", "gz_onboard", "estimate", *map(str, rides), "--no-plot", "--jobs", "1", "--json=-",
+             "--output", name, *options],
+            check=True, stdout=subprocess.PIPE, text=True,
+        ).stdout  # fmt: skip
+        after = os.times()
+    used = after.children_user + after.children_system - before.children_user - before.children_system
+    return used, sum(ride["duration_s"] for ride in json.loads(text)["rides"])
+
+
+def hour_ours(repeats: int, *options: str) -> float:
+    """CPU time [s] for a recorded hour: of a short ride, start-up included, and for the rest as of two longer ones."""
+    short = [offline_ours([SHORT_RIDE], *options) for _ in range(repeats)]
+    long = [offline_ours([RIDE, RIDE_2], *options) for _ in range(repeats)]
+    cpu_0, cpu_1 = median(c for c, _ in short), median(c for c, _ in long)
+    seconds_0, seconds_1 = short[0][1], long[0][1]
+    return cpu_0 + (cpu_1 - cpu_0) / (seconds_1 - seconds_0) * (3600 - seconds_0)
+
+
+def hour_plain(repeats: int, seconds: float, *options: str) -> tuple[float, float]:
+    """(CPU time [s] for a recorded hour, scaled from the first `seconds` of a ride, bytes of log per frame)."""
+    rows = []
+    for _ in range(repeats):
+        with tempfile.TemporaryDirectory() as name:
+            command = [sys.executable, "-m", "plain", "offline", str(RIDE), f"{name}/plain.mcap"]
+            text = subprocess.run(
+                [*command, "--seconds", str(seconds), *options], check=True, stdout=subprocess.PIPE, text=True, cwd=HERE
+            ).stdout
+        rows.append(json.loads(text))
+    per_second = median(row["cpu"] / row["seconds"] for row in rows)
+    return median(row["start"] for row in rows) + 3600 * per_second, rows[0]["bytes"] / rows[0]["frames"]
+
+
+# --- log ----------------------------------------------------------------------------------------------------------
+
+
+def log_of_ride(directory: Path) -> tuple[int, int, dict[str, float]]:
+    """The log that the daemon would write of a whole recorded ride: bytes, frames received, share by what it holds.
+
+    The daemon's own pipeline and recorder, called as its loop calls them, at the ride's times.
+    """
+    from gz_onboard.bus.logs import read_frames
+    from gz_onboard.bus.recorder import Recorder
+    from gz_onboard.daemon import TICK
+    from gz_onboard.pipeline import Pipeline, dbc_texts
+    from gz_onboard.vehicle import read_vehicle
+
+    vehicle = read_vehicle("reference")
+    recorder = Recorder(directory, vehicle.name, metadata={"vehicle_key": vehicle.key}, attachments=dbc_texts(vehicle))
+    pipeline = Pipeline(vehicle, log=recorder)
+    frames = [frame for batch in read_frames(RIDE) for frame in batch]
+    tick = round(TICK * 1e9)
+    done = 0
+    now = frames[0][0]
+    while done < len(frames):
+        now += tick
+        end = done
+        while end < len(frames) and frames[end][0] <= now:
+            end += 1
+        pipeline.advance(frames[done:end], now)
+        recorder.sync(now)
+        done = end
+    recorder.close()
+    size = sum(path.stat().st_size for path in recorder.paths)
+    return size, len(frames), contents(recorder.paths[0])
+
+
+def contents(log: Path) -> dict[str, float]:
+    """Bytes of a log by what they hold. Chunks hold several topics: their bytes are shared out by how large each
+    topic's messages are, compressed alone."""
+    import zstandard
+    from mcap.records import Attachment, Chunk, Message
+    from mcap.stream_reader import StreamReader, breakup_chunk
+
+    sizes: dict[str, float] = {"index, schemas, summary": 0.0, "attached DBC files": 0.0}
+    with log.open("rb") as file:
+        topics: dict[int, str] = {}
+        for record in StreamReader(file, emit_chunks=True).records:
+            if isinstance(record, Attachment):
+                sizes["attached DBC files"] += len(record.data)
+            elif hasattr(record, "topic"):
+                topics[record.id] = record.topic
+            elif isinstance(record, Chunk):
+                of_topic: dict[str, bytes] = {}
+                for message in breakup_chunk(record):
+                    if hasattr(message, "topic"):
+                        topics[message.id] = message.topic
+                    elif isinstance(message, Message):
+                        topic = topics[message.channel_id]
+                        kind = topic if not topic.startswith("/can/") or topic == "/can/frames" else "/can/MESSAGE"
+                        of_topic[kind] = of_topic.get(kind, b"") + message.data
+                alone = {kind: len(zstandard.compress(data)) for kind, data in of_topic.items()}
+                whole = len(record.data)
+                for kind, size in alone.items():
+                    sizes[kind] = sizes.get(kind, 0.0) + whole * size / sum(alone.values())
+    sizes["index, schemas, summary"] = log.stat().st_size - sum(sizes.values())
+    return sizes
+
+
+# --- all ----------------------------------------------------------------------------------------------------------
+
+
+def main() -> None:
+    """Measure all and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON too")
+    parser.add_argument("--seconds", type=float, default=63.0, help="of the live measurements (%(default)g)")
+    parser.add_argument("--repeats", type=int, default=3, help="of the others (%(default)s)")
+    arguments = parser.parse_args()
+    seconds, repeats = max(arguments.seconds, WARM_UP + 2 * WINDOW + 1), arguments.repeats
+
+    where = "vcan0" if has_can() else "UDP sockets instead of CAN sockets, for both pipelines (benchmarks/stand_in.py)"
+    print(f"Python {sys.version.split()[0]}, {os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}")
+    print(f"live frames over {where}\n")
+    rows: list[dict[str, object]] = []
+
+    def row(what: str, unit: str, ours: float, plain: float | None = None, aim: str = "") -> None:
+        rows.append({"what": what, "unit": unit, "ours": ours, "plain": plain, "aim": aim})
+        ratio = f"{plain / ours:10.1f}" if plain and ours and unit != "1" else ""
+        other = f"{plain:9.2f}" if plain is not None else ""
+        print(f"{what:52} {unit:8} {ours:9.2f} {other:9} {ratio:10}  {aim}", flush=True)
+
+    print(f"{'':52} {'unit':8} {'ours':>9} {'plain':>9} {'plain/ours':>10}  aim")
+    ride = recorded(seconds)
+    ours, plain = run_live("ours", ride), run_live("plain", ride)
+    row(f"live, {ours.rate:.0f} frames/s as recorded, with log", "µs/frame", ours.micros, plain.micros, "ratio ≥ 8")
+    row("  CPU of one processor", "%", 100 * ours.cpu_per_second, 100 * plain.cpu_per_second)
+    row("  frames lost", "%", 100 * (1 - ours.received / ours.sent), 100 * (1 - plain.received / plain.sent))
+    row("  resident memory at the end", "MB", ours.memory, plain.memory, "< 50")
+    logs = ours.log_bytes / ours.received, plain.log_bytes / plain.received
+    row("  log, all in, of so short a ride", "B/frame", *logs)
+    full = saturated(min(seconds, 28.0))
+    ours, plain = run_live("ours", full), run_live("plain", full)
+    row(f"live, {ours.rate:.0f} frames/s, saturated, with log", "µs/frame", ours.micros, plain.micros)
+    row("  CPU of one processor", "%", 100 * ours.cpu_per_second, 100 * plain.cpu_per_second)
+    row("  frames lost", "%", 100 * (1 - ours.received / ours.sent), 100 * (1 - plain.received / plain.sent))
+    row("start-up until ready", "CPU s", start_up("ours", repeats), start_up("plain", repeats), "< 0.8")
+
+    plain_hour, plain_bytes = hour_plain(repeats, 120.0)
+    plain_bare, _ = hour_plain(repeats, 120.0, "--no-frames")
+    ours_hour = hour_ours(repeats)
+    row("estimate of a recorded hour", "CPU s", ours_hour, plain_hour, "< 6, ratio ≥ 15")
+    row("  beside a plain pipeline that logs no frames", "CPU s", ours_hour, plain_bare)
+    row("  with the raw frames and signals logged", "CPU s", hour_ours(repeats, "--frames", "--signals"), plain_hour)
+    row("  real-time factor, ride over CPU time", "1", 3600 / ours_hour, 3600 / plain_hour)
+
+    with tempfile.TemporaryDirectory() as name:
+        size, frames, parts = log_of_ride(Path(name))
+    row("log of a whole recorded ride, all in", "B/frame", size / frames, plain_bytes, "≤ 13")
+    for part, held in sorted(parts.items(), key=lambda item: -item[1]):
+        row(f"  {part}", "B/frame", held / frames)
+    if arguments.json:
+        document = {"python": sys.version, "transport": where, "load": os.getloadavg(), "rows": rows}
+        arguments.json.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
