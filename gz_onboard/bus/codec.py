@@ -57,7 +57,7 @@ class Codec:
         self.latest: dict[int, tuple[int, bytes]] = {}  # identifier -> time [ns], data of the last good frame
         self._events: list[Event] = []
         self._origin_ns: int | None = None
-        self._last_ns = -(1 << 62)  # before any frame: far from every time
+        self._last_ns = -(1 << 80)  # before any frame: far from every time
         self._suspects = 0
         self._suspect_ns = 0  # the time of the last suspect
         self._before_ns = 0  # `_last_ns` when it came: a good frame in between clears the suspicion

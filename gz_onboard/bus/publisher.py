@@ -102,7 +102,7 @@ def _raw(message: Message, values: dict[str, float | None]) -> dict[str, int]:
         if value is None or not abs(value) < 1e12:  # infinity and NaN too
             raw[signal.name] = -(2 ** (signal.length - 1)) if signal.is_signed else 2**signal.length - 1
         else:
-            low, high = raw_range(signal, not_available=not signal.name.endswith("CRC"))
+            low, high = raw_range(signal, not_available=True)
             wanted = (value - float(signal.conversion.offset)) / float(signal.conversion.scale)
             raw[signal.name] = round(min(max(wanted, low), high))
     return raw

@@ -320,7 +320,7 @@ def test_times_are_seconds_since_the_first_frame():
     assert codec.nanoseconds(1.0) == EPOCH + S
 
 
-@pytest.mark.parametrize("start", [0, 1, -5 * S, 1_049 * MS, EPOCH, 2**62])
+@pytest.mark.parametrize("start", [0, 1, -5 * S, 1_049 * MS, EPOCH, 2**62, -(2**62), -(2**63), -(2**70)])
 def test_a_log_may_begin_at_any_time(start):
     codec = Codec(reference())
     events = codec.decode([temperatures(start), temperatures(start + 100 * MS)])

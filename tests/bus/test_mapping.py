@@ -57,6 +57,7 @@ pack_current = { signal = "Current", scale = -1 }
 inverter_current = { message = "Pack", signal = "Current", scale = 2, offset = 0.5 }
 motor_speed = { signal = "Speed", unit = "rev/s" }
 motor_temperature = "Heat"
+ambient_temperature = { signal = "Heat", scale = 2, offset = 1 }
 """
     got = {s.role: (s.message, s.signal, s.factor, s.offset) for s in mapping(tmp_path, roles).sources}
     assert got == {
@@ -65,6 +66,7 @@ motor_temperature = "Heat"
         "inverter_current": ("Pack", "Current", pytest.approx(0.2), 0.5),
         "motor_speed": ("Motor", "Speed", pytest.approx(6.283185307), 0.0),
         "motor_temperature": ("Motor", "Heat", 1.0, pytest.approx(-313.15)),
+        "ambient_temperature": ("Motor", "Heat", 2.0, pytest.approx(-625.3)),
     }
 
 
