@@ -18,6 +18,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from math import sqrt
 from pathlib import Path
+from typing import Any
 
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import Estimate
@@ -49,7 +50,7 @@ class Baseline:
     """Rolling Wh/km over 25 km."""
 
     capacity: float  # J
-    rows: deque = field(default_factory=deque)  # (distance [m], energy [J]), each kilometre or so
+    rows: deque[tuple[float, float]] = field(default_factory=deque)  # (distance [m], energy [J]), each kilometre or so
     energy: float = 0.0
     distance: float = 0.0
 
@@ -67,12 +68,12 @@ class Baseline:
         return max(soc - reserve, 0.0) * self.capacity / consumption
 
 
-def ride(file: Path, payload: float | None, full: bool) -> tuple[str, list[Sample]]:
+def ride(file: Path, payload: float | None) -> tuple[str, list[Sample]]:
     vehicle = read_vehicle("reference", payload)
-    battery, parameters = vehicle.battery, vehicle.parameters
+    battery = vehicle.battery
     assert battery
     samples: list[Sample] = []
-    state = {"soc": None, "time": 0.0, "next": 0.0}
+    state: dict[str, Any] = {"soc": None, "time": 0.0, "next": 0.0}
     baseline = Baseline(33.6 * 51.8 * 3600)
 
     def observe(e: Estimate) -> None:
@@ -92,6 +93,7 @@ def ride(file: Path, payload: float | None, full: bool) -> tuple[str, list[Sampl
         if e.time >= state["next"] and e.range is not None and baseline.rows:
             state["next"] = e.time + 1.0
             bms = signals["bms_state_of_charge"].value
+            assert pipeline.estimator.filter
             samples.append(
                 Sample(e.time, pipeline.estimator.filter.soc, e.soc_sd, state["soc"], e.innovation or 0.0, e.distance,
                        e.range, e.range_p10 or 0.0, e.range_p90 or 0.0, bms, baseline.range(bms, 0.15),
@@ -101,7 +103,6 @@ def ride(file: Path, payload: float | None, full: bool) -> tuple[str, list[Sampl
     pipeline = Pipeline(vehicle, observer=observe)
     for frames in read_frames(file):
         pipeline.advance(frames, frames[-1][0])
-    del parameters
     return f"{file.parent.name}/{file.stem}", samples
 
 
@@ -115,41 +116,55 @@ def main() -> None:
         for entry in json.loads(notes.read_text()):
             file = notes.parent / f"{entry['name']}.blf"
             if arguments.only in f"{notes.parent.name}/{entry['name']}":
-                work.append((file, entry.get("rider_mass_kg"), entry["kind"].startswith("full")))
+                work.append((file, entry.get("rider_mass_kg")))
     work.sort(key=lambda w: -w[0].stat().st_size)
     with ProcessPoolExecutor(2) as pool:
         results = sorted(pool.map(ride, *zip(*work, strict=True)))
-    print("| ride | minutes | SOC, start to end | worst error | worst error/sigma | innovation RMS, mV a cell |")
+    soc_table(results)
+    print()
+    range_table([(name, s) for name, s in results if "full" in name])
+
+
+def soc_table(results: list[tuple[str, list[Sample]]]) -> None:
+    print("| ride | min | SOC, start to end | worst error | worst error over sigma | innovation, mV RMS a cell |")
     print("| --- | --- | --- | --- | --- | --- |")
     for name, s in results:
-        worst = max(s, key=lambda x: abs(x.soc - x.reference))
-        sigma = max(abs(x.soc - x.reference) / x.soc_sd for x in s)
+        worst = max((x.soc - x.reference for x in s), key=abs)
+        sigmas = max(abs(x.soc - x.reference) / x.soc_sd for x in s)
         rms = sqrt(sum(x.innovation**2 for x in s) / len(s))
-        print(f"| {name} | {s[-1].time / 60:.0f} | {100 * s[0].reference:.1f} to {100 * s[-1].reference:.1f} % "
-              f"| {100 * (worst.soc - worst.reference):+.2f} % | {sigma:.2f} | {1000 * rms:.1f} |")  # fmt: skip
-    print(
-        "\n| ride | at SOC | really ridden, km | ours (P10 to P90) | error | 25 km mean, 15 % reserve | 25 km mean, to 0 % |"
-    )
+        ends = f"{100 * s[0].reference:.1f} to {100 * s[-1].reference:.1f} %"
+        print(f"| {name} | {s[-1].time / 60:.0f} | {ends} | {100 * worst:+.2f} % | {sigmas:.2f} | {1000 * rms:.1f} |")
+
+
+def range_table(results: list[tuple[str, list[Sample]]]) -> None:
+    print("| ride | at SOC | ridden, km | ours, km (P10 to P90) | error | 25 km mean, 15 % kept | 25 km mean, to 0 % |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name, s in results:
-        if "full" not in name:
-            continue
-        total = s[-1].distance
+        total, end = s[-1].distance, s[-1].used
         for level in (0.8, 0.5, 0.2):
-            at = next((x for x in s if x.reference <= level), None)
-            if at is None:
-                continue
+            at = next(x for x in s if x.reference <= level)
             true = total - at.distance
-            error = [100 * (x / true - 1) for x in (at.range, at.baseline, at.baseline_kind)]
-            print(f"| {name} | {100 * level:.0f} % | {true / 1000:.1f} | {at.range / 1000:.1f} ({at.p10 / 1000:.1f} to {at.p90 / 1000:.1f}) "
-                  f"| {error[0]:+.0f} % | {at.baseline / 1000:.1f}, {error[1]:+.0f} % | {at.baseline_kind / 1000:.1f}, {error[2]:+.0f} % |")  # fmt: skip
-            left = s[-1].used - at.used
-            print(f"|  | | {left / 3600:.0f} Wh at {left / true / 3.6:.1f} Wh/km "
-                  f"| {at.energy / 3600:.0f} Wh at {at.consumption / 3.6:.1f} Wh/km | | | |")  # fmt: skip
-        inside = [x.p10 <= total - x.distance <= x.p90 for x in s if x.distance > 3000 and total - x.distance > 500]
-        jumps = [abs((b.range - a.range) + (b.distance - a.distance)) for a, b in zip(s, s[60:], strict=False)]
-        print(f"| {name} | all | | inside P10 to P90: {100 * sum(inside) / len(inside):.0f} % of the way "
-              f"| largest change in a minute {max(jumps[600:]) / 1000:.1f} km | | |")  # fmt: skip
+            ours = f"{at.range / 1000:.1f} ({at.p10 / 1000:.1f} to {at.p90 / 1000:.1f})"
+            others = " | ".join(f"{x / 1000:.1f}, {_error(x, true)}" for x in (at.baseline, at.baseline_kind))
+            print(
+                f"| {name} | {100 * level:.0f} % | {true / 1000:.1f} | {ours} | {_error(at.range, true)} | {others} |"
+            )
+    print()
+    for name, s in results:
+        total, end = s[-1].distance, s[-1].used
+        way = [x for x in s if x.distance > 3000 and total - x.distance > 500]
+        inside = sum(x.p10 <= total - x.distance <= x.p90 for x in way) / len(way)
+        jumps = [abs((b.range - a.range) + (b.distance - a.distance)) for a, b in zip(s[600:], s[660:], strict=False)]
+        half = next(x for x in s if x.reference <= 0.5)
+        to_come, ahead = (end - half.used) / 3600, (total - half.distance) * 3.6
+        print(f"- {name}: the distance that was ridden lies within P10 to P90 for {100 * inside:.0f} % of the way; the "
+              f"largest change of the sum of ridden and remaining within a minute is {max(jumps) / 1000:.1f} km; at "
+              f"50 %, {to_come:.0f} Wh were still drawn (ours {half.energy / 3600:.0f}) at "
+              f"{(end - half.used) / ahead:.1f} Wh/km (ours {half.consumption / 3.6:.1f})")  # fmt: skip
+
+
+def _error(value: float, true: float) -> str:
+    return f"{100 * (value / true - 1):+.0f} %"
 
 
 if __name__ == "__main__":
