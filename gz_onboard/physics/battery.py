@@ -10,7 +10,7 @@ that strays beyond full or empty is still told its way back.
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 from math import exp, sqrt
 from typing import TYPE_CHECKING
@@ -33,34 +33,19 @@ def _linear(xs: Row, ys: Row, x: float) -> float:
     return ys[i] + (x - xs[i]) * (ys[i + 1] - ys[i]) / (xs[i + 1] - xs[i])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Mesh:
     """Values over SOC (columns) and temperature [degC] (rows)."""
 
     soc: Row
     temperature: Row
     value: tuple[Row, ...]
+    _rows: dict[float, Row] = field(default_factory=dict, init=False, repr=False)  # by temperature, the last few
 
     def at(self, soc: float, temperature: float) -> tuple[float, float]:
         """(value, its slope over SOC); beyond the mesh its edge, with slope zero."""
-        xs, ts = self.soc, self.temperature
-        if len(ts) == 1:
-            return self._row(self.value[0], soc)
-        j = min(max(bisect_right(ts, temperature) - 1, 0), len(ts) - 2)
-        w = min(max((temperature - ts[j]) / (ts[j + 1] - ts[j]), 0.0), 1.0)
-        cold, warm = self.value[j], self.value[j + 1]
-        i = bisect_right(xs, soc) - 1
-        if i < 0:
-            return cold[0] + w * (warm[0] - cold[0]), 0.0
-        if i >= len(xs) - 1:
-            return cold[-1] + w * (warm[-1] - cold[-1]), 0.0
-        left = cold[i] + w * (warm[i] - cold[i])
-        right = cold[i + 1] + w * (warm[i + 1] - cold[i + 1])
-        slope = (right - left) / (xs[i + 1] - xs[i])
-        return left + slope * (soc - xs[i]), slope
-
-    def _row(self, row: Row, soc: float) -> tuple[float, float]:
         xs = self.soc
+        row = self._rows.get(temperature) or self._row(temperature)
         i = bisect_right(xs, soc) - 1
         if i < 0:
             return row[0], 0.0
@@ -68,6 +53,19 @@ class Mesh:
             return row[-1], 0.0
         slope = (row[i + 1] - row[i]) / (xs[i + 1] - xs[i])
         return row[i] + slope * (soc - xs[i]), slope
+
+    def _row(self, temperature: float) -> Row:
+        """The values over SOC at `temperature`, kept: it changes far more slowly than SOC."""
+        ts = self.temperature
+        row = self.value[0]
+        if len(ts) > 1:
+            j = min(max(bisect_right(ts, temperature) - 1, 0), len(ts) - 2)
+            w = min(max((temperature - ts[j]) / (ts[j + 1] - ts[j]), 0.0), 1.0)
+            row = tuple(cold + w * (warm - cold) for cold, warm in zip(self.value[j], self.value[j + 1], strict=True))
+        if len(self._rows) >= 8:
+            self._rows.clear()
+        self._rows[temperature] = row
+        return row
 
 
 @dataclass(frozen=True)
