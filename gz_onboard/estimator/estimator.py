@@ -43,6 +43,8 @@ LOSS_SD = {
     Reason.NO_PACK_CURRENT: 0.03,
     Reason.NO_PACK_VOLTAGE: 0.02,
 }
+WEIGHTY = ~(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)  # reasons that degrade an estimate
+NO_PACK = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT
 MISMATCH = 3.0  # A between the two current sensors, over ten seconds or so
 
 
@@ -71,7 +73,6 @@ class Estimator:
         self._slots = [[self.signals[role] for role in group.roles] for group in groups]
         pace = [i for role in PACE for i, group in enumerate(groups) if role in group.roles]
         self._pace = pace[0] if pace else -1
-        self._mapped = {role for group in groups for role in group.roles}
         self._time: float | None = None  # s, of the last step
         self._deadline = float("-inf")
         self._current: float | None = None  # A of the pack, at the last step
@@ -301,11 +302,12 @@ class Estimator:
         if filter_ is None:
             return
         self._forecast_time = now
+        reasons = self._reasons(now)
         soc_sd = sqrt(filter_.covariance[0])
         temperature_sd = 1.0 if self.signals.cell_temperature.fresh(now) else 8.0
         self._forecast = self.forecaster.forecast(
             filter_.soc, soc_sd, temperature, temperature_sd, self._ambient(now)[0], self.road.altitude or 0.0,
-            sum(sd * sd for reason, sd in LOSS_SD.items() if reason & self._reasons(now)),
+            sum(sd * sd for reason, sd in LOSS_SD.items() if reason & reasons),
         )  # fmt: skip
 
     # --- results ----------------------------------------------------------------------------------------------
@@ -344,34 +346,30 @@ class Estimator:
             estimate.consumption_factor_sd = sqrt(riding.factor_variance)
             if forecast.mostly_prior:
                 estimate.reasons |= Reason.PRIOR_RIDING
-        weighty = estimate.reasons & ~(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)
-        estimate.state = State.DEGRADED if weighty else State.VALID
-        both = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT
-        if silent and estimate.reasons & both == both:
+        estimate.state = State.DEGRADED if estimate.reasons & WEIGHTY else State.VALID
+        if silent and estimate.reasons & NO_PACK == NO_PACK:
             estimate.state = State.INVALID
         return estimate
 
     def _reasons(self, now: float) -> Reason:
-        fresh = {role: self.signals[role].fresh(now) for role in self._mapped}
-        get = fresh.get
+        s = self.signals
         reasons = Reason(0)
-        if not get("pack_voltage"):
+        if not s.pack_voltage.fresh(now):
             reasons |= Reason.NO_PACK_VOLTAGE
-        if not get("pack_current"):
+        if not s.pack_current.fresh(now):
             reasons |= Reason.NO_PACK_CURRENT
-        if not get("inverter_current"):
+        if not s.inverter_current.fresh(now):
             reasons |= Reason.NO_INVERTER_CURRENT
-        if not get("cell_temperature"):
+        if not s.cell_temperature.fresh(now):
             reasons |= Reason.NO_CELL_TEMPERATURE
-        if not get("ambient_temperature"):
+        if not s.ambient_temperature.fresh(now):
             reasons |= Reason.NO_AMBIENT_TEMPERATURE
-        if not any(
-            get(role) for role in ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed", "gps_speed")
-        ):
+        speeds = s.motor_speed, s.wheel_speed_rear, s.wheel_speed_front, s.vehicle_speed, s.gps_speed
+        if not any(signal.fresh(now) for signal in speeds):
             reasons |= Reason.NO_SPEED
-        if not (get("rate_x") and get("rate_z") and get("accel_x")):
+        if not (s.rate_x.fresh(now) and s.rate_z.fresh(now) and s.accel_x.fresh(now)):
             reasons |= Reason.NO_IMU
-        if not get("gps_speed") and not get("latitude"):
+        if not s.gps_speed.fresh(now) and not s.latitude.fresh(now):
             reasons |= Reason.NO_GPS
         if abs(self._mismatch) > MISMATCH:
             reasons |= Reason.CURRENT_MISMATCH

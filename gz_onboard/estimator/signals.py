@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 from gz_onboard.events import ROLES
 
@@ -43,13 +44,12 @@ class Signals:
         self._all = {role: Signal() for role in ROLES}
         for role, seconds in stale_after:
             self._all[role].stale_after = seconds
+        self.__dict__ |= self._all
         self._mapped = [signal for signal in self._all.values() if signal.stale_after]
 
-    def __getattr__(self, role: str) -> Signal:
-        try:
-            return self.__dict__["_all"][role]  # type: ignore[no-any-return]
-        except KeyError:
-            raise AttributeError(role) from None
+    if TYPE_CHECKING:
+
+        def __getattr__(self, role: str) -> Signal: ...
 
     def __getitem__(self, role: str) -> Signal:
         return self._all[role]
