@@ -36,6 +36,7 @@ class Publisher:
     def __init__(self) -> None:
         self.database = load_database([find_dbc("range.dbc")])
         self._counters = {message.name: 0 for message in self.database.messages}
+        self._layouts = {message.name: _layout(message) for message in self.database.messages}
 
     def range(self, estimate: Estimate, counts: Counts, time_ns: int, channel: int = 0) -> list[Frame]:
         """The frames of every second."""
@@ -70,19 +71,21 @@ class Publisher:
             "RANGE_StateOfChargeSigma": _scaled(estimate.soc_sd, 100) if known else None,
             "RANGE_StatusState": estimate.state,
         }
-        for reason in Reason:
-            values[reason_signal(reason)] = bool(estimate.reasons & reason)
+        reasons = int(estimate.reasons)
+        for bit, signal in _REASON_SIGNALS:
+            values[signal] = reasons & bit != 0
         return [self._frame("RANGE_Status", values, time_ns, channel)]
 
     def _frame(self, name: str, values: dict[str, float | None], time_ns: int, channel: int) -> Frame:
-        message = self.database.get_message_by_name(name)
         part = name.removeprefix("RANGE_")
         counter = self._counters[name]
         self._counters[name] = (counter + 1) % 15
-        complete = {**values, f"RANGE_{part}Counter": counter, f"RANGE_{part}CRC": 0}
-        data = bytearray(message.encode(_raw(message, complete), scaling=False, padding=True, strict=False))
-        data[-1] = crc8_sae_j1850(bytes(data[:-1]))
-        return time_ns, message.frame_id, bytes(data), channel | TRANSMITTED
+        values[f"RANGE_{part}Counter"] = counter
+        identifier, word, fields = self._layouts[name]
+        for field in fields:
+            word |= field.bits(values[field.name])
+        data = word.to_bytes(7, "little")
+        return time_ns, identifier, data + bytes((crc8_sae_j1850(data),)), channel | TRANSMITTED
 
 
 def reason_signal(reason: Reason) -> str:
@@ -90,19 +93,50 @@ def reason_signal(reason: Reason) -> str:
     return "RANGE_" + "".join(word.capitalize() for word in str(reason.name).split("_"))
 
 
+_REASON_SIGNALS = [(int(reason), reason_signal(reason)) for reason in Reason]
+
+
 def _scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else value * factor
 
 
-def _raw(message: Message, values: dict[str, float | None]) -> dict[str, int]:
-    """Raw values: the nearest within the limits, or the code for not available."""
-    raw: dict[str, int] = {}
-    for signal in message.signals:
-        value = values[signal.name]
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """A signal's place in its message, an integer of little-endian bytes, and what can stand in it."""
+
+    name: str
+    start: int
+    mask: int
+    low: float
+    high: float
+    offset: float
+    scale: float
+    absent: int
+
+    def bits(self, value: float | None) -> int:
+        """The nearest raw value within the limits, or the code for not available, at its place."""
         if value is None or not abs(value) < 1e12:  # infinity and NaN too
-            raw[signal.name] = -(2 ** (signal.length - 1)) if signal.is_signed else 2**signal.length - 1
-        else:
-            low, high = raw_range(signal, not_available=True)
-            wanted = (value - float(signal.conversion.offset)) / float(signal.conversion.scale)
-            raw[signal.name] = round(min(max(wanted, low), high))
-    return raw
+            return self.absent << self.start
+        wanted = (value - self.offset) / self.scale
+        return (round(min(max(wanted, self.low), self.high)) & self.mask) << self.start
+
+
+def _layout(message: Message) -> tuple[int, int, list[_Field]]:
+    """Identifier, unused bits (they are ones), and all signals but the CRC, which is the last of the eight bytes.
+
+    cantools would take five times as long to encode them.
+    """
+    fields = []
+    unused = 2**56 - 1
+    for signal in message.signals:
+        if signal.name.endswith("CRC"):
+            continue
+        assert signal.byte_order == "little_endian" and message.length == 8, message.name
+        low, high = raw_range(signal, not_available=True)
+        absent = 2 ** (signal.length - 1) if signal.is_signed else 2**signal.length - 1
+        mask = 2**signal.length - 1
+        conversion = signal.conversion
+        scaling = float(conversion.offset), float(conversion.scale)
+        fields.append(_Field(signal.name, signal.start, mask, low, high, *scaling, absent))
+        unused &= ~(mask << signal.start)
+    return message.frame_id, unused, fields
