@@ -282,7 +282,8 @@ sys.exit(cli.main(["dashboard", "--interface", "virtual", "--channel", "x", *sys
 
 
 def start(*arguments, out, sending=60.0, **environment):
-    environment = {**os.environ, "TERM": "xterm", "PYTHONPATH": str(Path(__file__).resolve().parents[2]), **environment}
+    inherited = {k: v for k, v in os.environ.items() if k not in ("COLUMNS", "LINES")}  # pytest's workers have these
+    environment = {**inherited, "TERM": "xterm", "PYTHONPATH": str(Path(__file__).resolve().parents[2]), **environment}
     return subprocess.Popen(
         [sys.executable, "-c", CHILD, str(sending), *arguments], stdin=out, stdout=out, stderr=subprocess.PIPE,
         env=environment, start_new_session=True,
