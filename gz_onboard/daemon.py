@@ -40,7 +40,7 @@ class Daemon:
         self._save_at = 0.0
         self._said_at = 0.0
         self._said = ""
-        self._state_errors = 0
+        self._state_failing = False
 
     def stop(self, *_: object) -> None:
         """End after the current round."""
@@ -143,9 +143,13 @@ class Daemon:
         try:
             state.save(self._state_file, snapshot, time.time())
         except OSError as error:
-            self._state_errors += 1
-            if self._state_errors == 1:
+            if not self._state_failing:
                 log.warning("cannot save the state: %s", error)
+            self._state_failing = True
+        else:
+            if self._state_failing:
+                log.info("the state is saved again")
+            self._state_failing = False
 
 
 def _time_of(frame: Frame) -> int:
@@ -202,7 +206,6 @@ def run(arguments: argparse.Namespace) -> int:
         )  # fmt: skip
     state_file = None
     if arguments.state_dir:
-        arguments.state_dir.mkdir(parents=True, exist_ok=True)
         state_file = arguments.state_dir / f"{vehicle.name}.json"
     from gz_onboard.bus.codec import known_identifiers
 

@@ -10,7 +10,11 @@ from typing import Any
 
 
 def save(file: Path, snapshot: Mapping[str, Any], time: float) -> None:
-    """Write `snapshot`, taken at `time` [s since the epoch], so that a power cut leaves the old file or the new one."""
+    """Write `snapshot`, taken at `time` [s since the epoch], so that a power cut leaves the old file or the new one.
+
+    The directory is made if it is not there. OSError if it cannot be written.
+    """
+    file.parent.mkdir(parents=True, exist_ok=True)
     temporary = file.with_suffix(".new")
     with temporary.open("w", encoding="ascii") as stream:
         json.dump({"saved_at": time, "estimator": snapshot}, stream)
@@ -30,7 +34,7 @@ def load(file: Path, time: float) -> tuple[Mapping[str, Any], float | None] | No
         document = json.loads(file.read_text(encoding="ascii"))
     except FileNotFoundError:
         return None
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # not there, no text, no JSON, or JSON without end
         raise ValueError(f"cannot be read: {error}") from error
     if not isinstance(document, dict) or "estimator" not in document:
         raise ValueError("is not a saved state")

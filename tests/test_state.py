@@ -1,0 +1,136 @@
+"""The saved state: whole or not at all, and never half-used."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gz_onboard import state
+
+NOW = 1_700_000_100.0
+SNAPSHOT = {"version": 1, "soc": 0.5}
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats(allow_nan=False) | st.text(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=20,
+)
+
+
+@given(st.dictionaries(st.text(), JSON, max_size=6))
+def test_what_is_saved_is_loaded(tmp_path_factory: pytest.TempPathFactory, snapshot: dict[str, object]):
+    file = tmp_path_factory.mktemp("state") / "scooter.json"
+    state.save(file, snapshot, NOW - 30)
+    assert state.load(file, NOW) == (snapshot, 30.0)
+
+
+def test_there_is_none(tmp_path: Path):
+    assert state.load(tmp_path / "scooter.json", NOW) is None
+
+
+@pytest.mark.parametrize(
+    ("saved_at", "age"),
+    [
+        (NOW - 5.0, 5.0),
+        (NOW + 5.0, None),  # saved in the future: the clock was wrong then or is wrong now
+        (12.0, None),  # saved before the clock was set
+        ("yesterday", None),
+        (None, None),
+        (float("nan"), None),
+    ],
+)
+def test_age(tmp_path: Path, saved_at: object, age: float | None):
+    file = tmp_path / "scooter.json"
+    file.write_text(json.dumps({"saved_at": saved_at, "estimator": SNAPSHOT}))
+    assert state.load(file, NOW) == (SNAPSHOT, age)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"",
+        b"{",
+        b'{"saved_at": 1.7e9}',
+        b"[]",
+        b"null",
+        b"\x00" * 4096,  # what a power cut leaves of a file that was not synced
+        b"\xff\xfe{",
+        '{"saved_at": 1.7e9, "estimator": {"name": "ü"}}'.encode("latin-1"),
+        b"[" * 100_000,
+        b'{"saved_at": ' + b"9" * 5000 + b', "estimator": {}}',
+    ],
+    ids=["empty", "cut", "no estimator", "list", "null", "zeros", "no text", "latin-1", "deep", "long number"],
+)
+def test_damaged(tmp_path: Path, text: bytes):
+    file = tmp_path / "scooter.json"
+    file.write_bytes(text)
+    with pytest.raises(ValueError, match=r"cannot be read|is not a saved state"):
+        state.load(file, NOW)
+
+
+def test_cut_off_at_any_byte_it_is_refused(tmp_path: Path):
+    file = tmp_path / "scooter.json"
+    state.save(file, SNAPSHOT, NOW)
+    whole = file.read_bytes()
+    for length in range(len(whole)):
+        file.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match="cannot be read"):
+            state.load(file, NOW)
+
+
+def test_a_directory_in_its_place_is_refused(tmp_path: Path):
+    (tmp_path / "scooter.json").mkdir()
+    with pytest.raises(ValueError, match="cannot be read"):
+        state.load(tmp_path / "scooter.json", NOW)
+
+
+def test_the_directory_is_made(tmp_path: Path):
+    file = tmp_path / "var" / "lib" / "scooter.json"
+    state.save(file, SNAPSHOT, NOW)
+    assert state.load(file, NOW) == (SNAPSHOT, 0.0)
+
+
+def test_a_save_that_fails_leaves_the_old_one(tmp_path: Path):
+    file = tmp_path / "scooter.json"
+    state.save(file, SNAPSHOT, NOW)
+    with pytest.raises(TypeError):
+        state.save(file, {"soc": object()}, NOW + 1)
+    assert state.load(file, NOW) == (SNAPSHOT, 0.0)
+
+
+SAVING = """
+import sys
+from pathlib import Path
+from gz_onboard import state
+n = 0
+while True:
+    n += 1
+    state.save(Path(sys.argv[1]), {"n": n, "row": [n] * 2000}, float(n))
+"""
+
+
+def test_killed_at_any_time_it_leaves_a_whole_one(tmp_path: Path):
+    file = tmp_path / "scooter.json"
+    last = 0
+    for attempt in range(8):
+        with subprocess.Popen([sys.executable, "-c", SAVING, str(file)]) as process:
+            deadline = time.monotonic() + 20
+            while not file.exists() and time.monotonic() < deadline:
+                time.sleep(0.01)
+            time.sleep(0.02 + 0.007 * attempt)
+            os.kill(process.pid, signal.SIGKILL)
+        found = state.load(file, NOW)
+        assert found is not None
+        snapshot = found[0]
+        assert snapshot["row"] == [snapshot["n"]] * 2000
+        last = max(last, snapshot["n"])
+    assert last > 1
