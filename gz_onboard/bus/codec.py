@@ -57,6 +57,7 @@ class Codec:
         self.latest: dict[int, tuple[int, bytes]] = {}  # identifier -> time [ns], data of the last good frame
         self._events: list[Event] = []
         self._origin_ns: int | None = None
+        self._limits: dict[str, list[tuple[str, Any, float, float]]] = {}  # message -> signal, conversion, low, high
         self._last_ns = -(1 << 80)  # before any frame: far from every time
         self._suspects = 0
         self._suspect_ns = 0  # the time of the last suspect
@@ -191,12 +192,15 @@ class Codec:
         except Exception:  # cantools raises several types of its own on data that does not fit
             return {}
         values: dict[str, Any] = {}
-        for signal in message.signals:
-            value = raw.get(signal.name)
+        limits = self._limits.get(message.name)
+        if limits is None:
+            limits = [(s.name, s.conversion, *raw_range(s, self.mapping.not_available)) for s in message.signals]
+            self._limits[message.name] = limits
+        for name, conversion, low, high in limits:
+            value = raw.get(name)
             if isinstance(value, int | float):
-                low, high = raw_range(signal, self.mapping.not_available)
-                plausible = low <= value <= high  # False for NaN
-                values[signal.name] = signal.conversion.raw_to_scaled(value, False) if plausible else None
+                # NaN is not between any limits
+                values[name] = conversion.raw_to_scaled(value, False) if low <= value <= high else None
         return values
 
     def message_name(self, identifier: int) -> str | None:
