@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import signal
-import sys
 import time
 from itertools import count
 from pathlib import Path
@@ -97,15 +96,15 @@ class Pipeline:
     """Frames in; a log, and messages to be sent, out."""
 
     def __init__(self, log: Path, log_frames: bool = True, send: bool = True) -> None:
-        self.database = cantools.database.Database()
+        self.database: Any = cantools.database.Database()
         self.database.add_dbc_file(DBC / "vehicle.dbc")
         self.database.add_dbc_file(DBC / "hbm.dbc")
-        self.range_database = cantools.database.load_file(DBC / "range.dbc")
+        self.range_database: Any = cantools.database.load_file(DBC / "range.dbc")
         self.filter = Filter()
         self.log_frames = log_frames
         self.send = send
         self.file = log.open("wb")
-        self.writer = Writer(self.file)
+        self.writer: Any = Writer(self.file)
         self.writer.start()
         self.channels: dict[str, int] = {}
         self.counter = count()
@@ -176,7 +175,7 @@ class Pipeline:
         """A message with counter and CRC; what is not given is zero."""
         definition = self.range_database.get_message_by_name(name)
         part = name.removeprefix("RANGE_")
-        complete = {signal.name: 0 for signal in definition.signals}
+        complete: dict[str, float] = {signal.name: 0 for signal in definition.signals}
         complete |= values | {f"RANGE_{part}Counter": next(self.counter) % 15}
         data = bytearray(definition.encode(complete, strict=False))
         data[-1] = crc8_sae_j1850(bytes(data[:-1]))
@@ -244,4 +243,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -13,6 +13,7 @@ from __future__ import annotations
 import runpy
 import socket
 import sys
+from typing import Any
 
 from gz_onboard.bus._can import can
 
@@ -22,10 +23,10 @@ SOL_CAN_RAW = 101
 class StandIn(socket.socket):
     """A UDP socket that lets options of CAN sockets pass."""
 
-    def setsockopt(self, level: int, *arguments: object) -> None:  # type: ignore[override]
+    def setsockopt(self, level: int, *arguments: Any) -> None:
         """As a socket's, without those of AF_CAN."""
         if level != SOL_CAN_RAW:
-            super().setsockopt(level, *arguments)  # type: ignore[arg-type]
+            super().setsockopt(level, *arguments)
 
 
 def install(receive_port: int, send_port: int) -> None:
@@ -35,7 +36,7 @@ def install(receive_port: int, send_port: int) -> None:
     def create() -> socket.socket:
         return StandIn(socket.AF_INET, socket.SOCK_DGRAM)
 
-    def bind(sock: socket.socket, _channel: str = "") -> None:
+    def bind(sock: socket.socket, channel: str = "") -> None:
         sock.bind(("127.0.0.1", receive_port))
         sock.connect(("127.0.0.1", send_port))
 
