@@ -41,6 +41,7 @@ class Port(Enum):
     """Where an effect acts, with the unit of its term."""
 
     WHEEL_FORCE = "N"  # road load at the driven wheel's contact, against the motion
+    TYRE = "N (tyres)"  # the same, as a moment on the wheels: rolling loss
     MOTOR_LOSS = "W"  # heat in the motor: between shaft and inverter
     INVERTER_LOSS = "W (inverter)"  # heat in the inverter: between motor and DC link
     DC_POWER = "W (DC link)"  # power drawn from the pack beside the inverter

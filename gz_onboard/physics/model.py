@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from gz_onboard.toml import Table
 
+G = 9.80665  # m/s²
 GAS_CONSTANT_AIR = 287.05  # J/(kg·K)
 
 
@@ -64,7 +65,7 @@ class Model:
         speed = q["speed"]
         ledger: dict[str, Any] = {}
         force = 0.0
-        for name, effect in self._at[Port.WHEEL_FORCE]:
+        for name, effect in (*self._at[Port.WHEEL_FORCE], *self._at[Port.TYRE]):
             term = effect(q)
             force = force + term
             ledger[name] = term * speed

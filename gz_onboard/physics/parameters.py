@@ -35,6 +35,37 @@ BATTERY_PARAMETERS = (
     Parameter("pack_conductance", "W/K", 3.0, 1.5, 0.01, 200, "still air to a closed pack"),
 )
 
+# Only the simulation reads these.
+SIMULATION_PARAMETERS = (
+    Parameter("voltage_constant", "V·s/rad", 0.544, 0.01, 0.001, 20, "Lord 2016, fig. 2.12: 0.057 V per r/min"),
+    Parameter("motor_current_limit", "A", 211, 3, 1, 2000, "the greatest current of the recorded rides"),
+    Parameter("gear_efficiency", "1", 1.0, 0.01, 0.5, 1.0, "a hub motor has no gear"),
+    Parameter("brake_torque_limit", "N·m", 280, 60, 1, 5000, "both wheels: 0.6 g with rider"),
+    Parameter("front_brake_share", "1", 0.65, 0.1, 0, 1, "of the braking torque; the rear wheel is unloaded"),
+    Parameter("brake_viscous_constant", "N·s/rad", 60, 20, 0, 5000, "C_b of Lord 2016, eq. 2.13"),
+    Parameter("brake_disc_radius", "m", 0.09, 0.02, 0.01, 0.5, "a disc of 200 mm"),
+    Parameter("tyre_b", "1", 10.0, 3.0, 1, 40, "Pacejka 2012, ch. 4: with c and d a slip stiffness of 16 per load"),
+    Parameter("tyre_c", "1", 1.65, 0.1, 1, 2.5, "Pacejka 2012, ch. 4: longitudinal"),
+    Parameter("tyre_d", "1", 1.0, 0.15, 0.1, 2, "dry asphalt"),
+    Parameter("tyre_e", "1", 0.3, 0.3, -5, 1, "Pacejka 2012, ch. 4"),
+    Parameter(
+        "bms_resistance", "ohm", 0.002, 0.001, 0, 0.5, "transistors of a 48 V BMS; its part of the series resistance"
+    ),
+    Parameter("bms_heat_capacity", "J/K", 250, 100, 1, 1e5, "board and heat sink of 0.3 kg"),
+    Parameter("bms_conductance", "W/K", 0.6, 0.3, 0.001, 100, "to the battery it sits on"),
+    Parameter("inverter_board_capacity", "J/K", 600, 200, 1, 1e5, "board and sink of 0.7 kg"),
+    Parameter("inverter_box_capacity", "J/K", 2200, 700, 1, 1e5, "aluminium box of 2.4 kg"),
+    Parameter("inverter_board_to_air", "W/K", 1.5, 0.8, 0.001, 100, "still air in the box"),
+    Parameter("inverter_box_to_air", "W/K", 3.0, 1.5, 0.001, 100, "still air in the box"),
+    Parameter("inverter_board_to_box", "W/K", 4.0, 2.0, 0.001, 100, "through its mounting"),
+    Parameter("inverter_box_to_ambient", "W/K", 4.0, 2.0, 0.001, 500, "box in moving air"),
+    Parameter("motor_stator_capacity", "J/K", 3000, 1000, 1, 1e6, "copper and iron of 7 kg"),
+    Parameter("motor_rotor_capacity", "J/K", 4000, 1500, 1, 1e6, "rim and magnets of 8 kg"),
+    Parameter("motor_gap_conductance", "W/K", 5.0, 2.0, 0.001, 500, "air gap and bearings of a hub motor"),
+    Parameter("motor_rotor_to_ambient", "W/K", 6.0, 3.0, 0.001, 500, "rim in moving air"),
+    Parameter("motor_stator_share", "1", 0.9, 0.1, 0, 1, "copper and iron loss are in the stator"),
+)
+
 
 @dataclass(frozen=True)
 class Value:
@@ -78,7 +109,12 @@ class Parameters(Mapping[str, float]):
 def declared_parameters(effects: Iterable[Effect] = ()) -> dict[str, Parameter]:
     """Every parameter that a vehicle file may set: the vehicle's, the battery's, and those of all effects."""
     own = [load_effect(name) for name in known_effects()]
-    every = [*VEHICLE_PARAMETERS, *BATTERY_PARAMETERS, *(p for e in (*own, *effects) for p in e.parameters)]
+    every = [
+        *VEHICLE_PARAMETERS,
+        *BATTERY_PARAMETERS,
+        *SIMULATION_PARAMETERS,
+        *(p for e in (*own, *effects) for p in e.parameters),
+    ]
     return {parameter.name: parameter for parameter in every}
 
 

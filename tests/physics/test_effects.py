@@ -69,7 +69,7 @@ class TestContract:
         if effect.name in CONSERVATIVE:
             return
         term = call(effect, values)
-        power = term * values["speed"] if effect.port is Port.WHEEL_FORCE else term
+        power = term * values["speed"] if effect.port in (Port.WHEEL_FORCE, Port.TYRE) else term
         assert power >= -1e-12
 
 

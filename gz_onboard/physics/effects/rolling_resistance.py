@@ -9,7 +9,7 @@ from typing import Any
 
 from gz_onboard.physics.effect import Parameter, Port
 
-PORT = Port.WHEEL_FORCE
+PORT = Port.TYRE
 PARAMETERS = (
     Parameter("rolling_resistance_constant", "1", 0.015, 0.005, 0.0, 0.06, "scooter tyres: Cossalter 2006, sec. 2.3"),
     Parameter("rolling_resistance_speed", "s/m", 2e-4, 2e-4, 0.0, 3e-3, "SAE J2452: rises by a few percent per m/s"),

@@ -1,0 +1,114 @@
+"""The battery pack: first-order equivalent circuit of one representative cell (Lord 2016, eqs. 2.20-2.24)."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from math import exp, sqrt
+from typing import Protocol
+
+from gz_onboard.physics.battery import Battery
+
+TABLE_PERIOD = 1.0  # s: R0, R1 and C1 follow SOC and temperature this often; both move slowly
+
+
+class Pack(Protocol):
+    """What the scooter needs of a battery pack."""
+
+    soc: float
+
+    def draw(self, power: float, dt: float, temperature: float) -> tuple[float, float, float, float]:
+        """Deliver `power` [W] for `dt` [s] at a cell temperature [degC].
+
+        Gives (pack current [A], terminal voltage [V], heat [W], power really delivered [W]).
+        """
+
+    def chemical_energy_drawn(self) -> float:
+        """Energy [J] that has left the cells' chemistry since the start: what became terminal energy and heat."""
+
+
+class FirstOrderPack:
+    """R0 and one RC pair over SOC and temperature.
+
+    Eq. 2.24 as printed mixes cell and pack voltage; here heat = S·P·(V_oc - V_cell)·I_cell, which counts what the RC
+    pair's capacitor stores for a minute as heat, as the printed form does.
+    """
+
+    def __init__(self, battery: Battery, soc: float = 1.0, v1: float = 0.0) -> None:
+        self.battery = battery
+        self.soc = soc
+        self.v1 = v1  # V of a cell
+        self._age = TABLE_PERIOD
+        self._r0 = self._r1 = 0.0
+        self._c1 = 1.0
+        self._decay = 0.0
+        self._decay_dt = 0.0
+        self._charge = 1.0  # A·s of the pack
+        self._drawn = 0.0  # J, up to the last look-up
+        self._soc_before = soc  # at the last look-up
+
+    def _look_up(self, temperature: float, dt: float) -> None:
+        battery, soc = self.battery, self.soc
+        self._drawn += self._between(self._soc_before, soc)
+        self._soc_before = soc
+        self._r0 = battery.r0.at(soc, temperature)[0]
+        self._r1 = battery.r1.at(soc, temperature)[0]
+        self._c1 = battery.c1.at(soc, temperature)[0]
+        self._decay, self._decay_dt = exp(-dt / (self._r1 * self._c1)), dt
+        self._charge = 3600 * battery.pack_capacity(temperature)
+        self._age = 0.0
+
+    def draw(self, power: float, dt: float, temperature: float) -> tuple[float, float, float, float]:
+        """See `Pack`. The current is the root of V·I = P; where there is none, the current of greatest power."""
+        if self._age >= TABLE_PERIOD - 1e-9 or dt != self._decay_dt:
+            self._look_up(temperature, dt)
+        self._age += dt
+        battery = self.battery
+        n, m = battery.cells_series, battery.cells_parallel
+        ocv, slope = battery.ocv(self.soc)
+        resistance = n * self._r0 / m + battery.series_resistance
+        source = n * (ocv - self.v1)
+        root = source * source - 4 * resistance * power
+        current = 2 * power / (source + sqrt(root)) if root > 0 else source / (2 * resistance)
+        step = current * dt / self._charge
+        # V_oc at the middle of the step, so that charge times voltage is the energy between the two SOCs.
+        middle = n * (ocv - slope * step / 2)
+        voltage = middle - n * self.v1 - resistance * current
+        self.soc -= step
+        self.v1 = self._decay * self.v1 + self._r1 * (1 - self._decay) * current / m
+        return current, voltage, (middle - voltage) * current, voltage * current
+
+    def chemical_energy_drawn(self) -> float:
+        """See `Pack`: the integral of V_oc over the charge between the SOC at the start and now.
+
+        From the SOC alone, not from what was delivered: the check of the energy balance stands on it.
+        """
+        return self._drawn + self._between(self._soc_before, self.soc)
+
+    def _between(self, high: float, low: float) -> float:
+        """The integral of V_oc over charge from SOC `low` to `high` [J], exact for its straight pieces."""
+        ocv = self.battery.ocv
+        sign = 1.0 if high >= low else -1.0
+        a, b = (low, high) if high >= low else (high, low)
+        knots = [a, *(x for x in self.battery.ocv_soc[1:-1] if a < x < b), b]
+        total = sum((y - x) * (ocv(x)[0] + ocv(y)[0]) / 2 for x, y in pairwise(knots))
+        return sign * total * self.battery.cells_series * self._charge
+
+
+class SecondOrderPack(FirstOrderPack):
+    """The same with a second, slow RC pair: what the first-order model lacks (Lord 2016, sec. 3.3)."""
+
+    def __init__(self, battery: Battery, soc: float = 1.0, r2: float = 0.008, tau2: float = 1200.0) -> None:
+        super().__init__(battery, soc)
+        self.r2 = r2  # ohm of a cell
+        self.tau2 = tau2  # s
+        self.v2 = 0.0  # V of a cell
+
+    def draw(self, power: float, dt: float, temperature: float) -> tuple[float, float, float, float]:
+        """See `Pack`."""
+        fast, self.v1 = self.v1, self.v1 + self.v2
+        current, voltage, heat, delivered = super().draw(power, dt, temperature)
+        cell = current / self.battery.cells_parallel
+        self.v1 = self._decay * fast + self._r1 * (1 - self._decay) * cell
+        decay = exp(-dt / self.tau2)
+        self.v2 = decay * self.v2 + self.r2 * (1 - decay) * cell
+        return current, voltage, heat, delivered

@@ -1,0 +1,287 @@
+"""The scooter of the thesis, forward-looking: force forward, speed back (Lord 2016, figs. 2.1 and 3.1).
+
+Each step takes throttle and brake, finds the motor current that the controller allows, the torque at the wheel, the
+tyre's force and from it the new speeds of wheel and vehicle; then, with the speeds at the middle of the step, every
+watt from the battery to the road. Wheel, tyre and vehicle are solved together and implicitly, because the tyre's slip
+is stiff: with the mean speeds of the step each force times its speed is exactly the change of kinetic energy, and the
+ledger closes to rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from math import atan, sqrt
+from typing import Any
+
+from gz_onboard.physics.effect import QUANTITIES, Port
+from gz_onboard.physics.model import Bound, G, air_density
+from gz_onboard.simulation.parts.battery import FirstOrderPack, Pack
+from gz_onboard.simulation.parts.brakes import Brakes
+from gz_onboard.simulation.parts.controller import Controller
+from gz_onboard.simulation.parts.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
+from gz_onboard.simulation.parts.motor import EffectMotor, Motor
+from gz_onboard.simulation.parts.tyre import Tyre
+from gz_onboard.vehicle import Vehicle
+
+STEP = 0.01  # s
+
+Place = tuple[float, float, float]
+"""(grade as the sine of the road's angle, curvature [1/m] positive to the left, headwind [m/s])."""
+Road = Callable[[float], Place]
+"""The road at a distance [m]."""
+
+
+def straight(grade: float = 0.0, headwind: float = 0.0) -> Road:
+    """A road without end or bend."""
+    place = (grade, 0.0, headwind)
+    return lambda distance: place
+
+
+@dataclass(frozen=True)
+class Dynamometer:
+    """A chassis dynamometer: a roller of `inertia` [kg at its surface] that brakes with A + B·V + C·V² [N].
+
+    On it there is no air, no grade and no front wheel; tyre and rear axle load are as on the road.
+    """
+
+    inertia: float
+    a: float = 0.0  # N
+    b: float = 0.0  # N·s/m
+    c: float = 0.0  # N·s²/m²
+
+
+@dataclass
+class Ledger:
+    """Energy [J] by where it went, since the start."""
+
+    entries: dict[str, float] = field(default_factory=dict)
+
+    def total(self) -> float:
+        """The sum of all entries."""
+        return sum(self.entries.values())
+
+
+class Scooter:
+    """The assembled scooter; its state is the loop variable of a simulation.
+
+    `pack` and `motor` may be replaced by any object with the methods of `Pack` and `Motor`; the other parts are
+    attributes, to be set before the first step. Temperatures in degC.
+    """
+
+    def __init__(self, vehicle: Vehicle, road: Road | Dynamometer | None = None, *, soc: float = 1.0, ambient: float = 20.0,
+                 cell_temperature: float | None = None, altitude: float = 0.0, speed: float = 0.0, dt: float = STEP,
+                 pack: Pack | None = None, motor: Motor | None = None, tyre_form: str = "transient",
+                 brake_form: str = "friction") -> None:  # fmt: skip
+        if vehicle.battery is None:
+            raise vehicle.error("has no [battery], which a simulation needs")
+        p = vehicle.parameters
+        self.dt = dt
+        self.vehicle = vehicle
+        self.dynamometer = road if isinstance(road, Dynamometer) else None
+        self.road: Road = straight() if road is None or isinstance(road, Dynamometer) else road
+        self.ambient = ambient
+        self.speed = speed  # m/s
+        self.wheel_speed = speed / p["wheel_radius"]  # rad/s
+        self.distance = 0.0  # m
+        self.climb = 0.0  # m
+        self.time = 0.0  # s
+        self.current = 0.0  # A of the pack
+        self.voltage = vehicle.battery.cells_series * vehicle.battery.ocv(soc)[0]
+        self.motor_current = 0.0  # A
+        self.throttle = self.brake = 0.0
+        self.force = 0.0  # N, of the driven tyre
+        self.rear_load = self.front_load = 0.0  # N
+        self.ledger = Ledger()
+        self.pack: Pack = pack or FirstOrderPack(vehicle.battery, soc)
+        bound = {port: [(e.name, _bind(e, p)) for e in vehicle.model.effects if e.port is port] for port in Port}
+        # Effects that read the acceleration are the dynamics that this simulation integrates itself.
+        self._forces = [(n, b) for n, b in bound[Port.WHEEL_FORCE] if "acceleration" not in b.effect.quantities]
+        self._rolling = bound[Port.TYRE]
+        if self.dynamometer:
+            self._forces = []
+        self._inverter = bound[Port.INVERTER_LOSS]
+        self._dc = bound[Port.DC_POWER]
+        self.motor: Motor = motor or EffectMotor(bound[Port.MOTOR_LOSS], p["torque_constant"], p["voltage_constant"])
+        self.tyre = Tyre(p["tyre_b"], p["tyre_c"], p["tyre_d"], p["tyre_e"], form=tyre_form)
+        share = 0.0 if self.dynamometer else p["front_brake_share"]
+        self.brakes = Brakes(
+            p["brake_torque_limit"], p["brake_viscous_constant"], p["brake_disc_radius"], share, form=brake_form
+        )
+        self.controller = Controller(p["motor_current_limit"], p["regeneration_torque_limit"] / p["torque_constant"])
+        cells = ambient if cell_temperature is None else cell_temperature
+        self.inverter_cooling = InverterCooling(
+            p["inverter_board_capacity"], p["inverter_box_capacity"], p["inverter_board_to_air"],
+            p["inverter_box_to_air"], p["inverter_board_to_box"], p["inverter_box_to_ambient"], ambient, ambient,
+        )  # fmt: skip
+        self.motor_cooling = MotorCooling(
+            p["motor_stator_capacity"], p["motor_rotor_capacity"], p["motor_gap_conductance"],
+            p["motor_rotor_to_ambient"], p["motor_stator_share"], ambient, ambient,
+        )  # fmt: skip
+        self.pack_cooling = LumpedCooling(p["pack_heat_capacity"], p["pack_conductance"], cells)
+        self.bms_cooling = LumpedCooling(p["bms_heat_capacity"], p["bms_conductance"], cells)
+        self._radius = p["wheel_radius"]
+        self._gear = p["gear_ratio"]
+        self._gear_efficiency = p["gear_efficiency"]
+        self._bms_resistance = p["bms_resistance"]
+        self._mass = self.dynamometer.inertia if self.dynamometer else vehicle.model.mass
+        self._weight = vehicle.model.mass * G
+        self._rear_share = 1 - p["cg_to_rear"] / p["wheelbase"]
+        self._lever = p["cg_height"] / p["wheelbase"]
+        front = 0.0 if self.dynamometer else p["wheel_inertia_front"] / self._radius**2
+        self._moving_mass = self._mass + front  # the front wheel rolls without slip
+        self._inertia = p["wheel_inertia_rear"]
+        density = air_density(ambient, altitude)
+        self._q: dict[str, float] = dict.fromkeys((*QUANTITIES, "yaw_rate", "lateral_acceleration", "lean"), 0.0)
+        self._q.update(mass=vehicle.model.mass, air_density=density, grade_cosine=1.0, motor_temperature=ambient)
+        self._heat = {"inverter": 0.0, "motor": 0.0, "pack": 0.0, "bms": 0.0}  # J in the current cooling period
+        self._since_cooling = 0.0
+        self._watch()
+
+    def kinetic_energy(self) -> float:
+        """Of vehicle and wheels [J]."""
+        return 0.5 * (self._moving_mass * self.speed**2 + self._inertia * self.wheel_speed**2)
+
+    def potential_energy(self) -> float:
+        """Over the start [J]."""
+        return 0.0 if self.dynamometer else self._weight * self.climb
+
+    def step(self, throttle: float, brake: float) -> None:
+        """One step with throttle and brake [0..1]."""
+        dt, q, entries = self.dt, self._q, self.ledger.entries
+        v, w, r, gear = self.speed, self.wheel_speed, self._radius, self._gear
+        self.throttle, self.brake = throttle, brake
+
+        # --- what acts (eqs. 2.1, 2.8, 3.1, 3.2, 3.5-3.7, 3.9)
+        grade, curvature, headwind = self.road(self.distance)
+        cosine = sqrt(1 - grade * grade) if grade else 1.0
+        q["speed"], q["grade"], q["grade_cosine"], q["headwind"] = v, grade, cosine, headwind
+        if curvature:
+            lateral = v * v * curvature
+            q["yaw_rate"], q["lateral_acceleration"], q["lean"] = v * curvature, lateral, -atan(lateral / G)
+        elif q["yaw_rate"]:
+            q["yaw_rate"] = q["lateral_acceleration"] = q["lean"] = 0.0
+        normal = self._weight * cosine
+        shift = self.force * self._lever
+        rear = normal * self._rear_share + shift
+        rear = min(max(rear, 0.05 * normal), normal)
+        self.rear_load, self.front_load = rear, normal - rear
+        series = self.vehicle.battery.cells_series  # type: ignore[union-attr]
+        current = self.controller.current(throttle, brake, w / gear, self.voltage / series)
+        torque = self.motor.torque_constant * current
+        drive = torque / gear * (self._gear_efficiency if torque * w >= 0 else 1 / self._gear_efficiency)
+
+        terms: list[tuple[str, float]] = []
+        against = 0.0
+        for name, effect in self._forces:
+            term = effect(q)
+            terms.append((name, term))
+            against += term
+        rolling = [(name, effect(q)) for name, effect in self._rolling]
+        rear_rolling = front_rolling = 0.0
+        share = rear / normal
+        for _, term in rolling:
+            rear_rolling += share * term
+            if not self.dynamometer:
+                front_rolling += (1 - share) * term
+        against += front_rolling
+        if self.dynamometer:
+            d = self.dynamometer
+            absorbed = (d.a * v / sqrt(v * v + 0.01) if d.a else 0.0) + d.b * v + d.c * v * abs(v)
+            terms.append(("dynamometer", absorbed))
+            against += absorbed
+
+        front_braking = self.brakes.front_force(brake, v, r) if brake > 0.0 else 0.0
+        against += front_braking
+
+        # --- wheel, tyre and vehicle together, implicit in the slip (eqs. 2.11, 3.3, 3.8, 3.10-3.12)
+        base, gain, _ = self.tyre.linear(r * w, v, dt)
+        slip = base + gain * (r * w - v)
+        mu, slope = self.tyre.friction(slip)
+        grip, stiffness = rear * mu, rear * (slope if slope > 0.0 else 0.0) * gain
+        m, j = self._moving_mass / dt, self._inertia / dt
+        det = m * j + stiffness * (m * r * r + j)
+        f1 = grip - against
+        f2 = drive - r * (grip + rear_rolling)
+        dw = ((m + stiffness) * f2 + r * stiffness * f1) / det
+        braking = 0.0
+        if brake > 0.0:
+            per_torque = (m + stiffness) / det  # how much the wheel slows for each N·m
+            braking = self.brakes.torque(brake, w, (w + dw) / per_torque)
+            f2 -= braking
+            dw = ((m + stiffness) * f2 + r * stiffness * f1) / det
+        dv = ((j + r * r * stiffness) * f1 + r * stiffness * f2) / det
+        force = grip + stiffness * (r * dw - dv)
+        self.tyre.slip = base + gain * (r * (w + dw) - v - dv)
+        self.force = force
+        v_mean, w_mean = v + dv / 2, w + dw / 2
+        self.speed, self.wheel_speed = v + dv, w + dw
+        self.distance += v_mean * dt
+        self.climb += grade * v_mean * dt
+        self.time += dt
+
+        # --- every watt (eqs. 2.2-2.6, 2.9, 2.10, 2.16-2.19)
+        for name, term in terms:
+            if name != "grade_force":  # what it takes is the potential energy
+                entries[name] = entries.get(name, 0.0) + term * v_mean * dt
+        for name, term in rolling:
+            power = share * term * r * w_mean + (0.0 if self.dynamometer else (1 - share) * term * v_mean)
+            entries[name] = entries.get(name, 0.0) + power * dt
+        entries["tyre_slip"] = entries.get("tyre_slip", 0.0) + force * (r * w_mean - v_mean) * dt
+        entries["brakes"] = entries.get("brakes", 0.0) + (braking * w_mean + front_braking * v_mean) * dt
+        motor_speed = w_mean / gear
+        mechanical = torque * motor_speed
+        entries["gearing"] = entries.get("gearing", 0.0) + (mechanical - drive * w_mean) * dt
+        motor_heat = 0.0
+        for name, loss in self.motor.losses(motor_speed, current, self.motor_cooling.stator):
+            motor_heat += loss
+            entries[name] = entries.get(name, 0.0) + loss * dt
+        q["motor_speed"], q["motor_current"] = motor_speed, current
+        inverter_heat = 0.0
+        for name, effect in self._inverter:
+            loss = effect(q)
+            inverter_heat += loss
+            entries[name] = entries.get(name, 0.0) + loss * dt
+        power = mechanical + motor_heat + inverter_heat
+        for name, effect in self._dc:
+            load = effect(q)
+            power += load
+            entries[name] = entries.get(name, 0.0) + load * dt
+        bms_heat = self._bms_resistance * self.current * self.current
+        entries["bms"] = entries.get("bms", 0.0) + bms_heat * dt
+        power += bms_heat
+        self.current, self.voltage, pack_heat, delivered = self.pack.draw(power, dt, self.pack_cooling.temperature)
+        entries["battery_heat"] = entries.get("battery_heat", 0.0) + pack_heat * dt
+        if power - delivered > 1e-6 * abs(power):
+            entries["not_delivered"] = entries.get("not_delivered", 0.0) - (power - delivered) * dt
+        self.motor_current = current
+
+        heat = self._heat
+        heat["motor"] += motor_heat * dt
+        heat["inverter"] += inverter_heat * dt
+        heat["pack"] += pack_heat * dt
+        heat["bms"] += bms_heat * dt
+        self._since_cooling += dt
+        if self._since_cooling >= PERIOD - 1e-9:
+            self._cool(self._since_cooling)
+
+    def _cool(self, dt: float) -> None:
+        """The cooling networks, with the mean heat of the period (eqs. 2.25-2.31)."""
+        heat = self._heat
+        self.inverter_cooling.step(dt, heat["inverter"] / dt, self.ambient)
+        self.motor_cooling.step(dt, heat["motor"] / dt, self.ambient)
+        self.pack_cooling.step(dt, heat["pack"] / dt, self.ambient)
+        self.bms_cooling.step(dt, heat["bms"] / dt, self.pack_cooling.temperature)
+        for name in heat:
+            heat[name] = 0.0
+        self._since_cooling = 0.0
+        self._q["motor_temperature"] = self.motor_cooling.stator
+        self._watch()
+
+    def _watch(self) -> None:
+        motor, inverter = self.motor_cooling.stator, self.inverter_cooling.board
+        self.controller.watch(motor, inverter, self.pack_cooling.temperature, self.pack.soc)
+
+
+def _bind(effect: Any, parameters: Any) -> Bound:
+    return Bound(effect, {name: parameters[name] for name in effect.keywords})

@@ -1,0 +1,201 @@
+"""The assembled scooter: balance of energy, step halving, standstill, replaceable parts."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gz_onboard.simulation.parts.battery import SecondOrderPack
+from gz_onboard.simulation.parts.motor import MapMotor
+from gz_onboard.simulation.parts.rider import Rider
+from gz_onboard.simulation.scooter import Dynamometer, Scooter, straight
+from gz_onboard.vehicle import read_vehicle
+
+VEHICLE = read_vehicle("reference", 75.0)
+BATTERY = VEHICLE.battery
+assert BATTERY
+
+
+def follow(scooter, profile, seconds):
+    rider = Rider()
+    for i in range(round(seconds / scooter.dt)):
+        scooter.step(*rider.step(profile(i * scooter.dt), scooter.speed, scooter.dt))
+    return scooter
+
+
+def closure(scooter, kinetic):
+    """(energy out of the cells, energy accounted for) [J]; the first from the state of charge alone."""
+    accounted = scooter.ledger.total() + scooter.kinetic_energy() - kinetic + scooter.potential_energy()
+    return scooter.pack.chemical_energy_drawn(), accounted
+
+
+def town(t):
+    return max(0.0, 8 + 4 * math.sin(t / 13)) if 5 < t % 90 < 70 else 0.0
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    soc=st.floats(0.15, 0.98), ambient=st.floats(-5, 38), grade=st.floats(-0.08, 0.08), wind=st.floats(-6, 6),
+    form=st.sampled_from(["transient", "steady"]), brakes=st.sampled_from(["friction", "viscous"]),
+    ride=st.lists(st.tuples(st.floats(0, 1), st.floats(0, 1), st.integers(20, 300)), min_size=1, max_size=8),
+)  # fmt: skip
+def test_the_ledger_closes_over_any_ride(soc, ambient, grade, wind, form, brakes, ride):
+    scooter = Scooter(VEHICLE, straight(grade, wind), soc=soc, ambient=ambient, tyre_form=form, brake_form=brakes)
+    for throttle, brake, steps in ride:
+        for _ in range(steps):
+            scooter.step(throttle if brake < 0.5 else 0.0, brake if brake >= 0.5 else 0.0)
+    drawn, accounted = closure(scooter, 0.0)
+    turnover = sum(abs(x) for x in scooter.ledger.entries.values()) + scooter.kinetic_energy()
+    assert math.isfinite(scooter.speed)
+    assert abs(drawn - accounted) < 1e-4 * turnover
+
+
+def test_closes_to_better_than_a_ten_thousandth_of_a_long_ride():
+    scooter = follow(Scooter(VEHICLE, soc=0.8), town, 600)
+    drawn, accounted = closure(scooter, 0.0)
+    assert accounted == pytest.approx(drawn, rel=1e-5)
+
+
+def test_halving_the_step_changes_energy_by_less_than_a_thousandth():
+    coarse, fine = (follow(Scooter(VEHICLE, soc=0.8, dt=dt), town, 300) for dt in (0.01, 0.005))
+    assert coarse.pack.chemical_energy_drawn() == pytest.approx(fine.pack.chemical_energy_drawn(), rel=1e-3)
+    assert coarse.distance == pytest.approx(fine.distance, rel=1e-3)
+
+
+@pytest.mark.parametrize("grade", [-0.12, -0.05, 0.05, 0.12])
+@pytest.mark.parametrize("form", ["transient"])
+def test_braked_on_a_hill_it_comes_to_rest_and_stays(grade, form):
+    scooter = Scooter(VEHICLE, straight(grade), soc=0.8, speed=6.0, tyre_form=form)
+    for _ in range(1500):
+        scooter.step(0.0, 0.8)
+    stood = scooter.distance
+    for _ in range(3000):
+        scooter.step(0.0, 0.8)
+    assert abs(scooter.distance - stood) < 1e-4
+    assert abs(scooter.speed) < 1e-6
+    assert scooter.force == pytest.approx(VEHICLE.model.mass * 9.80665 * grade, rel=0.02)
+
+
+def test_no_chatter_at_standstill_or_pulling_away():
+    scooter = Scooter(VEHICLE, soc=0.8)
+    speeds = []
+    for i in range(600):
+        scooter.step(0.3 if i > 200 else 0.0, 0.0)
+        speeds.append(scooter.speed)
+    assert speeds[200] == pytest.approx(0.0, abs=1e-9)
+    rises = [b - a for a, b in zip(speeds[202:], speeds[203:], strict=False)]
+    assert min(rises) >= -1e-9
+
+
+def test_the_printed_brake_never_quite_stands():
+    """Eq. 2.13: why friction is the default."""
+    printed = Scooter(VEHICLE, straight(-0.05), soc=0.8, speed=5.0, brake_form="viscous")
+    friction = Scooter(VEHICLE, straight(-0.05), soc=0.8, speed=5.0)
+    for _ in range(3000):
+        printed.step(0.0, 1.0)
+        friction.step(0.0, 1.0)
+    assert printed.speed > 0.05
+    assert abs(friction.speed) < 1e-6
+
+
+def test_coasting_down_against_a_fine_integration_written_out():
+    """Eqs. 3.1-3.3 and 3.9 without motor: another integrator, other code."""
+    p = VEHICLE.parameters
+    scooter = Scooter(VEHICLE, soc=0.8, speed=12.0)
+    for _ in range(3000):
+        scooter.step(0.0, 0.0)
+    density = 101325 / (287.05 * 293.15)
+    mass = VEHICLE.model.mass
+    inertia = mass + (p["wheel_inertia_front"] + p["wheel_inertia_rear"]) / p["wheel_radius"] ** 2
+    v, dt = 12.0, 1e-3
+    for _ in range(30_000):
+        drag = 0.5 * density * p["drag_area"] * v * v
+        rolling = mass * 9.80665 * (p["rolling_resistance_constant"] + p["rolling_resistance_speed"] * v)
+        v -= dt * (drag + rolling) / inertia
+    assert scooter.speed == pytest.approx(v, abs=0.02)
+
+
+def test_axle_loads_shift_with_the_force():
+    """Eqs. 3.5-3.7."""
+    p = VEHICLE.parameters
+    scooter = Scooter(VEHICLE, soc=0.8)
+    for _ in range(100):
+        scooter.step(1.0, 0.0)
+    weight = VEHICLE.model.mass * 9.80665
+    expected = weight * (p["wheelbase"] - p["cg_to_rear"]) / p["wheelbase"]
+    expected += scooter.force * p["cg_height"] / p["wheelbase"]
+    assert scooter.rear_load == pytest.approx(expected, rel=0.01)
+    assert scooter.rear_load + scooter.front_load == pytest.approx(weight)
+
+
+def test_dynamometer_accelerates_its_roller_only():
+    scooter = Scooter(VEHICLE, Dynamometer(180.0, a=20.0, c=0.3), soc=0.8)
+    for _ in range(2000):
+        scooter.step(0.5, 0.0)
+    assert "aerodynamic_drag" not in scooter.ledger.entries
+    assert scooter.ledger.entries["dynamometer"] > 0
+    drawn, accounted = closure(scooter, 0.0)
+    assert accounted == pytest.approx(drawn, rel=1e-4)
+
+
+def test_the_battery_can_be_replaced():
+    """A two-RC pack sags more in the long run; the rest of the scooter does not know."""
+    one = follow(Scooter(VEHICLE, soc=0.8), town, 600)
+    two = follow(Scooter(VEHICLE, soc=0.8, pack=SecondOrderPack(BATTERY, 0.8)), town, 600)
+    assert two.ledger.entries["battery_heat"] > 1.005 * one.ledger.entries["battery_heat"]
+    assert two.distance == pytest.approx(one.distance, rel=1e-3)
+    drawn, accounted = closure(two, 0.0)
+    assert accounted == pytest.approx(drawn, rel=1e-4)
+
+
+def test_the_motor_can_be_replaced_by_a_measured_map():
+    p = VEHICLE.parameters
+    speeds, currents = [0.0, 20.0, 40.0, 60.0], [-60.0, 0.0, 60.0, 120.0, 220.0]
+    loss = [[0.017 * i * i + 0.9 * w + 0.0154 * w * w for i in currents] for w in speeds]
+    motor = MapMotor(speeds, currents, loss, p["torque_constant"], p["voltage_constant"])
+    scooter = follow(Scooter(VEHICLE, soc=0.8, motor=motor), town, 200)
+    assert scooter.ledger.entries["motor_map_loss"] > 0
+    assert "motor_copper_loss" not in scooter.ledger.entries
+    drawn, accounted = closure(scooter, 0.0)
+    assert accounted == pytest.approx(drawn, rel=1e-4)
+
+
+def test_heat_balance_of_the_cooling_networks():
+    """Steady state (eqs. 2.25-2.31): what goes in goes out."""
+    scooter = Scooter(VEHICLE, soc=0.8, ambient=15.0)
+    for network, sink in (
+        (scooter.motor_cooling, 15.0),
+        (scooter.inverter_cooling, 15.0),
+        (scooter.pack_cooling, 15.0),
+    ):
+        for _ in range(200_000):
+            network.step(1.0, 50.0, sink)
+    c = scooter.motor_cooling
+    assert c.rotor_to_ambient * (c.rotor - 15.0) == pytest.approx(50.0, rel=1e-6)
+    assert c.gap * (c.stator - c.rotor) == pytest.approx(c.stator_share * 50.0, rel=1e-6)
+    i = scooter.inverter_cooling
+    assert i.box_to_ambient * (i.box - 15.0) == pytest.approx(50.0, rel=1e-6)
+    b = scooter.pack_cooling
+    assert b.conductance * (b.temperature - 15.0) == pytest.approx(50.0, rel=1e-6)
+
+
+def test_cold_hot_and_empty_are_derated():
+    def pulled(**start):
+        scooter = Scooter(VEHICLE, **{"soc": 0.8, **start})
+        for _ in range(300):
+            scooter.step(1.0, 0.0)
+        return scooter.speed
+
+    assert pulled() > pulled(soc=0.02)
+    assert pulled() > pulled(cell_temperature=-15.0)
+
+
+def test_rider_stops_integrating_at_the_end_of_its_command():
+    rider = Rider()
+    for _ in range(10_000):
+        assert rider.step(30.0, 0.0, 0.01)[0] == 1.0
+    assert rider.sum < 1.01
+    assert rider.step(0.0, 10.0, 0.01)[1] > 0.5
