@@ -143,7 +143,7 @@ def started(which: str, directory: Path) -> Iterator[tuple[subprocess.Popen[str]
     ours = ["gz_onboard", "run", "--channel", "vcan0", "--log-dir", str(directory), "--state-dir", str(directory)]
     plain = ["plain", "live", "vcan0", str(directory / "plain.mcap")]
     notify = directory / "notify"
-    environment = os.environ | {"NOTIFY_SOCKET": str(notify), "PYTHONPATH": str(HERE)}
+    environment = os.environ | {"NOTIFY_SOCKET": str(notify)}
     with bus() as (prefix, sender), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
         ready.bind(str(notify))
         ready.settimeout(TIMEOUT)
@@ -334,6 +334,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=63.0, help="of the longest live run (%(default)g)")
     parser.add_argument("--repeats", type=int, default=3, help="of each measurement (%(default)s)")
     arguments = parser.parse_args()
+    os.environ["PYTHONPATH"] = f"{HERE.parent}{os.pathsep}{HERE}"  # this checkout, whatever is installed
     seconds, repeats = max(arguments.seconds, WARM_UP + 2 * WINDOW + 1), arguments.repeats
 
     where = "vcan0" if has_can() else "UDP sockets instead of CAN sockets, for both pipelines (benchmarks/stand_in.py)"
