@@ -1,0 +1,29 @@
+"""Cornering drag: tyres that push sideways also hold back, F = c·m·a_y²/g.
+
+A tyre's side force needs a slip angle, α = F_y/C_α, and along the path it then pulls back with F_y·α; summed over both
+axles this is (m·a_y)²·(s_f²/C_αf + s_r²/C_αr), s the share of the mass on each (Cossalter 2006, sec. 4.2; Pacejka 2012,
+sec. 1.3). Stiffness grows with load, so one number is left: c = s_f/c_f + s_r/c_r with c_f, c_r the stiffness per load
+[1/rad]. A leaning machine slips less, but its tyres twist on the road, which grows with the square of the lean, hence
+at small angles with a_y² too: c then is what both take together.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gz_onboard.physics.effect import Parameter, Port
+
+PORT = Port.WHEEL_FORCE
+PARAMETERS = (
+    Parameter(
+        "cornering_compliance", "rad", 0.1, 0.05, 0.0, 0.5, "Pacejka 2012, ch. 11: slip alone 0.06, lean up to 0.3"
+    ),
+)
+G = 9.80665  # m/s²
+STANDSTILL = 0.1  # m/s
+
+
+def term(speed: Any, mass: Any, lateral_acceleration: Any, *, cornering_compliance: float) -> Any:
+    """Force [N] against the motion."""
+    direction = speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5
+    return cornering_compliance * mass * lateral_acceleration * lateral_acceleration / G * direction
