@@ -1,0 +1,87 @@
+"""CSV files of numbers, with errors that name the file, the line and the column."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from gz_onboard.errors import InputError, nearest
+
+_KMH = re.compile(r"km?/h|km?ph", re.I)
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of a CSV file, all of one length, and the line that each row stands on."""
+
+    file: Path
+    lines: tuple[int, ...]
+    values: dict[str, tuple[float, ...]]
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def error(self, row: int, message: str) -> InputError:
+        """The error to raise about `row` (0 is the first below the header)."""
+        return InputError(f"{self.file}:{self.lines[row]}: {message}")
+
+    def check(self, name: str, low: float, high: float, unit: str) -> None:
+        """Refuse a value of column `name` outside [low, high]."""
+        for row, value in enumerate(self.values[name]):
+            if not low <= value <= high:
+                raise self.error(row, f"{name}: {value:g} {unit} is outside {low:g} to {high:g} {unit}")
+
+    def increasing(self, name: str, unit: str) -> None:
+        """Refuse a column `name` that does not increase from row to row."""
+        values = self.values[name]
+        for row in range(1, len(values)):
+            if values[row] <= values[row - 1]:
+                raise self.error(row, f"{name}: {values[row]:g} {unit} does not increase (before: {values[row - 1]:g})")
+
+
+def read_columns(file: Path, known: Collection[str], rows: int = 2) -> Columns:
+    """Read a CSV `file` of finite numbers whose header names columns out of `known`, with at least `rows` rows.
+
+    Blank lines are passed over. Raises InputError, naming file, line and column, if the file cannot be read, a
+    column is unknown or there twice, a row has too few or too many fields, or a field is no finite number.
+    """
+    try:
+        with file.open(encoding="utf-8-sig", newline="") as stream:
+            reader = csv.reader(stream)
+            records = [(reader.line_num, record) for record in reader if any(field.strip() for field in record)]
+    except OSError as error:
+        raise InputError(f"{file}: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{file}: not a CSV file: {error}") from error
+    if not records:
+        raise InputError(f"{file}: is empty; its first line must name columns out of {', '.join(known)}")
+    line, header = records[0][0], [name.strip() for name in records[0][1]]
+    for column, name in enumerate(header):
+        if name not in known:
+            meant = nearest(_KMH.sub("kmh", name).replace("m/s", "mps"), known)  # or "kph" would be taken for "mph"
+            raise InputError(f"{file}:{line}: unknown column {name!r}{meant}; known are {', '.join(known)}")
+        if name in header[:column]:
+            raise InputError(f"{file}:{line}: column {name!r} is there twice")
+    if len(records) <= rows:
+        raise InputError(f"{file}: has {len(records) - 1} rows below its header, must have at least {rows}")
+    table: list[list[float]] = []
+    for line, record in records[1:]:
+        if len(record) != len(header):
+            raise InputError(f"{file}:{line}: has {len(record)} fields, the header has {len(header)}")
+        table.append([_number(f"{file}:{line}: {name}", field) for name, field in zip(header, record, strict=True)])
+    values = {name: tuple(row[column] for row in table) for column, name in enumerate(header)}
+    return Columns(file, tuple(line for line, _ in records[1:]), values)
+
+
+def _number(place: str, field: str) -> float:
+    try:
+        value = float(field)
+    except ValueError:
+        raise InputError(f"{place}: {field!r} is not a number") from None
+    if not math.isfinite(value):
+        raise InputError(f"{place}: must be a finite number, is {field}")
+    return value

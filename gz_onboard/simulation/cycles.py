@@ -1,0 +1,227 @@
+"""Drive cycles: speed over time, those of the regulations built in, others from a CSV file.
+
+Where the built-in speeds come from, and how they compare with other tables, is in docs/cycles.md.
+"""
+
+from __future__ import annotations
+
+import csv
+from bisect import bisect_right
+from dataclasses import dataclass
+from functools import cache, cached_property
+from importlib.resources import files
+from itertools import pairwise
+from pathlib import Path
+
+from gz_onboard.errors import InputError, nearest
+from gz_onboard.simulation.columns import read_columns
+
+UNITS = {"mps": 1.0, "kmh": 1 / 3.6, "mph": 0.44704}  # [m/s] in one of each
+
+_GTR2 = "UN GTR No. 2, Annex 5 (the same in Regulation (EU) No 134/2014, Annex II, Appendix 6)"
+_TITLES = {
+    "ece15": ("ECE-15 urban driving cycle (UDC)", "UN Regulations No. 15 and No. 83, Annex 4"),
+    "r40": ("R40 for motorcycles: six times ECE-15", "UN Regulation No. 40, Annex 4"),
+    "udds": ("Urban Dynamometer Driving Schedule", "40 CFR Part 86, Appendix I (a)"),
+    "wmtc_part1": ("WMTC part 1", _GTR2),
+    "wmtc_part1_reduced": ("WMTC part 1, reduced speed", _GTR2),
+    "wmtc_part2": ("WMTC part 2", _GTR2),
+    "wmtc_part3": ("WMTC part 3", _GTR2),
+    "wmtc_class1": ("WMTC classes 1-1 and 1-2: part 1 at reduced speed, twice", _GTR2),
+    "wmtc_class1_3": ("WMTC class 1-3: part 1, twice", _GTR2),
+    "wmtc_class2_2": ("WMTC class 2-2: parts 1 and 2", _GTR2),
+    "wmtc_class3_2": ("WMTC class 3-2: parts 1, 2 and 3", _GTR2),
+}
+_PARTS = {
+    "r40": ("ece15",) * 6,
+    "wmtc_class1": ("wmtc_part1_reduced",) * 2,
+    "wmtc_class1_3": ("wmtc_part1",) * 2,
+    "wmtc_class2_2": ("wmtc_part1", "wmtc_part2"),
+    "wmtc_class3_2": ("wmtc_part1", "wmtc_part2", "wmtc_part3"),
+}
+_MISSING = {
+    "wmtc_part2_reduced": "its speeds",
+    "wmtc_part3_reduced": "its speeds",
+    "wmtc_class2_1": "part 2 at reduced speed",
+    "wmtc_class3_1": "part 3 at reduced speed",
+}
+# (time [s], speed [km/h]) at the corners; straight lines between them.
+_ECE15 = (
+    *((0, 0), (11, 0), (15, 15), (23, 15), (28, 0), (49, 0), (61, 32), (85, 32), (96, 0)),
+    *((117, 0), (143, 50), (155, 50), (163, 35), (176, 35), (188, 0), (195, 0)),
+)
+_MAX_SPEED = 100.0  # [m/s]: faster than any road vehicle of the regulations; more is a wrong unit
+_JOINT = 0.1  # [m/s]: two cycles are joined without a sample between them if their speeds differ by less
+
+
+@dataclass(frozen=True)
+class Cycle:
+    """Speed over time: `time` [s] from 0, evenly spaced, and `speed` [m/s], of one length (two at least)."""
+
+    name: str
+    time: tuple[float, ...]
+    speed: tuple[float, ...]
+    source: str
+    title: str
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the last [s]."""
+        return self.time[-1] - self.time[0]
+
+    @cached_property
+    def distance(self) -> float:
+        """Distance covered [m], the speed being linear between samples."""
+        samples = zip(self.time, self.speed, strict=True)
+        return sum((t1 - t0) * (v0 + v1) / 2 for (t0, v0), (t1, v1) in pairwise(samples))
+
+    @property
+    def max_speed(self) -> float:
+        """Highest speed [m/s]."""
+        return max(self.speed)
+
+    @cached_property
+    def accelerations(self) -> tuple[float, ...]:
+        """Acceleration from each sample to the next [m/s²]; one fewer than samples."""
+        samples = zip(self.time, self.speed, strict=True)
+        return tuple((v1 - v0) / (t1 - t0) for (t0, v0), (t1, v1) in pairwise(samples))
+
+    @property
+    def max_acceleration(self) -> float:
+        """Highest acceleration [m/s²]."""
+        return max(self.accelerations)
+
+    @property
+    def max_deceleration(self) -> float:
+        """Highest deceleration [m/s²], positive where the cycle brakes."""
+        return -min(self.accelerations)
+
+    def speed_at(self, time: float) -> float:
+        """Speed [m/s] at `time` [s], linear between samples; before the first and after the last as there."""
+        after = bisect_right(self.time, time)
+        if after == 0:
+            return self.speed[0]
+        if after == len(self.time):
+            return self.speed[-1]
+        t0, v0, v1 = self.time[after - 1], self.speed[after - 1], self.speed[after]
+        return v0 + (v1 - v0) * (time - t0) / (self.time[after] - t0)
+
+    def repeated(self, count: int) -> Cycle:
+        """The cycle `count` times, one after the other, the last sample of one being the first of the next.
+
+        Raises InputError if `count` is below 1, or if the cycle ends at another speed than it begins with.
+        """
+        if count < 1:
+            raise InputError(f"cycle {self.name}: cannot be ridden {count} times, must be at least 1")
+        if count == 1:
+            return self
+        time, speed = _joined((self,) * count)
+        return Cycle(f"{self.name}x{count}", time, speed, self.source, f"{self.title}, {count} times")
+
+
+def names() -> tuple[str, ...]:
+    """Names of the built-in cycles."""
+    return tuple(_TITLES)
+
+
+@cache
+def cycle(name: str) -> Cycle:
+    """The built-in cycle `name`, one sample a second.
+
+    Raises InputError, with the nearest name, if there is none.
+    """
+    if name in _MISSING:
+        raise InputError(
+            f"cycle {name!r} is not built in: no table of {_MISSING[name]} was at hand; "
+            "give the regulation's speeds as a CSV file with columns time_s, speed_kmh"
+        )
+    if name not in _TITLES:
+        raise InputError(f"unknown cycle {name!r}{nearest(name, names())}; known are {', '.join(names())}")
+    title, source = _TITLES[name]
+    if name in _PARTS:
+        time, speed = _joined(tuple(cycle(part) for part in _PARTS[name]))
+    else:
+        speed = _ece15() if name == "ece15" else _table()[name]
+        time = tuple(float(second) for second in range(len(speed)))
+    return Cycle(name, time, speed, source, title)
+
+
+def read_cycle(file: Path | str) -> Cycle:
+    """The cycle in a CSV `file`: columns time_s and one of speed_mps, speed_kmh, speed_mph; any even time step.
+
+    Time is counted from the first sample. Raises InputError, naming file and line, for what read_columns refuses,
+    a time that does not increase, a gap or an uneven step in it, a negative speed, and one above 100 m/s.
+    """
+    file = Path(file)
+    speeds = {f"speed_{unit}": factor for unit, factor in UNITS.items()}
+    columns = read_columns(file, ("time_s", *speeds))
+    given = [name for name in speeds if name in columns.values]
+    if "time_s" not in columns.values:
+        raise InputError(f"{file}: column time_s is missing")
+    if len(given) != 1:
+        raise InputError(
+            f"{file}: must have one of the columns {', '.join(speeds)}, has {' and '.join(given) or 'none'}"
+        )
+    column = given[0]
+    columns.increasing("time_s", "s")
+    time, values = columns.values["time_s"], columns.values[column]
+    step = min(after - before for before, after in pairwise(time))
+    for row, (before, after) in enumerate(pairwise(time), start=1):
+        if after - before > 1.1 * step:  # rounded times are even enough
+            raise columns.error(row, f"time_s: gap from {before:g} s to {after:g} s, other steps are {step:g} s")
+    columns.check(column, 0.0, _MAX_SPEED / speeds[column], column.removeprefix("speed_"))
+    return Cycle(
+        file.stem,
+        tuple(t - time[0] for t in time),
+        tuple(value * speeds[column] for value in values),
+        str(file),
+        file.stem,
+    )
+
+
+def find_cycle(name_or_file: str) -> Cycle:
+    """The built-in cycle of that name, or else the one in the CSV file of that name.
+
+    Raises InputError, with the nearest built-in name, if there is neither.
+    """
+    if name_or_file in _TITLES or name_or_file in _MISSING:
+        return cycle(name_or_file)
+    file = Path(name_or_file)
+    if file.exists() or file.suffix:
+        return read_cycle(file)
+    raise InputError(
+        f"{name_or_file!r} is neither a file nor a built-in cycle{nearest(name_or_file, names())}; "
+        f"built in are {', '.join(names())}"
+    )
+
+
+def _joined(parts: tuple[Cycle, ...]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    time, speed = list(parts[0].time), list(parts[0].speed)
+    for part in parts[1:]:
+        if abs(part.speed[0] - speed[-1]) > _JOINT:
+            raise InputError(
+                f"cycle {part.name}: begins at {part.speed[0]:.2f} m/s, the one before ends at {speed[-1]:.2f} m/s"
+            )
+        start = time[-1]
+        time += (start + t for t in part.time[1:])
+        speed += part.speed[1:]
+    return tuple(time), tuple(speed)
+
+
+def _ece15() -> tuple[float, ...]:
+    speeds = [0.0]
+    for (t0, v0), (t1, v1) in pairwise(_ECE15):
+        speeds += ((v0 + (v1 - v0) * (t - t0) / (t1 - t0)) * UNITS["kmh"] for t in range(t0 + 1, t1 + 1))
+    return tuple(speeds)
+
+
+@cache
+def _table() -> dict[str, tuple[float, ...]]:
+    """The columns of cycles.csv [m/s] by cycle; shorter ones end with empty fields."""
+    text = files(__package__).joinpath("cycles.csv").read_text(encoding="utf-8")
+    header, *rows = csv.reader(text.splitlines())
+    table = {}
+    for column, title in enumerate(header[1:], start=1):
+        name, unit = title.rsplit("_", 1)
+        table[name] = tuple(float(row[column]) * UNITS[unit] for row in rows if row[column])
+    return table

@@ -1,0 +1,319 @@
+"""A route as distance, altitude, curvature and speed limit, and the speed that a rider would ride it with.
+
+Altitude of a map or a receiver is off by a metre or so from point to point, and a bare difference over 20 m would
+turn that into grades of 5 %. Grade is therefore the slope of the straight line fitted (least squares) to the altitudes
+within `GRADE_LENGTH` around a point: with 1 m of independent noise on a 20 m grid its error is 0.5 % (one sigma). A
+hill of wavelength λ shows 3 (sin x − x cos x)/x³ of its grade, x = π GRADE_LENGTH/λ: 94 % at 800 m, 77 % at 400 m.
+Curvature is found likewise, from the headings of the chords within `CURVE_LENGTH`; a bend shorter than the distance
+between points shows as a longer and gentler one.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from dataclasses import dataclass
+from itertools import accumulate, pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from gz_onboard.errors import InputError
+from gz_onboard.simulation.columns import Columns, read_columns
+
+GRADE_LENGTH = 200.0  # [m]
+CURVE_LENGTH = 40.0  # [m]
+_CHORD = 10.0  # [m]: shorter chords have no heading worth the name
+_STEEPEST = 0.5  # sine; no road is steeper, a wrong unit is
+_CLOSEST = 0.01  # [m] between points
+_LIMITS = {"speed_limit_mps": 1.0, "speed_limit_kmh": 1 / 3.6}
+_KNOWN = ("distance_m", "latitude_deg", "longitude_deg", "altitude_m", "curvature_1pm", *_LIMITS)
+
+
+class RoutePoint(NamedTuple):
+    """What a route is like at one distance."""
+
+    grade: float  # sine of the road's angle, positive uphill
+    curvature: float  # [1/m], positive to the left
+    heading: float  # [rad] clockwise from north, 0 to 2π
+    speed_limit: float  # [m/s], infinite if none is given
+    altitude: float  # [m] as given, not smoothed
+    latitude: float  # [deg], NaN if positions are not given
+    longitude: float  # [deg], as latitude
+
+
+@dataclass(frozen=True)
+class Route:
+    """Tuples of one length (two at least) over `distance` [m], which begins with 0 and increases.
+
+    Units and signs are those of RoutePoint, except that `heading` is not reduced to one turn, so that it can be
+    interpolated. A speed limit holds from its point to the next.
+    """
+
+    name: str
+    distance: tuple[float, ...]
+    grade: tuple[float, ...]
+    curvature: tuple[float, ...]
+    heading: tuple[float, ...]
+    speed_limit: tuple[float, ...]
+    altitude: tuple[float, ...]
+    latitude: tuple[float, ...]
+    longitude: tuple[float, ...]
+
+    @property
+    def length(self) -> float:
+        """Length of the route [m]."""
+        return self.distance[-1]
+
+    def at(self, distance: float) -> RoutePoint:
+        """The route at `distance` [m]: linear between points; before its begin and past its end as there."""
+        i = max(0, min(bisect_right(self.distance, distance), len(self.distance) - 1) - 1)
+        start = self.distance[i]
+        part = max(0.0, min(1.0, (distance - start) / (self.distance[i + 1] - start)))
+
+        def between(values: tuple[float, ...]) -> float:
+            return values[i] + part * (values[i + 1] - values[i])
+
+        return RoutePoint(
+            between(self.grade),
+            between(self.curvature),
+            between(self.heading) % math.tau,
+            self.speed_limit[i if part < 1 else i + 1],
+            between(self.altitude),
+            between(self.latitude),
+            between(self.longitude),
+        )
+
+
+def read_route(file: Path | str, *, grade_length: float = GRADE_LENGTH, curve_length: float = CURVE_LENGTH) -> Route:
+    """The route in a CSV `file`.
+
+    Columns: altitude_m; distance_m along the road or latitude_deg and longitude_deg, or all three; optionally
+    curvature_1pm (otherwise from the positions, 0 without these) and speed_limit_mps or speed_limit_kmh. Altitude
+    is smoothed over `grade_length` [m], the heading for curvature over `curve_length` [m].
+
+    Raises InputError, naming file and line, for what read_columns refuses, missing columns, a distance that does
+    not increase, positions that do not move or do not fit the distance, and values that no road has.
+    """
+    file = Path(file)
+    for name, length in (("grade_length", grade_length), ("curve_length", curve_length)):
+        if not (math.isfinite(length) and length > 0):
+            raise InputError(f"{name}: {length:g} m, must be above 0 m")
+    columns = read_columns(file, _KNOWN)
+    values = columns.values
+    if "altitude_m" not in values:
+        raise InputError(f"{file}: column altitude_m is missing")
+    columns.check("altitude_m", -500.0, 9000.0, "m")
+    positions = _positions(columns)
+    if "distance_m" in values:
+        columns.increasing("distance_m", "m")
+        distance = tuple(d - values["distance_m"][0] for d in values["distance_m"])
+    elif positions:
+        distance = _lengths(positions)
+    else:
+        raise InputError(f"{file}: needs column distance_m, or latitude_deg and longitude_deg")
+    if positions:
+        _check_moving(columns, positions, distance)
+    heading, curvature = _course(columns, positions, distance, curve_length)
+    grade = _slopes(distance, values["altitude_m"], distance, grade_length)
+    for row, sine in enumerate(grade):
+        if abs(sine) > _STEEPEST:
+            raise columns.error(row, f"altitude_m: a grade of {100 * sine:.0f} % is no road's; are distances in m?")
+    none = (math.nan,) * len(columns)
+    return Route(
+        file.name.removesuffix(".csv").removesuffix(".route"),
+        distance,
+        grade,
+        curvature,
+        heading,
+        _speed_limits(columns),
+        values["altitude_m"],
+        values["latitude_deg"] if positions else none,
+        values["longitude_deg"] if positions else none,
+    )
+
+
+def _positions(columns: Columns) -> list[tuple[float, float]]:
+    """East and north [m] of each point from the first, on the WGS 84 ellipsoid; empty if not given."""
+    given = [name for name in ("latitude_deg", "longitude_deg") if name in columns.values]
+    if len(given) == 1:
+        raise InputError(f"{columns.file}: has {given[0]} alone; latitude_deg and longitude_deg go together")
+    if not given:
+        return []
+    columns.check("latitude_deg", -89.0, 89.0, "deg")
+    columns.check("longitude_deg", -180.0, 360.0, "deg")
+    a, e2 = 6378137.0, 6.69437999014e-3
+    points = [(0.0, 0.0)]
+    coordinates = zip(columns.values["latitude_deg"], columns.values["longitude_deg"], strict=True)
+    for (lat0, lon0), (lat1, lon1) in pairwise(coordinates):
+        middle = math.radians((lat0 + lat1) / 2)
+        w2 = 1 - e2 * math.sin(middle) ** 2
+        turned = (lon1 - lon0 + 180) % 360 - 180  # a step over the date line is a short one
+        east = math.radians(turned) * a / math.sqrt(w2) * math.cos(middle)
+        north = math.radians(lat1 - lat0) * a * (1 - e2) / w2**1.5
+        points.append((points[-1][0] + east, points[-1][1] + north))
+    return points
+
+
+def _lengths(positions: list[tuple[float, float]]) -> tuple[float, ...]:
+    return tuple(accumulate((math.dist(p, q) for p, q in pairwise(positions)), initial=0.0))
+
+
+def _check_moving(columns: Columns, positions: list[tuple[float, float]], distance: tuple[float, ...]) -> None:
+    for row, (p, q) in enumerate(pairwise(positions), start=1):
+        if math.dist(p, q) < _CLOSEST:
+            raise columns.error(row, "latitude_deg, longitude_deg: the same position as on the line before")
+    chords = _lengths(positions)[-1]
+    if not 0.5 < chords / distance[-1] < 1.2:
+        raise InputError(
+            f"{columns.file}: distance_m covers {distance[-1]:.0f} m, latitude_deg and longitude_deg {chords:.0f} m; "
+            "is distance_m in m?"
+        )
+
+
+def _course(
+    columns: Columns, positions: list[tuple[float, float]], distance: tuple[float, ...], curve_length: float
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Heading [rad] and curvature [1/m] at each point; what is not given follows from what is."""
+    middles: list[float] = []
+    headings: list[float] = []
+    last = 0
+    for i in range(1, len(positions)):
+        if distance[i] - distance[last] >= _CHORD or (i == len(positions) - 1 and not middles):
+            east, north = positions[i][0] - positions[last][0], positions[i][1] - positions[last][1]
+            heading = math.atan2(east, north)
+            if headings:
+                heading += math.tau * round((headings[-1] - heading) / math.tau)
+            middles.append((distance[last] + distance[i]) / 2)
+            headings.append(heading)
+            last = i
+    if "curvature_1pm" in columns.values:
+        columns.check("curvature_1pm", -1.0, 1.0, "1/m")
+        curvature = columns.values["curvature_1pm"]
+    elif len(middles) > 1:
+        curvature = tuple(-slope for slope in _slopes(tuple(middles), tuple(headings), distance, curve_length))
+    else:
+        curvature = (0.0,) * len(distance)
+    if middles:
+        return tuple(_interpolated(middles, headings, d) for d in distance), curvature
+    turns = ((d1 - d0) * (k0 + k1) / 2 for (d0, k0), (d1, k1) in pairwise(zip(distance, curvature, strict=True)))
+    return tuple(-turn for turn in accumulate(turns, initial=0.0)), curvature
+
+
+def _interpolated(x: list[float], y: list[float], at: float) -> float:
+    i = max(0, min(bisect_right(x, at), len(x) - 1) - 1)
+    if len(x) == 1 or at <= x[0]:
+        return y[0]
+    if at >= x[-1]:
+        return y[-1]
+    return y[i] + (y[i + 1] - y[i]) * (at - x[i]) / (x[i + 1] - x[i])
+
+
+def _speed_limits(columns: Columns) -> tuple[float, ...]:
+    given = [name for name in _LIMITS if name in columns.values]
+    if len(given) > 1:
+        raise InputError(f"{columns.file}: has {' and '.join(given)}; must have one speed limit")
+    if not given:
+        return (math.inf,) * len(columns)
+    name, factor = given[0], _LIMITS[given[0]]
+    columns.check(name, 0.1 / factor, 100.0 / factor, name.removeprefix("speed_limit_"))
+    return tuple(value * factor for value in columns.values[name])
+
+
+def _slopes(x: tuple[float, ...], y: tuple[float, ...], at: tuple[float, ...], length: float) -> tuple[float, ...]:
+    """Slope dy/dx, at each `at`, of the least-squares line through the points within `length` around it.
+
+    At the ends the length is kept and lies to one side, so that noise is smoothed there as elsewhere; where points
+    are sparse the nearest on both sides are taken.
+    """
+    import numpy as np
+
+    xs, ys, where = np.asarray(x), np.asarray(y), np.asarray(at)
+    length = min(length, x[-1] - x[0])
+    start = np.clip(where - length / 2, x[0], x[-1] - length)
+    slack = 1e-9 * max(1.0, x[-1])  # a grid's own points are not to drop out by rounding
+    first = np.searchsorted(xs, start - slack)
+    last = np.searchsorted(xs, start + length + slack, side="right")
+    before = np.clip(np.searchsorted(xs, where, side="right") - 1, 0, len(x) - 2)
+    first, last = np.minimum(first, before), np.maximum(last, before + 2)
+    slopes = []
+    for i, j in zip(first.tolist(), last.tolist(), strict=True):
+        dx = xs[i:j] - xs[i:j].mean()
+        slopes.append(float(dx @ ys[i:j] / (dx @ dx)))
+    return tuple(slopes)
+
+
+@dataclass(frozen=True)
+class SpeedProfile:
+    """Target `speed` [m/s] over `distance` [m] and the `time` [s] at which it is reached; tuples of one length.
+
+    Acceleration is constant between points. The ride begins and ends at standstill: a rider who follows speed over
+    distance must look a little ahead, or follow speed over time.
+    """
+
+    distance: tuple[float, ...]
+    speed: tuple[float, ...]
+    time: tuple[float, ...]
+
+    def speed_at(self, distance: float) -> float:
+        """Target speed [m/s] at `distance` [m]; 0 before the begin and past the end."""
+        if not 0.0 <= distance <= self.distance[-1]:
+            return 0.0
+        i = min(bisect_right(self.distance, distance), len(self.distance) - 1) - 1
+        part = (distance - self.distance[i]) / (self.distance[i + 1] - self.distance[i])
+        v0, v1 = self.speed[i], self.speed[i + 1]
+        return math.sqrt(v0 * v0 + part * (v1 * v1 - v0 * v0))
+
+    def speed_at_time(self, time: float) -> float:
+        """Target speed [m/s] at `time` [s] since the begin; 0 before the begin and past the end."""
+        if not 0.0 <= time <= self.time[-1]:
+            return 0.0
+        i = min(bisect_right(self.time, time), len(self.time) - 1) - 1
+        part = (time - self.time[i]) / (self.time[i + 1] - self.time[i])
+        return self.speed[i] + part * (self.speed[i + 1] - self.speed[i])
+
+
+def speed_profile(
+    route: Route,
+    *,
+    lateral_acceleration: float = 2.5,
+    acceleration: float = 1.2,
+    deceleration: float = 1.5,
+    top_speed: float = math.inf,
+    step: float = 5.0,
+) -> SpeedProfile:
+    """The fastest ride of `route`, from standstill to standstill, within its limits and the rider's.
+
+    Speed stays within the speed limit, `top_speed` [m/s] and √(lateral_acceleration/|curvature|), everywhere and
+    not only at points; it rises and falls with at most `acceleration` and `deceleration` (all in m/s²). Points are
+    the route's and others between them, at most `step` [m] apart. Raises InputError for a value that is not above 0.
+    """
+    for name, value, unit in (
+        ("lateral_acceleration", lateral_acceleration, "m/s²"),
+        ("acceleration", acceleration, "m/s²"),
+        ("deceleration", deceleration, "m/s²"),
+        ("top_speed", top_speed, "m/s"),
+        ("step", step, "m"),
+    ):
+        if not value > 0:
+            raise InputError(f"{name}: {value:g} {unit}, must be above 0 {unit}")
+    distance = [0.0]
+    curve: list[float] = [abs(route.curvature[0])]
+    limit: list[float] = []  # square of the speed allowed in each interval
+    for i, (d0, d1) in enumerate(pairwise(route.distance)):
+        pieces = max(2, math.ceil((d1 - d0) / step))  # two at least: one interval would be standstill throughout
+        fixed = min(route.speed_limit[i], top_speed) ** 2
+        for k in range(1, pieces + 1):
+            part = k / pieces
+            distance.append(d0 + part * (d1 - d0) if k < pieces else d1)
+            curve.append(abs(route.curvature[i] + part * (route.curvature[i + 1] - route.curvature[i])))
+            sharpest = max(curve[-2:])
+            limit.append(min(fixed, lateral_acceleration / sharpest if sharpest > 0 else math.inf))
+    square = [0.0, *(min(pair) for pair in pairwise(limit)), 0.0]
+    lengths = [d1 - d0 for d0, d1 in pairwise(distance)]
+    for i, length in enumerate(lengths):
+        square[i + 1] = min(square[i + 1], square[i] + 2 * acceleration * length)
+    for i, length in reversed(list(enumerate(lengths))):
+        square[i] = min(square[i], square[i + 1] + 2 * deceleration * length)
+    speed = [math.sqrt(v2) for v2 in square]
+    durations = (2 * length / (v0 + v1) for length, (v0, v1) in zip(lengths, pairwise(speed), strict=True))
+    return SpeedProfile(tuple(distance), tuple(speed), tuple(accumulate(durations, initial=0.0)))

@@ -1,0 +1,209 @@
+"""Drive cycles: the regulations' figures, files of one's own, and what is refused."""
+
+import csv
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gz_onboard.errors import InputError
+from gz_onboard.simulation.cycles import Cycle, cycle, find_cycle, names, read_cycle
+
+# Published: duration [s], distance [km], highest speed [km/h].
+PUBLISHED = {
+    "ece15": (195, 0.994, 50.0),
+    "r40": (1170, 6 * 0.994, 50.0),
+    "udds": (1369, 11.99, 91.25),
+    "wmtc_part1": (600, 4.065, 60.0),
+    "wmtc_part1_reduced": (600, 3.944, 50.0),
+    "wmtc_part2": (600, 9.111, 94.9),
+    "wmtc_part3": (600, 15.736, 125.3),
+    "wmtc_class1": (1200, 2 * 3.944, 50.0),
+    "wmtc_class1_3": (1200, 2 * 4.065, 60.0),
+    "wmtc_class2_2": (1200, 4.065 + 9.111, 94.9),
+    "wmtc_class3_2": (1800, 4.065 + 9.111 + 15.736, 125.3),
+}
+
+
+def test_every_built_in_cycle_is_compared_with_published_figures():
+    assert set(names()) == set(PUBLISHED)
+
+
+@pytest.mark.parametrize("name", names())
+def test_duration_distance_and_top_speed_are_those_published(name):
+    ridden, (duration, distance, top) = cycle(name), PUBLISHED[name]
+    assert ridden.name == name
+    assert ridden.time == tuple(range(duration + 1))
+    assert len(ridden.speed) == len(ridden.time)
+    assert ridden.duration == duration
+    assert ridden.distance == pytest.approx(1000 * distance, abs=1 + 0.0003 * 1000 * distance)
+    assert ridden.max_speed * 3.6 == pytest.approx(top, abs=0.01)
+    assert ridden.speed[0] == ridden.speed[-1] == 0.0
+    assert ridden.source and ridden.title
+
+
+@pytest.mark.parametrize("name", names())
+def test_accelerations_stay_within_what_the_regulations_ask_of_a_rider(name):
+    ridden = cycle(name)
+    assert 0.5 < ridden.max_acceleration < 2.75
+    assert 0.5 < ridden.max_deceleration < 2.05
+
+
+def test_single_seconds_stand_where_the_regulation_has_them():
+    part1 = cycle("wmtc_part1")
+    assert [round(3.6 * v, 1) for v in part1.speed[20:26]] == [0.0, 0.0, 1.0, 2.6, 4.8, 7.2]
+    assert [round(v / 0.44704, 1) for v in cycle("udds").speed[20:25]] == [0.0, 3.0, 5.9, 8.6, 11.5]
+    assert [round(3.6 * v, 2) for v in cycle("ece15").speed[10:16]] == [0.0, 0.0, 3.75, 7.5, 11.25, 15.0]
+
+
+def test_reduced_part_is_never_above_the_full_one():
+    full, reduced = cycle("wmtc_part1"), cycle("wmtc_part1_reduced")
+    assert all(slow <= fast for slow, fast in zip(reduced.speed, full.speed, strict=True))
+    assert sum(slow < fast for slow, fast in zip(reduced.speed, full.speed, strict=True)) > 50
+
+
+def test_classes_are_their_parts_end_to_end():
+    whole = cycle("wmtc_class3_2")
+    for number, part in enumerate(("wmtc_part1", "wmtc_part2", "wmtc_part3")):
+        assert whole.speed[600 * number : 600 * number + 601] == cycle(part).speed
+
+
+def test_speed_is_linear_between_samples_and_held_outside():
+    ramp = Cycle("ramp", (0.0, 1.0, 2.0), (0.0, 2.0, 1.0), "", "")
+    assert [ramp.speed_at(t) for t in (-1.0, 0.0, 0.5, 1.0, 1.5, 2.0, 9.0)] == [0.0, 0.0, 1.0, 2.0, 1.5, 1.0, 1.0]
+    assert ramp.distance == pytest.approx(2.5)
+    assert (ramp.max_acceleration, ramp.max_deceleration) == (2.0, 1.0)
+
+
+@given(st.sampled_from(names()), st.integers(1, 4))
+def test_repeating_multiplies_duration_and_distance(name, count):
+    once, often = cycle(name), cycle(name).repeated(count)
+    assert often.duration == count * once.duration
+    assert often.distance == pytest.approx(count * once.distance)
+    assert often.speed_at(often.duration - 30.25) == pytest.approx(once.speed_at(once.duration - 30.25))
+
+
+def test_repeating_refuses_a_jump_in_speed_and_no_times():
+    with pytest.raises(InputError, match=r"begins at 0\.00 m/s, the one before ends at 5\.00 m/s"):
+        Cycle("ramp", (0.0, 1.0), (0.0, 5.0), "", "").repeated(2)
+    with pytest.raises(InputError, match="0 times"):
+        cycle("ece15").repeated(0)
+
+
+def write(folder: Path, text: str) -> Path:
+    file = folder / "mine.csv"
+    file.write_text(text, encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("mps", 1.0), ("kmh", 1 / 3.6), ("mph", 0.44704)])
+def test_own_cycle_in_each_unit(tmp_path, unit, factor):
+    mine = read_cycle(write(tmp_path, f"time_s, speed_{unit}\n10.0,0\n10.5,3\n\n11.0,4.5\n"))
+    assert mine.name == "mine"
+    assert mine.time == (0.0, 0.5, 1.0)
+    assert mine.speed == pytest.approx((0.0, 3 * factor, 4.5 * factor))
+
+
+def test_own_cycle_may_have_rounded_times(tmp_path):
+    assert read_cycle(write(tmp_path, "time_s,speed_mps\n0,0\n0.33,1\n0.67,2\n1,3\n")).duration == 1.0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", r"mine\.csv: is empty"),
+        ("time_s,speed_kmh\n0,0\n", r"mine\.csv: has 1 rows .* at least 2"),
+        ("time_s,speed_kph\n0,0\n1,1\n", r"mine\.csv:1: unknown column 'speed_kph' \(did you mean 'speed_kmh'\?\)"),
+        ("time_s,speed_km/h\n0,0\n1,1\n", r"'speed_km/h' \(did you mean 'speed_kmh'\?\)"),
+        ("time_s,speed_m/s\n0,0\n1,1\n", r"'speed_m/s' \(did you mean 'speed_mps'\?\)"),
+        ("time_s,speed_kmh,speed_kmh\n0,0,0\n1,1,1\n", r":1: column 'speed_kmh' is there twice"),
+        ("time_s\n0\n1\n", "must have one of the columns speed_mps, speed_kmh, speed_mph, has none"),
+        ("time_s,speed_kmh,speed_mph\n0,0,0\n1,1,1\n", "has speed_kmh and speed_mph"),
+        ("speed_kmh\n0\n1\n", "column time_s is missing"),
+        ("time_s,speed_kmh\n0,0\n1\n", r":3: has 1 fields, the header has 2"),
+        ("time_s,speed_kmh\n0,0\n1,fast\n", r":3: speed_kmh: 'fast' is not a number"),
+        ("time_s,speed_kmh\n0,0\n1,nan\n", r":3: speed_kmh: must be a finite number, is nan"),
+        ("time_s,speed_kmh\n0,0\ninf,3\n", r":3: time_s: must be a finite number, is inf"),
+        ("time_s,speed_kmh\n0,0\n1,-3\n", r":3: speed_kmh: -3 kmh is outside 0 to 360 kmh"),
+        ("time_s,speed_mps\n0,0\n1,120\n", r":3: speed_mps: 120 mps is outside 0 to 100 mps"),
+        ("time_s,speed_kmh\n0,0\n1,1\n1,2\n", r":4: time_s: 1 s does not increase \(before: 1\)"),
+        ("time_s,speed_kmh\n0,0\n2,1\n1,2\n", r":4: time_s: 1 s does not increase \(before: 2\)"),
+        ("time_s,speed_kmh\n0,0\n1,1\n\n4,2\n5,2\n", r":5: time_s: gap from 1 s to 4 s, other steps are 1 s"),
+        ("time_s,speed_kmh\n0,0\n1.5,1\n2.5,2\n", r":3: time_s: gap from 0 s to 1\.5 s"),
+    ],
+)
+def test_own_cycle_refused(tmp_path, text, message):
+    with pytest.raises(InputError, match=message):
+        read_cycle(write(tmp_path, text))
+
+
+def test_file_that_is_no_text_or_not_there(tmp_path):
+    (tmp_path / "mine.csv").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(InputError, match=r"mine\.csv: not a CSV file"):
+        read_cycle(tmp_path / "mine.csv")
+    with pytest.raises(InputError, match=r"none\.csv: No such file"):
+        find_cycle(str(tmp_path / "none.csv"))
+    with pytest.raises(InputError, match="Is a directory"):
+        find_cycle(str(tmp_path))
+
+
+def test_finding_by_name_or_file(tmp_path):
+    assert find_cycle("udds") is cycle("udds")
+    assert find_cycle(str(write(tmp_path, "time_s,speed_mps\n0,0\n1,1\n"))).speed == (0.0, 1.0)
+    for find in (find_cycle, cycle):
+        with pytest.raises(InputError, match=r"did you mean 'wmtc_part1'\?"):
+            find("wmtc_prt1")
+
+
+@pytest.mark.parametrize("name", ["wmtc_part2_reduced", "wmtc_part3_reduced", "wmtc_class2_1", "wmtc_class3_1"])
+def test_cycles_without_a_table_say_so(name):
+    with pytest.raises(InputError, match=r"is not built in: no table of .* speed.* was at hand"):
+        find_cycle(name)
+
+
+@given(st.lists(st.floats(0, 60), min_size=2, max_size=30), st.sampled_from([0.1, 0.5, 1.0, 2.0]))
+def test_written_and_read_again_is_the_same(tmp_path_factory, speeds, step):
+    file = tmp_path_factory.mktemp("cycle") / "mine.csv"
+    rows = (f"{i * step!r},{v!r}\n" for i, v in enumerate(speeds))
+    file.write_text("time_s,speed_mps\n" + "".join(rows), encoding="utf-8")
+    mine = read_cycle(file)
+    assert mine.speed == tuple(speeds)
+    assert mine.max_speed == max(speeds)
+    assert all(min(speeds) <= mine.speed_at(t * step / 3) <= max(speeds) for t in range(3 * len(speeds)))
+    assert min(speeds) * mine.duration - 1e-9 <= mine.distance <= max(speeds) * mine.duration + 1e-9
+
+
+def test_importing_and_using_cycles_needs_no_numpy():
+    code = (
+        "import sys; from gz_onboard.simulation.cycles import cycle; cycle('udds'); assert 'numpy' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+OTHERS = Path(os.environ.get("GZ_ONBOARD_DATA", "")) / "real" / "drive_cycles"
+
+
+@pytest.mark.skipif(
+    not os.environ.get("GZ_ONBOARD_DATA") or not OTHERS.is_dir(),
+    reason="GZ_ONBOARD_DATA names no folder with real/drive_cycles",
+)
+@pytest.mark.parametrize(
+    ("name", "other", "tolerance"),
+    [
+        ("wmtc_part1", "wmtc_part1", 0.001),
+        ("wmtc_part1_reduced", "wmtc_part1_reduced", 0.001),
+        ("wmtc_part2", "wmtc_part2", 0.001),
+        ("wmtc_part3", "wmtc_part3", 0.001),
+        ("udds", "udds", 0.051),
+        ("ece15", "advisor_ece", 0.33),  # 23.4 km/h at 129 s where the straight line has 23.1
+    ],
+)
+def test_tables_of_others_agree(name, other, tolerance):
+    with (OTHERS / f"{other}.csv").open(encoding="utf-8") as stream:
+        theirs = [float(row["v_kmh"]) for row in csv.DictReader(stream)]
+    ours = [3.6 * v for v in cycle(name).speed]
+    assert max(abs(their - our) for their, our in zip(theirs, ours, strict=True)) <= tolerance
