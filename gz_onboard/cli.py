@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import re
 import sys
 from collections.abc import Sequence
 from typing import NoReturn
@@ -16,6 +17,7 @@ COMMANDS = {
     "dashboard": ("gz_onboard.dashboard.terminal", "show the range from the frames that the daemon sends"),
     "replay": ("gz_onboard.bus.replay", "put a recorded log onto a bus, in its own timing"),
     "estimate": ("gz_onboard.lab.estimate", "estimate recorded rides without a bus, as fast as it goes"),
+    "simulate": ("gz_onboard.simulation.simulate", "ride a drive cycle, a route or a recorded ride by simulation"),
     "export": ("gz_onboard.bus.export", "turn a log into candump, BLF, ASC, Parquet, CSV, ..."),
     "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride"),
 }
@@ -25,9 +27,9 @@ class _Parser(argparse.ArgumentParser):
     """argparse that names the nearest right option or command."""
 
     def error(self, message: str) -> NoReturn:
-        wrong = message.partition("invalid choice: ")[2].partition(" (")[0].strip("'")
+        wrong, _, choices = message.partition("invalid choice: ")[2].partition(" (choose from ")
         if wrong:
-            message += nearest(wrong, COMMANDS)
+            message += nearest(wrong.strip("'"), re.findall(r"[^\s',)]+", choices))
         elif message.startswith("unrecognized arguments: "):
             wrong = next((word for word in message.split()[2:] if word.startswith("-")), "")
             message += nearest(wrong.partition("=")[0], self.known_options()) if wrong else ""

@@ -199,6 +199,15 @@ def run(arguments: argparse.Namespace) -> int:
     logging.getLogger("can").setLevel(logging.WARNING)
     if not 0.005 <= arguments.tick <= TICK_NS * 1e-9:
         raise InputError(f"--tick {arguments.tick:g}: must be 0.005 to {TICK_NS * 1e-9:g} s")
+    if arguments.payload is not None and not 0 <= arguments.payload <= 300:
+        raise InputError(f"--payload {arguments.payload:g}: must be 0 to 300 kg")
+    for option in ("log_file_mb", "log_file_hours", "log_total_mb"):
+        if not 1e-3 <= (value := getattr(arguments, option)) <= 1e9:
+            raise InputError(f"--{option.replace('_', '-')} {value:g}: must be 0.001 to 1e9")
+    names = arguments.channel or ["can0"]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"--channel {name}: given twice; each of its frames would come twice")
     vehicle = read_vehicle(arguments.vehicle, arguments.payload)
     recorder = None
     if arguments.log_dir:
@@ -213,7 +222,6 @@ def run(arguments: argparse.Namespace) -> int:
     from gz_onboard.bus.codec import known_identifiers
 
     wanted = None if arguments.all_frames else known_identifiers(vehicle.mapping)
-    names = arguments.channel or ["can0"]
     channels = [Channel(arguments.interface, name, index, wanted) for index, name in enumerate(names)]
     for channel in channels:
         channel.open()

@@ -15,7 +15,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus._can import can
-from gz_onboard.errors import InputError
+from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Frame
 
 if TYPE_CHECKING:
@@ -57,6 +57,11 @@ class Channel:
 
     def open(self) -> None:
         """Open for the first time; InputError if there is no such interface or channel at all."""
+        if self.interface not in can.VALID_INTERFACES:
+            known = sorted(can.VALID_INTERFACES)
+            raise InputError(
+                f"--interface {self.interface}: unknown{nearest(self.interface, known)}; known are {', '.join(known)}"
+            )
         try:
             self._open()
         except (can.CanInterfaceNotImplementedError, ValueError, ImportError) as error:

@@ -1,0 +1,168 @@
+"""A wrong command line or file: status 2, the place and the nearest right name, never a traceback."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from gz_onboard.cli import main
+from tests.support import LOGS, ROOT
+
+RIDE = str(LOGS / "coastdown.blf")
+
+
+def _still_running(*_: object) -> None:
+    pytest.fail("the command was taken and runs")
+
+
+def status(*arguments: str) -> int:
+    signal.signal(signal.SIGALRM, _still_running)
+    signal.alarm(20)
+    try:
+        return main(arguments)
+    except SystemExit as exit_:
+        assert isinstance(exit_.code, int)
+        return exit_.code
+    finally:
+        signal.alarm(0)
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """What is written to stderr by a command that must be refused."""
+    assert status(*arguments) == 2
+    out, err = capsys.readouterr()
+    assert "Traceback" not in err
+    assert out == ""
+    return err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "COMMAND"),
+        (["rnu"], "did you mean 'run'"),
+        (["replai", RIDE], "did you mean 'replay'"),
+        (["run", "--chanel", "can0"], "did you mean '--channel'"),
+        (["run", "--chanel=can0"], "did you mean '--channel'"),
+        (["run", "--chan", "can0"], "did you mean '--channel'"),  # no abbreviations: they break when options are added
+        (["run", "--filter", "filterpi"], "did you mean 'filterpy'"),
+        (["run", "--filter", "plt"], "choose from"),
+        (["run", "--tick", "fast"], "--tick: invalid float value: 'fast'"),
+        (["run", "--tick", "5"], "--tick 5: must be 0.005 to 0.1 s"),
+        (["run", "--tick", "nan"], "--tick nan"),
+        (["run", "--payload", "nan"], "payload"),
+        (["run", "--payload", "-20"], "payload"),
+        (["run", "--vehicle", "refrence"], "did you mean 'reference'"),
+        (["run", "--interface", "sockectan"], "did you mean 'socketcan'"),
+        (["run", "--interface", "virtual", "--channel", "a", "--channel", "a"], "--channel a: given twice"),
+        (["run", "--interface", "virtual", "--log-dir", "/tmp/x", "--log-file-mb", "0"], "--log-file-mb 0"),
+        (["run", "--interface", "virtual", "--log-dir", "/tmp/x", "--log-file-mb", "nan"], "--log-file-mb nan"),
+        (["run", "--interface", "virtual", "--log-dir", "/tmp/x", "--log-total-mb", "inf"], "--log-total-mb inf"),
+        (["run", "--interface", "virtual", "--log-dir", "/tmp/x", "--log-file-hours", "-1"], "--log-file-hours -1"),
+        (["replay"], "file"),
+        (["replay", "nowhere.blf", "--interface", "virtual"], "nowhere.blf"),
+        (["replay", RIDE + "x"], "did you mean '.blf'"),
+        (["replay", RIDE, "--speed", "-1"], "--speed -1"),
+        (["replay", RIDE, "--from", "-1"], "--from -1"),
+        (["replay", RIDE, "--from", "20", "--to", "10"], "--to 10 s"),
+        (["replay", RIDE, "--interface", "virtul"], "did you mean 'virtual'"),
+        (["estimate"], "FILE"),
+        (["estimate", RIDE, "--vehicle", "referenz"], "did you mean 'reference'"),
+        (["export", "nowhere.blf", "x.log"], "nowhere.blf"),
+        (["plot", "nowhere.mcap"], "nowhere.mcap"),
+        (["dashboard", "--interface", "virtul"], "virtul"),
+    ],
+    ids=lambda value: " ".join(value).replace(RIDE, "RIDE") if isinstance(value, list) else "",
+)
+def test_command_line(capsys: pytest.CaptureFixture[str], arguments: list[str], said: str):
+    assert said in refused(capsys, *arguments)
+
+
+VEHICLE = (ROOT / "gz_onboard" / "vehicles" / "reference.toml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "said"),
+    [
+        (
+            'pack_voltage = "BMS_PackVoltage"',
+            'pack_voltage = "BMS_PackVoltge"',
+            ("BMS_PackVoltge", "'BMS_PackVoltage'"),
+        ),
+        ('pack_voltage = "BMS', 'pack_volltage = "BMS', ("pack_volltage", "'pack_voltage'")),
+        ('"vehicle.dbc"', '"vehicel.dbc"', ("vehicel.dbc", "'vehicle.dbc'")),
+        ("[bus.messages.INV_Motion]", "[bus.messages.INV_Moton]", ("INV_Moton", "'INV_Motion'")),
+        ("[battery]", "[batery]", ("batery", "'battery'")),
+        ("schema = 1", "schema = 2", ("schema", "2")),
+        ("schema = 1", "schema == 1", ("line 1",)),
+        ('"aerodynamic_drag"', '"aerodynamic_darg"', ("aerodynamic_darg", "'aerodynamic_drag'")),
+        ('drag_area = { value = 0.556, unit = "m²"', 'drag_area = { value = 0.556, unit = "m"', ("drag_area", "m²")),
+        ("drag_area = { value = 0.556", 'drag_area = { value = "large"', ("drag_area", "large")),
+        ("drag_area = { value = 0.556", "drag_area = { value = nan", ("drag_area", "nan")),
+        ("cells_series = 14", "cells_series = 0", ("cells_series", "0")),
+    ],
+)
+def test_vehicle_file(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, right: str, wrong: str, said: tuple[str, ...]
+):
+    assert VEHICLE.count(right) >= 1
+    file = tmp_path / "mine.toml"
+    file.write_text(VEHICLE.replace(right, wrong, 1), encoding="utf-8")
+    err = refused(capsys, "run", "--interface", "virtual", "--channel", "a", "--vehicle", str(file))
+    assert "mine.toml" in err
+    for words in said:
+        assert words in err
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "said"),
+    [
+        ("BO_ 512 BMS_Pack: 8 BMS", "BO_ 512 BMS_Pack: 8", "line"),
+        ("SG_ BMS_PackCurrent : 16|16@1-", "SG_ BMS_PackCurrent : 16|16@1", "line"),
+        ("SG_ BMS_PackCurrent : 16|16@1-", "SG_ BMS_PackCurrent : 8|16@1-", "BMS_Pack"),
+    ],
+)
+def test_dbc(capsys: pytest.CaptureFixture[str], tmp_path: Path, right: str, wrong: str, said: str):
+    dbc = (ROOT / "dbc" / "vehicle.dbc").read_text(encoding="utf-8")
+    assert right in dbc
+    (tmp_path / "vehicle.dbc").write_text(dbc.replace(right, wrong), encoding="utf-8")
+    (tmp_path / "mine.toml").write_text(VEHICLE, encoding="utf-8")
+    err = refused(capsys, "run", "--interface", "virtual", "--channel", "a", "--vehicle", str(tmp_path / "mine.toml"))
+    assert "vehicle.dbc" in err
+    assert said in err
+
+
+@pytest.mark.parametrize("name", ["none.blf", "empty.blf", "noise.blf", "noise.mcap", "noise.log.gz", "noise.log"])
+@pytest.mark.parametrize("command", ["replay", "estimate"])
+def test_log(capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str, name: str):
+    file = tmp_path / name
+    if name != "none.blf":
+        file.write_bytes(b"" if name.startswith("empty") else b"\x07noise\xff\n" * 100)
+    if command == "replay":
+        assert name in refused(capsys, "replay", str(file), "--interface", "virtual", "--channel", "a")
+    else:  # 1: of several logs the others would have been estimated
+        assert status("estimate", str(file), "--output", str(tmp_path / "out")) == 1
+        err = capsys.readouterr().err
+        assert name in err
+        assert "Traceback" not in err
+
+
+def test_as_a_process():
+    """Nothing else than the message, as a person would see it."""
+    command = [sys.executable, "-m", "gz_onboard", "run", "--vehicle", "refrence"]
+    run = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert run.returncode == 2
+    assert run.stdout == ""
+    (line,) = run.stderr.splitlines()
+    assert line.startswith("gz-onboard run: refrence: ")
+
+
+def test_help_and_version(capsys: pytest.CaptureFixture[str]):
+    for command in ("run", "replay", "estimate", "export", "plot", "dashboard"):
+        assert status(command, "--help") == 0
+        assert f"gz-onboard {command}" in capsys.readouterr().out
+    assert status("--version") == 0

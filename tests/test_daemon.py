@@ -1,0 +1,273 @@
+"""The daemon in this process, on python-can's virtual bus: frames in, frames out, and what fails around it."""
+
+from __future__ import annotations
+
+import json
+import logging
+import resource
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import count
+from pathlib import Path
+
+import can
+import pytest
+
+from gz_onboard.bus.channel import Channel
+from gz_onboard.bus.logs import read_frames, read_samples
+from gz_onboard.bus.recorder import Recorder
+from gz_onboard.daemon import Daemon
+from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame, Reason, State
+from tests.support import S, Scooter, check_frames, reference, ridden
+
+_NUMBERS = count()
+
+
+@pytest.fixture
+def bus() -> str:
+    """The name of a virtual bus of its own."""
+    return f"bus{next(_NUMBERS)}"
+
+
+class Scene:
+    """A daemon in a thread, a ride onto its bus in real time, and all that is heard there."""
+
+    def __init__(self, bus: str, **options: object) -> None:
+        channel = Channel("virtual", bus)
+        channel.open()
+        self.daemon = Daemon(reference(), [channel], **{"recorder": None, "state_file": None, **options})  # type: ignore[arg-type]
+        self.heard: list[Frame] = []
+        self.end = threading.Event()
+        self._bus = bus
+        self._thread = threading.Thread(target=self.daemon.run)
+        self._ear = threading.Thread(target=self._listen)
+
+    def _listen(self) -> None:
+        with can.Bus(interface="virtual", channel=self._bus) as bus:
+            while not self.end.is_set():
+                message = bus.recv(0.1)
+                if message is not None and message.arbitration_id >= 0x600:
+                    stamp = round(message.timestamp * 1e9)
+                    self.heard.append((stamp, message.arbitration_id, bytes(message.data), 0))
+
+    def __enter__(self) -> Scene:
+        self._ear.start()
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.daemon.stop()
+        self._thread.join(10)
+        self.end.set()
+        self._ear.join(10)
+        assert not self._thread.is_alive()
+
+    def ride(self, seconds: float, until: Callable[[], bool] = lambda: False) -> list[Frame]:
+        """Send a steady ride for so long, or until something is so."""
+        frames = Scooter().steady(seconds)
+        sent: list[Frame] = []
+        begin, first = time.monotonic(), frames[0][0]
+        with can.Bus(interface="virtual", channel=self._bus) as bus:
+            for frame in frames:
+                pause = begin + (frame[0] - first) / S - time.monotonic()
+                if pause > 0.005:
+                    time.sleep(pause)
+                    if until():
+                        break
+                bus.send(can.Message(arbitration_id=frame[1], data=frame[2], is_extended_id=False))
+                sent.append(frame)
+            time.sleep(0.2)
+        return sent
+
+    def reasons(self) -> Reason:
+        last = self.daemon.pipeline.last
+        return last.reasons if last else Reason(0)
+
+
+def test_frames_in_frames_out(bus: str, tmp_path: Path):
+    recorder = Recorder(tmp_path, "v")
+    with Scene(bus, recorder=recorder) as scene:
+        sent = scene.ride(4.0)
+    decoded = check_frames(scene.heard)
+    assert 38 <= len(decoded["RANGE_Status"]) <= 50
+    assert 4 <= len(decoded["RANGE_Estimate"]) <= 6
+    valid = [row for row in decoded["RANGE_Estimate"] if row["RANGE_EstimateState"] == State.VALID]
+    assert valid
+    # The same ride offline: the wall clock stamped the frames here, so they differ by its jitter.
+    offline = ridden(sent).estimates[-1]
+    assert offline.range is not None
+    assert valid[-1]["RANGE_Remaining"] == pytest.approx(offline.range / 1000, rel=0.01)
+    (path,) = recorder.paths
+    logged = [frame for batch in read_frames(path) for frame in batch]
+    assert [f[1:3] for f in logged if not f[3] & TRANSMITTED] == [f[1:3] for f in sent]
+    assert [f[1:3] for f in logged if f[3] & TRANSMITTED] == [f[1:3] for f in scene.heard]
+
+
+def test_a_silent_bus_is_told_that_there_is_nothing(bus: str):
+    with Scene(bus) as scene:
+        time.sleep(1.5)
+    decoded = check_frames(scene.heard)
+    assert 10 <= len(decoded["RANGE_Status"]) <= 20
+    assert {row["RANGE_EstimateState"] for row in decoded["RANGE_Estimate"]} == {State.STARTING}
+    assert all(row["RANGE_Remaining"] > 655.34 for row in decoded["RANGE_Estimate"])
+
+
+def test_identifiers_of_others_are_not_taken_in(bus: str):
+    channel = Channel("virtual", bus, identifiers=[0x200, EFF_FLAG | 0x201])
+    channel.open()
+    with can.Bus(interface="virtual", channel=bus) as other:
+        for can_id, extended in ((0x200, False), (0x201, False), (0x200, True), (0x201, True), (0x7FF, False)):
+            other.send(can.Message(arbitration_id=can_id, is_extended_id=extended, data=b"\1"))
+    assert [frame[1] for frame in channel.drain()] == [0x200, EFF_FLAG | 0x201]
+    channel.close()
+
+
+@contextmanager
+def largest_file(size: int) -> Iterator[None]:
+    """No file may grow beyond `size` bytes: writing fails as on a full disk."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+def test_a_log_that_cannot_be_written_is_told_and_begun_again(bus: str, tmp_path: Path):
+    recorder = Recorder(tmp_path, "v", sync_s=0.2, retry_s=0.5)
+    with Scene(bus, recorder=recorder) as scene:
+        with largest_file(8_000):
+            scene.ride(8.0, lambda: bool(scene.reasons() & Reason.LOG_FAILED))
+            assert scene.reasons() & Reason.LOG_FAILED
+        begin = time.time_ns()
+        scene.ride(4.0)
+        assert not scene.reasons() & Reason.LOG_FAILED
+    assert recorder.errors >= 1
+    assert "too large" in recorder.last_error
+    assert recorder.lost_frames > 0
+    told = [row for row in check_frames(scene.heard)["RANGE_Status"] if row["RANGE_LogFailed"]]
+    assert any(row["RANGE_StatusState"] == State.VALID and row["RANGE_StateOfCharge"] <= 100 for row in told)
+    frames = [frame for batch in read_frames(recorder.paths[-1]) for frame in batch]
+    assert sum(frame[0] > begin for frame in frames) > 1000
+    reasons = [v["reasons"] for topic, _, v in read_samples(recorder.paths[-1]) if topic == "/estimate"]
+    assert "LOG_FAILED" not in reasons[-1]
+
+
+def state_of(file: Path) -> dict[str, object]:
+    found = json.loads(file.read_text())
+    assert isinstance(found, dict)
+    return found
+
+
+def test_it_goes_on_where_it_was(bus: str, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    caplog.set_level(logging.INFO)
+    file = tmp_path / "scooter.json"
+    with Scene(bus, state_file=file) as scene:
+        scene.ride(2.0)
+    assert "going on" not in caplog.text
+    before = scene.daemon.pipeline.estimator.filter
+    assert before is not None
+    saved = state_of(file)
+    with Scene(bus, state_file=file) as scene:
+        scene.ride(1.0)
+        assert "going on from the state saved" in caplog.text
+        after = scene.daemon.pipeline.estimator.filter
+    assert after is not None
+    assert after.soc == pytest.approx(before.soc, abs=1e-3)
+    assert state_of(file)["saved_at"] > saved["saved_at"]  # type: ignore[operator]
+
+
+def damaged(text: str) -> str:
+    return text[: len(text) // 2]
+
+
+def no_object(text: str) -> str:
+    return "[]"
+
+
+def foreign(text: str) -> str:
+    document = json.loads(text)
+    document["estimator"]["key"] = "another scooter|10s4p"
+    return json.dumps(document)
+
+
+def other_version(text: str) -> str:
+    document = json.loads(text)
+    document["estimator"]["version"] = 99
+    return json.dumps(document)
+
+
+def implausible(text: str) -> str:
+    document = json.loads(text)
+    document["estimator"]["soc"] = 5.0
+    return json.dumps(document)
+
+
+def incomplete(text: str) -> str:
+    document = json.loads(text)
+    del document["estimator"]["riding"]
+    return json.dumps(document)
+
+
+def without_numbers(text: str) -> str:
+    document = json.loads(text)
+    document["estimator"]["covariance"] = ["a", None, {}]
+    return json.dumps(document)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (damaged, "cannot be read"),
+        (no_object, "is not a saved state"),
+        (foreign, "is of 'another scooter|10s4p', this is 'reference-scooter"),
+        (other_version, "is of version 99"),
+        (implausible, "implausible numbers"),
+        (incomplete, "is damaged: KeyError"),
+        (without_numbers, "not used"),
+    ],
+)
+def test_a_state_that_does_not_fit_is_refused_whole_and_said_so(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, spoil: Callable[[str], str], said: str
+):
+    caplog.set_level(logging.INFO)
+    file = tmp_path / "scooter.json"
+    first = ridden(Scooter().steady(5.0)).pipeline.estimator
+    first.road.bias_x = 0.01
+    text = json.dumps({"saved_at": time.time(), "estimator": first.snapshot(reference().key)})
+    file.write_text(spoil(text))
+    daemon = Daemon(reference(), [], None, file)
+    fresh = Daemon(reference(), [], None, None)
+    daemon.stop()
+    daemon.run()
+    assert said in caplog.text
+    assert "not used" in caplog.text
+    ours, new = daemon.pipeline.estimator, fresh.pipeline.estimator
+    assert ours.road == new.road
+    assert ours.forecaster.riding == new.forecaster.riding
+    assert ours._saved is None
+    assert file.read_text() == spoil(text)  # nothing is known yet, so nothing is saved over it
+
+
+def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    caplog.set_level(logging.INFO)
+    (tmp_path / "file").write_text("in the way")
+    with Scene(bus, state_file=tmp_path / "file" / "state" / "scooter.json") as scene:
+        scene.ride(1.0)
+        scene.daemon._save()
+        last = scene.daemon.pipeline.last
+        assert last is not None
+        assert last.state is State.VALID
+    assert caplog.text.count("cannot save the state") == 1
+    assert "not used" in caplog.text or "cannot be read" in caplog.text
+
+
+def test_what_changes_is_said_once(bus: str, caplog: pytest.LogCaptureFixture):
+    caplog.set_level(logging.INFO)
+    with Scene(bus) as scene:
+        scene.ride(3.0)
+    said = [record.getMessage() for record in caplog.records if "dropped" in record.getMessage()]
+    assert any(line.startswith("valid: ") for line in said)
+    assert len(said) <= 4
