@@ -98,7 +98,7 @@ VEHICLE_PARAMETERS = (
     Parameter("camber_stiffness_front", "1/rad", 0.85, 0.15, 0, 2, "per load: Pacejka 2012, ch. 11: 0.8"),
     Parameter("camber_stiffness_rear", "1/rad", 0.85, 0.15, 0, 2, "per load: Pacejka 2012, ch. 11: 0.8"),
     Parameter("side_friction", "1", 1.2, 0.15, 0.1, 2, "largest side force per load: Pacejka 2012, ch. 11"),
-    Parameter("twisting_arm", "m/rad", 0.03, 0.02, 0, 0.2, "Pacejka 2012, ch. 11: 0.08 at 2 kN, less on small tyres"),
+    Parameter("twisting_arm", "m/rad", 0.02, 0.015, 0, 0.2, "brush model, 20 per load, half width 25 mm: C_κ·w²/(3·r)"),
     Parameter("tyre_relaxation_length", "m", 0.15, 0.05, 0.02, 1, "sideways: Cossalter 2006, sec. 2.6, 0.1 to 0.3 m"),
     Parameter("regeneration_torque_limit", "N·m", 19, 3, 0, 500, "the most that the motor brakes with, at its shaft"),
 )

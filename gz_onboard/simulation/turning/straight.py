@@ -1,0 +1,59 @@
+"""The straight chassis with pitch (Lord 2016, eqs. 3.1-3.7): it knows no turn, whatever the steering does."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gz_onboard.simulation.turning.machine import Machine, Rates, Road, State
+
+
+@dataclass(frozen=True)
+class Straight:
+    """State: speed [m/s], distance [m]."""
+
+    machine: Machine
+
+    def start(self, speed: float) -> State:
+        """The state at `speed` [m/s]."""
+        return speed, 0.0
+
+    def energy(self, state: State) -> float:
+        """Kinetic energy [J], of the turning wheels too."""
+        m = self.machine
+        return (m.mass + m.spin_inertia / m.wheel_radius**2) * state[0] ** 2 / 2
+
+    def rates(self, state: State, steer: float, drive: float | None, road: Road) -> Rates:
+        """With a force `drive` [N] of the driven wheel (None: the one that holds the speed); `steer` does nothing."""
+        m = self.machine
+        speed = state[0]
+        drag, slope = m.resistance(speed, road)
+        weight = m.weight(road)
+        rolling = m.rolling(speed) * weight
+        against = drag + slope + rolling
+        if drive is None:
+            drive = against
+        acceleration = (drive - against) / (m.mass + m.spin_inertia / m.wheel_radius**2)
+        ground = m.mass * acceleration + drag + slope  # what the tyres push the machine with
+        front = min(max((weight * m.cg_to_rear - ground * m.cg_height) / m.wheelbase, 0.0), weight)
+        return Rates(
+            (acceleration, speed),
+            {
+                "aerodynamic drag": drag * speed,
+                "rolling": rolling * speed,
+                "sideslip": 0.0,
+                "twisting": 0.0,
+                "grade": slope * speed,
+                "drive": -drive * speed,
+            },
+            {
+                "speed": speed, "acceleration": acceleration, "drive": drive,
+                "lateral_acceleration": 0.0, "yaw_rate": 0.0, "lean": 0.0, "steer": 0.0,
+                "load_front": front, "load_rear": weight - front,
+                "plane_load_front": front, "plane_load_rear": weight - front, "rolling_radius": m.wheel_radius,
+                "slip_front": 0.0, "slip_rear": 0.0, "side_front": 0.0, "side_rear": 0.0,
+            },
+        )  # fmt: skip
+
+    def handlebar(self, steer: float, lean: float) -> float:
+        """Handlebar angle [rad] for a steer angle at the ground: there is no steering."""
+        return steer

@@ -1,0 +1,289 @@
+"""The comparative study of Lord 2016, sec. 4.4: coast-downs at constant roll in three chassis models.
+
+    python -m gz_onboard.simulation.turning.study --output DIR
+
+The rider leans in at a held speed, then lets go; he steers so that the product of speed and yaw rate, and with it the
+roll, stays the same while the speed falls: the turn tightens with the square of the speed. All models ride the turn of
+the leaning machine, so they differ in forces, not in path.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from math import atan, cos, degrees, pi, radians, tan
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gz_onboard.physics.model import G
+from gz_onboard.simulation.turning.leaning import Leaning
+from gz_onboard.simulation.turning.machine import Machine, Rates, Road, State, step
+from gz_onboard.simulation.turning.planar import Planar
+from gz_onboard.simulation.turning.straight import Straight
+from gz_onboard.simulation.turning.tyre import ideal_of
+from gz_onboard.vehicle import read_vehicle
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Chassis = Straight | Planar | Leaning
+
+ROLLS = (0.0, 5.0, 10.0, 20.0, 30.0)  # degrees
+MODELS: dict[str, type[Straight] | type[Planar] | type[Leaning]] = {
+    "straight": Straight,
+    "planar": Planar,
+    "leaning": Leaning,
+}
+FAST, SLOW = 12.5, 5.0  # m/s: the scooter's top speed; below 5 m/s a turn at 30 degrees has less than 4.5 m
+LEAD_IN, LEAN_IN = 8.0, 3.0  # s: until the rider lets go; in which he leans
+DISTANCE = 60.0  # m: over which energy is compared, for all models lose the same from one speed to another
+LOOK_AT = 8.0  # m/s: speed at which loads, slip and radius are compared
+STEP = 0.005  # s
+STEER_GAIN, STEER_INTEGRAL = 0.05, 0.5  # s, 1: steer for an error of the yaw rate, and for its integral
+
+
+@dataclass(frozen=True)
+class CoastDown:
+    """What was recorded from letting go on: times [s], distances [m], energy lost [J] by name and in all, the rest."""
+
+    time: list[float]
+    distance: list[float]
+    lost: list[dict[str, float]]
+    kinetic: list[float]
+    states: list[State]
+    seen: list[dict[str, float]]
+
+    def at_distance(self, distance: float, values: Sequence[float]) -> float:
+        """`values` where `distance` [m] has been ridden; inf if it never was."""
+        return _interpolate(distance, self.distance, values)
+
+    def at_speed(self, speed: float, name: str) -> float:
+        """What was seen as `name` when the speed [m/s] fell to `speed`; inf if it never did."""
+        return _interpolate(-speed, [-seen["speed"] for seen in self.seen], [seen[name] for seen in self.seen])
+
+
+def _interpolate(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
+    for i in range(1, len(xs)):
+        if xs[i - 1] <= x <= xs[i]:
+            share = (x - xs[i - 1]) / (xs[i] - xs[i - 1]) if xs[i] > xs[i - 1] else 0.0
+            return ys[i - 1] + share * (ys[i] - ys[i - 1])
+    return float("inf")
+
+
+class Rider:
+    """Steers `chassis` so that it turns as a machine that leans by `roll` [rad, positive right].
+
+    A kinematic steer for the wanted yaw rate -g·tan φ_ideal/u, and feedback of the yaw rate with an integral. That
+    integral and the time [s] are the last two entries of the state: the rider is integrated with the machine.
+    """
+
+    def __init__(self, chassis: Chassis, roll: float, road: Road) -> None:
+        self.chassis, self.road = chassis, road
+        machine = chassis.machine
+        self.turn = -G * tan(ideal_of(roll, machine.crown, machine.cg_height))  # m/s²
+        self.let_go = False
+
+    def start(self, speed: float) -> State:
+        """Straight ahead at `speed` [m/s]."""
+        return *self.chassis.start(speed), 0.0, 0.0
+
+    def rates(self, state: State) -> Rates:
+        """The rates of chassis and rider."""
+        *body, integral, time = state
+        speed = max(body[0], 1.0)
+        wanted = self.turn / speed
+        if time < LEAN_IN:
+            wanted *= (1 - cos(pi * time / LEAN_IN)) / 2
+        error = 0.0
+        steer = atan(self.chassis.machine.wheelbase * wanted / speed)
+        if not isinstance(self.chassis, Straight):
+            error = wanted - body[2]
+            steer += STEER_GAIN * error + integral
+        lean = body[8] if isinstance(self.chassis, Leaning) else 0.0
+        drive = 0.0 if self.let_go else None
+        rates = self.chassis.rates(tuple(body), self.chassis.handlebar(steer, lean), drive, self.road)
+        return Rates((*rates.change, STEER_INTEGRAL * error, 1.0), rates.power, rates.seen)
+
+
+def coast_down(
+    chassis: Chassis, roll: float, *, fast: float = FAST, slow: float = SLOW, road: Road | None = None, dt: float = STEP
+) -> CoastDown:
+    """Lean to `roll` [rad] at `fast` [m/s], let go, and record until `slow` [m/s] (at most 10 minutes)."""
+    rider = Rider(chassis, roll, road or Road())
+    state = rider.start(fast)
+    for _ in range(round(LEAD_IN / dt)):
+        state, _ = step(rider.rates, state, dt)
+    rider.let_go = True
+    record = CoastDown([], [], [], [], [], [])
+    lost = dict.fromkeys(rider.rates(state).power, 0.0)
+    distance = 0.0
+    for i in range(round(600 / dt)):
+        body = state[:-2]
+        record.time.append(i * dt)
+        record.distance.append(distance)
+        record.lost.append(dict(lost))
+        record.kinetic.append(chassis.energy(body))
+        record.states.append(body)
+        record.seen.append(rider.rates(state).seen)
+        if state[0] <= slow:
+            break
+        after, energy = step(rider.rates, state, dt)
+        distance += (state[0] + after[0]) / 2 * dt
+        for name, value in energy.items():
+            lost[name] += value
+        state = after
+    return record
+
+
+def held(chassis: Chassis, roll: float, speed: float, *, dt: float = STEP, seconds: float = 12.0) -> Rates:
+    """The steady turn at `roll` [rad] and `speed` [m/s], held by the drive: its power and what else is seen."""
+    rider = Rider(chassis, roll, Road())
+    state = rider.start(speed)
+    for _ in range(round(seconds / dt)):
+        state, _ = step(rider.rates, state, dt)
+    return rider.rates(state)
+
+
+def row(model: str, roll: float, run: CoastDown) -> dict[str, Any]:
+    """The figures of one coast-down at `roll` [degrees]; lengths in m, energies in J, angles in degrees."""
+
+    def over(name: str) -> float:
+        return run.at_distance(DISTANCE, [lost[name] for lost in run.lost])
+
+    parts = {name: over(name) for name in run.lost[0] if name not in ("grade", "drive")}
+    lateral = run.at_speed(LOOK_AT, "lateral_acceleration")
+    side = -1.0 if lateral < 0 else 1.0  # slip angles are told as positive into the turn
+    return {
+        "roll": roll,
+        "model": model,
+        "distance": run.distance[-1],
+        "time": run.time[-1],
+        "lost": sum(parts.values()),
+        "parts": parts,
+        "speed after": run.at_distance(DISTANCE, [seen["speed"] for seen in run.seen]),
+        "lateral acceleration": abs(lateral),
+        "load front": run.at_speed(LOOK_AT, "load_front"),
+        "load rear": run.at_speed(LOOK_AT, "load_rear"),
+        "plane load front": run.at_speed(LOOK_AT, "plane_load_front"),
+        "plane load rear": run.at_speed(LOOK_AT, "plane_load_rear"),
+        "rolling radius": run.at_speed(LOOK_AT, "rolling_radius"),
+        "slip front": side * degrees(run.at_speed(LOOK_AT, "slip_front")),
+        "slip rear": side * degrees(run.at_speed(LOOK_AT, "slip_rear")),
+    }
+
+
+def markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """The table of the study."""
+    lines = [
+        f"| roll | model | lost in {DISTANCE:.0f} m | air | rolling | sideslip | twisting "
+        f"| coasts to {SLOW:.0f} m/s in | load front, rear "
+        "| in the wheel's plane | rolling radius | slip front, rear |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for r in rows:
+        p = r["parts"]
+        lines.append(
+            f"| {r['roll']:.0f}° | {r['model']} | {r['lost']:.0f} J | {p['aerodynamic drag']:.0f} | {p['rolling']:.0f} "
+            f"| {p['sideslip']:.0f} | {p['twisting']:.0f} | {r['distance']:.0f} m, {r['time']:.1f} s "
+            f"| {r['load front']:.0f}, {r['load rear']:.0f} N "
+            f"| {r['plane load front']:.0f}, {r['plane load rear']:.0f} N | {1000 * r['rolling radius']:.1f} mm "
+            f"| {r['slip front']:.2f}°, {r['slip rear']:.2f}° |"
+        )
+    return "\n".join(lines)
+
+
+def plot(runs: dict[tuple[str, float], CoastDown], output: Path) -> list[Path]:
+    """Two pictures of the runs in the folder `output`; their paths."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    colours = dict(zip(ROLLS, ("#1f2933", "#1667b7", "#2f855a", "#d9730d", "#c53030"), strict=True))
+    styles = {"straight": ":", "planar": "--", "leaning": "-"}
+
+    def lines(axes: Axes, value: Callable[[CoastDown], tuple[list[float], list[float]]], title: str) -> None:
+        for (model, roll), run in runs.items():
+            if model != "straight" or roll == 0:
+                axes.plot(*value(run), styles[model], color=colours[roll], linewidth=1.4)
+        axes.set_title(title, fontsize=10, loc="left")
+        axes.grid(color="#e4e7eb")
+        axes.spines[["top", "right"]].set_visible(False)
+
+    def legend(axes: Axes) -> None:
+        from matplotlib.lines import Line2D
+
+        handles = [Line2D([], [], color=colours[roll], label=f"{roll:.0f}°") for roll in ROLLS]
+        for model in MODELS:
+            handles += axes.plot([], [], styles[model], color="#7b8794", label=model)
+        axes.legend(handles=handles, fontsize=8, frameon=False, ncols=2)
+
+    paths = []
+    figure, grid = plt.subplots(1, 3, figsize=(11.5, 3.8), layout="constrained")
+    lines(grid[0], lambda run: (run.time, [s["speed"] for s in run.seen]), "Speed [m/s] over time [s]")
+    legend(grid[0])
+    turned = {key: run for key, run in runs.items() if key[1] and key[0] != "straight"}
+    for (model, roll), run in turned.items():
+        grid[1].plot([s[3] for s in run.states], [s[4] for s in run.states], styles[model], color=colours[roll])
+    grid[1].set_aspect("equal", adjustable="datalim")
+    grid[1].set_title("Path of the coast-down [m]", fontsize=10, loc="left")
+    grid[1].grid(color="#e4e7eb")
+    names = ("aerodynamic drag", "rolling", "sideslip", "twisting")
+    shades = ("#9fb3c8", "#52606d", "#d9730d", "#c53030")
+    bottoms = [0.0] * (len(ROLLS) * len(MODELS))
+    keys = [(model, roll) for roll in ROLLS for model in MODELS]
+    rows = [row(model, roll, runs[model, roll]) for model, roll in keys]
+    places = [i + i // len(MODELS) for i in range(len(keys))]
+    for name, shade in zip(names, shades, strict=True):
+        heights = [r["parts"][name] / 1000 for r in rows]
+        grid[2].bar(places, heights, bottom=bottoms, color=shade, label=name, width=0.85)
+        bottoms = [low + height for low, height in zip(bottoms, heights, strict=True)]
+    labels = [f"{model[0]}\n{roll:.0f}°" if model == "planar" else model[0] for model, roll in keys]
+    grid[2].set_xticks(places, labels, fontsize=8)
+    grid[2].set_ylim(0, max(bottoms) * 1.3)
+    grid[2].legend(fontsize=8, frameon=False, ncols=2)
+    grid[2].set_title(f"Lost in {DISTANCE:.0f} m [kJ]: straight, planar, leaning", fontsize=10, loc="left")
+    grid[2].spines[["top", "right"]].set_visible(False)
+    paths.append(output / "turning_energy.png")
+    figure.savefig(paths[-1], dpi=90)
+
+    figure, grid = plt.subplots(1, 4, figsize=(13, 3.6), layout="constrained")
+    panels = (
+        ("load_front", 1.0, "Front load [N] over speed [m/s]"),
+        ("rolling_radius", 1000.0, "Rolling radius [mm]"),
+        ("slip_front", -180 / pi, "Front slip into the turn [°]"),
+        ("slip_rear", -180 / pi, "Rear slip into the turn [°]"),
+    )
+    for axes, (name, factor, title) in zip(grid, panels, strict=True):
+        lines(axes, lambda run: ([s["speed"] for s in run.seen], [factor * s[name] for s in run.seen]), title)  # noqa: B023
+        axes.invert_xaxis()
+    legend(grid[0])
+    paths.append(output / "turning_tyres.png")
+    figure.savefig(paths[-1], dpi=90)
+    plt.close("all")
+    return paths
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the study and write turning.md, turning.json and the pictures."""
+    parser = argparse.ArgumentParser(prog="python -m gz_onboard.simulation.turning.study", description=__doc__)
+    parser.add_argument("--output", type=Path, required=True, metavar="DIR", help="folder for the table and the plots")
+    parser.add_argument("--vehicle", default="reference", help="vehicle file (default: the reference scooter)")
+    arguments = parser.parse_args(argv)
+    machine = Machine.of(read_vehicle(arguments.vehicle).parameters)
+    runs = {(name, roll): coast_down(MODELS[name](machine), radians(roll)) for roll in ROLLS for name in MODELS}
+    rows = [row(model, roll, run) for (model, roll), run in runs.items()]
+    arguments.output.mkdir(parents=True, exist_ok=True)
+    table = markdown(rows)
+    (arguments.output / "turning.md").write_text(table + "\n", encoding="utf-8")
+    (arguments.output / "turning.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    plot(runs, arguments.output)
+    print(table)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
