@@ -9,7 +9,6 @@ import csv
 from bisect import bisect_right
 from dataclasses import dataclass
 from functools import cache, cached_property
-from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
 
@@ -218,7 +217,7 @@ def _ece15() -> tuple[float, ...]:
 @cache
 def _table() -> dict[str, tuple[float, ...]]:
     """The columns of cycles.csv [m/s] by cycle; shorter ones end with empty fields."""
-    text = files(__package__).joinpath("cycles.csv").read_text(encoding="utf-8")
+    text = Path(__file__).with_name("cycles.csv").read_text(encoding="utf-8")
     header, *rows = csv.reader(text.splitlines())
     table = {}
     for column, title in enumerate(header[1:], start=1):

@@ -90,9 +90,9 @@ def test_given_curvature_is_kept_and_gives_the_heading(tmp_path):
     assert math.isnan(way.at(0.0).latitude)
 
 
-@given(slope=st.floats(-0.2, 0.2), start=st.floats(-100, 1000), spacing=st.sampled_from([1.0, 7.0, 20.0, 150.0]))
+@given(slope=st.floats(-0.1, 0.1), start=st.floats(-100, 1000), spacing=st.sampled_from([1.0, 7.0, 20.0, 500.0]))
 def test_even_hill_has_its_grade_everywhere(tmp_path_factory, slope, start, spacing):
-    points = [(start + spacing * i, 3000 + start + slope * spacing * i) for i in range(60)]
+    points = [(start + spacing * i, 4000 + start + slope * spacing * i) for i in range(60)]
     way = road(tmp_path_factory.mktemp("hill"), points)
     assert way.grade == pytest.approx([slope] * 60, abs=1e-9)
     assert way.curvature == (0.0,) * 60
