@@ -39,6 +39,7 @@ BATTERY_PARAMETERS = (
 SIMULATION_PARAMETERS = (
     Parameter("voltage_constant", "V·s/rad", 0.544, 0.01, 0.001, 20, "Lord 2016, fig. 2.12: 0.057 V per r/min"),
     Parameter("motor_current_limit", "A", 211, 3, 1, 2000, "the greatest current of the recorded rides"),
+    Parameter("cell_mass", "kg", 0.047, 0.002, 0.001, 20, "18650 cell: what one more adds to the vehicle"),
     Parameter("gear_efficiency", "1", 1.0, 0.01, 0.5, 1.0, "a hub motor has no gear"),
     Parameter("brake_torque_limit", "N·m", 280, 60, 1, 5000, "both wheels: 0.6 g with rider"),
     Parameter("front_brake_share", "1", 0.65, 0.1, 0, 1, "of the braking torque; the rear wheel is unloaded"),

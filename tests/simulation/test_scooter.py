@@ -193,6 +193,29 @@ def test_cold_hot_and_empty_are_derated():
     assert pulled() > pulled(cell_temperature=-15.0)
 
 
+@pytest.mark.parametrize(("soc", "ambient"), [(0.12, -5.0), (0.1, 20.0), (0.3, -10.0)])
+def test_held_back_by_its_voltage_it_does_not_chatter(soc, ambient):
+    """Current sags the voltage, which limits the current: a loop that must not swing from step to step."""
+    scooter = Scooter(VEHICLE, straight(0.03), soc=soc, ambient=ambient)
+    voltage = []
+    for _ in range(1000):
+        scooter.step(1.0, 0.0)
+        voltage.append(scooter.voltage)
+    assert max(abs(b - a) for a, b in zip(voltage[200:], voltage[201:], strict=False)) < 0.2
+    assert scooter.motor_current < 0.95 * VEHICLE.parameters["motor_current_limit"]
+
+
+def test_effects_written_out_are_those_of_the_model():
+    from gz_onboard.physics.effect import QUANTITIES
+    from gz_onboard.physics.model import Bound
+    from gz_onboard.simulation.scooter import _bind
+
+    p = VEHICLE.parameters
+    q = {name: 1.5 + i for i, name in enumerate(QUANTITIES)}
+    for effect in VEHICLE.model.effects:
+        assert _bind(effect, p)(q) == Bound(effect, {name: p[name] for name in effect.keywords})(q)
+
+
 def test_rider_stops_integrating_at_the_end_of_its_command():
     rider = Rider()
     for _ in range(10_000):

@@ -1,6 +1,8 @@
 """The motor controller: current by throttle, limited by speed, temperature, voltage and state of charge.
 
-The thesis names it and does not give it (it is proprietary): piecewise-linear derating tables stand in.
+The thesis names it and does not give it (it is proprietary): piecewise-linear derating tables stand in. Those over
+speed and cell voltage are what eight road rides of the reference scooter show of current over throttle: constant up to
+35 rad/s, then falling as one over speed (constant power) to the speed limit; the rest are guesses.
 """
 
 from __future__ import annotations
@@ -29,14 +31,16 @@ class Controller:
 
     current_limit: float
     regeneration_limit: float  # A
-    by_speed: Table = ((0.0, 1.0), (54.0, 1.0), (57.0, 0.0))  # rad/s of the motor
+    by_speed: Table = (
+        (0.0, 1.0), (35.3, 1.0), (38.0, 0.929), (41.0, 0.861), (44.0, 0.802), (47.5, 0.743), (53.0, 0.666), (55.4, 0.0),
+    )  # rad/s of the motor  # fmt: skip
     by_motor: Table = ((0.0, 1.0), (120.0, 1.0), (150.0, 0.2))  # degC
     by_inverter: Table = ((0.0, 1.0), (80.0, 1.0), (100.0, 0.2))  # degC
     by_cell: Table = ((-20.0, 0.3), (-5.0, 1.0), (50.0, 1.0), (62.0, 0.1))  # degC
-    by_cell_voltage: Table = ((2.75, 0.05), (3.05, 1.0))  # V of a cell
+    by_cell_voltage: Table = ((2.75, 0.1), (2.89, 0.46), (3.04, 0.77), (3.16, 1.0))  # V of a cell
     by_soc: Table = ((0.0, 0.1), (0.08, 1.0))
     regeneration_by_soc: Table = ((0.95, 1.0), (1.0, 0.0))
-    regeneration_by_speed: Table = ((1.5, 0.0), (6.0, 1.0))  # rad/s
+    regeneration_by_speed: Table = ((7.0, 0.0), (14.5, 1.0))  # rad/s
     _slow: float = field(default=1.0, init=False)
     _slow_regeneration: float = field(default=1.0, init=False)
 

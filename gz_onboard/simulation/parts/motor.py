@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
-from gz_onboard.physics.model import Bound
+Loss = Callable[[Mapping[str, float]], float]
+"""Heat [W] at motor_speed, motor_current and motor_temperature."""
 
 
 class Motor(Protocol):
@@ -22,7 +23,7 @@ class Motor(Protocol):
 class EffectMotor:
     """A motor whose losses are effects of the vehicle's model: copper, iron, and what else its file lists."""
 
-    def __init__(self, effects: Sequence[tuple[str, Bound]], torque_constant: float, voltage_constant: float) -> None:
+    def __init__(self, effects: Sequence[tuple[str, Loss]], torque_constant: float, voltage_constant: float) -> None:
         self.torque_constant = torque_constant
         self.voltage_constant = voltage_constant
         self._effects = list(effects)

@@ -1,0 +1,291 @@
+"""Rides of the simulated scooter: along a cycle, along a route, or with throttle and brake given.
+
+`drive` is the loop; what it is told each step is a `Command`. Nothing here reads files or prints.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from math import nan
+from typing import TYPE_CHECKING, Any
+
+from gz_onboard.physics.battery import drawable
+from gz_onboard.simulation.parts.rider import Rider
+from gz_onboard.simulation.scooter import Road, Scooter
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    Array = np.ndarray[Any, np.dtype[np.float64]]
+
+COLUMNS = {
+    "time": "s",
+    "distance": "m",
+    "speed": "m/s",
+    "wanted_speed": "m/s",  # not a number where the ride is open loop
+    "throttle": "1",
+    "brake": "1",
+    "grade": "1",
+    "motor_speed": "rad/s",
+    "motor_current": "A",
+    "motor_torque": "N·m",
+    "pack_current": "A",
+    "pack_voltage": "V",
+    "soc": "1",
+    "energy": "J",  # delivered by the pack since the start, less what was recovered
+    "cell_temperature": "degC",
+    "motor_temperature": "degC",
+    "inverter_temperature": "degC",
+    "bms_temperature": "degC",
+    "rear_load": "N",
+    "front_load": "N",
+    "tyre_force": "N",
+}
+"""The time series of a run, with their units; signs as in `physics.effect`, current positive discharging."""
+
+TOLERANCE = 3.2 / 3.6  # m/s
+TOLERANCE_TIME = 1.0  # s
+"""How far from its speed a cycle may be ridden: 3.2 km/h from any speed within 1 s (UN GTR No. 2, par. 7.2; 40 CFR
+1066.425)."""
+
+Command = Callable[[Scooter], tuple[float, float, float]]
+"""(throttle 0..1, brake 0..1, wanted speed [m/s] or not a number) for the next step."""
+Progress = Callable[[float], None]
+"""Is told how many seconds have been ridden since it was told last."""
+
+
+@dataclass(frozen=True)
+class Shortfall:
+    """A stretch in which the ride was slower than the profile, beyond the tolerance."""
+
+    time: float  # s, its begin
+    distance: float  # m, its begin
+    duration: float  # s
+    missing: float  # m/s, at most
+    wanted: float  # m/s, where most was missing
+    throttle: float  # the mean in it: near 1, the vehicle could not; below, the rider did not
+
+    @property
+    def beyond_vehicle(self) -> bool:
+        """Whether the throttle was open all along."""
+        return self.throttle > 0.95
+
+
+@dataclass
+class Run:
+    """What came out of a ride. Energies in J."""
+
+    series: dict[str, Array]  # by the names of `COLUMNS`, of one length
+    ledger: dict[str, float]  # every loss by name, and kinetic and potential energy gained; its sum is `chemical`
+    chemical: float  # that has left the cells' chemistry
+    energy: float  # delivered at the pack's terminals, less what was recovered
+    recovered: float  # charged into the pack
+    distance: float  # m
+    duration: float  # s
+    soc_start: float
+    soc_end: float
+    mean_power: float  # W, at the terminals
+    form: float  # mean square of the pack current over the square of its mean
+    empty: bool = False  # the ride ended because the pack was empty
+    shortfalls: list[Shortfall] = field(default_factory=list)
+
+    @property
+    def consumption(self) -> float | None:
+        """Energy for the distance [J/m]; None below 100 m."""
+        return self.energy / self.distance if self.distance >= 100 else None
+
+    @property
+    def closure(self) -> float:
+        """What the ledger misses of the energy out of the cells, as a share of all that was turned over."""
+        turnover = sum(abs(energy) for energy in self.ledger.values())
+        return (self.chemical - sum(self.ledger.values())) / turnover if turnover else 0.0
+
+
+def drive(
+    scooter: Scooter,
+    command: Command,
+    seconds: float,
+    *,
+    sample: float = 0.1,
+    until_empty: bool = False,
+    finish: float | None = None,
+    progress: Progress | None = None,
+) -> Run:
+    """Ride for `seconds`; a row of the series each `sample` [s], the first before the first step.
+
+    until_empty: end where the cells reach the cut-off voltage or SOC 0. finish: end at this distance [m].
+    """
+    import numpy as np
+
+    dt = scooter.dt
+    every = max(round(sample / dt), 1)
+    battery = scooter.vehicle.battery
+    assert battery  # a Scooter has one
+    cutoff = battery.cutoff_voltage * battery.cells_series if until_empty else -1.0
+    end = finish if finish is not None else float("inf")
+    kinetic, soc_start = scooter.kinetic_energy(), scooter.pack.soc
+    energy = recovered = charge = squares = 0.0
+    wanted = nan
+    rows = [_row(scooter, nan, 0.0)]
+    steps = round(seconds / dt)
+    done, empty = 0, False
+    step = scooter.step
+    while done < steps:
+        throttle, brake, wanted = command(scooter)
+        step(throttle, brake)
+        done += 1
+        current = scooter.current
+        part = scooter.voltage * current * dt
+        energy += part
+        if part < 0.0:
+            recovered -= part
+        charge += current
+        squares += current * current
+        if not done % every:
+            rows.append(_row(scooter, wanted, energy))
+            if progress and not done % (100 * every):
+                progress(100 * every * dt)
+        if scooter.distance >= end:
+            break
+        if until_empty and (scooter.voltage <= cutoff or scooter.pack.soc <= 0.0):
+            empty = True
+            break
+    if done % every:
+        rows.append(_row(scooter, wanted, energy))
+    series = dict(zip(COLUMNS, np.array(rows, dtype=float).T, strict=True))
+    series["wanted_speed"][0] = series["wanted_speed"][1] if len(rows) > 1 else nan
+    duration = done * dt
+    run = Run(
+        series=series,
+        ledger={
+            **scooter.ledger.entries,
+            "kinetic_energy": scooter.kinetic_energy() - kinetic,
+            "potential_energy": scooter.potential_energy(),
+        },
+        chemical=scooter.pack.chemical_energy_drawn(),
+        energy=energy,
+        recovered=recovered,
+        distance=scooter.distance,
+        duration=duration,
+        soc_start=soc_start,
+        soc_end=scooter.pack.soc,
+        mean_power=energy / duration if duration else 0.0,
+        form=max(squares * done / (charge * charge), 1.0) if charge else 1.0,
+        empty=empty,
+    )
+    run.shortfalls = shortfalls(series)
+    return run
+
+
+def _row(scooter: Scooter, wanted: float, energy: float) -> tuple[float, ...]:
+    """The values of `COLUMNS`, in their order."""
+    return (
+        scooter.time, scooter.distance, scooter.speed, wanted, scooter.throttle, scooter.brake,
+        0.0 if scooter.dynamometer else scooter.road(scooter.distance)[0],
+        scooter.wheel_speed / scooter.vehicle.parameters["gear_ratio"], scooter.motor_current,
+        scooter.motor.torque_constant * scooter.motor_current, scooter.current, scooter.voltage, scooter.pack.soc,
+        energy,
+        scooter.pack_cooling.temperature, scooter.motor_cooling.stator, scooter.inverter_cooling.board,
+        scooter.bms_cooling.temperature, scooter.rear_load, scooter.front_load, scooter.force,
+    )  # fmt: skip
+
+
+# --- commands -----------------------------------------------------------------------------------------------------
+
+
+def follow(speeds: Sequence[float], dt: float, rider: Rider | None = None) -> Command:
+    """A rider who follows `speeds` [m/s], one for each step of `dt` [s]; after the last it begins anew."""
+    rider, count = rider or Rider(), len(speeds)
+
+    def command(scooter: Scooter) -> tuple[float, float, float]:
+        wanted = speeds[round(scooter.time / dt) % count]
+        return *rider.step(wanted, scooter.speed, dt), wanted
+
+    return command
+
+
+def replay(throttle: Sequence[float], brake: Sequence[float], dt: float) -> Command:
+    """Throttle and brake as given, one of each for each step of `dt` [s]; after the last as there."""
+    last = min(len(throttle), len(brake)) - 1
+
+    def command(scooter: Scooter) -> tuple[float, float, float]:
+        i = min(round(scooter.time / dt), last)
+        return throttle[i], brake[i], nan
+
+    return command
+
+
+def at_steps(time: Sequence[float], speed: Sequence[float], dt: float) -> list[float]:
+    """`speed` at each step of `dt` [s] within `time` [s], the end of the step counting: a rider looks ahead."""
+    import numpy as np
+
+    steps = round((time[-1] - time[0]) / dt)
+    values: list[float] = np.interp(time[0] + dt * np.arange(1, steps + 1), time, speed).tolist()
+    return values
+
+
+def road_table(
+    distance: Sequence[float], grade: Sequence[float], curvature: Sequence[float] | None = None, headwind: float = 0.0
+) -> Road:
+    """A road of pieces: at each `distance` [m] begins a piece of constant sine of grade and curvature [1/m]."""
+    bends = curvature or [0.0] * len(grade)
+    places = [(g, c, headwind) for g, c in zip(grade, bends, strict=True)]
+    starts = list(distance)
+    last = len(starts) - 1
+    here = 0
+
+    def road(at: float) -> tuple[float, float, float]:
+        nonlocal here  # the piece does not change for many steps
+        if starts[here] <= at and (here == last or at < starts[here + 1]):
+            return places[here]
+        here = min(max(bisect_right(starts, at) - 1, 0), last)
+        return places[here]
+
+    return road
+
+
+# --- what the profile asked beyond the vehicle -------------------------------------------------------------------
+
+
+def shortfalls(series: dict[str, Array]) -> list[Shortfall]:
+    """Where the speed stayed below all that was wanted within a second, by more than the tolerance; worst first."""
+    import numpy as np
+    from numpy.lib.stride_tricks import sliding_window_view
+
+    time, wanted, speed = series["time"], series["wanted_speed"], series["speed"]
+    if len(time) < 3 or np.isnan(wanted).all():
+        return []
+    reach = max(round(TOLERANCE_TIME / float(time[1] - time[0])), 1)
+    padded = np.pad(np.nan_to_num(wanted, nan=0.0), reach, mode="edge")
+    least = sliding_window_view(padded, 2 * reach + 1).min(axis=1)
+    missing = least - TOLERANCE - speed
+    short = np.concatenate(([False], missing > 0, [False]))
+    edges = np.flatnonzero(short[1:] != short[:-1])
+    found = []
+    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+        worst = begin + int(np.argmax(missing[begin:end]))
+        throttle = float(series["throttle"][begin:end].mean())
+        lasts = float(time[min(end, len(time) - 1)] - time[begin])
+        missed = float(wanted[worst] - speed[worst])
+        found.append(
+            Shortfall(
+                float(time[begin]), float(series["distance"][begin]), lasts, missed, float(wanted[worst]), throttle
+            )
+        )
+    return sorted(found, key=lambda s: -s.missing * s.duration)
+
+
+# --- range --------------------------------------------------------------------------------------------------------
+
+
+def range_by_energy(scooter: Scooter, run: Run, soc: float, temperature: float) -> float | None:
+    """How far [m] a pack at `soc` and `temperature` [degC] goes at the consumption of `run`; None if that is not known.
+
+    The energy left is that down to the cut-off voltage at the run's mean power and form of current.
+    """
+    battery, consumption = scooter.vehicle.battery, run.consumption
+    if battery is None or consumption is None or consumption <= 0:
+        return None
+    return float(drawable(battery, soc, temperature, run.mean_power, run.form).energy / consumption)

@@ -1,0 +1,458 @@
+"""``gz-onboard simulate``: the scooter along a drive cycle, a route or a recorded ride, without the scooter.
+
+It tells what the ride takes, how far a charge goes at that, where the energy went and where the ride asked more than
+the vehicle has; and writes time series and pictures.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import csv
+import json
+import math
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from gz_onboard.bus.publisher import WH, WH_PER_KM
+from gz_onboard.errors import InputError, nearest
+from gz_onboard.simulation.cycles import find_cycle
+from gz_onboard.simulation.run import (
+    COLUMNS,
+    Command,
+    Progress,
+    Run,
+    at_steps,
+    drive,
+    follow,
+    range_by_energy,
+    road_table,
+)
+from gz_onboard.simulation.scooter import STEP, Dynamometer, Road, Scooter, straight
+from gz_onboard.simulation.sweep import Sweep, grid, read_sweep, redesigned
+from gz_onboard.vehicle import Vehicle, read_vehicle
+
+SUMMARY_VERSION = 1
+KEYS = {
+    "what": "the cycle, route or ride, as given",
+    "kind": "cycle, route, ride (open loop) or ride (predictive)",
+    "vehicle": "name of the vehicle",
+    "payload_kg": "mass of rider and luggage",
+    "step_s": "step of the simulation",
+    "duration_s": "ridden",
+    "distance_km": "ridden",
+    "speed_max_km_h": "greatest speed",
+    "repetitions": "times that the cycle or route was ridden; the last may be unfinished",
+    "energy_wh": "delivered by the pack, less what was recovered",
+    "energy_recovered_wh": "charged into the pack",
+    "energy_cells_wh": "that left the cells' chemistry: energy_wh and the heat of the battery",
+    "consumption_wh_km": "energy_wh over distance; null below 0.1 km",
+    "soc_start": "state of charge, 0 to 1",
+    "soc_end": "at the end",
+    "range_km": "on this riding from soc_start, or null",
+    "range_by": "repetition: ridden until empty; energy: energy left at the start over the consumption",
+    "shortfalls": "where the profile asked more than was ridden, worst first: time_s, distance_km, duration_s, "
+    "missing_km_h at most, wanted_km_h there, beyond_vehicle (the throttle was open)",
+    "shortfall_s": "their time in all",
+    "ledger_wh": "where the energy of the cells went, by name; negative: gave",
+    "closure": "energy_cells_wh less the sum of the ledger, over all that was turned over",
+    "measured": "of a recorded ride: energy_wh, consumption_wh_km, distance_km, and the RMS of simulated less measured "
+    "speed_km_h, pack_voltage_v, pack_current_a; else null",
+    "files": "written",
+    "wall_s": "time taken by the simulation",
+    "sweep": "a list of {values, consumption_wh_km, range_km, shortfall_s}, or null",
+}
+"""What ``--json`` writes."""
+
+FORMATS = ("mcap", "parquet", "csv")
+_LOGS = (".mcap", ".blf", ".log", ".asc", ".trc", ".mf4", ".gz")
+_MOST_HOURS = 48.0  # of riding until empty
+_TOPIC = "simulation"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be ridden, once: the wanted speed over time, or over distance along a road."""
+
+    name: str
+    kind: str
+    seconds: float  # of one repetition, as planned
+    road: Road
+    command: Callable[[], Command]
+    length: float | None = None  # m: where it ends, if not by time
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``gz-onboard simulate``."""
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    keys = "\n".join(f"  {key:20} {meaning.replace('%', '%%')}" for key, meaning in KEYS.items())
+    parser.epilog = f"keys of the JSON summary, version {SUMMARY_VERSION}:\n{keys}"
+    add = parser.add_argument
+    add("what", metavar="WHAT", help="a built-in drive cycle by name, a CSV file of a cycle or of a route, or the log "
+        "of a recorded ride, whose throttle and brake are replayed")  # fmt: skip
+    add(
+        "--vehicle", default="reference", metavar="NAME|TOML", help="vehicle file or one of the package's (%(default)s)"
+    )
+    add("--payload", type=float, metavar="KG", help="mass of rider and luggage")
+    add("--soc", type=float, metavar="0..1", help="state of charge at the start (1; of a recorded ride, as there)")
+    add("--ambient", type=float, metavar="C", help="temperature of air and vehicle at the start (20)")
+    add("--grade", type=float, default=0.0, metavar="%", help="of the road, uphill positive, for cycles (%(default)g)")
+    add("--wind", type=float, default=0.0, metavar="M/S", help="headwind (%(default)g)")
+    often = parser.add_mutually_exclusive_group()
+    often.add_argument("--repeat", type=int, default=1, metavar="N", help="ride it N times (%(default)s)")
+    often.add_argument("--until-empty", action="store_true", help="repeat it until the pack is empty")
+    add("--dyno", metavar="KG[,A,B,C]", help="on a chassis dynamometer: inertia of its roller and absorber force "
+        "A + B·V + C·V² in N, V in m/s")  # fmt: skip
+    add("--predictive", action="store_true", help="of a recorded ride: the rider follows its speed, by own throttle")
+    add("--sweep", action="append", default=[], metavar="NAME=LO..HI[:STEPS]",
+        help="ride it with other values of a parameter, or of battery.cells_parallel or battery.cells_series; at most "
+        "twice")  # fmt: skip
+    add("--json", nargs="?", const="-", metavar="FILE|-", help="write the summary as JSON, to standard output or FILE")
+    add("--output", type=Path, default=Path(), metavar="DIR", help="where to write (the current directory)")
+    add("--format", choices=FORMATS, default="parquet", help="of the time series (%(default)s)")
+    add("--no-series", action="store_true", help="write no time series")
+    add("--no-plot", action="store_true", help="draw nothing")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """``gz-onboard simulate``."""
+    vehicle = read_vehicle(arguments.vehicle, arguments.payload)
+    _check(arguments)
+    sweeps = [read_sweep(text, vehicle) for text in arguments.sweep]
+    if len({sweep.name for sweep in sweeps}) < len(sweeps):
+        raise InputError(f"--sweep {sweeps[0].name}: given twice")
+    plan = find_plan(arguments)
+    begin = time.perf_counter()
+    with _bar(_expected_seconds(arguments, plan, sweeps), "s ridden") as progress:
+        result, scooter = ride(vehicle, plan, arguments, progress)
+        wall = time.perf_counter() - begin
+        variants = [_variant(vehicle, values, plan, arguments, progress) for values in grid(sweeps)] if sweeps else None
+    summary = summarise(vehicle, plan, arguments, result, scooter) | {"wall_s": wall, "sweep": variants}
+    summary["files"] = write(arguments, plan, result, summary, sweeps)
+    if arguments.json:
+        _write_json(arguments.json, {"version": SUMMARY_VERSION, **summary})
+    if arguments.json != "-":
+        print(summary_text(summary))
+    return 0
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """InputError for options that make no sense."""
+    limits = (
+        ("soc", arguments.soc, 0.0, 1.0, ""),
+        ("ambient", arguments.ambient, -40.0, 60.0, " degC"),
+        ("grade", arguments.grade, -30.0, 30.0, " %"),
+        ("wind", arguments.wind, -40.0, 40.0, " m/s"),
+        ("repeat", arguments.repeat, 1, 1000, ""),
+        ("payload", arguments.payload, 0.0, 300.0, " kg"),
+    )
+    for name, value, low, high, unit in limits:
+        if value is not None and not low <= value <= high:
+            raise InputError(f"--{name} {value:g}{unit} is outside {low:g} to {high:g}{unit}")
+    if len(arguments.sweep) > 2:
+        raise InputError(f"--sweep {arguments.sweep[2]}: at most two parameters can be swept")
+
+
+def dynamometer(text: str) -> Dynamometer:
+    """``KG[,A[,B[,C]]]`` as a dynamometer; InputError for anything else."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not 1 <= len(numbers) <= 4 or not all(map(math.isfinite, numbers)):
+        raise InputError(f"--dyno {text}: must be KG or KG,A,B,C: inertia in kg, force in N, N·s/m, N·s²/m²")
+    if not 1 <= numbers[0] <= 5000:
+        raise InputError(f"--dyno {text}: an inertia of {numbers[0]:g} kg is outside 1 to 5000 kg")
+    return Dynamometer(*numbers)
+
+
+# --- what is to be ridden -----------------------------------------------------------------------------------------
+
+
+def find_plan(arguments: argparse.Namespace) -> Plan:
+    """The plan that WHAT asks for; InputError for what is neither a file that can be ridden nor a built-in cycle."""
+    what = str(arguments.what)
+    path = Path(what)
+    kind = _kind(path)
+    if kind == "route":
+        return _route_plan(path, arguments)
+    cycle = find_cycle(what)
+    speeds = at_steps(cycle.time, cycle.speed, STEP)
+    sine = math.sin(math.atan(arguments.grade / 100))
+    return Plan(cycle.name, "cycle", cycle.duration, straight(sine, arguments.wind), lambda: follow(speeds, STEP))
+
+
+def _kind(path: Path) -> str:
+    """``ride``, ``route``, ``cycle``: of a CSV file by its first line, else by its name."""
+    if path.suffix.lower() in _LOGS:
+        return "ride"
+    if path.suffix.lower() != ".csv" or not path.is_file():
+        return "cycle"
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        header = [name.strip() for name in file.readline().split(",")]
+    if "time_s" in header:
+        return "cycle"
+    if {"distance_m", "altitude_m", "latitude_deg"} & set(header):
+        return "route"
+    if {"timestamp", "arbitration_id"} <= set(header):
+        return "ride"
+    known = ("time_s", "distance_m", "latitude_deg")
+    raise InputError(
+        f"{path}:1: the columns {', '.join(header[:6])} are neither those of a cycle (time_s and speed_mps, "
+        "speed_kmh or speed_mph) nor of a route (distance_m or latitude_deg and longitude_deg; altitude_m)"
+        f"{nearest(header[0], known)}"
+    )
+
+
+def _route_plan(path: Path, arguments: argparse.Namespace) -> Plan:
+    from gz_onboard.simulation.route import read_route, speed_profile
+
+    route = read_route(path)
+    profile = speed_profile(route, top_speed=50 / 3.6)
+    metres = [profile.speed_at(float(i)) for i in range(int(route.length) + 1)]
+    road = road_table(route.distance, route.grade, route.curvature, arguments.wind)
+    return Plan(route.name, "route", profile.time[-1], road, lambda: along(metres), route.length)
+
+
+def along(metres: Sequence[float]) -> Command:
+    """A rider who follows a speed for each metre [m/s], looking half a second ahead; at least at walking pace."""
+    from gz_onboard.simulation.parts.rider import Rider
+
+    rider, last = Rider(), len(metres) - 1
+
+    def command(scooter: Scooter) -> tuple[float, float, float]:
+        ahead = scooter.distance + 0.5 * scooter.speed
+        wanted = max(metres[min(max(int(ahead), 0), last)], 1.0)
+        return *rider.step(wanted, scooter.speed, scooter.dt), wanted
+
+    return command
+
+
+def ride(vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, progress: Progress | None) -> tuple[Run, Scooter]:
+    """Ride `plan` with the options of the command line."""
+    scooter = Scooter(
+        vehicle,
+        dynamometer(arguments.dyno) if arguments.dyno else plan.road,
+        soc=1.0 if arguments.soc is None else arguments.soc,
+        ambient=20.0 if arguments.ambient is None else arguments.ambient,
+    )
+    seconds = plan.seconds * arguments.repeat
+    if arguments.until_empty:
+        seconds = _MOST_HOURS * 3600
+    result = drive(scooter, plan.command(), seconds, until_empty=arguments.until_empty, progress=progress)
+    return result, scooter
+
+
+def _expected_seconds(arguments: argparse.Namespace, plan: Plan, sweeps: Sequence[Sweep]) -> float | None:
+    if arguments.until_empty:
+        return None
+    rides = 1 + (len(grid(sweeps)) if sweeps else 0)
+    return plan.seconds * float(arguments.repeat) * rides
+
+
+def _variant(
+    vehicle: Vehicle, values: dict[str, float], plan: Plan, arguments: argparse.Namespace, progress: Progress | None
+) -> dict[str, Any]:
+    result, scooter = ride(redesigned(vehicle, values), plan, arguments, progress)
+    metres, _ = cycle_range(result, scooter, arguments)
+    return {
+        "values": values,
+        "consumption_wh_km": _times(result.consumption, 1 / WH_PER_KM),
+        "range_km": _times(metres, 1e-3),
+        "shortfall_s": sum(s.duration for s in result.shortfalls),
+    }
+
+
+def cycle_range(result: Run, scooter: Scooter, arguments: argparse.Namespace) -> tuple[float | None, str | None]:
+    """(range [m], how it was found)."""
+    if result.empty:
+        return result.distance, "repetition"
+    temperature = float(result.series["cell_temperature"].mean())
+    metres = range_by_energy(scooter, result, result.soc_start, temperature)
+    return metres, None if metres is None else "energy"
+
+
+def summarise(
+    vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, result: Run, scooter: Scooter
+) -> dict[str, Any]:
+    """The summary without what is written and swept: see `KEYS`."""
+    metres, by = cycle_range(result, scooter, arguments)
+    return {
+        "what": str(arguments.what),
+        "kind": plan.kind,
+        "vehicle": vehicle.name,
+        "payload_kg": vehicle.parameters["payload_mass"],
+        "step_s": scooter.dt,
+        "duration_s": result.duration,
+        "distance_km": result.distance * 1e-3,
+        "speed_max_km_h": float(result.series["speed"].max()) * 3.6,
+        "repetitions": result.duration / plan.seconds,
+        "energy_wh": result.energy / WH,
+        "energy_recovered_wh": result.recovered / WH,
+        "energy_cells_wh": result.chemical / WH,
+        "consumption_wh_km": _times(result.consumption, 1 / WH_PER_KM),
+        "soc_start": result.soc_start,
+        "soc_end": result.soc_end,
+        "range_km": _times(metres, 1e-3),
+        "range_by": by,
+        "shortfalls": [
+            {
+                "time_s": s.time,
+                "distance_km": s.distance * 1e-3,
+                "duration_s": s.duration,
+                "missing_km_h": s.missing * 3.6,
+                "wanted_km_h": s.wanted * 3.6,
+                "beyond_vehicle": s.beyond_vehicle,
+            }
+            for s in result.shortfalls
+        ],
+        "shortfall_s": sum(s.duration for s in result.shortfalls),
+        "ledger_wh": {name: energy / WH for name, energy in result.ledger.items()},
+        "closure": result.closure,
+        "measured": None,
+    }
+
+
+def _times(value: float | None, factor: float) -> float | None:
+    return None if value is None else float(value * factor)
+
+
+# --- what is written ----------------------------------------------------------------------------------------------
+
+
+def write(
+    arguments: argparse.Namespace, plan: Plan, result: Run, summary: dict[str, Any], sweeps: Sequence[Sweep]
+) -> list[str]:
+    """The time series and the pictures; gives their names. Raises InputError if they cannot be written."""
+    stem: Path = arguments.output / f"{plan.name}.simulation"
+    files: list[Path] = []
+    try:
+        arguments.output.mkdir(parents=True, exist_ok=True)
+        if not arguments.no_series:
+            files.append(stem.with_name(f"{stem.name}.{arguments.format}"))
+            write_series(result, files[-1], {"vehicle": summary["vehicle"], "source": summary["what"]})
+    except OSError as error:
+        raise InputError(f"{error.filename or stem}: cannot be written: {error.strerror or error}") from error
+    return [str(file) for file in files]
+
+
+def write_series(result: Run, file: Path, metadata: dict[str, str]) -> None:
+    """The time series as MCAP, Parquet or CSV by the file's name; columns as ``name[unit]``, not a number as null."""
+    names = [f"{name}[{unit}]" for name, unit in COLUMNS.items()]
+    if file.suffix == ".parquet":
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        columns = [pa.array(column, from_pandas=True) for column in result.series.values()]
+        table = pa.table(columns, names=names)
+        pq.write_table(table.replace_schema_metadata(metadata), file)
+        return
+    rows = zip(*(column.tolist() for column in result.series.values()), strict=True)
+    if file.suffix == ".csv":
+        with file.open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(names)
+            writer.writerows(["" if math.isnan(value) else f"{value:.9g}" for value in row] for row in rows)
+        return
+    from gz_onboard.bus.recorder import LogFile
+
+    log = LogFile(file.open("wb"), 0, metadata)
+    try:
+        properties = {name: {"type": ["number", "null"], "description": unit} for name, unit in COLUMNS.items()}
+        log.channel(_TOPIC, {"title": "Simulation", "type": "object", "properties": properties})
+        for row in rows:
+            log.sample(_TOPIC, round(row[0] * 1e9), dict(zip(COLUMNS, row, strict=True)))
+        log.close()
+    finally:
+        log.abandon()
+
+
+# --- what a person sees -------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _bar(seconds: float | None, unit: str) -> Iterator[Progress | None]:
+    """What counts the seconds ridden; a progress bar where standard error is a terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from tqdm import tqdm
+
+    with tqdm(total=seconds, unit=f" {unit}", file=sys.stderr, leave=False, mininterval=0.2) as bar:
+        yield bar.update
+
+
+def summary_text(summary: dict[str, Any]) -> str:
+    """A summary for a terminal."""
+    minutes, seconds = divmod(round(summary["duration_s"]), 60)
+    hours, minutes = divmod(minutes, 60)
+    clock = f"{f'{hours} h ' if hours else ''}{minutes} min {seconds:02} s"
+    way = {"repetition": "ridden until empty", "energy": "energy left at the start over the consumption"}
+    ledger = sorted(summary["ledger_wh"].items(), key=lambda item: -item[1])
+    ledger = [(name, energy) for name, energy in ledger if abs(energy) >= 0.005]
+    gross = sum(energy for _, energy in ledger if energy > 0) or 1.0
+    rows = [
+        (summary["kind"], f"{clock}, {summary['distance_km']:.2f} km, at most {summary['speed_max_km_h']:.0f} km/h, "
+                          f"{summary['repetitions']:.3g} times"),
+        ("energy", f"{summary['energy_wh']:.1f} Wh net, {summary['energy_recovered_wh']:.1f} Wh recovered before; "
+                   f"{_number(summary['consumption_wh_km'], '.2f', 'Wh/km')}"),
+        ("state of charge", f"{100 * summary['soc_start']:.1f} → {100 * summary['soc_end']:.1f} %"),
+        ("range", f"{_number(summary['range_km'], '.1f', 'km')} "
+                  f"({way.get(summary['range_by'], 'not to be told')})"),
+        *_shortfall_rows(summary),
+        *(("where it went" if not i else "",
+           f"{name.replace('_', ' '):20} {energy:9.2f} Wh {100 * energy / gross:6.1f} %")
+          for i, (name, energy) in enumerate(ledger)),
+        ("closes to", f"{100 * summary['closure']:.1g} % of what was turned over"),
+        ("computed in", f"{summary['wall_s']:.2f} s, step {1000 * summary['step_s']:g} ms"),
+    ]  # fmt: skip
+    rows += [("written", ", ".join(summary["files"]))] if summary["files"] else []
+    lines = [f"{summary['what']}, {summary['vehicle']}, payload {summary['payload_kg']:g} kg"]
+    lines += [f"  {name:17} {text}" for name, text in rows]
+    if summary["sweep"]:
+        lines += ["", *_table(summary["sweep"])]
+    return "\n".join(lines)
+
+
+def _shortfall_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    found = summary["shortfalls"]
+    if not found:
+        return []
+    rows = [("shortfall", f"{summary['shortfall_s']:.0f} s slower than wanted, in {len(found)} stretches; the worst:")]
+    for s in found[:5]:
+        why = "beyond the vehicle" if s["beyond_vehicle"] else "the rider's lag"
+        place = f"at {s['time_s']:.0f} s, {s['distance_km']:.2f} km, for {s['duration_s']:.0f} s"
+        rows.append(("", f"{place}: {s['missing_km_h']:.1f} km/h below {s['wanted_km_h']:.0f} km/h: {why}"))
+    return rows
+
+
+def _table(sweep: Sequence[dict[str, Any]]) -> list[str]:
+    names = list(sweep[0]["values"])
+    heads = [*names, "Wh/km", "range km", "shortfall s"]
+    width = [max(len(head), 10) for head in heads]
+    lines = ["  ".join(f"{head:>{w}}" for head, w in zip(heads, width, strict=True))]
+    for variant in sweep:
+        cells = [f"{value:g}" for value in variant["values"].values()]
+        cells += [_number(variant["consumption_wh_km"], ".2f"), _number(variant["range_km"], ".1f"),
+                  f"{variant['shortfall_s']:.0f}"]  # fmt: skip
+        lines.append("  ".join(f"{cell:>{w}}" for cell, w in zip(cells, width, strict=True)))
+    return lines
+
+
+def _number(value: float | None, form: str, unit: str = "") -> str:
+    return "–" if value is None else f"{value:{form}} {unit}".rstrip()
+
+
+def _write_json(file: str, document: dict[str, Any]) -> None:
+    text = json.dumps(document, indent=1, ensure_ascii=False)
+    if file == "-":
+        print(text)
+        return
+    try:
+        Path(file).write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"--json {file}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,112 @@
+"""Design parameters swept: the same ride with other values, and what it takes and how far it goes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from gz_onboard.errors import InputError, nearest
+from gz_onboard.physics.model import Model
+from gz_onboard.physics.parameters import declared_parameters
+from gz_onboard.vehicle import Vehicle
+
+CELLS = ("battery.cells_parallel", "battery.cells_series")
+_SHORT = {"battery.parallel": CELLS[0], "battery.series": CELLS[1]}
+_STEPS = 5
+_MOST_STEPS = 50
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The values that one design parameter takes."""
+
+    name: str
+    unit: str
+    values: tuple[float, ...]
+
+    @property
+    def label(self) -> str:
+        """For a table or an axis."""
+        return self.name if self.unit == "1" else f"{self.name} [{self.unit}]"
+
+
+def read_sweep(text: str, vehicle: Vehicle) -> Sweep:
+    """``NAME=LO..HI[:STEPS]``: a parameter of `vehicle` by name, or a number of cells.
+
+    Without STEPS five values; of cells every number, up to nine. InputError for an unknown name (with the nearest),
+    a value out of the parameter's bounds (with its unit), and what is not of that form.
+    """
+    name, _, rest = text.partition("=")
+    span, _, steps = rest.partition(":")
+    first, dots, second = span.partition("..")
+    if not dots or (steps and not steps.isdecimal()):
+        raise InputError(f"--sweep {text}: must be NAME=LOW..HIGH or NAME=LOW..HIGH:STEPS, as in drag_area=0.4..0.6:5")
+    name = _SHORT.get(name.strip(), name.strip())
+    declared = declared_parameters(vehicle.model.effects)
+    if name not in (*declared, *CELLS):
+        raise InputError(f"--sweep {text}: no parameter is called {name!r}{nearest(name, [*declared, *CELLS])}")
+    low_bound, high_bound, unit = (1.0, 1000.0, "1")
+    if name in declared:
+        low_bound, high_bound, unit = declared[name].low, declared[name].high, declared[name].unit
+    ends = []
+    for number in (first, second):
+        try:
+            value = float(number)
+        except ValueError:
+            raise InputError(f"--sweep {text}: {number!r} is not a number") from None
+        if not low_bound <= value <= high_bound:
+            raise InputError(
+                f"--sweep {text}: {name} of {value:g} {unit} is outside {low_bound:g} to {high_bound:g} {unit}"
+            )
+        if name in CELLS and value != round(value):
+            raise InputError(f"--sweep {text}: {name} counts cells; {value:g} is not a whole number")
+        ends.append(value)
+    low, high = ends
+    if not low < high:
+        raise InputError(f"--sweep {text}: {low:g} is not below {high:g}")
+    count = int(steps) if steps else min(round(high - low) + 1, 9) if name in CELLS else _STEPS
+    if not 2 <= count <= _MOST_STEPS:
+        raise InputError(f"--sweep {text}: {count} steps; must be 2 to {_MOST_STEPS}")
+    values = [low + (high - low) * i / (count - 1) for i in range(count)]
+    if name in CELLS:
+        values = sorted({float(round(value)) for value in values})
+    return Sweep(name, unit, tuple(values))
+
+
+def redesigned(vehicle: Vehicle, values: Mapping[str, float]) -> Vehicle:
+    """`vehicle` with other values of parameters and numbers of cells.
+
+    More or fewer cells change the mass of the vehicle and the heat capacity of its pack in proportion.
+    """
+    battery = vehicle.battery
+    changed = {name: value for name, value in values.items() if name not in CELLS}
+    parameters = vehicle.parameters
+    if battery and set(values) & set(CELLS):
+        cells = battery.cells_series * battery.cells_parallel
+        battery = replace(
+            battery,
+            cells_parallel=round(values.get(CELLS[0], battery.cells_parallel)),
+            cells_series=round(values.get(CELLS[1], battery.cells_series)),
+        )
+        added = battery.cells_series * battery.cells_parallel - cells
+        parameters = parameters.replaced(
+            vehicle_mass=parameters["vehicle_mass"] + added * parameters["cell_mass"],
+            pack_heat_capacity=parameters["pack_heat_capacity"] * (1 + added / cells),
+        )
+    parameters = parameters.replaced(**changed)
+    if battery:
+        battery = replace(
+            battery,
+            capacity=parameters["cell_capacity"],
+            cutoff_voltage=parameters["cell_cutoff_voltage"],
+            series_resistance=parameters["pack_series_resistance"],
+        )
+    return replace(vehicle, parameters=parameters, battery=battery, model=Model(vehicle.model.effects, parameters))
+
+
+def grid(sweeps: Sequence[Sweep]) -> list[dict[str, float]]:
+    """The values of each variant; the last sweep changes fastest."""
+    points: list[dict[str, float]] = [{}]
+    for sweep in sweeps:
+        points = [{**point, sweep.name: value} for point in points for value in sweep.values]
+    return points
