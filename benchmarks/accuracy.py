@@ -73,24 +73,29 @@ def ride(file: Path, payload: float | None) -> tuple[str, list[Sample]]:
     battery = vehicle.battery
     assert battery
     samples: list[Sample] = []
-    state: dict[str, Any] = {"soc": None, "time": 0.0, "next": 0.0}
+    state: dict[str, Any] = {"soc": None, "time": 0.0, "next": 0.0, "first": None, "charge": 0.0}
     baseline = Baseline(33.6 * 51.8 * 3600)
 
     def observe(e: Estimate) -> None:
         signals = pipeline.estimator.signals
-        if e.soc is None or e.pack_current is None or e.pack_voltage is None or e.soc_sd is None:
+        if e.pack_current is None or e.pack_voltage is None:
             return
-        if state["soc"] is None:
-            cell = battery.cell_voltage(e.pack_voltage, e.pack_current)
-            r0 = battery.r0.at(e.soc, e.cell_temperature or 20.0)[0]
-            state["soc"] = min(battery.soc_at(cell + r0 * e.pack_current / battery.cells_parallel), 1.0)
+        dt = e.time - state["time"]
+        if state["first"] is None:  # at rest: what the count begins from
+            state["first"] = e.pack_voltage, e.pack_current
         else:
-            dt = e.time - state["time"]
-            capacity = battery.pack_capacity(e.cell_temperature or 20.0)
-            state["soc"] -= e.pack_current * dt / 3600 / capacity
+            state["charge"] += e.pack_current * dt / 3600
             baseline.ride(e.pack_voltage * e.pack_current, e.speed or 0.0, dt)
+        if state["soc"] is None and e.soc is not None:  # by now the temperature is known
+            voltage, current = state["first"]
+            r0 = battery.r0.at(e.soc, e.cell_temperature or 20.0)[0]
+            cell = battery.cell_voltage(voltage, current) + r0 * current / battery.cells_parallel
+            state["soc"] = min(battery.soc_at(cell), 1.0)
+        if state["soc"] is not None:
+            state["soc"] -= state["charge"] / battery.pack_capacity(e.cell_temperature or 20.0)
+            state["charge"] = 0.0
         state["time"] = e.time
-        if e.time >= state["next"] and e.range is not None and baseline.rows:
+        if e.time >= state["next"] and e.range is not None and e.soc_sd is not None and baseline.rows:
             state["next"] = e.time + 1.0
             bms = signals["bms_state_of_charge"].value
             assert pipeline.estimator.filter

@@ -23,6 +23,7 @@ SNAPSHOT_VERSION = 1
 PACE = ("pack_voltage", "inverter_voltage", "motor_speed")  # the message of the first that is mapped sets the pace
 STEP_AT_LEAST = 0.25  # s: without the message that sets the pace, a step is made after so long
 FORECAST_PERIOD = 1.0  # s
+START_WAIT = 1.5  # s to wait for the temperature of the cells before the first estimate
 ERROR_TIME = 600.0  # s: over so long the cell model errs the same way; its error does not average out faster
 EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
 OFFSET_TIME = 3600.0  # s: so long the current sensor's offset stays the same
@@ -76,6 +77,7 @@ class Estimator:
         self._time: float | None = None  # s, of the last step
         self._deadline = float("-inf")
         self._current: float | None = None  # A of the pack, at the last step
+        self._first: tuple[float, float, float] | None = None  # s, V, A of the pack: the first that was measured
         self._off_gate = 0
         self._innovation: float | None = None
         self._innovation_square = self._error_square = 0.0
@@ -196,7 +198,7 @@ class Estimator:
         filter_ = self.filter
         if filter_ is None:
             if voltage is not None:
-                self._start(voltage, current or 0.0, temperature)
+                self._wait(now, voltage, current or 0.0, temperature)
             self._current = current
             return
         if dt > 0:
@@ -243,6 +245,22 @@ class Estimator:
             self._off_gate = 0
         # What errs the same way for ERROR_TIME is worth one sample in that time, not one each step.
         filter_.update(cell_voltage, cell_current, temperature, slow * max(2 * ERROR_TIME / max(dt, 0.02), 1.0))
+
+    def _wait(self, now: float, voltage: float, current: float, temperature: float) -> None:
+        """Start from the first voltage, as soon as the cells' temperature, sent once a second, is known or overdue.
+
+        Riders pull away within a second: the first voltage is the one at rest, what flows meanwhile is counted.
+        """
+        if self._first is None:
+            self._first = now, voltage, current
+        began, first_voltage, first_current = self._first
+        signal = self.signals.cell_temperature
+        if signal.stale_after and not signal.fresh(now) and now - began < START_WAIT:
+            return
+        self._start(first_voltage, first_current, temperature)
+        if self.filter and now > began:
+            mean = (first_current + current) / 2 / self.battery.cells_parallel
+            self.filter.predict(now - began, mean, temperature, (1e-9, 1e-7))
 
     def _start(self, voltage: float, current: float, temperature: float) -> None:
         """The first SOC: from the voltage, taken as at rest, with what is not known about that in its variance."""
