@@ -42,6 +42,7 @@ class Daemon:
         self._said_at = 0.0
         self._said = ""
         self._state_failing = False
+        self._log_error = ""
 
     def stop(self, *_: object) -> None:
         """End after the current round."""
@@ -113,6 +114,10 @@ class Daemon:
         if now - self._said_at < 1.0:
             return
         self._said_at = now
+        error = self.recorder.last_error if self.recorder and self.recorder.failing else ""
+        if error and error != self._log_error:
+            log.warning("cannot write the log: %s", error)
+        self._log_error = error
         last = self.pipeline.last
         if last is None:
             return

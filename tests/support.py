@@ -237,7 +237,9 @@ def check_frames(frames: Sequence[Frame]) -> dict[str, list[dict[str, float]]]:
             if signal.length < 8 or raw[signal.name] != absent:
                 assert signal.minimum is not None
                 assert signal.maximum is not None
-                assert float(signal.minimum) <= values[signal.name] <= float(signal.maximum), signal.name
+                slack = 1e-6 * signal.scale  # of decimal fractions
+                low, high = float(signal.minimum) - slack, float(signal.maximum) + slack
+                assert low <= values[signal.name] <= high, signal.name
         decoded.setdefault(definition.name, []).append(values)
     for name, rows in decoded.items():
         counter = f"{name}Counter" if f"{name}Counter" in rows[0] else next(k for k in rows[0] if k.endswith("Counter"))

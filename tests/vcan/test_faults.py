@@ -1,0 +1,335 @@
+"""What happens to a daemon on a scooter: killed, unplugged, stopped, flooded, its clock set."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import struct
+import subprocess
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+from gz_onboard import state
+from gz_onboard.events import EFF_FLAG, State
+from tests.support import LOGS, S, Scooter, recorded, reference, ridden
+from tests.vcan.support import Listener, Running, ip, number, raw_frames, wait_for
+
+FRAME = struct.Struct("=IB3x8s")
+
+
+@contextmanager
+def sender(channel: str = "vcan0") -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
+        raw.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
+        raw.bind((channel,))
+        yield raw
+
+
+@contextmanager
+def steady_ride(*channels: str) -> Iterator[list[float]]:
+    """A ride at 10 m/s onto vcan0 (or the measuring system onto another channel), until left; gives when it failed."""
+    names = channels or ("vcan0",)
+    stopping = threading.Event()
+    failures: list[float] = []
+
+    def ride() -> None:
+        sockets = []
+        for name in names:
+            raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+            raw.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, b"")
+            raw.bind((name,))
+            sockets.append(raw)
+        frames = Scooter().steady(15.0, hbm=len(names) - 1)
+        begin, first = time.monotonic(), frames[0][0]
+        while not stopping.is_set():
+            for time_ns, can_id, data, channel in frames:
+                pause = begin + (time_ns - first) / S - time.monotonic()
+                if pause > 0.002:
+                    time.sleep(pause)
+                if stopping.is_set():
+                    break
+                try:
+                    sockets[channel].send(FRAME.pack(can_id, len(data), data))
+                except OSError:
+                    failures.append(time.monotonic())
+            begin += 15.0  # as many frames of each message as make its counter run on
+        for raw in sockets:
+            raw.close()
+
+    thread = threading.Thread(target=ride)
+    thread.start()
+    try:
+        yield failures
+    finally:
+        stopping.set()
+        thread.join()
+
+
+def test_killed_it_goes_on_from_the_saved_state(running: Running, listener: Listener):
+    city = LOGS / "city_14C.blf"
+    # What 200 s of the same ride have taught, as the state file of the day before would have it.
+    learned = ridden(recorded("city_14C", 0.0, 200.0))
+    snapshot = learned.pipeline.estimator.snapshot(reference().key)
+    assert snapshot is not None
+    folder = running.folder("a")
+    state.save(folder / f"{reference().name}.json", snapshot, time.time())
+    daemon = running.daemon()
+    assert "going on from the state saved" in daemon.journal
+    replay = running.replay(city, "--from", "200")
+    listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
+    time.sleep(14)  # the state is saved every 10 s
+    before = listener.decoded("RANGE_Status")[-1]
+    killed_ns = time.time_ns()
+    daemon.process.kill()
+    daemon.process.wait()
+
+    frames = raw_frames(daemon.logs[-1])
+    assert killed_ns - frames[-1][0] < 2 * S  # what is lost
+    first_log = daemon.logs[-1]
+    rows = daemon.estimates(first_log)
+    factor = snapshot["riding"]["factor"]
+    assert rows[-1]["consumption_factor"] == pytest.approx(factor, abs=0.03)
+    assert rows[-1]["consumption_factor_sd"] < 0.07  # the prior has 0.08
+
+    daemon = running.daemon()
+    after = listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
+    status = listener.decoded("RANGE_Status")[-1]
+    time.sleep(3)
+    replay.kill()
+    daemon.stop()
+    # Up to 10 s of riding before the kill and 2 s after it are not in the saved state: at 30 A 0.3 % of the pack.
+    assert status["RANGE_StateOfCharge"] == pytest.approx(before["RANGE_StateOfCharge"], abs=0.4)
+    assert status["RANGE_StateOfChargeSigma"] == pytest.approx(before["RANGE_StateOfChargeSigma"], abs=0.2)
+    assert after["RANGE_RemainingP10"] < after["RANGE_Remaining"] < after["RANGE_RemainingP90"]
+    again = daemon.estimates()
+    assert daemon.logs[-1] != first_log
+    assert again[-1]["consumption_factor"] == pytest.approx(rows[-1]["consumption_factor"], abs=0.03)
+    assert again[-1]["consumption_factor_sd"] == pytest.approx(rows[-1]["consumption_factor_sd"], abs=0.005)
+    assert again[-1]["soc"] == pytest.approx(rows[-1]["soc"], abs=0.004)
+
+
+@pytest.mark.administers
+def test_bus_down_and_up(running: Running, listener: Listener):
+    daemon = running.daemon()
+    with steady_ride() as failures:
+        listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
+        ip("link", "set", "vcan0", "down")
+        went_down = time.time_ns()
+        time.sleep(6)
+        came_up = time.time_ns()
+        ip("link", "set", "vcan0", "up")
+        time.sleep(4)
+        assert failures
+    assert daemon.process.poll() is None
+    daemon.stop()
+    rows = {round((row["time_ns"] - went_down) / S): row for row in daemon.estimates()}
+    during = [rows[t] for t in (3, 4, 5)]
+    assert all("BUS_DOWN" in row["reasons"] and row["state"] == "INVALID" for row in during)
+    assert all(row["speed"] is None and row["pack_current"] is None for row in during)
+    up = round((came_up - went_down) / S)
+    after = [row for t, row in rows.items() if t > up + 2]
+    assert after
+    assert all("BUS_DOWN" not in row["reasons"] and row["state"] == "VALID" for row in after)
+    assert "BUS_DOWN" in daemon.journal
+    heard = [frame[0] for frame in listener.frames if frame[0] > came_up]
+    assert heard
+    assert heard[0] < came_up + 3 * S
+    soc = [row["soc"] for row in daemon.estimates() if row["soc"] is not None]
+    assert all(abs(b - a) < 0.002 for a, b in pairwise(soc))
+
+
+@pytest.mark.administers
+def test_the_interface_is_taken_away_and_comes_back(running: Running, listener: Listener):
+    daemon = running.daemon()
+    with steady_ride():
+        listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
+    ip("link", "delete", "vcan0")
+    time.sleep(3)
+    assert daemon.process.poll() is None
+    open_files = len(list(Path(f"/proc/{daemon.process.pid}/fd").iterdir()))
+    time.sleep(4)  # four attempts to open what is not there
+    assert len(list(Path(f"/proc/{daemon.process.pid}/fd").iterdir())) == open_files
+    ip("link", "add", "dev", "vcan0", "type", "vcan")
+    ip("link", "set", "vcan0", "up")
+    with steady_ride():
+        listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
+    assert "not properly shut down" not in daemon.journal
+    daemon.stop()
+
+
+@pytest.mark.administers
+def test_started_before_there_is_an_interface(running: Running, listener: Listener):
+    ip("link", "delete", "vcan0")
+    daemon = running.daemon()
+    time.sleep(2)
+    ip("link", "add", "dev", "vcan0", "type", "vcan")
+    time.sleep(2)  # there, and down
+    assert daemon.process.poll() is None
+    ip("link", "set", "vcan0", "up")
+    listener.wait_for_new("RANGE_Status", 5, RANGE_StatusState=State.STARTING)
+    with steady_ride():
+        listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
+    daemon.stop()
+
+
+def test_two_channels(running: Running, listener: Listener):
+    daemon = running.daemon(channels=("vcan0", "vcan1"))
+    with steady_ride("vcan0", "vcan1"):
+        listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
+        time.sleep(3)
+    summary = daemon.stop()
+    frames = raw_frames(daemon.logs[-1])
+    assert number(summary, r"received (\d+)") == len(frames)
+    assert {frame[3] for frame in frames if frame[1] < 0x400} == {0}
+    assert {frame[3] for frame in frames if frame[1] >= 0x400} == {1}
+    assert all(b[0] >= a[0] for a, b in pairwise(frames))  # in the order of time, whatever the channel
+    assert not number(summary, r"dropped (\d+)")
+    assert daemon.estimates()[-2]["speed"] == pytest.approx(10.0, abs=0.01)
+
+
+@pytest.mark.administers
+def test_one_of_two_channels_goes_down(running: Running, listener: Listener):
+    daemon = running.daemon(channels=("vcan0", "vcan1"))
+    with steady_ride("vcan0", "vcan1"):
+        listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
+        ip("link", "set", "vcan1", "down")
+        try:
+            found = listener.wait_for_new("RANGE_Status", 5, RANGE_BusDown=1, RANGE_NoImu=1)
+            assert found["RANGE_StatusState"] == State.DEGRADED
+            assert found["RANGE_StateOfCharge"] <= 100
+        finally:
+            ip("link", "set", "vcan1", "up")
+        listener.wait_for_new("RANGE_Status", 6, RANGE_BusDown=0, RANGE_StatusState=State.VALID)
+    daemon.stop()
+
+
+@pytest.mark.parametrize("all_frames", [True, False])
+def test_unknown_identifiers(running: Running, listener: Listener, all_frames: bool):
+    daemon = running.daemon(*(["--all-frames"] if all_frames else []))
+    with sender() as raw:
+        for i in range(300):
+            raw.send(FRAME.pack(0x7E0 + i % 3, 8, bytes(8)))
+            raw.send(FRAME.pack(EFF_FLAG | 0x200, 8, bytes(8)))
+        for frame in Scooter().steady(1.0):
+            raw.send(FRAME.pack(frame[1], 8, frame[2].ljust(8, b"\0")))
+        found = listener.wait_for_new("RANGE_Diagnosis", 5, RANGE_CountUnknown=4 if all_frames else 0)
+    summary = daemon.stop()
+    known = len(Scooter().steady(1.0))
+    assert found["RANGE_CountDropped"] <= known
+    strangers = [frame for frame in raw_frames(daemon.logs[-1]) if frame[1] in (0x7E0, 0x7E1, 0x7E2, EFF_FLAG | 0x200)]
+    assert len(strangers) == (600 if all_frames else 0)
+    assert number(summary, r"received (\d+)") == known + (600 if all_frames else 0)
+    unknown = daemon.statuses()[-1]["unknown"]
+    assert unknown == ({"7E0": 100, "7E1": 100, "7E2": 100, "200": 300} if all_frames else {})
+
+
+def dropped_on_the_way() -> int:
+    """Frames of any interface that the kernel dropped because its queue of received ones was full."""
+    return sum(int(line.split()[1], 16) for line in Path("/proc/net/softnet_stat").read_text().splitlines())
+
+
+def test_what_the_kernel_drops_is_counted(running: Running, listener: Listener):
+    daemon = running.daemon()
+    count = 30_000
+    frame = FRAME.pack(0x413, 2, bytes(8))  # a message without counter: nothing but the kernel knows of the loss
+    on_the_way = dropped_on_the_way()
+    with sender() as raw:
+        os.kill(daemon.process.pid, signal.SIGSTOP)
+        for _ in range(count):
+            raw.send(frame)
+        os.kill(daemon.process.pid, signal.SIGCONT)
+        time.sleep(0.5)
+        for _ in range(10):  # the kernel tells with the next frame
+            raw.send(frame)
+            time.sleep(0.02)
+        listener.wait_for_new("RANGE_Status", 5, RANGE_FramesLost=1)
+        listener.wait_for_new("RANGE_Status", 5, RANGE_FramesLost=0)
+    summary = daemon.stop()
+    received, lost = number(summary, r"received (\d+)"), number(summary, r"lost (\d+)")
+    assert lost > 1000
+    # What the kernel drops before any socket sees it, where frames come faster than it hands them on, nobody counts.
+    assert count + 10 - (dropped_on_the_way() - on_the_way) <= received + lost <= count + 10
+    assert daemon.statuses()[-1]["kernel_lost"] == lost
+    told = [row for row in listener.decoded("RANGE_Status") if row["RANGE_FramesLost"]]
+    assert 9 <= len(told) <= 21
+    assert listener.decoded("RANGE_Diagnosis")[-1]["RANGE_CountLost"] == min(lost, 4094)
+
+
+@pytest.mark.administers
+@pytest.mark.skipif(not Path("/run/vcan-guest").is_dir(), reason="sets the clock: only in a guest")
+def test_the_clock_is_set(running: Running, listener: Listener):
+    daemon = running.daemon()
+    real = time.clock_gettime(time.CLOCK_BOOTTIME)
+    begin = time.time()
+
+    def set_clock(ahead: float) -> None:
+        now = begin + time.clock_gettime(time.CLOCK_BOOTTIME) - real
+        time.clock_settime(time.CLOCK_REALTIME, now + ahead)
+
+    try:
+        with steady_ride():
+            listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
+            for ahead in (3600.0, -7200.0, 40.0):
+                set_clock(ahead)
+                time.sleep(4)
+                assert listener.decoded("RANGE_Status")[-1]["time"] == pytest.approx(time.time(), abs=1.0)
+    finally:
+        set_clock(0.0)
+    wait_for(lambda: daemon.journal.count("the clock was set") == 4, 5, "the daemon says that the clock was set")
+    daemon.stop()
+    rows = daemon.estimates()
+    steps = [b["time"] - a["time"] for a, b in pairwise(rows)]
+    assert all(step == pytest.approx(1.0, abs=0.11) for step in steps), steps
+    riding = [row for row in rows if row["speed"] is not None]
+    assert all(row["state"] == "VALID" for row in riding[2:-2])
+    assert all(0 < b["distance"] - a["distance"] < 12 for a, b in pairwise(riding))
+    assert "implausible time" not in daemon.statuses()[-1]["faults"]
+    soc = [row["soc"] for row in riding if row["soc"] is not None]
+    assert max(soc) - min(soc) < 0.005
+
+
+def test_the_log_directory_cannot_be_written(running: Running, listener: Listener):
+    blocked = running.folder("a") / "file"
+    blocked.write_text("in the way")
+    daemon = running.daemon("--log-dir", str(blocked))
+    with steady_ride():
+        found = listener.wait_for_new("RANGE_Status", 10, RANGE_LogFailed=1, RANGE_StatusState=State.VALID)
+        assert found["RANGE_StateOfCharge"] <= 100
+        wait_for(lambda: "LOG_FAILED" in daemon.journal, 5, "the daemon says that it cannot write its log")
+    daemon.stop()
+    assert f"cannot write the log: [Errno 17] File exists: '{blocked}'" in daemon.journal
+
+
+@pytest.mark.administers
+def test_a_full_disk(running: Running, listener: Listener, tmp_path: Path):
+    """And room again: the log goes on in a new file."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mount = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(disk)], check=False, capture_output=True
+    )
+    if mount.returncode:
+        pytest.skip(f"no mount here: {mount.stderr.decode()}")
+    try:
+        ballast = disk / "ballast"
+        ballast.write_bytes(bytes(330_000))
+        daemon = running.daemon("--log-dir", str(disk))
+        with steady_ride():
+            listener.wait_for_new("RANGE_Status", 30, RANGE_LogFailed=1)
+            ballast.unlink()
+            listener.wait_for_new("RANGE_Status", 20, RANGE_LogFailed=0, RANGE_StatusState=State.VALID)
+            time.sleep(3)
+        daemon.stop()
+        logs = sorted(disk.glob("*.mcap"), key=lambda path: path.stat().st_mtime)
+        assert len(logs) >= 2
+        assert all(len(raw_frames(log)) > 500 for log in (logs[0], logs[-1]))  # both can be read
+    finally:
+        running.kill()
+        subprocess.run(["umount", str(disk)], check=False)
