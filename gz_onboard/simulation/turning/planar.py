@@ -17,12 +17,12 @@ load, so that they are solved for in closed form.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import cos, sin
+from math import cos, sin, sqrt
 
 from gz_onboard.simulation.turning.machine import Machine, Rates, Road, State
 from gz_onboard.simulation.turning.tyre import Tyre
 
-STANDSTILL = 0.1  # m/s: below it a tyre twists with less than its full moment, as it resists with less
+STANDSTILL = 0.1  # m/s: below it what camber does fades, as rolling resistance does
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,9 @@ class Planar:
     def _wheel(
         self, tyre: Tyre, slip: float, camber: float, along: float, radius: float
     ) -> tuple[float, float, float, float, float]:
-        side = tyre.side_force(slip, camber)
+        rolls = along / sqrt(along * along + STANDSTILL * STANDSTILL)  # a wheel that stands has no camber thrust
+        side = tyre.side_force(slip, camber * abs(rolls))
         # The load in the wheel's plane, W·sqrt(1 + (a_y/g)²) where the wheel leans as a thin disc would.
         in_plane = cos(camber) + side * sin(camber)
-        twist = tyre.twist(camber) * along / (along * along + STANDSTILL * STANDSTILL) ** 0.5
+        twist = tyre.twist(camber) * rolls
         return side, self.machine.rolling(along) * in_plane, twist, twist * sin(camber) / radius, in_plane
