@@ -107,10 +107,8 @@ class Scooter:
         self._dc = bound[Port.DC_POWER]
         self.motor: Motor = motor or EffectMotor(bound[Port.MOTOR_LOSS], p["torque_constant"], p["voltage_constant"])
         self.tyre = Tyre(p["tyre_b"], p["tyre_c"], p["tyre_d"], p["tyre_e"], form=tyre_form)
-        share = 0.0 if self.dynamometer else p["front_brake_share"]
-        self.brakes = Brakes(
-            p["brake_torque_limit"], p["brake_viscous_constant"], p["brake_disc_radius"], share, form=brake_form
-        )
+        self.brakes = Brakes(p["brake_torque_limit"], p["brake_viscous_constant"], p["brake_disc_radius"],
+                             p["front_brake_share"], form=brake_form)  # fmt: skip
         self.controller = Controller(p["motor_current_limit"], p["regeneration_torque_limit"] / p["torque_constant"])
         cells = ambient if cell_temperature is None else cell_temperature
         self.inverter_cooling = InverterCooling(
@@ -195,7 +193,7 @@ class Scooter:
             terms.append(("dynamometer", absorbed))
             against += absorbed
 
-        front_braking = self.brakes.front_force(brake, v, r) if brake > 0.0 else 0.0
+        front_braking = 0.0 if brake <= 0.0 or self.dynamometer else self.brakes.front_force(brake, v, r)
         against += front_braking
 
         # --- wheel, tyre and vehicle together, implicit in the slip (eqs. 2.11, 3.3, 3.8, 3.10-3.12)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import pytest
 from hypothesis import given, settings
@@ -15,8 +16,7 @@ from gz_onboard.simulation.scooter import Dynamometer, Scooter, straight
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference", 75.0)
-BATTERY = VEHICLE.battery
-assert BATTERY
+BATTERY = VEHICLE.pack
 
 
 def follow(scooter, profile, seconds):
@@ -86,7 +86,7 @@ def test_no_chatter_at_standstill_or_pulling_away():
         scooter.step(0.3 if i > 200 else 0.0, 0.0)
         speeds.append(scooter.speed)
     assert speeds[200] == pytest.approx(0.0, abs=1e-9)
-    rises = [b - a for a, b in zip(speeds[202:], speeds[203:], strict=False)]
+    rises = [b - a for a, b in pairwise(speeds[202:])]
     assert min(rises) >= -1e-9
 
 
@@ -201,7 +201,7 @@ def test_held_back_by_its_voltage_it_does_not_chatter(soc, ambient):
     for _ in range(1000):
         scooter.step(1.0, 0.0)
         voltage.append(scooter.voltage)
-    assert max(abs(b - a) for a, b in zip(voltage[200:], voltage[201:], strict=False)) < 0.2
+    assert max(abs(b - a) for a, b in pairwise(voltage[200:])) < 0.2
     assert scooter.motor_current < 0.95 * VEHICLE.parameters["motor_current_limit"]
 
 

@@ -41,6 +41,7 @@ class Controller:
     by_soc: Table = ((0.0, 0.1), (0.08, 1.0))
     regeneration_by_soc: Table = ((0.95, 1.0), (1.0, 0.0))
     regeneration_by_speed: Table = ((7.0, 0.0), (14.5, 1.0))  # rad/s
+    regeneration_gain: float = 50.0  # of the brake's command: all of it as soon as the lever is touched
     _slow: float = field(default=1.0, init=False)
     _slow_regeneration: float = field(default=1.0, init=False)
 
@@ -63,5 +64,5 @@ class Controller:
             limit = self.regeneration_limit * self._slow_regeneration
             if motor_speed < self.regeneration_by_speed[-1][0]:
                 limit *= interpolate(self.regeneration_by_speed, motor_speed)
-            return -min(brake * 3, 1.0) * limit
+            return -min(brake * self.regeneration_gain, 1.0) * limit
         return 0.0

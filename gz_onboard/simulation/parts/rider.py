@@ -9,8 +9,8 @@ from dataclasses import dataclass
 class Rider:
     """Follows a commanded speed. Gains in 1/(m/s) and 1/m."""
 
-    proportional: float = 0.35
-    integral: float = 0.06
+    proportional: float = 1.5
+    integral: float = 0.3
     sum: float = 0.0
 
     def step(self, wanted: float, speed: float, dt: float) -> tuple[float, float]:

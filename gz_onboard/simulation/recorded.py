@@ -1,0 +1,240 @@
+"""Recorded rides as inputs of a simulation: throttle and brake, speed, and what to compare the simulation with.
+
+Frames go through the codec of the bus, so what it drops is dropped here too. The road that was ridden is that of the
+estimator's road filter (accelerometer, altitude, yaw rate), or that of a route file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gz_onboard.bus.codec import Codec
+from gz_onboard.bus.logs import read_frames
+from gz_onboard.bus.mapping import Mapping, Source
+from gz_onboard.errors import InputError
+from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.simulation.run import road_table
+from gz_onboard.simulation.scooter import STEP, Dynamometer, Road
+from gz_onboard.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+# Signals that no estimator needs, of the reference scooter's instruments: role, message, signal, factor to SI.
+EXTRA = (
+    ("brake_pressure_front", "HBM_Brakes", "HBM_BrakePressureFront", 1e5),
+    ("brake_pressure_rear", "HBM_Brakes", "HBM_BrakePressureRear", 1e5),
+    ("roller_speed", "DYNO_Roller", "DYNO_RollerSpeed", 1.0),
+    ("roller_force", "DYNO_Roller", "DYNO_RollerForce", 1.0),
+)
+BRAKE_FORCE = 20e-5
+"""N of both brakes for each Pa, front and rear pressure added: deceleration on 8 road rides, with 19 N of scatter."""
+BRAKE_PRESSED = 0.5e5  # Pa: below this the sensors show noise
+BRAKE_MEAN = 90.0  # N: the mean of the same rides while the switch is on, where there are no pressures
+ROAD_PIECE = 5.0  # m
+_MOVING = 2.0  # m/s: slower than this, yaw rate over speed is no curvature
+_NEEDED = ("throttle", "brake")
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """A recorded ride, at even steps.
+
+    signals: by role, in its SI unit, arrays of one length; only what was recorded. ``speed`` [m/s] (of the driven
+    wheel), ``brake`` (0..1, of `brake_torque_limit`) and ``distance`` [m] are worked out.
+    """
+
+    name: str
+    dt: float  # s
+    signals: dict[str, Array]
+    grade: Array  # sine, each `ROAD_PIECE` of distance
+    curvature: Array  # 1/m, positive to the left, likewise
+
+    @property
+    def duration(self) -> float:
+        """[s]."""
+        return (len(self.signals["speed"]) - 1) * self.dt
+
+    @property
+    def distance(self) -> float:
+        """[m]."""
+        return float(self.signals["distance"][-1])
+
+    @property
+    def on_dynamometer(self) -> bool:
+        """Whether there was a roller under the wheel."""
+        return "roller_force" in self.signals
+
+    def first(self, role: str, default: float) -> float:
+        """What `role` was in the first second; `default` if it was not recorded."""
+        values = self.signals.get(role)
+        return default if values is None else float(values[: max(round(1 / self.dt), 1)].mean())
+
+    def energy(self) -> float | None:
+        """Energy out of the pack [J] as measured, or None."""
+        if "pack_voltage" not in self.signals or "pack_current" not in self.signals:
+            return None
+        return float((self.signals["pack_voltage"] * self.signals["pack_current"]).sum() * self.dt)
+
+    def road(self, headwind: float = 0.0) -> Road:
+        """The road that was ridden."""
+        starts = [ROAD_PIECE * i for i in range(len(self.grade))]
+        return road_table(starts, self.grade.tolist(), self.curvature.tolist(), headwind)
+
+
+def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] | None = None) -> Recorded:
+    """The ride in `log`, of `vehicle`. `progress` is told how many frames were read.
+
+    Raises InputError for a log that cannot be read, or that has no speed.
+    """
+    import numpy as np
+
+    if vehicle.battery is None:
+        raise vehicle.error("has no [battery], which a simulation needs")
+    codec = Codec(_extended(vehicle.mapping))
+    own = {role for role, *_ in EXTRA}
+    estimator_groups = [replace(g, roles=()) if own & set(g.roles) else g for g in codec.groups]
+    estimator = Estimator(estimator_groups, vehicle.battery, vehicle.model, vehicle.riding)
+    known = [bool(group.roles) for group in estimator_groups]
+    found: dict[str, tuple[list[float], list[float]]] = {}
+    slots = [[found.setdefault(role, ([], [])) for role in group.roles] for group in codec.groups]
+    rows: list[tuple[float, float, float]] = []  # distance, grade, yaw rate over speed
+    tick = 0.0
+    for batch in read_frames(log):
+        for event in codec.decode(batch):
+            time, group, values = event
+            for (times, column), value in zip(slots[group], values, strict=True):
+                if value is not None:
+                    times.append(time)
+                    column.append(value)
+            if known[group]:
+                estimator.handle(event)
+                if time >= tick:
+                    tick = time + 0.1
+                    road = estimator.road
+                    speed = road.speed or 0.0
+                    turning = (road.yaw_rate or 0.0) / speed if speed > _MOVING else 0.0
+                    rows.append((road.distance, road.grade or 0.0, turning))
+        if progress:
+            progress(len(batch))
+    if not codec.latest:
+        raise InputError(f"{log}: vehicle {vehicle.name!r} knows none of its {codec.received} frames")
+    columns = {role: (np.array(t), np.array(v)) for role, (t, v) in found.items() if len(t) > 1}
+    signals = _signals(log, columns, vehicle)
+    grade, curvature = _by_distance(np.array(rows))
+    name = log.name.removesuffix(".gz")
+    return Recorded(Path(name).stem, STEP, signals, grade, curvature)
+
+
+def _extended(mapping: Mapping) -> Mapping:
+    """`mapping` and those of `EXTRA` that its database has."""
+    sources = list(mapping.sources)
+    for role, message, signal, factor in EXTRA:
+        for m in mapping.database.messages:
+            if m.name == message and signal in m.signal_tree:
+                conversion = m.get_signal_by_name(signal).conversion
+                scale, offset = float(conversion.scale) * factor, float(conversion.offset) * factor
+                sources.append(Source(role, message, signal, scale, offset))
+    return replace(mapping, sources=tuple(sources))
+
+
+def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicle) -> dict[str, Array]:
+    """All on one grid of steps: the speeds interpolated, what comes in steps as it was last told."""
+    import numpy as np
+
+    radius, gear = vehicle.parameters["wheel_radius"], vehicle.parameters["gear_ratio"]
+    pace = next((r for r in ("motor_speed", "wheel_speed_rear", "vehicle_speed", "gps_speed") if r in columns), None)
+    if pace is None:
+        raise InputError(f"{log}: has no speed: neither motor_speed, wheel_speed_rear, vehicle_speed nor gps_speed")
+    time = columns[pace][0]
+    grid = np.arange(time[0], time[-1], STEP)
+    signals = {role: np.interp(grid, t, v) for role, (t, v) in columns.items()}
+    if "brake_switch" in columns:
+        t, v = columns["brake_switch"]
+        signals["brake_switch"] = v[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(v) - 1)]
+    factor = {"motor_speed": gear * radius, "wheel_speed_rear": radius}.get(pace, 1.0)
+    signals["speed"] = np.maximum(signals[pace] * factor, 0.0)
+    signals["distance"] = np.concatenate(([0.0], np.cumsum(signals["speed"][1:] * STEP)))
+    limit = vehicle.parameters["brake_torque_limit"] / radius
+    pressed = signals.get("brake_switch")
+    if "brake_pressure_front" in signals and "brake_pressure_rear" in signals:
+        pressure = signals["brake_pressure_front"] + signals["brake_pressure_rear"]
+        pressure = np.where(pressure > BRAKE_PRESSED, pressure, 0.0)
+        if pressed is not None:
+            pressure = np.where(pressed > 0.5, np.maximum(pressure, 1.0), 0.0)
+        signals["brake"] = np.clip(pressure * BRAKE_FORCE / limit, 0.0, 1.0)
+    elif pressed is not None:
+        signals["brake"] = np.where(pressed > 0.5, BRAKE_MEAN / limit, 0.0)
+    return signals
+
+
+def _by_distance(rows: Array) -> tuple[Array, Array]:
+    """Grade and curvature at even distances; where the scooter stood, the last that it had there."""
+    import numpy as np
+
+    distance, keep = np.unique(rows[:, 0], return_index=True)
+    if len(distance) < 2:
+        return np.zeros(1), np.zeros(1)
+    at = np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE)
+    return np.interp(at, distance, rows[keep, 1]), np.interp(at, distance, rows[keep, 2])
+
+
+def rest_soc(recorded: Recorded, vehicle: Vehicle) -> float | None:
+    """SOC in the first second, from voltage and current as if the RC pair had been at rest; None if not measured."""
+    battery = vehicle.battery
+    if battery is None or "pack_voltage" not in recorded.signals:
+        return None
+    current = recorded.first("pack_current", 0.0)
+    cell = battery.cell_voltage(recorded.first("pack_voltage", 0.0), current)
+    temperature = recorded.first("cell_temperature", 20.0)
+    soc = 0.5
+    for _ in range(5):  # R0 depends on SOC
+        soc = battery.soc_at(cell + battery.r0.at(soc, temperature)[0] * current / battery.cells_parallel)
+    return min(max(soc, 0.0), 1.0)
+
+
+def counted_soc(recorded: Recorded, vehicle: Vehicle, start: float) -> Array | None:
+    """SOC over the ride by counting the measured charge from `start`, its known offset and gain taken off."""
+    import numpy as np
+
+    battery, p = vehicle.battery, vehicle.parameters
+    if battery is None or "pack_current" not in recorded.signals:
+        return None
+    current = (recorded.signals["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"]
+    capacity = 3600 * battery.pack_capacity(recorded.first("cell_temperature", 20.0))
+    soc: Array = start - np.cumsum(current) * recorded.dt / capacity
+    return soc
+
+
+def fit_dynamometer(recorded: Recorded, inertia: float | None = None) -> Dynamometer:
+    """The roller of a recorded dynamometer run: F = M·dV/dt + A + B·V + C·V², by least squares over spans of 2 s.
+
+    `inertia` [kg] is held if given. Raises InputError if there was no roller, or it did not move.
+    """
+    import numpy as np
+
+    if not recorded.on_dynamometer:
+        raise InputError(f"{recorded.name}: no roller of a dynamometer was recorded")
+    n = round(2 / recorded.dt)
+    speed, force = recorded.signals["roller_speed"], recorded.signals["roller_force"]
+    spans = len(speed) // n
+    mean_v, mean_f = (x[: spans * n].reshape(spans, n).mean(axis=1) for x in (speed, force))
+    square = (speed[: spans * n].reshape(spans, n) ** 2).mean(axis=1)
+    edges = np.interp(np.arange(spans + 1) * n, np.arange(len(speed)), np.convolve(speed, np.ones(21) / 21, "same"))
+    acceleration = np.diff(edges) / (n * recorded.dt)
+    moving = mean_v > 1.0
+    if moving.sum() < 10:
+        raise InputError(f"{recorded.name}: its roller hardly moves; give --dyno KG,A,B,C")
+    terms = [np.ones(spans), mean_v, square]
+    rest = mean_f - (inertia or 0.0) * acceleration
+    if inertia is None:
+        terms.append(acceleration)
+    matrix: Any = np.stack(terms, axis=1)[moving]
+    solution = np.linalg.lstsq(matrix, rest[moving], rcond=None)[0].tolist()
+    return Dynamometer(solution[3] if inertia is None else inertia, *solution[:3])
