@@ -70,8 +70,7 @@ class Baseline:
 
 def ride(file: Path, payload: float | None) -> tuple[str, list[Sample]]:
     vehicle = read_vehicle("reference", payload)
-    battery = vehicle.battery
-    assert battery
+    battery = vehicle.pack
     samples: list[Sample] = []
     state: dict[str, Any] = {"soc": None, "time": 0.0, "next": 0.0, "first": None, "charge": 0.0}
     baseline = Baseline(33.6 * 51.8 * 3600)

@@ -96,6 +96,7 @@ class Daemon:
             pipeline.clock_set(step)
             frames = []
         pipeline.kernel_lost = sum(channel.overflow for channel in self.channels)
+        pipeline.send_failures = sum(channel.send_failures for channel in self.channels)
         reasons = Reason(0)
         if not all(channel.up for channel in self.channels):
             reasons |= Reason.BUS_DOWN
@@ -250,5 +251,5 @@ def _summary(daemon: Daemon) -> None:
         )
     if last and last.range is not None and last.range_p10 is not None and last.range_p90 is not None:
         print(f"range {last.range / 1000:.1f} km ({last.range_p10 / 1000:.1f} to {last.range_p90 / 1000:.1f})")
-    for path in daemon.recorder.paths if daemon.recorder else []:
+    for path in [path for path in daemon.recorder.paths if path.exists()] if daemon.recorder else []:
         print(f"log {path}")

@@ -24,6 +24,7 @@ TICK_NS = 100_000_000  # status at 10 Hz
 TICKS_PER_RANGE = 10  # range at 1 Hz
 ESTIMATE_TOPIC = "/estimate"
 STATUS_TOPIC = "/status"
+COUNTS = ("received", "error_frames", "kernel_lost", "send_failures", "unknown_others")
 DROPPING = (LENGTH, CRC, COUNTER, TIME, UNDECODABLE)  # reasons that drop a frame
 
 ESTIMATE_UNITS = {
@@ -57,17 +58,30 @@ class Pipeline:
     signals once a second. observer: called with each estimate made, ten times a second of the frames' time.
     """
 
-    def __init__(self, vehicle: Vehicle, *, filter_name: str = "scalar", log: Log | None = None, log_frames: bool = True,
-                 log_signals: bool = True, observer: Callable[[Estimate], None] | None = None) -> None:  # fmt: skip
-        if vehicle.battery is None:
-            raise vehicle.error("has no [battery]: without one no range can be estimated")
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        *,
+        filter_name: str = "scalar",
+        log: Log | None = None,
+        log_frames: bool = True,
+        log_signals: bool = True,
+        observer: Callable[[Estimate], None] | None = None,
+    ) -> None:
         self.vehicle = vehicle
         self.codec = Codec(vehicle.mapping)
         self.estimator = Estimator(
-            self.codec.groups, vehicle.battery, vehicle.model, vehicle.riding, filter_maker(filter_name)
+            self.codec.groups, vehicle.pack, vehicle.model, vehicle.riding, filter_maker(filter_name)
         )
         self.publisher = Publisher()
+        clash = {m.frame_id for m in vehicle.mapping.database.messages} & {
+            m.frame_id for m in self.publisher.database.messages
+        }
+        if clash:
+            names = ", ".join(f"{identifier:#x}" for identifier in sorted(clash))
+            raise vehicle.error(f"its DBC files take the identifiers of our own range frames (dbc/range.dbc): {names}")
         self.kernel_lost = 0  # frames; set by the daemon
+        self.send_failures = 0  # frames that a channel did not take; set by the daemon
         self.extra_reasons = Reason(0)  # set by the daemon: bus down, log failed
         self.last: Estimate | None = None
         self._log = log
@@ -180,6 +194,8 @@ class Pipeline:
             "received": codec.received,
             "error_frames": codec.error_frames,
             "kernel_lost": self.kernel_lost,
+            "send_failures": self.send_failures,
+            "unknown_others": codec.unknown_others,
             "faults": faults,
             "lost": dict(sorted(codec.lost.items())),
             "unknown": {f"{i & ~EFF_FLAG:X}": n for i, n in sorted(codec.unknown.items())[:32]},
@@ -214,7 +230,7 @@ def _declare(log: Log, codec: Codec, signals: bool) -> None:
     }
     properties |= {"state": {"type": "string"}, "reasons": {"type": "string"}}
     log.channel(ESTIMATE_TOPIC, {"title": "gz_onboard.Estimate", "type": "object", "properties": properties})
-    counts = {name: {"type": "integer"} for name in ("received", "error_frames", "kernel_lost")}
+    counts = {name: {"type": "integer"} for name in COUNTS}
     maps = {name: {"type": "object"} for name in ("faults", "lost", "unknown")}
     reasons = {"reasons": {"type": "array", "items": {"type": "string"}}}
     log.channel(STATUS_TOPIC, {"title": "gz_onboard.Status", "type": "object", "properties": counts | maps | reasons})

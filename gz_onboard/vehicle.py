@@ -34,6 +34,13 @@ class Vehicle:
         pack = f"{self.battery.cells_series}s{self.battery.cells_parallel}p" if self.battery else "no battery"
         return "|".join([self.name, pack, *(effect.name for effect in self.model.effects)])
 
+    @property
+    def pack(self) -> Battery:
+        """The battery; InputError if the file has none."""
+        if self.battery is None:
+            raise self.error("has no [battery]: without one there is no range and nothing to simulate")
+        return self.battery
+
     def error(self, message: str) -> InputError:
         """The error to raise about this vehicle's file."""
         return InputError(f"{self.file}: {message}")

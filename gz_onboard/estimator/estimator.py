@@ -7,7 +7,7 @@ All state of the on-board software that matters lives here; `snapshot` and `rest
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import exp, sqrt
+from math import exp, isfinite, sqrt
 from typing import Any
 
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
@@ -26,12 +26,12 @@ FORECAST_PERIOD = 1.0  # s
 START_WAIT = 1.5  # s to wait for the temperature of the cells before the first estimate
 ERROR_TIME = 600.0  # s: over so long the cell model errs the same way; its error does not average out faster
 EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
-OFFSET_TIME = 3600.0  # s: so long the current sensor's offset stays the same
 RESISTANCE_SD = 0.12  # relative: R0 of this pack at this place and temperature
 RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
 GATE = 5.0  # sd: a voltage further off is a glitch, unless it persists
 GATE_COUNT = 20  # so many in a row are no glitch
 CURRENT_SD = {"pack": 0.0, "inverter": 0.5, "model": 3.0, "none": 15.0}  # A, beside the sensor's own offset
+CURRENT_TIME = {"pack": 3600.0, "inverter": 3600.0, "model": 600.0, "none": 60.0}  # s that such an error stays the same
 UNCHECKED_CURRENT_SD = 0.2  # A, beside the offset's, while no second sensor confirms the first
 INVERTER_VOLTAGE_SD = 0.15  # V: the cable between pack and inverter
 # What is missing makes the consumption to come less certain; relative sd, judged by what each is worth on the rides.
@@ -114,6 +114,9 @@ class Estimator:
                 signal.total += value
                 signal.count += 1
         if group == self._pace or time >= self._deadline:
+            if self._time is None and group != self._pace and self._deadline < 0:
+                self._deadline = time + STEP_AT_LEAST  # the first step too is for the message that sets the pace
+                return
             self._step(time)
 
     def _step(self, now: float) -> None:
@@ -207,7 +210,9 @@ class Estimator:
             charge = 3600 * battery.pack_capacity(temperature)
             unchecked = 0.0 if self.signals.inverter_current.fresh(now) else UNCHECKED_CURRENT_SD
             sd = sqrt(self._offset_sd**2 + CURRENT_SD[source] ** 2 + unchecked**2)
-            q = (sd / charge) ** 2 * 2 * OFFSET_TIME * dt + self._charge_sd**2 * abs(mean * dt / charge)
+            q = (sd / charge) ** 2 * 2 * CURRENT_TIME[source] * min(dt, 1.0) + self._charge_sd**2 * abs(
+                mean * dt / charge
+            )
             if dt > 1.0:  # a pause: nobody knows what flowed, the last current is believed for a second
                 mean /= dt
                 q += (CURRENT_SD["none"] * (dt - 1.0) / charge) ** 2
@@ -422,7 +427,14 @@ class Estimator:
             soc, v1 = float(saved["soc"]), float(saved["v1"])
             p00, p01, p11 = (float(x) for x in saved["covariance"])
             bias_x, bias_z = (float(x) for x in saved["gyro_bias"])
-            if not (-0.1 < soc < 1.1 and abs(v1) < 1 and 0 < p00 < 1 and 0 < p11 < 1 and p01 * p01 <= p00 * p11):
+            if not (
+                isfinite(bias_x + bias_z)
+                and -0.1 < soc < 1.1
+                and abs(v1) < 1
+                and 0 < p00 < 1
+                and 0 < p11 < 1
+                and p01 * p01 <= p00 * p11
+            ):
                 raise ValueError("holds implausible numbers")
             self.forecaster.restore(saved["riding"])
         except (KeyError, TypeError, OverflowError) as error:

@@ -274,9 +274,11 @@ class Forecaster:
         segments = [Segment(*(float(x) for x in row)) for row in saved["segments"]]
         riding = Riding(factor=float(saved["factor"]), factor_variance=float(saved["factor_variance"]))
         riding.segments.extend(segments)
-        if not all(s.distance > 0 and s.duration > 0 and abs(s.level) < 1e9 for s in segments) or not (
-            0.3 <= riding.factor <= 3 and 0 < riding.factor_variance < 1
-        ):
+        numbers = [x for s in segments for x in (s.measured, s.squares, s.modelled, s.level)]
+        good = all(0 < s.distance < 1e5 and 0 < s.duration < 1e6 for s in segments) and all(
+            abs(x) < 1e12 for x in numbers
+        )
+        if not good or not (0.3 <= riding.factor <= 3 and 0 < riding.factor_variance < 1):
             raise ValueError("implausible riding")
         self.riding = riding
         self._sum_past()

@@ -76,7 +76,7 @@ KEYS = {
 """What the summary of a ride holds: ``--json`` writes {"version", "rides": [summaries], "failed": [{file, error}]}."""
 
 _GAP_NS = 2_000_000_000  # a longer pause between two frames is ridden through in steps
-_PAUSE_NS = 60_000_000_000  # beyond this the recording was stopped, and nothing is estimated meanwhile
+_PAUSE_NS = 30_000_000_000  # beyond this the recording was stopped, and nothing is estimated meanwhile
 _CONFIRM = 3  # fewer frames than this do not set the time
 
 Progress = Callable[[int], None]

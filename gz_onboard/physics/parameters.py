@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from gz_onboard.errors import InputError
 from gz_onboard.physics.effect import VEHICLE_PARAMETERS, Effect, Parameter, known_effects, load_effect
 
 if TYPE_CHECKING:
@@ -99,7 +100,15 @@ class Parameters(Mapping[str, float]):
         return self.known[name].sd
 
     def replaced(self, **values: float) -> Parameters:
-        """The same with other values, which their givers are taken to know well (a tenth of the sd)."""
+        """The same with other values, which their givers are taken to know well (a tenth of the sd).
+
+        InputError for a value that is out of its parameter's bounds, or no number.
+        """
+        declared = declared_parameters()
+        for name, value in values.items():
+            p = declared[name]
+            if not p.low <= value <= p.high:
+                raise InputError(f"{name}: {value:g} {p.unit} is outside {p.low:g} to {p.high:g} {p.unit}")
         changed = {
             name: Value(value, 0.1 * self.known[name].sd, self.known[name].unit, "data sheet", "as entered")
             for name, value in values.items()

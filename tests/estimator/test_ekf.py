@@ -11,8 +11,7 @@ from gz_onboard.estimator.ekf import ScalarFilter, filter_maker
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.vehicle import read_vehicle
 
-BATTERY = read_vehicle("reference").battery
-assert BATTERY
+BATTERY = read_vehicle("reference").pack
 
 steps = st.tuples(
     st.floats(0.02, 2.0),  # dt
@@ -107,7 +106,7 @@ def simulate(seed, seconds=1500, dt=1.0, white=2e-3):
         f.update(voltage, current, temperature, white**2)
         p = np.array([[f.covariance[0], f.covariance[1]], [f.covariance[1], f.covariance[2]]])
         e = np.array([f.soc - true_soc, f.v1 - true_v1])
-        nees += e @ np.linalg.solve(p, e)
+        nees += float(e @ np.linalg.solve(p, e))
     n = int(seconds / dt)
     return nis / n, nees / n
 

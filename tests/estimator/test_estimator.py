@@ -15,8 +15,7 @@ from gz_onboard.events import Group, Reason, State
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference", 75.0)
-BATTERY = VEHICLE.battery
-assert BATTERY
+BATTERY = VEHICLE.pack
 GROUPS = [
     Group("Pack", ("pack_voltage", "pack_current"), 0.1),
     Group("Motor", ("motor_speed",), 0.05),

@@ -14,7 +14,7 @@ VEHICLE = read_vehicle("reference", 75.0)
 
 
 def forecaster():
-    return Forecaster(VEHICLE.model, VEHICLE.battery, VEHICLE.riding)
+    return Forecaster(VEHICLE.model, VEHICLE.pack, VEHICLE.riding)
 
 
 def ride(f, kilometres, *, factor=1.0, seed=0, grade=lambda x: 0.0, stop_every=600.0, dt=0.1):

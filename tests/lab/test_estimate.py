@@ -89,7 +89,8 @@ def test_the_summary_of_a_ride_agrees_with_its_frames(tmp_path, capsys):
 
     logged = [values for _, values in estimates(ride["log"])]
     assert len(logged) == pytest.approx(ride["duration_s"], abs=2)
-    assert ride["soc_start"] == pytest.approx(logged[0]["soc"], abs=0.01)
+    first = next(row["soc"] for row in logged if row["soc"] is not None)
+    assert ride["soc_start"] == pytest.approx(first, abs=0.01)
     assert ride["soc_end"] == pytest.approx(logged[-1]["soc"], abs=0.002)
     assert ride["distance_km"] == pytest.approx(logged[-1]["distance"] / 1000, abs=0.02)
     assert ride["range_end_p10_km"] < ride["range_end_km"] < ride["range_end_p90_km"]
@@ -221,8 +222,8 @@ def test_a_gap_is_ridden_through_and_a_pause_is_not(vehicle, frames):
         estimate.feed(pipeline, [frames[:6000], later])
         return made
 
-    without, gap, pause = states(0), states(30), states(3600)
-    assert len(gap) == len(without) + 300
+    without, gap, pause = states(0), states(25), states(3600)
+    assert len(gap) == len(without) + 250
     assert {e.state.name for e in gap} > {e.state.name for e in without}  # silence shows
     assert len(pause) <= len(without) + 2
     for made in without, gap, pause:

@@ -49,7 +49,8 @@ def test_the_panels_show_what_the_log_says(log):
         ("pack current", "pack_current", 1),
         ("expected", "consumption_expected", 1 / 3.6),
     ):
-        assert np.asarray(lines[label].get_ydata()) == pytest.approx([row[name] * factor for row in rows])
+        expected = [float("nan") if row[name] is None else row[name] * factor for row in rows]
+        assert np.asarray(lines[label].get_ydata()) == pytest.approx(expected, nan_ok=True)
     assert np.max(lines["speed"].get_ydata()) == pytest.approx(max(row["speed"] for row in rows) * 3.6)
     strip = figure.axes[6]
     shown = [label.get_text() for label in strip.get_yticklabels()]

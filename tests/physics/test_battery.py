@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from gz_onboard.physics.battery import Mesh, drawable
 from gz_onboard.vehicle import read_vehicle
 
-BATTERY = read_vehicle("reference").battery
-assert BATTERY
+BATTERY = read_vehicle("reference").pack
 
 
 @given(st.floats(-0.2, 1.2), st.floats(-30, 60))

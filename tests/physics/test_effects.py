@@ -18,7 +18,8 @@ EFFECTS = [load_effect(name) for name in known_effects()]
 CONSERVATIVE = {"inertia", "grade_force"}  # what they take they give back
 LIMITS = {
     "speed": (-5, 40), "acceleration": (-8, 8), "grade": (-0.3, 0.3), "grade_cosine": (0.9, 1), "mass": (50, 400),
-    "air_density": (0.9, 1.5), "headwind": (-15, 15), "lateral_acceleration": (-8, 8), "motor_speed": (-30, 400), "motor_current": (-300, 300),
+    "air_density": (0.9, 1.5), "headwind": (-15, 15), "lateral_acceleration": (-8, 8), "motor_speed": (-30, 400),
+    "motor_current": (-300, 300),
     "motor_temperature": (-40, 200),
 }  # fmt: skip
 PRIORS = {name: parameter.prior for name, parameter in declared_parameters().items()}
