@@ -39,7 +39,6 @@ BRAKE_PRESSED = 0.5e5  # Pa: below this the sensors show noise
 BRAKE_MEAN = 90.0  # N: the mean of the same rides while the switch is on, where there are no pressures
 ROAD_PIECE = 5.0  # m
 _MOVING = 2.0  # m/s: slower than this, yaw rate over speed is no curvature
-_NEEDED = ("throttle", "brake")
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ class Recorded:
     """A recorded ride, at even steps.
 
     signals: by role, in its SI unit, arrays of one length; only what was recorded. ``speed`` [m/s] (of the driven
-    wheel), ``brake`` (0..1, of `brake_torque_limit`) and ``distance`` [m] are worked out.
+    wheel), ``distance`` [m], ``brake`` (0..1, of `brake_torque_limit`) and ``soc`` (counted charge) are worked out.
     """
 
     name: str
@@ -127,6 +126,8 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
         raise InputError(f"{log}: vehicle {vehicle.name!r} knows none of its {codec.received} frames")
     columns = {role: (np.array(t), np.array(v)) for role, (t, v) in found.items() if len(t) > 1}
     signals = _signals(log, columns, vehicle)
+    if "pack_voltage" in signals and "pack_current" in signals:
+        signals["soc"] = _counted_soc(signals, vehicle)
     grade, curvature = _by_distance(np.array(rows))
     name = log.name.removesuffix(".gz")
     return Recorded(Path(name).stem, STEP, signals, grade, curvature)
@@ -187,28 +188,34 @@ def _by_distance(rows: Array) -> tuple[Array, Array]:
 
 def rest_soc(recorded: Recorded, vehicle: Vehicle) -> float | None:
     """SOC in the first second, from voltage and current as if the RC pair had been at rest; None if not measured."""
+    return _rest_soc(recorded.signals, vehicle)
+
+
+def _rest_soc(signals: dict[str, Array], vehicle: Vehicle) -> float | None:
     battery = vehicle.battery
-    if battery is None or "pack_voltage" not in recorded.signals:
+    if battery is None or "pack_voltage" not in signals:
         return None
-    current = recorded.first("pack_current", 0.0)
-    cell = battery.cell_voltage(recorded.first("pack_voltage", 0.0), current)
-    temperature = recorded.first("cell_temperature", 20.0)
+    n = round(1 / STEP)
+    zero = signals["pack_voltage"][:n] * 0
+    current = float(signals.get("pack_current", zero)[:n].mean())
+    cell = battery.cell_voltage(float(signals["pack_voltage"][:n].mean()), current)
+    temperature = float(signals.get("cell_temperature", zero + 20)[:n].mean())
     soc = 0.5
     for _ in range(5):  # R0 depends on SOC
         soc = battery.soc_at(cell + battery.r0.at(soc, temperature)[0] * current / battery.cells_parallel)
     return min(max(soc, 0.0), 1.0)
 
 
-def counted_soc(recorded: Recorded, vehicle: Vehicle, start: float) -> Array | None:
-    """SOC over the ride by counting the measured charge from `start`, its known offset and gain taken off."""
+def _counted_soc(signals: dict[str, Array], vehicle: Vehicle) -> Array:
+    """SOC by counting the measured charge from that at the start, the sensor's known offset and gain taken off."""
     import numpy as np
 
     battery, p = vehicle.battery, vehicle.parameters
-    if battery is None or "pack_current" not in recorded.signals:
-        return None
-    current = (recorded.signals["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"]
-    capacity = 3600 * battery.pack_capacity(recorded.first("cell_temperature", 20.0))
-    soc: Array = start - np.cumsum(current) * recorded.dt / capacity
+    assert battery
+    current = (signals["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"]
+    temperature = float(signals["cell_temperature"][0]) if "cell_temperature" in signals else 20.0
+    charge = np.cumsum(current) * STEP / (3600 * battery.pack_capacity(temperature))
+    soc: Array = (_rest_soc(signals, vehicle) or 1.0) - charge
     return soc
 
 

@@ -155,7 +155,8 @@ def drive(
     if done % every:
         rows.append(_row(scooter, wanted, energy))
     series = dict(zip(COLUMNS, np.array(rows, dtype=float).T, strict=True))
-    series["wanted_speed"][0] = series["wanted_speed"][1] if len(rows) > 1 else nan
+    if len(rows) > 1 and not np.isnan(series["wanted_speed"][1]):
+        series["wanted_speed"][0] = series["speed"][0]  # before the first step nothing else can be wanted
     duration = done * dt
     run = Run(
         series=series,
@@ -213,6 +214,18 @@ def replay(throttle: Sequence[float], brake: Sequence[float], dt: float) -> Comm
     def command(scooter: Scooter) -> tuple[float, float, float]:
         i = min(round(scooter.time / dt), last)
         return throttle[i], brake[i], nan
+
+    return command
+
+
+def along(metres: Sequence[float]) -> Command:
+    """A rider who follows a speed for each metre [m/s], looking half a second ahead; at least at walking pace."""
+    rider, last = Rider(), len(metres) - 1
+
+    def command(scooter: Scooter) -> tuple[float, float, float]:
+        ahead = scooter.distance + 0.5 * scooter.speed
+        wanted = max(metres[min(max(int(ahead), 0), last)], 1.0)
+        return *rider.step(wanted, scooter.speed, scooter.dt), wanted
 
     return command
 

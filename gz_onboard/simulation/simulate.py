@@ -21,15 +21,19 @@ from typing import Any
 from gz_onboard.bus.publisher import WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.simulation.cycles import find_cycle
+from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded, rest_soc
+from gz_onboard.simulation.route import read_route, speed_profile
 from gz_onboard.simulation.run import (
     COLUMNS,
     Command,
     Progress,
     Run,
+    along,
     at_steps,
     drive,
     follow,
     range_by_energy,
+    replay,
     road_table,
 )
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Road, Scooter, straight
@@ -46,7 +50,7 @@ KEYS = {
     "duration_s": "ridden",
     "distance_km": "ridden",
     "speed_max_km_h": "greatest speed",
-    "repetitions": "times that the cycle or route was ridden; the last may be unfinished",
+    "repetitions": "times that the cycle was ridden; the last may be unfinished",
     "energy_wh": "delivered by the pack, less what was recovered",
     "energy_recovered_wh": "charged into the pack",
     "energy_cells_wh": "that left the cells' chemistry: energy_wh and the heat of the battery",
@@ -60,8 +64,8 @@ KEYS = {
     "shortfall_s": "their time in all",
     "ledger_wh": "where the energy of the cells went, by name; negative: gave",
     "closure": "energy_cells_wh less the sum of the ledger, over all that was turned over",
-    "measured": "of a recorded ride: energy_wh, consumption_wh_km, distance_km, and the RMS of simulated less measured "
-    "speed_km_h, pack_voltage_v, pack_current_a; else null",
+    "measured": "of a recorded ride: distance_km, energy_wh, consumption_wh_km, and RMS of simulated less measured: "
+    "rms_speed_km_h, rms_pack_voltage_v, rms_pack_current_a, rms_motor_torque_nm; else null",
     "files": "written",
     "wall_s": "time taken by the simulation",
     "sweep": "a list of {values, consumption_wh_km, range_km, shortfall_s}, or null",
@@ -72,18 +76,21 @@ FORMATS = ("mcap", "parquet", "csv")
 _LOGS = (".mcap", ".blf", ".log", ".asc", ".trc", ".mf4", ".gz")
 _MOST_HOURS = 48.0  # of riding until empty
 _TOPIC = "simulation"
+TOP_SPEED = 50 / 3.6
+"""m/s: what a rider wants to ride on a route without limits."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be ridden, once: the wanted speed over time, or over distance along a road."""
+    """What is to be ridden: commands, the road under them, and what is known of the start."""
 
     name: str
     kind: str
     seconds: float  # of one repetition, as planned
-    road: Road
+    road: Road | Dynamometer
     command: Callable[[], Command]
-    length: float | None = None  # m: where it ends, if not by time
+    length: float | None = None  # m, of one repetition; None if it ends by time
+    recorded: Recorded | None = None
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -125,7 +132,7 @@ def run(arguments: argparse.Namespace) -> int:
     sweeps = [read_sweep(text, vehicle) for text in arguments.sweep]
     if len({sweep.name for sweep in sweeps}) < len(sweeps):
         raise InputError(f"--sweep {sweeps[0].name}: given twice")
-    plan = find_plan(arguments)
+    plan = find_plan(arguments, vehicle)
     begin = time.perf_counter()
     with _bar(_expected_seconds(arguments, plan, sweeps), "s ridden") as progress:
         result, scooter = ride(vehicle, plan, arguments, progress)
@@ -173,17 +180,23 @@ def dynamometer(text: str) -> Dynamometer:
 # --- what is to be ridden -----------------------------------------------------------------------------------------
 
 
-def find_plan(arguments: argparse.Namespace) -> Plan:
+def find_plan(arguments: argparse.Namespace, vehicle: Vehicle) -> Plan:
     """The plan that WHAT asks for; InputError for what is neither a file that can be ridden nor a built-in cycle."""
-    what = str(arguments.what)
-    path = Path(what)
+    path = Path(arguments.what)
     kind = _kind(path)
+    if kind == "ride":
+        return _ride_plan(path, arguments, vehicle)
+    if arguments.predictive:
+        raise InputError(f"--predictive: {path} is a {kind}, whose speed is followed anyway; it is for recorded rides")
+    roller = dynamometer(arguments.dyno) if arguments.dyno else None
     if kind == "route":
-        return _route_plan(path, arguments)
-    cycle = find_cycle(what)
+        return _route_plan(path, arguments, roller)
+    cycle = find_cycle(arguments.what)
+    if arguments.repeat > 1 or arguments.until_empty:
+        cycle.repeated(2)  # its error if it ends at another speed than it begins with
     speeds = at_steps(cycle.time, cycle.speed, STEP)
-    sine = math.sin(math.atan(arguments.grade / 100))
-    return Plan(cycle.name, "cycle", cycle.duration, straight(sine, arguments.wind), lambda: follow(speeds, STEP))
+    road = roller or straight(math.sin(math.atan(arguments.grade / 100)), arguments.wind)
+    return Plan(cycle.name, "cycle", cycle.duration, road, lambda: follow(speeds, STEP))
 
 
 def _kind(path: Path) -> str:
@@ -208,42 +221,65 @@ def _kind(path: Path) -> str:
     )
 
 
-def _route_plan(path: Path, arguments: argparse.Namespace) -> Plan:
-    from gz_onboard.simulation.route import read_route, speed_profile
-
+def _route_plan(path: Path, arguments: argparse.Namespace, roller: Dynamometer | None) -> Plan:
+    if arguments.repeat > 1 or arguments.until_empty:
+        raise InputError(f"{path}: a route is ridden once: its end is not its begin; --repeat is for cycles")
     route = read_route(path)
-    profile = speed_profile(route, top_speed=50 / 3.6)
+    profile = speed_profile(route, top_speed=TOP_SPEED)
     metres = [profile.speed_at(float(i)) for i in range(int(route.length) + 1)]
-    road = road_table(route.distance, route.grade, route.curvature, arguments.wind)
+    road = roller or road_table(route.distance, route.grade, route.curvature, arguments.wind)
     return Plan(route.name, "route", profile.time[-1], road, lambda: along(metres), route.length)
 
 
-def along(metres: Sequence[float]) -> Command:
-    """A rider who follows a speed for each metre [m/s], looking half a second ahead; at least at walking pace."""
-    from gz_onboard.simulation.parts.rider import Rider
-
-    rider, last = Rider(), len(metres) - 1
-
-    def command(scooter: Scooter) -> tuple[float, float, float]:
-        ahead = scooter.distance + 0.5 * scooter.speed
-        wanted = max(metres[min(max(int(ahead), 0), last)], 1.0)
-        return *rider.step(wanted, scooter.speed, scooter.dt), wanted
-
-    return command
+def _ride_plan(path: Path, arguments: argparse.Namespace, vehicle: Vehicle) -> Plan:
+    if arguments.repeat > 1 or arguments.until_empty:
+        raise InputError(f"{path}: a recorded ride is ridden once; --repeat and --until-empty are for cycles")
+    recorded = read_recorded(path, vehicle)
+    signals = recorded.signals
+    beside = path.with_name(f"{recorded.name}.route.csv")
+    if arguments.dyno:
+        road: Road | Dynamometer = dynamometer(arguments.dyno)
+    elif recorded.on_dynamometer:
+        road = fit_dynamometer(recorded)
+    elif beside.is_file():
+        route = read_route(beside)
+        road = road_table(route.distance, route.grade, route.curvature, arguments.wind)
+    else:
+        road = recorded.road(arguments.wind)
+    if arguments.predictive:
+        speeds = signals["speed"].tolist()
+        kind, command = "ride (predictive)", lambda: follow(speeds, STEP)
+    else:
+        missing = [role for role in ("throttle", "brake") if role not in signals]
+        if missing:
+            raise InputError(
+                f"{path}: vehicle {vehicle.name!r} has no {missing[0]} in it to be replayed; --predictive needs none"
+            )
+        throttle, brake = signals["throttle"].tolist(), signals["brake"].tolist()
+        kind, command = "ride (open loop)", lambda: replay(throttle, brake, STEP)
+    return Plan(recorded.name, kind, recorded.duration, road, command, recorded=recorded)
 
 
 def ride(vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, progress: Progress | None) -> tuple[Run, Scooter]:
-    """Ride `plan` with the options of the command line."""
+    """Ride `plan` with the options of the command line; what these do not say of the start is as it was recorded."""
+    recorded = plan.recorded
+    measured = recorded.first if recorded else lambda _, default: default
+    ambient = measured("ambient_temperature", 20.0) if arguments.ambient is None else arguments.ambient
+    soc = arguments.soc
+    if soc is None:
+        soc = (rest_soc(recorded, vehicle) if recorded else None) or 1.0
     scooter = Scooter(
-        vehicle,
-        dynamometer(arguments.dyno) if arguments.dyno else plan.road,
-        soc=1.0 if arguments.soc is None else arguments.soc,
-        ambient=20.0 if arguments.ambient is None else arguments.ambient,
+        vehicle, plan.road, soc=soc, ambient=ambient, cell_temperature=measured("cell_temperature", ambient),
+        speed=measured("speed", 0.0),
+    )  # fmt: skip
+    scooter.motor_cooling.stator = scooter.motor_cooling.rotor = measured("motor_temperature", ambient)
+    scooter.inverter_cooling.board = scooter.inverter_cooling.box = measured("inverter_temperature", ambient)
+    seconds = _MOST_HOURS * 3600 if arguments.until_empty else plan.seconds * arguments.repeat
+    if plan.length is not None:
+        seconds = 3 * plan.seconds + 600  # a weak vehicle takes longer
+    result = drive(
+        scooter, plan.command(), seconds, until_empty=arguments.until_empty, finish=plan.length, progress=progress
     )
-    seconds = plan.seconds * arguments.repeat
-    if arguments.until_empty:
-        seconds = _MOST_HOURS * 3600
-    result = drive(scooter, plan.command(), seconds, until_empty=arguments.until_empty, progress=progress)
     return result, scooter
 
 
@@ -290,7 +326,7 @@ def summarise(
         "duration_s": result.duration,
         "distance_km": result.distance * 1e-3,
         "speed_max_km_h": float(result.series["speed"].max()) * 3.6,
-        "repetitions": result.duration / plan.seconds,
+        "repetitions": result.duration / plan.seconds if plan.kind == "cycle" else 1.0,
         "energy_wh": result.energy / WH,
         "energy_recovered_wh": result.recovered / WH,
         "energy_cells_wh": result.chemical / WH,
@@ -313,7 +349,41 @@ def summarise(
         "shortfall_s": sum(s.duration for s in result.shortfalls),
         "ledger_wh": {name: energy / WH for name, energy in result.ledger.items()},
         "closure": result.closure,
-        "measured": None,
+        "measured": compare(plan.recorded, result) if plan.recorded else None,
+    }
+
+
+def measured_columns(recorded: Recorded, result: Run) -> dict[str, Any]:
+    """What was recorded of the columns of a run, at the times of its series."""
+    import numpy as np
+
+    at = np.minimum(np.round(result.series["time"] / recorded.dt).astype(int), len(recorded.signals["speed"]) - 1)
+    columns = {name: values[at] for name, values in recorded.signals.items() if name in COLUMNS}
+    if "soc" in recorded.signals:
+        columns["soc"] = recorded.signals["soc"][at]
+    return columns
+
+
+def compare(recorded: Recorded, result: Run) -> dict[str, Any]:
+    """The entry ``measured`` of the summary."""
+    import numpy as np
+
+    columns = measured_columns(recorded, result)
+    energy = recorded.energy()
+
+    def rms(name: str, factor: float) -> float | None:
+        if name not in columns:
+            return None
+        return float(np.sqrt(np.mean((result.series[name] - columns[name]) ** 2))) * factor
+
+    return {
+        "distance_km": recorded.distance * 1e-3,
+        "energy_wh": _times(energy, 1 / WH),
+        "consumption_wh_km": None if energy is None else energy / recorded.distance / WH_PER_KM,
+        "rms_speed_km_h": rms("speed", 3.6),
+        "rms_pack_voltage_v": rms("pack_voltage", 1.0),
+        "rms_pack_current_a": rms("pack_current", 1.0),
+        "rms_motor_torque_nm": rms("motor_torque", 1.0),
     }
 
 
@@ -328,16 +398,48 @@ def write(
     arguments: argparse.Namespace, plan: Plan, result: Run, summary: dict[str, Any], sweeps: Sequence[Sweep]
 ) -> list[str]:
     """The time series and the pictures; gives their names. Raises InputError if they cannot be written."""
-    stem: Path = arguments.output / f"{plan.name}.simulation"
+    mode = ".predictive" if arguments.predictive else ""
+    name = f"{plan.name}{mode}.simulation"
     files: list[Path] = []
+
+    def file(ending: str) -> Path:
+        files.append(arguments.output / f"{name}{ending}")
+        return files[-1]
+
     try:
         arguments.output.mkdir(parents=True, exist_ok=True)
         if not arguments.no_series:
-            files.append(stem.with_name(f"{stem.name}.{arguments.format}"))
-            write_series(result, files[-1], {"vehicle": summary["vehicle"], "source": summary["what"]})
+            metadata = {"vehicle": str(summary["vehicle"]), "source": str(summary["what"])}
+            write_series(result, file(f".{arguments.format}"), metadata)
+        if not arguments.no_plot:
+            _draw(file, plan, result, summary, sweeps)
     except OSError as error:
-        raise InputError(f"{error.filename or stem}: cannot be written: {error.strerror or error}") from error
+        raise InputError(
+            f"{error.filename or arguments.output}: cannot be written: {error.strerror or error}"
+        ) from error
     return [str(file) for file in files]
+
+
+def _draw(
+    file: Callable[[str], Path], plan: Plan, result: Run, summary: dict[str, Any], sweeps: Sequence[Sweep]
+) -> None:
+    from gz_onboard.simulation import figures
+
+    title = f"{plan.name}, {summary['kind']} · {summary['vehicle']}, payload {summary['payload_kg']:g} kg"
+    drawn = [("", figures.overview(result, title)), (".ledger", figures.sankey(result.ledger, f"{title}: energy"))]
+    if plan.recorded:
+        columns = measured_columns(plan.recorded, result)
+        drawn.append((".measured", figures.comparison(result, columns, title)))
+    variants = summary["sweep"]
+    if len(sweeps) == 1:
+        drawn.append((".sweep", figures.sweep_lines(sweeps[0].label, sweeps[0].values, variants, title)))
+    elif sweeps:
+        one, two = sweeps
+        names, values = (one.label, two.label), (one.values, two.values)
+        drawn.append((".sweep", figures.sweep_map(names, values, variants, title)))
+    for ending, figure in drawn:
+        figures.save(figure, file(f"{ending}.png"))
+    figures.page(file(".html"), title, summary_text(summary | {"files": []}), [figure for _, figure in drawn])
 
 
 def write_series(result: Run, file: Path, metadata: dict[str, str]) -> None:
@@ -407,6 +509,7 @@ def summary_text(summary: dict[str, Any]) -> str:
         *(("where it went" if not i else "",
            f"{name.replace('_', ' '):20} {energy:9.2f} Wh {100 * energy / gross:6.1f} %")
           for i, (name, energy) in enumerate(ledger)),
+        *_measured_rows(summary),
         ("closes to", f"{100 * summary['closure']:.1g} % of what was turned over"),
         ("computed in", f"{summary['wall_s']:.2f} s, step {1000 * summary['step_s']:g} ms"),
     ]  # fmt: skip
@@ -428,6 +531,20 @@ def _shortfall_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         place = f"at {s['time_s']:.0f} s, {s['distance_km']:.2f} km, for {s['duration_s']:.0f} s"
         rows.append(("", f"{place}: {s['missing_km_h']:.1f} km/h below {s['wanted_km_h']:.0f} km/h: {why}"))
     return rows
+
+
+def _measured_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    m = summary["measured"]
+    if not m:
+        return []
+    return [
+        ("measured", f"{m['distance_km']:.2f} km, {_number(m['energy_wh'], '.1f', 'Wh')}, "
+                     f"{_number(m['consumption_wh_km'], '.2f', 'Wh/km')}"),
+        ("simulated less", "RMS " + ", ".join(
+            _number(m[key], form, unit) for key, form, unit in (
+                ("rms_speed_km_h", ".1f", "km/h"), ("rms_pack_voltage_v", ".2f", "V"),
+                ("rms_pack_current_a", ".1f", "A"), ("rms_motor_torque_nm", ".1f", "N·m")))),
+    ]  # fmt: skip
 
 
 def _table(sweep: Sequence[dict[str, Any]]) -> list[str]:

@@ -1,0 +1,290 @@
+"""Pictures of a simulated ride: time series, where the energy went, measured beside simulated, sweeps."""
+
+from __future__ import annotations
+
+import html
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gz_onboard.bus.publisher import WH
+from gz_onboard.simulation.run import Run
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_INK, _MUTED, _GRID = "#1f2933", "#7b8794", "#e4e7eb"
+_BLUE, _ORANGE, _GREEN, _RED, _PURPLE = "#1667b7", "#d9730d", "#2f855a", "#c53030", "#6b46c1"
+
+STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "battery": ("#6b46c1", ("battery_heat", "bms", "not_delivered")),
+    "auxiliary": ("#7b8794", ("auxiliary_load",)),
+    "drive": ("#1667b7", ("inverter_loss", "motor_copper_loss", "motor_iron_loss", "motor_map_loss", "gearing")),
+    "road": ("#2f855a", ("tyre_slip", "rolling_resistance", "aerodynamic_drag", "cornering_drag", "dynamometer")),
+    "brakes": ("#c53030", ("brakes",)),
+    "stored": ("#d9730d", ("kinetic_energy", "potential_energy")),
+}
+"""The entries of a ledger in the order in which energy passes them, each stage with its colour."""
+
+
+def overview(run: Run, title: str) -> Figure:
+    """The time series of a ride: speed, throttle and brake, pack, state of charge, temperatures, energy."""
+    import numpy as np
+
+    s = run.series
+    figure, axes = _panels(6, title, (1.7, 1.0, 1.3, 1.0, 1.0, 1.2))
+    x, label = _time(run)
+    if not np.isnan(s["wanted_speed"]).all():
+        axes[0].plot(x, s["wanted_speed"] * 3.6, color=_ORANGE, linewidth=1.0, label="wanted")
+    axes[0].plot(x, s["speed"] * 3.6, color=_BLUE, linewidth=1.2, label="ridden")
+    for i, short in enumerate(run.shortfalls):
+        begin = short.time / _unit(run)[0]
+        axes[0].axvspan(begin, begin + short.duration / _unit(run)[0], color=_RED, alpha=0.15, linewidth=0,
+                        label="shortfall" if not i else None)  # fmt: skip
+    _label(axes[0], "speed [km/h]")
+    axes[1].plot(x, s["throttle"] * 100, color=_GREEN, linewidth=0.8, label="throttle")
+    axes[1].plot(x, s["brake"] * -100, color=_RED, linewidth=0.8, label="brake (down)")
+    _label(axes[1], "rider [%]")
+    other = _second(axes[2], "current [A]", _ORANGE)
+    other.plot(x, s["pack_current"], color=_ORANGE, linewidth=0.7, alpha=0.8, label="pack current")
+    axes[2].plot(x, s["pack_voltage"], color=_PURPLE, linewidth=0.9, label="pack voltage")
+    _label(axes[2], "voltage [V]", _PURPLE)
+    axes[3].plot(x, s["soc"] * 100, color=_GREEN, linewidth=1.4, label="state of charge")
+    _label(axes[3], "SOC [%]")
+    for name, colour in (("motor", _RED), ("inverter", _ORANGE), ("cell", _PURPLE), ("bms", _MUTED)):
+        axes[4].plot(x, s[f"{name}_temperature"], color=colour, linewidth=1.1, label="BMS" if name == "bms" else name)
+    _label(axes[4], "temperature [°C]")
+    other_grade = _second(axes[5], "grade [%]", _MUTED)
+    other_grade.plot(x, s["grade"] * 100, color=_MUTED, linewidth=0.8, label="grade")
+    axes[5].plot(x, s["energy"] / WH, color=_BLUE, linewidth=1.4, label="energy from the pack")
+    _label(axes[5], "energy [Wh]", _BLUE)
+    _finish(axes, x, label, {2: other, 5: other_grade})
+    return figure
+
+
+def comparison(run: Run, measured: Mapping[str, Any], title: str) -> Figure:
+    """Measured beside simulated: speed, SOC, pack voltage, pack current, motor torque, throttle, temperatures.
+
+    measured: by the names of `run.COLUMNS`, of the length of the run's series; what is missing is not drawn.
+    """
+    s = run.series
+    rows = [
+        ("speed", "speed [km/h]", 3.6),
+        ("soc", "SOC [%]", 100.0),
+        ("pack_voltage", "pack voltage [V]", 1.0),
+        ("pack_current", "pack current [A]", 1.0),
+        ("motor_torque", "motor torque [N·m]", 1.0),
+        ("throttle", "throttle [%]", 100.0),
+        ("motor_temperature", "motor [°C]", 1.0),
+    ]
+    rows = [row for row in rows if row[0] in measured]
+    figure, axes = _panels(len(rows), title, [1.6, *[1.0] * (len(rows) - 1)])
+    x, label = _time(run)
+    for axis, (name, text, factor) in zip(axes, rows, strict=True):
+        axis.plot(x, measured[name] * factor, color=_INK, linewidth=1.0, label="measured")
+        axis.plot(x, s[name] * factor, color=_ORANGE, linewidth=0.9, alpha=0.85, label="simulated")
+        _label(axis, text)
+    _finish(axes, x, label, {})
+    return figure
+
+
+def sankey(ledger: Mapping[str, float], title: str) -> Figure:
+    """Where the energy went: sources on the left, on the right what took it, as thick as it is much.
+
+    ledger: J by name; what is negative gave energy and stands on the left with the cells.
+    """
+    from matplotlib.patches import PathPatch, Rectangle
+    from matplotlib.path import Path as Curve
+
+    figure = _figure(11, 7.2)
+    axis = figure.add_axes((0.02, 0.02, 0.96, 0.86))
+    axis.set_axis_off()
+    order = [(name, colour) for colour, names in STAGES.values() for name in names]
+    order += [(name, _MUTED) for name in ledger if name not in {n for n, _ in order}]
+    takes = [(name, ledger[name], colour) for name, colour in order if ledger.get(name, 0.0) > 0]
+    gives = [(name, -ledger[name], colour) for name, colour in order if ledger.get(name, 0.0) < 0]
+    total = sum(energy for _, energy, _ in takes) or 1.0
+    takes = [take for take in takes if take[1] >= 5e-5 * total]
+    cells = total - sum(energy for _, energy, _ in gives)
+    sources = [("cells", cells, _INK), *(give for give in gives if give[1] >= 5e-5 * total)]
+    gap = 0.028
+    left, right = 0.17, 0.62
+    height = 1.0 - gap * max(len(takes) - 1, 1)
+    places = []
+    y = 1.0
+    for name, energy, colour in takes:
+        thick = energy / total * height
+        places.append((name, energy, colour, y - thick, thick))
+        y -= thick + gap
+    trunk = 0.5 + height / 2
+    y = trunk
+    for name, energy, colour in sources:
+        thick = energy / total * height
+        axis.add_patch(Rectangle((left - 0.025, y - thick), 0.025, thick, color=colour, linewidth=0))
+        axis.text(left - 0.035, y - thick / 2, f"{_words(name)}\n{energy / WH:.1f} Wh", ha="right", va="center",
+                  fontsize=10, color=_INK)  # fmt: skip
+        y -= thick
+    y = trunk
+    middle = (left + right) / 2
+    for name, energy, colour, low, thick in places:
+        points = [(left, y), (middle, y), (middle, low + thick), (right, low + thick),
+                  (right, low), (middle, low), (middle, y - thick), (left, y - thick), (left, y)]  # fmt: skip
+        codes = [Curve.MOVETO, *[Curve.CURVE4] * 3, Curve.LINETO, *[Curve.CURVE4] * 3, Curve.CLOSEPOLY]
+        axis.add_patch(PathPatch(Curve(points, codes), facecolor=colour, alpha=0.38, linewidth=0))
+        axis.add_patch(Rectangle((right, low), 0.02, thick, color=colour, linewidth=0))
+        text = f"{_words(name)}   {energy / WH:.2f} Wh   {100 * energy / total:.1f} %"
+        axis.text(right + 0.03, low + thick / 2, text, va="center", fontsize=10, color=_INK)
+        y -= thick
+    axis.set_xlim(0, 1)
+    axis.set_ylim(-0.02, 1.02)
+    figure.text(0.03, 0.94, title, fontsize=13, fontweight="bold", color=_INK, va="center")
+    return figure
+
+
+def sweep_lines(name: str, values: Sequence[float], variants: Sequence[Mapping[str, Any]], title: str) -> Figure:
+    """Range and consumption against one parameter."""
+    figure, axes = _panels(2, title, (1.3, 1.3))
+    for axis, key, label, colour in zip(
+        axes, ("range_km", "consumption_wh_km"), ("range [km]", "consumption [Wh/km]"), (_BLUE, _ORANGE), strict=True
+    ):
+        column = [float("nan") if v[key] is None else v[key] for v in variants]
+        axis.plot(values, column, color=colour, linewidth=1.6, marker="o", markersize=4)
+        _label(axis, label, colour)
+    axes[0].tick_params(labelbottom=False)
+    axes[1].set_xlabel(name, color=_INK, fontsize=9, loc="left")
+    axes[0].margins(x=0.03)
+    return figure
+
+
+def sweep_map(
+    names: tuple[str, str], values: tuple[Sequence[float], Sequence[float]], variants: Sequence[Mapping[str, Any]],
+    title: str,
+) -> Figure:  # fmt: skip
+    """Range and consumption over two parameters, `variants` with the second changing fastest."""
+    import numpy as np
+
+    figure = _figure(12, 5.4)
+    for i, (key, text, colours) in enumerate(
+        (("range_km", "range [km]", "Blues"), ("consumption_wh_km", "consumption [Wh/km]", "Oranges"))
+    ):
+        axis = figure.add_axes((0.07 + 0.49 * i, 0.13, 0.36, 0.68))
+        flat = [np.nan if v[key] is None else v[key] for v in variants]
+        table = np.array(flat, dtype=float).reshape(len(values[0]), len(values[1]))
+        mesh = axis.pcolormesh(values[1], values[0], table, cmap=colours, shading="nearest", alpha=0.85)
+        if min(table.shape) > 1 and np.nanmax(table) > np.nanmin(table):
+            lines = axis.contour(values[1], values[0], table, colors=_INK, linewidths=0.8)
+            axis.clabel(lines, fontsize=8, fmt="%.4g")
+        bar = figure.colorbar(mesh, ax=axis, fraction=0.05)
+        bar.ax.tick_params(colors=_MUTED, labelsize=8, length=0)
+        axis.set_xlabel(names[1], fontsize=9, color=_INK)
+        axis.set_ylabel(names[0], fontsize=9, color=_INK)
+        axis.set_title(text, fontsize=10, color=_INK, loc="left")
+        axis.tick_params(colors=_MUTED, labelsize=8)
+    figure.text(0.03, 0.94, title, fontsize=13, fontweight="bold", color=_INK, va="center")
+    return figure
+
+
+def save(figure: Figure, file: Path) -> None:
+    """Write a PNG. Raises OSError."""
+    figure.savefig(file, format="png", dpi=110, metadata={"Software": "gz-onboard"})
+
+
+def page(file: Path, title: str, summary: str, figures: Sequence[Figure]) -> None:
+    """Write an HTML page that stands alone: the summary and the figures, as SVG. Raises OSError."""
+    import matplotlib as mpl
+
+    drawn = []
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "gz-onboard", "font.family": "sans-serif"}):
+        for figure in figures:
+            text = io.StringIO()
+            figure.savefig(text, format="svg", metadata={"Date": None})
+            drawn.append(text.getvalue().partition("<svg")[2])
+    body = "\n".join(f"<figure><svg{svg}</figure>" for svg in drawn)
+    file.write_text(
+        f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title><style>
+body {{ font-family: system-ui, sans-serif; color: {_INK}; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; }}
+pre {{ background: #f5f7fa; padding: 1rem; overflow-x: auto; }} figure {{ margin: 1.5rem 0; }}
+svg {{ width: 100%; height: auto; }}
+</style></head><body><h1>{html.escape(title)}</h1><pre>{html.escape(summary)}</pre>
+{body}
+</body></html>
+""",
+        encoding="utf-8",
+    )
+
+
+# --- style --------------------------------------------------------------------------------------------------------
+
+
+def _figure(width: float, height: float) -> Figure:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _panels(count: int, title: str, heights: Sequence[float]) -> tuple[Figure, list[Axes]]:
+    height = 1.6 + 1.15 * sum(heights)
+    figure = _figure(12, height)
+    grid = figure.add_gridspec(count, 1, height_ratios=heights, left=0.08, right=0.93, hspace=0.3,
+                               top=1 - 0.85 / height, bottom=0.55 / height)  # fmt: skip
+    axes: list[Axes] = []
+    for i in range(count):
+        axis = figure.add_subplot(grid[i], sharex=axes[0] if axes else None)
+        axis.grid(True, color=_GRID, linewidth=0.8)
+        axis.set_axisbelow(True)
+        axis.tick_params(colors=_MUTED, labelsize=8, length=0)
+        for side in ("top", "right", "left", "bottom"):
+            axis.spines[side].set_color(_GRID)
+        axes.append(axis)
+    figure.text(0.08, 1 - 0.35 / height, title, fontsize=13, fontweight="bold", color=_INK, va="center")
+    return figure, axes
+
+
+def _unit(run: Run) -> tuple[float, str]:
+    return (1.0, "s") if run.duration < 300 else (60.0, "min")
+
+
+def _time(run: Run) -> tuple[Any, str]:
+    seconds, unit = _unit(run)
+    return run.series["time"] / seconds, f"time [{unit}]"
+
+
+def _second(axis: Axes, label: str, colour: str) -> Axes:
+    """Another ordinate, on the right, drawn behind `axis`."""
+    other = axis.twinx()
+    other.tick_params(colors=_MUTED, labelsize=8, length=0)
+    for side in ("top", "right", "left", "bottom"):
+        other.spines[side].set_visible(False)
+    other.set_ylabel(label, color=colour, fontsize=8.5)
+    axis.set_zorder(other.get_zorder() + 1)
+    axis.patch.set_visible(False)
+    return other
+
+
+def _label(axis: Axes, text: str, colour: str = _INK) -> None:
+    axis.set_ylabel(text, color=colour, fontsize=8.5)
+
+
+def _finish(axes: Sequence[Axes], x: Any, label: str, seconds: Mapping[int, Axes]) -> None:
+    for i, axis in enumerate(axes):
+        handles, labels = axis.get_legend_handles_labels()
+        if i in seconds:
+            more, names = seconds[i].get_legend_handles_labels()
+            handles, labels = handles + more, labels + names
+        axis.legend(handles=handles, labels=labels, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.15,
+                    fontsize=7.5, ncols=len(labels), frameon=False, borderpad=0, handlelength=1.6, columnspacing=1.2,
+                    labelcolor=_MUTED)  # fmt: skip
+        if axis is not axes[-1]:
+            axis.tick_params(labelbottom=False)
+    axes[-1].set_xlabel(label, color=_INK, fontsize=9, loc="left")
+    axes[0].set_xlim(float(x[0]), max(float(x[-1]), float(x[0]) + 1e-3))
+
+
+def _words(name: str) -> str:
+    return "BMS" if name == "bms" else name.replace("_", " ")
