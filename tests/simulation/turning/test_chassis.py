@@ -55,7 +55,7 @@ def test_energy_of_a_coast_down_closes(machine, kind, roll):
     run = coast_down(kind(machine), radians(roll))
     for i in (len(run.time) // 2, len(run.time) - 1):
         lost = sum(run.lost[i].values())
-        assert run.kinetic[0] - run.kinetic[i] == pytest.approx(lost, rel=1e-5)
+        assert run.kinetic[0] - run.kinetic[i] == pytest.approx(lost, rel=1e-8)
 
 
 @pytest.mark.parametrize("kind", [Planar, Leaning])
@@ -99,7 +99,7 @@ def test_half_the_step_changes_nothing(machine, kind):
     whole, half = (coast_down(kind(machine), radians(20), slow=8.0, dt=dt) for dt in (0.01, 0.005))
     for distance in (10.0, 30.0, 60.0):
         lost = [run.at_distance(distance, [sum(x.values()) for x in run.lost]) for run in (whole, half)]
-        assert lost[0] == pytest.approx(lost[1], rel=1e-4)
+        assert lost[0] == pytest.approx(lost[1], rel=1e-6)
     assert whole.at_speed(9.0, "load_front") == pytest.approx(half.at_speed(9.0, "load_front"), rel=1e-5)
 
 
@@ -121,7 +121,7 @@ def test_planar_loss_is_the_closed_form(machine, roll):
     stiff_f = machine.front.cornering_stiffness * seen.seen["load_front"]
     stiff_r = machine.rear.cornering_stiffness * seen.seen["load_rear"]
     expected = 10.0 * (machine.mass * lateral) ** 2 * (share**2 / stiff_f + (1 - share) ** 2 / stiff_r)
-    tolerance = 0.012 + 0.7 * (lateral / G) ** 2  # the magic formula bends, and steer turns the forces
+    tolerance = 0.002 + 0.2 * (lateral / G) ** 2  # the magic formula bends, and steer turns the forces
     assert seen.power["sideslip"] == pytest.approx(expected, rel=tolerance)
     compliance = share / machine.front.cornering_stiffness + (1 - share) / machine.rear.cornering_stiffness
     drag = cornering_drag.term(10.0, machine.mass, lateral, cornering_compliance=compliance)
@@ -201,3 +201,20 @@ def test_path_is_a_circle_in_a_steady_turn(machine):
     after, _ = ride(chassis, state, 0.1, None, Road(), 3.14159265358979 / rate)
     across = ((after[3] - state[3]) ** 2 + (after[4] - state[4]) ** 2) ** 0.5
     assert across == pytest.approx(2 * speed / rate, rel=2e-3)
+
+
+@pytest.mark.parametrize("drive", [0.0, 200.0, None])
+def test_loads_in_a_turn_balance_pitch(machine, drive):
+    """Eq. 3.7 with what the ground pushes along the machine, m·(du/dt - v·r) and the drag, side forces included."""
+    chassis, road = Planar(machine), Road(0.05, 2.0)
+    state = (9.0, 0.2, 0.6, 0.0, 0.0, 0.0, 0.06, 0.04)
+    rates = chassis.rates(state, 0.35, drive, road)
+    drag, slope = machine.resistance(9.0, road)
+    push = machine.mass * (rates.change[0] - 0.2 * 0.6) + drag + slope
+    front = (machine.weight(road) * machine.cg_to_rear - push * machine.cg_height) / machine.wheelbase
+    assert rates.seen["load_front"] == pytest.approx(front, rel=1e-12)
+
+
+def test_distance_is_the_one_ridden(machine):
+    run = coast_down(Straight(machine), 0.0)
+    assert run.distance[-1] == pytest.approx(run.states[-1][1] - run.states[0][1], rel=1e-6)
