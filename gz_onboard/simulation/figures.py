@@ -56,11 +56,13 @@ def overview(run: Run, title: str) -> Figure:
     for name, colour in (("motor", _RED), ("inverter", _ORANGE), ("cell", _PURPLE), ("bms", _MUTED)):
         axes[4].plot(x, s[f"{name}_temperature"], color=colour, linewidth=1.1, label="BMS" if name == "bms" else name)
     _label(axes[4], "temperature [°C]")
-    other_grade = _second(axes[5], "grade [%]", _MUTED)
-    other_grade.plot(x, s["grade"] * 100, color=_MUTED, linewidth=0.8, label="grade")
+    others = {2: other}
+    if np.any(s["grade"]):
+        others[5] = _second(axes[5], "grade [%]", _MUTED)
+        others[5].plot(x, s["grade"] * 100, color=_MUTED, linewidth=0.8, label="grade")
     axes[5].plot(x, s["energy"] / WH, color=_BLUE, linewidth=1.4, label="energy from the pack")
     _label(axes[5], "energy [Wh]", _BLUE)
-    _finish(axes, x, label, {2: other, 5: other_grade})
+    _finish(axes, x, label, others)
     return figure
 
 
