@@ -7,6 +7,7 @@ import logging
 import os
 import signal
 import time
+from bisect import bisect_left
 from pathlib import Path
 
 from gz_onboard import notify, state
@@ -37,6 +38,7 @@ class Daemon:
         self._state_file = state_file
         self._tick = tick
         self._stopping = False
+        self._later: list[Frame] = []
         self._offset = _wall_offset()
         self._save_at = 0.0
         self._said_at = 0.0
@@ -82,11 +84,15 @@ class Daemon:
 
     def round(self) -> int:
         """One tick; gives the number of frames that came."""
-        frames: list[Frame] = []
+        now_ns = time.time_ns()
+        frames, self._later = self._later, []
         for channel in self.channels:
             frames += channel.drain()
         if len(self.channels) > 1:
+            # What came after the first channel was read waits for the next tick: of that channel some is missing.
             frames.sort(key=_time_of)
+            end = bisect_left(frames, (now_ns,))
+            frames, self._later = frames[:end], frames[end:]
         pipeline = self.pipeline
         offset = _wall_offset()
         step = offset - self._offset
@@ -94,7 +100,7 @@ class Daemon:
         if abs(step) > CLOCK_STEP_NS:  # by the network's or the GPS' time; what came meanwhile has either time
             log.warning("the clock was set by %.1f s", step * 1e-9)
             pipeline.clock_set(step)
-            frames = []
+            frames, self._later = [], []
         pipeline.kernel_lost = sum(channel.overflow for channel in self.channels)
         pipeline.send_failures = sum(channel.send_failures for channel in self.channels)
         reasons = Reason(0)
@@ -103,7 +109,6 @@ class Daemon:
         if self.recorder and self.recorder.failing:
             reasons |= Reason.LOG_FAILED
         pipeline.extra_reasons = reasons
-        now_ns = time.time_ns()
         for frame in pipeline.advance(frames, now_ns):
             self.channels[0].send(frame)
         if self.recorder:

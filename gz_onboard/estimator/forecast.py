@@ -157,6 +157,7 @@ class Forecaster:
         return {
             "speed": speed, "acceleration": acceleration, "grade": 0.0, "grade_cosine": 1.0, "headwind": 0.0,
             "mass": self.model.mass, "air_density": air_density(ambient, altitude), "motor_temperature": motor,
+            "lateral_acceleration": 0.0,
         }  # fmt: skip
 
     def _close(self, segment: Segment) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.physics.effect import Effect, Port, known_effects, load_effect
+from gz_onboard.physics.effect import Effect, Port, load_effect
 from gz_onboard.physics.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -18,6 +18,12 @@ if TYPE_CHECKING:
     from gz_onboard.toml import Table
 
 G = 9.80665  # m/s²
+BASE_EFFECTS = (
+    "aerodynamic_drag", "rolling_resistance", "grade_force", "inertia", "motor_copper_loss", "motor_iron_loss",
+    "inverter_loss", "auxiliary_load",
+)  # fmt: skip
+"""What a vehicle file gets that lists none: what every vehicle has."""
+
 GAS_CONSTANT_AIR = 287.05  # J/(kg·K)
 
 
@@ -83,7 +89,7 @@ class Model:
 
 
 def read_model(vehicle: Table) -> tuple[Effect, ...]:
-    """The effects that the vehicle file lists, all of the package's if it lists none."""
+    """The effects that the vehicle file lists, `BASE_EFFECTS` if it lists none."""
     table = vehicle.table("model")
     table.only(["effects", "effects_folder"])
     folder: Path | None = None
@@ -91,7 +97,7 @@ def read_model(vehicle: Table) -> tuple[Effect, ...]:
         folder = vehicle.file.parent / table.text("effects_folder")
         if not folder.is_dir():
             raise table.error(f"no folder {folder}", "effects_folder")
-    names = table.values.get("effects", list(known_effects()))
+    names = table.values.get("effects", list(BASE_EFFECTS))
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise table.error("must be a list of names of effects", "effects")
     effects = []

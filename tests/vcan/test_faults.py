@@ -319,10 +319,10 @@ def test_a_full_disk(running: Running, listener: Listener, tmp_path: Path):
         pytest.skip(f"no mount here: {mount.stderr.decode()}")
     try:
         ballast = disk / "ballast"
-        ballast.write_bytes(bytes(330_000))
+        ballast.write_bytes(bytes(345_000))
         daemon = running.daemon("--log-dir", str(disk))
         with steady_ride():
-            listener.wait_for_new("RANGE_Status", 30, RANGE_LogFailed=1)
+            listener.wait_for_new("RANGE_Status", 60, RANGE_LogFailed=1)
             ballast.unlink()
             listener.wait_for_new("RANGE_Status", 20, RANGE_LogFailed=0, RANGE_StatusState=State.VALID)
             time.sleep(3)
