@@ -43,7 +43,7 @@ def test_a_cycle_within_the_vehicle_is_ridden_as_it_is(wmtc):
     assert wmtc.distance == pytest.approx(c.distance, rel=0.01)  # its 50 km/h are just beyond the speed limiter
     assert not wmtc.shortfalls
     off = np.abs(wmtc.series["speed"] - np.interp(wmtc.series["time"], c.time, c.speed))
-    assert np.percentile(off, 90) < 0.2
+    assert np.percentile(off, 90) < 0.4
     assert wmtc.duration == c.duration
 
 
@@ -87,7 +87,8 @@ def test_shortfall_of_a_made_up_ride():
     series = {"time": time, "wanted_speed": wanted, "speed": speed, "throttle": np.full_like(time, 0.5),
               "distance": time * 9}  # fmt: skip
     first, second = shortfalls(series)
-    assert (first.time, first.duration) == (pytest.approx(20.0), pytest.approx(10.0))
+    assert first.time == pytest.approx(20.0)
+    assert first.duration == pytest.approx(10.0)
     assert first.missing == pytest.approx(4.0)
     assert not first.beyond_vehicle
     assert second.time == pytest.approx(40.0)
