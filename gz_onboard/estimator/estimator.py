@@ -100,6 +100,7 @@ class Estimator:
         self._rest_sd = sqrt(p.sd("rest_voltage_error") ** 2 + battery.ocv_sd**2)
         self._cell_scatter = p.sd("cell_capacity") / p["cell_capacity"]
         self._charge_sd = sqrt(self._cell_scatter**2 + gain_sd**2)
+        self._cable = p["cable_resistance"]
         self._radius, self._gear = p["wheel_radius"], p["gear_ratio"]
 
     # --- events -----------------------------------------------------------------------------------------------
@@ -151,14 +152,13 @@ class Estimator:
             current = (current - self._offset) / self._gain
             if inverter is not None:
                 self._mismatch += 0.01 * (current - inverter - auxiliary - self._mismatch)
+        through = current if current is not None else None if inverter is None else inverter + auxiliary
         if voltage is not None:
             voltage -= self._voltage_offset
         elif inverter_voltage is not None:
-            voltage = inverter_voltage
-        if current is not None:
-            return voltage, current, "pack"
-        if inverter is not None:
-            return voltage, inverter + auxiliary, "inverter"
+            voltage = inverter_voltage + self._cable * (through or 0.0)
+        if through is not None:
+            return voltage, through, "pack" if current is not None else "inverter"
         if self.road.speed is not None and voltage:
             return voltage, self._model_power(now) / voltage, "model"
         return voltage, None, "none"
@@ -210,9 +210,8 @@ class Estimator:
             charge = 3600 * battery.pack_capacity(temperature)
             unchecked = 0.0 if self.signals.inverter_current.fresh(now) else UNCHECKED_CURRENT_SD
             sd = sqrt(self._offset_sd**2 + CURRENT_SD[source] ** 2 + unchecked**2)
-            q = (sd / charge) ** 2 * 2 * CURRENT_TIME[source] * min(dt, 1.0) + self._charge_sd**2 * abs(
-                mean * dt / charge
-            )
+            q = (sd / charge) ** 2 * 2 * CURRENT_TIME[source] * min(dt, 1.0)
+            q += self._charge_sd**2 * abs(mean * dt / charge)
             if dt > 1.0:  # a pause: nobody knows what flowed, the last current is believed for a second
                 mean /= dt
                 q += (CURRENT_SD["none"] * (dt - 1.0) / charge) ** 2

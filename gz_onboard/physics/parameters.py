@@ -24,6 +24,7 @@ BATTERY_PARAMETERS = (
     Parameter("cell_capacity", "A·h", 2.8, 0.05, 0.1, 500, "18650 cell, Lord 2016, sec. 2.2"),
     Parameter("cell_cutoff_voltage", "V", 2.8, 0.05, 2.0, 3.5, "where the vehicle gives up"),
     Parameter("pack_series_resistance", "ohm", 0.01, 0.005, 0.0, 0.5, "bus bars, fuse and BMS beside the cells"),
+    Parameter("cable_resistance", "ohm", 0.005, 0.005, 0.0, 0.2, "pack to inverter, beyond where the BMS measures"),
     Parameter("pack_current_offset", "A", 0.0, 0.3, -5, 5, "what the current sensor shows at no current"),
     Parameter("pack_current_gain", "1", 1.0, 0.01, 0.5, 2, "what the current sensor shows over what flows"),
     Parameter("pack_current_noise", "A", 0.1, 0.05, 0, 10, "sd of a sample"),
