@@ -19,8 +19,8 @@ from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference", 75.0)
 P = VEHICLE.parameters
+assert VEHICLE.battery
 BATTERY = VEHICLE.battery
-assert BATTERY
 DT = 0.01
 
 
@@ -82,6 +82,7 @@ def test_2_8_torque_constant_makes_the_force():
 
 
 def test_2_9_and_2_10_motor_heat_is_its_loss(riding):
+    riding.motor_cooling.stator = 70.0
     watts, _, wheel = parted(riding, 0.5)
     current = riding.motor_current
     resistance = P["motor_copper_resistance"] * (
@@ -158,7 +159,7 @@ def test_2_22_rc_pair_settles_exponentially():
 
 
 def test_2_24_heat_is_what_does_not_leave():
-    pack = FirstOrderPack(BATTERY, 0.6)
+    pack = FirstOrderPack(BATTERY, 0.6, v1=0.03)
     before = pack.soc
     current, voltage, heat, delivered = pack.draw(2000.0, DT, 5.0)
     source = BATTERY.cells_series * BATTERY.ocv((before + pack.soc) / 2)[0]
@@ -295,10 +296,10 @@ def test_3_12_magic_formula_and_its_slope(slip):
 
 @given(wanted=st.floats(0.5, 30), speed=st.floats(0, 30))
 def test_3_13_to_3_16_rider(wanted, speed):
-    rider = Rider(0.4, 0.1)
+    rider = Rider(0.4, 0.1, sum=0.2)
     throttle, brake = rider.step(wanted, speed, DT)
-    command = 0.4 * (wanted - speed)
+    command = 0.4 * (wanted - speed) + 0.2
     assert throttle == pytest.approx(min(max(command, 0.0), 1.0))
     assert brake == pytest.approx(min(max(-command, 0.0), 1.0))
     if abs(command) < 1:
-        assert rider.sum == pytest.approx(0.1 * (wanted - speed) * DT)
+        assert rider.sum == pytest.approx(0.2 + 0.1 * (wanted - speed) * DT)
