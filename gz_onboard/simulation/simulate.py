@@ -21,6 +21,7 @@ from typing import Any
 from gz_onboard.bus.publisher import WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.simulation.cycles import find_cycle
+from gz_onboard.simulation.frames import Losses, check_output, simulate_frames, write_frames
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded, rest_soc
 from gz_onboard.simulation.route import read_route, speed_profile
 from gz_onboard.simulation.run import (
@@ -37,6 +38,7 @@ from gz_onboard.simulation.run import (
     road_table,
 )
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Road, Scooter, straight
+from gz_onboard.simulation.sensors import Trace
 from gz_onboard.simulation.sweep import Sweep, grid, read_sweep, redesigned
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -123,6 +125,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--format", choices=FORMATS, default="parquet", help="of the time series (%(default)s)")
     add("--no-series", action="store_true", help="write no time series")
     add("--no-plot", action="store_true", help="draw nothing")
+    add("--frames", type=Path, metavar="FILE", help="write the ride as the CAN frames of the vehicle's sensors, in the "
+        "format of the suffix: .blf .log .asc .trc .csv .mf4")  # fmt: skip
+    add("--seed", type=int, default=0, metavar="N", help="of the noise and losses of --frames (%(default)s)")
+    add("--frame-loss", type=float, default=Losses.frames, metavar="SHARE", help="of the frames that the bus loses "
+        "(%(default)g)")  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -132,14 +139,19 @@ def run(arguments: argparse.Namespace) -> int:
     sweeps = [read_sweep(text, vehicle) for text in arguments.sweep]
     if len({sweep.name for sweep in sweeps}) < len(sweeps):
         raise InputError(f"--sweep {sweeps[0].name}: given twice")
+    if arguments.frames:
+        check_output(arguments.frames)
     plan = find_plan(arguments, vehicle)
+    trace = Trace() if arguments.frames else None
     begin = time.perf_counter()
     with _bar(_expected_seconds(arguments, plan, sweeps), "s ridden") as progress:
-        result, scooter = ride(vehicle, plan, arguments, progress)
+        result, scooter = ride(vehicle, plan, arguments, progress, trace)
         wall = time.perf_counter() - begin
         variants = [_variant(vehicle, values, plan, arguments, progress) for values in grid(sweeps)] if sweeps else None
     summary = summarise(vehicle, plan, arguments, result, scooter) | {"wall_s": wall, "sweep": variants}
     summary["files"] = write(arguments, plan, result, summary, sweeps)
+    if trace:
+        summary["files"].append(_put_out(arguments, vehicle, trace, scooter))
     if arguments.json:
         _write_json(arguments.json, {"version": SUMMARY_VERSION, **summary})
     if arguments.json != "-":
@@ -156,6 +168,8 @@ def _check(arguments: argparse.Namespace) -> None:
         ("wind", arguments.wind, -40.0, 40.0, " m/s"),
         ("repeat", arguments.repeat, 1, 1000, ""),
         ("payload", arguments.payload, 0.0, 300.0, " kg"),
+        ("seed", arguments.seed, 0, 2**32 - 1, ""),
+        ("frame-loss", arguments.frame_loss, 0.0, 1.0, ""),
     )
     for name, value, low, high, unit in limits:
         if value is not None and not low <= value <= high:
@@ -260,7 +274,9 @@ def _ride_plan(path: Path, arguments: argparse.Namespace, vehicle: Vehicle) -> P
     return Plan(recorded.name, kind, recorded.duration, road, command, recorded=recorded)
 
 
-def ride(vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, progress: Progress | None) -> tuple[Run, Scooter]:
+def ride(
+    vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, progress: Progress | None, trace: Trace | None = None
+) -> tuple[Run, Scooter]:
     """Ride `plan` with the options of the command line; what these do not say of the start is as it was recorded."""
     recorded = plan.recorded
     measured = recorded.first if recorded else lambda _, default: default
@@ -277,9 +293,8 @@ def ride(vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, progress: 
     seconds = _MOST_HOURS * 3600 if arguments.until_empty else plan.seconds * arguments.repeat
     if plan.length is not None:
         seconds = 3 * plan.seconds + 600  # a weak vehicle takes longer
-    result = drive(
-        scooter, plan.command(), seconds, until_empty=arguments.until_empty, finish=plan.length, progress=progress
-    )
+    command = trace.watch(plan.command()) if trace else plan.command()
+    result = drive(scooter, command, seconds, until_empty=arguments.until_empty, finish=plan.length, progress=progress)
     return result, scooter
 
 
@@ -418,6 +433,17 @@ def write(
             f"{error.filename or arguments.output}: cannot be written: {error.strerror or error}"
         ) from error
     return [str(file) for file in files]
+
+
+def _put_out(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, scooter: Scooter) -> str:
+    """Write the ride's frames; gives the file's name. InputError if it cannot be written."""
+    sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, losses=Losses(frames=arguments.frame_loss))
+    try:
+        arguments.frames.parent.mkdir(parents=True, exist_ok=True)
+        write_frames(arguments.frames, sent)
+    except OSError as error:
+        raise InputError(f"{arguments.frames}: cannot be written: {error.strerror or error}") from error
+    return str(arguments.frames)
 
 
 def _draw(

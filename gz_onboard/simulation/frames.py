@@ -1,0 +1,241 @@
+"""A simulated ride as CAN frames: each message in its period, packed as its DBC file says, with what a bus loses.
+
+Time comes from an argument and chance from a seed: the same ride and seed give the same bytes. Each signal, each
+message's phase and each kind of loss draws from its own stream, so losing frames changes no other frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gz_onboard.bus.checksum import sae_j1850_tables
+from gz_onboard.bus.codec import raw_range
+from gz_onboard.bus.export import _out_suffix, _write_frames
+from gz_onboard.errors import InputError
+from gz_onboard.events import EFF_FLAG, Frame
+from gz_onboard.simulation.sensors import (
+    GPS_MESSAGES,
+    ROLLER,
+    SENSORS,
+    TURNS,
+    Sensor,
+    Truth,
+    spread,
+)
+from gz_onboard.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    import numpy as np
+    from cantools.database.can import Message
+    from cantools.database.can.signal import Signal
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+    Words = NDArray[np.uint64]
+
+START_NS = 1_700_000_000_000_000_000  # 2023-11-14: of a ride that says nothing else
+FORMATS = (".blf", ".log", ".asc", ".trc", ".csv", ".mf4")
+_BATCH = 10_000
+_PHASE, _LOSS, _GAPS = 101, 102, 103  # streams of chance that belong to no signal
+
+
+@dataclass(frozen=True)
+class Losses:
+    """What the bus and the GPS receiver do not deliver."""
+
+    frames: float = 1e-4  # share of the frames of each message
+    gps_gap_every: float = 600.0  # s in the mean from one gap without fix to the next; 0 is never
+    gps_gap: tuple[float, float] = (5.0, 20.0)  # s that a gap lasts, at least and at most
+
+
+@dataclass(frozen=True)
+class Sent:
+    """All frames of one message: `words` are its eight bytes as little-endian numbers."""
+
+    message: str
+    identifier: int  # with flags
+    times: NDArray[np.int64]  # ns
+    words: Words
+    dropped: int  # that were lost
+
+
+def simulate_frames(
+    vehicle: Vehicle, truth: Truth, seed: int = 0, start_ns: int = START_NS, losses: Losses | None = None
+) -> list[Sent]:
+    """The messages that the sensors of a ride send, from `start_ns` on.
+
+    Raises InputError if the vehicle's DBC files have none of the sensors' signals, or a message that cannot be packed.
+    """
+    sensors = {sensor.signal: sensor for sensor in (*SENSORS, *(ROLLER if truth.on_dynamometer else ()))}
+    known = {s.signal for s in (*SENSORS, *ROLLER)}
+    found = [m for m in vehicle.mapping.database.messages if known & {s.name for s in m.signals}]
+    if not found:
+        raise vehicle.error("its DBC files have none of the reference scooter's signals, which simulated frames carry")
+    gaps = _gps_gaps(truth, seed, losses or Losses())
+    sent = []
+    for message in vehicle.mapping.database.messages:
+        period = vehicle.mapping.periods.get(message.name)
+        roller = any(s.signal in {g.name for g in message.signals} for s in ROLLER)
+        if period is None or (roller and not truth.on_dynamometer):
+            continue
+        if message.length != 8 or message.is_multiplexed() or not all(map(_can_be_packed, message.signals)):
+            raise vehicle.error(
+                f"message {message.name}: simulated frames have eight bytes and little-endian integers, not multiplexed"
+            )
+        sent.append(_send(vehicle, message, sensors, truth, seed, start_ns, losses or Losses(), gaps))
+    if not sent:
+        raise vehicle.error("its DBC files give no GenMsgCycleTime, the period of simulated frames")
+    return sent
+
+
+def _can_be_packed(signal: Signal) -> bool:
+    return signal.byte_order == "little_endian" and not signal.conversion.is_float
+
+
+def batches(sent: list[Sent]) -> Iterator[list[Frame]]:
+    """The frames in the order of their times, some thousands at once."""
+    import numpy as np
+
+    times = np.concatenate([s.times for s in sent])
+    words = np.concatenate([s.words for s in sent])
+    identifiers = np.concatenate([np.full(len(s.times), s.identifier, dtype=np.int64) for s in sent])
+    order = np.lexsort((identifiers, times))
+    for begin in range(0, len(order), _BATCH):
+        part = order[begin : begin + _BATCH]
+        data = words[part].astype("<u8").tobytes()
+        yield [
+            (time, identifier, data[8 * i : 8 * i + 8], 0)
+            for i, (time, identifier) in enumerate(zip(times[part].tolist(), identifiers[part].tolist(), strict=True))
+        ]
+
+
+def check_output(out: Path) -> str:
+    """The format of `out` by its suffix; InputError if frames cannot be written into it."""
+    suffix = _out_suffix(out)
+    if suffix not in FORMATS:
+        raise InputError(f"{out}: frames are written as {' '.join(FORMATS)}")
+    return suffix
+
+
+def write_frames(out: Path, sent: list[Sent]) -> int:
+    """Write the frames in the format of the suffix of `out`; returns how many. InputError for an unknown suffix."""
+    return _write_frames(out, check_output(out), batches(sent))
+
+
+def _send(vehicle: Vehicle, message: Message, sensors: dict[str, Sensor], truth: Truth, seed: int, start_ns: int,
+          losses: Losses, gaps: Floats) -> Sent:  # fmt: skip
+    import numpy as np
+
+    period_ns = round(vehicle.mapping.periods[message.name] * 1e9)
+    rng = np.random.default_rng([seed, message.frame_id, _PHASE])
+    phase_us = int(rng.integers(0, period_ns // 1000))  # whole µs: candump has no more
+    span_ns = round(truth.count * truth.dt * 1e9)
+    offsets = np.arange(phase_us * 1000, span_ns, period_ns, dtype=np.int64)
+    seconds: Floats = offsets.astype(float) * 1e-9
+    no_fix = np.zeros(len(offsets), dtype=bool)
+    if message.name in GPS_MESSAGES:
+        for begin, end in gaps:
+            no_fix |= (seconds >= begin) & (seconds < end)
+    protection = vehicle.mapping.protection.get(message.name)
+    counter = protection.counter if protection else None
+    crc = protection.crc if protection else None
+    words = np.zeros(len(offsets), dtype=np.uint64)
+    raw: NDArray[np.int64]
+    used = 0
+    for index, signal in enumerate(message.signals):
+        mask = 2**signal.length - 1
+        used |= mask << signal.start
+        if signal.name == crc:
+            continue
+        if signal.name == counter:
+            low, high = raw_range(signal, not_available=True)
+            raw = np.arange(len(offsets), dtype=np.int64) % int(high - low + 1) + int(low)
+        elif signal.name.startswith("IMU_") and signal.name.endswith("Counter"):
+            raw = np.minimum(
+                np.arange(len(offsets), dtype=np.int64) % 256, 254
+            )  # as the real one: never the code for no value
+        else:
+            rng = np.random.default_rng([seed, message.frame_id, index])
+            values = _values(sensors.get(signal.name), truth, seconds, period_ns * 1e-9, rng)
+            raw = _raw(signal, _without_fix(signal.name, values, no_fix))
+        words |= (raw & mask).astype(np.uint64) << np.uint64(signal.start)
+    words |= np.uint64((2**64 - 1) & ~used)  # bits without a signal are ones
+    if crc:
+        words = _seal(words)
+    kept = np.random.default_rng([seed, message.frame_id, _LOSS]).random(len(offsets)) >= losses.frames
+    identifier = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
+    return Sent(message.name, identifier, start_ns + offsets[kept], words[kept], int((~kept).sum()))
+
+
+def _values(sensor: Sensor | None, truth: Truth, seconds: Floats, period: float, rng: np.random.Generator) -> Floats:
+    """What is read at `seconds`, in the unit of the DBC; not a number where there is no such sensor."""
+    import numpy as np
+
+    if sensor is None:
+        return np.full(len(seconds), np.nan)
+    steps = np.clip(((seconds - sensor.delay) / truth.dt + 1e-6).astype(int), 0, truth.count - 1)
+    values: Floats = sensor.read(truth)[steps]
+    sd = spread(sensor, truth.parameters)
+    if sd:
+        noise = rng.standard_normal(len(seconds))
+        if sensor.noise_time:
+            keep = np.exp(-period / sensor.noise_time)  # a first-order process of constant variance
+            fresh = np.sqrt(1 - keep * keep)
+            for i in range(1, len(noise)):
+                noise[i] = keep * noise[i - 1] + fresh * noise[i]
+        values = values + sd * noise
+    turn = TURNS.get(sensor.signal)
+    return values % turn if turn else values
+
+
+def _without_fix(signal: str, values: Floats, no_fix: NDArray[np.bool_]) -> Floats:
+    import numpy as np
+
+    if not no_fix.any():
+        return values
+    return np.where(no_fix, 0.0 if signal in ("GPS_Fix", "GPS_Satellites") else np.nan, values)
+
+
+def _raw(signal: Signal, values: Floats) -> NDArray[np.int64]:
+    """The nearest raw values within the limits; the code for not available for what is not a number."""
+    import numpy as np
+
+    low, high = raw_range(signal, not_available=True)
+    absent = -(2 ** (signal.length - 1)) if signal.is_signed else 2**signal.length - 1
+    scale, offset = float(signal.conversion.scale), float(signal.conversion.offset)
+    raw = np.clip(np.round((values - offset) / scale), low, high)
+    return np.where(np.isnan(values), absent, raw).astype(np.int64)
+
+
+def _seal(words: Words) -> Words:
+    """`words` with the CRC-8 SAE J1850 of their first seven bytes as the last."""
+    import numpy as np
+
+    constant, tables = sae_j1850_tables(7)
+    crc = np.full(len(words), constant, dtype=np.uint64)
+    for i, table in enumerate(tables):
+        crc ^= np.array(table, dtype=np.uint64)[(words >> np.uint64(8 * i)) & np.uint64(0xFF)]
+    return (words & np.uint64(2**56 - 1)) | crc << np.uint64(56)
+
+
+def _gps_gaps(truth: Truth, seed: int, losses: Losses) -> Any:
+    """(begin, end) [s] of each time without a fix; on a dynamometer, indoors, all of the ride."""
+    import numpy as np
+
+    duration = truth.count * truth.dt
+    if truth.on_dynamometer:
+        return np.array([(0.0, duration)])
+    rng = np.random.default_rng([seed, _GAPS])
+    gaps = []
+    at = 0.0
+    while losses.gps_gap_every > 0:
+        at += rng.exponential(losses.gps_gap_every)
+        if at >= duration:
+            break
+        end = at + rng.uniform(*losses.gps_gap)
+        gaps.append((at, end))
+        at = end
+    return np.array(gaps).reshape(-1, 2)

@@ -1,0 +1,285 @@
+"""What the reference scooter's sensors make of a simulated ride: values with gain, offset, noise and delay.
+
+A `Trace` keeps the scooter's state before each step; `SENSORS` says for each signal of the scooter's DBC files what of
+it is sensed and how well. Figures are those of docs/reference-scooter.md; where that has none, a guess of this file.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import cos, pi
+from typing import TYPE_CHECKING, Any
+
+from gz_onboard.physics.model import G
+from gz_onboard.simulation.recorded import BRAKE_FORCE
+from gz_onboard.simulation.run import Command
+from gz_onboard.simulation.scooter import Scooter
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    Array = np.ndarray[Any, np.dtype[np.float64]]
+
+BMS_DELAY = 0.10  # s behind the inverter
+GPS_DELAY = 0.4  # s
+CABLE = 0.0086  # Ω between pack and inverter
+ODOMETER_RADIUS = 0.245  # m, that the odometer assumes
+LEAN_TIME = 1.0  # s that a rider takes into a bend: the road's pieces change their curvature at once
+LATITUDE, LONGITUDE, ALTITUDE = 45.0, 9.0, 200.0  # deg, deg, m: where a simulated road begins, to the north
+_METRES_PER_DEGREE = 111_200.0
+
+_NAMES = (
+    "time", "speed", "wheel_speed", "distance", "climb", "grade", "curvature", "throttle", "brake", "motor_current",
+    "pack_current", "pack_voltage", "soc", "cell", "motor", "inverter", "bms", "tyre_force",
+)  # fmt: skip
+
+
+class Trace:
+    """The state of a scooter before each step of a ride; pass `run.drive` what `watch` gives."""
+
+    def __init__(self) -> None:
+        self._rows = array("d")
+
+    def watch(self, command: Command) -> Command:
+        """`command`, with the state that it is given kept."""
+        extend = self._rows.extend
+
+        def watched(s: Scooter) -> tuple[float, float, float]:
+            grade, curvature, _ = (0.0, 0.0, 0.0) if s.dynamometer else s.road(s.distance)
+            extend((
+                s.time, s.speed, s.wheel_speed, s.distance, s.climb, grade, curvature, s.throttle, s.brake,
+                s.motor_current, s.current, s.voltage, s.pack.soc, s.pack_cooling.temperature, s.motor_cooling.stator,
+                s.inverter_cooling.board, s.bms_cooling.temperature, s.force,
+            ))  # fmt: skip
+            return command(s)
+
+        return watched
+
+    def truth(self, scooter: Scooter) -> Truth:
+        """What there was to be sensed on the ride of `scooter`; ValueError if nothing was ridden."""
+        import numpy as np
+
+        if len(self._rows) < 3 * len(_NAMES):
+            raise ValueError("a trace of fewer than three steps")
+        columns = np.frombuffer(self._rows).reshape(-1, len(_NAMES)).T
+        return Truth(dict(zip(_NAMES, columns, strict=True)), scooter)
+
+
+class Truth:
+    """Everything that the sensors read, as arrays over the steps; SI units, temperatures in degC, angles in rad.
+
+    Those of `Trace`, and: ``acceleration`` and ``way`` (of the body over the ground: none on a dynamometer),
+    ``yaw_rate`` (left), ``lean`` (right), ``lean_rate``, ``pitch_rate`` (nose down), ``heading`` (from north),
+    ``north`` and ``east`` [m], ``auxiliary_current``.
+    """
+
+    def __init__(self, columns: Mapping[str, Array], scooter: Scooter) -> None:
+        import numpy as np
+
+        self.parameters = scooter.vehicle.parameters
+        self.ambient = scooter.ambient
+        self.on_dynamometer = scooter.dynamometer is not None
+        self.dt = dt = scooter.dt
+        self.columns = c = dict(columns)
+        self.count = len(c["time"])
+        moving = 0.0 if self.on_dynamometer else 1.0
+        c["way"] = moving * c["speed"]
+        c["acceleration"] = np.gradient(c["way"], dt)
+        width = min(2 * round(LEAN_TIME / dt / 2) + 1, self.count)
+        curvature = _smooth(c["curvature"], width)
+        c["yaw_rate"] = c["way"] * curvature
+        c["lean"] = -np.arctan(c["way"] ** 2 * curvature / G)
+        c["lean_rate"] = np.gradient(c["lean"], dt)
+        c["slope"] = np.arcsin(_smooth(c["grade"], width))
+        c["pitch_rate"] = -np.gradient(c["slope"], dt)
+        c["heading"] = -np.cumsum(c["yaw_rate"]) * dt
+        c["north"] = np.cumsum(c["way"] * np.cos(c["heading"])) * dt
+        c["east"] = np.cumsum(c["way"] * np.sin(c["heading"])) * dt
+        c["auxiliary_current"] = self.parameters["auxiliary_power"] / c["pack_voltage"]
+
+    def __getitem__(self, name: str) -> Array:
+        return self.columns[name]
+
+    def constant(self, value: float) -> Array:
+        """`value` at every step."""
+        import numpy as np
+
+        return np.full(self.count, value)
+
+
+def _smooth(values: Array, width: int) -> Array:
+    """The mean of `width` (odd) values about each."""
+    import numpy as np
+
+    padded = np.pad(values, width // 2, mode="edge")
+    sums = np.cumsum(np.concatenate(([0.0], padded)))
+    smooth: Array = ((sums[width:] - sums[:-width]) / width)[: len(values)]
+    return np.pad(smooth, (0, len(values) - len(smooth)), mode="edge")
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One signal: the true value in the unit of the DBC, as read `delay` [s] later with noise of `sd` in that unit.
+
+    noise_time: time constant [s] of the noise; 0 is white. Quantisation is that of the DBC.
+    """
+
+    signal: str
+    read: Callable[[Truth], Array]
+    sd: float = 0.0
+    delay: float = 0.0
+    noise_time: float = 0.0
+
+
+def _column(name: str, factor: float = 1.0) -> Callable[[Truth], Array]:
+    return lambda t: factor * t[name]
+
+
+def _temperatures() -> list[Sensor]:
+    places = {"INV_Temperature": "inverter", "INV_MotorTemperature": "motor", "TC_Inverter1": "inverter",
+              "TC_Inverter2": "inverter", "TC_Inverter3": "inverter"}  # fmt: skip
+    places |= {f"BMS_CellTemp{which}": "cell" for which in ("Min", "Max", "Mean")} | {"BMS_BoardTemp": "bms"}
+    places |= {f"TC_Pack{i}": "cell" for i in range(1, 7)}
+    sensors = [Sensor(signal, _column(place), delay=_delay(signal)) for signal, place in places.items()]
+    return sensors + [Sensor(signal, lambda t: t.constant(t.ambient)) for signal in ("TC_Ambient", "TC_Chassis")]
+
+
+def _delay(signal: str) -> float:
+    return BMS_DELAY if signal.startswith("BMS_") else 0.0
+
+
+def _inverter_current(t: Truth) -> Array:
+    """The DC current: no auxiliary load in it, nor the inverter's constant loss, which it does not show."""
+    p = t.parameters
+    return t["pack_current"] - (p["auxiliary_power"] + p["inverter_loss_constant"]) / t["pack_voltage"]
+
+
+def _pressure(share: Callable[[Mapping[str, float]], float]) -> Callable[[Truth], Array]:
+    """Brake pressure [bar] of the wheel with this share of the force."""
+
+    def read(t: Truth) -> Array:
+        p = t.parameters
+        return t["brake"] * (share(p) * p["brake_torque_limit"] / p["wheel_radius"] / BRAKE_FORCE * 1e-5)
+
+    return read
+
+
+def _lateral(t: Truth) -> Array:
+    import numpy as np
+
+    return G * np.cos(t["slope"]) * np.sin(t["lean"]) + t["way"] * t["yaw_rate"] * np.cos(t["lean"])
+
+
+def _vertical(t: Truth) -> Array:
+    import numpy as np
+
+    return G * np.cos(t["slope"]) * np.cos(t["lean"]) - t["way"] * t["yaw_rate"] * np.sin(t["lean"])
+
+
+def _forward(t: Truth) -> Array:
+    import numpy as np
+
+    return t["acceleration"] + G * np.sin(t["slope"])
+
+
+def _pitch(t: Truth) -> Array:
+    import numpy as np
+
+    return (t["pitch_rate"] * np.cos(t["lean"]) + t["yaw_rate"] * np.sin(t["lean"])) * (180 / pi)
+
+
+def _yaw(t: Truth) -> Array:
+    import numpy as np
+
+    return (t["yaw_rate"] * np.cos(t["lean"]) - t["pitch_rate"] * np.sin(t["lean"])) * (180 / pi)
+
+
+def _course(t: Truth) -> Array:
+    """Clockwise from north [deg]; not known while standing."""
+    import numpy as np
+
+    return np.where(t["way"] > 0.5, t["heading"] * (180 / pi), np.nan)
+
+
+def _longitude(t: Truth) -> Array:
+    return LONGITUDE + t["east"] / (_METRES_PER_DEGREE * cos(LATITUDE * pi / 180))
+
+
+def _inverter_state(t: Truth) -> Array:
+    """Ready, Drive or Regen."""
+    import numpy as np
+
+    current = t["motor_current"]
+    return np.where(current > 0.5, 2.0, np.where(current < -0.5, 3.0, 1.0))
+
+
+def _front_wheel(t: Truth) -> Array:
+    return t["way"] / (2 * pi * t.parameters["wheel_radius"])
+
+
+_RPM = 60 / (2 * pi)
+SENSORS: tuple[Sensor, ...] = (
+    # inverter
+    Sensor("INV_MotorSpeed", lambda t: t["wheel_speed"] * (_RPM / t.parameters["gear_ratio"]), sd=0.3),
+    Sensor("INV_MotorCurrent", _column("motor_current"), sd=0.3),
+    Sensor("INV_MotorTorque", lambda t: t["motor_current"] * t.parameters["torque_constant"], sd=0.1),
+    Sensor("INV_State", _inverter_state),
+    Sensor("INV_DcVoltage", lambda t: t["pack_voltage"] - CABLE * t["pack_current"], sd=0.042),
+    Sensor("INV_DcCurrent", _inverter_current, sd=0.35),
+    # battery; gain, offset and noise are the vehicle's, see `spread`
+    Sensor("BMS_PackVoltage", lambda t: t["pack_voltage"] + t.parameters["pack_voltage_offset"], delay=BMS_DELAY),
+    Sensor("BMS_PackCurrent", lambda t: t["pack_current"] * t.parameters["pack_current_gain"]
+           + t.parameters["pack_current_offset"], delay=BMS_DELAY),
+    Sensor("BMS_StateOfCharge", _column("soc", 100.0), delay=BMS_DELAY),
+    Sensor("BMS_State", lambda t: t.constant(2.0)),
+    Sensor("BMS_Contactor", lambda t: t.constant(1.0)),
+    # rider
+    Sensor("VCU_Throttle", _column("throttle", 100.0)),
+    Sensor("VCU_BrakeSwitch", lambda t: (t["brake"] > 0.0).astype(float)),
+    Sensor("VCU_RideMode", lambda t: t.constant(1.0)),
+    Sensor("VCU_SideStand", lambda t: t.constant(0.0)),
+    Sensor("VCU_ChargePlug", lambda t: t.constant(0.0)),
+    Sensor("VCU_HeadLamp", lambda t: t.constant(1.0)),
+    Sensor("VCU_Odometer", lambda t: t["distance"] * (1e-3 * ODOMETER_RADIUS / t.parameters["wheel_radius"])),
+    Sensor("VCU_Trip", lambda t: t["distance"] * (1e-3 * ODOMETER_RADIUS / t.parameters["wheel_radius"])),
+    # measuring system
+    Sensor("IMU_AccelX", _forward, sd=0.05),
+    Sensor("IMU_AccelY", _lateral, sd=0.05),
+    Sensor("IMU_AccelZ", _vertical, sd=0.05),
+    Sensor("IMU_RateX", _column("lean_rate", 180 / pi), sd=0.1),
+    Sensor("IMU_RateY", _pitch, sd=0.1),
+    Sensor("IMU_RateZ", _yaw, sd=0.1),
+    Sensor("HBM_WheelSpeedFront", _front_wheel, sd=0.002),
+    Sensor("HBM_WheelSpeedRear", _column("wheel_speed", 1 / (2 * pi)), sd=0.002),
+    Sensor("HBM_BrakePressureFront", _pressure(lambda p: p["front_brake_share"]), sd=0.05),
+    Sensor("HBM_BrakePressureRear", _pressure(lambda p: 1 - p["front_brake_share"]), sd=0.05),
+    Sensor("HBM_AuxCurrent", _column("auxiliary_current"), sd=0.01),
+    Sensor("GPS_Latitude", lambda t: LATITUDE + t["north"] / _METRES_PER_DEGREE, 1e-5, GPS_DELAY, 30.0),
+    Sensor("GPS_Longitude", _longitude, 1.4e-5, GPS_DELAY, 30.0),
+    Sensor("GPS_Speed", _column("way"), 0.1, GPS_DELAY),
+    Sensor("GPS_Course", _course, 1.0, GPS_DELAY),
+    Sensor("GPS_Altitude", lambda t: ALTITUDE + t["climb"], 1.5, GPS_DELAY, 30.0),
+    Sensor("GPS_Satellites", lambda t: t.constant(9.0)),
+    Sensor("GPS_Fix", lambda t: t.constant(3.0)),
+    *_temperatures(),
+)  # fmt: skip
+"""Cell voltages, limits, steering and suspension are in the DBC files but not here: the simulation has none."""
+
+ROLLER: tuple[Sensor, ...] = (
+    Sensor("DYNO_RollerSpeed", _column("speed"), sd=0.002),
+    Sensor("DYNO_RollerForce", _column("tyre_force"), sd=1.0),
+)
+"""On the chassis dynamometer only."""
+
+
+def spread(sensor: Sensor, parameters: Mapping[str, float]) -> float:
+    """The standard deviation of the sensor's noise, in the unit of its signal; of the pack's that of the vehicle."""
+    name = {"BMS_PackVoltage": "pack_voltage_noise", "BMS_PackCurrent": "pack_current_noise"}.get(sensor.signal)
+    return parameters[name] if name else sensor.sd
+
+
+TURNS = {"GPS_Course": 360.0}
+"""Signals that go round, and their turn."""
+GPS_MESSAGES = ("GPS_Position", "GPS_Motion")

@@ -1,0 +1,249 @@
+"""A simulated ride as frames: the bus is right, and what runs on a recorded ride runs on it."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from functools import cache
+from math import atan, pi, sin
+
+import numpy as np
+import pytest
+
+from gz_onboard.bus.codec import NOT_AVAILABLE, Codec
+from gz_onboard.bus.logs import read_frames
+from gz_onboard.cli import main
+from gz_onboard.events import Reason, State
+from gz_onboard.simulation.frames import START_NS, Losses, batches, simulate_frames, write_frames
+from gz_onboard.simulation.run import along, drive, road_table
+from gz_onboard.simulation.scooter import Dynamometer, Scooter
+from gz_onboard.simulation.sensors import ALTITUDE, ROLLER, SENSORS, Trace
+from tests.support import reference, ridden
+
+NONE = Losses(frames=0.0, gps_gap_every=0.0)
+SECONDS = 180.0
+
+
+@cache
+def ride():
+    """Three minutes: level, a bend to the left, a hill of 3 %."""
+    road = road_table([0.0, 400.0, 500.0, 700.0, 1000.0], [0.0, 0.0, 0.0, sin(atan(0.03)), 0.0],
+                      [0.0, 1 / 60, 0.0, 0.0, 0.0])  # fmt: skip
+    scooter = Scooter(reference(), road, soc=0.8)
+    trace = Trace()
+    metres = [10.0] * 5000
+    run = drive(scooter, trace.watch(along(metres)), SECONDS)
+    return run, trace.truth(scooter)
+
+
+def frames(seed=1, losses=NONE):
+    return [frame for batch in batches(simulate_frames(reference(), ride()[1], seed, losses=losses)) for frame in batch]
+
+
+@cache
+def estimated():
+    return ridden(frames())
+
+
+def column(role, all_frames=None):
+    """(times [s since the start], values) of a role as the codec decodes it."""
+    codec = Codec(reference().mapping)
+    found = codec.decode(all_frames or frames())
+    shift = ((all_frames or frames())[0][0] - START_NS) * 1e-9
+    rows = [
+        (time + shift, values[codec.groups[group].roles.index(role)])
+        for time, group, values in found
+        if role in codec.groups[group].roles
+    ]
+    rows = [row for row in rows if row[1] is not None]
+    return np.array([t for t, _ in rows]), np.array([v for _, v in rows])
+
+
+def true(name, times, delay=0.0):
+    truth = ride()[1]
+    return np.interp(times - delay, truth["time"], truth[name])
+
+
+def test_nothing_is_dropped_and_the_estimate_is_valid():
+    run = estimated()
+    reasons = {reason for _, reason in run.faults}
+    assert reasons <= {NOT_AVAILABLE}
+    assert {name for name, _ in run.faults} <= {"GPS_Motion.GPS_Course"}  # while standing
+    assert not run.pipeline.codec.lost
+    assert not run.pipeline.codec.unknown
+    assert all(e.state is State.VALID for e in run.between(10.0, SECONDS))
+
+
+def test_the_estimate_is_the_truth():
+    run, truth = estimated(), ride()[1]
+    last = run.estimates[-1]
+    assert abs(last.soc - truth["soc"][-1]) < 3 * last.soc_sd
+    shift = (frames()[0][0] - START_NS) * 1e-9
+    errors = [e.speed - float(true("speed", e.time + shift)) for e in run.between(20.0, SECONDS)]
+    assert abs(np.mean(errors)) < 0.05
+    assert np.abs(errors).max() < 0.1
+    assert last.consumption_factor == pytest.approx(1.0, abs=0.1)
+    energy = sum(e.pack_voltage * e.pack_current * 0.1 for e in run.estimates if e.pack_current is not None)
+    assert energy == pytest.approx(ride()[0].energy, rel=0.01)
+
+
+def test_lean_and_grade_are_found():
+    truth = ride()[1]
+    run = estimated()
+    shift = (frames()[0][0] - START_NS) * 1e-9
+    bend = np.flatnonzero((truth["distance"] > 440) & (truth["distance"] < 490))
+    leans = [e.lean for e in run.between(truth["time"][bend[0]] - shift, truth["time"][bend[-1]] - shift)]
+    assert np.mean(leans) == pytest.approx(truth["lean"][bend].mean(), abs=0.03)
+    assert np.mean(leans) < -0.1  # to the left
+    hill = np.flatnonzero((truth["distance"] > 850) & (truth["distance"] < 990))
+    grades = [e.grade for e in run.between(truth["time"][hill[0]] - shift, truth["time"][hill[-1]] - shift)]
+    assert np.mean(grades) == pytest.approx(0.03, abs=0.008)
+
+
+def test_each_message_has_its_rate():
+    counts = Counter(frame[1] for frame in frames())
+    for message in reference().mapping.database.messages:
+        expected = 0 if message.name == "DYNO_Roller" else SECONDS / reference().mapping.periods[message.name]
+        assert abs(counts[message.frame_id] - expected) <= 1, message.name
+    times = [frame[0] for frame in frames()]
+    assert times == sorted(times)
+    assert START_NS <= times[0] < START_NS + 10_000_000
+
+
+@pytest.mark.parametrize(
+    ("role", "name", "factor", "delay", "sd"),
+    [
+        ("pack_current", "pack_current", 1.011, 0.10, 0.061),
+        ("pack_voltage", "pack_voltage", 1.0, 0.10, 0.0105),
+        ("gps_speed", "way", 1.0, 0.4, 0.1),
+        ("motor_speed", "wheel_speed", 1.0, 0.0, 0.3 * 2 * pi / 60),
+    ],
+)
+def test_noise_and_delay_are_as_declared(role, name, factor, delay, sd):
+    times, values = column(role)
+    truth = ride()[1]
+    steps = np.clip(((times - delay) / truth.dt + 1e-3).astype(int), 0, truth.count - 1)
+    errors = values - factor * truth[name][steps]
+    assert errors.std() == pytest.approx(sd, rel=0.1)
+    wrong = np.clip(((times - delay + 0.3) / truth.dt).astype(int), 0, truth.count - 1)
+    assert (values - factor * truth[name][wrong]).std() > 1.1 * errors.std()
+
+
+def test_altitude_wanders_slowly():
+    times, values = column("gps_altitude")
+    errors = values - ALTITUDE - true("climb", times, 0.4)
+    assert 0.4 < np.sqrt(np.mean(errors**2)) < 4.0
+    assert np.diff(errors).std() < 0.3 * 1.5
+
+
+def test_what_the_scooter_does_not_send_is_not_available():
+    database = reference().mapping.database
+    absent = {"BMS_CellVoltageMin", "BMS_CellVoltageMax", "INV_CurrentLimit", "HBM_SteeringAngle", "BMS_CycleCount"}
+    codec = Codec(reference().mapping)
+    seen = set()
+    for _, identifier, data, _ in frames()[:5000]:
+        values = codec.values(identifier, data)
+        seen |= absent & set(values)
+        assert all(values[name] is None for name in absent & set(values))
+        assert database.get_message_by_frame_id(identifier).length == len(data)
+    assert seen == absent
+
+
+def test_the_same_seed_gives_the_same_bytes():
+    assert frames(1) == frames(1)
+    assert frames(1) != frames(2)
+
+
+def test_files_of_the_same_seed_are_the_same(tmp_path):
+    files = [tmp_path / name for name in ("one.blf", "two.blf", "other.blf")]
+    for file, seed in zip(files, (1, 1, 2), strict=True):
+        write_frames(file, simulate_frames(reference(), ride()[1], seed))
+    one, two, other = (file.read_bytes() for file in files)
+    assert one == two
+    assert one != other
+
+
+def test_each_sensor_is_in_the_dbc_files():
+    known = {signal.name for message in reference().mapping.database.messages for signal in message.signals}
+    names = [sensor.signal for sensor in (*SENSORS, *ROLLER)]
+    assert set(names) <= known
+    assert len(names) == len(set(names))
+
+
+def test_lost_frames_show_in_the_counters_and_change_no_other():
+    losses = Losses(frames=0.01, gps_gap_every=0.0)
+    sent = simulate_frames(reference(), ride()[1], 1, losses=losses)
+    left = frames(1, losses)
+    assert set(left) < set(frames(1))
+    run = ridden(left)
+    dropped = {s.message: s.dropped for s in sent}
+    for name in ("INV_Motion", "BMS_Pack"):
+        assert dropped[name] > 0
+        assert abs(run.pipeline.codec.lost[name] - dropped[name]) <= 2  # at the ends no counter tells
+    assert not {reason for _, reason in run.faults} - {NOT_AVAILABLE}
+
+
+def test_gaps_of_the_gps_have_no_fix():
+    losses = Losses(frames=0.0, gps_gap_every=40.0, gps_gap=(10.0, 12.0))
+    run = ridden(frames(3, losses))
+    without = [e for e in run.estimates if e.reasons & Reason.NO_GPS]
+    assert without
+    _, fixes = column("gps_fix", frames(3, losses))
+    assert set(fixes) == {0.0, 3.0}
+    assert len(column("latitude", frames(3, losses))[0]) == pytest.approx(
+        (fixes == 3).sum(), abs=4
+    )  # the phases differ
+
+
+def test_on_a_dynamometer_the_roller_turns_and_the_body_stands():
+    scooter = Scooter(reference(), Dynamometer(180.0, 5.0, 0.3, 0.27), soc=0.8)
+    trace = Trace()
+    drive(scooter, trace.watch(along([10.0] * 500)), 20.0)
+    sent = {s.message: s for s in simulate_frames(reference(), trace.truth(scooter), losses=NONE)}
+    codec = Codec(reference().mapping)
+
+    def decoded(name):
+        return [codec.values(sent[name].identifier, int(word).to_bytes(8, "little")) for word in sent[name].words]
+
+    assert decoded("DYNO_Roller")[-1]["DYNO_RollerSpeed"] == pytest.approx(scooter.speed, abs=0.05)
+    assert abs(np.mean([values["IMU_AccelX"] for values in decoded("IMU_Acceleration")])) < 0.01
+    assert {values["GPS_Fix"] for values in decoded("GPS_Motion")} == {0}
+
+
+@pytest.mark.parametrize("suffix", [".blf", ".log", ".asc"])
+def test_a_written_log_reads_back(tmp_path, suffix):
+    sent = simulate_frames(reference(), ride()[1], 1, losses=NONE)
+    file = tmp_path / f"ride{suffix}"
+    assert write_frames(file, sent) == len(frames())
+    back = [frame for batch in read_frames(file) for frame in batch]
+    assert [frame[1:3] for frame in back] == [frame[1:3] for frame in frames()]
+    if suffix != ".asc":
+        assert [frame[0] for frame in back] == [frame[0] for frame in frames()]
+
+
+def test_estimate_reads_what_simulate_wrote(tmp_path, capsys):
+    file = tmp_path / "ece15.blf"
+    common = ["--output", str(tmp_path), "--no-plot"]
+    assert main(["simulate", "ece15", "--no-series", "--soc", "0.7", "--frames", str(file), "--json", *common]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["files"] == [str(file)]
+    assert main(["estimate", str(file), "--json", "-", *common]) == 0
+    text = capsys.readouterr().out
+    (found,) = json.loads(text)["rides"]
+    assert found["distance_km"] == pytest.approx(told["distance_km"], rel=0.01)
+    assert found["energy_wh"] == pytest.approx(told["energy_wh"], rel=0.05)
+    assert abs(found["soc_end"] - told["soc_end"]) < 3 * found["soc_end_sd"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "word"),
+    [
+        (["--frames", "ride.blff"], ".blf"),
+        (["--frames", "ride.parquet"], "frames are written as"),
+        (["--frames", "ride.blf", "--seed", "-1"], "--seed"),
+        (["--frames", "ride.blf", "--frame-loss", "2"], "--frame-loss"),
+    ],
+)
+def test_what_cannot_be_put_out_is_refused(arguments, word, capsys):
+    assert main(["simulate", "ece15", *arguments]) != 0
+    assert word in capsys.readouterr().err
