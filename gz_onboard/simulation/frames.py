@@ -67,13 +67,19 @@ def simulate_frames(
 ) -> list[Sent]:
     """The messages that the sensors of a ride send, from `start_ns` on.
 
-    Raises InputError if the vehicle's DBC files have none of the sensors' signals, or a message that cannot be packed.
+    Raises InputError if the vehicle's DBC files have none of the sensors' signals, or a message that has no
+    period or cannot be packed.
     """
     sensors = {sensor.signal: sensor for sensor in (*SENSORS, *(ROLLER if truth.on_dynamometer else ()))}
     known = {s.signal for s in (*SENSORS, *ROLLER)}
     found = [m for m in vehicle.mapping.database.messages if known & {s.name for s in m.signals}]
     if not found:
         raise vehicle.error("its DBC files have none of the reference scooter's signals, which simulated frames carry")
+    for message in found:
+        if message.name not in vehicle.mapping.periods:
+            raise vehicle.error(
+                f"message {message.name}: its DBC file gives no GenMsgCycleTime, the period of its frames"
+            )
     gaps = _gps_gaps(truth, seed, losses or Losses())
     sent = []
     for message in vehicle.mapping.database.messages:
@@ -86,8 +92,6 @@ def simulate_frames(
                 f"message {message.name}: simulated frames have eight bytes and little-endian integers, not multiplexed"
             )
         sent.append(_send(vehicle, message, sensors, truth, seed, start_ns, losses or Losses(), gaps))
-    if not sent:
-        raise vehicle.error("its DBC files give no GenMsgCycleTime, the period of simulated frames")
     return sent
 
 

@@ -13,12 +13,14 @@ import pytest
 from gz_onboard.bus.codec import NOT_AVAILABLE, Codec
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.cli import main
+from gz_onboard.errors import InputError
 from gz_onboard.events import Reason, State
 from gz_onboard.simulation.frames import START_NS, Losses, batches, simulate_frames, write_frames
 from gz_onboard.simulation.run import along, drive, road_table
 from gz_onboard.simulation.scooter import Dynamometer, Scooter
 from gz_onboard.simulation.sensors import ALTITUDE, ROLLER, SENSORS, Trace
-from tests.support import reference, ridden
+from gz_onboard.vehicle import read_vehicle
+from tests.support import ROOT, reference, ridden
 
 NONE = Losses(frames=0.0, gps_gap_every=0.0)
 SECONDS = 180.0
@@ -233,6 +235,20 @@ def test_estimate_reads_what_simulate_wrote(tmp_path, capsys):
     assert found["distance_km"] == pytest.approx(told["distance_km"], rel=0.01)
     assert found["energy_wh"] == pytest.approx(told["energy_wh"], rel=0.05)
     assert abs(found["soc_end"] - told["soc_end"]) < 3 * found["soc_end_sd"]
+
+
+def test_a_vehicle_whose_bus_cannot_carry_them_is_refused(tmp_path):
+    for name in ("vehicle.dbc", "hbm.dbc"):
+        (tmp_path / name).write_text(
+            (ROOT / "dbc" / name).read_text().replace('BA_ "GenMsgCycleTime" BO_ 512 100;\n', "")
+        )
+    file = tmp_path / "slow.toml"
+    file.write_text((ROOT / "gz_onboard" / "vehicles" / "reference.toml").read_text())
+    with pytest.raises(InputError, match="BMS_Pack: its DBC file gives no GenMsgCycleTime"):
+        simulate_frames(read_vehicle(str(file)), ride()[1])
+    other = read_vehicle(str(ROOT / "tests" / "vehicles" / "tlmoto" / "tlmoto.toml"))
+    with pytest.raises(InputError, match="none of the reference scooter's signals"):
+        simulate_frames(other, ride()[1])
 
 
 @pytest.mark.parametrize(
