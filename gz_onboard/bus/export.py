@@ -51,7 +51,8 @@ def _open_text(out: Path) -> IO[str]:
     return out.open("w", newline="")
 
 
-def _write_frames(out: Path, suffix: str, batches: Iterable[list[Frame]]) -> int:
+def write_frames_as(out: Path, suffix: str, batches: Iterable[list[Frame]]) -> int:
+    """Write the frames to `out` in the format of `suffix`; gives how many it were."""
     if suffix == ".log":
         with _open_text(out) as text:
             return write_candump(text, batches)
@@ -314,7 +315,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run ``gz-onboard export``; raises InputError for what cannot be used."""
     log, out = args.log, args.out
-    suffix = _out_suffix(out)
+    suffix = out_suffix(out)
     if out.exists() and out.resolve() == log.resolve():
         raise InputError(f"{out}: is the log itself")
     section = log_section(log, args.start, args.end)
@@ -326,7 +327,7 @@ def run(args: argparse.Namespace) -> int:
             count = _export_signals(log, out, suffix, args.table_format, decoder, batches, section)
             left = f"; {decoder.unknown} frames are in no DBC file, {decoder.undecodable} do not fit theirs"
         else:
-            count = _write_frames(out, suffix, batches)
+            count = write_frames_as(out, suffix, batches)
             left = ""
     except OSError as error:
         raise InputError(f"{out}: cannot be written: {error.strerror or error}") from None
@@ -356,7 +357,8 @@ def _export_signals(
         return _write_signals(decoder.decode(batches), sink)
 
 
-def _out_suffix(out: Path) -> str:
+def out_suffix(out: Path) -> str:
+    """The suffix of `out` that says its format, lower case, without the .gz of a packed file."""
     suffixes = [suffix.lower() for suffix in out.suffixes]
     packed = suffixes[-1:] == [".gz"]
     suffix = "".join(suffixes[-2:-1] if packed else suffixes[-1:])

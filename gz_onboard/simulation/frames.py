@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.checksum import sae_j1850_tables
 from gz_onboard.bus.codec import raw_range
-from gz_onboard.bus.export import _out_suffix, _write_frames
+from gz_onboard.bus.export import out_suffix, write_frames_as
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, Frame
 from gz_onboard.simulation.sensors import (
@@ -118,7 +118,7 @@ def batches(sent: list[Sent]) -> Iterator[list[Frame]]:
 
 def check_output(out: Path) -> str:
     """The format of `out` by its suffix; InputError if frames cannot be written into it."""
-    suffix = _out_suffix(out)
+    suffix = out_suffix(out)
     if suffix not in FORMATS:
         raise InputError(f"{out}: frames are written as {' '.join(FORMATS)}")
     return suffix
@@ -126,7 +126,7 @@ def check_output(out: Path) -> str:
 
 def write_frames(out: Path, sent: list[Sent]) -> int:
     """Write the frames in the format of the suffix of `out`; returns how many. InputError for an unknown suffix."""
-    return _write_frames(out, check_output(out), batches(sent))
+    return write_frames_as(out, check_output(out), batches(sent))
 
 
 def _send(vehicle: Vehicle, message: Message, sensors: dict[str, Sensor], truth: Truth, seed: int, start_ns: int,
