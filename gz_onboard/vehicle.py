@@ -59,7 +59,7 @@ def find_vehicle(name: str) -> Path:
 def read_vehicle(name: str, payload: float | None = None) -> Vehicle:
     """The vehicle `name` (file or one of the package's own), with the rider's mass [kg] if it is known."""
     table = Table.read(find_vehicle(name))
-    table.only(["schema", "name", "dbc", "bus", "roles", "model", "parameters", "battery", "forecast"])
+    table.only(["schema", "name", "dbc", "bus", "roles", "model", "parameters", "correlation", "battery", "forecast"])
     if table.number("schema") != 1:
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
     effects = read_model(table)

@@ -121,3 +121,41 @@ def test_a_file_that_does_not_fit(tmp_path, old, new, line, parts):
         assert not told
     else:
         assert told and int(told[1]) == number + line, message
+
+
+CORRELATION = """
+[correlation.coastdown]
+parameters = ["drag_area", "rolling_resistance_constant"]
+value = [[1.0, 0.86], [0.86, 1.0]]
+"""
+
+
+def with_correlation(folder: Path, text: str) -> Path:
+    file = folder / "mine.toml"
+    file.write_text(re.sub(r"(?ms)^\[correlation.*?(?=^\[[^\[\d]|\Z)", "", REFERENCE) + text, encoding="utf-8")
+    return file
+
+
+def test_parameters_that_were_found_together_are_tied(tmp_path):
+    parameters = read_vehicle(str(with_correlation(tmp_path, CORRELATION))).parameters
+    sd = [parameters.sd(name) for name in ("drag_area", "rolling_resistance_constant")]
+    (a, ab), (ba, b) = parameters.covariance(["drag_area", "rolling_resistance_constant"])
+    assert (a, b) == pytest.approx((sd[0] ** 2, sd[1] ** 2))
+    assert ab == ba == pytest.approx(0.86 * sd[0] * sd[1])
+    assert parameters.covariance(["drag_area", "wheelbase"])[0][1] == 0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('"drag_area"', '"drag_aera"', "no parameter is called 'drag_aera' (did you mean 'drag_area'?)"),
+        ("[0.86, 1.0]]", "[0.85, 1.0]]", "not symmetric"),
+        ("[[1.0, 0.86]", "[[1.0, 1.86]", "1.86 is no correlation"),
+        ("[[1.0, 0.86], ", "[", "must be 2 rows of 2 numbers"),
+        ("[[1.0", "[[0.9", "diagonal must be 1"),
+    ],
+)
+def test_a_correlation_that_is_none_is_refused(tmp_path, old, new, says):
+    with pytest.raises(InputError, match=r"mine\.toml:\d+: correlation\.coastdown") as error:
+        read_vehicle(str(with_correlation(tmp_path, CORRELATION.replace(old, new))))
+    assert says in str(error.value)

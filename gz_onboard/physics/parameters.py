@@ -4,15 +4,20 @@
     drag_area = { value = 0.52, unit = "m^2", sd = 0.03, status = "measured", source = "coast-downs, 8 runs" }
 
 ``status`` is measured, data sheet or guess. What the file leaves out takes the prior of its effect, as a guess.
+Parameters that were found together are tied:
+
+    [correlation.coastdown]
+    parameters = ["drag_area", "rolling_resistance_constant"]
+    value = [[1.0, -0.86], [-0.86, 1.0]]
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from gz_onboard.errors import InputError
+from gz_onboard.errors import InputError, nearest
 from gz_onboard.physics.effect import VEHICLE_PARAMETERS, Effect, Parameter, known_effects, load_effect
 
 if TYPE_CHECKING:
@@ -84,8 +89,9 @@ class Value:
 class Parameters(Mapping[str, float]):
     """The values by name; `known` tells unit, standard deviation and source of each."""
 
-    def __init__(self, known: Mapping[str, Value]) -> None:
+    def __init__(self, known: Mapping[str, Value], correlations: Mapping[frozenset[str], float] | None = None) -> None:
         self.known = dict(known)
+        self.correlations = dict(correlations or {})
 
     def __getitem__(self, name: str) -> float:
         return self.known[name].value
@@ -99,6 +105,17 @@ class Parameters(Mapping[str, float]):
     def sd(self, name: str) -> float:
         """The standard deviation of `name`, in its unit."""
         return self.known[name].sd
+
+    def covariance(self, names: Sequence[str]) -> list[list[float]]:
+        """The covariance of the parameters `names`, in the products of their units."""
+        sds = [self.known[name].sd for name in names]
+        return [
+            [
+                s * t * (1.0 if a == b else self.correlations.get(frozenset((a, b)), 0.0))
+                for b, t in zip(names, sds, strict=True)
+            ]
+            for a, s in zip(names, sds, strict=True)
+        ]
 
     def replaced(self, **values: float) -> Parameters:
         """The same with other values, which their givers are taken to know well (a tenth of the sd).
@@ -114,7 +131,7 @@ class Parameters(Mapping[str, float]):
             name: Value(value, 0.1 * self.known[name].sd, self.known[name].unit, "data sheet", "as entered")
             for name, value in values.items()
         }
-        return Parameters({**self.known, **changed})
+        return Parameters({**self.known, **changed}, self.correlations)
 
 
 def declared_parameters(effects: Iterable[Effect] = ()) -> dict[str, Parameter]:
@@ -148,4 +165,34 @@ def read_parameters(vehicle: Table, effects: Iterable[Effect] = ()) -> Parameter
         known[name] = Value(
             value, entry.number("sd", low=0), unit, entry.text("status", choices=STATUS), entry.text("source")
         )
-    return Parameters(known)
+    return Parameters(known, _read_correlations(vehicle, known))
+
+
+def _read_correlations(vehicle: Table, known: Collection[str]) -> dict[frozenset[str], float]:
+    """The correlations of the tables ``correlation.NAME``; InputError for one that is none."""
+    correlations: dict[frozenset[str], float] = {}
+    every = vehicle.table("correlation")
+    for group in every.values:
+        table = every.table(group)
+        table.only(["parameters", "value", "source"])
+        names, rows = table.values.get("parameters"), table.values.get("value")
+        if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+            raise table.error("must be a list of names of parameters", "parameters")
+        for name in names:
+            if name not in known:
+                raise table.error(f"no parameter is called {name!r}{nearest(name, known)}", "parameters")
+        n = len(names)
+        square = isinstance(rows, list) and len(rows) == n and all(isinstance(r, list) and len(r) == n for r in rows)
+        if not square or not isinstance(rows, list):
+            raise table.error(f"must be {n} rows of {n} numbers, as many as parameters", "value")
+        for i, row in enumerate(rows):
+            for j, r in enumerate(row):
+                if isinstance(r, bool) or not isinstance(r, int | float) or not -1 <= r <= 1 or r != rows[j][i]:
+                    raise table.error(
+                        f"row {i + 1}, column {j + 1}: {r!r} is no correlation, or not symmetric", "value"
+                    )
+                if i == j and r != 1:
+                    raise table.error(f"the diagonal must be 1, is {r}", "value")
+                if i != j:
+                    correlations[frozenset((names[i], names[j]))] = float(r)
+    return correlations

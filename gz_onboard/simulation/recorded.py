@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.logs import read_frames
-from gz_onboard.bus.mapping import Mapping, Source
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.simulation.run import road_table
+from gz_onboard.simulation.samples import INSTRUMENTS, extended
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Road
 from gz_onboard.vehicle import Vehicle
 
@@ -26,13 +26,6 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-# Signals that no estimator needs, of the reference scooter's instruments: role, message, signal, factor to SI.
-EXTRA = (
-    ("brake_pressure_front", "HBM_Brakes", "HBM_BrakePressureFront", 1e5),
-    ("brake_pressure_rear", "HBM_Brakes", "HBM_BrakePressureRear", 1e5),
-    ("roller_speed", "DYNO_Roller", "DYNO_RollerSpeed", 1.0),
-    ("roller_force", "DYNO_Roller", "DYNO_RollerForce", 1.0),
-)
 BRAKE_FORCE = 20e-5
 """N of both brakes for each Pa, front and rear pressure added: deceleration on 8 road rides, with 19 N of scatter."""
 BRAKE_PRESSED = 0.5e5  # Pa: below this the sensors show noise
@@ -96,8 +89,8 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
 
     if vehicle.battery is None:
         raise vehicle.error("has no [battery], which a simulation needs")
-    codec = Codec(_extended(vehicle.mapping))
-    own = {role for role, *_ in EXTRA}
+    codec = Codec(extended(vehicle.mapping))
+    own = {role for role, *_ in INSTRUMENTS}
     estimator_groups = [replace(g, roles=()) if own & set(g.roles) else g for g in codec.groups]
     estimator = Estimator(estimator_groups, vehicle.battery, vehicle.model, vehicle.riding)
     known = [bool(group.roles) for group in estimator_groups]
@@ -131,18 +124,6 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     grade, curvature = _by_distance(np.array(rows))
     name = log.name.removesuffix(".gz")
     return Recorded(Path(name).stem, STEP, signals, grade, curvature)
-
-
-def _extended(mapping: Mapping) -> Mapping:
-    """`mapping` and those of `EXTRA` that its database has."""
-    sources = list(mapping.sources)
-    for role, message, signal, factor in EXTRA:
-        for m in mapping.database.messages:
-            if m.name == message and signal in m.signal_tree:
-                conversion = m.get_signal_by_name(signal).conversion
-                scale, offset = float(conversion.scale) * factor, float(conversion.offset) * factor
-                sources.append(Source(role, message, signal, scale, offset))
-    return replace(mapping, sources=tuple(sources))
 
 
 def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicle) -> dict[str, Array]:

@@ -1,0 +1,86 @@
+"""What a calibration procedure gives: values with their uncertainty, what could not be told, and how well it fits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Found:
+    """A parameter as found; the names and units are those of `physics.parameters`."""
+
+    value: float
+    sd: float
+    unit: str
+    source: str  # data, number of points, residual, conditions
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A table of the vehicle file over one or two axes, such as ``battery.r0`` over soc and temperature.
+
+    value: shape (len(axis),) or (len(second axis), len(first axis)); sd likewise, nan where data end.
+    """
+
+    axes: dict[str, Array]  # by the key of the vehicle file, the innermost first
+    value: Array
+    sd: Array
+    unit: str
+    source: str
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well a model follows data: in sample, or on data held out of the fit."""
+
+    what: str  # e.g. "motor loss"
+    unit: str
+    rms: float
+    largest: float  # magnitude
+    r2: float | None  # share of variance explained
+    points: int
+    held_out: bool
+    data: str  # which
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A curve of a plot, in the units of its panel."""
+
+    label: str
+    x: Array
+    y: Array
+    style: str = "-"  # as of matplotlib: "-" model, "." data
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One set of axes: data and model, or a residual."""
+
+    title: str
+    x_label: str  # with unit
+    y_label: str
+    traces: tuple[Trace, ...]
+
+
+@dataclass
+class Result:
+    """What one procedure found.
+
+    covariance: groups of parameters that are tied, each with its matrix in the parameters' units.
+    refusals: what the data could not tell, one sentence each, with the number that says so.
+    """
+
+    procedure: str
+    parameters: dict[str, Found] = field(default_factory=dict)
+    curves: dict[str, Curve] = field(default_factory=dict)  # by the dotted name of the vehicle file's table
+    covariance: list[tuple[tuple[str, ...], Array]] = field(default_factory=list)
+    fits: list[Fit] = field(default_factory=list)
+    refusals: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    panels: list[Panel] = field(default_factory=list)

@@ -1,0 +1,107 @@
+"""A measured ride: for each role the times and values that came through the codec.
+
+The lab knows no other form of a ride. A log, a simulated ride and any other source become `Samples`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gz_onboard.bus.codec import Codec
+from gz_onboard.bus.logs import read_frames
+from gz_onboard.bus.mapping import Mapping, Source
+from gz_onboard.errors import InputError
+from gz_onboard.vehicle import Vehicle
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+
+# Signals that no estimator needs, of the reference scooter's instruments: role, message, signal, factor to SI.
+INSTRUMENTS = (
+    ("brake_pressure_front", "HBM_Brakes", "HBM_BrakePressureFront", 1e5),  # Pa
+    ("brake_pressure_rear", "HBM_Brakes", "HBM_BrakePressureRear", 1e5),
+    ("roller_speed", "DYNO_Roller", "DYNO_RollerSpeed", 1.0),  # m/s
+    ("roller_force", "DYNO_Roller", "DYNO_RollerForce", 1.0),  # N
+)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """One ride as measured.
+
+    columns: by role (names and units of `events.ROLES`, and those of `INSTRUMENTS`) the times [s, of one clock for the
+    whole ride, increasing] and values (SI) of every sample that passed the codec, no two roles at the same times.
+    facts: what was written down about the ride (``rider_mass_kg``, ``ambient_C``, ``kind``, ``direction``, ...).
+    """
+
+    name: str
+    columns: dict[str, tuple[Array, Array]]
+    facts: dict[str, object] = field(default_factory=dict)
+
+    @property
+    def duration(self) -> float:
+        """From the first sample to the last [s]."""
+        starts, ends = zip(*((t[0], t[-1]) for t, _ in self.columns.values()), strict=True)
+        return float(max(ends) - min(starts))
+
+    @property
+    def rider_mass(self) -> float | None:
+        """The mass of rider and luggage as entered [kg], or None."""
+        mass = self.facts.get("rider_mass_kg")
+        return float(mass) if isinstance(mass, int | float) else None
+
+
+def read_samples(log: Path, vehicle: Vehicle, progress: Callable[[int], None] | None = None) -> Samples:
+    """The samples in the log of a ride of `vehicle`, with its facts from a ``rides.json`` beside it, if there is one.
+
+    progress: is told how many frames were read. Raises InputError for a log that cannot be read or is not of the
+    vehicle.
+    """
+    import numpy as np
+
+    codec = Codec(extended(vehicle.mapping))
+    found: dict[str, tuple[list[float], list[float]]] = {}
+    slots = [[found.setdefault(role, ([], [])) for role in group.roles] for group in codec.groups]
+    for batch in read_frames(log):
+        for time, group, values in codec.decode(batch):
+            for (times, column), value in zip(slots[group], values, strict=True):
+                if value is not None:
+                    times.append(time)
+                    column.append(value)
+        if progress:
+            progress(len(batch))
+    if not codec.latest:
+        raise InputError(f"{log}: vehicle {vehicle.name!r} knows none of its {codec.received} frames")
+    name = Path(log.name.removesuffix(".gz")).stem
+    columns = {role: (np.array(t), np.array(v)) for role, (t, v) in found.items() if len(t) > 1}
+    return Samples(name, columns, read_facts(log.parent / "rides.json").get(name, {}))
+
+
+def read_facts(file: Path) -> dict[str, dict[str, object]]:
+    """What is written down about rides, by their names: a JSON list of objects with ``name``. Empty without a file."""
+    if not file.is_file():
+        return {}
+    try:
+        rows = json.loads(file.read_text(encoding="utf-8"))
+        return {row["name"]: {key: value for key, value in row.items() if key != "name"} for row in rows}
+    except (ValueError, TypeError, KeyError) as error:
+        raise InputError(f"{file}: must be a JSON list of objects with a name: {error!r}") from error
+
+
+def extended(mapping: Mapping) -> Mapping:
+    """`mapping` and those of `INSTRUMENTS` that its database has."""
+    sources = list(mapping.sources)
+    for role, message, signal, factor in INSTRUMENTS:
+        for m in mapping.database.messages:
+            if m.name == message and signal in m.signal_tree:
+                conversion = m.get_signal_by_name(signal).conversion
+                scale, offset = float(conversion.scale) * factor, float(conversion.offset) * factor
+                sources.append(Source(role, message, signal, scale, offset))
+    return replace(mapping, sources=tuple(sources))
