@@ -1,0 +1,299 @@
+"""Least squares with covariance, held-out data, and what the data cannot tell apart.
+
+Two fits, `linear` and `nonlinear`, give a `Solution`. Its covariance is that of independent residuals; for samples
+that depend on each other (one run, one ride) give `groups`: then it is the sandwich of Liang & Zeger (1986), which
+takes whole groups as the independent pieces. `unseparated` and `profile` say what a solution does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from gz_onboard.errors import InputError
+from gz_onboard.lab.calibrate.result import Array, Fit, Found
+
+Mask = NDArray[np.bool_]
+Residual = Callable[[Array], Array]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Parameters that fit best.
+
+    value: shape (n,) in the order of `names`. covariance: (n, n). information: (n, n), the Fisher information of the
+    data alone, without priors. residual: (m,), weighted (in units of its sd if one was given), model less data.
+    variance: of a weighted residual, by which the covariance was scaled: 1 if the sd given is right.
+    """
+
+    names: tuple[str, ...]
+    value: Array
+    covariance: Array
+    information: Array
+    residual: Array
+    variance: float
+
+    def __getitem__(self, name: str) -> float:
+        return float(self.value[self.names.index(name)])
+
+    def sd(self, name: str) -> float:
+        """The standard deviation of `name`."""
+        i = self.names.index(name)
+        return float(np.sqrt(self.covariance[i, i]))
+
+    def correlation(self) -> Array:
+        """(n, n); zero for a parameter without spread."""
+        sd = np.sqrt(np.diag(self.covariance))
+        scale = np.where(sd > 0, sd, np.inf)
+        result: Array = self.covariance / np.outer(scale, scale)
+        np.fill_diagonal(result, 1.0)
+        return result
+
+    def part(self, names: Sequence[str]) -> Array:
+        """The covariance of `names`, in that order."""
+        i = [self.names.index(name) for name in names]
+        return self.covariance[np.ix_(i, i)]
+
+    def found(self, name: str, unit: str, source: str, sd_more: float = 0.0) -> Found:
+        """`name` as a result. sd_more: a further standard deviation that no sample shows, such as of the sensor."""
+        return Found(self[name], float(np.hypot(self.sd(name), sd_more)), unit, source)
+
+
+def linear(
+    columns: Mapping[str, Array],
+    y: Array,
+    sd: Array | float | None = None,
+    *,
+    prior: Mapping[str, tuple[float, float]] | None = None,
+    groups: Array | None = None,
+) -> Solution:
+    """The parameters p (one for each of `columns`, shape (m,)) for which sum(p·column) is nearest to y, shape (m,).
+
+    sd: of y, of one sample or of each; without it the residuals tell. prior: (value, sd) of parameters that more is
+    known of. groups: label of each sample, (m,), where samples of one label depend on each other.
+    Raises InputError for fewer samples than parameters, or columns that depend on each other without a prior.
+    """
+    names = tuple(columns)
+    a = np.column_stack([np.broadcast_to(np.asarray(c, dtype=float), y.shape) for c in columns.values()])
+    weight = np.broadcast_to(1.0 if sd is None else 1.0 / np.asarray(sd, dtype=float), y.shape)
+    jacobian = a * weight[:, None]
+    rows, targets = _prior_rows(names, prior, 1.0 if sd is not None else None, jacobian, y * weight)
+    full, target = np.vstack([jacobian, rows]), np.concatenate([y * weight, targets])
+    size = np.linalg.norm(full, axis=0)
+    _check(names, full, len(y), size)
+    value = np.linalg.lstsq(full / size, target, rcond=None)[0] / size
+    return _solution(names, value, jacobian, jacobian @ value - y * weight, rows, sd is not None, groups)
+
+
+def nonlinear(
+    residual: Residual,
+    start: Mapping[str, float],
+    *,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
+    groups: Array | None = None,
+    known_sd: bool = False,
+    loss: str = "linear",
+) -> Solution:
+    """The parameters near `start` for which `residual` (of an array in its order, weighted, shape (m,)) is least.
+
+    known_sd: the residual is in units of its true sd, so that its size is not scaled to 1 (a size above 1 still is:
+    what the model cannot follow makes parameters less sure); a prior needs it. loss: as of
+    `scipy.optimize.least_squares`. The rest as for `linear`.
+    """
+    if prior and not known_sd:
+        raise ValueError("a prior needs a residual in units of its sd to be weighed against")
+    names = tuple(start)
+    x0 = np.array([start[name] for name in names], dtype=float)
+    low = np.array([(bounds or {}).get(name, (-np.inf, np.inf))[0] for name in names])
+    high = np.array([(bounds or {}).get(name, (-np.inf, np.inf))[1] for name in names])
+    scale = np.where(x0 != 0, np.abs(x0), 1.0)
+    rows, targets = _prior_rows(names, prior, 1.0, np.empty((0, len(names))), np.empty(0))
+
+    def everything(x: Array) -> Array:
+        return np.concatenate([residual(x), rows @ x - targets])
+
+    best = least_squares(everything, x0, bounds=(low, high), x_scale=scale, loss=loss, jac="3-point")
+    m = len(best.fun) - len(rows)
+    jacobian = best.jac[:m]
+    _check(names, best.jac, m, np.linalg.norm(best.jac, axis=0))
+    return _solution(names, best.x, jacobian, best.fun[:m], rows, known_sd, groups)
+
+
+def _prior_rows(
+    names: tuple[str, ...],
+    prior: Mapping[str, tuple[float, float]] | None,
+    unit: float | None,
+    jacobian: Array,
+    target: Array,
+) -> tuple[Array, Array]:
+    """A row for each prior, as one more measurement; `unit` the sd of a weighted residual, found first if None."""
+    if not prior:
+        return np.empty((0, len(names))), np.empty(0)
+    if unit is None:  # without an sd of the data their own residual is what a prior is weighed against
+        rest = np.linalg.lstsq(jacobian, target, rcond=None)[0]
+        freedom = max(len(target) - len(names), 1)
+        unit = float(np.sqrt(np.sum((jacobian @ rest - target) ** 2) / freedom)) or 1e-12
+    rows = np.zeros((len(prior), len(names)))
+    for row, (name, (_, sd)) in zip(rows, prior.items(), strict=True):
+        row[names.index(name)] = unit / sd
+    return rows, np.array([unit * value / sd for value, sd in prior.values()])
+
+
+def _check(names: tuple[str, ...], jacobian: Array, points: int, size: Array) -> None:
+    if points < len(names) and len(jacobian) < len(names):
+        raise InputError(f"{points} points are too few for {len(names)} parameters ({', '.join(names)})")
+    for name, length in zip(names, size, strict=True):
+        if not length > 0:
+            raise InputError(f"the data say nothing of {name}: no point changes with it")
+    if (scaled := np.linalg.svd(jacobian / size, compute_uv=False))[-1] < 1e-9 * scaled[0]:
+        direction = np.linalg.svd(jacobian / size)[2][-1]
+        tied = [name for name, part in zip(names, direction, strict=True) if abs(part) > 0.1]
+        raise InputError(f"the data cannot separate {' and '.join(tied)}: they change every point in the same way")
+
+
+def _solution(
+    names: tuple[str, ...],
+    value: Array,
+    jacobian: Array,
+    residual: Array,
+    rows: Array,
+    known_sd: bool,
+    groups: Array | None,
+) -> Solution:
+    freedom = len(residual) + len(rows) - len(names)
+    mean_square = float(residual @ residual) / freedom if freedom > 0 else float("nan")
+    variance = max(1.0, mean_square) if known_sd else mean_square
+    information = jacobian.T @ jacobian / (variance or 1.0)
+    # Prior rows are in units of a weighted residual's sd: of 1 where that is known.
+    prior = rows.T @ rows * (variance if known_sd else 1.0)
+    bread = jacobian.T @ jacobian + prior
+    size = np.sqrt(np.diag(bread))
+    inverse = np.linalg.inv(bread / np.outer(size, size)) / np.outer(size, size)
+    if groups is None:
+        covariance = inverse * variance
+    else:
+        labels = np.unique(groups)
+        scores = np.array([jacobian[groups == label].T @ residual[groups == label] for label in labels])
+        factor = len(labels) / max(len(labels) - 1, 1)
+        meat = factor * scores.T @ scores + variance * prior
+        # Few groups give few directions: no parameter is surer than independent samples would make it.
+        covariance = inverse @ meat @ inverse
+        independent = inverse * variance
+        short = np.sqrt(np.maximum(np.diag(independent) / np.maximum(np.diag(covariance), 1e-300), 1.0))
+        covariance = covariance * np.outer(short, short)
+    return Solution(names, value, covariance, information, residual, variance)
+
+
+def split(count: int, share: float = 1 / 3, seed: int = 0) -> Mask:
+    """True for the points to fit, shape (count,); a random `share` of them is held out."""
+    keep = np.ones(count, dtype=bool)
+    keep[np.random.default_rng(seed).permutation(count)[: round(share * count)]] = False
+    return keep
+
+
+def score(what: str, unit: str, data: Array, model: Array, *, held_out: bool, source: str) -> Fit:
+    """How well `model` follows `data`, both of shape (m,). r2 is None for data without spread."""
+    error = np.asarray(model) - np.asarray(data)
+    spread = float(np.sum((data - np.mean(data)) ** 2))
+    r2 = 1 - float(error @ error) / spread if spread > 0 else None
+    rms = float(np.sqrt(np.mean(error**2)))
+    return Fit(what, unit, rms, float(np.max(np.abs(error))), r2, len(error), held_out, source)
+
+
+def unseparated(solution: Solution, scale: Mapping[str, float] | None = None, limit: float = 0.5) -> list[str]:
+    """What the data cannot tell, one sentence for each direction of parameters that they hardly change with.
+
+    The directions are the eigenvectors of the Fisher information in units of `scale` (default: each value; a prior
+    sd is better where there is one). A direction with an sd above `limit` of that is reported.
+    """
+    unit = np.array([(scale or {}).get(n, abs(v) or 1.0) for n, v in zip(solution.names, solution.value, strict=True)])
+    values, vectors = np.linalg.eigh(solution.information * np.outer(unit, unit))
+    said = []
+    for value, vector in zip(values, vectors.T, strict=True):
+        sd = 1 / np.sqrt(value) if value > 0 else np.inf
+        if sd > limit:
+            order = np.argsort(-np.abs(vector))
+            main = [i for i in order if abs(vector[i]) > 0.3 * abs(vector[order[0]])]
+            parts = [f"{solution.names[i]} {'+' if vector[i] * vector[order[0]] > 0 else '-'}" for i in main]
+            percent = f"{100 * sd:.0f} %" if sd < 100 else "any amount"
+            what = "changed alone" if len(parts) == 1 else "changed together"
+            said.append(f"{', '.join(parts)} ({what}, scaled): known to {percent} only")
+    return said
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The profile likelihood of one parameter (Raue et al. 2009): all others fitted anew at each of its values.
+
+    value, excess: shape (k,): chi-square over its least. low, high: the 95 % interval, infinite where it leaves the
+    values tried: then the data do not bound the parameter.
+    """
+
+    name: str
+    value: Array
+    excess: Array
+    low: float
+    high: float
+
+
+def profile(
+    residual: Residual,
+    solution: Solution,
+    name: str,
+    values: Array,
+    *,
+    bounds: Mapping[str, tuple[float, float]] | None = None,
+    prior: Mapping[str, tuple[float, float]] | None = None,
+) -> Profile:
+    """The profile of `name` over increasing `values` that hold the solution's, for a `residual` as of `nonlinear`."""
+    others = [n for n in solution.names if n != name]
+    inner = {n: p for n, p in (prior or {}).items() if n != name}
+    place = solution.names.index(name)
+    excess = np.empty(len(values))
+    least = _with_prior(solution, prior)
+    around = int(np.searchsorted(values, solution[name]))
+    order = [*range(around, len(values)), *range(around - 1, -1, -1)]  # outwards, each from its neighbour's optimum
+    start = {n: solution[n] for n in others}
+    for i in order:
+        if i == around - 1:
+            start = {n: solution[n] for n in others}
+
+        def fixed(x: Array, at: float = float(values[i])) -> Array:
+            return residual(np.insert(x, place, at))
+
+        if others:
+            best = nonlinear(fixed, start, bounds=bounds, prior=inner, known_sd=True)
+            start = {n: best[n] for n in others}
+            total = _with_prior(best, inner)
+        else:
+            r = fixed(np.empty(0))
+            total = float(r @ r)
+        if prior and name in prior:
+            total += ((float(values[i]) - prior[name][0]) / prior[name][1]) ** 2
+        excess[i] = (total - least) / solution.variance
+    limit = chi2.ppf(0.95, 1)
+    return Profile(name, values, excess, _crossing(values[:around], excess[:around], -1, limit, solution[name]),
+                   _crossing(values[around:], excess[around:], 1, limit, solution[name]))  # fmt: skip
+
+
+def _with_prior(solution: Solution, prior: Mapping[str, tuple[float, float]] | None) -> float:
+    away = sum(((solution[name] - value) / sd) ** 2 for name, (value, sd) in (prior or {}).items())
+    return float(solution.residual @ solution.residual) + away
+
+
+def _crossing(values: Array, excess: Array, sign: int, limit: float, best: float) -> float:
+    """Where the excess, followed outwards from `best`, first passes `limit`; infinite if it does not."""
+    xs = [best, *(values if sign > 0 else values[::-1])]
+    es = [0.0, *(excess if sign > 0 else excess[::-1])]
+    for i in range(1, len(xs)):
+        if es[i] > limit:
+            inner, outer = np.sqrt(max(es[i - 1], 0.0)), np.sqrt(es[i])  # a parabola's root is straight
+            share = (np.sqrt(limit) - inner) / (outer - inner)
+            return float(xs[i - 1] + share * (xs[i] - xs[i - 1]))
+    return sign * np.inf

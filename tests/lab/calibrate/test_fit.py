@@ -1,0 +1,115 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gz_onboard.errors import InputError
+from gz_onboard.lab.calibrate.fit import linear, nonlinear, profile, score, split, unseparated
+
+SEEDS = 400
+
+
+def inside(found, truth):
+    """Whether each parameter lies within its 95 % interval."""
+    return np.array([abs(found[name] - truth[name]) < 1.96 * found.sd(name) for name in found.names])
+
+
+@given(st.integers(0, 2**32 - 1), st.lists(st.floats(-1e3, 1e3), min_size=1, max_size=5))
+@settings(max_examples=50, deadline=None)
+def test_linear_finds_what_is_there(seed, truth):
+    columns = {f"p{i}": c for i, c in enumerate(np.random.default_rng(seed).normal(size=(len(truth), 40)))}
+    found = linear(columns, sum(p * c for p, c in zip(truth, columns.values(), strict=True)))
+    assert np.allclose(found.value, truth, rtol=1e-6, atol=1e-6)
+
+
+def test_linear_and_nonlinear_agree():
+    rng = np.random.default_rng(0)
+    x = np.linspace(0, 3, 60)
+    y = 2 + 0.7 * x + rng.normal(0, 0.1, 60)
+    a = linear({"a": np.ones(60), "b": x}, y, 0.1, prior={"b": (0.6, 0.05)})
+    b = nonlinear(lambda p: (p[0] + p[1] * x - y) / 0.1, {"a": 1.0, "b": 1.0}, prior={"b": (0.6, 0.05)}, known_sd=True)
+    assert np.allclose(a.value, b.value, rtol=1e-5)
+    assert np.allclose(a.covariance, b.covariance, rtol=1e-4)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_intervals_hold_95_percent(known):
+    x = np.linspace(0, 1, 30)
+    truth = {"a": 1.0, "b": -2.0, "c": 0.5}
+    held = np.zeros(3)
+    for seed in range(SEEDS):
+        y = 1 - 2 * x + 0.5 * x**2 + np.random.default_rng(seed).normal(0, 0.2, 30)
+        held += inside(linear({"a": np.ones(30), "b": x, "c": x**2}, y, 0.2 if known else None), truth)
+    assert np.all((held / SEEDS > 0.90) & (held / SEEDS < 0.99))
+
+
+def test_groups_hold_where_the_samples_of_a_run_depend_on_each_other():
+    runs, each = 20, 50
+    labels = np.repeat(np.arange(runs), each)
+    held = {True: 0, False: 0}
+    for seed in range(SEEDS):
+        rng = np.random.default_rng(seed)
+        x = np.repeat(rng.normal(size=runs), each) + 0.1 * rng.normal(size=runs * each)
+        y = 3 * x + np.repeat(rng.normal(size=runs), each) + 0.1 * rng.normal(size=runs * each)
+        for grouped in held:
+            held[grouped] += inside(linear({"k": x}, y, groups=labels if grouped else None), {"k": 3.0})[0]
+    assert held[True] / SEEDS > 0.88  # 20 groups: the sandwich is known to be a little short
+    assert held[False] / SEEDS < 0.5  # what taking all samples as independent would claim
+
+
+def test_a_prior_is_weighed_against_the_data_and_grows_when_they_say_nothing():
+    ones = np.ones(10)
+    found = linear({"a": ones, "b": ones}, 5 * ones, 1.0, prior={"a": (2.0, 0.1)})
+    assert found["a"] == pytest.approx(2) and found["b"] == pytest.approx(3)
+    assert found.sd("a") == pytest.approx(0.1) and found.sd("b") == pytest.approx(np.hypot(0.1, 1 / np.sqrt(10)))
+    assert found.correlation()[0, 1] < 0
+    with pytest.raises(InputError, match="cannot separate a and b"):
+        linear({"a": ones, "b": ones}, 5 * ones)
+
+
+def test_refusals():
+    with pytest.raises(InputError, match="1 points are too few for 2 parameters"):
+        linear({"a": np.ones(1), "b": np.ones(1)}, np.ones(1))
+    with pytest.raises(InputError, match="say nothing of b"):
+        linear({"a": np.ones(5), "b": np.zeros(5)}, np.ones(5))
+    with pytest.raises(InputError, match="say nothing of k"):
+        nonlinear(lambda p: p[:1] - np.ones(4), {"a": 0.0, "k": 1.0})
+
+
+def test_split_holds_out_a_share_and_is_the_same_each_time():
+    keep = split(90)
+    assert keep.sum() == 60 and np.array_equal(keep, split(90)) and not np.array_equal(keep, split(90, seed=1))
+
+
+def test_score():
+    fit = score("x", "W", np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 4.0]), held_out=True, source="here")
+    assert (fit.largest, fit.r2, fit.points) == (1.0, 0.5, 3) and fit.rms == pytest.approx(np.sqrt(1 / 3))
+    assert score("x", "W", np.ones(3), np.ones(3), held_out=True, source="here").r2 is None
+
+
+def heating(seed, end):
+    """Temperature of one mass with a constant heat, capacity 1000 J/K, conductance 2 W/K, seen until `end` [s]."""
+    t = np.linspace(0, end, 80)
+    data = 100 / 2 * (1 - np.exp(-2 * t / 1000)) + np.random.default_rng(seed).normal(0, 0.2, 80)
+    return lambda p: (100 / p[1] * (1 - np.exp(-p[1] * t / p[0])) - data) / 0.2
+
+
+def test_profile_is_the_interval_of_a_parameter_that_the_data_tell():
+    start = {"capacity": 700.0, "conductance": 3.0}
+    residual = heating(1, 2000)
+    found = nonlinear(residual, start, known_sd=True)
+    assert np.all(inside(found, {"capacity": 1000, "conductance": 2})) and not unseparated(found)
+    p = profile(residual, found, "conductance", np.linspace(1.98, 2.02, 21))
+    assert p.high - p.low == pytest.approx(2 * 1.96 * found.sd("conductance"), rel=0.05)
+
+
+def test_profile_is_open_where_the_data_tell_nothing():
+    start = {"capacity": 700.0, "conductance": 3.0}
+    bounds = {"capacity": (1.0, 1e5), "conductance": (1e-6, 100.0)}
+    residual = heating(1, 20)  # over before any heat has left
+    found = nonlinear(residual, start, known_sd=True, bounds=bounds)
+    assert any("conductance" in sentence for sentence in unseparated(found, {"conductance": 2.0, "capacity": 1000}))
+    p = profile(residual, found, "conductance", np.linspace(0.01, 60, 13), bounds=bounds)
+    assert p.low == -np.inf  # as well none at all
