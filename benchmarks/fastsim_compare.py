@@ -18,6 +18,7 @@ from typing import Any
 import fastsim  # type: ignore[import-not-found, unused-ignore]
 import numpy as np
 
+from gz_onboard.physics.derating import Curve
 from gz_onboard.physics.model import Model
 from gz_onboard.simulation.backward import backward
 from gz_onboard.simulation.cycles import cycle
@@ -177,11 +178,13 @@ def electric_braking(vehicle: Vehicle, **values: float) -> Vehicle:
 
 
 def unlimited(scooter: Scooter) -> Scooter:
-    c = scooter.controller
-    c.by_speed = ((0.0, 1.0), (1000.0, 1.0))
-    c.regeneration_by_speed = ((0.0, 0.0), (0.5, 1.0))
-    c.regeneration_by_soc = ((0.0, 1.0), (1.0, 1.0))
-    c.regeneration_gain = 1.0
+    scooter.controller.derating = replace(
+        scooter.controller.derating,
+        current_by_motor_speed=Curve((0.0,), (1.0,)),
+        regeneration_by_motor_speed=Curve((0.0, 0.5), (0.0, 1.0)),
+        regeneration_by_soc=Curve((0.0,), (1.0,)),
+        regeneration_gain=1.0,
+    )
     return scooter
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from gz_onboard.bus.mapping import Mapping, read_mapping
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.physics.battery import Battery, read_battery
+from gz_onboard.physics.derating import Derating, read_derating
 from gz_onboard.physics.model import Model, read_model
 from gz_onboard.physics.parameters import Parameters, read_parameters
 from gz_onboard.physics.riding import PriorRiding, read_riding
@@ -27,6 +28,7 @@ class Vehicle:
     battery: Battery | None
     model: Model
     riding: PriorRiding
+    derating: Derating = field(default_factory=Derating)
 
     @property
     def key(self) -> str:
@@ -59,7 +61,21 @@ def find_vehicle(name: str) -> Path:
 def read_vehicle(name: str, payload: float | None = None) -> Vehicle:
     """The vehicle `name` (file or one of the package's own), with the rider's mass [kg] if it is known."""
     table = Table.read(find_vehicle(name))
-    table.only(["schema", "name", "dbc", "bus", "roles", "model", "parameters", "correlation", "battery", "forecast"])
+    table.only(
+        [
+            "schema",
+            "name",
+            "dbc",
+            "bus",
+            "roles",
+            "model",
+            "parameters",
+            "correlation",
+            "battery",
+            "forecast",
+            "controller",
+        ]
+    )
     if table.number("schema") != 1:
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
     effects = read_model(table)
@@ -74,4 +90,5 @@ def read_vehicle(name: str, payload: float | None = None) -> Vehicle:
         battery=read_battery(table, parameters) if "battery" in table.values else None,
         model=Model(effects, parameters),
         riding=read_riding(table),
+        derating=read_derating(table),
     )

@@ -109,7 +109,8 @@ class Scooter:
         self.tyre = Tyre(p["tyre_b"], p["tyre_c"], p["tyre_d"], p["tyre_e"], form=tyre_form)
         self.brakes = Brakes(p["brake_torque_limit"], p["brake_viscous_constant"], p["brake_disc_radius"],
                              p["front_brake_share"], form=brake_form)  # fmt: skip
-        self.controller = Controller(p["motor_current_limit"], p["regeneration_torque_limit"] / p["torque_constant"])
+        regeneration = p["regeneration_torque_limit"] / p["torque_constant"]
+        self.controller = Controller(p["motor_current_limit"], regeneration, vehicle.derating)
         cells = ambient if cell_temperature is None else cell_temperature
         self.inverter_cooling = InverterCooling(
             p["inverter_board_capacity"], p["inverter_box_capacity"], p["inverter_board_to_air"],

@@ -60,10 +60,19 @@ def test_it_names_every_role():
 
 
 @pytest.mark.parametrize(
-    "module", ["bus/mapping", "vehicle", "physics/model", "physics/riding", "physics/parameters", "physics/battery"]
+    "module",
+    [
+        "bus/mapping",
+        "vehicle",
+        "physics/model",
+        "physics/riding",
+        "physics/parameters",
+        "physics/battery",
+        "physics/derating",
+    ],
 )
 def test_it_names_every_key(module):
     source = (ROOT / "gz_onboard" / f"{module}.py").read_text(encoding="utf-8")
-    keys = {key for group in re.findall(r"\.only\(\[(.*?)\]\)", source) for key in re.findall(r'"(\w+)"', group)}
+    keys = {key for group in re.findall(r"\.only\(\s*\[(.*?)\]", source, re.S) for key in re.findall(r'"(\w+)"', group)}
     assert keys
     assert not [key for key in keys if not re.search(rf"\b{key}\b", TEXT)]

@@ -1,0 +1,124 @@
+"""What a motor controller takes off its current: piecewise-linear shares over speed, temperature, voltage and charge.
+
+Lord 2016 names the controller and does not give it (it is proprietary). The defaults over speed and cell voltage are
+those of the reference scooter, where its file says how they were found; the others are guesses.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass, field, fields
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gz_onboard.toml import Table
+
+Row = tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A share `share` (0..1) over a quantity `at`: linear between the points, constant beyond the ends."""
+
+    at: Row
+    share: Row
+    full: tuple[float, float] = field(init=False, repr=False, compare=False)  # within it nothing is taken off
+
+    def __post_init__(self) -> None:
+        inf = float("inf")
+        ones = [i for i, share in enumerate(self.share) if share == 1.0]
+        low, high = inf, -inf
+        if ones:
+            first = last = ones[0]
+            while last + 1 in ones:
+                last += 1
+            low = -inf if first == 0 else self.at[first]
+            high = inf if last == len(self.at) - 1 else self.at[last]
+        object.__setattr__(self, "full", (low, high))
+
+    def __call__(self, x: float) -> float:
+        """The share at `x`."""
+        low, high = self.full
+        if low <= x <= high:
+            return 1.0
+        xs, ys = self.at, self.share
+        if x <= xs[0]:
+            return ys[0]
+        if x >= xs[-1]:
+            return ys[-1]
+        i = bisect_right(xs, x) - 1
+        return ys[i] + (ys[i + 1] - ys[i]) * (x - xs[i]) / (xs[i + 1] - xs[i])
+
+
+@dataclass(frozen=True)
+class Derating:
+    """Shares of the current limit while driving (``current_``) and while braking with the motor (``regeneration_``).
+
+    Those that act at once multiply; temperatures act on both. `regeneration_gain`: share of the regeneration for each
+    share of the brake's command; the most is all of it.
+    """
+
+    current_by_motor_speed: Curve = Curve(
+        (0.0, 35.3, 38.0, 41.0, 44.0, 47.5, 53.0, 55.4), (1.0, 1.0, 0.929, 0.861, 0.802, 0.743, 0.666, 0.0)
+    )
+    current_by_cell_voltage: Curve = Curve((2.75, 2.89, 3.04, 3.16), (0.1, 0.46, 0.77, 1.0))
+    current_by_soc: Curve = Curve((0.0, 0.08), (0.1, 1.0))
+    current_by_motor_temperature: Curve = Curve((0.0, 120.0, 150.0), (1.0, 1.0, 0.2))
+    current_by_inverter_temperature: Curve = Curve((0.0, 80.0, 100.0), (1.0, 1.0, 0.2))
+    current_by_cell_temperature: Curve = Curve((-20.0, -5.0, 50.0, 62.0), (0.3, 1.0, 1.0, 0.1))
+    regeneration_by_motor_speed: Curve = Curve((7.0, 14.5), (0.0, 1.0))
+    regeneration_by_soc: Curve = Curve((0.95, 1.0), (1.0, 0.0))
+    regeneration_gain: float = 50.0
+
+
+AXES: dict[str, tuple[str, float, float]] = {
+    "motor_speed": ("rad/s", 0.0, 5000.0),
+    "cell_voltage": ("V", 0.5, 5.0),
+    "soc": ("1", -0.01, 1.01),
+    "motor_temperature": ("degC", -60.0, 300.0),
+    "inverter_temperature": ("degC", -60.0, 200.0),
+    "cell_temperature": ("degC", -60.0, 150.0),
+}
+"""What a share may stand over: (unit, least, greatest)."""
+
+
+def read_derating(vehicle: Table) -> Derating:
+    """The table ``[controller]`` of a vehicle file; each entry that is not there is that of `Derating`.
+
+    Raises InputError for unknown keys, a unit that is not the axis', an axis that does not increase or is out of its
+    bounds, and shares outside 0 to 1.
+    """
+    table = vehicle.table("controller")
+    known = [entry.name for entry in fields(Derating)]
+    table.only(known)
+    found: dict[str, Curve | float] = {}
+    for name in known:
+        if name not in table.values:
+            continue
+        entry = table.table(name)
+        if name == "regeneration_gain":
+            entry.only(["value", "unit", "status", "source"])
+            entry.text("unit", choices=["1"])
+            found[name] = entry.number("value", low=0.01, high=1e6)
+        else:
+            found[name] = _curve(entry, *AXES[name.partition("_by_")[2]])
+    return Derating(**found)  # type: ignore[arg-type]
+
+
+def _curve(table: Table, unit: str, low: float, high: float) -> Curve:
+    table.only(["at", "share", "unit", "status", "source"])
+    table.text("unit", choices=[unit])
+    at, share = table.numbers("at"), table.numbers("share")
+    for a, b in pairwise(at):
+        if not a < b:
+            raise table.error(f"must increase, but {b:g} {unit} follows {a:g} {unit}", "at")
+    for x in at:
+        if not low <= x <= high:
+            raise table.error(f"{x:g} {unit} is outside {low:g} to {high:g} {unit}", "at")
+    for y in share:
+        if not 0 <= y <= 1:
+            raise table.error(f"{y:g} is outside 0 to 1", "share")
+    if len(at) != len(share):
+        raise table.error(f"has {len(share)} numbers for {len(at)} of at", "share")
+    return Curve(at, share)
