@@ -1,0 +1,288 @@
+"""Measurements in a table: CSV (also .csv.gz) or Parquet, one column a quantity, its unit in the name of the column.
+
+    time_s,current_A,voltage_mV,cell_temperature_degC
+
+A column is called quantity_unit; ``quantity[unit]`` and ``quantity (unit)`` are read too. What comes out is by
+quantity, in SI units and degC. For tables of other people a mapping says which column is what:
+
+    columns = { time = "t_s", voltage = "v_V", current = { column = "i_A", scale = -1 } }
+"""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import math
+import re
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from gz_onboard.errors import InputError, nearest
+from gz_onboard.lab.calibrate.result import Array
+
+if TYPE_CHECKING:
+    from gz_onboard.toml import Table as TomlTable
+
+# Unit as written -> (unit it is turned into, factor, offset)
+_PER_MINUTE = 2 * math.pi / 60
+UNITS: dict[str, tuple[str, float, float]] = {
+    "s": ("s", 1, 0), "ms": ("s", 1e-3, 0), "us": ("s", 1e-6, 0), "min": ("s", 60, 0), "h": ("s", 3600, 0),
+    "A": ("A", 1, 0), "mA": ("A", 1e-3, 0), "Arms": ("A", 1, 0),
+    "V": ("V", 1, 0), "mV": ("V", 1e-3, 0), "kV": ("V", 1e3, 0), "Vrms": ("V", 1, 0),
+    "degC": ("degC", 1, 0), "C": ("degC", 1, 0), "K": ("degC", 1, -273.15), "degF": ("degC", 5 / 9, -160 / 9),
+    "radps": ("rad/s", 1, 0), "rpm": ("rad/s", _PER_MINUTE, 0), "revps": ("rad/s", 2 * math.pi, 0),
+    "degps": ("rad/s", math.pi / 180, 0),
+    "mps": ("m/s", 1, 0), "kmph": ("m/s", 1 / 3.6, 0), "mph": ("m/s", 0.44704, 0),
+    "mps2": ("m/s^2", 1, 0),
+    "Nm": ("N·m", 1, 0), "mNm": ("N·m", 1e-3, 0),
+    "W": ("W", 1, 0), "kW": ("W", 1e3, 0), "mW": ("W", 1e-3, 0),
+    "N": ("N", 1, 0), "kN": ("N", 1e3, 0),
+    "ohm": ("ohm", 1, 0), "mohm": ("ohm", 1e-3, 0),
+    "Ah": ("A·h", 1, 0), "mAh": ("A·h", 1e-3, 0), "Wh": ("J", 3600, 0), "J": ("J", 1, 0),
+    "m": ("m", 1, 0), "km": ("m", 1e3, 0), "mm": ("m", 1e-3, 0),
+    "kg": ("kg", 1, 0), "Pa": ("Pa", 1, 0), "bar": ("Pa", 1e5, 0),
+    "rad": ("rad", 1, 0), "deg": ("rad", math.pi / 180, 0),
+    "pct": ("1", 0.01, 0), "1": ("1", 1, 0),
+}  # fmt: skip
+
+_SPELLINGS = {
+    "rad/s": "radps", "r/min": "rpm", "1/min": "rpm", "rev/s": "revps", "deg/s": "degps", "m/s": "mps",
+    "km/h": "kmph", "kmh": "kmph", "kph": "kmph", "m/s2": "mps2", "m/s^2": "mps2", "m/s²": "mps2", "N·m": "Nm",
+    "N.m": "Nm", "°C": "degC", "Ω": "ohm", "A·h": "Ah", "%": "pct", "°": "deg", "sec": "s", "Amps": "A", "Volts": "V",
+    "celsius": "degC", "hr": "h", "µs": "us", "mΩ": "mohm", "": "1", "-": "1",
+}  # fmt: skip
+
+# The last word of a quantity says in what it must be; None: several.
+_KINDS = {
+    "time": ("s",), "current": ("A",), "voltage": ("V",), "line": ("V",), "temperature": ("degC",),
+    "speed": ("rad/s", "m/s"), "torque": ("N·m",), "power": ("W",), "force": ("N",), "mass": ("kg",),
+    "charge": ("A·h",), "energy": ("J",),
+    "acceleration": ("m/s^2",), "distance": ("m",), "altitude": ("m",),
+}  # fmt: skip
+_SPEED_OF = {"motor_speed": "rad/s", "wheel_speed": "rad/s"}
+
+_BRACKETS = re.compile(r"^\s*(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]\s*$")
+
+
+class Named(NamedTuple):
+    """Which column of a file holds a quantity; unit: where its name does not say; scale: such as -1 for the sign."""
+
+    column: str
+    unit: str | None = None
+    scale: float = 1.0
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of measurements.
+
+    columns: by quantity (``current``, ``cell_temperature``, ...), all of one length, in SI units and degC; ``time``
+    never decreases; two rows at one time are the two sides of a step. lines: where each row stands in the file, from 1
+    (for Parquet: its row). trouble: why a column of the file cannot be used, by quantity; told when it is asked for.
+    """
+
+    file: Path
+    columns: dict[str, Array]
+    lines: Sequence[int] = ()
+    trouble: dict[str, str] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.columns
+
+    def __getitem__(self, name: str) -> Array:
+        """The column `name`; InputError if it is not there or of no use."""
+        if name in self.columns:
+            return self.columns[name]
+        if name in self.trouble:
+            raise InputError(f"{self.file}: {self.trouble[name]}")
+        known = [*self.columns, *self.trouble]
+        kinds = _kinds(name)
+        wanted = f", in {' or '.join(kinds)}" if kinds else ""
+        columns = ", ".join(known) or "none"
+        raise InputError(f"{self.file}: no column for {name!r}{wanted}{nearest(name, known)}; there are {columns}")
+
+    def line(self, row: int) -> int:
+        """Where row `row` stands in the file."""
+        return int(self.lines[row]) if len(self.lines) else row + 1
+
+    def error(self, message: str, row: int | None = None) -> InputError:
+        """The error to raise about this file, or about one row of it."""
+        return InputError(f"{self.file}{'' if row is None else f':{self.line(row)}'}: {message}")
+
+
+def read_table(file: Path, columns: Mapping[str, Named] | None = None, needed: Sequence[str] = ()) -> Table:
+    """The table in `file`.
+
+    columns: for a file with names of its own, the column of each quantity; all others are left out. needed: quantities
+    without which the file is of no use. Raises InputError naming file, line, column and value for a file that cannot be
+    read, for a missing column or unit, for what is not a finite number, and for a time that goes back.
+    """
+    names, raw, lines = _read_parquet(file) if file.suffix in (".parquet", ".pq") else _read_csv(file)
+    found: dict[str, Array] = {}
+    trouble: dict[str, str] = {}
+    asked = _asked(file, names, columns)
+    for quantity, (column, unit, scale) in asked.items():
+        values = raw[names.index(column)]
+        array, message = _converted(quantity, column, unit, scale, values, lines)
+        if array is None:
+            trouble[quantity] = message
+        else:
+            found[quantity] = array
+    table = Table(file, found, lines, trouble)
+    for quantity in needed:
+        table[quantity]
+    if columns and trouble:  # what somebody has named must be of use
+        raise InputError(f"{file}: {next(iter(trouble.values()))}")
+    if "time" in found:
+        wrong = np.flatnonzero(np.diff(found["time"]) < 0)
+        if len(wrong):
+            row = int(wrong[0]) + 1
+            before, after = found["time"][row - 1], found["time"][row]
+            raise table.error(f"time must not go back, but {after:g} s follows {before:g} s", row)
+    elif "time" in trouble:
+        raise InputError(f"{file}: {trouble['time']}")
+    return table
+
+
+def read_columns(table: TomlTable) -> dict[str, Named]:
+    """The table ``columns`` of a manifest: quantity = "column", or { column, unit, scale }."""
+    found = {}
+    for quantity, entry in table.values.items():
+        if isinstance(entry, str):
+            found[quantity] = Named(entry)
+            continue
+        inner = table.table(quantity)
+        inner.only(["column", "unit", "scale"])
+        unit = inner.text("unit") if "unit" in inner.values else None
+        if unit is not None and _unit(unit) is None:
+            raise inner.error(f"unknown unit {unit!r}{nearest(unit, UNITS)}; known are {', '.join(UNITS)}", "unit")
+        found[quantity] = Named(inner.text("column"), unit, inner.number("scale", 1.0))
+    return found
+
+
+def _asked(file: Path, names: Sequence[str], columns: Mapping[str, Named] | None) -> dict[str, Named]:
+    """For each quantity its column: as the mapping says, or all by their own names."""
+    if columns:
+        for quantity, named in columns.items():
+            if named.column not in names:
+                raise InputError(
+                    f"{file}: no column {named.column!r} for {quantity}{nearest(named.column, names)}; "
+                    f"there are {', '.join(names)}"
+                )
+        return dict(columns)
+    asked: dict[str, Named] = {}
+    for name in names:
+        quantity = _split(name)[0]
+        if quantity in asked:
+            raise InputError(f"{file}: columns {asked[quantity].column!r} and {name!r} are both {quantity!r}")
+        asked[quantity] = Named(name)
+    return asked
+
+
+def _split(name: str) -> tuple[str, str | None]:
+    """(quantity, unit as written or None) out of the name of a column."""
+    if match := _BRACKETS.match(name):
+        return match[1], match[2]
+    quantity, _, unit = name.strip().rpartition("_")
+    if quantity and (_unit(unit) is not None or not _kinds(name)):
+        return quantity, unit
+    return name.strip(), None
+
+
+def _unit(unit: str) -> tuple[str, float, float] | None:
+    return UNITS.get(_SPELLINGS.get(unit, unit))
+
+
+def _kinds(quantity: str) -> tuple[str, ...]:
+    """The units in which `quantity` may come out; empty if its name says nothing."""
+    for end, si in _SPEED_OF.items():
+        if quantity.startswith(end):
+            return (si,)
+    return _KINDS.get(quantity.rpartition("_")[2], ())
+
+
+def _converted(
+    quantity: str, column: str, unit: str | None, scale: float, values: Sequence[object], lines: Sequence[int]
+) -> tuple[Array | None, str]:
+    """(the column in SI units, "") or (None, why not)."""
+    written = unit if unit is not None else _split(column)[1]
+    kinds = _kinds(quantity)
+    fitting = ", ".join(name for name, (si, *_) in UNITS.items() if si in kinds or not kinds)
+    if written is None:
+        return None, f"column {column!r} has no unit in its name, such as {column}_{(fitting or 's').split(', ')[0]}"
+    conversion = _unit(written)
+    if conversion is None:
+        return None, f"column {column!r}: unknown unit {written!r}{nearest(written, UNITS)}; known are {fitting}"
+    si, factor, offset = conversion
+    if kinds and si not in kinds:
+        return None, f"column {column!r}: {quantity} cannot be in {written}; known are {fitting}"
+    try:
+        array = np.array(values, dtype=float)
+    except (ValueError, TypeError):
+        array = np.array([_number(value) for value in values])
+    wrong = np.flatnonzero(~np.isfinite(array))
+    if len(wrong):
+        row = int(wrong[0])
+        more = f", and {len(wrong) - 1} more" if len(wrong) > 1 else ""
+        return None, f"line {lines[row]}, column {column!r}: {values[row]!r} is not a finite number{more}"
+    return scale * (array * factor + offset), ""
+
+
+def _number(value: object) -> float:
+    try:
+        return float(value)  # type: ignore[arg-type]
+    except (ValueError, TypeError):
+        return math.nan
+
+
+def _read_csv(file: Path) -> tuple[list[str], list[list[object]], list[int]]:
+    """(names, columns as text, line of each row)."""
+    try:
+        with (
+            gzip.open(file, "rt", encoding="utf-8-sig", newline="")
+            if file.suffix == ".gz"
+            else file.open(encoding="utf-8-sig", newline="") as stream
+        ):
+            reader = csv.reader(stream)
+            names = [name.strip() for name in next(reader, [])]
+            if not names or not any(names):
+                raise InputError(f"{file}: is empty; the first line must name the columns, such as time_s,current_A")
+            rows: list[list[str]] = []
+            lines: list[int] = []
+            for row in reader:
+                if not row:
+                    continue
+                if len(row) != len(names):
+                    raise InputError(f"{file}:{reader.line_num}: {len(row)} values for {len(names)} columns")
+                rows.append(row)
+                lines.append(reader.line_num)
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(f"{file}: {getattr(error, 'strerror', None) or error}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{file}: not a CSV file: {error}") from error
+    if all(_number(name) == _number(name) for name in names):
+        raise InputError(f"{file}:1: {', '.join(names[:3])} ... are numbers, not names of columns such as time_s")
+    if not rows:
+        raise InputError(f"{file}: has no rows")
+    return names, [list(column) for column in zip(*rows, strict=True)], lines
+
+
+def _read_parquet(file: Path) -> tuple[list[str], list[list[object]], list[int]]:
+    import pyarrow
+    import pyarrow.parquet
+
+    try:
+        table = pyarrow.parquet.read_table(file)
+    except (OSError, pyarrow.ArrowException) as error:
+        raise InputError(f"{file}: {getattr(error, 'strerror', None) or f'not a Parquet file: {error}'}") from error
+    if table.num_rows == 0:
+        raise InputError(f"{file}: has no rows")
+    return list(table.column_names), [c.to_pylist() for c in table.columns], list(range(1, table.num_rows + 1))
