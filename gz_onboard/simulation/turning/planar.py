@@ -125,7 +125,8 @@ class Planar:
             "plane_load_front": load_f * plane_f, "plane_load_rear": load_r * plane_r, "rolling_radius": p.radius,
             "slip_front": slip_f, "slip_rear": slip_r, "side_front": load_f * side_f, "side_rear": load_r * side_r,
         }  # fmt: skip
-        return Rates(change, power, seen)
+        fastest = max(m.front.slip_decay(along_f), m.rear.slip_decay(along_r))
+        return Rates(change, power, seen, fastest)
 
     def _wheel(
         self, tyre: Tyre, slip: float, camber: float, along: float, radius: float

@@ -13,7 +13,7 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import atan, cos, degrees, pi, radians, tan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -105,7 +105,7 @@ class Rider:
         lean = body[8] if isinstance(self.chassis, Leaning) else 0.0
         drive = 0.0 if self.let_go else None
         rates = self.chassis.rates(tuple(body), self.chassis.handlebar(steer, lean), drive, self.road)
-        return Rates((*rates.change, STEER_INTEGRAL * error, 1.0), rates.power, rates.seen)
+        return replace(rates, change=(*rates.change, STEER_INTEGRAL * error, 1.0))
 
 
 def coast_down(

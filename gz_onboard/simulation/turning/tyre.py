@@ -47,7 +47,11 @@ class Tyre:
         That lag is what keeps the lateral motion from becoming stiff when the speed falls to zero.
         """
         speed = max(abs(forward), SLIP_SPEED)
-        return (-atan(sideways / speed) - slip) * speed / self.relaxation_length
+        return (-atan(sideways / speed) - slip) * self.slip_decay(forward)
+
+    def slip_decay(self, forward: float) -> float:
+        """How fast the slip angle settles [1/s] with the contact moving at `forward` [m/s]."""
+        return max(abs(forward), SLIP_SPEED) / self.relaxation_length
 
 
 def rolling_radius(radius: float, crown: float, lean: float) -> float:

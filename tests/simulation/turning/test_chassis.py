@@ -103,6 +103,19 @@ def test_half_the_step_changes_nothing(machine, kind):
     assert whole.at_speed(9.0, "load_front") == pytest.approx(half.at_speed(9.0, "load_front"), rel=1e-5)
 
 
+@pytest.mark.parametrize("kind", [Planar, Leaning])
+@pytest.mark.parametrize("speed", [35.0, 45.0, 80.0])
+def test_fast_it_stays_finite_at_ten_milliseconds(machine, kind, speed):
+    """Slip settles within the relaxation length: in 2 ms at 80 m/s, faster than a step of 10 ms can follow."""
+    chassis = kind(replace(machine, drag_area=0.0))  # whose moment would lift the front wheel
+    steer = 0.3 * G * machine.wheelbase / speed**2
+    coarse, fine = (ride(chassis, chassis.start(speed), steer, None, Road(), 2.0, dt) for dt in (0.01, 0.001))
+    assert all(isfinite(value) for value in coarse[0])
+    assert coarse[0][2] == pytest.approx(fine[0][2], rel=1e-3)
+    assert 0.1 * G < coarse[0][2] * speed < 1.2 * G  # it turns, no harder than its tyres hold
+    assert coarse[1]["sideslip"] == pytest.approx(fine[1]["sideslip"], rel=1e-3)
+
+
 def test_runge_kutta_converges_with_the_fourth_power(machine):
     chassis = Leaning(machine)
     start = chassis.start(10.0)
