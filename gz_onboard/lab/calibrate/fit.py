@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +71,7 @@ def linear(
     sd: Array | float | None = None,
     *,
     prior: Mapping[str, tuple[float, float]] | None = None,
-    groups: Array | None = None,
+    groups: NDArray[Any] | None = None,
 ) -> Solution:
     """The parameters p (one for each of `columns`, shape (m,)) for which sum(p·column) is nearest to y, shape (m,).
 
@@ -96,7 +97,7 @@ def nonlinear(
     *,
     bounds: Mapping[str, tuple[float, float]] | None = None,
     prior: Mapping[str, tuple[float, float]] | None = None,
-    groups: Array | None = None,
+    groups: NDArray[Any] | None = None,
     known_sd: bool = False,
     loss: str = "linear",
 ) -> Solution:
@@ -164,7 +165,7 @@ def _solution(
     residual: Array,
     rows: Array,
     known_sd: bool,
-    groups: Array | None,
+    groups: NDArray[Any] | None,
 ) -> Solution:
     freedom = len(residual) + len(rows) - len(names)
     mean_square = float(residual @ residual) / freedom if freedom > 0 else float("nan")

@@ -1,0 +1,240 @@
+"""Constants of the motor: back-EMF over speed, torque over current (Lord 2016, eqs. 2.7, 2.8, figs. 2.12, 2.13).
+
+The shaft gives what the air gap does less the drag of iron and bearings, so that shaft torque is no line through zero:
+
+    torque = torque_constant·i_m − motor_iron_linear·sign(ω) − motor_iron_quadratic·ω
+
+The drag is that of the effect motor_iron_loss; `losses.motor_losses` gives it from the same fit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gz_onboard.lab.calibrate.fit import Solution, linear, score, split
+from gz_onboard.lab.calibrate.result import Array, Fit, Panel, Result, Trace
+from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.physics.effects import motor_copper_loss
+
+RIDING_CURRENT = 120.0  # A: larger ones are short, and the constant falls with them
+COPPER = 0.00393  # 1/K (IEC 60034-1)
+ROUGH = 0.02  # a point's torque sd is not known better than to this share of the greatest torque
+
+
+def voltage_constant(ramp: Table) -> Result:
+    """voltage_constant [V·s/rad, line to line, RMS] out of `motor_speed` and `emf_line` at no torque.
+
+    The slope of a line with a free offset. Raises InputError for fewer than 5 points, speeds that hardly differ, or
+    a voltage that falls with speed.
+    """
+    speed, emf = ramp["motor_speed"], ramp["emf_line"]
+    if len(speed) < 5:
+        raise ramp.error(f"{len(speed)} points are too few for a line; 5 are needed")
+    if np.ptp(speed) < 0.3 * np.max(np.abs(speed)):
+        raise ramp.error(f"motor_speed {speed.min():.4g} to {speed.max():.4g} rad/s is too narrow a range for a slope")
+    columns = {"voltage_constant": speed, "offset": np.ones_like(speed)}
+    found = linear(columns, emf)
+    if found["voltage_constant"] <= 0:
+        raise ramp.error("emf_line falls where motor_speed rises: a sign is wrong")
+    keep = split(len(speed))
+    half = linear({name: column[keep] for name, column in columns.items()}, emf[keep])
+    result = Result("motor_constants")
+    source = f"{ramp.file.name}: {len(speed)} points, {speed.min():.3g} to {speed.max():.3g} rad/s"
+    model = found["voltage_constant"] * speed + found["offset"]
+    inside = score("back-EMF", "V", emf, model, held_out=False, source=source)
+    result.parameters["voltage_constant"] = found.found(
+        "voltage_constant", "V·s/rad", f"{source}; rms {inside.rms:.3g} V"
+    )
+    outside = half["voltage_constant"] * speed[~keep] + half["offset"]
+    result.fits += [
+        inside,
+        score("back-EMF", "V", emf[~keep], outside, held_out=True, source=f"a third of {ramp.file.name}"),
+    ]
+    if abs(found["offset"]) > 3 * found.sd("offset"):
+        result.notes.append(f"{ramp.file.name}: {found['offset']:+.3g} V at no speed, {found.sd('offset'):.2g} V sd")
+    order = np.argsort(speed)
+    result.panels += [
+        Panel("Back-EMF", "motor speed [rad/s]", "line voltage, RMS [V]",
+              (Trace("measured", speed, emf, "."), Trace("line", speed[order], model[order]))),
+        Panel("Back-EMF: residual", "motor speed [rad/s]", "measured less model [V]",
+              (Trace("residual", speed, emf - model, "."),)),
+    ]  # fmt: skip
+    return result
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Steady points of a motor dynamometer, each array of shape (n,), SI units."""
+
+    table: Table
+    speed: Array
+    current: Array
+    torque: Array  # of the shaft: mean of torque sensor and power analyser, where there are both
+    temperature: Array
+    loss: Array  # electrical less mechanical power
+
+
+def read_bench(dyno: Table) -> Bench:
+    """The points of a dynamometer run with their motor loss; InputError where signs or units cannot be right."""
+    speed, current, torque = dyno["motor_speed"], dyno["motor_current"], dyno["shaft_torque"]
+    ac, temperature = dyno["ac_power"], dyno["motor_temperature"]
+    if len(speed) < 12:
+        raise dyno.error(f"{len(speed)} points are too few for a loss map of four parameters; 12 are needed")
+    if np.corrcoef(current, torque)[0, 1] < 0.5:
+        raise dyno.error("shaft_torque does not rise with motor_current: a sign is wrong, or the rows are mixed up")
+    mechanical = torque * speed
+    if "mechanical_power" in dyno:
+        analysed = dyno["mechanical_power"]
+        ratio = float(analysed @ mechanical / (mechanical @ mechanical))
+        if abs(ratio - 1) > 0.1:
+            raise dyno.error(
+                f"mechanical_power is {ratio:.3g} times shaft_torque times motor_speed: a unit or a sign is wrong"
+            )
+        mechanical = (mechanical + analysed) / 2
+    moving = np.abs(speed) > 0.5
+    torque = np.where(moving, mechanical / np.where(moving, speed, 1.0), torque)
+    loss = ac - mechanical
+    if np.median(loss) <= 0:
+        row = int(np.argmin(loss))
+        raise dyno.error(
+            f"ac_power is below the mechanical power, by {-loss[row]:.4g} W: a motor would give energy", row
+        )
+    return Bench(dyno, speed, current, torque, temperature, loss)
+
+
+def solve(bench: Bench, use: NDArray[np.bool_]) -> Solution:
+    """torque_constant, motor_copper_resistance and both iron terms from loss and torque of the points `use`, together.
+
+    Both equations are linear in the four. Errors of torque grow into the loss by the speed, so a point's loss counts
+    with that sd; what its two equations share makes the covariance that of whole points.
+    """
+    w, i = bench.speed[use], bench.current[use]
+    copper = i**2 * (1 + COPPER * (bench.temperature[use] - 25))
+    nothing, sign = np.zeros_like(w), np.sign(w)
+    columns = {
+        "torque_constant": np.concatenate([i, nothing]),
+        "motor_copper_resistance": np.concatenate([nothing, copper]),
+        "motor_iron_linear": np.concatenate([-sign, np.abs(w)]),
+        "motor_iron_quadratic": np.concatenate([-w, w**2]),
+    }
+    y = np.concatenate([bench.torque[use], bench.loss[use]])
+    point = np.tile(np.arange(len(w)), 2)
+    torque_sd, floor = ROUGH * float(np.max(np.abs(bench.torque))), 2.0
+    for _ in range(4):  # the sd of torque and the rest of the loss's, from the residuals
+        sd = np.concatenate([np.full(len(w), torque_sd), np.hypot(floor, torque_sd * w)])
+        found = linear(columns, y, sd, groups=point)
+        residual = (found.residual * sd).reshape(2, -1)
+        torque_sd = max(float(np.sqrt(np.mean(residual[0] ** 2))), 1e-6)
+        floor = max(float(np.sqrt(max(np.mean(residual[1] ** 2 - (torque_sd * w) ** 2), 0.0))), 0.5)
+    return found
+
+
+def torque(solution: Solution, bench: Bench) -> Array:
+    """Shaft torque [N·m] of the model at all points."""
+    drag = solution["motor_iron_linear"] * np.sign(bench.speed) + solution["motor_iron_quadratic"] * bench.speed
+    result: Array = solution["torque_constant"] * bench.current - drag
+    return result
+
+
+def torque_constant(dyno: Table, warming: Table | None = None, largest_current: float = RIDING_CURRENT) -> Result:
+    """torque_constant [N·m/A, at the air gap] of steady points up to `largest_current` [A].
+
+    warming: a run at constant current in which the motor heats up: says how the torque falls with its temperature.
+    The sd holds the fall of the constant over the currents used, which one number cannot show.
+    """
+    bench = read_bench(dyno)
+    use = within(bench, largest_current)
+    found, keep = solve(bench, use), split(len(use))
+    held = solve(bench, use & keep)
+    i, name = bench.current, dyno.file.name
+    result = Result("motor_constants")
+    inside = score("shaft torque", "N·m", bench.torque[use], torque(found, bench)[use], held_out=False, source=name)
+    result.fits += [inside, *scores("shaft torque", "N·m", bench.torque, torque(held, bench), use, ~keep, bench)]
+    line = linear({"slope": i}, bench.torque)
+    result.fits.append(
+        score("shaft torque, thesis' line through zero", "N·m", bench.torque, line["slope"] * i, held_out=False,
+              source=f"{name}, all currents"))  # fmt: skip
+    at_gap = bench.torque + found["torque_constant"] * i - torque(found, bench)
+    saturation = linear({"small": i, "fall": i**3}, at_gap)
+    small, fall = saturation["small"], saturation["fall"]
+    largest = float(np.max(np.abs(i)))
+    systematic = 0.0
+    if abs(fall) > 3 * saturation.sd("fall"):
+        local = small + fall * i[use] ** 2  # torque over current
+        systematic = float(np.std(local))
+        result.notes.append(
+            f"torque over current falls with current: {small:.4f} N·m/A at small, {small + fall * largest**2:.4f} at "
+            f"{largest:.0f} A; {found['torque_constant']:.4f} stands for up to {largest_current:.0f} A"
+        )
+    low, high = bench.temperature[use].min(), bench.temperature[use].max()
+    result.parameters["torque_constant"] = found.found(
+        "torque_constant", "N·m/A",
+        f"{name}: {int(use.sum())} points up to {largest_current:.0f} A at {low:.0f} to {high:.0f} degC, air-gap "
+        f"torque; rms {inside.rms:.2g} N·m; sd holds its fall with current", systematic,
+    )  # fmt: skip
+    if warming is not None:
+        result.notes.append(_temperature_note(warming))
+    speeds = np.argsort(i)
+    result.panels += [
+        Panel("Shaft torque", "motor current, RMS [A]", "torque [N·m]",
+              (Trace("measured", i, bench.torque, "."), Trace("torque constant", i[speeds],
+                                                              found["torque_constant"] * i[speeds]))),
+        Panel("Shaft torque: residual", "motor current, RMS [A]", "measured less model [N·m]",
+              (Trace("used", i[use], (bench.torque - torque(found, bench))[use], "."),
+               Trace("beyond the range", i[~use], (bench.torque - torque(found, bench))[~use], "x"))),
+    ]  # fmt: skip
+    return result
+
+
+def within(bench: Bench, largest_current: float) -> NDArray[np.bool_]:
+    """Which points have a current up to `largest_current` [A]; InputError for too few."""
+    use: NDArray[np.bool_] = np.abs(bench.current) <= largest_current
+    if use.sum() < 12:
+        raise bench.table.error(f"{int(use.sum())} points up to {largest_current:g} A are too few; 12 are needed")
+    return use
+
+
+def scores(
+    what: str, unit: str, data: Array, model: Array, use: NDArray[np.bool_], held: NDArray[np.bool_], bench: Bench
+) -> list[Fit]:
+    """The fit on the points `held` out: those of the range used, and all."""
+    limit, name = float(np.max(np.abs(bench.current[use]))), bench.table.file.name
+    fits = [
+        score(
+            what,
+            unit,
+            data[use & held],
+            model[use & held],
+            held_out=True,
+            source=f"a third of {name}, up to {limit:.0f} A",
+        )
+    ]
+    if not use.all():
+        fits.append(
+            score(what, unit, data[held], model[held], held_out=True, source=f"a third of {name}, all currents")
+        )
+    return fits
+
+
+def _temperature_note(warming: Table) -> str:
+    current, hot = warming["motor_current"], warming["motor_temperature"]
+    on = np.abs(current - np.median(current[np.abs(current) > 1.0])) < 0.05 * np.max(np.abs(current))
+    ratio = warming["shaft_torque"][on] / current[on]
+    slope = linear({"fall": hot[on] - 25, "at25": np.ones(int(on.sum()))}, ratio)
+    percent = 100 * slope["fall"] / slope["at25"]
+    return (
+        f"{warming.file.name}: torque over current changes by {percent:+.3f} %/K of the winding's temperature, "
+        f"{hot[on].min():.0f} to {hot[on].max():.0f} degC (the magnets follow later): one constant leaves that out"
+    )
+
+
+def copper(solution: Solution, bench: Bench) -> Array:
+    """Copper loss [W] at all points."""
+    result: Array = motor_copper_loss.term(
+        bench.current, bench.temperature, motor_copper_resistance=solution["motor_copper_resistance"],
+        motor_copper_temperature_coefficient=COPPER,
+    )  # fmt: skip
+    return result
