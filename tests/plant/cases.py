@@ -62,9 +62,9 @@ EFFECTS: dict[str, tuple[str, str, float, float]] = {
 UNKNOWN: dict[str, tuple[float, float]] = {
     "resonance": (8.0, 30.0),  # N in a band of speed
     "hot_load": (60.0, 220.0),  # W that switch on with the motor's temperature
-    "surge_loss": (0.6, 3.0),  # W per N·m/s of changing torque
+    "surge_loss": (2.0, 10.0),  # W per N·m/s of changing torque
     "weak_window": (0.04, 0.20),  # ohm of a cell about one state of charge
-    "steering_drag": (60.0, 300.0),  # N per rad of steering
+    "steering_drag": (200.0, 700.0),  # N per rad of steering
     "left_drag": (8.0, 35.0),  # N, in left bends only
     "late_drag": (8.0, 25.0),  # N, after some minutes
 }
@@ -74,6 +74,7 @@ UNKNOWN: dict[str, tuple[float, float]] = {
 # the healthy scooter's parameter or model is known to.
 ENERGY_CLEAR = 0.05
 CHANNEL_CLEAR = {
+    "torque_constant_loss": 0.05,  # ± 1.3 %, and as much again with temperature
     "auxiliary_load": 10.0,  # W; its own current sensor: 45.3 ± 2.2 W
     "current_sensor_offset": 0.4,  # A; two sensors agree within 0.15
     "current_sensor_gain": 0.03,  # two sensors agree within 0.011

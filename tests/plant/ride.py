@@ -140,8 +140,9 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
     steps = int(duration.max() / STEP)
     noises = np.zeros((int(duration.max() / NOISE_STEP) + 5, plans[0].noise.shape[0], n))
     for i, x in enumerate(plans):
-        noises[: x.noise.shape[1], :, i] = x.noise.T
-        noises[x.noise.shape[1] :, :, i] = x.noise.T[-1]
+        k = min(x.noise.shape[1], len(noises))
+        noises[:k, :, i] = x.noise.T[:k]
+        noises[k:, :, i] = x.noise.T[k - 1]
 
     record = {name: np.empty((steps, n), np.float32) for name in COLUMNS}
 

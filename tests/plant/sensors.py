@@ -102,21 +102,21 @@ def measure(ridden: Ridden, name: str) -> Samples:
     dive = -0.011 * acceleration  # rad, nose up when accelerating: negative pitch down
     shake = 0.10 + 0.068 * speed
     sideways = speed * yaw
-    put("accel_x", t, acceleration + G * grade - G * dive * 0.5 + m.accel_bias_x, 0.002, 0.0)
-    out["accel_x"] = _shaken(rng, out["accel_x"], shake)
+    put("accel_x", t, acceleration + G * grade - G * dive * 0.5 + m.accel_bias_x, 0.002)
+    out["accel_x"] = _shaken(rng, out["accel_x"], shake, 0.002)
     put("accel_y", t, sideways * np.cos(lean) + G * np.sin(lean) + m.accel_bias_y, 0.002)
-    out["accel_y"] = _shaken(rng, out["accel_y"], shake)
+    out["accel_y"] = _shaken(rng, out["accel_y"], shake, 0.002)
     put("accel_z", t, G * np.cos(slope) * np.cos(lean) - sideways * np.sin(lean) + m.accel_bias_z, 0.002)
-    out["accel_z"] = _shaken(rng, out["accel_z"], 1.7 * shake)
+    out["accel_z"] = _shaken(rng, out["accel_z"], 1.7 * shake, 0.002)
     t = t + 0.0006
     tremble = 0.0062 + 0.0014 * speed
     step = np.radians(0.01)
-    pitch = -np.gradient(slope, t) + 0.011 * np.gradient(acceleration, t) * 0.0
+    pitch = -np.gradient(slope, t)
     put("rate_x", t, at(c["lean_rate"], t) + m.gyro_bias_x, step)
     put("rate_y", t, pitch + yaw * np.sin(lean) + m.gyro_bias_y, step)
     put("rate_z", t, yaw * np.cos(lean) + m.gyro_bias_z, step)
     for role in ("rate_x", "rate_y", "rate_z"):
-        out[role] = _shaken(rng, out[role], tremble)
+        out[role] = _shaken(rng, out[role], tremble, step)
     # chassis instruments
     t = message(0.020, 0.4)
     for role, column in (("wheel_speed_front", "front"), ("wheel_speed_rear", "rear")):
@@ -139,9 +139,9 @@ def measure(ridden: Ridden, name: str) -> Samples:
     return Samples(name, out, facts)
 
 
-def _shaken(rng: np.random.Generator, column: tuple[Array, Array], sd: Array) -> tuple[Array, Array]:
+def _shaken(rng: np.random.Generator, column: tuple[Array, Array], sd: Array, step: float) -> tuple[Array, Array]:
     times, values = column
-    return times, values + sd * rng.standard_normal(len(values))
+    return times, step * np.round((values + sd * rng.standard_normal(len(values))) / step)
 
 
 def _drift(rng: np.random.Generator, count: int, period: float, time: float, sd: float) -> Array:
