@@ -20,11 +20,8 @@ from tests.plant.roads import plan
 from tests.plant.sensors import measure
 
 FOLDER = Path(__file__).parent
-SECONDS = 100.0
-PLANS = [
-    replace(plan(7 + i, kind, "B", 15.0, 0.7), duration=SECONDS - 20 * (kind == "city"))
-    for i, kind in enumerate(("city", "oval"))
-]
+WAYS = (("city", 80.0), ("oval", 100.0))
+PLANS = [replace(plan(7 + i, kind, "B", 15.0, 0.7), duration=time) for i, (kind, time) in enumerate(WAYS)]
 PLANS[1] = replace(PLANS[1], curvature=abs(PLANS[1].curvature))  # to the left
 
 
