@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gz_onboard.bus.mapping import Mapping, read_mapping
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.physics.battery import Battery, read_battery
 from gz_onboard.physics.derating import Derating, read_derating
+from gz_onboard.physics.effect import Effect
 from gz_onboard.physics.model import Model, read_model
 from gz_onboard.physics.parameters import Parameters, read_parameters
 from gz_onboard.physics.riding import PriorRiding, read_riding
@@ -43,6 +45,16 @@ class Vehicle:
             raise self.error("has no [battery]: without one there is no range and nothing to simulate")
         return self.battery
 
+    def changed(self, parameters: Parameters, effects: Iterable[Effect] | None = None) -> Vehicle:
+        """The same vehicle with other parameters, and other effects if they are given."""
+        effects = self.model.effects if effects is None else tuple(effects)
+        return replace(
+            self,
+            parameters=parameters,
+            battery=self.battery and self.battery.with_parameters(parameters),
+            model=Model(effects, parameters),
+        )
+
     def error(self, message: str) -> InputError:
         """The error to raise about this vehicle's file."""
         return InputError(f"{self.file}: {message}")
@@ -58,8 +70,11 @@ def find_vehicle(name: str) -> Path:
     raise InputError(f"{name}: no such vehicle file; the package's own are {', '.join(own)}{nearest(name, own)}")
 
 
-def read_vehicle(name: str, payload: float | None = None) -> Vehicle:
-    """The vehicle `name` (file or one of the package's own), with the rider's mass [kg] if it is known."""
+def read_vehicle(name: str, payload: float | None = None, effects_folder: Path | None = None) -> Vehicle:
+    """The vehicle `name` (file or one of the package's own), with the rider's mass [kg] if it is known.
+
+    effects_folder: where effects of the user's own are, beside the file's own ``effects_folder``.
+    """
     table = Table.read(find_vehicle(name))
     table.only(
         [
@@ -78,7 +93,7 @@ def read_vehicle(name: str, payload: float | None = None) -> Vehicle:
     )
     if table.number("schema") != 1:
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
-    effects = read_model(table)
+    effects = read_model(table, effects_folder)
     parameters = read_parameters(table, effects)
     if payload is not None:
         parameters = parameters.replaced(payload_mass=payload)

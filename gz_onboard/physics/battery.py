@@ -10,7 +10,8 @@ that strays beyond full or empty is still told its way back.
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from math import exp, sqrt
 from typing import TYPE_CHECKING
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from gz_onboard.toml import Table
 
 Row = tuple[float, ...]
+Lacks = Callable[[float, float, float], float]
+"""What a cell's voltage lacks [V] beside R0 and the RC pair, at a cell's current [A], SOC and temperature [degC]."""
 
 
 def _linear(xs: Row, ys: Row, x: float) -> float:
@@ -54,6 +57,10 @@ class Mesh:
         slope = (row[i + 1] - row[i]) / (xs[i + 1] - xs[i])
         return row[i] + slope * (soc - xs[i]), slope
 
+    def scaled(self, factor: float) -> Mesh:
+        """The same mesh times `factor`."""
+        return Mesh(self.soc, self.temperature, tuple(tuple(factor * v for v in row) for row in self.value))
+
     def _row(self, temperature: float) -> Row:
         """The values over SOC at `temperature`, kept: it changes far more slowly than SOC."""
         ts = self.temperature
@@ -85,6 +92,7 @@ class Battery:
     r0: Mesh  # ohm
     r1: Mesh  # ohm
     c1: Mesh  # F
+    resistance_factor: float = 1.0  # that is in r0, r1 and c1
 
     def cell_capacity(self, temperature: float) -> float:
         """Capacity of a cell [A·h] at `temperature` [degC]: the charge between SOC 0 and 1."""
@@ -116,11 +124,34 @@ class Battery:
         decay = exp(-dt / (r1 * c1))
         return decay * v1 + r1 * (1 - decay) * current, decay
 
-    def settled_current(self, power: float, soc: float, temperature: float, form: float = 1.0) -> float | None:
+    def with_parameters(self, parameters: Mapping[str, float]) -> Battery:
+        """The same battery with what a vehicle's `parameters` say of capacity, cut-off and resistances."""
+        factor = parameters["cell_resistance_factor"]
+        battery = replace(
+            self,
+            capacity=parameters["cell_capacity"],
+            cutoff_voltage=parameters["cell_cutoff_voltage"],
+            series_resistance=parameters["pack_series_resistance"],
+        )
+        if factor == self.resistance_factor:
+            return battery
+        more = factor / self.resistance_factor
+        return replace(
+            battery,
+            r0=self.r0.scaled(more),
+            r1=self.r1.scaled(more),
+            c1=self.c1.scaled(1 / more),  # the time constant stays
+            resistance_factor=factor,
+        )
+
+    def settled_current(
+        self, power: float, soc: float, temperature: float, form: float = 1.0, lacks: Lacks | None = None
+    ) -> float | None:
         """Mean pack current [A] that delivers a mean `power` [W] once the RC pair has settled; None if none can.
 
         `form` is the mean square of the current over the square of its mean: in traffic the current comes in
-        bursts, which heat R0 more than a steady one; the RC pair smooths them.
+        bursts, which heat R0 more than a steady one; the RC pair smooths them. `lacks`: what a cell's voltage lacks
+        beside R0 and the RC pair.
         """
         n, m = self.cells_series, self.cells_parallel
         source = n * self.ocv(soc)[0]
@@ -129,7 +160,16 @@ class Battery:
         root = source * source - 4 * resistance * power
         if root < 0:
             return None
-        return 2 * power / (source + sqrt(root))
+        current = 2 * power / (source + sqrt(root))
+        if lacks is None:
+            return current
+        for _ in range(2):  # the lack moves the current by a percent, and that the lack by a percent of itself
+            lower = source - n * lacks(current / m, soc, temperature)
+            root = lower * lower - 4 * resistance * power
+            if root < 0:
+                return None
+            current = 2 * power / (lower + sqrt(root))
+        return current
 
 
 @dataclass(frozen=True)
@@ -146,24 +186,26 @@ _NODES = (0.019855072, 0.101666761, 0.237233795, 0.408282679, 0.591717321, 0.762
 _WEIGHTS = (0.050614268, 0.111190517, 0.156853323, 0.181341892, 0.181341892, 0.156853323, 0.111190517, 0.050614268)
 
 
-def drawable(battery: Battery, soc: float, temperature: float, power: float, form: float = 1.0) -> Drawable:
+def drawable(
+    battery: Battery, soc: float, temperature: float, power: float, form: float = 1.0, lacks: Lacks | None = None
+) -> Drawable:
     """What a pack at `soc` and `temperature` [degC] delivers at a mean `power` [W] until the cut-off.
 
     At constant power P the charge Q·dSOC passes in dt = Q·dSOC/I, so the energy is P·Q·∫ dSOC/I(SOC), from the
     SOC at which the terminal voltage at the mean load meets the cut-off: bursts are held back by the vehicle before.
-    `form`: see `Battery.settled_current`. The RC pair is taken as settled (V1 = R1·I): discharging
+    `form`, `lacks`: see `Battery.settled_current`. The RC pair is taken as settled (V1 = R1·I): discharging
     takes an hour, its time constant is a minute.
     """
     low, high = -0.05, soc
     charge = battery.pack_capacity(temperature) * 3600
     cutoff = battery.cutoff_voltage * battery.cells_series
-    current = battery.settled_current(power, soc, temperature)
+    current = battery.settled_current(power, soc, temperature, lacks=lacks)
     if current is None or power < cutoff * current:
         return Drawable(0.0, soc, charge * cutoff)
     slope = charge * power / current
     for _ in range(14):  # to 6e-5 of SOC
         middle = (low + high) / 2
-        current = battery.settled_current(power, middle, temperature)
+        current = battery.settled_current(power, middle, temperature, lacks=lacks)
         if current is None or power < cutoff * current:
             low = middle
         else:
@@ -171,7 +213,7 @@ def drawable(battery: Battery, soc: float, temperature: float, power: float, for
     width = soc - high
     total = 0.0
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
-        current = battery.settled_current(power, high + width * node, temperature, form)
+        current = battery.settled_current(power, high + width * node, temperature, form, lacks)
         total += weight / current if current else 0.0
     return Drawable(power * charge * width * total, high, slope)
 
@@ -198,7 +240,7 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
             raise capacity.error(f"must be {len(temperatures)} positive numbers, one for each temperature", "value")
         at_25 = _linear(temperatures, capacities, 25.0)
         capacities = tuple(value / at_25 for value in capacities)
-    return Battery(
+    battery = Battery(
         cells_series=round(table.number("cells_series", low=1, high=1000)),
         cells_parallel=round(table.number("cells_parallel", low=1, high=1000)),
         capacity=parameters["cell_capacity"],
@@ -213,6 +255,7 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         r1=_mesh(table.table("r1"), "ohm"),
         c1=_mesh(table.table("c1"), "F"),
     )
+    return battery.with_parameters(parameters)
 
 
 def _axis(table: Table, key: str, low: float, high: float) -> Row:

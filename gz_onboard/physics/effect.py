@@ -6,8 +6,13 @@ An effect file has
 - ``PARAMETERS``: a tuple of `Parameter`;
 - ``term(quantity, ..., *, parameter, ...)``: the equation. Its positional arguments are the quantities that it
   reads (names from `QUANTITIES`), its keyword arguments are its parameters, or
-  those of the vehicle (`VEHICLE_PARAMETERS`). Pure; floats and numpy arrays alike,
-  so it uses operators and ``abs`` only.
+  those of the vehicle (`VEHICLE_PARAMETERS`), or those of the package's other effects. Pure; floats and numpy arrays
+  alike, so it uses operators, ``abs``, and the functions of `physics.elementary` only;
+- if it has memory, ``decay(dt, quantity, ..., *, parameter, ...)``: the factor, 0 to 1, that its state keeps over
+  ``dt`` [s]. The effect's value then is not the term but the state x, 0 at the start, which goes to what the term
+  says: x' = decay·x + (1 - decay)·term, exact for quantities that are constant over the step;
+- ``SHOWN_BY``, if it is a candidate of the discovery: the data that would show it, and the ride that would split it
+  from its look-alikes.
 
 Sign conventions
     speed, motor torque, motor current   positive forward, driving
@@ -45,6 +50,7 @@ class Port(Enum):
     MOTOR_LOSS = "W"  # heat in the motor: between shaft and inverter
     INVERTER_LOSS = "W (inverter)"  # heat in the inverter: between motor and DC link
     DC_POWER = "W (DC link)"  # power drawn from the pack beside the inverter
+    CELL_VOLTAGE = "V"  # what a cell's terminals lack, beside OCV, R0 and the one RC pair; positive lowers them
 
 
 QUANTITIES: dict[str, str] = {
@@ -59,7 +65,16 @@ QUANTITIES: dict[str, str] = {
     "motor_speed": "rad/s",
     "motor_current": "A, RMS, as torque over torque constant",
     "motor_temperature": "degC",
+    "torque": "N·m, at the motor's shaft",
+    "heading": "rad, clockwise from north",
+    "time_moving": "s, faster than 0.5 m/s since the start",
+    "ambient_temperature": "degC",
+    "cell_current": "A, of one cell",
+    "cell_temperature": "degC",
+    "cell_capacity": "A·h, of one cell at its temperature",
+    "soc": "1, state of charge",
 }
+MOVING = 0.5  # m/s: what counts for time_moving
 
 
 @dataclass(frozen=True)
@@ -100,6 +115,7 @@ VEHICLE_PARAMETERS = (
     Parameter("side_friction", "1", 1.2, 0.15, 0.1, 2, "largest side force per load: Pacejka 2012, ch. 11"),
     Parameter("twisting_arm", "m/rad", 0.02, 0.015, 0, 0.2, "brush model, 20 per load, half width 25 mm: C_κ·w²/(3·r)"),
     Parameter("tyre_relaxation_length", "m", 0.15, 0.05, 0.02, 1, "sideways: Cossalter 2006, sec. 2.6, 0.1 to 0.3 m"),
+    Parameter("speed_sensor_scale", "1", 1.0, 0.005, 0.5, 2, "what the motor's speed sensor shows over what is"),
     Parameter("regeneration_torque_limit", "N·m", 19, 3, 0, 500, "the most that the motor brakes with, at its shaft"),
 )
 
@@ -115,6 +131,15 @@ class Effect:
     keywords: tuple[str, ...]  # parameters that the term takes: its own and the vehicle's
     term: Callable[..., Any]
     doc: str
+    decay: Callable[..., Any] | None = None
+    decay_quantities: tuple[str, ...] = ()
+    decay_keywords: tuple[str, ...] = ()
+    shown_by: str = ""
+
+    @property
+    def reads(self) -> frozenset[str]:
+        """The quantities that it needs, for its term and its decay."""
+        return frozenset((*self.quantities, *self.decay_quantities))
 
 
 @cache
@@ -130,8 +155,23 @@ def load_effect(name: str, folder: Path | None = None) -> Effect:
     if folder and (folder / f"{name}.py").is_file():
         return _effect(name, _import_file(name, folder / f"{name}.py"))
     if name not in known_effects():
-        raise InputError(f"no effect is called {name!r}{nearest(name, known_effects())}")
+        known = [*known_effects(), *effects_in(folder)] if folder else known_effects()
+        raise InputError(f"no effect is called {name!r}{nearest(name, known)}")
     return _effect(name, importlib.import_module(f"gz_onboard.physics.effects.{name}"))
+
+
+def effects_in(folder: Path) -> tuple[str, ...]:
+    """The names of the effects in a user's folder (files that begin with _ are none). InputError if there is none."""
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of effects")
+    return tuple(sorted(file.stem for file in folder.glob("*.py") if not file.stem.startswith("_")))
+
+
+@cache
+def _others_parameters() -> frozenset[str]:
+    """The names of the parameters that the package's effects declare."""
+    modules = (importlib.import_module(f"gz_onboard.physics.effects.{name}") for name in known_effects())
+    return frozenset(parameter.name for module in modules for parameter in module.PARAMETERS)
 
 
 def _import_file(name: str, file: Path) -> ModuleType:
@@ -151,16 +191,42 @@ def _effect(name: str, module: ModuleType) -> Effect:
     for attribute in ("PORT", "PARAMETERS", "term"):
         if not hasattr(module, attribute):
             raise InputError(f"{file}: an effect needs {attribute}")
-    quantities: list[str] = []
-    parameters: list[str] = []
-    for argument in inspect.signature(module.term).parameters.values():
-        (parameters if argument.kind is argument.KEYWORD_ONLY else quantities).append(argument.name)
-    for quantity in quantities:
+    quantities, parameters = _arguments(module.term)
+    decay = getattr(module, "decay", None)
+    decay_quantities: tuple[str, ...] = ()
+    decay_parameters: tuple[str, ...] = ()
+    if decay is not None:
+        decay_quantities, decay_parameters = _arguments(decay)
+        if decay_quantities[:1] != ("dt",):
+            raise InputError(f"{file}: the first argument of decay must be dt")
+        decay_quantities = decay_quantities[1:]
+    for quantity in (*quantities, *decay_quantities):
         if quantity not in QUANTITIES:
             raise InputError(f"{file}: no quantity is called {quantity!r}{nearest(quantity, QUANTITIES)}")
     declared = [parameter.name for parameter in module.PARAMETERS]
-    shared = [parameter.name for parameter in VEHICLE_PARAMETERS]
-    if set(declared) - set(parameters) or set(parameters) - {*declared, *shared}:
-        raise InputError(f"{file}: PARAMETERS declares {declared}, term takes {parameters}")
-    doc = inspect.getdoc(module) or ""
-    return Effect(name, module.PORT, tuple(module.PARAMETERS), tuple(quantities), tuple(parameters), module.term, doc)
+    taken = {*parameters, *decay_parameters}
+    foreign = taken - {*declared, *(parameter.name for parameter in VEHICLE_PARAMETERS)}
+    if set(declared) - taken or (foreign and foreign - _others_parameters()):
+        raise InputError(f"{file}: PARAMETERS declares {declared}, term and decay take {sorted(taken)}")
+    if not isinstance(module.PORT, Port):
+        raise InputError(f"{file}: PORT must be one of {', '.join(f'Port.{port.name}' for port in Port)}")
+    return Effect(
+        name=name,
+        port=module.PORT,
+        parameters=tuple(module.PARAMETERS),
+        quantities=quantities,
+        keywords=parameters,
+        term=module.term,
+        doc=inspect.getdoc(module) or "",
+        decay=decay,
+        decay_quantities=decay_quantities,
+        decay_keywords=decay_parameters,
+        shown_by=getattr(module, "SHOWN_BY", ""),
+    )
+
+
+def _arguments(function: Callable[..., Any]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The names of the (positional, keyword-only) arguments."""
+    arguments = inspect.signature(function).parameters.values()
+    keywords = tuple(a.name for a in arguments if a.kind is a.KEYWORD_ONLY)
+    return tuple(a.name for a in arguments if a.kind is not a.KEYWORD_ONLY), keywords

@@ -5,8 +5,8 @@ Backward in the sense of simulation (speed in, power out), light enough for on b
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, MutableMapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.physics.effect import Effect, Port, load_effect
@@ -39,32 +39,99 @@ class Bound:
 
     effect: Effect
     values: dict[str, float]
+    decay_values: dict[str, float] = field(default_factory=dict)
 
     def __call__(self, quantities: Mapping[str, Any]) -> Any:
-        """Its term at these quantities."""
+        """Its term at these quantities; of an effect with memory, what it settles at."""
         effect = self.effect
         return effect.term(*[quantities[name] for name in effect.quantities], **self.values)
 
+    def decay(self, dt: Any, quantities: Mapping[str, Any]) -> Any:
+        """The factor that its state keeps over `dt` [s]; of an effect without memory 0."""
+        effect = self.effect
+        if effect.decay is None:
+            return 0.0
+        return effect.decay(dt, *[quantities[name] for name in effect.decay_quantities], **self.decay_values)
+
+    def step(self, state: float, dt: float, quantities: Mapping[str, Any]) -> float:
+        """Its value after `dt` [s] from `state`."""
+        decay = self.decay(dt, quantities)
+        return float(decay * state + (1 - decay) * self(quantities))
+
+    def series(self, dt: Any, quantities: Mapping[str, Any], start: float = 0.0) -> Any:
+        """Its values at the ends of steps of `dt` [s], with the quantities in them: scalars, or arrays of shape (n,).
+
+        Shape (n,); n = 1 if all are scalars.
+        """
+        import numpy as np
+
+        target, decay = np.broadcast_arrays(
+            np.asarray(self(quantities), dtype=float), np.asarray(self.decay(dt, quantities), dtype=float), np.ones(1)
+        )[:2]
+        if self.effect.decay is None:
+            return target.copy()
+        x = start
+        values = []
+        for d, t in zip(decay.tolist(), target.tolist(), strict=True):  # floats: a step is shorter than numpy's call
+            x = d * x + (1 - d) * t
+            values.append(x)
+        return np.array(values)
+
+
+def bind(effect: Effect, parameters: Mapping[str, float]) -> Bound:
+    """`effect` with the values that `parameters` have for it."""
+    return Bound(
+        effect,
+        {name: parameters[name] for name in effect.keywords},
+        {name: parameters[name] for name in effect.decay_keywords},
+    )
+
+
+Recall = Callable[[Bound, Mapping[str, Any]], Any]
+"""The value of an effect with memory at these quantities."""
+
+
+def over(dt: Any) -> Recall:
+    """For arrays over steps of `dt` [s], in their order, from nothing remembered: see `Bound.series`."""
+    return lambda effect, quantities: effect.series(dt, quantities)
+
+
+def stepping(states: MutableMapping[str, float], dt: float) -> Recall:
+    """One step of `dt` [s] from `states`, by the names of the effects, which it moves on; 0 for what is not there."""
+
+    def recall(effect: Bound, quantities: Mapping[str, Any]) -> float:
+        name = effect.effect.name
+        states[name] = x = effect.step(states.get(name, 0.0), dt, quantities)
+        return x
+
+    return recall
+
 
 class Model:
-    """The effects of one vehicle with its parameters."""
+    """The effects of one vehicle with its parameters.
+
+    reads: the quantities that its effects need. cell_voltage: the effects in the cells, by name.
+    """
 
     def __init__(self, effects: tuple[Effect, ...], parameters: Parameters) -> None:
         self.effects = effects
         self.parameters = parameters
         self._at: dict[Port, list[tuple[str, Bound]]] = {port: [] for port in Port}
         for effect in effects:
-            values = {name: parameters[name] for name in effect.keywords}
-            self._at[effect.port].append((effect.name, Bound(effect, values)))
+            self._at[effect.port].append((effect.name, bind(effect, parameters)))
+        self.reads: frozenset[str] = frozenset(name for effect in effects for name in effect.reads)
+        self.cell_voltage = self._at[Port.CELL_VOLTAGE]
         self.mass = parameters["vehicle_mass"] + parameters["payload_mass"]
         self._motor_per_speed = 1 / (parameters["wheel_radius"] * parameters["gear_ratio"])
 
-    def power(self, quantities: Mapping[str, Any]) -> dict[str, Any]:
+    def power(self, quantities: Mapping[str, Any], recall: Recall | None = None) -> dict[str, Any]:
         """The ledger [W] of moving as `quantities` say: what each effect takes out of the pack, by name.
 
-        `quantities` are the names of `effect.QUANTITIES` but for motor_speed and motor_current, which follow
-        from the road load. ``brakes`` is what the friction brakes turn to heat where the motor cannot brake
-        enough. The sum of the ledger is the power at the pack's terminals; kinetic and potential energy are
+        `quantities` are those that the model `reads`, but for motor_speed, torque and motor_current, which follow
+        from the road load. recall: gives the value of an effect with memory; without one, what it settles at. Effects
+        in the cells are not in it: they are behind the pack's terminals.
+        ``brakes`` is what the friction brakes turn to heat where the motor cannot brake enough. The sum of the ledger
+        is the power at the pack's terminals; kinetic and potential energy are
         the entries ``inertia`` and ``grade_force``.
         """
         q = dict(quantities)
@@ -72,7 +139,7 @@ class Model:
         ledger: dict[str, Any] = {}
         force = 0.0
         for name, effect in (*self._at[Port.WHEEL_FORCE], *self._at[Port.TYRE]):
-            term = effect(q)
+            term = recall(effect, q) if recall and effect.effect.decay else effect(q)
             force = force + term
             ledger[name] = term * speed
         motor_speed = speed * self._motor_per_speed
@@ -81,29 +148,41 @@ class Model:
         torque = (wanted + limit + abs(wanted - limit)) / 2  # the greater of both, for arrays too
         ledger["brakes"] = (torque - wanted) * motor_speed
         q["motor_speed"] = motor_speed
+        q["torque"] = torque
         q["motor_current"] = torque / self.parameters["torque_constant"]
         for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS, Port.DC_POWER):
             for name, effect in self._at[port]:
-                ledger[name] = effect(q)
+                ledger[name] = recall(effect, q) if recall and effect.effect.decay else effect(q)
         return ledger
 
+    def settled_cell_voltage(self, quantities: Mapping[str, Any]) -> Any:
+        """What a cell's terminals lack [V] by all effects in the cells, settled at these quantities."""
+        return sum(effect(quantities) for _, effect in self.cell_voltage)
 
-def read_model(vehicle: Table) -> tuple[Effect, ...]:
-    """The effects that the vehicle file lists, `BASE_EFFECTS` if it lists none."""
+
+def read_model(vehicle: Table, folder: Path | None = None) -> tuple[Effect, ...]:
+    """The effects that the vehicle file lists, `BASE_EFFECTS` if it lists none.
+
+    An effect is looked for in `folder`, in the file's own ``effects_folder``, and among the package's.
+    """
     table = vehicle.table("model")
     table.only(["effects", "effects_folder"])
-    folder: Path | None = None
+    folders = [folder] if folder else []
     if "effects_folder" in table.values:
-        folder = vehicle.file.parent / table.text("effects_folder")
-        if not folder.is_dir():
-            raise table.error(f"no folder {folder}", "effects_folder")
+        folders.append(vehicle.file.parent / table.text("effects_folder"))
+        if not folders[-1].is_dir():
+            raise table.error(f"no folder {folders[-1]}", "effects_folder")
     names = table.values.get("effects", list(BASE_EFFECTS))
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise table.error("must be a list of names of effects", "effects")
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise table.error(f"{twice!r} is there twice", "effects")
     effects = []
     for name in names:
+        where = next((place for place in folders if (place / f"{name}.py").is_file()), folders[0] if folders else None)
         try:
-            effects.append(load_effect(name, folder))
+            effects.append(load_effect(name, where))
         except Exception as error:
             raise table.error(str(error), "effects") from error
     return tuple(effects)

@@ -27,6 +27,9 @@ STATUS = ("measured", "data sheet", "guess")
 
 BATTERY_PARAMETERS = (
     Parameter("cell_capacity", "A·h", 2.8, 0.05, 0.1, 500, "18650 cell, Lord 2016, sec. 2.2"),
+    Parameter(
+        "cell_resistance_factor", "1", 1.0, 0.1, 0.2, 10, "R0 and R1 over their tables': a bench cell's to the pack's"
+    ),
     Parameter("cell_cutoff_voltage", "V", 2.8, 0.05, 2.0, 3.5, "where the vehicle gives up"),
     Parameter("pack_series_resistance", "ohm", 0.01, 0.005, 0.0, 0.5, "bus bars, fuse and BMS beside the cells"),
     Parameter("cable_resistance", "ohm", 0.005, 0.005, 0.0, 0.2, "pack to inverter, beyond where the BMS measures"),
@@ -35,6 +38,9 @@ BATTERY_PARAMETERS = (
     Parameter("pack_current_noise", "A", 0.1, 0.05, 0, 10, "sd of a sample"),
     Parameter("pack_voltage_noise", "V", 0.02, 0.01, 0, 1, "sd of a sample"),
     Parameter("pack_voltage_offset", "V", 0.0, 0.1, -3, 3, "what the voltage sensor shows too much"),
+    Parameter(
+        "pack_voltage_latency", "s", 0.0, 0.05, -2, 2, "how far the pack's voltage lags its current; leads if negative"
+    ),
     Parameter("cell_voltage_error", "V", 0.0, 0.012, 0, 0, "sd: what one RC pair cannot follow, slow as minutes"),
     Parameter("cell_voltage_error_empty", "V", 0.0, 0.06, 0, 0, "sd: the same at 5 % SOC and below"),
     Parameter("rest_voltage_error", "V", 0.0, 0.008, 0, 0, "sd: rest voltage against OCV: relaxation, hysteresis"),
@@ -71,6 +77,7 @@ SIMULATION_PARAMETERS = (
     Parameter("motor_rotor_capacity", "J/K", 4000, 1500, 1, 1e6, "rim and magnets of 8 kg"),
     Parameter("motor_gap_conductance", "W/K", 5.0, 2.0, 0.001, 500, "air gap and bearings of a hub motor"),
     Parameter("motor_rotor_to_ambient", "W/K", 6.0, 3.0, 0.001, 500, "rim in moving air"),
+    Parameter("cooling_factor", "1", 1.0, 0.1, 0.02, 5, "on what motor, inverter and pack give to the ambient air"),
     Parameter("motor_stator_share", "1", 0.9, 0.1, 0, 1, "copper and iron loss are in the stator"),
 )
 
@@ -89,9 +96,15 @@ class Value:
 class Parameters(Mapping[str, float]):
     """The values by name; `known` tells unit, standard deviation and source of each."""
 
-    def __init__(self, known: Mapping[str, Value], correlations: Mapping[frozenset[str], float] | None = None) -> None:
+    def __init__(
+        self,
+        known: Mapping[str, Value],
+        correlations: Mapping[frozenset[str], float] | None = None,
+        declared: Mapping[str, Parameter] | None = None,
+    ) -> None:
         self.known = dict(known)
         self.correlations = dict(correlations or {})
+        self.declared = dict(declared or declared_parameters())  # with those of the user's own effects
 
     def __getitem__(self, name: str) -> float:
         return self.known[name].value
@@ -122,16 +135,21 @@ class Parameters(Mapping[str, float]):
 
         InputError for a value that is out of its parameter's bounds, or no number.
         """
-        declared = declared_parameters()
         for name, value in values.items():
-            p = declared[name]
+            p = self.declared[name]
             if not p.low <= value <= p.high:
                 raise InputError(f"{name}: {value:g} {p.unit} is outside {p.low:g} to {p.high:g} {p.unit}")
         changed = {
             name: Value(value, 0.1 * self.known[name].sd, self.known[name].unit, "data sheet", "as entered")
             for name, value in values.items()
         }
-        return Parameters({**self.known, **changed}, self.correlations)
+        return Parameters({**self.known, **changed}, self.correlations, self.declared)
+
+    def joined(self, effects: Iterable[Effect]) -> Parameters:
+        """The same and the parameters of `effects` that are not yet known, at their priors."""
+        new = {p.name: p for effect in effects for p in effect.parameters if p.name not in self.known}
+        values = {name: Value(p.prior, p.prior_sd, p.unit, "guess", f"prior: {p.source}") for name, p in new.items()}
+        return Parameters({**self.known, **values}, self.correlations, {**self.declared, **new})
 
 
 def declared_parameters(effects: Iterable[Effect] = ()) -> dict[str, Parameter]:
@@ -165,7 +183,7 @@ def read_parameters(vehicle: Table, effects: Iterable[Effect] = ()) -> Parameter
         known[name] = Value(
             value, entry.number("sd", low=0), unit, entry.text("status", choices=STATUS), entry.text("source")
         )
-    return Parameters(known, _read_correlations(vehicle, known))
+    return Parameters(known, _read_correlations(vehicle, known), declared)
 
 
 def _read_correlations(vehicle: Table, known: Collection[str]) -> dict[frozenset[str], float]:

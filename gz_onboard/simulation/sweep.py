@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import Vehicle
 
@@ -94,14 +93,7 @@ def redesigned(vehicle: Vehicle, values: Mapping[str, float]) -> Vehicle:
             pack_heat_capacity=parameters["pack_heat_capacity"] * (1 + added / cells),
         )
     parameters = parameters.replaced(**changed)
-    if battery:
-        battery = replace(
-            battery,
-            capacity=parameters["cell_capacity"],
-            cutoff_voltage=parameters["cell_cutoff_voltage"],
-            series_resistance=parameters["pack_series_resistance"],
-        )
-    return replace(vehicle, parameters=parameters, battery=battery, model=Model(vehicle.model.effects, parameters))
+    return replace(vehicle, battery=battery).changed(parameters)
 
 
 def grid(sweeps: Sequence[Sweep]) -> list[dict[str, float]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from hypothesis import strategies as st
 from gz_onboard.physics.battery import Mesh, drawable
 from gz_onboard.vehicle import read_vehicle
 
-BATTERY = read_vehicle("reference").pack
+VEHICLE = read_vehicle("reference")
+BATTERY = VEHICLE.pack
+PARAMETERS = VEHICLE.parameters
 
 
 @given(st.floats(-0.2, 1.2), st.floats(-30, 60))
@@ -114,3 +117,27 @@ def test_drawable_is_sane(soc, temperature, power):
     assert drawable(BATTERY, soc, temperature, 1.5 * power).energy <= now.energy * (1 + 1e-9)
     full = BATTERY.pack_capacity(temperature) * 3600 * BATTERY.cells_series * BATTERY.ocv(soc)[0]
     assert now.energy < full * (soc + 0.06)
+
+
+@given(st.floats(0.3, 3.0), st.floats(0.02, 1.0), st.floats(-10, 45))
+def test_the_resistance_factor_is_on_both_resistances_and_leaves_the_time_constant(factor, soc, temperature):
+    more = BATTERY.with_parameters(PARAMETERS.replaced(cell_resistance_factor=factor))
+    for mesh in ("r0", "r1"):
+        base = getattr(BATTERY, mesh).at(soc, temperature)[0]
+        assert getattr(more, mesh).at(soc, temperature)[0] == pytest.approx(factor * base)
+    time = BATTERY.r1.at(soc, 25.0)[0] * BATTERY.c1.at(soc, 25.0)[0]
+    if temperature == 25.0:
+        assert more.r1.at(soc, 25.0)[0] * more.c1.at(soc, 25.0)[0] == pytest.approx(time)
+    again = more.with_parameters(PARAMETERS.replaced(cell_resistance_factor=1.0))
+    assert again.r0.at(soc, temperature)[0] == pytest.approx(BATTERY.r0.at(soc, temperature)[0])
+
+
+@pytest.mark.parametrize("soc", [0.9, 0.3])
+def test_a_resistance_beside_equals_one_inside(soc):
+    """A lack of r·I is the same as r more of R1: found by iteration there, in closed form here."""
+    r = 0.01
+    flat = replace(BATTERY, r1=Mesh((0.0, 1.0), (25.0,), ((0.02, 0.02),)))
+    inside = replace(BATTERY, r1=Mesh((0.0, 1.0), (25.0,), ((0.02 + r, 0.02 + r),)))
+    beside = drawable(flat, soc, 20.0, 800.0, 2.0, lambda current, soc, temperature: r * current)
+    assert beside.energy == pytest.approx(drawable(inside, soc, 20.0, 800.0, 2.0).energy, rel=1e-3)
+    assert beside.energy < drawable(flat, soc, 20.0, 800.0, 2.0).energy

@@ -19,6 +19,10 @@ PARAMETERS = (
         "cornering_compliance", "rad", 0.1, 0.05, 0.0, 0.5, "Pacejka 2012, ch. 11: slip alone 0.06, lean up to 0.3"
     ),
 )
+SHOWN_BY = (
+    "Road load that grows with the square of speed times yaw rate and is absent on the straight; bends at one speed, "
+    "left and right, split it from drag area and rolling resistance."
+)
 G = 9.80665  # m/s²
 STANDSTILL = 0.1  # m/s
 

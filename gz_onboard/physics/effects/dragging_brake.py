@@ -1,0 +1,25 @@
+"""A brake that drags, F = F_b while the vehicle moves: pads rub with a force of their own, whatever the load.
+
+Coulomb friction of pads that do not come free (Limpert 2011, Brake Design and Safety). Smooth around standstill.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gz_onboard.physics.effect import Parameter, Port
+
+PORT = Port.WHEEL_FORCE
+PARAMETERS = (
+    Parameter("brake_drag_force", "N", 5.0, 5.0, 0.0, 200.0, "a guess: a free disc takes 1 to 3 N at the tyre"),
+)
+SHOWN_BY = (
+    "Road load that is the same at all speeds and loads; rides with another payload split it from rolling resistance, "
+    "which grows with weight."
+)
+STANDSTILL = 0.1  # m/s
+
+
+def term(speed: Any, *, brake_drag_force: float) -> Any:
+    """Force [N] against the motion."""
+    return brake_drag_force * speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5

@@ -1,0 +1,32 @@
+"""Headwind, F = ½·ρ·C_d·A·((V_r + w)·|V_r + w| - V_r·|V_r|), w = w_N·cos ψ + w_E·sin ψ; of a steady wind over the land.
+
+The wind (w_N, w_E) is named after where it blows from; ψ is the heading, V_r the speed and any headwind known
+otherwise, so this is the part of the aerodynamic drag (Lord 2016, eq. 3.1) that the wind adds. Side wind, which adds a
+little to the flow's speed and changes C_d, is left out: Cossalter 2006, sec. 3.2, knows the drag area head on only.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.elementary import cos, sin
+
+PORT = Port.WHEEL_FORCE
+PARAMETERS = (
+    Parameter("wind_north", "m/s", 0.0, 2.0, -15.0, 15.0, "at 1 m over ground half of the 3-5 m/s that weather tells"),
+    Parameter("wind_east", "m/s", 0.0, 2.0, -15.0, 15.0, "at 1 m over ground half of the 3-5 m/s that weather tells"),
+)
+SHOWN_BY = (
+    "Road load above 5 m/s that goes with the heading once round, as 2·V·w; the same road in both directions splits it "
+    "from drag area and grade."
+)
+
+
+def term(
+    speed: Any, headwind: Any, heading: Any, air_density: Any, *, drag_area: float, wind_north: float, wind_east: float
+) -> Any:
+    """Force [N] against the motion."""
+    still = speed + headwind
+    flow = still + wind_north * cos(heading) + wind_east * sin(heading)
+    return 0.5 * air_density * drag_area * (flow * abs(flow) - still * abs(still))

@@ -1,0 +1,33 @@
+"""Hysteresis of the open-circuit voltage, dh = γ·|dSOC|·(M·sign(I) - h): Plett 2004, part 2, eq. 7.
+
+At rest the voltage depends on whether the cell was charged or discharged before: h goes to ±M with the charge passed,
+and stays where it is at rest. Positive when discharging. The sign is smooth below 10 mA of a cell.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.elementary import exp
+
+PORT = Port.CELL_VOLTAGE
+PARAMETERS = (
+    Parameter("hysteresis_voltage", "V", 0.01, 0.008, 0.0, 0.1, "NMC: Barai et al. 2015, 5 to 20 mV"),
+    Parameter("hysteresis_rate", "1", 30.0, 15.0, 1.0, 1000.0, "Plett 2004, part 2: settles within 5 % of SOC"),
+)
+SHOWN_BY = (
+    "Voltage that stays low at rest after riding and high after charging or long braking, without coming back; rests "
+    "at the same SOC reached from above and from below split it from slow relaxation, which fades."
+)
+SMALL = 0.01  # A
+
+
+def term(cell_current: Any, *, hysteresis_voltage: float) -> Any:
+    """What the terminals lack [V] once settled."""
+    return hysteresis_voltage * cell_current / (cell_current * cell_current + SMALL * SMALL) ** 0.5
+
+
+def decay(dt: Any, cell_current: Any, cell_capacity: Any, *, hysteresis_rate: float) -> Any:
+    """The share that is left after `dt` [s] of `cell_current` [A]."""
+    return exp(-hysteresis_rate * abs(cell_current) * dt / (3600 * cell_capacity))

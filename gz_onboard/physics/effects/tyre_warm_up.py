@@ -1,0 +1,40 @@
+"""Cold tyres, F = m·g·cos θ·c0·s·exp(-t/τ): so much more rolling resistance, fading with the time t ridden.
+
+Rubber loses less as it warms: ISO 28580 has a tyre run for half an hour before its rolling resistance is measured.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.elementary import exp
+
+PORT = Port.TYRE
+PARAMETERS = (
+    Parameter("warm_up_share", "1", 0.3, 0.2, 0.0, 2.0, "a guess: as cold days over warm ones, 20 to 40 %"),
+    Parameter(
+        "warm_up_time", "s", 600.0, 200.0, 60.0, 3600.0, "ISO 28580: warm after 30 min of running: three times this"
+    ),
+)
+SHOWN_BY = (
+    "Road load that falls within the first 10-20 min ridden, at all speeds, and does not when riding on straight "
+    "after; a ride that starts with a warm motor and cold tyres splits it from what the motor's temperature does."
+)
+STANDSTILL = 0.1  # m/s
+
+
+def term(
+    speed: Any,
+    mass: Any,
+    grade_cosine: Any,
+    time_moving: Any,
+    *,
+    rolling_resistance_constant: float,
+    warm_up_share: float,
+    warm_up_time: float,
+) -> Any:
+    """Force [N] against the motion."""
+    direction = speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5
+    cold = warm_up_share * exp(-time_moving / warm_up_time)
+    return mass * 9.80665 * grade_cosine * rolling_resistance_constant * cold * direction

@@ -1,0 +1,33 @@
+"""Elementary functions for effects, of floats and of numpy arrays alike; numpy is imported only where one comes."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+
+def exp(x: Any) -> Any:
+    """e to the power of `x`."""
+    if isinstance(x, float | int):
+        return math.exp(x)
+    import numpy as np
+
+    return np.exp(x)
+
+
+def sin(x: Any) -> Any:
+    """The sine of `x` [rad]."""
+    if isinstance(x, float | int):
+        return math.sin(x)
+    import numpy as np
+
+    return np.sin(x)
+
+
+def cos(x: Any) -> Any:
+    """The cosine of `x` [rad]."""
+    if isinstance(x, float | int):
+        return math.cos(x)
+    import numpy as np
+
+    return np.cos(x)
