@@ -1,0 +1,130 @@
+"""A cell's equivalent circuit over arrays: filters of the current, tables over SOC and temperature, voltage.
+
+    V = V_oc(SOC) - R0·I - Σ R_k·x_k,    dx_k/dt = (I - x_k)/τ_k        (V_k = R_k·x_k: Lord 2016, eqs. 2.22 and 2.23)
+
+I is the cell's current [A], positive when discharging. With the time constants given, V is linear in every table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import exp
+
+import numpy as np
+
+from gz_onboard.lab.calibrate.result import Array
+
+KELVIN = 273.15
+
+
+@dataclass(frozen=True)
+class Circuit:
+    """Tables of one cell: R0, one fast RC pair and, if `slow_resistance` is given, a slow one.
+
+    ocv: (n,) [V] over ocv_soc. r0, r1 [ohm], c1 [F], slow_resistance [ohm], slow_time [s]: (temperatures, soc).
+    capacity: (temperatures,) [A·h].
+    """
+
+    ocv_soc: Array
+    ocv: Array
+    soc: Array
+    temperature: Array
+    capacity: Array
+    r0: Array
+    r1: Array
+    c1: Array
+    slow_resistance: Array | None = None
+    slow_time: Array | None = None
+
+
+def hats(nodes: Array, x: Array) -> Array:
+    """(len(x), len(nodes)): the weights of linear interpolation between `nodes`, constant beyond them."""
+    x = np.clip(x, nodes[0], nodes[-1])
+    i = np.clip(np.searchsorted(nodes, x, side="right") - 1, 0, len(nodes) - 2)
+    w = (x - nodes[i]) / (nodes[i + 1] - nodes[i])
+    result = np.zeros((len(x), len(nodes)))
+    rows = np.arange(len(x))
+    result[rows, i] = 1 - w
+    result[rows, i + 1] = w
+    return result
+
+
+def at(nodes: Array, rows: Array, table: Array, x: Array, temperature: Array) -> Array:
+    """`table` (len(rows), len(nodes)) at `x` and `temperature`, both (m,), bilinear, the edge beyond: as on board."""
+    if len(rows) == 1:
+        return np.asarray(np.interp(x, nodes, table[0]))
+    across = np.stack([np.interp(x, nodes, row) for row in table], axis=1)
+    return np.asarray(np.sum(across * hats(rows, temperature), axis=1))
+
+
+def follow(current: Array, dt: Array, tau: float | Array) -> Array:
+    """x (m,) that follows `current` (m,) [A], which flows for the `dt` (m,) [s] before each sample, with `tau` [s]."""
+    decay = np.exp(-dt / tau).tolist()
+    x, result = 0.0, []
+    for a, i in zip(decay, current.tolist(), strict=True):
+        x = i + a * (x - i)
+        result.append(x)
+    return np.array(result)
+
+
+def follow_slope(current: Array, dt: Array, tau: Array) -> tuple[Array, Array]:
+    """(x, its derivative over ln τ) for a time constant (m,) [s] that changes along the way."""
+    decay = np.exp(-dt / tau)
+    x, y, xs, ys = 0.0, 0.0, [], []
+    for a, d, i in zip(decay.tolist(), (decay * dt / tau).tolist(), current.tolist(), strict=True):
+        y = a * y + d * (x - i)
+        x = i + a * (x - i)
+        xs.append(x)
+        ys.append(y)
+    return np.array(xs), np.array(ys)
+
+
+def voltage(
+    cell: Circuit, flowed: Array, current: Array, dt: Array, soc: Array, temperature: Array, rested: bool = True
+) -> Array:
+    """The cell's voltage (m,) [V] as the on-board model steps it.
+
+    flowed: the mean current over the `dt` before each sample; current: at the sample. `rested`: all RC pairs start at
+    zero, the only start there is a use for.
+    """
+    if not rested:
+        raise ValueError("a cell that has not rested starts from an unknown polarisation")
+    r0, r1, c1 = (at(cell.soc, cell.temperature, t, soc, temperature) for t in (cell.r0, cell.r1, cell.c1))
+    result = ocv_at(cell.ocv_soc, cell.ocv, soc) - r0 * current - _pair(r1, r1 * c1, flowed, dt)
+    if cell.slow_resistance is not None and cell.slow_time is not None:
+        r2 = at(cell.soc, cell.temperature, cell.slow_resistance, soc, temperature)
+        result = result - _pair(r2, at(cell.soc, cell.temperature, cell.slow_time, soc, temperature), flowed, dt)
+    return np.asarray(result)
+
+
+def _pair(resistance: Array, tau: Array, current: Array, dt: Array) -> Array:
+    """Voltage (m,) [V] of an RC pair, exact for a current constant over each step (eq. 2.22)."""
+    v, result = 0.0, []
+    for dt_, r, t, i in zip(dt.tolist(), resistance.tolist(), tau.tolist(), current.tolist(), strict=True):
+        a = exp(-dt_ / t)
+        v = a * v + r * (1 - a) * i
+        result.append(v)
+    return np.array(result)
+
+
+def ocv_at(nodes: Array, values: Array, soc: Array) -> Array:
+    """Open-circuit voltage, beyond the ends along the last slope, as on board."""
+    i = np.clip(np.searchsorted(nodes, soc, side="right") - 1, 0, len(nodes) - 2)
+    return np.asarray(values[i] + (soc - nodes[i]) * (values[i + 1] - values[i]) / (nodes[i + 1] - nodes[i]))
+
+
+def riding_current(duration: int = 1200, seed: int = 1) -> Array:
+    """A current (duration,) [any unit, each for 1 s] such as a scooter in town draws, after a minute's rest.
+
+    Pulling away, cruising, braking with recuperation, waiting, with shares of time and of current as in
+    urban riding (mean over RMS about 0.6). Only its shape counts: what is reduced over it is linear.
+    """
+    rng = np.random.default_rng(seed)
+    parts = [np.zeros(60)]
+    while sum(map(len, parts)) < duration:
+        parts.append(np.full(rng.integers(5, 13), rng.uniform(3.0, 5.0)))
+        for _ in range(rng.integers(1, 5)):
+            parts.append(np.full(rng.integers(5, 25), rng.uniform(0.4, 2.2)))
+        parts.append(np.full(rng.integers(3, 8), rng.uniform(-0.9, -0.2)))
+        parts.append(np.full(rng.integers(2, 30), 0.0))
+    return np.concatenate(parts)[:duration]

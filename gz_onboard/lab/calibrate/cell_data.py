@@ -1,0 +1,116 @@
+"""A cell's bench test as taken from a table, checked: what all procedures on cells begin with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gz_onboard.lab.calibrate.result import Array
+from gz_onboard.lab.calibrate.table import Table
+
+FEWEST = 50  # samples
+LONGEST_GAP = 150.0  # s between samples while a current flows
+STEP = 0.1  # of the largest current: what counts as switching it
+
+
+@dataclass(frozen=True)
+class CellTest:
+    """One test of one cell.
+
+    All (m,): time [s], dt [s] before each sample, flowed [A]: the mean current over that dt, current [A] at the sample,
+    voltage [V], temperature [degC], drawn [A·h] since the first sample. block: number of the pulse with the rest after
+    it, 0 before the first; rest: True where no current flows.
+    """
+
+    table: Table
+    time: Array
+    dt: Array
+    flowed: Array
+    current: Array
+    voltage: Array
+    temperature: Array
+    drawn: Array
+    block: NDArray[np.int_]
+    rest: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.table.file.name
+
+
+def cell_test(table: Table) -> CellTest:
+    """The test in `table`: columns time, current, voltage, cell_temperature and, where it has one, charge.
+
+    ``charge`` [A·h] is the tester's own counter, of either sign; with it a gap in the samples does no harm. Raises
+    InputError, with the line: missing columns, too few samples, a gap while a current flows, a current of the wrong
+    sign, a voltage that is clipped.
+    """
+    time, current, volts = table["time"], table["current"], table["voltage"]
+    temperature = table["cell_temperature"]
+    if len(time) < FEWEST:
+        raise table.error(f"{len(time)} samples are too few for a test of a cell, at least {FEWEST} are needed")
+    largest = float(np.max(np.abs(current)))
+    if largest < 1e-3:
+        raise table.error(f"no current flows: the largest is {largest:g} A")
+    dt = np.diff(time, prepend=time[0])
+    before = np.concatenate([current[:1], current[:-1]])
+    # A tester writes a sample when it switches: until then the current before it flowed.
+    switched = np.abs(current - before) > STEP * largest
+    flowed = np.where(switched & (dt > 0.3), before, (before + current) / 2)
+    on = np.abs(current) > 0.02 * largest
+    if "charge" in table:
+        counter = table["charge"] - table["charge"][0]
+        sign = 1.0 if float(np.dot(np.diff(counter), flowed[1:])) >= 0 else -1.0
+        drawn = sign * counter
+        long = dt > 5.0
+        flowed = np.where(long, np.diff(drawn, prepend=0.0) * 3600 / np.where(dt > 0, dt, 1.0), flowed)
+    else:
+        gap = (dt > LONGEST_GAP) & (on | np.concatenate([on[:1], on[:-1]]))
+        if np.any(gap):
+            row = int(np.flatnonzero(gap)[0])
+            raise table.error(
+                f"a gap of {dt[row]:.0f} s while a current of {before[row]:.3g} A flows: what was drawn "
+                "meanwhile is not known; a column 'charge' (the tester's counter, Ah) would tell",
+                row,
+            )
+        drawn = np.cumsum(flowed * dt) / 3600
+    _check_sign(table, current, volts, dt, largest)
+    _check_clipped(table, current, volts, on)
+    starts = on & ~np.concatenate([[False], on[:-1]])
+    return CellTest(table, time, dt, flowed, current, volts, temperature, drawn, np.cumsum(starts), ~on)
+
+
+def _check_sign(table: Table, current: Array, volts: Array, dt: Array, largest: float) -> None:
+    """Discharging must lower the voltage: at the steps of the current, or over all samples if there are none."""
+    step, change = np.diff(current), np.diff(volts)
+    steps = (np.abs(step) > 0.2 * largest) & (dt[1:] < LONGEST_GAP)
+    if np.any(steps) and float(np.median(change[steps] / step[steps])) > 0:
+        row = int(np.flatnonzero(steps)[0]) + 1
+        raise table.error(
+            f"the voltage rises by {change[row - 1]:.3g} V as the current goes from {current[row - 1]:.3g} to "
+            f"{current[row]:.3g} A, and so at most steps: discharging must be positive (scale = -1 turns it)",
+            row,
+        )
+
+
+def _check_clipped(table: Table, current: Array, volts: Array, on: NDArray[np.bool_]) -> None:
+    """A voltage that stays at its own largest or least value while the current does not is the instrument's limit.
+
+    Holding a voltage with a falling current is not: then the current moves slowly, and changes from sample to sample.
+    """
+    for edge, word in ((float(volts.max()), "largest"), (float(volts.min()), "least")):
+        stuck = (volts == edge) & on
+        steady = stuck[1:] & stuck[:-1] & (np.abs(np.diff(current)) < 1e-3 * np.max(np.abs(current)))
+        if np.count_nonzero(steady) > 10:
+            row = int(np.flatnonzero(steady)[0]) + 1
+            raise table.error(
+                f"the voltage stays at {edge:g} V, its {word}, for {np.count_nonzero(steady)} samples of constant "
+                f"current ({current[row]:.3g} A): it is clipped",
+                row,
+            )

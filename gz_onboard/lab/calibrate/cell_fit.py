@@ -1,0 +1,186 @@
+"""Six RC pairs of fixed time constants fitted to a pulse test, and their reduction to one pair or two.
+
+With the time constants fixed the voltage is linear in every table, so the fit has one minimum and needs no start. The
+pairs span what a test shows, charge transfer in a second to diffusion in half an hour (a discrete distribution of
+relaxation times: Schmidt et al. 2013). One pair cannot follow all of that; which part it should depends on the load, so
+it is the one whose voltage is nearest under a given current, node by node.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.optimize import lsq_linear
+
+from gz_onboard.lab.calibrate.cell_circuit import KELVIN, follow, hats
+from gz_onboard.lab.calibrate.cell_data import CellTest
+from gz_onboard.lab.calibrate.result import Array
+
+TIMES = (1.0, 4.0, 15.0, 60.0, 240.0, 1500.0)  # s
+VOLTAGE_SD = 0.004  # V: what the model leaves, independent every CORRELATED samples
+SOC_SD = 0.003  # how far the state of charge may be off, which matters where the OCV is steep
+CORRELATED = 20
+BEND_SD = 0.3  # relative: how far a table may bend from node to node, per 0.05 of SOC
+SHIFT_SD, SHIFT_SD_EMPTY = 0.01, 0.05  # V: rest voltage of this test against the OCV; below 10 % SOC
+
+
+@dataclass(frozen=True)
+class Branches:
+    """Six pairs at one temperature.
+
+    resistance: (1 + len(TIMES), n) [ohm], R0 first; shift: (n,) [V] of the rest voltage against the OCV. covariance: of
+    both, flattened in this order, from the scatter between pulses. covered: (n,), False at nodes without a pulse near.
+    residual: (m,) [V], measured less model.
+    """
+
+    soc: Array
+    temperature: float
+    resistance: Array
+    shift: Array
+    covariance: Array
+    covered: NDArray[np.bool_]
+    residual: Array
+
+    def node_covariance(self, k: int) -> Array:
+        """(1 + len(TIMES),)² at node k."""
+        n = len(self.soc)
+        i = np.arange(len(self.resistance)) * n + k
+        return np.asarray(self.covariance[np.ix_(i, i)])
+
+
+def fit_branches(
+    test: CellTest,
+    level: Array,
+    ocv: tuple[Array, Array],
+    soc: Array,
+    temperature: float,
+    activation: tuple[float, float] = (0.0, 0.0),
+    keep: NDArray[np.bool_] | None = None,
+) -> Branches:
+    """The six pairs of `test`, whose state of charge is `level` (m,), over nodes `soc` (n,) at `temperature` [degC].
+
+    ocv: (voltage (m,) [V], slope (m,) [V]) at `level`. activation: of R0 and of the pairs [K]: R goes as
+    exp(activation/T), which moves samples at other temperatures than the nominal one. keep: True for samples to use.
+    """
+    rows = np.ones(len(test), dtype=bool) if keep is None else keep
+    inverse = 1 / (test.temperature + KELVIN) - 1 / (temperature + KELVIN)
+    hat = hats(soc, level)
+    columns = [-(test.current * np.exp(activation[0] * inverse))[:, None] * hat]
+    warm = np.exp(activation[1] * inverse)
+    columns += [-(follow(test.flowed, test.dt, tau) * warm)[:, None] * hat for tau in TIMES]
+    weight = 1 / (np.hypot(VOLTAGE_SD, SOC_SD * ocv[1]) * np.sqrt(CORRELATED))
+    matrix = np.hstack([*columns, hat])
+    target = test.voltage - ocv[0]
+    a, b = (matrix * weight[:, None])[rows], (target * weight)[rows]
+    n, branches = len(soc), len(columns)
+    data = a.T @ a
+    scale = np.full(branches, 0.02)  # ohm
+    for _ in range(2):  # how far a table may bend is relative to its size, which the first turn tells
+        normal = data + _smoothness(soc, scale, n, branches)
+        upper = cholesky(normal, lower=False)
+        right = solve_triangular(upper, a.T @ b, trans="T")
+        low = np.concatenate([np.zeros(n * branches), np.full(n, -np.inf)])
+        p = lsq_linear(upper, right, bounds=(low, np.inf), method="bvls").x
+        scale = np.maximum(np.median(p[: n * branches].reshape(branches, n), axis=1), 2e-3)
+    residual = target - matrix @ p
+    weighted = b - a @ p
+    labels = test.block[rows]
+    scores = np.array([a[labels == k].T @ weighted[labels == k] for k in np.unique(labels)])
+    bread = cho_solve(cho_factor(normal), np.eye(len(normal)))
+    covariance = bread @ (scores.T @ scores + normal - data) @ bread
+    used = rows & ~test.rest
+    covered = hat[used].sum(axis=0) > 3
+    return Branches(soc, temperature, p[: n * branches].reshape(branches, n), p[n * branches :], covariance, covered,
+                    residual)  # fmt: skip
+
+
+def _smoothness(soc: Array, scale: Array, n: int, branches: int) -> Array:
+    """The normal matrix of the priors: tables bend little from node to node, rest voltages stay near the OCV."""
+    total = np.zeros((n * (branches + 1), n * (branches + 1)))
+    bend = np.zeros((n - 2, n))
+    for k in range(n - 2):
+        left, right = soc[k + 1] - soc[k], soc[k + 2] - soc[k + 1]
+        # As far as a straight line through the neighbours misses the middle one, in steps of 0.05.
+        w = right / (left + right)
+        bend[k, k : k + 3] = np.array([w, -1.0, 1 - w]) / max(2 * left * right / (left + right) / 0.05, 0.3)
+    for j in range(branches):
+        block = slice(j * n, (j + 1) * n)
+        total[block, block] = bend.T @ bend / (BEND_SD * scale[j]) ** 2 + 1e-4 / scale[j] ** 2 * np.eye(n)
+    block = slice(branches * n, (branches + 1) * n)
+    sd = np.where(soc < 0.1, SHIFT_SD_EMPTY, SHIFT_SD)
+    total[block, block] = np.diag(1 / sd**2) + bend.T @ (bend / (0.5 * np.minimum(sd[:-2], sd[1:-1])[:, None]) ** 2)
+    return total
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """R0 [ohm], then resistance [ohm] and time constant [s] of each pair."""
+
+    r0: float
+    resistance: tuple[float, ...]
+    time: tuple[float, ...]
+    rms: float  # V per A RMS of the load: what the pairs leave of six
+
+
+class Reduction:
+    """From six pairs to `count` pairs, under `loads`: currents from rest, one value for each `step` [s]."""
+
+    def __init__(self, loads: Sequence[Array], step: float = 1.0, count: int = 1) -> None:
+        def filtered_by(tau: float) -> Array:
+            return np.concatenate([follow(x, np.full(len(x), step), tau) for x in loads])
+
+        load = np.concatenate(list(loads))
+        self._six = np.column_stack([load, *(filtered_by(tau) for tau in TIMES)])
+        self._square = float(np.mean(load**2))
+        fast = np.geomspace(3, 300, 50) if count == 1 else np.geomspace(1.5, 120, 26)
+        slow = np.geomspace(150, 3000, 16)
+        filtered = {float(tau): filtered_by(float(tau)) for tau in (*fast, *(slow if count == 2 else ()))}
+        times = [(float(t),) for t in fast] if count == 1 else [(float(t), float(u)) for t in fast for u in slow]
+        self._times = np.array(times)
+        self._count = count
+        gram = self._six.T @ self._six
+        solved, left = [], []
+        for row in times:
+            g = np.column_stack([load, *(filtered[t] for t in row)])
+            cross = g.T @ self._six
+            m = np.linalg.solve(g.T @ g, cross)
+            solved.append(m)
+            left.append(gram - cross.T @ m)
+        self._solved, self._left = np.array(solved), np.array(left)
+
+    def __call__(self, resistance: Array) -> Pairs:
+        """The pairs nearest to the six of `resistance` (1 + len(TIMES),) [ohm]."""
+        cost = np.einsum("i,kij,j->k", resistance, self._left, resistance)
+        best = self._solved @ resistance
+        cost = np.where(np.all(best > 0, axis=1), cost, np.inf)
+        k = int(np.argmin(cost))
+        solution, times = best[k], self._times[k]
+        if self._count == 1 and 0 < k < len(cost) - 1 and np.all(np.isfinite(cost[k - 1 : k + 2])):
+            down, here, up = cost[k - 1 : k + 2]
+            move = 0.5 * (down - up) / max(down - 2 * here + up, 1e-30)
+            j = k + (1 if move > 0 else -1)
+            solution = best[k] + abs(move) * (best[j] - best[k])
+            times = np.exp(np.log(times) + abs(move) * (np.log(self._times[j]) - np.log(times)))
+        rms = float(np.sqrt(max(cost[k], 0.0) / len(self._six) / self._square)) if np.isfinite(cost[k]) else np.nan
+        return Pairs(float(solution[0]), tuple(map(float, solution[1:])), tuple(map(float, times)), rms)
+
+    def spread(self, resistance: Array, covariance: Array) -> Array:
+        """Covariance of ln(R0, R of each pair, τ of each pair), by differences from that of the six."""
+        sd = np.sqrt(np.maximum(np.diag(covariance), 0))
+        base = _logs(self(resistance))
+        slopes = np.zeros((len(base), len(sd)))
+        for k, s in enumerate(sd):
+            if s > 0:
+                step = 0.3 * s
+                moved = resistance.copy()
+                moved[k] += step
+                slopes[:, k] = (_logs(self(moved)) - base) / step
+        return np.asarray(slopes @ covariance @ slopes.T)
+
+
+def _logs(pairs: Pairs) -> Array:
+    return np.log([pairs.r0, *pairs.resistance, *pairs.time])
