@@ -118,6 +118,7 @@ class Case:
     truths: tuple[Truth, ...]
     rides: list[Samples]
     accepted: tuple[str, ...] = ()  # of look-alikes: the set that is a right answer too
+    twins: list[Samples] = field(default_factory=list)  # the same rides with nothing hidden: what an oracle has left
 
 
 @dataclass
@@ -273,6 +274,14 @@ def _hot(hidden: Hidden, plans: Sequence[Plan]) -> list[Hidden]:
     return [replace(hidden, hot_at=x.ambient + 9.0) for x in plans]
 
 
+def _variants(draft: _Draft, truths: bool) -> list[Hidden]:
+    """What is ridden of a case: all that is wrong; then all but one for each; last nothing wrong at all."""
+    if not truths or not draft.parts:
+        return [draft.hidden()]
+    fewer = [draft.hidden(without=name) for name in draft.parts]
+    return [draft.hidden(), *fewer, *([Hidden()] if len(draft.parts) > 1 else [])]
+
+
 def draw_many(
     seeds: Sequence[int], kind: str | None = None, names: tuple[str, ...] | None = None, truths: bool = True
 ) -> list[Case]:
@@ -287,21 +296,21 @@ def draw_many(
     for draft in drafts:
         machine = scooter(draft.seed // CASES_OF_A_SCOOTER)
         own = _service_plans(draft)
-        for hidden in (draft.hidden(), *(draft.hidden(without=name) for name in draft.parts if truths)):
+        for hidden in _variants(draft, truths):
             plans += own
             machines += [machine] * RIDES
             hiddens += _hot(hidden, own)
     ridden = iter(ride(plans, machines, hiddens))
     cases = []
     for draft in drafts:
-        with_it = [next(ridden) for _ in range(RIDES)]
-        found = []
-        for name in draft.parts:
-            without = [next(ridden) for _ in range(RIDES)] if truths else with_it
-            found.append(_truth(draft, name, with_it, without))
+        with_it, *others = [[next(ridden) for _ in range(RIDES)] for _ in _variants(draft, truths)]
+        found = tuple(
+            _truth(draft, name, with_it, others[i] if truths else with_it) for i, name in enumerate(draft.parts)
+        )
         rides = [measure(x, f"ride_{i:03d}") for i, x in enumerate(with_it)]
+        twins = [measure(x, f"ride_{i:03d}") for i, x in enumerate(others[-1])] if others else []
         number = draft.seed // CASES_OF_A_SCOOTER
-        cases.append(Case(draft.seed, number, draft.kind, tuple(found), rides, draft.accepted))
+        cases.append(Case(draft.seed, number, draft.kind, found, rides, draft.accepted, twins))
     return cases
 
 
