@@ -9,7 +9,8 @@ from collections.abc import Callable, Mapping, MutableMapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.physics.effect import Effect, Port, load_effect
+from gz_onboard.physics.battery import Battery, Lacks
+from gz_onboard.physics.effect import QUANTITIES, Effect, Port, load_effect
 from gz_onboard.physics.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -155,9 +156,21 @@ class Model:
                 ledger[name] = recall(effect, q) if recall and effect.effect.decay else effect(q)
         return ledger
 
-    def settled_cell_voltage(self, quantities: Mapping[str, Any]) -> Any:
-        """What a cell's terminals lack [V] by all effects in the cells, settled at these quantities."""
-        return sum(effect(quantities) for _, effect in self.cell_voltage)
+    def lacks(self, battery: Battery) -> Lacks | None:
+        """What the terminals of `battery`'s cells lack [V] by all effects in them, settled; None without any."""
+        if not self.cell_voltage:
+            return None
+
+        def lacks(current: float, soc: float, temperature: float) -> float:
+            q = dict.fromkeys(QUANTITIES, 0.0) | {
+                "cell_current": current,
+                "soc": soc,
+                "cell_temperature": temperature,
+                "cell_capacity": battery.cell_capacity(temperature),
+            }
+            return float(sum(effect(q) for _, effect in self.cell_voltage))
+
+        return lacks
 
 
 def read_model(vehicle: Table, folder: Path | None = None) -> tuple[Effect, ...]:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.physics.effect import QUANTITIES
-from gz_onboard.physics.model import air_density
+from gz_onboard.physics.effect import MOVING, QUANTITIES
+from gz_onboard.physics.model import air_density, over
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ def backward(
     *,
     grade: ArrayLike = 0.0,
     curvature: ArrayLike = 0.0,
+    heading: ArrayLike | None = None,
     headwind: ArrayLike = 0.0,
     ambient: float = 20.0,
     altitude: float = 0.0,
@@ -52,8 +53,9 @@ def backward(
 ) -> Energy:
     """The energy of riding `speed` [m/s] over `time` [s], both of shape (n,); n of 2 or more.
 
-    grade (sine of the road's angle), curvature [1/m], headwind [m/s], motor_temperature [degC, ambient if not given]:
-    scalars or shape (n,). smoothing: the acceleration is the mean one over so many seconds; 0 for a drive cycle.
+    grade (sine of the road's angle), curvature [1/m], headwind [m/s], heading [rad clockwise from north; if not given,
+    as the curvature turns it from north], motor_temperature [degC, ambient if not given]: scalars or shape (n,).
+    smoothing: the acceleration is the mean one over so many seconds; 0 for a drive cycle.
     Raises ValueError for shapes that do not fit and time that does not increase.
     """
     import numpy as np
@@ -78,9 +80,15 @@ def backward(
         "air_density": air_density(ambient, altitude),
         "headwind": _middle(headwind),
         "lateral_acceleration": middle * middle * _middle(curvature) if np.any(curvature) else 0.0,
+        "ambient_temperature": ambient,
         "motor_temperature": ambient if motor_temperature is None else _middle(motor_temperature),
     }
-    terms = vehicle.model.power(q)
+    if "heading" in vehicle.model.reads:
+        turn = -np.cumsum(middle * _middle(curvature) * dt)
+        q["heading"] = turn if heading is None else _middle(heading)
+    if "time_moving" in vehicle.model.reads:
+        q["time_moving"] = np.cumsum(np.where(middle > MOVING, dt, 0.0))
+    terms = vehicle.model.power(q, over(dt))
     power = sum(terms.values(), start=np.zeros_like(middle))
     ledger = {name: float(np.sum(term * dt)) for name, term in terms.items()}
     return Energy(np.append(power, power[-1]), ledger, float(power @ dt), float(middle @ dt))

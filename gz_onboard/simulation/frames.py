@@ -23,6 +23,7 @@ from gz_onboard.simulation.sensors import (
     TURNS,
     Sensor,
     Truth,
+    latency,
     spread,
 )
 from gz_onboard.vehicle import Vehicle
@@ -180,7 +181,7 @@ def _values(sensor: Sensor | None, truth: Truth, seconds: Floats, period: float,
 
     if sensor is None:
         return np.full(len(seconds), np.nan)
-    steps = np.clip(((seconds - sensor.delay) / truth.dt + 1e-6).astype(int), 0, truth.count - 1)
+    steps = np.clip(((seconds - latency(sensor, truth.parameters)) / truth.dt + 1e-6).astype(int), 0, truth.count - 1)
     values: Floats = sensor.read(truth)[steps]
     sd = spread(sensor, truth.parameters)
     if sd:

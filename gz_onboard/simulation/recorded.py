@@ -47,6 +47,7 @@ class Recorded:
     signals: dict[str, Array]
     grade: Array  # sine, each `ROAD_PIECE` of distance
     curvature: Array  # 1/m, positive to the left, likewise
+    heading: Array | None = None  # rad clockwise from north, likewise; None without GPS
 
     @property
     def duration(self) -> float:
@@ -74,6 +75,12 @@ class Recorded:
             return None
         return float((self.signals["pack_voltage"] * self.signals["pack_current"]).sum() * self.dt)
 
+    def heading_at(self, distance: float) -> float:
+        """The heading [rad] at `distance` [m]; north where none is known."""
+        if self.heading is None:
+            return 0.0
+        return float(self.heading[min(max(int(distance / ROAD_PIECE), 0), len(self.heading) - 1)])
+
     def road(self, headwind: float = 0.0) -> Road:
         """The road that was ridden."""
         starts = [ROAD_PIECE * i for i in range(len(self.grade))]
@@ -97,6 +104,7 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     found: dict[str, tuple[list[float], list[float]]] = {}
     slots = [[found.setdefault(role, ([], [])) for role in group.roles] for group in codec.groups]
     rows: list[tuple[float, float, float]] = []  # distance, grade, yaw rate over speed
+    headings: list[tuple[float, float]] = []
     tick = 0.0
     for batch in read_frames(log):
         for event in codec.decode(batch):
@@ -113,6 +121,8 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
                     speed = road.speed or 0.0
                     turning = (road.yaw_rate or 0.0) / speed if speed > _MOVING else 0.0
                     rows.append((road.distance, road.grade or 0.0, turning))
+                    if road.heading is not None and speed > _MOVING:
+                        headings.append((road.distance, road.heading))
         if progress:
             progress(len(batch))
     if not codec.latest:
@@ -123,7 +133,7 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
         signals["soc"] = _counted_soc(signals, vehicle)
     grade, curvature = _by_distance(np.array(rows))
     name = log.name.removesuffix(".gz")
-    return Recorded(Path(name).stem, STEP, signals, grade, curvature)
+    return Recorded(Path(name).stem, STEP, signals, grade, curvature, _headings(headings))
 
 
 def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicle) -> dict[str, Array]:
@@ -140,7 +150,8 @@ def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicl
     if "brake_switch" in columns:
         t, v = columns["brake_switch"]
         signals["brake_switch"] = v[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(v) - 1)]
-    factor = {"motor_speed": gear * radius, "wheel_speed_rear": radius}.get(pace, 1.0)
+    scale = vehicle.parameters["speed_sensor_scale"]
+    factor = {"motor_speed": gear * radius / scale, "wheel_speed_rear": radius}.get(pace, 1.0)
     signals["speed"] = np.maximum(signals[pace] * factor, 0.0)
     signals["distance"] = np.concatenate(([0.0], np.cumsum(signals["speed"][1:] * STEP)))
     limit = vehicle.parameters["brake_torque_limit"] / radius
@@ -165,6 +176,17 @@ def _by_distance(rows: Array) -> tuple[Array, Array]:
         return np.zeros(1), np.zeros(1)
     at = np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE)
     return np.interp(at, distance, rows[keep, 1]), np.interp(at, distance, rows[keep, 2])
+
+
+def _headings(rows: list[tuple[float, float]]) -> Array | None:
+    """The heading at even distances, going on over a whole turn; None if hardly any is known."""
+    import numpy as np
+
+    if len(rows) < 10:
+        return None
+    distance, keep = np.unique([row[0] for row in rows], return_index=True)
+    heading = np.unwrap(np.array([row[1] for row in rows])[keep])
+    return np.interp(np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE), distance, heading)
 
 
 def rest_soc(recorded: Recorded, vehicle: Vehicle) -> float | None:

@@ -301,4 +301,6 @@ def range_by_energy(scooter: Scooter, run: Run, soc: float, temperature: float) 
     battery, consumption = scooter.vehicle.battery, run.consumption
     if battery is None or consumption is None or consumption <= 0:
         return None
-    return float(drawable(battery, soc, temperature, run.mean_power, run.form).energy / consumption)
+    lacks = scooter.vehicle.model.lacks(battery)
+    left = drawable(battery, soc, temperature, run.mean_power, run.form, lacks)
+    return float(left.energy / consumption)

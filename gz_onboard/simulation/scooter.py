@@ -9,13 +9,13 @@ ledger closes to rounding.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from math import atan, sqrt
 
-from gz_onboard.physics.effect import QUANTITIES, Effect, Port
+from gz_onboard.physics.effect import MOVING, QUANTITIES, Effect, Port
 from gz_onboard.physics.model import G, air_density
-from gz_onboard.simulation.parts.battery import FirstOrderPack, Pack
+from gz_onboard.simulation.parts.battery import EffectPack, FirstOrderPack, Pack
 from gz_onboard.simulation.parts.brakes import Brakes
 from gz_onboard.simulation.parts.controller import Controller
 from gz_onboard.simulation.parts.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
@@ -24,6 +24,8 @@ from gz_onboard.simulation.parts.tyre import Tyre
 from gz_onboard.vehicle import Vehicle
 
 STEP = 0.01  # s
+WHEEL_ONLY = {"speed", "motor_speed", "time_moving"}
+"""What a force may read to act on a dynamometer too: it is at the wheel, not of air, hill or bend."""
 VOLTAGE_FILTER = 0.3  # s: the controller's own; without one, current and sag would chase each other each step
 
 Place = tuple[float, float, float]
@@ -66,13 +68,16 @@ class Scooter:
     """The assembled scooter; its state is the loop variable of a simulation.
 
     `pack` and `motor` may be replaced by any object with the methods of `Pack` and `Motor`; the other parts are
-    attributes, to be set before the first step. Temperatures in degC.
+    attributes, to be set before the first step; effects of the model in the cells act in the own pack only.
+    Temperatures in degC; `heading`, in rad clockwise from north, is that over distance [m], or that where the road
+    begins and its curvature turns.
     """
 
     def __init__(self, vehicle: Vehicle, road: Road | Dynamometer | None = None, *, soc: float = 1.0,
                  ambient: float = 20.0, cell_temperature: float | None = None, altitude: float = 0.0,
                  speed: float = 0.0, dt: float = STEP, pack: Pack | None = None, motor: Motor | None = None,
-                 tyre_form: str = "transient", brake_form: str = "friction") -> None:  # fmt: skip
+                 tyre_form: str = "transient", brake_form: str = "friction",
+                 heading: float | Callable[[float], float] = 0.0) -> None:  # fmt: skip
         if vehicle.battery is None:
             raise vehicle.error("has no [battery], which a simulation needs")
         p = vehicle.parameters
@@ -94,33 +99,48 @@ class Scooter:
         self.force = 0.0  # N, of the driven tyre
         self.rear_load = self.front_load = 0.0  # N
         self.ledger = Ledger()
-        self.pack: Pack = pack or FirstOrderPack(vehicle.battery, soc)
-        effects = vehicle.model.effects
-        bound = {port: [(e.name, _bind(e, p)) for e in effects if e.port is port] for port in Port}
+        self._heading_at = heading if callable(heading) else None
+        self.start_heading = self.heading = heading(0.0) if callable(heading) else heading  # rad
+        self.time_moving = 0.0  # s
+        self._q: dict[str, float] = dict.fromkeys((*QUANTITIES, "yaw_rate", "lean"), 0.0)
+        model = vehicle.model
+        own: Pack
+        if model.cell_voltage:
+            own = EffectPack(vehicle.battery, soc, [effect for _, effect in model.cell_voltage], self._q)
+        else:
+            own = FirstOrderPack(vehicle.battery, soc)
+        self.pack: Pack = pack or own
+        effects = model.effects
+        bound = {port: [(e.name, _bind(e, p, dt)) for e in effects if e.port is port] for port in Port}
+        self._tracks = bool(model.reads & {"heading", "time_moving", "soc", "cell_temperature", "cell_current"})
         # Forces that read the acceleration are the dynamics that this simulation integrates itself.
         dynamics = {e.name for e in effects if "acceleration" in e.quantities}
         self._forces = [(name, force) for name, force in bound[Port.WHEEL_FORCE] if name not in dynamics]
         self._rolling = bound[Port.TYRE]
         if self.dynamometer:
-            self._forces = []
+            at_wheel = {e.name for e in effects if e.reads <= WHEEL_ONLY}
+            self._forces = [(name, force) for name, force in self._forces if name in at_wheel]
         self._inverter = bound[Port.INVERTER_LOSS]
         self._dc = bound[Port.DC_POWER]
-        self.motor: Motor = motor or EffectMotor(bound[Port.MOTOR_LOSS], p["torque_constant"], p["voltage_constant"])
+        constants = p["torque_constant"], p["voltage_constant"]
+        self.motor: Motor = motor or EffectMotor(bound[Port.MOTOR_LOSS], *constants, self._q)
         self.tyre = Tyre(p["tyre_b"], p["tyre_c"], p["tyre_d"], p["tyre_e"], form=tyre_form)
         self.brakes = Brakes(p["brake_torque_limit"], p["brake_viscous_constant"], p["brake_disc_radius"],
                              p["front_brake_share"], form=brake_form)  # fmt: skip
         regeneration = p["regeneration_torque_limit"] / p["torque_constant"]
         self.controller = Controller(p["motor_current_limit"], regeneration, vehicle.derating)
         cells = ambient if cell_temperature is None else cell_temperature
+        cooled = p["cooling_factor"]
         self.inverter_cooling = InverterCooling(
             p["inverter_board_capacity"], p["inverter_box_capacity"], p["inverter_board_to_air"],
-            p["inverter_box_to_air"], p["inverter_board_to_box"], p["inverter_box_to_ambient"], ambient, ambient,
+            p["inverter_box_to_air"], p["inverter_board_to_box"], cooled * p["inverter_box_to_ambient"], ambient,
+            ambient,
         )  # fmt: skip
         self.motor_cooling = MotorCooling(
             p["motor_stator_capacity"], p["motor_rotor_capacity"], p["motor_gap_conductance"],
-            p["motor_rotor_to_ambient"], p["motor_stator_share"], ambient, ambient,
+            cooled * p["motor_rotor_to_ambient"], p["motor_stator_share"], ambient, ambient,
         )  # fmt: skip
-        self.pack_cooling = LumpedCooling(p["pack_heat_capacity"], p["pack_conductance"], cells)
+        self.pack_cooling = LumpedCooling(p["pack_heat_capacity"], cooled * p["pack_conductance"], cells)
         self.bms_cooling = LumpedCooling(p["bms_heat_capacity"], p["bms_conductance"], cells)
         self._radius = p["wheel_radius"]
         self._gear = p["gear_ratio"]
@@ -134,8 +154,9 @@ class Scooter:
         self._moving_mass = self._mass + front  # the front wheel rolls without slip
         self._inertia = p["wheel_inertia_rear"]
         density = air_density(ambient, altitude)
-        self._q: dict[str, float] = dict.fromkeys((*QUANTITIES, "yaw_rate", "lateral_acceleration", "lean"), 0.0)
-        self._q.update(mass=vehicle.model.mass, air_density=density, grade_cosine=1.0, motor_temperature=ambient)
+        self._q.update(mass=model.mass, air_density=density, grade_cosine=1.0, motor_temperature=ambient)
+        self._q.update(ambient_temperature=ambient, heading=self.heading)
+        self._q["cell_capacity"] = vehicle.battery.cell_capacity(cells)
         self._heat = {"inverter": 0.0, "motor": 0.0, "pack": 0.0, "bms": 0.0}  # J in the current cooling period
         self._since_cooling = 0.0
         self._watch()
@@ -163,6 +184,8 @@ class Scooter:
             q["yaw_rate"], q["lateral_acceleration"], q["lean"] = v * curvature, lateral, -atan(lateral / G)
         elif q["yaw_rate"]:
             q["yaw_rate"] = q["lateral_acceleration"] = q["lean"] = 0.0
+        if self._tracks:
+            self._track(curvature)
         normal = self._weight * cosine
         shift = self.force * self._lever
         rear = normal * self._rear_share + shift
@@ -235,6 +258,7 @@ class Scooter:
         motor_speed = w_mean / gear
         mechanical = torque * motor_speed
         entries["gearing"] = entries.get("gearing", 0.0) + (mechanical - drive * w_mean) * dt
+        q["torque"] = torque
         motor_heat = 0.0
         for name, loss in self.motor.losses(motor_speed, current, self.motor_cooling.stator):
             motor_heat += loss
@@ -268,6 +292,19 @@ class Scooter:
         if self._since_cooling >= PERIOD - 1e-9:
             self._cool(self._since_cooling)
 
+    def _track(self, curvature: float) -> None:
+        """What effects read beyond speed and road, up to date before the step."""
+        q = self._q
+        if self._heading_at:
+            self.heading = self._heading_at(self.distance)
+        else:
+            self.heading -= self.speed * curvature * self.dt
+        if self.speed > MOVING:
+            self.time_moving += self.dt
+        q["heading"], q["time_moving"] = self.heading, self.time_moving
+        q["soc"], q["cell_temperature"] = self.pack.soc, self.pack_cooling.temperature
+        q["cell_current"] = self.current / self.vehicle.pack.cells_parallel
+
     def _cool(self, dt: float) -> None:
         """The cooling networks, with the mean heat of the period (eqs. 2.25-2.31)."""
         heat = self._heat
@@ -286,14 +323,35 @@ class Scooter:
         self.controller.watch(motor, inverter, self.pack_cooling.temperature, self.pack.soc)
 
 
-def _bind(effect: Effect, parameters: Mapping[str, float]) -> Callable[[Mapping[str, float]], float]:
-    """The effect's term as a function of the quantities.
+Bound = Callable[[Mapping[str, float]], float]
+
+
+def _bind(effect: Effect, parameters: Mapping[str, float], dt: float = STEP) -> Bound:
+    """The effect's value as a function of the quantities; one with memory must be called once each step of `dt` [s].
 
     Its call is written out, as it is made a hundred times for each second ridden: a ride takes a third less time than
     by `model.Bound`.
     """
-    arguments = [f"q[{name!r}]" for name in effect.quantities]
-    arguments += [f"{name}={parameters[name]!r}" for name in effect.keywords]
-    text = f"lambda q: term({', '.join(arguments)})"
-    call: Callable[[Mapping[str, float]], float] = eval(text, {"term": effect.term})
+    term = _written_out(effect.term, effect.quantities, effect.keywords, parameters)
+    if effect.decay is None:
+        return term
+    fade = _written_out(lambda *q, **p: effect.decay(dt, *q, **p), effect.decay_quantities, effect.decay_keywords,  # type: ignore[misc]
+                        parameters)  # fmt: skip
+    state = 0.0
+
+    def value(q: Mapping[str, float]) -> float:
+        nonlocal state
+        decay = fade(q)
+        state = decay * state + (1 - decay) * term(q)
+        return state
+
+    return value
+
+
+def _written_out(
+    function: Callable[..., float], quantities: Iterable[str], keywords: Iterable[str], parameters: Mapping[str, float]
+) -> Bound:
+    arguments = [f"q[{name!r}]" for name in quantities]
+    arguments += [f"{name}={parameters[name]!r}" for name in keywords]
+    call: Bound = eval(f"lambda q: function({', '.join(arguments)})", {"function": function})
     return call

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 BMS_DELAY = 0.10  # s behind the inverter
 GPS_DELAY = 0.4  # s
 CABLE = 0.0086  # Ω between pack and inverter
+REPORTED_TORQUE = 0.47  # N·m/A, that the inverter makes torque of its current with, whatever the magnets are
 ODOMETER_RADIUS = 0.245  # m, that the odometer assumes
 LEAN_TIME = 1.0  # s that a rider takes into a bend: the road's pieces change their curvature at once
 LATITUDE, LONGITUDE, ALTITUDE = 45.0, 9.0, 200.0  # deg, deg, m: where a simulated road begins, to the north
@@ -94,7 +95,7 @@ class Truth:
         c["lean_rate"] = np.gradient(c["lean"], dt)
         c["slope"] = np.arcsin(_smooth(c["grade"], width))
         c["pitch_rate"] = -np.gradient(c["slope"], dt)
-        c["heading"] = -np.cumsum(c["yaw_rate"]) * dt
+        c["heading"] = scooter.start_heading - np.cumsum(c["yaw_rate"]) * dt
         c["north"] = np.cumsum(c["way"] * np.cos(c["heading"])) * dt
         c["east"] = np.cumsum(c["way"] * np.sin(c["heading"])) * dt
         c["auxiliary_current"] = self.parameters["auxiliary_power"] / c["pack_voltage"]
@@ -215,6 +216,10 @@ def _inverter_state(t: Truth) -> Array:
     return np.where(current > 0.5, 2.0, np.where(current < -0.5, 3.0, 1.0))
 
 
+def _motor_speed(t: Truth) -> Array:
+    return t["wheel_speed"] * (_RPM * t.parameters["speed_sensor_scale"] / t.parameters["gear_ratio"])
+
+
 def _front_wheel(t: Truth) -> Array:
     return t["way"] / (2 * pi * t.parameters["wheel_radius"])
 
@@ -222,9 +227,9 @@ def _front_wheel(t: Truth) -> Array:
 _RPM = 60 / (2 * pi)
 SENSORS: tuple[Sensor, ...] = (
     # inverter
-    Sensor("INV_MotorSpeed", lambda t: t["wheel_speed"] * (_RPM / t.parameters["gear_ratio"]), sd=0.3),
+    Sensor("INV_MotorSpeed", _motor_speed, sd=0.3),
     Sensor("INV_MotorCurrent", _column("motor_current"), sd=0.3),
-    Sensor("INV_MotorTorque", lambda t: t["motor_current"] * t.parameters["torque_constant"], sd=0.1),
+    Sensor("INV_MotorTorque", _column("motor_current", REPORTED_TORQUE), sd=0.1),
     Sensor("INV_State", _inverter_state),
     Sensor("INV_DcVoltage", lambda t: t["pack_voltage"] - CABLE * t["pack_current"], sd=0.042),
     Sensor("INV_DcCurrent", _inverter_current, sd=0.35),
@@ -278,6 +283,11 @@ def spread(sensor: Sensor, parameters: Mapping[str, float]) -> float:
     """The standard deviation of the sensor's noise, in the unit of its signal; of the pack's that of the vehicle."""
     name = {"BMS_PackVoltage": "pack_voltage_noise", "BMS_PackCurrent": "pack_current_noise"}.get(sensor.signal)
     return parameters[name] if name else sensor.sd
+
+
+def latency(sensor: Sensor, parameters: Mapping[str, float]) -> float:
+    """How late the sensor is [s]: the pack's voltage as much later than its current as the vehicle's file says."""
+    return sensor.delay + (parameters["pack_voltage_latency"] if sensor.signal == "BMS_PackVoltage" else 0.0)
 
 
 TURNS = {"GPS_Course": 360.0}

@@ -93,6 +93,7 @@ class Plan:
     command: Callable[[], Command]
     length: float | None = None  # m, of one repetition; None if it ends by time
     recorded: Recorded | None = None
+    heading: float | Callable[[float], float] = 0.0  # rad clockwise from north, where it begins or over distance
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -242,7 +243,9 @@ def _route_plan(path: Path, arguments: argparse.Namespace, roller: Dynamometer |
     profile = speed_profile(route, top_speed=TOP_SPEED)
     metres = [profile.speed_at(float(i)) for i in range(int(route.length) + 1)]
     road = roller or road_table(route.distance, route.grade, route.curvature, arguments.wind)
-    return Plan(route.name, "route", profile.time[-1], road, lambda: along(metres), route.length)
+    return Plan(
+        route.name, "route", profile.time[-1], road, lambda: along(metres), route.length, heading=route.heading[0]
+    )
 
 
 def _ride_plan(path: Path, arguments: argparse.Namespace, vehicle: Vehicle) -> Plan:
@@ -251,12 +254,14 @@ def _ride_plan(path: Path, arguments: argparse.Namespace, vehicle: Vehicle) -> P
     recorded = read_recorded(path, vehicle)
     signals = recorded.signals
     beside = path.with_name(f"{recorded.name}.route.csv")
+    heading: float | Callable[[float], float] = recorded.heading_at
     if arguments.dyno:
         road: Road | Dynamometer = dynamometer(arguments.dyno)
     elif recorded.on_dynamometer:
         road = fit_dynamometer(recorded)
     elif beside.is_file():
         route = read_route(beside)
+        heading = route.heading[0]
         road = road_table(route.distance, route.grade, route.curvature, arguments.wind)
     else:
         road = recorded.road(arguments.wind)
@@ -271,7 +276,7 @@ def _ride_plan(path: Path, arguments: argparse.Namespace, vehicle: Vehicle) -> P
             )
         throttle, brake = signals["throttle"].tolist(), signals["brake"].tolist()
         kind, command = "ride (open loop)", lambda: replay(throttle, brake, STEP)
-    return Plan(recorded.name, kind, recorded.duration, road, command, recorded=recorded)
+    return Plan(recorded.name, kind, recorded.duration, road, command, recorded=recorded, heading=heading)
 
 
 def ride(
@@ -286,7 +291,7 @@ def ride(
         soc = (rest_soc(recorded, vehicle) if recorded else None) or 1.0
     scooter = Scooter(
         vehicle, plan.road, soc=soc, ambient=ambient, cell_temperature=measured("cell_temperature", ambient),
-        speed=measured("speed", 0.0),
+        speed=measured("speed", 0.0), heading=plan.heading,
     )  # fmt: skip
     scooter.motor_cooling.stator = scooter.motor_cooling.rotor = measured("motor_temperature", ambient)
     scooter.inverter_cooling.board = scooter.inverter_cooling.box = measured("inverter_temperature", ambient)

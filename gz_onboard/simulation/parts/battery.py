@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import MutableMapping, Sequence
 from itertools import pairwise
 from math import exp, sqrt
 from typing import Protocol
 
 from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.model import Bound
 
 TABLE_PERIOD = 1.0  # s: R0, R1 and C1 follow SOC and temperature this often; both move slowly
 
@@ -111,4 +113,34 @@ class SecondOrderPack(FirstOrderPack):
         self.v1 = self._decay * fast + self._r1 * (1 - self._decay) * cell
         decay = exp(-dt / self.tau2)
         self.v2 = decay * self.v2 + self.r2 * (1 - decay) * cell
+        return current, voltage, heat, delivered
+
+
+class EffectPack(FirstOrderPack):
+    """The first-order pack with effects of the vehicle's model in its cells: slow relaxation, hysteresis, one's own.
+
+    They act on each step with what they were after the one before; what they take from the voltage is heat of the pack.
+    quantities: what the effects read; those of the cells are kept up to date here.
+    """
+
+    def __init__(
+        self, battery: Battery, soc: float, effects: Sequence[Bound], quantities: MutableMapping[str, float]
+    ) -> None:
+        super().__init__(battery, soc)
+        self.states = {effect.effect.name: 0.0 for effect in effects}  # V of a cell
+        self._effects = list(effects)
+        self._q = quantities
+
+    def draw(self, power: float, dt: float, temperature: float) -> tuple[float, float, float, float]:
+        """See `Pack`."""
+        fast, states, q = self.v1, self.states, self._q
+        self.v1 = fast + sum(states.values())
+        current, voltage, heat, delivered = super().draw(power, dt, temperature)
+        cell = current / self.battery.cells_parallel
+        self.v1 = self._decay * fast + self._r1 * (1 - self._decay) * cell
+        q["cell_current"], q["soc"], q["cell_temperature"] = cell, self.soc, temperature
+        q["cell_capacity"] = self._charge / (3600 * self.battery.cells_parallel)
+        for effect in self._effects:
+            name = effect.effect.name
+            states[name] = effect.step(states[name], dt, q)
         return current, voltage, heat, delivered

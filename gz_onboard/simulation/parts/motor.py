@@ -23,11 +23,17 @@ class Motor(Protocol):
 class EffectMotor:
     """A motor whose losses are effects of the vehicle's model: copper, iron, and what else its file lists."""
 
-    def __init__(self, effects: Sequence[tuple[str, Loss]], torque_constant: float, voltage_constant: float) -> None:
+    def __init__(
+        self,
+        effects: Sequence[tuple[str, Loss]],
+        torque_constant: float,
+        voltage_constant: float,
+        quantities: dict[str, float] | None = None,
+    ) -> None:
         self.torque_constant = torque_constant
         self.voltage_constant = voltage_constant
         self._effects = list(effects)
-        self._q = {"motor_speed": 0.0, "motor_current": 0.0, "motor_temperature": 0.0}
+        self._q = {} if quantities is None else quantities  # what else the effects read
 
     def losses(self, speed: float, current: float, temperature: float) -> list[tuple[str, float]]:
         """See `Motor`."""

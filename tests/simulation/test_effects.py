@@ -1,0 +1,201 @@
+"""Every effect and movable parameter acts in the simulation, and the balance of energy closes with all of them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gz_onboard.physics.effect import known_effects, load_effect
+from gz_onboard.simulation.backward import backward
+from gz_onboard.simulation.cycles import cycle, names
+from gz_onboard.simulation.parts.battery import EffectPack
+from gz_onboard.simulation.run import Run, at_steps, drive, follow
+from gz_onboard.simulation.scooter import STEP, Dynamometer, Scooter, straight
+from gz_onboard.simulation.sensors import SENSORS, Trace, latency
+from gz_onboard.vehicle import Vehicle, read_vehicle
+
+BASE = read_vehicle("reference")
+CANDIDATES = ("cornering_drag", "headwind", "dragging_brake", "tyre_warm_up", "drivetrain_drag", "regen_loss",
+              "slow_relaxation", "ocv_hysteresis")  # fmt: skip
+
+
+def extended(*names: str, **values: float) -> Vehicle:
+    effects = [load_effect(name) for name in names]
+    return BASE.changed(BASE.parameters.joined(effects).replaced(**values), (*BASE.model.effects, *effects))
+
+
+def per_metre(run: Run) -> float:
+    return run.energy / run.distance
+
+
+def states(scooter: Scooter) -> dict[str, float]:
+    assert isinstance(scooter.pack, EffectPack)
+    return scooter.pack.states
+
+
+def bends(distance: float) -> tuple[float, float, float]:
+    return 0.02 * math.sin(distance / 80), (0.02 if distance % 200 < 100 else -0.01), 0.0
+
+
+def stop_and_go(scooter: Scooter) -> tuple[float, float, float]:
+    """20 s at up to 10 m/s, braking, 4 s of standing, again."""
+    t = scooter.time % 32
+    return (0.5 if t < 20 and scooter.speed < 10 else 0.0), (0.4 if t > 22 else 0.0), math.nan
+
+
+def ride(vehicle: Vehicle, seconds: float = 96.0, road: Any = bends, **options: Any) -> tuple[Run, Scooter]:
+    scooter = Scooter(vehicle, road, soc=0.8, **options)
+    return drive(scooter, stop_and_go, seconds), scooter
+
+
+def test_the_candidates_are_all_effects_beyond_the_base():
+    base = {effect.name for effect in BASE.model.effects}
+    assert set(known_effects()) == base | set(CANDIDATES)
+
+
+def test_the_balance_closes_with_all_effects_and_parameters():
+    vehicle = extended(*CANDIDATES, wind_north=4.0, wind_east=-2.0, cell_resistance_factor=1.4, cooling_factor=0.3,
+                       speed_sensor_scale=1.02, pack_voltage_latency=0.2, cell_capacity=2.4, hysteresis_voltage=0.02,
+                       hysteresis_rate=100.0)  # fmt: skip
+    run, scooter = ride(vehicle, 300.0)
+    assert abs(run.closure) < 1e-4
+    assert set(CANDIDATES) - {"slow_relaxation", "ocv_hysteresis"} <= set(run.ledger)
+    for name in set(CANDIDATES) & set(run.ledger) - {"headwind"}:
+        assert run.ledger[name] > 0, name
+    assert states(scooter)["slow_relaxation"] > 0
+    plain, _ = ride(BASE, 300.0)
+    assert per_metre(run) > 1.1 * per_metre(plain)
+
+
+@pytest.mark.parametrize("name", [name for name in CANDIDATES if name != "headwind"])
+def test_each_effect_alone_costs_and_closes(name):
+    base, _ = ride(BASE, 64.0)
+    strong = {"regen_loss": {"regeneration_loss_share": 0.5}, "ocv_hysteresis": {"hysteresis_rate": 500.0}}
+    run, _ = ride(extended(name, **strong.get(name, {})), 64.0)
+    assert abs(run.closure) < 1e-4
+    assert run.chemical / run.distance > base.chemical / base.distance
+
+
+def test_wind_costs_against_and_gives_along_by_the_heading():
+    calm = extended("headwind")
+    windy = extended("headwind", wind_north=4.0)
+    cost = {}
+    for heading in (0.0, math.pi):
+        for key, vehicle in (("calm", calm), ("windy", windy)):
+            cost[heading, key] = per_metre(ride(vehicle, 64.0, straight(), heading=heading)[0])
+    assert cost[0.0, "calm"] == cost[math.pi, "calm"]
+    assert cost[math.pi, "windy"] < cost[0.0, "calm"] < cost[0.0, "windy"]
+    by_place = ride(BASE, 64.0, straight(headwind=4.0))[0]
+    assert cost[0.0, "windy"] == pytest.approx(per_metre(by_place), rel=1e-6)
+
+
+def test_the_heading_is_that_of_the_road():
+    """A left circle turns it from north to the west, by the way over the radius."""
+    vehicle = extended("headwind")
+    scooter = Scooter(vehicle, lambda distance: (0.0, 1 / 50, 0.0), heading=0.5)
+    drive(scooter, stop_and_go, 20.0)
+    assert scooter.heading == pytest.approx(0.5 - scooter.distance / 50, abs=0.01)
+    given = Scooter(vehicle, bends, heading=lambda distance: 1.0 + distance / 1000)
+    drive(given, stop_and_go, 10.0)
+    assert given.heading == pytest.approx(1.0 + given.distance / 1000, abs=0.001)
+
+
+def test_slow_relaxation_is_a_second_rc_pair():
+    """The same as the pack of two pairs, which is code of its own."""
+    from gz_onboard.simulation.parts.battery import SecondOrderPack
+
+    vehicle = extended("slow_relaxation", slow_resistance=0.012, slow_time=900.0)
+    one = ride(vehicle, 96.0)[0]
+    two = ride(BASE, 96.0, pack=SecondOrderPack(BASE.pack, 0.8, 0.012, 900.0))[0]
+    assert one.series["pack_voltage"] == pytest.approx(two.series["pack_voltage"], rel=1e-9)
+
+
+def test_hysteresis_stays_at_rest_and_relaxation_does_not():
+    vehicle = extended("slow_relaxation", "ocv_hysteresis", hysteresis_rate=500.0, slow_time=120.0)
+    scooter = Scooter(vehicle, straight(), soc=0.8)
+    drive(scooter, stop_and_go, 64.0)
+    for _ in range(3000):
+        scooter.pack.draw(0.0, 1.0, 20.0)
+    assert abs(states(scooter)["slow_relaxation"]) < 1e-6
+    assert states(scooter)["ocv_hysteresis"] > 0.004
+
+
+def test_more_resistance_and_less_cooling_heat_and_less_capacity_empties():
+    base, scooter = ride(BASE, 160.0)
+    grown, _ = ride(extended(cell_resistance_factor=2.0), 160.0)
+    assert grown.ledger["battery_heat"] > 1.7 * base.ledger["battery_heat"]
+    assert grown.series["pack_voltage"].min() < base.series["pack_voltage"].min()
+    faded, _ = ride(extended(cell_capacity=2.0), 160.0)
+    ratio = BASE.parameters["cell_capacity"] / 2.0
+    assert 0.8 - faded.soc_end == pytest.approx(ratio * (0.8 - base.soc_end), rel=0.02)
+    _, hot = ride(extended(cooling_factor=0.1), 160.0)
+    for part in ("motor_cooling", "inverter_cooling", "pack_cooling"):
+        assert getattr(hot, part).temperature > getattr(scooter, part).temperature
+
+
+def test_on_a_dynamometer_what_is_at_the_wheel_acts_and_air_and_bends_do_not():
+    vehicle = extended(
+        "dragging_brake", "drivetrain_drag", "cornering_drag", "headwind", "tyre_warm_up", wind_north=5.0
+    )
+    run, _ = ride(vehicle, 32.0, Dynamometer(185.0, 20.0, 0.0, 0.3))
+    assert {"dragging_brake", "drivetrain_drag", "tyre_warm_up"} <= set(run.ledger)
+    assert not {"cornering_drag", "headwind", "aerodynamic_drag"} & set(run.ledger)
+    assert abs(run.closure) < 1e-4
+
+
+def test_backward_agrees_with_forward_with_all_forces():
+    vehicle = extended("headwind", "dragging_brake", "tyre_warm_up", "drivetrain_drag", "cornering_drag", wind_east=3.0)
+    speeds = at_steps(*_cycle(), STEP)
+    curve = 0.004
+    scooter = Scooter(vehicle, lambda distance: (0.0, curve, 0.0), soc=0.9)
+    run = drive(scooter, follow(speeds, STEP), 300.0)
+    energy = backward(vehicle, run.series["time"], run.series["speed"], curvature=curve, smoothing=0.0)
+    for name in ("headwind", "dragging_brake", "tyre_warm_up", "drivetrain_drag", "cornering_drag"):
+        assert energy.ledger[name] == pytest.approx(run.ledger[name], rel=0.02, abs=200.0), name
+
+
+def _cycle() -> tuple[Any, Any]:
+    wmtc = cycle(names()[0])
+    return wmtc.time, wmtc.speed
+
+
+def test_what_the_sensors_show_of_it():
+    def signals(vehicle):
+        trace = Trace()
+        scooter = Scooter(vehicle, straight(), soc=0.8)
+        drive(scooter, trace.watch(stop_and_go), 20.0)
+        truth = trace.truth(scooter)
+        return {sensor.signal: sensor.read(truth) for sensor in SENSORS}
+
+    true = signals(BASE)
+    false = signals(extended(speed_sensor_scale=1.05, pack_current_offset=0.5, pack_current_gain=1.1,
+                             pack_voltage_offset=-0.3))  # fmt: skip
+    moving = true["HBM_WheelSpeedRear"] > 1
+    assert false["INV_MotorSpeed"][moving] == pytest.approx(1.05 * true["INV_MotorSpeed"][moving])
+    for other in ("HBM_WheelSpeedRear", "HBM_WheelSpeedFront", "GPS_Speed", "INV_DcVoltage", "VCU_Odometer"):
+        assert false[other] == pytest.approx(true[other], rel=1e-12)
+    assert false["BMS_PackVoltage"] == pytest.approx(true["BMS_PackVoltage"] - 0.3)
+    p = BASE.parameters
+    current = (true["BMS_PackCurrent"] - p["pack_current_offset"]) / p["pack_current_gain"]
+    assert false["BMS_PackCurrent"] == pytest.approx(1.1 * current + 0.5)
+    late = {s.signal: latency(s, extended(pack_voltage_latency=0.3).parameters) - s.delay for s in SENSORS}
+    assert {name: delay for name, delay in late.items() if delay} == {"BMS_PackVoltage": pytest.approx(0.3)}
+
+
+def test_weak_magnets_are_not_what_the_inverter_reports():
+    """Torque reported is 0.47 times current: with less torque for it, more current for the same ride."""
+
+    def ratio(torque_constant):
+        trace = Trace()
+        scooter = Scooter(extended(torque_constant=torque_constant), straight(), soc=0.8)
+        run = drive(scooter, trace.watch(stop_and_go), 20.0)
+        truth = trace.truth(scooter)
+        shown = next(s for s in SENSORS if s.signal == "INV_MotorTorque").read(truth)
+        driving = truth["motor_current"] > 1
+        assert (shown / np.where(driving, truth["motor_current"], 1))[driving] == pytest.approx(0.47)
+        return run.distance
+
+    assert ratio(0.40) < ratio(0.45)
