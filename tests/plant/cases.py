@@ -282,36 +282,62 @@ def _variants(draft: _Draft, truths: bool) -> list[Hidden]:
     return [draft.hidden(), *fewer, *([Hidden()] if len(draft.parts) > 1 else [])]
 
 
+Run = tuple[Plan, Machine, Hidden]
+
+
+def _case_runs(draft: _Draft, truths: bool) -> list[Run]:
+    machine, plans = scooter(draft.seed // CASES_OF_A_SCOOTER), _service_plans(draft)
+    return [
+        (own, machine, hidden)
+        for variant in _variants(draft, truths)
+        for own, hidden in zip(plans, _hot(variant, plans), strict=True)
+    ]
+
+
+def _case(draft: _Draft, ridden: Sequence[Ridden], truths: bool) -> Case:
+    with_it, *others = [list(ridden[i : i + RIDES]) for i in range(0, len(ridden), RIDES)]
+    found = tuple(_truth(draft, name, with_it, others[i] if truths else with_it) for i, name in enumerate(draft.parts))
+    rides = [measure(x, f"ride_{i:03d}") for i, x in enumerate(with_it)]
+    twins = [measure(x, f"ride_{i:03d}") for i, x in enumerate(others[-1])] if others else []
+    return Case(draft.seed, draft.seed // CASES_OF_A_SCOOTER, draft.kind, found, rides, draft.accepted, twins)
+
+
+def _ride_all(runs: Sequence[Run]) -> list[Ridden]:
+    plans, machines, hiddens = zip(*runs, strict=True)
+    return ride(plans, machines, hiddens)
+
+
+def trial(
+    numbers: Sequence[int],
+    seeds: Sequence[int],
+    kind: str | None = None,
+    names: tuple[str, ...] | None = None,
+    truths: bool = True,
+) -> tuple[dict[int, list[Samples]], list[Case]]:
+    """The healthy rides of the scooters `numbers` and the cases of `seeds`, ridden in one batch: that is cheap.
+
+    `kind` and `names` overrule what the seed would draw. Every case is ridden again without each of its effects, for
+    the energy that it takes, and without any; not so without `truths`.
+    """
+    drafts = [_draft(seed, kind, names) for seed in seeds]
+    healthy = [_commissioning_runs(number) for number in numbers]
+    hidden = [_case_runs(draft, truths) for draft in drafts]
+    ridden = iter(_ride_all([run for runs in (*healthy, *hidden) for run in runs]))
+    rides = {
+        number: [measure(next(ridden), f"commissioning_{i:03d}") for i in range(len(runs))]
+        for number, runs in zip(numbers, healthy, strict=True)
+    }
+    cases = [
+        _case(draft, [next(ridden) for _ in runs], truths) for draft, runs in zip(drafts, hidden, strict=True)
+    ]  # fmt: skip
+    return rides, cases
+
+
 def draw_many(
     seeds: Sequence[int], kind: str | None = None, names: tuple[str, ...] | None = None, truths: bool = True
 ) -> list[Case]:
-    """The cases of `seeds`, ridden in one batch; `kind` and `names` overrule what the seed would draw.
-
-    Every case is ridden again without each of its effects, for the energy that it takes; not so without `truths`.
-    """
-    drafts = [_draft(seed, kind, names) for seed in seeds]
-    plans: list[Plan] = []
-    machines: list[Machine] = []
-    hiddens: list[Hidden] = []
-    for draft in drafts:
-        machine = scooter(draft.seed // CASES_OF_A_SCOOTER)
-        own = _service_plans(draft)
-        for hidden in _variants(draft, truths):
-            plans += own
-            machines += [machine] * RIDES
-            hiddens += _hot(hidden, own)
-    ridden = iter(ride(plans, machines, hiddens))
-    cases = []
-    for draft in drafts:
-        with_it, *others = [[next(ridden) for _ in range(RIDES)] for _ in _variants(draft, truths)]
-        found = tuple(
-            _truth(draft, name, with_it, others[i] if truths else with_it) for i, name in enumerate(draft.parts)
-        )
-        rides = [measure(x, f"ride_{i:03d}") for i, x in enumerate(with_it)]
-        twins = [measure(x, f"ride_{i:03d}") for i, x in enumerate(others[-1])] if others else []
-        number = draft.seed // CASES_OF_A_SCOOTER
-        cases.append(Case(draft.seed, number, draft.kind, found, rides, draft.accepted, twins))
-    return cases
+    """The cases of `seeds`: see `trial`."""
+    return trial((), seeds, kind, names, truths)[1]
 
 
 def draw(seed: int) -> Case:
@@ -358,22 +384,20 @@ def _truth(draft: _Draft, name: str, with_it: Sequence[Ridden], without: Sequenc
     return Truth(name, parameter, unit, change, name in RELATIVE, seeming, clear)
 
 
-def commissioning_many(numbers: Sequence[int]) -> list[list[Samples]]:
-    """The healthy rides of several scooters, ridden in one batch."""
+def _commissioning_runs(number: int) -> list[Run]:
+    rng = np.random.default_rng([number, 7])
     kinds = ["city", "suburban", "mixed", "arterial", "oval"] * 2
-    plans, machines = [], []
-    for number in numbers:
-        rng = np.random.default_rng([number, 7])
-        air = rng.permutation(np.linspace(1, 33, 10)) + rng.uniform(-1, 1, 10)
-        charge = rng.permutation(np.linspace(0.25, 0.99, 10))
-        riders = [*rng.permutation(list("ABCDE")), *rng.permutation(list("ABCDE"))]
-        for i in range(10):
-            seed = 1_000_000_000 + number * 64 + i
-            plans.append(plan(seed, kinds[i], str(riders[i]), float(air[i]), float(charge[i])))
-            machines.append(scooter(number))
-    ridden = ride(plans, machines, [Hidden()] * len(plans))
-    rides = [measure(x, f"commissioning_{i % 10:03d}") for i, x in enumerate(ridden)]
-    return [rides[10 * i : 10 * i + 10] for i in range(len(numbers))]
+    air = rng.permutation(np.linspace(1, 33, 10)) + rng.uniform(-1, 1, 10)
+    charge = rng.permutation(np.linspace(0.25, 0.99, 10))
+    riders = [*rng.permutation(list("ABCDE")), *rng.permutation(list("ABCDE"))]
+    seed = 1_000_000_000 + number * 64
+    plans = [plan(seed + i, kinds[i], str(riders[i]), float(air[i]), float(charge[i])) for i in range(10)]
+    return [(own, scooter(number), Hidden()) for own in plans]
+
+
+def commissioning_many(numbers: Sequence[int]) -> list[list[Samples]]:
+    """The healthy rides of several scooters."""
+    return list(trial(numbers, ())[0].values())
 
 
 def commissioning(number: int) -> list[Samples]:
