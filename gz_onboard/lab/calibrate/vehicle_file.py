@@ -178,9 +178,9 @@ def _correlations(
     for i, result in enumerate(results):
         for number_, (names, covariance) in enumerate(result.covariance):
             for name in names:
-                if name not in result.parameters:
-                    raise InputError(f"{base}: {result.procedure}: a covariance of {name}, which it did not find")
-            kept = [k for k, name in enumerate(names) if last[name] == i]  # a later procedure knows better
+                if name not in last:
+                    raise InputError(f"{base}: {result.procedure}: a covariance of {name}, which was not found")
+            kept = [k for k, name in enumerate(names) if last[name] <= i]  # a later procedure knows better
             if len(kept) < 2:
                 continue
             key = result.procedure if number_ == 0 else f"{result.procedure}_{number_ + 1}"

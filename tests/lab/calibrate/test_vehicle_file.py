@@ -183,7 +183,7 @@ def test_files_beside_the_base_are_found_from_the_new_place(tmp_path):
             Result("t", curves={"battery.r0": Curve({"soc": np.ones(2)}, np.ones(3), np.ones(3), "ohm", "x")}),
             r"battery.r0: must be \(2,\) finite numbers",
         ),
-        (Result("t", covariance=[(("drag_area",), np.ones((1, 1)))]), "covariance of drag_area, which it did not find"),
+        (Result("t", covariance=[(("drag_area",), np.ones((1, 1)))]), "covariance of drag_area, which was not found"),
     ],
 )
 def test_nothing_is_written_that_could_not_be_read(tmp_path, result, message):

@@ -1,0 +1,131 @@
+"""``calibration.toml``: which file is for which procedure of a calibration.
+
+    schema = 1
+    vehicle = "scooter.toml"               # what is known without measuring; or one of the package's own
+
+    [ocv]
+    data = ["cell_ocv_25C.csv.gz"]
+
+    [pulse]
+    data = ["cell_pulse_0C.csv.gz", "cell_pulse_25C.csv.gz"]
+    held_out = ["cell_road_profile_25C.csv"]
+    columns = { time = "t_s", voltage = "v_V", current = { column = "i_A", scale = -1 } }
+
+Paths are from the manifest's folder. ``SLOT_columns`` is for the tables of one key only, such as ``held_out_columns``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gz_onboard.errors import InputError, nearest
+from gz_onboard.lab.calibrate.table import Named, read_columns
+from gz_onboard.toml import Table
+from gz_onboard.vehicle import find_vehicle
+
+NAME = "calibration.toml"
+_OWN = ("schema", "vehicle", "source")
+
+Option = float | str
+
+
+@dataclass(frozen=True)
+class Slot:
+    """What a procedure is given by one key of the manifest.
+
+    kind: "table", "ride", or "any": CSV and Parquet are tables then. least: of files, 0 for a slot that may be left
+    out. most: None for any number.
+    """
+
+    kind: str
+    what: str
+    least: int = 0
+    most: int | None = None
+
+
+@dataclass(frozen=True)
+class Step:
+    """One procedure with its files by slot, names of columns by slot, and options."""
+
+    procedure: str
+    files: dict[str, tuple[Path, ...]]
+    columns: dict[str, dict[str, Named]] = field(default_factory=dict)
+    options: dict[str, Option] = field(default_factory=dict)
+
+
+def read_manifest(
+    folder: Path, slots: Mapping[str, Mapping[str, Slot]], options: Mapping[str, Mapping[str, Option]]
+) -> tuple[Path, list[Step]]:
+    """(vehicle file, steps in the order of `slots`) of the manifest in `folder` (or of that file itself).
+
+    slots, options: of each procedure, by name; options with their defaults. Raises InputError naming file and line.
+    """
+    file = folder / NAME if folder.is_dir() else folder
+    if not file.is_file():
+        raise InputError(f"{file}: no such file; `calibrate all` takes a folder with a manifest {NAME}")
+    table = Table.read(file)
+    table.only([*_OWN, *slots])
+    if table.number("schema") != 1:
+        raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
+    steps = [
+        _step(table.table(name), name, slots[name], options.get(name, {})) for name in slots if name in table.values
+    ]
+    if not steps:
+        raise table.error(f"names no procedure; there are {', '.join(slots)}")
+    name = table.text("vehicle", "reference")
+    beside = file.parent / name
+    if beside.is_file():
+        return beside, steps
+    try:
+        return find_vehicle(name), steps
+    except InputError as error:
+        raise table.error(f"no file {beside}: {error}", "vehicle") from error
+
+
+def _step(table: Table, name: str, slots: Mapping[str, Slot], options: Mapping[str, Option]) -> Step:
+    table.only([*slots, *options, "columns", *(f"{slot}_columns" for slot in slots)])
+    files = {slot: _files(table, slot) for slot in slots if slot in table.values}
+    for slot, needed in slots.items():
+        try:
+            check_count(name, slot, needed, len(files.get(slot, ())))
+        except InputError as error:
+            raise table.error(str(error), slot if slot in files else "") from error
+    columns = {}
+    for slot in files:
+        own = f"{slot}_columns"
+        if named := read_columns(table.table(own if own in table.values else "columns")):
+            columns[slot] = named
+    return Step(name, files, columns, _options(table, options))
+
+
+def check_count(procedure: str, slot: str, needed: Slot, count: int) -> None:
+    """InputError if a slot is given too few or too many files."""
+    if count < needed.least:
+        raise InputError(f"{procedure} needs {needed.what} ({slot}: {needed.least} or more), has {count}")
+    if needed.most is not None and count > needed.most:
+        raise InputError(f"{procedure} takes {needed.most} for {slot} ({needed.what}), has {count}")
+
+
+def _files(table: Table, slot: str) -> tuple[Path, ...]:
+    value = table.values[slot]
+    names = [value] if isinstance(value, str) else value
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
+        raise table.error("must be the name of a file, or a list of them", slot)
+    folder = table.file.parent
+    for i, name in enumerate(names):
+        if not (folder / name).is_file():
+            there = sorted(p.name for p in (folder / name).parent.glob("*")) if (folder / name).parent.is_dir() else []
+            raise table.error(f"no file {folder / name}{nearest(Path(name).name, there)}", slot)
+        if name in names[:i]:
+            raise table.error(f"names {name} twice", slot)
+    return tuple(folder / name for name in names)
+
+
+def _options(table: Table, options: Mapping[str, Option]) -> dict[str, Option]:
+    found: dict[str, Option] = {}
+    for key, default in options.items():
+        if key in table.values:
+            found[key] = table.text(key) if isinstance(default, str) else table.number(key)
+    return found
