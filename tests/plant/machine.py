@@ -97,6 +97,7 @@ class Machine:
     inverter_voltage_offset: float = -0.015
     inverter_current_gain: float = 1.0
     accel_bias_x: float = 0.0
+    accel_pitch: float = -0.02  # of the acceleration: the body pitches, and the sensor's gain
     accel_bias_y: float = 0.0
     accel_bias_z: float = -0.045
     gyro_bias_x: float = 0.0022
@@ -120,7 +121,7 @@ SPREAD = {
 }  # fmt: skip
 SPREAD_ABSOLUTE = {
     "current_gain": 0.004, "current_offset": 0.03, "voltage_offset": 0.015, "inverter_voltage_offset": 0.015,
-    "inverter_current_gain": 0.003, "accel_bias_x": 0.03, "accel_bias_y": 0.03, "gyro_bias_x": 0.001,
+    "inverter_current_gain": 0.003, "accel_bias_x": 0.03, "accel_pitch": 0.03, "accel_bias_y": 0.03, "gyro_bias_x": 0.001,
     "gyro_bias_y": 0.001, "gyro_bias_z": 0.0006, "ambient_bias": 0.3, "gps_latency": 0.03, "ocv_shift": 0.002,
     "ocv_wave": 0.0015, "ocv_phase": 3.0, "cell_probe_bias": 0.3,
 }  # fmt: skip

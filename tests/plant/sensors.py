@@ -99,10 +99,9 @@ def measure(ridden: Ridden, name: str) -> Samples:
     speed, lean, yaw = at(c["speed"], t), at(c["lean"], t), at(c["yaw_rate"], t)
     acceleration, grade = at(c["acceleration"], t), at(c["grade"], t)
     slope = np.arcsin(grade)
-    dive = -0.011 * acceleration  # rad, nose up when accelerating: negative pitch down
     shake = 0.10 + 0.068 * speed
     sideways = speed * yaw
-    put("accel_x", t, acceleration + G * grade - G * dive * 0.5 + m.accel_bias_x, 0.002)
+    put("accel_x", t, (1 + m.accel_pitch) * acceleration + G * grade + m.accel_bias_x, 0.002)
     out["accel_x"] = _shaken(rng, out["accel_x"], shake, 0.002)
     put("accel_y", t, sideways * np.cos(lean) + G * np.sin(lean) + m.accel_bias_y, 0.002)
     out["accel_y"] = _shaken(rng, out["accel_y"], shake, 0.002)
