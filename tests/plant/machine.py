@@ -122,8 +122,8 @@ SPREAD = {
 SPREAD_ABSOLUTE = {
     "current_gain": 0.004, "current_offset": 0.03, "voltage_offset": 0.015, "inverter_voltage_offset": 0.015,
     "inverter_current_gain": 0.003, "accel_bias_x": 0.03, "accel_pitch": 0.03, "accel_bias_y": 0.03,
-    "gyro_bias_x": 0.001, "gyro_bias_y": 0.001, "gyro_bias_z": 0.0006, "ambient_bias": 0.3, "gps_latency": 0.03, "ocv_shift": 0.002,
-    "ocv_wave": 0.0015, "ocv_phase": 3.0, "cell_probe_bias": 0.3,
+    "gyro_bias_x": 0.001, "gyro_bias_y": 0.001, "gyro_bias_z": 0.0006, "ambient_bias": 0.3, "gps_latency": 0.03,
+    "ocv_shift": 0.002, "ocv_wave": 0.0015, "ocv_phase": 3.0, "cell_probe_bias": 0.3,
 }  # fmt: skip
 
 
