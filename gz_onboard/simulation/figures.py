@@ -22,10 +22,11 @@ STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
     "battery": ("#6b46c1", ("battery_heat", "bms", "not_delivered")),
     "auxiliary": ("#7b8794", ("auxiliary_load",)),
     "drive": ("#1667b7", ("inverter_loss", "motor_copper_loss", "motor_iron_loss", "motor_map_loss", "gearing")),
-    "road": ("#2f855a", ("tyre_slip", "rolling_resistance", "aerodynamic_drag", "cornering_drag", "dynamometer")),
+    "road": ("#2f855a", ("tyre_slip", "rolling_resistance", "aerodynamic_drag", "cornering_drag", "turning",
+                         "dynamometer")),
     "brakes": ("#c53030", ("brakes",)),
     "stored": ("#d9730d", ("kinetic_energy", "potential_energy")),
-}
+}  # fmt: skip
 """The entries of a ledger in the order in which energy passes them, each stage with its colour."""
 
 

@@ -17,6 +17,7 @@ from gz_onboard.physics.effect import MOVING, QUANTITIES, Effect, Port
 from gz_onboard.physics.model import G, air_density
 from gz_onboard.simulation.parts.battery import EffectPack, FirstOrderPack, Pack
 from gz_onboard.simulation.parts.brakes import Brakes
+from gz_onboard.simulation.parts.chassis import STRAIGHT_ON, Chassis, StraightChassis
 from gz_onboard.simulation.parts.controller import Controller
 from gz_onboard.simulation.parts.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.simulation.parts.motor import EffectMotor, Motor
@@ -26,6 +27,7 @@ from gz_onboard.vehicle import Vehicle
 STEP = 0.01  # s
 WHEEL_ONLY = {"speed", "motor_speed", "time_moving"}
 """What a force may read to act on a dynamometer too: it is at the wheel, not of air, hill or bend."""
+TURNING_EFFECT = "cornering_drag"
 VOLTAGE_FILTER = 0.3  # s: the controller's own; without one, current and sag would chase each other each step
 
 Place = tuple[float, float, float]
@@ -67,7 +69,8 @@ class Ledger:
 class Scooter:
     """The assembled scooter; its state is the loop variable of a simulation.
 
-    `pack` and `motor` may be replaced by any object with the methods of `Pack` and `Motor`; the other parts are
+    `pack`, `motor`, `chassis` may be replaced by any object with the methods of `Pack`, `Motor`, `Chassis`; a chassis
+    that turns is refused (InputError) beside the effect `cornering_drag`, which is the same loss. The other parts are
     attributes, to be set before the first step; effects of the model in the cells act in the own pack only.
     Temperatures in degC; `heading`, in rad clockwise from north, is that over distance [m], or that where the road
     begins and its curvature turns.
@@ -77,10 +80,17 @@ class Scooter:
                  ambient: float = 20.0, cell_temperature: float | None = None, altitude: float = 0.0,
                  speed: float = 0.0, dt: float = STEP, pack: Pack | None = None, motor: Motor | None = None,
                  tyre_form: str = "transient", brake_form: str = "friction",
-                 heading: float | Callable[[float], float] = 0.0) -> None:  # fmt: skip
+                 heading: float | Callable[[float], float] = 0.0,
+                 chassis: Chassis | None = None) -> None:  # fmt: skip
         if vehicle.battery is None:
             raise vehicle.error("has no [battery], which a simulation needs")
         p = vehicle.parameters
+        self.chassis: Chassis = chassis or StraightChassis()
+        if self.chassis.name != "straight" and any(e.name == TURNING_EFFECT for e in vehicle.model.effects):
+            raise vehicle.error(
+                f"model.effects lists {TURNING_EFFECT}, and the {self.chassis.name} chassis has the same loss: "
+                "it would count twice; take one of them"
+            )
         self.dt = dt
         self.vehicle = vehicle
         self.dynamometer = road if isinstance(road, Dynamometer) else None
@@ -148,6 +158,8 @@ class Scooter:
         self._bms_resistance = p["bms_resistance"]
         self._mass = self.dynamometer.inertia if self.dynamometer else vehicle.model.mass
         self._weight = vehicle.model.mass * G
+        self._turns = self.chassis.name != "straight" and not self.dynamometer
+        self._turn = STRAIGHT_ON
         self._rear_share = 1 - p["cg_to_rear"] / p["wheelbase"]
         self._lever = p["cg_height"] / p["wheelbase"]
         front = 0.0 if self.dynamometer else p["wheel_inertia_front"] / self._radius**2
@@ -160,6 +172,11 @@ class Scooter:
         self._heat = {"inverter": 0.0, "motor": 0.0, "pack": 0.0, "bms": 0.0}  # J in the current cooling period
         self._since_cooling = 0.0
         self._watch()
+
+    @property
+    def lean(self) -> float:
+        """[rad], positive right; 0 of a chassis that does not lean."""
+        return self._turn.lean
 
     def kinetic_energy(self) -> float:
         """Of vehicle and wheels [J]."""
@@ -187,7 +204,16 @@ class Scooter:
         if self._tracks:
             self._track(curvature)
         normal = self._weight * cosine
-        shift = self.force * self._lever
+        turning = 0.0
+        if self._turns:
+            turn = self._turn = self.chassis.turn(v, curvature, dt)
+            turning = turn.resistance * normal * v / sqrt(v * v + 0.01)
+            q["lean"] = turn.lean
+            r *= turn.radius
+            # The tyres hold back at the ground: what of their force moves load is what pushes the machine.
+            shift = (self.force - turning) * self._lever * turn.height - turn.front_load * normal
+        else:
+            shift = self.force * self._lever
         rear = normal * self._rear_share + shift
         rear = min(max(rear, 0.05 * normal), normal)
         self.rear_load, self.front_load = rear, normal - rear
@@ -211,6 +237,9 @@ class Scooter:
             if not self.dynamometer:
                 front_rolling += (1 - share) * term
         against += front_rolling
+        if turning:
+            terms.append(("turning", turning))
+            against += turning
         if self.dynamometer:
             d = self.dynamometer
             absorbed = (d.a * v / sqrt(v * v + 0.01) if d.a else 0.0) + d.b * v + d.c * v * abs(v)

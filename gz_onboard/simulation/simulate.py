@@ -22,6 +22,7 @@ from gz_onboard.bus.publisher import WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.simulation.cycles import find_cycle
 from gz_onboard.simulation.frames import Losses, check_output, simulate_frames, write_frames
+from gz_onboard.simulation.parts.chassis import MODELS, chassis
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded, rest_soc
 from gz_onboard.simulation.route import read_route, speed_profile
 from gz_onboard.simulation.run import (
@@ -66,6 +67,8 @@ KEYS = {
     "shortfall_s": "their time in all",
     "ledger_wh": "where the energy of the cells went, by name; negative: gave",
     "closure": "energy_cells_wh less the sum of the ledger, over all that was turned over",
+    "chassis": "straight, planar or leaning",
+    "turning_beyond_s": "time in which the road turned harder than the chassis' model goes; its edge was taken",
     "measured": "of a recorded ride: distance_km, energy_wh, consumption_wh_km, and RMS of simulated less measured: "
     "rms_speed_km_h, rms_pack_voltage_v, rms_pack_current_a, rms_motor_torque_nm; else null",
     "files": "written",
@@ -117,6 +120,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     often.add_argument("--until-empty", action="store_true", help="repeat it until the pack is empty")
     add("--dyno", metavar="KG[,A,B,C]", help="on a chassis dynamometer: inertia of its roller and absorber force "
         "A + B·V + C·V² in N, V in m/s")  # fmt: skip
+    add("--chassis", choices=tuple(MODELS), default="straight", help="what bends do to it: nothing, or what "
+        "this turning model says (%(default)s)")  # fmt: skip
     add("--predictive", action="store_true", help="of a recorded ride: the rider follows its speed, by own throttle")
     add("--sweep", action="append", default=[], metavar="NAME=LO..HI[:STEPS]",
         help="ride it with other values of a parameter, or of battery.cells_parallel or battery.cells_series; at most "
@@ -143,6 +148,9 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.frames:
         check_output(arguments.frames)
     plan = find_plan(arguments, vehicle)
+    if arguments.chassis != "straight" and (plan.kind == "cycle" or isinstance(plan.road, Dynamometer)):
+        where = "on a dynamometer" if isinstance(plan.road, Dynamometer) else "in a drive cycle"
+        raise InputError(f"--chassis {arguments.chassis}: there are no bends {where}; it is for routes and rides")
     trace = Trace() if arguments.frames else None
     begin = time.perf_counter()
     with _bar(_expected_seconds(arguments, plan, sweeps), "s ridden") as progress:
@@ -291,7 +299,7 @@ def ride(
         soc = (rest_soc(recorded, vehicle) if recorded else None) or 1.0
     scooter = Scooter(
         vehicle, plan.road, soc=soc, ambient=ambient, cell_temperature=measured("cell_temperature", ambient),
-        speed=measured("speed", 0.0), heading=plan.heading,
+        speed=measured("speed", 0.0), heading=plan.heading, chassis=chassis(arguments.chassis, vehicle.parameters),
     )  # fmt: skip
     scooter.motor_cooling.stator = scooter.motor_cooling.rotor = measured("motor_temperature", ambient)
     scooter.inverter_cooling.board = scooter.inverter_cooling.box = measured("inverter_temperature", ambient)
@@ -369,6 +377,8 @@ def summarise(
         "shortfall_s": sum(s.duration for s in result.shortfalls),
         "ledger_wh": {name: energy / WH for name, energy in result.ledger.items()},
         "closure": result.closure,
+        "chassis": scooter.chassis.name,
+        "turning_beyond_s": scooter.chassis.beyond,
         "measured": compare(plan.recorded, result) if plan.recorded else None,
     }
 
@@ -541,6 +551,7 @@ def summary_text(summary: dict[str, Any]) -> str:
            f"{name.replace('_', ' '):20} {energy:9.2f} Wh {100 * energy / gross:6.1f} %")
           for i, (name, energy) in enumerate(ledger)),
         *_measured_rows(summary),
+        *_turning_rows(summary),
         ("closes to", f"{100 * summary['closure']:.1g} % of what was turned over"),
         ("computed in", f"{summary['wall_s']:.2f} s, step {1000 * summary['step_s']:g} ms"),
     ]  # fmt: skip
@@ -562,6 +573,13 @@ def _shortfall_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
         place = f"at {s['time_s']:.0f} s, {s['distance_km']:.2f} km, for {s['duration_s']:.0f} s"
         rows.append(("", f"{place}: {s['missing_km_h']:.1f} km/h below {s['wanted_km_h']:.0f} km/h: {why}"))
     return rows
+
+
+def _turning_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    seconds = summary["turning_beyond_s"]
+    if not seconds:
+        return []
+    return [("turning", f"{seconds:.1f} s in bends harder than the {summary['chassis']} model goes: taken at its edge")]
 
 
 def _measured_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:

@@ -33,6 +33,10 @@ class Leaning(Planar):
         """Straight ahead, upright, at `speed` [m/s]."""
         return *super().start(speed), 0.0
 
+    def settled(self, u: float, v: float, r: float, steer: float) -> State:
+        """The state at speed, lateral speed [m/s] and yaw rate [rad/s] in which lean and slip have settled."""
+        return self._slipped((u, v, r, 0.0, 0.0, 0.0, 0.0, 0.0, self._balance(u, r)), steer)
+
     def posture(self, state: State, steer: float) -> Posture:
         """Leaning as the state says."""
         m = self.machine
@@ -57,6 +61,7 @@ class Leaning(Planar):
         return replace(rates, change=(*rates.change, self._lean_rate(state)))
 
     def _lean_rate(self, state: State) -> float:
-        m = self.machine
-        balance = lean_of(-atan(state[0] * state[2] / G), m.crown, m.cg_height)
-        return (balance - state[8]) / LEAN_TIME
+        return (self._balance(state[0], state[2]) - state[8]) / LEAN_TIME
+
+    def _balance(self, u: float, r: float) -> float:
+        return lean_of(-atan(u * r / G), self.machine.crown, self.machine.cg_height)

@@ -48,6 +48,19 @@ class Planar:
         """Straight ahead at `speed` [m/s]."""
         return speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
 
+    def settled(self, u: float, v: float, r: float, steer: float) -> State:
+        """The state at speed, lateral speed [m/s] and yaw rate [rad/s] in which slip has settled."""
+        return self._slipped((u, v, r, 0.0, 0.0, 0.0, 0.0, 0.0), steer)
+
+    def _slipped(self, state: State, steer: float) -> State:
+        m = self.machine
+        u, v, r, x, y, heading, _, _, *rest = state
+        delta = self.posture(state, steer).steer
+        across = v + (m.wheelbase - m.cg_to_rear) * r
+        along_f, across_f = u * cos(delta) + across * sin(delta), across * cos(delta) - u * sin(delta)
+        front = m.front.settled_slip(along_f, across_f)
+        return u, v, r, x, y, heading, front, m.rear.settled_slip(u, v - m.cg_to_rear * r), *rest
+
     def posture(self, state: State, steer: float) -> Posture:
         """Upright, whatever the turn."""
         m = self.machine

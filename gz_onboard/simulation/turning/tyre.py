@@ -46,8 +46,11 @@ class Tyre:
         The printed α = -atan(sideways/forward), reached over the relaxation length (Pacejka 2012, eq. 7.12).
         That lag is what keeps the lateral motion from becoming stiff when the speed falls to zero.
         """
-        speed = max(abs(forward), SLIP_SPEED)
-        return (-atan(sideways / speed) - slip) * self.slip_decay(forward)
+        return (self.settled_slip(forward, sideways) - slip) * self.slip_decay(forward)
+
+    def settled_slip(self, forward: float, sideways: float) -> float:
+        """The slip angle [rad] that a contact moving at these speeds [m/s] comes to."""
+        return -atan(sideways / max(abs(forward), SLIP_SPEED))
 
     def slip_decay(self, forward: float) -> float:
         """How fast the slip angle settles [1/s] with the contact moving at `forward` [m/s]."""
