@@ -1,0 +1,181 @@
+"""How far a simulation is from what was measured: errors, percent, pass or fail, and where they live.
+
+Definitions, the same for every channel. Both signals are first averaged over whole seconds: delays of the sensors of
+0.1 s are no error of the model. Error is simulated less measured.
+
+    rms, max       of the error, in the channel's unit
+    percent        mean absolute error over mean absolute measured. A mean of relative errors would be without meaning
+                   where a current or a torque passes through zero, and a share of the greatest value would flatter
+    of_spread      rms error over the standard deviation of the measured: for a voltage, whose percent is small by
+                   nature, this is the figure that tells. 1 is no better than its mean
+    of a temperature percent is the mean absolute error over the rise, max less min measured, at least 10 K
+    energy         the integral of the error over the integral of the measured
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+GATE, COMPONENT_GATE = 20.0, 10.0  # percent: Lord 2016, ch. 3
+LEAST_RISE = 10.0  # K
+LEAST_SECONDS = 20  # of a condition; fewer tell nothing
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A measured signal: its unit, what people call it."""
+
+    unit: str
+    label: str
+    temperature: bool = False
+
+
+CHANNELS = {
+    "pack_current": Channel("A", "battery current"),
+    "pack_voltage": Channel("V", "battery voltage"),
+    "motor_torque": Channel("N·m", "motor torque"),
+    "motor_speed": Channel("rad/s", "motor speed"),
+    "motor_temperature": Channel("degC", "motor temperature", True),
+    "inverter_temperature": Channel("degC", "inverter temperature", True),
+    "cell_temperature": Channel("degC", "cell temperature", True),
+}
+"""The thesis' gate is on the first four; temperatures are judged by the same percentage."""
+
+
+def errors(measured: Array, simulated: Array, channel: Channel, limit: float) -> dict[str, Any]:
+    """The entry of a channel in the JSON: see the module's text. Arrays of shape (n,), n > 0."""
+    error = simulated - measured
+    mae = float(np.abs(error).mean())
+    base = float(max(np.ptp(measured), LEAST_RISE)) if channel.temperature else float(np.abs(measured).mean())
+    percent = 100 * mae / base if base > 0 else None
+    spread = float(measured.std())
+    return {
+        "unit": "K" if channel.temperature else channel.unit,
+        "rms": float(np.sqrt(np.mean(error**2))),
+        "max": float(np.abs(error).max()),
+        "mean_error": float(error.mean()),
+        "percent": percent,
+        "of_spread": float(np.sqrt(np.mean(error**2))) / spread if spread > 0 else None,
+        "limit_percent": limit,
+        "passed": percent is not None and percent <= limit,
+    }
+
+
+def seconds(values: Array, per_second: int) -> Array:
+    """Means over whole seconds of a signal with `per_second` samples in each."""
+    n = len(values) // per_second
+    result: Array = values[: n * per_second].reshape(n, per_second).mean(axis=1)
+    return result
+
+
+def conditions(measured: Mapping[str, Array]) -> tuple[dict[str, dict[str, Mask]], list[str]]:
+    """(the seconds of each condition, by what they are sorted by; what could not be sorted by, and why).
+
+    measured: per second: ``speed`` [m/s]; if known ``acceleration`` [m/s²], ``yaw_rate`` [rad/s], ``grade`` (sine),
+    ``ambient_temperature`` [degC], ``braking`` (share of the second).
+    """
+    speed = measured["speed"]
+    moving = speed > 2.0
+    straight = moving.copy()
+    missing = []
+    found: dict[str, dict[str, Mask]] = {}
+    if "yaw_rate" in measured:
+        lateral = np.abs(speed * measured["yaw_rate"])
+        straight &= lateral < 0.5
+        found["turning"] = {
+            "straight": straight,
+            "slightly": moving & (lateral >= 0.5) & (lateral < 1.5),
+            "turning": moving & (lateral >= 1.5),
+        }
+    else:
+        missing.append("not split into straight and turning: the ride has no yaw rate (rate_z), or is on a roller")
+    if "grade" in measured:
+        grade = measured["grade"]
+        found["grade"] = {
+            "uphill": moving & (grade > 0.01),
+            "level": moving & (np.abs(grade) <= 0.01),
+            "downhill": moving & (grade < -0.01),
+        }
+    if "ambient_temperature" in measured:
+        ambient = measured["ambient_temperature"]
+        found["temperature"] = {
+            "cold": straight & (ambient < 12.0),
+            "mild": straight & (ambient >= 12.0) & (ambient < 20.0),
+            "warm": straight & (ambient >= 20.0),
+        }
+    else:
+        missing.append("not split into cold and warm: the ride has no ambient_temperature")
+    begun = np.cumsum(moving)
+    found["since start"] = {
+        "first 3 min": straight & (begun <= 180),
+        "3 to 10 min": straight & (begun > 180) & (begun <= 600),
+        "later": straight & (begun > 600),
+    }
+    edges = (0.0, 0.5, 4.0, 8.0, 11.0, 40.0)
+    names = ("standing", "below 4 m/s", "4 to 8 m/s", "8 to 11 m/s", "above 11 m/s")
+    found["speed"] = {name: (speed >= a) & (speed < b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True)}
+    a = measured["acceleration"]
+    braking = measured.get("braking", np.zeros(len(speed))) > 0
+    found["pace"] = {
+        "hard acceleration": moving & (a > 1.0) & ~braking,
+        "acceleration": moving & (a > 0.3) & (a <= 1.0) & ~braking,
+        "steady": moving & (np.abs(a) <= 0.3) & ~braking,
+        "coasting": moving & (a < -0.3) & ~braking,
+        "braking": moving & braking,
+    }
+    return found, missing
+
+
+LABELS = {
+    "turning": "lateral acceleration below 0.5, 0.5 to 1.5, above 1.5 m/s²",
+    "grade": "above 1 %, within, below −1 %",
+    "temperature": "air below 12, 12 to 20, above 20 °C, straight on",
+    "since start": "time ridden since the start, straight on",
+    "speed": "speed",
+    "pace": "acceleration above 1, 0.3 to 1, within 0.3, below −0.3 m/s² without brake; with brake",
+}
+
+
+def split(
+    measured: Array, simulated: Array, found: Mapping[str, Mapping[str, Mask]], valid: Mask | None = None
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Per condition of at least `LEAST_SECONDS`: seconds and the means that `KEYS` of `validate` lists."""
+    n = min(len(measured), len(simulated))
+    result: dict[str, dict[str, dict[str, float]]] = {}
+    for by, masks in found.items():
+        for name, mask in masks.items():
+            inside = mask[:n] if valid is None else mask[:n] & valid[:n]
+            count = int(inside.sum())
+            if count < LEAST_SECONDS:
+                continue
+            m, e = measured[:n][inside], (simulated[:n] - measured[:n])[inside]
+            result.setdefault(by, {})[name] = {
+                "seconds": count,
+                "mean_measured": float(m.mean()),
+                "mean_error": float(e.mean()),
+                "mean_abs_error": float(np.abs(e).mean()),
+                "mean_abs_measured": float(np.abs(m).mean()),
+            }
+    return result
+
+
+def pooled(rows: list[dict[str, float]]) -> dict[str, float]:
+    """Entries of `split` of several rides as one, every second alike; with ``percent``, ``bias_percent``."""
+    total = sum(row["seconds"] for row in rows)
+    result = {key: sum(row[key] * row["seconds"] for row in rows) / total for key in rows[0] if key != "seconds"}
+    base = result["mean_abs_measured"]
+    return {
+        "seconds": total,
+        "rides": len(rows),
+        **result,
+        "percent": 100 * result["mean_abs_error"] / base if base else 0.0,
+        "bias_percent": 100 * result["mean_error"] / base if base else 0.0,
+    }

@@ -1,0 +1,262 @@
+"""Validation: its definitions, a recorded ride against models right and wrong, bad input, the command."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gz_onboard.cli import main
+from gz_onboard.lab.validate import KEYS, per_second, pool
+from gz_onboard.lab.validate_components import components
+from gz_onboard.lab.validate_report import COLUMNS, failures
+from gz_onboard.lab.validate_score import CHANNELS, LABELS, conditions, errors, pooled, seconds, split
+from gz_onboard.physics.model import Model
+from gz_onboard.simulation.recorded import read_recorded, rest_soc
+from gz_onboard.vehicle import OWN, read_vehicle
+
+LOGS = Path(__file__).parents[2] / "replay_logs"
+
+# --- definitions --------------------------------------------------------------------------------------------------
+
+
+def test_percent_is_of_the_mean_magnitude():
+    measured, simulated = np.array([10.0, -10.0, 0.0, 20.0]), np.array([11.0, -12.0, 1.0, 20.0])
+    found = errors(measured, simulated, CHANNELS["pack_current"], 10.0)
+    assert found["percent"] == pytest.approx(100 * 4 / 40)
+    assert found["rms"] == pytest.approx(np.sqrt(6 / 4))
+    assert found["max"] == 2
+    assert found["mean_error"] == 0
+    assert found["passed"]
+    assert not errors(measured, simulated, CHANNELS["pack_current"], 9.9)["passed"]
+
+
+@pytest.mark.parametrize(("rise", "base"), [(40.0, 40.0), (3.0, 10.0)])
+def test_a_temperature_is_judged_by_its_rise(rise, base):
+    measured = 20 + rise * np.linspace(0, 1, 50)
+    found = errors(measured, measured + 2, CHANNELS["motor_temperature"], 20.0)
+    assert found["percent"] == pytest.approx(100 * 2 / base)
+    assert found["unit"] == "K"
+
+
+def test_nothing_measured_is_no_pass():
+    found = errors(np.zeros(9), np.ones(9), CHANNELS["motor_torque"], 20.0)
+    assert found["percent"] is None
+    assert not found["passed"]
+
+
+@given(st.integers(1, 40), st.integers(1, 20), st.integers(0, 19))
+def test_seconds_keep_the_mean(count, rate, rest):
+    values = np.random.default_rng(count).normal(size=count * rate + min(rest, rate - 1))
+    means = seconds(values, rate)
+    assert len(means) == count
+    assert means.mean() == pytest.approx(values[: count * rate].mean())
+
+
+def ride(n, seed=0):
+    rng = np.random.default_rng(seed)
+    speed = np.where(np.arange(n) < n // 4, 0.0, 8.0)
+    return {
+        "speed": speed,
+        "acceleration": np.where(np.arange(n) % 50 < 10, 1.5, 0.0),
+        "yaw_rate": np.where(np.arange(n) % 90 < 30, 0.3, 0.0),
+        "grade": rng.choice([-0.03, 0.0, 0.03], n),
+        "ambient_temperature": np.full(n, 5.0),
+        "braking": np.zeros(n),
+    }
+
+
+def test_each_second_has_one_condition_of_a_sorting():
+    measured = ride(400)
+    found, missing = conditions(measured)
+    assert set(found) == set(LABELS)
+    assert not missing
+    moving = measured["speed"] > 2
+    for by in ("turning", "grade", "pace"):
+        assert (np.sum(list(found[by].values()), axis=0) == moving).all(), by
+    assert (np.sum(list(found["speed"].values()), axis=0) == 1).all()
+    assert found["turning"]["turning"].sum() == (moving & (measured["yaw_rate"] > 0.1)).sum()
+    assert (found["temperature"]["cold"] == found["turning"]["straight"]).all()
+
+
+def test_without_yaw_rate_turning_is_said_to_be_missing():
+    measured = {name: values for name, values in ride(100).items() if name not in ("yaw_rate", "ambient_temperature")}
+    found, missing = conditions(measured)
+    assert "turning" not in found
+    assert "temperature" not in found
+    assert any("yaw rate" in text for text in missing)
+    assert any("cold and warm" in text for text in missing)
+
+
+@given(st.integers(0, 1000))
+def test_pooled_rides_are_as_one(seed):
+    rng = np.random.default_rng(seed)
+    every = {"all": {"all": np.ones(300, dtype=bool)}}
+    measured, simulated = rng.normal(20, 30, (2, 300))
+    cut = int(rng.integers(30, 270))
+    parts = [
+        split(m, s, {"all": {"all": np.ones(len(m), dtype=bool)}})["all"]["all"]
+        for m, s in ((measured[:cut], simulated[:cut]), (measured[cut:], simulated[cut:]))
+    ]
+    assert pooled(parts) == pytest.approx(pooled([split(measured, simulated, every)["all"]["all"]]) | {"rides": 2})
+
+
+def test_a_bias_in_turns_is_found_there():
+    measured = ride(900)
+    found, _ = conditions(measured)
+    power = np.full(900, 500.0)
+    short = power - 100 * found["turning"]["turning"]
+    entry = {"on_dynamometer": False, "splits": {"predictive": {"pack_power": split(power, short, found)}}}
+    table = {(by, kind): cells[0] for by, kind, _, cells in failures(pool([entry])["road"])}
+    assert COLUMNS[0][:2] == ("predictive", "pack_power")
+    assert table["turning", "turning"] == pytest.approx((-100, -20))
+    assert table["turning", "straight"] == pytest.approx((0, 0))
+
+
+# --- a recorded ride ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def city():
+    vehicle = read_vehicle("reference", 75.0)
+    recorded = read_recorded(LOGS / "city_34C.blf", vehicle)
+    road = recorded.road()
+    measured = per_second(recorded, vehicle)
+    place = seconds(recorded.signals["distance"], 100)
+    return vehicle, measured | {"grade": np.array([road(at)[0] for at in place])}, rest_soc(recorded, vehicle)
+
+
+def changed(vehicle, **values):
+    parameters = vehicle.parameters.replaced(**values)
+    return replace(vehicle, parameters=parameters, model=Model(vehicle.model.effects, parameters))
+
+
+def alone(city, name, **values):
+    vehicle, measured, soc = city
+    c = components(changed(vehicle, **values), measured, soc, 30.0, None)[name]
+    return errors(c.measured[c.valid], c.modelled[c.valid], c.channel, 10.0)
+
+
+def test_components_of_the_right_model(city):
+    assert alone(city, "battery_voltage")["percent"] < 1
+    assert alone(city, "battery_voltage")["of_spread"] < 0.5
+    assert alone(city, "inverter_power")["percent"] < 5
+    assert alone(city, "motor_torque")["passed"]
+    assert alone(city, "cell_temperature")["max"] < 3
+
+
+@pytest.mark.parametrize(
+    ("component", "change"),
+    [
+        ("inverter_power", {"motor_copper_resistance": 0.06}),
+        ("inverter_power", {"inverter_loss_constant": 80.0}),
+        ("motor_torque", {"torque_constant": 0.38}),
+        ("road_load", {"drag_area": 1.1}),
+        ("road_load", {"vehicle_mass": 165.0}),
+        ("cell_temperature", {"pack_heat_capacity": 3000.0}),
+    ],
+)
+def test_a_wrong_parameter_shows_in_its_component(city, component, change):
+    right, wrong = alone(city, component), alone(city, component, **change)
+    assert wrong["rms"] > 1.2 * right["rms"]
+    if component in ("inverter_power", "motor_torque"):
+        assert wrong["percent"] > right["percent"] + 3
+
+
+def test_current_is_that_which_flows(city):
+    vehicle, *_ = city
+    recorded = read_recorded(LOGS / "coastdown.blf", vehicle)
+    raw = seconds(recorded.signals["pack_current"], 100)
+    p = vehicle.parameters
+    flows = per_second(recorded, vehicle)["pack_current"]
+    assert flows * p["pack_current_gain"] + p["pack_current_offset"] == pytest.approx(raw)
+
+
+# --- the command --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def two(tmp_path_factory):
+    """(folder, summary) of the coast-down twice, in two processes."""
+    folder = tmp_path_factory.mktemp("validate")
+    other = folder / "other"
+    other.mkdir()
+    shutil.copy(LOGS / "coastdown.blf", other / "coastdown.blf")
+    (other / "rides.json").write_text('[{"name": "coastdown", "kind": "roll", "rider_mass_kg": 75.0}]')
+    out = folder / "out"
+    logs = [str(LOGS / "coastdown.blf"), str(other / "coastdown.blf")]
+    assert main(["validate", *logs, "--json", str(folder / "v.json"), "--output", str(out), "--jobs", "2"]) == 0
+    return out, json.loads((folder / "v.json").read_text())
+
+
+def test_the_summary_has_its_keys(two):
+    _, summary = two
+    assert summary["version"] == 1
+    assert summary["failed"] == []
+    first, second = summary["rides"]
+    assert set(first) == set(KEYS) - {"channels", "energy_percent"}
+    assert set(first["open_loop"]) == {"channels", "energy_percent", "passed"}
+    assert set(first["open_loop"]["channels"]) == set(CHANNELS)
+    assert second["kind"] == "roll"
+    assert second["payload_kg"] == 75.0
+    assert {e["limit_percent"] for e in first["components"]["channels"].values()} == {10.0}
+    assert {e["limit_percent"] for e in first["predictive"]["channels"].values()} == {20.0}
+    assert first["passed"] == all(first[form]["passed"] for form in ("open_loop", "predictive", "components"))
+    assert first["energy_wh"] == pytest.approx(second["energy_wh"])
+
+
+def test_pictures_and_page(two):
+    out, summary = two
+    for entry in summary["rides"]:
+        assert Path(entry["plot"]).stat().st_size > 50_000
+    page = (out / "validation.html").read_text()
+    assert page.count("data:image/png;base64,") == 2
+    assert "http" not in page
+    assert "Where the model fails" in page
+    assert "class=bad" in page
+
+
+def test_a_repeated_run_is_the_same(two, capsys):
+    _, summary = two
+    arguments = ["validate", str(LOGS / "coastdown.blf"), "--payload", "75", "--json", "--no-plot", "--gate"]
+    status = main(arguments)
+    found = json.loads(capsys.readouterr().out)["rides"][0]
+    assert status == (0 if found["passed"] else 1)
+    twin = summary["rides"][1]
+    for form in ("open_loop", "predictive", "components"):
+        assert found[form] == twin[form]
+
+
+def test_a_ride_without_throttle_and_yaw_rate_is_judged_by_the_rest(tmp_path, capsys):
+    text = (OWN / "reference.toml").read_text().splitlines()
+    text = [line for line in text if not line.startswith(("throttle =", "rate_z ="))]
+    (tmp_path / "blind.toml").write_text("\n".join(text))
+    arguments = ["--vehicle", str(tmp_path / "blind.toml"), "--json", "--no-plot"]
+    assert main(["validate", str(LOGS / "coastdown.blf"), *arguments]) == 0
+    found = json.loads(capsys.readouterr().out)["rides"][0]
+    assert found["open_loop"] is None
+    assert found["predictive"]["channels"]["motor_speed"]["passed"]
+    assert "turning" not in found["splits"]["predictive"]["pack_power"]
+    assert any("no throttle" in text for text in found["missing"])
+    assert any("yaw rate" in text for text in found["missing"])
+
+
+def test_bad_input(tmp_path, capsys):
+    other = tmp_path / "other.log"
+    other.write_text("(1.000000) can0 7AB#0011223344556677\n(1.010000) can0 7AB#0011223344556677\n")
+    none = tmp_path / "none.blf"
+    assert main(["validate", str(other), str(none), "--jobs", "1", "--no-plot", "--output", str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert "knows none" in said
+    assert "none.blf" in said
+    assert main(["validate", str(other), "--jobs", "0"]) == 2
+    assert main(["validate", "--vehicle", "refrence", str(other)]) == 2
+    assert "did you mean 'reference'" in capsys.readouterr().err
+    assert main(["validate", str(other), "--json", "ride.blf"]) == 2
+    assert "name of a log" in capsys.readouterr().err
