@@ -127,11 +127,12 @@ def test_2_16_and_2_17_bms(riding):
 
 
 def test_2_18_and_2_23_pack_voltage():
-    pack = FirstOrderPack(BATTERY, 0.6)
+    pack = FirstOrderPack(BATTERY, 0.6, v1=0.03)
     current, voltage, _, _ = pack.draw(1500.0, DT, 25.0)
     cell = current / BATTERY.cells_parallel
     r0 = BATTERY.r0.at(0.6, 25.0)[0]
-    expected = BATTERY.cells_series * (BATTERY.ocv(0.6)[0] - r0 * cell) - BATTERY.series_resistance * current
+    source = BATTERY.ocv(0.6)[0] - r0 * cell - 0.03
+    expected = BATTERY.cells_series * source - BATTERY.series_resistance * current
     assert voltage == pytest.approx(expected, rel=1e-5)
     assert voltage * current == pytest.approx(1500.0, rel=1e-4)
 
