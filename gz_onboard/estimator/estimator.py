@@ -6,20 +6,22 @@ All state of the on-board software that matters lives here; `snapshot` and `rest
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from math import exp, isfinite, sqrt
 from typing import Any
 
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
-from gz_onboard.estimator.forecast import Forecast, Forecaster
+from gz_onboard.estimator.forecast import Forecast, Forecaster, Turn
 from gz_onboard.estimator.road import Road
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.events import STALE_PERIODS, Estimate, Event, Group, Reason, State
 from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.effect import QUANTITIES
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.riding import PriorRiding
 
-SNAPSHOT_VERSION = 1
+SNAPSHOT_VERSION = 2  # 2: the states of effects with memory
 PACE = ("pack_voltage", "inverter_voltage", "motor_speed")  # the message of the first that is mapped sets the pace
 STEP_AT_LEAST = 0.25  # s: without the message that sets the pace, a step is made after so long
 FORECAST_PERIOD = 1.0  # s
@@ -101,7 +103,15 @@ class Estimator:
         self._cell_scatter = p.sd("cell_capacity") / p["cell_capacity"]
         self._charge_sd = sqrt(self._cell_scatter**2 + gain_sd**2)
         self._cable = p["cable_resistance"]
-        self._radius, self._gear = p["wheel_radius"], p["gear_ratio"]
+        self._radius, self._gear = p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"]
+        self._latency = p["pack_voltage_latency"]
+        self._recent: deque[tuple[float, float, float]] = (
+            deque()
+        )  # s, V, A of the pack; kept if the two are not in step
+        self._in_cells = [effect for _, effect in model.cell_voltage]
+        self._cell_states = {effect.effect.name: 0.0 for effect in self._in_cells}  # V of a cell
+        self._lacking = 0.0  # V, their sum
+        self._cell_quantities = dict.fromkeys(QUANTITIES, 0.0)
 
     # --- events -----------------------------------------------------------------------------------------------
 
@@ -169,6 +179,8 @@ class Estimator:
             road.speed or 0.0, road.acceleration or 0.0, self._ambient(now)[0], road.altitude or 0.0, 40.0
         )
         quantities["grade"] = road.grade or 0.0
+        if self.forecaster.extended:
+            self.forecaster.add(quantities, self._turn(), self._ambient(now)[0])
         return float(sum(self.model.power(quantities).values()))
 
     def _ambient(self, now: float) -> tuple[float, float]:
@@ -216,13 +228,21 @@ class Estimator:
                 mean /= dt
                 q += (CURRENT_SD["none"] * (dt - 1.0) / charge) ** 2
             filter_.predict(dt, mean / battery.cells_parallel, temperature, (q, 1e-8 * dt))
+            if self._in_cells:
+                self._move_cells(dt, mean / battery.cells_parallel, filter_.soc, temperature)
             if filter_.soc < -0.05 or filter_.soc > 1.05:
                 filter_.soc = min(max(filter_.soc, -0.05), 1.05)
         self._current = current
         if voltage is None or current is None:
             self._innovation = None
             return
-        cell_voltage = battery.cell_voltage(voltage, current)
+        if self._latency and self.signals.pack_voltage.fresh(now):
+            pair = self._paired(now, voltage, current)
+            if pair is None:
+                return
+            voltage, current = pair
+        # What effects in the cells take is known: the filter sees the voltage that there would be without them.
+        cell_voltage = battery.cell_voltage(voltage, current) + self._lacking
         cell_current = current / battery.cells_parallel
         r0 = battery.r0.at(filter_.soc, temperature)[0]
         resistance_sd = RESISTANCE_SD if self.signals.cell_temperature.fresh(now) else RESISTANCE_SD_COLD
@@ -250,6 +270,35 @@ class Estimator:
         # What errs the same way for ERROR_TIME is worth one sample in that time, not one each step.
         filter_.update(cell_voltage, cell_current, temperature, slow * max(2 * ERROR_TIME / max(dt, 0.02), 1.0))
 
+    def _move_cells(self, dt: float, current: float, soc: float, temperature: float) -> None:
+        """The effects in the cells, `dt` [s] on at a mean cell current [A]."""
+        q, states = self._cell_quantities, self._cell_states
+        q["cell_current"], q["soc"], q["cell_temperature"] = current, soc, temperature
+        q["cell_capacity"] = self.battery.cell_capacity(temperature)
+        for effect in self._in_cells:
+            name = effect.effect.name
+            states[name] = effect.step(states[name], dt, q)
+        self._lacking = sum(states.values())
+
+    def _paired(self, now: float, voltage: float, current: float) -> tuple[float, float] | None:
+        """Voltage and current of one time, where the voltage comes later or earlier than the current; None if not yet.
+
+        The one that comes first is kept, and is interpolated.
+        """
+        recent, then = self._recent, now - abs(self._latency)
+        recent.append((now, voltage, current))
+        if recent[0][0] > then:
+            return None
+        while recent[1][0] <= then:
+            recent.popleft()
+        (t0, v0, i0), (t1, v1, i1) = recent[0], recent[1]
+        if t1 - t0 > 1.0:  # a pause between
+            return None
+        share = (then - t0) / (t1 - t0)
+        if self._latency > 0:
+            return voltage, i0 + share * (i1 - i0)
+        return v0 + share * (v1 - v0), current
+
     def _wait(self, now: float, voltage: float, current: float, temperature: float) -> None:
         """Start from the first voltage, as soon as the cells' temperature, sent once a second, is known or overdue.
 
@@ -270,7 +319,7 @@ class Estimator:
         """The first SOC: from the voltage, taken as at rest, with what is not known about that in its variance."""
         battery = self.battery
         cell_current = current / battery.cells_parallel
-        cell_voltage = battery.cell_voltage(voltage, current)
+        cell_voltage = battery.cell_voltage(voltage, current) + self._lacking  # of before a restart
         soc = 0.5
         for _ in range(5):  # R0 depends on SOC
             soc = battery.soc_at(cell_voltage + battery.r0.at(soc, temperature)[0] * cell_current)
@@ -316,8 +365,15 @@ class Estimator:
         motor = self.signals.motor_temperature.get(now)
         self.forecaster.ride(
             dt, speed, self.road.grade, voltage * current, self._ambient(now)[0], self.road.altitude or 0.0,
-            40.0 if motor is None else motor,
+            40.0 if motor is None else motor, self._turn() if self.forecaster.extended else None,
         )  # fmt: skip
+
+    def _turn(self) -> Turn:
+        """What effects beyond the base's may read while riding."""
+        road, filter_ = self.road, self.filter
+        lateral = None if road.yaw_rate is None or road.speed is None else road.speed * road.yaw_rate
+        cells = (filter_.soc if filter_ else 0.5, self._cell_temperature or 20.0, self._current or 0.0)
+        return Turn(lateral, road.heading, *cells)
 
     def _make_forecast(self, now: float, temperature: float) -> None:
         filter_ = self.filter
@@ -412,6 +468,7 @@ class Estimator:
             "v1": self.filter.v1,
             "covariance": list(self.filter.covariance),
             "cell_temperature": self._cell_temperature,
+            "cell_effects": dict(self._cell_states),
             "gyro_bias": [self.road.bias_x, self.road.bias_z],
             "riding": self.forecaster.snapshot(),
         }
@@ -435,6 +492,9 @@ class Estimator:
                 and p01 * p01 <= p00 * p11
             ):
                 raise ValueError("holds implausible numbers")
+            states = {name: float(saved["cell_effects"][name]) for name in self._cell_states}
+            if not all(abs(x) < 1 for x in states.values()):
+                raise ValueError("holds implausible voltages of effects in the cells")
             self.forecaster.restore(saved["riding"])
         except (KeyError, TypeError, OverflowError) as error:
             raise ValueError(f"is damaged: {error!r}") from error
@@ -444,3 +504,6 @@ class Estimator:
             self._cell_temperature = float(cells)
         self._saved = {"soc": soc, "v1": v1, "covariance": (p00, p01, p11)}
         self._saved_age = age
+        if states:  # at rest meanwhile; for how long if that is not known: for long
+            self._cell_states = states
+            self._move_cells(1e9 if age is None else age, 0.0, soc, 20.0)

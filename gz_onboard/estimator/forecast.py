@@ -12,6 +12,14 @@ model says the same riding takes, as it was and less what height and speed have 
 
 The range is the energy that can be drawn before the cut-off at the power to be expected, over that consumption,
 with a log-normal distribution.
+
+Effects of an extended model read more than speed, acceleration and grade, which is all that is known of the way to
+come. What is modelled of the way ridden has the heading, the lateral acceleration (its root mean square over each
+second) and the time moving as they were. What is expected of the way to come has
+- of the heading nothing: the mean over all of them, so that a steady wind costs what it costs on a round trip;
+- the lateral acceleration that the same piece of way had; before anything is ridden, or without IMU, the prior's;
+- the time moving of half an hour on, as a range lasts an hour or so: tyres are warm then;
+- of memory nothing: effects are settled. Those in the cells take their voltage at the mean current.
 """
 
 from __future__ import annotations
@@ -19,11 +27,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import exp, sqrt
+from math import exp, isfinite, pi, sqrt
 from typing import Any
 
 from gz_onboard.physics.battery import Battery, drawable
-from gz_onboard.physics.model import Model, air_density
+from gz_onboard.physics.effect import MOVING
+from gz_onboard.physics.model import Model, air_density, stepping
 from gz_onboard.physics.riding import PriorRiding
 
 SEGMENT = 250.0  # m
@@ -36,6 +45,13 @@ SEGMENT_SD = 0.18  # relative: measured against modelled energy of one segment, 
 PRIOR_FORM = 2.5  # mean square of the power over the square of its mean, of the eight commissioning rides
 PRIOR_SCATTER = 0.25  # relative sd of segments of a riding not yet known
 G = 9.80665  # m/s²
+AHEAD = 1800.0  # s: half of what a range lasts
+HEADINGS = tuple(
+    pi / 4 * i for i in range(8)
+)  # rad: of a wind slower than the scooter their mean is that of all, exactly
+BASE = {"speed", "acceleration", "grade", "grade_cosine", "headwind", "mass", "air_density", "motor_temperature",
+        "motor_speed", "motor_current", "torque"}  # fmt: skip
+"""Quantities that need nothing beyond speed, grade and air."""
 DECILE = 1.2815515655446004
 
 
@@ -64,6 +80,9 @@ class Riding:
     energy: float = 0.0  # J in it
     squares: float = 0.0  # W²·s in it
     climb: float = 0.0  # m in it
+    lateral: float = 0.0  # m²/s³ in it: the square of the lateral acceleration
+    lateral_seconds: float = 0.0  # s in it for which that is known
+    time_moving: float = 0.0  # s since the start
     speed_before: float | None = None  # m/s, at its start
 
 
@@ -97,6 +116,17 @@ class Forecast:
     mostly_prior: bool
 
 
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """What effects beyond the base's may read at one time; None where it is not known."""
+
+    lateral_acceleration: float | None  # m/s²
+    heading: float | None  # rad, clockwise from north
+    soc: float
+    cell_temperature: float  # degC
+    current: float  # A of the pack
+
+
 class Forecaster:
     """Learns from the riding and forecasts the range."""
 
@@ -108,13 +138,20 @@ class Forecaster:
         self._past = Past()
         self._prior_at: tuple[tuple[float, float], float] = (float("nan"), 0.0), 0.0
         parameters = model.parameters
+        self.extended = not model.reads <= BASE or any(e.decay for e in model.effects)
+        self._by_heading = "heading" in model.reads
+        self._lacks = model.lacks(battery)
+        self._states: dict[str, float] = {}  # of effects with memory between road and pack
         self._capacity_sd = parameters.sd("cell_capacity") / parameters["cell_capacity"]
 
     # --- learning ---------------------------------------------------------------------------------------------
 
     def ride(self, dt: float, speed: float, grade: float | None, power: float, ambient: float, altitude: float,
-             motor_temperature: float) -> None:  # fmt: skip
-        """Take in `dt` [s] of riding: speed [m/s], grade (sine), power at the pack [W], ambient and motor [degC]."""
+             motor_temperature: float, turn: Turn | None = None) -> None:  # fmt: skip
+        """Take in `dt` [s] of riding: speed [m/s], grade (sine), power at the pack [W], ambient and motor [degC].
+
+        `turn` is needed, and read, if the model is `extended`.
+        """
         r = self.riding
         if r.speed_before is None:
             r.speed_before = speed
@@ -123,6 +160,12 @@ class Forecaster:
         r.energy += power * dt
         r.squares += power * power * dt
         r.climb += (grade or 0.0) * speed * dt
+        if turn:
+            if turn.lateral_acceleration is not None:
+                r.lateral += turn.lateral_acceleration**2 * dt
+                r.lateral_seconds += dt
+            if speed > MOVING:
+                r.time_moving += dt
         if r.seconds < 1.0:
             return
         mean = r.way / r.seconds
@@ -135,11 +178,17 @@ class Forecaster:
         segment.duration += r.seconds
         segment.measured += r.energy
         segment.squares += r.squares
-        energy = sum(self.model.power(q).values()) * r.seconds
+        if turn:
+            self.add(q, turn, ambient)
+            if r.lateral_seconds:
+                q["lateral_acceleration"] = sqrt(r.lateral / r.lateral_seconds)
+            energy, to_come = (power * r.seconds for power in self._with_memory(q, turn.heading is not None, r.seconds))
+        else:
+            energy = to_come = sum(self.model.power(q).values()) * r.seconds
         segment.modelled += energy
         stored = G * r.climb + (speed * speed - r.speed_before * r.speed_before) / 2
-        segment.level += energy - self.model.mass * stored
-        r.seconds = r.way = r.energy = r.squares = r.climb = 0.0
+        segment.level += to_come - self.model.mass * stored
+        r.seconds = r.way = r.energy = r.squares = r.climb = r.lateral = r.lateral_seconds = 0.0
         r.speed_before = speed
         if segment.distance >= SEGMENT:
             self._close(segment)
@@ -147,7 +196,7 @@ class Forecaster:
     def pause(self) -> None:
         """Something was not known for a while: leave the second that was being gathered."""
         r = self.riding
-        r.seconds = r.way = r.energy = r.squares = r.climb = 0.0
+        r.seconds = r.way = r.energy = r.squares = r.climb = r.lateral = r.lateral_seconds = 0.0
         r.speed_before = None
 
     def quantities(
@@ -159,6 +208,40 @@ class Forecaster:
             "mass": self.model.mass, "air_density": air_density(ambient, altitude), "motor_temperature": motor,
             "lateral_acceleration": 0.0,
         }  # fmt: skip
+
+    def add(self, q: dict[str, Any], turn: Turn, ambient: float) -> None:
+        """Add to `q` what an extended model may read beside; `ambient` in degC."""
+        lateral = turn.lateral_acceleration
+        if lateral is None:
+            lateral = self.prior.lateral_acceleration if q["speed"] > MOVING else 0.0
+        q["lateral_acceleration"] = lateral
+        q["heading"] = turn.heading or 0.0
+        q["time_moving"] = self.riding.time_moving
+        self._add_cells(q, turn.soc, turn.cell_temperature, turn.current, ambient)
+
+    def _add_cells(self, q: dict[str, Any], soc: float, temperature: float, current: float, ambient: float) -> None:
+        q |= {
+            "ambient_temperature": ambient,
+            "soc": soc,
+            "cell_temperature": temperature,
+            "cell_current": current / self.battery.cells_parallel,
+            "cell_capacity": self.battery.cell_capacity(temperature),
+        }
+
+    def _with_memory(self, q: dict[str, Any], heading_known: bool, dt: float) -> tuple[float, float]:
+        """The power [W] as it was, over the last `dt` [s], and as it is to be expected of riding the same again."""
+        q_then = q | {"time_moving": q["time_moving"] + AHEAD}
+        to_come = self._over_headings(q_then)
+        if self._by_heading and not heading_known:
+            return self._over_headings(q), to_come
+        return float(sum(self.model.power(q, stepping(self._states, dt)).values())), to_come
+
+    def _over_headings(self, q: dict[str, Any]) -> float:
+        """The power [W] with all settled, in the mean over the headings if the model reads them."""
+        if not self._by_heading:
+            return float(sum(self.model.power(q).values()))
+        powers = (sum(self.model.power(q | {"heading": heading}).values()) for heading in HEADINGS)
+        return float(sum(powers)) / len(HEADINGS)
 
     def _close(self, segment: Segment) -> None:
         r = self.riding
@@ -199,8 +282,8 @@ class Forecaster:
         form = (PRIOR_FORM * prior_power**2 * prior_time + past.power_squares) * (prior_time + past.duration) / mean**2
         form = min(max(form, 1.0), 6.0)
 
-        left = drawable(self.battery, soc, cell_temperature, power, form)
-        colder = drawable(self.battery, soc, cell_temperature - temperature_sd, power, form)
+        left = drawable(self.battery, soc, cell_temperature, power, form, self._lacks)
+        colder = drawable(self.battery, soc, cell_temperature - temperature_sd, power, form, self._lacks)
         energy_sd = sqrt(
             (soc_sd * left.slope) ** 2 + (left.energy - colder.energy) ** 2 + (self._capacity_sd * left.energy) ** 2
         )
@@ -258,7 +341,13 @@ class Forecaster:
             power = 0.0
             for share, speed, acceleration in self.prior.points:
                 q = self.quantities(speed, acceleration, ambient, altitude, 40.0)
-                power += share * sum(self.model.power(q).values())
+                if self.extended:
+                    q["time_moving"] = AHEAD
+                    q["lateral_acceleration"] = self.prior.lateral_acceleration if speed > MOVING else 0.0
+                    self._add_cells(q, 0.5, float(ambient), 0.0, float(ambient))
+                    power += share * self._over_headings(q)
+                else:
+                    power += share * sum(self.model.power(q).values())
             self._prior_at = (ambient, altitude), power * self.prior.unevenness
         return self._prior_at[1], self.prior.speed
 
@@ -268,18 +357,24 @@ class Forecaster:
         """What is to be kept over a restart."""
         r = self.riding
         rows = [[s.distance, s.duration, s.measured, s.squares, s.modelled, s.level] for s in r.segments]
-        return {"segments": rows, "factor": r.factor, "factor_variance": r.factor_variance}
+        return {"segments": rows, "factor": r.factor, "factor_variance": r.factor_variance,
+                "time_moving": r.time_moving, "states": dict(self._states)}  # fmt: skip
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Take what `snapshot` gave; raises KeyError, TypeError or ValueError if it is not that."""
         segments = [Segment(*(float(x) for x in row)) for row in saved["segments"]]
         riding = Riding(factor=float(saved["factor"]), factor_variance=float(saved["factor_variance"]))
         riding.segments.extend(segments)
+        riding.time_moving = float(saved["time_moving"])
+        states = {str(name): float(x) for name, x in saved["states"].items()}
         numbers = [x for s in segments for x in (s.measured, s.squares, s.modelled, s.level)]
         good = all(0 < s.distance < 1e5 and 0 < s.duration < 1e6 for s in segments) and all(
             abs(x) < 1e12 for x in numbers
         )
         if not good or not (0.3 <= riding.factor <= 3 and 0 < riding.factor_variance < 1):
             raise ValueError("implausible riding")
+        if not (0 <= riding.time_moving < 1e7 and all(map(isfinite, states.values()))):
+            raise ValueError("implausible states of effects")
+        self._states = states
         self.riding = riding
         self._sum_past()

@@ -9,13 +9,16 @@ if TYPE_CHECKING:
     from gz_onboard.toml import Table
 
 
+LATERAL = 1.1  # m/s², of the eight commissioning rides; each alone 0.26 (suburban) to 1.7 (oval)
+
+
 @dataclass(frozen=True)
 class PriorRiding:
     """A riding as operating points, and what the model makes of it.
 
     points: (share of time, speed [m/s], acceleration [m/s²]). unevenness: what hills and what lies between the
     points add to the energy modelled. factor, factor_sd: energy measured over modelled, and how that differs from
-    ride to ride.
+    ride to ride. lateral_acceleration: its root mean square while moving [m/s²]; only a model that reads it asks.
     """
 
     points: tuple[tuple[float, float, float], ...] = (
@@ -25,6 +28,7 @@ class PriorRiding:
     unevenness: float = 1.1
     factor: float = 1.0
     factor_sd: float = 0.15
+    lateral_acceleration: float = LATERAL
 
     @property
     def speed(self) -> float:
@@ -35,7 +39,7 @@ class PriorRiding:
 def read_riding(vehicle: Table) -> PriorRiding:
     """The table ``[forecast]`` of a vehicle file; without one, town riding as in the first part of the WMTC."""
     table = vehicle.table("forecast")
-    table.only(["riding", "unevenness", "factor", "factor_sd", "source"])
+    table.only(["riding", "unevenness", "factor", "factor_sd", "lateral_acceleration", "source"])
     town = PriorRiding()
     if "riding" not in table.values:
         points = town.points
@@ -57,4 +61,5 @@ def read_riding(vehicle: Table) -> PriorRiding:
         table.number("unevenness", town.unevenness, 1.0, 2.0),
         table.number("factor", town.factor, 0.3, 3.0),
         table.number("factor_sd", town.factor_sd, 0.001, 1.0),
+        table.number("lateral_acceleration", town.lateral_acceleration, 0.0, 9.0),
     )

@@ -1,0 +1,292 @@
+"""The estimator with an extended model: effects in the cells, of bends and wind, warming tyres, sensors that err."""
+
+from __future__ import annotations
+
+import json
+import math
+
+import numpy as np
+import pytest
+
+from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.estimator.forecast import Forecaster, Turn
+from gz_onboard.physics.effect import load_effect
+from gz_onboard.vehicle import Vehicle, read_vehicle
+from tests.estimator.test_estimator import CELLS, GROUPS, MOTOR, PACK, Plant
+
+BASE = read_vehicle("reference", 75.0)
+
+
+def extended(*names: str, **values: float) -> Vehicle:
+    effects = [load_effect(name) for name in names]
+    return BASE.changed(BASE.parameters.joined(effects).replaced(**values), (*BASE.model.effects, *effects))
+
+
+def estimator(vehicle: Vehicle) -> Estimator:
+    return Estimator(GROUPS, vehicle.pack, vehicle.model, vehicle.riding)
+
+
+def run(vehicle, seconds, change=lambda events: events, plant=None):
+    """(estimator, the innovations [V] after the first minute)."""
+    e = estimator(vehicle)
+    innovations, due = [], 60.0
+    for event in change(event for event, _ in (plant or Plant(offset=0.0)).ride(seconds)):
+        e.handle(event)
+        if event[0] >= due:
+            due += 0.5
+            found = e.estimate(event[0]).innovation
+            if found is not None:
+                innovations.append(found)
+    return e, np.array(innovations)
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+# --- effects in the cells -----------------------------------------------------------------------------------------
+
+
+def slow_plant(resistance, seconds=700.0):
+    """Events of a pack as the base model has it, and a slow RC pair of 5 min: bursts of 35 A for 20 s in 30."""
+    battery, soc, fast, slow = BASE.pack, 0.7, 0.0, 0.0
+    p = BASE.parameters
+    for step in range(round(seconds / 0.1)):
+        t = 0.1 * step
+        current = 0.0 if t < 3 else 35.0 if t % 30 < 20 else 2.0
+        cell = current / battery.cells_parallel
+        volts = battery.ocv(soc)[0] - battery.r0.at(soc, 25.0)[0] * cell - fast - slow
+        pack = battery.cells_series * volts - battery.series_resistance * current
+        yield t, PACK, (pack, p["pack_current_gain"] * current + p["pack_current_offset"])
+        yield t + 0.01, MOTOR, (20.0,)
+        if step % 10 == 0:
+            yield t + 0.02, CELLS, (25.0, 20.0)
+        fade = math.exp(-0.1 / (battery.r1.at(soc, 25.0)[0] * battery.c1.at(soc, 25.0)[0]))
+        fast = fade * fast + battery.r1.at(soc, 25.0)[0] * (1 - fade) * cell
+        slow = math.exp(-0.1 / 300) * slow + resistance * (1 - math.exp(-0.1 / 300)) * cell
+        soc -= current * 0.1 / 3600 / battery.pack_capacity(25.0)
+    yield t, PACK, (slow, soc)  # the truth, for the test; not handled
+
+
+def test_a_second_rc_pair_is_taken_out_of_the_innovation_and_of_the_soc():
+    results = {}
+    for name, vehicle in (("base", BASE), ("slow", extended("slow_relaxation", slow_resistance=0.03, slow_time=300.0))):
+        *events, (_, _, (slow, soc)) = slow_plant(0.03)
+        e = estimator(vehicle)
+        for event in events:
+            e.handle(event)
+        found = e.estimate(events[-1][0])
+        assert found.innovation is not None
+        assert found.soc is not None
+        results[name] = abs(found.innovation), abs(found.soc - soc)
+        if name == "slow":
+            assert e._lacking == pytest.approx(slow, rel=0.02)
+    assert results["slow"][0] < 0.003
+    assert results["base"][0] > 10 * results["slow"][0]
+    assert results["slow"][1] < 0.002
+
+
+def test_the_states_outlive_a_restart_and_relax_meanwhile():
+    vehicle = extended("slow_relaxation", "ocv_hysteresis", slow_time=600.0, hysteresis_rate=300.0)
+    first, _ = run(vehicle, 300)
+    saved = json.loads(json.dumps(first.snapshot(vehicle.key)))
+    before = dict(first._cell_states)
+    assert before["slow_relaxation"] > 1e-3
+    assert before["ocv_hysteresis"] > 1e-3
+    for age, share in ((0.0, 1.0), (600.0, math.exp(-1)), (None, 0.0)):
+        second = estimator(vehicle)
+        second.restore(saved, vehicle.key, age)
+        assert second._cell_states["slow_relaxation"] == pytest.approx(share * before["slow_relaxation"], abs=1e-9)
+        assert second._cell_states["ocv_hysteresis"] == pytest.approx(before["ocv_hysteresis"])
+        assert second._lacking == pytest.approx(sum(second._cell_states.values()))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        ({"version": 1}, "version 1"),
+        ({"cell_effects": {}}, "damaged"),
+        ({"cell_effects": {"slow_relaxation": 3.0}}, "implausible"),
+        ({"cell_effects": {"slow_relaxation": float("nan")}}, "implausible"),
+    ],
+)
+def test_a_snapshot_without_good_states_is_refused(damage, message):
+    vehicle = extended("slow_relaxation")
+    e, _ = run(vehicle, 30)
+    with pytest.raises(ValueError, match=message):
+        estimator(vehicle).restore({**e.snapshot(vehicle.key), **damage}, vehicle.key, 1.0)
+
+
+def test_a_snapshot_of_the_base_model_is_not_that_of_the_extended():
+    e, _ = run(BASE, 30)
+    with pytest.raises(ValueError, match="this is"):
+        estimator(extended("slow_relaxation")).restore(e.snapshot(BASE.key), extended("slow_relaxation").key, 1.0)
+
+
+def test_slow_relaxation_leaves_less_to_be_drawn():
+    at = (0.3, 0.01, 0.0, 1.0, 10.0, 0.0)
+    base = Forecaster(BASE.model, BASE.pack, BASE.riding).forecast(*at)
+    vehicle = extended("slow_relaxation", slow_resistance=0.04)
+    slow = Forecaster(vehicle.model, vehicle.pack, vehicle.riding).forecast(*at)
+    assert slow.consumption == base.consumption
+    assert slow.energy < 0.99 * base.energy
+
+
+# --- sensors ------------------------------------------------------------------------------------------------------
+
+
+def shifted(voltage_late):
+    """Pack messages whose voltage is that of `voltage_late` messages before (or after) their current."""
+
+    def change(events):
+        events = list(events)
+        packs = [event for event in events if event[1] == PACK]
+        index = {event[0]: i for i, event in enumerate(packs)}
+        for time, group, values in events:
+            if group == PACK:
+                other = packs[min(max(index[time] - voltage_late, 0), len(packs) - 1)]
+                yield time, group, (other[2][0], values[1])
+            else:
+                yield time, group, values
+
+    return change
+
+
+@pytest.mark.parametrize("late", [3, -2])
+def test_voltage_and_current_out_of_step_are_paired(late):
+    _, true = run(BASE, 400)
+    _, off = run(BASE, 400, shifted(late))
+    _, mended = run(extended(pack_voltage_latency=0.1 * late), 400, shifted(late))
+    jumps = [float(np.std(np.diff(values))) for values in (true, mended, off)]  # what is slow has other causes
+    assert jumps[1] < 1.1 * jumps[0]
+    assert jumps[2] > 2 * jumps[0]
+
+
+def test_no_voltage_of_long_ago_is_paired():
+    """After a pause what is from before it is of no use."""
+    vehicle = extended(pack_voltage_latency=0.3)
+
+    def pause(events):
+        return (event for event in events if not 100 < event[0] < 160)
+
+    _, with_pause = run(vehicle, 200, lambda events: pause(shifted(3)(events)))
+    assert np.abs(with_pause).max() < 0.05
+
+
+def test_a_speed_sensor_that_shows_too_much():
+    def fast(events):
+        return ((t, g, (v[0] * 1.05,) if g == MOTOR else v) for t, g, v in events)
+
+    way = run(BASE, 120)[0].road.distance
+    assert run(BASE, 120, fast)[0].road.distance == pytest.approx(1.05 * way)
+    assert run(extended(speed_sensor_scale=1.05), 120, fast)[0].road.distance == pytest.approx(way)
+
+
+# --- the way to come ----------------------------------------------------------------------------------------------
+
+
+def ride(f, truth, kilometres, *, heading=0.0, radius=0.0):
+    """Stop and go; the pack delivers what the model `truth` says, with every other bend to the left."""
+    x = v = moving = 0.0
+    target = 10.0
+    while x < kilometres * 1000:
+        target = 0.2 if x % 500 > 450 and target > 0.2 else 10.0 if v < 0.3 else target
+        a = min(max(0.5 * (target - v), -1.2), 0.9)
+        lateral = (1 if x % 200 < 100 else -1) * v * v / radius if radius else 0.0
+        moving += 0.1 if v > 0.5 else 0.0
+        turn = Turn(lateral, heading, 0.6, 20.0, 5.0)
+        q = f.quantities(v, a, 20.0, 0.0, 40.0) | {"lateral_acceleration": lateral, "heading": heading}
+        power = sum(truth.power(q | {"time_moving": moving}).values())
+        f.ride(0.1, v, 0.0, power, 20.0, 0.0, 40.0, turn if f.extended else None)
+        x += v * 0.1
+        v += a * 0.1
+    return f
+
+
+def forecaster(vehicle):
+    return Forecaster(vehicle.model, vehicle.pack, vehicle.riding)
+
+
+def expected(f):
+    return f.forecast(0.6, 0.01, 20.0, 1.0, 20.0, 0.0).consumption
+
+
+def test_the_base_model_asks_for_nothing_more():
+    assert not forecaster(BASE).extended
+    assert not forecaster(extended("dragging_brake", "drivetrain_drag", "regen_loss")).extended
+    for name in ("cornering_drag", "headwind", "tyre_warm_up"):
+        assert forecaster(extended(name)).extended
+
+
+def test_of_bends_those_ridden_count():
+    vehicle = extended("cornering_drag")
+    straight, winding = (ride(forecaster(vehicle), vehicle.model, 6, radius=r) for r in (0.0, 40.0))
+    base = ride(forecaster(BASE), vehicle.model, 6, radius=40.0)
+    assert expected(winding) > 1.05 * expected(straight)
+    assert straight.riding.factor == pytest.approx(1.0, abs=0.02)
+    assert winding.riding.factor == pytest.approx(1.0, abs=0.02)  # the model explains it
+    assert base.riding.factor > 1.05  # there the factor must
+    assert expected(forecaster(vehicle)) > expected(forecaster(BASE))  # the prior has bends too
+
+
+def test_of_the_wind_the_mean_over_all_headings_is_expected():
+    vehicle = extended("headwind", wind_north=4.0)
+    north, south = (ride(forecaster(vehicle), vehicle.model, 4, heading=h) for h in (0.0, math.pi))
+    calm = ride(forecaster(BASE), BASE.model, 4)
+    measured = [sum(s.measured for s in f.riding.segments) for f in (south, calm, north)]
+    assert measured[0] < 0.9 * measured[1] < 0.81 * measured[2]
+    for f in (north, south):
+        assert f.riding.factor == pytest.approx(1.0, abs=0.04)
+    levels = [sum(s.level for s in f.riding.segments) for f in (south, calm, north)]
+    assert levels[0] == pytest.approx(levels[2], rel=1e-6)  # the same to come, wherever from
+    # The mean of (v + w·cos ψ)² over all ψ is v² + w²/2.
+    more = 0.5 * 1.2 * BASE.parameters["drag_area"] * 4.0**2 / 2
+    way = sum(s.distance for s in north.riding.segments)
+    assert (levels[2] - levels[1]) / way == pytest.approx(more, rel=0.35)  # and what the motor takes for it
+
+
+def test_cold_tyres_are_not_expected_for_the_rest_of_the_way():
+    vehicle = extended("tyre_warm_up", warm_up_share=1.0)
+    f = ride(forecaster(vehicle), vehicle.model, 3)
+    assert f.riding.factor == pytest.approx(1.0, abs=0.03)
+    warm = ride(forecaster(BASE), BASE.model, 3)
+    early, same = f.riding.segments[1], warm.riding.segments[1]
+    assert early.modelled > 1.2 * same.modelled
+    assert early.level == pytest.approx(same.level, rel=0.05)
+    assert expected(f) == pytest.approx(expected(warm), rel=0.05)
+
+
+def test_the_time_moving_outlives_a_restart():
+    vehicle = extended("tyre_warm_up")
+    f = ride(forecaster(vehicle), vehicle.model, 2)
+    again = forecaster(vehicle)
+    again.restore(json.loads(json.dumps(f.snapshot())))
+    assert again.riding.time_moving == f.riding.time_moving > 150
+
+
+def test_memory_between_road_and_pack_steps_each_second(tmp_path):
+    """A drag that comes up over a minute, as of a user's own file."""
+    (tmp_path / "slow_drag.py").write_text(
+        '"""A drag that comes up slowly."""\n'
+        "from gz_onboard.physics.effect import Parameter, Port\n"
+        "from gz_onboard.physics.elementary import exp\n"
+        "PORT = Port.WHEEL_FORCE\n"
+        'PARAMETERS = (Parameter("slow_drag", "N", 20.0, 5.0, 0.0, 50.0, "made up for a test"),)\n'
+        "def term(speed, *, slow_drag):\n"
+        "    return slow_drag * (speed > 0.5)\n"
+        "def decay(dt):\n"
+        "    return exp(-dt / 60.0)\n"
+    )
+    effect = load_effect("slow_drag", tmp_path)
+    vehicle = BASE.changed(BASE.parameters.joined([effect]), (*BASE.model.effects, effect))
+    fresh, settled = forecaster(vehicle), forecaster(vehicle)
+    settled._states["slow_drag"] = 20.0
+    pairs = zip(*(ride(f, BASE.model, 2).riding.segments for f in (fresh, settled)), strict=True)
+    shares = [one.modelled / other.modelled for one, other in pairs]
+    assert shares[0] < 0.9
+    assert shares[-1] == pytest.approx(1.0, abs=0.02)
+    assert 1 < fresh._states["slow_drag"] < 20
+    assert fresh._states["slow_drag"] == pytest.approx(settled._states["slow_drag"], rel=0.1)
+    again = forecaster(vehicle)
+    again.restore(json.loads(json.dumps(fresh.snapshot())))
+    assert again._states == fresh._states
