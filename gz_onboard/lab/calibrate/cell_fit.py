@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
-from scipy.optimize import lsq_linear
+from scipy.optimize import nnls
 
 from gz_onboard.lab.calibrate.cell_circuit import KELVIN, follow, hats
 from gz_onboard.lab.calibrate.cell_data import CellTest
@@ -79,12 +79,13 @@ def fit_branches(
     n, branches = len(soc), len(columns)
     data = a.T @ a
     scale = np.full(branches, 0.02)  # ohm
+    floor = np.concatenate([np.zeros(n * branches), np.ones(n)])
     for _ in range(2):  # how far a table may bend is relative to its size, which the first turn tells
         normal = data + _smoothness(soc, scale, n, branches)
         upper = cholesky(normal, lower=False)
         right = solve_triangular(upper, a.T @ b, trans="T")
-        low = np.concatenate([np.zeros(n * branches), np.full(n, -np.inf)])
-        p = lsq_linear(upper, right, bounds=(low, np.inf), method="bvls").x
+        # Resistances are not negative; shifts may be, so they are counted from -1 V.
+        p = nnls(upper, right + upper @ floor)[0] - floor
         scale = np.maximum(np.median(p[: n * branches].reshape(branches, n), axis=1), 2e-3)
     residual = target - matrix @ p
     weighted = b - a @ p

@@ -18,6 +18,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.cell_circuit import KELVIN, Circuit, ocv_at, riding_current, voltage
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
 from gz_onboard.lab.calibrate.cell_fit import Branches, Reduction, fit_branches
+from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.result import Array, Curve, Fit, Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.table import Table
 
@@ -99,6 +100,10 @@ def calibrate(
     result.curves["slow_c1"] = curve(slow.c1, slow.c1 * np.hypot(sd_two[1], sd_two[3]), "F", "C1 beside a slow pair")
     result.curves["slow_resistance"] = curve(tables_two[2], tables_two[2] * sd_two[2], "ohm", "slow pair")
     result.curves["slow_time"] = curve(tables_two[4], tables_two[4] * sd_two[4], "s", "slow pair")
+    shifts = np.array([f.shift for f in fitted])
+    shift_sd = np.array([np.sqrt(np.diag(f.covariance)[-len(soc) :]) for f in fitted])
+    reference = shifts[_nearest(tested)]
+    result.curves["rest_shift"] = curve(shifts - reference, shift_sd, "V", "rest voltage against that near 25 degC")
     for t, f in zip(tested, fitted, strict=True):
         if not np.all(f.covered):
             result.refusals.append(
@@ -106,6 +111,7 @@ def calibrate(
                 f"{t.temperature:g} degC; the table there only continues its neighbours (no sd)"
             )
     _voltages(result, tested, cell, slow)
+    _mesh_quality(result, tested, fitted, nodes, volts, one, tables_one)
     return result
 
 
@@ -243,20 +249,58 @@ def _smooth(soc: Array, logs: Array, sds: Array) -> Array:
             slope = np.diff(np.eye(n), axis=0) / (LEVEL * np.maximum(np.diff(soc), 0.05) / 0.1)[:, None]
             rows.append(slope)
         matrix = np.vstack(rows)
-        target = np.concatenate([weight * logs[:, j], np.zeros(len(matrix) - n)])
-        result[:, j] = np.linalg.lstsq(matrix, target, rcond=None)[0]
+        result[:, j] = np.linalg.solve(matrix.T @ matrix, weight**2 * logs[:, j])
     return result
+
+
+def _nearest(tested: list[Tested]) -> int:
+    return min(range(len(tested)), key=lambda k: abs(tested[k].temperature - 25))
 
 
 def _rest_shift(fitted: list[Branches], tested: list[Tested], nodes: Array, ocv: Curve) -> tuple[Array, Array]:
     """(shift, sd) (len(nodes),) [V] from the OCV to where the cell rests after discharging, near 25 degC."""
-    nearest = min(range(len(tested)), key=lambda k: abs(tested[k].temperature - 25))
+    nearest = _nearest(tested)
     shift = np.interp(nodes, fitted[nearest].soc, fitted[nearest].shift)
     scatter = np.std([np.interp(nodes, f.soc, f.shift) for f in fitted], axis=0) if len(fitted) > 1 else np.abs(shift)
     shift[nodes == 1] = 0.0 if abs(tested[nearest].test.voltage[0] - ocv.value[-1]) < FULL_WITHIN else shift[-1]
     moved = ocv.value + shift
     shift = np.maximum.accumulate(moved + 1e-3 * (nodes[-1] - nodes)) - 1e-3 * (nodes[-1] - nodes) - ocv.value
     return shift, np.hypot(np.minimum(ocv.sd, np.abs(shift) + 0.003), scatter)
+
+
+def _mesh_quality(
+    result: Result, tested: list[Tested], fitted: list[Branches], nodes: Array, volts: Array, one: Reduction,
+    tables: list[Array],
+) -> None:  # fmt: skip
+    """R² of the meshes: of the smooth one against each node's own, and of what half the pulse groups say of the other.
+
+    A group is what lies between two long rests; every other one makes a mesh, which the rest's is compared with.
+    """
+    soc = fitted[0].soc
+    halves, covered = [], np.tile((soc > 0.19) & (soc < 0.91), (len(tested), 1))
+    for odd in (0, 1):
+        part = []
+        for t in tested:
+            step = np.zeros(len(t.test), dtype=int)
+            step[t.rests] = 1
+            keep = (np.cumsum(step) - step) % 2 == odd
+            part.append(fit_branches(t.test, t.level, _ocv(nodes, volts, t.level), soc, t.temperature, keep=keep))
+        covered &= np.array([f.covered for f in part])
+        halves.append(_meshes(part, one, 1)[0])
+    raw = [[one(f.resistance[:, k]) for k in range(len(soc))] for f in fitted]
+    single = [
+        np.array([[p.r0 for p in row] for row in raw]),
+        np.array([[p.resistance[0] for p in row] for row in raw]),
+        np.array([[p.time[0] for p in row] for row in raw]),
+    ]
+    names = ", ".join(t.test.name for t in tested)
+    for name, unit, number in (("R0", "ohm", 0), ("R1", "ohm", 1), ("C1", "F", 2)):
+        every = [x[number] / x[1] if number == 2 else x[number] for x in (tables, single, *halves)]
+        mesh, own, even, other = (x[covered] for x in every)
+        for what, a, b, held_out in (("node by node", own, mesh, False), ("half against half", even, other, True)):
+            result.fits.append(
+                score(f"mesh of {name}, SOC 0.2 to 0.9, {what}", unit, a, b, held_out=held_out, source=names)
+            )
 
 
 def _voltages(result: Result, tested: list[Tested], cell: Circuit, slow: Circuit) -> None:

@@ -1,0 +1,79 @@
+"""A simulated cell on a simulated tester: other code than the calibration's, one or more RC pairs, its own curve."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from gz_onboard.lab.calibrate.table import Table
+
+
+@dataclass
+class Plant:
+    """V = ocv(soc) - r0·I - Σ v, each v' = (r·I - v)/tau; resistances grow by `cold` per K below 25 degC."""
+
+    capacity: float = 2.5
+    r0: float = 0.05
+    pairs: tuple[tuple[float, float], ...] = ((0.03, 30.0),)  # ohm, s
+    cold: float = 0.04
+    hysteresis: float = 0.0  # V: half the gap of the curves
+    noise: float = 0.0005
+    seed: int = 0
+    soc: float = 1.0
+    state: list[float] = field(default_factory=list)
+
+    def ocv(self, soc):
+        return 3.35 + 0.75 * soc + 0.1 * np.exp(-(((soc - 0.95) / 0.08) ** 2)) - 0.5 * np.exp(-soc / 0.03)
+
+    def run(self, pieces, temperature=25.0, name="cell.csv"):
+        """pieces: (current, seconds, step); a sample 0.1 s after each change, then each `step`."""
+        rng = np.random.default_rng(self.seed)
+        factor = np.exp(self.cold * (25 - temperature))
+        self.state = [0.0] * len(self.pairs)
+        now, rows, side = 0.0, [(0.0, 0.0, float(self.ocv(self.soc)))], -1.0
+        for current, seconds, step in pieces:
+            for dt in [0.1, *[step] * round(seconds / step)]:
+                now += dt
+                self.soc -= current * dt / 3600 / self.capacity
+                if current:
+                    side = np.sign(current)
+                for k, (r, tau) in enumerate(self.pairs):
+                    a = np.exp(-dt / tau)
+                    self.state[k] = a * self.state[k] + (1 - a) * r * factor * current
+                volts = self.ocv(self.soc) - self.r0 * factor * current - sum(self.state) - side * self.hysteresis
+                rows.append((now, current, volts))
+        time, current, volts = (np.array(c) for c in zip(*rows, strict=True))
+        size = len(time)
+        volts = volts + rng.normal(0, self.noise, size)
+        columns = {"time": time, "current": current, "voltage": volts,
+                   "cell_temperature": np.full(size, float(temperature)) + rng.normal(0, 0.05, size)}  # fmt: skip
+        return Table(Path(name), columns)
+
+
+def slow_test(charge=1.0, hours=20, **plant):
+    """Full, rest, discharge in `hours`, rest, and `charge` times of it back."""
+    cell = Plant(**plant)
+    current, seconds = cell.capacity / hours, hours * 3600
+    pieces: list[tuple[float, float, float]] = [(0.0, 600, 60), (current, seconds, 60), (0.0, 3600, 60)]
+    if charge:
+        pieces += [(-current, seconds * charge, 60), (0.0, 600, 60)]
+    return cell.run(pieces, name="ocv.csv"), cell
+
+
+def pulse_pieces(capacity=2.5, levels=10, sizes=(1.0, 2.5, 5.0)):
+    """At each of `levels` states: pulses of both signs, 0.5 s samples after a step, then a step of SOC and a rest."""
+    pieces: list[tuple[float, float, float]] = [(0.0, 1500, 10)]
+    for k in range(levels):
+        for size in sizes:
+            for sign in (1, -1) if k else (1,):
+                pieces += [(sign * size, 30, 0.5), (0.0, 10, 0.5), (0.0, 110, 5)]
+        down = capacity / levels * 3600 * 0.95 / 1.25 - (0 if k else 30 * sum(sizes) / 1.25)
+        pieces += [(1.25, 5 * round(down / 5), 5), (0.0, 1500, 10)]
+    return pieces
+
+
+def pulse_test(temperature=25.0, levels=10, **plant):
+    cell = Plant(**plant)
+    return cell.run(pulse_pieces(cell.capacity, levels), temperature, f"pulse_{temperature:g}C.csv"), cell

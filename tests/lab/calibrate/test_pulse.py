@@ -1,0 +1,163 @@
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gz_onboard.errors import InputError
+from gz_onboard.lab.calibrate import ocv, pulse
+from gz_onboard.lab.calibrate.cell_circuit import riding_current
+from gz_onboard.lab.calibrate.cell_data import cell_test
+from gz_onboard.lab.calibrate.cell_fit import TIMES, Reduction
+from gz_onboard.lab.calibrate.result import Found
+from gz_onboard.lab.calibrate.table import read_table
+from tests.lab.calibrate.cells import Plant, pulse_pieces, pulse_test, slow_test
+
+DATA = os.environ.get("GZ_ONBOARD_DATA")
+NEEDS_DATA = pytest.mark.skipif(not DATA, reason="GZ_ONBOARD_DATA is not set")
+INSIDE = (pulse.SOC > 0.12) & (pulse.SOC < 0.95)
+
+
+@cache
+def slow():
+    result = ocv.calibrate(slow_test()[0])
+    return result.curves["battery.ocv"], result.parameters["cell_capacity"]
+
+
+@cache
+def found(seed=0, pairs=((0.03, 30.0),), temperatures=(0.0, 25.0), levels=10):
+    tables = [pulse_test(t, levels, seed=seed + k, pairs=pairs)[0] for k, t in enumerate(temperatures)]
+    return pulse.calibrate(tables, *slow())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_was_planted_comes_back_within_its_uncertainty(seed):
+    result = found(seed)
+    cold = np.exp([[1.0], [0.0]])
+    for name, truth in (("r0", 0.05 * cold), ("r1", 0.03 * cold), ("c1", 1000 / cold)):
+        curve = result.curves[f"battery.{name}"]
+        error = (curve.value - truth)[:, INSIDE]
+        assert np.mean(np.abs(error) < 1.96 * curve.sd[:, INSIDE]) > 0.9, name
+        assert np.all(np.abs(error) < 0.12 * truth), name
+    assert np.all(np.abs(result.curves["battery.capacity"].value - 2.5) < 2 * result.curves["battery.capacity"].sd)
+    assert list(result.curves["battery.r0"].axes["temperature"]) == [0, 25]
+
+
+def test_tables_are_positive_and_marked_where_data_end():
+    result = found()
+    for name in ("battery.r0", "battery.r1", "battery.c1", "slow_resistance", "slow_time"):
+        curve = result.curves[name]
+        assert np.all(curve.value > 0)
+        assert np.all(np.isnan(curve.sd[:, pulse.SOC < 0.03]))
+        assert np.all(np.isfinite(curve.sd[:, INSIDE]))
+    assert any("no pulses near SOC 0, 0.02 at 25 degC" in text for text in result.refusals)
+
+
+@cache
+def road(seed=9, pairs=((0.03, 30.0),)):
+    cell = Plant(seed=seed, pairs=pairs, soc=0.9)
+    load = 0.7 * riding_current(1500, seed)
+    return cell_test(cell.run([(float(i), 1.0, 0.5) for i in load], 20.0, "road.csv"))
+
+
+def test_the_tables_follow_a_load_at_a_temperature_between_those_of_the_tests():
+    model, measured = pulse.follow_profile(pulse.circuit(found(temperatures=(15.0, 25.0))), road())
+    assert np.sqrt(np.mean((model - measured) ** 2)) < 0.005
+    assert np.sqrt(np.mean((model - model.mean() - measured + measured.mean()) ** 2)) < 0.1 * np.std(measured)
+
+
+def test_two_pairs_follow_slow_relaxation_better_than_one():
+    pairs = ((0.02, 10.0), (0.03, 900.0))
+    result = found(pairs=pairs, temperatures=(15.0, 25.0))
+    errors = []
+    for two in (False, True):
+        model, measured = pulse.follow_profile(pulse.circuit(result, two), road(pairs=pairs))
+        errors.append(np.sqrt(np.mean((model - measured) ** 2)))
+    assert errors[1] < 0.8 * errors[0]
+
+
+def test_the_reduction_gives_back_a_pair_that_is_one_of_the_six():
+    reduction = Reduction([riding_current(600)])
+    six = np.zeros(1 + len(TIMES))
+    six[0], six[3] = 0.05, 0.02  # 15 s
+    pairs = reduction(six)
+    assert pairs.r0 == pytest.approx(0.05, rel=0.01)
+    assert pairs.resistance[0] == pytest.approx(0.02, rel=0.02)
+    assert pairs.time[0] == pytest.approx(15, rel=0.05)
+    scaled = reduction(3 * six)
+    assert scaled.r0 == pytest.approx(3 * pairs.r0)
+    assert scaled.time == pytest.approx(pairs.time)
+
+
+def test_the_tester_s_counter_bridges_gaps():
+    table = pulse_test()[0]
+    drawn = np.cumsum(table["current"] * np.diff(table["time"], prepend=0.0)) / 3600
+    counted = replace(table, columns={**table.columns, "charge": -drawn})
+    step = np.flatnonzero((table["current"] == 1.25) & (np.diff(table["time"], prepend=0.0) > 1))
+    keep = np.ones(len(table), dtype=bool)
+    keep[step[5:60]] = False  # the middle of the first step of SOC is missing
+
+    def without(t):
+        return replace(t, columns={k: v[keep] for k, v in t.columns.items()})
+
+    with pytest.raises(InputError, match="what was drawn meanwhile is not known"):
+        pulse.calibrate([without(table)], *slow())
+    result = pulse.calibrate([without(counted)], *slow())
+    assert result.curves["battery.r0"].value[0, INSIDE] == pytest.approx(0.05, rel=0.03)
+
+
+def changed(**columns):
+    table = pulse_test()[0]
+    return replace(table, columns={**table.columns, **{k: f(table.columns[k].copy()) for k, f in columns.items()}})
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ([], "no pulse test"),
+        ([changed(current=lambda c: -c)], r"pulse_25C.csv:\d+: the voltage rises .* discharging must be positive"),
+        ([changed(voltage=lambda v: np.minimum(v, 3.9))], "clipped"),
+        ([slow_test()[0]], "has 2 pulses; at least 6"),
+        ([replace(changed(), columns={k: v[:1500] for k, v in changed().columns.items()})], "states of charge; at"),
+        ([changed(), changed()], "are both at 25 degC"),
+    ],
+)
+def test_what_is_no_pulse_test_is_refused(tables, words):
+    with pytest.raises(InputError, match=words):
+        pulse.calibrate(tables, *slow())
+
+
+def test_half_a_range_is_refused():
+    curve = slow()[0]
+    with pytest.raises(InputError, match="at least half of the range"):
+        pulse.calibrate([pulse_test()[0]], curve, Found(6.0, 0.1, "A·h", "another cell"))
+
+
+def test_a_start_below_full_is_said():
+    cell = Plant(soc=0.85)
+    table = cell.run(pulse_pieces(2.0, 8), 25.0, "late.csv")
+    result = pulse.calibrate([table], *slow())
+    assert any("SOC 0.8" in note and "not full" in note for note in result.notes)
+    assert result.curves["battery.r0"].value[0, 8] == pytest.approx(0.05, rel=0.03)
+    assert any("0.05, 1 at 25 degC" in text for text in result.refusals)
+
+
+@NEEDS_DATA
+def test_the_bench_cell_on_road_profiles_that_were_not_fitted():
+    folder = Path(str(DATA)) / "bench"
+    slow_result = ocv.calibrate(read_table(folder / "cell_ocv_25C.csv.gz"))
+    tables = [read_table(folder / f"cell_pulse_{t}C.csv.gz") for t in (-10, 0, 10, 25, 40)]
+    result = pulse.calibrate(tables, slow_result.curves["battery.ocv"], slow_result.parameters["cell_capacity"])
+    for name, limit_one, limit_two in (("25C", 0.0126, 0.007), ("5C", 0.0254, 0.0125)):
+        profile = cell_test(read_table(folder / f"cell_road_profile_{name}.csv"))
+        for two, limit in ((False, limit_one), (True, limit_two)):
+            model, measured = pulse.follow_profile(pulse.circuit(result, two), profile)
+            assert np.sqrt(np.mean((model - measured) ** 2)) < limit
+    held_out = {f.what: f.r2 or 0.0 for f in result.fits if f.held_out}
+    thesis = {"R0": 0.9976, "R1": 0.9210, "C1": 0.9600}
+    for name, r2 in thesis.items():
+        assert held_out[f"mesh of {name}, SOC 0.2 to 0.9, half against half"] > r2 - 0.01
