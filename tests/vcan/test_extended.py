@@ -1,0 +1,74 @@
+"""An extended model in the daemon on a real vcan: the same daemon, the vehicle's file names more effects."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from gz_onboard.vehicle import OWN
+from tests.support import LOGS
+from tests.vcan.support import Listener, Running, wait_for
+
+CITY = LOGS / "city_14C.blf"
+SECONDS = 12.0
+MORE = '"auxiliary_load", "cornering_drag", "headwind", "slow_relaxation", "ocv_hysteresis",\n]'
+VALUES = """[parameters]
+slow_resistance = { value = 0.03, unit = "ohm", sd = 0.005, status = "guess", source = "made up for a test" }
+wind_north = { value = 4.0, unit = "m/s", sd = 1.0, status = "guess", source = "made up for a test" }
+pack_voltage_latency = { value = 0.1, unit = "s", sd = 0.05, status = "guess", source = "made up for a test" }
+"""
+
+
+def extended(folder: Path) -> Path:
+    """The reference scooter with more effects, and a current sensor that shows 2 A more than it did."""
+    text = (OWN / "reference.toml").read_text()
+    for old, new in (
+        ('"auxiliary_load",\n]', MORE),
+        ("[parameters]\n", VALUES),
+        ("pack_current_offset = { value = 0.02", "pack_current_offset = { value = 2.02"),
+    ):
+        assert text.count(old) == 1, old
+        text = text.replace(old, new)
+    file = folder / "extended.toml"
+    file.write_text(text)
+    return file
+
+
+@pytest.fixture
+def pair(running: Running, tmp_path: Path):
+    """The extended daemon on vcan0 and the base one on vcan1, the same ride on both."""
+    with Listener() as listener:
+        more = running.daemon("--vehicle", str(extended(tmp_path)), name="extended")
+        base = running.daemon(channels=("vcan1",), name="base")
+        replays = [running.replay(CITY, channel=channel) for channel in ("vcan0", "vcan1")]
+        wait_for(lambda: len(listener.decoded("RANGE_Estimate")) >= SECONDS, 60, "range frames")
+        for replay in replays:
+            replay.terminate()
+            replay.wait(10)
+        summaries = [daemon.stop() for daemon in (more, base)]
+    yield more, base, listener, summaries
+
+
+def test_an_extended_model_runs_as_it_is_and_expects_less_range(running: Running, pair):
+    more, base, listener, summaries = pair
+    assert all("dropped 0" in summary for summary in summaries)
+    last, other = more.estimates()[-1], base.estimates()[-1]
+    assert last["consumption_expected"] > 1.02 * other["consumption_expected"]  # bends and the mean wind
+    assert last["range"] < 0.98 * other["range"]
+    assert last["energy_left"] < other["energy_left"]  # the slow resistance
+    published = listener.decoded("RANGE_Estimate")[-1]["RANGE_Remaining"]
+    assert any(1000 * published == pytest.approx(row["range"], abs=6) for row in more.estimates()[-4:])
+
+    # A restart goes on with the own state, in the cells too; that of the other model is refused, whole.
+    (file,) = more.state_dir.glob("*.json")
+    assert json.loads(file.read_text())["estimator"]["cell_effects"]["slow_relaxation"] > 0
+    vehicle = str(more.state_dir.parent / "extended.toml")
+    journals = [daemon.journal for daemon in (more, base)]
+    for name in ("extended", "base"):
+        running.daemon("--vehicle", vehicle, name=name).stop()
+    own, foreign = (daemon.journal.removeprefix(old) for daemon, old in zip((more, base), journals, strict=True))
+    assert "going on from the state" in own
+    assert "not used" in foreign
+    assert "slow_relaxation" in foreign  # it says which models do not agree
