@@ -336,6 +336,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--payload", type=float, metavar="KG", help="mass of rider and luggage (as noted in rides.json beside the log)")
     add("--output", type=Path, default=Path(), metavar="DIR", help="where to write (the current directory)")
     add("--json", nargs="?", const="-", metavar="FILE|-", help="write the summary as JSON, to standard output or FILE")
+    add("--markdown", type=Path, metavar="FILE", help="write the tables of the page as Markdown")
     add("--no-plot", action="store_true", help="draw nothing and write no page")
     add("--gate", action="store_true", help="end with status 1 if a ride does not pass")
     add("--jobs", type=int, metavar="N", help="so many rides at a time (as many as there are processors)")
@@ -361,19 +362,28 @@ def run(arguments: argparse.Namespace) -> int:
             if arguments.json != "-":
                 say(ride_text(result), sys.stdout)
     together = pool(rides)
-    if rides and not arguments.no_plot:
-        from gz_onboard.lab.validate_report import write_page
-
-        file = arguments.output / "validation.html"
-        try:
-            write_page(file, rides, together)
-        except OSError as error:
-            raise InputError(f"{file}: cannot be written: {error.strerror}") from error
-        if arguments.json != "-":
-            print(f"written: {file}")
+    if rides:
+        _write_tables(arguments, rides, together)
     if arguments.json:
         _write_json(arguments.json, {"version": SUMMARY_VERSION, "rides": rides, "pooled": together, "failed": failed})
     return 1 if failed or (arguments.gate and not all(ride["passed"] for ride in rides)) else 0
+
+
+def _write_tables(arguments: argparse.Namespace, rides: list[dict[str, Any]], together: dict[str, Any]) -> None:
+    from gz_onboard.lab.validate_report import markdown, write_page
+
+    written = []
+    try:
+        if not arguments.no_plot:
+            written.append(arguments.output / "validation.html")
+            write_page(written[-1], rides, together)
+        if arguments.markdown:
+            written.append(arguments.markdown)
+            arguments.markdown.write_text(markdown(rides, together), encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{written[-1]}: cannot be written: {error.strerror}") from error
+    if arguments.json != "-" and written:
+        print(f"written: {', '.join(map(str, written))}")
 
 
 def _tasks(arguments: argparse.Namespace) -> list[Task]:

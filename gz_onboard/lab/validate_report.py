@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gz_onboard.lab.validate_components import Component
-from gz_onboard.lab.validate_score import CHANNELS, LABELS, Array
+from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -90,13 +90,14 @@ def draw_ride(
             right.set_title(
                 "simulated less measured: each second, and the mean of 30 s", fontsize=9, loc="left", color=_INK
             )
-            handles, labels = left.get_legend_handles_labels()
-            figure.legend(handles=handles, labels=labels, loc="upper right", ncols=4, frameon=False, fontsize=9,
-                          bbox_to_anchor=(0.99, 1.0))  # fmt: skip
         if i == len(rows) - 1:
             for axis in (left, right):
                 axis.set_xlabel(f"time [{'min' if minutes > 1 else 's'}]", fontsize=8.5, loc="left", color=_INK)
     assert first
+    named = {label: line for axis in figure.axes for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    order = [label for label in ("measured", *_NAMES.values()) if label in named]
+    figure.legend(handles=[named[label] for label in order], labels=order, loc="upper right", ncols=4, frameon=False,
+                  fontsize=9, bbox_to_anchor=(0.99, 1.0))  # fmt: skip
     first.set_xlim(0, max(entry["duration_s"] / minutes, 1e-3))
     air = "" if entry["ambient_c"] is None else f", air {entry['ambient_c']:.0f} °C"
     title = f"{entry['name']} · {entry['vehicle']}, {entry['payload_kg']:g} kg{air}, {entry['distance_km']:.1f} km"
@@ -180,7 +181,7 @@ def failures(forms: Mapping[str, Any]) -> list[tuple[str, str, float, list[tuple
         kinds = dict.fromkeys(
             kind for form, channel, *_ in COLUMNS for kind in forms.get(form, {}).get(channel, {}).get(by, {})
         )
-        for kind in kinds:
+        for kind in sorted(kinds, key=ORDER.index):
             cells: list[tuple[float, float] | None] = []
             time = 0.0
             for form, channel, *_ in COLUMNS:
@@ -204,3 +205,47 @@ def _failures(forms: Mapping[str, Any]) -> str:
         )
         rows.append(f"<tr><td>{kind}</td><td>{time / 60:.1f}</td>{values}</tr>")
     return f"<table><tr><th>condition</th><th>min</th>{head}</tr>{''.join(rows)}</table>"
+
+
+# --- Markdown -----------------------------------------------------------------------------------------------------
+
+
+def markdown(rides: Sequence[Mapping[str, Any]], together: Mapping[str, Any]) -> str:
+    """The tables of the page as Markdown; what is beyond its limit in bold."""
+    parts = []
+    for form in ("open_loop", "predictive", "components"):
+        names = list(dict.fromkeys(name for ride in rides if ride[form] for name in ride[form]["channels"]))
+        energy = form != "components"
+        heads = ["ride", *(name.replace("_", " ") for name in names), *(["energy"] if energy else [])]
+        rows = []
+        for ride in rides:
+            if not ride[form]:
+                continue
+            cells = [_bold(ride[form]["channels"].get(name)) for name in names]
+            if energy:
+                percent = ride[form]["energy_percent"]
+                cells.append("–" if percent is None else f"{percent:+.1f}")
+            rows.append([ride["name"], *cells])
+        parts.append(f"### {_NAMES[form].capitalize()}, percent\n\n{_table(heads, rows)}")
+    for where, forms in together.items():
+        heads = ["condition", "min", *(f"{title}, {unit}" for *_, unit, title in COLUMNS)]
+        rows, before = [], ""
+        for by, kind, time, cells in failures(forms):
+            if by != before:
+                rows.append([f"*{LABELS[by]}*", "", *([""] * len(COLUMNS))])
+                before = by
+            values = ["–" if cell is None else f"{cell[0]:+.3g} ({cell[1]:+.1f} %)" for cell in cells]
+            rows.append([kind, f"{time / 60:.0f}", *values])
+        parts.append(f"### Mean error by condition, {where}\n\n{_table(heads, rows)}")
+    return "\n\n".join(parts) + "\n"
+
+
+def _bold(entry: Mapping[str, Any] | None) -> str:
+    if entry is None or entry["percent"] is None:
+        return "–"
+    return f"{entry['percent']:.1f}" if entry["passed"] else f"**{entry['percent']:.1f}**"
+
+
+def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

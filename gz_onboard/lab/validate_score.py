@@ -144,6 +144,14 @@ LABELS = {
 }
 
 
+ORDER = (
+    "straight", "slightly", "turning", "uphill", "level", "downhill", "cold", "mild", "warm", "first 3 min",
+    "3 to 10 min", "later", "standing", "below 4 m/s", "4 to 8 m/s", "8 to 11 m/s", "above 11 m/s", "hard acceleration",
+    "acceleration", "steady", "coasting", "braking",
+)  # fmt: skip
+"""The conditions as tables list them."""
+
+
 def split(
     measured: Array, simulated: Array, found: Mapping[str, Mapping[str, Mask]], valid: Mask | None = None
 ) -> dict[str, dict[str, dict[str, float]]]:

@@ -16,7 +16,7 @@ from gz_onboard.cli import main
 from gz_onboard.lab.validate import KEYS, per_second, pool
 from gz_onboard.lab.validate_components import components
 from gz_onboard.lab.validate_report import COLUMNS, failures
-from gz_onboard.lab.validate_score import CHANNELS, LABELS, conditions, errors, pooled, seconds, split
+from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, conditions, errors, pooled, seconds, split
 from gz_onboard.physics.model import Model
 from gz_onboard.simulation.recorded import read_recorded, rest_soc
 from gz_onboard.vehicle import OWN, read_vehicle
@@ -191,7 +191,8 @@ def two(tmp_path_factory):
     (other / "rides.json").write_text('[{"name": "coastdown", "kind": "roll", "rider_mass_kg": 75.0}]')
     out = folder / "out"
     logs = [str(LOGS / "coastdown.blf"), str(other / "coastdown.blf")]
-    assert main(["validate", *logs, "--json", str(folder / "v.json"), "--output", str(out), "--jobs", "2"]) == 0
+    files = ["--json", str(folder / "v.json"), "--markdown", str(folder / "v.md"), "--output", str(out)]
+    assert main(["validate", *logs, *files, "--jobs", "2"]) == 0
     return out, json.loads((folder / "v.json").read_text())
 
 
@@ -220,6 +221,21 @@ def test_pictures_and_page(two):
     assert "http" not in page
     assert "Where the model fails" in page
     assert "class=bad" in page
+
+
+def test_tables_as_markdown(two):
+    out, summary = two
+    text = (out.parent / "v.md").read_text()
+    percent = summary["rides"][0]["predictive"]["channels"]["motor_torque"]
+    assert f"**{percent['percent']:.1f}**" in text or percent["passed"]
+    assert text.count("| coastdown |") == 6
+    assert "### Mean error by condition, road" in text
+    assert text.index("| steady |") > text.index("| first 3 min |")
+
+
+def test_each_condition_has_its_place_in_tables():
+    found, _ = conditions(ride(400))
+    assert [kind for by in LABELS for kind in found[by]] == list(ORDER)
 
 
 def test_a_repeated_run_is_the_same(two, capsys):
