@@ -119,7 +119,7 @@ def nonlinear(
     def everything(x: Array) -> Array:
         return np.concatenate([residual(x), rows @ x - targets])
 
-    best = least_squares(everything, x0, bounds=(low, high), x_scale=scale, loss=loss, jac="3-point")
+    best = least_squares(everything, x0, bounds=(low, high), x_scale=scale, loss=loss)
     m = len(best.fun) - len(rows)
     jacobian = best.jac[:m]
     _check(names, best.jac, m, np.linalg.norm(best.jac, axis=0))

@@ -1,0 +1,189 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gz_onboard.errors import InputError
+from gz_onboard.lab.calibrate import cooling
+from gz_onboard.lab.calibrate.cooling import (
+    Run,
+    bench_run,
+    bms_cooling,
+    inverter_cooling,
+    motor_cooling,
+    pack_cooling,
+    ride_run,
+)
+from gz_onboard.lab.calibrate.table import read_table
+from gz_onboard.simulation.samples import Samples
+from gz_onboard.vehicle import read_vehicle
+
+from .bench import bench_file, changed, needs_data, table, without
+
+VEHICLE = read_vehicle("reference")
+TRUTH = {
+    "motor_stator_capacity": 2500.0,
+    "motor_rotor_capacity": 3200.0,
+    "motor_gap_conductance": 4.5,
+    "motor_rotor_to_ambient": 5.0,
+    "motor_stator_share": VEHICLE.parameters["motor_stator_share"],
+    "inverter_board_capacity": 300.0,
+    "inverter_box_capacity": 1600.0,
+    "inverter_board_to_box": 4.2,
+    "inverter_box_to_ambient": 2.2,
+    "inverter_board_to_air": VEHICLE.parameters["inverter_board_to_air"],
+    "inverter_box_to_air": VEHICLE.parameters["inverter_box_to_air"],
+    "pack_heat_capacity": 11000.0,
+    "pack_conductance": 3.0,
+    "bms_resistance": 0.002,
+    "bms_heat_capacity": 220.0,
+    "bms_conductance": 0.5,
+}
+ROOM = {"motor": 1.8, "inverter": 1.1}
+NETWORKS = {
+    "motor": cooling.motor_temperatures,
+    "inverter": cooling.inverter_temperatures,
+    "cell": cooling.pack_temperatures,
+    "bms": cooling.bms_temperatures,
+}
+
+
+def planted(name, seed, still, seconds=900, noise=0.2):
+    """A run with the temperatures of the planted networks: warmed for 40 %, then cooled, or in bursts while riding."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(float(seconds))
+    if still:
+        load = (time < 0.4 * seconds).astype(float)
+    else:
+        load = np.repeat(rng.uniform(0.2, 1.2, seconds // 60), 60)
+    run = Run(
+        name, still, time, np.full(seconds, 20.0), 10.0 * load, 280 * load, 60 * load, 70 * load, 150 * load,
+        900 * load, {f"{sensor}_temperature": np.full(seconds, 20.0) for sensor in (*NETWORKS, "inverter_box")},
+    )  # fmt: skip
+    measured = dict(run.measured)
+    for network, model in NETWORKS.items():
+        truth = {**TRUTH, "room": ROOM[network]} if network in ROOM else TRUTH
+        for sensor, values in model(truth, replace(run, measured=dict(measured))).items():
+            measured[sensor] = values
+    return replace(run, measured={k: v + noise * rng.normal(size=seconds) for k, v in measured.items()})
+
+
+def runs(seed, noise=0.2):
+    return [planted("room", seed, True, noise=noise)] + [
+        planted(f"ride_{i}", 1000 * (i + 1) + seed, False, noise=noise) for i in range(3)
+    ]
+
+
+@pytest.mark.parametrize("procedure", [motor_cooling, inverter_cooling, pack_cooling])
+def test_without_noise_the_network_is_found(procedure):
+    result = procedure(runs(0, noise=1e-4), VEHICLE)
+    for name, found in result.parameters.items():
+        assert found.value == pytest.approx(TRUTH[name], rel=0.02), name
+    assert all(fit.rms < 0.02 for fit in result.fits)
+
+
+def test_conductances_come_back_within_their_own_intervals():
+    held = count = 0
+    for procedure, seeds in ((pack_cooling, 15), (inverter_cooling, 2)):
+        for seed in range(seeds):
+            for name, found in procedure(runs(seed), VEHICLE).parameters.items():
+                held += abs(found.value - TRUTH[name]) < 1.96 * found.sd
+                count += 1
+    assert held / count >= 0.84  # 38 intervals: 0.95 less three sd
+
+
+def test_riding_cools_more_than_a_closed_room():
+    result = motor_cooling(runs(1), VEHICLE)
+    found = result.parameters["motor_rotor_to_ambient"]
+    assert abs(found.value - TRUTH["motor_rotor_to_ambient"]) < 3 * found.sd < 3
+    assert any("W/K riding" in note and "in a closed room" in note for note in result.notes)
+    alone = motor_cooling([planted("room", 1, True, seconds=2400)], VEHICLE)
+    room = alone.parameters["motor_rotor_to_ambient"]
+    assert room.value == pytest.approx(ROOM["motor"], rel=0.2) and room.sd > 0.4 * room.value
+    assert any("without a ride that of riding is unknown" in refusal for refusal in alone.refusals)
+
+
+def test_what_the_data_cannot_separate_is_said():
+    everything = runs(2)
+    assert any("motor_stator_share" in r and "profile" in r for r in motor_cooling(everything, VEHICLE).refusals)
+    assert any("only board_to_box" in r for r in inverter_cooling(everything, VEHICLE).refusals)
+    bms = bms_cooling(everything, VEHICLE)
+    assert any("ratios" in r or "only" in r for r in bms.refusals)
+    ((names, covariance),) = bms.covariance
+    assert names == ("bms_resistance", "bms_heat_capacity", "bms_conductance")
+    sd = np.sqrt(np.diag(covariance))
+    assert np.all((covariance / np.outer(sd, sd))[np.triu_indices(3, 1)] > 0.9)  # one scale for all three
+    ratio = bms.parameters["bms_resistance"].value / bms.parameters["bms_conductance"].value
+    assert ratio == pytest.approx(TRUTH["bms_resistance"] / TRUTH["bms_conductance"], rel=0.1)
+
+
+def test_a_box_without_a_sensor_is_said():
+    blind = [replace(r, measured={k: v for k, v in r.measured.items() if "box" not in k}) for r in runs(3)]
+    assert any("no sensor on the box" in r for r in inverter_cooling(blind, VEHICLE).refusals)
+
+
+def test_held_out_rides_are_not_in_their_fit():
+    spoilt = runs(4)
+    spoilt[2].measured["cell_temperature"][300:] += 5  # the second ride
+    fits = {fit.held_out: fit for fit in pack_cooling(spoilt, VEHICLE).fits if "riding" in fit.what}
+    assert fits[True].data == "ride_1" and fits[True].largest > 3
+
+
+def test_runs_that_tell_nothing_are_left_out_or_refused():
+    calm = planted("calm", 0, False)
+    calm = replace(calm, measured={"motor_temperature": np.full(600, 20.0)})
+    result = motor_cooling([planted("room", 0, True), calm], VEHICLE)
+    assert any("calm: motor_temperature changes by 0.0 K only" in note for note in result.notes)
+    with pytest.raises(InputError, match="no run tells anything of inverter_temperature"):
+        inverter_cooling([calm], VEHICLE)
+
+
+def bench(seconds=400):
+    time = np.arange(float(seconds))
+    on = np.ones(seconds)
+    return table(
+        time=time, motor_temperature=30 + 0.05 * time, inverter_temperature=30 + 0.05 * time, motor_current=100 * on,
+        motor_speed=30 * on, ac_power=1600 * on, dc_power=1680 * on, shaft_torque=45 * on, ambient_temperature=25 * on,
+    )  # fmt: skip
+
+
+def test_bench_run_takes_the_measured_heat():
+    run = bench_run(bench(), VEHICLE)
+    assert run.still and np.allclose(run.motor_heat, 1600 - 45 * 30) and np.allclose(run.inverter_heat, 80)
+    with pytest.raises(InputError, match="no column for 'dc_power'"):
+        bench_run(without(bench(), "dc_power"), VEHICLE)
+    with pytest.raises(InputError, match="99 s are too short"):
+        bench_run(bench(100), VEHICLE)
+    right = bench()
+    swapped = changed(right, dc_power=right["ac_power"], ac_power=right["dc_power"])
+    with pytest.raises(InputError, match="is no heat"):
+        bench_run(swapped, VEHICLE)
+
+
+def test_ride_run_takes_the_heat_of_the_vehicles_own_losses():
+    fast, slow = np.arange(0, 600, 0.05), np.arange(0, 600, 1.0)
+    values = {"motor_speed": 40.0, "motor_current": 50.0, "pack_current": 24.0, "pack_voltage": 52.0}
+    columns = {role: (fast, np.full(len(fast), value)) for role, value in values.items()}
+    columns |= {role: (slow, np.full(len(slow), 25.0)) for role in ("motor_temperature", "ambient_temperature")}
+    columns["cell_temperature"] = (slow, np.full(len(slow), 25.0))
+    run = ride_run(Samples("steady", columns), VEHICLE)
+    p = VEHICLE.parameters
+    iron = p["motor_iron_linear"] * 40 + p["motor_iron_quadratic"] * 1600
+    assert np.allclose(run.iron, iron) and not run.still
+    assert np.allclose(run.motor_heat, iron + p["motor_copper_resistance"] * 2500, rtol=1e-6)
+    cell = (24 - p["pack_current_offset"]) / p["pack_current_gain"] / 12
+    settled = 168 * cell**2 * (VEHICLE.pack.r0.at(0.5, 25)[0] + VEHICLE.pack.r1.at(0.5, 25)[0])
+    assert run.pack_heat[-1] == pytest.approx(settled, rel=0.2)
+    with pytest.raises(InputError, match="steady: no motor_current"):
+        ride_run(Samples("steady", {k: v for k, v in columns.items() if k != "motor_current"}), VEHICLE)
+
+
+@needs_data
+def test_reference_bench_against_the_thesis():
+    step, validation = (bench_run(read_table(bench_file(f"thermal_{n}.csv")), VEHICLE) for n in ("step", "validation"))
+    for procedure, calibrated, validated in ((motor_cooling, 4, 10), (inverter_cooling, 1, 6)):
+        fits = procedure([step], VEHICLE, [validation]).fits
+        assert max(fit.largest for fit in fits if not fit.held_out) < calibrated
+        assert max(fit.largest for fit in fits if fit.held_out) < validated
