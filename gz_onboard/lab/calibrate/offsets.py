@@ -1,0 +1,156 @@
+"""Sensors of the pack: offset, gain and noise of current and voltage, at rest and against the inverter's.
+
+Pack current less auxiliary current is the inverter's DC current; the inverter's own small consumption at rest does not
+show in its reading, but is in the pack's. Two sensors tell where they differ, not which one errs: without a third the
+gain found is that of the pack against the inverter's, and its sd is that of a sensor's class.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gz_onboard.errors import InputError
+from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD
+from gz_onboard.lab.calibrate.fit import linear, score, split
+from gz_onboard.lab.calibrate.result import Array, Found, Panel, Result, Trace
+from gz_onboard.simulation.samples import Samples
+from gz_onboard.vehicle import Vehicle
+
+LAGS = np.arange(-0.3, 0.31, 0.05)  # s: what one set of sensors may lag the other
+MOVING, DRIVING = 0.3, 3.0  # rad/s and A of the motor: below is rest
+LEAST_REST = 20  # samples
+WINDOW = 2.0  # s: means over that tell gains apart from timing
+GAIN_SD = 0.007  # of a current sensor of 1 % class
+
+
+class Pair(NamedTuple):
+    """Two readings of one ride at the times of the pack's current [s], and whether the vehicle stood without load."""
+
+    name: str
+    time: Array
+    pack: Array
+    inverter: Array
+    auxiliary: Array
+    pack_voltage: Array
+    inverter_voltage: Array
+    rest: NDArray[np.bool_]
+    lag: float  # s: of the pack's sensors behind the inverter's
+
+
+def read_pair(ride: Samples, vehicle: Vehicle) -> Pair:
+    """The readings of pack and inverter at the same times, their lag taken off. InputError for what is missing."""
+    for role in (
+        "pack_current",
+        "pack_voltage",
+        "inverter_current",
+        "inverter_voltage",
+        "motor_speed",
+        "motor_current",
+    ):
+        if role not in ride.columns:
+            raise InputError(f"{ride.name}: no {role}, which sensor offsets and resistances need")
+    time, pack = ride.columns["pack_current"]
+
+    def at(role: str, lag: float = 0.0) -> Array:
+        return np.interp(time - lag, *ride.columns[role])
+
+    if "auxiliary_current" in ride.columns:
+        auxiliary = at("auxiliary_current")
+    else:
+        auxiliary = vehicle.parameters["auxiliary_power"] / np.maximum(at("pack_voltage"), 1.0)
+    lag = float(min(LAGS, key=lambda x: float(np.std(pack - auxiliary - at("inverter_current", x)))))
+    speed, current = np.abs(at("motor_speed")), np.abs(at("motor_current"))
+    rest = (speed < MOVING) & (current < DRIVING) & (np.abs(at("inverter_current", lag)) < 2.0)
+    return Pair(ride.name, time, pack, at("inverter_current", lag), auxiliary, at("pack_voltage"),
+                at("inverter_voltage", lag), rest, lag)  # fmt: skip
+
+
+def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
+    """pack_current_offset, pack_current_gain, both noises and pack_voltage_offset of the pack's sensors.
+
+    Raises InputError if no ride has readings of both, or none stands still for `LEAST_REST` samples.
+    """
+    pairs = [read_pair(ride, vehicle) for ride in rides]
+    if not pairs:
+        raise InputError("no ride, which sensor offsets come from")
+    resting = [pair for pair in pairs if pair.rest.sum() >= LEAST_REST]
+    if not resting:
+        raise InputError(f"{pairs[0].name}: no ride stands without load for {LEAST_REST} samples; offsets show at rest")
+    p, result = vehicle.parameters, Result("offsets")
+    own = np.array([p["inverter_loss_constant"] / pair.pack_voltage[pair.rest].mean() for pair in resting])
+    apart = np.array([(pair.pack - pair.inverter - pair.auxiliary)[pair.rest].mean() for pair in resting])
+    own_sd = p.sd("inverter_loss_constant") / float(resting[0].pack_voltage.mean())
+    spread = float(np.std(apart - own, ddof=1)) if len(apart) > 1 else 0.05
+    offset = float(np.mean(apart - own))
+    result.parameters["pack_current_offset"] = Found(
+        offset, float(np.hypot(max(spread, 0.02), own_sd) + CURRENT_SD * 0.85), "A",
+        f"{len(resting)} rides at rest: pack less inverter less auxiliary is {apart.mean():+.3f} ± {spread:.3f} "
+        f"A, {own.mean():.3f} A of it the inverter's own {p['inverter_loss_constant']:.1f} W",
+    )  # fmt: skip
+    _gain(result, pairs)
+    noises = np.array([(_noise(pair.pack, pair.rest), _noise(pair.pack_voltage, pair.rest)) for pair in resting])
+    for (name, unit), column in zip((("pack_current_noise", "A"), ("pack_voltage_noise", "V")), noises.T, strict=True):
+        sd = float(column.std(ddof=1)) if len(column) > 1 else 0.2 * float(column.mean())
+        result.parameters[name] = Found(float(np.median(column)), max(sd, 1e-4), unit,
+                                        f"first differences at rest, {len(resting)} rides, white")  # fmt: skip
+    volts = np.array([(pair.pack_voltage - pair.inverter_voltage)[pair.rest].mean() for pair in resting])
+    result.parameters["pack_voltage_offset"] = Found(
+        0.0, float(max(abs(volts.mean()), 0.01)), "V",
+        f"reads {volts.mean():+.3f} V over the inverter's at rest, {len(resting)} rides; which one errs is unknown",
+    )  # fmt: skip
+    result.refusals.append(
+        f"pack_voltage_offset: {volts.mean():+.3f} V between two sensors is all that the data tell, not which one "
+        "errs; left at zero with that sd"
+    )
+    lags = [pair.lag for pair in pairs]
+    result.notes.append(
+        f"pack's sensors lag the inverter's by {np.median(lags):.2f} s ({min(lags):.2f} to {max(lags):.2f})"
+    )
+    return result
+
+
+def _windows(pair: Pair, values: Array) -> Array:
+    """Means of `values` over `WINDOW`."""
+    count = max(round(WINDOW / max(float(np.median(np.diff(pair.time))), 1e-3)), 1)
+    whole = len(values) // count * count
+    means: Array = values[:whole].reshape(-1, count).mean(axis=1)
+    return means
+
+
+def _gain(result: Result, pairs: Sequence[Pair]) -> None:
+    """The pack's current over inverter's and auxiliary together, by ride."""
+    total = [_windows(pair, pair.inverter + pair.auxiliary) for pair in pairs]
+    pack = [_windows(pair, pair.pack) for pair in pairs]
+    x, y = np.concatenate(total), np.concatenate(pack)
+    labels = np.concatenate([np.full(len(column), k) for k, column in enumerate(total)])
+    if np.ptp(x) < 5.0:
+        result.refusals.append(f"pack_current_gain: currents of {x.min():.1f} to {x.max():.1f} A only tell no gain")
+        return
+    columns = {"pack_current_gain": x, "offset": np.ones_like(x)}
+    found = linear(columns, y, groups=labels if len(pairs) > 2 else None)
+    source = f"{len(pairs)} rides, {len(x)} means of {WINDOW:g} s, against inverter and auxiliary current"
+    result.parameters["pack_current_gain"] = found.found("pack_current_gain", "1", source, GAIN_SD)
+    result.refusals.append(
+        f"pack_current_gain: {found['pack_current_gain']:.4f} ± {found.sd('pack_current_gain'):.4f} is the ratio of "
+        f"two sensors; which one errs is unknown, so that its sd holds a sensor's class of {100 * GAIN_SD:.1f} %"
+    )
+    fitted = labels % 2 == 0 if len(pairs) > 1 else split(len(x))
+    half = linear({name: column[fitted] for name, column in columns.items()}, y[fitted])
+    model = half["pack_current_gain"] * x + half["offset"]
+    result.fits += [
+        score("pack current", "A", y, found["pack_current_gain"] * x + found["offset"], held_out=False, source=source),
+        score("pack current", "A", y[~fitted], model[~fitted], held_out=True, source="every second ride"),
+    ]
+    residual = y - found["pack_current_gain"] * x - found["offset"]
+    result.panels.append(Panel("Pack current against inverter and auxiliary", "inverter and auxiliary current [A]",
+                               "pack current less line [A]", (Trace("means of 2 s", x, residual, "."),)))  # fmt: skip
+
+
+def _noise(values: Array, rest: NDArray[np.bool_]) -> float:
+    """The sd of a sample, out of differences of neighbours that both are at rest."""
+    both = rest[1:] & rest[:-1]
+    return float(np.std(np.diff(values)[both]) / np.sqrt(2)) if both.sum() > 5 else float("nan")

@@ -1,0 +1,43 @@
+"""Rides with planted resistances and sensor errors, of bursts, braking and rest."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from gz_onboard.simulation.samples import Samples
+from gz_onboard.vehicle import read_vehicle
+
+VEHICLE = read_vehicle("reference")
+UNLIT, LIT = 44.0, 48.0  # W
+GAIN, OFFSET, CURRENT_NOISE, VOLTAGE_NOISE = 1.01, 0.05, 0.06, 0.01
+CABLE, SERIES = 0.009, 0.006  # ohm
+VOLTS_APART = 0.03
+CELL_STEP = 0.04  # ohm of a cell, at once
+
+
+def ride(seed: int, *, drop=(), auxiliary_sign=1, seconds=400, temperature=25.0, cell=CELL_STEP, calm=False) -> Samples:
+    """10 Hz: current in steps of 5 s, every third at rest with the brake on; all sensors noisy."""
+    rng = np.random.default_rng(seed)
+    time = np.arange(0, seconds, 0.1)
+    steps = seconds // 5
+    level = rng.uniform(-10, 80, steps) * (0.02 if calm else 1.0)
+    rest = np.arange(steps) % 3 == 0
+    load = np.repeat(np.where(rest, 0.0, level), 50)
+    brake = np.repeat((rest & (rng.random(steps) < 0.8)).astype(float), 50)
+    source, power = 54.0, np.where(brake > 0, LIT, UNLIT)
+    own = VEHICLE.parameters["inverter_loss_constant"] / source
+    current = load + power / source + own
+    inside = 14 / 12 * cell + SERIES
+    voltage = source - inside * current
+    columns = {
+        "pack_current": GAIN * current + OFFSET + CURRENT_NOISE * rng.normal(size=len(time)),
+        "pack_voltage": voltage + VOLTS_APART + VOLTAGE_NOISE * rng.normal(size=len(time)),
+        "inverter_current": load + 0.3 * rng.normal(size=len(time)),
+        "inverter_voltage": voltage - CABLE * load + 0.04 * rng.normal(size=len(time)),
+        "auxiliary_current": auxiliary_sign * power / voltage + 0.01 * rng.normal(size=len(time)),
+        "motor_speed": np.where(load == 0, 0.0, 30.0),
+        "motor_current": 1.5 * load,
+        "brake_switch": brake,
+        "cell_temperature": np.full(len(time), temperature),
+    }
+    return Samples(f"ride_{seed}", {role: (time, values) for role, values in columns.items() if role not in drop})

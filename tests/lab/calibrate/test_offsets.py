@@ -1,0 +1,50 @@
+from __future__ import annotations
+
+import pytest
+
+from gz_onboard.errors import InputError
+from gz_onboard.lab.calibrate.offsets import offsets
+
+from .rides import CURRENT_NOISE, GAIN, OFFSET, VEHICLE, VOLTAGE_NOISE, VOLTS_APART, ride
+
+
+def test_planted_errors_come_back_within_their_intervals():
+    held = {"pack_current_offset": 0, "pack_current_gain": 0}
+    for seed in range(0, 60, 3):
+        found = offsets([ride(seed + k) for k in range(3)], VEHICLE).parameters
+        held["pack_current_gain"] += abs(found["pack_current_gain"].value - GAIN) < 1.96 * found["pack_current_gain"].sd
+        held["pack_current_offset"] += (
+            abs(found["pack_current_offset"].value - OFFSET) < 1.96 * found["pack_current_offset"].sd
+        )
+    assert all(count >= 18 for count in held.values()), held
+
+
+def test_noise_is_that_of_a_sample():
+    found = offsets([ride(seed) for seed in range(3)], VEHICLE).parameters
+    assert found["pack_current_noise"].value == pytest.approx(CURRENT_NOISE, rel=0.1)
+    assert found["pack_voltage_noise"].value == pytest.approx(VOLTAGE_NOISE, rel=0.1)
+
+
+def test_what_two_sensors_cannot_tell_is_said():
+    result = offsets([ride(seed) for seed in range(3)], VEHICLE)
+    assert result.parameters["pack_voltage_offset"].value == 0
+    assert result.parameters["pack_voltage_offset"].sd == pytest.approx(VOLTS_APART, rel=0.2)
+    assert any("pack_voltage_offset: +0.0" in refusal for refusal in result.refusals)
+    assert any("pack_current_gain" in refusal and "ratio" in refusal for refusal in result.refusals)
+
+
+def test_no_gain_without_current():
+    result = offsets([ride(0, calm=True)], VEHICLE)
+    assert "pack_current_gain" not in result.parameters
+    assert any("tell no gain" in refusal for refusal in result.refusals)
+
+
+def test_bad_rides_are_refused():
+    with pytest.raises(InputError, match="ride_0: no inverter_current"):
+        offsets([ride(0, drop=["inverter_current"])], VEHICLE)
+    moving = ride(0)
+    moving.columns["motor_speed"][1][:] = 30.0
+    with pytest.raises(InputError, match="no ride stands without load"):
+        offsets([moving], VEHICLE)
+    with pytest.raises(InputError, match="no ride"):
+        offsets([], VEHICLE)
