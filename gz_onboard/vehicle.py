@@ -31,6 +31,7 @@ class Vehicle:
     model: Model
     riding: PriorRiding
     derating: Derating = field(default_factory=Derating)
+    healthy: object = None  # what the discovery learned of it on healthy rides
 
     @property
     def key(self) -> str:

@@ -1,0 +1,166 @@
+"""Baseline and discovery: what a healthy vehicle shows, and what a set of rides shows beyond it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from gz_onboard.errors import InputError
+from gz_onboard.lab.discover.gain import measure_gain
+from gz_onboard.lab.discover.grid import Array, Ride
+from gz_onboard.lab.discover.linear import Linear, Normal, Posterior, fit_mixed, learn_noise, linearise, normal
+from gz_onboard.lab.discover.result import Report
+from gz_onboard.lab.discover.search import Search, evidence
+from gz_onboard.lab.discover.shapes import learn_shapes
+from gz_onboard.lab.discover.state import State, initial, restore
+from gz_onboard.lab.discover.verdict import reach
+from gz_onboard.physics.parameters import Parameters, Value
+from gz_onboard.simulation.samples import Samples
+from gz_onboard.vehicle import Vehicle
+
+WEIGHT = 3.0  # rides that the scatter before any healthy ride is worth
+ROUNDS = 4
+Progress = Callable[[str], None]
+
+
+def baseline(
+    vehicle: Vehicle, healthy: Sequence[Samples], folder: Path | None = None, progress: Progress | None = None,
+    workers: int = 1,
+) -> Vehicle:  # fmt: skip
+    """`vehicle` as `healthy` rides show it: parameters refitted within their calibration, and the null statistics.
+
+    Needs three rides. Raises InputError for rides that cannot be used.
+    """
+    if len(healthy) < 3:
+        raise InputError(f"{len(healthy)} healthy rides: three are the least that tell how rides differ")
+    state = initial(vehicle, folder)
+    state = learn(state, [state.ride(samples) for samples in healthy], progress or (lambda _: None), workers)
+    return adopted(vehicle, state)
+
+
+def adopted(vehicle: Vehicle, state: State) -> Vehicle:
+    """`vehicle` with the values and standard deviations of its own parameters that `state` has learned."""
+    known = dict(vehicle.parameters.known)
+    sd = np.sqrt(np.diag(state.prior)) * state.scale
+    at = state.unit_value(state.mean)
+    model = {name for effect in vehicle.model.effects for name in effect.keywords}
+    for name, s in zip(state.names, sd, strict=True):
+        if name in known and (name in model or not known[name].source.startswith("prior:")):
+            old = known[name]
+            wide = float(s * (old.value if name in LOGARITHMIC else 1.0))
+            source = f"{old.source}; refitted on {state.healthy} healthy rides"
+            known[name] = Value(float(at[name]), wide, old.unit, "measured", source)
+    return replace(vehicle, parameters=Parameters(known, vehicle.parameters.correlations), healthy=state)
+
+
+from gz_onboard.lab.discover.terms import LOG as LOGARITHMIC  # noqa: E402
+
+
+def _linearised(job: tuple[Ride, State]) -> Linear:
+    ride, state = job
+    return linearise(ride, state.values, state.names, state.scale, state.system)
+
+
+def linearise_all(rides: Sequence[Ride], state: State, workers: int = 1) -> list[Linear]:
+    """All rides, in `workers` processes."""
+    jobs = [(ride, state) for ride in rides]
+    if workers < 2 or len(rides) < 2:
+        return [_linearised(job) for job in jobs]
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    with ProcessPoolExecutor(workers) as pool:
+        return list(pool.map(_linearised, jobs))
+
+
+def learn(state: State, rides: Sequence[Ride], progress: Progress, workers: int = 1) -> State:
+    """`state` as `rides` of the healthy vehicle teach it: common part and noise first, then the scatter of rides.
+
+    In this order, for a scatter that is free while the noise is learned takes what is noise for its own.
+    """
+    noise = state.noise
+    values, first = dict(state.values), state.mean
+    shift = np.zeros(len(state.names))
+    for i in range(ROUNDS):
+        progress(f"healthy rides, round {i + 1} of {ROUNDS}")
+        lines = linearise_all(rides, replace(state, values=values), workers)
+        normals = [normal(line, noise) for line in lines]
+        post = fit_mixed(normals, first - shift, state.prior, state.scatter, WEIGHT, state.free, 0)
+        noise = learn_noise(lines, post.mean + post.own, noise)
+        shift = shift + post.mean
+        values = state.unit_value(shift)
+    progress("scatter between healthy rides")
+    lines = linearise_all(rides, replace(state, values=values), workers)
+    normals = [normal(line, noise) for line in lines]
+    post = fit_mixed(normals, first - shift, state.prior, state.scatter, WEIGHT, state.free, 40)
+    after = replace(state, values=values, mean=post.mean, prior=post.covariance, scatter=post.scatter, noise=noise,
+                    healthy=len(rides))  # fmt: skip
+    before = replace(after, mean=first - shift, prior=state.prior)
+    inflation = left_out(before, normals)
+    return replace(after, inflation=inflation, shapes=learn_shapes(after, lines, normals))
+
+
+def left_out(before: State, normals: Sequence[Normal], size: int = 2) -> dict[str, float]:
+    """By how much the score of each cause is too high on healthy rides that the rest did not learn from.
+
+    Mean of chi-squared over folds of `size` rides, with a prior of 1 worth two folds; at least 1.
+    """
+    folds = [list(range(i, min(i + size, len(normals)))) for i in range(0, len(normals), size)]
+    total: dict[str, float] = {}
+    count = 0
+    for fold in folds:
+        rest = [n for i, n in enumerate(normals) if i not in fold]
+        if len(rest) < 2:
+            continue
+        post: Posterior = fit_mixed(rest, before.mean, before.prior, before.scatter, WEIGHT, before.free, 0)
+        state = replace(before, mean=post.mean, prior=post.covariance, inflation={})
+        e = evidence(state, [normals[i] for i in fold])
+        count += 1
+        for cause in usable_causes(before):
+            index = before.index(cause.names)
+            total[cause.name] = total.get(cause.name, 0.0) + e.gain(index) / len(index)
+    return {name: max(1.0, (2 + x) / (2 + count)) for name, x in total.items()}
+
+
+def usable_causes(state: State) -> list:  # type: ignore[type-arg]
+    """The candidates whose parameters some channel depends on."""
+    return [c for c in state.causes if set(c.names) <= set(state.names)]
+
+
+def discover(
+    vehicle: Vehicle, rides: Sequence[Samples], seed: int = 0, folder: Path | None = None,
+    progress: Progress | None = None, workers: int = 1, holdout: Sequence[str] | None = None,
+) -> Report:  # fmt: skip
+    """What `rides` show that `vehicle` does not: shown, named, measured. See `Report`.
+
+    seed: of the draw of the rides that are held out. holdout: their names instead. workers: processes.
+    Raises InputError where no ride can be used.
+    """
+    say = progress or (lambda _: None)
+    state = restore(vehicle, folder)
+    notes: list[str] = []
+    usable: list[Ride] = []
+    for samples in rides:
+        try:
+            ride = state.ride(samples)
+        except InputError as error:
+            notes.append(str(error))
+            continue
+        if ride.distance < 300:
+            notes.append(f"ride {ride.name}: {ride.distance:.0f} m; less than 300 m tell nothing")
+            continue
+        usable.append(ride)
+    if not usable:
+        raise InputError("no ride can be used: " + "; ".join(notes or ["none given"]))
+    say(f"{len(usable)} rides, {len(state.names)} parameters")
+    lines = linearise_all(usable, state, workers)
+    report = reach(state, lines, notes, say, lambda s: linearise_all(usable, s, workers))
+    say("gain on rides held out")
+    report.gain = measure_gain(report, seed, holdout)
+    return report
+
+
+__all__ = ["Array", "Search", "adopted", "baseline", "discover", "learn", "left_out"]

@@ -1,0 +1,86 @@
+"""The gain on whole rides held out of the fit: before, with the present parameters refitted, and extended."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gz_onboard.lab.discover.grid import Array
+from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed
+from gz_onboard.lab.discover.result import Report
+
+from gz_onboard.lab.discover.state import State
+
+
+def measure_gain(report: Report, seed: int, holdout: Sequence[str] | None) -> dict[str, Any]:
+    """Errors of rides that were not fitted, with `report`'s causes and without. Every ride is held out once if none
+    are named.
+    """
+    state, lines, normals = report.state, report.lines, report.normals
+    assert state is not None
+    if len(lines) < 2:
+        return {"holdout": [], "note": "one ride: nothing to hold out"}
+    names = [line.ride.name for line in lines]
+    folds = [[i for i, n in enumerate(names) if n in holdout]] if holdout else [[i] for i in range(len(lines))]
+    rows: dict[str, list[tuple[float, float, float]]] = {}
+    causes = [c for c in state.causes if c.name in {found.name for found in report.causes}]
+    for fold in folds:
+        rest = [n for i, n in enumerate(normals) if i not in fold]
+        if not rest or not fold:
+            continue
+        control = fit_mixed(rest, state.mean, state.prior, state.scatter, 1.0, state.free, 0).mean
+        after = control.copy()
+        if causes:
+            after = extended_mean(state, rest, causes)
+        for i in fold:
+            triple = [errors(lines[i], theta) for theta in (state.mean, control, after)]
+            for metric in triple[0]:
+                rows.setdefault(metric, []).append(tuple(t[metric] for t in triple))  # type: ignore[arg-type]
+    result: dict[str, Any] = {"holdout": [names[i] for fold in folds for i in fold]}
+    rng = np.random.default_rng(seed)
+    for metric, triples in rows.items():
+        table = np.array(triples)
+        before, control_, after_ = table.mean(axis=0)
+        draws = rng.integers(0, len(table), (400, len(table)))
+        saved = (table[:, 1] - table[:, 2])[draws].mean(axis=1)
+        result[metric] = {
+            "before": float(before), "control": float(control_), "after": float(after_),
+            "ci95": [float(np.quantile(saved, 0.025)), float(np.quantile(saved, 0.975))],
+        }  # fmt: skip
+    return result
+
+
+def extended_mean(state: State, rest: Sequence[Normal], causes: Sequence[Any]) -> Array:
+    """The common part from `rest` with the parameters of `causes` free."""
+    wide = state.prior.copy()
+    index = [i for cause in causes for i in state.index(cause.names)]
+    for i in index:
+        wide[i, i] += 1e6
+    return fit_mixed(rest, state.mean, wide, state.scatter, 1.0, state.free, 0).mean
+
+
+def errors(line: Linear, theta: Array) -> dict[str, float]:
+    """Of one ride with parameters `theta` (p,): rms power [W], energy per way [J/m], cell voltage [V], range [1]."""
+    from gz_onboard.lab.discover.verdict import energy, power_of, share_of_time  # noqa: PLC0415
+
+    more, square = 0.0, 0.0
+    found: dict[str, float] = {}
+    for name, table in line.tables.items():
+        rest = table.y - table.a @ theta
+        power = power_of(name, line, rest)
+        if power is not None and len(power):
+            more += float(np.mean(power)) * share_of_time(line, name)
+            square += float(np.mean(power**2))
+        if name == "cell_voltage":
+            found["voltage"] = float(np.sqrt(np.mean(rest**2)))
+    found["power"] = float(np.sqrt(square))
+    found["energy_per_way"] = abs(more) / max(line.ride.distance, 1.0)
+    drawn = energy(line)
+    model = drawn - more
+    found["range"] = abs(more) / model if model > 0 else float("nan")
+    return found
+
+
+__all__ = ["errors", "measure_gain"]

@@ -1,0 +1,185 @@
+"""A ride on one grid of time: what the channels of the discovery read.
+
+Signals come at rates of their own; here each is averaged over every tenth of a second. Where a signal was missing for
+longer than three of its periods (and 0.3 s), the grid says so: nothing is made up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from gz_onboard.errors import InputError
+from gz_onboard.physics.model import G, air_density
+from gz_onboard.simulation.samples import Samples
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+STEP = 0.1  # s
+LAGS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}
+"""By how much later than the inverter's a value is sent [s]; what is left of it is fitted (see `channels`)."""
+NEEDED = ("motor_speed", "motor_current")
+BRAKE_PRESSURE = 0.8e5  # Pa: above what the sensors show at rest
+MOVING = 0.5  # m/s
+
+
+@dataclass
+class Ride:
+    """A ride on the grid.
+
+    time: shape (n,) [s from the start]. signals: by role, shape (n,); valid: likewise, where it was measured.
+    quantities: what effects read (names of `physics.effect.QUANTITIES`), shape (n,) or a float, with the vehicle's
+    nominal mass and radius. have: the roles that are there.
+    """
+
+    name: str
+    time: Array
+    signals: dict[str, Array]
+    valid: dict[str, Mask]
+    radius: float
+    payload: float | None
+    quantities: dict[str, Array] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
+
+    @property
+    def have(self) -> set[str]:
+        """The roles that are there."""
+        return set(self.signals)
+
+    def mask(self, *roles: str) -> Mask:
+        """Where all of `roles` were measured, shape (n,)."""
+        result = np.ones(len(self.time), dtype=bool)
+        for role in roles:
+            result &= self.valid[role]
+        return result
+
+    @property
+    def distance(self) -> float:
+        """The way ridden [m]."""
+        return float(np.sum(np.abs(self.quantities["speed"])) * STEP)
+
+    @property
+    def braking(self) -> Mask:
+        """Where a brake is touched, or was within 0.5 s, shape (n,)."""
+        result = np.zeros(len(self.time), dtype=bool)
+        if "brake_switch" in self.signals:
+            result |= self.signals["brake_switch"] > 0.01
+        for role in ("brake_pressure_front", "brake_pressure_rear"):
+            if role in self.signals:
+                result |= self.signals[role] > BRAKE_PRESSURE
+        if not {"brake_switch", "brake_pressure_rear"} & self.have:  # regeneration is all that tells
+            result |= self.signals["motor_current"] < -1.0
+        wide = np.convolve(result, np.ones(11), mode="same") > 0
+        return np.asarray(wide, dtype=bool)
+
+
+def averaged(times: Array, values: Array, grid: Array, width: float = STEP) -> Array:
+    """The mean of the line through (times, values) over `width` [s] around each of `grid`, shape of `grid`."""
+    whole = np.concatenate([[0.0], np.cumsum(np.diff(times) * (values[1:] + values[:-1]) / 2)])
+
+    def integral(t: Array) -> Array:
+        inside = np.clip(t, times[0], times[-1])
+        i = np.clip(np.searchsorted(times, inside, side="right") - 1, 0, len(times) - 2)
+        dt = inside - times[i]
+        slope = (values[i + 1] - values[i]) / np.maximum(times[i + 1] - times[i], 1e-9)
+        within = whole[i] + dt * (values[i] + slope * dt / 2)
+        # beyond its ends a signal keeps its last value
+        result: Array = within + np.where(t < times[0], (t - times[0]) * values[0], 0.0)
+        return result + np.where(t > times[-1], (t - times[-1]) * values[-1], 0.0)
+
+    return (integral(grid + width / 2) - integral(grid - width / 2)) / width
+
+
+def measured(times: Array, grid: Array) -> Mask:
+    """Where `grid` lies within three periods (and 0.3 s) of a sample on both sides, shape of `grid`."""
+    limit = max(0.3, 3 * float(np.median(np.diff(times))))
+    i = np.clip(np.searchsorted(times, grid), 1, len(times) - 1)
+    gap = times[i] - times[i - 1]
+    return np.asarray((gap < limit) & (grid > times[0] - limit) & (grid < times[-1] + limit))
+
+
+def read_ride(samples: Samples, radius: float, mass: float) -> Ride:
+    """`samples` on the grid. radius: of the driven wheel over the gear ratio [m], mass: of vehicle and payload [kg].
+
+    Raises InputError for a ride without motor speed or current, or shorter than a minute.
+    """
+    for role in NEEDED:
+        if role not in samples.columns:
+            raise InputError(f"ride {samples.name}: has no {role}, without which nothing can be compared")
+    start = max(samples.columns[role][0][0] for role in NEEDED)
+    end = min(samples.columns[role][0][-1] for role in NEEDED)
+    if end - start < 60:
+        raise InputError(f"ride {samples.name}: {end - start:.0f} s of motor speed and current; a minute is the least")
+    grid = np.arange(start, end, STEP)
+    signals: dict[str, Array] = {}
+    valid: dict[str, Mask] = {}
+    for role, (times, values) in samples.columns.items():
+        if len(times) < 20:
+            continue
+        at = grid + LAGS.get(role, 0.0)
+        turned = np.unwrap(values) if role == "gps_course" else values
+        signals[role] = averaged(times, turned, at)
+        valid[role] = measured(times, at)
+    ride = Ride(samples.name, grid - start, signals, valid, radius, samples.rider_mass)
+    ride.quantities = _quantities(ride, mass)
+    wanted = ("accel_x", "rate_z", "gps_speed", "gps_altitude", "gps_course", "pack_voltage", "pack_current",
+              "inverter_voltage", "inverter_current", "auxiliary_current", "cell_temperature", "ambient_temperature",
+              "motor_temperature", "inverter_temperature", "wheel_speed_front", "wheel_speed_rear")  # fmt: skip
+    ride.missing = tuple(role for role in wanted if role not in signals)
+    return ride
+
+
+def smooth(values: Array, seconds: float) -> Array:
+    """The running mean over about `seconds`, shape kept; the ends are those of a shorter window."""
+    n = max(1, round(seconds / STEP / 2) * 2 + 1)
+    kernel = np.ones(n)
+    return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
+
+
+def _quantities(ride: Ride, mass: float) -> dict[str, Array]:
+    s = ride.signals
+    n = len(ride.time)
+    motor_speed = s["motor_speed"]
+    speed = motor_speed * ride.radius
+    acceleration = np.gradient(smooth(speed, 0.4), STEP)
+    ambient = s.get("ambient_temperature", np.full(n, 20.0))
+    temperature = s.get("cell_temperature", ambient)
+    still = np.abs(speed) < 0.05
+    yaw = np.zeros(n)
+    if "rate_z" in s:
+        bias = float(np.median(s["rate_z"][still])) if still.sum() > 30 else float(np.median(s["rate_z"]))
+        yaw = smooth(s["rate_z"] - bias, 0.5)
+    # the body leans: its yaw rate is r·cos φ, and tan φ = v·r/g, so sin φ = v·rate/g
+    sine = np.clip(speed * yaw / G, -0.85, 0.85)
+    lateral = G * sine / np.sqrt(1 - sine**2)
+    grade, around = np.zeros(n), np.zeros(n)
+    if "accel_x" in s:
+        specific = s["accel_x"] - acceleration
+        around = (smooth(specific, 24.0) * 24 - smooth(specific, 8.0) * 8) / 16
+        grade = smooth((s["accel_x"] - acceleration) / G, 2.0)
+    moved = np.cumsum(np.abs(speed) > MOVING) * STEP
+    course = s.get("gps_course", np.zeros(n))
+    altitude = float(np.median(s["gps_altitude"])) if "gps_altitude" in s else 0.0
+    density = air_density(float(np.median(ambient)), altitude)
+    return {
+        "speed": speed,
+        "acceleration": acceleration,
+        "grade": grade,
+        "grade_around": around,  # m/s²: G times the grade before and behind, free of the noise of here and now
+        "grade_cosine": np.sqrt(1 - np.clip(grade, -0.5, 0.5) ** 2),
+        "mass": np.full(n, mass),
+        "air_density": np.full(n, density),
+        "headwind": np.zeros(n),
+        "lateral_acceleration": lateral,
+        "motor_speed": motor_speed,
+        "motor_current": s["motor_current"],
+        "motor_temperature": s.get("motor_temperature", ambient),
+        "ambient_temperature": ambient,
+        "cell_temperature": temperature,
+        "heading": np.mod(course, 2 * np.pi),
+        "time_moving": moved,
+        "torque": s["motor_current"],
+    }

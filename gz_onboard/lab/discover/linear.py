@@ -1,0 +1,238 @@
+"""The linear mixed model of all channels, and the small matrices that every question is asked of.
+
+About the present parameters θ the residuals y of ride r are y = A·(θ_r − θ) + noise, θ_r = μ + u_r: μ common to all rides
+(Laird & Ware 1982), u_r the ride's own with covariance T, which healthy rides tell: that the parameters of a healthy
+vehicle seem to differ from ride to ride is the model's discrepancy (Brynjarsdóttir & O'Hagan 2014), and nothing
+smaller than it is taken for a cause. Noise is white and exponentially correlated. Of each ride there remain N = AᵀC⁻¹A
+and b = AᵀC⁻¹y. All parameters are in units of their scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gz_onboard.lab.discover.channels import CHANNELS, Channel, System, blocks, depends, roughness, support, usable
+from gz_onboard.lab.discover.grid import Array, Mask, Ride
+from gz_onboard.lab.discover.terms import stepped
+
+Noise = dict[str, tuple[float, float, float]]  # by channel: white sd, correlated sd, correlation time [s]
+
+
+@dataclass(frozen=True)
+class Table:
+    """One channel of one ride, linearised: y (m,) [unit], a (m, parameters) [unit per scale], time (m,) [s].
+
+    Both are divided by the blocks' `channels.roughness`.
+    """
+
+    channel: Channel
+    y: Array
+    a: Array
+    time: Array
+    used: Mask  # of the channel's blocks, which are in y
+
+
+@dataclass
+class Linear:
+    """A ride, linearised."""
+
+    ride: Ride
+    tables: dict[str, Table]
+
+    def seen_from(self, offset: Array) -> Linear:
+        """The same, with residuals as they would be at parameters `offset` (p,) before these, were the model linear."""
+        return Linear(self.ride, {n: replace(t, y=t.y + t.a @ offset) for n, t in self.tables.items()})
+
+
+def linearise(ride: Ride, values: Mapping[str, float], names: Sequence[str], scale: Array, system: System) -> Linear:
+    """The residuals of `ride` at `values`, and their columns over `names`, each by a forward difference of `scale`."""
+    tables = {}
+    for channel in CHANNELS:
+        if not usable(channel, ride, system):
+            continue
+        used = support(channel, ride)
+        if used.sum() < 10:
+            continue
+        mine = depends(channel, system.effects)
+        y = blocks(channel, ride, values, system)[used]
+        a = np.zeros((len(y), len(names)))
+        for i, name in enumerate(names):
+            if name in mine:
+                moved = {**values, name: stepped(name, values[name], float(scale[i]))}
+                a[:, i] = y - blocks(channel, ride, moved, system)[used]
+        rough = roughness(channel, ride)[used]
+        y, a = y / rough, a / rough[:, None]
+        good = np.isfinite(y) & np.isfinite(a).all(axis=1)
+        good[good] = inliers(y[good], a[good])
+        index = np.flatnonzero(used)
+        used = used.copy()
+        used[index[~good]] = False
+        tables[channel.name] = Table(channel, y[good], a[good], (index[good] + 0.5) * channel.block, used)
+    return Linear(ride, tables)
+
+
+def whitened(table: Table, noise: tuple[float, float, float], values: Array) -> Array:
+    """`values` (m,) or (m, k) in units of their noise: the innovations of a Kalman filter of white and exponentially
+    correlated noise (Anderson & Moore 1979, ch. 9), divided by their standard deviation.
+    """
+    white, slow, time = noise
+    if not table.channel.correlated or slow < 1e-9 * white:
+        return np.asarray(values / white)
+    decay = np.exp(-np.diff(table.time, prepend=table.time[0]) / time)
+    variance = slow**2
+    state = np.zeros(values.shape[1:])
+    out = np.empty_like(values)
+    for i, factor in enumerate(decay.tolist()):
+        state = factor * state
+        variance = factor * factor * variance + (1 - factor * factor) * slow**2
+        total = variance + white**2
+        innovation = values[i] - state
+        out[i] = innovation / total**0.5
+        gain = variance / total
+        state = state + gain * innovation
+        variance *= 1 - gain
+    return out
+
+
+def likelihoods(times: Array, rest: Array, ratio: Array, time: Array) -> tuple[Array, Array]:
+    """For each pair of `ratio` (correlated over white sd) and `time` [s], shape (k,): the sum of squares in units of
+    the white noise, and the sum of the logarithms of the innovations' variances.
+    """
+    steps = np.exp(-np.diff(times, prepend=times[0])[:, None] / time)
+    power = ratio**2
+    variance, state = power.copy(), np.zeros(len(ratio))
+    quadratic, logarithm = np.zeros(len(ratio)), np.zeros(len(ratio))
+    for factor, y in zip(steps, rest.tolist(), strict=True):
+        state = factor * state
+        variance = factor * factor * (variance - power) + power
+        total = variance + 1
+        innovation = y - state
+        quadratic += innovation * innovation / total
+        logarithm += np.log(total)
+        gain = variance / total
+        state = state + gain * innovation
+        variance = variance * (1 - gain)
+    return quadratic, logarithm
+
+
+def inliers(y: Array, a: Array) -> Mask:
+    """Blocks that no parameters make fit, by far, are none of the vehicle's: gaps of the recording, a bump. (m,)
+
+    Those beyond eight robust standard deviations of a fit of all columns, three times over (Rousseeuw & Leroy 1987).
+    """
+    touched = a[:, np.any(a != 0, axis=0)]
+    good = np.ones(len(y), dtype=bool)
+    size = np.linalg.norm(touched, axis=0)
+    columns = touched / np.where(size > 0, size, 1.0)
+    for _ in range(3):
+        c = np.linalg.lstsq(columns[good], y[good], rcond=1e-6)[0]
+        rest = y - columns @ c
+        spread = 1.4826 * float(np.median(np.abs(rest[good]))) + 1e-12
+        good = np.abs(rest) < 8 * spread
+    return good if good.mean() > 0.9 else np.abs(rest) <= np.quantile(np.abs(rest), 0.9)
+
+
+@dataclass(frozen=True)
+class Normal:
+    """N (p, p) and b (p,) of one ride."""
+
+    n: Array
+    b: Array
+
+
+def normal(linear: Linear, noise: Noise, only: Sequence[str] | None = None) -> Normal:
+    """The normal equations of a ride, over all channels or `only` some."""
+    size = next(iter(linear.tables.values())).a.shape[1]
+    n, b = np.zeros((size, size)), np.zeros(size)
+    for name, table in linear.tables.items():
+        if only is not None and name not in only:
+            continue
+        touched = np.flatnonzero(np.any(table.a != 0, axis=0))
+        both = whitened(table, noise[name], np.column_stack([table.a[:, touched], table.y]))
+        a, y = both[:, :-1], both[:, -1]
+        n[np.ix_(touched, touched)] += a.T @ a
+        b[touched] += a.T @ y
+    return Normal(n, b)
+
+
+def marginal(ride: Normal, scatter: Array) -> Normal:
+    """The same once the ride's own part, of variances `scatter` (p,), is integrated out."""
+    solve = np.linalg.solve(np.eye(len(scatter)) + ride.n * scatter, np.column_stack([ride.n, ride.b]))
+    n = solve[:, :-1]
+    return Normal((n + n.T) / 2, solve[:, -1])
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """mean (p,), covariance (p, p) of the common part; scatter (p,) variances of the rides' own; own (rides, p)."""
+
+    mean: Array
+    covariance: Array
+    scatter: Array
+    own: Array
+
+
+def fit_mixed(
+    rides: Sequence[Normal], mean: Array, prior: Array, scatter: Array, weight: float, free: Mask, rounds: int = 60
+) -> Posterior:
+    """Common part, and the scatter between rides by expectation and maximisation (Dempster, Laird & Rubin 1977).
+
+    mean, prior: (p,), (p, p) of the common part before. scatter: (p,) variances before, worth `weight` rides;
+    only those of `free` (p,) are learned.
+    """
+    before = scatter.copy()
+    now = scatter.copy()
+    information = np.linalg.inv(prior)
+    for _ in range(max(rounds, 1)):
+        parts = [marginal(ride, now) for ride in rides]
+        after = np.linalg.inv(information + sum(part.n for part in parts))
+        common = after @ (information @ mean + sum(part.b for part in parts))
+        total = weight * before
+        own = []
+        for ride in rides:
+            v = np.linalg.inv(np.diag(1 / now) + ride.n)
+            u = v @ (ride.b - ride.n @ common)
+            vn = v @ ride.n
+            total = total + u**2 + np.diag(v) + np.einsum("ij,jk,ik->i", vn, after, vn)
+            own.append(u)
+        if rounds > 0:
+            now = np.where(free, np.clip(total / (weight + len(rides)), 0.1 * before, 9 * before), before)
+    return Posterior(common, after, now, np.array(own))
+
+
+def residuals(linear: Linear, shift: Array) -> dict[str, Array]:
+    """y − A·shift by channel."""
+    return {name: table.y - table.a @ shift for name, table in linear.tables.items()}
+
+
+def learn_noise(rides: Sequence[Linear], shifts: Array, start: Noise) -> Noise:
+    """White and correlated noise of each channel by maximum likelihood on a grid, all rides together.
+
+    shifts: (rides, p), what each ride's parameters are.
+    """
+    result = dict(start)
+    every = [residuals(ride, shift) for ride, shift in zip(rides, shifts, strict=True)]
+    for channel in CHANNELS:
+        rows = [(ride.tables[channel.name], rest[channel.name]) for ride, rest in zip(rides, every, strict=True)
+                if channel.name in rest]  # fmt: skip
+        if not rows:
+            continue
+        pooled = np.concatenate([rest for _, rest in rows])
+        spread = float(1.4826 * np.median(np.abs(pooled - np.median(pooled)))) or float(np.std(pooled)) or 1e-9
+        rows = [(t, np.clip(rest, -6 * spread, 6 * spread)) for t, rest in rows]
+        if not channel.correlated:
+            result[channel.name] = (float(np.sqrt(np.mean(np.concatenate([r for _, r in rows]) ** 2))), 0.0, 10.0)
+            continue
+        grid = [(q, t) for t in (3 * channel.block, 10 * channel.block, 60.0, 200.0, 600.0)
+                for q in (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0)]  # fmt: skip
+        ratio, time = (np.array(column) for column in zip(*grid, strict=True))
+        parts = [likelihoods(table.time, rest, ratio, time) for table, rest in rows]
+        count = sum(len(rest) for _, rest in rows)
+        quadratic = sum((q for q, _ in parts), np.zeros(len(ratio)))
+        i = int(np.argmin(count * np.log(quadratic / count) + sum(part[1] for part in parts)))
+        sd = float(np.sqrt(quadratic[i] / count))
+        result[channel.name] = (sd, float(ratio[i]) * sd, float(time[i]))
+    return result

@@ -1,0 +1,75 @@
+"""What a discovery found: the report and its JSON."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from gz_onboard.lab.discover.linear import Linear, Normal
+from gz_onboard.lab.discover.state import State
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A cause that was named. value: of the parameter in the vehicle file once accepted; change: over the healthy one's."""
+
+    name: str
+    parameter: str
+    value: float
+    unit: str
+    ci95: tuple[float, float]
+    change: float
+    energy_share: float
+    evidence: float  # chi-squared with one degree of freedom that leaving it out costs
+    others: tuple[tuple[str, float, tuple[float, float]], ...] = ()  # further parameters: name, value, interval
+
+    def to_json(self) -> dict[str, Any]:
+        """As a JSON object."""
+        return {
+            "name": self.name, "parameter": self.parameter, "value": self.value, "unit": self.unit,
+            "ci95": list(self.ci95), "change": self.change, "energy_share": self.energy_share,
+            "evidence": self.evidence,
+            "parameters": {self.parameter: {"value": self.value, "ci95": list(self.ci95)}}
+            | {name: {"value": value, "ci95": list(ci)} for name, value, ci in self.others},
+        }  # fmt: skip
+
+
+@dataclass
+class Report:
+    """What was found; the fields up to `advice` are those of the JSON."""
+
+    verdict: str  # cause, none, ambiguous, unknown
+    causes: list[Cause]
+    ambiguous: list[list[str]]
+    unknown: dict[str, Any] | None
+    ranking: list[tuple[str, float]]
+    residuals: dict[str, dict[str, float]]
+    gain: dict[str, Any]
+    advice: list[str]
+    notes: list[str]
+    isolability: dict[str, Any]
+    threshold: float
+    extended_model: str | None = None
+    state: State | None = field(default=None, repr=False)
+    lines: list[Linear] = field(default_factory=list, repr=False)
+    normals: list[Normal] = field(default_factory=list, repr=False)
+
+    def to_json(self) -> dict[str, Any]:
+        """The contract's keys; numbers plain."""
+        return {
+            "schema": SCHEMA,
+            "verdict": self.verdict,
+            "causes": [cause.to_json() for cause in self.causes],
+            "ambiguous": self.ambiguous,
+            "unknown": self.unknown,
+            "ranking": [{"name": name, "score": score} for name, score in self.ranking],
+            "residuals": self.residuals,
+            "gain": self.gain,
+            "extended_model": self.extended_model,
+            "advice": self.advice,
+            "notes": self.notes,
+            "isolability": self.isolability,
+            "threshold": self.threshold,
+        }

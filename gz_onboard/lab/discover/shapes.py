@@ -1,0 +1,184 @@
+"""Smooth curves over quantities: what a channel's residual looks like when no cause has its name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gz_onboard.lab.discover.channels import BY_NAME, over_blocks
+from gz_onboard.lab.discover.grid import STEP, Array, Ride
+from gz_onboard.lab.discover.linear import Linear, Noise, Normal, Table, marginal, whitened
+from gz_onboard.lab.discover.search import _evidence
+from gz_onboard.lab.discover.state import Shape, State
+
+# knots of the hat functions, the middle one left out (it is the level); unit
+QUANTITIES: dict[str, tuple[tuple[float, ...], str]] = {
+    "speed": ((2.0, 4.5, 6.5, 8.5, 10.0, 11.5, 13.0, 15.0), "m/s"),
+    "acceleration": ((-2.0, -1.0, -0.3, 0.0, 0.3, 1.0, 2.0), "m/s²"),
+    "lateral_acceleration": ((-4.0, -2.0, -0.7, 0.0, 0.7, 2.0, 4.0), "m/s²"),
+    "grade": ((-0.08, -0.04, -0.015, 0.0, 0.015, 0.04, 0.08), "1"),
+    "heading": ((0.0, 0.9, 1.8, 2.7, 3.6, 4.5, 5.4), "rad"),
+    "motor_temperature": ((0.0, 15.0, 30.0, 40.0, 50.0, 65.0, 80.0), "degC"),
+    "time": ((0.0, 120.0, 240.0, 400.0, 600.0, 800.0, 1200.0), "s"),
+    "motor_current": ((-40.0, 0.0, 20.0, 50.0, 90.0, 140.0, 200.0), "A"),
+    "current_change": ((0.0, 5.0, 15.0, 30.0, 60.0, 100.0), "A"),
+    "pack_current": ((-15.0, 0.0, 8.0, 20.0, 40.0, 60.0, 90.0), "A"),
+    "soc": ((0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0), "1"),
+    "steering": ((-0.5, -0.2, -0.06, 0.0, 0.06, 0.2, 0.5), "rad"),
+}
+PAIRS: tuple[tuple[str, tuple[str, ...]], ...] = (
+    ("road_force", ("speed", "acceleration", "lateral_acceleration", "grade", "heading", "motor_temperature", "time",
+                    "motor_current", "current_change", "steering")),
+    ("inverter_power", ("speed", "motor_current", "motor_temperature", "time", "current_change")),
+    ("auxiliary", ("speed", "motor_temperature", "time", "pack_current")),
+    ("pack_balance", ("speed", "pack_current", "motor_temperature", "time")),
+    ("cell_voltage", ("pack_current", "soc", "time", "current_change")),
+)  # fmt: skip
+SHARE = 0.15  # sd before of a coefficient, over the residual's own standard deviation: see `amplitude`
+
+
+def names() -> list[str]:
+    """Every pair of channel and quantity, as ``channel over quantity``."""
+    return [f"{channel} over {quantity}" for channel, quantities in PAIRS for quantity in quantities]
+
+
+def quantity(ride: Ride, name: str, table: Table) -> Array | None:
+    """The quantity over the blocks of `table`, (m,); None if the ride has it not."""
+    channel = table.channel
+    q = ride.quantities
+    if name == "time":
+        values = ride.time
+    elif name == "current_change":
+        n = round(channel.block / STEP)
+        mean = over_blocks(channel, ride.signals["motor_current"])
+        square = over_blocks(channel, ride.signals["motor_current"] ** 2)
+        return np.asarray(np.sqrt(np.maximum(square - mean**2, 0))[table.used]) if n > 1 else None
+    elif name == "pack_current":
+        if name not in ride.signals:
+            return None
+        values = ride.signals[name]
+    elif name == "soc":
+        if "soc" not in q:
+            return None
+        values = q["soc"]
+    elif name == "steering":  # of a bicycle without slip: wheelbase over the radius of the bend
+        speed = np.maximum(np.abs(q["speed"]), 1.0)
+        values = np.clip(1.32 * q["lateral_acceleration"] / speed**2, -0.6, 0.6)
+    else:
+        values = q[name]
+    return over_blocks(channel, values)[table.used]
+
+
+def hats(x: Array, knots: Sequence[float], periodic: bool = False) -> Array:
+    """Linear hat functions over `knots` but the one that most is at, (m, k)."""
+    at = np.array(knots)
+    if periodic:
+        at = np.append(at, 2 * np.pi)
+        full = np.array([np.interp(np.mod(x, 2 * np.pi), at, np.eye(len(at))[i]) for i in range(len(at))]).T
+        full[:, 0] += full[:, -1]
+        full = full[:, :-1]
+    else:
+        full = np.array([np.interp(x, at, np.eye(len(at))[i]) for i in range(len(at))]).T
+    return np.asarray(full)
+
+
+def columns(ride: Ride, name: str, table: Table) -> Array | None:
+    """The curve's columns over the blocks of `table`, (m, k), in the channel's unit."""
+    x = quantity(ride, name, table)
+    if x is None:
+        return None
+    return hats(x, QUANTITIES[name][0], name == "heading")
+
+
+def extended(linear: Linear, normal: Normal, pair: str, noise: Noise, size: float) -> Normal | None:
+    """`normal` with the columns of the curve `pair`, each in units of `size` of the channel's residual."""
+    channel, _, name = pair.partition(" over ")
+    table = linear.tables.get(channel)
+    if table is None:
+        return None
+    curve = columns(linear.ride, name, table)
+    if curve is None:
+        return None
+    from gz_onboard.lab.discover.channels import roughness  # noqa: PLC0415
+
+    rough = roughness(table.channel, linear.ride)[: len(table.used)][table.used]
+    k, p = curve.shape[1], len(normal.b)
+    both = whitened(table, noise[channel], np.column_stack([curve * size / rough[:, None], table.a, table.y]))
+    b, a, y = both[:, :k], both[:, k:-1], both[:, -1]
+    n = np.zeros((p + k, p + k))
+    n[:p, :p] = normal.n
+    n[p:, p:] = b.T @ b
+    n[p:, :p] = b.T @ a
+    n[:p, p:] = n[p:, :p].T
+    return Normal(n, np.concatenate([normal.b, b.T @ y]))
+
+
+SIZES = {"road_force": 5.0, "inverter_power": 10.0, "auxiliary": 2.0, "pack_balance": 0.1, "cell_voltage": 0.005}
+"""Unit of a curve's coefficients, in the channel's; `SCATTER` of it is taken to differ between rides."""
+SCATTER = 0.3
+
+
+def shape_evidence(
+    state: State, linears: Sequence[Linear], normals: Sequence[Normal], pair: str, fixed: Sequence[int]
+) -> tuple[float, int, Array, Array] | None:
+    """(rise of twice the log likelihood by the curve beside changes at `fixed`, its degrees of freedom, coefficients
+    in the channel's unit, their sd); None where no ride has it.
+    """
+    size = SIZES[pair.partition(" over ")[0]]
+    rides = [extended(line, normal, pair, state.noise, size) for line, normal in zip(linears, normals, strict=True)]
+    rides = [ride for ride in rides if ride is not None]
+    if not rides:
+        return None
+    p = len(state.mean)
+    k = len(rides[0].b) - p  # type: ignore[union-attr]
+    shape = state.shapes.get(pair)
+    mean = np.concatenate([state.mean, shape.mean if shape else np.zeros(k)])
+    prior = np.zeros((p + k, p + k))
+    prior[:p, :p] = state.prior
+    prior[p:, p:] = shape.covariance if shape else np.eye(k) * SCATTER**2
+    scatter = np.concatenate([state.scatter, np.full(k, SCATTER**2)])
+    e = _evidence(mean, prior, scatter, rides)  # type: ignore[arg-type]
+    mine = list(range(p, p + k))
+    inner = e.information[np.ix_(mine, mine)] + 1e-3 * np.eye(k)
+    if fixed:
+        f = list(fixed)
+        cross = np.linalg.solve(e.information[np.ix_(f, f)] + 1e-6 * np.eye(len(f)), np.column_stack(
+            [e.information[np.ix_(f, mine)], e.score[f]]))  # fmt: skip
+        inner = inner - e.information[np.ix_(mine, f)] @ cross[:, :-1]
+        score = e.score[mine] - e.information[np.ix_(mine, f)] @ cross[:, -1]
+    else:
+        score = e.score[mine]
+    inner = inner + 1e-3 * np.eye(k)
+    estimate = np.linalg.solve(inner, score)
+    return (
+        float(score @ estimate), k, estimate * size, np.sqrt(np.abs(np.diag(np.linalg.inv(inner)))) * size
+    )  # fmt: skip
+
+
+def learn_shapes(state: State, linears: Sequence[Linear], normals: Sequence[Normal]) -> dict[str, Shape]:
+    """What the healthy rides leave over each quantity, beside what the parameters of `state` explain."""
+    found = {}
+    for pair in names():
+        size = SIZES[pair.partition(" over ")[0]]
+        rides = [extended(line, normal, pair, state.noise, size) for line, normal in zip(linears, normals, strict=True)]
+        rides = [ride for ride in rides if ride is not None]
+        if not rides:
+            continue
+        p = len(state.mean)
+        k = len(rides[0].b) - p  # type: ignore[union-attr]
+        # the parameters stay as they were learned: their values at the mean, the curve what is left
+        m, c = np.zeros((k, k)), np.zeros(k)
+        for ride in rides:
+            v = np.linalg.inv(np.diag(1 / state.scatter) + ride.n[:p, :p])  # type: ignore[union-attr]
+            u = state.mean + v @ (ride.b[:p] - ride.n[:p, :p] @ state.mean)  # type: ignore[union-attr]
+            inner = ride.n[p:, p:] - ride.n[p:, :p] @ v @ ride.n[:p, p:]  # type: ignore[union-attr]
+            score = ride.b[p:] - ride.n[p:, :p] @ u  # type: ignore[union-attr]
+            part = marginal(Normal((inner + inner.T) / 2, score), np.full(k, SCATTER**2))
+            m, c = m + part.n, c + part.b
+        covariance = np.linalg.inv(m + np.eye(k))
+        found[pair] = Shape(covariance @ c, covariance, 1.0)
+    return found
+
+
+__all__ = ["BY_NAME", "QUANTITIES", "hats", "learn_shapes", "names", "shape_evidence"]

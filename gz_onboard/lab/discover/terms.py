@@ -1,0 +1,107 @@
+"""The parameters of the linear model of all channels: what is known of each before, and how it changes by ride.
+
+Three kinds. *Base*: the vehicle file's parameters, as sure as their calibration says. *Nuisance*: what no vehicle file has
+and no cause is named after, such as the bias of the accelerometer or a wind; each with a mean over the vehicle's life
+and a scatter between rides. *Candidate*: what a cause would move. `RIDE_SD` is how much a parameter is taken to scatter
+from ride to ride before healthy rides have told (the discrepancy of Brynjarsdóttir & O'Hagan 2014, as a random effect).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import exp
+
+
+@dataclass(frozen=True)
+class Nuisance:
+    """A parameter that no vehicle file has: sd is of its mean, ride_sd of its scatter from ride to ride."""
+
+    name: str
+    unit: str
+    value: float
+    sd: float
+    ride_sd: float
+    text: str
+
+
+NUISANCES = (
+    Nuisance("payload_error", "kg", 0.0, 0.0, 2.0, "clothes and luggage beside the mass entered"),
+    Nuisance("accel_bias", "m/s²", 0.0, 0.05, 0.02, "bias of the forward accelerometer, or its mounting angle"),
+    Nuisance("pitch_gain", "1", 0.0, 0.1, 0.02, "pitch of the body under acceleration, and the accelerometer's gain"),
+    Nuisance("altitude_start", "m", 0.0, 0.0, 20.0, "error of the first GPS altitude"),
+    Nuisance("rolling_cold", "1/(20 K)", 0.0, 0.3, 0.05, "rolling resistance below 20 degC, as a share"),
+    Nuisance("torque_constant_slope", "1/K", 0.0, 7e-4, 1e-4, "magnets weaken when warm"),
+    Nuisance("torque_saturation", "1/(100 A)", 0.0, 0.03, 0.005, "torque per current falls at high current"),
+    Nuisance("copper_speed", "s/(50 rad)", 0.0, 0.25, 0.02, "copper loss grows with frequency"),
+    Nuisance("inverter_current_gain", "1", 1.0, 0.003, 0.002, "gain of the inverter's current measurement"),
+    Nuisance("inverter_current_offset", "A", 0.0, 0.2, 0.03, "its offset"),
+    Nuisance("idle_current", "A", 0.0, 0.2, 0.01, "drawn beside inverter and auxiliary current sensors"),
+    Nuisance("pack_inverter_lag", "s", 0.0, 0.1, 0.02, "pack current later than the inverter's, beyond 0.1 s"),
+    Nuisance("torque_lag", "s", 0.0, 0.1, 0.02, "DC current later than the motor's"),
+    Nuisance("loss_speed", "W/(50 rad/s)", 0.0, 15.0, 1.0, "loss that grows with speed, beside the model's"),
+    Nuisance("loss_cross", "W/(2500 A·rad/s)", 0.0, 60.0, 2.0, "loss that grows with current times speed"),
+    Nuisance("brake_light", "W", 0.0, 6.0, 0.3, "more auxiliary power while the brake is touched"),
+    Nuisance("inverter_voltage_offset", "V", 0.0, 0.1, 0.01, "offset of the inverter's voltage measurement"),
+    Nuisance("soc_start", "1", 0.0, 0.0, 0.04, "state of charge at the start, beyond what the first voltage says"),
+    Nuisance("v1_start", "V", 0.0, 0.0, 0.01, "relaxation left over from before the ride"),
+    Nuisance("ocv_offset", "V", 0.0, 0.006, 0.004, "rest voltage against the table: hysteresis, relaxation"),
+    Nuisance("ocv_tilt", "V", 0.0, 0.03, 0.03, "slope of the rest voltage over SOC against the table"),
+    Nuisance("resistance_empty", "1", 0.0, 0.3, 0.05, "cell resistance at SOC 0.6 less that at 1.0, as a share"),
+    Nuisance("resistance_current", "1/(5 A)", 0.0, 0.1, 0.01, "cell resistance falls with current"),
+    Nuisance("resistance_cold", "1/(20 K)", 0.0, 0.15, 0.04, "cell resistance below 20 degC beyond the tables"),
+    Nuisance("fast_resistance", "1", 0.0, 0.2, 0.05, "resistance at 0.1 s over that of the tables"),
+    Nuisance("slip_per_force", "1/(100 N)", 0.0, 0.02, 0.003, "slip of the driven wheel"),
+    Nuisance("lean_radius", "1", 0.0, 0.3, 0.05, "rolling radius falls with lean"),
+    Nuisance("front_lean", "1", 0.0, 0.3, 0.05, "the same, front against rear"),
+    Nuisance("gps_lag", "s", 0.0, 0.2, 0.05, "GPS speed later than 0.4 s"),
+    Nuisance("rear_scale", "1", 0.0, 0.003, 3e-4, "rear wheel-speed sensor over motor speed"),
+    Nuisance("front_scale", "1", 0.0, 0.02, 1e-3, "front wheel turns faster: its radius is smaller"),
+    Nuisance("wheel_lag", "s", 0.0, 0.05, 0.01, "wheel-speed sensors later than motor speed"),
+    Nuisance("motor_start", "K", 0.0, 0.3, 0.5, "first motor temperature: quantised"),
+    Nuisance("rotor_start", "1/10", 0.0, 0.5, 1.0, "rotor colder than stator at the start, per 10 K above ambient"),
+    Nuisance("motor_airflow", "1/(10 m/s)", 0.0, 1.0, 0.1, "rim cools better in moving air"),
+    Nuisance("inverter_start", "K", 0.0, 0.3, 0.5, "first inverter temperature: quantised"),
+    Nuisance("box_start", "K", 0.0, 1.0, 1.0, "box against board at the start"),
+    Nuisance("inverter_airflow", "1/(10 m/s)", 0.0, 1.0, 0.1, "box cools better in moving air"),
+    Nuisance("cells_start", "K", 0.0, 0.3, 0.5, "first cell temperature: quantised"),
+    Nuisance("pack_airflow", "1/(10 m/s)", 0.0, 1.0, 0.1, "pack cools better in moving air"),
+)  # fmt: skip
+
+LOG = frozenset((
+    "motor_stator_capacity", "motor_rotor_capacity", "motor_gap_conductance", "motor_rotor_to_ambient",
+    "inverter_board_capacity", "inverter_box_capacity", "inverter_board_to_box", "inverter_box_to_ambient",
+    "pack_heat_capacity", "pack_conductance",
+))  # fmt: skip
+"""Those that are positive and known to a factor only: a step is one of their logarithm."""
+
+
+def stepped(name: str, value: float, step: float) -> float:
+    """`value` of the parameter `name` after a step, in its unit, or of the logarithm."""
+    return value * exp(step) if name in LOG else value + step
+
+
+FIXED = ("soc_start", "v1_start", "altitude_start", "payload_error", "motor_start", "rotor_start", "inverter_start",
+         "box_start", "cells_start")  # fmt: skip
+"""Those whose scatter is of the ride's start or of what was entered: nothing that healthy rides would tell better."""
+
+BASE = (
+    "wheel_radius", "payload_mass", "torque_constant", "cell_capacity", "pack_series_resistance", "cable_resistance",
+    "pack_current_offset", "pack_current_gain", "pack_voltage_offset", "pack_heat_capacity", "pack_conductance",
+    "motor_stator_capacity", "motor_rotor_capacity", "motor_gap_conductance", "motor_rotor_to_ambient",
+    "inverter_board_capacity", "inverter_box_capacity", "inverter_board_to_box", "inverter_box_to_ambient",
+)  # fmt: skip
+"""Of the vehicle's own parameters those that a channel depends on; those of the model's effects come on top."""
+
+RIDE_SD = {
+    "wheel_radius": 4e-4, "payload_mass": 0.0, "torque_constant": 0.002, "cell_capacity": 0.06,
+    "pack_series_resistance": 3e-4, "cable_resistance": 2e-4, "pack_current_offset": 0.03, "pack_current_gain": 0.002,
+    "pack_voltage_offset": 0.01, "drag_area": 0.01, "rolling_resistance_constant": 7e-4,
+    "rolling_resistance_speed": 2e-5, "motor_copper_resistance": 3e-4, "motor_iron_linear": 0.03,
+    "motor_iron_quadratic": 0.001, "inverter_loss_constant": 0.5, "inverter_loss_linear": 0.02,
+    "inverter_loss_quadratic": 1e-4, "auxiliary_power": 0.7, "cornering_compliance": 0.015,
+    "wind_north": 1.2, "wind_east": 1.2, "brake_drag_force": 1.0, "drivetrain_drag_torque": 0.005,
+    "warm_up_share": 0.05, "regeneration_loss_share": 0.02, "slow_resistance": 0.002, "hysteresis_voltage": 0.002,
+    "cell_resistance_factor": 0.03, "cooling_factor": 0.03, "speed_sensor_scale": 3e-4, "pack_voltage_latency": 0.004,
+}  # fmt: skip
+RIDE_SD_SHARE = 0.1
+"""What a parameter without a row scatters by, as a share of its prior's standard deviation."""

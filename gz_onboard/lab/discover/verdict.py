@@ -1,0 +1,300 @@
+"""From evidence to a verdict: which causes, how sure, what could stand in, what has no name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from scipy.stats import t as student
+
+from gz_onboard.lab.discover.candidates import Candidate
+from gz_onboard.lab.discover.grid import Array
+from gz_onboard.lab.discover.linear import Linear, normal
+from gz_onboard.lab.discover.result import Cause, Report
+from gz_onboard.lab.discover.search import Evidence, Search, evidence, one_degree
+from gz_onboard.lab.discover.shapes import QUANTITIES, names, shape_evidence
+from gz_onboard.lab.discover.state import State
+from gz_onboard.lab.discover.terms import LOG, stepped
+
+FALSE_ALARMS = 0.05  # of sets of healthy rides, all candidates and curves together
+EXTRA = 0.75  # of a curve's score that a name must explain
+MARGIN = 6.0  # of chi-squared within which another cause explains as well: a likelihood ratio of 20
+
+
+def threshold(state: State, tried: int) -> float:
+    """The chi-squared of one cause that healthy rides exceed with `FALSE_ALARMS`, among `tried`.
+
+    Student's t, for the scatter between rides is known from the healthy rides alone; Šidák over the candidates.
+    """
+    one = 1 - (1 - FALSE_ALARMS) ** (1 / tried)
+    freedom = max(2 * (state.healthy + 3), 8)
+    return float(student.ppf(1 - one / 2, freedom) ** 2)
+
+
+def reach(
+    state: State, lines: Sequence[Linear], notes: list[str], say: Callable[[str], None],
+    again: Callable[[State], list[Linear]],
+) -> Report:  # fmt: skip
+    """The verdict over linearised rides. again: linearises them at another state."""
+    normals = [normal(line, state.noise) for line in lines]
+    e = evidence(state, normals)
+    causes = seen(state, e, notes)
+    limit = threshold(state, max(len(causes), 1) + 8)
+    search = Search(state, e, causes)
+    say(f"{len(causes)} candidates")
+    choice = search.select(limit)
+    offset = np.zeros(len(state.mean))
+    chosen = choice.names
+    for _ in range(2):  # a large change is not linear: once more about what was found
+        if not chosen:
+            break
+        index = search.index(chosen)
+        target = np.zeros(len(offset))
+        target[index] = search.evidence.estimate(index)
+        offset = target
+        for name in chosen:
+            for i in search.place[name]:
+                offset[i] = kept(state, i, offset[i])
+        moved = replace(state, values=state.unit_value(offset), mean=state.mean)
+        lines = [line.seen_from(offset) for line in again(moved)]
+        normals = [normal(line, state.noise) for line in lines]
+        e = evidence(state, normals)
+        search = Search(state, e, causes)
+        chosen = search.select(limit).names
+    found = causes_of(state, search, chosen, lines)
+    sets = [list(s) for s in search.stand_ins(chosen, MARGIN)]
+    say("curves over quantities")
+    unknown = unexplained(state, search, lines, normals, chosen, limit)
+    verdict = "none"
+    if unknown is not None:
+        verdict = "unknown"
+    elif sets:
+        verdict = "ambiguous"
+    elif found:
+        verdict = "cause"
+    ranking = sorted(((c.name, round(search.step([n for n in chosen if n != c.name], c.name), 2)) for c in causes),
+                     key=lambda pair: -pair[1])  # fmt: skip
+    if unknown is not None:
+        found = [] if unknown["replaces"] else found
+    return Report(
+        verdict, found, sets, unknown, ranking, sizes(lines), {}, advice(search, sets, unknown), notes,
+        isolability(search), limit, state=state, lines=list(lines), normals=normals,
+    )  # fmt: skip
+
+
+def kept(state: State, i: int, x: float) -> float:
+    """A change `x` of the parameter at `i`, in scales, that leaves it a positive share of a positive value."""
+    name, value = state.names[i], state.values[state.names[i]]
+    if name in LOG or value == 0:
+        return x
+    share = x * float(state.scale[i]) / value
+    return float(np.clip(share, -0.7, 5.0) * value / state.scale[i]) if value > 0 else x
+
+
+def seen(state: State, e: Evidence, notes: list[str]) -> list[Candidate]:
+    """The candidates that these rides can say anything of; the others go into `notes`."""
+    found, blind = [], []
+    for cause in state.causes:
+        if not set(cause.names) <= set(state.names):
+            blind.append(cause.name)
+            continue
+        index = state.index(cause.names)
+        if np.any(np.diag(e.information)[index] < 1e-4):
+            blind.append(cause.name)
+        else:
+            found.append(cause)
+    if blind:
+        notes.append("these rides say nothing of " + ", ".join(blind))
+    return found
+
+
+def causes_of(state: State, search: Search, chosen: Sequence[str], lines: Sequence[Linear]) -> list[Cause]:
+    """The chosen causes with values and intervals."""
+    if not chosen:
+        return []
+    index = search.index(chosen)
+    estimate = search.evidence.estimate(index)
+    covariance = search.evidence.covariance(index)
+    quantile = float(student.ppf(0.975, max(state.healthy + 3, 4)))
+    result, at = [], 0
+    for name in chosen:
+        cause = search.causes[name]
+        rows = []
+        evidence_ = search.step([n for n in chosen if n != name], name)
+        inflation = state.inflation.get(name, 1.0)
+        change = np.zeros(len(state.mean))
+        for parameter in cause.parameters:
+            i = index[at]
+            healthy = own_value(state, parameter.name)
+            sd = float(np.sqrt(covariance[at, at] * inflation))
+            x = float(estimate[at])
+            change[i] = x
+            step = float(state.scale[i])
+            if parameter.name in LOG:
+                ends = [healthy * np.exp(step * (x + s * quantile * sd)) for s in (0, -1, 1)]
+            else:
+                ends = [healthy + step * (x + s * quantile * sd) for s in (0, -1, 1)]
+            rows.append((parameter.name, float(ends[0]), (float(ends[1]), float(ends[2])), float(ends[0] - healthy)))
+            at += 1
+        first = rows[0]
+        result.append(Cause(
+            name, first[0], first[1], cause.parameters[0].unit, first[2], first[3],
+            energy_share(state, lines, change), round(evidence_, 2),
+            tuple((n, v, ci) for n, v, ci, _ in rows[1:]),
+        ))  # fmt: skip
+    return result
+
+
+def own_value(state: State, name: str) -> float:
+    """The healthy vehicle's value of a parameter: that of its file, 0 for an effect that its model lacks."""
+    absent = {n for c in state.causes if c.effect and c.effect.name not in
+              {x.name for x in state.vehicle.model.effects} for n in c.names}  # fmt: skip
+    return 0.0 if name in absent else float(state.vehicle.parameters[name])
+
+
+def power_of(table_name: str, line: Linear, values: Array) -> Array | None:
+    """What a residual of a channel is worth at the pack's terminals [W], over its blocks."""
+    table = line.tables[table_name]
+    from gz_onboard.lab.discover.channels import over_blocks, roughness  # noqa: PLC0415
+
+    rough = roughness(table.channel, line.ride)[: len(table.used)][table.used]
+    real = values * rough
+    if table_name == "road_force":
+        return np.asarray(real * over_blocks(table.channel, line.ride.quantities["speed"])[table.used])
+    if table_name in ("inverter_power", "auxiliary"):
+        return np.asarray(real)
+    if table_name == "pack_balance" and "pack_voltage" in line.ride.signals:
+        return np.asarray(real * over_blocks(table.channel, line.ride.signals["pack_voltage"])[table.used])
+    return None
+
+
+def energy_share(state: State, lines: Sequence[Linear], change: Array) -> float:
+    """The part of the energy drawn that `change` (p,) of the parameters makes, over these rides."""
+    more = drawn = 0.0
+    for line in lines:
+        drawn += energy(line)
+        for name in line.tables:
+            power = power_of(name, line, -(line.tables[name].a @ change) * -1.0)
+            if power is not None and len(power):
+                more += float(np.mean(power)) * share_of_time(line, name)
+    return more / drawn if drawn else 0.0
+
+
+def energy(line: Linear) -> float:
+    """What the pack gave over the ride [J]."""
+    s = line.ride.signals
+    volts, amperes = ("pack_voltage", "pack_current") if "pack_current" in s else ("inverter_voltage", "inverter_current")
+    if amperes not in s or volts not in s:
+        return float(np.sum(np.abs(s["motor_current"] * line.ride.quantities["motor_speed"]))) * 0.045
+    return float(np.sum(s[volts] * s[amperes])) * 0.1
+
+
+def share_of_time(line: Linear, channel: str) -> float:
+    """The time [s] for which a channel's mean holds: the ride, or that part of it in which it moves."""
+    whole = len(line.ride.time) * 0.1
+    if channel == "road_force":
+        return float(np.mean(np.abs(line.ride.quantities["speed"]) > 2.0)) * whole
+    return whole
+
+
+def unexplained(
+    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str], limit: float
+) -> dict[str, Any] | None:
+    """The curve that explains most beside the causes chosen, if it is significant; or instead of them, if it does better."""
+    index = search.index(chosen)
+    best: dict[str, Any] | None = None
+    for pair in names():
+        inflation = state.shapes[pair].inflation if pair in state.shapes else 1.0
+        beside = shape_evidence(state, lines, normals, pair, index)
+        if beside is None:
+            continue
+        chi2, k, curve, sd = beside
+        score = one_degree(chi2 / inflation, k)
+        if best is None or score > best["score"]:
+            channel, _, quantity = pair.partition(" over ")
+            best = {"channel": channel, "quantity": quantity, "unit": QUANTITIES[quantity][1], "score": score,
+                    "chi2": chi2, "knots": list(QUANTITIES[quantity][0]), "values": curve.tolist(),
+                    "sd": sd.tolist()}  # fmt: skip
+    if best is None or best["score"] < 1.5 * limit:
+        return None
+    total = search.evidence.gain(index)
+    best["replaces"] = bool(chosen) and best["chi2"] > (1 - EXTRA) / EXTRA * total
+    best["curve"] = [list(pair) for pair in zip(best.pop("knots"), best.pop("values"), best.pop("sd"), strict=True)]
+    best["share"] = shape_share(lines, best)
+    return best
+
+
+def shape_share(lines: Sequence[Linear], shape: dict[str, Any]) -> float:
+    """The part of the energy drawn that the curve takes."""
+    from gz_onboard.lab.discover.shapes import columns  # noqa: PLC0415
+    from gz_onboard.lab.discover.channels import roughness  # noqa: PLC0415
+
+    more = drawn = 0.0
+    values = np.array([row[1] for row in shape["curve"]])
+    for line in lines:
+        drawn += energy(line)
+        table = line.tables.get(shape["channel"])
+        if table is None:
+            continue
+        c = columns(line.ride, shape["quantity"], table)
+        if c is None:
+            continue
+        rough = roughness(table.channel, line.ride)[: len(table.used)][table.used]
+        power = power_of(shape["channel"], line, c @ values / rough)
+        if power is not None and len(power):
+            more += float(np.mean(power)) * share_of_time(line, shape["channel"])
+    return more / drawn if drawn else 0.0
+
+
+def sizes(lines: Sequence[Linear]) -> dict[str, dict[str, float]]:
+    """Of each channel's residual: mean, rms, correlation of neighbours, share of the energy."""
+    result: dict[str, dict[str, float]] = {}
+    drawn = sum(energy(line) for line in lines)
+    for name in sorted({name for line in lines for name in line.tables}):
+        tables = [(line, line.tables[name]) for line in lines if name in line.tables]
+        y = np.concatenate([table.y for _, table in tables])
+        pairs = [(table.y[1:], table.y[:-1]) for _, table in tables]
+        late, early = (np.concatenate(side) for side in zip(*pairs, strict=True))
+        correlation = float(np.corrcoef(late, early)[0, 1]) if np.std(late) > 0 and np.std(early) > 0 else 0.0
+        powers = [power_of(name, line, table.y) for line, table in tables]
+        more = sum(float(np.mean(w)) * share_of_time(line, name)
+                   for w, (line, _) in zip(powers, tables, strict=True) if w is not None and len(w))  # fmt: skip
+        share = more / drawn if drawn else 0.0
+        result[name] = {
+            "mean": float(y.mean()), "rms": float(np.sqrt(np.mean(y**2))), "autocorrelation": correlation,
+            "blocks": len(y), "energy_share": share, "range_share": -share / (1 + share) if share > -1 else 0.0,
+        }  # fmt: skip
+    return result
+
+
+def isolability(search: Search) -> dict[str, Any]:
+    """Pairs of candidates that these rides can hardly separate: cosine of their columns once nuisances are out."""
+    singles = {n: i[0] for n, i in search.place.items()}
+    information = search.evidence.information
+    pairs = []
+    keys = list(singles)
+    for a_at, a in enumerate(keys):
+        for b in keys[a_at + 1 :]:
+            i, j = singles[a], singles[b]
+            scale = np.sqrt(abs(information[i, i] * information[j, j]))
+            if scale > 0 and abs(cosine := information[i, j] / scale) > 0.8:
+                pairs.append([a, b, round(float(cosine), 3)])
+    return {"look_alikes": sorted(pairs, key=lambda p: -abs(p[2]))}
+
+
+def advice(search: Search, sets: Sequence[Sequence[str]], unknown: dict[str, Any] | None) -> list[str]:
+    """What to ride next."""
+    lines = []
+    for group in sets:
+        lines.append(f"To tell {', '.join(group)} apart: " + " ".join(search.causes[name].shown_by for name in group[:2]))
+    if unknown is not None:
+        lines.append(
+            f"Ride over the whole span of {unknown['quantity']} with all else the same, twice: what {unknown['channel']} "
+            f"leaves goes with it, or with what changes along with it."
+        )
+    return lines
+
+
+__all__ = ["reach", "stepped", "threshold"]
