@@ -30,7 +30,6 @@ INSTRUMENTS = (
     ("roller_speed", "DYNO_Roller", "DYNO_RollerSpeed", 1.0),  # m/s
     ("roller_force", "DYNO_Roller", "DYNO_RollerForce", 1.0),  # N
     ("bms_temperature", "BMS_Cells", "BMS_BoardTemp", 1.0),  # degC
-    ("inverter_box_temperature", "TC_Pack1", "TC_Inverter3", 1.0),
     *((f"pack_temperature_{i}", "TC_Pack1" if i < 4 else "TC_Pack2", f"TC_Pack{i}", 1.0) for i in range(1, 7)),
 )
 
