@@ -19,6 +19,7 @@ COMMANDS = {
     "estimate": ("gz_onboard.lab.estimate", "estimate recorded rides without a bus, as fast as it goes"),
     "simulate": ("gz_onboard.simulation.simulate", "ride a drive cycle, a route or a recorded ride by simulation"),
     "validate": ("gz_onboard.lab.validate", "hold recorded rides against their simulation, by a gate of 20 %"),
+    "calibrate": ("gz_onboard.lab.calibrate.command", "find a vehicle's parameters from measurements"),
     "export": ("gz_onboard.bus.export", "turn a log into candump, BLF, ASC, Parquet, CSV, ..."),
     "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride"),
 }

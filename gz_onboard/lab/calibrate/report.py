@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gz_onboard.lab.calibrate import thesis
 from gz_onboard.lab.calibrate.result import Array, Curve, Fit, Panel, Result
 from gz_onboard.lab.calibrate.vehicle_file import correlation
 
@@ -24,12 +25,13 @@ _MOST_POINTS = 4000  # of a trace: more than a picture shows
 
 
 def document(results: Sequence[Result], vehicle: str, out: str | None) -> dict[str, Any]:
-    """What ``--json`` writes: {"version", "vehicle", "out", "procedures": [...]}; nan as null."""
+    """What ``--json`` writes: {"version", "vehicle", "out", "procedures": [...], "thesis": [...]}; nan as null."""
     return {
         "version": VERSION,
         "vehicle": vehicle,
         "out": out,
         "procedures": [_procedure(result) for result in results],
+        "thesis": [dict(zip(thesis.HEAD, row, strict=True)) for row in thesis.compare(results)],
     }
 
 
@@ -119,6 +121,8 @@ def shape(curve: Curve) -> str:
 def write_report(file: Path, title: str, results: Sequence[Result]) -> None:
     """Write the page: of each procedure its values, fits, refusals and a picture. Raises OSError."""
     body = "\n".join(_section(result) for result in results)
+    if rows := thesis.compare(results):
+        body += f"<h2>The thesis and ours</h2>{_table(thesis.HEAD, rows, [1, 2, 3])}"
     contents = ", ".join(f'<a href="#{_escaped(r.procedure)}">{_escaped(r.procedure)}</a>' for r in results)
     file.write_text(
         f"""<!doctype html>

@@ -54,6 +54,8 @@ def merged(text: str, results: Sequence[Result], base: Path, out: Path) -> str:
     parameters = {name: found for result in results for name, found in result.parameters.items()}
     curves = {name: curve for result in results for name, curve in result.curves.items()}
     _check(parameters, curves, base)
+    order = list(declared_parameters())
+    parameters = dict(sorted(parameters.items(), key=lambda p: order.index(p[0]) if p[0] in order else len(order)))
     groups = _correlations(document, results, set(parameters), base)
     new: dict[KeyPath, str] = {
         **{("parameters", name): f"{name} = {_parameter(found)}\n" for name, found in parameters.items()},
@@ -119,7 +121,7 @@ def _parameter(found: Found) -> str:
 
 
 def _curve(name: str, curve: Curve) -> str:
-    """The table of `curve`: axes, value, unit, sd (one number for all of it) and source."""
+    """The table of `curve`: axes, value, unit, sd (one number for all of it: the median) and source."""
     lines = [f"[{name}]"]
     lines += [f"{axis} = {_row(values)}" for axis, values in curve.axes.items()]
     if curve.value.ndim == 1:
@@ -129,7 +131,7 @@ def _curve(name: str, curve: Curve) -> str:
     lines.append(f"unit = {string(curve.unit)}")
     known = np.isfinite(curve.sd)
     if known.any() and curve.unit == "V":
-        lines.append(f"sd = {number(float(np.sqrt(np.mean(curve.sd[known] ** 2))))}")
+        lines.append(f"sd = {number(float(np.median(curve.sd[known])))}")
     elif known.any():
         lines.append(f"sd_relative = {number(float(np.median(curve.sd[known] / np.abs(curve.value[known]))))}")
     lines += ['status = "measured"', f"source = {string(curve.source)}"]
