@@ -157,7 +157,11 @@ class Reduction:
         """The pairs nearest to the six of `resistance` (1 + len(TIMES),) [ohm]."""
         cost = np.einsum("i,kij,j->k", resistance, self._left, resistance)
         best = self._solved @ resistance
-        cost = np.where(np.all(best > 0, axis=1), cost, np.inf)
+        positive = np.all(best > 0, axis=1)
+        if np.any(positive):
+            cost = np.where(positive, cost, np.inf)
+        else:  # no pairs at all: they are given a thousandth of R0
+            best = np.maximum(best, 1e-3 * best[:, :1])
         k = int(np.argmin(cost))
         solution, times = best[k], self._times[k]
         if self._count == 1 and 0 < k < len(cost) - 1 and np.all(np.isfinite(cost[k - 1 : k + 2])):

@@ -1,0 +1,410 @@
+"""State of charge of a real cell: the on-board filter on a Panasonic NCR18650PF, -20 to 25 degC.
+
+    OMP_NUM_THREADS=1 python benchmarks/real_cell.py DATA_FOLDER [--write docs/real-cell.md]
+
+Data: Kollmeyer, "Panasonic 18650PF Li-ion Battery Data", Mendeley Data 2018, doi:10.17632/wykht8y7tg.1, as Parquet and
+1 Hz CSV. The tables come from the pulse (HPPC) tests and the C/20 discharge alone, by `gz_onboard.lab.calibrate`; the
+filter is that of the on-board estimator, fed with events once a second; the drive cycles are used for nothing else.
+"""
+
+from __future__ import annotations
+
+import argparse
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from math import exp, sqrt
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gz_onboard.estimator.ekf import Covariance, ScalarFilter, SocFilter
+from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.events import Group
+from gz_onboard.lab.calibrate import ocv, pulse
+from gz_onboard.lab.calibrate.cell_circuit import Circuit, voltage
+from gz_onboard.lab.calibrate.result import Array, Result
+from gz_onboard.lab.calibrate.table import Named, Table, read_table
+from gz_onboard.physics.battery import Battery, Mesh
+from gz_onboard.physics.model import Model
+from gz_onboard.physics.parameters import Parameters
+from gz_onboard.vehicle import read_vehicle
+
+TEMPERATURES = (25, 10, 0, -10, -20)
+OFFSET = 0.05  # A of the cell: what the current sensor shows too much
+WRONG = -0.2  # of SOC
+RIGHT_SD = 0.01  # of SOC: how far the right one is believed
+CONVERGED = 0.025  # of SOC: from here on the error counts
+NOMINAL = 2.9  # A·h, for C-rates
+SENSOR = {"pack_current_offset": (0.0, OFFSET), "pack_current_gain": (1.0, 0.005), "pack_voltage_offset": (0.0, 0.002)}
+COLUMNS = {
+    "time": Named("t_s", "s"), "current": Named("i_A", "A", -1), "voltage": Named("v_V", "V"),
+    "cell_temperature": Named("t_cell_C", "degC"), "charge": Named("q_Ah", "Ah", -1),
+}  # fmt: skip
+
+
+def pulse_test(folder: Path, temperature: int) -> Table:
+    """The pulses, with the discharge and the rest between them, which stand in a file of their own.
+
+    That one has a clock of its own: its first rest ends where the pulses go on.
+    """
+    main = read_table(folder / f"{temperature}C_hppc.parquet", COLUMNS)
+    between = read_table(folder / f"{temperature}C_hppc_between_pulses.parquet", COLUMNS)
+    time = main["time"]
+    gaps = np.flatnonzero(np.diff(time) > 1000)
+    flows = np.abs(between["current"]) > 0.1
+    start = int(np.argmin(flows))  # the first rest
+    end = start + int(np.argmax(flows[start:])) - 1
+    shift = time[gaps[0] + 1] - between["time"][end]
+    inside = np.zeros(len(between["time"]), dtype=bool)
+    for g in gaps:
+        inside |= (between["time"] + shift > time[g] + 1) & (between["time"] + shift < time[g + 1] - 1)
+    inside &= between["voltage"] > 1.0  # a glitch
+    order = np.argsort(np.concatenate([time, between["time"][inside] + shift]), kind="stable")
+    columns = {}
+    for name in COLUMNS:
+        extra = between[name][inside] + (shift if name == "time" else 0.0)
+        columns[name] = np.concatenate([main[name], extra])[order]
+    # The counter of one file never leads that of the other by more than its resolution.
+    columns["charge"] = np.maximum.accumulate(columns["charge"])
+    return Table(main.file, columns)
+
+
+@dataclass(frozen=True, eq=False)
+class Cycle:
+    temperature: int
+    name: str
+    current: Array  # A, discharging positive, means of 1 s
+    voltage: Array
+    cell: Array  # degC
+    drawn: Array  # A·h
+
+
+def cycles(folder: Path) -> list[Cycle]:
+    """The drive cycles, cut where the cell is emptiest: some go on with the charge after it."""
+    found = []
+    for temperature in TEMPERATURES:
+        for file in sorted(folder.glob(f"drive1hz_{temperature}C_*.csv.gz")):
+            rows = np.genfromtxt(file, delimiter=",", skip_header=1)
+            rows = rows[np.all(np.isfinite(rows), axis=1)]
+            rows = rows[: int(np.argmin(rows[:, 4])) + 1]
+            name = file.name.removeprefix(f"drive1hz_{temperature}C_").removesuffix(".csv.gz")
+            found.append(Cycle(temperature, name, -rows[:, 2], rows[:, 1], rows[:, 3], -rows[:, 4] + rows[0, 4]))
+    return found
+
+
+def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
+    """The cell as the on-board battery, 1s1p."""
+    rows = [tuple(map(float, x)) for x in (cell.soc, cell.temperature, cell.capacity / capacity_25)]
+    soc, temperature, share = rows
+
+    def mesh(table: Array) -> Mesh:
+        return Mesh(soc, temperature, tuple(tuple(map(float, row)) for row in table))
+
+    sd = result.curves["battery.ocv"].sd[(cell.ocv_soc > 0.1) & (cell.ocv_soc < 0.95)]
+    return Battery(
+        1, 1, capacity_25, temperature, share, 2.5, 0.0, tuple(map(float, cell.ocv_soc)), tuple(map(float, cell.ocv)),
+        float(np.median(sd)), mesh(cell.r0), mesh(cell.r1), mesh(cell.c1),
+    )  # fmt: skip
+
+
+class Extended(ScalarFilter):
+    """The on-board filter with what one RC pair lacks, as far as asked for.
+
+    A slow pair that follows the current alone, and the rest voltage's shift with temperature.
+    """
+
+    slow_resistance: Mesh | None = None
+    slow_time: Mesh | None = None
+    shift: tuple[Array, Array] | None = None  # degC, V
+    v2 = 0.0
+
+    def predict(self, dt: float, current: float, temperature: float, noise: tuple[float, float]) -> None:
+        if self.slow_resistance and self.slow_time:
+            decay = exp(-dt / self.slow_time.at(self.soc, temperature)[0])
+            r2 = self.slow_resistance.at(self.soc, temperature)[0]
+            self.v2 = decay * self.v2 + (1 - decay) * r2 * current
+        super().predict(dt, current, temperature, noise)
+
+    def _observe(self, current: float, temperature: float) -> tuple[float, float]:
+        predicted, slope = super()._observe(current, temperature)
+        more = float(np.interp(temperature, *self.shift)) if self.shift else 0.0
+        return predicted - self.v2 + more, slope
+
+
+@dataclass(frozen=True)
+class Setting:
+    """A filter with its numbers."""
+
+    name: str
+    battery: Battery
+    result: Result
+    slow: tuple[Mesh, Mesh] | None = None
+    shift: tuple[Array, Array] | None = None
+
+    def make(self, battery: Battery, soc: float, v1: float, covariance: Covariance) -> SocFilter:
+        if not self.slow and not self.shift:
+            return ScalarFilter(battery, soc, v1, covariance)
+        made = Extended(battery, soc, v1, covariance)
+        if self.slow:
+            made.slow_resistance, made.slow_time = self.slow
+        made.shift = self.shift
+        return made
+
+
+@dataclass(frozen=True)
+class Score:
+    """Errors of SOC, once converged; `start`: s until then, nan if never; sd: mean of the filter's own."""
+
+    rms: float
+    mae: float
+    largest: float
+    outside: float
+    start: float
+    sd: float
+
+
+def estimator_of(setting: Setting) -> Estimator:
+    battery, result = setting.battery, setting.result
+    vehicle = read_vehicle("reference")
+    known = dict(vehicle.parameters.known)
+    rests = [f.rms for f in result.fits if f.what.startswith("rest voltage")]
+    values = {
+        **SENSOR,
+        "cell_capacity": (battery.capacity, result.parameters["cell_capacity"].sd),
+        "cell_voltage_error": (0.0, result.parameters["cell_voltage_error"].sd),
+        "cell_voltage_error_empty": (0.0, result.parameters["cell_voltage_error_empty"].sd),
+        "rest_voltage_error": (0.0, float(np.mean(rests))),
+    }
+    for name, (value, sd) in values.items():
+        known[name] = replace(known[name], value=value, sd=sd)
+    model = Model(vehicle.model.effects, Parameters(known))
+    groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
+    estimator = Estimator(groups, battery, model, vehicle.riding, setting.make)
+    estimator._forecast_time = float("inf")  # no range is asked for
+    return estimator
+
+
+def run(setting: Setting, cycle: Cycle, wrong: float, offset: float) -> Score:
+    """One cycle through the on-board estimator, which is told the SOC, or one that is `wrong`, after its first step."""
+    estimator = estimator_of(setting)
+    truth = 1 - cycle.drawn / setting.battery.cell_capacity(cycle.temperature)
+    soc, sd = np.full(len(truth), np.nan), np.full(len(truth), np.nan)
+    told = False
+    for k, (v, i, t) in enumerate(zip(cycle.voltage, cycle.current + offset, cycle.cell, strict=True)):
+        estimator.handle((1.0 + k, 0, (t,)))
+        estimator.handle((1.0 + k, 1, (v, i)))
+        f = estimator.filter
+        if f is None:
+            continue
+        if not told:
+            told = True
+            f.soc, f.v1 = float(truth[k]) + wrong, 0.0
+            f.covariance = (max(abs(wrong), RIGHT_SD) ** 2, 0.0, f.covariance[2])
+        soc[k], sd[k] = f.soc, sqrt(f.covariance[0])
+    known = np.isfinite(soc)
+    error, sd = (soc - truth)[known], sd[known]
+    near = np.flatnonzero(np.abs(error) < CONVERGED)
+    if not len(near):
+        nan = float("nan")
+        return Score(nan, nan, nan, float(np.mean(np.abs(error) > 3 * sd)), nan, float(np.mean(sd)))
+    e, start = error[near[0] :], int(near[0])
+    outside = float(np.mean(np.abs(error) > 3 * sd))
+    return Score(
+        float(np.sqrt(np.mean(e**2))), float(np.mean(np.abs(e))), float(np.abs(e).max()), outside, float(start),
+        float(np.mean(sd)),
+    )  # fmt: skip
+
+
+def open_loop(cell: Circuit, cycle: Cycle, capacity: float) -> Array:
+    """Voltage of the tables less measured (m,) [V], at the true state of charge."""
+    dt = np.ones(len(cycle.current))
+    level = 1 - cycle.drawn / capacity
+    return voltage(cell, cycle.current, cycle.current, dt, level, cycle.cell) - cycle.voltage
+
+
+def pulse_resistance(table: Table, capacity: float) -> dict[float, float]:
+    """By C-rate the voltage drop of the 10 s pulses nearest to half full over their current [ohm]."""
+    time, current, volts = table["time"], table["current"], table["voltage"]
+    on = current > 0.1 * NOMINAL
+    found: dict[float, tuple[float, float]] = {}
+    for k in np.flatnonzero(on[1:] & ~on[:-1]) + 1:
+        end = k + int(np.argmin(on[k:])) - 1
+        rate = min((0.5, 1.0, 2.0, 4.0, 6.0), key=lambda r: abs(r - np.median(current[k : end + 1]) / NOMINAL))
+        away = abs(float(table["charge"][k]) / capacity - 0.5)
+        if 9 < time[end] - time[k] < 11 and away < found.get(rate, (0.1, 0.0))[0]:
+            found[rate] = away, float((volts[k - 1] - volts[end]) / np.mean(current[k + 3 : end + 1]))
+    return {rate: r for rate, (_, r) in sorted(found.items())}
+
+
+def settings(rest: Result, result: Result) -> list[Setting]:
+    """The filter on board, and with each part that one RC pair lacks."""
+    result.parameters["cell_capacity"] = rest.parameters["cell_capacity"]
+    capacity = result.curves["battery.capacity"]
+    at_25 = float(np.interp(25, capacity.axes["temperature"], capacity.value))
+    one, two = pulse.circuit(result), pulse.circuit(result, slow=True)
+    shifts = result.curves["rest_shift"]
+    middle = (shifts.axes["soc"] > 0.15) & (shifts.axes["soc"] < 0.95)
+    shift = shifts.axes["temperature"], shifts.value[:, middle].mean(axis=1)
+    single, double = battery_of(one, result, at_25), battery_of(two, result, at_25)
+    assert two.slow_resistance is not None
+    assert two.slow_time is not None
+    axes = double.r0.soc, double.r0.temperature
+    slow = tuple(Mesh(*axes, tuple(map(tuple, t.tolist()))) for t in (two.slow_resistance, two.slow_time))
+    return [
+        Setting("on board: one RC pair", single, result),
+        Setting("and rest voltage over temperature", single, result, shift=shift),
+        Setting("two RC pairs", double, result, slow=(slow[0], slow[1])),
+        Setting("two RC pairs and rest voltage over temperature", double, result, slow=(slow[0], slow[1]), shift=shift),
+    ]
+
+
+def jobs(work: tuple[Setting, Cycle, float, float]) -> Score:
+    return run(*work)
+
+
+def percent(value: float | np.floating[Any], digits: int = 2) -> str:
+    return "never" if np.isnan(value) else f"{100 * value:.{digits}f}"
+
+
+def report(folder: Path) -> list[str]:
+    """The tables of docs/real-cell.md, as lines of Markdown."""
+    rest = ocv.calibrate(read_table(folder / "25C_c20_ocv.parquet", COLUMNS))
+    tables = {t: pulse_test(folder, t) for t in TEMPERATURES}
+    result = pulse.calibrate(list(tables.values()), rest.curves["battery.ocv"], rest.parameters["cell_capacity"])
+    every = settings(rest, result)
+    work = cycles(folder)
+    plain = [c for c in work if "trise" not in c.name]
+    cases = [(0.0, 0.0), (0.0, OFFSET), (WRONG, 0.0), (WRONG, OFFSET)]
+    runs = [(every[0], c, wrong, offset) for c in work for wrong, offset in cases]
+    runs += [(s, c, *case) for s in every[1:] for c in work for case in (cases[0], cases[3])]
+    with ProcessPoolExecutor(2) as pool:
+        keys = [(s.name, c, wrong, offset) for s, c, wrong, offset in runs]
+        scores = dict(zip(keys, pool.map(jobs, runs, chunksize=4), strict=True))
+    lines = ["## What the calibration found", ""]
+    lines += [f"- {text}" for r in (rest, result) for text in (*r.refusals, *r.notes)]
+    lines += _tables(result)
+    lines += ["", "## State of charge on the drive cycles, filter as on board", "", *_detail(every[0], work, scores)]
+    lines += ["", "Means over the cycles of a temperature, without those of rising temperature:", ""]
+    lines += _summary(every[:1], plain, scores, cases)
+    lines += ["", "## What is missing", "", "### In the filter: the same with more in the model", ""]
+    lines += _summary(every, plain, scores, [cases[0], cases[3]])
+    lines += ["", "The cycles of rising temperature, right start, no offset:", ""]
+    lines += _summary(every, [c for c in work if "trise" in c.name], scores, [cases[0]])
+    lines += ["", "### In the voltage", "", *_residuals(result, every[0], plain)]
+    lines += ["", "### Over current: the pulses themselves", "", *_rates(tables, every[0])]
+    return lines
+
+
+def _tables(result: Result) -> list[str]:
+    c = result.curves
+    lines = ["", "| °C | capacity, A·h | rest voltage, mV | R0, R1 half full, mΩ | τ1, s | slow R, mΩ | slow τ, s |",
+             "| --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+    soc = c["battery.r0"].axes["soc"]
+    k = int(np.argmin(np.abs(soc - 0.5)))
+    middle = (soc > 0.15) & (soc < 0.95)
+    for j, t in enumerate(c["battery.r0"].axes["temperature"]):
+        r0, r1, c1 = (c[f"battery.{n}"].value[j, k] for n in ("r0", "r1", "c1"))
+        shift = 1e3 * c["rest_shift"].value[j, middle].mean()
+        lines.append(
+            f"| {t:.0f} | {c['battery.capacity'].value[j]:.3f} | {shift:+.0f} | "
+            f"{1e3 * r0:.0f}, {1e3 * r1:.0f} | {r1 * c1:.0f} | {1e3 * c['slow_resistance'].value[j, k]:.0f} | "
+            f"{c['slow_time'].value[j, k]:.0f} |"
+        )
+    lines += ["", "| fit, in sample | RMS, mV | largest, mV |", "| --- | --- | --- |"]
+    lines += [f"| {f.what} | {1e3 * f.rms:.1f} | {1e3 * f.largest:.0f} |" for f in result.fits if f.unit == "V"]
+    lines += ["", "| mesh | RMS | R² | held out |", "| --- | --- | --- | --- |"]
+    lines += [f"| {f.what} | {f.rms:.3g} {f.unit} | {f.r2 or 0:.4f} | {'yes' if f.held_out else 'no'} |"
+              for f in result.fits if f.what.startswith("mesh")]  # fmt: skip
+    return lines
+
+
+Scores = dict[tuple[str, Cycle, float, float], Score]
+
+
+def _detail(setting: Setting, work: list[Cycle], scores: Scores) -> list[str]:
+    lines = ["| °C | cycle | to SOC, % | right: RMS, MAE, max, >3σ | right, offset | 20 % wrong: RMS, MAE, max, >3σ, s "
+             "| 20 % wrong, offset | σ |", "| --- | --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+    for c in work:
+        cells = []
+        for case in ((0.0, 0.0), (0.0, OFFSET), (WRONG, 0.0), (WRONG, OFFSET)):
+            s = scores[setting.name, c, *case]
+            cell = f"{percent(s.rms)}, {percent(s.mae)}, {percent(s.largest, 1)}, {percent(s.outside, 0)}"
+            cells.append(cell + (f", {s.start:.0f}" if case[0] else ""))
+        end = 1 - c.drawn[-1] / setting.battery.cell_capacity(c.temperature)
+        sd = scores[setting.name, c, 0.0, 0.0].sd
+        lines.append(f"| {c.temperature} | {c.name} | {100 * end:.0f} | {' | '.join(cells)} | {100 * sd:.1f} |")
+    return lines
+
+
+def _summary(every: list[Setting], work: list[Cycle], scores: Scores, cases: list[tuple[float, float]]) -> list[str]:
+    names = {
+        (0.0, 0.0): "right",
+        (0.0, OFFSET): "right, offset",
+        (WRONG, 0.0): "wrong",
+        (WRONG, OFFSET): "wrong, offset",
+    }
+    lines = ["| model | start | " + " | ".join(f"{t} °C" for t in TEMPERATURES) + " |", "| --- " * 7 + "|"]
+    for setting in every:
+        for case in cases:
+            cells = []
+            for t in TEMPERATURES:
+                mine = [scores[setting.name, c, *case] for c in work if c.temperature == t]
+                if mine:
+                    rms, worst = np.mean([s.rms for s in mine]), max(s.rms for s in mine)
+                    cells.append(f"{percent(rms)} ({percent(worst)}; {percent(max(s.largest for s in mine), 1)})")
+                else:
+                    cells.append("–")
+            lines.append(f"| {setting.name} | {names[case]} | {' | '.join(cells)} |")
+    return lines
+
+
+def _residuals(result: Result, setting: Setting, work: list[Cycle]) -> list[str]:
+    one, two = pulse.circuit(result), pulse.circuit(result, slow=True)
+    bins = ((-99, -1), (-1, 0.3), (0.3, 1.5), (1.5, 4), (4, 8), (8, 99))
+    heads = ["below -1 A", "-1 to 0.3 A", "0.3 to 1.5 A", "1.5 to 4 A", "4 to 8 A", "above 8 A"]
+    lines = ["| °C | one pair: RMS (mean) | two pairs: RMS (mean) | " + " | ".join(heads) + " |",
+             "| --- " * (3 + len(bins)) + "|"]  # fmt: skip
+    for t in TEMPERATURES:
+        mine = [c for c in work if c.temperature == t]
+        capacity = setting.battery.cell_capacity(t)
+        use = [1 - c.drawn / capacity > 0.15 for c in mine]
+        e1, e2 = (np.concatenate([1e3 * open_loop(x, c, capacity)[u] for c, u in zip(mine, use, strict=True)])
+                  for x in (one, two))  # fmt: skip
+        i = np.concatenate([c.current[u] for c, u in zip(mine, use, strict=True)])
+        cells = []
+        for low, high in bins:
+            part = (i >= low) & (i < high)
+            cells.append(f"{e1[part].mean():+.0f}" if np.count_nonzero(part) > 30 else "–")
+        lines.append(f"| {t} | {np.sqrt(np.mean(e1**2)):.0f} ({e1.mean():+.0f}) | {np.sqrt(np.mean(e2**2)):.0f} "
+                     f"({e2.mean():+.0f}) | {' | '.join(cells)} |")  # fmt: skip
+    return lines
+
+
+def _rates(tables: dict[int, Table], setting: Setting) -> list[str]:
+    lines = ["| °C | C/2 | 1 C | 2 C | 4 C | 6 C |", "| --- " * 6 + "|"]
+    for t, table in tables.items():
+        found = pulse_resistance(table, setting.battery.cell_capacity(t))
+        cells = [f"{1e3 * found[r]:.0f}" if r in found else "–" for r in (0.5, 1.0, 2.0, 4.0, 6.0)]
+        lines.append(f"| {t} | {' | '.join(cells)} |")
+    return lines
+
+
+MARK = "<!-- made by benchmarks/real_cell.py from here on -->"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("data", type=Path, help="folder of the cell's files")
+    parser.add_argument("--write", type=Path, help="replace what stands in this file after its mark")
+    arguments = parser.parse_args()
+    lines = report(arguments.data)
+    if arguments.write:
+        head = arguments.write.read_text(encoding="utf-8").partition(MARK)[0]
+        arguments.write.write_text("\n".join([head + MARK, "", *lines]) + "\n", encoding="utf-8")
+    else:
+        print(*lines, sep="\n")
+
+
+if __name__ == "__main__":
+    main()
