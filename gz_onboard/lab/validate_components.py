@@ -78,15 +78,22 @@ def battery_voltage(vehicle: Vehicle, current: Array, temperature: Array, soc: f
     battery = vehicle.pack
     n, m = battery.cells_series, battery.cells_parallel
     v1, result = 0.0, np.empty(len(current))
+    states = {name: 0.0 for name, _ in vehicle.model.cell_voltage}  # V of a cell, of effects in it
+    q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0)
     for i, (amperes, celsius) in enumerate(zip(current.tolist(), temperature.tolist(), strict=True)):
         cell = amperes / m
         r0, r1, c1 = (mesh.at(soc, celsius)[0] for mesh in (battery.r0, battery.r1, battery.c1))
         decay = exp(-0.5 / (r1 * c1))  # to the middle of the second, over which the measured is averaged
         v1 = decay * v1 + r1 * (1 - decay) * cell
         soc -= 0.5 * amperes / (3600 * battery.pack_capacity(celsius))
-        result[i] = n * (battery.ocv(soc)[0] - r0 * cell - v1) - battery.series_resistance * amperes
+        lacking = v1 + sum(states.values())
+        result[i] = n * (battery.ocv(soc)[0] - r0 * cell - lacking) - battery.series_resistance * amperes
         v1 = decay * v1 + r1 * (1 - decay) * cell
         soc -= 0.5 * amperes / (3600 * battery.pack_capacity(celsius))
+        if states:
+            q |= {"cell_current": cell, "soc": soc, "cell_temperature": celsius}
+            q["cell_capacity"] = battery.cell_capacity(celsius)
+            states = {name: effect.step(states[name], 1.0, q) for name, effect in vehicle.model.cell_voltage}
     return result + vehicle.parameters["pack_voltage_offset"]
 
 
@@ -94,8 +101,9 @@ def losses(vehicle: Vehicle, current: Array, speed: Array, temperature: Array) -
     """(motor loss that comes with current, motor loss without current, inverter loss), all W of shape (n,)."""
     q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0)
     q |= {"motor_current": current, "motor_speed": speed, "motor_temperature": temperature}
+    q["torque"] = vehicle.parameters["torque_constant"] * current
     motor, inverter = _sum(vehicle, Port.MOTOR_LOSS, q), _sum(vehicle, Port.INVERTER_LOSS, q)
-    idle = _sum(vehicle, Port.MOTOR_LOSS, q | {"motor_current": 0.0 * current})
+    idle = _sum(vehicle, Port.MOTOR_LOSS, q | dict.fromkeys(("motor_current", "torque"), 0.0 * current))
     return motor - idle, idle, inverter
 
 
@@ -129,8 +137,10 @@ def road_load(vehicle: Vehicle, measured: Mapping[str, Array], ambient: float, r
         "lateral_acceleration": speed * measured.get("yaw_rate", zero),
         "motor_current": zero,
         "motor_temperature": ambient,
+        "ambient_temperature": measured.get("ambient_temperature", zero + ambient),
         "motor_speed": measured["motor_speed"],
         "time_moving": np.cumsum(speed > 1.0),
+        "heading": measured.get("gps_course", zero),
     }
     if not roller:
         return _sum(vehicle, Port.WHEEL_FORCE, q) + _sum(vehicle, Port.TYRE, q)

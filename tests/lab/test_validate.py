@@ -17,7 +17,9 @@ from gz_onboard.lab.validate import KEYS, per_second, pool
 from gz_onboard.lab.validate_components import components
 from gz_onboard.lab.validate_report import COLUMNS, failures
 from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, conditions, errors, pooled, seconds, split
+from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
+from gz_onboard.physics.parameters import Parameters
 from gz_onboard.simulation.recorded import read_recorded, rest_soc
 from gz_onboard.vehicle import OWN, read_vehicle
 
@@ -176,6 +178,22 @@ def test_current_is_that_which_flows(city):
     p = vehicle.parameters
     flows = per_second(recorded, vehicle)["pack_current"]
     assert flows * p["pack_current_gain"] + p["pack_current_offset"] == pytest.approx(raw)
+
+
+def test_effects_in_the_cells_count(city):
+    """A second RC pair takes off its resistance times the mean current, once it has settled."""
+    vehicle, measured, soc = city
+    effects = (*vehicle.model.effects, load_effect("slow_relaxation"))
+    known = dict(vehicle.parameters.known)
+    known["slow_resistance"] = replace(known["cable_resistance"], value=0.01)
+    known["slow_time"] = replace(known["cable_resistance"], value=1.0)
+    parameters = Parameters(known)
+    extended = replace(vehicle, parameters=parameters, model=Model(effects, parameters))
+    first, second = (
+        components(v, measured, soc, 30.0, None)["battery_voltage"].modelled.mean() for v in (vehicle, extended)
+    )
+    cells = vehicle.battery.cells_series * measured["pack_current"].mean() / vehicle.battery.cells_parallel
+    assert first - second == pytest.approx(0.01 * cells, rel=0.02)
 
 
 # --- the command --------------------------------------------------------------------------------------------------

@@ -344,6 +344,7 @@ class Force:
             "headwind": wind,
             "motor_speed": speed / (self.p["wheel_radius"] * self.p["gear_ratio"]),
             "motor_temperature": run.temperature,
+            "ambient_temperature": run.temperature,
         }
         return _sum(self._road, q) + _sum(self._motor, q) / speed
 
