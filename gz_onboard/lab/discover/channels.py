@@ -247,7 +247,8 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, A
     charge = np.cumsum(cell / (3600 * capacity)) * DT
     soc = p["soc_start"] + start_soc(ride, system) - (charge - cell / (3600 * capacity) * DT / 2)
     factor = p.get("cell_resistance_factor", 1.0) * (1 + p["resistance_cold"] * (20 - temperature) / 20)
-    factor = factor * (1 + p["resistance_empty"] * (1 - soc) / 0.4 - p["resistance_current"] * np.abs(cell) / 5)
+    bent = p["resistance_current"] + p["resistance_current_cold"] * (20 - temperature) / 20
+    factor = factor * (1 + p["resistance_empty"] * (1 - soc) / 0.4 - bent * np.abs(cell) / 5)
     r0 = mesh_at(battery.r0, soc, temperature) * factor
     r1 = mesh_at(battery.r1, soc, temperature)
     decay = np.exp(-DT / (r1 * mesh_at(battery.c1, soc, temperature)))
@@ -436,6 +437,7 @@ class Channel:
     noise: tuple[float, float, float] = (1.0, 1.0, 60.0)  # white sd, correlated sd, s: before any healthy ride
     battery: bool = False
     correlated: bool = True
+    slow: float = 0.0  # s: the shortest correlation that its noise can have; what its model lacks is slow
     rough: float = 0.0  # A of motor current within a block that double its variance; 0: none do
 
 
@@ -444,6 +446,7 @@ _SPEED = ("wheel_radius", "speed_sensor_scale")
 _CELL = (
     "pack_current_offset", "pack_current_gain", "cell_capacity", "soc_start", "cell_resistance_factor", "v1_start",
     "resistance_cold", "ocv_offset", "ocv_tilt", "resistance_empty", "resistance_current",
+    "resistance_current_cold",
 )  # fmt: skip
 
 CHANNELS = (
@@ -479,12 +482,12 @@ CHANNELS = (
     Channel(
         "cell_voltage", "V", 2.0, SLOW, ("pack_voltage", "pack_current"), cell_voltage, _always,
         (*_CELL, "pack_voltage_offset", "pack_series_resistance"), ("CELL_VOLTAGE",), (0.002, 0.008, 300.0), True,
-        rough=10.0,
+        slow=60.0, rough=10.0,
     ),
     Channel(
         "voltage_timing", "V", 0.1, 1, ("pack_voltage", "pack_current"), voltage_timing, _always,
         ("pack_current_gain", "pack_voltage_latency", "fast_resistance", "cell_resistance_factor",
-         "pack_series_resistance"), (), (0.002, 0.0, 10.0), True, False, 3.0,
+         "pack_series_resistance"), (), (0.002, 0.0, 10.0), True, False, rough=3.0,
     ),
     Channel(
         "gps_speed", "m/s", 2.0, 1, ("gps_speed", "motor_speed"), gps_speed, _fast,
@@ -502,19 +505,19 @@ CHANNELS = (
         "motor_temperature", "K", 10.0, SLOW, ("motor_temperature", "ambient_temperature"), motor_temperature, _always,
         ("motor_start", "rotor_start", "motor_stator_share", "motor_gap_conductance", "motor_stator_capacity",
          "motor_rotor_capacity", "motor_rotor_to_ambient", "motor_airflow", "cooling_factor", "copper_speed"),
-        ("MOTOR_LOSS",), (0.4, 0.7, 200.0),
+        ("MOTOR_LOSS",), (0.4, 0.7, 200.0), slow=200.0,
     ),
     Channel(
         "inverter_temperature", "K", 10.0, SLOW, ("inverter_temperature", "ambient_temperature"), inverter_temperature,
         _always, ("inverter_start", "box_start", "inverter_board_to_box", "inverter_box_to_ambient",
                   "inverter_board_capacity", "inverter_box_capacity", "inverter_airflow", "cooling_factor"),
-        ("INVERTER_LOSS",), (0.4, 0.7, 200.0),
+        ("INVERTER_LOSS",), (0.4, 0.7, 200.0), slow=200.0,
     ),
     Channel(
         "cell_temperature", "K", 10.0, SLOW, ("cell_temperature", "ambient_temperature", "pack_voltage",
                                                "pack_current"), cell_temperature, _always,
         ("cells_start", "pack_heat_capacity", "pack_conductance", "pack_airflow", "cooling_factor",
-         "cell_resistance_factor", "pack_current_gain"), ("CELL_VOLTAGE",), (0.3, 0.5, 300.0), True,
+         "cell_resistance_factor", "pack_current_gain"), ("CELL_VOLTAGE",), (0.3, 0.5, 300.0), True, slow=200.0,
     ),
 )  # fmt: skip
 BY_NAME = {channel.name: channel for channel in CHANNELS}

@@ -13,10 +13,19 @@ import numpy as np
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.gain import measure_gain
 from gz_onboard.lab.discover.grid import Array, Ride
-from gz_onboard.lab.discover.linear import Linear, Normal, Posterior, fit_mixed, learn_noise, linearise, normal
+from gz_onboard.lab.discover.linear import (
+    Linear,
+    Normal,
+    fit_mixed,
+    learn_noise,
+    linearise,
+    normal,
+    spread_out,
+    trimmed,
+)
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.search import Search, evidence
-from gz_onboard.lab.discover.shapes import learn_shapes
+from gz_onboard.lab.discover.shapes import with_inflation
 from gz_onboard.lab.discover.state import State, initial, restore
 from gz_onboard.lab.discover.verdict import reach
 from gz_onboard.physics.parameters import Parameters, Value
@@ -63,7 +72,12 @@ from gz_onboard.lab.discover.terms import LOG as LOGARITHMIC  # noqa: E402
 
 def _linearised(job: tuple[Ride, State]) -> Linear:
     ride, state = job
-    return linearise(ride, state.values, state.names, state.scale, state.system)
+    line = linearise(ride, state.values, state.names, state.scale, state.system)
+    wide = np.sqrt(np.diag(state.prior)) + 3 * np.sqrt(state.scatter)
+    for i in [i for cause in usable_causes(state) for i in state.index(cause.names)]:
+        wide[i] += 10 * np.sqrt(state.scatter[i])
+    line = trimmed(line, state.noise, state.mean, wide)
+    return spread_out(line, state.noise, state.mean, wide) if state.healthy else line
 
 
 def linearise_all(rides: Sequence[Ride], state: State, workers: int = 1) -> list[Linear]:
@@ -86,43 +100,47 @@ def learn(state: State, rides: Sequence[Ride], progress: Progress, workers: int 
     shift = np.zeros(len(state.names))
     for i in range(ROUNDS):
         progress(f"healthy rides, round {i + 1} of {ROUNDS}")
-        lines = linearise_all(rides, replace(state, values=values), workers)
+        lines = linearise_all(rides, replace(state, values=values, mean=first - shift, noise=noise), workers)
         normals = [normal(line, noise) for line in lines]
         post = fit_mixed(normals, first - shift, state.prior, state.scatter, WEIGHT, state.free, 0)
         noise = learn_noise(lines, post.mean + post.own, noise)
         shift = shift + post.mean
         values = state.unit_value(shift)
     progress("scatter between healthy rides")
-    lines = linearise_all(rides, replace(state, values=values), workers)
+    lines = linearise_all(rides, replace(state, values=values, mean=first - shift, noise=noise), workers)
     normals = [normal(line, noise) for line in lines]
     post = fit_mixed(normals, first - shift, state.prior, state.scatter, WEIGHT, state.free, 40)
     after = replace(state, values=values, mean=post.mean, prior=post.covariance, scatter=post.scatter, noise=noise,
                     healthy=len(rides))  # fmt: skip
     before = replace(after, mean=first - shift, prior=state.prior)
-    inflation = left_out(before, normals)
-    return replace(after, inflation=inflation, shapes=learn_shapes(after, lines, normals))
+    folds = left_out(before, normals)
+    return replace(after, inflation=inflation(folds, normals), shapes=with_inflation(after, folds, lines, normals))
 
 
-def left_out(before: State, normals: Sequence[Normal], size: int = 2) -> dict[str, float]:
+def left_out(before: State, normals: Sequence[Normal], size: int = 2) -> list[tuple[State, list[int]]]:
+    """What is learned without each `size` of the rides, and which those are."""
+    folds = []
+    for start in range(0, len(normals), size):
+        held = list(range(start, min(start + size, len(normals))))
+        rest = [n for i, n in enumerate(normals) if i not in held]
+        if len(rest) >= 2:
+            post = fit_mixed(rest, before.mean, before.prior, before.scatter, WEIGHT, before.free, 0)
+            folds.append((replace(before, mean=post.mean, prior=post.covariance), held))
+    return folds
+
+
+def inflation(folds: Sequence[tuple[State, list[int]]], normals: Sequence[Normal]) -> dict[str, float]:
     """By how much the score of each cause is too high on healthy rides that the rest did not learn from.
 
-    Mean of chi-squared over folds of `size` rides, with a prior of 1 worth two folds; at least 1.
+    Mean of chi-squared over the folds, with a prior of 1 worth two folds; at least 1.
     """
-    folds = [list(range(i, min(i + size, len(normals)))) for i in range(0, len(normals), size)]
-    total: dict[str, float] = {}
-    count = 0
-    for fold in folds:
-        rest = [n for i, n in enumerate(normals) if i not in fold]
-        if len(rest) < 2:
-            continue
-        post: Posterior = fit_mixed(rest, before.mean, before.prior, before.scatter, WEIGHT, before.free, 0)
-        state = replace(before, mean=post.mean, prior=post.covariance, inflation={})
-        e = evidence(state, [normals[i] for i in fold])
-        count += 1
-        for cause in usable_causes(before):
-            index = before.index(cause.names)
-            total[cause.name] = total.get(cause.name, 0.0) + e.gain(index) / len(index)
-    return {name: max(1.0, (2 + x) / (2 + count)) for name, x in total.items()}
+    total: dict[str, list[float]] = {}
+    for state, held in folds:
+        e = evidence(state, [normals[i] for i in held])
+        for cause in usable_causes(state):
+            index = state.index(cause.names)
+            total.setdefault(cause.name, []).append(e.gain(index) / len(index))
+    return {name: max(1.0, (2 + sum(x)) / (2 + len(x))) for name, x in total.items()}
 
 
 def usable_causes(state: State) -> list:  # type: ignore[type-arg]

@@ -10,7 +10,7 @@ and b = AᵀC⁻¹y. All parameters are in units of their scale.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -33,6 +33,18 @@ class Table:
     a: Array
     time: Array
     used: Mask  # of the channel's blocks, which are in y
+    factor: float = 1.0  # what y and a were divided by beside
+    roughness: Array = field(default_factory=lambda: np.ones(0))  # of all blocks
+
+    @property
+    def unit(self) -> Array:
+        """What y is to be multiplied with to be in the channel's unit, (m,)."""
+        return self.factor * self.rough
+
+    @property
+    def rough(self) -> Array:
+        """The roughness of its blocks, (m,)."""
+        return self.roughness[self.used]
 
 
 @dataclass
@@ -63,14 +75,13 @@ def linearise(ride: Ride, values: Mapping[str, float], names: Sequence[str], sca
             if name in mine:
                 moved = {**values, name: stepped(name, values[name], float(scale[i]))}
                 a[:, i] = y - blocks(channel, ride, moved, system)[used]
-        rough = roughness(channel, ride)[used]
-        y, a = y / rough, a / rough[:, None]
+        every = roughness(channel, ride)
+        y, a = y / every[used], a / every[used][:, None]
         good = np.isfinite(y) & np.isfinite(a).all(axis=1)
-        good[good] = inliers(y[good], a[good])
         index = np.flatnonzero(used)
         used = used.copy()
         used[index[~good]] = False
-        tables[channel.name] = Table(channel, y[good], a[good], (index[good] + 0.5) * channel.block, used)
+        tables[channel.name] = Table(channel, y[good], a[good], (index[good] + 0.5) * channel.block, used, 1.0, every)
     return Linear(ride, tables)
 
 
@@ -118,21 +129,46 @@ def likelihoods(times: Array, rest: Array, ratio: Array, time: Array) -> tuple[A
     return quadratic, logarithm
 
 
-def inliers(y: Array, a: Array) -> Mask:
-    """Blocks that no parameters make fit, by far, are none of the vehicle's: gaps of the recording, a bump. (m,)
+def trimmed(line: Linear, noise: Noise, mean: Array, spread: Array) -> Linear:
+    """`line` without the blocks that no likely parameters of the ride make fit: a wheel that lets go, a current limit
+    that cuts in, a gap. mean, spread (p,): of the ride's parameters before, in scales.
 
-    Those beyond eight robust standard deviations of a fit of all columns, three times over (Rousseeuw & Leroy 1987).
+    Those beyond five standard deviations, or robust ones where these are larger, three times over (Rousseeuw & Leroy
+    1987), with their neighbours; a tenth of a channel at most.
     """
-    touched = a[:, np.any(a != 0, axis=0)]
-    good = np.ones(len(y), dtype=bool)
-    size = np.linalg.norm(touched, axis=0)
-    columns = touched / np.where(size > 0, size, 1.0)
+    tables = line.tables
     for _ in range(3):
-        c = np.linalg.lstsq(columns[good], y[good], rcond=1e-6)[0]
-        rest = y - columns @ c
-        spread = 1.4826 * float(np.median(np.abs(rest[good]))) + 1e-12
-        good = np.abs(rest) < 8 * spread
-    return good if good.mean() > 0.9 else np.abs(rest) <= np.quantile(np.abs(rest), 0.9)
+        ride = normal(Linear(line.ride, tables), noise)
+        own = mean + np.linalg.solve(np.diag(1 / spread**2) + ride.n, ride.b - ride.n @ mean)
+        tables = {name: _trim(table, noise[name], own) for name, table in line.tables.items()}
+    return Linear(line.ride, tables)
+
+
+def spread_out(line: Linear, noise: Noise, mean: Array, spread: Array) -> Linear:
+    """`line` with the noise of each channel raised to what this ride shows, where that is more: a ride that no
+    parameters make fit counts for less.
+    """
+    ride = normal(line, noise)
+    own = mean + np.linalg.solve(np.diag(1 / spread**2) + ride.n, ride.b - ride.n @ mean)
+    tables = {}
+    for name, table in line.tables.items():
+        rest = whitened(table, noise[name], table.y - table.a @ own)
+        factor = max(1.0, float(np.sqrt(np.mean(rest**2))))
+        tables[name] = Table(table.channel, table.y / factor, table.a / factor, table.time, table.used, factor, table.roughness)
+    return Linear(line.ride, tables)
+
+
+def _trim(table: Table, noise: tuple[float, float, float], own: Array) -> Table:
+    rest = table.y - table.a @ own
+    rest = rest - np.median(rest)
+    limit = 5 * max(float(np.hypot(noise[0], noise[1])), 1.4826 * float(np.median(np.abs(rest))))
+    bad = np.abs(rest) > max(limit, float(np.quantile(np.abs(rest), 0.95)))
+    bad = bad | np.append(bad[1:], False) | np.insert(bad[:-1], 0, False)
+    if not bad.any() or bad.mean() > 0.2:
+        return table
+    used = table.used.copy()
+    used[np.flatnonzero(used)[bad]] = False
+    return Table(table.channel, table.y[~bad], table.a[~bad], table.time[~bad], used, table.factor, table.roughness)
 
 
 @dataclass(frozen=True)
@@ -227,7 +263,8 @@ def learn_noise(rides: Sequence[Linear], shifts: Array, start: Noise) -> Noise:
             result[channel.name] = (float(np.sqrt(np.mean(np.concatenate([r for _, r in rows]) ** 2))), 0.0, 10.0)
             continue
         grid = [(q, t) for t in (3 * channel.block, 10 * channel.block, 60.0, 200.0, 600.0)
-                for q in (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0)]  # fmt: skip
+                for q in (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0)
+                if not channel.slow or (t >= channel.slow and q >= 0.5)]  # fmt: skip
         ratio, time = (np.array(column) for column in zip(*grid, strict=True))
         parts = [likelihoods(table.time, rest, ratio, time) for table, rest in rows]
         count = sum(len(rest) for _, rest in rows)

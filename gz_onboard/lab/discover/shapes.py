@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -100,11 +101,8 @@ def extended(linear: Linear, normal: Normal, pair: str, noise: Noise, size: floa
     curve = columns(linear.ride, name, table)
     if curve is None:
         return None
-    from gz_onboard.lab.discover.channels import roughness  # noqa: PLC0415
-
-    rough = roughness(table.channel, linear.ride)[: len(table.used)][table.used]
     k, p = curve.shape[1], len(normal.b)
-    both = whitened(table, noise[channel], np.column_stack([curve * size / rough[:, None], table.a, table.y]))
+    both = whitened(table, noise[channel], np.column_stack([curve * size / table.unit[:, None], table.a, table.y]))
     b, a, y = both[:, :k], both[:, k:-1], both[:, -1]
     n = np.zeros((p + k, p + k))
     n[:p, :p] = normal.n
@@ -179,6 +177,26 @@ def learn_shapes(state: State, linears: Sequence[Linear], normals: Sequence[Norm
         covariance = np.linalg.inv(m + np.eye(k))
         found[pair] = Shape(covariance @ c, covariance, 1.0)
     return found
+
+
+def with_inflation(
+    state: State, folds: Sequence[tuple[State, Sequence[int]]], linears: Sequence[Linear], normals: Sequence[Normal]
+) -> dict[str, Shape]:
+    """The shapes of `state`, each with how much too high its score is on healthy rides left out of `folds`."""
+    total: dict[str, list[float]] = {}
+    for learned, held in folds:
+        rest = [i for i in range(len(linears)) if i not in held]
+        shapes = learn_shapes(learned, [linears[i] for i in rest], [normals[i] for i in rest])
+        blind = replace(learned, shapes=shapes)
+        for pair in shapes:
+            found = shape_evidence(blind, [linears[i] for i in held], [normals[i] for i in held], pair, [])
+            if found:
+                total.setdefault(pair, []).append(found[0] / found[1])
+    whole = learn_shapes(state, linears, normals)
+    return {
+        pair: replace(shape, inflation=max(1.0, (2 + sum(total.get(pair, []))) / (2 + len(total.get(pair, [])))))
+        for pair, shape in whole.items()
+    }
 
 
 __all__ = ["BY_NAME", "QUANTITIES", "hats", "learn_shapes", "names", "shape_evidence"]

@@ -48,6 +48,7 @@ NUISANCES = (
     Nuisance("ocv_tilt", "V", 0.0, 0.03, 0.03, "slope of the rest voltage over SOC against the table"),
     Nuisance("resistance_empty", "1", 0.0, 0.3, 0.05, "cell resistance at SOC 0.6 less that at 1.0, as a share"),
     Nuisance("resistance_current", "1/(5 A)", 0.0, 0.1, 0.01, "cell resistance falls with current"),
+    Nuisance("resistance_current_cold", "1/(5 A·20 K)", 0.0, 0.1, 0.01, "the more so below 20 degC"),
     Nuisance("resistance_cold", "1/(20 K)", 0.0, 0.15, 0.04, "cell resistance below 20 degC beyond the tables"),
     Nuisance("fast_resistance", "1", 0.0, 0.2, 0.05, "resistance at 0.1 s over that of the tables"),
     Nuisance("slip_per_force", "1/(100 N)", 0.0, 0.02, 0.003, "slip of the driven wheel"),

@@ -10,11 +10,12 @@ import numpy as np
 from scipy.stats import t as student
 
 from gz_onboard.lab.discover.candidates import Candidate
+from gz_onboard.lab.discover.channels import over_blocks
 from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, normal
 from gz_onboard.lab.discover.result import Cause, Report
 from gz_onboard.lab.discover.search import Evidence, Search, evidence, one_degree
-from gz_onboard.lab.discover.shapes import QUANTITIES, names, shape_evidence
+from gz_onboard.lab.discover.shapes import QUANTITIES, columns, names, shape_evidence
 from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.terms import LOG, stepped
 
@@ -157,10 +158,7 @@ def own_value(state: State, name: str) -> float:
 def power_of(table_name: str, line: Linear, values: Array) -> Array | None:
     """What a residual of a channel is worth at the pack's terminals [W], over its blocks."""
     table = line.tables[table_name]
-    from gz_onboard.lab.discover.channels import over_blocks, roughness  # noqa: PLC0415
-
-    rough = roughness(table.channel, line.ride)[: len(table.used)][table.used]
-    real = values * rough
+    real = values * table.unit
     if table_name == "road_force":
         return np.asarray(real * over_blocks(table.channel, line.ride.quantities["speed"])[table.used])
     if table_name in ("inverter_power", "auxiliary"):
@@ -228,8 +226,6 @@ def unexplained(
 
 def shape_share(lines: Sequence[Linear], shape: dict[str, Any]) -> float:
     """The part of the energy drawn that the curve takes."""
-    from gz_onboard.lab.discover.shapes import columns  # noqa: PLC0415
-    from gz_onboard.lab.discover.channels import roughness  # noqa: PLC0415
 
     more = drawn = 0.0
     values = np.array([row[1] for row in shape["curve"]])
@@ -241,8 +237,7 @@ def shape_share(lines: Sequence[Linear], shape: dict[str, Any]) -> float:
         c = columns(line.ride, shape["quantity"], table)
         if c is None:
             continue
-        rough = roughness(table.channel, line.ride)[: len(table.used)][table.used]
-        power = power_of(shape["channel"], line, c @ values / rough)
+        power = power_of(shape["channel"], line, c @ values / table.unit)
         if power is not None and len(power):
             more += float(np.mean(power)) * share_of_time(line, shape["channel"])
     return more / drawn if drawn else 0.0
