@@ -105,7 +105,7 @@ class Battery:
     def ocv(self, soc: float) -> tuple[float, float]:
         """(open-circuit voltage of a cell [V], its slope [V])."""
         xs, ys = self.ocv_soc, self.ocv_value
-        i = min(max(bisect_right(xs, soc) - 1, 0), len(xs) - 2)
+        i = bisect_right(xs, soc, 1, len(xs) - 1) - 1
         slope = (ys[i + 1] - ys[i]) / (xs[i + 1] - xs[i])
         return ys[i] + slope * (soc - xs[i]), slope
 

@@ -9,6 +9,7 @@ ledger closes to rounding.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from math import atan, sqrt
@@ -59,7 +60,7 @@ class Dynamometer:
 class Ledger:
     """Energy [J] by where it went, since the start."""
 
-    entries: dict[str, float] = field(default_factory=dict)
+    entries: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
 
     def total(self) -> float:
         """The sum of all entries."""
@@ -104,6 +105,8 @@ class Scooter:
         self.current = 0.0  # A of the pack
         self.voltage = vehicle.battery.cells_series * vehicle.battery.ocv(soc)[0]
         self.sensed_voltage = self.voltage  # V, as the controller has it
+        self._series = vehicle.battery.cells_series
+        self._voltage_gain = min(dt / VOLTAGE_FILTER, 1.0)
         self.motor_current = 0.0  # A
         self.throttle = self.brake = 0.0
         self.force = 0.0  # N, of the driven tyre
@@ -188,7 +191,7 @@ class Scooter:
 
     def step(self, throttle: float, brake: float) -> None:
         """One step with throttle and brake [0..1]."""
-        dt, q, entries = self.dt, self._q, self.ledger.entries
+        dt, q, entries, dynamometer = self.dt, self._q, self.ledger.entries, self.dynamometer
         v, w, r, gear = self.speed, self.wheel_speed, self._radius, self._gear
         self.throttle, self.brake = throttle, brake
 
@@ -215,11 +218,13 @@ class Scooter:
         else:
             shift = self.force * self._lever
         rear = normal * self._rear_share + shift
-        rear = min(max(rear, 0.05 * normal), normal)
+        if rear < 0.05 * normal:
+            rear = 0.05 * normal
+        elif rear > normal:
+            rear = normal
         self.rear_load, self.front_load = rear, normal - rear
-        series = self.vehicle.battery.cells_series  # type: ignore[union-attr]
-        self.sensed_voltage += (self.voltage - self.sensed_voltage) * min(dt / VOLTAGE_FILTER, 1.0)
-        current = self.controller.current(throttle, brake, w / gear, self.sensed_voltage / series)
+        self.sensed_voltage += (self.voltage - self.sensed_voltage) * self._voltage_gain
+        current = self.controller.current(throttle, brake, w / gear, self.sensed_voltage / self._series)
         torque = self.motor.torque_constant * current
         drive = torque / gear * (self._gear_efficiency if torque * w >= 0 else 1 / self._gear_efficiency)
 
@@ -229,24 +234,25 @@ class Scooter:
             term = effect(q)
             terms.append((name, term))
             against += term
-        rolling = [(name, effect(q)) for name, effect in self._rolling]
+        rolling: list[tuple[str, float]] = []
         rear_rolling = front_rolling = 0.0
         share = rear / normal
-        for _, term in rolling:
+        front_share = 0.0 if dynamometer else 1 - share
+        for name, effect in self._rolling:
+            term = effect(q)
+            rolling.append((name, term))
             rear_rolling += share * term
-            if not self.dynamometer:
-                front_rolling += (1 - share) * term
+            front_rolling += front_share * term
         against += front_rolling
         if turning:
             terms.append(("turning", turning))
             against += turning
-        if self.dynamometer:
-            d = self.dynamometer
+        if d := dynamometer:
             absorbed = (d.a * v / sqrt(v * v + 0.01) if d.a else 0.0) + d.b * v + d.c * v * abs(v)
             terms.append(("dynamometer", absorbed))
             against += absorbed
 
-        front_braking = 0.0 if brake <= 0.0 or self.dynamometer else self.brakes.front_force(brake, v, r)
+        front_braking = 0.0 if brake <= 0.0 or dynamometer else self.brakes.front_force(brake, v, r)
         against += front_braking
 
         # --- wheel, tyre and vehicle together, implicit in the slip (eqs. 2.11, 3.3, 3.8, 3.10-3.12)
@@ -278,38 +284,37 @@ class Scooter:
         # --- every watt (eqs. 2.2-2.6, 2.9, 2.10, 2.16-2.19)
         for name, term in terms:
             if name != "grade_force":  # what it takes is the potential energy
-                entries[name] = entries.get(name, 0.0) + term * v_mean * dt
+                entries[name] += term * v_mean * dt
         for name, term in rolling:
-            power = share * term * r * w_mean + (0.0 if self.dynamometer else (1 - share) * term * v_mean)
-            entries[name] = entries.get(name, 0.0) + power * dt
-        entries["tyre_slip"] = entries.get("tyre_slip", 0.0) + force * (r * w_mean - v_mean) * dt
-        entries["brakes"] = entries.get("brakes", 0.0) + (braking * w_mean + front_braking * v_mean) * dt
+            entries[name] += (share * term * r * w_mean + front_share * term * v_mean) * dt
+        entries["tyre_slip"] += force * (r * w_mean - v_mean) * dt
+        entries["brakes"] += (braking * w_mean + front_braking * v_mean) * dt
         motor_speed = w_mean / gear
         mechanical = torque * motor_speed
-        entries["gearing"] = entries.get("gearing", 0.0) + (mechanical - drive * w_mean) * dt
+        entries["gearing"] += (mechanical - drive * w_mean) * dt
         q["torque"] = torque
         motor_heat = 0.0
         for name, loss in self.motor.losses(motor_speed, current, self.motor_cooling.stator):
             motor_heat += loss
-            entries[name] = entries.get(name, 0.0) + loss * dt
+            entries[name] += loss * dt
         q["motor_speed"], q["motor_current"] = motor_speed, current
         inverter_heat = 0.0
         for name, effect in self._inverter:
             loss = effect(q)
             inverter_heat += loss
-            entries[name] = entries.get(name, 0.0) + loss * dt
+            entries[name] += loss * dt
         power = mechanical + motor_heat + inverter_heat
         for name, effect in self._dc:
             load = effect(q)
             power += load
-            entries[name] = entries.get(name, 0.0) + load * dt
+            entries[name] += load * dt
         bms_heat = self._bms_resistance * self.current * self.current
-        entries["bms"] = entries.get("bms", 0.0) + bms_heat * dt
+        entries["bms"] += bms_heat * dt
         power += bms_heat
         self.current, self.voltage, pack_heat, delivered = self.pack.draw(power, dt, self.pack_cooling.temperature)
-        entries["battery_heat"] = entries.get("battery_heat", 0.0) + pack_heat * dt
+        entries["battery_heat"] += pack_heat * dt
         if power - delivered > 1e-6 * abs(power):
-            entries["not_delivered"] = entries.get("not_delivered", 0.0) - (power - delivered) * dt
+            entries["not_delivered"] -= (power - delivered) * dt
         self.motor_current = current
 
         heat = self._heat

@@ -18,9 +18,11 @@ class Rider:
         error = wanted - speed
         command = self.proportional * error + self.sum
         if -1 < command < 1 or error * command < 0:
-            self.sum += self.integral * error * dt
-            self.sum = min(max(self.sum, -1.0), 1.0)
+            total = self.sum + self.integral * error * dt
+            self.sum = -1.0 if total < -1.0 else 1.0 if total > 1.0 else total
         if wanted <= 0 and speed < 0.3:  # stands: holds the brake
             self.sum = min(self.sum, 0.0)
             return 0.0, max(-command, 0.3)
-        return min(max(command, 0.0), 1.0), min(max(-command, 0.0), 1.0)
+        if command >= 0:
+            return (command if command < 1.0 else 1.0), 0.0
+        return 0.0, (-command if command > -1.0 else 1.0)
