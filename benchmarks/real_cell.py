@@ -330,7 +330,7 @@ def _detail(setting: Setting, work: list[Cycle], scores: Scores) -> list[str]:
         for case in ((0.0, 0.0), (0.0, OFFSET), (WRONG, 0.0), (WRONG, OFFSET)):
             s = scores[setting.name, c, *case]
             cell = f"{percent(s.rms)}, {percent(s.mae)}, {percent(s.largest, 1)}, {percent(s.outside, 0)}"
-            cells.append(cell + (f", {s.start:.0f}" if case[0] else ""))
+            cells.append(("never" if np.isnan(s.rms) else cell) + (f", {s.start:.0f}" if s.start > 0 else ""))
         end = 1 - c.drawn[-1] / setting.battery.cell_capacity(c.temperature)
         sd = scores[setting.name, c, 0.0, 0.0].sd
         lines.append(f"| {c.temperature} | {c.name} | {100 * end:.0f} | {' | '.join(cells)} | {100 * sd:.1f} |")
@@ -351,8 +351,10 @@ def _summary(every: list[Setting], work: list[Cycle], scores: Scores, cases: lis
             for t in TEMPERATURES:
                 mine = [scores[setting.name, c, *case] for c in work if c.temperature == t]
                 if mine:
-                    rms, worst = np.mean([s.rms for s in mine]), max(s.rms for s in mine)
-                    cells.append(f"{percent(rms)} ({percent(worst)}; {percent(max(s.largest for s in mine), 1)})")
+                    good = [s for s in mine if np.isfinite(s.rms)]
+                    rms, worst = np.mean([s.rms for s in good]), max(s.rms for s in good)
+                    lost = f", {len(mine) - len(good)} never" if len(good) < len(mine) else ""
+                    cells.append(f"{percent(rms)} ({percent(worst)}; {percent(max(s.largest for s in good), 1)}){lost}")
                 else:
                     cells.append("–")
             lines.append(f"| {setting.name} | {names[case]} | {' | '.join(cells)} |")

@@ -25,6 +25,7 @@ VOLTAGE_SD = 0.004  # V: what the model leaves, independent every CORRELATED sam
 SOC_SD = 0.003  # how far the state of charge may be off, which matters where the OCV is steep
 CORRELATED = 20
 BEND_SD = 0.3  # relative: how far a table may bend from node to node, per 0.05 of SOC
+LEAST = 1e-6  # ohm
 SHIFT_SD, SHIFT_SD_EMPTY = 0.01, 0.05  # V: rest voltage of this test against the OCV; below 10 % SOC
 
 
@@ -160,8 +161,8 @@ class Reduction:
         positive = np.all(best > 0, axis=1)
         if np.any(positive):
             cost = np.where(positive, cost, np.inf)
-        else:  # no pairs at all: they are given a thousandth of R0
-            best = np.maximum(best, 1e-3 * best[:, :1])
+        else:  # there is nothing that pairs could follow
+            best = np.maximum(best, LEAST)
         k = int(np.argmin(cost))
         solution, times = best[k], self._times[k]
         if self._count == 1 and 0 < k < len(cost) - 1 and np.all(np.isfinite(cost[k - 1 : k + 2])):
