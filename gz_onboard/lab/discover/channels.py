@@ -7,7 +7,7 @@ channels, and causes that look alike in the energy drawn (a heavier rider, a wea
     road_force           N      torque at the wheel, less road load; mass times the accelerometer is grade and inertia
     altitude             m      GPS altitude, less the way times the grade that the accelerometer shows
     inverter_power       W      DC power of the inverter, less air-gap power and losses
-    pack_balance         A      pack current, less inverter and auxiliary current
+    pack_balance         A      pack current less auxiliary current, less inverter current
     auxiliary            W      what the auxiliary current sensor shows
     voltage_balance      V      pack voltage, less inverter voltage and cable drop
     cell_voltage         V      of a mean cell, less the equivalent circuit at the current measured
@@ -164,19 +164,19 @@ def road_force(ride: Ride, p: Values, system: System) -> Array:
     speed = q["motor_speed"]
     direction = speed / np.hypot(speed, 0.5)
     shaft = q["torque"] - drag / np.hypot(speed, 0.5) * direction
-    m = float(ride.quantities["mass"][0])  # as entered
-    more = mass(ride, p, system) - m
+    entered, m = float(ride.quantities["mass"][0]), mass(ride, p, system)
     rotating = (p["wheel_inertia_front"] + p["wheel_inertia_rear"]) / p["wheel_radius"] ** 2
     specific = ride.signals["accel_x"] - p["accel_bias"] - p["pitch_gain"] * q["acceleration"]
-    force = m * specific + rotating * q["acceleration"]
-    # a wrong mass is not sought where the accelerometer errs: regression on what is noisy pulls towards nothing
-    force = force + more * (q["acceleration"] + q["grade_around"] - p["accel_bias"])
+    force = rotating * q["acceleration"]
     for effect in system.at("WHEEL_FORCE", "TYRE"):
         term = system.term(effect, q, p, STEP)
         if effect.name == "rolling_resistance":
             term = term * (1 + p["rolling_cold"] * (20 - q["ambient_temperature"]) / 20)
         force = force + term
-    return np.asarray(shaft / (p["wheel_radius"] * p["gear_ratio"]) - force)
+    push = shaft / (p["wheel_radius"] * p["gear_ratio"]) - force
+    # what is noisy stands alone: were the accelerometer multiplied with the mass that is sought, the least noise would
+    # be had with the least mass, and all that it is weighed with would shrink along
+    return np.asarray(entered * (push / m - specific))
 
 
 def altitude(ride: Ride, p: Values, system: System) -> Array:
@@ -195,21 +195,23 @@ def inverter_power(ride: Ride, p: Values, system: System) -> Array:
     power = q["torque"] * q["motor_speed"] + electric
     for effect in system.at("INVERTER_LOSS"):
         power = power + system.term(effect, q, p, STEP)
-    amperes = (ride.signals["inverter_current"] - p["inverter_current_offset"]) / p["inverter_current_gain"]
     spin = np.abs(q["motor_speed"]) / 50
     power = power + (p["loss_speed"] + p["loss_cross"] * np.abs(q["motor_current"]) / 50) * spin
     power = power - p["torque_lag"] * np.gradient(smooth3(np.broadcast_to(power, len(ride.time))), STEP)
-    return np.asarray(amperes * ride.signals["inverter_voltage"] - power)
+    volts = ride.signals["inverter_voltage"]
+    shown = p["inverter_current_gain"] * power + p["inverter_current_offset"] * volts
+    return np.asarray(ride.signals["inverter_current"] * volts - shown)
 
 
 def pack_balance(ride: Ride, p: Values, system: System) -> Array:
     """[A]"""
     s = ride.signals
-    inverter = (s["inverter_current"] - p["inverter_current_offset"]) / p["inverter_current_gain"]
-    # what is drawn when nothing is: the inverter's own supply beside its current sensor
-    inverter = inverter - p["pack_inverter_lag"] * np.gradient(smooth3(inverter), STEP)
-    true = inverter + s["auxiliary_current"] + p["idle_current"]
-    return np.asarray(s["pack_current"] - p["pack_current_offset"] - p["pack_current_gain"] * true)
+    true = (s["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"]
+    true = true + p["pack_inverter_lag"] * np.gradient(smooth3(true), STEP)
+    # beside the auxiliary load there is what is drawn when nothing is: the inverter's own supply
+    inverter = true - s["auxiliary_current"] - p["idle_current"]
+    shown = p["inverter_current_offset"] + p["inverter_current_gain"] * inverter
+    return np.asarray(shown - s["inverter_current"])
 
 
 def smooth3(x: Array) -> Array:

@@ -32,8 +32,9 @@ from gz_onboard.physics.parameters import Parameters, Value
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
-WEIGHT = 3.0  # rides that the scatter before any healthy ride is worth
-ROUNDS = 4
+WEIGHT = 1.0  # rides that the scatter before any healthy ride is worth
+ROUNDS = 3
+LEAST = 0.6
 Progress = Callable[[str], None]
 
 
@@ -109,7 +110,7 @@ def learn(state: State, rides: Sequence[Ride], progress: Progress, workers: int 
     progress("scatter between healthy rides")
     lines = linearise_all(rides, replace(state, values=values, mean=first - shift, noise=noise), workers)
     normals = [normal(line, noise) for line in lines]
-    post = fit_mixed(normals, first - shift, state.prior, state.scatter, WEIGHT, state.free, 40)
+    post = fit_mixed(normals, first - shift, state.prior, state.scatter, WEIGHT, state.free, 120)
     after = replace(state, values=values, mean=post.mean, prior=post.covariance, scatter=post.scatter, noise=noise,
                     healthy=len(rides))  # fmt: skip
     before = replace(after, mean=first - shift, prior=state.prior)
@@ -132,7 +133,7 @@ def left_out(before: State, normals: Sequence[Normal], size: int = 2) -> list[tu
 def inflation(folds: Sequence[tuple[State, list[int]]], normals: Sequence[Normal]) -> dict[str, float]:
     """By how much the score of each cause is too high on healthy rides that the rest did not learn from.
 
-    Mean of chi-squared over the folds, with a prior of 1 worth two folds; at least 1.
+    Mean of chi-squared over the folds, with a prior of 1 worth one fold; at least `LEAST`.
     """
     total: dict[str, list[float]] = {}
     for state, held in folds:
@@ -140,7 +141,7 @@ def inflation(folds: Sequence[tuple[State, list[int]]], normals: Sequence[Normal
         for cause in usable_causes(state):
             index = state.index(cause.names)
             total.setdefault(cause.name, []).append(e.gain(index) / len(index))
-    return {name: max(1.0, (2 + sum(x)) / (2 + len(x))) for name, x in total.items()}
+    return {name: max(LEAST, (1 + sum(x)) / (1 + len(x))) for name, x in total.items()}
 
 
 def usable_causes(state: State) -> list:  # type: ignore[type-arg]

@@ -155,10 +155,8 @@ def _quantities(ride: Ride, mass: float) -> dict[str, Array]:
     # the body leans: its yaw rate is r·cos φ, and tan φ = v·r/g, so sin φ = v·rate/g
     sine = np.clip(speed * yaw / G, -0.85, 0.85)
     lateral = G * sine / np.sqrt(1 - sine**2)
-    grade, around = np.zeros(n), np.zeros(n)
+    grade = np.zeros(n)
     if "accel_x" in s:
-        specific = s["accel_x"] - acceleration
-        around = (smooth(specific, 24.0) * 24 - smooth(specific, 8.0) * 8) / 16
         grade = smooth((s["accel_x"] - acceleration) / G, 2.0)
     moved = np.cumsum(np.abs(speed) > MOVING) * STEP
     course = s.get("gps_course", np.zeros(n))
@@ -168,7 +166,6 @@ def _quantities(ride: Ride, mass: float) -> dict[str, Array]:
         "speed": speed,
         "acceleration": acceleration,
         "grade": grade,
-        "grade_around": around,  # m/s²: G times the grade before and behind, free of the noise of here and now
         "grade_cosine": np.sqrt(1 - np.clip(grade, -0.5, 0.5) ** 2),
         "mass": np.full(n, mass),
         "air_density": np.full(n, density),

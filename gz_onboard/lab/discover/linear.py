@@ -235,7 +235,7 @@ def fit_mixed(
             total = total + u**2 + np.diag(v) + np.einsum("ij,jk,ik->i", vn, after, vn)
             own.append(u)
         if rounds > 0:
-            now = np.where(free, np.clip(total / (weight + len(rides)), 0.1 * before, 9 * before), before)
+            now = np.where(free, np.clip(total / (weight + len(rides)), 0.02 * before, 9 * before), before)
     return Posterior(common, after, now, np.array(own))
 
 

@@ -33,7 +33,7 @@ NUISANCES = (
     Nuisance("torque_constant_slope", "1/K", 0.0, 7e-4, 1e-4, "magnets weaken when warm"),
     Nuisance("torque_saturation", "1/(100 A)", 0.0, 0.03, 0.005, "torque per current falls at high current"),
     Nuisance("copper_speed", "s/(50 rad)", 0.0, 0.25, 0.02, "copper loss grows with frequency"),
-    Nuisance("inverter_current_gain", "1", 1.0, 0.003, 0.002, "gain of the inverter's current measurement"),
+    Nuisance("inverter_current_gain", "1", 1.0, 0.007, 0.002, "gain of the inverter's current measurement"),
     Nuisance("inverter_current_offset", "A", 0.0, 0.2, 0.03, "its offset"),
     Nuisance("idle_current", "A", 0.0, 0.2, 0.01, "drawn beside inverter and auxiliary current sensors"),
     Nuisance("pack_inverter_lag", "s", 0.0, 0.1, 0.02, "pack current later than the inverter's, beyond 0.1 s"),
