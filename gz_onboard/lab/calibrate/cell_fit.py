@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.optimize import nnls
 
-from gz_onboard.lab.calibrate.cell_circuit import KELVIN, follow, hats
+from gz_onboard.lab.calibrate.cell_circuit import KELVIN, follow, follow_slope, hats
 from gz_onboard.lab.calibrate.cell_data import CellTest
 from gz_onboard.lab.calibrate.result import Array
 
@@ -26,6 +26,8 @@ SOC_SD = 0.003  # how far the state of charge may be off, which matters where th
 CORRELATED = 20
 BEND_SD = 0.3  # relative: how far a table may bend from node to node, per 0.05 of SOC
 LEAST = 1e-6  # ohm
+TIME_BEND = 0.5  # of ln τ, as BEND_SD
+TURNS = 8  # of Gauss and Newton
 SHIFT_SD, SHIFT_SD_EMPTY = 0.01, 0.05  # V: rest voltage of this test against the OCV; below 10 % SOC
 
 
@@ -190,3 +192,54 @@ class Reduction:
 
 def _logs(pairs: Pairs) -> Array:
     return np.log([pairs.r0, *pairs.resistance, *pairs.time])
+
+
+@dataclass(frozen=True)
+class Direct:
+    """One pair at one temperature: R0, R1 [ohm], τ [s], each (n,), and the sd of their logarithms, (3, n)."""
+
+    r0: Array
+    r1: Array
+    time: Array
+    sd: Array
+
+
+def fit_direct(
+    test: CellTest,
+    level: Array,
+    ocv: tuple[Array, Array],
+    start: Branches,
+    pairs: tuple[Array, Array, Array],
+    activation: tuple[float, float] = (0.0, 0.0),
+) -> Direct:
+    """The one pair whose voltage is nearest to that of `test`, from `pairs` (R0, R1, τ over the nodes of `start`).
+
+    Gauss and Newton: the voltage is linear in R0, R1 and the shift of the rest voltage, and its slope over ln τ is
+    that of the filtered current. The rest as for `fit_branches`.
+    """
+    soc, n = start.soc, len(start.soc)
+    inverse = 1 / (test.temperature + KELVIN) - 1 / (start.temperature + KELVIN)
+    hat = hats(soc, level)
+    weight = 1 / (np.hypot(VOLTAGE_SD, SOC_SD * ocv[1]) * np.sqrt(CORRELATED))
+    warm = np.exp(activation[1] * inverse)
+    resistive = -(test.current * np.exp(activation[0] * inverse))[:, None] * hat
+    p = np.concatenate([pairs[0], pairs[1], np.log(pairs[2]), start.shift])
+    scale = np.array([np.median(pairs[0]), np.median(pairs[1]), TIME_BEND / BEND_SD])
+    prior = _smoothness(soc, scale, n, 3)
+    for _ in range(TURNS):
+        tau = np.exp(hat @ p[2 * n : 3 * n])
+        x, slope = follow_slope(test.flowed, test.dt, tau)
+        relaxing = -(x * warm)[:, None] * hat
+        turning = -(slope * warm * (hat @ p[n : 2 * n]))[:, None] * hat
+        a = np.hstack([resistive, relaxing, turning, hat]) * weight[:, None]
+        model = resistive @ p[:n] + relaxing @ p[n : 2 * n] + hat @ p[3 * n :]
+        b = (test.voltage - ocv[0] - model) * weight
+        normal = a.T @ a + prior
+        step = cho_solve(cho_factor(normal), a.T @ b - prior @ p)
+        step[2 * n : 3 * n] = np.clip(step[2 * n : 3 * n], -0.5, 0.5)
+        p = p + step
+        p[: 2 * n] = np.maximum(p[: 2 * n], LEAST)
+    scores = np.array([a[test.block == k].T @ (b[test.block == k]) for k in np.unique(test.block)])
+    bread = cho_solve(cho_factor(normal), np.eye(len(normal)))
+    sd = np.sqrt(np.diag(bread @ (scores.T @ scores + prior) @ bread)).reshape(4, n)
+    return Direct(p[:n], p[n : 2 * n], np.exp(p[2 * n : 3 * n]), sd[:3] / np.array([p[:n], p[n : 2 * n], np.ones(n)]))

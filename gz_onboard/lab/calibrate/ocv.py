@@ -111,7 +111,7 @@ def calibrate(table: Table, soc: Array = SOC) -> Result:
     if np.any(up):
         traces.append(Trace("charge", level[up], test.voltage[up], "."))
     result.panels.append(
-        Panel("Open-circuit voltage", "state of charge", "voltage, V", (*traces, Trace("OCV", soc, value)))
+        Panel("Open-circuit voltage", "state of charge", "voltage [V]", (*traces, Trace("OCV", soc, value)))
     )
     result.panels.append(
         Panel("Half the gap of the branches", "state of charge", "mV", (Trace("half gap", soc, 1e3 * half, "."),

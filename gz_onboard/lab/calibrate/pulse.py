@@ -14,11 +14,12 @@ from itertools import pairwise
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from gz_onboard.errors import InputError
+from gz_onboard.errors import InputError, nearest
 from gz_onboard.lab.calibrate.cell_circuit import KELVIN, Circuit, ocv_at, riding_current, voltage
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
-from gz_onboard.lab.calibrate.cell_fit import Branches, Reduction, fit_branches
+from gz_onboard.lab.calibrate.cell_fit import Branches, Reduction, fit_branches, fit_direct
 from gz_onboard.lab.calibrate.fit import score
+from gz_onboard.lab.calibrate.ocv import TESTER
 from gz_onboard.lab.calibrate.result import Array, Curve, Fit, Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.table import Table
 
@@ -50,6 +51,7 @@ def calibrate(
     capacity: Found,
     *,
     loads: Sequence[Array] | None = None,
+    method: str = "reduced",
     soc: Array = SOC,
 ) -> Result:
     """``battery.r0``, ``r1``, ``c1``, ``capacity``, ``ocv``, and beside them a slow pair.
@@ -57,7 +59,11 @@ def calibrate(
     tables: one for each temperature. ocv, capacity: from `ocv.calibrate`. loads: currents [any unit, one value a
     second, each from rest] that the pair is to follow; synthetic rides if None. Raises InputError for tables that are
     no pulse tests (see `cell_data.cell_test`), too few pulses, too narrow a range, or two tests at one temperature.
+    method: ``reduced``, the pair that follows a load best; or ``direct``, the pair that is nearest to the pulses
+    themselves, which gives back the numbers of a cell that has but one pair, and follows a ride worse.
     """
+    if method not in ("reduced", "direct"):
+        raise InputError(f"method {method!r} is not known{nearest(method, ('reduced', 'direct'))}: reduced or direct")
     if not tables:
         raise InputError("no pulse test is given")
     result = Result("pulse")
@@ -68,12 +74,15 @@ def calibrate(
             raise InputError(
                 f"{cold.test.table.file} and {warm.test.table.file} are both at {warm.temperature:g} degC: one of them"
             )
-    fitted = _fit_all(tested, nodes, volts, soc)
+    fitted, activation = _fit_all(tested, nodes, volts, soc)
     rides = [riding_current(seed=k) for k in range(1, 4)] if loads is None else loads
     one, two = Reduction(rides), Reduction(rides, count=2)
     tables_one, sd_one = _meshes(fitted, one, 1)
+    if method == "direct":
+        tables_one, sd_one = _direct(tested, fitted, activation, nodes, volts, tables_one)
     tables_two, sd_two = _meshes(fitted, two, 2)
     r0, r1, tau = tables_one
+    sd_one, sd_two = ([np.hypot(x, TESTER) for x in sds] for sds in (sd_one, sd_two))
     covered = np.array([f.covered for f in fitted])
     shift, ocv_sd = _rest_shift(fitted, tested, nodes, ocv)
     cell = Circuit(nodes, volts + shift, soc, np.array([t.temperature for t in tested]),
@@ -83,6 +92,8 @@ def calibrate(
     names = ", ".join(t.test.name for t in tested)
     axes = {"soc": soc, "temperature": cell.temperature}
     how = f"{names}: six RC pairs, reduced over {'synthetic rides' if loads is None else 'the loads given'}"
+    if method == "direct":
+        how = f"{names}: least squares of one RC pair"
 
     def curve(value: Array, sd: Array, unit: str, what: str) -> Curve:
         return Curve(axes, value, np.where(covered, sd, np.nan), unit, f"{how}; {what}")
@@ -173,7 +184,7 @@ def _tested(table: Table, nodes: Array, volts: Array, capacity: Found, result: R
     curvature = (np.sum((misses(share + 1e-3)[0] - error) ** 2)) / 1e-6
     sd = float(np.sqrt(max(np.sum(error**2) / max(len(error) - 2, 1), 1e-6) / max(curvature, 1e-12)))
     found = share * capacity.value
-    temperature = float(np.round(np.median(test.temperature[rests])))
+    temperature = float(np.round(np.median(test.temperature[rests]))) + 0.0  # no -0
     result.fits.append(
         Fit(f"rest voltage at {temperature:g} degC, SOC above 0.12", "V", float(np.sqrt(np.mean(error**2))),
             float(np.abs(error).max()), None, len(error), False, test.name)
@@ -188,7 +199,9 @@ def _began(test: CellTest, end: int) -> int:
     return int(moving[-1]) + 1 if len(moving) else 0
 
 
-def _fit_all(tested: list[Tested], nodes: Array, volts: Array, soc: Array) -> list[Branches]:
+def _fit_all(
+    tested: list[Tested], nodes: Array, volts: Array, soc: Array
+) -> tuple[list[Branches], list[tuple[float, float]]]:
     """The six pairs of every test, each moved to its nominal temperature by the activation seen between the tests."""
     activation = [(0.0, 0.0)] * len(tested)
     fitted: list[Branches] = []
@@ -206,7 +219,20 @@ def _fit_all(tested: list[Tested], nodes: Array, volts: Array, soc: Array) -> li
             ]
             slopes = [np.clip(np.gradient(x, inverse), 0, 8000) for x in logs]
             activation = [(float(a), float(b)) for a, b in zip(*slopes, strict=True)]
-    return fitted
+    return fitted, activation
+
+
+def _direct(
+    tested: list[Tested], fitted: list[Branches], activation: list[tuple[float, float]], nodes: Array, volts: Array,
+    start: list[Array],
+) -> tuple[list[Array], list[Array]]:  # fmt: skip
+    """As `_meshes` for one pair, from the pulses themselves."""
+    found = [
+        fit_direct(t.test, t.level, _ocv(nodes, volts, t.level), f, (start[0][k], start[1][k], start[2][k]), a)
+        for k, (t, f, a) in enumerate(zip(tested, fitted, activation, strict=True))
+    ]
+    tables = [np.array([d.r0 for d in found]), np.array([d.r1 for d in found]), np.array([d.time for d in found])]
+    return tables, [np.array([d.sd[j] for d in found]) for j in range(3)]
 
 
 def _ocv(nodes: Array, volts: Array, level: Array) -> tuple[Array, Array]:
@@ -325,7 +351,7 @@ def _voltages(result: Result, tested: list[Tested], cell: Circuit, slow: Circuit
         model = voltage(cell, test.flowed, test.current, test.dt, t.level, test.temperature)
         hours = test.time / 3600
         result.panels.append(
-            Panel(f"Pulse test at {t.temperature:g} °C", "time, h", "voltage, V",
+            Panel(f"Pulse test at {t.temperature:g} °C", "time [h]", "voltage [V]",
                   (Trace("measured", hours, test.voltage, "."), Trace("model", hours, model)))
         )  # fmt: skip
     for key, unit, factor in (("r0", "mΩ", 1e3), ("r1", "mΩ", 1e3), ("c1", "F", 1.0)):

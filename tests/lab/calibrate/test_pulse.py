@@ -47,6 +47,22 @@ def test_what_was_planted_comes_back_within_its_uncertainty(seed):
     assert list(result.curves["battery.r0"].axes["temperature"]) == [0, 25]
 
 
+def test_the_direct_fit_gives_back_a_cell_that_has_one_pair():
+    tables = [pulse_test(t, seed=k)[0] for k, t in enumerate((0.0, 25.0))]
+    result = pulse.calibrate(tables, *slow(), method="direct")
+    cold = np.exp([[1.0], [0.0]])
+    for name, truth in (("r0", 0.05 * cold), ("r1", 0.03 * cold), ("c1", 1000 / cold)):
+        curve = result.curves[f"battery.{name}"]
+        error = (curve.value - truth)[:, INSIDE]
+        assert np.all(np.abs(error) < 0.04 * truth), name
+        assert np.mean(np.abs(error) < 1.96 * curve.sd[:, INSIDE]) > 0.9, name
+
+
+def test_an_unknown_method_is_named():
+    with pytest.raises(InputError, match="did you mean 'direct'"):
+        pulse.calibrate([pulse_test()[0]], *slow(), method="dirct")
+
+
 def test_tables_are_positive_and_marked_where_data_end():
     result = found()
     for name in ("battery.r0", "battery.r1", "battery.c1", "slow_resistance", "slow_time"):
