@@ -15,6 +15,21 @@ from gz_onboard.bus.publisher import WH_PER_KM
 from gz_onboard.errors import InputError
 from gz_onboard.events import Reason, State
 from gz_onboard.pipeline import ESTIMATE_TOPIC, STATUS_TOPIC
+from gz_onboard.simulation.style import (
+    BLUE,
+    GREEN,
+    MUTED,
+    ORANGE,
+    PURPLE,
+    close,
+    headline,
+    legend,
+    new_figure,
+    ordinate,
+    save,
+    second,
+    stack,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -24,8 +39,6 @@ Row = dict[str, Any]
 
 NAIVE_LENGTH = 25_000.0  # m: what usual displays average the consumption over
 NAIVE_FROM = 1_000.0  # m
-_INK, _MUTED, _GRID = "#1f2933", "#7b8794", "#e4e7eb"
-_BLUE, _ORANGE, _GREEN, _RED, _PURPLE = "#1667b7", "#d9730d", "#2f855a", "#c53030", "#6b46c1"
 _STATES = {State.STARTING: "#9fb3c8", State.VALID: "#3f9d6b", State.DEGRADED: "#e8a33d", State.INVALID: "#c53030"}
 _NAN = float("nan")
 
@@ -79,36 +92,24 @@ def plot_log(log: Path, picture: Path, over: str = "time") -> None:
     """Draw the ride in `log` into the PNG `picture`, over ``time`` or ``distance``. Raises InputError, OSError."""
     rows, times, status = read_ride(log)
     figure = draw(rows, times, status, _title(log, rows, times), over)
-    figure.savefig(picture, format="png", dpi=110, metadata={"Software": "gz-onboard"})
+    save(figure, picture)
 
 
 def draw(rows: Sequence[Row], times: Sequence[int], status: Row, title: tuple[str, str], over: str = "time") -> Figure:
     """The overview of a ride as a figure, over ``time`` or ``distance``."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     reasons = [reason for reason in Reason if any(str(reason.name) in row["reasons"].split() for row in rows)]
     strip = 0.34 + 0.17 * len(reasons)
     heights = [2.0, 1.3, 1.3, 1.0, 1.3, 1.3, strip]
-    figure = Figure(figsize=(12, 2.1 + 1.12 * sum(heights)), facecolor="white")
-    FigureCanvasAgg(figure)
-    height = figure.get_figheight()
-    grid = figure.add_gridspec(len(heights), 1, height_ratios=heights, left=0.125, right=0.93, hspace=0.26,
-                               top=1 - 0.95 / height, bottom=0.5 / height)  # fmt: skip
-    axes: list[Axes] = []
-    for i in range(len(heights)):
-        axes.append(figure.add_subplot(grid[i], sharex=axes[0] if axes else None))
-    x, label = _abscissa(rows, times, over)
+    height = 2.1 + 1.12 * sum(heights)
+    figure = new_figure(12, height)
+    axes = stack(figure, heights, left=0.125, hspace=0.26, top=0.95, bottom=0.5)
+    x, text = _abscissa(rows, times, over)
     for axis, panel in zip(axes, (_range, _soc, _electric, _innovation, _motion, _consumption), strict=False):
-        _style(axis)
         panel(axis, x, rows)
     _strip(axes[-1], x, rows, reasons, status)
-    for axis in axes[:-1]:
-        axis.tick_params(labelbottom=False)
-    axes[-1].set_xlabel(label, color=_INK, fontsize=9, loc="left")
-    axes[0].set_xlim(x[0], max(x[-1], x[0] + 1e-3))
-    figure.text(0.125, 1 - 0.32 / height, title[0], fontsize=14, fontweight="bold", color=_INK, va="center")
-    figure.text(0.125, 1 - 0.60 / height, title[1], fontsize=9.5, color=_MUTED, va="center")
+    close(axes, x, text)
+    headline(figure, 0.125, 1 - 0.32 / height, title[0], 14)
+    figure.text(0.125, 1 - 0.60 / height, title[1], fontsize=9.5, color=MUTED, va="center")
     return figure
 
 
@@ -136,42 +137,6 @@ def _abscissa(rows: Sequence[Row], times: Sequence[int], over: str) -> tuple[lis
     return [(row["time"] - start) / seconds for row in rows], f"time [{unit}]"
 
 
-def _style(axis: Axes) -> None:
-    axis.grid(True, color=_GRID, linewidth=0.8)
-    axis.set_axisbelow(True)
-    axis.tick_params(colors=_MUTED, labelsize=8, length=0)
-    for side in ("top", "right", "left", "bottom"):
-        axis.spines[side].set_color(_GRID)
-    axis.margins(x=0)
-
-
-def _second(axis: Axes, label: str, colour: str) -> Axes:
-    """Another ordinate, on the right, drawn behind `axis`."""
-    other = axis.twinx()
-    other.tick_params(colors=_MUTED, labelsize=8, length=0)
-    for side in ("top", "right", "left", "bottom"):
-        other.spines[side].set_visible(False)
-    other.set_ylabel(label, color=colour, fontsize=8.5)
-    axis.set_zorder(other.get_zorder() + 1)
-    axis.patch.set_visible(False)
-    return other
-
-
-def _label(axis: Axes, text: str, colour: str = _INK) -> None:
-    axis.set_ylabel(text, color=colour, fontsize=8.5)
-
-
-def _legend(axis: Axes, *others: Axes) -> None:
-    """A legend of all the axes, above the panel, where it hides nothing."""
-    handles, labels = axis.get_legend_handles_labels()
-    for other in others:
-        more, names = other.get_legend_handles_labels()
-        handles, labels = handles + more, labels + names
-    axis.legend(handles=handles, labels=labels, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.15,
-                fontsize=7.5, ncols=len(labels), frameon=False, borderpad=0, handlelength=1.6, columnspacing=1.2,
-                labelcolor=_MUTED)  # fmt: skip
-
-
 def _column(rows: Sequence[Row], name: str, factor: float = 1.0) -> list[float]:
     """A field of the estimates; what is not known leaves a gap in the line."""
     return [_NAN if (value := row.get(name)) is None else value * factor for row in rows]
@@ -190,63 +155,62 @@ def _finite(*columns: Sequence[float]) -> list[float]:
 def _range(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
     p10, p90 = _column(rows, "range_p10", 1e-3), _column(rows, "range_p90", 1e-3)
     naive = [_NAN if value is None else value / 1000 for value in naive_range(rows)]
-    axis.fill_between(x, p10, p90, color=_BLUE, alpha=0.18, linewidth=0, label="P10 to P90")
-    axis.plot(x, naive, color=_MUTED, linewidth=0.9, linestyle=(0, (4, 2)), label="by the last 25 km's Wh/km alone")
-    axis.plot(x, _column(rows, "range", 1e-3), color=_BLUE, linewidth=1.8, label="range")
+    axis.fill_between(x, p10, p90, color=BLUE, alpha=0.18, linewidth=0, label="P10 to P90")
+    axis.plot(x, naive, color=MUTED, linewidth=0.9, linestyle=(0, (4, 2)), label="by the last 25 km's Wh/km alone")
+    axis.plot(x, _column(rows, "range", 1e-3), color=BLUE, linewidth=1.8, label="range")
     top = max(_finite(p90), default=1.0)
     axis.set_ylim(0, top * 1.12)  # the naive one may be anything: it does not set the scale
-    _label(axis, "range [km]", _BLUE)
-    _legend(axis)
+    ordinate(axis, "range [km]", BLUE)
+    legend(axis)
 
 
 def _soc(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
     soc = _column(rows, "soc", 100)
-    _band(axis, x, soc, _column(rows, "soc_sd", 100), _GREEN, "± σ")
-    axis.plot(x, soc, color=_GREEN, linewidth=1.6, label="state of charge")
-    _label(axis, "SOC [%]", _GREEN)
-    _legend(axis)
+    _band(axis, x, soc, _column(rows, "soc_sd", 100), GREEN, "± σ")
+    axis.plot(x, soc, color=GREEN, linewidth=1.6, label="state of charge")
+    ordinate(axis, "SOC [%]", GREEN)
+    legend(axis)
 
 
 def _electric(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
-    other = _second(axis, "current [A]", _ORANGE)
-    other.plot(x, _column(rows, "pack_current"), color=_ORANGE, linewidth=0.7, alpha=0.8, label="pack current")
-    axis.plot(x, _column(rows, "pack_voltage"), color=_PURPLE, linewidth=1.0, label="pack voltage")
-    _label(axis, "voltage [V]", _PURPLE)
-    _legend(axis, other)
+    other = second(axis, "current [A]", ORANGE)
+    other.plot(x, _column(rows, "pack_current"), color=ORANGE, linewidth=0.7, alpha=0.8, label="pack current")
+    axis.plot(x, _column(rows, "pack_voltage"), color=PURPLE, linewidth=1.0, label="pack voltage")
+    ordinate(axis, "voltage [V]", PURPLE)
+    legend(axis, other)
 
 
 def _innovation(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
     rms = _column(rows, "innovation_rms", 1000)
-    axis.fill_between(x, [-v for v in rms], rms, color=_PURPLE, alpha=0.2, linewidth=0, label="± RMS of 10 s")
-    axis.plot(x, _column(rows, "innovation", 1000), color=_PURPLE, linewidth=0.8, label="innovation")
-    axis.axhline(0, color=_MUTED, linewidth=0.6, zorder=1)
-    _label(axis, "innovation\n[mV of a cell]", _PURPLE)
-    _legend(axis)
+    axis.fill_between(x, [-v for v in rms], rms, color=PURPLE, alpha=0.2, linewidth=0, label="± RMS of 10 s")
+    axis.plot(x, _column(rows, "innovation", 1000), color=PURPLE, linewidth=0.8, label="innovation")
+    axis.axhline(0, color=MUTED, linewidth=0.6, zorder=1)
+    ordinate(axis, "innovation\n[mV of a cell]", PURPLE)
+    legend(axis)
 
 
 def _motion(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
-    other = _second(axis, "grade [%], lean [°]", _MUTED)
-    other.plot(x, _column(rows, "lean", 57.29578), color=_ORANGE, linewidth=0.6, alpha=0.75, label="lean")
-    other.plot(x, _column(rows, "grade", 100), color=_GREEN, linewidth=1.0, label="grade")
-    other.axhline(0, color=_MUTED, linewidth=0.6, zorder=1)
-    axis.plot(x, _column(rows, "speed", 3.6), color=_BLUE, linewidth=1.1, label="speed")
-    _label(axis, "speed [km/h]", _BLUE)
-    _legend(axis, other)
+    other = second(axis, "grade [%], lean [°]", MUTED)
+    other.plot(x, _column(rows, "lean", 57.29578), color=ORANGE, linewidth=0.6, alpha=0.75, label="lean")
+    other.plot(x, _column(rows, "grade", 100), color=GREEN, linewidth=1.0, label="grade")
+    other.axhline(0, color=MUTED, linewidth=0.6, zorder=1)
+    axis.plot(x, _column(rows, "speed", 3.6), color=BLUE, linewidth=1.1, label="speed")
+    ordinate(axis, "speed [km/h]", BLUE)
+    legend(axis, other)
 
 
 def _consumption(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
     expected = _column(rows, "consumption_expected", 1 / WH_PER_KM)
-    _band(axis, x, expected, _column(rows, "consumption_expected_sd", 1 / WH_PER_KM), _BLUE, "± σ")
-    axis.plot(x, expected, color=_BLUE, linewidth=1.6, label="expected")
+    _band(axis, x, expected, _column(rows, "consumption_expected_sd", 1 / WH_PER_KM), BLUE, "± σ")
+    axis.plot(x, expected, color=BLUE, linewidth=1.6, label="expected")
     recent = _column(rows, "consumption_recent", 1 / WH_PER_KM)
-    axis.plot(x, recent, color=_ORANGE, linewidth=1.0, label="recent (last km)")
-    _label(axis, "consumption\n[Wh/km]")
-    _legend(axis)
+    axis.plot(x, recent, color=ORANGE, linewidth=1.0, label="recent (last km)")
+    ordinate(axis, "consumption\n[Wh/km]")
+    legend(axis)
 
 
 def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Row], reasons: Sequence[Reason], status: Row) -> None:
     """State and reasons over the ride, one line each."""
-    _style(axis)
     axis.grid(visible=False)
     for state, colour in _STATES.items():
         spans = _spans(x, [row["state"] == state.name for row in rows])
@@ -255,11 +219,11 @@ def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Row], reasons: Sequenc
     labels = ["state"]
     for place, reason in enumerate(reasons, 1):
         spans = _spans(x, [reason.name in row["reasons"].split() for row in rows])
-        axis.broken_barh(spans, (place - 0.3, 0.6), facecolors=_MUTED, linewidth=0)
+        axis.broken_barh(spans, (place - 0.3, 0.6), facecolors=MUTED, linewidth=0)
         labels.append(reason_words(reason))
     axis.set_ylim(len(labels) - 0.4, -0.6)
     axis.set_yticks(range(len(labels)), labels, fontsize=7)
-    _legend(axis)
+    legend(axis)
     if status:
         faults = sum(sum(places.values()) for places in status.get("faults", {}).values())
         text = (
@@ -267,7 +231,7 @@ def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Row], reasons: Sequenc
             f"{faults} frames or signals dropped, {len(status.get('unknown', {}))} unknown identifiers"
         )
         axis.annotate(text, (1, 0), (0, -27), xycoords="axes fraction", textcoords="offset points", ha="right",
-                      fontsize=8, color=_MUTED)  # fmt: skip
+                      fontsize=8, color=MUTED)  # fmt: skip
 
 
 def reason_words(reason: Reason) -> str:

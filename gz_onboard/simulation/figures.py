@@ -10,13 +10,26 @@ from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.publisher import WH
 from gz_onboard.simulation.run import Run
+from gz_onboard.simulation.style import (
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    ORANGE,
+    PURPLE,
+    RED,
+    close,
+    headline,
+    legend,
+    new_figure,
+    ordinate,
+    second,
+    stack,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-_INK, _MUTED, _GRID = "#1f2933", "#7b8794", "#e4e7eb"
-_BLUE, _ORANGE, _GREEN, _RED, _PURPLE = "#1667b7", "#d9730d", "#2f855a", "#c53030", "#6b46c1"
 
 STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
     "battery": ("#6b46c1", ("battery_heat", "bms", "not_delivered")),
@@ -35,34 +48,34 @@ def overview(run: Run, title: str) -> Figure:
     import numpy as np
 
     s = run.series
-    figure, axes = _panels(6, title, (1.7, 1.0, 1.3, 1.0, 1.0, 1.2))
+    figure, axes = _panels(title, (1.7, 1.0, 1.3, 1.0, 1.0, 1.2))
     x, label = _time(run)
     if not np.isnan(s["wanted_speed"]).all():
-        axes[0].plot(x, s["wanted_speed"] * 3.6, color=_ORANGE, linewidth=1.0, label="wanted")
-    axes[0].plot(x, s["speed"] * 3.6, color=_BLUE, linewidth=1.2, label="ridden")
+        axes[0].plot(x, s["wanted_speed"] * 3.6, color=ORANGE, linewidth=1.0, label="wanted")
+    axes[0].plot(x, s["speed"] * 3.6, color=BLUE, linewidth=1.2, label="ridden")
     for i, short in enumerate(run.shortfalls):
         begin = short.time / _unit(run)[0]
-        axes[0].axvspan(begin, begin + short.duration / _unit(run)[0], color=_RED, alpha=0.15, linewidth=0,
+        axes[0].axvspan(begin, begin + short.duration / _unit(run)[0], color=RED, alpha=0.15, linewidth=0,
                         label="shortfall" if not i else None)  # fmt: skip
-    _label(axes[0], "speed [km/h]")
-    axes[1].plot(x, s["throttle"] * 100, color=_GREEN, linewidth=0.8, label="throttle")
-    axes[1].plot(x, s["brake"] * -100, color=_RED, linewidth=0.8, label="brake (down)")
-    _label(axes[1], "rider [%]")
-    other = _second(axes[2], "current [A]", _ORANGE)
-    other.plot(x, s["pack_current"], color=_ORANGE, linewidth=0.7, alpha=0.8, label="pack current")
-    axes[2].plot(x, s["pack_voltage"], color=_PURPLE, linewidth=0.9, label="pack voltage")
-    _label(axes[2], "voltage [V]", _PURPLE)
-    axes[3].plot(x, s["soc"] * 100, color=_GREEN, linewidth=1.4, label="state of charge")
-    _label(axes[3], "SOC [%]")
-    for name, colour in (("motor", _RED), ("inverter", _ORANGE), ("cell", _PURPLE), ("bms", _MUTED)):
+    ordinate(axes[0], "speed [km/h]")
+    axes[1].plot(x, s["throttle"] * 100, color=GREEN, linewidth=0.8, label="throttle")
+    axes[1].plot(x, s["brake"] * -100, color=RED, linewidth=0.8, label="brake (down)")
+    ordinate(axes[1], "rider [%]")
+    other = second(axes[2], "current [A]", ORANGE)
+    other.plot(x, s["pack_current"], color=ORANGE, linewidth=0.7, alpha=0.8, label="pack current")
+    axes[2].plot(x, s["pack_voltage"], color=PURPLE, linewidth=0.9, label="pack voltage")
+    ordinate(axes[2], "voltage [V]", PURPLE)
+    axes[3].plot(x, s["soc"] * 100, color=GREEN, linewidth=1.4, label="state of charge")
+    ordinate(axes[3], "SOC [%]")
+    for name, colour in (("motor", RED), ("inverter", ORANGE), ("cell", PURPLE), ("bms", MUTED)):
         axes[4].plot(x, s[f"{name}_temperature"], color=colour, linewidth=1.1, label="BMS" if name == "bms" else name)
-    _label(axes[4], "temperature [°C]")
+    ordinate(axes[4], "temperature [°C]")
     others = {2: other}
     if np.any(s["grade"]):
-        others[5] = _second(axes[5], "grade [%]", _MUTED)
-        others[5].plot(x, s["grade"] * 100, color=_MUTED, linewidth=0.8, label="grade")
-    axes[5].plot(x, s["energy"] / WH, color=_BLUE, linewidth=1.4, label="energy from the pack")
-    _label(axes[5], "energy [Wh]", _BLUE)
+        others[5] = second(axes[5], "grade [%]", MUTED)
+        others[5].plot(x, s["grade"] * 100, color=MUTED, linewidth=0.8, label="grade")
+    axes[5].plot(x, s["energy"] / WH, color=BLUE, linewidth=1.4, label="energy from the pack")
+    ordinate(axes[5], "energy [Wh]", BLUE)
     _finish(axes, x, label, others)
     return figure
 
@@ -83,12 +96,12 @@ def comparison(run: Run, measured: Mapping[str, Any], title: str) -> Figure:
         ("motor_temperature", "motor [°C]", 1.0),
     ]
     rows = [row for row in rows if row[0] in measured]
-    figure, axes = _panels(len(rows), title, [1.6, *[1.0] * (len(rows) - 1)])
+    figure, axes = _panels(title, [1.6, *[1.0] * (len(rows) - 1)])
     x, label = _time(run)
     for axis, (name, text, factor) in zip(axes, rows, strict=True):
-        axis.plot(x, measured[name] * factor, color=_INK, linewidth=1.0, label="measured")
-        axis.plot(x, s[name] * factor, color=_ORANGE, linewidth=0.9, alpha=0.85, label="simulated")
-        _label(axis, text)
+        axis.plot(x, measured[name] * factor, color=INK, linewidth=1.0, label="measured")
+        axis.plot(x, s[name] * factor, color=ORANGE, linewidth=0.9, alpha=0.85, label="simulated")
+        ordinate(axis, text)
     _finish(axes, x, label, {})
     return figure
 
@@ -101,17 +114,17 @@ def sankey(ledger: Mapping[str, float], title: str) -> Figure:
     from matplotlib.patches import PathPatch, Rectangle
     from matplotlib.path import Path as Curve
 
-    figure = _figure(11, 7.2)
+    figure = new_figure(11, 7.2)
     axis = figure.add_axes((0.02, 0.02, 0.96, 0.86))
     axis.set_axis_off()
     order = [(name, colour) for colour, names in STAGES.values() for name in names]
-    order += [(name, _MUTED) for name in ledger if name not in {n for n, _ in order}]
+    order += [(name, MUTED) for name in ledger if name not in {n for n, _ in order}]
     takes = [(name, ledger[name], colour) for name, colour in order if ledger.get(name, 0.0) > 0]
     gives = [(name, -ledger[name], colour) for name, colour in order if ledger.get(name, 0.0) < 0]
     total = sum(energy for _, energy, _ in takes) or 1.0
     takes = [take for take in takes if take[1] >= 5e-5 * total]
     cells = total - sum(energy for _, energy, _ in gives)
-    sources = [("cells", cells, _INK), *(give for give in gives if give[1] >= 5e-5 * total)]
+    sources = [("cells", cells, INK), *(give for give in gives if give[1] >= 5e-5 * total)]
     gap = 0.028
     left, right = 0.17, 0.62
     height = 1.0 - gap * max(len(takes) - 1, 1)
@@ -127,7 +140,7 @@ def sankey(ledger: Mapping[str, float], title: str) -> Figure:
         thick = energy / total * height
         axis.add_patch(Rectangle((left - 0.025, y - thick), 0.025, thick, color=colour, linewidth=0))
         axis.text(left - 0.035, y - thick / 2, f"{_words(name)}\n{energy / WH:.1f} Wh", ha="right", va="center",
-                  fontsize=10, color=_INK)  # fmt: skip
+                  fontsize=10, color=INK)  # fmt: skip
         y -= thick
     y = trunk
     middle = (left + right) / 2
@@ -138,25 +151,25 @@ def sankey(ledger: Mapping[str, float], title: str) -> Figure:
         axis.add_patch(PathPatch(Curve(points, codes), facecolor=colour, alpha=0.38, linewidth=0))
         axis.add_patch(Rectangle((right, low), 0.02, thick, color=colour, linewidth=0))
         text = f"{_words(name)}   {energy / WH:.2f} Wh   {100 * energy / total:.1f} %"
-        axis.text(right + 0.03, low + thick / 2, text, va="center", fontsize=10, color=_INK)
+        axis.text(right + 0.03, low + thick / 2, text, va="center", fontsize=10, color=INK)
         y -= thick
     axis.set_xlim(0, 1)
     axis.set_ylim(-0.02, 1.02)
-    figure.text(0.03, 0.94, title, fontsize=13, fontweight="bold", color=_INK, va="center")
+    headline(figure, 0.03, 0.94, title)
     return figure
 
 
 def sweep_lines(name: str, values: Sequence[float], variants: Sequence[Mapping[str, Any]], title: str) -> Figure:
     """Range and consumption against one parameter."""
-    figure, axes = _panels(2, title, (1.3, 1.3))
-    for axis, key, label, colour in zip(
-        axes, ("range_km", "consumption_wh_km"), ("range [km]", "consumption [Wh/km]"), (_BLUE, _ORANGE), strict=True
+    figure, axes = _panels(title, (1.3, 1.3))
+    for axis, key, text, colour in zip(
+        axes, ("range_km", "consumption_wh_km"), ("range [km]", "consumption [Wh/km]"), (BLUE, ORANGE), strict=True
     ):
         column = [float("nan") if v[key] is None else v[key] for v in variants]
         axis.plot(values, column, color=colour, linewidth=1.6, marker="o", markersize=4)
-        _label(axis, label, colour)
+        ordinate(axis, text, colour)
     axes[0].tick_params(labelbottom=False)
-    axes[1].set_xlabel(name, color=_INK, fontsize=9, loc="left")
+    axes[1].set_xlabel(name, color=INK, fontsize=9, loc="left")
     axes[0].margins(x=0.03)
     return figure
 
@@ -168,7 +181,7 @@ def sweep_map(
     """Range and consumption over two parameters, `variants` with the second changing fastest."""
     import numpy as np
 
-    figure = _figure(12, 5.4)
+    figure = new_figure(12, 5.4)
     for i, (key, text, colours) in enumerate(
         (("range_km", "range [km]", "Blues"), ("consumption_wh_km", "consumption [Wh/km]", "Oranges"))
     ):
@@ -177,21 +190,16 @@ def sweep_map(
         table = np.array(flat, dtype=float).reshape(len(values[0]), len(values[1]))
         mesh = axis.pcolormesh(values[1], values[0], table, cmap=colours, shading="nearest", alpha=0.85)
         if min(table.shape) > 1 and np.nanmax(table) > np.nanmin(table):
-            lines = axis.contour(values[1], values[0], table, colors=_INK, linewidths=0.8)
+            lines = axis.contour(values[1], values[0], table, colors=INK, linewidths=0.8)
             axis.clabel(lines, fontsize=8, fmt="%.4g")
         bar = figure.colorbar(mesh, ax=axis, fraction=0.05)
-        bar.ax.tick_params(colors=_MUTED, labelsize=8, length=0)
-        axis.set_xlabel(names[1], fontsize=9, color=_INK)
-        axis.set_ylabel(names[0], fontsize=9, color=_INK)
-        axis.set_title(text, fontsize=10, color=_INK, loc="left")
-        axis.tick_params(colors=_MUTED, labelsize=8)
-    figure.text(0.03, 0.94, title, fontsize=13, fontweight="bold", color=_INK, va="center")
+        bar.ax.tick_params(colors=MUTED, labelsize=8, length=0)
+        axis.set_xlabel(names[1], fontsize=9, color=INK)
+        axis.set_ylabel(names[0], fontsize=9, color=INK)
+        axis.set_title(text, fontsize=10, color=INK, loc="left")
+        axis.tick_params(colors=MUTED, labelsize=8)
+    headline(figure, 0.03, 0.94, title)
     return figure
-
-
-def save(figure: Figure, file: Path) -> None:
-    """Write a PNG. Raises OSError."""
-    figure.savefig(file, format="png", dpi=110, metadata={"Software": "gz-onboard"})
 
 
 def page(file: Path, title: str, summary: str, figures: Sequence[Figure]) -> None:
@@ -208,7 +216,7 @@ def page(file: Path, title: str, summary: str, figures: Sequence[Figure]) -> Non
     file.write_text(
         f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title><style>
-body {{ font-family: system-ui, sans-serif; color: {_INK}; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; }}
+body {{ font-family: system-ui, sans-serif; color: {INK}; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; }}
 pre {{ background: #f5f7fa; padding: 1rem; overflow-x: auto; }} figure {{ margin: 1.5rem 0; }}
 svg {{ width: 100%; height: auto; }}
 </style></head><body><h1>{html.escape(title)}</h1><pre>{html.escape(summary)}</pre>
@@ -219,34 +227,14 @@ svg {{ width: 100%; height: auto; }}
     )
 
 
-# --- style --------------------------------------------------------------------------------------------------------
+# --- panels -------------------------------------------------------------------------------------------------------
 
 
-def _figure(width: float, height: float) -> Figure:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), facecolor="white")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def _panels(count: int, title: str, heights: Sequence[float]) -> tuple[Figure, list[Axes]]:
+def _panels(title: str, heights: Sequence[float]) -> tuple[Figure, list[Axes]]:
     height = 1.6 + 1.15 * sum(heights)
-    figure = _figure(12, height)
-    grid = figure.add_gridspec(count, 1, height_ratios=heights, left=0.08, right=0.93, hspace=0.3,
-                               top=1 - 0.85 / height, bottom=0.55 / height)  # fmt: skip
-    axes: list[Axes] = []
-    for i in range(count):
-        axis = figure.add_subplot(grid[i], sharex=axes[0] if axes else None)
-        axis.grid(True, color=_GRID, linewidth=0.8)
-        axis.set_axisbelow(True)
-        axis.tick_params(colors=_MUTED, labelsize=8, length=0)
-        for side in ("top", "right", "left", "bottom"):
-            axis.spines[side].set_color(_GRID)
-        axes.append(axis)
-    figure.text(0.08, 1 - 0.35 / height, title, fontsize=13, fontweight="bold", color=_INK, va="center")
-    return figure, axes
+    figure = new_figure(12, height)
+    headline(figure, 0.08, 1 - 0.35 / height, title)
+    return figure, stack(figure, heights, left=0.08, hspace=0.3, top=0.85, bottom=0.55)
 
 
 def _unit(run: Run) -> tuple[float, str]:
@@ -258,35 +246,10 @@ def _time(run: Run) -> tuple[Any, str]:
     return run.series["time"] / seconds, f"time [{unit}]"
 
 
-def _second(axis: Axes, label: str, colour: str) -> Axes:
-    """Another ordinate, on the right, drawn behind `axis`."""
-    other = axis.twinx()
-    other.tick_params(colors=_MUTED, labelsize=8, length=0)
-    for side in ("top", "right", "left", "bottom"):
-        other.spines[side].set_visible(False)
-    other.set_ylabel(label, color=colour, fontsize=8.5)
-    axis.set_zorder(other.get_zorder() + 1)
-    axis.patch.set_visible(False)
-    return other
-
-
-def _label(axis: Axes, text: str, colour: str = _INK) -> None:
-    axis.set_ylabel(text, color=colour, fontsize=8.5)
-
-
-def _finish(axes: Sequence[Axes], x: Any, label: str, seconds: Mapping[int, Axes]) -> None:
+def _finish(axes: Sequence[Axes], x: Any, text: str, seconds: Mapping[int, Axes]) -> None:
     for i, axis in enumerate(axes):
-        handles, labels = axis.get_legend_handles_labels()
-        if i in seconds:
-            more, names = seconds[i].get_legend_handles_labels()
-            handles, labels = handles + more, labels + names
-        axis.legend(handles=handles, labels=labels, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.15,
-                    fontsize=7.5, ncols=len(labels), frameon=False, borderpad=0, handlelength=1.6, columnspacing=1.2,
-                    labelcolor=_MUTED)  # fmt: skip
-        if axis is not axes[-1]:
-            axis.tick_params(labelbottom=False)
-    axes[-1].set_xlabel(label, color=_INK, fontsize=9, loc="left")
-    axes[0].set_xlim(float(x[0]), max(float(x[-1]), float(x[0]) + 1e-3))
+        legend(axis, *([seconds[i]] if i in seconds else []))
+    close(axes, x, text)
 
 
 def _words(name: str) -> str:

@@ -40,6 +40,7 @@ from gz_onboard.simulation.run import (
 )
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Road, Scooter, straight
 from gz_onboard.simulation.sensors import Trace
+from gz_onboard.simulation.style import save
 from gz_onboard.simulation.sweep import Sweep, grid, read_sweep, redesigned
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -479,7 +480,7 @@ def _draw(
         names, values = (one.label, two.label), (one.values, two.values)
         drawn.append((".sweep", figures.sweep_map(names, values, variants, title)))
     for ending, figure in drawn:
-        figures.save(figure, file(f"{ending}.png"))
+        save(figure, file(f"{ending}.png"))
     figures.page(file(".html"), title, summary_text(summary | {"files": []}), [figure for _, figure in drawn])
 
 

@@ -1,0 +1,94 @@
+"""How the project's pictures look, drawn without a screen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+INK, MUTED, GRID = "#1f2933", "#7b8794", "#e4e7eb"
+BLUE, ORANGE, GREEN, RED, PURPLE = "#1667b7", "#d9730d", "#2f855a", "#c53030", "#6b46c1"
+_SIDES = ("top", "right", "left", "bottom")
+
+
+def new_figure(width: float, height: float) -> Figure:
+    """An empty figure of width and height [inch]."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), facecolor="white")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save(figure: Figure, file: Path) -> None:
+    """Write a PNG, the same bytes for the same figure. Raises OSError."""
+    figure.savefig(file, format="png", dpi=110, metadata={"Software": "gz-onboard"})
+
+
+def stack(
+    figure: Figure, heights: Sequence[float], *, left: float, hspace: float, top: float, bottom: float
+) -> list[Axes]:
+    """Panels one above the other, of one abscissa; `top` and `bottom` are margins [inch]."""
+    height = figure.get_figheight()
+    grid = figure.add_gridspec(len(heights), 1, height_ratios=heights, left=left, right=0.93, hspace=hspace,
+                               top=1 - top / height, bottom=bottom / height)  # fmt: skip
+    axes: list[Axes] = []
+    for i in range(len(heights)):
+        axes.append(figure.add_subplot(grid[i], sharex=axes[0] if axes else None))
+        rule(axes[-1])
+    return axes
+
+
+def rule(axis: Axes) -> None:
+    """Grid, ticks and frame of a panel."""
+    axis.grid(True, color=GRID, linewidth=0.8)
+    axis.set_axisbelow(True)
+    axis.tick_params(colors=MUTED, labelsize=8, length=0)
+    for side in _SIDES:
+        axis.spines[side].set_color(GRID)
+
+
+def second(axis: Axes, text: str, colour: str) -> Axes:
+    """Another ordinate, on the right, drawn behind `axis`."""
+    other = axis.twinx()
+    other.tick_params(colors=MUTED, labelsize=8, length=0)
+    for side in _SIDES:
+        other.spines[side].set_visible(False)
+    ordinate(other, text, colour)
+    axis.set_zorder(other.get_zorder() + 1)
+    axis.patch.set_visible(False)
+    return other
+
+
+def ordinate(axis: Axes, text: str, colour: str = INK) -> None:
+    """Name the ordinate."""
+    axis.set_ylabel(text, color=colour, fontsize=8.5)
+
+
+def legend(axis: Axes, *others: Axes) -> None:
+    """A legend of all the axes, above the panel, where it hides nothing."""
+    handles, labels = axis.get_legend_handles_labels()
+    for other in others:
+        more, names = other.get_legend_handles_labels()
+        handles, labels = handles + more, labels + names
+    axis.legend(handles=handles, labels=labels, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.15,
+                fontsize=7.5, ncols=len(labels), frameon=False, borderpad=0, handlelength=1.6, columnspacing=1.2,
+                labelcolor=MUTED)  # fmt: skip
+
+
+def close(axes: Sequence[Axes], x: Sequence[float], text: str) -> None:
+    """The abscissa `x` of a stack: named below the last panel, with numbers there alone, from end to end."""
+    for axis in axes[:-1]:
+        axis.tick_params(labelbottom=False)
+    axes[-1].set_xlabel(text, color=INK, fontsize=9, loc="left")
+    axes[0].set_xlim(float(x[0]), max(float(x[-1]), float(x[0]) + 1e-3))
+
+
+def headline(figure: Figure, x: float, y: float, text: str, size: float = 13) -> None:
+    """The title, left, at a place in shares of the figure."""
+    figure.text(x, y, text, fontsize=size, fontweight="bold", color=INK, va="center")
