@@ -3,10 +3,12 @@
 RIDE ?= $(firstword $(wildcard replay_logs/*.blf))
 SPEED ?= 1
 SECONDS ?= 60
+CASES ?= 120
+FIRST ?= 100000
 PYTHON_IN_VENV := .venv/bin/python
 DEMO = replay_logs/demo.py "$(RIDE)" --speed $(SPEED) --seconds $(SECONDS)
 
-.PHONY: help setup run test lint format bench clean
+.PHONY: help setup run test lint format bench trial clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -39,6 +41,9 @@ format: setup  ## let ruff format the code
 
 bench: setup  ## cost per frame, start-up, memory, beside the obvious pipeline of the same libraries
 	$(PYTHON_IN_VENV) benchmarks/bench.py
+
+trial: setup  ## hidden effects in rides of a scooter that is not the model's: does discover name them? (CASES=n FIRST=seed)
+	$(PYTHON_IN_VENV) -m benchmarks.trial --cases $(CASES) --first $(FIRST)
 
 clean:  ## remove what the other targets made, except runs/
 	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
