@@ -12,7 +12,7 @@ import pytest
 from gz_onboard.bus.logs import read_samples
 from gz_onboard.cli import main
 from gz_onboard.simulation.run import COLUMNS
-from gz_onboard.simulation.simulate import KEYS, SUMMARY_VERSION
+from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION
 
 PNG = b"\x89PNG"
 

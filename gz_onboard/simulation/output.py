@@ -1,0 +1,114 @@
+"""What ``gz-onboard simulate`` writes: time series, pictures, an HTML page, CAN frames."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from gz_onboard.errors import InputError
+from gz_onboard.simulation.frames import Losses, simulate_frames, write_frames
+from gz_onboard.simulation.plan import Plan
+from gz_onboard.simulation.run import COLUMNS, Run
+from gz_onboard.simulation.scooter import Scooter
+from gz_onboard.simulation.sensors import Trace
+from gz_onboard.simulation.style import save
+from gz_onboard.simulation.summary import measured_columns, summary_text
+from gz_onboard.simulation.sweep import Sweep
+from gz_onboard.vehicle import Vehicle
+
+FORMATS = ("mcap", "parquet", "csv")
+_TOPIC = "simulation"
+
+
+def write(
+    arguments: argparse.Namespace, plan: Plan, result: Run, summary: dict[str, Any], sweeps: Sequence[Sweep]
+) -> list[str]:
+    """The time series and the pictures; gives their names. Raises InputError if they cannot be written."""
+    mode = ".predictive" if arguments.predictive else ""
+    name = f"{plan.name}{mode}.simulation"
+    files: list[Path] = []
+
+    def file(ending: str) -> Path:
+        files.append(arguments.output / f"{name}{ending}")
+        return files[-1]
+
+    try:
+        arguments.output.mkdir(parents=True, exist_ok=True)
+        if not arguments.no_series:
+            metadata = {"vehicle": str(summary["vehicle"]), "source": str(summary["what"])}
+            write_series(result, file(f".{arguments.format}"), metadata)
+        if not arguments.no_plot:
+            _draw(file, plan, result, summary, sweeps)
+    except OSError as error:
+        raise InputError(
+            f"{error.filename or arguments.output}: cannot be written: {error.strerror or error}"
+        ) from error
+    return [str(file) for file in files]
+
+
+def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, scooter: Scooter) -> str:
+    """Write the ride's frames; gives the file's name. InputError if it cannot be written."""
+    sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, losses=Losses(frames=arguments.frame_loss))
+    try:
+        arguments.frames.parent.mkdir(parents=True, exist_ok=True)
+        write_frames(arguments.frames, sent)
+    except OSError as error:
+        raise InputError(f"{arguments.frames}: cannot be written: {error.strerror or error}") from error
+    return str(arguments.frames)
+
+
+def _draw(
+    file: Callable[[str], Path], plan: Plan, result: Run, summary: dict[str, Any], sweeps: Sequence[Sweep]
+) -> None:
+    from gz_onboard.simulation import figures
+
+    title = f"{plan.name}, {summary['kind']} · {summary['vehicle']}, payload {summary['payload_kg']:g} kg"
+    drawn = [("", figures.overview(result, title)), (".ledger", figures.sankey(result.ledger, f"{title}: energy"))]
+    if plan.recorded:
+        columns = measured_columns(plan.recorded, result)
+        drawn.append((".measured", figures.comparison(result, columns, title)))
+    variants = summary["sweep"]
+    if len(sweeps) == 1:
+        drawn.append((".sweep", figures.sweep_lines(sweeps[0].label, sweeps[0].values, variants, title)))
+    elif sweeps:
+        one, two = sweeps
+        names, values = (one.label, two.label), (one.values, two.values)
+        drawn.append((".sweep", figures.sweep_map(names, values, variants, title)))
+    for ending, figure in drawn:
+        save(figure, file(f"{ending}.png"))
+    figures.page(file(".html"), title, summary_text(summary | {"files": []}), [figure for _, figure in drawn])
+
+
+def write_series(result: Run, file: Path, metadata: dict[str, str]) -> None:
+    """The time series as MCAP, Parquet or CSV by the file's name; columns as ``name[unit]``, not a number as null."""
+    names = [f"{name}[{unit}]" for name, unit in COLUMNS.items()]
+    if file.suffix == ".parquet":
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        columns = [pa.array(column, from_pandas=True) for column in result.series.values()]
+        table = pa.table(columns, names=names)
+        pq.write_table(table.replace_schema_metadata(metadata), file)
+        return
+    rows = zip(*(column.tolist() for column in result.series.values()), strict=True)
+    if file.suffix == ".csv":
+        with file.open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream)
+            writer.writerow(names)
+            writer.writerows(["" if math.isnan(value) else f"{value:.9g}" for value in row] for row in rows)
+        return
+    from gz_onboard.bus.recorder import LogFile
+
+    log = LogFile(file.open("wb"), 0, metadata)
+    try:
+        properties = {name: {"type": ["number", "null"], "description": unit} for name, unit in COLUMNS.items()}
+        log.channel(_TOPIC, {"title": "Simulation", "type": "object", "properties": properties})
+        for row in rows:
+            log.sample(_TOPIC, round(row[0] * 1e9), dict(zip(COLUMNS, row, strict=True)))
+        log.close()
+    finally:
+        log.abandon()

@@ -1,0 +1,132 @@
+"""What ``gz-onboard simulate`` is asked to ride: a cycle, a route or a recorded ride, as a `Plan`."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from gz_onboard.errors import InputError, nearest
+from gz_onboard.simulation.cycles import find_cycle
+from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded
+from gz_onboard.simulation.route import read_route, speed_profile
+from gz_onboard.simulation.run import Command, along, at_steps, follow, replay, road_table
+from gz_onboard.simulation.scooter import STEP, Dynamometer, Road, straight
+from gz_onboard.vehicle import Vehicle
+
+_LOGS = (".mcap", ".blf", ".log", ".asc", ".trc", ".mf4", ".gz")
+TOP_SPEED = 50 / 3.6
+"""m/s: what a rider wants to ride on a route without limits."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be ridden: commands, the road under them, and what is known of the start."""
+
+    name: str
+    kind: str
+    seconds: float  # of one repetition, as planned
+    road: Road | Dynamometer
+    command: Callable[[], Command]
+    length: float | None = None  # m, of one repetition; None if it ends by time
+    recorded: Recorded | None = None
+    heading: float | Callable[[float], float] = 0.0  # rad clockwise from north, where it begins or over distance
+
+
+def find_plan(arguments: argparse.Namespace, vehicle: Vehicle) -> Plan:
+    """The plan that WHAT asks for; InputError for what is neither a file that can be ridden nor a built-in cycle."""
+    path = Path(arguments.what)
+    kind = _kind(path)
+    if kind == "ride":
+        return _ride_plan(path, arguments, vehicle)
+    if arguments.predictive:
+        raise InputError(f"--predictive: {path} is a {kind}, whose speed is followed anyway; it is for recorded rides")
+    roller = dynamometer(arguments.dyno) if arguments.dyno else None
+    if kind == "route":
+        return _route_plan(path, arguments, roller)
+    cycle = find_cycle(arguments.what)
+    if arguments.repeat > 1 or arguments.until_empty:
+        cycle.repeated(2)  # its error if it ends at another speed than it begins with
+    speeds = at_steps(cycle.time, cycle.speed, STEP)
+    road = roller or straight(math.sin(math.atan(arguments.grade / 100)), arguments.wind)
+    return Plan(cycle.name, "cycle", cycle.duration, road, lambda: follow(speeds, STEP))
+
+
+def _kind(path: Path) -> str:
+    """``ride``, ``route``, ``cycle``: of a CSV file by its first line, else by its name."""
+    if path.suffix.lower() in _LOGS:
+        return "ride"
+    if path.suffix.lower() != ".csv" or not path.is_file():
+        return "cycle"
+    with path.open(encoding="utf-8-sig", errors="replace") as file:
+        header = [name.strip() for name in file.readline().split(",")]
+    if "time_s" in header:
+        return "cycle"
+    if {"distance_m", "altitude_m", "latitude_deg"} & set(header):
+        return "route"
+    if {"timestamp", "arbitration_id"} <= set(header):
+        return "ride"
+    known = ("time_s", "distance_m", "latitude_deg")
+    raise InputError(
+        f"{path}:1: the columns {', '.join(header[:6])} are neither those of a cycle (time_s and speed_mps, "
+        "speed_kmh or speed_mph) nor of a route (distance_m or latitude_deg and longitude_deg; altitude_m)"
+        f"{nearest(header[0], known)}"
+    )
+
+
+def _route_plan(path: Path, arguments: argparse.Namespace, roller: Dynamometer | None) -> Plan:
+    if arguments.repeat > 1 or arguments.until_empty:
+        raise InputError(f"{path}: a route is ridden once: its end is not its begin; --repeat is for cycles")
+    route = read_route(path)
+    profile = speed_profile(route, top_speed=TOP_SPEED)
+    metres = [profile.speed_at(float(i)) for i in range(int(route.length) + 1)]
+    road = roller or road_table(route.distance, route.grade, route.curvature, arguments.wind)
+    return Plan(
+        route.name, "route", profile.time[-1], road, lambda: along(metres), route.length, heading=route.heading[0]
+    )
+
+
+def _ride_plan(path: Path, arguments: argparse.Namespace, vehicle: Vehicle) -> Plan:
+    if arguments.repeat > 1 or arguments.until_empty:
+        raise InputError(f"{path}: a recorded ride is ridden once; --repeat and --until-empty are for cycles")
+    recorded = read_recorded(path, vehicle)
+    signals = recorded.signals
+    beside = path.with_name(f"{recorded.name}.route.csv")
+    heading: float | Callable[[float], float] = recorded.heading_at
+    if arguments.dyno:
+        road: Road | Dynamometer = dynamometer(arguments.dyno)
+    elif recorded.on_dynamometer:
+        road = fit_dynamometer(recorded)
+    elif beside.is_file():
+        route = read_route(beside)
+        heading = route.heading[0]
+        road = road_table(route.distance, route.grade, route.curvature, arguments.wind)
+    else:
+        road = recorded.road(arguments.wind)
+    if arguments.predictive:
+        speeds = signals["speed"].tolist()
+        kind, command = "ride (predictive)", lambda: follow(speeds, STEP)
+    else:
+        missing = [role for role in ("throttle", "brake") if role not in signals]
+        if missing:
+            raise InputError(
+                f"{path}: vehicle {vehicle.name!r} has no {missing[0]} in it to be replayed; --predictive needs none"
+            )
+        throttle, brake = signals["throttle"].tolist(), signals["brake"].tolist()
+        kind, command = "ride (open loop)", lambda: replay(throttle, brake, STEP)
+    return Plan(recorded.name, kind, recorded.duration, road, command, recorded=recorded, heading=heading)
+
+
+def dynamometer(text: str) -> Dynamometer:
+    """``KG[,A[,B[,C]]]`` as a dynamometer; InputError for anything else."""
+    try:
+        numbers = [float(part) for part in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not 1 <= len(numbers) <= 4 or not all(map(math.isfinite, numbers)):
+        raise InputError(f"--dyno {text}: must be KG or KG,A,B,C: inertia in kg, force in N, N·s/m, N·s²/m²")
+    if not 1 <= numbers[0] <= 5000:
+        raise InputError(f"--dyno {text}: an inertia of {numbers[0]:g} kg is outside 1 to 5000 kg")
+    return Dynamometer(*numbers)

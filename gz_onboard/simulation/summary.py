@@ -1,0 +1,223 @@
+"""What a simulated ride came to: the summary of ``gz-onboard simulate``, as JSON keys and as text."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any
+
+from gz_onboard.bus.publisher import WH, WH_PER_KM
+from gz_onboard.simulation.plan import Plan
+from gz_onboard.simulation.recorded import Recorded
+from gz_onboard.simulation.run import COLUMNS, Run, range_by_energy
+from gz_onboard.simulation.scooter import Scooter
+from gz_onboard.vehicle import Vehicle
+
+SUMMARY_VERSION = 1
+KEYS = {
+    "what": "the cycle, route or ride, as given",
+    "kind": "cycle, route, ride (open loop) or ride (predictive)",
+    "vehicle": "name of the vehicle",
+    "payload_kg": "mass of rider and luggage",
+    "step_s": "step of the simulation",
+    "duration_s": "ridden",
+    "distance_km": "ridden",
+    "speed_max_km_h": "greatest speed",
+    "repetitions": "times that the cycle was ridden; the last may be unfinished",
+    "energy_wh": "delivered by the pack, less what was recovered",
+    "energy_recovered_wh": "charged into the pack",
+    "energy_cells_wh": "that left the cells' chemistry: energy_wh and the heat of the battery",
+    "consumption_wh_km": "energy_wh over distance; null below 0.1 km",
+    "soc_start": "state of charge, 0 to 1",
+    "soc_end": "at the end",
+    "range_km": "on this riding from soc_start, or null",
+    "range_by": "repetition: ridden until empty; energy: energy left at the start over the consumption",
+    "shortfalls": "where the profile asked more than was ridden, worst first: time_s, distance_km, duration_s, "
+    "missing_km_h at most, wanted_km_h there, beyond_vehicle (the throttle was open)",
+    "shortfall_s": "their time in all",
+    "ledger_wh": "where the energy of the cells went, by name; negative: gave",
+    "closure": "energy_cells_wh less the sum of the ledger, over all that was turned over",
+    "chassis": "straight, planar or leaning",
+    "turning_beyond_s": "time in which the road turned harder than the chassis' model goes; its edge was taken",
+    "measured": "of a recorded ride: distance_km, energy_wh, consumption_wh_km, and RMS of simulated less measured: "
+    "rms_speed_km_h, rms_pack_voltage_v, rms_pack_current_a, rms_motor_torque_nm; else null",
+    "files": "written",
+    "wall_s": "time taken by the simulation",
+    "sweep": "a list of {values, consumption_wh_km, range_km, shortfall_s}, or null",
+}
+"""What ``--json`` writes."""
+
+
+def cycle_range(result: Run, scooter: Scooter, arguments: argparse.Namespace) -> tuple[float | None, str | None]:
+    """(range [m], how it was found)."""
+    if result.empty:
+        return result.distance, "repetition"
+    temperature = float(result.series["cell_temperature"].mean())
+    metres = range_by_energy(scooter, result, result.soc_start, temperature)
+    return metres, None if metres is None else "energy"
+
+
+def summarise(
+    vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, result: Run, scooter: Scooter
+) -> dict[str, Any]:
+    """The summary without what is written and swept: see `KEYS`."""
+    metres, by = cycle_range(result, scooter, arguments)
+    return {
+        "what": str(arguments.what),
+        "kind": plan.kind,
+        "vehicle": vehicle.name,
+        "payload_kg": vehicle.parameters["payload_mass"],
+        "step_s": scooter.dt,
+        "duration_s": result.duration,
+        "distance_km": result.distance * 1e-3,
+        "speed_max_km_h": float(result.series["speed"].max()) * 3.6,
+        "repetitions": result.duration / plan.seconds if plan.kind == "cycle" else 1.0,
+        "energy_wh": result.energy / WH,
+        "energy_recovered_wh": result.recovered / WH,
+        "energy_cells_wh": result.chemical / WH,
+        "consumption_wh_km": times(result.consumption, 1 / WH_PER_KM),
+        "soc_start": result.soc_start,
+        "soc_end": result.soc_end,
+        "range_km": times(metres, 1e-3),
+        "range_by": by,
+        "shortfalls": [
+            {
+                "time_s": s.time,
+                "distance_km": s.distance * 1e-3,
+                "duration_s": s.duration,
+                "missing_km_h": s.missing * 3.6,
+                "wanted_km_h": s.wanted * 3.6,
+                "beyond_vehicle": s.beyond_vehicle,
+            }
+            for s in result.shortfalls
+        ],
+        "shortfall_s": sum(s.duration for s in result.shortfalls),
+        "ledger_wh": {name: energy / WH for name, energy in result.ledger.items()},
+        "closure": result.closure,
+        "chassis": scooter.chassis.name,
+        "turning_beyond_s": scooter.chassis.beyond,
+        "measured": compare(plan.recorded, result) if plan.recorded else None,
+    }
+
+
+def measured_columns(recorded: Recorded, result: Run) -> dict[str, Any]:
+    """What was recorded of the columns of a run, at the times of its series."""
+    import numpy as np
+
+    at = np.minimum(np.round(result.series["time"] / recorded.dt).astype(int), len(recorded.signals["speed"]) - 1)
+    columns = {name: values[at] for name, values in recorded.signals.items() if name in COLUMNS}
+    if "soc" in recorded.signals:
+        columns["soc"] = recorded.signals["soc"][at]
+    return columns
+
+
+def compare(recorded: Recorded, result: Run) -> dict[str, Any]:
+    """The entry ``measured`` of the summary."""
+    import numpy as np
+
+    columns = measured_columns(recorded, result)
+    energy = recorded.energy()
+
+    def rms(name: str, factor: float) -> float | None:
+        if name not in columns:
+            return None
+        return float(np.sqrt(np.mean((result.series[name] - columns[name]) ** 2))) * factor
+
+    return {
+        "distance_km": recorded.distance * 1e-3,
+        "energy_wh": times(energy, 1 / WH),
+        "consumption_wh_km": None if energy is None else energy / recorded.distance / WH_PER_KM,
+        "rms_speed_km_h": rms("speed", 3.6),
+        "rms_pack_voltage_v": rms("pack_voltage", 1.0),
+        "rms_pack_current_a": rms("pack_current", 1.0),
+        "rms_motor_torque_nm": rms("motor_torque", 1.0),
+    }
+
+
+def times(value: float | None, factor: float) -> float | None:
+    """`value` in another unit; None stays None."""
+    return None if value is None else float(value * factor)
+
+
+def summary_text(summary: dict[str, Any]) -> str:
+    """A summary for a terminal."""
+    minutes, seconds = divmod(round(summary["duration_s"]), 60)
+    hours, minutes = divmod(minutes, 60)
+    clock = f"{f'{hours} h ' if hours else ''}{minutes} min {seconds:02} s"
+    way = {"repetition": "ridden until empty", "energy": "energy left at the start over the consumption"}
+    ledger = sorted(summary["ledger_wh"].items(), key=lambda item: -item[1])
+    ledger = [(name, energy) for name, energy in ledger if abs(energy) >= 0.005]
+    gross = sum(energy for _, energy in ledger if energy > 0) or 1.0
+    rows = [
+        (summary["kind"], f"{clock}, {summary['distance_km']:.2f} km, at most {summary['speed_max_km_h']:.0f} km/h, "
+                          f"{summary['repetitions']:.3g} times"),
+        ("energy", f"{summary['energy_wh']:.1f} Wh net, {summary['energy_recovered_wh']:.1f} Wh recovered before; "
+                   f"{_number(summary['consumption_wh_km'], '.2f', 'Wh/km')}"),
+        ("state of charge", f"{100 * summary['soc_start']:.1f} → {100 * summary['soc_end']:.1f} %"),
+        ("range", f"{_number(summary['range_km'], '.1f', 'km')} "
+                  f"({way.get(summary['range_by'], 'not to be told')})"),
+        *_shortfall_rows(summary),
+        *(("where it went" if not i else "",
+           f"{name.replace('_', ' '):20} {energy:9.2f} Wh {100 * energy / gross:6.1f} %")
+          for i, (name, energy) in enumerate(ledger)),
+        *_measured_rows(summary),
+        *_turning_rows(summary),
+        ("closes to", f"{100 * summary['closure']:.1g} % of what was turned over"),
+        ("computed in", f"{summary['wall_s']:.2f} s, step {1000 * summary['step_s']:g} ms"),
+    ]  # fmt: skip
+    rows += [("written", ", ".join(summary["files"]))] if summary["files"] else []
+    lines = [f"{summary['what']}, {summary['vehicle']}, payload {summary['payload_kg']:g} kg"]
+    lines += [f"  {name:17} {text}" for name, text in rows]
+    if summary["sweep"]:
+        lines += ["", *_table(summary["sweep"])]
+    return "\n".join(lines)
+
+
+def _shortfall_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    found = summary["shortfalls"]
+    if not found:
+        return []
+    rows = [("shortfall", f"{summary['shortfall_s']:.0f} s slower than wanted, in {len(found)} stretches; the worst:")]
+    for s in found[:5]:
+        why = "beyond the vehicle" if s["beyond_vehicle"] else "the rider's lag"
+        place = f"at {s['time_s']:.0f} s, {s['distance_km']:.2f} km, for {s['duration_s']:.0f} s"
+        rows.append(("", f"{place}: {s['missing_km_h']:.1f} km/h below {s['wanted_km_h']:.0f} km/h: {why}"))
+    return rows
+
+
+def _turning_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    seconds = summary["turning_beyond_s"]
+    if not seconds:
+        return []
+    return [("turning", f"{seconds:.1f} s in bends harder than the {summary['chassis']} model goes: taken at its edge")]
+
+
+def _measured_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
+    m = summary["measured"]
+    if not m:
+        return []
+    return [
+        ("measured", f"{m['distance_km']:.2f} km, {_number(m['energy_wh'], '.1f', 'Wh')}, "
+                     f"{_number(m['consumption_wh_km'], '.2f', 'Wh/km')}"),
+        ("simulated less", "RMS " + ", ".join(
+            _number(m[key], form, unit) for key, form, unit in (
+                ("rms_speed_km_h", ".1f", "km/h"), ("rms_pack_voltage_v", ".2f", "V"),
+                ("rms_pack_current_a", ".1f", "A"), ("rms_motor_torque_nm", ".1f", "N·m")))),
+    ]  # fmt: skip
+
+
+def _table(sweep: Sequence[dict[str, Any]]) -> list[str]:
+    names = list(sweep[0]["values"])
+    heads = [*names, "Wh/km", "range km", "shortfall s"]
+    width = [max(len(head), 10) for head in heads]
+    lines = ["  ".join(f"{head:>{w}}" for head, w in zip(heads, width, strict=True))]
+    for variant in sweep:
+        cells = [f"{value:g}" for value in variant["values"].values()]
+        cells += [_number(variant["consumption_wh_km"], ".2f"), _number(variant["range_km"], ".1f"),
+                  f"{variant['shortfall_s']:.0f}"]  # fmt: skip
+        lines.append("  ".join(f"{cell:>{w}}" for cell, w in zip(cells, width, strict=True)))
+    return lines
+
+
+def _number(value: float | None, form: str, unit: str = "") -> str:
+    return "–" if value is None else f"{value:{form}} {unit}".rstrip()
