@@ -324,6 +324,36 @@ def contents(log: Path) -> dict[str, float]:
     return sizes
 
 
+# --- simulation ---------------------------------------------------------------------------------------------------
+
+
+def simulation(repeats: int) -> tuple[float, float]:
+    """CPU s of 20 minutes at 100 Hz: of the full scooter on WMTC class 1, and of the energy-only backward form."""
+    import numpy as np
+
+    from gz_onboard.simulation.backward import backward
+    from gz_onboard.simulation.cycles import cycle
+    from gz_onboard.simulation.run import at_steps, drive, follow
+    from gz_onboard.simulation.scooter import STEP, Scooter
+    from gz_onboard.vehicle import read_vehicle
+
+    vehicle = read_vehicle("reference")
+    ridden = cycle("wmtc_class1")
+    forward_times, backward_times = [], []
+    for _ in range(repeats):
+        begin = time.process_time()
+        speeds = at_steps(ridden.time, ridden.speed, STEP)
+        drive(Scooter(vehicle, soc=0.95), follow(speeds, STEP), ridden.time[-1])
+        forward_times.append(time.process_time() - begin)
+    t = np.arange(0, 1200, 0.01)
+    v = np.maximum(0, 8 + 4 * np.sin(t / 13))
+    for _ in range(10 * repeats):
+        begin = time.process_time()
+        backward(vehicle, t, v, grade=0.02 * np.sin(t / 50))
+        backward_times.append(time.process_time() - begin)
+    return median(forward_times), median(backward_times)
+
+
 # --- all ----------------------------------------------------------------------------------------------------------
 
 
@@ -368,6 +398,10 @@ def main() -> None:
     row("  beside a plain pipeline that logs no frames", "CPU s", ours_hour, plain_bare)
     row("  with the raw frames and signals logged", "CPU s", hour_ours(repeats, "--frames", "--signals"), plain_hour)
     row("  real-time factor, ride over CPU time", "1", 3600 / ours_hour, 3600 / plain_hour)
+
+    forward, energy_only = simulation(repeats)
+    row("simulation of 20 minutes at 100 Hz", "CPU s", forward, aim="< 2")
+    row("  energy-only backward form", "CPU ms", 1000 * energy_only, aim="< 20")
 
     with tempfile.TemporaryDirectory() as name:
         size, frames, parts = log_of_ride(Path(name))

@@ -65,7 +65,7 @@ QUANTITIES: dict[str, str] = {
     "motor_speed": "rad/s",
     "motor_current": "A, RMS, as torque over torque constant",
     "motor_temperature": "degC",
-    "torque": "N·m, at the motor's shaft",
+    "torque": "N·m, in the motor's air gap: torque constant times motor_current",
     "heading": "rad, clockwise from north",
     "time_moving": "s, faster than 0.5 m/s since the start",
     "ambient_temperature": "degC",

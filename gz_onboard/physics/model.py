@@ -25,6 +25,7 @@ BASE_EFFECTS = (
 )  # fmt: skip
 """What a vehicle file gets that lists none: what every vehicle has."""
 
+STANDSTILL = 0.1  # rad/s of the motor: below this its drag fades
 GAS_CONSTANT_AIR = 287.05  # J/(kg·K)
 
 
@@ -108,6 +109,11 @@ def stepping(states: MutableMapping[str, float], dt: float) -> Recall:
     return recall
 
 
+def drag_torque(power: Any, motor_speed: Any) -> Any:
+    """Torque [N·m] against the motion by which `power` [W] of loss at no current slows the motor; 0 at standstill."""
+    return power * motor_speed / (motor_speed * motor_speed + STANDSTILL * STANDSTILL)
+
+
 class Model:
     """The effects of one vehicle with its parameters.
 
@@ -149,8 +155,12 @@ class Model:
         torque = (wanted + limit + abs(wanted - limit)) / 2  # the greater of both, for arrays too
         ledger["brakes"] = (torque - wanted) * motor_speed
         q["motor_speed"] = motor_speed
-        q["torque"] = torque
-        q["motor_current"] = torque / self.parameters["torque_constant"]
+        q["torque"] = q["motor_current"] = 0.0
+        drag = 0.0  # power that the motor takes to turn without current: its current makes up for it
+        for _, effect in self._at[Port.MOTOR_LOSS]:
+            drag = drag + effect(q)
+        q["torque"] = torque + drag_torque(drag, motor_speed)
+        q["motor_current"] = q["torque"] / self.parameters["torque_constant"]
         for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS, Port.DC_POWER):
             for name, effect in self._at[port]:
                 ledger[name] = recall(effect, q) if recall and effect.effect.decay else effect(q)

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from math import atan, sqrt
 
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Effect, Port
-from gz_onboard.physics.model import G, air_density
+from gz_onboard.physics.model import G, air_density, drag_torque
 from gz_onboard.simulation.parts.battery import EffectPack, FirstOrderPack, Pack
 from gz_onboard.simulation.parts.brakes import Brakes
 from gz_onboard.simulation.parts.chassis import STRAIGHT_ON, Chassis, StraightChassis
@@ -225,7 +225,11 @@ class Scooter:
         self.rear_load, self.front_load = rear, normal - rear
         self.sensed_voltage += (self.voltage - self.sensed_voltage) * self._voltage_gain
         current = self.controller.current(throttle, brake, w / gear, self.sensed_voltage / self._series)
-        torque = self.motor.torque_constant * current
+        # The motor's current makes torque in the air gap; what turning costs without current is drag on the shaft.
+        idle = 0.0
+        for _, loss in self.motor.losses(w / gear, 0.0, self.motor_cooling.stator):
+            idle += loss
+        torque = self.motor.torque_constant * current - drag_torque(idle, w / gear)
         drive = torque / gear * (self._gear_efficiency if torque * w >= 0 else 1 / self._gear_efficiency)
 
         terms: list[tuple[str, float]] = []
@@ -292,7 +296,7 @@ class Scooter:
         motor_speed = w_mean / gear
         mechanical = torque * motor_speed
         entries["gearing"] += (mechanical - drive * w_mean) * dt
-        q["torque"] = torque
+        q["torque"] = self.motor.torque_constant * current
         motor_heat = 0.0
         for name, loss in self.motor.losses(motor_speed, current, self.motor_cooling.stator):
             motor_heat += loss

@@ -47,9 +47,9 @@ def test_ledger_against_the_equations_written_out(q):
     )  # fmt: skip
     torque = max(force * r, -P["regeneration_torque_limit"])
     speed = v / r
-    current = torque / P["torque_constant"]
-    copper = P["motor_copper_resistance"] * (1 + 0.00393 * (q["motor_temperature"] - 25)) * current**2
     iron = P["motor_iron_linear"] * speed + P["motor_iron_quadratic"] * speed**2
+    current = (torque + iron * speed / (speed**2 + 0.01)) / P["torque_constant"]  # in the air gap
+    copper = P["motor_copper_resistance"] * (1 + 0.00393 * (q["motor_temperature"] - 25)) * current**2
     inverter = (
         P["inverter_loss_constant"] + P["inverter_loss_linear"] * abs(current)
         + P["inverter_loss_quadratic"] * current**2
@@ -90,3 +90,18 @@ def test_air_density_of_the_standard_atmosphere():
     """ISO 2533, table 1: 15 degC at sea level 1.225; 8.5 degC at 1000 m 1.1116 kg/m³."""
     assert air_density(15.0) == pytest.approx(1.225, rel=1e-3)
     assert air_density(8.501, 1000.0) == pytest.approx(1.1116, rel=1e-3)
+
+
+def test_a_motor_without_current_takes_nothing_from_the_pack_and_slows_the_scooter():
+    """Iron loss is drag: at the deceleration that it makes, current and copper loss are nought."""
+    v = 10.0
+    speed = v / P["wheel_radius"]
+    iron = P["motor_iron_linear"] * speed + P["motor_iron_quadratic"] * speed**2
+    q = {"speed": v, "acceleration": 0.0, "grade": 0.0, "headwind": 0.0, "air_density": 1.2, "motor_temperature": 40.0}
+    level = MODEL.power(complete(q))
+    force = sum(level[name] for name in ("aerodynamic_drag", "rolling_resistance")) / v
+    inertia = MODEL.mass + (P["wheel_inertia_front"] + P["wheel_inertia_rear"]) / P["wheel_radius"] ** 2
+    rolling = MODEL.power(complete(q | {"acceleration": -(force + iron / v) / inertia}))
+    assert rolling["motor_copper_loss"] == pytest.approx(0, abs=1e-4)
+    idle = P["inverter_loss_constant"] + P["auxiliary_power"]
+    assert sum(rolling.values()) == pytest.approx(idle, abs=0.05)

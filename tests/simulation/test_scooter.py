@@ -102,7 +102,7 @@ def test_the_printed_brake_never_quite_stands():
 
 
 def test_coasting_down_against_a_fine_integration_written_out():
-    """Eqs. 3.1-3.3 and 3.9 without motor: another integrator, other code."""
+    """Eqs. 3.1-3.3 and 3.9 with the motor's iron drag and no current: another integrator, other code."""
     p = VEHICLE.parameters
     scooter = Scooter(VEHICLE, soc=0.8, speed=12.0)
     for _ in range(3000):
@@ -114,8 +114,10 @@ def test_coasting_down_against_a_fine_integration_written_out():
     for _ in range(30_000):
         drag = 0.5 * density * p["drag_area"] * v * v
         rolling = mass * 9.80665 * (p["rolling_resistance_constant"] + p["rolling_resistance_speed"] * v)
-        v -= dt * (drag + rolling) / inertia
+        iron = p["motor_iron_linear"] / p["wheel_radius"] + p["motor_iron_quadratic"] * v / p["wheel_radius"] ** 2
+        v -= dt * (drag + rolling + iron) / inertia
     assert scooter.speed == pytest.approx(v, abs=0.02)
+    assert scooter.motor_current == 0
 
 
 def test_axle_loads_shift_with_the_force():
@@ -172,7 +174,7 @@ def test_heat_balance_of_the_cooling_networks():
         (scooter.pack_cooling, 15.0),
     ):
         for _ in range(200_000):
-            network.step(1.0, 50.0, sink)
+            network.step(10.0, 50.0, sink)
     c = scooter.motor_cooling
     assert c.rotor_to_ambient * (c.rotor - 15.0) == pytest.approx(50.0, rel=1e-6)
     assert c.gap * (c.stator - c.rotor) == pytest.approx(c.stator_share * 50.0, rel=1e-6)

@@ -17,7 +17,10 @@ class Motor(Protocol):
     voltage_constant: float  # V·s/rad, line to line, RMS (eq. 2.7)
 
     def losses(self, speed: float, current: float, temperature: float) -> list[tuple[str, float]]:
-        """(name, heat [W]) of each loss at a shaft speed [rad/s], current [A] and temperature [degC]."""
+        """(name, heat [W]) of each loss at a shaft speed [rad/s], current [A] and temperature [degC].
+
+        What it loses without current is drag: it slows the shaft.
+        """
 
 
 class EffectMotor:
@@ -39,6 +42,7 @@ class EffectMotor:
         """See `Motor`."""
         q = self._q
         q["motor_speed"], q["motor_current"], q["motor_temperature"] = speed, current, temperature
+        q["torque"] = self.torque_constant * current
         return [(name, effect(q)) for name, effect in self._effects]
 
 
