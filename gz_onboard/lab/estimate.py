@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
-import json
 import os
 import signal
 import sys
@@ -33,6 +32,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log, reason_words
 from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, reason_names
+from gz_onboard.simulation.telling import clock, explain_keys, number, times, write_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 SUMMARY_VERSION = 1
@@ -301,19 +301,19 @@ def _summary(
         "start_ns": start_ns,
         "duration_s": last.time,
         "distance_km": last.distance * 1e-3,
-        "speed_max_km_h": _times(tally.speed_max, 3.6),
-        "energy_wh": _times(tally.drawn, 1 / WH),
+        "speed_max_km_h": times(tally.speed_max, 3.6),
+        "energy_wh": times(tally.drawn, 1 / WH),
         "energy_recovered_wh": None if tally.drawn is None else tally.recovered / WH,
-        "consumption_wh_km": _times(tally.drawn, 1 / last.distance / WH_PER_KM) if last.distance >= 100 else None,
+        "consumption_wh_km": times(tally.drawn, 1 / last.distance / WH_PER_KM) if last.distance >= 100 else None,
         "soc_start": soc_start[0],
         "soc_start_sd": soc_start[1],
         "soc_end": soc_end[0],
         "soc_end_sd": soc_end[1],
-        "range_start_km": _times(tally.range_start, 1e-3),
-        "range_end_km": _times(last.range, 1e-3),
-        "range_end_p10_km": _times(last.range_p10, 1e-3),
-        "range_end_p90_km": _times(last.range_p90, 1e-3),
-        "energy_left_wh": _times(last.energy_left, 1 / WH),
+        "range_start_km": times(tally.range_start, 1e-3),
+        "range_end_km": times(last.range, 1e-3),
+        "range_end_p10_km": times(last.range_p10, 1e-3),
+        "range_end_p90_km": times(last.range_p90, 1e-3),
+        "energy_left_wh": times(last.energy_left, 1 / WH),
         "innovation_rms_v": tally.innovation_rms,
         "innovation_max_v": tally.innovation_max if tally.innovation_rms is not None else None,
         "states": {state.name: round(states[state.name] * 0.1, 1) for state in State if states[state.name]},
@@ -329,18 +329,12 @@ def _summary(
     }
 
 
-def _times(value: float | None, factor: float) -> float | None:
-    return None if value is None else value * factor
-
-
 # --- the command --------------------------------------------------------------------------------------------------
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard estimate``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    keys = "\n".join(f"  {key:20} {meaning.replace('%', '%%')}" for key, meaning in KEYS.items())
-    parser.epilog = f"keys of a ride in the JSON summary, version {SUMMARY_VERSION}:\n{keys}"
+    explain_keys(parser, "a ride in the", SUMMARY_VERSION, KEYS)
     add = parser.add_argument
     add("logs", nargs="+", type=Path, metavar="FILE", help="candump .log, .asc, .blf, .trc, .mf4, .csv, .mcap, or .gz")
     add(
@@ -374,7 +368,7 @@ def run(arguments: argparse.Namespace) -> int:
             if arguments.json != "-":
                 say(summary_text(result), sys.stdout)
     if arguments.json:
-        _write_json(arguments.json, {"version": SUMMARY_VERSION, "rides": rides, "failed": failed})
+        write_json(arguments.json, {"version": SUMMARY_VERSION, "rides": rides, "failed": failed})
     return 1 if failed else 0
 
 
@@ -505,49 +499,32 @@ def _expected(path: Path) -> int | None:
 
 def summary_text(ride: dict[str, Any]) -> str:
     """A ride's summary for a terminal."""
-    minutes, seconds = divmod(round(ride["duration_s"]), 60)
-    hours, minutes = divmod(minutes, 60)
     soc = [_percent(ride[f"soc_{end}"], ride[f"soc_{end}_sd"]) for end in ("start", "end")]
     rows = [
-        ("ride", f"{f'{hours} h ' if hours else ''}{minutes} min {seconds:02} s, {ride['distance_km']:.2f} km, "
-                 f"at most {_number(ride['speed_max_km_h'], '.0f', 'km/h')}"),
-        ("energy", f"{_number(ride['energy_wh'], '.0f', 'Wh')} drawn net, "
-                   f"{_number(ride['energy_recovered_wh'], '.0f', 'Wh')} of it recovered before; "
-                   f"{_number(ride['consumption_wh_km'], '.1f', 'Wh/km')}"),
+        ("ride", f"{clock(ride['duration_s'])}, {ride['distance_km']:.2f} km, "
+                 f"at most {number(ride['speed_max_km_h'], '.0f', 'km/h')}"),
+        ("energy", f"{number(ride['energy_wh'], '.0f', 'Wh')} drawn net, "
+                   f"{number(ride['energy_recovered_wh'], '.0f', 'Wh')} of it recovered before; "
+                   f"{number(ride['consumption_wh_km'], '.1f', 'Wh/km')}"),
         ("state of charge", f"{soc[0]} at the start, {soc[1]} at the end"),
-        ("range at the end", f"{_number(ride['range_end_km'], '.1f', 'km')} "
-                             f"({_number(ride['range_end_p10_km'], '.1f')} to "
-                             f"{_number(ride['range_end_p90_km'], '.1f')}, 80 % interval), "
-                             f"{_number(ride['energy_left_wh'], '.0f', 'Wh')} left"),
-        ("innovation", f"{_number(ride['innovation_rms_v'], '.1f', 'mV', 1000)} RMS, "
-                       f"{_number(ride['innovation_max_v'], '.0f', 'mV', 1000)} at most, of a cell"),
+        ("range at the end", f"{number(ride['range_end_km'], '.1f', 'km')} "
+                             f"({number(ride['range_end_p10_km'], '.1f')} to "
+                             f"{number(ride['range_end_p90_km'], '.1f')}, 80 % interval), "
+                             f"{number(ride['energy_left_wh'], '.0f', 'Wh')} left"),
+        ("innovation", f"{number(ride['innovation_rms_v'], '.1f', 'mV', 1000)} RMS, "
+                       f"{number(ride['innovation_max_v'], '.0f', 'mV', 1000)} at most, of a cell"),
         ("frames", f"{ride['frames']} received, {ride['dropped']} dropped, {ride['lost']} lost, "
                    f"{ride['unknown']} unknown identifiers, {ride['error_frames']} error frames"),
         *(("sensor faults", f"{reason}: " + ", ".join(f"{name} {count}" for name, count in places.items()))
           for reason, places in ride["faults"].items()),
         ("state", ", ".join(f"{name.lower()} {duration:.1f} s" for name, duration in ride["states"].items())),
         *(("", f"{reason_words(Reason[name])} {duration:.1f} s") for name, duration in ride["reasons"].items()),
-        ("computed", f"{ride['cpu_s']:.2f} s of processor time, {_number(ride['real_time_factor'], '.0f')} times "
+        ("computed", f"{ride['cpu_s']:.2f} s of processor time, {number(ride['real_time_factor'], '.0f')} times "
                      "as fast as the ride"),
         ("written", f"{ride['log']}{' and .png' if ride['plot'] else ''}"),
     ]  # fmt: skip
     return "\n".join([f"{ride['file']}", *(f"  {name:17} {text}" for name, text in rows)])
 
 
-def _number(value: float | None, form: str, unit: str = "", factor: float = 1.0) -> str:
-    return "–" if value is None else f"{value * factor:{form}} {unit}".rstrip()
-
-
 def _percent(value: float | None, sd: float | None) -> str:
     return "–" if value is None or sd is None else f"{100 * value:.1f} ± {100 * sd:.1f} %"
-
-
-def _write_json(file: str, document: dict[str, Any]) -> None:
-    text = json.dumps(document, indent=1, ensure_ascii=False)
-    if file == "-":
-        print(text)
-        return
-    try:
-        Path(file).write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"--json {file}: cannot be written: {error.strerror}") from error

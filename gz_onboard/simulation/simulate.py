@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -25,8 +24,9 @@ from gz_onboard.simulation.recorded import rest_soc
 from gz_onboard.simulation.run import Progress, Run, drive
 from gz_onboard.simulation.scooter import Dynamometer, Scooter
 from gz_onboard.simulation.sensors import Trace
-from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION, cycle_range, summarise, summary_text, times
+from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION, cycle_range, summarise, summary_text
 from gz_onboard.simulation.sweep import Sweep, grid, read_sweep, redesigned
+from gz_onboard.simulation.telling import explain_keys, times, write_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 _MOST_HOURS = 48.0  # of riding until empty
@@ -34,9 +34,7 @@ _MOST_HOURS = 48.0  # of riding until empty
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard simulate``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    keys = "\n".join(f"  {key:20} {meaning.replace('%', '%%')}" for key, meaning in KEYS.items())
-    parser.epilog = f"keys of the JSON summary, version {SUMMARY_VERSION}:\n{keys}"
+    explain_keys(parser, "the", SUMMARY_VERSION, KEYS)
     add = parser.add_argument
     add("what", metavar="WHAT", help="a built-in drive cycle by name, a CSV file of a cycle or of a route, or the log "
         "of a recorded ride, whose throttle and brake are replayed")  # fmt: skip
@@ -95,7 +93,7 @@ def run(arguments: argparse.Namespace) -> int:
     if trace:
         summary["files"].append(write_trace(arguments, vehicle, trace, scooter))
     if arguments.json:
-        _write_json(arguments.json, {"version": SUMMARY_VERSION, **summary})
+        write_json(arguments.json, {"version": SUMMARY_VERSION, **summary})
     if arguments.json != "-":
         print(summary_text(summary))
     return 0
@@ -174,14 +172,3 @@ def _bar(seconds: float | None, unit: str) -> Iterator[Progress | None]:
 
     with tqdm(total=seconds, unit=f" {unit}", file=sys.stderr, leave=False, mininterval=0.2) as bar:
         yield bar.update
-
-
-def _write_json(file: str, document: dict[str, Any]) -> None:
-    text = json.dumps(document, indent=1, ensure_ascii=False)
-    if file == "-":
-        print(text)
-        return
-    try:
-        Path(file).write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"--json {file}: cannot be written: {error.strerror}") from error

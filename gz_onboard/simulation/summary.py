@@ -11,6 +11,7 @@ from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.recorded import Recorded
 from gz_onboard.simulation.run import COLUMNS, Run, range_by_energy
 from gz_onboard.simulation.scooter import Scooter
+from gz_onboard.simulation.telling import clock, number, times
 from gz_onboard.vehicle import Vehicle
 
 SUMMARY_VERSION = 1
@@ -134,27 +135,20 @@ def compare(recorded: Recorded, result: Run) -> dict[str, Any]:
     }
 
 
-def times(value: float | None, factor: float) -> float | None:
-    """`value` in another unit; None stays None."""
-    return None if value is None else float(value * factor)
-
-
 def summary_text(summary: dict[str, Any]) -> str:
     """A summary for a terminal."""
-    minutes, seconds = divmod(round(summary["duration_s"]), 60)
-    hours, minutes = divmod(minutes, 60)
-    clock = f"{f'{hours} h ' if hours else ''}{minutes} min {seconds:02} s"
     way = {"repetition": "ridden until empty", "energy": "energy left at the start over the consumption"}
     ledger = sorted(summary["ledger_wh"].items(), key=lambda item: -item[1])
     ledger = [(name, energy) for name, energy in ledger if abs(energy) >= 0.005]
     gross = sum(energy for _, energy in ledger if energy > 0) or 1.0
     rows = [
-        (summary["kind"], f"{clock}, {summary['distance_km']:.2f} km, at most {summary['speed_max_km_h']:.0f} km/h, "
+        (summary["kind"], f"{clock(summary['duration_s'])}, {summary['distance_km']:.2f} km, "
+                          f"at most {summary['speed_max_km_h']:.0f} km/h, "
                           f"{summary['repetitions']:.3g} times"),
         ("energy", f"{summary['energy_wh']:.1f} Wh net, {summary['energy_recovered_wh']:.1f} Wh recovered before; "
-                   f"{_number(summary['consumption_wh_km'], '.2f', 'Wh/km')}"),
+                   f"{number(summary['consumption_wh_km'], '.2f', 'Wh/km')}"),
         ("state of charge", f"{100 * summary['soc_start']:.1f} → {100 * summary['soc_end']:.1f} %"),
-        ("range", f"{_number(summary['range_km'], '.1f', 'km')} "
+        ("range", f"{number(summary['range_km'], '.1f', 'km')} "
                   f"({way.get(summary['range_by'], 'not to be told')})"),
         *_shortfall_rows(summary),
         *(("where it went" if not i else "",
@@ -197,10 +191,10 @@ def _measured_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
     if not m:
         return []
     return [
-        ("measured", f"{m['distance_km']:.2f} km, {_number(m['energy_wh'], '.1f', 'Wh')}, "
-                     f"{_number(m['consumption_wh_km'], '.2f', 'Wh/km')}"),
+        ("measured", f"{m['distance_km']:.2f} km, {number(m['energy_wh'], '.1f', 'Wh')}, "
+                     f"{number(m['consumption_wh_km'], '.2f', 'Wh/km')}"),
         ("simulated less", "RMS " + ", ".join(
-            _number(m[key], form, unit) for key, form, unit in (
+            number(m[key], form, unit) for key, form, unit in (
                 ("rms_speed_km_h", ".1f", "km/h"), ("rms_pack_voltage_v", ".2f", "V"),
                 ("rms_pack_current_a", ".1f", "A"), ("rms_motor_torque_nm", ".1f", "N·m")))),
     ]  # fmt: skip
@@ -213,11 +207,7 @@ def _table(sweep: Sequence[dict[str, Any]]) -> list[str]:
     lines = ["  ".join(f"{head:>{w}}" for head, w in zip(heads, width, strict=True))]
     for variant in sweep:
         cells = [f"{value:g}" for value in variant["values"].values()]
-        cells += [_number(variant["consumption_wh_km"], ".2f"), _number(variant["range_km"], ".1f"),
+        cells += [number(variant["consumption_wh_km"], ".2f"), number(variant["range_km"], ".1f"),
                   f"{variant['shortfall_s']:.0f}"]  # fmt: skip
         lines.append("  ".join(f"{cell:>{w}}" for cell, w in zip(cells, width, strict=True)))
     return lines
-
-
-def _number(value: float | None, form: str, unit: str = "") -> str:
-    return "–" if value is None else f"{value:{form}} {unit}".rstrip()
