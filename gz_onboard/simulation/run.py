@@ -42,6 +42,7 @@ COLUMNS = {
     "rear_load": "N",
     "front_load": "N",
     "tyre_force": "N",
+    "lean": "rad",  # positive right; 0 with a chassis that does not lean
 }
 """The time series of a run, with their units; signs as in `physics.effect`, current positive discharging."""
 
@@ -190,6 +191,7 @@ def _row(scooter: Scooter, wanted: float, energy: float) -> tuple[float, ...]:
         energy,
         scooter.pack_cooling.temperature, scooter.motor_cooling.stator, scooter.inverter_cooling.board,
         scooter.bms_cooling.temperature, scooter.rear_load, scooter.front_load, scooter.force,
+        scooter.lean,
     )  # fmt: skip
 
 
