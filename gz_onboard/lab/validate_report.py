@@ -195,13 +195,13 @@ def failures(forms: Mapping[str, Any]) -> list[tuple[str, str, float, list[tuple
 def _failures(forms: Mapping[str, Any]) -> str:
     head = "".join(f"<th>{title}<br>mean error [{unit}]</th><th>%</th>" for *_, unit, title in COLUMNS)
     rows, before = [], ""
-    for by, kind, time, cells in failures(forms):
+    for by, kind, time, means in failures(forms):
         if by != before:
             rows.append(f"<tr><th colspan={3 + 2 * len(COLUMNS)}>{html.escape(LABELS[by])}</th></tr>")
             before = by
         values = "".join(
             "<td>–</td><td>–</td>" if cell is None else f"<td>{cell[0]:+.3g}</td><td>{cell[1]:+.1f}</td>"
-            for cell in cells
+            for cell in means
         )
         rows.append(f"<tr><td>{kind}</td><td>{time / 60:.1f}</td>{values}</tr>")
     return f"<table><tr><th>condition</th><th>min</th>{head}</tr>{''.join(rows)}</table>"
@@ -230,11 +230,11 @@ def markdown(rides: Sequence[Mapping[str, Any]], together: Mapping[str, Any]) ->
     for where, forms in together.items():
         heads = ["condition", "min", *(f"{title}, {unit}" for *_, unit, title in COLUMNS)]
         rows, before = [], ""
-        for by, kind, time, cells in failures(forms):
+        for by, kind, time, means in failures(forms):
             if by != before:
                 rows.append([f"*{LABELS[by]}*", "", *([""] * len(COLUMNS))])
                 before = by
-            values = ["–" if cell is None else f"{cell[0]:+.3g} ({cell[1]:+.1f} %)" for cell in cells]
+            values = ["–" if cell is None else f"{cell[0]:+.3g} ({cell[1]:+.1f} %)" for cell in means]
             rows.append([kind, f"{time / 60:.0f}", *values])
         parts.append(f"### Mean error by condition, {where}\n\n{_table(heads, rows)}")
     return "\n\n".join(parts) + "\n"

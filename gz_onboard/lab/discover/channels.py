@@ -575,4 +575,15 @@ def over_blocks(channel: Channel, values: Array) -> Array:
     return mean_over(values, round(channel.block / STEP))
 
 
-__all__ = ["BY_NAME", "CHANNELS", "Channel", "System", "blocks", "depends", "over_blocks", "roughness", "support", "usable"]
+__all__ = [
+    "BY_NAME",
+    "CHANNELS",
+    "Channel",
+    "System",
+    "blocks",
+    "depends",
+    "over_blocks",
+    "roughness",
+    "support",
+    "usable",
+]

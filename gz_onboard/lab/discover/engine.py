@@ -27,8 +27,9 @@ from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.search import Search, evidence
 from gz_onboard.lab.discover.shapes import with_inflation
 from gz_onboard.lab.discover.state import State, initial, restore
+from gz_onboard.lab.discover.terms import LOG
 from gz_onboard.lab.discover.verdict import reach
-from gz_onboard.physics.parameters import Parameters, Value
+from gz_onboard.physics.parameters import Parameters, Value, declared_parameters
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
@@ -58,17 +59,16 @@ def adopted(vehicle: Vehicle, state: State) -> Vehicle:
     known = dict(vehicle.parameters.known)
     sd = np.sqrt(np.diag(state.prior)) * state.scale
     at = state.unit_value(state.mean)
+    declared = declared_parameters(vehicle.model.effects)
     model = {name for effect in vehicle.model.effects for name in effect.keywords}
     for name, s in zip(state.names, sd, strict=True):
         if name in known and (name in model or not known[name].source.startswith("prior:")):
             old = known[name]
-            wide = float(s * (old.value if name in LOGARITHMIC else 1.0))
+            wide = float(s * (old.value if name in LOG else 1.0))
             source = f"{old.source}; refitted on {state.healthy} healthy rides"
-            known[name] = Value(float(at[name]), wide, old.unit, "measured", source)
+            bounds = declared[name]
+            known[name] = Value(float(np.clip(at[name], bounds.low, bounds.high)), wide, old.unit, "measured", source)
     return replace(vehicle, parameters=Parameters(known, vehicle.parameters.correlations), healthy=state)
-
-
-from gz_onboard.lab.discover.terms import LOG as LOGARITHMIC  # noqa: E402
 
 
 def _linearised(job: tuple[Ride, State]) -> Linear:

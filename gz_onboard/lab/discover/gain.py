@@ -10,7 +10,6 @@ import numpy as np
 from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed
 from gz_onboard.lab.discover.result import Report
-
 from gz_onboard.lab.discover.state import State
 
 
@@ -63,7 +62,7 @@ def extended_mean(state: State, rest: Sequence[Normal], causes: Sequence[Any]) -
 
 def errors(line: Linear, theta: Array) -> dict[str, float]:
     """Of one ride with parameters `theta` (p,): rms power [W], energy per way [J/m], cell voltage [V], range [1]."""
-    from gz_onboard.lab.discover.verdict import energy, power_of, share_of_time  # noqa: PLC0415
+    from gz_onboard.lab.discover.verdict import energy, power_of, share_of_time
 
     more, square = 0.0, 0.0
     found: dict[str, float] = {}

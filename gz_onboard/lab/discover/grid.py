@@ -144,7 +144,7 @@ def _quantities(ride: Ride, mass: float) -> dict[str, Array]:
     n = len(ride.time)
     motor_speed = s["motor_speed"]
     speed = motor_speed * ride.radius
-    acceleration = np.gradient(smooth(speed, 0.4), STEP)
+    acceleration: Array = np.gradient(smooth(speed, 0.4), STEP)
     ambient = s.get("ambient_temperature", np.full(n, 20.0))
     temperature = s.get("cell_temperature", ambient)
     still = np.abs(speed) < 0.05
@@ -166,7 +166,7 @@ def _quantities(ride: Ride, mass: float) -> dict[str, Array]:
         "speed": speed,
         "acceleration": acceleration,
         "grade": grade,
-        "grade_cosine": np.sqrt(1 - np.clip(grade, -0.5, 0.5) ** 2),
+        "grade_cosine": np.asarray(np.sqrt(1 - np.clip(grade, -0.5, 0.5) ** 2)),
         "mass": np.full(n, mass),
         "air_density": np.full(n, density),
         "headwind": np.zeros(n),
@@ -176,7 +176,7 @@ def _quantities(ride: Ride, mass: float) -> dict[str, Array]:
         "motor_temperature": s.get("motor_temperature", ambient),
         "ambient_temperature": ambient,
         "cell_temperature": temperature,
-        "heading": np.mod(course, 2 * np.pi),
-        "time_moving": moved,
+        "heading": np.asarray(np.mod(course, 2 * np.pi), dtype=np.float64),
+        "time_moving": np.asarray(moved, dtype=np.float64),
         "torque": s["motor_current"],
     }

@@ -1,6 +1,6 @@
 """The linear mixed model of all channels, and the small matrices that every question is asked of.
 
-About the present parameters θ the residuals y of ride r are y = A·(θ_r − θ) + noise, θ_r = μ + u_r: μ common to all rides
+About the present parameters θ the residuals of ride r are y = A·(θ_r − θ) + noise, θ_r = μ + u_r: μ common to all
 (Laird & Ware 1982), u_r the ride's own with covariance T, which healthy rides tell: that the parameters of a healthy
 vehicle seem to differ from ride to ride is the model's discrepancy (Brynjarsdóttir & O'Hagan 2014), and nothing
 smaller than it is taken for a cause. Noise is white and exponentially correlated. Of each ride there remain N = AᵀC⁻¹A
@@ -81,7 +81,9 @@ def linearise(ride: Ride, values: Mapping[str, float], names: Sequence[str], sca
         index = np.flatnonzero(used)
         used = used.copy()
         used[index[~good]] = False
-        tables[channel.name] = Table(channel, y[good], a[good], (index[good] + 0.5) * channel.block, used, 1.0, every)
+        tables[channel.name] = Table(
+            channel, y[good], a[good], np.asarray((index[good] + 0.5) * channel.block), used, 1.0, every
+        )
     return Linear(ride, tables)
 
 
@@ -154,7 +156,9 @@ def spread_out(line: Linear, noise: Noise, mean: Array, spread: Array) -> Linear
     for name, table in line.tables.items():
         rest = whitened(table, noise[name], table.y - table.a @ own)
         factor = max(1.0, float(np.sqrt(np.mean(rest**2))))
-        tables[name] = Table(table.channel, table.y / factor, table.a / factor, table.time, table.used, factor, table.roughness)
+        tables[name] = Table(
+            table.channel, table.y / factor, table.a / factor, table.time, table.used, factor, table.roughness
+        )
     return Linear(line.ride, tables)
 
 
@@ -198,7 +202,7 @@ def marginal(ride: Normal, scatter: Array) -> Normal:
     """The same once the ride's own part, of variances `scatter` (p,), is integrated out."""
     solve = np.linalg.solve(np.eye(len(scatter)) + ride.n * scatter, np.column_stack([ride.n, ride.b]))
     n = solve[:, :-1]
-    return Normal((n + n.T) / 2, solve[:, -1])
+    return Normal(np.asarray((n + n.T) / 2), np.asarray(solve[:, -1]))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class Cause:
-    """A cause that was named. value: of the parameter in the vehicle file once accepted; change: over the healthy one's."""
+    """A cause that was named. value: of the parameter once accepted; change: over the healthy one's."""
 
     name: str
     parameter: str

@@ -150,7 +150,7 @@ def shape_evidence(
     inner = inner + 1e-3 * np.eye(k)
     estimate = np.linalg.solve(inner, score)
     return (
-        float(score @ estimate), k, estimate * size, np.sqrt(np.abs(np.diag(np.linalg.inv(inner)))) * size
+        float(score @ estimate), k, np.asarray(estimate * size), np.sqrt(np.abs(np.diag(np.linalg.inv(inner)))) * size
     )  # fmt: skip
 
 
@@ -175,7 +175,7 @@ def learn_shapes(state: State, linears: Sequence[Linear], normals: Sequence[Norm
             part = marginal(Normal((inner + inner.T) / 2, score), np.full(k, SCATTER**2))
             m, c = m + part.n, c + part.b
         covariance = np.linalg.inv(m + np.eye(k))
-        found[pair] = Shape(covariance @ c, covariance, 1.0)
+        found[pair] = Shape(np.asarray(covariance @ c), np.asarray(covariance), 1.0)
     return found
 
 

@@ -58,9 +58,12 @@ class State:
     noise: Noise
     healthy: int  # rides that it was learned on
     free: Mask  # whose scatter between rides is learned, (p,)
-    inflation: dict[str, float] = field(default_factory=dict)  # of a cause's score on healthy rides left out, 1 if right
+    inflation: dict[str, float] = field(
+        default_factory=dict
+    )  # of a cause's score on healthy rides left out, 1 if right
     shapes: dict[str, Shape] = field(default_factory=dict)  # what healthy rides show over quantities, by name
     total: float = 0.0  # energy of the healthy rides per way [J/m]
+
     def index(self, names: Sequence[str]) -> list[int]:
         """Where `names` stand."""
         return [self.names.index(name) for name in names]
@@ -140,4 +143,9 @@ def restore(vehicle: Vehicle, folder: Path | None = None) -> State:
     """What healthy rides taught of `vehicle`, or its file alone."""
     if isinstance(vehicle.healthy, State):
         return vehicle.healthy
-    return initial(vehicle, folder)
+    state = initial(vehicle, folder)
+    if isinstance(vehicle.healthy, Path):
+        from gz_onboard.lab.discover.files import load
+
+        return load(state, vehicle.healthy)
+    return state

@@ -1,9 +1,10 @@
 """The parameters of the linear model of all channels: what is known of each before, and how it changes by ride.
 
-Three kinds. *Base*: the vehicle file's parameters, as sure as their calibration says. *Nuisance*: what no vehicle file has
-and no cause is named after, such as the bias of the accelerometer or a wind; each with a mean over the vehicle's life
-and a scatter between rides. *Candidate*: what a cause would move. `RIDE_SD` is how much a parameter is taken to scatter
-from ride to ride before healthy rides have told (the discrepancy of Brynjarsdóttir & O'Hagan 2014, as a random effect).
+Three kinds. *Base*: the vehicle file's parameters, as sure as their calibration says. *Nuisance*: what no vehicle
+file has and no cause is named after, such as the bias of the accelerometer or a wind; each with a mean over the
+vehicle's life and a scatter between rides. *Candidate*: what a cause would move. `RIDE_SD` is how much a parameter
+is taken to scatter from ride to ride before healthy rides have told (the discrepancy of Brynjarsdóttir & O'Hagan
+2014, as a random effect).
 """
 
 from __future__ import annotations

@@ -20,11 +20,19 @@ from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.terms import LOG, stepped
 
 FALSE_ALARMS = 0.05  # of sets of healthy rides, all candidates and curves together
-EXTRA = 0.75  # of a curve's score that a name must explain
+EXTRA = 0.97  # of what a curve and the names explain, the part that names must
 MARGIN = 6.0  # of chi-squared within which another cause explains as well: a likelihood ratio of 20
 
 
-def threshold(state: State, tried: int) -> float:
+def tries(e: Evidence, index: Sequence[int]) -> float:
+    """How many independent tries the columns at `index` are, look-alikes being one (Li & Ji 2005, eq. 5)."""
+    inner = e.information[np.ix_(index, index)]
+    size = np.sqrt(np.maximum(np.diag(inner), 1e-12))
+    values = np.abs(np.linalg.eigvalsh(inner / np.outer(size, size)))
+    return float(np.sum((values >= 1) + (values - np.floor(values))))
+
+
+def threshold(state: State, tried: float) -> float:
     """The chi-squared of one cause that healthy rides exceed with `FALSE_ALARMS`, among `tried`.
 
     Student's t, for the scatter between rides is known from the healthy rides alone; Šidák over the candidates.
@@ -42,7 +50,7 @@ def reach(
     normals = [normal(line, state.noise) for line in lines]
     e = evidence(state, normals)
     causes = seen(state, e, notes)
-    limit = threshold(state, max(len(causes), 1) + 8)
+    limit = threshold(state, tries(e, [i for c in causes for i in state.index(c.names)]))
     search = Search(state, e, causes)
     say(f"{len(causes)} candidates")
     choice = search.select(limit)
@@ -183,7 +191,9 @@ def energy_share(state: State, lines: Sequence[Linear], change: Array) -> float:
 def energy(line: Linear) -> float:
     """What the pack gave over the ride [J]."""
     s = line.ride.signals
-    volts, amperes = ("pack_voltage", "pack_current") if "pack_current" in s else ("inverter_voltage", "inverter_current")
+    volts, amperes = (
+        ("pack_voltage", "pack_current") if "pack_current" in s else ("inverter_voltage", "inverter_current")
+    )
     if amperes not in s or volts not in s:
         return float(np.sum(np.abs(s["motor_current"] * line.ride.quantities["motor_speed"]))) * 0.045
     return float(np.sum(s[volts] * s[amperes])) * 0.1
@@ -200,7 +210,7 @@ def share_of_time(line: Linear, channel: str) -> float:
 def unexplained(
     state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str], limit: float
 ) -> dict[str, Any] | None:
-    """The curve that explains most beside the causes chosen, if it is significant; or instead of them, if it does better."""
+    """The curve that explains most beside the causes chosen, or instead of them; None if none is significant."""
     index = search.index(chosen)
     best: dict[str, Any] | None = None
     for pair in names():
@@ -283,11 +293,13 @@ def advice(search: Search, sets: Sequence[Sequence[str]], unknown: dict[str, Any
     """What to ride next."""
     lines = []
     for group in sets:
-        lines.append(f"To tell {', '.join(group)} apart: " + " ".join(search.causes[name].shown_by for name in group[:2]))
+        lines.append(
+            f"To tell {', '.join(group)} apart: " + " ".join(search.causes[name].shown_by for name in group[:2])
+        )
     if unknown is not None:
         lines.append(
-            f"Ride over the whole span of {unknown['quantity']} with all else the same, twice: what {unknown['channel']} "
-            f"leaves goes with it, or with what changes along with it."
+            f"Ride over the whole span of {unknown['quantity']} with all else the same, twice: what "
+            f"{unknown['channel']} leaves goes with it, or with what changes along with it."
         )
     return lines
 

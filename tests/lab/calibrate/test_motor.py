@@ -76,11 +76,11 @@ def test_bad_ramps_are_refused():
 @needs_data
 def test_reference_motor_against_the_thesis():
     emf = voltage_constant(read_table(bench_file("motor_emf_ramp.csv")))
-    assert min(fit.r2 for fit in emf.fits if fit.held_out) > 0.9993
+    assert min(fit.r2 or 0.0 for fit in emf.fits if fit.held_out) > 0.9993
     assert emf.parameters["voltage_constant"].value == pytest.approx(0.531, abs=0.002)
     result = torque_constant(
         read_table(bench_file("motor_dyno.csv")), warming=read_table(bench_file("thermal_step.csv"))
     )
-    assert min(fit.r2 for fit in result.fits if fit.held_out) > 0.9804
+    assert min(fit.r2 or 0.0 for fit in result.fits if fit.held_out) > 0.9804
     assert result.parameters["torque_constant"].value == pytest.approx(0.4527, abs=0.003)
     assert any("-0.039 %/K" in note for note in result.notes)

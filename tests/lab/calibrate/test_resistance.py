@@ -18,9 +18,9 @@ def pulse(temperature, ohm, sign=1):
             time.append(now)
             current.append(sign * (5.0 if k % 2 else 0.0))
             now += dt
-    current = np.array(current)
+    amperes = np.array(current)
     return table(
-        time=time, current=current, voltage=3.7 - ohm * current, cell_temperature=np.full(len(time), temperature)
+        time=time, current=amperes, voltage=3.7 - ohm * amperes, cell_temperature=np.full(len(time), temperature)
     )
 
 
