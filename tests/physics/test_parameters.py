@@ -28,7 +28,7 @@ def vehicle(tmp_path: Path, old: str, new: str):
         (r"^drag_area", "drag_aera", ["drag_aera", "did you mean 'drag_area'"]),
         (r'^(drag_area = .*status = )"\w+"', r'\1"measuerd"', ["measuerd", "did you mean 'measured'"]),
         (r"^(drag_area = .*), sd = [\d.]+", r"\1", ["drag_area", "sd", "missing"]),
-        (r"^soc = \[0.000, 0.005", "soc = [0.005, 0.000", ["battery.ocv", "must increase", "0"]),
+        (r"^soc = \[0\.0, 0\.005", "soc = [0.005, 0.0", ["battery.ocv", "must increase", "0"]),
         (r"^cells_series = 14", "cells_series = 0", ["cells_series", "0 is outside 1"]),
         (r'"aerodynamic_drag"', '"aerodynamic_darg"', ["aerodynamic_darg", "did you mean 'aerodynamic_drag'"]),
         (r"^schema = 1", "schema = 7", ["schema", "7", "reads 1"]),
