@@ -4,7 +4,7 @@ Prediction (Lord 2016, eqs. 2.21 and 2.22, exact for a current that is constant 
 
     SOC' = SOC - I·dt/(3600·Ah)         V1' = a·V1 + R1·(1 - a)·I,  a = exp(-dt/(R1·C1))
 
-Measurement (eq. 2.23): V = V_oc(SOC) - R0·I - V1, so H = [dV_oc/dSOC - I·dR0/dSOC, -1].
+Measurement (eq. 2.23): V = V_oc(SOC, T) - R0·I - V1, so H = [dV_oc/dSOC - I·dR0/dSOC, -1].
 
 The covariance is updated in Joseph's form (Bucy & Joseph 1968), which is symmetric and positive by construction.
 Two backends do the same: `ScalarFilter`, plain floats, for on board; and `FilterpyFilter` around filterpy's
@@ -61,7 +61,7 @@ class ScalarFilter:
 
     def _observe(self, current: float, temperature: float) -> tuple[float, float]:
         """(predicted voltage, its derivative over SOC)."""
-        ocv, slope = self.battery.ocv(self.soc)
+        ocv, slope = self.battery.ocv(self.soc, temperature)
         r0, r0_slope = self.battery.r0.at(self.soc, temperature)
         return ocv - r0 * current - self.v1, slope - current * r0_slope
 

@@ -61,7 +61,7 @@ class FilterpyFilter:
 
     def _hx(self, x: NDArray[np.float64], current: float, temperature: float) -> NDArray[np.float64]:
         soc, v1 = float(x[0, 0]), float(x[1, 0])
-        predicted = self.battery.ocv(soc)[0] - self.battery.r0.at(soc, temperature)[0] * current - v1
+        predicted = self.battery.ocv(soc, temperature)[0] - self.battery.r0.at(soc, temperature)[0] * current - v1
         return np.array([[predicted]])  # (1, 1): a scalar would turn x into 2×2
 
     def _jacobian(self, x: NDArray[np.float64], current: float, temperature: float) -> NDArray[np.float64]:

@@ -99,7 +99,7 @@ class Estimator:
         self._voltage_sd = p.sd("pack_voltage_offset") / battery.cells_series
         self._model_sd = p.sd("cell_voltage_error")
         self._empty_sd = p.sd("cell_voltage_error_empty")
-        self._rest_sd = sqrt(p.sd("rest_voltage_error") ** 2 + battery.ocv_sd**2)
+        self._rest_sd = sqrt(p.sd("rest_voltage_error") ** 2 + battery.ocv_sd**2 + battery.rest_shift_sd**2)
         self._cell_scatter = p.sd("cell_capacity") / p["cell_capacity"]
         self._charge_sd = sqrt(self._cell_scatter**2 + gain_sd**2)
         self._cable = p["cable_resistance"]
@@ -322,7 +322,8 @@ class Estimator:
         cell_voltage = battery.cell_voltage(voltage, current) + self._lacking  # of before a restart
         soc = 0.5
         for _ in range(5):  # R0 depends on SOC
-            soc = battery.soc_at(cell_voltage + battery.r0.at(soc, temperature)[0] * cell_current)
+            rest = cell_voltage + battery.r0.at(soc, temperature)[0] * cell_current
+            soc = battery.soc_at(rest, temperature)
         soc = min(max(soc, -0.02), 1.02)
         r0, r1 = battery.r0.at(soc, temperature)[0], battery.r1.at(soc, temperature)[0]
         v1_sd = 0.005 + 0.5 * r1 * abs(cell_current)

@@ -87,7 +87,7 @@ def battery_voltage(vehicle: Vehicle, current: Array, temperature: Array, soc: f
         v1 = decay * v1 + r1 * (1 - decay) * cell
         soc -= 0.5 * amperes / (3600 * battery.pack_capacity(celsius))
         lacking = v1 + sum(states.values())
-        result[i] = n * (battery.ocv(soc)[0] - r0 * cell - lacking) - battery.series_resistance * amperes
+        result[i] = n * (battery.ocv(soc, celsius)[0] - r0 * cell - lacking) - battery.series_resistance * amperes
         v1 = decay * v1 + r1 * (1 - decay) * cell
         soc -= 0.5 * amperes / (3600 * battery.pack_capacity(celsius))
         if states:

@@ -4,7 +4,8 @@
 
 with I the cell's current, positive when discharging. R0, R1 and C1 are tables over SOC and temperature, linear in
 between; outside them the nearest edge counts, except that V_oc goes on along its last slope, so that an estimate
-that strays beyond full or empty is still told its way back.
+that strays beyond full or empty is still told its way back. A cold cell rests lower: with `rest_shift`
+V_oc(SOC, T) = V_oc(SOC) + shift(T), linear in T, constant beyond its ends.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
 Row = tuple[float, ...]
 Lacks = Callable[[float, float, float], float]
 """What a cell's voltage lacks [V] beside R0 and the RC pair, at a cell's current [A], SOC and temperature [degC]."""
+LARGEST_SHIFT = 0.2  # V: real cells rest tens of mV apart from -20 to 25 degC; more is a mistyped unit
 
 
 def _linear(xs: Row, ys: Row, x: float) -> float:
@@ -93,6 +95,9 @@ class Battery:
     r1: Mesh  # ohm
     c1: Mesh  # F
     resistance_factor: float = 1.0  # that is in r0, r1 and c1
+    rest_shift_temperature: Row = ()  # degC; none: V_oc does not depend on temperature
+    rest_shift_value: Row = ()  # V of a cell
+    rest_shift_sd: float = 0.0  # V
 
     def cell_capacity(self, temperature: float) -> float:
         """Capacity of a cell [A·h] at `temperature` [degC]: the charge between SOC 0 and 1."""
@@ -102,15 +107,26 @@ class Battery:
         """Capacity of the pack [A·h] at `temperature` [degC]."""
         return self.cell_capacity(temperature) * self.cells_parallel
 
-    def ocv(self, soc: float) -> tuple[float, float]:
-        """(open-circuit voltage of a cell [V], its slope [V])."""
+    def rest_shift(self, temperature: float) -> float:
+        """How much higher [V] a cell rests at `temperature` [degC] than `ocv_value` says."""
+        if not self.rest_shift_value:
+            return 0.0
+        return _linear(self.rest_shift_temperature, self.rest_shift_value, temperature)
+
+    def ocv(self, soc: float, temperature: float | None = None) -> tuple[float, float]:
+        """(open-circuit voltage of a cell [V], its slope [V]) at `temperature` [degC]; None: as tabulated over SOC."""
         xs, ys = self.ocv_soc, self.ocv_value
         i = bisect_right(xs, soc, 1, len(xs) - 1) - 1
         slope = (ys[i + 1] - ys[i]) / (xs[i + 1] - xs[i])
-        return ys[i] + slope * (soc - xs[i]), slope
+        volts = ys[i] + slope * (soc - xs[i])
+        if temperature is not None and self.rest_shift_value:
+            volts += _linear(self.rest_shift_temperature, self.rest_shift_value, temperature)
+        return volts, slope
 
-    def soc_at(self, ocv: float) -> float:
-        """The SOC at which the open-circuit voltage of a cell is `ocv` [V]."""
+    def soc_at(self, ocv: float, temperature: float | None = None) -> float:
+        """The SOC at which the open-circuit voltage of a cell is `ocv` [V]; `temperature` as for `ocv`."""
+        if temperature is not None and self.rest_shift_value:
+            ocv -= _linear(self.rest_shift_temperature, self.rest_shift_value, temperature)
         xs, ys = self.ocv_soc, self.ocv_value
         i = min(max(bisect_right(ys, ocv) - 1, 0), len(xs) - 2)
         return xs[i] + (ocv - ys[i]) * (xs[i + 1] - xs[i]) / (ys[i + 1] - ys[i])
@@ -154,7 +170,7 @@ class Battery:
         beside R0 and the RC pair.
         """
         n, m = self.cells_series, self.cells_parallel
-        source = n * self.ocv(soc)[0]
+        source = n * self.ocv(soc, temperature)[0]
         cell = form * self.r0.at(soc, temperature)[0] + self.r1.at(soc, temperature)[0]
         resistance = n * cell / m + form * self.series_resistance
         root = source * source - 4 * resistance * power
@@ -221,7 +237,7 @@ def drawable(
 def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
     """The battery in the vehicle file; InputError for tables that do not make sense."""
     table = vehicle.table("battery")
-    table.only(["cells_series", "cells_parallel", "ocv", "capacity", "r0", "r1", "c1"])
+    table.only(["cells_series", "cells_parallel", "ocv", "rest_shift", "capacity", "r0", "r1", "c1"])
     ocv = table.table("ocv")
     ocv.only(["soc", "value", "unit", "sd", "source", "status"])
     ocv.text("unit", choices=["V"])
@@ -240,6 +256,7 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
             raise capacity.error(f"must be {len(temperatures)} positive numbers, one for each temperature", "value")
         at_25 = _linear(temperatures, capacities, 25.0)
         capacities = tuple(value / at_25 for value in capacities)
+    shift_temperatures, shifts, shift_sd = _rest_shift(table)
     battery = Battery(
         cells_series=round(table.number("cells_series", low=1, high=1000)),
         cells_parallel=round(table.number("cells_parallel", low=1, high=1000)),
@@ -254,8 +271,25 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         r0=_mesh(table.table("r0"), "ohm"),
         r1=_mesh(table.table("r1"), "ohm"),
         c1=_mesh(table.table("c1"), "F"),
+        rest_shift_temperature=shift_temperatures,
+        rest_shift_value=shifts,
+        rest_shift_sd=shift_sd,
     )
     return battery.with_parameters(parameters)
+
+
+def _rest_shift(battery: Table) -> tuple[Row, Row, float]:
+    """(temperatures [degC], shifts [V], their sd [V]); nothing if the file does not have the table."""
+    if "rest_shift" not in battery.values:
+        return (), (), 0.0
+    table = battery.table("rest_shift")
+    table.only(["temperature", "value", "unit", "sd", "source", "status"])
+    table.text("unit", choices=["V"])
+    temperatures, shifts = _axis(table, "temperature", -60, 100), table.numbers("value")
+    if len(shifts) != len(temperatures) or max(map(abs, shifts)) > LARGEST_SHIFT:
+        wanted = f"must be {len(temperatures)} numbers within {-LARGEST_SHIFT:g} to {LARGEST_SHIFT:g} V"
+        raise table.error(f"{wanted}, one for each temperature", "value")
+    return temperatures, shifts, table.number("sd", 0.005, low=0.0, high=LARGEST_SHIFT)
 
 
 def _axis(table: Table, key: str, low: float, high: float) -> Row:

@@ -205,7 +205,8 @@ def _rest_soc(signals: dict[str, Array], vehicle: Vehicle) -> float | None:
     temperature = float(signals.get("cell_temperature", zero + 20)[:n].mean())
     soc = 0.5
     for _ in range(5):  # R0 depends on SOC
-        soc = battery.soc_at(cell + battery.r0.at(soc, temperature)[0] * current / battery.cells_parallel)
+        rest = cell + battery.r0.at(soc, temperature)[0] * current / battery.cells_parallel
+        soc = battery.soc_at(rest, temperature)
     return min(max(soc, 0.0), 1.0)
 
 

@@ -45,6 +45,7 @@ class FirstOrderPack:
         self._decay = 0.0
         self._decay_dt = 0.0
         self._charge = 1.0  # A·s of the pack
+        self._shift = 0.0  # V of a cell
         self._drawn = 0.0  # J, up to the last look-up
         self._soc_before = soc  # at the last look-up
 
@@ -57,6 +58,7 @@ class FirstOrderPack:
         self._c1 = battery.c1.at(soc, temperature)[0]
         self._decay, self._decay_dt = exp(-dt / (self._r1 * self._c1)), dt
         self._charge = 3600 * battery.pack_capacity(temperature)
+        self._shift = battery.rest_shift(temperature)
         self._age = 0.0
 
     def draw(self, power: float, dt: float, temperature: float) -> tuple[float, float, float, float]:
@@ -67,6 +69,7 @@ class FirstOrderPack:
         battery = self.battery
         n, m = battery.cells_series, battery.cells_parallel
         ocv, slope = battery.ocv(self.soc)
+        ocv += self._shift
         resistance = n * self._r0 / m + battery.series_resistance
         source = n * (ocv - self.v1)
         root = source * source - 4 * resistance * power
@@ -93,6 +96,7 @@ class FirstOrderPack:
         a, b = (low, high) if high >= low else (high, low)
         knots = [a, *(x for x in self.battery.ocv_soc[1:-1] if a < x < b), b]
         total = sum((y - x) * (ocv(x)[0] + ocv(y)[0]) / 2 for x, y in pairwise(knots))
+        total += (b - a) * self._shift
         return sign * total * self.battery.cells_series * self._charge
 
 
