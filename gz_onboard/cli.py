@@ -20,6 +20,10 @@ COMMANDS = {
     "simulate": ("gz_onboard.simulation.simulate", "ride a drive cycle, a route or a recorded ride by simulation"),
     "validate": ("gz_onboard.lab.validate", "hold recorded rides against their simulation, by a gate of 20 %"),
     "calibrate": ("gz_onboard.lab.calibrate.command", "find a vehicle's parameters from measurements"),
+    "discover": (
+        "gz_onboard.lab.discover.command",
+        "find what the model gets wrong on rides, name the cause, extend it",
+    ),
     "export": ("gz_onboard.bus.export", "turn a log into candump, BLF, ASC, Parquet, CSV, ..."),
     "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride"),
 }

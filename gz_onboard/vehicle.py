@@ -90,6 +90,7 @@ def read_vehicle(name: str, payload: float | None = None, effects_folder: Path |
             "battery",
             "forecast",
             "controller",
+            "healthy",
         ]
     )
     if table.number("schema") != 1:
@@ -107,4 +108,16 @@ def read_vehicle(name: str, payload: float | None = None, effects_folder: Path |
         model=Model(effects, parameters),
         riding=read_riding(table),
         derating=read_derating(table),
+        healthy=_healthy(table.table("healthy")),
     )
+
+
+def _healthy(table: Table) -> Path | None:
+    """The file of what the discovery learned on healthy rides, beside the vehicle file."""
+    table.only(["file", "rides"])
+    if "file" not in table.values:
+        return None
+    file = table.file.parent / table.text("file")
+    if not file.is_file():
+        raise table.error(f"no file {file}", "file")
+    return file

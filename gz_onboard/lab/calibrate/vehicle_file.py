@@ -69,6 +69,12 @@ def merged(text: str, results: Sequence[Result], base: Path, out: Path) -> str:
     return _spliced(list(_entries(text, base)), new, tables, dropped, base)
 
 
+def with_keys(text: str, keys: Mapping[KeyPath, str], file: Path, without: Iterable[KeyPath] = ()) -> str:
+    """The text of the vehicle file `file` with the TOML values `keys` at these paths, and without these tables."""
+    new = {path: f"{_key(path[-1])} = {value}\n" for path, value in keys.items()}
+    return _spliced(list(_entries(text, file)), new, {}, set(without), file)
+
+
 def _check(parameters: Mapping[str, Found], curves: Mapping[str, Curve], base: Path) -> None:
     """InputError if the file could not be read again, naming what was found."""
     declared = declared_parameters()

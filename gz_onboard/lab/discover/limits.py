@@ -1,0 +1,92 @@
+"""What a set of rides could show at all: the smallest change of each cause, and the residuals they cannot form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gz_onboard.lab.discover.channels import CHANNELS
+from gz_onboard.lab.discover.linear import normal
+from gz_onboard.lab.discover.result import Report
+from gz_onboard.lab.discover.search import evidence
+from gz_onboard.lab.discover.terms import LOG
+from gz_onboard.lab.discover.verdict import energy, energy_share, own_value
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The smallest change of a cause that these rides would show, half the time, were it alone.
+
+    change: of its first parameter [unit]; inf if the rides say nothing of it. share: of the energy, as a magnitude;
+    0 for one that takes none.
+    """
+
+    name: str
+    parameter: str
+    change: float
+    unit: str
+    share: float
+
+
+def limits(report: Report) -> list[Limit]:
+    """Of every candidate, in the order of the ranking, those that the rides say nothing of last."""
+    state = report.state
+    if state is None:
+        return []
+    found = evidence(state, report.normals or [normal(line, state.noise) for line in report.lines])
+    order = {name: i for i, (name, _) in enumerate(report.ranking)}
+    result = []
+    for cause in sorted(state.causes, key=lambda c: order.get(c.name, len(order))):
+        parameter = cause.parameters[0]
+        place = state.names.index(parameter.name) if parameter.name in state.names else None
+        information = float(found.information[place, place]) if place is not None else 0.0
+        if place is None or cause.name not in order or information <= 0:
+            result.append(Limit(cause.name, parameter.name, float("inf"), parameter.unit, float("inf")))
+            continue
+        steps = float(np.sqrt(report.threshold * state.inflation.get(cause.name, 1.0) / information))
+        change = np.zeros(len(state.mean))
+        change[place] = steps
+        step = float(state.scale[place]) * (own_value(state, parameter.name) if parameter.name in LOG else 1.0)
+        share = abs(energy_share(state, report.lines, change))
+        result.append(Limit(cause.name, parameter.name, steps * step, parameter.unit, share))
+    return result
+
+
+def unformed(report: Report) -> list[str]:
+    """What measurements the rides lack, and which residuals and candidates that costs, one sentence for each set."""
+    state = report.state
+    if state is None:
+        return []
+    lost: dict[tuple[str, ...], list[str]] = {}
+    for channel in CHANNELS:
+        if channel.battery and state.system.battery is None:
+            continue
+        for line in report.lines:
+            lacking = tuple(role for role in channel.roles if role not in line.ride.have)
+            if lacking and channel.name not in lost.setdefault(lacking, []):
+                lost[lacking].append(channel.name)
+    for role, name in (("rate_z", "anything over lateral acceleration"), ("gps_course", "anything over heading")):
+        if any(role not in line.ride.have for line in report.lines):
+            lost.setdefault((role,), []).append(name)
+    sentences = []
+    for roles, names in lost.items():
+        without = [line.ride.name for line in report.lines if not set(roles) <= line.ride.have]
+        rides = "no ride has" if len(without) == len(report.lines) else f"{', '.join(without)}: without"
+        sentences.append(f"{rides} {' and '.join(roles)}: no {', no '.join(words(name) for name in names)} there")
+    return sentences
+
+
+def size(report: Report) -> tuple[float, float, float]:
+    """(way [m], time [s], energy drawn [J]) of the rides that were used."""
+    way = sum(line.ride.distance for line in report.lines)
+    time = sum(float(line.ride.time[-1] - line.ride.time[0]) for line in report.lines)
+    return way, time, sum(energy(line) for line in report.lines)
+
+
+def words(name: str) -> str:
+    """A name of the code in words."""
+    return name.replace("_", " ").replace("gps", "GPS")
+
+
+__all__ = ["Limit", "limits", "size", "unformed", "words"]

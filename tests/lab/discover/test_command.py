@@ -1,0 +1,93 @@
+"""gz-onboard discover from the command line: what it refuses, what it says, what it writes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from gz_onboard.cli import main
+from gz_onboard.lab.discover.candidates import candidates
+from gz_onboard.lab.discover.command import KEYS
+from tests.support import LOGS, ROOT
+
+RIDE = LOGS / "city_34C.blf"
+
+
+def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """What is written to stderr by a command that must be refused."""
+    assert main(["discover", *arguments]) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "Traceback" not in err
+    return err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "no ride is given"),
+        (["nowhere.blf"], "nowhere.blf: no such log"),
+        ([str(ROOT / "dbc")], "this folder holds no log"),
+        ([str(ROOT / "README.md")], "unknown log format '.md'"),
+        ([str(RIDE), "--effects", "nowhere"], "--effects nowhere: no such folder"),
+        ([str(RIDE), "--vehicle", "refrence"], "did you mean 'reference'"),
+        ([str(RIDE), str(RIDE)], "two rides are called city_34C"),
+        ([str(RIDE), "--holdout", "city_34C"], "one ride alone"),
+        ([str(LOGS), "--holdout", "city_43C"], "no ride is called 'city_43C' (did you mean 'city_34C'?)"),
+        ([str(RIDE), "--json", "nowhere/out.json"], "no folder nowhere"),
+        ([str(RIDE), "--write-model", "new.txt"], "a vehicle file is a .toml"),
+        ([str(RIDE), "--payload", "900"], "must be 0 to 300 kg"),
+        ([str(RIDE), "--baseline", "out.toml", "--quiet"], "three are the least"),
+    ],
+)
+def test_what_cannot_be_is_refused(capsys, monkeypatch, tmp_path, arguments: list[str], words: str):
+    monkeypatch.chdir(tmp_path)
+    assert words in said(capsys, *arguments)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_vehicle_file_itself_is_not_overwritten(capsys):
+    own = str(ROOT / "gz_onboard" / "vehicles" / "reference.toml")
+    assert "is the vehicle file itself" in said(capsys, str(RIDE), "--write-model", own)
+
+
+def test_the_list_says_of_each_what_it_is_and_what_shows_it(capsys):
+    assert main(["discover", "--list"]) == 0
+    entries = {part.split()[0]: part for part in capsys.readouterr().out.split("\n\n")}
+    assert set(entries) == {c.name for c in candidates()}
+    for c in candidates():
+        assert c.equation and c.shown_by, c.name
+        text = " ".join(entries[c.name].split())
+        assert c.equation in text and c.shown_by in text
+        assert all(f"{p.name} [{p.unit}], prior" in text for p in c.parameters)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One healthy ride, against the vehicle file alone."""
+    folder = tmp_path_factory.mktemp("discover")
+    files = [f"--{option}={folder / name}" for option, name in
+             (("json", "out.json"), ("report", "out.html"), ("write-model", "new.toml"))]  # fmt: skip
+    assert main(["discover", str(RIDE), "--workers", "1", "--quiet", *files]) == 0
+    return folder
+
+
+def test_one_healthy_ride(alone: Path):
+    found = json.loads((alone / "out.json").read_text())
+    assert set(found) == {"schema", *KEYS}
+    assert found["verdict"] == "none"
+    assert found["causes"] == []
+    assert not (alone / "new.toml").exists()  # nothing to extend it with
+    assert found["gain"]["holdout"] == []
+    limits = found["limits"]
+    assert set(limits) == {c.name for c in candidates()}
+    assert 0.02 < limits["rolling_resistance"]["energy_share"] < 1
+    assert limits["payload_mass"]["change"] > 1
+
+
+def test_the_report_is_one_file_with_its_pictures(alone: Path):
+    page = (alone / "out.html").read_text()
+    assert page.count("data:image/png;base64,") >= 3
+    assert 'src="http' not in page
