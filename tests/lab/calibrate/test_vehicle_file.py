@@ -28,7 +28,8 @@ def found(name: str, value: float, sd: float = 0.1, source: str = "a test") -> F
 @st.composite
 def results(draw: st.DrawFn) -> Result:
     """Any parameters within their bounds, correlated in any way, and battery tables."""
-    names = draw(st.lists(st.sampled_from(sorted(DECLARED)), min_size=1, max_size=8, unique=True))
+    plain = sorted(set(DECLARED) - {"cell_resistance_factor"})  # which scales the tables as they are read
+    names = draw(st.lists(st.sampled_from(plain), min_size=1, max_size=8, unique=True))
     parameters = {}
     for name in names:
         p = DECLARED[name]
