@@ -1,0 +1,257 @@
+"""The vehicle files that discovery writes: read again as they were meant, and used by all that rides."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gz_onboard.cli import main
+from gz_onboard.errors import InputError
+from gz_onboard.estimator.forecast import Forecaster
+from gz_onboard.lab.discover.engine import adopted, linearise_all
+from gz_onboard.lab.discover.files import curve_text, load, modelled_share, write_baseline, write_model
+from gz_onboard.lab.discover.linear import Linear
+from gz_onboard.lab.discover.result import Cause, Report
+from gz_onboard.lab.discover.shapes import hats
+from gz_onboard.lab.discover.state import Shape, State, initial, restore
+from gz_onboard.physics.effect import load_effect
+from gz_onboard.physics.model import bind
+from gz_onboard.simulation.samples import read_samples
+from gz_onboard.vehicle import find_vehicle, read_vehicle
+from tests.support import LOGS
+
+REFERENCE = find_vehicle("reference")
+KNOTS = [[0.0, -4.0, 1.0], [4.0, 1.0, 1.0], [8.0, 6.0, 2.0], [12.0, 2.0, 1.0]]
+CURVE = {"channel": "road_force", "quantity": "speed", "unit": "m/s", "share": 0.03, "score": 40.0, "curve": KNOTS}
+
+
+@pytest.fixture(scope="module")
+def state() -> State:
+    return initial(read_vehicle("reference"))
+
+
+@pytest.fixture(scope="module")
+def lines(state: State) -> list[Linear]:
+    return linearise_all([state.ride(read_samples(LOGS / "coastdown.blf", state.vehicle))], state)
+
+
+def report(state: State, lines: list[Linear], *causes: Cause, unknown: dict[str, object] | None = None) -> Report:
+    verdict = "unknown" if unknown else "cause"
+    return Report(verdict, list(causes), [], unknown, [], {}, {}, [], [], {}, 15.0, state=state, lines=lines)
+
+
+def cornering(share: float = 0.04) -> Cause:
+    return Cause("cornering_drag", "cornering_compliance", 0.25, "rad", (0.2, 0.3), 0.25, share, 70.0)
+
+
+def rolling() -> Cause:
+    return Cause("rolling_resistance", "rolling_resistance_constant", 0.015, "1", (0.014, 0.016), 0.0033, 0.1, 50.0)
+
+
+def wind() -> Cause:
+    others = (("wind_east", -1.0, (-2.0, 0.0)),)
+    return Cause("headwind", "wind_north", 3.0, "m/s", (2.0, 4.0), 3.0, 0.01, 30.0, others)
+
+
+def test_causes_become_effects_and_parameters(state, lines, tmp_path: Path):
+    out = tmp_path / "new.toml"
+    found = report(state, lines, cornering(), rolling(), wind())
+    words = write_model(found, state.vehicle, REFERENCE, out)
+    assert found.extended_model == str(out)
+    before, after = state.vehicle, read_vehicle(str(out))
+    added = [e.name for e in after.model.effects][len(before.model.effects) :]
+    assert added == ["cornering_drag", "headwind"]
+    assert after.parameters["cornering_compliance"] == 0.25
+    assert after.parameters["rolling_resistance_constant"] == 0.015
+    assert (after.parameters["wind_north"], after.parameters["wind_east"]) == (3.0, -1.0)
+    # the interval is two-sided 95 % of Student's t with 4 degrees of freedom: 2.776 of these to either side
+    assert after.parameters.sd("cornering_compliance") == pytest.approx(0.05 / 2.776, rel=1e-3)
+    value = after.parameters.known["cornering_compliance"]
+    assert value.status == "measured"
+    assert "cornering_drag" in value.source and "coastdown" in value.source
+    assert any("cornering_compliance = 0.25" in word for word in words)
+    untouched = {n for n in before.parameters.known if n not in
+                 {"cornering_compliance", "rolling_resistance_constant", "wind_north", "wind_east"}}  # fmt: skip
+    assert all(after.parameters.known[name] == before.parameters.known[name] for name in untouched)
+
+
+def test_what_the_model_lacked_leaves_the_forecast_factor(state, lines, tmp_path: Path):
+    """factor / (1 + s·factor): measured energy stays what it is while the model now gives s of it more."""
+    out = tmp_path / "new.toml"
+    found = report(state, lines, rolling())
+    change = np.zeros(len(state.names))
+    place = state.names.index("rolling_resistance_constant")
+    change[place] = 0.0033 / state.scale[place]
+    share = modelled_share(found, change)
+    assert share > 0.01
+    write_model(found, state.vehicle, REFERENCE, out)
+    before, after = state.vehicle.riding, read_vehicle(str(out)).riding
+    assert after == replace(before, factor=pytest.approx(before.factor / (1 + share * before.factor), rel=1e-5))
+    source = tomllib.loads(out.read_text())["forecast"]["source"]
+    assert f"{share:.1%}" in source and f"{before.factor:g}" in source
+    assert tomllib.loads(REFERENCE.read_text())["forecast"]["source"] in source
+
+
+def test_what_came_on_top_of_healthy_rides_does_not(state, lines, tmp_path: Path):
+    """The factor was measured on a vehicle that had not yet changed."""
+    out = tmp_path / "new.toml"
+    write_model(report(replace(state, healthy=5), lines, rolling()), state.vehicle, REFERENCE, out)
+    assert read_vehicle(str(out)).riding == state.vehicle.riding
+
+
+def test_a_sensors_error_is_no_energy(state, lines, tmp_path: Path):
+    out = tmp_path / "new.toml"
+    gain = Cause("current_sensor_gain", "pack_current_gain", 1.03, "1", (1.02, 1.04), 0.02, 0.02, 50.0)
+    write_model(report(state, lines, gain), state.vehicle, REFERENCE, out)
+    assert read_vehicle(str(out)).riding == state.vehicle.riding
+
+
+def test_a_value_beyond_its_bounds_is_written_at_the_bound(state, lines, tmp_path: Path):
+    out = tmp_path / "new.toml"
+    write_model(report(state, lines, replace(cornering(), value=0.9)), state.vehicle, REFERENCE, out)
+    assert read_vehicle(str(out)).parameters["cornering_compliance"] == 0.5
+
+
+@pytest.mark.parametrize("quantity", ["speed", "acceleration", "heading", "time", "lateral_acceleration"])
+def test_the_empirical_effect_is_the_curve(state, lines, tmp_path: Path, quantity: str):
+    top = 6.0 if quantity == "heading" else 12.0
+    knots = [[at * top / 12, value, sd] for at, value, sd in KNOTS]
+    name, text = curve_text(report(state, lines, unknown={**CURVE, "quantity": quantity, "curve": knots}))
+    (tmp_path / f"{name}.py").write_text(text)
+    effect = load_effect(name, tmp_path)
+    assert effect.port.name == "WHEEL_FORCE"
+    scale = {f"{name}_scale": 1.0}
+    x = np.linspace(0, 6.2 if quantity == "heading" else 15, 40)
+    at, values, _ = np.array(knots).T
+    expected = hats(x, at, quantity == "heading") @ values
+    fast = {"speed": x if quantity == "speed" else np.full(len(x), 30.0)}
+    reads = {q: fast["speed"] if q == "speed" else x for q in effect.quantities}
+    fade = fast["speed"] ** 2 / (fast["speed"] ** 2 + 1)
+    assert bind(effect, scale)(reads) == pytest.approx(expected * fade, abs=1e-4)
+    one = {q: float(v[7]) for q, v in reads.items()}  # on board: floats
+    assert bind(effect, scale)(one) == pytest.approx(expected[7] * fade[7], abs=1e-4)
+
+
+def test_a_curve_that_no_effect_can_read_is_not_written(state, lines, tmp_path: Path):
+    found = report(state, lines, unknown={**CURVE, "quantity": "current_change"})
+    words = write_model(found, state.vehicle, REFERENCE, tmp_path / "new.toml")
+    assert found.extended_model is None
+    assert "no effect can read current_change" in words[0]
+    assert not list(tmp_path.iterdir())
+
+
+def test_effects_of_the_users_own_go_along(state, lines, tmp_path: Path):
+    own = tmp_path / "mine"
+    own.mkdir()
+    (own / "top_box.py").write_text(
+        "from gz_onboard.physics.effect import Parameter, Port\nPORT = Port.WHEEL_FORCE\n"
+        'PARAMETERS = (Parameter("box_area", "m²", 0.04, 0.03, 0.0, 0.3, "a guess"),)\n'
+        "def term(speed, air_density, *, box_area):\n    return air_density * box_area * speed * speed / 2\n"
+    )
+    there = tmp_path / "there"
+    there.mkdir()
+    known = initial(state.vehicle, own)
+    box = Cause("top_box", "box_area", 0.06, "m²", (0.05, 0.07), 0.06, 0.03, 30.0)
+    found = report(known, linearise_all([line.ride for line in lines], known), box, unknown=CURVE)
+    write_model(found, state.vehicle, REFERENCE, there / "new.toml")
+    (own / "top_box.py").unlink()  # what was written stands alone
+    after = read_vehicle(str(there / "new.toml"))
+    assert [e.name for e in after.model.effects][-2:] == ["top_box", "empirical_road_force_speed"]
+    assert after.parameters["box_area"] == 0.06
+
+
+@pytest.fixture(scope="module")
+def extended(state, lines, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("extended") / "new.toml"
+    write_model(report(state, lines, cornering(), unknown=CURVE), state.vehicle, REFERENCE, out)
+    return out
+
+
+def test_estimate_uses_it_unchanged(extended: Path, tmp_path: Path, capsys):
+    out = str(tmp_path)
+    assert (
+        main(["estimate", str(LOGS / "coastdown.blf"), "--vehicle", str(extended), "--no-plot", "--output", out]) == 0
+    )
+
+
+def test_simulate_has_it_in_the_ledger(extended: Path, capsys):
+    assert main(["simulate", "wmtc_part1", "--vehicle", str(extended), "--no-series", "--no-plot"]) == 0
+    assert "empirical road force speed" in capsys.readouterr().out
+
+
+def test_the_forecast_on_board_knows_it(extended: Path):
+    ranges = []
+    for vehicle in (read_vehicle("reference"), read_vehicle(str(extended))):
+        # the factor apart, which was lowered for this
+        riding = replace(vehicle.riding, factor=1.0)
+        ranges.append(Forecaster(vehicle.model, vehicle.pack, riding).forecast(0.8, 0.01, 20.0, 1.0, 20.0, 0.0).range)
+    assert ranges[1] < 0.97 * ranges[0]
+
+
+# --- baseline -----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def learned(state: State) -> State:
+    n = len(state.names)
+    rng = np.random.default_rng(4)
+    shape = Shape(rng.normal(size=8), np.eye(8), 1.3)
+    return replace(
+        state, mean=rng.normal(size=n) * 0.1, prior=np.diag(rng.uniform(0.5, 1, n)), scatter=rng.uniform(0.5, 1, n),
+        healthy=7, inflation={"headwind": 1.4}, shapes={"road_force over speed": shape},
+    )  # fmt: skip
+
+
+def test_a_baseline_is_read_as_it_was_written(learned: State, tmp_path: Path):
+    out = tmp_path / "base.toml"
+    vehicle = adopted(learned.vehicle, learned)
+    write_baseline(vehicle, REFERENCE, out)
+    again = read_vehicle(str(out))
+    assert again.healthy == tmp_path / "base.healthy.npz"
+    for name, value in vehicle.parameters.known.items():
+        assert again.parameters[name] == pytest.approx(value.value, rel=1e-5)
+    restored = restore(again)
+    assert restored.names == learned.names
+    assert restored.healthy == 7
+    assert restored.noise == learned.noise
+    assert restored.inflation == learned.inflation
+    for field in ("mean", "prior", "scatter", "scale"):
+        assert getattr(restored, field) == pytest.approx(getattr(learned, field))
+    assert {n: restored.values[n] for n in learned.names} == {n: learned.values[n] for n in learned.names}
+    pair = restored.shapes["road_force over speed"]
+    assert (pair.mean.tolist(), pair.inflation) == (learned.shapes["road_force over speed"].mean.tolist(), 1.3)
+
+
+def test_once_more_gives_one_healthy_table(learned: State, tmp_path: Path):
+    first, second = tmp_path / "one.toml", tmp_path / "two.toml"
+    write_baseline(adopted(learned.vehicle, learned), REFERENCE, first)
+    again = read_vehicle(str(first))
+    write_baseline(adopted(again, replace(learned, vehicle=again, healthy=9)), first, second)
+    assert tomllib.loads(second.read_text())["healthy"] == {"file": "two.healthy.npz", "rides": 9}
+
+
+def test_the_extended_model_has_no_statistics_of_before(learned: State, lines, tmp_path: Path):
+    base, out = tmp_path / "base.toml", tmp_path / "new.toml"
+    write_baseline(adopted(learned.vehicle, learned), REFERENCE, base)
+    vehicle = read_vehicle(str(base))
+    write_model(report(learned, lines, cornering()), vehicle, base, out)
+    assert read_vehicle(str(out)).healthy is None
+
+
+def test_statistics_that_cannot_be_read_are_refused(learned: State, state: State, tmp_path: Path):
+    base = tmp_path / "base.toml"
+    write_baseline(adopted(learned.vehicle, learned), REFERENCE, base)
+    beside = tmp_path / "base.healthy.npz"
+    fewer = replace(state, names=state.names[:-3])
+    with pytest.raises(InputError, match="another model"):
+        load(fewer, beside)
+    beside.write_bytes(b"no zip")
+    with pytest.raises(InputError, match="cannot be read"):
+        restore(read_vehicle(str(base)))
+    beside.unlink()
+    with pytest.raises(InputError, match="no file"):
+        read_vehicle(str(base))
