@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.errors import InputError
+from gz_onboard.lab.discover.alone import NOTE, alone
 from gz_onboard.lab.discover.gain import measure_gain
 from gz_onboard.lab.discover.grid import Array, Ride
 from gz_onboard.lab.discover.linear import (
@@ -175,6 +176,9 @@ def discover(
     if not usable:
         raise InputError("no ride can be used: " + "; ".join(notes or ["none given"]))
     say(f"{len(usable)} rides, {len(state.names)} parameters")
+    if not state.healthy:
+        notes.append(NOTE)
+        state = alone(state, usable, lambda some, at: linearise_all(some, at, workers))
     lines = linearise_all(usable, state, workers)
     report = reach(state, lines, notes, say, lambda s: linearise_all(usable, s, workers))
     say("gain on rides held out")

@@ -21,6 +21,8 @@ from gz_onboard.lab.discover.terms import LOG, stepped
 
 FALSE_ALARMS = 0.05  # of sets of healthy rides, all candidates and curves together
 EXTRA = 0.97  # of what a curve and the names explain, the part that names must
+NOISY = "road_force over grade"
+"""Of which healthy rides must tell: both are made from the accelerometer, whose noise makes a slope of its own."""
 MARGIN = 6.0  # of chi-squared within which another cause explains as well: a likelihood ratio of 20
 
 
@@ -214,6 +216,8 @@ def unexplained(
     index = search.index(chosen)
     best: dict[str, Any] | None = None
     for pair in names():
+        if pair == NOISY and pair not in state.shapes:
+            continue
         inflation = state.shapes[pair].inflation if pair in state.shapes else 1.0
         beside = shape_evidence(state, lines, normals, pair, index)
         if beside is None:

@@ -120,7 +120,9 @@ def test_a_value_beyond_its_bounds_is_written_at_the_bound(state, lines, tmp_pat
 def test_the_empirical_effect_is_the_curve(state, lines, tmp_path: Path, quantity: str):
     top = 6.0 if quantity == "heading" else 12.0
     knots = [[at * top / 12, value, sd] for at, value, sd in KNOTS]
-    name, text = curve_text(report(state, lines, unknown={**CURVE, "quantity": quantity, "curve": knots}))
+    written = curve_text(report(state, lines, unknown={**CURVE, "quantity": quantity, "curve": knots}))
+    assert written is not None
+    name, text = written
     (tmp_path / f"{name}.py").write_text(text)
     effect = load_effect(name, tmp_path)
     assert effect.port.name == "WHEEL_FORCE"

@@ -1,0 +1,57 @@
+"""What is known of a vehicle of which no healthy rides are: its file is taken at its word.
+
+An effect that its model lacks is not there; noise and scatter between rides are those of the very rides that are
+looked into, with everything free that could be a cause, so that no cause makes them look noisier than they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gz_onboard.lab.discover.grid import Array, Ride
+from gz_onboard.lab.discover.linear import Linear, fit_mixed, learn_noise, normal
+from gz_onboard.lab.discover.state import TRANSFER, State
+
+FREE = 25.0  # variance in scales that is added to that of every parameter while noise and scatter are learned
+ROUNDS = 2
+SCATTER_FROM = 3  # rides
+TRANSFERRED = 3.0  # times the standard deviation of a bench: see `state.TRANSFER`
+ABSENT = 1e-3  # sd in scales of an effect that the model lacks
+NOTE = ("no healthy rides are known of this vehicle (--baseline): it is held against its file, whose model is taken at "
+        "its word, and the rate of false alarms is not calibrated")  # fmt: skip
+
+
+def alone(
+    state: State, rides: Sequence[Ride], linearise: Callable[[Sequence[Ride], State], list[Linear]]
+) -> State:  # fmt: skip
+    """`state` of a vehicle file, to judge `rides` with. linearise: rides at a state."""
+    lines = linearise(rides, state)
+    noise = state.noise
+    free = state.prior + FREE * np.eye(len(state.names))
+    for _ in range(ROUNDS):
+        post = fit_mixed([normal(line, noise) for line in lines], state.mean, free, state.scatter, 1.0, state.free, 0)
+        noise = learn_noise(lines, post.mean + post.own, noise)
+    scatter = state.scatter
+    if len(rides) >= SCATTER_FROM:
+        normals = [normal(line, noise) for line in lines]
+        scatter = fit_mixed(normals, state.mean, free, state.scatter, 1.0, state.free, 60).scatter
+    return replace(state, noise=noise, scatter=scatter, prior=as_the_file_says(state))
+
+
+def as_the_file_says(state: State) -> Array:
+    """The prior of `state` in which an effect that the model lacks is not there, and what was found on a bench holds
+    on the road as `TRANSFER` says.
+    """
+    has = {effect.name for effect in state.vehicle.model.effects}
+    prior = state.prior.copy()
+    for cause in state.causes:
+        if cause.effect and cause.effect.name not in has:
+            for name in set(cause.names) & set(state.names):
+                i = state.names.index(name)
+                prior[i, :] = prior[:, i] = 0.0
+                prior[i, i] = ABSENT**2
+    wider = np.array([TRANSFERRED if name in TRANSFER else 1.0 for name in state.names])
+    return np.asarray(prior * np.outer(wider, wider))
