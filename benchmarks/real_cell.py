@@ -102,21 +102,25 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
         return Mesh(soc, temperature, tuple(tuple(map(float, row)) for row in table))
 
     sd = result.curves["battery.ocv"].sd[(cell.ocv_soc > 0.1) & (cell.ocv_soc < 0.95)]
-    return Battery(
+    battery = Battery(
         1, 1, capacity_25, temperature, share, 2.5, 0.0, tuple(map(float, cell.ocv_soc)), tuple(map(float, cell.ocv)),
         float(np.median(sd)), mesh(cell.r0), mesh(cell.r1), mesh(cell.c1),
     )  # fmt: skip
+    if (shift := result.curves.get("battery.rest_shift")) is None:
+        return battery
+    return replace(
+        battery,
+        rest_shift_temperature=temperature,
+        rest_shift_value=tuple(map(float, shift.value)),
+        rest_shift_sd=float(np.median(shift.sd)),
+    )
 
 
 class Extended(ScalarFilter):
-    """The on-board filter with what one RC pair lacks, as far as asked for.
-
-    A slow pair that follows the current alone, and the rest voltage's shift with temperature.
-    """
+    """The on-board filter with a second, slow pair that follows the current alone."""
 
     slow_resistance: Mesh | None = None
     slow_time: Mesh | None = None
-    shift: tuple[Array, Array] | None = None  # degC, V
     v2 = 0.0
 
     def predict(self, dt: float, current: float, temperature: float, noise: tuple[float, float]) -> None:
@@ -128,8 +132,7 @@ class Extended(ScalarFilter):
 
     def _observe(self, current: float, temperature: float) -> tuple[float, float]:
         predicted, slope = super()._observe(current, temperature)
-        more = float(np.interp(temperature, *self.shift)) if self.shift else 0.0
-        return predicted - self.v2 + more, slope
+        return predicted - self.v2, slope
 
 
 @dataclass(frozen=True)
@@ -140,15 +143,12 @@ class Setting:
     battery: Battery
     result: Result
     slow: tuple[Mesh, Mesh] | None = None
-    shift: tuple[Array, Array] | None = None
 
     def make(self, battery: Battery, soc: float, v1: float, covariance: Covariance) -> SocFilter:
-        if not self.slow and not self.shift:
+        if not self.slow:
             return ScalarFilter(battery, soc, v1, covariance)
         made = Extended(battery, soc, v1, covariance)
-        if self.slow:
-            made.slow_resistance, made.slow_time = self.slow
-        made.shift = self.shift
+        made.slow_resistance, made.slow_time = self.slow
         return made
 
 
@@ -238,14 +238,11 @@ def pulse_resistance(table: Table, capacity: float) -> dict[float, float]:
 
 
 def settings(rest: Result, result: Result) -> list[Setting]:
-    """The filter on board, and with each part that one RC pair lacks."""
+    """The filter on board, without its rest voltage over temperature, and with a second pair."""
     result.parameters["cell_capacity"] = rest.parameters["cell_capacity"]
     capacity = result.curves["battery.capacity"]
     at_25 = float(np.interp(25, capacity.axes["temperature"], capacity.value))
     one, two = pulse.circuit(result), pulse.circuit(result, slow=True)
-    shifts = result.curves["rest_shift"]
-    middle = (shifts.axes["soc"] > 0.15) & (shifts.axes["soc"] < 0.95)
-    shift = shifts.axes["temperature"], shifts.value[:, middle].mean(axis=1)
     single, double = battery_of(one, result, at_25), battery_of(two, result, at_25)
     assert two.slow_resistance is not None
     assert two.slow_time is not None
@@ -253,10 +250,14 @@ def settings(rest: Result, result: Result) -> list[Setting]:
     slow = tuple(Mesh(*axes, tuple(map(tuple, t.tolist()))) for t in (two.slow_resistance, two.slow_time))
     return [
         Setting("on board: one RC pair", single, result),
-        Setting("and rest voltage over temperature", single, result, shift=shift),
+        Setting("rest voltage one for all temperatures", _unshifted(single), result),
         Setting("two RC pairs", double, result, slow=(slow[0], slow[1])),
-        Setting("two RC pairs and rest voltage over temperature", double, result, slow=(slow[0], slow[1]), shift=shift),
+        Setting("two RC pairs, rest voltage one for all", _unshifted(double), result, slow=(slow[0], slow[1])),
     ]
+
+
+def _unshifted(battery: Battery) -> Battery:
+    return replace(battery, rest_shift_temperature=(), rest_shift_value=(), rest_shift_sd=0.0)
 
 
 def jobs(work: tuple[Setting, Cycle, float, float]) -> Score:
@@ -302,10 +303,10 @@ def _tables(result: Result) -> list[str]:
              "| --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
     soc = c["battery.r0"].axes["soc"]
     k = int(np.argmin(np.abs(soc - 0.5)))
-    middle = (soc > 0.15) & (soc < 0.95)
+    written = c["battery.rest_shift"].value if "battery.rest_shift" in c else np.zeros(len(TEMPERATURES))
     for j, t in enumerate(c["battery.r0"].axes["temperature"]):
         r0, r1, c1 = (c[f"battery.{n}"].value[j, k] for n in ("r0", "r1", "c1"))
-        shift = 1e3 * c["rest_shift"].value[j, middle].mean()
+        shift = 1e3 * written[j]
         lines.append(
             f"| {t:.0f} | {c['battery.capacity'].value[j]:.3f} | {shift:+.0f} | "
             f"{1e3 * r0:.0f}, {1e3 * r1:.0f} | {r1 * c1:.0f} | {1e3 * c['slow_resistance'].value[j, k]:.0f} | "

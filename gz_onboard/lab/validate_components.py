@@ -184,7 +184,8 @@ def _temperatures(
         charge = np.cumsum(measured["pack_current"] / 3600) / battery.pack_capacity(
             float(measured["cell_temperature"][0])
         )
-        source = np.array([battery.ocv(s)[0] for s in (soc - charge).tolist()]) * battery.cells_series
+        levels = zip((soc - charge).tolist(), measured["cell_temperature"].tolist(), strict=True)
+        source = np.array([battery.ocv(s, celsius)[0] for s, celsius in levels]) * battery.cells_series
         heat = (source - measured["pack_voltage"]) * measured["pack_current"]
         pack = parts.pack_cooling
         pack.temperature = float(measured["cell_temperature"][0])

@@ -103,7 +103,8 @@ class Scooter:
         self.climb = 0.0  # m
         self.time = 0.0  # s
         self.current = 0.0  # A of the pack
-        self.voltage = vehicle.battery.cells_series * vehicle.battery.ocv(soc)[0]
+        cells = ambient if cell_temperature is None else cell_temperature
+        self.voltage = vehicle.battery.cells_series * vehicle.battery.ocv(soc, cells)[0]
         self.sensed_voltage = self.voltage  # V, as the controller has it
         self._series = vehicle.battery.cells_series
         self._voltage_gain = min(dt / VOLTAGE_FILTER, 1.0)
@@ -142,7 +143,6 @@ class Scooter:
                              p["front_brake_share"], form=brake_form)  # fmt: skip
         regeneration = p["regeneration_torque_limit"] / p["torque_constant"]
         self.controller = Controller(p["motor_current_limit"], regeneration, vehicle.derating)
-        cells = ambient if cell_temperature is None else cell_temperature
         cooled = p["cooling_factor"]
         self.inverter_cooling = InverterCooling(
             p["inverter_board_capacity"], p["inverter_box_capacity"], p["inverter_board_to_air"],

@@ -1,6 +1,8 @@
 """A cell's equivalent circuit over arrays: filters of the current, tables over SOC and temperature, voltage.
 
-    V = V_oc(SOC) - R0·I - Σ R_k·x_k,    dx_k/dt = (I - x_k)/τ_k        (V_k = R_k·x_k: Lord 2016, eqs. 2.22 and 2.23)
+    V = V_oc(SOC) + shift(T) - R0·I - Σ R_k·x_k,    dx_k/dt = (I - x_k)/τ_k
+
+V_k = R_k·x_k (Lord 2016, eqs. 2.22 and 2.23); shift is nothing unless the rests tell one.
 
 I is the cell's current [A], positive when discharging. With the time constants given, V is linear in every table.
 """
@@ -22,7 +24,7 @@ class Circuit:
     """Tables of one cell: R0, one fast RC pair and, if `slow_resistance` is given, a slow one.
 
     ocv: (n,) [V] over ocv_soc. r0, r1 [ohm], c1 [F], slow_resistance [ohm], slow_time [s]: (temperatures, soc).
-    capacity: (temperatures,) [A·h].
+    capacity: (temperatures,) [A·h]. rest_shift: (temperatures,) [V], how much higher the cell rests than `ocv`.
     """
 
     ocv_soc: Array
@@ -35,6 +37,13 @@ class Circuit:
     c1: Array
     slow_resistance: Array | None = None
     slow_time: Array | None = None
+    rest_shift: Array | None = None
+
+    def ocv_shift(self, temperature: Array) -> Array:
+        """What the open-circuit voltage (m,) [V] is above `ocv` at `temperature` (m,) [degC]."""
+        if self.rest_shift is None:
+            return np.zeros(np.shape(temperature))
+        return np.asarray(np.interp(temperature, self.temperature, self.rest_shift))
 
 
 def hats(nodes: Array, x: Array) -> Array:
@@ -90,7 +99,8 @@ def voltage(
     if not rested:
         raise ValueError("a cell that has not rested starts from an unknown polarisation")
     r0, r1, c1 = (at(cell.soc, cell.temperature, t, soc, temperature) for t in (cell.r0, cell.r1, cell.c1))
-    result = ocv_at(cell.ocv_soc, cell.ocv, soc) - r0 * current - _pair(r1, r1 * c1, flowed, dt)
+    rest = ocv_at(cell.ocv_soc, cell.ocv, soc) + cell.ocv_shift(temperature)
+    result = rest - r0 * current - _pair(r1, r1 * c1, flowed, dt)
     if cell.slow_resistance is not None and cell.slow_time is not None:
         r2 = at(cell.soc, cell.temperature, cell.slow_resistance, soc, temperature)
         result = result - _pair(r2, at(cell.soc, cell.temperature, cell.slow_time, soc, temperature), flowed, dt)

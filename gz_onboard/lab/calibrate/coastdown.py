@@ -14,12 +14,10 @@ the standard deviations would be too small (Kariya & Kurata 2004).
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import sqrt
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,9 +27,10 @@ from scipy.optimize import minimize, minimize_scalar
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.lab.calibrate.fit import Solution, linear, score
 from gz_onboard.lab.calibrate.result import Array, Fit, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.table import Table
 from gz_onboard.physics.effect import QUANTITIES, Effect, Port
 from gz_onboard.physics.model import G, air_density
-from gz_onboard.simulation.samples import Samples
+from gz_onboard.simulation.samples import Samples, read_facts
 from gz_onboard.vehicle import Vehicle
 
 NAMES = ("rolling_resistance_constant", "rolling_resistance_speed", "drag_area")
@@ -91,71 +90,38 @@ class Noise:
 # --- what is measured ---------------------------------------------------------------------------------------------
 
 
-def read_coastdown(
-    file: Path,
-    *,
-    direction: str,
-    total_mass: float,
-    ambient: float,
-    unit: str = "",
-    period: float = 1.0,
-) -> Samples:
-    """A coast-down of a CSV file, as `Samples` with a ``vehicle_speed``.
+_ROLES = {"speed": "vehicle_speed"} | dict.fromkeys(
+    ("vehicle_speed", "motor_speed", "wheel_speed_rear", "throttle", "brake_switch", "motor_current",
+     "ambient_temperature", "gps_altitude", "gps_course"), ""
+)  # fmt: skip
 
-    The file has a header with ``time_s`` and ``speed_mps`` or ``speed_kmh``; or no header: then one column of speeds in
-    `unit` (``mps`` or ``kmh``) every `period` [s]. direction: ``up`` or ``down``, or any two words for the two ways.
-    total_mass [kg]: vehicle and rider. ambient [degC]. Raises InputError naming file, line and column.
+
+def samples(table: Table, facts: Mapping[str, object] | None = None) -> Samples:
+    """The coast-down in `table`, of ``time`` and ``speed`` [m/s] (or ``motor_speed``) and, if it has them, more roles.
+
+    facts: what was written down of it; None: in a ``rides.json`` beside the table. It needs ``direction`` (``up`` or
+    ``down``, or any two words for the two ways), ``rider_mass_kg`` or ``total_mass_kg``, and ``ambient_C`` if there is
+    no column ambient_temperature. Raises InputError naming file, line and column.
     """
-    try:
-        text = file.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file}: cannot be read: {getattr(error, 'strerror', None) or error}") from error
-    rows = [(i, row) for i, row in enumerate(csv.reader(text.splitlines()), start=1) if any(f.strip() for f in row)]
-    if len(rows) < 3:
-        raise InputError(f"{file}: has {len(rows)} rows; a coast-down needs more")
-    units = {"mps": 1.0, "kmh": 1 / 3.6}
-    head = [name.strip() for name in rows[0][1]]
-    if _is_number(head[0]):
-        if len(head) != 1 or unit not in units:
-            raise InputError(
-                f"{file}:1: no header: a file without one has one column, and its unit must be told (mps or kmh, is "
-                f"{unit!r}); else its header must name time_s and speed_mps or speed_kmh"
-            )
-        names, factor, body = ["speed"], units[unit], rows
-    else:
-        known = ("time_s", "speed_mps", "speed_kmh")
-        for name in head:
-            if name not in known:
-                raise InputError(
-                    f"{file}:{rows[0][0]}: unknown column {name!r}{nearest(name, known)}; known are {', '.join(known)}"
-                )
-        if "time_s" not in head or len(set(head) & {"speed_mps", "speed_kmh"}) != 1 or len(head) != 2:
-            raise InputError(f"{file}:{rows[0][0]}: must name time_s and one of speed_mps, speed_kmh; names {head}")
-        names = ["time" if name == "time_s" else "speed" for name in head]
-        factor = units["kmh" if "speed_kmh" in head else "mps"]
-        body = rows[1:]
-    columns: dict[str, list[float]] = {name: [] for name in names}
-    for line, row in body:
-        if len(row) != len(names):
-            raise InputError(f"{file}:{line}: has {len(row)} fields, must have {len(names)}")
-        for name, field in zip(names, row, strict=True):
-            if not _is_number(field):
-                raise InputError(f"{file}:{line}: {name}: {field!r} is not a number")
-            columns[name].append(float(field))
-    speed: Array = np.array(columns["speed"]) * factor
-    time: Array = np.array(columns["time"]) if "time" in columns else period * np.arange(float(len(speed)))
-    back = np.flatnonzero(np.diff(time) <= 0)
-    if len(back):
-        raise InputError(f"{file}:{body[back[0] + 1][0]}: time_s: {time[back[0] + 1]:g} s does not increase")
-    facts: dict[str, object] = {"direction": direction, "total_mass_kg": total_mass, "ambient_C": ambient}
-    return Samples(file.stem, {"vehicle_speed": (time, speed)}, facts)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        return bool(np.isfinite(float(text)))
-    except ValueError:
-        return False
+    time = table["time"]
+    again = np.flatnonzero(np.diff(time) <= 0)
+    if len(again):
+        raise table.error(f"time: {time[again[0] + 1]:g} s does not increase", int(again[0]) + 1)
+    if "motor_speed" not in table and "vehicle_speed" not in table:
+        table["speed"]  # which is missing, or of no use
+    name = table.file.name.removesuffix(".gz").rpartition(".")[0]
+    notes = table.file.parent / "rides.json"
+    known = dict(read_facts(notes).get(name, {}) if facts is None else facts)
+    for keys in (("direction",), ("total_mass_kg", "rider_mass_kg")):
+        if not known.keys() & set(keys):
+            close = nearest(keys[0], [str(key) for key in known])
+            raise table.error(f"{notes.name} beside it says no {' or '.join(keys)} of {name!r}{close}")
+    if "ambient_temperature" not in table and "ambient_C" not in known:
+        raise table.error(f"no column ambient_temperature, and {notes.name} beside it says no ambient_C of {name!r}")
+    for key in ("total_mass_kg", "rider_mass_kg", "ambient_C"):
+        if key in known and (isinstance(known[key], bool) or not isinstance(known[key], int | float)):
+            raise table.error(f"{notes.name} beside it: {key} of {name!r} is {known[key]!r}, no number")
+    return Samples(name, {new or old: (time, table[old]) for old, new in _ROLES.items() if old in table}, known)
 
 
 def coast(run: Samples, vehicle: Vehicle, direction: int) -> Coast:

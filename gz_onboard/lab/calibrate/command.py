@@ -185,9 +185,8 @@ def _cooling_runs(given: Given, slot: str) -> list[cooling.Run]:
 
 
 def _coastdown(given: Given) -> Result:
-    return coasting.calibrate(
-        given.rides["data"], given.vehicle, wind_sd=given.number("wind_sd"), slope_sd=given.number("slope_sd")
-    )
+    runs = given.rides.get("data", []) + [coasting.samples(table) for table in given.tables.get("data", [])]
+    return coasting.calibrate(runs, given.vehicle, wind_sd=given.number("wind_sd"), slope_sd=given.number("slope_sd"))
 
 
 _LARGEST: dict[str, Option] = {"largest_current": motor.RIDING_CURRENT}
@@ -257,7 +256,7 @@ PROCEDURES: dict[str, Procedure] = {
     ),
     "coastdown": Procedure(
         "rolling resistance and drag area from coast-downs in both directions",
-        {"data": Slot("ride", "coast-downs in both directions", 2)},
+        {"data": Slot("any", "coast-downs in both directions: rides, or tables of time and speed", 2)},
         _coastdown,
         {"wind_sd": coasting.WIND_SD, "slope_sd": coasting.SLOPE_SD},
     ),

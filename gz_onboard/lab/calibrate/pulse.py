@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import minimize_scalar
+from scipy.stats import chi2
 
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.lab.calibrate.cell_circuit import KELVIN, Circuit, ocv_at, riding_current, voltage
@@ -29,6 +30,7 @@ FEWEST_LEVELS = 3
 REST = 1200.0  # s without current, after which a voltage is that of rest
 FULL_WITHIN = 0.03  # V: a first voltage so near to the full cell's is that of a full cell
 LEVEL = 0.15  # relative: how far a time constant may change over 0.1 of SOC
+SURE = 0.99  # how surely the rests must tell that temperature moves them, before the vehicle file says so
 SMOOTH = 0.08  # relative: how far ln of a table may bend over 0.1 of SOC, where the data say little
 
 
@@ -55,6 +57,8 @@ def calibrate(
     soc: Array = SOC,
 ) -> Result:
     """``battery.r0``, ``r1``, ``c1``, ``capacity``, ``ocv``, and beside them a slow pair.
+
+    Also ``battery.rest_shift``, if the rests tell that temperature moves the open-circuit voltage (`_shift_of_rests`).
 
     tables: one for each temperature. ocv, capacity: from `ocv.calibrate`. loads: currents [any unit, one value a
     second, each from rest] that the pair is to follow; synthetic rides if None. Raises InputError for tables that are
@@ -85,11 +89,14 @@ def calibrate(
     sd_one, sd_two = ([np.hypot(x, TESTER) for x in sds] for sds in (sd_one, sd_two))
     covered = np.array([f.covered for f in fitted])
     shift, ocv_sd = _rest_shift(fitted, tested, nodes, ocv)
-    cell = Circuit(nodes, volts + shift, soc, np.array([t.temperature for t in tested]),
-                   np.array([t.capacity for t in tested]), r0, r1, tau / r1)  # fmt: skip
-    slow = Circuit(nodes, volts + shift, soc, cell.temperature, cell.capacity, tables_two[0], tables_two[1],
-                   tables_two[3] / tables_two[1], tables_two[2], tables_two[4])  # fmt: skip
     names = ", ".join(t.test.name for t in tested)
+    rests = _rests_over_soc(fitted, tested, names)
+    result.curves["rest_shift"] = rests
+    rest_shift = _shift_of_rests(rests, tested, names, result)
+    cell = Circuit(nodes, volts + shift, soc, np.array([t.temperature for t in tested]),
+                   np.array([t.capacity for t in tested]), r0, r1, tau / r1, rest_shift=rest_shift)  # fmt: skip
+    slow = Circuit(nodes, volts + shift, soc, cell.temperature, cell.capacity, tables_two[0], tables_two[1],
+                   tables_two[3] / tables_two[1], tables_two[2], tables_two[4], rest_shift)  # fmt: skip
     axes = {"soc": soc, "temperature": cell.temperature}
     how = f"{names}: six RC pairs, reduced over {'synthetic rides' if loads is None else 'the loads given'}"
     if method == "direct":
@@ -111,10 +118,6 @@ def calibrate(
     result.curves["slow_c1"] = curve(slow.c1, slow.c1 * np.hypot(sd_two[1], sd_two[3]), "F", "C1 beside a slow pair")
     result.curves["slow_resistance"] = curve(tables_two[2], tables_two[2] * sd_two[2], "ohm", "slow pair")
     result.curves["slow_time"] = curve(tables_two[4], tables_two[4] * sd_two[4], "s", "slow pair")
-    shifts = np.array([f.shift for f in fitted])
-    shift_sd = np.array([np.sqrt(np.diag(f.covariance)[-len(soc) :]) for f in fitted])
-    reference = shifts[_nearest(tested)]
-    result.curves["rest_shift"] = curve(shifts - reference, shift_sd, "V", "rest voltage against that near 25 degC")
     for t, f in zip(tested, fitted, strict=True):
         if not np.all(f.covered):
             result.refusals.append(
@@ -131,17 +134,19 @@ def circuit(result: Result, slow: bool = False) -> Circuit:
     c = result.curves
     ocv, axes = c["battery.ocv"], c["battery.r0"].axes
     base = (ocv.axes["soc"], ocv.value, axes["soc"], axes["temperature"], c["battery.capacity"].value)
+    cold = c["battery.rest_shift"].value if "battery.rest_shift" in c else None
     if slow:
         return Circuit(*base, c["slow_r0"].value, c["slow_r1"].value, c["slow_c1"].value, c["slow_resistance"].value,
-                       c["slow_time"].value)  # fmt: skip
-    return Circuit(*base, c["battery.r0"].value, c["battery.r1"].value, c["battery.c1"].value)
+                       c["slow_time"].value, cold)  # fmt: skip
+    return Circuit(*base, c["battery.r0"].value, c["battery.r1"].value, c["battery.c1"].value, rest_shift=cold)
 
 
 def follow_profile(cell: Circuit, test: CellTest) -> tuple[Array, Array]:
     """(model, measured) voltage (m,) [V]: from the SOC of the first voltage, at rest, on by the current alone."""
     slope = np.interp(test.temperature, cell.temperature, cell.capacity)
     order = np.argsort(cell.ocv)
-    start = float(np.interp(test.voltage[0], cell.ocv[order], cell.ocv_soc[order]))
+    rest = test.voltage[0] - cell.ocv_shift(test.temperature[:1])[0]
+    start = float(np.interp(rest, cell.ocv[order], cell.ocv_soc[order]))
     level = start - np.cumsum(np.diff(test.drawn, prepend=0.0) / slope)
     return voltage(cell, test.flowed, test.current, test.dt, level, test.temperature), test.voltage
 
@@ -292,6 +297,50 @@ def _rest_shift(fitted: list[Branches], tested: list[Tested], nodes: Array, ocv:
     moved = ocv.value + shift
     shift = np.maximum.accumulate(moved + 1e-3 * (nodes[-1] - nodes)) - 1e-3 * (nodes[-1] - nodes) - ocv.value
     return shift, np.hypot(np.minimum(ocv.sd, np.abs(shift) + 0.003), scatter)
+
+
+def _rests_over_soc(fitted: list[Branches], tested: list[Tested], names: str) -> Curve:
+    """How much higher the cell rests at each temperature and SOC than near 25 degC."""
+    shifts = np.array([f.shift for f in fitted])
+    sd = np.array([np.sqrt(np.diag(f.covariance)[-len(f.soc) :]) for f in fitted])
+    axes = {"soc": fitted[0].soc, "temperature": np.array([t.temperature for t in tested])}
+    covered = np.array([f.covered for f in fitted])
+    return Curve(axes, shifts - shifts[_nearest(tested)], np.where(covered, sd, np.nan), "V",
+                 f"{names}: rest voltage against that near 25 degC")  # fmt: skip
+
+
+def _shift_of_rests(rests: Curve, tested: list[Tested], names: str, result: Result) -> Array | None:
+    """The shift (temperatures,) [V] of the open-circuit voltage, as ``battery.rest_shift``; None if it is not sure.
+
+    The mean over 15 to 95 % SOC; its sd holds how it varies there, since one number is to stand for all of it.
+    """
+    reference = _nearest(tested)
+    soc = rests.axes["soc"]
+    middle = (soc > 0.15) & (soc < 0.95)
+    if len(tested) < 2:
+        return None
+    known = [row[middle & np.isfinite(sd)] for row, sd in zip(rests.value, rests.sd, strict=True)]
+    within = [sd[middle & np.isfinite(sd)] for sd in rests.sd]
+    if not all(map(len, known)):
+        return None
+    mean = np.array([row.mean() for row in known])
+    sd = np.array([np.hypot(row.std(), s.mean()) for row, s in zip(known, within, strict=True)])
+    others = np.arange(len(tested)) != reference
+    chance = float(chi2.sf(np.sum((mean[others] / np.maximum(sd[others], 1e-3)) ** 2), len(tested) - 1))
+    told = ", ".join(f"{1e3 * m:+.1f} ± {1e3 * s:.1f} mV at {t.temperature:g} degC"
+                     for t, m, s, other in zip(tested, mean, sd, others, strict=True) if other)  # fmt: skip
+    if chance > 1 - SURE:
+        result.notes.append(
+            f"rests do not move with temperature beyond how they scatter over the state of charge: {told}; "
+            "the open-circuit voltage is one for all temperatures"
+        )
+        return None
+    result.notes.append(f"the cell rests {told} against {tested[reference].temperature:g} degC")
+    result.curves["battery.rest_shift"] = Curve(
+        {"temperature": rests.axes["temperature"]}, mean, sd, "V",
+        f"{names}: mean over 15 to 95 % SOC of the rests against those near 25 degC",
+    )  # fmt: skip
+    return mean
 
 
 def _mesh_quality(

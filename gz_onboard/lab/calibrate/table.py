@@ -64,7 +64,7 @@ _KINDS = {
     "charge": ("A·h",), "energy": ("J",),
     "acceleration": ("m/s^2",), "distance": ("m",), "altitude": ("m",),
 }  # fmt: skip
-_SPEED_OF = {"motor_speed": "rad/s", "wheel_speed": "rad/s"}
+_SPEED_OF = {"motor_speed": "rad/s", "wheel_speed": "rad/s", "vehicle_speed": "m/s", "speed": "m/s"}
 
 _BRACKETS = re.compile(r"^\s*(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]\s*$")
 

@@ -12,12 +12,14 @@ from gz_onboard.lab.calibrate.table import Table
 
 @dataclass
 class Plant:
-    """V = ocv(soc) - r0·I - Σ v, each v' = (r·I - v)/tau; resistances grow by `cold` per K below 25 degC."""
+    """V = ocv(soc) - r0·I - Σ v, each v' = (r·I - v)/tau; resistances grow by `cold` and ocv falls by `rest` per K
+    below 25 degC."""
 
     capacity: float = 2.5
     r0: float = 0.05
     pairs: tuple[tuple[float, float], ...] = ((0.03, 30.0),)  # ohm, s
     cold: float = 0.04
+    rest: float = 0.0  # V/K
     hysteresis: float = 0.0  # V: half the gap of the curves
     noise: float = 0.0005
     seed: int = 0
@@ -32,7 +34,8 @@ class Plant:
         rng = np.random.default_rng(self.seed)
         factor = np.exp(self.cold * (25 - temperature))
         self.state = [0.0] * len(self.pairs)
-        now, rows, side = 0.0, [(0.0, 0.0, float(self.ocv(self.soc)))], -1.0
+        lower = self.rest * (25 - temperature)
+        now, rows, side = 0.0, [(0.0, 0.0, float(self.ocv(self.soc)) - lower)], -1.0
         for current, seconds, step in pieces:
             for dt in [0.1, *[step] * round(seconds / step)]:
                 now += dt
@@ -42,7 +45,9 @@ class Plant:
                 for k, (r, tau) in enumerate(self.pairs):
                     a = np.exp(-dt / tau)
                     self.state[k] = a * self.state[k] + (1 - a) * r * factor * current
-                volts = self.ocv(self.soc) - self.r0 * factor * current - sum(self.state) - side * self.hysteresis
+                volts = (
+                    self.ocv(self.soc) - lower - self.r0 * factor * current - sum(self.state) - side * self.hysteresis
+                )
                 rows.append((now, current, volts))
         time, current, volts = (np.array(c) for c in zip(*rows, strict=True))
         size = len(time)

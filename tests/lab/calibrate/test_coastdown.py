@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from gz_onboard.cli import main
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.coastdown import NAMES, calibrate, coast, directions, read_coastdown
+from gz_onboard.lab.calibrate.coastdown import NAMES, calibrate, coast, directions, samples
+from gz_onboard.lab.calibrate.table import Table, read_table
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
 from gz_onboard.simulation.samples import Samples, read_samples
@@ -190,38 +193,72 @@ def test_commissioning_coastdowns():
 # --- CSV ----------------------------------------------------------------------------------------------------------
 
 
+NOTES = '[{"name": "down", "direction": "down", "total_mass_kg": 180, "ambient_C": 20}]'
+
+
+def in_table(folder, text, notes=NOTES):
+    (folder / "rides.json").write_text(notes)
+    file = folder / "down.csv"
+    file.write_text(text)
+    return samples(read_table(file))
+
+
 def test_a_table_of_time_and_speed(tmp_path):
-    file = tmp_path / "down.csv"
-    file.write_text("time_s,speed_kmh\n0,36\n1,35.1\n2.5,34.2\n")
-    run = read_coastdown(file, direction="down", total_mass=180.0, ambient=20.0)
+    run = in_table(tmp_path, "time_s,speed_kmh\n0,36\n1,35.1\n2.5,34.2\n")
     time, speed = run.columns["vehicle_speed"]
     assert time.tolist() == [0, 1, 2.5]
     assert speed == pytest.approx([10, 9.75, 9.5])
-    assert run.facts == {"direction": "down", "total_mass_kg": 180.0, "ambient_C": 20.0}
+    assert (run.name, run.facts) == ("down", {"direction": "down", "total_mass_kg": 180, "ambient_C": 20})
+    warm = in_table(tmp_path, "time_s,motor_speed_rpm,ambient_temperature_degC\n0,300,21\n1,295,21\n",
+                    '[{"name": "down", "direction": "down", "rider_mass_kg": 70}]')  # fmt: skip
+    assert warm.columns["motor_speed"][1][0] == pytest.approx(31.416, abs=1e-3)
+    assert warm.columns["ambient_temperature"][1].tolist() == [21, 21]
+    assert warm.rider_mass == 70
 
 
 @pytest.mark.parametrize(
-    ("text", "unit", "message"),
+    ("text", "notes", "message"),
     [
-        ("time_s,speed_kph\n0,1\n1,2\n", "", r"down.csv:1: unknown column 'speed_kph' \(did you mean 'speed_kmh'\?\)"),
-        ("time_s,speed_mps\n0,1\n1,fast\n2,3\n", "", "down.csv:3: speed: 'fast' is not a number"),
-        ("time_s,speed_mps\n0,9\n2,8\n1,7\n", "", "down.csv:4: time_s: 1 s does not increase"),
-        ("time_s\n0\n1\n2\n", "", "must name time_s and one of"),
-        ("9\n8\n7\n", "", "down.csv:1: no header: .* unit must be told"),
-        ("time_s,speed_mps\n0,9\n1,8,7\n2,7\n", "", "down.csv:3: has 3 fields, must have 2"),
-        ("9\n", "mps", "has 1 rows"),
+        ("time_s,sped_kmh\n0,1\n1,2\n", NOTES, r"down.csv: no column for 'speed', in m/s \(did you mean 'sped'\?\)"),
+        ("time_s,speed_rpm\n0,1\n1,2\n", NOTES, r"'speed_rpm': speed cannot be in rpm"),
+        ("time_s,speed_mps\n0,1\n1,fast\n2,3\n", NOTES, "line 3, column 'speed_mps': 'fast' is not a finite number"),
+        ("time_s,speed_mps\n0,9\n1,8\n1,7\n", NOTES, "down.csv:4: time: 1 s does not increase"),
+        ("9\n8\n7\n", NOTES, "down.csv:1: 9 ... are numbers, not names of columns"),
+        ("time_s,speed_mps\n0,9\n1,8,7\n", NOTES, "down.csv:3: 3 values for 2 columns"),
+        ("time_s,speed_mps\n0,9\n1,8\n", "[]", "rides.json beside it says no direction of 'down'"),
+        ("time_s,speed_mps\n0,9\n1,8\n", NOTES.replace("tot", "t"), "says no total_mass_kg or rider_mass_kg"),
+        ("time_s,speed_mps\n0,9\n1,8\n", NOTES.replace("ambient", "air"), "says no ambient_C of 'down'"),
+        ("time_s,speed_mps\n0,9\n1,8\n", NOTES.replace("180", '"180 kg"'), "is '180 kg', no number"),
     ],
 )
-def test_what_is_wrong_in_a_table_is_named(tmp_path, text, unit, message):
-    file = tmp_path / "down.csv"
-    file.write_text(text)
+def test_what_is_wrong_in_a_table_is_named(tmp_path, text, notes, message):
     with pytest.raises(InputError, match=message):
-        read_coastdown(file, direction="down", total_mass=180.0, ambient=20.0, unit=unit)
+        in_table(tmp_path, text, notes)
 
 
-def test_no_file(tmp_path):
-    with pytest.raises(InputError, match=r"none.csv: cannot be read: No such file"):
-        read_coastdown(tmp_path / "none.csv", direction="up", total_mass=1.0, ambient=20.0)
+def test_tables_give_what_the_same_runs_give_as_rides(tmp_path, healthy):
+    """By the command: 1 Hz speeds in CSV, facts beside them."""
+    runs, truth = healthy
+    notes = []
+    for run in runs:
+        time, speed = run.columns["motor_speed"]
+        rolling = coast(run, VEHICLE, 1)
+        inside = (time >= rolling.time[0]) & (time <= rolling.time[-1])
+        rows = zip(time[inside], speed[inside] * VEHICLE.parameters["wheel_radius"] * 3.6, strict=True)
+        lines = ["time_s,speed_kmh", *(f"{t:.2f},{v:.4f}" for t, v in rows)]
+        (tmp_path / f"{run.name}.csv").write_text("\n".join(lines) + "\n")
+        notes.append({"name": run.name, "direction": run.facts["direction"], "ambient_C": rolling.temperature,
+                      "rider_mass_kg": rolling.payload})  # fmt: skip
+    (tmp_path / "rides.json").write_text(json.dumps(notes))
+    answer = tmp_path / "answer.json"
+    files = [str(tmp_path / f"{run.name}.csv") for run in runs]
+    assert main(["calibrate", "coastdown", *files, "--json", str(answer)]) == 0
+    (found,) = json.loads(answer.read_text())["procedures"]
+    same = calibrate(runs, VEHICLE, hold_out=False)
+    for name in ("rolling_resistance_constant", "drag_area"):
+        value = found["parameters"][name]["value"]
+        assert value == pytest.approx(same.parameters[name].value, abs=0.5 * same.parameters[name].sd)
+        assert abs(value - truth[name]) < 3 * found["parameters"][name]["sd"]
 
 
 def small_car():
@@ -242,10 +279,11 @@ def test_speeds_alone_give_wide_intervals():
     folder = Path(DATA or "") / "real" / "coastdown_ecomarathon"
     if not folder.is_dir():
         pytest.skip("no Eco-marathon coast-downs in GZ_ONBOARD_DATA")
-    runs = [
-        read_coastdown(folder / f"Michelin60{name}.csv", direction=name[0], total_mass=76.0, ambient=30.0, unit="kmh")
-        for name in ("A", "A1", "B", "B1")
-    ]
+    runs = []
+    for name in ("A", "A1", "B", "B1"):
+        speed = np.loadtxt(folder / f"Michelin60{name}.csv") / 3.6
+        table = Table(Path(f"{name}.csv"), {"time": np.arange(float(len(speed))), "speed": speed})
+        runs.append(samples(table, {"direction": name[0], "total_mass_kg": 76.0, "ambient_C": 30.0}))
     found = calibrate(runs, small_car(), hold_out=True)
     c0, area = (found.parameters[name] for name in ("rolling_resistance_constant", "drag_area"))
     assert 0.001 < c0.value < 0.008

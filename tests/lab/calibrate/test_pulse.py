@@ -10,7 +10,7 @@ import pytest
 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate import ocv, pulse
-from gz_onboard.lab.calibrate.cell_circuit import riding_current
+from gz_onboard.lab.calibrate.cell_circuit import riding_current, voltage
 from gz_onboard.lab.calibrate.cell_data import cell_test
 from gz_onboard.lab.calibrate.cell_fit import TIMES, Reduction
 from gz_onboard.lab.calibrate.result import Found
@@ -56,6 +56,34 @@ def test_the_direct_fit_gives_back_a_cell_that_has_one_pair():
         error = (curve.value - truth)[:, INSIDE]
         assert np.all(np.abs(error) < 0.04 * truth), name
         assert np.mean(np.abs(error) < 1.96 * curve.sd[:, INSIDE]) > 0.9, name
+
+
+@cache
+def resting(rest, seed):
+    """Of a cell whose rest voltage falls by `rest` [V/K] below 25 degC, and by what the tester's noise makes of it."""
+    return pulse.calibrate(
+        [pulse_test(t, seed=seed + k, rest=rest)[0] for k, t in enumerate((-5.0, 10.0, 25.0))], *slow()
+    )
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_rests_that_move_with_temperature_are_found(seed):
+    result = resting(0.5e-3, 10 * seed)
+    curve = result.curves["battery.rest_shift"]
+    assert list(curve.axes["temperature"]) == [-5, 10, 25]
+    assert curve.value == pytest.approx([-0.015, -0.0075, 0.0], abs=0.003)
+    assert np.all(np.abs(curve.value - [-0.015, -0.0075, 0.0]) < 2 * curve.sd + 1e-9)
+    level, nothing = np.array([0.3, 0.5, 0.7]), np.zeros(3)
+    at_rest = voltage(pulse.circuit(result), nothing, nothing, np.ones(3), level, np.full(3, -5.0))
+    assert at_rest == pytest.approx(Plant().ocv(level) - 0.015, abs=0.004)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_rests_that_do_not_are_not_said_to(seed):
+    result = resting(0.0, 100 + 10 * seed)
+    assert "battery.rest_shift" not in result.curves
+    assert any("rests do not move with temperature" in note for note in result.notes)
+    assert pulse.circuit(result).rest_shift is None
 
 
 def test_an_unknown_method_is_named():

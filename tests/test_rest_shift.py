@@ -1,0 +1,145 @@
+"""A cell that rests lower when cold: `[battery.rest_shift]` in the vehicle file, and everything that goes by it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gz_onboard.errors import InputError
+from gz_onboard.estimator.ekf import ScalarFilter
+from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
+from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.events import Group
+from gz_onboard.physics.battery import Battery, drawable
+from gz_onboard.simulation.parts.battery import FirstOrderPack
+from gz_onboard.simulation.recorded import Recorded, rest_soc
+from gz_onboard.simulation.scooter import Scooter
+from gz_onboard.vehicle import OWN, read_vehicle
+
+VEHICLE = read_vehicle("reference", 75.0)
+PLAIN = VEHICLE.pack
+COLD = replace(
+    PLAIN, rest_shift_temperature=(-10.0, 10.0, 25.0), rest_shift_value=(-0.03, -0.01, 0.0), rest_shift_sd=0.004
+)
+TABLE = """
+[battery.rest_shift]
+temperature = [-10.0, 10.0, 25.0]
+value = [-0.030, -0.010, 0.0]
+unit = "V"
+sd = 0.004
+"""
+temperatures = st.floats(-30, 50)
+
+
+def read(folder: Path, table: str) -> Battery:
+    file = folder / "vehicle.toml"
+    file.write_text((OWN / "reference.toml").read_text() + table)
+    return read_vehicle(str(file)).pack
+
+
+def test_the_table_is_read(tmp_path):
+    battery = read(tmp_path, TABLE)
+    assert (battery.rest_shift_temperature, battery.rest_shift_value, battery.rest_shift_sd) == (
+        COLD.rest_shift_temperature, COLD.rest_shift_value, COLD.rest_shift_sd,
+    )  # fmt: skip
+    assert battery.rest_shift(0.0) == pytest.approx(-0.02)
+    assert (battery.rest_shift(-40.0), battery.rest_shift(60.0)) == (-0.03, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "parts"),
+    [
+        ('"V"', '"mV"', ["battery.rest_shift", "mV", "V"]),
+        ("-0.010, 0.0", "-0.010", ["battery.rest_shift", "3 numbers", "one for each temperature"]),
+        ("-0.030", "-30.0", ["battery.rest_shift", "within -0.2 to 0.2 V"]),
+        ("-10.0, 10.0", "10.0, -10.0", ["battery.rest_shift", "must increase"]),
+        ("sd = 0.004", "sd = 4.0", ["battery.rest_shift", "sd", "0.2"]),
+        ("unit", "units", ["battery.rest_shift", "did you mean 'unit'"]),
+    ],
+)
+def test_bad_tables_are_refused(tmp_path, old, new, parts):
+    with pytest.raises(InputError) as error:
+        read(tmp_path, TABLE.replace(old, new, 1))
+    for part in parts:
+        assert part in str(error.value)
+
+
+@given(st.floats(-0.05, 1.05), temperatures)
+def test_soc_at_inverts_ocv(soc, temperature):
+    assert COLD.soc_at(COLD.ocv(soc, temperature)[0], temperature) == pytest.approx(soc, abs=1e-9)
+    assert COLD.ocv(soc, temperature)[0] - PLAIN.ocv(soc)[0] == pytest.approx(COLD.rest_shift(temperature), abs=1e-12)
+
+
+@given(st.floats(-0.05, 1.05), temperatures, st.floats(-500, 3000))
+def test_without_the_table_the_same_bits(soc, temperature, power):
+    assert PLAIN.ocv(soc, temperature) == PLAIN.ocv(soc)
+    volts = PLAIN.ocv(soc)[0]
+    assert PLAIN.soc_at(volts, temperature) == PLAIN.soc_at(volts)
+    flat = replace(COLD, rest_shift_value=(0.0, 0.0, 0.0))
+    assert flat.settled_current(power, soc, temperature) == PLAIN.settled_current(power, soc, temperature)
+
+
+@pytest.mark.parametrize("backend", [ScalarFilter, FilterpyFilter])
+def test_the_filter_reckons_with_it(backend):
+    """A cold cell that rests 20 mV lower: told so, the filter stays where it is right; not told, it is drawn away."""
+    soc = {}
+    for battery in (COLD, PLAIN):
+        f = backend(battery, 0.6, 0.0, (0.05**2, 0.0, 1e-6))
+        volts = COLD.ocv(0.6, 0.0)[0]
+        for _ in range(200):
+            f.predict(1.0, 0.0, 0.0, (1e-9, 1e-8))
+            f.update(volts, 0.0, 0.0, 0.01**2)
+        soc[battery is COLD] = f.soc
+    assert soc[True] == pytest.approx(0.6, abs=1e-6)
+    assert soc[False] < 0.6 - 0.5 * 0.02 / COLD.ocv(0.6)[1]
+
+
+def test_the_estimator_starts_from_the_cold_rest_voltage_and_doubts_it():
+    groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
+    sd = {}
+    for battery in (COLD, PLAIN):
+        estimator = Estimator(groups, battery, VEHICLE.model, VEHICLE.riding)
+        estimator.handle((0.9, 0, (0.0,)))
+        estimator.handle((1.0, 1, (14 * COLD.ocv(0.6, 0.0)[0], VEHICLE.parameters["pack_current_offset"])))
+        assert estimator.filter
+        expected = 0.6 if battery is COLD else PLAIN.soc_at(COLD.ocv(0.6, 0.0)[0])
+        assert estimator.filter.soc == pytest.approx(expected, abs=1e-3)
+        sd[battery is COLD] = estimator.filter.covariance[0]
+    assert sd[True] > 1.01 * sd[False]
+
+
+def test_a_ride_s_rest_voltage_is_taken_as_cold():
+    signals = {
+        "pack_voltage": np.full(600, 14 * COLD.ocv(0.6, 0.0)[0]),
+        "cell_temperature": np.zeros(600),
+        "pack_current": np.zeros(600),
+    }
+    recorded = Recorded("cold", 0.1, signals, np.zeros(1), np.zeros(1))
+    assert rest_soc(recorded, replace(VEHICLE, battery=COLD)) == pytest.approx(0.6, abs=1e-6)
+    assert rest_soc(recorded, VEHICLE) == pytest.approx(PLAIN.soc_at(COLD.ocv(0.6, 0.0)[0]), abs=1e-6)
+
+
+def test_the_simulated_pack_rests_there_and_its_energy_closes():
+    pack = FirstOrderPack(COLD, 0.6)
+    assert pack.draw(0.0, 0.01, 0.0)[1] == pytest.approx(14 * COLD.ocv(0.6, 0.0)[0], abs=1e-6)
+    delivered = heat = 0.0
+    for k in range(60_000):
+        temperature = -10 + 30 * k / 60_000  # the shift moves on the way
+        _, _, warmth, power = pack.draw(900.0, 0.01, temperature)
+        delivered, heat = delivered + 0.01 * power, heat + 0.01 * warmth
+    assert pack.chemical_energy_drawn() == pytest.approx(delivered + heat, rel=2e-5)
+    standing = Scooter(replace(VEHICLE, battery=COLD), soc=0.6, ambient=0.0)
+    assert standing.voltage == pytest.approx(14 * COLD.ocv(0.6, 0.0)[0])
+
+
+@given(st.floats(0.1, 1.0), st.floats(-10, 20), st.floats(100, 2000))
+def test_less_can_be_drawn_from_cells_that_rest_lower(soc, temperature, power):
+    less, more = (drawable(battery, soc, temperature, power).energy for battery in (COLD, PLAIN))
+    assert less <= more + 1e-6
+    if more > 1e5:
+        assert less < more
