@@ -18,7 +18,9 @@ from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.engine import baseline, discover
 from gz_onboard.lab.discover.files import write_baseline, write_model
 from gz_onboard.lab.discover.limits import limits, size, unformed, words
-from gz_onboard.lab.discover.result import SCHEMA, Report
+from gz_onboard.lab.discover.parts import before_and_after
+from gz_onboard.lab.discover.result import METRICS, SCHEMA, VERDICTS, Report
+from gz_onboard.lab.discover.verdict import sizes
 from gz_onboard.simulation.samples import Samples, read_samples
 from gz_onboard.simulation.telling import clock, explain_keys, write_json
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
@@ -40,19 +42,6 @@ KEYS = {
     "threshold": "score that healthy rides exceed in 5 % of such searches",
     "limits": "per candidate: parameter, change, unit, energy_share: the least that would be found half the time",
 }
-VERDICTS = {
-    "cause": "something differs from the model, and it has a name",
-    "none": "nothing is wrong that these rides could show",
-    "ambiguous": "something differs, and these rides cannot tell which of several",
-    "unknown": "something differs that is none of the candidates",
-}
-METRICS = {
-    "power": ("power, rms", 1.0, "W"),
-    "energy_per_way": ("consumption", 1 / 3.6, "Wh/km"),
-    "range": ("range", 100.0, "%"),
-    "voltage": ("voltage of a cell", 1e3, "mV"),
-}
-"""Of the gain: what it says, factor and unit."""
 _ROWS = 3  # residuals and limits told in the terminal
 
 
@@ -327,7 +316,8 @@ def summary(report: Report, vehicle: Vehicle, told: Sequence[str] = ()) -> str:
                      f"{u['share']:+.1%} of the energy, score {u['score']:.0f}")  # fmt: skip
     best = ", ".join(f"{name} {score:.0f}" for name, score in report.ranking[:5])
     lines.append(f"scores       {best}; healthy rides stay below {report.threshold:.0f}")
-    largest = sorted(report.residuals.items(), key=lambda row: -abs(row[1]["energy_share"]))[:_ROWS]
+    left = sizes(before_and_after(report)[0])
+    largest = sorted(left.items(), key=lambda row: -abs(row[1]["energy_share"]))[:_ROWS]
     text = "; ".join(f"{words(name)} {r['mean']:+.3g} ± {r['rms']:.3g} {BY_NAME[name].unit} ({r['energy_share']:+.1%} "
                      "of the energy)" for name, r in largest)  # fmt: skip
     lines.append(f"residuals    {text}")

@@ -66,7 +66,7 @@ def unformed(report: Report) -> list[str]:
             lacking = tuple(role for role in channel.roles if role not in line.ride.have)
             if lacking and channel.name not in lost.setdefault(lacking, []):
                 lost[lacking].append(channel.name)
-    for role, name in (("rate_z", "anything over lateral acceleration"), ("gps_course", "anything over heading")):
+    for role, name in (("rate_z", "residual over lateral acceleration"), ("gps_course", "anything over heading")):
         if any(role not in line.ride.have for line in report.lines):
             lost.setdefault((role,), []).append(name)
     sentences = []

@@ -9,6 +9,19 @@ from gz_onboard.lab.discover.linear import Linear, Normal
 from gz_onboard.lab.discover.state import State
 
 SCHEMA = 1
+VERDICTS = {
+    "cause": "something differs from the model, and it has a name",
+    "none": "nothing is wrong that these rides could show",
+    "ambiguous": "something differs, and these rides cannot tell which of several",
+    "unknown": "something differs that is none of the candidates",
+}
+METRICS = {
+    "power": ("power, rms", 1.0, "W"),
+    "energy_per_way": ("consumption", 1 / 3.6, "Wh/km"),
+    "range": ("range", 100.0, "%"),
+    "voltage": ("voltage of a cell", 1e3, "mV"),
+}
+"""Of the gain: what it says, factor and unit."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,157 @@
+"""What is left of each residual before and after the causes: sensors' biases, wind and the like of each ride taken off.
+
+A residual as measured holds what is no error of the vehicle's model: the accelerometer's mounting angle alone makes
+some newtons of road force. So all parameters are fitted together, those of the causes free; then everything but the
+causes is taken off for "before", and the causes too for "after".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from gz_onboard.lab.discover.channels import BY_NAME, SLOW, cell_circuit, over_blocks, usable
+from gz_onboard.lab.discover.grid import STEP, Array, Ride
+from gz_onboard.lab.discover.linear import Linear, Table, fit_mixed
+from gz_onboard.lab.discover.result import Report
+from gz_onboard.lab.discover.state import State
+
+FREE = 1e6  # variance in scales of a cause that is free
+JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
+LONGEST = 60.0  # s since it did
+
+QUANTITIES: dict[str, tuple[str, str]] = {
+    "speed": ("speed", "m/s"),
+    "acceleration": ("acceleration", "m/s²"),
+    "lateral_acceleration": ("lateral acceleration, left positive", "m/s²"),
+    "grade": ("grade", "1"),
+    "heading": ("heading, clockwise from north", "rad"),
+    "ambient_temperature": ("air", "degC"),
+    "motor_temperature": ("motor", "degC"),
+    "cell_temperature": ("cells", "degC"),
+    "soc": ("state of charge", "1"),
+    "pack_current": ("pack current", "A"),
+    "motor_current": ("motor current", "A"),
+    "time": ("time since the start", "s"),
+    "since_change": ("time since the current changed", "s"),
+}
+"""What residuals are looked at over: words and unit."""
+
+
+def before_and_after(report: Report) -> tuple[list[Linear], list[Linear]]:
+    """The rides of `report` with residuals before and after its causes."""
+    state = report.state
+    assert state is not None
+    index = [i for cause in report.causes for i in _places(state, cause.name)]
+    prior = state.prior.copy()
+    for i in index:
+        prior[i, i] += FREE
+    post = fit_mixed(report.normals, state.mean, prior, state.scatter, 1.0, state.free, 0)
+    before, after = [], []
+    for line, own in zip(report.lines, post.own, strict=True):
+        theta = post.mean + own
+        rest = theta.copy()
+        rest[index] = state.mean[index] + own[index]
+        before.append(line.seen_from(-rest))
+        after.append(line.seen_from(-theta))
+    return before, after
+
+
+def _places(state: State, name: str) -> list[int]:
+    return state.index(next(c for c in state.causes if c.name == name).names)
+
+
+class Over:
+    """The quantities of the rides over the blocks of their channels; those that cost something are kept."""
+
+    def __init__(self, state: State) -> None:
+        self._state = state
+        self._kept: dict[tuple[int, str], Array | None] = {}
+
+    def __call__(self, line: Linear, name: str, table: Table) -> Array | None:
+        """The quantity `name` of `QUANTITIES` over the blocks in `table`, (m,); None if the ride has it not."""
+        key = (id(line.ride), name)
+        if key not in self._kept:
+            self._kept[key] = on_grid(line.ride, name, self._state)
+        values = self._kept[key]
+        return None if values is None else over_blocks(table.channel, values)[table.used]
+
+
+NEEDS = {"lateral_acceleration": "rate_z", "grade": "accel_x", "heading": "gps_course",
+         "ambient_temperature": "ambient_temperature", "motor_temperature": "motor_temperature",
+         "cell_temperature": "cell_temperature", "pack_current": "pack_current"}  # fmt: skip
+"""The role without which a quantity is made up."""
+
+
+def on_grid(ride: Ride, name: str, state: State) -> Array | None:
+    """A quantity on the grid of the ride, shape of its time; None if the ride has it not."""
+    if NEEDS.get(name, "motor_speed") not in ride.have:
+        return None
+    if name == "time":
+        return ride.time
+    if name == "pack_current":
+        return ride.signals[name]
+    if name == "since_change":
+        return since_change(ride.signals["motor_current"])
+    if name == "soc":
+        if not usable(BY_NAME["cell_voltage"], ride, state.system):
+            return None
+        soc = np.repeat(cell_circuit(ride, state.values, state.system)[2], SLOW)
+        return np.append(soc, np.full(max(0, len(ride.time) - len(soc)), soc[-1]))
+    return ride.quantities[name]
+
+
+def since_change(current: Array) -> Array:
+    """Time [s] since `current` (n,) changed by more than `JUMP` within `WITHIN`, at most `LONGEST`, (n,)."""
+    n = round(WITHIN / STEP)
+    jump = np.abs(current - np.concatenate([np.full(n, current[0]), current[:-n]])) > JUMP
+    last = np.maximum.accumulate(np.where(jump, np.arange(len(current)), -round(LONGEST / STEP)))
+    return np.asarray(np.minimum((np.arange(len(current)) - last) * STEP, LONGEST))
+
+
+def gathered(lines: Sequence[Linear], channel: str, name: str, over: Over) -> tuple[Array, Array, Array]:
+    """(quantity, residual in the channel's unit, number of the ride) of all blocks, each (m,)."""
+    xs, ys, rides = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
+    for i, line in enumerate(lines):
+        table = line.tables.get(channel)
+        x = over(line, name, table) if table is not None else None
+        if table is not None and x is not None:
+            xs.append(x)
+            ys.append(table.y * table.unit)
+            rides.append(np.full(len(x), float(i)))
+    return np.concatenate(xs), np.concatenate(ys), np.concatenate(rides)
+
+
+def edges(x: Array, count: int = 12) -> Array:
+    """Edges of `count` bins of as many of `x`, fewer where many are alike: none is narrower than a 25th of the span."""
+    at = np.quantile(x, np.linspace(0, 1, count + 1))
+    least = (np.quantile(x, 0.98) - np.quantile(x, 0.02)) / 25
+    kept = [at[0]]
+    for edge in at[1:-1]:
+        if edge - kept[-1] >= least and at[-1] - edge >= least:
+            kept.append(edge)
+    return np.array([*kept, at[-1]])
+
+
+def binned(x: Array, y: Array, at: Array) -> Array:
+    """Rows (mean of x, mean of y, its standard error, blocks) of the bins between `at` that hold more than 3 blocks."""
+    place = np.clip(np.searchsorted(at, x, side="right") - 1, 0, max(len(at) - 2, 0))
+    rows = []
+    for i in range(max(len(at) - 1, 1)):
+        inside = place == i
+        if (count := int(inside.sum())) > 3:
+            rows.append((x[inside].mean(), y[inside].mean(), y[inside].std() / np.sqrt(count), count))
+    return np.array(rows).reshape(-1, 4)
+
+
+def share_over(x: Array, y: Array) -> float:
+    """The share of the variance of `y` that goes with `x`: correlation ratio of its bins, less what chance gives."""
+    if len(x) < 30 or np.ptp(x) == 0 or np.std(y) == 0:
+        return 0.0
+    rows = binned(x, y, edges(x))
+    if len(rows) < 2:
+        return 0.0
+    mean = np.average(rows[:, 1], weights=rows[:, 3])
+    between = float(np.average((rows[:, 1] - mean) ** 2, weights=rows[:, 3])) / float(np.var(y))
+    return max(0.0, between - (len(rows) - 1) / len(x))
