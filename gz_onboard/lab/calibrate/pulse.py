@@ -249,13 +249,14 @@ def _meshes(fitted: list[Branches], reduction: Reduction, count: int) -> tuple[l
     """(R0, R of each pair, τ of each pair), each (temperatures, soc), smooth; their relative sd likewise."""
     logs, sds = [], []
     for f in fitted:
-        rows, spread = [], []
+        rows, weights, spread = [], [], []
         for k in range(len(f.soc)):
             r = f.resistance[:, k]
             pairs = reduction(r)
             rows.append(np.log([pairs.r0, *pairs.resistance, *pairs.time]))
-            spread.append(np.sqrt(np.diag(reduction.spread(r, f.node_covariance(k)))))
-        logs.append(_smooth(f.soc, np.array(rows), np.array(spread)))
+            weights.append(np.sqrt(np.diag(reduction.spread(r, f.at_node(f.covariance, k)))))
+            spread.append(np.sqrt(np.diag(reduction.spread(r, f.at_node(f.jackknife, k)))))
+        logs.append(_smooth(f.soc, np.array(rows), np.array(weights)))
         sds.append(np.array(spread))
     parts = 1 + 2 * count
     return [np.exp(np.array([x[:, j] for x in logs])) for j in range(parts)], [
@@ -302,7 +303,7 @@ def _rest_shift(fitted: list[Branches], tested: list[Tested], nodes: Array, ocv:
 def _rests_over_soc(fitted: list[Branches], tested: list[Tested], names: str) -> Curve:
     """How much higher the cell rests at each temperature and SOC than near 25 degC."""
     shifts = np.array([f.shift for f in fitted])
-    sd = np.array([np.sqrt(np.diag(f.covariance)[-len(f.soc) :]) for f in fitted])
+    sd = np.array([np.sqrt(np.diag(f.jackknife)[-len(f.soc) :]) for f in fitted])
     axes = {"soc": fitted[0].soc, "temperature": np.array([t.temperature for t in tested])}
     covered = np.array([f.covered for f in fitted])
     return Curve(axes, shifts - shifts[_nearest(tested)], np.where(covered, sd, np.nan), "V",

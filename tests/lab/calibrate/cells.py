@@ -13,7 +13,11 @@ from gz_onboard.lab.calibrate.table import Table
 @dataclass
 class Plant:
     """V = ocv(soc) - r0·I - Σ v, each v' = (r·I - v)/tau; resistances grow by `cold` and ocv falls by `rest` per K
-    below 25 degC."""
+    below 25 degC.
+
+    What a tester and a cell do that no model says: the current is measured wrong by `gain`, and the resistances of each
+    pulse with its rest differ by `scatter` from those of the next, both relative.
+    """
 
     capacity: float = 2.5
     r0: float = 0.05
@@ -22,6 +26,8 @@ class Plant:
     rest: float = 0.0  # V/K
     hysteresis: float = 0.0  # V: half the gap of the curves
     noise: float = 0.0005
+    gain: float = 0.0
+    scatter: float = 0.0
     seed: int = 0
     soc: float = 1.0
     state: list[float] = field(default_factory=list)
@@ -32,7 +38,7 @@ class Plant:
     def run(self, pieces, temperature=25.0, name="cell.csv"):
         """pieces: (current, seconds, step); a sample 0.1 s after each change, then each `step`."""
         rng = np.random.default_rng(self.seed)
-        factor = np.exp(self.cold * (25 - temperature))
+        factor = usual = np.exp(self.cold * (25 - temperature))
         self.state = [0.0] * len(self.pairs)
         lower = self.rest * (25 - temperature)
         now, rows, side = 0.0, [(0.0, 0.0, float(self.ocv(self.soc)) - lower)], -1.0
@@ -40,6 +46,8 @@ class Plant:
             for dt in [0.1, *[step] * round(seconds / step)]:
                 now += dt
                 self.soc -= current * dt / 3600 / self.capacity
+                if current and dt == 0.1:
+                    factor = usual * (1 + self.scatter * rng.normal())
                 if current:
                     side = np.sign(current)
                 for k, (r, tau) in enumerate(self.pairs):
@@ -52,7 +60,7 @@ class Plant:
         time, current, volts = (np.array(c) for c in zip(*rows, strict=True))
         size = len(time)
         volts = volts + rng.normal(0, self.noise, size)
-        columns = {"time": time, "current": current, "voltage": volts,
+        columns = {"time": time, "current": current * (1 + self.gain), "voltage": volts,
                    "cell_temperature": np.full(size, float(temperature)) + rng.normal(0, 0.05, size)}  # fmt: skip
         return Table(Path(name), columns)
 

@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -45,6 +46,20 @@ def test_what_was_planted_comes_back_within_its_uncertainty(seed):
         assert np.all(np.abs(error) < 0.12 * truth), name
     assert np.all(np.abs(result.curves["battery.capacity"].value - 2.5) < 2 * result.curves["battery.capacity"].sd)
     assert list(result.curves["battery.r0"].axes["temperature"]) == [0, 25]
+
+
+def test_intervals_hold_what_a_tester_and_a_cell_do_that_no_model_says():
+    """A current that reads 0.5 % wrong (1 sd) and resistances that scatter by 3 % from pulse to pulse, over seeds."""
+    cold, held = np.exp([[1.0], [0.0]]), dict[str, list[Any]]()
+    for seed in range(8):
+        gain = 0.005 * float(np.random.default_rng(seed).normal())
+        tables = [pulse_test(t, seed=50 + 2 * seed + k, gain=gain, scatter=0.03)[0] for k, t in enumerate((0.0, 25.0))]
+        curves = pulse.calibrate(tables, *slow(), method="direct").curves
+        for name, truth in (("r0", 0.05 * cold), ("r1", 0.03 * cold), ("c1", 1000 / cold)):
+            curve = curves[f"battery.{name}"]
+            held.setdefault(name, []).append((np.abs(curve.value - truth) < 1.96 * curve.sd)[:, INSIDE])
+    assert 0.9 <= np.mean(held["r0"]) <= 0.99, {name: np.mean(x) for name, x in held.items()}
+    assert all(np.mean(x) >= 0.9 for x in held.values()), {name: np.mean(x) for name, x in held.items()}
 
 
 def test_the_direct_fit_gives_back_a_cell_that_has_one_pair():
