@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import re
 import shlex
 import subprocess
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gz_onboard.cli import main
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import bind
@@ -31,16 +33,21 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What a reader of the page has."""
     folder = tmp_path_factory.mktemp("own")
     (folder / "effects").mkdir()
-    box, flat = blocks("python")
-    (folder / "effects" / "top_box.py").write_text(box, encoding="utf-8")
-    (folder / "effects" / "flat_spot.py").write_text(flat, encoding="utf-8")
-    model, parameter = blocks("toml")
+    for name, text in zip(("top_box", "flat_spot", "heated_grips"), blocks("python"), strict=True):
+        (folder / "effects" / f"{name}.py").write_text(text, encoding="utf-8")
+    model, box, grips = blocks("toml")
+    write_vehicle(folder / "boxed.toml", model, box)
+    write_vehicle(folder / "gripped.toml", model.replace('"top_box"', '"heated_grips"'), grips)
+    return folder
+
+
+def write_vehicle(file: Path, model: str, parameter: str) -> None:
+    """The reference scooter's file with the page's tables."""
     text = (OWN / "reference.toml").read_text(encoding="utf-8")
     text, models = re.subn(r"^\[model\]\neffects = \[.*?^\]\n", lambda _: model, text, flags=re.M | re.S)
     text, parameters = re.subn(r"^\[parameters\]\n", lambda _: parameter, text, flags=re.M)
     assert models == parameters == 1
-    (folder / "boxed.toml").write_text(text, encoding="utf-8")
-    return folder
+    file.write_text(text, encoding="utf-8")
 
 
 def test_its_commands_give_what_it_shows(folder: Path):
@@ -55,17 +62,38 @@ def test_its_commands_give_what_it_shows(folder: Path):
             )
             assert run.stdout.strip() == shown.strip(), run.stderr
             commands += 1
-    assert commands >= 2
+    assert commands >= 5
+    found = read_vehicle(str(folder / "found.toml"))
+    assert "heated_grips" in found.key
+    low, high = (25.0 + sign * 3 * found.parameters.sd("heated_grips_power") for sign in (-1, 1))
+    assert low < found.parameters["heated_grips_power"] < high
 
 
-@pytest.mark.parametrize("name", ["top_box", "flat_spot"])
+@pytest.mark.parametrize("name", ["top_box", "flat_spot", "heated_grips"])
 def test_its_effects_keep_to_the_contract(folder: Path, name: str):
     effect = load_effect(name, folder / "effects")
     values = bind(effect, {**read_vehicle("reference").parameters, **{p.name: p.prior for p in effect.parameters}})
-    rows = [{"speed": v, "headwind": 1.0, "air_density": 1.2, "time_moving": 60.0 * v} for v in (0.0, 3.0, 12.0)]
+    rows = [
+        {"speed": v, "headwind": 1.0, "air_density": 1.2, "time_moving": 60.0 * v, "ambient_temperature": 10.0}
+        for v in (0.0, 3.0, 12.0)
+    ]
     arrays = {key: np.array([row[key] for row in rows]) for key in rows[0]}
     assert values(arrays) == pytest.approx([values(row) for row in rows])
     assert values(rows[2]) > 0
+
+
+def test_it_goes_to_another_process(folder: Path):
+    effect = load_effect("top_box", folder / "effects")
+    script = "import pickle, sys; print(pickle.load(sys.stdin.buffer).parameters[0].name)"
+    run = subprocess.run([sys.executable, "-c", script], input=pickle.dumps(effect), capture_output=True, check=False)
+    assert run.stdout.decode().strip() == "top_box_drag_area", run.stderr
+
+
+def test_the_list_has_it(folder: Path, capsys):
+    assert main(["discover", "--list", "--effects", str(folder / "effects")]) == 0
+    listed = capsys.readouterr().out
+    assert "top_box_drag_area [m²], prior 0.04 ± 0.03" in listed
+    assert "More auxiliary current on rides below 12 degC" in listed
 
 
 def test_the_onboard_model_has_it(folder: Path):

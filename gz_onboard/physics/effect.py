@@ -141,6 +141,15 @@ class Effect:
         """The quantities that it needs, for its term and its decay."""
         return frozenset((*self.quantities, *self.decay_quantities))
 
+    def __reduce__(self) -> tuple[Callable[..., Effect], tuple[str, str]]:
+        """Pickled as its file: another process does not know the modules of a user's own."""
+        return _again, (self.name, inspect.getfile(self.term))
+
+
+def _again(name: str, file: str) -> Effect:
+    """The effect `name` of a Python file, as another process knew it."""
+    return load_effect(name, Path(file).parent)
+
 
 @cache
 def known_effects() -> tuple[str, ...]:

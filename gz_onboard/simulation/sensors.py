@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from math import cos, pi
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.physics.model import G
+from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
+from gz_onboard.physics.model import G, bind
 from gz_onboard.simulation.recorded import BRAKE_FORCE
 from gz_onboard.simulation.run import Command
 from gz_onboard.simulation.scooter import Scooter
@@ -73,7 +74,7 @@ class Truth:
 
     Those of `Trace`, and: ``acceleration`` and ``way`` (of the body over the ground: none on a dynamometer),
     ``yaw_rate`` (left), ``lean`` (right), ``lean_rate``, ``pitch_rate`` (nose down), ``heading`` (from north),
-    ``north`` and ``east`` [m], ``auxiliary_current``.
+    ``north`` and ``east`` [m], ``auxiliary_power`` (of all effects at the DC link), ``auxiliary_current``.
     """
 
     def __init__(self, columns: Mapping[str, Array], scooter: Scooter) -> None:
@@ -98,7 +99,25 @@ class Truth:
         c["heading"] = scooter.start_heading - np.cumsum(c["yaw_rate"]) * dt
         c["north"] = np.cumsum(c["way"] * np.cos(c["heading"])) * dt
         c["east"] = np.cumsum(c["way"] * np.sin(c["heading"])) * dt
-        c["auxiliary_current"] = self.parameters["auxiliary_power"] / c["pack_voltage"]
+        c["auxiliary_power"] = self._auxiliary(scooter)
+        c["auxiliary_current"] = c["auxiliary_power"] / c["pack_voltage"]
+
+    def _auxiliary(self, scooter: Scooter) -> Array:
+        """What all effects at the DC link draw beside the inverter [W]."""
+        import numpy as np
+
+        c = self.columns
+        q = dict.fromkeys(QUANTITIES, 0.0) | {
+            "speed": c["way"], "acceleration": c["acceleration"], "grade": c["grade"], "soc": c["soc"],
+            "lateral_acceleration": c["way"] * c["yaw_rate"], "heading": c["heading"],
+            "motor_current": c["motor_current"], "motor_temperature": c["motor"], "cell_temperature": c["cell"],
+            "time_moving": np.cumsum(c["way"] > MOVING) * self.dt, "ambient_temperature": self.ambient,
+        }  # fmt: skip
+        power = np.zeros(self.count)
+        for effect in scooter.vehicle.model.effects:
+            if effect.port is Port.DC_POWER:
+                power = power + bind(effect, self.parameters).series(self.dt, q)
+        return power
 
     def __getitem__(self, name: str) -> Array:
         return self.columns[name]
@@ -154,7 +173,7 @@ def _delay(signal: str) -> float:
 def _inverter_current(t: Truth) -> Array:
     """The DC current: no auxiliary load in it, nor the inverter's constant loss, which it does not show."""
     p = t.parameters
-    return t["pack_current"] - (p["auxiliary_power"] + p["inverter_loss_constant"]) / t["pack_voltage"]
+    return t["pack_current"] - (t["auxiliary_power"] + p["inverter_loss_constant"]) / t["pack_voltage"]
 
 
 def _pressure(share: Callable[[Mapping[str, float]], float]) -> Callable[[Truth], Array]:
