@@ -15,8 +15,24 @@ VOLTS_APART = 0.03
 CELL_STEP = 0.04  # ohm of a cell, at once
 
 
-def ride(seed: int, *, drop=(), auxiliary_sign=1, seconds=400, temperature=25.0, cell=CELL_STEP, calm=False) -> Samples:
-    """10 Hz: current in steps of 5 s, every third at rest with the brake on; all sensors noisy."""
+def ride(
+    seed: int,
+    *,
+    drop=(),
+    auxiliary_sign=1.0,
+    seconds=400,
+    temperature=25.0,
+    cell=CELL_STEP,
+    calm=False,
+    inverter_gain=1.0,
+    own_loss=1.0,
+    series=SERIES,
+) -> Samples:
+    """10 Hz: current in steps of 5 s, every third at rest with the brake on; all sensors noisy.
+
+    inverter_gain, auxiliary_sign: what those current sensors make of a current. own_loss: of the inverter at rest, as a
+    share of what the vehicle file says.
+    """
     rng = np.random.default_rng(seed)
     time = np.arange(0, seconds, 0.1)
     steps = seconds // 5
@@ -25,14 +41,14 @@ def ride(seed: int, *, drop=(), auxiliary_sign=1, seconds=400, temperature=25.0,
     load = np.repeat(np.where(rest, 0.0, level), 50)
     brake = np.repeat((rest & (rng.random(steps) < 0.8)).astype(float), 50)
     source, power = 54.0, np.where(brake > 0, LIT, UNLIT)
-    own = VEHICLE.parameters["inverter_loss_constant"] / source
+    own = own_loss * VEHICLE.parameters["inverter_loss_constant"] / source
     current = load + power / source + own
-    inside = 14 / 12 * cell + SERIES
+    inside = 14 / 12 * cell + series
     voltage = source - inside * current
     columns = {
         "pack_current": GAIN * current + OFFSET + CURRENT_NOISE * rng.normal(size=len(time)),
         "pack_voltage": voltage + VOLTS_APART + VOLTAGE_NOISE * rng.normal(size=len(time)),
-        "inverter_current": load + 0.3 * rng.normal(size=len(time)),
+        "inverter_current": inverter_gain * load + 0.3 * rng.normal(size=len(time)),
         "inverter_voltage": voltage - CABLE * load + 0.04 * rng.normal(size=len(time)),
         "auxiliary_current": auxiliary_sign * power / voltage + 0.01 * rng.normal(size=len(time)),
         "motor_speed": np.where(load == 0, 0.0, 30.0),

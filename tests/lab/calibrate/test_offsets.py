@@ -1,9 +1,11 @@
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.offsets import offsets
+from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD
+from gz_onboard.lab.calibrate.offsets import GAIN_SD, offsets
 
 from .rides import CURRENT_NOISE, GAIN, OFFSET, VEHICLE, VOLTAGE_NOISE, VOLTS_APART, ride
 
@@ -17,6 +19,22 @@ def test_planted_errors_come_back_within_their_intervals():
             abs(found["pack_current_offset"].value - OFFSET) < 1.96 * found["pack_current_offset"].sd
         )
     assert all(count >= 18 for count in held.values()), held
+
+
+def test_intervals_hold_what_instruments_of_their_class_do():
+    """Over scooters whose inverter's current sensor and own loss err as their class and the vehicle file say."""
+    rng, known = np.random.default_rng(0), VEHICLE.parameters
+    own_sd = known.sd("inverter_loss_constant") / known["inverter_loss_constant"]
+    away = []
+    for seed in range(0, 300, 3):
+        errs = {"inverter_gain": 1 + GAIN_SD * rng.normal(), "own_loss": 1 + own_sd * rng.normal(),
+                "auxiliary_sign": 1 + CURRENT_SD * rng.normal()}  # fmt: skip
+        found = offsets([ride(seed + k, seconds=200, **errs) for k in range(3)], VEHICLE).parameters
+        away.append([(found[name].value - truth) / found[name].sd
+                     for name, truth in (("pack_current_gain", GAIN), ("pack_current_offset", OFFSET))])  # fmt: skip
+    gain, offset = np.mean(np.abs(away) < 1.96, axis=0)
+    assert 0.9 <= gain <= 0.99
+    assert offset >= 0.9  # rides' scatter is reckoned as if it were the mean's
 
 
 def test_noise_is_that_of_a_sample():

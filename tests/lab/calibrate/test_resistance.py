@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.resistance import cable_resistance, cell_steps, pack_series_resistance
+from gz_onboard.lab.calibrate.resistance import CELL_SHARE_SD, cable_resistance, cell_steps, pack_series_resistance
 
 from .bench import table
 from .rides import CABLE, CELL_STEP, SERIES, VEHICLE, ride
@@ -45,6 +45,18 @@ def test_series_resistance_is_what_the_cells_do_not_explain():
     found = pack_series_resistance([ride(seed) for seed in range(4)], VEHICLE, pulses)
     series = found.parameters["pack_series_resistance"]
     assert abs(series.value - SERIES) < 1.96 * series.sd and "pulse tests" in series.source
+
+
+def test_series_intervals_hold_cells_that_differ():
+    """Over packs whose cells are not those of the pulse test, by what cells scatter."""
+    pulses, rng = [pulse(10.0, CELL_STEP), pulse(40.0, CELL_STEP)], np.random.default_rng(0)
+    held, count = 0, 60
+    for seed in range(count):
+        cell = CELL_STEP * (1 + CELL_SHARE_SD * rng.normal())
+        rides = [ride(3 * seed + k, seconds=200, cell=cell, series=2 * SERIES) for k in range(3)]
+        found = pack_series_resistance(rides, VEHICLE, pulses).parameters["pack_series_resistance"]
+        held += abs(found.value - 2 * SERIES) < 1.96 * found.sd
+    assert 0.9 <= held / count <= 0.99
 
 
 def test_no_number_where_the_cells_own_doubt_is_greater():
