@@ -105,7 +105,8 @@ THESIS_VOLTS = 0.02  # V: what Lord 2016 gives for a cell on a road profile
 def _pulse(given: Given) -> Result:
     curve, capacity = _open_circuit(given)
     loads = [_load(ride) for ride in given.rides.get("load", [])]
-    result = pulse.calibrate(given.tables["data"], curve, capacity, loads=loads or None)
+    method = str(given.options["method"])
+    result = pulse.calibrate(given.tables["data"], curve, capacity, loads=loads or None, method=method)
     cell = pulse.circuit(result)
     for table in given.tables.get("held_out", []):
         test = cell_test(table)
@@ -227,6 +228,7 @@ PROCEDURES: dict[str, Procedure] = {
             "load": Slot("ride", "rides whose current the cell is to follow", 0),
         },
         _pulse,
+        {"method": "reduced"},
     ),
     "auxiliary": Procedure(
         "power of lamps, dashboard and control",
@@ -241,7 +243,7 @@ PROCEDURES: dict[str, Procedure] = {
     "resistance": Procedure(
         "resistance of pack and cable beside the cells",
         {
-            "data": Slot("ride", "rides, above 22 degC for the pack", 1),
+            "data": Slot("ride", "rides, above 20 degC for the pack", 1),
             "pulses": Slot("table", "pulse tests of a cell, at two temperatures or more", 0),
         },
         _resistance,

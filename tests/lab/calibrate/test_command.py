@@ -97,6 +97,8 @@ def test_columns_of_other_people(tmp_path, capsys):
             ["motor", "motor_dyno.csv.gz", "--set", "largest_current=0"],
             "motor: .*motor_dyno.csv.gz: .* points up to 0 A",
         ),
+        (["pulse", "cell_pulse_25C.csv.gz", "--set", "method=dirct"], r"pulse: method 'dirct' .*did you mean 'direct'"),
+        (["coastdown", "motor_dyno.csv.gz", "motor_emf_ramp.csv.gz"], "motor_dyno.csv.gz: no column for 'time'"),
         (["motor", "motor_dyno.csv.gz", "--out", "none/x.toml"], "there is no folder none"),
         (["motor", "motor_dyno.csv.gz", "--vehicle", "refrence"], r"no such vehicle file; .*did you mean 'reference'"),
         (["all", "..", ".."], "all takes one folder"),
