@@ -394,7 +394,7 @@ def _score(job: Job, values: Values, runs: Sequence[Run], held_out: bool, result
 def _panels(job: Job, values: Values, runs: Sequence[Run], held: Sequence[Run]) -> list[Panel]:
     panels = []
     for run in [*runs, *held]:
-        x, traces, modelled = run.time - run.time[0], [], job.model(values, run)
+        x, traces, left, modelled = run.time - run.time[0], [], [], job.model(values, run)
         for sensor, model in modelled.items():
             if sensor in run.measured:
                 label = sensor.removesuffix("_temperature").replace("_", " ")
@@ -402,8 +402,12 @@ def _panels(job: Job, values: Values, runs: Sequence[Run], held: Sequence[Run]) 
                     Trace(f"{label}, measured", x, run.measured[sensor], "."),
                     Trace(f"{label}, model", x, model),
                 ]
+                left.append(Trace(label, x, model - run.measured[sensor]))
         title = f"{run.name}{' (held out)' if run in held else ''}"
-        panels.append(Panel(title, "time [s]", "temperature [degC]", tuple(traces)))
+        panels += [
+            Panel(title, "time [s]", "temperature [degC]", tuple(traces)),
+            Panel(f"{title}: residual", "time [s]", "model less measured [K]", tuple(left)),
+        ]
     return panels
 
 

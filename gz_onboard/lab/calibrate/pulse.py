@@ -400,10 +400,12 @@ def _voltages(result: Result, tested: list[Tested], cell: Circuit, slow: Circuit
                         (residuals if name == "above" else empties).append(float(np.mean(error[part] ** 2)))
         model = voltage(cell, test.flowed, test.current, test.dt, t.level, test.temperature)
         hours = test.time / 3600
-        result.panels.append(
+        result.panels += [
             Panel(f"Pulse test at {t.temperature:g} °C", "time [h]", "voltage [V]",
-                  (Trace("measured", hours, test.voltage, "."), Trace("model", hours, model)))
-        )  # fmt: skip
+                  (Trace("measured", hours, test.voltage, "."), Trace("model", hours, model))),
+            Panel(f"Pulse test at {t.temperature:g} °C: residual", "time [h]", "model less measured [mV]",
+                  (Trace("", hours, 1000 * (model - test.voltage)),)),
+        ]  # fmt: skip
     for key, unit, factor in (("r0", "mΩ", 1e3), ("r1", "mΩ", 1e3), ("c1", "F", 1.0)):
         mesh = result.curves[f"battery.{key}"]
         result.panels.append(

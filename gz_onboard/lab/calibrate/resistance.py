@@ -66,7 +66,7 @@ def cable_resistance(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         max(found["cable_resistance"], 0.0), float(np.hypot(found.sd("cable_resistance"), 2e-4)), "ohm",
         f"{source}; {found['offset']:+.3f} V at no current",
     )  # fmt: skip
-    result.panels.append(_panel("Voltage between pack and inverter", i, v, model, "pack less inverter voltage [V]"))
+    result.panels += _panels("Voltage between pack and inverter", i, v, model, "pack less inverter voltage [V]")
     return result
 
 
@@ -130,7 +130,7 @@ def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: S
     )
     model = (cell + found["series"]) * di
     result.fits.append(score("voltage step", "V", dv, model, held_out=False, source=source))
-    result.panels.append(_panel("Steps of pack voltage", di, dv, model, "fall of voltage [V]"))
+    result.panels += _panels("Steps of pack voltage", di, dv, model, "fall of voltage [V]")
     if found["series"] < 2 * sd:
         result.refusals.append(
             f"pack_series_resistance: {1e3 * found['series']:+.1f} ± {1e3 * sd:.1f} mohm is left of {1e3 * whole:.1f} "
@@ -181,8 +181,10 @@ def _soc(ride: Samples, vehicle: Vehicle) -> float:
     return start - 0.5 * charge / battery.pack_capacity(25.0)
 
 
-def _panel(title: str, x: Array, data: Array, model: Array, y_label: str) -> Panel:
+def _panels(title: str, x: Array, data: Array, model: Array, y_label: str) -> list[Panel]:
     order = np.argsort(x)
-    return Panel(
-        title, "current [A]", y_label, (Trace("measured", x, data, "."), Trace("model", x[order], model[order]))
-    )
+    traces = Trace("measured", x, data, "."), Trace("model", x[order], model[order])
+    return [
+        Panel(title, "current [A]", y_label, traces),
+        Panel(f"{title}: residual", "current [A]", "measured less model [V]", (Trace("", x, data - model, "."),)),
+    ]
