@@ -17,7 +17,7 @@ from gz_onboard.lab.discover.candidates import Candidate, candidates
 from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.engine import baseline, discover
 from gz_onboard.lab.discover.files import write_baseline, write_model
-from gz_onboard.lab.discover.limits import limits, size, unformed, words
+from gz_onboard.lab.discover.limits import limits, size, strange, unformed, words
 from gz_onboard.lab.discover.parts import before_and_after
 from gz_onboard.lab.discover.result import METRICS, SCHEMA, VERDICTS, Report
 from gz_onboard.lab.discover.verdict import sizes
@@ -79,11 +79,15 @@ def run(arguments: argparse.Namespace) -> int:
     rides, refused = read_rides(logs, arguments)
     if arguments.baseline:
         return run_baseline(arguments, vehicle, rides, refused)
+    refused += [f"{ride.name}: is a ride on a roller; left out" for ride in rides if "roller_speed" in ride.columns]
+    rides = [ride for ride in rides if "roller_speed" not in ride.columns]
+    if not rides:
+        raise InputError("; ".join(refused))
     holdout = [name.strip() for name in arguments.holdout.split(",")] if arguments.holdout else None
     with _Bar(arguments.quiet) as bar:
         report = discover(vehicle, rides, arguments.seed, arguments.effects, bar.say, arguments.workers, holdout)
     report.notes[:0] = refused
-    report.notes += unformed(report)
+    report.notes += [*strange(report), *unformed(report)]
     told = write_extended(report, vehicle, arguments) if arguments.write_model else []
     if arguments.json:
         write_json(arguments.json, document(report))

@@ -13,6 +13,9 @@ from gz_onboard.lab.discover.search import evidence
 from gz_onboard.lab.discover.terms import LOG
 from gz_onboard.lab.discover.verdict import energy, energy_share, own_value
 
+RIDING = 5.0  # m/s
+FAR = 1.1  # no tyre changes its radius by as much
+
 
 @dataclass(frozen=True)
 class Limit:
@@ -75,6 +78,22 @@ def unformed(report: Report) -> list[str]:
         rides = "no ride has" if len(without) == len(report.lines) else f"{', '.join(without)}: without"
         sentences.append(f"{rides} {' and '.join(roles)}: no {', no '.join(words(name) for name in names)} there")
     return sentences
+
+
+def strange(report: Report) -> list[str]:
+    """Rides whose GPS speed does not go with the motor's at all: perhaps they are another vehicle's."""
+    found = []
+    for line in report.lines:
+        s, speed = line.ride.signals, np.abs(line.ride.quantities["speed"])
+        if "gps_speed" not in s or not np.any(moving := speed > RIDING):
+            continue
+        ratio = float(np.median(s["gps_speed"][moving] / speed[moving]))
+        if not 1 / FAR < ratio < FAR:
+            found.append(
+                f"{line.ride.name}: GPS speed is {ratio:.2f} times what motor speed and wheel radius make; is this "
+                "a ride of this vehicle?"
+            )
+    return found
 
 
 def size(report: Report) -> tuple[float, float, float]:

@@ -13,6 +13,7 @@ from gz_onboard.lab.discover.command import KEYS
 from tests.support import LOGS, ROOT
 
 RIDE = LOGS / "city_34C.blf"
+CAR = ROOT / "tests" / "vehicles" / "car" / "car.toml"
 
 
 def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -40,6 +41,8 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         ([str(RIDE), "--write-model", "new.txt"], "a vehicle file is a .toml"),
         ([str(RIDE), "--payload", "900"], "must be 0 to 300 kg"),
         ([str(RIDE), "--baseline", "out.toml", "--quiet"], "three are the least"),
+        ([str(LOGS / "coastdown.blf"), "--quiet", "--vehicle", str(CAR)], "knows none of its"),
+        ([str(LOGS / "calibration" / "dyno_02.blf"), "--quiet"], "is a ride on a roller"),
     ],
 )
 def test_what_cannot_be_is_refused(capsys, monkeypatch, tmp_path, arguments: list[str], words: str):

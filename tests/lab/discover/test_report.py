@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from gz_onboard.lab.discover.alone import as_the_file_says
 from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.engine import linearise_all
-from gz_onboard.lab.discover.limits import limits, unformed
+from gz_onboard.lab.discover.limits import limits, strange, unformed
 from gz_onboard.lab.discover.linear import normal
 from gz_onboard.lab.discover.parts import (
     QUANTITIES,
@@ -143,6 +143,14 @@ def test_limits_shrink_with_the_rides(report: Report):
     assert all(two[name].change <= one[name].change for name in one)
     assert two["auxiliary_load"].change < 0.9 * one["auxiliary_load"].change
     assert 0.01 < one["rolling_resistance"].share < 1
+
+
+def test_a_ride_of_another_vehicle_is_suspected(report: Report):
+    assert strange(report) == []
+    (line,) = report.lines
+    signals = {**line.ride.signals, "gps_speed": 1.35 * line.ride.signals["gps_speed"]}
+    (said,) = strange(replace(report, lines=[replace(line, ride=replace(line.ride, signals=signals))]))
+    assert "coastdown: GPS speed is 1.3" in said
 
 
 def test_what_the_rides_lack_is_said(samples: Samples):
