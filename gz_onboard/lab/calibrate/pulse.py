@@ -125,7 +125,8 @@ def calibrate(
                 f"{t.temperature:g} degC; the table there only continues its neighbours (no sd)"
             )
     _voltages(result, tested, cell, slow)
-    _mesh_quality(result, tested, fitted, nodes, volts, one, tables_one)
+    if method == "reduced":  # the halves are
+        _mesh_quality(result, tested, fitted, nodes, volts, one, tables_one)
     return result
 
 

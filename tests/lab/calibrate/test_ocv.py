@@ -83,7 +83,7 @@ def put(index, value):
 @pytest.mark.parametrize(
     ("table", "words"),
     [
-        (changed(current=lambda c: -c), "ocv.csv:13: the voltage rises"),
+        (changed(current=lambda c: -c), "ocv.csv:13: the voltage falls"),
         (changed(current=lambda c: 0 * c), "no current flows"),
         (changed(time=lambda t: np.where(t > 30000, t + 9000, t)), "a gap of 9060 s while a current"),
         (changed(voltage=lambda v: np.maximum(v, 3.6)), "it is clipped"),

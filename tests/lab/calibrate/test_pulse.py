@@ -178,7 +178,7 @@ def changed(**columns):
     ("tables", "words"),
     [
         ([], "no pulse test"),
-        ([changed(current=lambda c: -c)], r"pulse_25C.csv:\d+: the voltage rises .* discharging must be positive"),
+        ([changed(current=lambda c: -c)], r"pulse_25C.csv:\d+: the voltage falls .* discharging must be positive"),
         ([changed(voltage=lambda v: np.minimum(v, 3.9))], "clipped"),
         ([slow_test()[0]], "has 2 pulses; at least 6"),
         ([replace(changed(), columns={k: v[:1500] for k, v in changed().columns.items()})], "states of charge; at"),
