@@ -103,9 +103,14 @@ def size(report: Report) -> tuple[float, float, float]:
     return way, time, sum(energy(line) for line in report.lines)
 
 
+def unit(name: str) -> str:
+    """A unit behind a number: that of a pure number is not said."""
+    return "" if name == "1" else name
+
+
 def words(name: str) -> str:
     """A name of the code in words."""
     return name.replace("_", " ").replace("gps", "GPS")
 
 
-__all__ = ["Limit", "limits", "size", "unformed", "words"]
+__all__ = ["Limit", "limits", "size", "strange", "unformed", "unit", "words"]

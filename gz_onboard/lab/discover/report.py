@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gz_onboard.lab.discover.channels import BY_NAME
-from gz_onboard.lab.discover.limits import limits, size, words
+from gz_onboard.lab.discover.limits import limits, size, unit, words
 from gz_onboard.lab.discover.linear import Linear
 from gz_onboard.lab.discover.parts import QUANTITIES, Over, before_and_after, binned, edges, gathered, share_over
 from gz_onboard.lab.discover.result import METRICS, VERDICTS, Report
@@ -39,6 +39,12 @@ summary { cursor: pointer; font-weight: 600; margin: .6rem 0 }
 """
 
 
+_GRADE = (
+    '<p class="muted">Grade is made from the accelerometer, whose noise is in the road force too, with the other sign: '
+    "a falling line over grade is that noise.</p>"
+)
+
+
 def write_report(report: Report, out: Path) -> None:
     """Write `report` to the HTML file `out`. Raises OSError."""
     out.write_text(page(report), encoding="utf-8")
@@ -63,7 +69,8 @@ def page(report: Report) -> str:
     for name in [*shown, *(c for c in channels if c not in shown)]:
         title = f"{words(name)} [{BY_NAME[name].unit}]"
         picture = _picture(panels(before, after, name, over, bool(report.causes)))
-        parts.append(f"<details{' open' if name in shown else ''}><summary>{title}</summary>{picture}</details>")
+        note = _GRADE if name == "road_force" else ""
+        parts.append(f"<details{' open' if name in shown else ''}><summary>{title}</summary>{picture}{note}</details>")
     parts += [
         "<h2>Which cause</h2>" + _picture(ranking(report)),
         "<h2>What it is worth: rides held out of the fit</h2>" + _gain(report),
@@ -118,7 +125,7 @@ def _causes(report: Report) -> str:
     rows = []
     for c in report.causes:
         rows.append([
-            words(c.name), c.parameter, f"{c.value:.4g} {c.unit}", f"{c.ci95[0]:.4g} to {c.ci95[1]:.4g}",
+            words(c.name), c.parameter, f"{c.value:.4g} {unit(c.unit)}", f"{c.ci95[0]:.4g} to {c.ci95[1]:.4g}",
             f"{c.change:+.4g}", f"{c.energy_share:+.1%}", f"{c.evidence:.0f}",
         ])  # fmt: skip
         rows += [["", name, f"{value:.4g}", f"{ci[0]:.4g} to {ci[1]:.4g}", "", "", ""] for name, value, ci in c.others]
@@ -215,7 +222,7 @@ def _limits(report: Report) -> str:
     for limit in limits(report):
         if limit.change < float("inf"):
             share = f"{limit.share:.1%}" if limit.share > 1e-5 else "–"
-            rows.append([words(limit.name), limit.parameter, f"{limit.change:.3g} {limit.unit}", share])
+            rows.append([words(limit.name), limit.parameter, f"{limit.change:.3g} {unit(limit.unit)}", share])
         else:
             rows.append([words(limit.name), limit.parameter, "not by these rides", "–"])
     return (
