@@ -17,7 +17,7 @@ from gz_onboard.lab.discover.candidates import Candidate, candidates
 from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.engine import baseline, discover
 from gz_onboard.lab.discover.files import write_baseline, write_model
-from gz_onboard.lab.discover.limits import limits, size, strange, unformed, unit, words
+from gz_onboard.lab.discover.limits import amount, limits, size, strange, unformed, words
 from gz_onboard.lab.discover.parts import before_and_after
 from gz_onboard.lab.discover.result import METRICS, SCHEMA, VERDICTS, Report
 from gz_onboard.lab.discover.verdict import sizes
@@ -308,7 +308,8 @@ def summary(report: Report, vehicle: Vehicle, told: Sequence[str] = ()) -> str:
     ]
     for c in report.causes:
         lines.append(
-            f"  {c.name:20} {c.parameter} = {f'{c.value:.4g} {unit(c.unit)}'.rstrip()} (95 %: {c.ci95[0]:.4g} to {c.ci95[1]:.4g}), "
+            f"  {c.name:20} {c.parameter} = {amount(c.value, c.unit)} "
+            f"(95 %: {c.ci95[0]:.4g} to {c.ci95[1]:.4g}), "
             f"{c.energy_share:+.1%} of the energy, score {c.evidence:.0f}"
         )
         lines += [f"  {'':20} {name} = {value:.4g} (95 %: {ci[0]:.4g} to {ci[1]:.4g})" for name, value, ci in c.others]

@@ -17,7 +17,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.result import Found, Result
 from gz_onboard.lab.calibrate.vehicle_file import merged, number, string, with_keys
 from gz_onboard.lab.discover.grid import Array
-from gz_onboard.lab.discover.limits import unit
+from gz_onboard.lab.discover.limits import amount
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.state import Shape, State
 from gz_onboard.lab.discover.verdict import energy, power_of, share_of_time
@@ -127,7 +127,7 @@ def write_model(report: Report, vehicle: Vehicle, base: Path, out: Path) -> list
     state = report.state
     assert state is not None
     found, added = extension(report, vehicle)
-    words = [f"{name} = {f.value:.4g} ± {f.sd:.2g} {unit(f.unit)}".rstrip() for name, f in found.items()]
+    words = [f"{name} = {f.value:.4g} ± {amount(f.sd, f.unit, '.2g')}" for name, f in found.items()]
     folder = out.with_name(f"{out.stem}_effects")
     names = [effect.name for effect in (*vehicle.model.effects, *added)]
     own = [effect for effect in (*vehicle.model.effects, *added) if effect.name not in known_effects()]

@@ -103,9 +103,9 @@ def size(report: Report) -> tuple[float, float, float]:
     return way, time, sum(energy(line) for line in report.lines)
 
 
-def unit(name: str) -> str:
-    """A unit behind a number: that of a pure number is not said."""
-    return "" if name == "1" else name
+def amount(value: float, unit: str, form: str = ".4g") -> str:
+    """A value with its unit; that of a pure number is not said."""
+    return f"{value:{form}}" if unit == "1" else f"{value:{form}} {unit}"
 
 
 def words(name: str) -> str:
@@ -113,4 +113,4 @@ def words(name: str) -> str:
     return name.replace("_", " ").replace("gps", "GPS")
 
 
-__all__ = ["Limit", "limits", "size", "strange", "unformed", "unit", "words"]
+__all__ = ["Limit", "amount", "limits", "size", "strange", "unformed", "words"]

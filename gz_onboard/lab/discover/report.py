@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gz_onboard.lab.discover.channels import BY_NAME
-from gz_onboard.lab.discover.limits import limits, size, unit, words
+from gz_onboard.lab.discover.limits import amount, limits, size, words
 from gz_onboard.lab.discover.linear import Linear
 from gz_onboard.lab.discover.parts import QUANTITIES, Over, before_and_after, binned, edges, gathered, share_over
 from gz_onboard.lab.discover.result import METRICS, VERDICTS, Report
@@ -125,7 +125,7 @@ def _causes(report: Report) -> str:
     rows = []
     for c in report.causes:
         rows.append([
-            words(c.name), c.parameter, f"{c.value:.4g} {unit(c.unit)}", f"{c.ci95[0]:.4g} to {c.ci95[1]:.4g}",
+            words(c.name), c.parameter, amount(c.value, c.unit), f"{c.ci95[0]:.4g} to {c.ci95[1]:.4g}",
             f"{c.change:+.4g}", f"{c.energy_share:+.1%}", f"{c.evidence:.0f}",
         ])  # fmt: skip
         rows += [["", name, f"{value:.4g}", f"{ci[0]:.4g} to {ci[1]:.4g}", "", "", ""] for name, value, ci in c.others]
@@ -222,7 +222,7 @@ def _limits(report: Report) -> str:
     for limit in limits(report):
         if limit.change < float("inf"):
             share = f"{limit.share:.1%}" if limit.share > 1e-5 else "–"
-            rows.append([words(limit.name), limit.parameter, f"{limit.change:.3g} {unit(limit.unit)}", share])
+            rows.append([words(limit.name), limit.parameter, amount(limit.change, limit.unit, ".3g"), share])
         else:
             rows.append([words(limit.name), limit.parameter, "not by these rides", "–"])
     return (
