@@ -13,13 +13,15 @@ import numpy as np
 
 from gz_onboard.lab.discover.channels import BY_NAME, SLOW, cell_circuit, over_blocks, usable
 from gz_onboard.lab.discover.grid import STEP, Array, Ride
-from gz_onboard.lab.discover.linear import Linear, Table, fit_mixed
+from gz_onboard.lab.discover.limits import words
+from gz_onboard.lab.discover.linear import Linear, Posterior, Table, fit_mixed
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.state import State
 
 FREE = 1e6  # variance in scales of a cause that is free
 JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
 LONGEST = 60.0  # s since it did
+OUTSTANDING = 3.5  # standard deviations of what differs between healthy rides
 
 QUANTITIES: dict[str, tuple[str, str]] = {
     "speed": ("speed", "m/s"),
@@ -43,11 +45,7 @@ def before_and_after(report: Report) -> tuple[list[Linear], list[Linear]]:
     """The rides of `report` with residuals before and after its causes."""
     state = report.state
     assert state is not None
-    index = [i for cause in report.causes for i in _places(state, cause.name)]
-    prior = state.prior.copy()
-    for i in index:
-        prior[i, i] += FREE
-    post = fit_mixed(report.normals, state.mean, prior, state.scatter, 1.0, state.free, 0)
+    index, post = fitted(report)
     before, after = [], []
     for line, own in zip(report.lines, post.own, strict=True):
         theta = post.mean + own
@@ -56,6 +54,37 @@ def before_and_after(report: Report) -> tuple[list[Linear], list[Linear]]:
         before.append(line.seen_from(-rest))
         after.append(line.seen_from(-theta))
     return before, after
+
+
+def fitted(report: Report) -> tuple[list[int], Posterior]:
+    """Where the parameters of the causes are, and all parameters as the rides show them with these free."""
+    state = report.state
+    assert state is not None
+    index = [i for cause in report.causes for i in _places(state, cause.name)]
+    prior = state.prior.copy()
+    for i in index:
+        prior[i, i] += FREE
+    return index, fit_mixed(report.normals, state.mean, prior, state.scatter, 1.0, state.free, 0)
+
+
+def outstanding(report: Report) -> list[str]:
+    """What differs in single rides by more than `OUTSTANDING` of what healthy rides scatter by, a sentence for each.
+
+    No cause is common to them; it may be the day, such as wind, or the ride.
+    """
+    state = report.state
+    if state is None or not report.normals:
+        return []
+    index, post = fitted(report)
+    sentences = []
+    for line, own in zip(report.lines, post.own, strict=True):
+        beyond = own / np.sqrt(state.scatter)
+        beyond[index] = 0.0
+        rows = [(abs(z), name, z) for name, z in zip(state.names, beyond, strict=True) if abs(z) > OUTSTANDING]
+        if rows:
+            told = ", ".join(f"{words(name)} {z:+.1f}" for _, name, z in sorted(rows, reverse=True)[:3])
+            sentences.append(f"{line.ride.name} alone differs by more than rides do: {told} standard deviations")
+    return sentences
 
 
 def _places(state: State, name: str) -> list[int]:

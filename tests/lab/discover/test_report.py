@@ -22,6 +22,7 @@ from gz_onboard.lab.discover.parts import (
     binned,
     edges,
     gathered,
+    outstanding,
     share_over,
     since_change,
 )
@@ -151,6 +152,18 @@ def test_a_ride_of_another_vehicle_is_suspected(report: Report):
     signals = {**line.ride.signals, "gps_speed": 1.35 * line.ride.signals["gps_speed"]}
     (said,) = strange(replace(report, lines=[replace(line, ride=replace(line.ride, signals=signals))]))
     assert "coastdown: GPS speed is 1.3" in said
+
+
+def test_what_one_ride_alone_shows_is_said(report: Report):
+    state = report.state
+    assert state is not None
+    assert outstanding(report) == []
+    far = np.zeros(len(state.names))
+    far[state.names.index("soc_start")] = 12.0
+    lines = [line.seen_from(far) for line in report.lines]
+    (said,) = outstanding(replace(report, lines=lines, normals=[normal(line, state.noise) for line in lines]))
+    assert "coastdown alone differs" in said
+    assert "soc start +1" in said
 
 
 def test_what_the_rides_lack_is_said(samples: Samples):
