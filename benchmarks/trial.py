@@ -80,7 +80,7 @@ def judge(base: Any, case: plant.Case) -> Row:
     except Exception:
         return row | {"verdict": "error", "error": traceback.format_exc(), "causes": [], "ambiguous": [], "ranking": []}
     row["cpu_s"], row["wall_s"] = time.process_time() - began, time.monotonic() - wall
-    row |= {key: report[key] for key in ("verdict", "causes", "ambiguous", "unknown", "gain")}
+    row |= {key: report[key] for key in ("verdict", "causes", "ambiguous", "unknown", "gain", "constancy")}
     row["ranking"] = report["ranking"][:5]
     row["parameters"] = [check for t in case.truths for check in _parameters(report, t)]
     if case.twins and case.kind != "unknown":

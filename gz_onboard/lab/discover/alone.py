@@ -13,12 +13,11 @@ import numpy as np
 
 from gz_onboard.lab.discover.grid import Array, Ride
 from gz_onboard.lab.discover.linear import Linear, fit_mixed, learn_noise, normal
-from gz_onboard.lab.discover.state import TRANSFER, State
+from gz_onboard.lab.discover.state import State
 
 FREE = 25.0  # variance in scales that is added to that of every parameter while noise and scatter are learned
 ROUNDS = 2
 SCATTER_FROM = 3  # rides
-TRANSFERRED = 3.0  # times the standard deviation of a bench: see `state.TRANSFER`
 ABSENT = 1e-3  # sd in scales of an effect that the model lacks
 NOTE = ("no healthy rides are known of this vehicle (--baseline): it is held against its file, whose model is taken at "
         "its word, and the rate of false alarms is not calibrated")  # fmt: skip
@@ -42,9 +41,7 @@ def alone(
 
 
 def as_the_file_says(state: State) -> Array:
-    """The prior of `state` in which an effect that the model lacks is not there, and what was found on a bench holds
-    on the road as `TRANSFER` says.
-    """
+    """The prior of `state` in which an effect that the model lacks is not there."""
     has = {effect.name for effect in state.vehicle.model.effects}
     prior = state.prior.copy()
     for cause in state.causes:
@@ -53,5 +50,4 @@ def as_the_file_says(state: State) -> Array:
                 i = state.names.index(name)
                 prior[i, :] = prior[:, i] = 0.0
                 prior[i, i] = ABSENT**2
-    wider = np.array([TRANSFERRED if name in TRANSFER else 1.0 for name in state.names])
-    return np.asarray(prior * np.outer(wider, wider))
+    return prior

@@ -35,6 +35,7 @@ from gz_onboard.physics.model import G
 Values = Mapping[str, float]
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
 DT = SLOW * STEP
+MID = 200.0  # s: between the pair of the vehicle file and slow relaxation
 NOT_ROAD = ("grade_force", "inertia")  # what the accelerometer measures
 
 
@@ -45,6 +46,7 @@ class System:
     effects: tuple[Effect, ...]
     battery: Battery | None
     payload: float  # kg, of the vehicle file: what a ride without an entry carries
+    copper: float = 0.0  # ohm, of the healthy motor
 
     def at(self, *ports: str) -> list[Effect]:
         """The effects at these ports."""
@@ -143,7 +145,8 @@ def motor_losses(ride: Ride, q: Mapping[str, Array], p: Values, system: System) 
         if "motor_current" not in effect.quantities:
             drag = drag + term
         elif effect.name == "motor_copper_loss":
-            electric = electric + term * (1 + p["copper_speed"] * np.abs(q["motor_speed"]) / 50)
+            own = system.copper / p["motor_copper_resistance"]  # what a cause adds does not grow with frequency
+            electric = electric + term * (1 + own * p["copper_speed"] * np.abs(q["motor_speed"]) / 50)
         else:
             electric = electric + term
     return electric, drag
@@ -248,20 +251,24 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, A
     capacity = p["cell_capacity"] * share
     charge = np.cumsum(cell / (3600 * capacity)) * DT
     soc = p["soc_start"] + start_soc(ride, system) - (charge - cell / (3600 * capacity) * DT / 2)
-    factor = p.get("cell_resistance_factor", 1.0) * (1 + p["resistance_cold"] * (20 - temperature) / 20)
+    grown = p.get("cell_resistance_factor", 1.0)
+    factor = grown * (1 + p["resistance_level"] + p["resistance_cold"] * (20 - temperature) / 20)
     bent = p["resistance_current"] + p["resistance_current_cold"] * (20 - temperature) / 20
     factor = factor * (1 + p["resistance_empty"] * (1 - soc) / 0.4 - bent * np.abs(cell) / 5)
     r0 = mesh_at(battery.r0, soc, temperature) * factor
     r1 = mesh_at(battery.r1, soc, temperature)
-    decay = np.exp(-DT / (r1 * mesh_at(battery.c1, soc, temperature)))
+    decay = np.exp(-DT / (r1 * mesh_at(battery.c1, soc, temperature) * np.exp(p["pair_time"])))
+    r1 = r1 * (1 + p["pair_resistance"])
     v1 = recursion(decay, r1 * factor * cell, p["v1_start"])
     v1 = (v1 + decay * v1 + (1 - decay) * r1 * factor * cell) / 2  # the mean of the step's ends
-    extra: Any = 0.0
+    extra: Any = p["drift"] * np.arange(len(cell)) * DT / 600
+    extra = extra + p["mid_resistance"] * recursion(np.full(len(cell), np.exp(-DT / MID)), cell)
     q = {name: mean_over(value, SLOW) for name, value in ride.quantities.items()}
     q |= {"cell_current": cell, "soc": soc, "cell_temperature": temperature, "cell_capacity": capacity}
     for effect in system.at("CELL_VOLTAGE"):
         extra = extra + system.term(effect, q, p, DT)
     rest = ocv_at(battery, soc) + p["ocv_offset"] + p["ocv_tilt"] * (soc - 0.7)
+    rest = rest + p["ocv_cold"] * (20 - temperature) / 20
     return rest - r0 * cell - v1 - extra, cell * battery.cells_parallel, soc
 
 
@@ -274,6 +281,14 @@ def start_soc(ride: Ride, system: System) -> float:
     volts = float(np.mean(ride.signals["pack_voltage"][first])) / battery.cells_series
     temperature = float(ride.quantities["cell_temperature"][0])
     return battery.soc_at(volts + amperes * battery.r0.at(0.6, temperature)[0])
+
+
+def counted_soc(ride: Ride, system: System) -> Array:
+    """SOC by counting the current from where the first voltages point to, shape (n,)."""
+    battery = system.battery
+    assert battery is not None
+    charge = np.cumsum(ride.signals["pack_current"]) * STEP
+    return np.asarray(start_soc(ride, system) - charge / (3600 * battery.pack_capacity(25.0)))
 
 
 def cell_voltage(ride: Ride, p: Values, system: System) -> Array:
@@ -447,8 +462,10 @@ _TORQUE = ("torque_constant", "torque_constant_slope", "torque_saturation")
 _SPEED = ("wheel_radius", "speed_sensor_scale")
 _CELL = (
     "pack_current_offset", "pack_current_gain", "cell_capacity", "soc_start", "cell_resistance_factor", "v1_start",
-    "resistance_cold", "ocv_offset", "ocv_tilt", "resistance_empty", "resistance_current",
-    "resistance_current_cold",
+    "resistance_cold", "ocv_offset", "ocv_tilt", "ocv_cold", "pair_resistance", "pair_time", "mid_resistance", "drift",
+    "resistance_level",
+    "resistance_empty",
+    "resistance_current", "resistance_current_cold",
 )  # fmt: skip
 
 CHANNELS = (

@@ -16,7 +16,9 @@ from gz_onboard.lab.discover.gain import measure_gain
 from gz_onboard.lab.discover.grid import Array, Ride
 from gz_onboard.lab.discover.linear import (
     Linear,
+    Noise,
     Normal,
+    Posterior,
     fit_mixed,
     learn_noise,
     linearise,
@@ -28,7 +30,7 @@ from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.search import Search, evidence
 from gz_onboard.lab.discover.shapes import with_inflation
 from gz_onboard.lab.discover.state import State, initial, restore
-from gz_onboard.lab.discover.terms import LOG
+from gz_onboard.lab.discover.terms import FIXED, LOG, WEATHER
 from gz_onboard.lab.discover.verdict import reach
 from gz_onboard.physics.parameters import Parameters, Value, declared_parameters
 from gz_onboard.simulation.samples import Samples
@@ -105,18 +107,29 @@ def learn(state: State, rides: Sequence[Ride], progress: Progress, workers: int 
         lines = linearise_all(rides, replace(state, values=values, mean=first - shift, noise=noise), workers)
         normals = [normal(line, noise) for line in lines]
         post = fit_mixed(normals, first - shift, state.prior, state.scatter, WEIGHT, state.free, 0)
-        noise = learn_noise(lines, post.mean + post.own, noise)
+        noise = learned_noise(state, lines, post, noise)
         shift = shift + post.mean
         values = state.unit_value(shift)
     progress("scatter between healthy rides")
     lines = linearise_all(rides, replace(state, values=values, mean=first - shift, noise=noise), workers)
     normals = [normal(line, noise) for line in lines]
-    post = fit_mixed(normals, first - shift, state.prior, state.scatter, WEIGHT, state.free, 120)
+    least = np.array([0.7 if name in WEATHER else 0.02 for name in state.names])
+    post = fit_mixed(normals, first - shift, state.prior, state.scatter, WEIGHT, state.free, 120, least)
     after = replace(state, values=values, mean=post.mean, prior=post.covariance, scatter=post.scatter, noise=noise,
                     healthy=len(rides))  # fmt: skip
     before = replace(after, mean=first - shift, prior=state.prior)
     folds = left_out(before, normals)
     return replace(after, inflation=inflation(folds, normals), shapes=with_inflation(after, folds, lines, normals))
+
+
+def learned_noise(state: State, lines: Sequence[Linear], post: Posterior, noise: Noise) -> Noise:
+    """`noise` as the residuals show it, each ride at its own parameters; of the cells at its own start alone, for there
+    what differs between rides is the circuit's lack, and would be taken for knowledge.
+    """
+    starts = np.array([name in FIXED for name in state.names])
+    free = learn_noise(lines, post.mean + post.own, noise)
+    held = learn_noise(lines, post.mean + post.own * starts, noise)
+    return {name: (held if name == "cell_voltage" else free)[name] for name in free}
 
 
 def left_out(before: State, normals: Sequence[Normal], size: int = 2) -> list[tuple[State, list[int]]]:

@@ -11,6 +11,7 @@ from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.state import State
+from gz_onboard.lab.discover.terms import STARTS
 
 
 def measure_gain(report: Report, seed: int, holdout: Sequence[str] | None) -> dict[str, Any]:
@@ -34,7 +35,7 @@ def measure_gain(report: Report, seed: int, holdout: Sequence[str] | None) -> di
         if causes:
             after = extended_mean(state, rest, causes)
         for i in fold:
-            triple = [errors(lines[i], theta) for theta in (state.mean, control, after)]
+            triple = [errors(lines[i], with_start(state, normals[i], theta)) for theta in (state.mean, control, after)]
             for metric in triple[0]:
                 rows.setdefault(metric, []).append(tuple(t[metric] for t in triple))  # type: ignore[arg-type]
     result: dict[str, Any] = {"holdout": [names[i] for fold in folds for i in fold]}
@@ -49,6 +50,16 @@ def measure_gain(report: Report, seed: int, holdout: Sequence[str] | None) -> di
             "ci95": [float(np.quantile(saved, 0.025)), float(np.quantile(saved, 0.975))],
         }  # fmt: skip
     return result
+
+
+def with_start(state: State, ride: Normal, theta: Array) -> Array:
+    """`theta` (p,) with what is the ride's own of `terms.STARTS`, which is no merit or fault of a model."""
+    m = [i for i, name in enumerate(state.names) if name in STARTS]
+    variance = state.scatter[m] + np.diag(state.prior)[m]
+    rest = ride.b[m] - ride.n[m] @ theta
+    moved = theta.copy()
+    moved[m] += np.linalg.solve(np.diag(1 / variance) + ride.n[np.ix_(m, m)], rest)
+    return moved
 
 
 def extended_mean(state: State, rest: Sequence[Normal], causes: Sequence[Any]) -> Array:

@@ -216,12 +216,13 @@ class Posterior:
 
 
 def fit_mixed(
-    rides: Sequence[Normal], mean: Array, prior: Array, scatter: Array, weight: float, free: Mask, rounds: int = 60
-) -> Posterior:
+    rides: Sequence[Normal], mean: Array, prior: Array, scatter: Array, weight: float, free: Mask, rounds: int = 60,
+    least: Array | float = 0.02,
+) -> Posterior:  # fmt: skip
     """Common part, and the scatter between rides by expectation and maximisation (Dempster, Laird & Rubin 1977).
 
     mean, prior: (p,), (p, p) of the common part before. scatter: (p,) variances before, worth `weight` rides;
-    only those of `free` (p,) are learned.
+    only those of `free` (p,) are learned, down to `least` of what they were.
     """
     before = scatter.copy()
     now = scatter.copy()
@@ -239,7 +240,7 @@ def fit_mixed(
             total = total + u**2 + np.diag(v) + np.einsum("ij,jk,ik->i", vn, after, vn)
             own.append(u)
         if rounds > 0:
-            now = np.where(free, np.clip(total / (weight + len(rides)), 0.02 * before, 9 * before), before)
+            now = np.where(free, np.clip(total / (weight + len(rides)), least * before, 9 * before), before)
     return Posterior(common, after, now, np.array(own))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from gz_onboard.lab.discover.constancy import Split
 from gz_onboard.lab.discover.linear import Linear, Normal
 from gz_onboard.lab.discover.state import State
 
@@ -64,6 +65,7 @@ class Report:
     notes: list[str]
     isolability: dict[str, Any]
     threshold: float
+    constancy: list[Split] = field(default_factory=list)
     extended_model: str | None = None
     state: State | None = field(default=None, repr=False)
     lines: list[Linear] = field(default_factory=list, repr=False)
@@ -85,4 +87,7 @@ class Report:
             "notes": self.notes,
             "isolability": self.isolability,
             "threshold": self.threshold,
+            "constancy": [
+                {"cause": s.cause, "quantity": s.quantity, "ratio": s.ratio, "chi2": s.chi2} for s in self.constancy
+            ],
         }

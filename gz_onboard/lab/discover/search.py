@@ -5,7 +5,7 @@ All questions are asked of one pair of matrices (`Evidence`), so that trying a s
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from gz_onboard.lab.discover.linear import Normal, marginal
 from gz_onboard.lab.discover.state import State
 
 RIDGE = 1e-6
+BEND = 0.02  # of a cause's evidence: no effect has exactly the form of the real one, and others take up what is left
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,11 @@ class Choice:
 class Search:
     """The hypotheses over one `Evidence`."""
 
-    def __init__(self, state: State, evidence: Evidence, causes: Sequence[Candidate]) -> None:
-        self.state, self.evidence = state, evidence
+    def __init__(
+        self, state: State, evidence: Evidence, causes: Sequence[Candidate],
+        shares: Mapping[str, Mapping[str, float]] | None = None,
+    ) -> None:  # fmt: skip
+        self.state, self.evidence, self.shares = state, evidence, shares or {}
         self.causes = {c.name: c for c in causes}
         self.place = {c.name: state.index(c.names) for c in causes}
 
@@ -102,13 +106,22 @@ class Search:
         k = len(self.place[name])
         return one_degree(more, k) if k > 1 else more
 
+    def overlap(self, a: str, b: str) -> float:
+        """How much of the evidence for `a` and for `b` comes from the same channels, 0 to 1."""
+        mine, theirs = self.shares.get(a, {}), self.shares.get(b, {})
+        return sum(min(share, theirs.get(channel, 0.0)) for channel, share in mine.items())
+
+    def bend(self, base: Sequence[str], name: str) -> float:
+        """What `name` would add to `base` if it only mended the form of what is there: see `BEND`."""
+        return BEND * sum(self.step([m for m in base if m != n], n) * self.overlap(n, name) for n in base)
+
     def select(self, threshold: float, most: int = 3) -> Choice:
         """Causes one after the other, each exchanged for what explains more together with the rest."""
         chosen: list[str] = []
         while len(chosen) < most:
             steps = {n: self.step(chosen, n) for n in self.causes if n not in chosen}
             best = max(steps, key=lambda n: steps[n])
-            if steps[best] < threshold:
+            if steps[best] < max(threshold, self.bend(chosen, best)):
                 break
             chosen.append(best)
             for _ in range(3):
@@ -123,19 +136,25 @@ class Search:
                     break
         for old in list(chosen):
             rest = [n for n in chosen if n != old]
-            if rest and self.step(rest, old) < threshold:
+            if rest and self.step(rest, old) < max(threshold, self.bend(rest, old)):
                 chosen.remove(old)
         chosen.sort(key=lambda n: -self.step([m for m in chosen if m != n], n))
         return Choice(tuple(chosen), self.gain(chosen))
 
-    def stand_ins(self, chosen: Sequence[str], margin: float) -> list[tuple[str, ...]]:
-        """For each of `chosen` the set of causes that explain nearly as much in its place, itself first."""
+    def stand_ins(self, chosen: Sequence[str], margin: float, least: float) -> list[tuple[str, ...]]:
+        """For each of `chosen` the set of causes that explain nearly as much in its place, itself first.
+
+        margin: of chi-squared, on the scale of the less certain of the two. least: that each must score by itself.
+        """
         sets = []
         for name in chosen:
             rest = [n for n in chosen if n != name]
-            own = self.step(rest, name)
-            near = {n: self.step(rest, n) for n in self.causes if n not in chosen}
-            others = sorted((n for n, g in near.items() if g > own - margin), key=lambda n: -near[n])
+            own = self.gain([*rest, name])
+            near = {n: self.gain([*rest, n]) for n in self.causes if n not in chosen}
+            inflation = self.state.inflation
+            allowed = {n: margin * max(1.0, inflation.get(n, 1.0), inflation.get(name, 1.0)) for n in near}
+            others = sorted((n for n, g in near.items() if g > own - allowed[n] and self.step(rest, n) > least),
+                            key=lambda n: -near[n])  # fmt: skip
             if others:
                 sets.append((name, *others))
         return sets

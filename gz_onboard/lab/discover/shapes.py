@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gz_onboard.lab.discover.channels import BY_NAME, over_blocks
-from gz_onboard.lab.discover.grid import STEP, Array, Ride
+from gz_onboard.lab.discover.grid import STEP, Array, Ride, smooth
 from gz_onboard.lab.discover.linear import Linear, Noise, Normal, Table, marginal, whitened
 from gz_onboard.lab.discover.search import _evidence
 from gz_onboard.lab.discover.state import Shape, State
@@ -63,12 +63,20 @@ def quantity(ride: Ride, name: str, table: Table) -> Array | None:
         if "soc" not in q:
             return None
         values = q["soc"]
+    elif name == "grade" and "gps_altitude" in ride.signals:  # not of the accelerometer, whose noise is in the channel
+        rise = np.gradient(smooth(ride.signals["gps_altitude"], 8.0), STEP)
+        values = smooth(rise, 8.0) / np.maximum(smooth(np.abs(q["speed"]), 8.0), 2.0)
     elif name == "steering":  # of a bicycle without slip: wheelbase over the radius of the bend
         speed = np.maximum(np.abs(q["speed"]), 1.0)
         values = np.clip(1.32 * q["lateral_acceleration"] / speed**2, -0.6, 0.6)
     else:
         values = q[name]
     return over_blocks(channel, values)[table.used]
+
+
+def scattering(pair: str) -> float:
+    """By how much the coefficients of the curve `pair` differ between rides, in `SIZES`."""
+    return SCATTERS.get(pair.partition(" over ")[0], SCATTER)
 
 
 def hats(x: Array, knots: Sequence[float], periodic: bool = False) -> Array:
@@ -115,43 +123,70 @@ def extended(linear: Linear, normal: Normal, pair: str, noise: Noise, size: floa
 SIZES = {"road_force": 5.0, "inverter_power": 10.0, "auxiliary": 2.0, "pack_balance": 0.1, "cell_voltage": 0.005}
 """Unit of a curve's coefficients, in the channel's; `SCATTER` of it is taken to differ between rides."""
 SCATTER = 0.3
+SCATTERS = {"cell_voltage": 1.0}  # whose model lacks more
+
+
+@dataclass(frozen=True)
+class Curve:
+    """What rides show over a quantity. chi2: twice the rise of the log likelihood, of `k` degrees of freedom.
+
+    values (k,): coefficients [the channel's unit]; covariance (k, k); weights (k,): how much of the rides is at each
+    knot, together 1.
+    """
+
+    chi2: float
+    values: Array
+    covariance: Array
+    weights: Array
+
+    @property
+    def k(self) -> int:
+        """How many knots."""
+        return len(self.values)
+
+    @property
+    def sd(self) -> Array:
+        """Of the values, (k,)."""
+        return np.asarray(np.sqrt(np.abs(np.diag(self.covariance))))
+
+    def contrasts(self) -> tuple[Array, Array]:
+        """(values less their mean, standard deviations of these), each (k,): what no constant could be."""
+        d = np.eye(self.k) - self.weights
+        return d @ self.values, np.sqrt(np.abs(np.diag(d @ self.covariance @ d.T)))
 
 
 def shape_evidence(
     state: State, linears: Sequence[Linear], normals: Sequence[Normal], pair: str, fixed: Sequence[int]
-) -> tuple[float, int, Array, Array] | None:
-    """(rise of twice the log likelihood by the curve beside changes at `fixed`, its degrees of freedom, coefficients
-    in the channel's unit, their sd); None where no ride has it.
-    """
+) -> Curve | None:
+    """The curve `pair` beside changes at `fixed`; None where no ride has it."""
     size = SIZES[pair.partition(" over ")[0]]
-    rides = [extended(line, normal, pair, state.noise, size) for line, normal in zip(linears, normals, strict=True)]
-    rides = [ride for ride in rides if ride is not None]
+    found = [extended(line, normal, pair, state.noise, size) for line, normal in zip(linears, normals, strict=True)]
+    rides = [ride for ride in found if ride is not None]
     if not rides:
         return None
     p = len(state.mean)
-    k = len(rides[0].b) - p  # type: ignore[union-attr]
+    k = len(rides[0].b) - p
     shape = state.shapes.get(pair)
     mean = np.concatenate([state.mean, shape.mean if shape else np.zeros(k)])
     prior = np.zeros((p + k, p + k))
     prior[:p, :p] = state.prior
-    prior[p:, p:] = shape.covariance if shape else np.eye(k) * SCATTER**2
-    scatter = np.concatenate([state.scatter, np.full(k, SCATTER**2)])
-    e = _evidence(mean, prior, scatter, rides)  # type: ignore[arg-type]
+    prior[p:, p:] = shape.covariance if shape else np.eye(k) * scattering(pair) ** 2
+    scatter = np.concatenate([state.scatter, np.full(k, scattering(pair) ** 2)])
+    e = _evidence(mean, prior, scatter, rides)
     mine = list(range(p, p + k))
     inner = e.information[np.ix_(mine, mine)] + 1e-3 * np.eye(k)
+    score = e.score[mine]
     if fixed:
         f = list(fixed)
         cross = np.linalg.solve(e.information[np.ix_(f, f)] + 1e-6 * np.eye(len(f)), np.column_stack(
             [e.information[np.ix_(f, mine)], e.score[f]]))  # fmt: skip
         inner = inner - e.information[np.ix_(mine, f)] @ cross[:, :-1]
-        score = e.score[mine] - e.information[np.ix_(mine, f)] @ cross[:, -1]
-    else:
-        score = e.score[mine]
+        score = score - e.information[np.ix_(mine, f)] @ cross[:, -1]
     inner = inner + 1e-3 * np.eye(k)
     estimate = np.linalg.solve(inner, score)
-    return (
-        float(score @ estimate), k, np.asarray(estimate * size), np.sqrt(np.abs(np.diag(np.linalg.inv(inner)))) * size
-    )  # fmt: skip
+    weights = sum(np.diag(ride.n)[p:] for ride in rides)
+    return Curve(float(score @ estimate), np.asarray(estimate * size), np.asarray(np.linalg.inv(inner) * size**2),
+                 np.asarray(weights / np.sum(weights)))  # fmt: skip
 
 
 def learn_shapes(state: State, linears: Sequence[Linear], normals: Sequence[Normal]) -> dict[str, Shape]:
@@ -172,7 +207,7 @@ def learn_shapes(state: State, linears: Sequence[Linear], normals: Sequence[Norm
             u = state.mean + v @ (ride.b[:p] - ride.n[:p, :p] @ state.mean)  # type: ignore[union-attr]
             inner = ride.n[p:, p:] - ride.n[p:, :p] @ v @ ride.n[:p, p:]  # type: ignore[union-attr]
             score = ride.b[p:] - ride.n[p:, :p] @ u  # type: ignore[union-attr]
-            part = marginal(Normal((inner + inner.T) / 2, score), np.full(k, SCATTER**2))
+            part = marginal(Normal((inner + inner.T) / 2, score), np.full(k, scattering(pair) ** 2))
             m, c = m + part.n, c + part.b
         covariance = np.linalg.inv(m + np.eye(k))
         found[pair] = Shape(np.asarray(covariance @ c), np.asarray(covariance), 1.0)
@@ -191,7 +226,7 @@ def with_inflation(
         for pair in shapes:
             found = shape_evidence(blind, [linears[i] for i in held], [normals[i] for i in held], pair, [])
             if found:
-                total.setdefault(pair, []).append(found[0] / found[1])
+                total.setdefault(pair, []).append(found.chi2 / found.k)
     whole = learn_shapes(state, linears, normals)
     return {
         pair: replace(shape, inflation=max(1.0, (2 + sum(total.get(pair, []))) / (2 + len(total.get(pair, [])))))

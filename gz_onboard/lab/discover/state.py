@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.lab.discover.candidates import Candidate, candidates
-from gz_onboard.lab.discover.channels import CHANNELS, System, depends
+from gz_onboard.lab.discover.channels import CHANNELS, System, counted_soc, depends
 from gz_onboard.lab.discover.grid import Array, Mask, Ride, read_ride
 from gz_onboard.lab.discover.linear import Noise
 from gz_onboard.lab.discover.terms import BASE, FIXED, LOG, NUISANCES, RIDE_SD, RIDE_SD_SHARE, stepped
@@ -21,13 +21,14 @@ from gz_onboard.vehicle import Vehicle
 MEAN_SD = {
     "cornering_compliance": 0.1, "wind_north": 0.4, "wind_east": 0.4, "brake_drag_force": 1.5,
     "drivetrain_drag_torque": 0.01, "warm_up_share": 0.2, "regeneration_loss_share": 0.03, "slow_resistance": 0.01,
-    "hysteresis_voltage": 0.005, "cell_resistance_factor": 0.1, "cooling_factor": 0.01, "speed_sensor_scale": 0.001,
+    "hysteresis_voltage": 0.005, "cell_resistance_factor": 0.005, "cooling_factor": 0.01, "speed_sensor_scale": 0.001,
     "pack_voltage_latency": 0.02, "payload_mass": 2.0,
 }  # fmt: skip
 """Of what a healthy vehicle may show of a candidate that its model lacks: standard deviation about none."""
 TRANSFER = ("motor_copper_resistance", "motor_iron_linear", "motor_iron_quadratic", "inverter_loss_constant",
             "inverter_loss_linear", "inverter_loss_quadratic", "torque_constant", "cable_resistance")  # fmt: skip
-"""Found on a bench at steady points: on the road they hold within three times their standard deviation."""
+TRANSFERRED = 3.0
+"""Found on a bench at steady points: on the road they hold within so many times their standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +80,10 @@ class State:
         """`samples` on the grid of this vehicle."""
         p = self.vehicle.parameters
         payload = samples.rider_mass if samples.rider_mass is not None else p["payload_mass"]
-        return read_ride(samples, p["wheel_radius"] * p["gear_ratio"], p["vehicle_mass"] + payload)
+        ride = read_ride(samples, p["wheel_radius"] * p["gear_ratio"], p["vehicle_mass"] + payload)
+        if self.system.battery is not None and {"pack_voltage", "pack_current"} <= ride.have:
+            ride.quantities["soc"] = counted_soc(ride, self.system)
+        return ride
 
 
 def initial(vehicle: Vehicle, folder: Path | None = None) -> State:
@@ -87,7 +91,8 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> State:
     causes = candidates(folder)
     lacking = [c.effect for c in causes if c.effect and c.name not in {e.name for e in vehicle.model.effects}]
     effects: tuple[Effect, ...] = (*vehicle.model.effects, *lacking)
-    system = System(effects, vehicle.battery, vehicle.parameters["payload_mass"])
+    p = vehicle.parameters
+    system = System(effects, vehicle.battery, p["payload_mass"], p.get("motor_copper_resistance", 0.0))
     declared = declared_parameters(effects)
     known = vehicle.parameters
     values = {name: p.prior for name, p in declared.items()} | {name: known[name] for name in known}
@@ -114,6 +119,8 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> State:
                 name in MEAN_SD and (name in absent or name not in vehicle_file_names(vehicle))
             ) or name == "payload_mass":
                 spread = MEAN_SD[name]
+            if name in TRANSFER:
+                spread *= TRANSFERRED
             scatter = RIDE_SD.get(name, RIDE_SD_SHARE * declared[name].prior_sd)
         if name in LOG:
             spread = min(spread / values[name], 0.5)

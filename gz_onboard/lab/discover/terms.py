@@ -46,11 +46,17 @@ NUISANCES = (
     Nuisance("soc_start", "1", 0.0, 0.0, 0.04, "state of charge at the start, beyond what the first voltage says"),
     Nuisance("v1_start", "V", 0.0, 0.0, 0.01, "relaxation left over from before the ride"),
     Nuisance("ocv_offset", "V", 0.0, 0.006, 0.004, "rest voltage against the table: hysteresis, relaxation"),
-    Nuisance("ocv_tilt", "V", 0.0, 0.03, 0.03, "slope of the rest voltage over SOC against the table"),
+    Nuisance("ocv_tilt", "V", 0.0, 0.03, 0.005, "slope of the rest voltage over SOC against the table"),
+    Nuisance("ocv_cold", "V/(20 K)", 0.0, 0.02, 0.001, "rest voltage at 0 degC less that at 20 degC"),
+    Nuisance("resistance_level", "1", 0.0, 0.1, 0.03, "cell resistance against the tables"),
+    Nuisance("drift", "V/(600 s)", 0.0, 0.001, 0.004, "what no circuit of the model follows over a ride"),
+    Nuisance("pair_resistance", "1", 0.0, 0.3, 0.02, "R1 of one pair where a second one has the slow part"),
+    Nuisance("pair_time", "1", 0.0, 0.4, 0.03, "its time constant, logarithm of the share"),
+    Nuisance("mid_resistance", "ohm", 0.0, 0.02, 0.001, "a pair between it and the slow one"),
     Nuisance("resistance_empty", "1", 0.0, 0.3, 0.05, "cell resistance at SOC 0.6 less that at 1.0, as a share"),
     Nuisance("resistance_current", "1/(5 A)", 0.0, 0.1, 0.01, "cell resistance falls with current"),
     Nuisance("resistance_current_cold", "1/(5 A·20 K)", 0.0, 0.1, 0.01, "the more so below 20 degC"),
-    Nuisance("resistance_cold", "1/(20 K)", 0.0, 0.15, 0.04, "cell resistance below 20 degC beyond the tables"),
+    Nuisance("resistance_cold", "1/(20 K)", 0.0, 0.15, 0.03, "cell resistance below 20 degC beyond the tables"),
     Nuisance("fast_resistance", "1", 0.0, 0.2, 0.05, "resistance at 0.1 s over that of the tables"),
     Nuisance("slip_per_force", "1/(100 N)", 0.0, 0.02, 0.003, "slip of the driven wheel"),
     Nuisance("lean_radius", "1", 0.0, 0.3, 0.05, "rolling radius falls with lean"),
@@ -86,8 +92,14 @@ FIXED = ("soc_start", "v1_start", "altitude_start", "payload_error", "motor_star
          "box_start", "cells_start")  # fmt: skip
 """Those whose scatter is of the ride's start or of what was entered: nothing that healthy rides would tell better."""
 
+WEATHER = ("wind_north", "wind_east")
+"""Those whose scatter is the weather's: calm days do not promise more of them."""
+
+STARTS = (*(name for name in FIXED if name != "payload_error"), "accel_bias", "pitch_gain", "gps_lag", "wheel_lag")
+"""Those that are the sensors' or the start's, not the vehicle's: each ride tells its own, whatever the model."""
+
 BASE = (
-    "wheel_radius", "payload_mass", "torque_constant", "cell_capacity", "pack_series_resistance", "cable_resistance",
+    "wheel_radius", "payload_mass", "torque_constant", "cell_capacity", "cable_resistance",
     "pack_current_offset", "pack_current_gain", "pack_voltage_offset", "pack_heat_capacity", "pack_conductance",
     "motor_stator_capacity", "motor_rotor_capacity", "motor_gap_conductance", "motor_rotor_to_ambient",
     "inverter_board_capacity", "inverter_box_capacity", "inverter_board_to_box", "inverter_box_to_ambient",
@@ -95,15 +107,15 @@ BASE = (
 """Of the vehicle's own parameters those that a channel depends on; those of the model's effects come on top."""
 
 RIDE_SD = {
-    "wheel_radius": 4e-4, "payload_mass": 0.0, "torque_constant": 0.002, "cell_capacity": 0.06,
+    "wheel_radius": 4e-4, "payload_mass": 0.0, "torque_constant": 0.002, "cell_capacity": 0.01,
     "pack_series_resistance": 3e-4, "cable_resistance": 2e-4, "pack_current_offset": 0.03, "pack_current_gain": 0.002,
     "pack_voltage_offset": 0.01, "drag_area": 0.01, "rolling_resistance_constant": 7e-4,
     "rolling_resistance_speed": 2e-5, "motor_copper_resistance": 3e-4, "motor_iron_linear": 0.03,
     "motor_iron_quadratic": 0.001, "inverter_loss_constant": 0.5, "inverter_loss_linear": 0.02,
     "inverter_loss_quadratic": 1e-4, "auxiliary_power": 0.7, "cornering_compliance": 0.015,
     "wind_north": 1.2, "wind_east": 1.2, "brake_drag_force": 1.0, "drivetrain_drag_torque": 0.005,
-    "warm_up_share": 0.05, "regeneration_loss_share": 0.02, "slow_resistance": 0.002, "hysteresis_voltage": 0.002,
-    "cell_resistance_factor": 0.03, "cooling_factor": 0.03, "speed_sensor_scale": 3e-4, "pack_voltage_latency": 0.004,
+    "warm_up_share": 0.05, "regeneration_loss_share": 0.02, "slow_resistance": 0.001, "hysteresis_voltage": 0.001,
+    "cell_resistance_factor": 0.01, "cooling_factor": 0.08, "speed_sensor_scale": 3e-4, "pack_voltage_latency": 0.004,
 }  # fmt: skip
 RIDE_SD_SHARE = 0.1
 """What a parameter without a row scatters by, as a share of its prior's standard deviation."""

@@ -11,18 +11,25 @@ from scipy.stats import t as student
 
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.channels import over_blocks
+from gz_onboard.lab.discover.constancy import Split, splits
 from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, normal
 from gz_onboard.lab.discover.result import Cause, Report
 from gz_onboard.lab.discover.search import Evidence, Search, evidence, one_degree
-from gz_onboard.lab.discover.shapes import QUANTITIES, columns, names, shape_evidence
+from gz_onboard.lab.discover.shapes import QUANTITIES, Curve, columns, names, shape_evidence
 from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.terms import LOG, stepped
 
 FALSE_ALARMS = 0.05  # of sets of healthy rides, all candidates and curves together
-EXTRA = 0.97  # of what a curve and the names explain, the part that names must
-NOISY = "road_force over grade"
-"""Of which healthy rides must tell: both are made from the accelerometer, whose noise makes a slope of its own."""
+LEFT = 0.1  # of what causes explain: a curve beside them that takes less is the bend of a large effect
+CURVE = 1.5  # a curve's evidence over that of a cause: there are many, and their knots are chosen by eye
+UNLIKE = 0.5  # of a cause's effect in a channel: a curve beside it that takes more is not the cause's bend
+UNLIKE_LEFT = 0.01  # of what causes explain: less is not worth the doubt
+CLEAR = 4.0  # standard deviations of a curve's coefficient that counts
+DISCREPANCY = 0.05  # of a change, sd: the form of an effect is not exactly the real one's
+LUMPED = ("cell_voltage", "voltage_timing", "motor_temperature", "inverter_temperature", "cell_temperature")
+"""Channels whose model is a circuit or network of lumps: the discrepancy of what is found in them is twice that."""
+LEAST = 0.4  # of the threshold, by which a stand-in must explain something itself
 MARGIN = 6.0  # of chi-squared within which another cause explains as well: a likelihood ratio of 20
 
 
@@ -53,7 +60,8 @@ def reach(
     e = evidence(state, normals)
     causes = seen(state, e, notes)
     limit = threshold(state, tries(e, [i for c in causes for i in state.index(c.names)]))
-    search = Search(state, e, causes)
+    shares = channel_shares(state, lines, causes)
+    search = Search(state, e, causes, shares)
     say(f"{len(causes)} candidates")
     choice = search.select(limit)
     offset = np.zeros(len(state.mean))
@@ -72,27 +80,43 @@ def reach(
         lines = [line.seen_from(offset) for line in again(moved)]
         normals = [normal(line, state.noise) for line in lines]
         e = evidence(state, normals)
-        search = Search(state, e, causes)
+        search = Search(state, e, causes, shares)
         chosen = search.select(limit).names
     found = causes_of(state, search, chosen, lines)
-    sets = [list(s) for s in search.stand_ins(chosen, MARGIN)]
+    sets = [list(s) for s in search.stand_ins(chosen, MARGIN, LEAST * limit)]
     say("curves over quantities")
-    unknown = unexplained(state, search, lines, normals, chosen, limit)
+    change = np.zeros(len(state.mean))
+    change[search.index(chosen)] = search.evidence.estimate(search.index(chosen))
+    constancy = splits(state, lines, normals, search.place, chosen, change) if chosen else []
+    unknown = unexplained(state, search, lines, normals, chosen, change, [s for s in constancy if s.unequal], limit)
     verdict = "none"
-    if unknown is not None:
-        verdict = "unknown"
+    if unknown is not None and unknown["replaces"]:
+        verdict, found, sets = "unknown", [], []
     elif sets:
         verdict = "ambiguous"
     elif found:
         verdict = "cause"
     ranking = sorted(((c.name, round(search.step([n for n in chosen if n != c.name], c.name), 2)) for c in causes),
                      key=lambda pair: -pair[1])  # fmt: skip
-    if unknown is not None:
-        found = [] if unknown["replaces"] else found
     return Report(
         verdict, found, sets, unknown, ranking, sizes(lines), {}, advice(search, sets, unknown), notes,
-        isolability(search), limit, state=state, lines=list(lines), normals=normals,
+        isolability(search), limit, constancy=constancy, state=state, lines=list(lines), normals=normals,
     )  # fmt: skip
+
+
+def channel_shares(state: State, lines: Sequence[Linear], causes: Sequence[Candidate]) -> dict[str, dict[str, float]]:
+    """Of each cause, by channel, its share of what could be seen of it."""
+    found = {}
+    for cause in causes:
+        index = state.index(cause.names)
+        seen_in: dict[str, float] = {}
+        for line in lines:
+            for name, table in line.tables.items():
+                noise = float(np.hypot(*state.noise[name][:2]))
+                seen_in[name] = seen_in.get(name, 0.0) + float(np.sum((table.a[:, index] / noise) ** 2))
+        whole = sum(seen_in.values()) or 1.0
+        found[cause.name] = {name: value / whole for name, value in seen_in.items()}
+    return found
 
 
 def kept(state: State, i: int, x: float) -> float:
@@ -139,8 +163,9 @@ def causes_of(state: State, search: Search, chosen: Sequence[str], lines: Sequen
         for parameter in cause.parameters:
             i = index[at]
             healthy = own_value(state, parameter.name)
-            sd = float(np.sqrt(covariance[at, at] * inflation))
             x = float(estimate[at])
+            own = DISCREPANCY * (1 + sum(search.shares.get(name, {}).get(channel, 0.0) for channel in LUMPED))
+            sd = float(np.hypot(np.sqrt(covariance[at, at] * inflation), own * x))
             change[i] = x
             step = float(state.scale[i])
             if parameter.name in LOG:
@@ -210,31 +235,91 @@ def share_of_time(line: Linear, channel: str) -> float:
 
 
 def unexplained(
-    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str], limit: float
-) -> dict[str, Any] | None:
-    """The curve that explains most beside the causes chosen, or instead of them; None if none is significant."""
+    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str],
+    change: Array, unequal: Sequence[Split], limit: float,
+) -> dict[str, Any] | None:  # fmt: skip
+    """The curve that explains most beside the causes chosen, and whether it shows them to be no causes at all; None if
+    none is significant.
+
+    change (p,): of the parameters by the causes. A curve replaces the causes if it takes back, or adds, half or more of
+    what they do somewhere in a channel that names them, or if they are `unequal` in the halves of the rides.
+    """
     index = search.index(chosen)
+    total = search.evidence.gain(index)
     best: dict[str, Any] | None = None
     for pair in names():
-        if pair == NOISY and pair not in state.shapes:
+        curve = shape_evidence(state, lines, normals, pair, index)
+        if curve is None:
             continue
         inflation = state.shapes[pair].inflation if pair in state.shapes else 1.0
-        beside = shape_evidence(state, lines, normals, pair, index)
-        if beside is None:
+        score = one_degree(curve.chi2 / inflation, curve.k)
+        if score < CURVE * limit:
             continue
-        chi2, k, curve, sd = beside
-        score = one_degree(chi2 / inflation, k)
-        if best is None or score > best["score"]:
-            channel, _, quantity = pair.partition(" over ")
-            best = {"channel": channel, "quantity": quantity, "unit": QUANTITIES[quantity][1], "score": score,
-                    "chi2": chi2, "knots": list(QUANTITIES[quantity][0]), "values": curve.tolist(),
-                    "sd": sd.tolist()}  # fmt: skip
-    if best is None or best["score"] < 1.5 * limit:
+        unlike = unlike_causes(curve, inflation, *weight(state, lines, pair.partition(" over ")[0], change))
+        if chosen and curve.chi2 < (UNLIKE_LEFT if unlike else LEFT) * total:
+            continue
+        if best is None or (unlike, score) > (best["replaces"], best["score"]):
+            best = described(pair, curve, score) | {"replaces": unlike}
+    if unequal and (best is None or not best["replaces"]):
+        worst = max(unequal, key=lambda s: s.chi2)
+        best = halves(state, lines, normals, worst) or best
+    if best is None:
         return None
-    total = search.evidence.gain(index)
-    best["replaces"] = bool(chosen) and best["chi2"] > (1 - EXTRA) / EXTRA * total
-    best["curve"] = [list(pair) for pair in zip(best.pop("knots"), best.pop("values"), best.pop("sd"), strict=True)]
+    best["replaces"] = best["replaces"] or not chosen
     best["share"] = shape_share(lines, best)
+    return best
+
+
+def described(pair: str, curve: Curve, score: float) -> dict[str, Any]:
+    """The curve for the report."""
+    channel, _, quantity = pair.partition(" over ")
+    knots, unit = QUANTITIES[quantity]
+    rows = zip(knots, curve.values.tolist(), curve.sd.tolist(), strict=True)
+    return {"channel": channel, "quantity": quantity, "unit": unit, "score": score, "chi2": curve.chi2,
+            "curve": [list(row) for row in rows]}  # fmt: skip
+
+
+def unlike_causes(curve: Curve, inflation: float, size: float, share: float) -> bool:
+    """Whether what is left beside the causes, of `size` in this channel and `share` of the evidence for them, is no
+    mere bend of what they do.
+    """
+    value, sd = curve.contrasts()
+    certain = (np.abs(value) > CLEAR * sd * inflation**0.5) & (curve.weights > 0.02)
+    return bool(share > 0.3 and size > 0 and np.any(np.abs(value)[certain] > UNLIKE * size))
+
+
+def weight(state: State, lines: Sequence[Linear], channel: str, change: Array) -> tuple[float, float]:
+    """(what `change` (p,) of the parameters makes in `channel`, rms where it acts [unit]; the channel's share of the
+    evidence for it).
+    """
+    parts, here, everywhere = [np.zeros(1)], 0.0, 0.0
+    for line in lines:
+        for name, table in line.tables.items():
+            effect = table.a @ change
+            strength = float(np.sum((effect / np.hypot(*state.noise[name][:2])) ** 2))
+            everywhere += strength
+            if name == channel:
+                here += strength
+                parts.append(np.abs(effect * table.unit))
+    effect = np.concatenate(parts)
+    acting = effect[effect > 0.1 * effect.max()]
+    if effect.max() < 1e-9 or not len(acting):
+        return 0.0, 0.0
+    return float(np.sqrt(np.mean(acting**2))), here / everywhere
+
+
+def halves(state: State, lines: Sequence[Linear], normals: Sequence[Any], split: Split) -> dict[str, Any] | None:
+    """The curve over the quantity of `split`, with no cause named, in the channel where it has most to say."""
+    best: dict[str, Any] | None = None
+    for pair in names():
+        if not pair.endswith(f" over {split.quantity}"):
+            continue
+        curve = shape_evidence(state, lines, normals, pair, [])
+        if curve is None:
+            continue
+        score = one_degree(curve.chi2 / (state.shapes[pair].inflation if pair in state.shapes else 1.0), curve.k)
+        if best is None or score > best["score"]:
+            best = described(pair, curve, score) | {"replaces": True}
     return best
 
 

@@ -1,0 +1,112 @@
+"""Does a named cause act alike wherever it should? What stands in for something without a name does not.
+
+The columns of a cause are split in two by a quantity, left bends and right ones, early and late, slow and fast, and the
+difference of the halves becomes a parameter of its own, the `ratio` to their mean: 0 for the cause itself, ±1 for what
+acts in one half only (a test of the constancy of a coefficient: Chow 1960; Hansen 1992). Real causes differ a little
+between halves, more so from ride to ride; only what no such difference explains counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gz_onboard.lab.discover.channels import over_blocks
+from gz_onboard.lab.discover.grid import Array, Ride
+from gz_onboard.lab.discover.linear import Linear, Normal, Table, whitened
+from gz_onboard.lab.discover.search import _evidence
+from gz_onboard.lab.discover.state import State
+
+RATIO_SD, RIDE_SD = 0.15, 0.25  # of a real cause: on all rides, and from ride to ride
+RATIO = 0.5  # beyond which half of the cause is missing in one of the halves
+CHI2 = 16.0  # four standard deviations
+
+
+def _side(ride: Ride, table: Table) -> Array:
+    """+1 in left bends, -1 in right ones, 0 on the straight."""
+    return np.asarray(np.tanh(over_blocks(table.channel, ride.quantities["lateral_acceleration"])[table.used] / 0.3))
+
+
+def _halves(name: str) -> Callable[[Ride, Table], Array]:
+    """-1 below the ride's median of a quantity while it moves, +1 above."""
+
+    def sign(ride: Ride, table: Table) -> Array:
+        values = ride.time if name == "time" else ride.quantities[name]
+        moving = np.abs(ride.quantities["speed"]) > 1.0
+        middle = float(np.median(values[moving])) if moving.any() else 0.0
+        return np.asarray(np.sign(over_blocks(table.channel, values)[table.used] - middle))
+
+    return sign
+
+
+SPLITS: Mapping[str, Callable[[Ride, Table], Array]] = {
+    "lateral_acceleration": _side,
+    "time": _halves("time"),
+    "speed": _halves("speed"),
+}
+
+
+@dataclass(frozen=True)
+class Split:
+    """How unequal a cause is between the halves of a quantity. ratio: half the difference over the mean."""
+
+    cause: str
+    quantity: str
+    ratio: float
+    chi2: float
+
+    @property
+    def unequal(self) -> bool:
+        """Whether it is not the same cause in both."""
+        return abs(self.ratio) > RATIO and self.chi2 > CHI2
+
+
+def splits(
+    state: State, lines: Sequence[Linear], normals: Sequence[Normal], place: Mapping[str, Sequence[int]],
+    chosen: Sequence[str], change: Array,
+) -> list[Split]:  # fmt: skip
+    """Of each of `chosen`, whose parameters stand at `place` and were found to change by `change` (p,), in scales."""
+    fixed = [i for name in chosen for i in place[name]]
+    found = []
+    for name in chosen:
+        index = list(place[name])
+        for quantity, sign in SPLITS.items():
+            rides = [_extended(line, normal, state, index, change[index], sign)
+                     for line, normal in zip(lines, normals, strict=True)]  # fmt: skip
+            p = len(state.mean)
+            prior = np.zeros((p + 1, p + 1))
+            prior[:p, :p] = state.prior
+            prior[p, p] = RATIO_SD**2
+            e = _evidence(np.append(state.mean, 0.0), prior, np.append(state.scatter, RIDE_SD**2), rides)
+            cross = np.linalg.solve(e.information[np.ix_(fixed, fixed)] + 1e-6 * np.eye(len(fixed)), np.column_stack(
+                [e.information[fixed, p], e.score[fixed]]))  # fmt: skip
+            inner = e.information[p, p] - e.information[p, fixed] @ cross[:, 0]
+            score = e.score[p] - e.information[p, fixed] @ cross[:, 1]
+            if inner > 1e-6:
+                found.append(Split(name, quantity, float(score / inner), float(score * score / inner)))
+    return found
+
+
+def _extended(
+    line: Linear, normal: Normal, state: State, index: Sequence[int], change: Array,
+    sign: Callable[[Ride, Table], Array],
+) -> Normal:  # fmt: skip
+    """`normal` with one more column: what the cause does, times the sign."""
+    p = len(normal.b)
+    n, b = np.zeros((p + 1, p + 1)), np.zeros(p + 1)
+    n[:p, :p], b[:p] = normal.n, normal.b
+    for name, table in line.tables.items():
+        effect = table.a[:, index] @ change
+        if not np.any(effect):
+            continue
+        touched = np.flatnonzero(np.any(table.a != 0, axis=0))
+        both = whitened(table, state.noise[name], np.column_stack(
+            [effect * sign(line.ride, table), table.a[:, touched], table.y]))  # fmt: skip
+        split, a, y = both[:, 0], both[:, 1:-1], both[:, -1]
+        n[p, p] += split @ split
+        n[p, touched] += split @ a
+        n[touched, p] += split @ a
+        b[p] += split @ y
+    return Normal(n, b)
