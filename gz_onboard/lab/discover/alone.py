@@ -12,12 +12,13 @@ from dataclasses import replace
 import numpy as np
 
 from gz_onboard.lab.discover.grid import Array, Ride
-from gz_onboard.lab.discover.linear import Linear, fit_mixed, learn_noise, normal
+from gz_onboard.lab.discover.linear import Linear, Noise, fit_mixed, learn_noise, normal
 from gz_onboard.lab.discover.state import State
 
 FREE = 25.0  # variance in scales that is added to that of every parameter while noise and scatter are learned
 ROUNDS = 2
 SCATTER_FROM = 3  # rides
+CIRCUIT_TIME = 300.0  # s: what one RC pair lacks relaxes over minutes
 ABSENT = 1e-3  # sd in scales of an effect that the model lacks
 NOTE = ("no healthy rides are known of this vehicle (--baseline): it is held against its file, whose model is taken at "
         "its word, and the rate of false alarms is not calibrated")  # fmt: skip
@@ -37,7 +38,17 @@ def alone(
     if len(rides) >= SCATTER_FROM:
         normals = [normal(line, noise) for line in lines]
         scatter = fit_mixed(normals, state.mean, free, state.scatter, 1.0, state.free, 60).scatter
+    noise = as_wrong_as_it_says(noise, state)
     return replace(state, noise=noise, scatter=scatter, prior=as_the_file_says(state))
+
+
+def as_wrong_as_it_says(noise: Noise, state: State) -> Noise:
+    """`noise` in which the circuit of a cell errs as the file says that it does (`cell_voltage_error`): slowly."""
+    if "cell_voltage" not in noise or "cell_voltage_error" not in state.vehicle.parameters:
+        return noise
+    white, slow, time = noise["cell_voltage"]
+    stated = state.vehicle.parameters.sd("cell_voltage_error")
+    return {**noise, "cell_voltage": (white, max(slow, stated), max(time, CIRCUIT_TIME))}
 
 
 def as_the_file_says(state: State) -> Array:

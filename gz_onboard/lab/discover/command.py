@@ -39,7 +39,9 @@ KEYS = {
     "advice": "what to ride next",
     "notes": "what could not be used, and what was left out",
     "isolability": "look_alikes: pairs and the cosine of what they do to the residuals",
-    "threshold": "score that healthy rides exceed in 5 % of such searches",
+    "threshold": "score that one in twenty such searches of healthy rides exceeds",
+    "constancy": "whether a cause acts alike everywhere: cause, quantity, ratio (half the difference of the halves "
+    "of the quantity over the mean), chi2",
     "limits": "per candidate: parameter, change, unit, energy_share: the least that would be found half the time",
 }
 _ROWS = 3  # residuals and limits told in the terminal

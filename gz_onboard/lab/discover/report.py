@@ -77,7 +77,7 @@ def page(report: Report) -> str:
     ]
     if report.unknown:
         parts.append("<h2>What has no name</h2>" + _picture(curve(report.unknown)))
-    parts += [_limits(report), _separable(report), _notes(report)]
+    parts += [_constancy(report), _limits(report), _separable(report), _notes(report)]
     body = "\n".join(parts)
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Discovery: {report.verdict}</title>'
@@ -214,6 +214,18 @@ def _gain(report: Report) -> str:
     return table(heads, rows) + (
         f'<p class="muted">{text}: {held}. Control: the parameters that the model has already, refitted on the other '
         "rides. After: the causes as well.</p>"
+    )
+
+
+def _constancy(report: Report) -> str:
+    splits = report.constancy
+    if not splits:
+        return ""
+    rows = [[words(s.cause), words(s.quantity), f"{s.ratio:+.2f}", f"{s.chi2:.1f}"] for s in splits]
+    return (
+        "<h2>Whether a cause acts alike everywhere</h2><p>Half the difference of left and right bends, or of the upper "
+        "and lower half of a quantity, over the mean: 0 for the cause itself, ±1 for what acts in one half only.</p>"
+        + table(["cause", "over", "ratio", "chi-squared"], rows)
     )
 
 

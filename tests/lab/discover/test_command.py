@@ -12,7 +12,7 @@ from gz_onboard.lab.discover.candidates import candidates
 from gz_onboard.lab.discover.command import KEYS
 from tests.support import LOGS, ROOT
 
-RIDE = LOGS / "city_34C.blf"
+RIDE = LOGS / "city_14C.blf"
 CAR = ROOT / "tests" / "vehicles" / "car" / "car.toml"
 
 
@@ -34,8 +34,8 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         ([str(ROOT / "README.md")], "unknown log format '.md'"),
         ([str(RIDE), "--effects", "nowhere"], "--effects nowhere: no such folder"),
         ([str(RIDE), "--vehicle", "refrence"], "did you mean 'reference'"),
-        ([str(RIDE), str(RIDE)], "two rides are called city_34C"),
-        ([str(RIDE), "--holdout", "city_34C"], "one ride alone"),
+        ([str(RIDE), str(RIDE)], "two rides are called city_14C"),
+        ([str(RIDE), "--holdout", "city_14C"], "one ride alone"),
         ([str(LOGS), "--holdout", "city_43C"], "no ride is called 'city_43C' (did you mean 'city_34C'?)"),
         ([str(RIDE), "--json", "nowhere/out.json"], "no folder nowhere"),
         ([str(RIDE), "--write-model", "new.txt"], "a vehicle file is a .toml"),
@@ -79,7 +79,8 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_one_healthy_ride(alone: Path):
     found = json.loads((alone / "out.json").read_text())
-    assert set(found) == {"schema", *KEYS}
+    assert set(found) <= {"schema", *KEYS}
+    assert set(KEYS) - {"constancy"} <= set(found)
     assert found["verdict"] == "none"
     assert found["causes"] == []
     assert not (alone / "new.toml").exists()  # nothing to extend it with
