@@ -17,7 +17,7 @@ from gz_onboard.lab.discover.candidates import Candidate, candidates
 from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.engine import baseline, discover
 from gz_onboard.lab.discover.files import write_baseline, write_model
-from gz_onboard.lab.discover.limits import amount, limits, size, strange, unformed, words
+from gz_onboard.lab.discover.limits import amount, limits, size, strange, unformed, unsettled, words
 from gz_onboard.lab.discover.parts import before_and_after, outstanding
 from gz_onboard.lab.discover.result import METRICS, SCHEMA, VERDICTS, Report
 from gz_onboard.lab.discover.verdict import sizes
@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
     with _Bar(arguments.quiet) as bar:
         report = discover(vehicle, rides, arguments.seed, arguments.effects, bar.say, arguments.workers, holdout)
     report.notes[:0] = refused
-    report.notes += [*strange(report), *unformed(report), *outstanding(report)]
+    report.notes += [*unsettled(report), *outstanding(report), *strange(report), *unformed(report)]
     told = write_extended(report, vehicle, arguments) if arguments.write_model else []
     if arguments.json:
         write_json(arguments.json, document(report))

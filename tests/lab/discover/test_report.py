@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from gz_onboard.lab.discover.alone import as_the_file_says
 from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.engine import linearise_all
-from gz_onboard.lab.discover.limits import limits, strange, unformed
+from gz_onboard.lab.discover.limits import limits, strange, unformed, unsettled
 from gz_onboard.lab.discover.linear import normal
 from gz_onboard.lab.discover.parts import (
     QUANTITIES,
@@ -152,6 +152,14 @@ def test_a_ride_of_another_vehicle_is_suspected(report: Report):
     signals = {**line.ride.signals, "gps_speed": 1.35 * line.ride.signals["gps_speed"]}
     (said,) = strange(replace(report, lines=[replace(line, ride=replace(line.ride, signals=signals))]))
     assert "coastdown: GPS speed is 1.3" in said
+
+
+def test_a_range_that_is_still_missed_is_said(report: Report):
+    errors = {"before": 0.2, "control": 0.1, "after": 0.09, "ci95": [0.0, 0.02]}
+    (said,) = unsettled(replace(report, gain={"range": errors}))
+    assert "9% of the range is missed" in said
+    assert unsettled(replace(report, gain={"range": {**errors, "after": 0.02}})) == []
+    assert unsettled(replace(report, gain={"note": "one ride: nothing to hold out"})) == []
 
 
 def test_what_one_ride_alone_shows_is_said(report: Report):
