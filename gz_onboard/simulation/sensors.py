@@ -34,7 +34,7 @@ _METRES_PER_DEGREE = 111_200.0
 
 _NAMES = (
     "time", "speed", "wheel_speed", "distance", "climb", "grade", "curvature", "throttle", "brake", "motor_current",
-    "pack_current", "pack_voltage", "soc", "cell", "motor", "inverter", "bms", "tyre_force",
+    "pack_current", "pack_voltage", "soc", "cell", "motor", "inverter", "bms", "tyre_force", "chassis_lean",
 )  # fmt: skip
 
 
@@ -53,7 +53,7 @@ class Trace:
             extend((
                 s.time, s.speed, s.wheel_speed, s.distance, s.climb, grade, curvature, s.throttle, s.brake,
                 s.motor_current, s.current, s.voltage, s.pack.soc, s.pack_cooling.temperature, s.motor_cooling.stator,
-                s.inverter_cooling.board, s.bms_cooling.temperature, s.force,
+                s.inverter_cooling.board, s.bms_cooling.temperature, s.force, s.lean,
             ))  # fmt: skip
             return command(s)
 
@@ -73,8 +73,9 @@ class Truth:
     """Everything that the sensors read, as arrays over the steps; SI units, temperatures in degC, angles in rad.
 
     Those of `Trace`, and: ``acceleration`` and ``way`` (of the body over the ground: none on a dynamometer),
-    ``yaw_rate`` (left), ``lean`` (right), ``lean_rate``, ``pitch_rate`` (nose down), ``heading`` (from north),
-    ``north`` and ``east`` [m], ``auxiliary_power`` (of all effects at the DC link), ``auxiliary_current``.
+    ``yaw_rate`` (left), ``lean`` (right; of a leaning chassis its own, else `_lean_of`), ``lean_rate``, ``pitch_rate``
+    (nose down), ``heading`` (from north), ``north`` and ``east`` [m], ``auxiliary_power`` (of all effects at the DC
+    link), ``auxiliary_current``.
     """
 
     def __init__(self, columns: Mapping[str, Array], scooter: Scooter) -> None:
@@ -92,7 +93,10 @@ class Truth:
         width = min(2 * round(LEAN_TIME / dt / 2) + 1, self.count)
         curvature = _smooth(c["curvature"], width)
         c["yaw_rate"] = c["way"] * curvature
-        c["lean"] = -np.arctan(c["way"] ** 2 * curvature / G)
+        if scooter.chassis.name == "leaning":
+            c["lean"] = _smooth(c["chassis_lean"], width)
+        else:
+            c["lean"] = _lean_of(-np.arctan(c["way"] ** 2 * curvature / G), self.parameters)
         c["lean_rate"] = np.gradient(c["lean"], dt)
         c["slope"] = np.arcsin(_smooth(c["grade"], width))
         c["pitch_rate"] = -np.gradient(c["slope"], dt)
@@ -127,6 +131,18 @@ class Truth:
         import numpy as np
 
         return np.full(self.count, value)
+
+
+def _lean_of(ideal: Array, p: Mapping[str, float]) -> Array:
+    """Lean [rad] of a machine on round tyres where a thin disc leans by `ideal`, as `turning.tyre.lean_of`.
+
+    A chassis without lean has nobody on it who leans; its sensors are those of one that does.
+    """
+    import numpy as np
+
+    crown, height = p["tyre_crown_radius"], p["cg_height"]
+    lean: Array = ideal + np.arcsin(np.clip(crown * np.sin(ideal) / (height - crown), -1.0, 1.0))
+    return lean
 
 
 def _smooth(values: Array, width: int) -> Array:

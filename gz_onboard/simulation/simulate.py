@@ -55,8 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "this turning model says (%(default)s)")  # fmt: skip
     add("--predictive", action="store_true", help="of a recorded ride: the rider follows its speed, by own throttle")
     add("--sweep", action="append", default=[], metavar="NAME=LO..HI[:STEPS]",
-        help="ride it with other values of a parameter, or of battery.cells_parallel or battery.cells_series; at most "
-        "twice")  # fmt: skip
+        help="ride it with other values of a parameter, or of battery.parallel or battery.series (cells); at "
+        "most twice")  # fmt: skip
     add("--json", nargs="?", const="-", metavar="FILE|-", help="write the summary as JSON, to standard output or FILE")
     add("--output", type=Path, default=Path(), metavar="DIR", help="where to write (the current directory)")
     add("--format", choices=FORMATS, default="parquet", help="of the time series (%(default)s)")

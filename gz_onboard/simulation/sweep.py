@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from gz_onboard.errors import InputError, nearest
@@ -11,6 +12,12 @@ from gz_onboard.vehicle import Vehicle
 
 CELLS = ("battery.cells_parallel", "battery.cells_series")
 _SHORT = {"battery.parallel": CELLS[0], "battery.series": CELLS[1]}
+_SPOKEN = {
+    "battery": CELLS[0], "cells": CELLS[0], "parallel": CELLS[0], "cells_parallel": CELLS[0],
+    "series": CELLS[1], "cells_series": CELLS[1], "capacity": "cell_capacity", "mass": "vehicle_mass",
+    "payload": "payload_mass", "cda": "drag_area", "rolling_resistance": "rolling_resistance_constant",
+}  # fmt: skip
+"""What is said for a parameter, so that the nearest by letters is the one that is meant."""
 _STEPS = 5
 _MOST_STEPS = 50
 
@@ -43,7 +50,7 @@ def read_sweep(text: str, vehicle: Vehicle) -> Sweep:
     name = _SHORT.get(name.strip(), name.strip())
     declared = declared_parameters(vehicle.model.effects)
     if name not in (*declared, *CELLS):
-        raise InputError(f"--sweep {text}: no parameter is called {name!r}{nearest(name, [*declared, *CELLS])}")
+        raise InputError(f"--sweep {text}: no parameter is called {name!r}{_meant(name, declared)}")
     low_bound, high_bound, unit = (1.0, 1000.0, "1")
     if name in declared:
         low_bound, high_bound, unit = declared[name].low, declared[name].high, declared[name].unit
@@ -70,6 +77,14 @@ def read_sweep(text: str, vehicle: Vehicle) -> Sweep:
     if name in CELLS:
         values = sorted({float(round(value)) for value in values})
     return Sweep(name, unit, tuple(values))
+
+
+def _meant(name: str, declared: Iterable[str]) -> str:
+    """The hint at the parameter meant by `name`, of which the last of its dotted parts counts."""
+    known = {name: name for name in declared} | _SPOKEN
+    last = name.rpartition(".")[2].lower()
+    match = difflib.get_close_matches(last, known, n=1, cutoff=0.6)
+    return f" (did you mean {known[match[0]]!r}?)" if match else nearest(last, known)
 
 
 def redesigned(vehicle: Vehicle, values: Mapping[str, float]) -> Vehicle:

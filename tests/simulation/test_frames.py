@@ -15,10 +15,13 @@ from gz_onboard.bus.logs import read_frames
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
 from gz_onboard.events import Reason, State
+from gz_onboard.physics.model import G
 from gz_onboard.simulation.frames import START_NS, Losses, batches, simulate_frames, write_frames
+from gz_onboard.simulation.parts.chassis import chassis
 from gz_onboard.simulation.run import along, drive, road_table
 from gz_onboard.simulation.scooter import Dynamometer, Scooter
 from gz_onboard.simulation.sensors import ALTITUDE, ROLLER, SENSORS, Trace
+from gz_onboard.simulation.turning.tyre import lean_of
 from gz_onboard.vehicle import read_vehicle
 from tests.support import ROOT, reference, ridden
 
@@ -100,6 +103,22 @@ def test_lean_and_grade_are_found():
     hill = np.flatnonzero((truth["distance"] > 850) & (truth["distance"] < 990))
     grades = [e.grade for e in run.between(truth["time"][hill[0]] - shift, truth["time"][hill[-1]] - shift)]
     assert np.mean(grades) == pytest.approx(0.03, abs=0.008)
+
+
+@pytest.mark.parametrize("name", ["straight", "planar", "leaning"])
+def test_lean_is_that_of_round_tyres(name):
+    """In a long bend: more than a thin disc's, of every chassis what the leaning one settles at."""
+    p = reference().parameters
+    speed, curvature = 8.0, 1 / 25
+    scooter = Scooter(reference(), lambda distance: (0.0, curvature, 0.0), soc=0.8, speed=speed,
+                      chassis=chassis(name, p))  # fmt: skip
+    trace = Trace()
+    drive(scooter, trace.watch(along([speed] * 100)), 6.0)
+    truth = trace.truth(scooter)
+    v = truth["speed"][400]
+    ideal = -atan(v * v * curvature / G)
+    assert truth["lean"][400] == pytest.approx(lean_of(ideal, p["tyre_crown_radius"], p["cg_height"]), rel=0.01)
+    assert truth["lean"][400] < 1.05 * ideal
 
 
 def test_each_message_has_its_rate():

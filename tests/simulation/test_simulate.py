@@ -13,6 +13,8 @@ from gz_onboard.bus.logs import read_samples
 from gz_onboard.cli import main
 from gz_onboard.simulation.run import COLUMNS
 from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION
+from gz_onboard.simulation.sweep import read_sweep
+from gz_onboard.vehicle import read_vehicle
 
 PNG = b"\x89PNG"
 
@@ -134,6 +136,13 @@ def test_sweep_of_one_parameter(short, tmp_path, capsys):
     assert (tmp_path / "short.simulation.sweep.png").read_bytes().startswith(PNG)
 
 
+@pytest.mark.parametrize("name", ["battery.parallel", "battery.cells_parallel"])
+def test_sweep_of_cells_takes_every_number(name):
+    sweep = read_sweep(f"{name}=8..16", read_vehicle("reference"))
+    assert sweep.values == tuple(float(count) for count in range(8, 17))
+    assert sweep.name == "battery.cells_parallel"
+
+
 def test_sweep_of_two(short, tmp_path, capsys):
     sweeps = ("--sweep", "battery.parallel=10..12", "--sweep", "payload_mass=60..120:2")
     assert simulate(short, *sweeps, "--no-series", "--output", tmp_path) == 0
@@ -151,6 +160,17 @@ def test_sweep_of_two(short, tmp_path, capsys):
     [
         (["wmtc_clas1"], ["wmtc_class1"]),
         (["ece15", "--sweep", "drag_aera=0.4..0.6"], ["drag_aera", "did you mean 'drag_area'"]),
+        *(
+            (["ece15", "--sweep", f"{said}=8..16"], [repr(said), f"did you mean {meant!r}"])
+            for said, meant in (
+                ("battery.paralel", "battery.cells_parallel"),
+                ("battery.sereis", "battery.cells_series"),
+                ("series", "battery.cells_series"),
+                ("battery.capacity", "cell_capacity"),
+                ("vehicle.mass", "vehicle_mass"),
+                ("rolling_resistance", "rolling_resistance_constant"),
+            )
+        ),
         (["ece15", "--sweep", "drag_area=0.4..9"], ["9 m²", "0.1 to 1.5 m²"]),
         (["ece15", "--sweep", "drag_area=0.6..0.4"], ["0.6", "below"]),
         (["ece15", "--sweep", "drag_area"], ["NAME=LOW..HIGH"]),
