@@ -41,14 +41,32 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[str,
     return folder, result
 
 
+ESSENTIAL = ("rides ", "verdict ", "  cornering_drag ", "model ", "  energy ", "  measured ", "  simulated less")
+
+
+def essence(text: str) -> str:
+    """The lines that carry what the page says; the others tell what else was looked at."""
+    return "\n".join(line for line in text.splitlines() if line.startswith(ESSENTIAL))
+
+
 def test_its_commands_give_what_it_shows(ran: tuple[Path, list[tuple[str, str]]]):
-    """The same words and, within 5 %, the same numbers: the last digits depend on the processor's arithmetic."""
+    """The same words and, within 10 %, the same numbers."""
     _, results = ran
     assert len(results) >= 4
-    for shown, printed in results:
+    for shown, printed in ((essence(a), essence(b)) for a, b in results):
+        assert shown
         assert NUMBER.sub("#", printed).split() == NUMBER.sub("#", shown).split()
         wanted, got = ([float(x) for x in NUMBER.findall(text)] for text in (shown, printed))
-        assert got == pytest.approx(wanted, rel=0.05, abs=0.11)
+        assert got == pytest.approx(wanted, rel=0.1, abs=0.02)
+
+
+def test_it_predicts_rides_held_out_better_than_a_refit(ran: tuple[Path, list[tuple[str, str]]]):
+    for metric in ("power, rms", "consumption", "range"):
+        before, control, after = (
+            float(x) for x in re.findall(rf"^  {metric}\s+([0-9.]+) before,\s+([0-9.]+) refitted,\s+([0-9.]+) extended",
+                                         ran[1][0][1], re.M)[0]
+        )  # fmt: skip
+        assert after < 0.9 * control < before
 
 
 def test_the_cause_is_cornering_and_nothing_stands_in_for_it(ran: tuple[Path, list[tuple[str, str]]]):

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.lab.discover.grid import Array
-from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed
+from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed, normal
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.terms import STARTS
@@ -35,7 +35,9 @@ def measure_gain(report: Report, seed: int, holdout: Sequence[str] | None) -> di
         if causes:
             after = extended_mean(state, rest, causes)
         for i in fold:
-            triple = [errors(lines[i], with_start(state, normals[i], theta)) for theta in (state.mean, control, after)]
+            # not the road force itself: its mean would be taken for the accelerometer's bias
+            start = normal(lines[i], state.noise, [name for name in lines[i].tables if name != "road_force"])
+            triple = [errors(lines[i], with_start(state, start, theta)) for theta in (state.mean, control, after)]
             for metric in triple[0]:
                 rows.setdefault(metric, []).append(tuple(t[metric] for t in triple))  # type: ignore[arg-type]
     result: dict[str, Any] = {"holdout": [names[i] for fold in folds for i in fold]}
