@@ -44,6 +44,7 @@ KEYS = {
     "of the quantity over the mean), chi2",
     "limits": "per candidate: parameter, change, unit, energy_share: the least that would be found half the time",
 }
+_STAGES = ("before", "control", "after")
 _ROWS = 3  # residuals and limits told in the terminal
 
 
@@ -347,9 +348,13 @@ def _gain(report: Report) -> list[str]:
     for metric, (label, factor, unit) in METRICS.items():
         g = report.gain.get(metric)
         if isinstance(g, dict):
-            before, control, after = (g[key] * factor for key in ("before", "control", "after"))
-            lines.append(f"{label:20} {before:8.3g} before, {control:8.3g} refitted, {after:8.3g} extended  {unit}")
+            before, control, after, low, high = (x * factor for x in (*(g[k] for k in _STAGES), *g["ci95"]))
+            lines.append(
+                f"{label:18} {before:6.3g} before, {control:6.3g} refitted, {after:6.3g} extended  {unit:6} "
+                f"(gain {low:+.2g} to {high:+.2g})"
+            )
     if not lines:
         return [f"held out     {report.gain.get('note', 'nothing')}"]
-    head = "errors on rides held out of the fit; refitted: with the parameters that the model has already"
+    head = ("errors on rides held out of the fit; refitted: with the parameters that the model has already; "
+            "gain over that, 95 % over rides")  # fmt: skip
     return [f"held out     {head}", *(f"  {line}" for line in lines)]
