@@ -53,6 +53,9 @@ class EfficiencyMotor:
         efficiency = EFFICIENCY[i] + part * (EFFICIENCY[i + 1] - EFFICIENCY[i])
         return [("motor", power / efficiency - power if power >= 0 else power * efficiency - power)]
 
+    def idle(self, speed: float, temperature: float) -> float:
+        return 0.0
+
 
 class EfficiencyPack:
     """FASTSim's battery as a part of the scooter: a constant efficiency either way, a constant voltage."""
@@ -241,14 +244,14 @@ def mean_efficiency(vehicle: Vehicle) -> tuple[list[float], list[float]]:
     p = vehicle.parameters
     speed = 9.0 / p["wheel_radius"]
     shares, efficiency = list(SHARES), []
+    iron = p["motor_iron_linear"] * speed + p["motor_iron_quadratic"] * speed**2
     for share in shares:
-        current = max(share, 0.004) * POWER / speed / p["torque_constant"]
+        shaft = max(share, 0.004) * POWER
+        current = (shaft + iron) / speed / p["torque_constant"]  # iron loss is drag on the shaft
         copper = p["motor_copper_resistance"] * 1.02 * current**2
-        iron = p["motor_iron_linear"] * speed + p["motor_iron_quadratic"] * speed**2
         inverter = p["inverter_loss_linear"] * current + p["inverter_loss_quadratic"] * current**2
-        mechanical = p["torque_constant"] * current * speed
         losses = copper + iron + inverter + p["inverter_loss_constant"]
-        efficiency.append(max(mechanical / (mechanical + losses), 0.05))
+        efficiency.append(max(shaft / (shaft + losses), 0.05))
     efficiency[0] = 0.82  # of braking: 19 N·m at 6 m/s
     return shares, efficiency
 

@@ -1,6 +1,6 @@
 """Every recorded ride through the simulation, open loop and predictive: the table of docs/simulation.md.
 
-    python benchmarks/recorded_rides.py DATA/rides [--only full_00 ...] [--figures DIR]
+    python benchmarks/recorded_rides.py DATA/rides [--only full_00 ...] [--chassis leaning] [--figures DIR]
 
 DATA/rides holds folders of logs, each with a rides.json that names rider mass and kind. Prints a line of JSON for each
 ride and form, then the table.
@@ -30,8 +30,8 @@ GROUPS = {  # by folder, then by the begin of the name
     "commissioning/dyno": "chassis dynamometer",
     "commissioning/ride": "commissioning, road",
     "fulldischarge": "full discharges",
-    "service_a": "service, nothing wrong",
-    "service_c": "service, tyres at half pressure",
+    "service_a": "service, tyres at half pressure",
+    "service_b": "service, nothing wrong",
     "service": "service, others",
 }
 COLUMNS = ("energy_pct", "consumption_pct", "speed_km_h", "voltage_v", "current_pct", "torque_pct", "motor_k")
@@ -42,11 +42,11 @@ def group(folder: str, name: str) -> str:
     return next(text for begin, text in GROUPS.items() if f"{folder}/{name}".startswith(begin))
 
 
-def both(log: Path, payload: float, figures: Path | None) -> dict[str, dict[str, Any]]:
+def both(log: Path, payload: float, chassis: str, figures: Path | None) -> dict[str, dict[str, Any]]:
     """The errors of one ride by form, simulated less measured."""
     parser = argparse.ArgumentParser()
     add_arguments(parser)
-    arguments = parser.parse_args([str(log)])
+    arguments = parser.parse_args([str(log), "--chassis", chassis])
     vehicle = read_vehicle("reference", payload)
     plan = find_plan(arguments, vehicle)
     recorded = plan.recorded
@@ -109,6 +109,7 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("rides", type=Path)
     parser.add_argument("--only", nargs="*", default=[])
+    parser.add_argument("--chassis", default="straight")
     parser.add_argument("--figures", type=Path)
     options = parser.parse_args()
     rows = []
@@ -118,7 +119,7 @@ def main() -> None:
             if options.only and name not in options.only and f"{folder}/{name}" not in options.only:
                 continue
             log = listed.with_name(f"{name}.blf")
-            for form, errors in both(log, entry["rider_mass_kg"], options.figures).items():
+            for form, errors in both(log, entry["rider_mass_kg"], options.chassis, options.figures).items():
                 row = {"group": group(folder, name), "ride": f"{folder}/{name}", "form": form, **errors}
                 rows.append(row)
                 print(json.dumps(row), flush=True)

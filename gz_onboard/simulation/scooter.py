@@ -10,7 +10,7 @@ ledger closes to rounding.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import atan, sqrt
 
@@ -125,19 +125,24 @@ class Scooter:
             own = FirstOrderPack(vehicle.battery, soc)
         self.pack: Pack = pack or own
         effects = model.effects
-        bound = {port: [(e.name, _bind(e, p, dt)) for e in effects if e.port is port] for port in Port}
+        at = {port: [e for e in effects if e.port is port] for port in Port}
         self._tracks = bool(model.reads & {"heading", "time_moving", "soc", "cell_temperature", "cell_current"})
         # Forces that read the acceleration are the dynamics that this simulation integrates itself.
-        dynamics = {e.name for e in effects if "acceleration" in e.quantities}
-        self._forces = [(name, force) for name, force in bound[Port.WHEEL_FORCE] if name not in dynamics]
-        self._rolling = bound[Port.TYRE]
+        forces = [e for e in at[Port.WHEEL_FORCE] if "acceleration" not in e.quantities]
         if self.dynamometer:
-            at_wheel = {e.name for e in effects if e.reads <= WHEEL_ONLY}
-            self._forces = [(name, force) for name, force in self._forces if name in at_wheel]
-        self._inverter = bound[Port.INVERTER_LOSS]
-        self._dc = bound[Port.DC_POWER]
+            forces = [e for e in forces if e.reads <= WHEEL_ONLY]
+        self._forces = _together(forces, p, dt)
+        # What grade takes is the potential energy.
+        self._force_entries = [(i, e.name) for i, e in enumerate(forces) if e.name != "grade_force"]
+        self._rolling, self._rolling_entries = _together(at[Port.TYRE], p, dt), _names(at[Port.TYRE])
+        inverter, direct = at[Port.INVERTER_LOSS], at[Port.DC_POWER]
+        self._inverter, self._inverter_entries = _together(inverter, p, dt), _names(inverter)
+        self._dc, self._dc_entries = _together(direct, p, dt), _names(direct)
         constants = p["torque_constant"], p["voltage_constant"]
-        self.motor: Motor = motor or EffectMotor(bound[Port.MOTOR_LOSS], *constants, self._q)
+        losses = at[Port.MOTOR_LOSS]
+        self.motor: Motor = motor or EffectMotor(
+            _names(losses), _together(losses, p, dt), _together(losses, p, None), *constants, self._q
+        )
         self.tyre = Tyre(p["tyre_b"], p["tyre_c"], p["tyre_d"], p["tyre_e"], form=tyre_form)
         self.brakes = Brakes(p["brake_torque_limit"], p["brake_viscous_constant"], p["brake_disc_radius"],
                              p["front_brake_share"], form=brake_form)  # fmt: skip
@@ -226,34 +231,25 @@ class Scooter:
         self.sensed_voltage += (self.voltage - self.sensed_voltage) * self._voltage_gain
         current = self.controller.current(throttle, brake, w / gear, self.sensed_voltage / self._series)
         # The motor's current makes torque in the air gap; what turning costs without current is drag on the shaft.
-        idle = 0.0
-        for _, loss in self.motor.losses(w / gear, 0.0, self.motor_cooling.stator):
-            idle += loss
+        idle = self.motor.idle(w / gear, self.motor_cooling.stator)
         torque = self.motor.torque_constant * current - drag_torque(idle, w / gear)
         drive = torque / gear * (self._gear_efficiency if torque * w >= 0 else 1 / self._gear_efficiency)
 
-        terms: list[tuple[str, float]] = []
+        forces = self._forces(q)
         against = 0.0
-        for name, effect in self._forces:
-            term = effect(q)
-            terms.append((name, term))
+        for term in forces:
             against += term
-        rolling: list[tuple[str, float]] = []
+        rolling = self._rolling(q)
         rear_rolling = front_rolling = 0.0
         share = rear / normal
         front_share = 0.0 if dynamometer else 1 - share
-        for name, effect in self._rolling:
-            term = effect(q)
-            rolling.append((name, term))
+        for term in rolling:
             rear_rolling += share * term
             front_rolling += front_share * term
-        against += front_rolling
-        if turning:
-            terms.append(("turning", turning))
-            against += turning
+        against += front_rolling + turning
+        absorbed = 0.0
         if d := dynamometer:
             absorbed = (d.a * v / sqrt(v * v + 0.01) if d.a else 0.0) + d.b * v + d.c * v * abs(v)
-            terms.append(("dynamometer", absorbed))
             against += absorbed
 
         front_braking = 0.0 if brake <= 0.0 or dynamometer else self.brakes.front_force(brake, v, r)
@@ -286,11 +282,15 @@ class Scooter:
         self.time += dt
 
         # --- every watt (eqs. 2.2-2.6, 2.9, 2.10, 2.16-2.19)
-        for name, term in terms:
-            if name != "grade_force":  # what it takes is the potential energy
-                entries[name] += term * v_mean * dt
-        for name, term in rolling:
-            entries[name] += (share * term * r * w_mean + front_share * term * v_mean) * dt
+        for i, name in self._force_entries:
+            entries[name] += forces[i] * v_mean * dt
+        if turning:
+            entries["turning"] += turning * v_mean * dt
+        if dynamometer:
+            entries["dynamometer"] += absorbed * v_mean * dt
+        turned = share * r * w_mean + front_share * v_mean
+        for name, term in zip(self._rolling_entries, rolling, strict=True):
+            entries[name] += term * turned * dt
         entries["tyre_slip"] += force * (r * w_mean - v_mean) * dt
         entries["brakes"] += (braking * w_mean + front_braking * v_mean) * dt
         motor_speed = w_mean / gear
@@ -303,13 +303,11 @@ class Scooter:
             entries[name] += loss * dt
         q["motor_speed"], q["motor_current"] = motor_speed, current
         inverter_heat = 0.0
-        for name, effect in self._inverter:
-            loss = effect(q)
+        for name, loss in zip(self._inverter_entries, self._inverter(q), strict=True):
             inverter_heat += loss
             entries[name] += loss * dt
         power = mechanical + motor_heat + inverter_heat
-        for name, effect in self._dc:
-            load = effect(q)
+        for name, load in zip(self._dc_entries, self._dc(q), strict=True):
             power += load
             entries[name] += load * dt
         bms_heat = self._bms_resistance * self.current * self.current
@@ -361,35 +359,51 @@ class Scooter:
         self.controller.watch(motor, inverter, self.pack_cooling.temperature, self.pack.soc)
 
 
-Bound = Callable[[Mapping[str, float]], float]
+def _names(effects: Sequence[Effect]) -> list[str]:
+    return [effect.name for effect in effects]
 
 
-def _bind(effect: Effect, parameters: Mapping[str, float], dt: float = STEP) -> Bound:
-    """The effect's value as a function of the quantities; one with memory must be called once each step of `dt` [s].
+Terms = Callable[[Mapping[str, float]], tuple[float, ...]]
 
-    Its call is written out, as it is made a hundred times for each second ridden: a ride takes a third less time than
-    by `model.Bound`.
+
+def _together(effects: Sequence[Effect], parameters: Mapping[str, float], dt: float | None) -> Terms:
+    """The effects' values as one function of the quantities; with memory it must be called once each step of `dt` [s].
+
+    dt: None for what each settles at. Their calls are written out, as they are made a hundred times for each second
+    ridden: a ride takes a third less time than by `model.Bound`.
     """
-    term = _written_out(effect.term, effect.quantities, effect.keywords, parameters)
-    if effect.decay is None:
-        return term
-    fade = _written_out(lambda *q, **p: effect.decay(dt, *q, **p), effect.decay_quantities, effect.decay_keywords,  # type: ignore[misc]
-                        parameters)  # fmt: skip
+    scope: dict[str, object] = {}
+    calls = []
+    for i, effect in enumerate(effects):
+        if effect.decay is None or dt is None:
+            scope[f"f{i}"] = effect.term
+            calls.append(f"f{i}({_arguments(effect.quantities, effect.keywords, parameters)})")
+        else:
+            scope[f"f{i}"] = _remembering(effect, effect.decay, parameters, dt)
+            calls.append(f"f{i}(q)")
+    terms: Terms = eval(f"lambda q: ({''.join(f'{call}, ' for call in calls)})", scope)
+    return terms
+
+
+def _remembering(
+    effect: Effect, decay: Callable[..., float], parameters: Mapping[str, float], dt: float
+) -> Callable[[Mapping[str, float]], float]:
+    """The value of an effect with memory, from 0; each call is a step."""
+    term = _arguments(effect.quantities, effect.keywords, parameters)
+    fade = _arguments(effect.decay_quantities, effect.decay_keywords, parameters)
+    scope = {"term": effect.term, "decay": decay, "dt": dt}
+    text = f"lambda q: (term({term}), decay(dt, {fade}))"
+    both: Callable[[Mapping[str, float]], tuple[float, float]] = eval(text, scope)
     state = 0.0
 
     def value(q: Mapping[str, float]) -> float:
         nonlocal state
-        decay = fade(q)
-        state = decay * state + (1 - decay) * term(q)
+        settled, kept = both(q)
+        state = kept * state + (1 - kept) * settled
         return state
 
     return value
 
 
-def _written_out(
-    function: Callable[..., float], quantities: Iterable[str], keywords: Iterable[str], parameters: Mapping[str, float]
-) -> Bound:
-    arguments = [f"q[{name!r}]" for name in quantities]
-    arguments += [f"{name}={parameters[name]!r}" for name in keywords]
-    call: Bound = eval(f"lambda q: function({', '.join(arguments)})", {"function": function})
-    return call
+def _arguments(quantities: Iterable[str], keywords: Iterable[str], parameters: Mapping[str, float]) -> str:
+    return ", ".join([f"q[{name!r}]" for name in quantities] + [f"{name}={parameters[name]!r}" for name in keywords])

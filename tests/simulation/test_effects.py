@@ -113,6 +113,32 @@ def test_slow_relaxation_is_a_second_rc_pair():
     assert one.series["pack_voltage"] == pytest.approx(two.series["pack_voltage"], rel=1e-9)
 
 
+BEARING = """
+from gz_onboard.physics.effect import Parameter, Port
+PORT = Port.MOTOR_LOSS
+PARAMETERS = (Parameter("bearing_loss", "W", 40.0, 5.0, 0.0, 200.0, "made up"),)
+def term(motor_speed, *, bearing_loss):
+    return bearing_loss * motor_speed / (motor_speed + 1)
+def decay(dt, motor_speed):
+    return 0.99
+"""
+
+
+def test_a_motor_loss_with_memory_goes_on_once_each_step(tmp_path):
+    (tmp_path / "bearing.py").write_text('"""Made up."""\n' + BEARING)
+    effect = load_effect("bearing", tmp_path)
+    vehicle = BASE.changed(BASE.parameters.joined([effect]), (*BASE.model.effects, effect))
+    scooter = Scooter(vehicle, straight(), soc=0.8, speed=8.0)
+    value, energy = 0.0, 0.0
+    for _ in range(50):
+        before = scooter.wheel_speed
+        scooter.step(0.3, 0.0)
+        speed = (before + scooter.wheel_speed) / 2
+        value = 0.99 * value + 0.01 * 40.0 * speed / (speed + 1)
+        energy += value * STEP
+    assert scooter.ledger.entries["bearing"] == pytest.approx(energy, rel=1e-9)
+
+
 def test_hysteresis_stays_at_rest_and_relaxation_does_not():
     vehicle = extended("slow_relaxation", "ocv_hysteresis", hysteresis_rate=500.0, slow_time=120.0)
     scooter = Scooter(vehicle, straight(), soc=0.8)

@@ -209,6 +209,30 @@ def test_2_31_the_bms_stands_on_the_battery():
     assert scooter.bms_cooling.temperature == pytest.approx(warmed, rel=0.01)
 
 
+def test_2_24_to_2_31_each_network_takes_its_own_heat():
+    """In the first period all stand at the air's temperature and lose nothing: they gain what the ledger says."""
+    scooter = Scooter(VEHICLE, soc=0.7, ambient=20.0)
+    for _ in range(100):
+        scooter.step(0.5, 0.0)
+    e, motor, box = scooter.ledger.entries, scooter.motor_cooling, scooter.inverter_cooling
+    gained = P["motor_stator_capacity"] * (motor.stator - 20) + P["motor_rotor_capacity"] * (motor.rotor - 20)
+    assert gained == pytest.approx(e["motor_copper_loss"] + e["motor_iron_loss"], rel=1e-9)
+    gained = P["inverter_board_capacity"] * (box.board - 20) + P["inverter_box_capacity"] * (box.box - 20)
+    assert gained == pytest.approx(e["inverter_loss"], rel=1e-9)
+    assert P["pack_heat_capacity"] * (scooter.pack_cooling.temperature - 20) == pytest.approx(e["battery_heat"])
+    from_pack = P["bms_conductance"] * (scooter.pack_cooling.temperature - 20)  # which is warmed before
+    assert P["bms_heat_capacity"] * (scooter.bms_cooling.temperature - 20) == pytest.approx(e["bms"] + from_pack)
+    assert min(e[name] for name in ("motor_copper_loss", "inverter_loss", "battery_heat", "bms")) > 0.1
+
+
+def test_2_30_the_battery_cools_to_the_air():
+    scooter = Scooter(VEHICLE, soc=0.7, ambient=0.0, cell_temperature=30.0)
+    for _ in range(100):
+        scooter.step(0.0, 0.0)
+    lost = P["pack_heat_capacity"] * (30.0 - scooter.pack_cooling.temperature) + scooter.ledger.entries["battery_heat"]
+    assert lost == pytest.approx(P["pack_conductance"] * 30.0, rel=1e-6)
+
+
 @pytest.mark.parametrize("wind", [-15.0, 0.0, 4.0])
 def test_3_1_drag_keeps_its_sign_in_a_tailwind(wind):
     scooter = Scooter(VEHICLE, straight(0.0, wind), soc=0.7, speed=9.0)

@@ -210,12 +210,12 @@ def test_held_back_by_its_voltage_it_does_not_chatter(soc, ambient):
 def test_effects_written_out_are_those_of_the_model():
     from gz_onboard.physics.effect import QUANTITIES
     from gz_onboard.physics.model import Bound
-    from gz_onboard.simulation.scooter import _bind
+    from gz_onboard.simulation.scooter import _together
 
     p = VEHICLE.parameters
     q = {name: 1.5 + i for i, name in enumerate(QUANTITIES)}
     for effect in VEHICLE.model.effects:
-        assert _bind(effect, p)(q) == Bound(effect, {name: p[name] for name in effect.keywords})(q)
+        assert _together([effect], p, None)(q)[0] == Bound(effect, {name: p[name] for name in effect.keywords})(q)
 
 
 def test_rider_stops_integrating_at_the_end_of_its_command():

@@ -6,8 +6,8 @@ from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
-Loss = Callable[[Mapping[str, float]], float]
-"""Heat [W] at motor_speed, motor_current and motor_temperature."""
+Losses = Callable[[Mapping[str, float]], tuple[float, ...]]
+"""Heat [W] of each effect at motor_speed, motor_current, motor_temperature and what else it reads."""
 
 
 class Motor(Protocol):
@@ -17,33 +17,47 @@ class Motor(Protocol):
     voltage_constant: float  # V·s/rad, line to line, RMS (eq. 2.7)
 
     def losses(self, speed: float, current: float, temperature: float) -> list[tuple[str, float]]:
-        """(name, heat [W]) of each loss at a shaft speed [rad/s], current [A] and temperature [degC].
+        """(name, heat [W]) of each loss at a shaft speed [rad/s], current [A] and temperature [degC]."""
 
-        What it loses without current is drag: it slows the shaft.
-        """
+    def idle(self, speed: float, temperature: float) -> float:
+        """What it loses [W] turning without current: it is drag, which slows the shaft."""
 
 
 class EffectMotor:
-    """A motor whose losses are effects of the vehicle's model: copper, iron, and what else its file lists."""
+    """A motor whose losses are effects of the vehicle's model: copper, iron, and what else its file lists.
+
+    names, losses: of the effects, and their values [W] together; settled: the same of those with memory at their end.
+    quantities: what else the effects read.
+    """
 
     def __init__(
         self,
-        effects: Sequence[tuple[str, Loss]],
+        names: Sequence[str],
+        losses: Losses,
+        settled: Losses,
         torque_constant: float,
         voltage_constant: float,
-        quantities: dict[str, float] | None = None,
+        quantities: dict[str, float],
     ) -> None:
         self.torque_constant = torque_constant
         self.voltage_constant = voltage_constant
-        self._effects = list(effects)
-        self._q = {} if quantities is None else quantities  # what else the effects read
+        self._names = tuple(names)
+        self._losses, self._settled = losses, settled
+        self._q = quantities
 
     def losses(self, speed: float, current: float, temperature: float) -> list[tuple[str, float]]:
         """See `Motor`."""
         q = self._q
         q["motor_speed"], q["motor_current"], q["motor_temperature"] = speed, current, temperature
         q["torque"] = self.torque_constant * current
-        return [(name, effect(q)) for name, effect in self._effects]
+        return list(zip(self._names, self._losses(q), strict=True))
+
+    def idle(self, speed: float, temperature: float) -> float:
+        """See `Motor`; not a step for an effect with memory."""
+        q = self._q
+        q["motor_speed"], q["motor_temperature"] = speed, temperature
+        q["motor_current"] = q["torque"] = 0.0
+        return sum(self._settled(q))
 
 
 class MapMotor:
@@ -66,3 +80,7 @@ class MapMotor:
         low, high = self._loss[i], self._loss[i + 1]
         one, two = low[j] + b * (low[j + 1] - low[j]), high[j] + b * (high[j + 1] - high[j])
         return [("motor_map_loss", one + a * (two - one))]
+
+    def idle(self, speed: float, temperature: float) -> float:
+        """See `Motor`."""
+        return self.losses(speed, 0.0, temperature)[0][1]
