@@ -6,6 +6,7 @@ any speed as ridden. What a forward simulation finds beyond it is what those par
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 SMOOTHING = 0.5  # s: a wheel speed sensor's steps of 0.1 r/min at 100 Hz are 0.25 m/s² of acceleration
+
+BLOCK = 8192  # steps at once: what stays in the processor's cache takes half the time
 
 
 @dataclass(frozen=True)
@@ -88,10 +91,15 @@ def backward(
         q["heading"] = turn if heading is None else _middle(heading)
     if "time_moving" in vehicle.model.reads:
         q["time_moving"] = np.cumsum(np.where(middle > MOVING, dt, 0.0))
-    terms = vehicle.model.power(q, over(dt))
-    power = sum(terms.values(), start=np.zeros_like(middle))
-    ledger = {name: float(np.sum(term * dt)) for name, term in terms.items()}
-    return Energy(np.append(power, power[-1]), ledger, float(power @ dt), float(middle @ dt))
+    power, ledger = np.zeros_like(middle), defaultdict[str, float](float)
+    block = len(dt) if any(effect.decay for effect in vehicle.model.effects) else BLOCK
+    for first in range(0, len(dt), block):
+        part = slice(first, first + block)
+        some = {name: value[part] if isinstance(value, np.ndarray) else value for name, value in q.items()}
+        for name, term in vehicle.model.power(some, over(dt[part])).items():
+            power[part] += term
+            ledger[name] += float(np.sum(term * dt[part]))
+    return Energy(np.append(power, power[-1]), dict(ledger), float(power @ dt), float(middle @ dt))
 
 
 def _middle(values: ArrayLike) -> Any:

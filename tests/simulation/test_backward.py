@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from gz_onboard.physics.effect import QUANTITIES
+from gz_onboard.physics.effect import QUANTITIES, load_effect
 from gz_onboard.physics.model import air_density
 from gz_onboard.simulation.backward import backward
 from gz_onboard.simulation.cycles import cycle
@@ -44,6 +44,19 @@ def test_agrees_with_the_forward_simulation_on_a_cycle():
     assert energy.total == pytest.approx(run.energy, rel=0.05)
     for name in ("aerodynamic_drag", "rolling_resistance", "auxiliary_load", "motor_iron_loss"):
         assert energy.ledger[name] == pytest.approx(run.ledger[name], rel=0.03), name
+
+
+@pytest.mark.parametrize("effects", [(), ("tyre_warm_up", "drivetrain_drag", "headwind")])
+def test_blocks_are_one_ride(effects, monkeypatch):
+    more = [load_effect(name) for name in effects]
+    vehicle = VEHICLE.changed(VEHICLE.parameters.joined(more), (*VEHICLE.model.effects, *more))
+    t = np.arange(0, 60, 0.01)
+    v, grade = 8 + 4 * np.sin(t / 7), 0.02 * np.sin(t / 5)
+    whole = backward(vehicle, t, v, grade=grade, curvature=0.01 * np.cos(t / 3), headwind=2.0)
+    monkeypatch.setattr("gz_onboard.simulation.backward.BLOCK", 700)
+    parts = backward(vehicle, t, v, grade=grade, curvature=0.01 * np.cos(t / 3), headwind=2.0)
+    assert parts.power == pytest.approx(whole.power, rel=1e-12)
+    assert parts.ledger == pytest.approx(whole.ledger, rel=1e-12)
 
 
 def test_kinetic_energy_comes_back():
