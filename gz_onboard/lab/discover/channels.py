@@ -254,7 +254,8 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, A
     grown = p.get("cell_resistance_factor", 1.0)
     factor = grown * (1 + p["resistance_level"] + p["resistance_cold"] * (20 - temperature) / 20)
     bent = p["resistance_current"] + p["resistance_current_cold"] * (20 - temperature) / 20
-    factor = factor * (1 + p["resistance_empty"] * (1 - soc) / 0.4 - bent * np.abs(cell) / 5)
+    empty = p["resistance_empty"] + p["resistance_empty_cold"] * (20 - temperature) / 20
+    factor = factor * (1 + empty * (1 - soc) / 0.4 - bent * np.abs(cell) / 5)
     r0 = mesh_at(battery.r0, soc, temperature) * factor
     r1 = mesh_at(battery.r1, soc, temperature)
     decay = np.exp(-DT / (r1 * mesh_at(battery.c1, soc, temperature) * np.exp(p["pair_time"])))
@@ -269,6 +270,8 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, A
         extra = extra + system.term(effect, q, p, DT)
     rest = ocv_at(battery, soc) + p["ocv_offset"] + p["ocv_tilt"] * (soc - 0.7)
     rest = rest + p["ocv_cold"] * (20 - temperature) / 20
+    if battery.rest_shift_value:
+        rest = rest + np.interp(temperature, battery.rest_shift_temperature, battery.rest_shift_value)
     return rest - r0 * cell - v1 - extra, cell * battery.cells_parallel, soc
 
 
@@ -280,7 +283,7 @@ def start_soc(ride: Ride, system: System) -> float:
     amperes = float(np.mean(ride.signals["pack_current"][first])) / battery.cells_parallel
     volts = float(np.mean(ride.signals["pack_voltage"][first])) / battery.cells_series
     temperature = float(ride.quantities["cell_temperature"][0])
-    return battery.soc_at(volts + amperes * battery.r0.at(0.6, temperature)[0])
+    return battery.soc_at(volts + amperes * battery.r0.at(0.6, temperature)[0], temperature)
 
 
 def counted_soc(ride: Ride, system: System) -> Array:
@@ -463,7 +466,7 @@ _SPEED = ("wheel_radius", "speed_sensor_scale")
 _CELL = (
     "pack_current_offset", "pack_current_gain", "cell_capacity", "soc_start", "cell_resistance_factor", "v1_start",
     "resistance_cold", "ocv_offset", "ocv_tilt", "ocv_cold", "pair_resistance", "pair_time", "mid_resistance", "drift",
-    "resistance_level",
+    "resistance_level", "resistance_empty_cold",
     "resistance_empty",
     "resistance_current", "resistance_current_cold",
 )  # fmt: skip

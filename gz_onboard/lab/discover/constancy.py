@@ -21,31 +21,38 @@ from gz_onboard.lab.discover.state import State
 
 RATIO_SD, RIDE_SD = 0.15, 0.25  # of a real cause: on all rides, and from ride to ride
 RATIO = 0.5  # beyond which half of the cause is missing in one of the halves
-CHI2 = 16.0  # four standard deviations
+CHI2 = 9.0  # three standard deviations
 
 
-def _side(ride: Ride, table: Table) -> Array:
+Sign = Callable[[Ride, Table, Array], Array]
+
+
+def _side(ride: Ride, table: Table, effect: Array) -> Array:
     """+1 in left bends, -1 in right ones, 0 on the straight."""
     return np.asarray(np.tanh(over_blocks(table.channel, ride.quantities["lateral_acceleration"])[table.used] / 0.3))
 
 
-def _halves(name: str) -> Callable[[Ride, Table], Array]:
-    """-1 below the ride's median of a quantity while it moves, +1 above."""
+def _halves(name: str) -> Sign:
+    """-1 below a value of the quantity, +1 above it, half of the cause's own squared effect on either side."""
 
-    def sign(ride: Ride, table: Table) -> Array:
+    def sign(ride: Ride, table: Table, effect: Array) -> Array:
         values = ride.time if name == "time" else ride.quantities[name]
-        moving = np.abs(ride.quantities["speed"]) > 1.0
-        middle = float(np.median(values[moving])) if moving.any() else 0.0
-        return np.asarray(np.sign(over_blocks(table.channel, values)[table.used] - middle))
+        at = over_blocks(table.channel, values)[table.used]
+        order = np.argsort(at)
+        half = np.cumsum(effect[order] ** 2)
+        return np.asarray(np.sign(at - at[order][np.searchsorted(half, half[-1] / 2)]))
 
     return sign
 
 
-SPLITS: Mapping[str, Callable[[Ride, Table], Array]] = {
-    "lateral_acceleration": _side,
-    "time": _halves("time"),
-    "speed": _halves("speed"),
-}
+def _of_ride(mine: Ride) -> Sign:
+    """1 in one ride, 0 in the others."""
+    return lambda ride, table, effect: np.full(len(effect), 1.0 if ride is mine else 0.0)
+
+
+SPLITS: Mapping[str, Sign] = {"lateral_acceleration": _side, "time": _halves("time"), "speed": _halves("speed")}
+RIDE = "ride "  # before a ride's name, where the split is that ride against the others
+OF_RIDES = ("headwind",)  # that differ from ride to ride by themselves
 
 
 @dataclass(frozen=True)
@@ -72,7 +79,10 @@ def splits(
     found = []
     for name in chosen:
         index = list(place[name])
-        for quantity, sign in SPLITS.items():
+        tests = dict(SPLITS)
+        if len(lines) > 2 and name not in OF_RIDES:
+            tests |= {f"{RIDE}{line.ride.name}": _of_ride(line.ride) for line in lines}
+        for quantity, sign in tests.items():
             rides = [_extended(line, normal, state, index, change[index], sign)
                      for line, normal in zip(lines, normals, strict=True)]  # fmt: skip
             p = len(state.mean)
@@ -91,7 +101,7 @@ def splits(
 
 def _extended(
     line: Linear, normal: Normal, state: State, index: Sequence[int], change: Array,
-    sign: Callable[[Ride, Table], Array],
+    sign: Sign,
 ) -> Normal:  # fmt: skip
     """`normal` with one more column: what the cause does, times the sign."""
     p = len(normal.b)
@@ -103,7 +113,7 @@ def _extended(
             continue
         touched = np.flatnonzero(np.any(table.a != 0, axis=0))
         both = whitened(table, state.noise[name], np.column_stack(
-            [effect * sign(line.ride, table), table.a[:, touched], table.y]))  # fmt: skip
+            [effect * sign(line.ride, table, effect), table.a[:, touched], table.y]))  # fmt: skip
         split, a, y = both[:, 0], both[:, 1:-1], both[:, -1]
         n[p, p] += split @ split
         n[p, touched] += split @ a

@@ -78,8 +78,9 @@ def _linearised(job: tuple[Ride, State]) -> Linear:
     ride, state = job
     line = linearise(ride, state.values, state.names, state.scale, state.system)
     wide = np.sqrt(np.diag(state.prior)) + 3 * np.sqrt(state.scatter)
-    for i in [i for cause in usable_causes(state) for i in state.index(cause.names)]:
-        wide[i] += 10 * np.sqrt(state.scatter[i])
+    for parameter in [parameter for cause in usable_causes(state) for parameter in cause.parameters]:
+        (i,) = state.index([parameter.name])
+        wide[i] += max(10 * float(np.sqrt(state.scatter[i])), 3 * parameter.prior_sd / float(state.scale[i]))
     line = trimmed(line, state.noise, state.mean, wide)
     return spread_out(line, state.noise, state.mean, wide) if state.healthy else line
 

@@ -16,6 +16,7 @@ from gz_onboard.lab.discover.linear import Normal, marginal
 from gz_onboard.lab.discover.state import State
 
 RIDGE = 1e-6
+ALIKE = 0.6  # cosine of two columns, all that is common or random taken off
 BEND = 0.02  # of a cause's evidence: no effect has exactly the form of the real one, and others take up what is left
 
 
@@ -90,7 +91,17 @@ class Search:
             if sign and change[at] * sign < 0:
                 return False
             at += len(self.place[name])
-        return True
+        return not self.cancel(self.index(names), change)
+
+    def cancel(self, index: Sequence[int], change: Array) -> bool:
+        """Whether two of the changes look alike and work against each other: two faults that hide each other are less
+        likely than one that is neither.
+        """
+        inner = self.evidence.information[np.ix_(index, index)]
+        size = np.sqrt(np.maximum(np.diag(inner), 1e-12))
+        both = inner / np.outer(size, size) * np.sign(np.outer(change, change))
+        np.fill_diagonal(both, 1.0)
+        return bool(np.min(both, initial=1.0) < -ALIKE)
 
     def gain(self, names: Sequence[str]) -> float:
         """Of a set of causes; 0 for one that cannot be."""

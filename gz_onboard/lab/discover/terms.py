@@ -57,6 +57,7 @@ NUISANCES = (
     Nuisance("resistance_current", "1/(5 A)", 0.0, 0.1, 0.01, "cell resistance falls with current"),
     Nuisance("resistance_current_cold", "1/(5 A·20 K)", 0.0, 0.1, 0.01, "the more so below 20 degC"),
     Nuisance("resistance_cold", "1/(20 K)", 0.0, 0.15, 0.03, "cell resistance below 20 degC beyond the tables"),
+    Nuisance("resistance_empty_cold", "1", 0.0, 0.3, 0.03, "at SOC 0.6 and 0 degC more than either alone"),
     Nuisance("fast_resistance", "1", 0.0, 0.2, 0.05, "resistance at 0.1 s over that of the tables"),
     Nuisance("slip_per_force", "1/(100 N)", 0.0, 0.02, 0.003, "slip of the driven wheel"),
     Nuisance("lean_radius", "1", 0.0, 0.3, 0.05, "rolling radius falls with lean"),

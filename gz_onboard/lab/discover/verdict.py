@@ -11,7 +11,7 @@ from scipy.stats import t as student
 
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.channels import over_blocks
-from gz_onboard.lab.discover.constancy import Split, splits
+from gz_onboard.lab.discover.constancy import RIDE, Split, splits
 from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, normal
 from gz_onboard.lab.discover.result import Cause, Report
@@ -21,14 +21,17 @@ from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.terms import LOG, stepped
 
 FALSE_ALARMS = 0.05  # of sets of healthy rides, all candidates and curves together
+AGAIN = 5  # times at most that all is linearised about what was found: large changes are not linear
 LEFT = 0.1  # of what causes explain: a curve beside them that takes less is the bend of a large effect
 CURVE = 1.5  # a curve's evidence over that of a cause: there are many, and their knots are chosen by eye
 UNLIKE = 0.5  # of a cause's effect in a channel: a curve beside it that takes more is not the cause's bend
-UNLIKE_LEFT = 0.01  # of what causes explain: less is not worth the doubt
+UNLIKE_LEFT = 0.004  # of what causes explain: less is not worth the doubt
 CLEAR = 4.0  # standard deviations of a curve's coefficient that counts
 DISCREPANCY = 0.05  # of a change, sd: the form of an effect is not exactly the real one's
-LUMPED = ("cell_voltage", "voltage_timing", "motor_temperature", "inverter_temperature", "cell_temperature")
-"""Channels whose model is a circuit or network of lumps: the discrepancy of what is found in them is twice that."""
+LUMPED = {"cell_voltage": 1, "voltage_timing": 1, "motor_temperature": 3, "inverter_temperature": 3,
+          "cell_temperature": 3}  # fmt: skip
+"""Channels whose model is a circuit or a network of lumps: by how much more than that they err, in shares of it."""
+BETTER = 15.0  # of chi-squared, each further knot taken off with 2, by which a curve in a cause's place beats it
 LEAST = 0.4  # of the threshold, by which a stand-in must explain something itself
 MARGIN = 6.0  # of chi-squared within which another cause explains as well: a likelihood ratio of 20
 
@@ -66,9 +69,10 @@ def reach(
     choice = search.select(limit)
     offset = np.zeros(len(state.mean))
     chosen = choice.names
-    for _ in range(2):  # a large change is not linear: once more about what was found
+    for _ in range(AGAIN):
         if not chosen:
             break
+        before = offset
         index = search.index(chosen)
         target = np.zeros(len(offset))
         target[index] = search.evidence.estimate(index)
@@ -82,26 +86,64 @@ def reach(
         e = evidence(state, normals)
         search = Search(state, e, causes, shares)
         chosen = search.select(limit).names
-    found = causes_of(state, search, chosen, lines)
-    sets = [list(s) for s in search.stand_ins(chosen, MARGIN, LEAST * limit)]
+        if np.all(np.abs(offset - before) < 0.03 * np.abs(offset) + 1e-9):
+            break
     say("curves over quantities")
     change = np.zeros(len(state.mean))
     change[search.index(chosen)] = search.evidence.estimate(search.index(chosen))
     constancy = splits(state, lines, normals, search.place, chosen, change) if chosen else []
-    unknown = unexplained(state, search, lines, normals, chosen, change, [s for s in constancy if s.unequal], limit)
+    unknown = unexplained(state, search, lines, normals, chosen, change, constancy, limit)
+    if unknown is not None:
+        chosen = tuple(name for name in chosen if name not in unknown["denies"])
+    found = causes_of(state, search, chosen, lines)
+    sets = [list(s) for s in search.stand_ins(chosen, MARGIN, LEAST * limit)]
+    scores = {c.name: search.step([n for n in chosen if n != c.name], c.name) for c in causes}
+    if "headwind" in search.place and "headwind" not in chosen:
+        score, words = own_winds(state, lines, normals, search.place["headwind"], change)
+        scores["headwind"] = max(scores["headwind"], score)
+        if score > limit:
+            (wind,) = causes_of(state, search, [*chosen, "headwind"], lines)[-1:]
+            found = [*found, replace(wind, evidence=round(score, 2))]
+            notes.append("the wind differed from ride to ride: " + words)
     verdict = "none"
-    if unknown is not None and unknown["replaces"]:
-        verdict, found, sets = "unknown", [], []
+    if unknown is not None and not found:
+        verdict = "unknown"
     elif sets:
         verdict = "ambiguous"
     elif found:
         verdict = "cause"
-    ranking = sorted(((c.name, round(search.step([n for n in chosen if n != c.name], c.name), 2)) for c in causes),
-                     key=lambda pair: -pair[1])  # fmt: skip
+    ranking = sorted(((name, round(score, 2)) for name, score in scores.items()), key=lambda pair: -pair[1])
     return Report(
         verdict, found, sets, unknown, ranking, sizes(lines), {}, advice(search, sets, unknown), notes,
         isolability(search), limit, constancy=constancy, state=state, lines=list(lines), normals=normals,
     )  # fmt: skip
+
+
+def own_winds(
+    state: State, lines: Sequence[Linear], normals: Sequence[Any], index: Sequence[int], change: Array
+) -> tuple[float, str]:
+    """(evidence that the winds of these rides are more than healthy ones show, whatever their directions; in words).
+
+    change (p,): what causes explain. A wind blows as it likes on another day, so that a common vector misses it.
+    """
+    w = list(index)
+    rest = [i for i in range(len(state.mean)) if i not in w]
+    spread = state.prior + np.diag(state.scatter)
+    inside = np.zeros_like(spread)
+    inside[np.ix_(rest, rest)] = np.linalg.inv(spread[np.ix_(rest, rest)])
+    mean = state.mean + change
+    total, words = 0.0, []
+    for line, ride in zip(lines, normals, strict=True):
+        if np.any(np.diag(ride.n)[w] < 1e-6):
+            continue
+        covariance = np.linalg.inv(inside + ride.n)
+        wind = (covariance @ (ride.b + inside @ mean))[w] - mean[w]
+        total += float(wind @ np.linalg.solve(spread[np.ix_(w, w)] + covariance[np.ix_(w, w)], wind))
+        north, east = (wind * state.scale[w]).tolist()
+        words.append(
+            f"{line.ride.name} {np.hypot(north, east):.1f} m/s from {np.degrees(np.arctan2(east, north)) % 360:.0f}°"
+        )
+    return one_degree(total, 2 * len(words)) if words else 0.0, ", ".join(words)
 
 
 def channel_shares(state: State, lines: Sequence[Linear], causes: Sequence[Candidate]) -> dict[str, dict[str, float]]:
@@ -120,12 +162,16 @@ def channel_shares(state: State, lines: Sequence[Linear], causes: Sequence[Candi
 
 
 def kept(state: State, i: int, x: float) -> float:
-    """A change `x` of the parameter at `i`, in scales, that leaves it a positive share of a positive value."""
+    """A change `x` of the parameter at `i`, in scales, that stays within the bounds of what it is, and does not take
+    more than two thirds of it at once.
+    """
     name, value = state.names[i], state.values[state.names[i]]
-    if name in LOG or value == 0:
+    bounds = next((p for c in state.causes for p in c.parameters if p.name == name), None)
+    if name in LOG or bounds is None:
         return x
-    share = x * float(state.scale[i]) / value
-    return float(np.clip(share, -0.7, 5.0) * value / state.scale[i]) if value > 0 else x
+    low = max(bounds.low, value / 3) if bounds.low > 0 else bounds.low
+    moved = float(np.clip(value + x * float(state.scale[i]), low, bounds.high))
+    return (moved - value) / float(state.scale[i])
 
 
 def seen(state: State, e: Evidence, notes: list[str]) -> list[Candidate]:
@@ -164,7 +210,9 @@ def causes_of(state: State, search: Search, chosen: Sequence[str], lines: Sequen
             i = index[at]
             healthy = own_value(state, parameter.name)
             x = float(estimate[at])
-            own = DISCREPANCY * (1 + sum(search.shares.get(name, {}).get(channel, 0.0) for channel in LUMPED))
+            own = DISCREPANCY * (
+                1 + sum(more * search.shares.get(name, {}).get(channel, 0.0) for channel, more in LUMPED.items())
+            )
             sd = float(np.hypot(np.sqrt(covariance[at, at] * inflation), own * x))
             change[i] = x
             step = float(state.scale[i])
@@ -236,13 +284,14 @@ def share_of_time(line: Linear, channel: str) -> float:
 
 def unexplained(
     state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str],
-    change: Array, unequal: Sequence[Split], limit: float,
+    change: Array, constancy: Sequence[Split], limit: float,
 ) -> dict[str, Any] | None:  # fmt: skip
-    """The curve that explains most beside the causes chosen, and whether it shows them to be no causes at all; None if
-    none is significant.
+    """The curve that explains most beside the causes chosen, and which of them it `denies`, as they are none; None if
+    no curve is significant.
 
-    change (p,): of the parameters by the causes. A curve replaces the causes if it takes back, or adds, half or more of
-    what they do somewhere in a channel that names them, or if they are `unequal` in the halves of the rides.
+    change (p,): of the parameters by the causes. A curve denies causes if it takes back, or adds, half or more of
+    what they do somewhere in a channel that names them, if it explains much more than one of them in its place, or if
+    `constancy` finds one unequal.
     """
     index = search.index(chosen)
     total = search.evidence.gain(index)
@@ -258,16 +307,59 @@ def unexplained(
         unlike = unlike_causes(curve, inflation, *weight(state, lines, pair.partition(" over ")[0], change))
         if chosen and curve.chi2 < (UNLIKE_LEFT if unlike else LEFT) * total:
             continue
-        if best is None or (unlike, score) > (best["replaces"], best["score"]):
-            best = described(pair, curve, score) | {"replaces": unlike}
-    if unequal and (best is None or not best["replaces"]):
+        if best is None or (unlike, score) > (bool(best["denies"]), best["score"]):
+            channel = pair.partition(" over ")[0]
+            mine = [name for name in chosen if search.shares.get(name, {}).get(channel, 0.0) > 0.3] if unlike else []
+            best = described(pair, curve, score) | {"denies": mine}
+    if best is None or not best["denies"]:
+        best = instead(state, search, lines, normals, chosen) or best
+    unequal = [s for s in constancy if s.unequal]
+    if unequal and (best is None or not best["denies"]):
         worst = max(unequal, key=lambda s: s.chi2)
-        best = halves(state, lines, normals, worst) or best
+        best = halves(state, lines, normals, worst) or of_rides(state, lines, change, worst, constancy)
     if best is None:
         return None
-    best["replaces"] = best["replaces"] or not chosen
-    best["share"] = shape_share(lines, best)
+    if best["denies"]:
+        best["denies"] = list(dict.fromkeys([*best["denies"], *(s.cause for s in unequal)]))
+    if "share" not in best:
+        best["share"] = shape_share(lines, best)
     return best
+
+
+def instead(
+    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str]
+) -> dict[str, Any] | None:
+    """The curve that explains much better than one of the causes chosen what that one explains, in its own channel."""
+    best: dict[str, Any] | None = None
+    most = BETTER
+    for name in chosen:
+        rest = [other for other in chosen if other != name]
+        own = search.step(rest, name)
+        for pair in names():
+            channel = pair.partition(" over ")[0]
+            if search.shares.get(name, {}).get(channel, 0.0) < 0.3:
+                continue
+            curve = shape_evidence(state, lines, normals, pair, search.index(rest))
+            if curve is None:
+                continue
+            inflation = state.shapes[pair].inflation if pair in state.shapes else 1.0
+            ahead = curve.chi2 / inflation - 2 * (curve.k - 1) - own * max(state.inflation.get(name, 1.0), 1.0)
+            if ahead > max(most, UNLIKE_LEFT * own):
+                most = ahead
+                best = described(pair, curve, one_degree(curve.chi2 / inflation, curve.k)) | {"denies": [name]}
+    return best
+
+
+def of_rides(
+    state: State, lines: Sequence[Linear], change: Array, worst: Split, constancy: Sequence[Split]
+) -> dict[str, Any]:
+    """What no cause is that acts in some rides and not in others: by how much more or less in each."""
+    channels = {name for line in lines for name in line.tables}
+    channel = max(channels, key=lambda name: weight(state, lines, name, change)[1])
+    mine = [s for s in constancy if s.cause == worst.cause and s.quantity.startswith(RIDE)]
+    rows = [[float(i), s.ratio, abs(s.ratio) / max(s.chi2, 1e-9) ** 0.5] for i, s in enumerate(mine)]
+    return {"channel": channel, "quantity": "ride", "unit": "", "score": worst.chi2, "chi2": worst.chi2, "curve": rows,
+            "denies": [worst.cause], "share": energy_share(state, lines, change)}  # fmt: skip
 
 
 def described(pair: str, curve: Curve, score: float) -> dict[str, Any]:
@@ -319,7 +411,7 @@ def halves(state: State, lines: Sequence[Linear], normals: Sequence[Any], split:
             continue
         score = one_degree(curve.chi2 / (state.shapes[pair].inflation if pair in state.shapes else 1.0), curve.k)
         if best is None or score > best["score"]:
-            best = described(pair, curve, score) | {"replaces": True}
+            best = described(pair, curve, score) | {"denies": [split.cause]}
     return best
 
 
@@ -387,7 +479,9 @@ def advice(search: Search, sets: Sequence[Sequence[str]], unknown: dict[str, Any
         )
     if unknown is not None:
         lines.append(
-            f"Ride over the whole span of {unknown['quantity']} with all else the same, twice: what "
+            f"Ride one and the same way several times: what {unknown['channel']} leaves differs from ride to ride."
+            if unknown["quantity"] == "ride"
+            else f"Ride over the whole span of {unknown['quantity']} with all else the same, twice: what "
             f"{unknown['channel']} leaves goes with it, or with what changes along with it."
         )
     return lines

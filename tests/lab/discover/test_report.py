@@ -84,7 +84,7 @@ def reported(state: State, samples: Samples) -> Report:
     cause = Cause("rolling_resistance", "rolling_resistance_constant", 0.015, "1", (0.014, 0.016), 0.003, 0.1, 50.0)
     knots = [[float(v), float(v - 5), 0.5] for v in range(0, 16, 3)]
     unknown = {"channel": "road_force", "quantity": "speed", "unit": "m/s", "share": 0.03, "score": 40.0,
-               "curve": knots, "replaces": False}  # fmt: skip
+               "curve": knots, "denies": []}  # fmt: skip
     ranking = [(c.name, 1.0) for c in state.causes]
     gain = {"holdout": ["a<b", "c"], "power": {"before": 9.0, "control": 8.0, "after": 7.0, "ci95": [0.5, 1.5]}}
     return Report(
