@@ -92,8 +92,9 @@ def _check_sign(table: Table, current: Array, volts: Array, dt: Array, largest: 
     steps = (np.abs(step) > 0.2 * largest) & (dt[1:] < LONGEST_GAP)
     if np.any(steps) and float(np.median(change[steps] / step[steps])) > 0:
         row = int(np.flatnonzero(steps)[0]) + 1
+        way = "rises" if change[row - 1] > 0 else "falls"
         raise table.error(
-            f"the voltage {'rises' if change[row - 1] > 0 else 'falls'} by {abs(change[row - 1]):.3g} V as the current goes from {current[row - 1]:.3g} to "
+            f"the voltage {way} by {abs(change[row - 1]):.3g} V as the current goes from {current[row - 1]:.3g} to "
             f"{current[row]:.3g} A, and so at most steps: discharging must be positive (scale = -1 turns it)",
             row,
         )
