@@ -1,6 +1,6 @@
 """Residuals: in each channel, what was measured less what the model says of it, given the other measurements.
 
-Each channel is an analytical redundancy relation (Gertler 1998; Frisk & Krysander 2015): a balance of one part of the
+Each channel is an analytical redundancy relation (Gertler 1998; Krysander & Frisk 2008): a balance of one part of the
 vehicle that takes its inputs from sensors, not from the model of another part. So a fault in one part shows in few
 channels, and causes that look alike in the energy drawn (a heavier rider, a weaker magnet) do not in all of them.
 

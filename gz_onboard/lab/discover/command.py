@@ -38,7 +38,8 @@ KEYS = {
     "extended_model": "the vehicle file written, or null",
     "advice": "what to ride next",
     "notes": "what could not be used, and what was left out",
-    "isolability": "look_alikes: pairs and the cosine of what they do to the residuals",
+    "isolability": "signatures: channels of each candidate; same_signature: groups that differ in form alone; "
+    "look_alikes: pairs and the cosine of what they do to the residuals",
     "threshold": "score that one in twenty such searches of healthy rides exceeds",
     "constancy": "whether a cause acts alike everywhere: cause, quantity, ratio (half the difference of the halves "
     "of the quantity over the mean), chi2",

@@ -456,18 +456,26 @@ def sizes(lines: Sequence[Linear]) -> dict[str, dict[str, float]]:
 
 
 def isolability(search: Search) -> dict[str, Any]:
-    """Pairs of candidates that these rides can hardly separate: cosine of their columns once nuisances are out."""
-    singles = {n: i[0] for n, i in search.place.items()}
+    """What could be told apart at all. signatures: of each candidate the channels that depend on it (Krysander & Frisk
+    2008). same_signature: those that only the form of what they do separates, no matter how much is measured.
+    look_alikes: pairs that these rides can hardly separate, by the cosine of what they do once nuisances are out.
+    """
+    signatures = {name: sorted(c for c, share in search.shares.get(name, {}).items() if share > 0)
+                  for name in search.place}  # fmt: skip
+    groups: dict[tuple[str, ...], list[str]] = {}
+    for name, channels in signatures.items():
+        groups.setdefault(tuple(channels), []).append(name)
     information = search.evidence.information
     pairs = []
-    keys = list(singles)
+    keys = list(search.place)
     for a_at, a in enumerate(keys):
         for b in keys[a_at + 1 :]:
-            i, j = singles[a], singles[b]
+            i, j = search.place[a][0], search.place[b][0]
             scale = np.sqrt(abs(information[i, i] * information[j, j]))
             if scale > 0 and abs(cosine := information[i, j] / scale) > 0.8:
                 pairs.append([a, b, round(float(cosine), 3)])
-    return {"look_alikes": sorted(pairs, key=lambda p: -abs(p[2]))}
+    return {"signatures": signatures, "same_signature": [group for group in groups.values() if len(group) > 1],
+            "look_alikes": sorted(pairs, key=lambda p: -abs(p[2]))}  # fmt: skip
 
 
 def advice(search: Search, sets: Sequence[Sequence[str]], unknown: dict[str, Any] | None) -> list[str]:
