@@ -29,6 +29,7 @@ STEP = 0.01  # s
 WHEEL_ONLY = {"speed", "motor_speed", "time_moving"}
 """What a force may read to act on a dynamometer too: it is at the wheel, not of air, hill or bend."""
 TURNING_EFFECT = "cornering_drag"
+BRAKE_PASSES = 4  # of front and rear brake in turn, where both hold; each leaves a twentieth of what they disagree by
 VOLTAGE_FILTER = 0.3  # s: the controller's own; without one, current and sag would chase each other each step
 
 Place = tuple[float, float, float]
@@ -252,9 +253,6 @@ class Scooter:
             absorbed = (d.a * v / sqrt(v * v + 0.01) if d.a else 0.0) + d.b * v + d.c * v * abs(v)
             against += absorbed
 
-        front_braking = 0.0 if brake <= 0.0 or dynamometer else self.brakes.front_force(brake, v, r)
-        against += front_braking
-
         # --- wheel, tyre and vehicle together, implicit in the slip (eqs. 2.11, 3.3, 3.8, 3.10-3.12)
         base, gain, _ = self.tyre.linear(r * w, v, dt)
         slip = base + gain * (r * w - v)
@@ -264,13 +262,21 @@ class Scooter:
         det = m * j + stiffness * (m * r * r + j)
         f1 = grip - against
         f2 = drive - r * (grip + rear_rolling)
-        dw = ((m + stiffness) * f2 + r * stiffness * f1) / det
-        braking = 0.0
+        braking = front_braking = 0.0
         if brake > 0.0:
-            per_torque = (m + stiffness) / det  # how much the wheel slows for each N·m
-            braking = self.brakes.torque(brake, w, (w + dw) / per_torque)
+            # How much each slows what it is on and what is on the other side of the tyre.
+            by_torque, by_force, across = (m + stiffness) / det, (j + r * r * stiffness) / det, r * stiffness / det
+            for _ in range(BRAKE_PASSES):
+                if not dynamometer:
+                    to_stop = (v + by_force * f1 + across * (f2 - braking)) / by_force
+                    front_braking = self.brakes.front_force(brake, v, r, to_stop)
+                to_stop = (w + by_torque * f2 + across * (f1 - front_braking)) / by_torque
+                braking = self.brakes.torque(brake, w, to_stop)
+                if v > 0.5:  # the front brake does all it can: it stops nothing within a step
+                    break
+            f1 -= front_braking
             f2 -= braking
-            dw = ((m + stiffness) * f2 + r * stiffness * f1) / det
+        dw = ((m + stiffness) * f2 + r * stiffness * f1) / det
         dv = ((j + r * r * stiffness) * f1 + r * stiffness * f2) / det
         force = grip + stiffness * (r * dw - dv)
         self.tyre.slip = base + gain * (r * (w + dw) - v - dv)

@@ -21,7 +21,7 @@ from gz_onboard.simulation.run import (
     road_table,
     shortfalls,
 )
-from gz_onboard.simulation.scooter import Scooter, straight
+from gz_onboard.simulation.scooter import STEP, Scooter, straight
 from gz_onboard.simulation.sweep import redesigned
 from gz_onboard.vehicle import read_vehicle
 
@@ -152,6 +152,17 @@ def test_uphill_costs_what_it_lifts():
 def ridden_at(grade):
     scooter = Scooter(VEHICLE, straight(grade), soc=0.8)
     return drive(scooter, follow([6.0] * 12_000, 0.01), 120)
+
+
+def test_a_hill_that_it_cannot_climb_is_a_shortfall_and_no_ride_backwards():
+    c = cycle("ece15")
+    command = follow(at_steps(c.time, c.speed, STEP), STEP)
+    run = drive(Scooter(VEHICLE, straight(0.25), soc=0.9), command, c.duration)
+    assert run.distance > -20
+    assert abs(run.series["speed"][-1]) < 0.01
+    assert run.soc_end < run.soc_start
+    assert all(short.beyond_vehicle for short in run.shortfalls if short.duration > 10)
+    assert sum(short.duration for short in run.shortfalls) > 100
 
 
 def test_finish_ends_the_ride():

@@ -8,7 +8,6 @@ as much as it must, up to its limit.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import sqrt
 
 
 @dataclass
@@ -28,11 +27,11 @@ class Brakes:
         limit = command * (1 - self.front_share) * self.torque_limit
         return min(max(to_stop, -limit), limit)
 
-    def front_force(self, command: float, speed: float, wheel_radius: float) -> float:
-        """Force [N] of the front brake against a vehicle at `speed` [m/s]: smooth around standstill."""
+    def front_force(self, command: float, speed: float, wheel_radius: float, to_stop: float) -> float:
+        """Force [N] of the front brake against a vehicle at `speed` [m/s]; `to_stop` as in `torque`."""
         if self.form == "viscous":
             return (
                 speed / wheel_radius * command * self.front_share * self.viscous_constant * self.radius / wheel_radius
             )
         limit = command * self.front_share * self.torque_limit / wheel_radius
-        return limit * speed / sqrt(speed * speed + 0.01)
+        return min(max(to_stop, -limit), limit)
