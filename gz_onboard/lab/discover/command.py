@@ -30,7 +30,8 @@ KEYS = {
     "causes": "name, parameter, value, unit, ci95, change (over the healthy value), energy_share, evidence "
     "(chi-squared of one degree of freedom), parameters (all of them: value, ci95)",
     "ambiguous": "sets of names that these rides cannot tell apart, the likeliest first",
-    "unknown": "what has no name: channel, quantity, unit, share of the energy, curve [[at, value, sd], ...]; or null",
+    "unknown": "what has no name: channel, quantity, unit, share of the energy, curve [[at, value, sd], ...], denies "
+    "(causes that it shows to be none); or null",
     "ranking": "name, score of every candidate beside the causes named",
     "residuals": "per channel: mean, rms, autocorrelation, blocks, energy_share, range_share",
     "gain": "on rides held out: holdout, and per metric before, control (present parameters refitted), after, "
@@ -323,6 +324,8 @@ def summary(report: Report, vehicle: Vehicle, told: Sequence[str] = ()) -> str:
         u = report.unknown
         lines.append(f"  no name:             {words(u['channel'])} over {words(u['quantity'])}, "
                      f"{u['share']:+.1%} of the energy, score {u['score']:.0f}")  # fmt: skip
+        if u["denies"]:
+            lines.append(f"  denied:              {', '.join(u['denies'])}, which would not act alike everywhere")
     best = ", ".join(f"{name} {score:.0f}" for name, score in report.ranking[:5])
     lines.append(f"scores       {best}; healthy rides stay below {report.threshold:.0f}")
     left = sizes(before_and_after(report)[0])

@@ -144,6 +144,9 @@ def _causes(report: Report) -> str:
             f"<p><b>No candidate explains</b> what {words(u['channel'])} leaves over {words(u['quantity'])}: "
             f"{u['share']:+.1%} of the energy, score {u['score']:.0f}.</p>"
         )
+        if u["denies"]:
+            names = ", ".join(words(name) for name in u["denies"])
+            text += f"<p><b>Denied:</b> {names}, which would not act alike everywhere.</p>"
     return text
 
 
@@ -381,7 +384,10 @@ def curve(unknown: dict[str, Any]) -> Figure:
     axis.set_ylim(*_limits_of(y, sd))
     axis.axhline(0, color=INK, linewidth=0.6)
     axis.set_xlabel(f"{words(unknown['quantity'])} [{unknown['unit']}]", fontsize=9, color=INK)
-    axis.set_ylabel(f"{words(unknown['channel'])} [{BY_NAME[unknown['channel']].unit}]", fontsize=9, color=INK)
+    left = f"{words(unknown['channel'])} [{BY_NAME[unknown['channel']].unit}]"
+    if unknown["quantity"] == "ride":
+        left = f"{words(unknown['denies'][0])}, over its mean [1]"
+    axis.set_ylabel(left, fontsize=9, color=INK)
     return figure
 
 
