@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from bisect import bisect_right
+from collections.abc import MutableMapping
 from dataclasses import replace
 from typing import Any
 
@@ -45,13 +46,17 @@ class EfficiencyMotor:
         self.torque_constant = torque_constant
         self.voltage_constant = voltage_constant
 
-    def losses(self, speed: float, current: float, temperature: float) -> list[tuple[str, float]]:
+    def heat(
+        self, speed: float, current: float, temperature: float, dt: float, ledger: MutableMapping[str, float]
+    ) -> float:
         power = self.torque_constant * current * speed
         share = min(max(power, 0.0) / POWER, 1.0)
         i = min(bisect_right(SHARES, share), len(SHARES) - 1) - 1
         part = (share - SHARES[i]) / (SHARES[i + 1] - SHARES[i])
         efficiency = EFFICIENCY[i] + part * (EFFICIENCY[i + 1] - EFFICIENCY[i])
-        return [("motor", power / efficiency - power if power >= 0 else power * efficiency - power)]
+        loss = power / efficiency - power if power >= 0 else power * efficiency - power
+        ledger["motor"] += loss * dt
+        return loss
 
     def idle(self, speed: float, temperature: float) -> float:
         return 0.0

@@ -10,9 +10,10 @@ ledger closes to rounding.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field
 from math import atan, sqrt
+from typing import Any
 
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Effect, Port
 from gz_onboard.physics.model import G, air_density, drag_torque
@@ -136,14 +137,11 @@ class Scooter:
         # What grade takes is the potential energy.
         self._force_entries = [(i, e.name) for i, e in enumerate(forces) if e.name != "grade_force"]
         self._rolling, self._rolling_entries = _together(at[Port.TYRE], p, dt), _names(at[Port.TYRE])
-        inverter, direct = at[Port.INVERTER_LOSS], at[Port.DC_POWER]
-        self._inverter, self._inverter_entries = _together(inverter, p, dt), _names(inverter)
-        self._dc, self._dc_entries = _together(direct, p, dt), _names(direct)
+        self._inverter = _booked(at[Port.INVERTER_LOSS], p, dt)
+        self._dc = _booked(at[Port.DC_POWER], p, dt)
         constants = p["torque_constant"], p["voltage_constant"]
         losses = at[Port.MOTOR_LOSS]
-        self.motor: Motor = motor or EffectMotor(
-            _names(losses), _together(losses, p, dt), _together(losses, p, None), *constants, self._q
-        )
+        self.motor: Motor = motor or EffectMotor(_booked(losses, p, dt), _settled(losses, p), *constants, self._q)
         self.tyre = Tyre(p["tyre_b"], p["tyre_c"], p["tyre_d"], p["tyre_e"], form=tyre_form)
         self.brakes = Brakes(p["brake_torque_limit"], p["brake_viscous_constant"], p["brake_disc_radius"],
                              p["front_brake_share"], form=brake_form)  # fmt: skip
@@ -303,19 +301,10 @@ class Scooter:
         mechanical = torque * motor_speed
         entries["gearing"] += (mechanical - drive * w_mean) * dt
         q["torque"] = self.motor.torque_constant * current
-        motor_heat = 0.0
-        for name, loss in self.motor.losses(motor_speed, current, self.motor_cooling.stator):
-            motor_heat += loss
-            entries[name] += loss * dt
+        motor_heat = self.motor.heat(motor_speed, current, self.motor_cooling.stator, dt, entries)
         q["motor_speed"], q["motor_current"] = motor_speed, current
-        inverter_heat = 0.0
-        for name, loss in zip(self._inverter_entries, self._inverter(q), strict=True):
-            inverter_heat += loss
-            entries[name] += loss * dt
-        power = mechanical + motor_heat + inverter_heat
-        for name, load in zip(self._dc_entries, self._dc(q), strict=True):
-            power += load
-            entries[name] += load * dt
+        inverter_heat = self._inverter(q, entries)
+        power = mechanical + motor_heat + inverter_heat + self._dc(q, entries)
         bms_heat = self._bms_resistance * self.current * self.current
         entries["bms"] += bms_heat * dt
         power += bms_heat
@@ -370,15 +359,43 @@ def _names(effects: Sequence[Effect]) -> list[str]:
 
 
 Terms = Callable[[Mapping[str, float]], tuple[float, ...]]
+Sum = Callable[[Mapping[str, float]], float]
+Booked = Callable[[Mapping[str, float], MutableMapping[str, float]], float]
+# Calls of effects are written out, as they are made a hundred times for each second ridden: a ride takes two thirds
+# of the time that it takes by `model.Bound`. What has memory must be called once each step of `dt` [s].
 
 
 def _together(effects: Sequence[Effect], parameters: Mapping[str, float], dt: float | None) -> Terms:
-    """The effects' values as one function of the quantities; with memory it must be called once each step of `dt` [s].
+    """The effects' values as one function of the quantities; `dt` is None for what each settles at."""
+    calls, scope = _calls(effects, parameters, dt)
+    terms: Terms = eval(f"lambda q: ({''.join(f'{call}, ' for call in calls)})", scope)
+    return terms
 
-    dt: None for what each settles at. Their calls are written out, as they are made a hundred times for each second
-    ridden: a ride takes a third less time than by `model.Bound`.
-    """
-    scope: dict[str, object] = {}
+
+def _settled(effects: Sequence[Effect], parameters: Mapping[str, float]) -> Sum:
+    """The sum of what the effects settle at."""
+    calls, scope = _calls(effects, parameters, None)
+    total: Sum = eval(f"lambda q: {' + '.join(calls) or '0.0'}", scope)
+    return total
+
+
+def _booked(effects: Sequence[Effect], parameters: Mapping[str, float], dt: float) -> Booked:
+    """The sum of the effects' values, which adds each, times `dt`, to a ledger by its name."""
+    calls, scope = _calls(effects, parameters, dt)
+    lines = ["def booked(q, entries):"]
+    for i, (effect, call) in enumerate(zip(effects, calls, strict=True)):
+        lines += [f"    x{i} = {call}", f"    entries[{effect.name!r}] += x{i} * {dt!r}"]
+    lines.append(f"    return {' + '.join(f'x{i}' for i in range(len(calls))) or '0.0'}")
+    exec("\n".join(lines), scope)
+    booked: Booked = scope["booked"]
+    return booked
+
+
+def _calls(
+    effects: Sequence[Effect], parameters: Mapping[str, float], dt: float | None
+) -> tuple[list[str], dict[str, Any]]:
+    """The effects' calls over ``q`` as text, and the functions that they name."""
+    scope: dict[str, Any] = {}
     calls = []
     for i, effect in enumerate(effects):
         if effect.decay is None or dt is None:
@@ -387,8 +404,7 @@ def _together(effects: Sequence[Effect], parameters: Mapping[str, float], dt: fl
         else:
             scope[f"f{i}"] = _remembering(effect, effect.decay, parameters, dt)
             calls.append(f"f{i}(q)")
-    terms: Terms = eval(f"lambda q: ({''.join(f'{call}, ' for call in calls)})", scope)
-    return terms
+    return calls, scope
 
 
 def _remembering(
