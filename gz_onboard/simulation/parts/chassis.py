@@ -7,6 +7,7 @@ settle, and following the lateral motion itself would make a ride ten times slow
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping
 from math import atan
 from typing import NamedTuple, Protocol
@@ -78,34 +79,22 @@ class SteadyTurn:
         if hard < 1e-6:
             return STRAIGHT_ON
         speed = min(max(abs(speed), _SPEEDS[0]), _SPEEDS[-1])
-        i = 0
-        while i < len(_SPEEDS) - 2 and speed > _SPEEDS[i + 1]:
-            i += 1
+        i = max(bisect_left(_SPEEDS, speed), 1) - 1
         part = (speed - _SPEEDS[i]) / (_SPEEDS[i + 1] - _SPEEDS[i])
-        slow, a = self._at(i, hard)
-        fast, b = self._at(i + 1, hard)
-        if a > 1.0:
+        slow, fast = hard / self._limits[i], hard / self._limits[i + 1]
+        if slow > 1.0:
             part = 1.0  # the slower of the two cannot turn as tightly
-            if b > 1.0:
+            if fast > 1.0:
                 self.beyond += dt
-        rest = 1.0 - part
-        side = -1.0 if self.lateral > 0 else 1.0
-        return Turn(
-            rest * slow[0] + part * fast[0],
-            rest * slow[1] + part * fast[1],
-            rest * slow[2] + part * fast[2],
-            rest * slow[3] + part * fast[3],
-            side * (rest * slow[4] + part * fast[4]),
-        )
-
-    def _at(self, i: int, lateral: float) -> tuple[Turn, float]:
-        """(the turn at the i-th speed, linear between the table's, `lateral` over the greatest there)."""
-        share = lateral / self._limits[i]
-        place = min(share, 1.0) * _SHARES
-        k = min(int(place), _SHARES - 1)
-        part = place - k
-        one, two = self._table[i][k], self._table[i][k + 1]
-        return Turn(*[x + part * (y - x) for x, y in zip(one, two, strict=True)]), share
+        slow, fast = _SHARES * min(slow, 1.0), _SHARES * min(fast, 1.0)
+        k, m = min(int(slow), _SHARES - 1), min(int(fast), _SHARES - 1)
+        b, d = (1.0 - part) * (slow - k), part * (fast - m)
+        a, c = 1.0 - part - b, part - d
+        one, two = self._table[i], self._table[i + 1]
+        resistance, load, height, radius, lean = [
+            a * w + b * x + c * y + d * z for w, x, y, z in zip(one[k], one[k + 1], two[m], two[m + 1], strict=True)
+        ]
+        return Turn(resistance, load, height, radius, -lean if self.lateral > 0 else lean)
 
 
 def chassis(name: str, parameters: Mapping[str, float]) -> Chassis:
