@@ -12,6 +12,7 @@ import numpy as np
 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.alone import NOTE, alone
+from gz_onboard.lab.discover.channels import BY_NAME, usable, voltage_timing
 from gz_onboard.lab.discover.gain import measure_gain
 from gz_onboard.lab.discover.grid import Array, Ride
 from gz_onboard.lab.discover.linear import (
@@ -40,6 +41,7 @@ WEIGHT = 1.0  # rides that the scatter before any healthy ride is worth
 ROUNDS = 3
 LEAST = 0.6
 Progress = Callable[[str], None]
+LATENCY = "pack_voltage_latency"
 
 
 def baseline(
@@ -159,6 +161,26 @@ def inflation(folds: Sequence[tuple[State, list[int]]], normals: Sequence[Normal
     return {name: max(LEAST, (1 + sum(x)) / (1 + len(x))) for name, x in total.items()}
 
 
+def coarse(state: State, rides: Sequence[Ride]) -> Array:
+    """Where to linearise first, (p,) in scales: at the delay of the voltage that fits best of a grid, for a delay of
+    more than the time between two frames is no linear change.
+    """
+    offset = np.zeros(len(state.names))
+    mine = [ride for ride in rides if usable(BY_NAME["voltage_timing"], ride, state.system)]
+    if LATENCY not in state.names or not mine:
+        return offset
+    i = state.names.index(LATENCY)
+    healthy = state.unit_value(state.mean)
+    spread = {
+        late: sum(float(np.mean(np.abs(voltage_timing(r, {**healthy, LATENCY: late}, state.system)))) for r in mine)
+        for late in (healthy[LATENCY] + 0.1 * k for k in range(-10, 11))
+    }
+    best = min(spread, key=lambda late: spread[late])
+    if abs(best - healthy[LATENCY]) > 0.15:
+        offset[i] = (best - healthy[LATENCY]) / state.scale[i]
+    return offset
+
+
 def usable_causes(state: State) -> list:  # type: ignore[type-arg]
     """The candidates whose parameters some channel depends on."""
     return [c for c in state.causes if set(c.names) <= set(state.names)]
@@ -176,7 +198,7 @@ def discover(
     say = progress or (lambda _: None)
     state = restore(vehicle, folder)
     notes: list[str] = []
-    usable: list[Ride] = []
+    found: list[Ride] = []
     for samples in rides:
         try:
             ride = state.ride(samples)
@@ -186,15 +208,14 @@ def discover(
         if ride.distance < 300:
             notes.append(f"ride {ride.name}: {ride.distance:.0f} m; less than 300 m tell nothing")
             continue
-        usable.append(ride)
-    if not usable:
+        found.append(ride)
+    if not found:
         raise InputError("no ride can be used: " + "; ".join(notes or ["none given"]))
-    say(f"{len(usable)} rides, {len(state.names)} parameters")
+    say(f"{len(found)} rides, {len(state.names)} parameters")
     if not state.healthy:
         notes.append(NOTE)
-        state = alone(state, usable, lambda some, at: linearise_all(some, at, workers))
-    lines = linearise_all(usable, state, workers)
-    report = reach(state, lines, notes, say, lambda s: linearise_all(usable, s, workers))
+        state = alone(state, found, lambda some, at: linearise_all(some, at, workers))
+    report = reach(state, notes, say, lambda s: linearise_all(found, s, workers), coarse(state, found))
     say("gain on rides held out")
     report.gain = measure_gain(report, seed, holdout)
     return report

@@ -25,6 +25,7 @@ AGAIN = 5  # times at most that all is linearised about what was found: large ch
 LEFT = 0.1  # of what causes explain: a curve beside them that takes less is the bend of a large effect
 CURVE = 1.5  # a curve's evidence over that of a cause: there are many, and their knots are chosen by eye
 UNLIKE = 0.5  # of a cause's effect in a channel: a curve beside it that takes more is not the cause's bend
+RIVAL = 0.25  # of the evidence for the causes of its channel: a curve beside them that has more is no bend
 UNLIKE_LEFT = 0.004  # of what causes explain: less is not worth the doubt
 CLEAR = 4.0  # standard deviations of a curve's coefficient that counts
 DISCREPANCY = 0.05  # of a change, sd: the form of an effect is not exactly the real one's
@@ -55,10 +56,16 @@ def threshold(state: State, tried: float) -> float:
 
 
 def reach(
-    state: State, lines: Sequence[Linear], notes: list[str], say: Callable[[str], None],
-    again: Callable[[State], list[Linear]],
+    state: State, notes: list[str], say: Callable[[str], None], linearised: Callable[[State], list[Linear]],
+    start: Array,
 ) -> Report:  # fmt: skip
-    """The verdict over linearised rides. again: linearises them at another state."""
+    """The verdict. linearised: the rides at a state. start (p,): where to linearise first, in scales."""
+
+    def about(offset: Array) -> list[Linear]:
+        moved = replace(state, values=state.unit_value(offset)) if np.any(offset) else state
+        return [line.seen_from(offset) for line in linearised(moved)]
+
+    lines = about(start)
     normals = [normal(line, state.noise) for line in lines]
     e = evidence(state, normals)
     causes = seen(state, e, notes)
@@ -67,7 +74,7 @@ def reach(
     search = Search(state, e, causes, shares)
     say(f"{len(causes)} candidates")
     choice = search.select(limit)
-    offset = np.zeros(len(state.mean))
+    offset = start
     chosen = choice.names
     for _ in range(AGAIN):
         if not chosen:
@@ -80,8 +87,7 @@ def reach(
         for name in chosen:
             for i in search.place[name]:
                 offset[i] = kept(state, i, offset[i])
-        moved = replace(state, values=state.unit_value(offset), mean=state.mean)
-        lines = [line.seen_from(offset) for line in again(moved)]
+        lines = about(offset)
         normals = [normal(line, state.noise) for line in lines]
         e = evidence(state, normals)
         search = Search(state, e, causes, shares)
@@ -289,9 +295,10 @@ def unexplained(
     """The curve that explains most beside the causes chosen, and which of them it `denies`, as they are none; None if
     no curve is significant.
 
-    change (p,): of the parameters by the causes. A curve denies causes if it takes back, or adds, half or more of
-    what they do somewhere in a channel that names them, if it explains much more than one of them in its place, or if
-    `constancy` finds one unequal.
+    change (p,): of the parameters by the causes. A curve denies causes if it takes back, or adds, half or more of what
+    they do somewhere in a channel that names them, if it has a quarter of their evidence beside them, if it explains
+    much more than one of them in its place, or if `constancy` finds one unequal. What else was found must then stand
+    without what is denied.
     """
     index = search.index(chosen)
     total = search.evidence.gain(index)
@@ -304,13 +311,15 @@ def unexplained(
         score = one_degree(curve.chi2 / inflation, curve.k)
         if score < CURVE * limit:
             continue
-        unlike = unlike_causes(curve, inflation, *weight(state, lines, pair.partition(" over ")[0], change))
+        channel = pair.partition(" over ")[0]
+        mine = [name for name in chosen if search.shares.get(name, {}).get(channel, 0.0) > 0.3]
+        theirs = sum(search.step([other for other in chosen if other != name], name) for name in mine)
+        unlike = unlike_causes(curve, inflation, *weight(state, lines, channel, change))
+        unlike = unlike or bool(mine and curve.chi2 / inflation > RIVAL * theirs)
         if chosen and curve.chi2 < (UNLIKE_LEFT if unlike else LEFT) * total:
             continue
         if best is None or (unlike, score) > (bool(best["denies"]), best["score"]):
-            channel = pair.partition(" over ")[0]
-            mine = [name for name in chosen if search.shares.get(name, {}).get(channel, 0.0) > 0.3] if unlike else []
-            best = described(pair, curve, score) | {"denies": mine}
+            best = described(pair, curve, score) | {"denies": mine if unlike else []}
     if best is None or not best["denies"]:
         best = instead(state, search, lines, normals, chosen) or best
     unequal = [s for s in constancy if s.unequal]
@@ -320,7 +329,11 @@ def unexplained(
     if best is None:
         return None
     if best["denies"]:
-        best["denies"] = list(dict.fromkeys([*best["denies"], *(s.cause for s in unequal)]))
+        denied = dict.fromkeys([*best["denies"], *(s.cause for s in unequal)])
+        left = [name for name in chosen if name not in denied]  # what was found beside it must stand without it
+        least = max(limit, LEFT * best["chi2"])
+        denied |= dict.fromkeys(n for n in left if search.step([m for m in left if m != n], n) < least)
+        best["denies"] = list(denied)
     if "share" not in best:
         best["share"] = shape_share(lines, best)
     return best
