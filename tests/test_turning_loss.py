@@ -85,6 +85,18 @@ def test_the_models_written_differ_as_little_as_their_intervals_say(ran: tuple[P
     assert every.riding.factor < read_vehicle("reference").riding.factor  # what was found has left it
 
 
+def test_the_model_that_runs_on_a_bus_is_the_one_written_here(ran: tuple[Path, list[tuple[str, str]]]):
+    """tests/vehicles/discovered.toml, which tests/vcan has the daemon run."""
+    folder, _ = ran
+    kept, now = (
+        read_vehicle(str(ROOT / "tests" / "vehicles" / "discovered.toml")),
+        read_vehicle(str(folder / "turning.toml")),
+    )
+    assert [effect.name for effect in kept.model.effects] == [effect.name for effect in now.model.effects]
+    assert kept.parameters["cornering_compliance"] == pytest.approx(now.parameters["cornering_compliance"], rel=0.1)
+    assert kept.riding.factor == pytest.approx(now.riding.factor, rel=0.02)
+
+
 def test_the_oval_that_was_in_no_fit_is_simulated_better(ran: tuple[Path, list[tuple[str, str]]]):
     found = []
     for _, printed in ran[1][-2:]:

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.vehicle import OWN
-from tests.support import LOGS
+from gz_onboard.vehicle import OWN, read_vehicle
+from tests.support import LOGS, ROOT
 from tests.vcan.support import Listener, Running, wait_for
 
 CITY = LOGS / "city_14C.blf"
 SECONDS = 12.0
+DISCOVERED = ROOT / "tests" / "vehicles" / "discovered.toml"  # see tests/test_turning_loss.py
 MORE = '"auxiliary_load", "cornering_drag", "headwind", "slow_relaxation", "ocv_hysteresis",\n]'
 VALUES = """[parameters]
 slow_resistance = { value = 0.03, unit = "ohm", sd = 0.005, status = "guess", source = "made up for a test" }
@@ -72,3 +73,15 @@ def test_an_extended_model_runs_as_it_is_and_expects_less_range(running: Running
     assert "going on from the state" in own
     assert "not used" in foreign
     assert "slow_relaxation" in foreign  # it says which models do not agree
+
+
+def test_the_file_that_discover_wrote_runs_as_it_is(running: Running):
+    assert "cornering_drag" in {effect.name for effect in read_vehicle(str(DISCOVERED)).model.effects}
+    with Listener() as listener:
+        daemon = running.daemon("--vehicle", str(DISCOVERED), name="discovered")
+        replay = running.replay(CITY, channel="vcan0")
+        wait_for(lambda: len(listener.decoded("RANGE_Estimate")) >= SECONDS / 2, 60, "range frames")
+        replay.terminate()
+        replay.wait(10)
+        assert "dropped 0" in daemon.stop()
+    assert 5 < listener.decoded("RANGE_Estimate")[-1]["RANGE_Remaining"] < 120  # km
