@@ -1,0 +1,69 @@
+"""Hidden effects in rides of a scooter that is not the package's model: a small blind trial with fixed seeds.
+
+The large one is `make trial` (docs/trial.md); nothing was tuned on the seeds of either.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.trial import Row, interval, judge_scooter, reported, right, summary
+
+FIRST = 200_000
+CASES = 8
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[Row]:
+    return judge_scooter(range(FIRST, FIRST + CASES))
+
+
+def test_every_case_is_judged(rows):
+    assert [row["seed"] for row in rows] == list(range(FIRST, FIRST + CASES))
+    assert {row["verdict"] for row in rows} <= {"cause", "none", "ambiguous", "unknown"}
+    assert {row["kind"] for row in rows} > {"healthy", "one"}  # else the seeds would test too little
+
+
+def test_no_alarm_on_healthy_rides(rows):
+    assert [row["seed"] for row in rows if row["kind"] == "healthy" and row["verdict"] != "none"] == []
+
+
+def test_what_is_clear_is_in_the_reported_set(rows):
+    clear = [(row, t) for row in rows if row["kind"] != "unknown" for t in row["truths"] if t["clear"]]
+    found = [t["name"] in reported(row) for row, t in clear]
+    assert clear
+    assert sum(found) >= 0.75 * len(found), [(row["seed"], t["name"], reported(row)) for row, t in clear]
+    assert sum(right(row, t) for row, t in clear) >= 0.5 * len(found)
+
+
+def test_what_has_no_name_is_given_none(rows):
+    wrong = [(row["seed"], reported(row)) for row in rows if row["kind"] == "unknown" and reported(row)]
+    assert len(wrong) <= sum(row["kind"] == "unknown" for row in rows) / 2, wrong
+
+
+def test_the_counting_itself():
+    """On made-up rows, so that the table can be trusted."""
+
+    def row(kind: str, hidden: str, verdict: str, causes: list[str], sets: list[list[str]]) -> Row:
+        truth = {"name": hidden, "clear": True, "change": [1.0], "share": 0.1}
+        return {"seed": 1, "kind": kind, "truths": [truth] if hidden else [], "verdict": verdict, "ranking": [],
+                "causes": [{"name": name} for name in causes], "ambiguous": sets, "accepted": []}  # fmt: skip
+
+    made = [
+        row("healthy", "", "none", [], []),
+        row("healthy", "", "cause", ["headwind"], []),
+        row("one", "headwind", "cause", ["headwind"], []),
+        row("one", "headwind", "cause", ["aero_drag_area", "headwind"], []),
+        row("one", "headwind", "none", [], []),
+        row("look-alike", "dragging_brake", "ambiguous", [], [["dragging_brake", "rolling_resistance"]]),
+        row("unknown", "resonance", "unknown", [], []),
+        row("unknown", "resonance", "ambiguous", [], [["headwind", "aero_drag_area"]]),
+    ]
+    lines = summary(made)
+    assert lines["false alarms on healthy rides (aim ≤ 5 %)"].startswith("1 of 2, 50 %")
+    assert lines["clear effects: top cause (aim ≥ 85 %)"].startswith("2 of 4, 50 %")
+    assert lines["clear effects: in the reported set (aim ≥ 95 %)"].startswith("3 of 4")
+    assert lines["clear effects: nothing found"].startswith("1 of 4")
+    assert lines["unknown effects: not given a wrong name (aim ≥ 80 %)"].startswith("1 of 2")
+    assert lines["cases with an effect: a name too many among the causes"].startswith("1 of 4")
+    assert interval(8, 10) == pytest.approx((0.490, 0.943), abs=1e-3)  # Wilson 1927; Brown, Cai & DasGupta 2001
