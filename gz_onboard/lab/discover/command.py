@@ -35,7 +35,7 @@ KEYS = {
     "ranking": "name, score of every candidate beside the causes named",
     "residuals": "per channel: mean, rms, autocorrelation, blocks, energy_share, range_share",
     "gain": "on rides held out: holdout, and per metric before, control (present parameters refitted), after, "
-    "ci95 (of control less after, over rides)",
+    "ci95 (of control less after, over rides); apart: whether these rides had no part in the choice either",
     "extended_model": "the vehicle file written, or null",
     "advice": "what to ride next",
     "notes": "what could not be used, and what was left out",

@@ -32,7 +32,7 @@ from gz_onboard.lab.discover.search import Search, evidence
 from gz_onboard.lab.discover.shapes import with_inflation
 from gz_onboard.lab.discover.state import State, initial, restore
 from gz_onboard.lab.discover.terms import FIXED, LOG, WEATHER
-from gz_onboard.lab.discover.verdict import reach
+from gz_onboard.lab.discover.verdict import about, reach
 from gz_onboard.physics.parameters import Parameters, Value, declared_parameters
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
@@ -192,7 +192,8 @@ def discover(
 ) -> Report:  # fmt: skip
     """What `rides` show that `vehicle` does not: shown, named, measured. See `Report`.
 
-    seed: of the draw of the rides that are held out. holdout: their names instead. workers: processes.
+    seed: of the bootstrap over rides held out. holdout: names of rides that only the gain is measured on, in no choice
+    and no fit; without any each ride in turn is left out of the fit. workers: processes.
     Raises InputError where no ride can be used.
     """
     say = progress or (lambda _: None)
@@ -211,13 +212,19 @@ def discover(
         found.append(ride)
     if not found:
         raise InputError("no ride can be used: " + "; ".join(notes or ["none given"]))
+    apart = [ride for ride in found if holdout and ride.name in holdout]
+    found = [ride for ride in found if not (holdout and ride.name in holdout)]
+    if not found:
+        raise InputError("every ride is held out: none is left to look into")
     say(f"{len(found)} rides, {len(state.names)} parameters")
     if not state.healthy:
         notes.append(NOTE)
         state = alone(state, found, lambda some, at: linearise_all(some, at, workers))
     report = reach(state, notes, say, lambda s: linearise_all(found, s, workers), coarse(state, found))
     say("gain on rides held out")
-    report.gain = measure_gain(report, seed, holdout)
+    assert report.at is not None
+    held = about(state, report.at, lambda s: linearise_all(apart, s, workers)) if apart else []
+    report.gain = measure_gain(report, seed, held)
     return report
 
 

@@ -14,16 +14,21 @@ from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.terms import STARTS
 
 
-def measure_gain(report: Report, seed: int, holdout: Sequence[str] | None) -> dict[str, Any]:
-    """Errors of rides that were not fitted, with `report`'s causes and without. Every ride is held out once if none
-    are named.
+def measure_gain(report: Report, seed: int, apart: Sequence[Linear] = ()) -> dict[str, Any]:
+    """Errors of rides that were not fitted, with `report`'s causes and without.
+
+    apart: rides that had no part in `report`, linearised where it is. Without any, each ride of the report is held out
+    in turn; the choice of the causes is then shared.
     """
-    state, lines, normals = report.state, report.lines, report.normals
+    state = report.state
     assert state is not None
+    lines = [*report.lines, *apart]
+    normals = [*report.normals, *(normal(line, state.noise) for line in apart)]
     if len(lines) < 2:
         return {"holdout": [], "note": "one ride: nothing to hold out"}
     names = [line.ride.name for line in lines]
-    folds = [[i for i, n in enumerate(names) if n in holdout]] if holdout else [[i] for i in range(len(lines))]
+    known = len(report.lines)
+    folds = [list(range(known, len(lines)))] if apart else [[i] for i in range(known)]
     rows: dict[str, list[tuple[float, float, float]]] = {}
     causes = [c for c in state.causes if c.name in {found.name for found in report.causes}]
     for fold in folds:
@@ -40,7 +45,7 @@ def measure_gain(report: Report, seed: int, holdout: Sequence[str] | None) -> di
             triple = [errors(lines[i], with_start(state, start, theta)) for theta in (state.mean, control, after)]
             for metric in triple[0]:
                 rows.setdefault(metric, []).append(tuple(t[metric] for t in triple))  # type: ignore[arg-type]
-    result: dict[str, Any] = {"holdout": [names[i] for fold in folds for i in fold]}
+    result: dict[str, Any] = {"holdout": [names[i] for fold in folds for i in fold], "apart": bool(apart)}
     rng = np.random.default_rng(seed)
     for metric, triples in rows.items():
         table = np.array(triples)

@@ -213,7 +213,7 @@ def _gain(report: Report) -> str:
         return f"<p>{html.escape(str(report.gain.get('note', 'nothing was held out')))}</p>"
     heads = ["error", "before", "control", "after", "gain over control, 95 % over rides"]
     held = ", ".join(map(html.escape, report.gain.get("holdout", [])))
-    text = "Each in turn was held out of the fit" if len(report.gain.get("holdout", [])) > 1 else "Held out"
+    text = "In no choice and no fit" if report.gain.get("apart") else "Each in turn was held out of the fit"
     return table(heads, rows) + (
         f'<p class="muted">{text}: {held}. Control: the parameters that the model has already, refitted on the other '
         "rides. After: the causes as well.</p>"

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from gz_onboard.lab.discover.constancy import Split
+from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, Normal
 from gz_onboard.lab.discover.state import State
 
@@ -68,6 +69,7 @@ class Report:
     constancy: list[Split] = field(default_factory=list)
     extended_model: str | None = None
     state: State | None = field(default=None, repr=False)
+    at: Array | None = field(default=None, repr=False)  # where the rides are linearised, in scales, (p,)
     lines: list[Linear] = field(default_factory=list, repr=False)
     normals: list[Normal] = field(default_factory=list, repr=False)
 

@@ -61,11 +61,7 @@ def reach(
 ) -> Report:  # fmt: skip
     """The verdict. linearised: the rides at a state. start (p,): where to linearise first, in scales."""
 
-    def about(offset: Array) -> list[Linear]:
-        moved = replace(state, values=state.unit_value(offset)) if np.any(offset) else state
-        return [line.seen_from(offset) for line in linearised(moved)]
-
-    lines = about(start)
+    lines = about(state, start, linearised)
     normals = [normal(line, state.noise) for line in lines]
     e = evidence(state, normals)
     causes = seen(state, e, notes)
@@ -87,7 +83,7 @@ def reach(
         for name in chosen:
             for i in search.place[name]:
                 offset[i] = kept(state, i, offset[i])
-        lines = about(offset)
+        lines = about(state, offset, linearised)
         normals = [normal(line, state.noise) for line in lines]
         e = evidence(state, normals)
         search = Search(state, e, causes, shares)
@@ -121,8 +117,15 @@ def reach(
     ranking = sorted(((name, round(score, 2)) for name, score in scores.items()), key=lambda pair: -pair[1])
     return Report(
         verdict, found, sets, unknown, ranking, sizes(lines), {}, advice(search, sets, unknown), notes,
-        isolability(search), limit, constancy=constancy, state=state, lines=list(lines), normals=normals,
+        isolability(search), limit, constancy=constancy, state=state, at=offset, lines=list(lines),
+        normals=normals,
     )  # fmt: skip
+
+
+def about(state: State, offset: Array, linearised: Callable[[State], list[Linear]]) -> list[Linear]:
+    """The rides linearised at `offset` (p,) in scales, their residuals as seen from the values of `state`."""
+    moved = replace(state, values=state.unit_value(offset)) if np.any(offset) else state
+    return [line.seen_from(offset) for line in linearised(moved)]
 
 
 def own_winds(

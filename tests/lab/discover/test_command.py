@@ -8,8 +8,12 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.cli import main
+from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.candidates import candidates
 from gz_onboard.lab.discover.command import KEYS
+from gz_onboard.lab.discover.engine import discover
+from gz_onboard.simulation.samples import read_samples
+from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS, ROOT
 
 RIDE = LOGS / "city_14C.blf"
@@ -95,3 +99,16 @@ def test_the_report_is_one_file_with_its_pictures(alone: Path):
     page = (alone / "out.html").read_text()
     assert page.count("data:image/png;base64,") >= 3
     assert 'src="http' not in page
+
+
+def test_rides_held_out_by_name_have_no_part_in_anything():
+    vehicle = read_vehicle("reference")
+    rides = [read_samples(LOGS / f"city_{name}.blf", vehicle) for name in ("14C", "34C")]
+    report = discover(vehicle, rides, holdout=["city_34C"])
+    assert [line.ride.name for line in report.lines] == ["city_14C"]
+    assert report.gain["holdout"] == ["city_34C"] and report.gain["apart"]
+    alone = discover(vehicle, rides[:1])
+    assert [c.name for c in report.causes] == [c.name for c in alone.causes]
+    assert report.ranking == alone.ranking
+    with pytest.raises(InputError, match="none is left"):
+        discover(vehicle, rides, holdout=["city_14C", "city_34C"])
