@@ -99,7 +99,8 @@ def backward(
         for name, term in vehicle.model.power(some, over(dt[part])).items():
             power[part] += term
             ledger[name] += float(np.sum(term * dt[part]))
-    return Energy(np.append(power, power[-1]), dict(ledger), float(power @ dt), float(middle @ dt))
+    # sums, not products of vectors: threads of the linear algebra would take longer to start than to add
+    return Energy(np.append(power, power[-1]), dict(ledger), float(np.sum(power * dt)), float(np.sum(middle * dt)))
 
 
 def _middle(values: ArrayLike) -> Any:
