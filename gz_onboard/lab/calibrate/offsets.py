@@ -24,6 +24,7 @@ LAGS = np.arange(-0.3, 0.31, 0.05)  # s: what one set of sensors may lag the oth
 MOVING, DRIVING = 0.3, 3.0  # rad/s and A of the motor: below is rest
 LEAST_REST = 20  # samples
 WINDOW = 2.0  # s: means over that tell gains apart from timing
+DRIFT_SD = 0.02  # A: of a current sensor's zero from day to day, the least that is believed
 GAIN_SD = 0.007  # of a current sensor of 1 % class
 
 
@@ -83,11 +84,12 @@ def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     p, result = vehicle.parameters, Result("offsets")
     own = np.array([p["inverter_loss_constant"] / pair.pack_voltage[pair.rest].mean() for pair in resting])
     apart = np.array([(pair.pack - pair.inverter - pair.auxiliary)[pair.rest].mean() for pair in resting])
+    # of a ride to come: what differs from ride to ride, the inverter's own loss, and the auxiliary sensor's share
     own_sd = p.sd("inverter_loss_constant") / float(resting[0].pack_voltage.mean())
     spread = float(np.std(apart - own, ddof=1)) if len(apart) > 1 else 0.05
     offset = float(np.mean(apart - own))
     result.parameters["pack_current_offset"] = Found(
-        offset, float(np.hypot(max(spread, 0.02), own_sd) + CURRENT_SD * 0.85), "A",
+        offset, float(np.hypot(max(spread, DRIFT_SD), own_sd) + CURRENT_SD * 0.85), "A",
         f"{len(resting)} rides at rest: pack less inverter less auxiliary is {apart.mean():+.3f} ± {spread:.3f} "
         f"A, {own.mean():.3f} A of it the inverter's own {p['inverter_loss_constant']:.1f} W",
     )  # fmt: skip

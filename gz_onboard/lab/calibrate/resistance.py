@@ -23,6 +23,7 @@ LEAST_STEP = 15.0  # A
 LEAST_STEPS = 20
 LEAST_SPAN = 10.0  # A: of current, for a line
 WARM = 20.0  # degC: below the cells' resistance is many times that of bars and fuse
+VOLTAGE_GAIN_SD = 1e-3  # of each voltage sensor: a volt of either's gain over the sag of the pack looks like resistance
 CELL_SHARE_SD = 0.05  # of the cells' resistance, from cell to cell and from table to step
 
 
@@ -31,12 +32,14 @@ def cable_resistance(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     result = Result("cable_resistance")
     currents: list[Array] = []
     volts: list[Array] = []
+    packs: list[Array] = []
     labels: list[Array] = []
     for k, ride in enumerate(rides):
         pair = read_pair(ride, vehicle)
         count = max(round(1.0 / float(np.median(np.diff(pair.time)))), 1)  # means of a second: timing counts less
         whole = len(pair.time) // count * count
-        for column, values in ((currents, pair.inverter), (volts, pair.pack_voltage - pair.inverter_voltage)):
+        apart = pair.pack_voltage - pair.inverter_voltage
+        for column, values in ((currents, pair.inverter), (volts, apart), (packs, pair.pack_voltage)):
             column.append(values[:whole].reshape(-1, count).mean(axis=1))
         labels.append(np.full(whole // count, k))
     if not currents:
@@ -61,9 +64,10 @@ def cable_resistance(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         score("voltage between pack and inverter", "V", v[~fitted], outside[~fitted], held_out=True,
               source="every second ride"),
     ]  # fmt: skip
-    # a volt of either sensor's gain would look like resistance: 0.1 % over the sag of the pack
+    sag = abs(linear(columns, np.concatenate(packs), groups=label if len(rides) > 2 else None)["cable_resistance"])
+    gains = 2**0.5 * VOLTAGE_GAIN_SD * sag
     result.parameters["cable_resistance"] = Found(
-        max(found["cable_resistance"], 0.0), float(np.hypot(found.sd("cable_resistance"), 2e-4)), "ohm",
+        max(found["cable_resistance"], 0.0), float(np.hypot(found.sd("cable_resistance"), gains)), "ohm",
         f"{source}; {found['offset']:+.3f} V at no current",
     )  # fmt: skip
     result.panels += _panels("Voltage between pack and inverter", i, v, model, "pack less inverter voltage [V]")

@@ -27,11 +27,14 @@ def ride(
     inverter_gain=1.0,
     own_loss=1.0,
     series=SERIES,
+    voltage_gains=(1.0, 1.0),
+    drift=0.0,
 ) -> Samples:
     """10 Hz: current in steps of 5 s, every third at rest with the brake on; all sensors noisy.
 
     inverter_gain, auxiliary_sign: what those current sensors make of a current. own_loss: of the inverter at rest, as a
-    share of what the vehicle file says.
+    share of what the vehicle file says. voltage_gains: what the sensors of pack and inverter make of a volt.
+    drift: of the zero of the pack's current sensor [A].
     """
     rng = np.random.default_rng(seed)
     time = np.arange(0, seconds, 0.1)
@@ -46,10 +49,10 @@ def ride(
     inside = 14 / 12 * cell + series
     voltage = source - inside * current
     columns = {
-        "pack_current": GAIN * current + OFFSET + CURRENT_NOISE * rng.normal(size=len(time)),
-        "pack_voltage": voltage + VOLTS_APART + VOLTAGE_NOISE * rng.normal(size=len(time)),
+        "pack_current": GAIN * current + OFFSET + drift + CURRENT_NOISE * rng.normal(size=len(time)),
+        "pack_voltage": voltage_gains[0] * voltage + VOLTS_APART + VOLTAGE_NOISE * rng.normal(size=len(time)),
         "inverter_current": inverter_gain * load + 0.3 * rng.normal(size=len(time)),
-        "inverter_voltage": voltage - CABLE * load + 0.04 * rng.normal(size=len(time)),
+        "inverter_voltage": voltage_gains[1] * (voltage - CABLE * load) + 0.04 * rng.normal(size=len(time)),
         "auxiliary_current": auxiliary_sign * power / voltage + 0.01 * rng.normal(size=len(time)),
         "motor_speed": np.where(load == 0, 0.0, 30.0),
         "motor_current": 1.5 * load,
