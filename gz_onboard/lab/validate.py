@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import os
 import signal
 import sys
@@ -45,6 +44,7 @@ from gz_onboard.simulation.route import read_route
 from gz_onboard.simulation.run import Command, Run, drive, follow, replay, road_table
 from gz_onboard.simulation.samples import read_facts
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Place, Road, Scooter
+from gz_onboard.simulation.telling import write_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 SUMMARY_VERSION = 1
@@ -365,7 +365,7 @@ def run(arguments: argparse.Namespace) -> int:
     if rides:
         _write_tables(arguments, rides, together)
     if arguments.json:
-        _write_json(arguments.json, {"version": SUMMARY_VERSION, "rides": rides, "pooled": together, "failed": failed})
+        write_json(arguments.json, {"version": SUMMARY_VERSION, "rides": rides, "pooled": together, "failed": failed})
     return 1 if failed or (arguments.gate and not all(ride["passed"] for ride in rides)) else 0
 
 
@@ -491,14 +491,3 @@ def ride_text(ride: dict[str, Any]) -> str:
                 f"rms {e['rms']:7.2f}, max {e['max']:7.2f}, mean {e['mean_error']:+7.2f} {e['unit']}{spread}"
             )
     return "\n".join([*lines, *(f"  {text}" for text in ride["missing"])])
-
-
-def _write_json(file: str, document: dict[str, Any]) -> None:
-    text = json.dumps(document, indent=1, ensure_ascii=False)
-    if file == "-":
-        print(text)
-        return
-    try:
-        Path(file).write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"--json {file}: cannot be written: {error.strerror}") from error

@@ -20,7 +20,7 @@ from gz_onboard.lab.discover.files import write_baseline, write_model
 from gz_onboard.lab.discover.limits import amount, limits, size, strange, unformed, unsettled, words
 from gz_onboard.lab.discover.parts import before_and_after, outstanding
 from gz_onboard.lab.discover.result import METRICS, SCHEMA, VERDICTS, Report
-from gz_onboard.lab.discover.verdict import sizes
+from gz_onboard.lab.discover.worth import sizes
 from gz_onboard.simulation.samples import Samples, read_samples
 from gz_onboard.simulation.telling import clock, explain_keys, write_json
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle

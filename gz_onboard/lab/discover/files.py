@@ -20,7 +20,7 @@ from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.limits import amount
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.state import Shape, State
-from gz_onboard.lab.discover.verdict import energy, power_of, share_of_time
+from gz_onboard.lab.discover.worth import energy, power_of, share_of_time
 from gz_onboard.physics.effect import QUANTITIES, Effect, known_effects
 from gz_onboard.vehicle import Vehicle
 

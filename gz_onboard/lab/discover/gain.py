@@ -12,6 +12,7 @@ from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed, normal
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.terms import STARTS
+from gz_onboard.lab.discover.worth import energy, power_of, share_of_time
 
 
 def measure_gain(report: Report, seed: int, apart: Sequence[Linear] = ()) -> dict[str, Any]:
@@ -80,8 +81,6 @@ def extended_mean(state: State, rest: Sequence[Normal], causes: Sequence[Any]) -
 
 def errors(line: Linear, theta: Array) -> dict[str, float]:
     """Of one ride with parameters `theta` (p,): rms power [W], energy per way [J/m], cell voltage [V], range [1]."""
-    from gz_onboard.lab.discover.verdict import energy, power_of, share_of_time
-
     more, square = 0.0, 0.0
     found: dict[str, float] = {}
     for name, table in line.tables.items():

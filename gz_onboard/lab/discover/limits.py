@@ -11,7 +11,8 @@ from gz_onboard.lab.discover.linear import normal
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.search import evidence
 from gz_onboard.lab.discover.terms import LOG
-from gz_onboard.lab.discover.verdict import energy, energy_share, own_value
+from gz_onboard.lab.discover.verdict import own_value
+from gz_onboard.lab.discover.worth import energy, energy_share
 
 RIDING = 5.0  # m/s
 MISSED = 0.05  # of the range

@@ -16,7 +16,7 @@ from gz_onboard.lab.discover.limits import amount, limits, size, words
 from gz_onboard.lab.discover.linear import Linear
 from gz_onboard.lab.discover.parts import QUANTITIES, Over, before_and_after, binned, edges, gathered, share_over
 from gz_onboard.lab.discover.result import METRICS, VERDICTS, Report
-from gz_onboard.lab.discover.verdict import sizes
+from gz_onboard.lab.discover.worth import sizes
 from gz_onboard.simulation.style import BLUE, GRID, INK, MUTED, ORANGE, headline, legend, new_figure, rule
 from gz_onboard.simulation.telling import clock
 

@@ -63,7 +63,6 @@ class State:
         default_factory=dict
     )  # of a cause's score on healthy rides left out, 1 if right
     shapes: dict[str, Shape] = field(default_factory=dict)  # what healthy rides show over quantities, by name
-    total: float = 0.0  # energy of the healthy rides per way [J/m]
 
     def index(self, names: Sequence[str]) -> list[int]:
         """Where `names` stand."""

@@ -10,29 +10,22 @@ import numpy as np
 from scipy.stats import t as student
 
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.channels import over_blocks
-from gz_onboard.lab.discover.constancy import RIDE, Split, splits
+from gz_onboard.lab.discover.constancy import splits
 from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, normal
 from gz_onboard.lab.discover.result import Cause, Report
 from gz_onboard.lab.discover.search import Evidence, Search, evidence, one_degree
-from gz_onboard.lab.discover.shapes import QUANTITIES, Curve, columns, names, shape_evidence
 from gz_onboard.lab.discover.state import State
-from gz_onboard.lab.discover.terms import LOG, stepped
+from gz_onboard.lab.discover.terms import LOG
+from gz_onboard.lab.discover.unknown import unexplained
+from gz_onboard.lab.discover.worth import energy_share, sizes
 
 FALSE_ALARMS = 0.05  # of sets of healthy rides, all candidates and curves together
 AGAIN = 5  # times at most that all is linearised about what was found: large changes are not linear
-LEFT = 0.1  # of what causes explain: a curve beside them that takes less is the bend of a large effect
-CURVE = 1.5  # a curve's evidence over that of a cause: there are many, and their knots are chosen by eye
-UNLIKE = 0.5  # of a cause's effect in a channel: a curve beside it that takes more is not the cause's bend
-RIVAL = 0.25  # of the evidence for the causes of its channel: a curve beside them that has more is no bend
-UNLIKE_LEFT = 0.004  # of what causes explain: less is not worth the doubt
-CLEAR = 4.0  # standard deviations of a curve's coefficient that counts
 DISCREPANCY = 0.05  # of a change, sd: the form of an effect is not exactly the real one's
 LUMPED = {"cell_voltage": 1, "voltage_timing": 1, "motor_temperature": 3, "inverter_temperature": 3,
           "cell_temperature": 3}  # fmt: skip
 """Channels whose model is a circuit or a network of lumps: by how much more than that they err, in shares of it."""
-BETTER = 15.0  # of chi-squared, each further knot taken off with 2, by which a curve in a cause's place beats it
 LEAST = 0.4  # of the threshold, by which a stand-in must explain something itself
 MARGIN = 6.0  # of chi-squared within which another cause explains as well: a likelihood ratio of 20
 
@@ -247,230 +240,6 @@ def own_value(state: State, name: str) -> float:
     return 0.0 if name in absent else float(state.vehicle.parameters[name])
 
 
-def power_of(table_name: str, line: Linear, values: Array) -> Array | None:
-    """What a residual of a channel is worth at the pack's terminals [W], over its blocks."""
-    table = line.tables[table_name]
-    real = values * table.unit
-    if table_name == "road_force":
-        return np.asarray(real * over_blocks(table.channel, line.ride.quantities["speed"])[table.used])
-    if table_name in ("inverter_power", "auxiliary"):
-        return np.asarray(real)
-    if table_name == "pack_balance" and "pack_voltage" in line.ride.signals:
-        return np.asarray(real * over_blocks(table.channel, line.ride.signals["pack_voltage"])[table.used])
-    return None
-
-
-def energy_share(state: State, lines: Sequence[Linear], change: Array) -> float:
-    """The part of the energy drawn that `change` (p,) of the parameters makes, over these rides."""
-    more = drawn = 0.0
-    for line in lines:
-        drawn += energy(line)
-        for name in line.tables:
-            power = power_of(name, line, -(line.tables[name].a @ change) * -1.0)
-            if power is not None and len(power):
-                more += float(np.mean(power)) * share_of_time(line, name)
-    return more / drawn if drawn else 0.0
-
-
-def energy(line: Linear) -> float:
-    """What the pack gave over the ride [J]."""
-    s = line.ride.signals
-    volts, amperes = (
-        ("pack_voltage", "pack_current") if "pack_current" in s else ("inverter_voltage", "inverter_current")
-    )
-    if amperes not in s or volts not in s:
-        return float(np.sum(np.abs(s["motor_current"] * line.ride.quantities["motor_speed"]))) * 0.045
-    return float(np.sum(s[volts] * s[amperes])) * 0.1
-
-
-def share_of_time(line: Linear, channel: str) -> float:
-    """The time [s] for which a channel's mean holds: the ride, or that part of it in which it moves."""
-    whole = len(line.ride.time) * 0.1
-    if channel == "road_force":
-        return float(np.mean(np.abs(line.ride.quantities["speed"]) > 2.0)) * whole
-    return whole
-
-
-def unexplained(
-    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str],
-    change: Array, constancy: Sequence[Split], limit: float,
-) -> dict[str, Any] | None:  # fmt: skip
-    """The curve that explains most beside the causes chosen, and which of them it `denies`, as they are none; None if
-    no curve is significant.
-
-    change (p,): of the parameters by the causes. A curve denies causes if it takes back, or adds, half or more of what
-    they do somewhere in a channel that names them, if it has a quarter of their evidence beside them, if it explains
-    much more than one of them in its place, or if `constancy` finds one unequal. What else was found must then stand
-    without what is denied.
-    """
-    index = search.index(chosen)
-    total = search.evidence.gain(index)
-    best: dict[str, Any] | None = None
-    for pair in names():
-        curve = shape_evidence(state, lines, normals, pair, index)
-        if curve is None:
-            continue
-        inflation = state.shapes[pair].inflation if pair in state.shapes else 1.0
-        score = one_degree(curve.chi2 / inflation, curve.k)
-        if score < CURVE * limit:
-            continue
-        channel = pair.partition(" over ")[0]
-        mine = [name for name in chosen if search.shares.get(name, {}).get(channel, 0.0) > 0.3]
-        theirs = sum(search.step([other for other in chosen if other != name], name) for name in mine)
-        unlike = unlike_causes(curve, inflation, *weight(state, lines, channel, change))
-        unlike = unlike or bool(mine and curve.chi2 / inflation > RIVAL * theirs)
-        if chosen and curve.chi2 < (UNLIKE_LEFT if unlike else LEFT) * total:
-            continue
-        if best is None or (unlike, score) > (bool(best["denies"]), best["score"]):
-            best = described(pair, curve, score) | {"denies": mine if unlike else []}
-    if best is None or not best["denies"]:
-        best = instead(state, search, lines, normals, chosen) or best
-    unequal = [s for s in constancy if s.unequal]
-    if unequal and (best is None or not best["denies"]):
-        worst = max(unequal, key=lambda s: s.chi2)
-        best = halves(state, lines, normals, worst) or of_rides(state, lines, change, worst, constancy)
-    if best is None:
-        return None
-    if best["denies"]:
-        denied = dict.fromkeys([*best["denies"], *(s.cause for s in unequal)])
-        left = [name for name in chosen if name not in denied]  # what was found beside it must stand without it
-        least = max(limit, LEFT * best["chi2"])
-        denied |= dict.fromkeys(n for n in left if search.step([m for m in left if m != n], n) < least)
-        best["denies"] = list(denied)
-    if "share" not in best:
-        best["share"] = shape_share(lines, best)
-    return best
-
-
-def instead(
-    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str]
-) -> dict[str, Any] | None:
-    """The curve that explains much better than one of the causes chosen what that one explains, in its own channel."""
-    best: dict[str, Any] | None = None
-    most = BETTER
-    for name in chosen:
-        rest = [other for other in chosen if other != name]
-        own = search.step(rest, name)
-        for pair in names():
-            channel = pair.partition(" over ")[0]
-            if search.shares.get(name, {}).get(channel, 0.0) < 0.3:
-                continue
-            curve = shape_evidence(state, lines, normals, pair, search.index(rest))
-            if curve is None:
-                continue
-            inflation = state.shapes[pair].inflation if pair in state.shapes else 1.0
-            ahead = curve.chi2 / inflation - 2 * (curve.k - 1) - own * max(state.inflation.get(name, 1.0), 1.0)
-            if ahead > max(most, UNLIKE_LEFT * own):
-                most = ahead
-                best = described(pair, curve, one_degree(curve.chi2 / inflation, curve.k)) | {"denies": [name]}
-    return best
-
-
-def of_rides(
-    state: State, lines: Sequence[Linear], change: Array, worst: Split, constancy: Sequence[Split]
-) -> dict[str, Any]:
-    """What no cause is that acts in some rides and not in others: by how much more or less in each."""
-    channels = {name for line in lines for name in line.tables}
-    channel = max(channels, key=lambda name: weight(state, lines, name, change)[1])
-    mine = [s for s in constancy if s.cause == worst.cause and s.quantity.startswith(RIDE)]
-    rows = [[float(i), s.ratio, abs(s.ratio) / max(s.chi2, 1e-9) ** 0.5] for i, s in enumerate(mine)]
-    return {"channel": channel, "quantity": "ride", "unit": "", "score": worst.chi2, "chi2": worst.chi2, "curve": rows,
-            "denies": [worst.cause], "share": energy_share(state, lines, change)}  # fmt: skip
-
-
-def described(pair: str, curve: Curve, score: float) -> dict[str, Any]:
-    """The curve for the report."""
-    channel, _, quantity = pair.partition(" over ")
-    knots, unit = QUANTITIES[quantity]
-    rows = zip(knots, curve.values.tolist(), curve.sd.tolist(), strict=True)
-    return {"channel": channel, "quantity": quantity, "unit": unit, "score": score, "chi2": curve.chi2,
-            "curve": [list(row) for row in rows]}  # fmt: skip
-
-
-def unlike_causes(curve: Curve, inflation: float, size: float, share: float) -> bool:
-    """Whether what is left beside the causes, of `size` in this channel and `share` of the evidence for them, is no
-    mere bend of what they do.
-    """
-    value, sd = curve.contrasts()
-    certain = (np.abs(value) > CLEAR * sd * inflation**0.5) & (curve.weights > 0.02)
-    return bool(share > 0.3 and size > 0 and np.any(np.abs(value)[certain] > UNLIKE * size))
-
-
-def weight(state: State, lines: Sequence[Linear], channel: str, change: Array) -> tuple[float, float]:
-    """(what `change` (p,) of the parameters makes in `channel`, rms where it acts [unit]; the channel's share of the
-    evidence for it).
-    """
-    parts, here, everywhere = [np.zeros(1)], 0.0, 0.0
-    for line in lines:
-        for name, table in line.tables.items():
-            effect = table.a @ change
-            strength = float(np.sum((effect / np.hypot(*state.noise[name][:2])) ** 2))
-            everywhere += strength
-            if name == channel:
-                here += strength
-                parts.append(np.abs(effect * table.unit))
-    effect = np.concatenate(parts)
-    acting = effect[effect > 0.1 * effect.max()]
-    if effect.max() < 1e-9 or not len(acting):
-        return 0.0, 0.0
-    return float(np.sqrt(np.mean(acting**2))), here / everywhere
-
-
-def halves(state: State, lines: Sequence[Linear], normals: Sequence[Any], split: Split) -> dict[str, Any] | None:
-    """The curve over the quantity of `split`, with no cause named, in the channel where it has most to say."""
-    best: dict[str, Any] | None = None
-    for pair in names():
-        if not pair.endswith(f" over {split.quantity}"):
-            continue
-        curve = shape_evidence(state, lines, normals, pair, [])
-        if curve is None:
-            continue
-        score = one_degree(curve.chi2 / (state.shapes[pair].inflation if pair in state.shapes else 1.0), curve.k)
-        if best is None or score > best["score"]:
-            best = described(pair, curve, score) | {"denies": [split.cause]}
-    return best
-
-
-def shape_share(lines: Sequence[Linear], shape: dict[str, Any]) -> float:
-    """The part of the energy drawn that the curve takes."""
-
-    more = drawn = 0.0
-    values = np.array([row[1] for row in shape["curve"]])
-    for line in lines:
-        drawn += energy(line)
-        table = line.tables.get(shape["channel"])
-        if table is None:
-            continue
-        c = columns(line.ride, shape["quantity"], table)
-        if c is None:
-            continue
-        power = power_of(shape["channel"], line, c @ values / table.unit)
-        if power is not None and len(power):
-            more += float(np.mean(power)) * share_of_time(line, shape["channel"])
-    return more / drawn if drawn else 0.0
-
-
-def sizes(lines: Sequence[Linear]) -> dict[str, dict[str, float]]:
-    """Of each channel's residual: mean, rms, correlation of neighbours, share of the energy."""
-    result: dict[str, dict[str, float]] = {}
-    drawn = sum(energy(line) for line in lines)
-    for name in sorted({name for line in lines for name in line.tables}):
-        tables = [(line, line.tables[name]) for line in lines if name in line.tables]
-        y = np.concatenate([table.y for _, table in tables])
-        pairs = [(table.y[1:], table.y[:-1]) for _, table in tables]
-        late, early = (np.concatenate(side) for side in zip(*pairs, strict=True))
-        correlation = float(np.corrcoef(late, early)[0, 1]) if np.std(late) > 0 and np.std(early) > 0 else 0.0
-        powers = [power_of(name, line, table.y) for line, table in tables]
-        more = sum(float(np.mean(w)) * share_of_time(line, name)
-                   for w, (line, _) in zip(powers, tables, strict=True) if w is not None and len(w))  # fmt: skip
-        share = more / drawn if drawn else 0.0
-        result[name] = {
-            "mean": float(y.mean()), "rms": float(np.sqrt(np.mean(y**2))), "autocorrelation": correlation,
-            "blocks": len(y), "energy_share": share, "range_share": -share / (1 + share) if share > -1 else 0.0,
-        }  # fmt: skip
-    return result
-
-
 def isolability(search: Search) -> dict[str, Any]:
     """What could be told apart at all. signatures: of each candidate the channels that depend on it (Krysander & Frisk
     2008). same_signature: those that only the form of what they do separates, no matter how much is measured.
@@ -511,4 +280,4 @@ def advice(search: Search, sets: Sequence[Sequence[str]], unknown: dict[str, Any
     return lines
 
 
-__all__ = ["reach", "stepped", "threshold"]
+__all__ = ["about", "own_value", "reach", "threshold"]
