@@ -18,7 +18,7 @@ import can
 import pytest
 
 from gz_onboard.bus.logs import read_frames, read_samples
-from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame
+from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame, State
 from tests.support import LOGS, range_database
 
 COASTDOWN = LOGS / "coastdown.blf"
@@ -140,9 +140,10 @@ class Running:
 
 
 class Listener:
-    """Every range frame on vcan0, as anyone on the bus sees it, with the kernel's time."""
+    """Every range frame on a vcan, as anyone on the bus sees it, with the kernel's time."""
 
-    def __init__(self) -> None:
+    def __init__(self, channel: str = "vcan0") -> None:
+        self.channel = channel
         self.messages: list[can.Message] = []
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._listen)
@@ -160,7 +161,7 @@ class Listener:
         filters = [can.typechecking.CanFilter(can_id=i, can_mask=0x7FF) for i in identifiers]
         while not self._stopping.is_set():
             try:
-                with can.Bus(interface="socketcan", channel="vcan0", can_filters=filters) as bus:
+                with can.Bus(interface="socketcan", channel=self.channel, can_filters=filters) as bus:
                     while not self._stopping.is_set():
                         message = bus.recv(0.2)
                         if message is not None:
@@ -185,6 +186,15 @@ class Listener:
             if m.arbitration_id == wanted.frame_id
         ]
 
+    def wait_for_valid(self, count: float, seconds: float = 60.0) -> None:
+        """Until it has heard this many valid estimates; those before the first frame of a ride hold no range."""
+
+        def enough() -> bool:
+            told = [row["RANGE_EstimateState"] for row in self.decoded("RANGE_Estimate")]
+            return told.count(State.VALID) >= count
+
+        wait_for(enough, seconds, f"{count:g} valid estimates on {self.channel}")
+
     def wait_for_new(self, name: str, seconds: float = 10.0, **values: float) -> dict[str, Any]:
         """The next frame of a message, from now on, that has these values."""
         begin = len(self.messages)
@@ -200,7 +210,7 @@ class Listener:
                     if all(found[key] == value for key, value in values.items()):
                         return {"time": m.timestamp, **found}
             time.sleep(0.05)
-        pytest.fail(f"no {name} {values} on vcan0 within {seconds:g} s")
+        pytest.fail(f"no {name} {values} on {self.channel} within {seconds:g} s")
 
 
 def number(text: str, pattern: str) -> float:

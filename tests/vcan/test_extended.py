@@ -9,7 +9,7 @@ import pytest
 
 from gz_onboard.vehicle import OWN, read_vehicle
 from tests.support import LOGS, ROOT
-from tests.vcan.support import Listener, Running, wait_for
+from tests.vcan.support import Listener, Running
 
 CITY = LOGS / "city_14C.blf"
 SECONDS = 12.0
@@ -40,11 +40,12 @@ def extended(folder: Path) -> Path:
 @pytest.fixture
 def pair(running: Running, tmp_path: Path):
     """The extended daemon on vcan0 and the base one on vcan1, the same ride on both."""
-    with Listener() as listener:
+    with Listener() as listener, Listener("vcan1") as other:
         more = running.daemon("--vehicle", str(extended(tmp_path)), name="extended")
         base = running.daemon(channels=("vcan1",), name="base")
         replays = [running.replay(CITY, channel=channel) for channel in ("vcan0", "vcan1")]
-        wait_for(lambda: len(listener.decoded("RANGE_Estimate")) >= SECONDS, 60, "range frames")
+        listener.wait_for_valid(SECONDS)
+        other.wait_for_valid(SECONDS)
         for replay in replays:
             replay.terminate()
             replay.wait(10)
@@ -80,7 +81,7 @@ def test_the_file_that_discover_wrote_runs_as_it_is(running: Running):
     with Listener() as listener:
         daemon = running.daemon("--vehicle", str(DISCOVERED), name="discovered")
         replay = running.replay(CITY, channel="vcan0")
-        wait_for(lambda: len(listener.decoded("RANGE_Estimate")) >= SECONDS / 2, 60, "range frames")
+        listener.wait_for_valid(SECONDS / 2)
         replay.terminate()
         replay.wait(10)
         assert "dropped 0" in daemon.stop()
