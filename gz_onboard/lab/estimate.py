@@ -10,17 +10,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import functools
-import os
-import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from math import sqrt
-from multiprocessing import Value
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +26,7 @@ from gz_onboard.bus.recorder import LogFile
 from gz_onboard.errors import InputError
 from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log, reason_words
+from gz_onboard.lab.processes import Progress, over_rides, progress_bar
 from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, reason_names
 from gz_onboard.simulation.telling import clock, explain_keys, number, times, write_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -78,8 +74,6 @@ KEYS = {
 _GAP_NS = 2_000_000_000  # a longer pause between two frames is ridden through in steps
 _PAUSE_NS = 30_000_000_000  # beyond this the recording was stopped, and nothing is estimated meanwhile
 _CONFIRM = 3  # fewer frames than this do not set the time
-
-Progress = Callable[[int], None]
 
 
 @dataclass(frozen=True)
@@ -356,10 +350,10 @@ def run(arguments: argparse.Namespace) -> int:
     _vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
     rides: list[dict[str, Any]] = []
     failed: list[dict[str, str]] = []
-    with _bar(tasks) as (progress, say):
+    with progress_bar(lambda: _frames(tasks), unit=" frames", unit_scale=True) as (progress, say):
         for task, result in _results(tasks, arguments.jobs, progress):
-            if isinstance(result, str):
-                failed.append({"file": str(task.path), "error": result})
+            if isinstance(result, InputError):
+                failed.append({"file": str(task.path), "error": str(result)})
                 say(f"gz-onboard estimate: {result}", sys.stderr)
                 continue
             rides.append(result)
@@ -413,74 +407,23 @@ def _stem(path: Path) -> str:
 
 def _results(
     tasks: Sequence[Task], jobs: int | None, progress: Progress
-) -> Iterator[tuple[Task, dict[str, Any] | str]]:
+) -> Iterator[tuple[Task, dict[str, Any] | InputError]]:
     """Each task with its summary or its error, in order."""
-    jobs = min(jobs or len(os.sched_getaffinity(0)), len(tasks))
-    if jobs == 1:
-        for task in tasks:
-            yield task, _attempt(task, progress)
-        return
-    done = Value("q")
     try:
-        with ProcessPoolExecutor(jobs, initializer=_begin, initargs=(done,)) as pool:
-            futures = [pool.submit(_attempt, task) for task in tasks]
-            told = 0
-            for task, future in zip(tasks, futures, strict=True):
-                while not future.done():
-                    wait([future], 0.2)
-                    now = int(done.value)
-                    progress(now - told)
-                    told = now
-                yield task, _result(task, future)
+        yield from over_rides(estimate_log, tasks, jobs, progress)
     finally:
         for task in tasks:  # of processes that were stopped
-            task.part.unlink(missing_ok=True)
-
-
-def _result(task: Task, future: Future[dict[str, Any] | str]) -> dict[str, Any] | str:
-    try:
-        return future.result()
-    except BrokenProcessPool:
-        return f"{task.path}: the process was killed; is there enough memory? Try --jobs 1"
-
-
-_done: Any = None  # frames estimated by all processes of the pool
-
-
-def _begin(done: Any) -> None:
-    """In each process of the pool: Ctrl-C ends it without a word; the parent process tells."""
-    global _done  # noqa: PLW0603 - the only way into a process of the pool
-    _done = done
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def _count(frames: int) -> None:
-    with _done.get_lock():
-        _done.value += frames
-
-
-def _attempt(task: Task, progress: Progress = _count) -> dict[str, Any] | str:
-    try:
-        return estimate_log(task, progress)
-    except InputError as error:
-        return str(error)
+            with contextlib.suppress(OSError):  # no such folder; why was told
+                task.part.unlink(missing_ok=True)
 
 
 # --- what a person sees -------------------------------------------------------------------------------------------
 
 
-@contextlib.contextmanager
-def _bar(tasks: Sequence[Task]) -> Iterator[tuple[Progress, Callable[[str, Any], None]]]:
-    """(what counts frames, what prints a text to a stream); a progress bar where standard error is a terminal."""
-    if not sys.stderr.isatty():
-        yield lambda _: None, lambda text, stream: print(text, file=stream, flush=True)
-        return
-    from tqdm import tqdm
-
+def _frames(tasks: Sequence[Task]) -> int | None:
+    """About how many frames all the logs hold; None if that of one is unknown."""
     sizes = [_expected(task.path) for task in tasks]
-    total = sum(size for size in sizes if size) if all(sizes) else None
-    with tqdm(total=total, unit=" frames", unit_scale=True, file=sys.stderr, leave=False, mininterval=0.2) as bar:
-        yield bar.update, lambda text, stream: tqdm.write(text, file=stream)
+    return sum(size for size in sizes if size) if all(sizes) else None
 
 
 def _expected(path: Path) -> int | None:

@@ -10,22 +10,17 @@ also move the hills.
 from __future__ import annotations
 
 import argparse
-import contextlib
-import os
-import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Sequence
 from dataclasses import dataclass
-from multiprocessing import Value
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from gz_onboard.errors import InputError
+from gz_onboard.lab.processes import Progress, over_rides, progress_bar
 from gz_onboard.lab.validate_components import Component, components
 from gz_onboard.lab.validate_score import (
     CHANNELS,
@@ -96,15 +91,11 @@ class Task:
             return 1
 
 
-Progress = Callable[[float], None]
-"""Is told how many bytes' worth of work was done."""
-
-
 # --- one ride -----------------------------------------------------------------------------------------------------
 
 
 def validate_ride(task: Task, progress: Progress = lambda _: None) -> dict[str, Any]:
-    """The entry of one ride: see `KEYS`. Raises InputError."""
+    """The entry of one ride: see `KEYS`; `progress` is told bytes of the log. Raises InputError."""
     facts = read_facts(task.path.parent / "rides.json").get(task.name, {})
     noted = facts.get("rider_mass_kg")
     payload = task.payload if task.payload is not None else (float(noted) if isinstance(noted, int | float) else None)
@@ -352,10 +343,11 @@ def run(arguments: argparse.Namespace) -> int:
         arguments.output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"--output {arguments.output}: cannot be written: {error.strerror}") from error
-    with _bar(tasks) as (progress, say):
-        for task, result in _results(tasks, arguments.jobs, progress):
-            if isinstance(result, str):
-                failed.append({"file": str(task.path), "error": result})
+    form = "{percentage:3.0f}%|{bar}| {elapsed} < {remaining}"
+    with progress_bar(lambda: sum(task.size for task in tasks), bar_format=form) as (progress, say):
+        for task, result in over_rides(validate_ride, tasks, arguments.jobs, progress):
+            if isinstance(result, InputError):
+                failed.append({"file": str(task.path), "error": str(result)})
                 say(f"gz-onboard validate: {result}", sys.stderr)
                 continue
             rides.append(result)
@@ -405,67 +397,6 @@ def _tasks(arguments: argparse.Namespace) -> list[Task]:
              None if arguments.no_plot else arguments.output / f"{stem}.validation.png")
         for path, name, stem in zip(paths, names, stems, strict=True)
     ]  # fmt: skip
-
-
-_done: Any = None  # work done by all processes of the pool
-
-
-def _begin(done: Any) -> None:
-    """In each process of the pool: Ctrl-C ends it without a word; the parent process tells."""
-    global _done  # noqa: PLW0603 - the only way into a process of the pool
-    _done = done
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-def _count(work: float) -> None:
-    with _done.get_lock():
-        _done.value += work
-
-
-def _attempt(task: Task, progress: Progress = _count) -> dict[str, Any] | str:
-    try:
-        return validate_ride(task, progress)
-    except InputError as error:
-        return str(error)
-
-
-def _results(
-    tasks: Sequence[Task], jobs: int | None, progress: Progress
-) -> Iterator[tuple[Task, dict[str, Any] | str]]:
-    """Each task with its entry or its error, in order."""
-    jobs = min(jobs or len(os.sched_getaffinity(0)), len(tasks))
-    if jobs == 1:
-        for task in tasks:
-            yield task, _attempt(task, progress)
-        return
-    done = Value("d")
-    with ProcessPoolExecutor(jobs, initializer=_begin, initargs=(done,)) as executor:
-        futures = [executor.submit(_attempt, task) for task in tasks]
-        told = 0.0
-        for task, future in zip(tasks, futures, strict=True):
-            while not future.done():
-                wait([future], 0.2)
-                now = float(done.value)
-                progress(now - told)
-                told = now
-            try:
-                yield task, future.result()
-            except BrokenProcessPool:
-                yield task, f"{task.path}: the process was killed; is there enough memory? Try --jobs 1"
-
-
-@contextlib.contextmanager
-def _bar(tasks: Sequence[Task]) -> Iterator[tuple[Progress, Callable[[str, Any], None]]]:
-    """(what counts the work, what prints a text to a stream); a progress bar where standard error is a terminal."""
-    if not sys.stderr.isatty():
-        yield lambda _: None, lambda text, stream: print(text, file=stream, flush=True)
-        return
-    from tqdm import tqdm
-
-    total = sum(task.size for task in tasks)
-    form = "{percentage:3.0f}%|{bar}| {elapsed} < {remaining}"
-    with tqdm(total=total, bar_format=form, file=sys.stderr, leave=False, mininterval=0.2) as bar:
-        yield bar.update, lambda text, stream: tqdm.write(text, file=stream)
 
 
 def ride_text(ride: dict[str, Any]) -> str:

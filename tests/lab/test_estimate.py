@@ -242,7 +242,7 @@ def test_no_jump_of_the_clock_stops_it(jumps, size):
     for place, jump, length in jumps:
         moved[place : place + length] = [(t + jump, i, d, c) for t, i, d, c in moved[place : place + length]]
     made: list[Estimate] = []
-    counted: list[int] = []
+    counted: list[float] = []
     pipeline = Pipeline(REFERENCE, observer=made.append)
     estimate.feed(pipeline, [moved[i : i + size] for i in range(0, len(moved), size)], counted.append)
     assert sum(counted) == len(moved) == pipeline.codec.received
@@ -260,7 +260,7 @@ def test_progress_is_told_from_all_processes(tmp_path, frames, monkeypatch):
     logs = [candump(tmp_path / f"{n}.log", frames[:3000]) for n in range(3)]
     tasks = [estimate.Task(log, tmp_path / log.stem, "reference", plot=False) for log in logs]
     for jobs in 1, 2:
-        told: list[int] = []
+        told: list[float] = []
         results = list(estimate._results(tasks, jobs, told.append))
         assert all(isinstance(result, dict) for _, result in results)
         assert sum(told) <= 9000

@@ -7,8 +7,7 @@ import os
 import sys
 import textwrap
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gz_onboard.bus.logs import log_suffix
@@ -21,6 +20,7 @@ from gz_onboard.lab.discover.limits import amount, limits, size, strange, unform
 from gz_onboard.lab.discover.parts import before_and_after, outstanding
 from gz_onboard.lab.discover.result import METRICS, SCHEMA, VERDICTS, Report
 from gz_onboard.lab.discover.worth import sizes
+from gz_onboard.lab.processes import Progress, over_rides
 from gz_onboard.simulation.samples import Samples, read_samples
 from gz_onboard.simulation.telling import clock, explain_keys, write_json
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
@@ -188,14 +188,19 @@ def stem(log: Path) -> str:
     return Path(log.name.removesuffix(".gz")).stem
 
 
-def _read(job: tuple[Path, str, float | None]) -> Samples | str:
-    log, name, payload = job
-    try:
-        samples = read_samples(log, read_vehicle(name))
-    except InputError as error:
-        return str(error)
-    if payload is not None and samples.rider_mass is None:
-        samples = replace(samples, facts={**samples.facts, "rider_mass_kg": payload})
+@dataclass(frozen=True)
+class _Reading:
+    """A log to be read."""
+
+    path: Path
+    vehicle: str
+    payload: float | None  # kg, where none is noted
+
+
+def _read(task: _Reading, _: Progress) -> Samples:
+    samples = read_samples(task.path, read_vehicle(task.vehicle))
+    if task.payload is not None and samples.rider_mass is None:
+        samples = replace(samples, facts={**samples.facts, "rider_mass_kg": task.payload})
     return samples
 
 
@@ -203,21 +208,16 @@ def read_rides(logs: Sequence[Path], arguments: argparse.Namespace) -> tuple[lis
     """The rides, and why a log is none. InputError if no log is one."""
     from tqdm import tqdm
 
-    jobs = [(log, arguments.vehicle, arguments.payload) for log in logs]
-    bar = tqdm(total=len(jobs), desc="reading", unit=" rides", leave=False, disable=arguments.quiet or None)
-    found: list[Samples | str] = []
-    with bar:
-        if arguments.workers < 2 or len(jobs) < 2:
-            for job in jobs:
-                found.append(_read(job))
-                bar.update()
-        else:
-            with ProcessPoolExecutor(arguments.workers) as pool:
-                for samples in pool.map(_read, jobs):
-                    found.append(samples)
-                    bar.update()
-    rides = [ride for ride in found if isinstance(ride, Samples)]
-    refused = [ride for ride in found if isinstance(ride, str)]
+    tasks = [_Reading(log, arguments.vehicle, arguments.payload) for log in logs]
+    rides: list[Samples] = []
+    refused: list[str] = []
+    with tqdm(total=len(tasks), desc="reading", unit=" rides", leave=False, disable=arguments.quiet or None) as bar:
+        for _, result in over_rides(_read, tasks, max(arguments.workers, 1), option="--workers"):
+            if isinstance(result, InputError):
+                refused.append(str(result))
+            else:
+                rides.append(result)
+            bar.update()
     if not rides:
         raise InputError("; ".join(refused))
     return rides, refused
