@@ -30,6 +30,7 @@ from gz_onboard.lab.calibrate import (
 )
 from gz_onboard.lab.calibrate import coastdown as coasting
 from gz_onboard.lab.calibrate.cell_data import cell_test
+from gz_onboard.lab.calibrate.coastdown_run import samples as coastdown_samples
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.manifest import Option, Slot, Step, check_count
 from gz_onboard.lab.calibrate.result import Array, Curve, Found, Panel, Result, Trace
@@ -186,7 +187,7 @@ def _cooling_runs(given: Given, slot: str) -> list[cooling.Run]:
 
 
 def _coastdown(given: Given) -> Result:
-    runs = given.rides.get("data", []) + [coasting.samples(table) for table in given.tables.get("data", [])]
+    runs = given.rides.get("data", []) + [coastdown_samples(table) for table in given.tables.get("data", [])]
     return coasting.calibrate(runs, given.vehicle, wind_sd=given.number("wind_sd"), slope_sd=given.number("slope_sd"))
 
 

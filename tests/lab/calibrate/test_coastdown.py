@@ -13,7 +13,9 @@ import pytest
 
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.coastdown import NAMES, calibrate, coast, directions, samples
+from gz_onboard.lab.calibrate.coastdown import calibrate
+from gz_onboard.lab.calibrate.coastdown_run import coast, directions, samples
+from gz_onboard.lab.calibrate.road_load import NAMES
 from gz_onboard.lab.calibrate.table import Table, read_table
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model

@@ -1,0 +1,248 @@
+"""Road load fitted to coast-downs: generalised least squares, all runs at once.
+
+What the fit leaves over has two parts, both found by maximum likelihood: gusts, whose force grows with speed and lasts
+some seconds, and noise of the speed, which two neighbouring spans share with opposite signs. Without that, samples
+would count as independent and the standard deviations would be too small (Kariya & Kurata 2004).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from math import sqrt
+
+import numpy as np
+from scipy.linalg import cholesky, solve_triangular
+from scipy.optimize import minimize
+
+from gz_onboard.lab.calibrate.coastdown_run import SPAN, Coast
+from gz_onboard.lab.calibrate.fit import Solution, linear
+from gz_onboard.lab.calibrate.result import Array
+from gz_onboard.lab.calibrate.road_load import NAMES, RoadLoad
+from gz_onboard.physics.effect import Port
+from gz_onboard.physics.model import air_density
+from gz_onboard.vehicle import Vehicle
+
+SPEED_PRIOR = 1e-3  # s/m: no tyre's rolling resistance grows faster (SAE J2452)
+_ENTERED_MASS_SD = 1.0  # kg: of a rider who was weighed, with clothes
+_DENSITY_SD = 0.015  # relative: of weather's pressure and of the thermometer
+_STEP = {"rolling_resistance_constant": 1e-4, "rolling_resistance_speed": 1e-5, "drag_area": 1e-3, "slope": 1e-5}
+
+
+@dataclass(frozen=True)
+class Noise:
+    """What no parameter explains: speed noise at the ends of a span [m/s]; gusts [m/s], lasting [s]."""
+
+    speed: float
+    gust: float
+    lasting: float
+
+
+@dataclass(frozen=True)
+class RoadFit:
+    """A fit of all runs: its solution over `NAMES` (but for those held), ``slope`` and each run's ``wind NAME``."""
+
+    solution: Solution
+    noise: Noise
+    held: dict[str, float]
+
+    def value(self, name: str) -> float:
+        """Of a parameter, fitted or held."""
+        return self.held[name] if name in self.held else self.solution[name]
+
+    def values(self) -> dict[str, float]:
+        """All, held ones too."""
+        return dict(zip(self.solution.names, self.solution.value.tolist(), strict=True)) | self.held
+
+    def force(self, vehicle: Vehicle) -> RoadLoad:
+        """The force with these parameters."""
+        return RoadLoad(vehicle, {name: self.value(name) for name in NAMES})
+
+
+def fit_road(
+    runs: Sequence[Coast],
+    vehicle: Vehicle,
+    held: Mapping[str, float],
+    wind_sd: float,
+    slope_sd: float,
+    noise: Noise | None = None,
+    start: RoadFit | None = None,
+) -> RoadFit:
+    """All runs at once: Gauss-Newton in the parameters and, unless given, maximum likelihood of the noise.
+
+    start: from there in one step, linear about it.
+    """
+    winds = [f"wind {run.name}" for run in runs]
+    names = [*(name for name in NAMES if name not in held), "slope", *winds]
+    prior = {"slope": (0.0, slope_sd), **dict.fromkeys(winds, (0.0, wind_sd))}
+    if "rolling_resistance_speed" in names:
+        prior["rolling_resistance_speed"] = (0.0, SPEED_PRIOR)
+    value = {"rolling_resistance_constant": 0.012, "rolling_resistance_speed": 0.0, "drag_area": 0.5}
+    value |= dict.fromkeys(("slope", *winds), 0.0) | (start.values() if start else {}) | dict(held)
+    known, solution = noise, None
+    for step in range(1 if start else 4):
+        now = known or Noise(0.02, 0.5, 5.0)
+        columns, left = _linearised(runs, vehicle, value, names, now.gust)
+        if noise is None and step == 1:
+            known = now = _likely(runs, vehicle, value, columns, left, names, prior, now)
+        whitened, target = _whiten(runs, value, now, columns, left, names, value)
+        solution = linear(whitened, target, 1.0, prior=prior)
+        value |= {name: solution[name] for name in names}
+    assert solution
+    return RoadFit(solution, known or Noise(0.02, 0.5, 5.0), dict(held))
+
+
+def _linearised(
+    runs: Sequence[Coast], vehicle: Vehicle, value: Mapping[str, float], names: Sequence[str], gust: float
+) -> tuple[dict[str, list[Array]], list[Array]]:
+    """Derivative of each run's deceleration by each of `names`, and what is measured over what is modelled.
+
+    Gusts of `gust` [m/s] add their mean square to that of the flow.
+    """
+    here = RoadLoad(vehicle, {name: value[name] for name in NAMES})
+    moved = {name: RoadLoad(vehicle, {n: value[n] + (_STEP[n] if n == name else 0.0) for n in NAMES})
+             for name in names if name in NAMES}  # fmt: skip
+    columns: dict[str, list[Array]] = {name: [] for name in names}
+    left = []
+    for run in runs:
+        v, slope, wind = run.middle, value["slope"], value[f"wind {run.name}"]
+        base = here.slowing(v, run, slope, wind)
+        gusty = 0.5 * air_density(run.temperature, run.altitude) * value["drag_area"] * gust**2 / run.mass
+        left.append(run.slowing - base - gusty)
+        for name in names:
+            if name in NAMES:
+                column = (moved[name].slowing(v, run, slope, wind) - base) / _STEP[name]
+            elif name == "slope":
+                column = (here.slowing(v, run, slope + _STEP["slope"], wind) - base) / _STEP["slope"]
+            elif name == f"wind {run.name}":
+                column = (here.slowing(v, run, slope, wind + 1e-3) - here.slowing(v, run, slope, wind - 1e-3)) / 2e-3
+            else:
+                column = np.zeros(len(v))
+            columns[name].append(np.broadcast_to(column, v.shape))
+    return columns, left
+
+
+def _covariance(run: Coast, drag_area: float, noise: Noise) -> Array:
+    """Of the deceleration of the spans: gusts that last, and speed noise that neighbouring spans share."""
+    n, dt = len(run.middle), SPAN
+    at = (run.time[1:] + run.time[:-1]) / 2
+    push = air_density(run.temperature, run.altitude) * drag_area * run.middle / run.mass * noise.gust
+    gusts = np.outer(push, push) * np.exp(-np.abs(at[:, None] - at[None, :]) / noise.lasting)
+    ends = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
+    result: Array = gusts + (noise.speed / dt) ** 2 * ends + 1e-10 * np.eye(n)
+    return result
+
+
+def _whiten(
+    runs: Sequence[Coast],
+    value: Mapping[str, float],
+    noise: Noise,
+    columns: Mapping[str, list[Array]],
+    left: Sequence[Array],
+    names: Sequence[str],
+    about: Mapping[str, float],
+) -> tuple[dict[str, Array], Array]:
+    """Columns and target in units of independent noise of 1, the target such that the solution is the whole value."""
+    tall: list[Array] = []
+    for i, run in enumerate(runs):
+        root = cholesky(_covariance(run, max(value["drag_area"], 0.02), noise), lower=True)
+        block = np.column_stack([*(columns[name][i] for name in names), left[i]])
+        tall.append(solve_triangular(root, block, lower=True))
+    whole = np.vstack(tall)
+    centre = np.array([about[name] for name in names])
+    return {name: whole[:, i] for i, name in enumerate(names)}, whole[:, -1] + whole[:, :-1] @ centre
+
+
+def _likely(
+    runs: Sequence[Coast],
+    vehicle: Vehicle,
+    value: Mapping[str, float],
+    columns: Mapping[str, list[Array]],
+    left: Sequence[Array],
+    names: Sequence[str],
+    prior: Mapping[str, tuple[float, float]],
+    start: Noise,
+) -> Noise:
+    """The noise of greatest restricted likelihood (REML: Patterson & Thompson 1971), the parameters marginal."""
+    drag = max(value["drag_area"], 0.02)
+    blocks = [np.column_stack([*(columns[name][i] for name in names), left[i]]) for i in range(len(runs))]
+    centre = np.array([value[name] for name in names])
+    precision = np.zeros(len(names))
+    pull = np.zeros(len(names))
+    for name, (mean, sd) in prior.items():
+        precision[names.index(name)] = sd**-2
+        pull[names.index(name)] = mean
+
+    def minus_log(x: Array) -> float:
+        noise = Noise(*np.exp(x).tolist())
+        logs, normal, right, square = 0.0, np.diag(precision).copy(), precision * (pull - centre), 0.0
+        for run, block in zip(runs, blocks, strict=True):
+            root = cholesky(_covariance(run, drag, noise), lower=True, check_finite=False)
+            white = solve_triangular(root, block, lower=True, check_finite=False)
+            a, y = white[:, :-1], white[:, -1]
+            logs += 2 * float(np.log(np.diag(root)).sum())
+            normal += a.T @ a
+            right = right + a.T @ y
+            square += float(y @ y)
+        square += float(precision @ (pull - centre) ** 2)
+        best = np.linalg.solve(normal, right)
+        logs += float(np.linalg.slogdet(normal)[1])
+        # Weak priors keep the noise where it can be: a few tenths of m/s of gusts for a few seconds.
+        weak = (x[1] - np.log(0.5)) ** 2 / 4 + (x[2] - np.log(5.0)) ** 2 / 2
+        return float(logs + square - float(right @ best) + weak)
+
+    x0 = np.log([start.speed, start.gust, start.lasting])
+    best = minimize(minus_log, x0, method="Nelder-Mead", options={"xatol": 0.1, "fatol": 0.1, "maxiter": 120})
+    return Noise(*np.exp(best.x).tolist())
+
+
+def covariance_with_nuisance(
+    road: RoadFit, about: RoadFit, runs: Sequence[Coast], vehicle: Vehicle, names: Sequence[str]
+) -> tuple[Array, dict[str, float]]:
+    """(covariance of `names` with what else is not known well; the share of each of these in the sd of drag area).
+
+    Mass, inertia, radius, the motor's own drag and air density are taken as given in the fit. What they shift, were
+    they one sd off, is added: -(X'X)⁻¹·X'·D, with D the derivative of the deceleration by them, about `about`.
+    """
+    p = vehicle.parameters
+    solution = road.solution
+    value = about.values()
+    columns, left = _linearised(runs, vehicle, value, solution.names, road.noise.gust)
+    base = {name: value[name] for name in NAMES}
+    motor = [n for e in vehicle.model.effects if e.port is Port.MOTOR_LOSS for n in e.keywords if p.sd(n) > 0]
+    drag = [n for n in dict.fromkeys(["wheel_inertia_front", "wheel_inertia_rear", "wheel_radius", *motor])
+            if p.sd(n) > 0]  # fmt: skip
+    here = RoadLoad(vehicle, base)
+    moved: list[tuple[str, Callable[[Coast], Array]]] = []
+
+    def at(force: RoadLoad, run: Coast, density: float = 1.0) -> Array:
+        result: Array = force.slowing(run.middle, run, value["slope"], value[f"wind {run.name}"], density)
+        return result
+
+    def shifted(force: RoadLoad, scale: float, run: Coast) -> Array:
+        return at(force, run) - at(here, run) * scale
+
+    for name in drag:
+        force = RoadLoad(vehicle, base | {name: p[name] + p.sd(name)})
+        scale = (p[name] + p.sd(name)) / p[name] if name == "wheel_radius" else 1.0  # a larger wheel has been faster
+        moved.append((name, partial(shifted, force, scale)))
+    mass_sd = sqrt(p.sd("vehicle_mass") ** 2 + _ENTERED_MASS_SD**2)
+    heavy = RoadLoad(vehicle, base | {"_mass": mass_sd})
+    moved.append(("mass", lambda run: at(heavy, run) - at(here, run)))
+    moved.append(("air density", lambda run: at(here, run, 1 + _DENSITY_SD) - at(here, run)))
+    wide = {**columns, **{name: [shift(run) for run in runs] for name, shift in moved}}
+    every = [*solution.names, *(name for name, _ in moved)]
+    white, _ = _whiten(runs, value, road.noise, wide, left, every, dict.fromkeys(every, 0.0))
+    x = np.column_stack([white[name] for name in solution.names])
+    d = np.column_stack([white[name] for name, _ in moved])
+    shift = -solution.covariance / solution.variance @ x.T @ d  # by one sd of each
+    correlation = np.eye(len(moved))
+    known = p.covariance(drag)
+    for i, a in enumerate(drag):
+        for j, b in enumerate(drag):
+            correlation[i, j] = known[i][j] / (p.sd(a) * p.sd(b))
+    at_names = [solution.names.index(name) for name in names]
+    covariance = solution.part(list(names)) + (shift @ correlation @ shift.T)[np.ix_(at_names, at_names)]
+    row = solution.names.index("drag_area")
+    return covariance, {name: float(shift[row, i]) for i, (name, _) in enumerate(moved)}

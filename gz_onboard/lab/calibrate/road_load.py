@@ -1,0 +1,89 @@
+"""Road load of a coasting vehicle by the effects of its own model, and its speed rolling to rest against it.
+
+    (m + J/r²)·dV/dt = -m·g·(c0·cos θ + c1·V + sin θ) - ½·ρ·CdA·(V + w)·|V + w| - P_motor(V/r)/V
+
+w: headwind. The motor turns with the wheel: what it takes without current is taken off by the vehicle's own motor
+model. Air density is that of the measured temperature and altitude.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import sqrt
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from gz_onboard.lab.calibrate.coastdown_run import Coast
+from gz_onboard.lab.calibrate.result import Array
+from gz_onboard.physics.effect import QUANTITIES, Effect, Port
+from gz_onboard.physics.model import air_density
+from gz_onboard.vehicle import Vehicle
+
+NAMES = ("rolling_resistance_constant", "rolling_resistance_speed", "drag_area")
+
+
+class RoadLoad:
+    """What holds a coasting vehicle back, by the effects of its own model."""
+
+    def __init__(self, vehicle: Vehicle, values: Mapping[str, float] | None = None) -> None:
+        p = dict(vehicle.parameters) | dict(values or {})
+        self.p = p
+        bound = [(e, {name: p[name] for name in e.keywords}) for e in vehicle.model.effects]
+        self._road = [(e, values) for e, values in bound
+                      if e.port in (Port.WHEEL_FORCE, Port.TYRE) and "acceleration" not in e.quantities]  # fmt: skip
+        self._motor = [(e, values) for e, values in bound if e.port is Port.MOTOR_LOSS]
+        self.rotating = (p["wheel_inertia_front"] + p["wheel_inertia_rear"]) / p["wheel_radius"] ** 2
+
+    def __call__(self, speed: Any, run: Coast, slope: float, wind: float, density: float = 1.0) -> Any:
+        """Force [N] at `speed` [m/s] (above zero). slope: sine, uphill in direction +1. wind [m/s]: against it.
+
+        density: factor on the air's density.
+        """
+        grade = run.direction * slope
+        q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0) | {  # straight on, no current
+            "speed": speed,
+            "grade": grade,
+            "grade_cosine": sqrt(1 - grade * grade),
+            "mass": run.mass + self.p.get("_mass", 0.0),
+            "air_density": density * air_density(run.temperature, run.altitude),
+            "headwind": wind,
+            "motor_speed": speed / (self.p["wheel_radius"] * self.p["gear_ratio"]),
+            "motor_temperature": run.temperature,
+            "ambient_temperature": run.temperature,
+        }
+        return _sum(self._road, q) + _sum(self._motor, q) / speed
+
+    def slowing(self, speed: Any, run: Coast, slope: float, wind: float, density: float = 1.0) -> Any:
+        """Deceleration [m/s²]."""
+        return self(speed, run, slope, wind, density) / (run.mass + self.p.get("_mass", 0.0) + self.rotating)
+
+
+def _sum(effects: Sequence[tuple[Effect, dict[str, float]]], q: Mapping[str, Any]) -> Any:
+    return sum(effect.term(*[q[name] for name in effect.quantities], **values) for effect, values in effects)
+
+
+def roll(force: RoadLoad, run: Coast, slope: float, wind: float, time: Array) -> Array:
+    """Speed [m/s] at `time` [s] from the run's first speed on: Runge-Kutta of fourth order; zero after standstill."""
+    speed = np.empty(len(time))
+    v = float(run.speed[0])
+    speed[0] = v
+    for i, dt in enumerate(np.diff(time).tolist()):
+        if v > 0.05:
+            k1 = force.slowing(v, run, slope, wind)
+            k2 = force.slowing(max(v - dt / 2 * k1, 1e-3), run, slope, wind)
+            k3 = force.slowing(max(v - dt / 2 * k2, 1e-3), run, slope, wind)
+            k4 = force.slowing(max(v - dt * k3, 1e-3), run, slope, wind)
+            v = max(v - dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4), 0.0)
+        speed[i + 1] = v
+    return speed
+
+
+def own_wind(force: RoadLoad, run: Coast, slope: float) -> float:
+    """The constant headwind [m/s] with which `run` is followed best."""
+    best = minimize_scalar(
+        lambda wind: float(np.sum((roll(force, run, slope, wind, run.time) - run.speed) ** 2)),
+        bounds=(-8.0, 8.0), method="bounded", options={"xatol": 0.01},
+    )  # fmt: skip
+    return float(best.x)
