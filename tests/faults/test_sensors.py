@@ -1,0 +1,137 @@
+"""Sensors that are missing: told, counted into the interval, stood in for by others, and back again."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import pytest
+
+from gz_onboard.events import Reason, State
+from tests.faults.support import (
+    BEGIN,
+    END,
+    RIDE,
+    USUAL,
+    Spoil,
+    absent,
+    both,
+    check_all,
+    numbers,
+    ride,
+    spoilt,
+    unspoilt,
+    without,
+)
+from tests.support import S, check_sound, identifier, reasons_in, ridden, spread
+
+SPEEDS = both(
+    absent("INV_Motion", "INV_MotorSpeed"), without("HBM_Wheels"), absent("GPS_Motion", "GPS_Speed", "GPS_Course")
+)
+CURRENTS = both(absent("BMS_Pack", "BMS_PackCurrent"), absent("INV_Power", "INV_DcCurrent"))
+VOLTAGES = both(absent("BMS_Pack", "BMS_PackVoltage"), absent("INV_Power", "INV_DcVoltage"))
+# What is lost, the reason that is given, after how long [s], what widens, and by how much SOC and range may differ.
+LOSSES: dict[str, tuple[Spoil, Reason, float, str, float, float]] = {
+    "imu": (without("IMU_Acceleration", "IMU_AngularRate"), Reason.NO_IMU, 0.3, "range", 0.0005, 0.03),
+    "gps": (without("GPS_Position", "GPS_Motion"), Reason.NO_GPS, 2.3, "range", 0.0005, 0.03),
+    "cells": (without("BMS_Cells"), Reason.NO_CELL_TEMPERATURE, 10.3, "range", 0.0005, 0.01),
+    "ambient": (without("TC_Ambient"), Reason.NO_AMBIENT_TEMPERATURE, 10.3, "range", 0.0005, 0.03),
+    "pack current": (absent("BMS_Pack", "BMS_PackCurrent"), Reason.NO_PACK_CURRENT, 1.3, "both", 0.001, 0.03),
+    "inverter current": (absent("INV_Power", "INV_DcCurrent"), Reason.NO_INVERTER_CURRENT, 1.3, "soc", 0.0005, 0.03),
+    "currents": (CURRENTS, Reason.NO_PACK_CURRENT | Reason.NO_INVERTER_CURRENT, 1.3, "both", 0.006, 0.04),
+    "pack voltage": (absent("BMS_Pack", "BMS_PackVoltage"), Reason.NO_PACK_VOLTAGE, 1.3, "both", 0.001, 0.03),
+    "voltages": (VOLTAGES, Reason.NO_PACK_VOLTAGE, 1.3, "both", 0.002, 0.03),
+    "pack": (without("BMS_Pack"), Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT, 1.3, "both", 0.001, 0.03),
+    "speeds": (SPEEDS, Reason.NO_SPEED, 2.3, "range", 0.0005, 0.03),
+}
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_lost_sensor_is_told_widens_the_interval_and_comes_back(name: str):
+    spoil, reason, delay, widens, soc, range_ = LOSSES[name]
+    run = ridden(spoilt(spoil))
+    check_all(run, soc, range_)
+    healthy = unspoilt()
+    before, lost, after = run.between(5.0, BEGIN), run.between(BEGIN + delay, END), run.between(END + 2.3, RIDE)
+    assert not reasons_in(before) & reason
+    assert all(e.reasons & reason == reason and e.state is State.DEGRADED for e in lost)
+    # With a current from the model alone the cell's voltage may not be what is expected: it is told, too.
+    others = reasons_in(lost) & ~reason & ~USUAL & ~(Reason.VOLTAGE_MISMATCH if name == "currents" else Reason(0))
+    assert not others, f"{others} is given too"
+    assert not reasons_in(after) & reason
+    assert {e.state for e in after} == {State.VALID}
+    a, b = run.at(END), healthy.at(END)
+    if widens in ("soc", "both"):
+        assert numbers(a)[1] > numbers(b)[1], "the SOC is said to be as certain as before"
+    if widens in ("range", "both"):
+        assert spread(a) > spread(b) * 1.005, "the range is said to be as certain as before"
+        # The sensor is back, and with it the certainty, but for what could not be learned meanwhile.
+        as_before = max(spread(healthy.at(BEGIN)), spread(healthy.at(RIDE)))
+        assert spread(run.at(RIDE)) < as_before + 0.01
+
+
+def test_the_inverters_current_stands_in_for_the_packs():
+    run = ridden(spoilt(absent("BMS_Pack", "BMS_PackCurrent")))
+    pairs = [
+        (a.pack_current, b.pack_current)
+        for a, b in zip(run.between(BEGIN + 1.5, END), unspoilt().between(BEGIN + 1.5, END), strict=True)
+    ]
+    differences = [a - b for a, b in pairs if a is not None and b is not None]
+    assert len(differences) == len(pairs)
+    assert abs(sum(differences) / len(differences)) < 0.3
+    assert sqrt(sum(d * d for d in differences) / len(differences)) < 2.0  # A, of up to 76: 0.1 s apart in time
+
+
+def test_the_model_stands_in_for_both_currents():
+    run = ridden(spoilt(CURRENTS))
+    during = run.between(BEGIN + 1.5, END)
+    assert all(e.pack_current is not None for e in during)
+    true = unspoilt().between(BEGIN + 1.5, END)
+    drawn = sum(e.pack_current or 0.0 for e in during) / sum(e.pack_current or 0.0 for e in true)
+    assert 0.6 < drawn < 1.5  # of the charge that really flowed
+    assert run.at(END).soc_sd > unspoilt().at(END).soc_sd  # type: ignore[operator]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "tolerance"),
+    [
+        (absent("INV_Motion", "INV_MotorSpeed"), 0.6),
+        (both(absent("INV_Motion", "INV_MotorSpeed"), absent("HBM_Wheels", "HBM_WheelSpeedRear")), 0.6),
+        (both(without("INV_Motion"), without("HBM_Wheels")), 1.5),
+    ],
+    ids=["rear wheel", "front wheel", "gps"],
+)
+def test_another_speed_stands_in_for_the_motors(spoil: Spoil, tolerance: float):
+    run = ridden(spoilt(spoil))
+    check_all(run, 0.0005, 0.03)
+    for a, b in zip(run.between(BEGIN + 0.3, END), unspoilt().between(BEGIN + 0.3, END), strict=True):
+        assert a.speed is not None
+        assert b.speed is not None
+        assert abs(a.speed - b.speed) < tolerance
+        assert not a.reasons & Reason.NO_SPEED
+    assert run.at(RIDE).distance == pytest.approx(unspoilt().at(RIDE).distance, rel=0.01)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_a_sensor_that_was_never_there(name: str):
+    spoil, reason, _, _, _, _ = LOSSES[name]
+    run = ridden(spoilt(spoil, -1.0, RIDE + 1))
+    check_sound(run)
+    late = run.between(12.0, RIDE)
+    assert all(e.reasons & reason == reason for e in late)
+    if name == "voltages":  # no voltage, no state of charge: nothing is published
+        assert {e.state for e in late} == {State.INVALID}
+        assert all(e.soc is None and e.range is None for e in late)
+        return
+    assert {e.state for e in late} == {State.DEGRADED}
+    end, true = numbers(run.at(RIDE)), numbers(unspoilt().at(RIDE))
+    assert abs(end[0] - true[0]) < 3 * end[1]
+    assert end[3] < true[2] < end[4]
+
+
+def test_stale_after_ten_periods_and_not_before():
+    last = max(f[0] for f in ride() if f[1] == identifier("BMS_Cells") and f[0] < ride()[0][0] + BEGIN * S)
+    since = (last - ride()[0][0]) / S
+    run = ridden(spoilt(without("BMS_Cells")))
+    missing = [e.time for e in run.estimates if e.time > BEGIN and e.reasons & Reason.NO_CELL_TEMPERATURE]
+    assert missing[0] - since == pytest.approx(10.0, abs=0.11)
+    assert all(e.cell_temperature is not None for e in run.between(5.0, RIDE))  # the last known stands in
