@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard.bus import _can  # noqa: F401 - before cantools, which would import it with asammdf and pandas
-from gz_onboard.bus.logs import LogDamage, log_suffix, read_frames
+from gz_onboard.bus.logs import LogDamage, read_frames
 from gz_onboard.bus.publisher import WH, WH_PER_KM, Counts, Publisher
 from gz_onboard.bus.recorder import LogFile
 from gz_onboard.errors import InputError
@@ -28,7 +28,7 @@ from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log, reason_words
 from gz_onboard.lab.processes import Progress, over_rides, progress_bar
 from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, reason_names
-from gz_onboard.simulation.telling import clock, explain_keys, number, times, write_json
+from gz_onboard.simulation.telling import check_json, clock, explain_keys, number, output_names, times, write_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 SUMMARY_VERSION = 1
@@ -369,31 +369,14 @@ def run(arguments: argparse.Namespace) -> int:
 def _tasks(arguments: argparse.Namespace) -> list[Task]:
     if arguments.jobs is not None and arguments.jobs < 1:
         raise InputError(f"--jobs {arguments.jobs}: at least 1")
-    if arguments.json and _is_log(Path(arguments.json)):  # as in: estimate --json ride.blf
-        raise InputError(f"--json {arguments.json}: that is the name of a log; write --json=- or put --json last")
+    check_json(arguments.json)
     paths = list(dict.fromkeys(arguments.logs))
-    names = Counter(_stem(path) for path in paths)
-    tasks = []
-    for path in paths:
-        name = _stem(path)
-        if names[name] > 1:  # rides of the same name in several folders
-            name = "-".join([*path.resolve().parent.parts[-1:], name])
-        tasks.append(
-            Task(path, arguments.output / name, arguments.vehicle, arguments.payload, arguments.filter,
-                 arguments.frames, arguments.signals, not arguments.no_plot)
-        )  # fmt: skip
-    twice = [stem for stem, count in Counter(task.stem for task in tasks).items() if count > 1]
-    if twice:
-        both = " and ".join(str(task.path) for task in tasks if task.stem == twice[0])
-        raise InputError(f"{both} would both be written as {twice[0]}.estimate.mcap; estimate them one at a time")
-    return tasks
-
-
-def _is_log(path: Path) -> bool:
-    try:
-        return path.suffix != ".csv" and bool(log_suffix(path))
-    except InputError:
-        return False
+    names = output_names(paths, [_stem(path) for path in paths], ".estimate.mcap")
+    return [
+        Task(path, arguments.output / name, arguments.vehicle, arguments.payload, arguments.filter,
+             arguments.frames, arguments.signals, not arguments.no_plot)
+        for path, name in zip(paths, names, strict=True)
+    ]  # fmt: skip
 
 
 def _stem(path: Path) -> str:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,7 +38,7 @@ from gz_onboard.simulation.route import read_route
 from gz_onboard.simulation.run import Command, Run, drive, follow, replay, road_table
 from gz_onboard.simulation.samples import read_facts
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Place, Road, Scooter
-from gz_onboard.simulation.telling import write_json
+from gz_onboard.simulation.telling import check_json, explain_keys, output_names, write_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 SUMMARY_VERSION = 1
@@ -67,7 +66,7 @@ KEYS = {
 }
 """What ``--json`` holds of a ride: {"version", "rides", "pooled": splits of all rides, "failed": [{file, error}]}."""
 
-PROFILE = 0.5  # s: over which the measured speed is averaged before the rider model follows it: its noise is no ride
+AVERAGED = 0.5  # s: over which the measured speed is averaged: its noise is no ride for a rider model to follow
 STANDING = 0.3  # m/s: less is noise of a wheel that stands
 _READ, _RIDE = 0.4, 0.3  # shares of the work
 
@@ -135,7 +134,7 @@ def validate_ride(task: Task, progress: Progress = lambda _: None) -> dict[str, 
         gone = [name for name in ("throttle", "brake") if name not in recorded.signals]
         missing.append(f"not simulated open loop: the ride has no {' and no '.join(gone)}")
         progress(_RIDE * task.size)
-    profile = np.convolve(np.pad(recorded.signals["speed"], 25, mode="edge"), np.ones(51) / 51, "valid")
+    profile = _averaged_speed(recorded)
     profile[profile < STANDING] = 0.0  # or the rider would hold a hill by throttle, not by brake
     commands["predictive"] = follow(profile.tolist(), STEP)
     entry: dict[str, Any] = {
@@ -193,7 +192,7 @@ def per_second(recorded: Recorded, vehicle: Vehicle) -> dict[str, Array]:
     """
     rate = round(1 / recorded.dt)
     measured = {role: seconds(values, rate) for role, values in recorded.signals.items()}
-    smooth = np.convolve(np.pad(recorded.signals["speed"], 25, mode="edge"), np.ones(51) / 51, "valid")
+    smooth = _averaged_speed(recorded)
     n = len(measured["speed"])
     ends = np.minimum(np.arange(n + 1) * rate, len(smooth) - 1)
     measured["acceleration"] = np.diff(smooth[ends])  # over one second
@@ -207,6 +206,13 @@ def per_second(recorded: Recorded, vehicle: Vehicle) -> dict[str, Array]:
         if "pack_voltage" in measured:
             measured["pack_power"] = measured["pack_voltage"] * measured["pack_current"]
     return measured
+
+
+def _averaged_speed(recorded: Recorded) -> Array:
+    """The measured speed [m/s], each sample the mean over `AVERAGED` about it."""
+    reach = round(AVERAGED / recorded.dt / 2)
+    width = 2 * reach + 1
+    return np.convolve(np.pad(recorded.signals["speed"], reach, mode="edge"), np.ones(width) / width, "valid")
 
 
 def _road(recorded: Recorded, log: Path) -> tuple[Road | Dynamometer, Array | None]:
@@ -316,9 +322,7 @@ def pool(rides: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard validate``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    keys = "\n".join(f"  {key:16} {meaning.replace('%', '%%')}" for key, meaning in KEYS.items())
-    parser.epilog = f"keys of a ride in the JSON summary, version {SUMMARY_VERSION}:\n{keys}"
+    explain_keys(parser, "a ride in the", SUMMARY_VERSION, KEYS)
     add = parser.add_argument
     add("logs", nargs="+", type=Path, metavar="RIDE", help="logs of rides: .blf .log .asc .trc .mf4 .csv .mcap, or .gz")
     add(
@@ -381,17 +385,10 @@ def _write_tables(arguments: argparse.Namespace, rides: list[dict[str, Any]], to
 def _tasks(arguments: argparse.Namespace) -> list[Task]:
     if arguments.jobs is not None and arguments.jobs < 1:
         raise InputError(f"--jobs {arguments.jobs}: at least 1")
-    if arguments.json and Path(arguments.json).suffix in (".blf", ".mcap", ".log", ".asc", ".gz"):
-        raise InputError(f"--json {arguments.json}: that is the name of a log; write --json=- or put --json last")
+    check_json(arguments.json)
     paths = list(dict.fromkeys(arguments.logs))
     names = [Path(path.name.removesuffix(".gz")).stem for path in paths]
-    stems = [
-        name if names.count(name) == 1 else "-".join([*path.resolve().parent.parts[-1:], name])
-        for path, name in zip(paths, names, strict=True)
-    ]
-    twice = [stem for stem, count in Counter(stems).items() if count > 1]
-    if twice:
-        raise InputError(f"two rides would both be written as {twice[0]}.validation.png; validate them one at a time")
+    stems = output_names(paths, names, ".validation.png")
     return [
         Task(path, name, arguments.vehicle, arguments.payload,
              None if arguments.no_plot else arguments.output / f"{stem}.validation.png")

@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.codec import Codec
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.events import Event
 from gz_onboard.simulation.run import road_table
-from gz_onboard.simulation.samples import INSTRUMENTS, extended
+from gz_onboard.simulation.samples import INSTRUMENTS, extended, read_roles
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Road
 from gz_onboard.vehicle import Vehicle
 
@@ -101,33 +101,25 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     estimator_groups = [replace(g, roles=()) if own & set(g.roles) else g for g in codec.groups]
     estimator = Estimator(estimator_groups, vehicle.battery, vehicle.model, vehicle.riding)
     known = [bool(group.roles) for group in estimator_groups]
-    found: dict[str, tuple[list[float], list[float]]] = {}
-    slots = [[found.setdefault(role, ([], [])) for role in group.roles] for group in codec.groups]
     rows: list[tuple[float, float, float]] = []  # distance, grade, yaw rate over speed
     headings: list[tuple[float, float]] = []
     tick = 0.0
-    for batch in read_frames(log):
-        for event in codec.decode(batch):
-            time, group, values = event
-            for (times, column), value in zip(slots[group], values, strict=True):
-                if value is not None:
-                    times.append(time)
-                    column.append(value)
-            if known[group]:
-                estimator.handle(event)
-                if time >= tick:
-                    tick = time + 0.1
-                    road = estimator.road
-                    speed = road.speed or 0.0
-                    turning = (road.yaw_rate or 0.0) / speed if speed > _MOVING else 0.0
-                    rows.append((road.distance, road.grade or 0.0, turning))
-                    if road.heading is not None and speed > _MOVING:
-                        headings.append((road.distance, road.heading))
-        if progress:
-            progress(len(batch))
-    if not codec.latest:
-        raise InputError(f"{log}: vehicle {vehicle.name!r} knows none of its {codec.received} frames")
-    columns = {role: (np.array(t), np.array(v)) for role, (t, v) in found.items() if len(t) > 1}
+
+    def observe(event: Event) -> None:
+        nonlocal tick
+        if not known[event[1]]:
+            return
+        estimator.handle(event)
+        if event[0] >= tick:
+            tick = event[0] + 0.1
+            road = estimator.road
+            speed = road.speed or 0.0
+            turning = (road.yaw_rate or 0.0) / speed if speed > _MOVING else 0.0
+            rows.append((road.distance, road.grade or 0.0, turning))
+            if road.heading is not None and speed > _MOVING:
+                headings.append((road.distance, road.heading))
+
+    columns = read_roles(log, vehicle, codec, progress, observe)
     signals = _signals(log, columns, vehicle)
     if "pack_voltage" in signals and "pack_current" in signals:
         signals["soc"] = _counted_soc(signals, vehicle)

@@ -15,6 +15,7 @@ from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.mapping import Mapping, Source
 from gz_onboard.errors import InputError
+from gz_onboard.events import Event
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -66,24 +67,41 @@ def read_samples(log: Path, vehicle: Vehicle, progress: Callable[[int], None] | 
     progress: is told how many frames were read. Raises InputError for a log that cannot be read or is not of the
     vehicle.
     """
+    columns = read_roles(log, vehicle, Codec(extended(vehicle.mapping)), progress)
+    name = Path(log.name.removesuffix(".gz")).stem
+    return Samples(name, columns, read_facts(log.parent / "rides.json").get(name, {}))
+
+
+def read_roles(
+    log: Path,
+    vehicle: Vehicle,
+    codec: Codec,
+    progress: Callable[[int], None] | None = None,
+    observe: Callable[[Event], None] | None = None,
+) -> dict[str, tuple[Array, Array]]:
+    """(times [s], values) by role of all that `codec` decodes in `log` more than once; `observe` is told every event.
+
+    progress: is told how many frames were read. Raises InputError for a log that cannot be read or is not of the
+    vehicle.
+    """
     import numpy as np
 
-    codec = Codec(extended(vehicle.mapping))
     found: dict[str, tuple[list[float], list[float]]] = {}
     slots = [[found.setdefault(role, ([], [])) for role in group.roles] for group in codec.groups]
     for batch in read_frames(log):
-        for time, group, values in codec.decode(batch):
+        for event in codec.decode(batch):
+            time, group, values = event
             for (times, column), value in zip(slots[group], values, strict=True):
                 if value is not None:
                     times.append(time)
                     column.append(value)
+            if observe:
+                observe(event)
         if progress:
             progress(len(batch))
     if not codec.latest:
         raise InputError(f"{log}: vehicle {vehicle.name!r} knows none of its {codec.received} frames")
-    name = Path(log.name.removesuffix(".gz")).stem
-    columns = {role: (np.array(t), np.array(v)) for role, (t, v) in found.items() if len(t) > 1}
-    return Samples(name, columns, read_facts(log.parent / "rides.json").get(name, {}))
+    return {role: (np.array(t), np.array(v)) for role, (t, v) in found.items() if len(t) > 1}
 
 
 def read_facts(file: Path) -> dict[str, dict[str, object]]:
