@@ -42,7 +42,7 @@ format: setup  ## let ruff format the code
 bench: setup  ## cost per frame, start-up, memory, beside the obvious pipeline of the same libraries
 	$(PYTHON_IN_VENV) benchmarks/bench.py
 
-trial: setup  ## hidden effects in rides of a scooter that is not the model's: does discover name them? (CASES=n FIRST=seed)
+trial: setup  ## does discover name hidden effects in rides of a scooter that is not the model's? rewrites docs/trial.md (CASES=n FIRST=seed)
 	$(PYTHON_IN_VENV) -m benchmarks.trial --cases $(CASES) --first $(FIRST)
 
 clean:  ## remove what the other targets made, except runs/
