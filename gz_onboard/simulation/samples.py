@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 INSTRUMENTS = (
     ("brake_pressure_front", "HBM_Brakes", "HBM_BrakePressureFront", 1e5),  # Pa
     ("brake_pressure_rear", "HBM_Brakes", "HBM_BrakePressureRear", 1e5),
+    ("suspension_front", "HBM_Chassis", "HBM_SuspensionFront", 1e-3),  # m
+    ("suspension_rear", "HBM_Chassis", "HBM_SuspensionRear", 1e-3),
     ("roller_speed", "DYNO_Roller", "DYNO_RollerSpeed", 1.0),  # m/s
     ("roller_force", "DYNO_Roller", "DYNO_RollerForce", 1.0),  # N
     ("bms_temperature", "BMS_Cells", "BMS_BoardTemp", 1.0),  # degC

@@ -67,6 +67,7 @@ UNKNOWN: dict[str, tuple[float, float]] = {
     "steering_drag": (200.0, 700.0),  # N per rad of steering
     "left_drag": (8.0, 35.0),  # N, in left bends only
     "late_drag": (8.0, 25.0),  # N, after some minutes
+    "rough_drag": (7.0, 25.0),  # N on a rough road
 }
 
 # When a hidden effect must be found, in terms of the truth alone: it takes or seems to take this share of energy, or
@@ -210,6 +211,7 @@ def _unknown_strength(rng: np.random.Generator, name: str) -> tuple[dict[str, fl
         "weak_window": {"window_resistance": x, "window_soc": float(rng.uniform(0.35, 0.6))},
         "steering_drag": {"steer_drag": x},
         "left_drag": {"left_drag": x},
+        "rough_drag": {"rough_drag": x},
         "late_drag": {"late_force": x, "late_time": float(rng.uniform(200, 380))},
     }[name]
     return fields, (x,)

@@ -41,7 +41,7 @@ SPEED_LIMIT = (50.5, 54.0)  # rad/s: where the controller begins to take the tor
 COLUMNS = (
     "speed", "acceleration", "distance", "altitude", "grade", "lean", "lean_rate", "yaw_rate", "heading", "north",
     "east", "rear", "front", "motor_current", "throttle", "brake", "squeeze", "pack_voltage", "pack_current",
-    "inverter_voltage", "inverter_current", "auxiliary_current", "soc", "shell", "stator", "board", "ambient",
+    "inverter_voltage", "inverter_current", "auxiliary_current", "soc", "shell", "stator", "board", "ambient", "rough",
 )  # fmt: skip
 
 
@@ -90,6 +90,7 @@ class Hidden:
     left_drag: float = 0.0  # N, in left bends only
     late_force: float = 0.0  # N, after late_time of riding
     late_time: float = 300.0
+    rough_drag: float = 0.0  # N at 10 m/s, by the square of how rough the road is: what worn dampers take
 
 
 @dataclass
@@ -125,9 +126,9 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
 
     # the way: curvature, grade and speed on one grid, padded with its last value
     length = max(len(x.speed) for x in plans)
-    way = np.zeros((n * length, 3))
+    way = np.zeros((n * length, 4))
     for i, x in enumerate(plans):
-        for j, values in enumerate((x.curvature, x.grade, x.speed)):
+        for j, values in enumerate((x.curvature, x.grade, x.speed, x.rough)):
             way[i * length : (i + 1) * length, j] = np.pad(values, (0, length - len(values)), mode="edge")
     base = rows * length
     stop_count = max(len(x.stops) for x in plans)
@@ -188,7 +189,7 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
         index = np.minimum(place.astype(int), length - 2)
         part = (place - index)[:, None]
         here = way[base + index] * (1 - part) + way[base + index + 1] * part
-        curvature, grade, allowed = here[:, 0], here[:, 1], here[:, 2]
+        curvature, grade, allowed, rough = here.T
         ahead = np.minimum(((s + v * r.preview) / GRID).astype(int), length - 1)
         allowed = np.minimum(allowed, way[base + ahead, 2])
         to_stop = stops[rows, next_stop] - s
@@ -267,7 +268,7 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
         extra = m.bearing_drag + h.pad_force * (1 + 0.1 * noise[PAD]) + h.wheel_viscous * v / radius**2
         extra = extra + h.band_force * np.exp(-0.5 * ((v - h.band_speed) / 1.0) ** 2)
         extra = extra + h.steer_drag * steering + h.left_drag * np.clip(curvature * 60, 0, 1)
-        extra = extra + h.late_force * (moved > h.late_time)
+        extra = extra + h.late_force * (moved > h.late_time) + h.rough_drag * rough * rough * v / 10
         road = (rolling + turning + extra) * moving + air
         # --- motor
         hot = 1 - m.torque_temperature * (stator - 40)
@@ -378,6 +379,7 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
             v, acceleration, s, altitude, grade, lean, lean_rate, yaw_rate, heading, north, east, rear, front,
             motor_current, throttle, braking, squeeze, pack_voltage, pack_current, inverter_voltage,
             dc / inverter_voltage, auxiliary / pack_voltage, soc, shell, stator, board, p.ambient,
+            rough,
         )  # fmt: skip
         for name, value in zip(COLUMNS, now, strict=True):
             record[name][step] = value

@@ -56,6 +56,7 @@ class Plan:
     motor_warmer: float
     curvature: Array  # 1/m over the way, positive to the left
     grade: Array  # sine of the road's angle
+    rough: Array  # how rough it is, 1 in the mean
     speed: Array  # m/s, what limit and bends allow
     stops: Array  # m
     waits: Array  # s
@@ -112,6 +113,7 @@ def plan(
         motor_warmer=float(rng.choice([0.0, 0.0, rng.uniform(0, 8)])),
         curvature=curvature,
         grade=_hills(rng, len(curvature), hilly),
+        rough=_surface(np.random.default_rng([seed, 23]), len(curvature)),
         speed=speed,
         stops=stops,
         waits=np.clip(rng.exponential(14.0, len(stops)), 2.0, 60.0),
@@ -169,6 +171,17 @@ def _hills(rng: np.random.Generator, count: int, hilly: float) -> Array:
             2 * np.pi * x / length + rng.uniform(0, 2 * np.pi)
         )  # fmt: skip
     return np.clip(grade, -0.09, 0.09)
+
+
+def _surface(rng: np.random.Generator, count: int) -> Array:
+    """Asphalt, patched or cracked, for some hundred metres each; now and then setts."""
+    rough = np.ones(count)
+    at = 0
+    while at < count:
+        end = at + int(rng.uniform(120, 600) / GRID)
+        rough[at:end] = rng.uniform(1.6, 2.6) if rng.random() < 0.12 else np.exp(rng.normal(-0.1, 0.22))
+        at = end
+    return rough
 
 
 def _noises(rng: np.random.Generator, duration: float) -> Array:

@@ -99,7 +99,7 @@ def measure(ridden: Ridden, name: str) -> Samples:
     speed, lean, yaw = at(c["speed"], t), at(c["lean"], t), at(c["yaw_rate"], t)
     acceleration, grade = at(c["acceleration"], t), at(c["grade"], t)
     slope = np.arcsin(grade)
-    shake = 0.10 + 0.068 * speed
+    shake = 0.10 + 0.068 * speed * at(c["rough"], t)
     sideways = speed * yaw
     put("accel_x", t, (1 + m.accel_pitch) * acceleration + G * grade + m.accel_bias_x, 0.002)
     out["accel_x"] = _shaken(rng, out["accel_x"], shake, 0.002)

@@ -459,6 +459,7 @@ class Channel:
     correlated: bool = True
     slow: float = 0.0  # s: the shortest correlation that its noise can have; what its model lacks is slow
     rough: float = 0.0  # A of motor current within a block that double its variance; 0: none do
+    shaken: float = 0.0  # m/s² of vibration that do; 0: none
 
 
 _TORQUE = ("torque_constant", "torque_constant_slope", "torque_saturation")
@@ -475,7 +476,7 @@ CHANNELS = (
     Channel(
         "road_force", "N", 4.0, 1, ("motor_speed", "motor_current", "accel_x"), road_force, _rolling,
         (*_TORQUE, *_SPEED, "payload_mass", "payload_error", "accel_bias", "pitch_gain", "rolling_cold"),
-        ("WHEEL_FORCE", "TYRE", "MOTOR_LOSS"), (7.0, 3.0, 60.0), rough=20.0,
+        ("WHEEL_FORCE", "TYRE", "MOTOR_LOSS"), (5.0, 2.0, 60.0), rough=60.0, shaken=0.85,
     ),
     Channel(
         "altitude", "m", 10.0, 1, ("accel_x", "gps_altitude"), altitude, _always,
@@ -579,15 +580,18 @@ def blocks(channel: Channel, ride: Ride, p: Values, system: System) -> Array:
 
 def roughness(channel: Channel, ride: Ride) -> Array:
     """By how much more a block's residual scatters, shape (blocks,): where the current changes within it, small errors
-    of timing and of dynamics weigh more.
+    of timing and of dynamics weigh more; on a rough road the accelerometer is noisy.
     """
     n = round(channel.block / STEP)
+    shaken = np.ones(len(ride.time) // n)
+    if channel.shaken > 0 and "vibration" in ride.quantities:
+        shaken = shaken + mean_over(ride.quantities["vibration"] ** 2, n) / channel.shaken**2
     if channel.rough <= 0:
-        return np.ones(len(ride.time) // n)
+        return np.asarray(np.sqrt(shaken))
     amperes = ride.signals["motor_current"]
     level = mean_over(np.abs(amperes), n)
     swing = np.sqrt(np.maximum(mean_over(amperes**2, n) - mean_over(amperes, n) ** 2, 0.0))
-    return np.asarray(np.sqrt(1 + ((swing + 0.2 * level) / channel.rough) ** 2))
+    return np.asarray(np.sqrt(shaken * (1 + ((swing + 0.2 * level) / channel.rough) ** 2)))
 
 
 def over_blocks(channel: Channel, values: Array) -> Array:

@@ -254,7 +254,7 @@ class _Bar:
 
 def write_extended(report: Report, vehicle: Vehicle, arguments: argparse.Namespace) -> list[str]:
     """Write the extended model if there is anything to extend it with; what was done, in words."""
-    if not report.causes and report.unknown is None:
+    if all(cause.varies for cause in report.causes) and report.unknown is None:
         return ["not written: there is nothing to extend it with"]
     try:
         added = write_model(report, vehicle, find_vehicle(arguments.vehicle), arguments.write_model)
@@ -318,6 +318,8 @@ def summary(report: Report, vehicle: Vehicle, told: Sequence[str] = ()) -> str:
             f"{c.energy_share:+.1%} of the energy, score {c.evidence:.0f}"
         )
         lines += [f"  {'':20} {name} = {value:.4g} (95 %: {ci[0]:.4g} to {ci[1]:.4g})" for name, value, ci in c.others]
+        if c.varies:
+            lines.append(f"  {'':20} differs from ride to ride: named, but no model is extended with it")
     for group in report.ambiguous:
         lines.append(f"  not told apart:      {', '.join(group)}")
     if report.unknown:

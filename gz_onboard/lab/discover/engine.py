@@ -38,6 +38,7 @@ from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
 WEIGHT = 1.0  # rides that the scatter before any healthy ride is worth
+WEATHER_WEIGHT = 4.0  # the same of the wind's: a few calm days do not promise more of them
 ROUNDS = 3
 LEAST = 0.6
 Progress = Callable[[str], None]
@@ -116,8 +117,8 @@ def learn(state: State, rides: Sequence[Ride], progress: Progress, workers: int 
     progress("scatter between healthy rides")
     lines = linearise_all(rides, replace(state, values=values, mean=first - shift, noise=noise), workers)
     normals = [normal(line, noise) for line in lines]
-    least = np.array([0.7 if name in WEATHER else 0.02 for name in state.names])
-    post = fit_mixed(normals, first - shift, state.prior, state.scatter, WEIGHT, state.free, 120, least)
+    weight = np.array([WEATHER_WEIGHT if name in WEATHER else WEIGHT for name in state.names])
+    post = fit_mixed(normals, first - shift, state.prior, state.scatter, weight, state.free, 120)
     after = replace(state, values=values, mean=post.mean, prior=post.covariance, scatter=post.scatter, noise=noise,
                     healthy=len(rides))  # fmt: skip
     before = replace(after, mean=first - shift, prior=state.prior)

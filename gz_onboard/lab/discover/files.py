@@ -174,7 +174,7 @@ def extension(report: Report, vehicle: Vehicle) -> tuple[dict[str, Found], list[
     rides = f"{len(report.lines)} rides ({names})" if len(names) < 150 else f"{len(report.lines)} rides"
     has = {effect.name for effect in vehicle.model.effects}
     found, added = {}, []
-    for cause in report.causes:
+    for cause in (c for c in report.causes if not c.varies):
         candidate = next(c for c in state.causes if c.name == cause.name)
         rows = [(cause.parameter, cause.value, cause.ci95), *cause.others]
         for (name, value, ci), parameter in zip(rows, candidate.parameters, strict=True):
@@ -198,7 +198,9 @@ def lowered(report: Report, vehicle: Vehicle, curve: bool) -> tuple[float, str] 
     factor = vehicle.riding.factor
     if abs(share) < 1e-4 or not 0.3 < (value := factor / (1 + share * factor)) < 3:
         return None
-    what = ", ".join([*(cause.name for cause in report.causes), *(["a curve without a name"] if curve else [])])
+    what = ", ".join(
+        [*(cause.name for cause in report.causes if not cause.varies), *(["a curve without a name"] if curve else [])]
+    )
     text = f"{what}, found on {len(report.lines)} rides, are {share:.1%} of the energy there and left the factor: "
     return value, f"{text}{factor:g} / (1 + {share:.4f} · {factor:g})"
 
@@ -208,7 +210,7 @@ def changes(report: Report) -> list[Array]:
     state = report.state
     assert state is not None
     result = []
-    for cause in report.causes:
+    for cause in (c for c in report.causes if not c.varies):
         change = np.zeros(len(state.names))
         for name, value in ((cause.parameter, cause.value), *((n, v) for n, v, _ in cause.others)):
             place = state.names.index(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,9 +11,13 @@ import numpy as np
 from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed, normal
 from gz_onboard.lab.discover.result import Report
+from gz_onboard.lab.discover.shapes import Form, columns, extended
 from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.terms import STARTS
+from gz_onboard.lab.discover.unknown import RIDES
 from gz_onboard.lab.discover.worth import energy, power_of, share_of_time
+
+WIDE = 100.0  # variance of a curve's coefficients, in units of `Form.size`
 
 
 def measure_gain(report: Report, seed: int, apart: Sequence[Linear] = ()) -> dict[str, Any]:
@@ -31,19 +36,23 @@ def measure_gain(report: Report, seed: int, apart: Sequence[Linear] = ()) -> dic
     known = len(report.lines)
     folds = [list(range(known, len(lines)))] if apart else [[i] for i in range(known)]
     rows: dict[str, list[tuple[float, float, float]]] = {}
-    causes = [c for c in state.causes if c.name in {found.name for found in report.causes}]
+    causes = [c for c in state.causes if c.name in {found.name for found in report.causes if not found.varies}]
+    form = form_of(report.unknown) if report.unknown is not None else None
     for fold in folds:
         rest = [n for i, n in enumerate(normals) if i not in fold]
         if not rest or not fold:
             continue
         control = fit_mixed(rest, state.mean, state.prior, state.scatter, 1.0, state.free, 0).mean
-        after = control.copy()
-        if causes:
+        after, curve = control, np.zeros(0)
+        if form is not None:
+            fitted = [(line, n) for i, (line, n) in enumerate(zip(lines, normals, strict=True)) if i not in fold]
+            after, curve = with_curve(state, fitted, causes, form)
+        elif causes:
             after = extended_mean(state, rest, causes)
         for i in fold:
-            # not the road force itself: its mean would be taken for the accelerometer's bias
-            start = normal(lines[i], state.noise, [name for name in lines[i].tables if name != "road_force"])
-            triple = [errors(lines[i], with_start(state, start, theta)) for theta in (state.mean, control, after)]
+            shown = lines[i] if form is None else without(lines[i], form, curve)
+            models = ((lines[i], state.mean), (lines[i], control), (shown, after))
+            triple = [errors(line, with_start(state, started(state, line), theta)) for line, theta in models]
             for metric in triple[0]:
                 rows.setdefault(metric, []).append(tuple(t[metric] for t in triple))  # type: ignore[arg-type]
     result: dict[str, Any] = {"holdout": [names[i] for fold in folds for i in fold], "apart": bool(apart)}
@@ -58,6 +67,48 @@ def measure_gain(report: Report, seed: int, apart: Sequence[Linear] = ()) -> dic
             "ci95": [float(np.quantile(saved, 0.025)), float(np.quantile(saved, 0.975))],
         }  # fmt: skip
     return result
+
+
+def started(state: State, line: Linear) -> Normal:
+    """What tells how a ride began: not the road force, whose mean would be taken for the accelerometer's bias."""
+    return normal(line, state.noise, [name for name in line.tables if name != "road_force"])
+
+
+def form_of(unknown: dict[str, Any]) -> Form | None:
+    """The curve of what has no name; None if it is one of rides."""
+    if unknown["quantity"] == RIDES:
+        return None
+    return Form(unknown["channel"], unknown["quantity"], unknown["straight"])
+
+
+def with_curve(
+    state: State, fitted: Sequence[tuple[Linear, Normal]], causes: Sequence[Any], form: Form
+) -> tuple[Array, Array]:
+    """(the common part (p,), the coefficients of `form` (k,)) from the rides `fitted`, the `causes` free."""
+    p, k = len(state.mean), form.basis.shape[1]
+    shape = state.shapes.get(form.name)
+    mean = np.concatenate([state.mean, shape.mean if shape else np.zeros(k)])
+    prior = np.diag(np.full(p + k, WIDE))
+    prior[:p, :p] = state.prior
+    for i in (i for cause in causes for i in state.index(cause.names)):
+        prior[i, i] += 1e6
+    scatter = np.concatenate([state.scatter, np.full(k, form.scatter**2)])
+    rides = []
+    for line, plain in fitted:
+        more = extended(line, plain, form, state.noise)
+        rides.append(more or Normal(np.pad(plain.n, (0, k)), np.pad(plain.b, (0, k))))
+    both = fit_mixed(rides, mean, prior, scatter, 1.0, np.zeros(p + k, dtype=bool), 0).mean
+    return both[:p], both[p:]
+
+
+def without(line: Linear, form: Form, coefficients: Array) -> Linear:
+    """`line` less the curve."""
+    table = line.tables.get(form.channel)
+    knots = columns(line.ride, form.quantity, table) if table else None
+    if table is None or knots is None:
+        return line
+    less = knots @ form.basis @ coefficients * form.size / table.unit
+    return Linear(line.ride, {**line.tables, form.channel: replace(table, y=table.y - less)})
 
 
 def with_start(state: State, ride: Normal, theta: Array) -> Array:

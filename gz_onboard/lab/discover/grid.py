@@ -6,6 +6,7 @@ longer than three of its periods (and 0.3 s), the grid says so: nothing is made 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from gz_onboard.errors import InputError
 from gz_onboard.physics.model import G, air_density
+from gz_onboard.physics.vibration import Vibration
 from gz_onboard.simulation.samples import Samples
 
 Array = NDArray[np.float64]
@@ -24,6 +26,9 @@ LAGS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage"
 NEEDED = ("motor_speed", "motor_current")
 BRAKE_PRESSURE = 0.8e5  # Pa: above what the sensors show at rest
 MOVING = 0.5  # m/s
+SUSPENSION = ("suspension_front", "suspension_rear")
+SHAKING = 0.034  # s: samples further apart do not show what a road does to a wheel
+LONGEST = 60.0  # s since a brake was touched, or a current changed: what was longer ago is as good as never
 
 
 @dataclass
@@ -125,11 +130,45 @@ def read_ride(samples: Samples, radius: float, mass: float) -> Ride:
         valid[role] = measured(times, at)
     ride = Ride(samples.name, grid - start, signals, valid, radius, samples.rider_mass)
     ride.quantities = _quantities(ride, mass)
+    ride.quantities["since_braking"] = since(ride.braking)
+    wheels = [samples.columns[role] for role in SUSPENSION if role in samples.columns]
+    if wheels and all(np.median(np.diff(times)) < SHAKING for times, _ in wheels):
+        ride.quantities["suspension_speed"] = suspension_speed(wheels, grid)
+    if "accel_z" in samples.columns and np.median(np.diff(samples.columns["accel_z"][0])) < SHAKING:
+        ride.quantities["vibration"] = vibration(*samples.columns["accel_z"], grid)
     wanted = ("accel_x", "rate_z", "gps_speed", "gps_altitude", "gps_course", "pack_voltage", "pack_current",
               "inverter_voltage", "inverter_current", "auxiliary_current", "cell_temperature", "ambient_temperature",
               "motor_temperature", "inverter_temperature", "wheel_speed_front", "wheel_speed_rear")  # fmt: skip
     ride.missing = tuple(role for role in wanted if role not in signals)
     return ride
+
+
+def since(happens: Mask) -> Array:
+    """Time [s] since `happens` (n,) was last True, at most `LONGEST`, (n,)."""
+    steps = np.arange(len(happens))
+    last = np.maximum.accumulate(np.where(happens, steps, -round(LONGEST / STEP)))
+    return np.asarray(np.minimum((steps - last) * STEP, LONGEST))
+
+
+def vibration(times: Array, values: Array, grid: Array) -> Array:
+    """How rough the road is [m/s²]: of vertical acceleration `values` at `times`, at `grid`; see `Vibration`."""
+    shaken, rms = Vibration(), []
+    for dt, value in zip(np.diff(times, prepend=times[0]).tolist(), values.tolist(), strict=True):
+        shaken.update(dt, value)
+        rms.append(shaken.value)
+    return np.asarray(np.interp(grid, times, rms))
+
+
+def suspension_speed(wheels: Sequence[tuple[Array, Array]], grid: Array, width: float = 2.0) -> Array:
+    """The RMS [m/s] over `width` [s] of how fast the suspension moves, of all `wheels` together, at `grid`.
+
+    wheels: (times [s], travel [m]) of each.
+    """
+    square = np.zeros_like(grid)
+    for times, travel in wheels:
+        speed = np.gradient(travel, times)
+        square += averaged(times, speed * speed, grid, width)
+    return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
 
 def smooth(values: Array, seconds: float) -> Array:

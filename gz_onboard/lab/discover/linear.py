@@ -216,12 +216,12 @@ class Posterior:
 
 
 def fit_mixed(
-    rides: Sequence[Normal], mean: Array, prior: Array, scatter: Array, weight: float, free: Mask, rounds: int = 60,
-    least: Array | float = 0.02,
+    rides: Sequence[Normal], mean: Array, prior: Array, scatter: Array, weight: Array | float, free: Mask,
+    rounds: int = 60, least: float = 0.02,
 ) -> Posterior:  # fmt: skip
     """Common part, and the scatter between rides by expectation and maximisation (Dempster, Laird & Rubin 1977).
 
-    mean, prior: (p,), (p, p) of the common part before. scatter: (p,) variances before, worth `weight` rides;
+    mean, prior: (p,), (p, p) of the common part before. scatter: (p,) variances before, worth `weight` (p,) rides;
     only those of `free` (p,) are learned, down to `least` of what they were.
     """
     before = scatter.copy()

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gz_onboard.lab.discover.channels import BY_NAME, SLOW, cell_circuit, over_blocks, usable
-from gz_onboard.lab.discover.grid import STEP, Array, Ride
+from gz_onboard.lab.discover.grid import STEP, Array, Ride, since
 from gz_onboard.lab.discover.limits import words
 from gz_onboard.lab.discover.linear import Linear, Posterior, Table, fit_mixed
 from gz_onboard.lab.discover.result import Report
@@ -20,7 +20,6 @@ from gz_onboard.lab.discover.state import State
 
 FREE = 1e6  # variance in scales of a cause that is free
 JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
-LONGEST = 60.0  # s since it did
 OUTSTANDING = 3.5  # standard deviations of what differs between healthy rides
 
 QUANTITIES: dict[str, tuple[str, str]] = {
@@ -37,6 +36,9 @@ QUANTITIES: dict[str, tuple[str, str]] = {
     "motor_current": ("motor current", "A"),
     "time": ("time since the start", "s"),
     "since_change": ("time since the current changed", "s"),
+    "since_braking": ("time since a brake was touched", "s"),
+    "suspension_speed": ("speed of the suspension", "m/s"),
+    "vibration": ("vibration: how rough the road is", "m/s²"),
 }
 """What residuals are looked at over: words and unit."""
 
@@ -128,15 +130,13 @@ def on_grid(ride: Ride, name: str, state: State) -> Array | None:
             return None
         soc = np.repeat(cell_circuit(ride, state.values, state.system)[2], SLOW)
         return np.append(soc, np.full(max(0, len(ride.time) - len(soc)), soc[-1]))
-    return ride.quantities[name]
+    return ride.quantities.get(name)
 
 
 def since_change(current: Array) -> Array:
-    """Time [s] since `current` (n,) changed by more than `JUMP` within `WITHIN`, at most `LONGEST`, (n,)."""
+    """Time [s] since `current` (n,) changed by more than `JUMP` within `WITHIN`, at most `grid.LONGEST`, (n,)."""
     n = round(WITHIN / STEP)
-    jump = np.abs(current - np.concatenate([np.full(n, current[0]), current[:-n]])) > JUMP
-    last = np.maximum.accumulate(np.where(jump, np.arange(len(current)), -round(LONGEST / STEP)))
-    return np.asarray(np.minimum((np.arange(len(current)) - last) * STEP, LONGEST))
+    return since(np.abs(current - np.concatenate([np.full(n, current[0]), current[:-n]])) > JUMP)
 
 
 def gathered(lines: Sequence[Linear], channel: str, name: str, over: Over) -> tuple[Array, Array, Array]:

@@ -39,13 +39,14 @@ class Cause:
     energy_share: float
     evidence: float  # chi-squared with one degree of freedom that leaving it out costs
     others: tuple[tuple[str, float, tuple[float, float]], ...] = ()  # further parameters: name, value, interval
+    varies: bool = False  # from ride to ride: what these show promises nothing for the next, and no model is extended
 
     def to_json(self) -> dict[str, Any]:
         """As a JSON object."""
         return {
             "name": self.name, "parameter": self.parameter, "value": self.value, "unit": self.unit,
             "ci95": list(self.ci95), "change": self.change, "energy_share": self.energy_share,
-            "evidence": self.evidence,
+            "evidence": self.evidence, "varies": self.varies,
             "parameters": {self.parameter: {"value": self.value, "ci95": list(self.ci95)}}
             | {name: {"value": value, "ci95": list(ci)} for name, value, ci in self.others},
         }  # fmt: skip

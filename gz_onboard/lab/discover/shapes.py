@@ -27,21 +27,62 @@ QUANTITIES: dict[str, tuple[tuple[float, ...], str]] = {
     "pack_current": ((-15.0, 0.0, 8.0, 20.0, 40.0, 60.0, 90.0), "A"),
     "soc": ((0.2, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0), "1"),
     "steering": ((-0.5, -0.2, -0.06, 0.0, 0.06, 0.2, 0.5), "rad"),
+    "vibration": ((0.3, 0.7, 1.0, 1.4, 1.9, 2.5, 3.3), "m/s²"),
+    "suspension_speed": ((0.02, 0.06, 0.1, 0.14, 0.19, 0.25, 0.35), "m/s"),
+    "since_braking": ((0.0, 4.0, 8.0, 15.0, 30.0, 60.0), "s"),
 }
 PAIRS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("road_force", ("speed", "acceleration", "lateral_acceleration", "grade", "heading", "motor_temperature", "time",
-                    "motor_current", "current_change", "steering")),
+                    "motor_current", "current_change", "steering", "vibration", "suspension_speed", "since_braking")),
     ("inverter_power", ("speed", "motor_current", "motor_temperature", "time", "current_change")),
-    ("auxiliary", ("speed", "motor_temperature", "time", "pack_current")),
+    ("auxiliary", ("speed", "motor_temperature", "time", "pack_current", "vibration")),
     ("pack_balance", ("speed", "pack_current", "motor_temperature", "time")),
-    ("cell_voltage", ("pack_current", "soc", "time", "current_change")),
+    ("cell_voltage", ("pack_current", "soc", "time", "current_change", "vibration")),
 )  # fmt: skip
 SHARE = 0.15  # sd before of a coefficient, over the residual's own standard deviation: see `amplitude`
 
 
-def names() -> list[str]:
-    """Every pair of channel and quantity, as ``channel over quantity``."""
-    return [f"{channel} over {quantity}" for channel, quantities in PAIRS for quantity in quantities]
+ROUND = ("heading",)
+NO_LINE = (*ROUND, "motor_temperature", "soc", "since_braking")
+"""Quantities whose zero means nothing: what goes in proportion to them is no likely effect."""
+
+
+@dataclass(frozen=True)
+class Form:
+    """What a channel may leave over a quantity: a curve, or what is in proportion, which needs less to be seen."""
+
+    channel: str
+    quantity: str
+    straight: bool = False
+
+    @property
+    def name(self) -> str:
+        """``channel over quantity`` of a curve."""
+        return f"{self.channel} {'along' if self.straight else 'over'} {self.quantity}"
+
+    @property
+    def size(self) -> float:
+        """Unit of its coefficients, in the channel's."""
+        return SIZES[self.channel]
+
+    @property
+    def scatter(self) -> float:
+        """By how much its coefficients differ between rides, in `size`."""
+        return SCATTERS.get(self.channel, SCATTER)
+
+    @property
+    def basis(self) -> Array:
+        """Its values at the knots for coefficients of one, (knots, k); what is in proportion has one."""
+        knots = np.array(QUANTITIES[self.quantity][0])
+        if not self.straight:
+            return np.eye(len(knots))
+        return np.asarray(knots[:, None] / np.abs(knots).max())
+
+
+def forms() -> list[Form]:
+    """A curve for every pair of channel and quantity, and a line where zero means none."""
+    every = [Form(channel, quantity) for channel, quantities in PAIRS for quantity in quantities]
+    return [*every, *(replace(form, straight=True) for form in every if form.quantity not in NO_LINE)]
 
 
 def quantity(ride: Ride, name: str, table: Table) -> Array | None:
@@ -59,10 +100,10 @@ def quantity(ride: Ride, name: str, table: Table) -> Array | None:
         if name not in ride.signals:
             return None
         values = ride.signals[name]
-    elif name == "soc":
-        if "soc" not in q:
+    elif name in ("soc", "vibration", "suspension_speed"):
+        if name not in q:
             return None
-        values = q["soc"]
+        values = q[name]
     elif name == "grade" and "gps_altitude" in ride.signals:  # not of the accelerometer, whose noise is in the channel
         rise = np.gradient(smooth(ride.signals["gps_altitude"], 8.0), STEP)
         values = smooth(rise, 8.0) / np.maximum(smooth(np.abs(q["speed"]), 8.0), 2.0)
@@ -72,11 +113,6 @@ def quantity(ride: Ride, name: str, table: Table) -> Array | None:
     else:
         values = q[name]
     return over_blocks(channel, values)[table.used]
-
-
-def scattering(pair: str) -> float:
-    """By how much the coefficients of the curve `pair` differ between rides, in `SIZES`."""
-    return SCATTERS.get(pair.partition(" over ")[0], SCATTER)
 
 
 def hats(x: Array, knots: Sequence[float], periodic: bool = False) -> Array:
@@ -97,20 +133,20 @@ def columns(ride: Ride, name: str, table: Table) -> Array | None:
     x = quantity(ride, name, table)
     if x is None:
         return None
-    return hats(x, QUANTITIES[name][0], name == "heading")
+    return hats(x, QUANTITIES[name][0], name in ROUND)
 
 
-def extended(linear: Linear, normal: Normal, pair: str, noise: Noise, size: float) -> Normal | None:
-    """`normal` with the columns of the curve `pair`, each in units of `size` of the channel's residual."""
-    channel, _, name = pair.partition(" over ")
-    table = linear.tables.get(channel)
+def extended(linear: Linear, normal: Normal, form: Form, noise: Noise) -> Normal | None:
+    """`normal` with the columns of `form`."""
+    table = linear.tables.get(form.channel)
     if table is None:
         return None
-    curve = columns(linear.ride, name, table)
-    if curve is None:
+    knots = columns(linear.ride, form.quantity, table)
+    if knots is None:
         return None
+    curve = knots @ form.basis * form.size / table.unit[:, None]
     k, p = curve.shape[1], len(normal.b)
-    both = whitened(table, noise[channel], np.column_stack([curve * size / table.unit[:, None], table.a, table.y]))
+    both = whitened(table, noise[form.channel], np.column_stack([curve, table.a, table.y]))
     b, a, y = both[:, :k], both[:, k:-1], both[:, -1]
     n = np.zeros((p + k, p + k))
     n[:p, :p] = normal.n
@@ -130,19 +166,15 @@ SCATTERS = {"cell_voltage": 1.0}  # whose model lacks more
 class Curve:
     """What rides show over a quantity. chi2: twice the rise of the log likelihood, of `k` degrees of freedom.
 
-    values (k,): coefficients [the channel's unit]; covariance (k, k); weights (k,): how much of the rides is at each
-    knot, together 1.
+    values (knots,): of the curve at each knot [the channel's unit]; covariance (knots, knots); weights (knots,): how
+    much of the rides is at each, together 1.
     """
 
     chi2: float
+    k: int
     values: Array
     covariance: Array
     weights: Array
-
-    @property
-    def k(self) -> int:
-        """How many knots."""
-        return len(self.values)
 
     @property
     def sd(self) -> Array:
@@ -151,27 +183,26 @@ class Curve:
 
     def contrasts(self) -> tuple[Array, Array]:
         """(values less their mean, standard deviations of these), each (k,): what no constant could be."""
-        d = np.eye(self.k) - self.weights
+        d = np.eye(len(self.values)) - self.weights
         return d @ self.values, np.sqrt(np.abs(np.diag(d @ self.covariance @ d.T)))
 
 
 def shape_evidence(
-    state: State, linears: Sequence[Linear], normals: Sequence[Normal], pair: str, fixed: Sequence[int]
+    state: State, linears: Sequence[Linear], normals: Sequence[Normal], form: Form, fixed: Sequence[int]
 ) -> Curve | None:
-    """The curve `pair` beside changes at `fixed`; None where no ride has it."""
-    size = SIZES[pair.partition(" over ")[0]]
-    found = [extended(line, normal, pair, state.noise, size) for line, normal in zip(linears, normals, strict=True)]
+    """What `form` is beside changes at `fixed`; None where no ride has it."""
+    found = [extended(line, normal, form, state.noise) for line, normal in zip(linears, normals, strict=True)]
     rides = [ride for ride in found if ride is not None]
     if not rides:
         return None
     p = len(state.mean)
     k = len(rides[0].b) - p
-    shape = state.shapes.get(pair)
+    shape = state.shapes.get(form.name)
     mean = np.concatenate([state.mean, shape.mean if shape else np.zeros(k)])
     prior = np.zeros((p + k, p + k))
     prior[:p, :p] = state.prior
-    prior[p:, p:] = shape.covariance if shape else np.eye(k) * scattering(pair) ** 2
-    scatter = np.concatenate([state.scatter, np.full(k, scattering(pair) ** 2)])
+    prior[p:, p:] = shape.covariance if shape else np.eye(k) * form.scatter**2
+    scatter = np.concatenate([state.scatter, np.full(k, form.scatter**2)])
     e = _evidence(mean, prior, scatter, rides)
     mine = list(range(p, p + k))
     inner = e.information[np.ix_(mine, mine)] + 1e-3 * np.eye(k)
@@ -184,17 +215,21 @@ def shape_evidence(
         score = score - e.information[np.ix_(mine, f)] @ cross[:, -1]
     inner = inner + 1e-3 * np.eye(k)
     estimate = np.linalg.solve(inner, score)
-    weights = sum(np.diag(ride.n)[p:] for ride in rides)
-    return Curve(float(score @ estimate), np.asarray(estimate * size), np.asarray(np.linalg.inv(inner) * size**2),
-                 np.asarray(weights / np.sum(weights)))  # fmt: skip
+    at = form.basis * form.size
+    weights = np.zeros(len(at))
+    for line in linears:
+        if form.channel in line.tables:
+            knots = columns(line.ride, form.quantity, line.tables[form.channel])
+            weights += 0.0 if knots is None else (knots**2).sum(axis=0)
+    return Curve(float(score @ estimate), k, at @ estimate, at @ np.linalg.inv(inner) @ at.T,
+                 weights / np.sum(weights))  # fmt: skip
 
 
 def learn_shapes(state: State, linears: Sequence[Linear], normals: Sequence[Normal]) -> dict[str, Shape]:
     """What the healthy rides leave over each quantity, beside what the parameters of `state` explain."""
     found = {}
-    for pair in names():
-        size = SIZES[pair.partition(" over ")[0]]
-        rides = [extended(line, normal, pair, state.noise, size) for line, normal in zip(linears, normals, strict=True)]
+    for form in forms():
+        rides = [extended(line, normal, form, state.noise) for line, normal in zip(linears, normals, strict=True)]
         rides = [ride for ride in rides if ride is not None]
         if not rides:
             continue
@@ -207,10 +242,10 @@ def learn_shapes(state: State, linears: Sequence[Linear], normals: Sequence[Norm
             u = state.mean + v @ (ride.b[:p] - ride.n[:p, :p] @ state.mean)  # type: ignore[union-attr]
             inner = ride.n[p:, p:] - ride.n[p:, :p] @ v @ ride.n[:p, p:]  # type: ignore[union-attr]
             score = ride.b[p:] - ride.n[p:, :p] @ u  # type: ignore[union-attr]
-            part = marginal(Normal((inner + inner.T) / 2, score), np.full(k, scattering(pair) ** 2))
+            part = marginal(Normal((inner + inner.T) / 2, score), np.full(k, form.scatter**2))
             m, c = m + part.n, c + part.b
         covariance = np.linalg.inv(m + np.eye(k))
-        found[pair] = Shape(np.asarray(covariance @ c), np.asarray(covariance), 1.0)
+        found[form.name] = Shape(np.asarray(covariance @ c), np.asarray(covariance), 1.0)
     return found
 
 
@@ -223,15 +258,15 @@ def with_inflation(
         rest = [i for i in range(len(linears)) if i not in held]
         shapes = learn_shapes(learned, [linears[i] for i in rest], [normals[i] for i in rest])
         blind = replace(learned, shapes=shapes)
-        for pair in shapes:
-            found = shape_evidence(blind, [linears[i] for i in held], [normals[i] for i in held], pair, [])
+        for form in forms():
+            found = shape_evidence(blind, [linears[i] for i in held], [normals[i] for i in held], form, [])
             if found:
-                total.setdefault(pair, []).append(found.chi2 / found.k)
+                total.setdefault(form.name, []).append(found.chi2 / found.k)
     whole = learn_shapes(state, linears, normals)
     return {
-        pair: replace(shape, inflation=max(1.0, (2 + sum(total.get(pair, []))) / (2 + len(total.get(pair, [])))))
-        for pair, shape in whole.items()
+        name: replace(shape, inflation=max(1.0, (2 + sum(total.get(name, []))) / (2 + len(total.get(name, [])))))
+        for name, shape in whole.items()
     }
 
 
-__all__ = ["BY_NAME", "QUANTITIES", "hats", "learn_shapes", "names", "shape_evidence"]
+__all__ = ["BY_NAME", "QUANTITIES", "Form", "forms", "hats", "learn_shapes", "shape_evidence"]

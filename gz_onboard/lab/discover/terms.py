@@ -94,7 +94,7 @@ FIXED = ("soc_start", "v1_start", "altitude_start", "payload_error", "motor_star
 """Those whose scatter is of the ride's start or of what was entered: nothing that healthy rides would tell better."""
 
 WEATHER = ("wind_north", "wind_east")
-"""Those whose scatter is the weather's: calm days do not promise more of them."""
+"""Those whose scatter is the weather's: a few calm days do not promise more of them."""
 
 STARTS = (*(name for name in FIXED if name != "payload_error"), "accel_bias", "pitch_gain", "gps_lag", "wheel_lag")
 """Those that are the sensors' or the start's, not the vehicle's: each ride tells its own, whatever the model."""

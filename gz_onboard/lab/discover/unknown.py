@@ -11,12 +11,13 @@ from gz_onboard.lab.discover.constancy import RIDE, Split
 from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear
 from gz_onboard.lab.discover.search import Search, one_degree
-from gz_onboard.lab.discover.shapes import QUANTITIES, Curve, names, shape_evidence
+from gz_onboard.lab.discover.shapes import QUANTITIES, Curve, Form, forms, shape_evidence
 from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.worth import energy_share, shape_share
 
+RIDES = "ride"  # the quantity of what differs from ride to ride
 LEFT = 0.1  # of what causes explain: a curve beside them that takes less is the bend of a large effect
-CURVE = 1.5  # a curve's evidence over that of a cause: there are many, and their knots are chosen by eye
+CURVE = 1.5  # a curve's evidence over that of a cause: their knots are chosen by eye; lines count as tries instead
 UNLIKE = 0.5  # of a cause's effect in a channel: a curve beside it that takes more is not the cause's bend
 RIVAL = 0.25  # of the evidence for the causes of its channel: a curve beside them that has more is no bend
 UNLIKE_LEFT = 0.004  # of what causes explain: less is not worth the doubt
@@ -39,23 +40,22 @@ def unexplained(
     index = search.index(chosen)
     total = search.evidence.gain(index)
     best: dict[str, Any] | None = None
-    for pair in names():
-        curve = shape_evidence(state, lines, normals, pair, index)
+    for form in forms():
+        curve = shape_evidence(state, lines, normals, form, index)
         if curve is None:
             continue
-        inflation = state.shapes[pair].inflation if pair in state.shapes else 1.0
+        inflation = inflated(state, form)
         score = one_degree(curve.chi2 / inflation, curve.k)
-        if score < CURVE * limit:
+        if score < limit * (1.0 if form.straight else CURVE):
             continue
-        channel = pair.partition(" over ")[0]
-        mine = [name for name in chosen if search.shares.get(name, {}).get(channel, 0.0) > 0.3]
+        mine = [name for name in chosen if search.shares.get(name, {}).get(form.channel, 0.0) > 0.3]
         theirs = sum(search.step([other for other in chosen if other != name], name) for name in mine)
-        unlike = unlike_causes(curve, inflation, *weight(state, lines, channel, change))
+        unlike = unlike_causes(curve, inflation, *weight(state, lines, form.channel, change))
         unlike = unlike or bool(mine and curve.chi2 / inflation > RIVAL * theirs)
         if chosen and curve.chi2 < (UNLIKE_LEFT if unlike else LEFT) * total:
             continue
         if best is None or (unlike, score) > (bool(best["denies"]), best["score"]):
-            best = described(pair, curve, score) | {"denies": mine if unlike else []}
+            best = described(form, curve, score) | {"denies": mine if unlike else []}
     if best is None or not best["denies"]:
         best = instead(state, search, lines, normals, chosen) or best
     unequal = [s for s in constancy if s.unequal]
@@ -84,18 +84,17 @@ def instead(
     for name in chosen:
         rest = [other for other in chosen if other != name]
         own = search.step(rest, name)
-        for pair in names():
-            channel = pair.partition(" over ")[0]
-            if search.shares.get(name, {}).get(channel, 0.0) < 0.3:
+        for form in forms():
+            if search.shares.get(name, {}).get(form.channel, 0.0) < 0.3:
                 continue
-            curve = shape_evidence(state, lines, normals, pair, search.index(rest))
+            curve = shape_evidence(state, lines, normals, form, search.index(rest))
             if curve is None:
                 continue
-            inflation = state.shapes[pair].inflation if pair in state.shapes else 1.0
+            inflation = inflated(state, form)
             ahead = curve.chi2 / inflation - 2 * (curve.k - 1) - own * max(state.inflation.get(name, 1.0), 1.0)
             if ahead > max(most, UNLIKE_LEFT * own):
                 most = ahead
-                best = described(pair, curve, one_degree(curve.chi2 / inflation, curve.k)) | {"denies": [name]}
+                best = described(form, curve, one_degree(curve.chi2 / inflation, curve.k)) | {"denies": [name]}
     return best
 
 
@@ -107,17 +106,22 @@ def of_rides(
     channel = max(channels, key=lambda name: weight(state, lines, name, change)[1])
     mine = [s for s in constancy if s.cause == worst.cause and s.quantity.startswith(RIDE)]
     rows = [[float(i), s.ratio, abs(s.ratio) / max(s.chi2, 1e-9) ** 0.5] for i, s in enumerate(mine)]
-    return {"channel": channel, "quantity": "ride", "unit": "", "score": worst.chi2, "chi2": worst.chi2, "curve": rows,
+    return {"channel": channel, "quantity": RIDES, "unit": "", "score": worst.chi2, "chi2": worst.chi2, "curve": rows,
             "denies": [worst.cause], "share": energy_share(state, lines, change)}  # fmt: skip
 
 
-def described(pair: str, curve: Curve, score: float) -> dict[str, Any]:
+def inflated(state: State, form: Form) -> float:
+    """By how much the chi-squared of `form` is too high on healthy rides that were left out."""
+    shape = state.shapes.get(form.name)
+    return shape.inflation if shape else 1.0
+
+
+def described(form: Form, curve: Curve, score: float) -> dict[str, Any]:
     """The curve for the report."""
-    channel, _, quantity = pair.partition(" over ")
-    knots, unit = QUANTITIES[quantity]
+    knots, unit = QUANTITIES[form.quantity]
     rows = zip(knots, curve.values.tolist(), curve.sd.tolist(), strict=True)
-    return {"channel": channel, "quantity": quantity, "unit": unit, "score": score, "chi2": curve.chi2,
-            "curve": [list(row) for row in rows]}  # fmt: skip
+    return {"channel": form.channel, "quantity": form.quantity, "straight": form.straight, "unit": unit,
+            "score": score, "chi2": curve.chi2, "curve": [list(row) for row in rows]}  # fmt: skip
 
 
 def unlike_causes(curve: Curve, inflation: float, size: float, share: float) -> bool:
@@ -152,13 +156,13 @@ def weight(state: State, lines: Sequence[Linear], channel: str, change: Array) -
 def halves(state: State, lines: Sequence[Linear], normals: Sequence[Any], split: Split) -> dict[str, Any] | None:
     """The curve over the quantity of `split`, with no cause named, in the channel where it has most to say."""
     best: dict[str, Any] | None = None
-    for pair in names():
-        if not pair.endswith(f" over {split.quantity}"):
+    for form in forms():
+        if form.quantity != split.quantity or form.straight:
             continue
-        curve = shape_evidence(state, lines, normals, pair, [])
+        curve = shape_evidence(state, lines, normals, form, [])
         if curve is None:
             continue
-        score = one_degree(curve.chi2 / (state.shapes[pair].inflation if pair in state.shapes else 1.0), curve.k)
+        score = one_degree(curve.chi2 / inflated(state, form), curve.k)
         if best is None or score > best["score"]:
-            best = described(pair, curve, score) | {"denies": [split.cause]}
+            best = described(form, curve, score) | {"denies": [split.cause]}
     return best

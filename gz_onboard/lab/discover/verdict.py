@@ -15,9 +15,10 @@ from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, normal
 from gz_onboard.lab.discover.result import Cause, Report
 from gz_onboard.lab.discover.search import Evidence, Search, evidence, one_degree
+from gz_onboard.lab.discover.shapes import forms
 from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.terms import LOG
-from gz_onboard.lab.discover.unknown import unexplained
+from gz_onboard.lab.discover.unknown import RIDES, unexplained
 from gz_onboard.lab.discover.worth import energy_share, sizes
 
 FALSE_ALARMS = 0.05  # of sets of healthy rides, all candidates and curves together
@@ -58,7 +59,8 @@ def reach(
     normals = [normal(line, state.noise) for line in lines]
     e = evidence(state, normals)
     causes = seen(state, e, notes)
-    limit = threshold(state, tries(e, [i for c in causes for i in state.index(c.names)]))
+    proportions = sum(form.straight and form.channel in {c for line in lines for c in line.tables} for form in forms())
+    limit = threshold(state, tries(e, [i for c in causes for i in state.index(c.names)]) + proportions)
     shares = channel_shares(state, lines, causes)
     search = Search(state, e, causes, shares)
     say(f"{len(causes)} candidates")
@@ -98,7 +100,7 @@ def reach(
         scores["headwind"] = max(scores["headwind"], score)
         if score > limit:
             (wind,) = causes_of(state, search, [*chosen, "headwind"], lines)[-1:]
-            found = [*found, replace(wind, evidence=round(score, 2))]
+            found = [*found, replace(wind, evidence=round(score, 2), varies=True)]
             notes.append("the wind differed from ride to ride: " + words)
     verdict = "none"
     if unknown is not None and not found:
@@ -273,7 +275,7 @@ def advice(search: Search, sets: Sequence[Sequence[str]], unknown: dict[str, Any
     if unknown is not None:
         lines.append(
             f"Ride one and the same way several times: what {unknown['channel']} leaves differs from ride to ride."
-            if unknown["quantity"] == "ride"
+            if unknown["quantity"] == RIDES
             else f"Ride over the whole span of {unknown['quantity']} with all else the same, twice: what "
             f"{unknown['channel']} leaves goes with it, or with what changes along with it."
         )
