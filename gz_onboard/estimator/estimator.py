@@ -14,6 +14,7 @@ from typing import Any
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
 from gz_onboard.estimator.forecast import Forecast, Forecaster, Turn
 from gz_onboard.estimator.road import Road
+from gz_onboard.estimator.shaking import Shaking
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.events import STALE_PERIODS, Estimate, Event, Group, Reason, State
 from gz_onboard.physics.battery import Battery
@@ -76,6 +77,11 @@ class Estimator:
         self._slots = [[self.signals[role] for role in group.roles] for group in groups]
         pace = [i for role in PACE for i, group in enumerate(groups) if role in group.roles]
         self._pace = pace[0] if pace else -1
+        # Every sample of accel_z is looked at, but only for a model that reads what it tells.
+        self._reads_vibration = "vibration" in model.reads
+        shaken = [(i, group.roles.index("accel_z")) for i, group in enumerate(groups) if "accel_z" in group.roles]
+        self._shaken, self._accel_z = shaken[0] if self._reads_vibration and shaken else (-1, 0)
+        self._shaking = Shaking()
         self._time: float | None = None  # s, of the last step
         self._deadline = float("-inf")
         self._current: float | None = None  # A of the pack, at the last step
@@ -124,6 +130,8 @@ class Estimator:
                 signal.time = time
                 signal.total += value
                 signal.count += 1
+        if group == self._shaken and (accel_z := values[self._accel_z]) is not None:
+            self._shaking.sample(time, accel_z)
         if group == self._pace or time >= self._deadline:
             if self._time is None and group != self._pace and self._deadline < 0:
                 self._deadline = time + STEP_AT_LEAST  # the first step too is for the message that sets the pace
@@ -180,7 +188,7 @@ class Estimator:
         )
         quantities["grade"] = road.grade or 0.0
         if self.forecaster.extended:
-            self.forecaster.add(quantities, self._turn(), self._ambient(now)[0])
+            self.forecaster.add(quantities, self._turn(now), self._ambient(now)[0])
         return float(sum(self.model.power(quantities).values()))
 
     def _ambient(self, now: float) -> tuple[float, float]:
@@ -229,6 +237,8 @@ class Estimator:
                 q += (CURRENT_SD["none"] * (dt - 1.0) / charge) ** 2
             filter_.predict(dt, mean / battery.cells_parallel, temperature, (q, 1e-8 * dt))
             if self._in_cells:
+                if self._reads_vibration:
+                    self._cell_quantities["vibration"] = self.vibration(now)
                 self._move_cells(dt, mean / battery.cells_parallel, filter_.soc, temperature)
             if filter_.soc < -0.05 or filter_.soc > 1.05:
                 filter_.soc = min(max(filter_.soc, -0.05), 1.05)
@@ -366,15 +376,20 @@ class Estimator:
         motor = self.signals.motor_temperature.get(now)
         self.forecaster.ride(
             dt, speed, self.road.grade, voltage * current, self._ambient(now)[0], self.road.altitude or 0.0,
-            40.0 if motor is None else motor, self._turn() if self.forecaster.extended else None,
+            40.0 if motor is None else motor, self._turn(now) if self.forecaster.extended else None,
         )  # fmt: skip
 
-    def _turn(self) -> Turn:
+    def _turn(self, now: float) -> Turn:
         """What effects beyond the base's may read while riding."""
         road, filter_ = self.road, self.filter
         lateral = None if road.yaw_rate is None or road.speed is None else road.speed * road.yaw_rate
         cells = (filter_.soc if filter_ else 0.5, self._cell_temperature or 20.0, self._current or 0.0)
-        return Turn(lateral, road.heading, *cells)
+        return Turn(lateral, road.heading, *cells, self._shaking.value(now) if self._reads_vibration else None)
+
+    def vibration(self, now: float) -> float:
+        """What effects read as ``vibration`` [m/s²]: the typical value while it is not known."""
+        value = self._shaking.value(now)
+        return self.forecaster.typical_vibration(self.road.speed or 0.0) if value is None else value
 
     def _make_forecast(self, now: float, temperature: float) -> None:
         filter_ = self.filter

@@ -14,10 +14,11 @@ The range is the energy that can be drawn before the cut-off at the power to be 
 with a log-normal distribution.
 
 Effects of an extended model read more than speed, acceleration and grade, which is all that is known of the way to
-come. What is modelled of the way ridden has the heading, the lateral acceleration (its root mean square over each
-second) and the time moving as they were. What is expected of the way to come has
+come. What is modelled of the way ridden has the heading, the lateral acceleration and the vibration (the root mean
+square over each second) and the time moving as they were. What is expected of the way to come has
 - of the heading nothing: the mean over all of them, so that a steady wind costs what it costs on a round trip;
-- the lateral acceleration that the same piece of way had; before anything is ridden, or without IMU, the prior's;
+- the lateral acceleration and the vibration that the same piece of way had; before anything is ridden, or without IMU,
+  the prior's;
 - the time moving of half an hour on, as a range lasts an hour or so: tyres are warm then;
 - of memory nothing: effects are settled. Those in the cells take their voltage at the mean current.
 """
@@ -82,6 +83,8 @@ class Riding:
     climb: float = 0.0  # m in it
     lateral: float = 0.0  # m²/s³ in it: the square of the lateral acceleration
     lateral_seconds: float = 0.0  # s in it for which that is known
+    shaken: float = 0.0  # m²/s³ in it: the square of the vibration
+    shaken_seconds: float = 0.0  # s in it for which that is known
     time_moving: float = 0.0  # s since the start
     speed_before: float | None = None  # m/s, at its start
 
@@ -125,6 +128,7 @@ class Turn:
     soc: float
     cell_temperature: float  # degC
     current: float  # A of the pack
+    vibration: float | None = None  # m/s²
 
 
 class Forecaster:
@@ -140,7 +144,7 @@ class Forecaster:
         parameters = model.parameters
         self.extended = not model.reads <= BASE or any(e.decay for e in model.effects)
         self._by_heading = "heading" in model.reads
-        self._lacks = model.lacks(battery)
+        self._lacks = model.lacks(battery, {"vibration": prior.vibration})
         self._states: dict[str, float] = {}  # of effects with memory between road and pack
         self._capacity_sd = parameters.sd("cell_capacity") / parameters["cell_capacity"]
 
@@ -164,6 +168,9 @@ class Forecaster:
             if turn.lateral_acceleration is not None:
                 r.lateral += turn.lateral_acceleration**2 * dt
                 r.lateral_seconds += dt
+            if turn.vibration is not None:
+                r.shaken += turn.vibration**2 * dt
+                r.shaken_seconds += dt
             if speed > MOVING:
                 r.time_moving += dt
         if r.seconds < 1.0:
@@ -182,22 +189,28 @@ class Forecaster:
             self.add(q, turn, ambient)
             if r.lateral_seconds:
                 q["lateral_acceleration"] = sqrt(r.lateral / r.lateral_seconds)
+            if r.shaken_seconds:
+                q["vibration"] = sqrt(r.shaken / r.shaken_seconds)
             energy, to_come = (power * r.seconds for power in self._with_memory(q, turn.heading is not None, r.seconds))
         else:
             energy = to_come = sum(self.model.power(q).values()) * r.seconds
         segment.modelled += energy
         stored = G * r.climb + (speed * speed - r.speed_before * r.speed_before) / 2
         segment.level += to_come - self.model.mass * stored
-        r.seconds = r.way = r.energy = r.squares = r.climb = r.lateral = r.lateral_seconds = 0.0
+        self._next_second()
         r.speed_before = speed
         if segment.distance >= SEGMENT:
             self._close(segment)
 
     def pause(self) -> None:
         """Something was not known for a while: leave the second that was being gathered."""
+        self._next_second()
+        self.riding.speed_before = None
+
+    def _next_second(self) -> None:
         r = self.riding
-        r.seconds = r.way = r.energy = r.squares = r.climb = r.lateral = r.lateral_seconds = 0.0
-        r.speed_before = None
+        r.seconds = r.way = r.energy = r.squares = r.climb = 0.0
+        r.lateral = r.lateral_seconds = r.shaken = r.shaken_seconds = 0.0
 
     def quantities(
         self, speed: float, acceleration: float, ambient: float, altitude: float, motor: float
@@ -215,9 +228,14 @@ class Forecaster:
         if lateral is None:
             lateral = self.prior.lateral_acceleration if q["speed"] > MOVING else 0.0
         q["lateral_acceleration"] = lateral
+        q["vibration"] = self.typical_vibration(q["speed"]) if turn.vibration is None else turn.vibration
         q["heading"] = turn.heading or 0.0
         q["time_moving"] = self.riding.time_moving
         self._add_cells(q, turn.soc, turn.cell_temperature, turn.current, ambient)
+
+    def typical_vibration(self, speed: float) -> float:
+        """The prior riding's [m/s²] at `speed` [m/s]: what is taken where it is not known."""
+        return self.prior.vibration if speed > MOVING else 0.0
 
     def _add_cells(self, q: dict[str, Any], soc: float, temperature: float, current: float, ambient: float) -> None:
         q |= {
@@ -344,6 +362,7 @@ class Forecaster:
                 if self.extended:
                     q["time_moving"] = AHEAD
                     q["lateral_acceleration"] = self.prior.lateral_acceleration if speed > MOVING else 0.0
+                    q["vibration"] = self.typical_vibration(speed)
                     self._add_cells(q, 0.5, float(ambient), 0.0, float(ambient))
                     power += share * self._over_headings(q)
                 else:

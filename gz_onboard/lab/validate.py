@@ -4,7 +4,7 @@ Each ride is simulated twice from its measured start: open loop, with the measur
 rider model following the measured speed. Each component is also fed alone with its measured inputs. Battery current and
 voltage, motor torque and speed must be within 20 % (temperatures too), components within 10 %; `validate_score` says of
 what. The grade is that of the place where the scooter really was at that time, so that a speed that drifts does not
-also move the hills.
+also move the hills; so is the vibration.
 """
 
 from __future__ import annotations
@@ -245,10 +245,11 @@ def _ride(
     """The simulated ride; `progress` is told its shares."""
     here: Place = (0.0, 0.0, 0.0)
     distance = recorded.signals["distance"].tolist()
-    told = 0
+    rough = recorded.signals["vibration"].tolist() if "vibration" in recorded.signals else None
+    told = step = 0
 
     def where(scooter: Scooter) -> tuple[float, float, float]:
-        nonlocal here, told
+        nonlocal here, told, step
         step = min(round(scooter.time / STEP), len(distance) - 1)
         if not isinstance(road, Dynamometer):
             here = road(distance[step])
@@ -261,7 +262,7 @@ def _ride(
     scooter = Scooter(
         vehicle, road if isinstance(road, Dynamometer) else lambda _: here, soc=0.5 if soc is None else soc,
         ambient=ambient, cell_temperature=recorded.first("cell_temperature", ambient),
-        speed=recorded.first("speed", 0.0),
+        speed=recorded.first("speed", 0.0), vibration=(lambda _: rough[step]) if rough else None,
     )  # fmt: skip
     motor, inverter = scooter.motor_cooling, scooter.inverter_cooling
     motor.stator = motor.rotor = recorded.first("motor_temperature", ambient)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.lab.validate_score import Array, Channel, Mask
-from gz_onboard.physics.effect import QUANTITIES, Effect, Port
+from gz_onboard.physics.effect import MOVING, QUANTITIES, Effect, Port
 from gz_onboard.physics.model import air_density
 from gz_onboard.simulation.scooter import Dynamometer, Scooter
 from gz_onboard.vehicle import Vehicle
@@ -46,7 +46,9 @@ def components(
     has = measured.keys()
     every = np.ones(len(measured["speed"]), dtype=bool)
     if has >= {"pack_current", "pack_voltage", "cell_temperature"} and soc is not None:
-        voltage = battery_voltage(vehicle, measured["pack_current"], measured["cell_temperature"], soc)
+        voltage = battery_voltage(
+            vehicle, measured["pack_current"], measured["cell_temperature"], soc, vibration(vehicle, measured)
+        )
         found["battery_voltage"] = Component(Channel("V", "battery voltage"), measured["pack_voltage"], voltage, every)
     if has >= {"motor_current", "motor_speed"}:
         current, speed = measured["motor_current"], measured["motor_speed"]
@@ -73,14 +75,24 @@ def components(
     return found
 
 
-def battery_voltage(vehicle: Vehicle, current: Array, temperature: Array, soc: float) -> Array:
-    """Pack voltage [V] per second by the circuit of `physics.battery`, at rest before the first; sensor's offset in."""
+def vibration(vehicle: Vehicle, measured: Mapping[str, Array]) -> Array:
+    """[m/s²] per second; where the ride does not tell it, while moving what the vehicle's file expects."""
+    typical = np.where(measured["speed"] > MOVING, vehicle.riding.vibration, 0.0)
+    return measured.get("vibration", typical)
+
+
+def battery_voltage(vehicle: Vehicle, current: Array, temperature: Array, soc: float, rough: Array) -> Array:
+    """Pack voltage [V] per second by the circuit of `physics.battery`, at rest before the first; sensor's offset in.
+
+    rough: the vibration [m/s²].
+    """
     battery = vehicle.pack
     n, m = battery.cells_series, battery.cells_parallel
     v1, result = 0.0, np.empty(len(current))
     states = {name: 0.0 for name, _ in vehicle.model.cell_voltage}  # V of a cell, of effects in it
     q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0)
-    for i, (amperes, celsius) in enumerate(zip(current.tolist(), temperature.tolist(), strict=True)):
+    rows = zip(current.tolist(), temperature.tolist(), rough.tolist(), strict=True)
+    for i, (amperes, celsius, shaken) in enumerate(rows):
         cell = amperes / m
         r0, r1, c1 = (mesh.at(soc, celsius)[0] for mesh in (battery.r0, battery.r1, battery.c1))
         decay = exp(-0.5 / (r1 * c1))  # to the middle of the second, over which the measured is averaged
@@ -91,7 +103,7 @@ def battery_voltage(vehicle: Vehicle, current: Array, temperature: Array, soc: f
         v1 = decay * v1 + r1 * (1 - decay) * cell
         soc -= 0.5 * amperes / (3600 * battery.pack_capacity(celsius))
         if states:
-            q |= {"cell_current": cell, "soc": soc, "cell_temperature": celsius}
+            q |= {"cell_current": cell, "soc": soc, "cell_temperature": celsius, "vibration": shaken}
             q["cell_capacity"] = battery.cell_capacity(celsius)
             states = {name: effect.step(states[name], 1.0, q) for name, effect in vehicle.model.cell_voltage}
     return result + vehicle.parameters["pack_voltage_offset"]
@@ -135,6 +147,7 @@ def road_load(vehicle: Vehicle, measured: Mapping[str, Array], ambient: float, r
         "mass": vehicle.model.mass,
         "air_density": air_density(ambient),
         "lateral_acceleration": speed * measured.get("yaw_rate", zero),
+        "vibration": vibration(vehicle, measured),
         "motor_current": zero,
         "motor_temperature": ambient,
         "ambient_temperature": measured.get("ambient_temperature", zero + ambient),

@@ -62,6 +62,7 @@ QUANTITIES: dict[str, str] = {
     "air_density": "kg/m^3",
     "headwind": "m/s",
     "lateral_acceleration": "m/s^2, horizontal, positive to the left: speed times yaw rate",
+    "vibration": "m/s^2, RMS of the vertical acceleration faster than 0.1 s, over about 2 s",
     "motor_speed": "rad/s",
     "motor_current": "A, RMS, as torque over torque constant",
     "motor_temperature": "degC",

@@ -166,13 +166,17 @@ class Model:
                 ledger[name] = recall(effect, q) if recall and effect.effect.decay else effect(q)
         return ledger
 
-    def lacks(self, battery: Battery) -> Lacks | None:
-        """What the terminals of `battery`'s cells lack [V] by all effects in them, settled; None without any."""
+    def lacks(self, battery: Battery, beside: Mapping[str, float] | None = None) -> Lacks | None:
+        """What the terminals of `battery`'s cells lack [V] by all effects in them, settled; None without any.
+
+        beside: other quantities than the cells' that they may read; 0 if not given.
+        """
         if not self.cell_voltage:
             return None
+        others = dict.fromkeys(QUANTITIES, 0.0) | dict(beside or {})
 
         def lacks(current: float, soc: float, temperature: float) -> float:
-            q = dict.fromkeys(QUANTITIES, 0.0) | {
+            q = others | {
                 "cell_current": current,
                 "soc": soc,
                 "cell_temperature": temperature,

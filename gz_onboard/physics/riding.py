@@ -10,6 +10,7 @@ if TYPE_CHECKING:
 
 
 LATERAL = 1.1  # m/s², of the eight commissioning rides; each alone 0.26 (suburban) to 1.7 (oval)
+VIBRATION = 1.3  # m/s², RMS while moving, of the median of the eight commissioning rides; each alone 1.14 to 1.43
 
 
 @dataclass(frozen=True)
@@ -18,7 +19,8 @@ class PriorRiding:
 
     points: (share of time, speed [m/s], acceleration [m/s²]). unevenness: what hills and what lies between the
     points add to the energy modelled. factor, factor_sd: energy measured over modelled, and how that differs from
-    ride to ride. lateral_acceleration: its root mean square while moving [m/s²]; only a model that reads it asks.
+    ride to ride. lateral_acceleration, vibration: the root mean square while moving [m/s²]; only a model that reads it
+    asks.
     """
 
     points: tuple[tuple[float, float, float], ...] = (
@@ -29,6 +31,7 @@ class PriorRiding:
     factor: float = 1.0
     factor_sd: float = 0.15
     lateral_acceleration: float = LATERAL
+    vibration: float = VIBRATION
 
     @property
     def speed(self) -> float:
@@ -39,7 +42,7 @@ class PriorRiding:
 def read_riding(vehicle: Table) -> PriorRiding:
     """The table ``[forecast]`` of a vehicle file; without one, town riding as in the first part of the WMTC."""
     table = vehicle.table("forecast")
-    table.only(["riding", "unevenness", "factor", "factor_sd", "lateral_acceleration", "source"])
+    table.only(["riding", "unevenness", "factor", "factor_sd", "lateral_acceleration", "vibration", "source"])
     town = PriorRiding()
     if "riding" not in table.values:
         points = town.points
@@ -62,4 +65,5 @@ def read_riding(vehicle: Table) -> PriorRiding:
         table.number("factor", town.factor, 0.3, 3.0),
         table.number("factor_sd", town.factor_sd, 0.001, 1.0),
         table.number("lateral_acceleration", town.lateral_acceleration, 0.0, 9.0),
+        table.number("vibration", town.vibration, 0.0, 20.0),
     )

@@ -52,12 +52,14 @@ def backward(
     ambient: float = 20.0,
     altitude: float = 0.0,
     motor_temperature: ArrayLike | None = None,
+    vibration: ArrayLike | None = None,
     smoothing: float = SMOOTHING,
 ) -> Energy:
     """The energy of riding `speed` [m/s] over `time` [s], both of shape (n,); n of 2 or more.
 
     grade (sine of the road's angle), curvature [1/m], headwind [m/s], heading [rad clockwise from north; if not given,
-    as the curvature turns it from north], motor_temperature [degC, ambient if not given]: scalars or shape (n,).
+    as the curvature turns it from north], motor_temperature [degC, ambient if not given], vibration [m/s², while moving
+    what the vehicle's file expects if not given]: scalars or shape (n,).
     smoothing: the acceleration is the mean one over so many seconds; 0 for a drive cycle.
     Raises ValueError for shapes that do not fit and time that does not increase.
     """
@@ -89,6 +91,9 @@ def backward(
     if "heading" in vehicle.model.reads:
         turn = -np.cumsum(middle * _middle(curvature) * dt)
         q["heading"] = turn if heading is None else _middle(heading)
+    if "vibration" in vehicle.model.reads:
+        rough = vehicle.riding.vibration
+        q["vibration"] = np.where(middle > MOVING, rough, 0.0) if vibration is None else _middle(vibration)
     if "time_moving" in vehicle.model.reads:
         q["time_moving"] = np.cumsum(np.where(middle > MOVING, dt, 0.0))
     power, ledger = np.zeros_like(middle), defaultdict[str, float](float)

@@ -33,6 +33,7 @@ class Plan:
     length: float | None = None  # m, of one repetition; None if it ends by time
     recorded: Recorded | None = None
     heading: float | Callable[[float], float] = 0.0  # rad clockwise from north, where it begins or over distance
+    vibration: Callable[[float], float] | None = None  # m/s² over distance, as it was recorded
 
 
 def find_plan(arguments: argparse.Namespace, vehicle: Vehicle) -> Plan:
@@ -116,7 +117,17 @@ def _ride_plan(path: Path, arguments: argparse.Namespace, vehicle: Vehicle) -> P
             )
         throttle, brake = signals["throttle"].tolist(), signals["brake"].tolist()
         kind, command = "ride (open loop)", lambda: replay(throttle, brake, STEP)
-    return Plan(recorded.name, kind, recorded.duration, road, command, recorded=recorded, heading=heading)
+    rough = recorded.vibration is not None and not isinstance(road, Dynamometer)
+    return Plan(
+        recorded.name,
+        kind,
+        recorded.duration,
+        road,
+        command,
+        recorded=recorded,
+        heading=heading,
+        vibration=recorded.vibration_at if rough else None,
+    )
 
 
 def dynamometer(text: str) -> Dynamometer:

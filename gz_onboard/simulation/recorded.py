@@ -1,7 +1,8 @@
 """Recorded rides as inputs of a simulation: throttle and brake, speed, and what to compare the simulation with.
 
 Frames go through the codec of the bus, so what it drops is dropped here too. The road that was ridden is that of the
-estimator's road filter (accelerometer, altitude, yaw rate), or that of a route file.
+estimator's road filter (accelerometer, altitude, yaw rate), or that of a route file. How rough it was is what the
+estimator takes it for.
 """
 
 from __future__ import annotations
@@ -39,7 +40,8 @@ class Recorded:
     """A recorded ride, at even steps.
 
     signals: by role, in its SI unit, arrays of one length; only what was recorded. ``speed`` [m/s] (of the driven
-    wheel), ``distance`` [m], ``brake`` (0..1, of `brake_torque_limit`) and ``soc`` (counted charge) are worked out.
+    wheel), ``distance`` [m], ``brake`` (0..1, of `brake_torque_limit`) and ``soc`` (counted charge) are worked out;
+    ``vibration`` [m/s²] too, if the vehicle's model reads it and the ride tells it.
     """
 
     name: str
@@ -48,6 +50,7 @@ class Recorded:
     grade: Array  # sine, each `ROAD_PIECE` of distance
     curvature: Array  # 1/m, positive to the left, likewise
     heading: Array | None = None  # rad clockwise from north, likewise; None without GPS
+    vibration: Array | None = None  # m/s², likewise; None where ``vibration`` is not known
 
     @property
     def duration(self) -> float:
@@ -81,6 +84,11 @@ class Recorded:
             return 0.0
         return float(self.heading[min(max(int(distance / ROAD_PIECE), 0), len(self.heading) - 1)])
 
+    def vibration_at(self, distance: float) -> float:
+        """How rough the road is [m/s²] at `distance` [m]; only if `vibration` is known."""
+        assert self.vibration is not None
+        return float(self.vibration[min(max(int(distance / ROAD_PIECE), 0), len(self.vibration) - 1)])
+
     def road(self, headwind: float = 0.0) -> Road:
         """The road that was ridden."""
         starts = [ROAD_PIECE * i for i in range(len(self.grade))]
@@ -103,6 +111,8 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     known = [bool(group.roles) for group in estimator_groups]
     rows: list[tuple[float, float, float]] = []  # distance, grade, yaw rate over speed
     headings: list[tuple[float, float]] = []
+    rough: list[tuple[float, float, float]] = []  # time, distance, vibration
+    reads_vibration = "vibration" in vehicle.model.reads
     tick = 0.0
 
     def observe(event: Event) -> None:
@@ -118,14 +128,20 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
             rows.append((road.distance, road.grade or 0.0, turning))
             if road.heading is not None and speed > _MOVING:
                 headings.append((road.distance, road.heading))
+            if reads_vibration:
+                rough.append((event[0], road.distance, estimator.vibration(event[0])))
 
     columns = read_roles(log, vehicle, codec, progress, observe)
+    felt = np.array(rough) if rough and "accel_z" in columns else None
+    if felt is not None:
+        columns["vibration"] = felt[:, 0], felt[:, 2]
     signals = _signals(log, columns, vehicle)
     if "pack_voltage" in signals and "pack_current" in signals:
         signals["soc"] = _counted_soc(signals, vehicle)
     grade, curvature = _by_distance(np.array(rows))
     name = log.name.removesuffix(".gz")
-    return Recorded(Path(name).stem, STEP, signals, grade, curvature, _headings(headings))
+    vibration = None if felt is None else _vibration(felt[:, 1], felt[:, 2])
+    return Recorded(Path(name).stem, STEP, signals, grade, curvature, _headings(headings), vibration)
 
 
 def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicle) -> dict[str, Array]:
@@ -168,6 +184,14 @@ def _by_distance(rows: Array) -> tuple[Array, Array]:
         return np.zeros(1), np.zeros(1)
     at = np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE)
     return np.interp(at, distance, rows[keep, 1]), np.interp(at, distance, rows[keep, 2])
+
+
+def _vibration(distance: Array, values: Array) -> Array:
+    """The vibration at even distances; where the scooter stood, as it came there."""
+    import numpy as np
+
+    distance, keep = np.unique(distance, return_index=True)
+    return np.interp(np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE), distance, values[keep])
 
 
 def _headings(rows: list[tuple[float, float]]) -> Array | None:

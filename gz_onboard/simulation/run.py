@@ -303,6 +303,6 @@ def range_by_energy(scooter: Scooter, run: Run, soc: float, temperature: float) 
     battery, consumption = scooter.vehicle.battery, run.consumption
     if battery is None or consumption is None or consumption <= 0:
         return None
-    lacks = scooter.vehicle.model.lacks(battery)
+    lacks = scooter.vehicle.model.lacks(battery, {"vibration": scooter.vehicle.riding.vibration})
     left = drawable(battery, soc, temperature, run.mean_power, run.form, lacks)
     return float(left.energy / consumption)

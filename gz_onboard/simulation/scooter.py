@@ -75,8 +75,9 @@ class Scooter:
     `pack`, `motor`, `chassis` may be replaced by any object with the methods of `Pack`, `Motor`, `Chassis`; a chassis
     that turns is refused (InputError) beside the effect `cornering_drag`, which is the same loss. The other parts are
     attributes, to be set before the first step; effects of the model in the cells act in the own pack only.
-    Temperatures in degC; `heading`, in rad clockwise from north, is that over distance [m], or that where the road
-    begins and its curvature turns.
+    `vibration` [m/s²], a number or over distance [m], is how rough the road is wherever the scooter moves; if not given
+    what the vehicle's file expects, on a roller 0. Temperatures in degC; `heading`, in rad clockwise from north, is
+    that over distance [m], or that where the road begins and its curvature turns.
     """
 
     def __init__(self, vehicle: Vehicle, road: Road | Dynamometer | None = None, *, soc: float = 1.0,
@@ -84,6 +85,7 @@ class Scooter:
                  speed: float = 0.0, dt: float = STEP, pack: Pack | None = None, motor: Motor | None = None,
                  tyre_form: str = "transient", brake_form: str = "friction",
                  heading: float | Callable[[float], float] = 0.0,
+                 vibration: float | Callable[[float], float] | None = None,
                  chassis: Chassis | None = None) -> None:  # fmt: skip
         if vehicle.battery is None:
             raise vehicle.error("has no [battery], which a simulation needs")
@@ -118,6 +120,11 @@ class Scooter:
         self._heading_at = heading if callable(heading) else None
         self.start_heading = self.heading = heading(0.0) if callable(heading) else heading  # rad
         self.time_moving = 0.0  # s
+        if vibration is None:
+            vibration = 0.0 if self.dynamometer else vehicle.riding.vibration
+        self._vibration_at = vibration if callable(vibration) else None
+        self._rough = 0.0 if callable(vibration) else vibration
+        self.vibration = 0.0  # m/s², of a vehicle whose effects read it
         self._q: dict[str, float] = dict.fromkeys((*QUANTITIES, "yaw_rate", "lean"), 0.0)
         model = vehicle.model
         own: Pack
@@ -128,7 +135,8 @@ class Scooter:
         self.pack: Pack = pack or own
         effects = model.effects
         at = {port: [e for e in effects if e.port is port] for port in Port}
-        self._tracks = bool(model.reads & {"heading", "time_moving", "soc", "cell_temperature", "cell_current"})
+        self._tracks = bool(model.reads & {"heading", "time_moving", "soc", "cell_temperature", "cell_current",
+                                             "vibration"})  # fmt: skip
         # Forces that read the acceleration are the dynamics that this simulation integrates itself.
         forces = [e for e in at[Port.WHEEL_FORCE] if "acceleration" not in e.quantities]
         if self.dynamometer:
@@ -332,6 +340,10 @@ class Scooter:
             self.heading -= self.speed * curvature * self.dt
         if self.speed > MOVING:
             self.time_moving += self.dt
+            self.vibration = self._vibration_at(self.distance) if self._vibration_at else self._rough
+        else:
+            self.vibration = 0.0
+        q["vibration"] = self.vibration
         q["heading"], q["time_moving"] = self.heading, self.time_moving
         q["soc"], q["cell_temperature"] = self.pack.soc, self.pack_cooling.temperature
         q["cell_current"] = self.current / self.vehicle.pack.cells_parallel

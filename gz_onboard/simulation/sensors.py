@@ -35,6 +35,7 @@ _METRES_PER_DEGREE = 111_200.0
 _NAMES = (
     "time", "speed", "wheel_speed", "distance", "climb", "grade", "curvature", "throttle", "brake", "motor_current",
     "pack_current", "pack_voltage", "soc", "cell", "motor", "inverter", "bms", "tyre_force", "chassis_lean",
+    "vibration",
 )  # fmt: skip
 
 
@@ -53,7 +54,7 @@ class Trace:
             extend((
                 s.time, s.speed, s.wheel_speed, s.distance, s.climb, grade, curvature, s.throttle, s.brake,
                 s.motor_current, s.current, s.voltage, s.pack.soc, s.pack_cooling.temperature, s.motor_cooling.stator,
-                s.inverter_cooling.board, s.bms_cooling.temperature, s.force, s.lean,
+                s.inverter_cooling.board, s.bms_cooling.temperature, s.force, s.lean, s.vibration,
             ))  # fmt: skip
             return command(s)
 
@@ -116,6 +117,7 @@ class Truth:
             "lateral_acceleration": c["way"] * c["yaw_rate"], "heading": c["heading"],
             "motor_current": c["motor_current"], "motor_temperature": c["motor"], "cell_temperature": c["cell"],
             "time_moving": np.cumsum(c["way"] > MOVING) * self.dt, "ambient_temperature": self.ambient,
+            "vibration": c["vibration"],
         }  # fmt: skip
         power = np.zeros(self.count)
         for effect in scooter.vehicle.model.effects:

@@ -130,7 +130,8 @@ def ride(
         soc = (rest_soc(recorded, vehicle) if recorded else None) or 1.0
     scooter = Scooter(
         vehicle, plan.road, soc=soc, ambient=ambient, cell_temperature=measured("cell_temperature", ambient),
-        speed=measured("speed", 0.0), heading=plan.heading, chassis=chassis(arguments.chassis, vehicle.parameters),
+        speed=measured("speed", 0.0), heading=plan.heading, vibration=plan.vibration,
+        chassis=chassis(arguments.chassis, vehicle.parameters),
     )  # fmt: skip
     scooter.motor_cooling.stator = scooter.motor_cooling.rotor = measured("motor_temperature", ambient)
     scooter.inverter_cooling.board = scooter.inverter_cooling.box = measured("inverter_temperature", ambient)

@@ -1,0 +1,48 @@
+"""How rough the road is, from samples as a bus brings them: some late, some lost, some the same for ever."""
+
+from __future__ import annotations
+
+from gz_onboard.physics.vibration import FAST, SLOW, Vibration
+
+SETTLED = 3 * SLOW  # s of samples before the value is told: 97 % of it is there
+MOST = 0.034  # s between samples in the mean: those further apart do not show what a road does to a wheel
+STUCK = 1.0  # s of one and the same value: no accelerometer, not even at rest, says that
+
+
+class Shaking:
+    """`Vibration` of samples of accel_z. Not told while it would be a wrong number: see `value`."""
+
+    __slots__ = ("_before", "_count", "_same", "_since", "_time", "_vibration")
+
+    def __init__(self) -> None:
+        self._anew(float("-inf"), float("nan"))
+
+    def _anew(self, time: float, accel_z: float) -> None:
+        self._vibration = Vibration()
+        self._vibration.update(0.0, accel_z)
+        self._since = self._time = self._same = time  # s: the first sample, the last, the first of the last's value
+        self._before = accel_z
+        self._count = 0  # samples after the first
+
+    def sample(self, time: float, accel_z: float) -> None:
+        """A sample [m/s²] at `time` [s]. After a gap, time that goes back or a stuck sensor all begins anew."""
+        dt = time - self._time
+        if dt == 0:
+            return
+        if not 0 < dt <= FAST or time - self._same > STUCK:
+            same = self._same if accel_z == self._before else time
+            self._anew(time, accel_z)
+            self._same = same if dt > 0 else time
+            return
+        if accel_z != self._before:
+            self._before, self._same = accel_z, time
+        self._time = time
+        self._count += 1
+        self._vibration.update(dt, accel_z)
+
+    def value(self, now: float) -> float | None:
+        """[m/s²] at `now` [s]; None while samples are missing, too few, or only just come again."""
+        elapsed = self._time - self._since
+        if now - self._time > FAST or elapsed < SETTLED or self._count * MOST < elapsed:
+            return None
+        return self._vibration.value
