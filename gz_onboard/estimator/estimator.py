@@ -239,6 +239,7 @@ class Estimator:
             if self._in_cells:
                 if self._reads_vibration:
                     self._cell_quantities["vibration"] = self.vibration(now)
+                self._cell_quantities["time_moving"] = self.forecaster.riding.time_moving
                 self._move_cells(dt, mean / battery.cells_parallel, filter_.soc, temperature)
             if filter_.soc < -0.05 or filter_.soc > 1.05:
                 filter_.soc = min(max(filter_.soc, -0.05), 1.05)

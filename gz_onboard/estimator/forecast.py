@@ -144,7 +144,7 @@ class Forecaster:
         parameters = model.parameters
         self.extended = not model.reads <= BASE or any(e.decay for e in model.effects)
         self._by_heading = "heading" in model.reads
-        self._lacks = model.lacks(battery, {"vibration": prior.vibration})
+        self._lacks = model.lacks(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
         self._states: dict[str, float] = {}  # of effects with memory between road and pack
         self._capacity_sd = parameters.sd("cell_capacity") / parameters["cell_capacity"]
 

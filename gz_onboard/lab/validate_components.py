@@ -46,9 +46,7 @@ def components(
     has = measured.keys()
     every = np.ones(len(measured["speed"]), dtype=bool)
     if has >= {"pack_current", "pack_voltage", "cell_temperature"} and soc is not None:
-        voltage = battery_voltage(
-            vehicle, measured["pack_current"], measured["cell_temperature"], soc, vibration(vehicle, measured)
-        )
+        voltage = battery_voltage(vehicle, measured, soc)
         found["battery_voltage"] = Component(Channel("V", "battery voltage"), measured["pack_voltage"], voltage, every)
     if has >= {"motor_current", "motor_speed"}:
         current, speed = measured["motor_current"], measured["motor_speed"]
@@ -81,18 +79,22 @@ def vibration(vehicle: Vehicle, measured: Mapping[str, Array]) -> Array:
     return measured.get("vibration", typical)
 
 
-def battery_voltage(vehicle: Vehicle, current: Array, temperature: Array, soc: float, rough: Array) -> Array:
-    """Pack voltage [V] per second by the circuit of `physics.battery`, at rest before the first; sensor's offset in.
+def time_moving(measured: Mapping[str, Array]) -> Array:
+    """[s] since the start, per second."""
+    return np.asarray(np.cumsum(measured["speed"] > 1.0), dtype=float)
 
-    rough: the vibration [m/s²].
-    """
+
+def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float) -> Array:
+    """Pack voltage [V] per second by the circuit of `physics.battery`, at rest before the first; sensor's offset in."""
     battery = vehicle.pack
     n, m = battery.cells_series, battery.cells_parallel
-    v1, result = 0.0, np.empty(len(current))
+    columns = (measured["pack_current"], measured["cell_temperature"], vibration(vehicle, measured),
+               time_moving(measured))  # fmt: skip
+    v1, result = 0.0, np.empty(len(columns[0]))
     states = {name: 0.0 for name, _ in vehicle.model.cell_voltage}  # V of a cell, of effects in it
     q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0)
-    rows = zip(current.tolist(), temperature.tolist(), rough.tolist(), strict=True)
-    for i, (amperes, celsius, shaken) in enumerate(rows):
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    for i, (amperes, celsius, shaken, moving) in enumerate(rows):
         cell = amperes / m
         r0, r1, c1 = (mesh.at(soc, celsius)[0] for mesh in (battery.r0, battery.r1, battery.c1))
         decay = exp(-0.5 / (r1 * c1))  # to the middle of the second, over which the measured is averaged
@@ -104,7 +106,7 @@ def battery_voltage(vehicle: Vehicle, current: Array, temperature: Array, soc: f
         soc -= 0.5 * amperes / (3600 * battery.pack_capacity(celsius))
         if states:
             q |= {"cell_current": cell, "soc": soc, "cell_temperature": celsius, "vibration": shaken}
-            q["cell_capacity"] = battery.cell_capacity(celsius)
+            q |= {"cell_capacity": battery.cell_capacity(celsius), "time_moving": moving}
             states = {name: effect.step(states[name], 1.0, q) for name, effect in vehicle.model.cell_voltage}
     return result + vehicle.parameters["pack_voltage_offset"]
 
@@ -152,7 +154,7 @@ def road_load(vehicle: Vehicle, measured: Mapping[str, Array], ambient: float, r
         "motor_temperature": ambient,
         "ambient_temperature": measured.get("ambient_temperature", zero + ambient),
         "motor_speed": measured["motor_speed"],
-        "time_moving": np.cumsum(speed > 1.0),
+        "time_moving": time_moving(measured),
         "heading": measured.get("gps_course", zero),
     }
     if not roller:

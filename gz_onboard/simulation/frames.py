@@ -24,6 +24,7 @@ from gz_onboard.simulation.sensors import (
     Sensor,
     Truth,
     latency,
+    shaken,
     spread,
 )
 from gz_onboard.vehicle import Vehicle
@@ -191,7 +192,8 @@ def _values(sensor: Sensor | None, truth: Truth, seconds: Floats, period: float,
             fresh = np.sqrt(1 - keep * keep)
             for i in range(1, len(noise)):
                 noise[i] = keep * noise[i - 1] + fresh * noise[i]
-        values = values + sd * noise
+        rough = shaken(sensor, truth, period)
+        values = values + (sd if rough is None else np.hypot(sd, rough[steps])) * noise
     turn = TURNS.get(sensor.signal)
     return values % turn if turn else values
 

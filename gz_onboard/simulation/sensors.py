@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
 from gz_onboard.physics.model import G, bind
+from gz_onboard.physics.vibration import FAST
 from gz_onboard.simulation.recorded import BRAKE_FORCE
 from gz_onboard.simulation.run import Command
 from gz_onboard.simulation.scooter import Scooter
@@ -76,7 +77,7 @@ class Truth:
     Those of `Trace`, and: ``acceleration`` and ``way`` (of the body over the ground: none on a dynamometer),
     ``yaw_rate`` (left), ``lean`` (right; of a leaning chassis its own, else `_lean_of`), ``lean_rate``, ``pitch_rate``
     (nose down), ``heading`` (from north), ``north`` and ``east`` [m], ``auxiliary_power`` (of all effects at the DC
-    link), ``auxiliary_current``.
+    link), ``auxiliary_current``. ``vibration`` is 0 unless the model reads it.
     """
 
     def __init__(self, columns: Mapping[str, Array], scooter: Scooter) -> None:
@@ -314,6 +315,20 @@ ROLLER: tuple[Sensor, ...] = (
     Sensor("DYNO_RollerForce", _column("tyre_force"), sd=1.0),
 )
 """On the chassis dynamometer only."""
+
+
+def shaken(sensor: Sensor, truth: Truth, period: float) -> Array | None:
+    """The standard deviation of what the road shakes into the sensor [its unit] at each step; None if it does not.
+
+    White, sampled each `period` [s], of the size that `physics.vibration.Vibration` makes the truth's vibration of.
+    """
+    import numpy as np
+
+    if sensor.signal != "IMU_AccelZ" or not truth["vibration"].any():
+        return None
+    keep = np.exp(-period / FAST)  # of the slow mean; the variance of what is faster is keep²·(1 + (1-keep)/(1+keep))
+    shown: Array = truth["vibration"] / (keep * np.sqrt(2 / (1 + keep)))
+    return shown
 
 
 def spread(sensor: Sensor, parameters: Mapping[str, float]) -> float:

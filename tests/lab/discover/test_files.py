@@ -116,7 +116,7 @@ def test_a_value_beyond_its_bounds_is_written_at_the_bound(state, lines, tmp_pat
     assert read_vehicle(str(out)).parameters["cornering_compliance"] == 0.5
 
 
-@pytest.mark.parametrize("quantity", ["speed", "acceleration", "heading", "time", "lateral_acceleration"])
+@pytest.mark.parametrize("quantity", ["speed", "acceleration", "heading", "time", "lateral_acceleration", "vibration"])
 def test_the_empirical_effect_is_the_curve(state, lines, tmp_path: Path, quantity: str):
     top = 6.0 if quantity == "heading" else 12.0
     knots = [[at * top / 12, value, sd] for at, value, sd in KNOTS]

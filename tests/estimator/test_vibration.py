@@ -1,0 +1,251 @@
+"""An effect that reads how rough the road is: what the estimator makes of the vertical accelerometer's samples."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.estimator.forecast import Forecaster
+from gz_onboard.estimator.shaking import SETTLED, STUCK, Shaking
+from gz_onboard.events import Group
+from gz_onboard.physics.effect import load_effect
+from gz_onboard.physics.vibration import Vibration
+from gz_onboard.simulation.frames import batches, simulate_frames
+from gz_onboard.simulation.run import along, drive
+from gz_onboard.simulation.scooter import Scooter
+from gz_onboard.simulation.sensors import Trace
+from gz_onboard.vehicle import Vehicle, read_vehicle
+from tests.estimator.test_estimator import GROUPS, Plant
+from tests.support import ridden
+
+BASE = read_vehicle("reference", 75.0)
+ROUGH = """\"\"\"Drag of a rough road, in proportion to the vibration, made up for a test.\"\"\"
+from gz_onboard.physics.effect import Parameter, Port
+PORT = Port.{port}
+PARAMETERS = (Parameter("rough_road", "1", {value}, 1.0, 0.0, 50.0, "made up for a test"),)
+def term(vibration, *, rough_road):
+    return rough_road * vibration
+"""
+NEWTONS = 8.0  # N per m/s²
+SHAKEN = [*GROUPS, Group("Shaken", ("accel_z",), 0.01)]
+AT = len(GROUPS)
+TYPICAL = BASE.riding.vibration
+
+
+def vehicle_with(folder: Path, port: str = "WHEEL_FORCE", value: float = NEWTONS) -> Vehicle:
+    (folder / "rough_road.py").write_text(ROUGH.format(port=port, value=value))
+    effect = load_effect("rough_road", folder)
+    return BASE.changed(BASE.parameters.joined([effect]), (*BASE.model.effects, effect))
+
+
+@pytest.fixture(scope="module")
+def rough(tmp_path_factory) -> Vehicle:
+    return vehicle_with(tmp_path_factory.mktemp("rough"))
+
+
+# --- the samples --------------------------------------------------------------------------------------------------
+
+
+def shaken(seconds, rms, *, step=0.01, begin=0.0, seed=1):
+    """(time, accel_z) of white shaking that `Vibration` shows as `rms`."""
+    keep = math.exp(-step / 0.1)
+    noise = (
+        rms / (keep * math.sqrt(2 / (1 + keep))) * np.random.default_rng(seed).standard_normal(round(seconds / step))
+    )
+    return [(begin + step * i, 9.81 + z) for i, z in enumerate(noise.tolist())]
+
+
+def fed(samples, shaking=None):
+    shaking = shaking or Shaking()
+    for time, z in samples:
+        shaking.sample(time, z)
+    return shaking
+
+
+def test_it_is_what_the_lab_makes_of_the_same_samples():
+    samples = shaken(30, 1.7)
+    lab = Vibration()
+    for (before, _), (time, z) in zip([samples[0], *samples], samples, strict=False):
+        lab.update(time - before, z)
+    assert fed(samples).value(samples[-1][0]) == lab.value == pytest.approx(1.7, rel=0.15)
+
+
+def test_slow_motion_is_no_vibration():
+    hills = [(0.01 * i, 9.81 + 2.0 * math.sin(0.01 * i)) for i in range(2000)]
+    assert fed(hills).value(19.99) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("samples", "known"),
+    [
+        ([], False),
+        (shaken(SETTLED - 1, 1.0), False),  # would be told too small
+        (shaken(SETTLED + 1, 1.0), True),
+        (shaken(SETTLED + 1, 1.0, step=0.03), True),
+        (shaken(30, 1.0, step=0.05), False),  # too slow to show it
+        ([(0.01 * i, 9.81) for i in range(3000)], False),  # stuck
+        ([(0.01 * i, 9.81 + 0.1 * (i % 90 < 45)) for i in range(3000)], True),  # coarse, but alive
+        (shaken(20, 1.0) + shaken(5, 1.0, begin=20.2), False),  # a gap, just now
+        (shaken(20, 1.0) + shaken(8, 1.0, begin=20.2), True),
+        (shaken(20, 1.0, begin=50) + shaken(5, 1.0), False),  # time went back
+        ([row for i, row in enumerate(shaken(30, 1.0)) if i % 10 > 1], True),  # every fifth lost
+    ],
+)
+def test_known_or_not(samples, known):
+    now = samples[-1][0] if samples else 0.0
+    shaking = fed(samples)
+    assert (shaking.value(now) is not None) == known
+    assert shaking.value(now + 0.2) is None
+
+
+def test_after_a_stuck_sensor_it_begins_anew():
+    stuck = shaken(20, 3.0) + [(20 + 0.01 * i, 11.0) for i in range(round(100 * (STUCK + 1)))]
+    shaking = fed(stuck)
+    assert shaking.value(stuck[-1][0]) is None
+    again = shaken(60, 1.0, begin=stuck[-1][0] + 0.01)
+    assert fed(again[:300], shaking).value(again[299][0]) is None
+    assert fed(again[300:], shaking).value(again[-1][0]) == pytest.approx(1.0, rel=0.2)
+
+
+@given(st.lists(st.tuples(st.floats(-0.1, 0.3), st.floats(-60, 60)), max_size=60), st.floats(0, 0.2))
+def test_whatever_comes_it_is_none_or_a_possible_number(steps, after):
+    now, shaking = 0.0, fed(shaken(SETTLED + 1, 1.0, begin=-8.0))
+    for dt, z in steps:
+        now += dt
+        shaking.sample(now, z)
+    value = shaking.value(now + after)
+    assert value is None or 0 <= value <= 120
+
+
+# --- in the estimator ---------------------------------------------------------------------------------------------
+
+
+def events(seconds, vibration, lost=lambda t: False):
+    """The plant's ride with shaking of `vibration` [m/s²] in accel_z, from the first second on."""
+    both = [event for event, _ in Plant(offset=0.0).ride(seconds)]
+    both += [(t + 0.0005, AT, (None if lost(t) else z,)) for t, z in shaken(seconds, vibration)]
+    return sorted(both, key=lambda event: event[0])
+
+
+def estimated(vehicle, rows, groups=SHAKEN):
+    e = Estimator(groups, vehicle.pack, vehicle.model, vehicle.riding)
+    for event in rows:
+        e.handle(event)
+    return e
+
+
+def modelled(e):
+    """(energy [J], way [m]) of the closed segments."""
+    segments = e.forecaster.riding.segments
+    return sum(s.modelled for s in segments), sum(s.distance for s in segments)
+
+
+@pytest.fixture(scope="module")
+def quiet(rough):
+    return estimated(rough, events(240, 1e-6))
+
+
+def test_the_road_load_is_that_of_the_shaking(rough, quiet):
+    for vibration in (1.0, 2.5):
+        e = estimated(rough, events(240, vibration))
+        assert e.vibration(240.0 - 0.01) == pytest.approx(vibration, rel=0.15)
+        (energy, way), (base, same) = modelled(e), modelled(quiet)
+        assert way == same
+        # and what the motor loses for it
+        assert NEWTONS * vibration * 0.95 < (energy - base) / way < NEWTONS * vibration * 1.25
+        # what was measured is the same: less of it is left for the factor
+        assert e.forecaster.riding.factor < quiet.forecaster.riding.factor
+
+
+def test_missing_or_implausible_it_is_the_typical(rough, quiet):
+    base, way = modelled(quiet)
+    found = []
+    for rows, groups in (
+        ([row for row in events(240, 2.5) if row[1] != AT], GROUPS),  # a vehicle without
+        ([row for row in events(240, 2.5) if row[1] != AT], SHAKEN),  # nothing came
+        (events(240, 2.5, lambda t: True), SHAKEN),  # implausible or dropped, all of it
+        ([row for row in events(240, 2.5) if row[1] != AT or round(row[0], 2) * 10 % 1 < 0.05], SHAKEN),  # at 10 Hz
+    ):
+        e = estimated(rough, rows, groups)
+        found.append(modelled(e)[0])
+        assert (found[-1] - base) / way == pytest.approx(NEWTONS * TYPICAL, rel=0.15)
+    assert len(set(found)) == 1
+
+
+def test_lost_midway_it_goes_over_to_the_typical_and_back(rough):
+    e, seen = estimated(rough, []), {}
+    for event in events(120, 2.5, lambda t: 50 < t < 70):
+        e.handle(event)
+        seen[round(event[0])] = e.vibration(event[0])
+    assert seen[49] == pytest.approx(2.5, rel=0.2)
+    assert seen[60] in (TYPICAL, 0.0)
+    assert seen[74] in (TYPICAL, 0.0)
+    assert seen[90] == pytest.approx(2.5, rel=0.2)
+
+
+def test_a_model_that_does_not_read_it_does_not_look(quiet):
+    with_samples, without = (estimated(BASE, rows) for rows in (events(60, 2.0), [
+        row for row in events(60, 2.0) if row[1] != AT]))  # fmt: skip
+    assert with_samples._shaking.value(60.0) is None
+    assert with_samples.estimate(60.0) == without.estimate(60.0)
+
+
+def test_before_anything_is_ridden_the_prior_counts(rough):
+    consumption = []
+    for vibration in (0.0, TYPICAL):
+        riding = BASE.riding.__class__(vibration=vibration)
+        f = Forecaster(rough.model, rough.pack, riding)
+        consumption.append(f.forecast(0.6, 0.01, 20.0, 1.0, 20.0, 0.0).consumption)
+    more = riding.factor * riding.unevenness * NEWTONS * TYPICAL
+    assert more * 0.95 < consumption[1] - consumption[0] < more * 1.2
+
+
+def test_what_was_learned_outlives_a_restart(rough):
+    first = estimated(rough, events(240, 2.5))
+    saved = json.loads(json.dumps(first.snapshot(rough.key)))
+    second = estimated(rough, [])
+    second.restore(saved, rough.key, 5.0)
+    assert second.snapshot(rough.key) is None  # it waits for a voltage
+    assert second.forecaster.snapshot() == first.forecaster.snapshot()
+    assert second.vibration(240.0) == 0.0  # standing, and nothing is known of the road
+    at = (0.6, 0.01, 20.0, 1.0, 20.0, 0.0)
+    mended = first.forecaster
+    mended.riding.current = mended.riding.current.__class__()  # a restart leaves the open segment
+    assert second.forecaster.forecast(*at) == mended.forecast(*at)
+    with pytest.raises(ValueError, match="this is"):
+        estimated(BASE, []).restore(saved, BASE.key, 5.0)
+
+
+def test_a_contact_that_loses_voltage_on_rough_roads(tmp_path):
+    """In the cells too it is what is felt, and the typical for the energy left."""
+    loose = vehicle_with(tmp_path, "CELL_VOLTAGE", 0.01)
+    for vibration in (1e-6, 2.5):
+        e = estimated(loose, events(60, vibration))
+        assert e._lacking == pytest.approx(0.01 * vibration, rel=0.2, abs=1e-4)
+    lacks = e.forecaster._lacks
+    assert lacks is not None
+    assert lacks(1.0, 0.5, 20.0) == pytest.approx(0.01 * TYPICAL)
+
+
+# --- from frames --------------------------------------------------------------------------------------------------
+
+
+def test_simulated_frames_tell_it_and_live_is_replay(rough):
+    scooter = Scooter(rough, soc=0.8, vibration=lambda distance: 0.6 if distance < 600 else 2.2)
+    trace = Trace()
+    drive(scooter, trace.watch(along([8.0] * 2000)), 140.0)
+    frames = [frame for batch in batches(simulate_frames(rough, trace.truth(scooter), 3)) for frame in batch]
+    whole, single, base = ridden(frames, rough), ridden(frames, rough, portion=1), ridden(frames, BASE)
+    assert single.estimates == whole.estimates
+    assert whole.pipeline.estimator.vibration(whole.estimates[-1].time) == pytest.approx(2.2, rel=0.2)
+    segments, without = (run.pipeline.estimator.forecaster.riding.segments for run in (whole, base))
+    assert segments[-1].measured / segments[-1].modelled == pytest.approx(1.0, abs=0.05)
+    assert without[-1].measured / without[-1].modelled > 1.25
+    assert segments[-1].level > 1.15 * segments[1].level  # of the way to come the same
