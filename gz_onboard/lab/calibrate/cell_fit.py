@@ -1,4 +1,4 @@
-"""Six RC pairs of fixed time constants fitted to a pulse test, and their reduction to one pair or two.
+"""Many RC pairs of fixed time constants fitted to a pulse test, and their reduction to one pair or two.
 
 With the time constants fixed the voltage is linear in every table, so the fit has one minimum and needs no start. The
 pairs span what a test shows, charge transfer in a second to diffusion in half an hour (a discrete distribution of
@@ -16,30 +16,53 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.optimize import nnls
+from scipy.signal import lfilter
 
 from gz_onboard.lab.calibrate.cell_circuit import KELVIN, follow, follow_slope, hats
 from gz_onboard.lab.calibrate.cell_data import CellTest
 from gz_onboard.lab.calibrate.result import Array
 
-TIMES = (1.0, 4.0, 15.0, 60.0, 240.0, 1500.0)  # s
+# s. A pair between two of them is made of both, and one pair made of these is off by the square of their distance: C1
+# of a pair of 30 s by -10 % for a factor of 4 from each to the next, -1 % for the 1.75 of these.
+TIMES = tuple(float(tau) for tau in np.geomspace(1.0, 1500.0, 14))
 VOLTAGE_SD = 0.004  # V: what the model leaves, independent every CORRELATED samples
 SOC_SD = 0.003  # how far the state of charge may be off, which matters where the OCV is steep
 CORRELATED = 20
 BEND_SD = 0.3  # relative: how far a table may bend from node to node, per 0.05 of SOC
 LEAST = 1e-6  # ohm
+LEFT_OUT = 0.5  # of a piece's weight, to see how much hangs on it
 TIME_BEND = 0.5  # of ln τ, as BEND_SD
 TURNS = 8  # of Gauss and Newton
 SHIFT_SD, SHIFT_SD_EMPTY = 0.01, 0.05  # V: rest voltage of this test against the OCV; below 10 % SOC
 
 
 @dataclass(frozen=True)
-class Branches:
-    """Six pairs at one temperature.
+class Pieces:
+    """A pulse test as normal equations, one piece for each pulse with the rest after it.
 
-    resistance: (1 + len(TIMES), n) [ohm], R0 first; shift: (n,) [V] of the rest voltage against the OCV. covariance: of
-    both, flattened in this order, from the scatter between pulses; it weighs nodes against each other. jackknife: the
-    same from leaving out each pulse, which is what few pulses for many numbers tell honestly (`left_out`). covered:
-    (n,), False at nodes without a pulse near. residual: (m,) [V], measured less model.
+    Of R0, the pairs and the shift of the rest voltage, each over the nodes `soc` (n,), flattened in this order to p
+    numbers. label: (pieces,) of `CellTest.block`; gram: (pieces, p, p), right: (pieces, p), weighted; samples:
+    (pieces, n), how many with a current are near each node.
+    """
+
+    soc: Array
+    temperature: float
+    label: NDArray[np.int_]
+    gram: Array
+    right: Array
+    samples: Array
+
+
+@dataclass(frozen=True)
+class Branches:
+    """The pairs at one temperature.
+
+    resistance: (1 + len(TIMES), n) [ohm], R0 first; shift: (n,) [V] of the rest voltage against the OCV.
+    covariance: (n,) of those of the resistances at a node, from the scatter of what the pieces leave over, as if a
+    resistance could be negative; it weighs nodes against each other. without:
+    (pieces, 2 + len(TIMES), n), both as they are with half of each piece left out, if that was asked for.
+    shift_prior: (n,) [V], the sd of the shift that the priors' own doubt leaves. covered: (n,), False at nodes without
+    a pulse near.
     """
 
     soc: Array
@@ -47,63 +70,98 @@ class Branches:
     resistance: Array
     shift: Array
     covariance: Array
-    jackknife: Array
+    without: Array
+    shift_prior: Array
     covered: NDArray[np.bool_]
-    residual: Array
-
-    def at_node(self, covariance: Array, k: int) -> Array:
-        """Of a covariance its (1 + len(TIMES),)² at node k."""
-        n = len(self.soc)
-        i = np.arange(len(self.resistance)) * n + k
-        return np.asarray(covariance[np.ix_(i, i)])
 
 
-def fit_branches(
+def filtered(test: CellTest) -> Array:
+    """(m, len(TIMES)) [A]: the current that flows in the resistance of each pair."""
+    return np.column_stack([follow(test.flowed, test.dt, tau) for tau in TIMES])
+
+
+def pieces(
     test: CellTest,
     level: Array,
     ocv: tuple[Array, Array],
     soc: Array,
     temperature: float,
+    relaxing: Array,
     activation: tuple[float, float] = (0.0, 0.0),
-    keep: NDArray[np.bool_] | None = None,
-) -> Branches:
-    """The six pairs of `test`, whose state of charge is `level` (m,), over nodes `soc` (n,) at `temperature` [degC].
+) -> Pieces:
+    """`test`, whose state of charge is `level` (m,), over nodes `soc` (n,) at `temperature` [degC].
 
-    ocv: (voltage (m,) [V], slope (m,) [V]) at `level`. activation: of R0 and of the pairs [K]: R goes as
-    exp(activation/T), which moves samples at other temperatures than the nominal one. keep: True for samples to use.
+    ocv: (voltage (m,) [V], slope (m,) [V]) at `level`. relaxing: `filtered` of the test. activation: of R0 and of the
+    pairs [K]: R goes as exp(activation/T), which moves samples at other temperatures than the nominal one.
     """
-    rows = np.ones(len(test), dtype=bool) if keep is None else keep
     inverse = 1 / (test.temperature + KELVIN) - 1 / (temperature + KELVIN)
-    hat = hats(soc, level)
-    columns = [-(test.current * np.exp(activation[0] * inverse))[:, None] * hat]
-    warm = np.exp(activation[1] * inverse)
-    columns += [-(follow(test.flowed, test.dt, tau) * warm)[:, None] * hat for tau in TIMES]
     weight = 1 / (np.hypot(VOLTAGE_SD, SOC_SD * ocv[1]) * np.sqrt(CORRELATED))
-    matrix = np.hstack([*columns, hat])
-    target = test.voltage - ocv[0]
-    a, b = (matrix * weight[:, None])[rows], (target * weight)[rows]
-    n, branches = len(soc), len(columns)
-    data = a.T @ a
+    columns = np.column_stack(
+        [-test.current * np.exp(activation[0] * inverse), -relaxing * np.exp(activation[1] * inverse)[:, None],
+         np.ones(len(test))]
+    )  # fmt: skip
+    columns *= weight[:, None]
+    target = (test.voltage - ocv[0]) * weight
+    hat = hats(soc, level)
+    labels, first = np.unique(test.block, return_index=True)  # the number of the block never falls
+    n, size = len(soc), columns.shape[1] * len(soc)
+    gram, right, samples = (
+        np.zeros((len(labels), size, size)),
+        np.zeros((len(labels), size)),
+        np.zeros((len(labels), n)),
+    )
+    for k, (start, end) in enumerate(zip(first, [*first[1:], len(test)], strict=True)):
+        rows = slice(start, end)
+        near = np.flatnonzero(hat[rows].any(axis=0))  # a pulse touches few nodes
+        a = (columns[rows, :, None] * hat[rows, None, near]).reshape(end - start, -1)
+        places = (np.arange(columns.shape[1])[:, None] * n + near).ravel()
+        gram[k][np.ix_(places, places)] = a.T @ a
+        right[k, places] = a.T @ target[rows]
+        samples[k] = hat[rows][~test.rest[rows]].sum(axis=0)
+    return Pieces(soc, temperature, labels, gram, right, samples)
+
+
+def fit_branches(of: Pieces, keep: NDArray[np.bool_] | None = None, leave_out: bool = False) -> Branches:
+    """The pairs that fit the pieces best. keep: (pieces,), True for those to use; leave_out: of each left out too."""
+    used = np.ones(len(of.label), dtype=bool) if keep is None else keep
+    n, branches = len(of.soc), 1 + len(TIMES)
+    gram, right = of.gram[used].sum(axis=0), of.right[used].sum(axis=0)
     scale = np.full(branches, 0.02)  # ohm
-    floor = np.concatenate([np.zeros(n * branches), np.ones(n)])
     for _ in range(2):  # how far a table may bend is relative to its size, which the first turn tells
-        normal = data + _smoothness(soc, scale, n, branches)
-        upper = cholesky(normal, lower=False)
-        right = solve_triangular(upper, a.T @ b, trans="T")
-        # Resistances are not negative; shifts may be, so they are counted from -1 V.
-        p = nnls(upper, right + upper @ floor)[0] - floor
-        scale = np.maximum(np.median(p[: n * branches].reshape(branches, n), axis=1), 2e-3)
-    residual = target - matrix @ p
-    weighted = b - a @ p
-    labels = test.block[rows]
-    scores = np.array([a[labels == k].T @ weighted[labels == k] for k in np.unique(labels)])
-    bread = cho_solve(cho_factor(normal), np.eye(len(normal)))
-    covariance = bread @ (scores.T @ scores + normal - data) @ bread
-    jackknife = left_out(a, weighted, labels, normal) + bread @ (normal - data) @ bread
-    used = rows & ~test.rest
-    covered = hat[used].sum(axis=0) > 3
-    return Branches(soc, temperature, p[: n * branches].reshape(branches, n), p[n * branches :], covariance, jackknife,
-                    covered, residual)  # fmt: skip
+        prior = _smoothness(of.soc, scale, n, branches)
+        p = _positive(gram + prior, right, n)
+        scale = np.maximum(np.median(p[:-n].reshape(branches, n), axis=1), 2e-3)
+    without = [
+        _positive(gram + prior - LEFT_OUT * of.gram[k], right - LEFT_OUT * of.right[k], n)
+        for k in np.flatnonzero(used)
+        if leave_out
+    ]
+    bread = np.linalg.inv(gram + prior)
+    scores = of.right[used] - of.gram[used] @ p
+    covariance = (bread @ (scores.T @ scores + prior) @ bread).reshape(branches + 1, n, branches + 1, n)
+    shift_prior = np.sqrt(np.diag(bread @ prior @ bread)[-n:])
+    at_node = np.array([covariance[:-1, k, :-1, k] for k in range(n)])
+    return Branches(of.soc, of.temperature, p[:-n].reshape(branches, n), p[-n:], at_node,
+                    np.reshape(without, (-1, branches + 1, n)), shift_prior,
+                    of.samples[used].sum(axis=0) > 3)  # fmt: skip
+
+
+def _positive(normal: Array, right: Array, n: int) -> Array:
+    """The solution of normal equations whose first numbers are not negative; the last `n`, shifts, may be, to -1 V."""
+    upper = cholesky(normal, lower=False)
+    floor = np.concatenate([np.zeros(len(right) - n), np.ones(n)])
+    return np.asarray(nnls(upper, solve_triangular(upper, right, trans="T") + upper @ floor)[0] - floor)
+
+
+def jackknife(whole: Array, without: Array) -> Array:
+    """The sd of `whole` (...) from what it is with `LEFT_OUT` of each piece of the data left out, (pieces, ...).
+
+    The scatter of what is left over tells too little where pieces are few, each of which pulls the fit towards itself;
+    leaving out whole pieces (the jackknife, Efron 1982, eq. 3.13) tells too much. Half of each is right to the first
+    order of a piece's leverage, as CR2 of Bell & McCaffrey 2002 is.
+    """
+    count = max(len(without), 1)
+    return np.asarray(np.sqrt((count - 1) / count * np.sum(((without - whole) / LEFT_OUT) ** 2, axis=0)))
 
 
 def left_out(a: Array, residual: Array, labels: NDArray[Any], normal: Array) -> Array:
@@ -148,18 +206,19 @@ class Pairs:
     r0: float
     resistance: tuple[float, ...]
     time: tuple[float, ...]
-    rms: float  # V per A RMS of the load: what the pairs leave of six
+    rms: float  # V per A RMS of the load: what they leave of the many
 
 
 class Reduction:
-    """From six pairs to `count` pairs, under `loads`: currents from rest, one value for each `step` [s]."""
+    """From many pairs to `count` pairs, under `loads`: currents from rest, one value for each `step` [s]."""
 
     def __init__(self, loads: Sequence[Array], step: float = 1.0, count: int = 1) -> None:
         def filtered_by(tau: float) -> Array:
-            return np.concatenate([follow(x, np.full(len(x), step), tau) for x in loads])
+            a = np.exp(-step / tau)
+            return np.concatenate([lfilter([1 - a], [1, -a], x) for x in loads])
 
         load = np.concatenate(list(loads))
-        self._six = np.column_stack([load, *(filtered_by(tau) for tau in TIMES)])
+        self._many = np.column_stack([load, *(filtered_by(tau) for tau in TIMES)])
         self._square = float(np.mean(load**2))
         fast = np.geomspace(3, 300, 50) if count == 1 else np.geomspace(1.5, 120, 26)
         slow = np.geomspace(150, 3000, 16)
@@ -167,18 +226,18 @@ class Reduction:
         times = [(float(t),) for t in fast] if count == 1 else [(float(t), float(u)) for t in fast for u in slow]
         self._times = np.array(times)
         self._count = count
-        gram = self._six.T @ self._six
+        gram = self._many.T @ self._many
         solved, left = [], []
         for row in times:
             g = np.column_stack([load, *(filtered[t] for t in row)])
-            cross = g.T @ self._six
+            cross = g.T @ self._many
             m = np.linalg.solve(g.T @ g, cross)
             solved.append(m)
             left.append(gram - cross.T @ m)
         self._solved, self._left = np.array(solved), np.array(left)
 
     def __call__(self, resistance: Array) -> Pairs:
-        """The pairs nearest to the six of `resistance` (1 + len(TIMES),) [ohm]."""
+        """The pairs nearest to the many of `resistance` (1 + len(TIMES),) [ohm]."""
         cost = np.einsum("i,kij,j->k", resistance, self._left, resistance)
         best = self._solved @ resistance
         positive = np.all(best > 0, axis=1)
@@ -194,30 +253,25 @@ class Reduction:
             j = k + (1 if move > 0 else -1)
             solution = best[k] + abs(move) * (best[j] - best[k])
             times = np.exp(np.log(times) + abs(move) * (np.log(self._times[j]) - np.log(times)))
-        rms = float(np.sqrt(max(cost[k], 0.0) / len(self._six) / self._square)) if np.isfinite(cost[k]) else np.nan
+        rms = float(np.sqrt(max(cost[k], 0.0) / len(self._many) / self._square)) if np.isfinite(cost[k]) else np.nan
         return Pairs(float(solution[0]), tuple(map(float, solution[1:])), tuple(map(float, times)), rms)
 
     def spread(self, resistance: Array, covariance: Array) -> Array:
-        """Covariance of ln(R0, R of each pair, τ of each pair), by differences from that of the six."""
-        sd = np.sqrt(np.maximum(np.diag(covariance), 0))
-        base = _logs(self(resistance))
-        slopes = np.zeros((len(base), len(sd)))
-        for k, s in enumerate(sd):
-            if s > 0:
-                step = 0.3 * s
-                moved = resistance.copy()
-                moved[k] += step
-                slopes[:, k] = (_logs(self(moved)) - base) / step
-        return np.asarray(slopes @ covariance @ slopes.T)
+        """Covariance of a row of `logs`, from that of `resistance`: moved by one sd along the axes of its ellipsoid."""
+        values, vectors = np.linalg.eigh(covariance)
+        axes = (np.sqrt(np.maximum(values, 0.0)) * vectors)[:, values > 1e-9 * values[-1]]
+        change = 0.5 * (self.logs(resistance[:, None] + axes) - self.logs(resistance[:, None] - axes))
+        return np.asarray(change.T @ change)
 
-
-def _logs(pairs: Pairs) -> Array:
-    return np.log([pairs.r0, *pairs.resistance, *pairs.time])
+    def logs(self, resistances: Array) -> Array:
+        """(n, 1 + 2 count): ln of R0, R of each pair, τ of each pair, for `resistances` (1 + len(TIMES), n) [ohm]."""
+        found = [self(r) for r in resistances.T]
+        return np.log([[pairs.r0, *pairs.resistance, *pairs.time] for pairs in found])
 
 
 @dataclass(frozen=True)
 class Direct:
-    """One pair at one temperature: R0, R1 [ohm], τ [s], each (n,), and the sd of their logarithms, (3, n)."""
+    """One pair at one temperature: R0, R1 [ohm], τ [s], each (n,), and the relative sd of these and of C1, (4, n)."""
 
     r0: Array
     r1: Array
@@ -261,5 +315,9 @@ def fit_direct(
         p = p + step
         p[: 2 * n] = np.maximum(p[: 2 * n], LEAST)
     bread = cho_solve(cho_factor(normal), np.eye(len(normal)))
-    sd = np.sqrt(np.diag(left_out(a, b, test.block, normal) + bread @ prior @ bread)).reshape(4, n)
-    return Direct(p[:n], p[n : 2 * n], np.exp(p[2 * n : 3 * n]), sd[:3] / np.array([p[:n], p[n : 2 * n], np.ones(n)]))
+    covariance = left_out(a, b, test.block, normal) + bread @ prior @ bread
+    of_logs = np.zeros((4 * n, 4 * n))  # ln R0, ln R1, ln τ, and ln τ less ln R1, from R0, R1, ln τ
+    of_logs[: 3 * n, : 3 * n] = np.diag(1 / np.concatenate([p[: 2 * n], np.ones(n)]))
+    of_logs[3 * n :] = of_logs[2 * n : 3 * n] - of_logs[n : 2 * n]
+    sd = np.sqrt(np.diag(of_logs @ covariance @ of_logs.T)).reshape(4, n)
+    return Direct(p[:n], p[n : 2 * n], np.exp(p[2 * n : 3 * n]), sd)

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import truncnorm
 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.fit import Solution, nonlinear, score
@@ -19,6 +20,7 @@ from gz_onboard.lab.calibrate.result import Array, Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.table import Table
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import Bound
+from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.simulation.parts.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
@@ -293,7 +295,8 @@ class Job:
             if all(run.still for run in runs):
                 del start[self.outside]
         prior = {name: known for name, known in self.prior.items() if name in start}
-        bounds = {name: (1e-4 * value, 1e3 * value) for name, value in start.items()}
+        least = {name: known.low for name, known in declared_parameters().items()}
+        bounds = {name: (max(1e-4 * value, least.get(name, 0.0)), 1e3 * value) for name, value in start.items()}
         bounds |= {"per_speed": (-np.inf, np.inf), "iron_share": (0.0, 1.0)}
         if len(runs) < MANY:  # the noise of where a run starts lasts; of many runs the pieces are whole runs
             modelled = self.model({**self.held, **start}, runs[0])
@@ -361,6 +364,35 @@ def _with_doubt(job: Job, first: Solution, second: Solution, values: Values, rid
     return replace(second, covariance=second.covariance + more)
 
 
+def _with_doubt_of_held(
+    job: Job, fitted: _Fitted, runs: Sequence[Run], doubted: Mapping[str, tuple[float, float]]
+) -> _Fitted:
+    """`fitted`, its covariances more by what holding a parameter at its (lower, upper) likely value would change."""
+    still, riding = fitted.still, fitted.riding
+    for name, values in doubted.items():
+        for value in values:
+            other = _fit(replace(job, held={**job.held, name: value}), runs)
+            still = _moved(still, fitted.still, other.still)
+            riding = _moved(riding, fitted.riding, other.riding)
+    return _Fitted(still, riding, fitted.values)
+
+
+def _moved(sum_: Solution | None, one: Solution | None, other: Solution | None) -> Solution | None:
+    """`sum_` with half the square of `other` less `one` in its covariance: of two values as likely as each other."""
+    if sum_ is None or one is None or other is None:
+        return sum_
+    change = other.value - one.value
+    return replace(sum_, covariance=sum_.covariance + 0.5 * np.outer(change, change))
+
+
+def _likely(vehicle: Vehicle, name: str) -> tuple[float, float]:
+    """One sd below and above the mean of what is known of `name`, within its limits."""
+    known, declared = vehicle.parameters.known[name], declared_parameters()[name]
+    limits = ((edge - known.value) / known.sd for edge in (declared.low, declared.high))
+    within = truncnorm(*limits, loc=known.value, scale=known.sd)
+    return float(within.mean() - within.std()), float(within.mean() + within.std())
+
+
 def _usable(runs: Sequence[Run], sensor: str, result: Result) -> list[Run]:
     """The runs with that sensor in which it changes enough to tell anything."""
     good, least = [], 1.0 if sensor == "cell_temperature" else LEAST_RISE
@@ -424,13 +456,15 @@ def _solve(
     validation: Sequence[Run],
     names: Sequence[str],
     more: Mapping[str, float],
+    doubted: Mapping[str, tuple[float, float]] | None = None,
+    hold_out: bool = True,
 ) -> _Fitted:
     """The fit of all `runs`, put into `result` with its scores: in sample, on every second ride (fitted without them)
-    and on `validation`. more: an sd that no sample shows, by parameter."""
-    fitted = _fit(job, runs)
+    and on `validation`. more: an sd that no sample shows, by parameter; doubted: as for `_with_doubt_of_held`."""
+    fitted = _with_doubt_of_held(job, _fit(job, runs), runs, doubted or {})
     _score(job, fitted.values, runs, False, result)
     part, held = _halves(runs)
-    if held and part:
+    if hold_out and held and part:
         _score(job, _fit(job, part).values, held, True, result)
     if validation:
         _score(job, fitted.values, validation, True, result)
@@ -447,7 +481,7 @@ def _solve(
             extra = np.diag([more.get(name, 0.0) ** 2 for name in tied])
             result.covariance.append((tied, found.part(tied) + extra))
     if job.outside:
-        _outside_notes(result, job, fitted, runs)
+        _outside_notes(result, job, fitted, runs, hold_out)
     return fitted
 
 
@@ -460,7 +494,7 @@ def _source(runs: Sequence[Run]) -> str:
     return f"{listed}: {sum(len(run.time) for run in runs)} s"
 
 
-def _outside_notes(result: Result, job: Job, fitted: _Fitted, runs: Sequence[Run]) -> None:
+def _outside_notes(result: Result, job: Job, fitted: _Fitted, runs: Sequence[Run], hold_out: bool) -> None:
     """How the airflow of riding differs from a closed room, and whether it grows with speed."""
     name, still, riding = job.outside, fitted.still, fitted.riding
     if still is None or riding is None:
@@ -480,7 +514,7 @@ def _outside_notes(result: Result, job: Job, fitted: _Fitted, runs: Sequence[Run
         f"{job.rms(fitted.values, rides):.2f} K"
     )
     part, held = _halves(rides)
-    if not held:
+    if not held or not hold_out:
         return
     inner = {key: value for key, value in fitted.values.items() if key != name}
     alone = Job(job.model, {name: job.start[name]}, inner, {}, name)
@@ -499,10 +533,13 @@ def _outside_notes(result: Result, job: Job, fitted: _Fitted, runs: Sequence[Run
     )
 
 
-def motor_cooling(runs: Sequence[Run], vehicle: Vehicle, validation: Sequence[Run] = ()) -> Result:
+def motor_cooling(
+    runs: Sequence[Run], vehicle: Vehicle, validation: Sequence[Run] = (), hold_out: bool = True
+) -> Result:
     """Capacities of stator and rotor, the gap's conductance and the rotor's to the ambient.
 
-    `validation` is never fitted. Raises InputError if the motor's temperature changes in none of the runs.
+    `validation` is never fitted. hold_out: also fit parts of the runs and score the rest, and say what other networks
+    would do, which takes five times as long. Raises InputError if the motor's temperature changes in none of the runs.
     """
     p = vehicle.parameters
     names = ("motor_stator_capacity", "motor_rotor_capacity", "motor_gap_conductance", "motor_rotor_to_ambient")
@@ -510,9 +547,11 @@ def motor_cooling(runs: Sequence[Run], vehicle: Vehicle, validation: Sequence[Ru
     runs = _usable(runs, "motor_temperature", result)
     held = {"motor_stator_share": p["motor_stator_share"]}
     job = Job(motor_temperatures, {name: p[name] for name in names}, held, _priors(vehicle, names[:3]), names[3])
-    fitted = _solve(result, job, runs, validation, names, {})
-    _share_refusal(result, job, runs)
-    _iron_note(result, job, fitted, runs, validation)
+    doubted = {"motor_stator_share": _likely(vehicle, "motor_stator_share")}
+    fitted = _solve(result, job, runs, validation, names, {}, doubted, hold_out)
+    if hold_out:
+        _share_refusal(result, job, runs)
+        _iron_note(result, job, fitted, runs, validation)
     return result
 
 
@@ -558,7 +597,9 @@ def _iron_note(result: Result, job: Job, fitted: _Fitted, runs: Sequence[Run], v
         )
 
 
-def inverter_cooling(runs: Sequence[Run], vehicle: Vehicle, validation: Sequence[Run] = ()) -> Result:
+def inverter_cooling(
+    runs: Sequence[Run], vehicle: Vehicle, validation: Sequence[Run] = (), hold_out: bool = True
+) -> Result:
     """Capacities of board and box, the conductance between them and the box's to the ambient.
 
     Between board and box act board_to_box and, beside it, the two to the air in series: the air has no sensor and no
@@ -574,7 +615,7 @@ def inverter_cooling(runs: Sequence[Run], vehicle: Vehicle, validation: Sequence
     b, c = held.values()
     series, sds = b * c / (b + c), [p.known[name].sd for name in air]
     series_sd = float(np.hypot(sds[0] * (c / (b + c)) ** 2, sds[1] * (b / (b + c)) ** 2))
-    fitted = _solve(result, job, runs, validation, names, {names[2]: series_sd})
+    fitted = _solve(result, job, runs, validation, names, {names[2]: series_sd}, hold_out=hold_out)
     found = fitted.solution(names[2])
     assert found is not None
     result.refusals.append(

@@ -1,7 +1,7 @@
 """R0, R1 and C1 over state of charge and temperature from pulse tests of one cell (Lord 2016, sec. 2.2).
 
 One table per temperature. Each test begins at full and rests before its pulses; what it rests at tells how much charge
-there is between full and empty at its temperature. Six RC pairs of fixed time constants are fitted, linear in every
+there is between full and empty at its temperature. Many RC pairs of fixed time constants are fitted, linear in every
 table; then the one pair (and beside it the two) that is nearest to them under a load like riding (see `cell_fit`).
 """
 
@@ -12,13 +12,24 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.lab.calibrate.cell_circuit import KELVIN, Circuit, ocv_at, riding_current, voltage
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
-from gz_onboard.lab.calibrate.cell_fit import Branches, Reduction, fit_branches, fit_direct
+from gz_onboard.lab.calibrate.cell_fit import (
+    TIMES,
+    Branches,
+    Pieces,
+    Reduction,
+    filtered,
+    fit_branches,
+    fit_direct,
+    jackknife,
+    pieces,
+)
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.ocv import TESTER
 from gz_onboard.lab.calibrate.result import Array, Curve, Fit, Found, Panel, Result, Trace
@@ -31,6 +42,7 @@ REST = 1200.0  # s without current, after which a voltage is that of rest
 FULL_WITHIN = 0.03  # V: a first voltage so near to the full cell's is that of a full cell
 LEVEL = 0.15  # relative: how far a time constant may change over 0.1 of SOC
 SURE = 0.99  # how surely the rests must tell that temperature moves them, before the vehicle file says so
+POOLED = 0.1  # of SOC: how far the scatter of pulses is taken to be alike
 SMOOTH = 0.08  # relative: how far ln of a table may bend over 0.1 of SOC, where the data say little
 
 
@@ -78,13 +90,14 @@ def calibrate(
             raise InputError(
                 f"{cold.test.table.file} and {warm.test.table.file} are both at {warm.temperature:g} degC: one of them"
             )
-    fitted, activation = _fit_all(tested, nodes, volts, soc)
+    split, activation = _pieces(tested, nodes, volts, soc)
+    fitted = [fit_branches(x, leave_out=True) for x in split]
     rides = [riding_current(seed=k) for k in range(1, 4)] if loads is None else loads
     one, two = Reduction(rides), Reduction(rides, count=2)
-    tables_one, sd_one = _meshes(fitted, one, 1)
+    tables_one, sd_one = _meshes(fitted, one)
     if method == "direct":
         tables_one, sd_one = _direct(tested, fitted, activation, nodes, volts, tables_one)
-    tables_two, sd_two = _meshes(fitted, two, 2)
+    tables_two, sd_two = _meshes(fitted, two)
     r0, r1, tau = tables_one
     sd_one, sd_two = ([np.hypot(x, TESTER) for x in sds] for sds in (sd_one, sd_two))
     covered = np.array([f.covered for f in fitted])
@@ -98,7 +111,7 @@ def calibrate(
     slow = Circuit(nodes, volts + shift, soc, cell.temperature, cell.capacity, tables_two[0], tables_two[1],
                    tables_two[3] / tables_two[1], tables_two[2], tables_two[4], rest_shift)  # fmt: skip
     axes = {"soc": soc, "temperature": cell.temperature}
-    how = f"{names}: six RC pairs, reduced over {'synthetic rides' if loads is None else 'the loads given'}"
+    how = f"{names}: {len(TIMES)} RC pairs, reduced over {'synthetic rides' if loads is None else 'the loads given'}"
     if method == "direct":
         how = f"{names}: least squares of one RC pair"
 
@@ -112,10 +125,10 @@ def calibrate(
     )  # fmt: skip
     result.curves["battery.r0"] = curve(r0, r0 * sd_one[0], "ohm", "R0")
     result.curves["battery.r1"] = curve(r1, r1 * sd_one[1], "ohm", "R1")
-    result.curves["battery.c1"] = curve(cell.c1, cell.c1 * np.hypot(sd_one[1], sd_one[2]), "F", "τ1/R1")
+    result.curves["battery.c1"] = curve(cell.c1, cell.c1 * sd_one[3], "F", "τ1/R1")
     result.curves["slow_r0"] = curve(slow.r0, slow.r0 * sd_two[0], "ohm", "R0 beside two pairs")
     result.curves["slow_r1"] = curve(slow.r1, slow.r1 * sd_two[1], "ohm", "R1 beside a slow pair")
-    result.curves["slow_c1"] = curve(slow.c1, slow.c1 * np.hypot(sd_two[1], sd_two[3]), "F", "C1 beside a slow pair")
+    result.curves["slow_c1"] = curve(slow.c1, slow.c1 * sd_two[5], "F", "C1 beside a slow pair")
     result.curves["slow_resistance"] = curve(tables_two[2], tables_two[2] * sd_two[2], "ohm", "slow pair")
     result.curves["slow_time"] = curve(tables_two[4], tables_two[4] * sd_two[4], "s", "slow pair")
     for t, f in zip(tested, fitted, strict=True):
@@ -126,7 +139,7 @@ def calibrate(
             )
     _voltages(result, tested, cell, slow)
     if method == "reduced":  # the halves are
-        _mesh_quality(result, tested, fitted, nodes, volts, one, tables_one)
+        _mesh_quality(result, tested, fitted, split, one, tables_one)
     return result
 
 
@@ -205,27 +218,31 @@ def _began(test: CellTest, end: int) -> int:
     return int(moving[-1]) + 1 if len(moving) else 0
 
 
-def _fit_all(
+def _pieces(
     tested: list[Tested], nodes: Array, volts: Array, soc: Array
-) -> tuple[list[Branches], list[tuple[float, float]]]:
-    """The six pairs of every test, each moved to its nominal temperature by the activation seen between the tests."""
-    activation = [(0.0, 0.0)] * len(tested)
-    fitted: list[Branches] = []
-    for turn in range(2 if len(tested) > 1 else 1):
-        fitted = [
-            fit_branches(t.test, t.level, _ocv(nodes, volts, t.level), soc, t.temperature, a)
-            for t, a in zip(tested, activation, strict=True)
+) -> tuple[list[Pieces], list[tuple[float, float]]]:
+    """Every test's pieces, moved to its nominal temperature by the activation seen between the tests, and that."""
+    relaxing = [filtered(t.test) for t in tested]
+
+    def split(activation: list[tuple[float, float]]) -> list[Pieces]:
+        return [
+            pieces(t.test, t.level, _ocv(nodes, volts, t.level), soc, t.temperature, x, a)
+            for t, x, a in zip(tested, relaxing, activation, strict=True)
         ]
-        if turn == 0 and len(tested) > 1:
-            middle = (soc > 0.15) & (soc < 0.95)
-            inverse = np.array([1 / (t.temperature + KELVIN) for t in tested])
-            logs = [
-                np.log([np.median(np.sum(f.resistance[part][:, middle], axis=0)) for f in fitted])
-                for part in (slice(0, 1), slice(1, 6))
-            ]
-            slopes = [np.clip(np.gradient(x, inverse), 0, 8000) for x in logs]
-            activation = [(float(a), float(b)) for a, b in zip(*slopes, strict=True)]
-    return fitted, activation
+
+    activation = [(0.0, 0.0)] * len(tested)
+    if len(tested) == 1:
+        return split(activation), activation
+    fitted = [fit_branches(x) for x in split(activation)]
+    middle = (soc > 0.15) & (soc < 0.95)
+    inverse = np.array([1 / (t.temperature + KELVIN) for t in tested])
+    logs = [
+        np.log([np.median(np.sum(f.resistance[part][:, middle], axis=0)) for f in fitted])
+        for part in (slice(0, 1), slice(1, None))
+    ]
+    slopes = [np.clip(np.gradient(x, inverse), 0, 8000) for x in logs]
+    activation = [(float(a), float(b)) for a, b in zip(*slopes, strict=True)]
+    return split(activation), activation
 
 
 def _direct(
@@ -238,7 +255,7 @@ def _direct(
         for k, (t, f, a) in enumerate(zip(tested, fitted, activation, strict=True))
     ]
     tables = [np.array([d.r0 for d in found]), np.array([d.r1 for d in found]), np.array([d.time for d in found])]
-    return tables, [np.array([d.sd[j] for d in found]) for j in range(3)]
+    return tables, [np.array([d.sd[j] for d in found]) for j in range(4)]
 
 
 def _ocv(nodes: Array, volts: Array, level: Array) -> tuple[Array, Array]:
@@ -246,23 +263,36 @@ def _ocv(nodes: Array, volts: Array, level: Array) -> tuple[Array, Array]:
     return ocv_at(nodes, volts, level), (up - down) / 0.01
 
 
-def _meshes(fitted: list[Branches], reduction: Reduction, count: int) -> tuple[list[Array], list[Array]]:
-    """(R0, R of each pair, τ of each pair), each (temperatures, soc), smooth; their relative sd likewise."""
-    logs, sds = [], []
+def _meshes(fitted: list[Branches], reduction: Reduction) -> tuple[list[Array], list[Array]]:
+    """(R0, R of each pair, τ of each pair), each (temperatures, soc), smooth; their relative sd, and last that of C1.
+
+    The sd is that of the whole way from pulses to smooth tables, half of each pulse left out in turn.
+    """
+    tables, sds = [], []
     for f in fitted:
-        rows, weights, spread = [], [], []
-        for k in range(len(f.soc)):
-            r = f.resistance[:, k]
-            pairs = reduction(r)
-            rows.append(np.log([pairs.r0, *pairs.resistance, *pairs.time]))
-            weights.append(np.sqrt(np.diag(reduction.spread(r, f.at_node(f.covariance, k)))))
-            spread.append(np.sqrt(np.diag(reduction.spread(r, f.at_node(f.jackknife, k)))))
-        logs.append(_smooth(f.soc, np.array(rows), np.array(weights)))
-        sds.append(np.array(spread))
-    parts = 1 + 2 * count
-    return [np.exp(np.array([x[:, j] for x in logs])) for j in range(parts)], [
-        np.array([x[:, j] for x in sds]) for j in range(parts)
-    ]
+        raw = reduction.logs(f.resistance)
+        others = np.array([reduction.logs(x[:-1]) for x in f.without])
+        weights = np.array(
+            [np.sqrt(np.diag(reduction.spread(r, c))) for r, c in zip(f.resistance.T, f.covariance, strict=True)]
+        )
+        smooth = _with_c1(_smooth(f.soc, raw, weights))
+        without = np.array([_with_c1(_smooth(f.soc, x, weights)) for x in others]).reshape(-1, *smooth.shape)
+        tables.append(np.exp(smooth))
+        sds.append(_pooled(f.soc, jackknife(smooth, without), f.covered))
+    return list(np.array(tables).transpose(2, 0, 1)[:-1]), list(np.array(sds).transpose(2, 0, 1))
+
+
+def _pooled(soc: Array, sd: Array, covered: NDArray[np.bool_]) -> Array:
+    """`sd` (n, parts) with what the covered neighbours' say: the few pulses at one node tell a scatter badly."""
+    near = np.exp(-0.5 * ((soc[:, None] - soc) / POOLED) ** 2) * covered
+    near[~covered] = np.eye(len(soc))[~covered]
+    return np.asarray(np.sqrt(near @ sd**2 / near.sum(axis=1)[:, None]))
+
+
+def _with_c1(logs: Array) -> Array:
+    """`logs` (n, 1 + 2 count) with ln C1 as a further column."""
+    first = (logs.shape[1] + 1) // 2
+    return np.column_stack([logs, logs[:, first] - logs[:, 1]])
 
 
 def _smooth(soc: Array, logs: Array, sds: Array) -> Array:
@@ -304,7 +334,7 @@ def _rest_shift(fitted: list[Branches], tested: list[Tested], nodes: Array, ocv:
 def _rests_over_soc(fitted: list[Branches], tested: list[Tested], names: str) -> Curve:
     """How much higher the cell rests at each temperature and SOC than near 25 degC."""
     shifts = np.array([f.shift for f in fitted])
-    sd = np.array([np.sqrt(np.diag(f.jackknife)[-len(f.soc) :]) for f in fitted])
+    sd = np.array([np.hypot(jackknife(f.shift, f.without[:, -1]), f.shift_prior) for f in fitted])
     axes = {"soc": fitted[0].soc, "temperature": np.array([t.temperature for t in tested])}
     covered = np.array([f.covered for f in fitted])
     return Curve(axes, shifts - shifts[_nearest(tested)], np.where(covered, sd, np.nan), "V",
@@ -346,9 +376,13 @@ def _shift_of_rests(rests: Curve, tested: list[Tested], names: str, result: Resu
 
 
 def _mesh_quality(
-    result: Result, tested: list[Tested], fitted: list[Branches], nodes: Array, volts: Array, one: Reduction,
+    result: Result,
+    tested: list[Tested],
+    fitted: list[Branches],
+    split: list[Pieces],
+    one: Reduction,
     tables: list[Array],
-) -> None:  # fmt: skip
+) -> None:
     """R² of the meshes: of the smooth one against each node's own, and of what half the pulse groups say of the other.
 
     A group is what lies between two long rests; every other one makes a mesh, which the rest's is compared with.
@@ -357,19 +391,14 @@ def _mesh_quality(
     halves, covered = [], np.tile((soc > 0.19) & (soc < 0.91), (len(tested), 1))
     for odd in (0, 1):
         part = []
-        for t in tested:
+        for t, x in zip(tested, split, strict=True):
             step = np.zeros(len(t.test), dtype=int)
             step[t.rests] = 1
-            keep = (np.cumsum(step) - step) % 2 == odd
-            part.append(fit_branches(t.test, t.level, _ocv(nodes, volts, t.level), soc, t.temperature, keep=keep))
+            group = np.cumsum(step) - step
+            part.append(fit_branches(x, group[np.searchsorted(t.test.block, x.label)] % 2 == odd))
         covered &= np.array([f.covered for f in part])
-        halves.append(_meshes(part, one, 1)[0])
-    raw = [[one(f.resistance[:, k]) for k in range(len(soc))] for f in fitted]
-    single = [
-        np.array([[p.r0 for p in row] for row in raw]),
-        np.array([[p.resistance[0] for p in row] for row in raw]),
-        np.array([[p.time[0] for p in row] for row in raw]),
-    ]
+        halves.append(_meshes(part, one)[0])
+    single = list(np.exp([one.logs(f.resistance) for f in fitted]).transpose(2, 0, 1))
     names = ", ".join(t.test.name for t in tested)
     for name, unit, number in (("R0", "ohm", 0), ("R1", "ohm", 1), ("C1", "F", 2)):
         every = [x[number] / x[1] if number == 2 else x[number] for x in (tables, single, *halves)]

@@ -17,6 +17,7 @@ from gz_onboard.lab.calibrate.cooling import (
     ride_run,
 )
 from gz_onboard.lab.calibrate.table import read_table
+from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import read_vehicle
 
@@ -84,19 +85,41 @@ def test_without_noise_the_network_is_found(procedure):
     assert all(fit.rms < 0.02 for fit in result.fits)
 
 
-def test_conductances_come_back_within_their_own_intervals():
-    """Of the BMS a scale that temperatures do not tell, so that its truth is drawn from the priors."""
-    held, p = list[bool](), VEHICLE.parameters
-    for procedure, seeds in ((pack_cooling, 15), (bms_cooling, 15), (inverter_cooling, 3), (motor_cooling, 1)):
-        for seed in range(seeds):
-            truth = dict(TRUTH)
-            if procedure is bms_cooling:
-                rng = np.random.default_rng(seed)
-                names = ("bms_resistance", "bms_heat_capacity", "bms_conductance")
-                truth |= {name: max(rng.normal(p[name], p.sd(name)), 0.2 * p[name]) for name in names}
-            for name, found in procedure(runs(seed, truth=truth), VEHICLE).parameters.items():
-                held.append(abs(found.value - truth[name]) < 1.96 * found.sd)
-    assert len(held) > 80
+# What a procedure takes as given, or what only its priors scale: no data tell it, so that its truth is drawn.
+UNTOLD = {
+    motor_cooling: ("motor_stator_share",),
+    inverter_cooling: ("inverter_board_to_air", "inverter_box_to_air"),
+    pack_cooling: (),
+    bms_cooling: ("bms_resistance", "bms_heat_capacity", "bms_conductance"),
+}
+
+
+def drawn(procedure, seed):
+    """The truth with what the data do not tell drawn from its prior, as far as that is physical."""
+    rng, truth, p, limits = np.random.default_rng(10_000 + seed), dict(TRUTH), VEHICLE.parameters, declared_parameters()
+    for name in UNTOLD[procedure]:
+        value = -np.inf
+        while not limits[name].low <= value <= limits[name].high:
+            value = rng.normal(p[name], p.sd(name))
+        truth[name] = value
+    return truth
+
+
+def away(procedure, seed):
+    """How far the values found are from the truth, in their own sd, by parameter."""
+    truth = drawn(procedure, seed)
+    quick = {"hold_out": False} if procedure in (motor_cooling, inverter_cooling) else {}
+    found = procedure(runs(seed, truth=truth), VEHICLE, **quick).parameters
+    return {name: (x.value - truth[name]) / x.sd for name, x in found.items()}
+
+
+@pytest.mark.parametrize(
+    ("procedure", "seeds"), [(pack_cooling, 40), (bms_cooling, 40), (inverter_cooling, 16), (motor_cooling, 16)]
+)
+def test_parameters_come_back_within_their_own_intervals(procedure, seeds):
+    """Few seeds, so that what is counted is all parameters of a network; `benchmarks.recovery` counts each."""
+    held = [abs(z) < 1.96 for seed in range(seeds) for z in away(procedure, seed).values()]
+    assert len(held) >= 64
     assert 0.9 <= np.mean(held) <= 0.99
 
 

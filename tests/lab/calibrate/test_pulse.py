@@ -4,7 +4,6 @@ import os
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,7 @@ from gz_onboard.lab.calibrate.cell_data import cell_test
 from gz_onboard.lab.calibrate.cell_fit import TIMES, Reduction
 from gz_onboard.lab.calibrate.result import Found
 from gz_onboard.lab.calibrate.table import read_table
-from tests.lab.calibrate.cells import Plant, pulse_pieces, pulse_test, slow_test
+from tests.lab.calibrate.cells import MANY, Plant, nearest_pair, pulse_pieces, pulse_test, slow_test
 
 DATA = os.environ.get("GZ_ONBOARD_DATA")
 NEEDS_DATA = pytest.mark.skipif(not DATA, reason="GZ_ONBOARD_DATA is not set")
@@ -48,18 +47,36 @@ def test_what_was_planted_comes_back_within_its_uncertainty(seed):
     assert list(result.curves["battery.r0"].axes["temperature"]) == [0, 25]
 
 
-def test_intervals_hold_what_a_tester_and_a_cell_do_that_no_model_says():
-    """A current that reads 0.5 % wrong (1 sd) and resistances that scatter by 3 % from pulse to pulse, over seeds."""
-    cold, held = np.exp([[1.0], [0.0]]), dict[str, list[Any]]()
-    for seed in range(8):
-        gain = 0.005 * float(np.random.default_rng(seed).normal())
-        tables = [pulse_test(t, seed=50 + 2 * seed + k, gain=gain, scatter=0.03)[0] for k, t in enumerate((0.0, 25.0))]
-        curves = pulse.calibrate(tables, *slow(), method="direct").curves
-        for name, truth in (("r0", 0.05 * cold), ("r1", 0.03 * cold), ("c1", 1000 / cold)):
-            curve = curves[f"battery.{name}"]
-            held.setdefault(name, []).append((np.abs(curve.value - truth) < 1.96 * curve.sd)[:, INSIDE])
-    assert 0.9 <= np.mean(held["r0"]) <= 0.99, {name: np.mean(x) for name, x in held.items()}
-    assert all(np.mean(x) >= 0.9 for x in held.values()), {name: np.mean(x) for name, x in held.items()}
+def away(seed, method, pairs=((0.03, 30.0),), scatter=0.03):
+    """How far R0, R1, C1 are from the truth in their own sd, each (2, nodes), of a cell measured by a tester whose
+    current reads 0.5 % wrong (1 sd) and whose resistances and times scatter from pulse to pulse."""
+    cold, gain = np.exp([[1.0], [0.0]]), 0.005 * float(np.random.default_rng(seed).normal())
+    tables = [
+        pulse_test(t, seed=50 + 2 * seed + k, gain=gain, scatter=scatter, pairs=pairs)[0]
+        for k, t in enumerate((0.0, 25.0))
+    ]
+    curves = pulse.calibrate(tables, *slow(), method=method).curves
+    r0, r1, c1 = nearest_pair(pairs, 0.05, [riding_current(seed=k) for k in range(1, 4)])
+    truths = {"r0": r0 * cold, "r1": r1 * cold, "c1": c1 / cold}
+    found = {name: curves[f"battery.{name}"] for name in truths}
+    return {name: ((found[name].value - x) / found[name].sd)[:, INSIDE] for name, x in truths.items()}
+
+
+@pytest.mark.parametrize(("method", "pairs"), [("direct", ((0.03, 30.0),)), ("reduced", MANY)])
+def test_intervals_hold_what_a_tester_and_a_cell_do_that_no_model_says(method, pairs):
+    """Over seeds; a cell of many pairs is to give the one pair nearest to them, which other code finds."""
+    found = [away(seed, method, pairs) for seed in range(6)]
+    held = {name: np.mean([np.abs(z[name]) < 1.96 for z in found]) for name in found[0]}
+    assert all(share >= 0.9 for share in held.values()), held
+    assert np.mean(list(held.values())) <= 0.99, held  # of few seeds; `python -m benchmarks.recovery` counts each
+
+
+def test_a_pair_between_two_of_the_times_comes_back():
+    """Not from noise or scatter: what the distance of the fixed times costs."""
+    tables = [pulse_test(t, seed=k, noise=1e-6)[0] for k, t in enumerate((0.0, 25.0))]
+    curves, cold = pulse.calibrate(tables, *slow()).curves, np.exp([[1.0], [0.0]])
+    for name, truth in (("r0", 0.05 * cold), ("r1", 0.03 * cold), ("c1", 1000 / cold)):
+        assert np.mean(curves[f"battery.{name}"].value / truth - 1, where=INSIDE) == pytest.approx(0, abs=0.015), name
 
 
 def test_the_direct_fit_gives_back_a_cell_that_has_one_pair():
@@ -139,15 +156,15 @@ def test_two_pairs_follow_slow_relaxation_better_than_one():
     assert errors[1] < 0.8 * errors[0]
 
 
-def test_the_reduction_gives_back_a_pair_that_is_one_of_the_six():
+def test_the_reduction_gives_back_a_pair_that_is_one_of_the_many():
     reduction = Reduction([riding_current(600)])
-    six = np.zeros(1 + len(TIMES))
-    six[0], six[3] = 0.05, 0.02  # 15 s
-    pairs = reduction(six)
+    many, place = np.zeros(1 + len(TIMES)), 5
+    many[0], many[1 + place] = 0.05, 0.02
+    pairs = reduction(many)
     assert pairs.r0 == pytest.approx(0.05, rel=0.01)
     assert pairs.resistance[0] == pytest.approx(0.02, rel=0.02)
-    assert pairs.time[0] == pytest.approx(15, rel=0.05)
-    scaled = reduction(3 * six)
+    assert pairs.time[0] == pytest.approx(TIMES[place], rel=0.05)
+    scaled = reduction(3 * many)
     assert scaled.r0 == pytest.approx(3 * pairs.r0)
     assert scaled.time == pytest.approx(pairs.time)
 
