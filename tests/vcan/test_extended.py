@@ -14,16 +14,26 @@ from tests.vcan.support import Listener, Running
 CITY = LOGS / "city_14C.blf"
 SECONDS = 12.0
 DISCOVERED = ROOT / "tests" / "vehicles" / "discovered.toml"  # see tests/test_turning_loss.py
-MORE = '"auxiliary_load", "cornering_drag", "headwind", "slow_relaxation", "ocv_hysteresis",\n]'
+MORE = (
+    '"auxiliary_load", "cornering_drag", "headwind", "slow_relaxation", "ocv_hysteresis", "rough_road",\n]\n'
+    'effects_folder = "effects"'
+)
 VALUES = """[parameters]
 slow_resistance = { value = 0.03, unit = "ohm", sd = 0.005, status = "guess", source = "made up for a test" }
 wind_north = { value = 4.0, unit = "m/s", sd = 1.0, status = "guess", source = "made up for a test" }
 pack_voltage_latency = { value = 0.1, unit = "s", sd = 0.05, status = "guess", source = "made up for a test" }
 """
+ROUGH = """'''Drag in proportion to the vibration, as discovery writes a curve over it; made up for a test.'''
+from gz_onboard.physics.effect import Parameter, Port
+PORT = Port.WHEEL_FORCE
+PARAMETERS = (Parameter("rough_road_drag", "N·s²/m", 6.0, 1.0, 0.0, 50.0, "made up for a test"),)
+def term(vibration, *, rough_road_drag):
+    return rough_road_drag * vibration
+"""
 
 
 def extended(folder: Path) -> Path:
-    """The reference scooter with more effects, and a current sensor that shows 2 A more than it did."""
+    """The reference scooter with more effects, one a file of its own, and a current sensor that shows 2 A more."""
     text = (OWN / "reference.toml").read_text()
     for old, new in (
         ('"auxiliary_load",\n]', MORE),
@@ -32,6 +42,8 @@ def extended(folder: Path) -> Path:
     ):
         assert text.count(old) == 1, old
         text = text.replace(old, new)
+    (folder / "effects").mkdir(exist_ok=True)
+    (folder / "effects" / "rough_road.py").write_text(ROUGH)
     file = folder / "extended.toml"
     file.write_text(text)
     return file
