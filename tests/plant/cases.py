@@ -67,7 +67,7 @@ UNKNOWN: dict[str, tuple[float, float]] = {
     "steering_drag": (200.0, 700.0),  # N per rad of steering
     "left_drag": (8.0, 35.0),  # N, in left bends only
     "late_drag": (8.0, 25.0),  # N, after some minutes
-    "rough_drag": (7.0, 25.0),  # N on a rough road
+    "rough_drag": (3.0, 14.0),  # N at 10 m/s, more on a rough road
 }
 
 # When a hidden effect must be found, in terms of the truth alone: it takes or seems to take this share of energy, or
@@ -345,6 +345,18 @@ def draw_many(
 def draw(seed: int) -> Case:
     """The case of `seed`."""
     return draw_many([seed])[0]
+
+
+def windy(seed: int, speed: float) -> list[Samples]:
+    """Rides of the healthy scooter of `seed` on windy days [m/s], each with a wind from elsewhere."""
+    machine = scooter(seed // CASES_OF_A_SCOOTER)
+    plans = _service_plans(_draft(seed, "healthy"))
+    from_where = 2 * np.pi * np.arange(len(plans)) / len(plans)
+    windy = [
+        replace(own, wind_north=speed * float(np.cos(a)), wind_east=speed * float(np.sin(a)))
+        for own, a in zip(plans, from_where, strict=True)
+    ]
+    return [measure(x, f"ride_{i:03d}") for i, x in enumerate(_ride_all([(own, machine, Hidden()) for own in windy]))]
 
 
 def _seeming_share(name: str, change: float, without: Sequence[Ridden]) -> float | None:

@@ -27,10 +27,12 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.lab.discover.grid import STEP, Array, Mask, Ride
+from gz_onboard.errors import InputError
+from gz_onboard.lab.discover.grid import MOVING, STEP, Array, Mask, Ride
 from gz_onboard.physics.battery import Battery, Mesh
 from gz_onboard.physics.effect import Effect
 from gz_onboard.physics.model import G
+from gz_onboard.physics.riding import VIBRATION
 
 Values = Mapping[str, float]
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
@@ -54,15 +56,24 @@ class System:
 
     def term(self, effect: Effect, q: Mapping[str, Any], p: Values, dt: float) -> Any:
         """The term of `effect` over time; the state's, if it has memory."""
-        term = effect.term(*[q[name] for name in effect.quantities], **{name: p[name] for name in effect.keywords})
+        read = [q[name] if name in q else typical(q, name) for name in effect.quantities]
+        term = effect.term(*read, **{name: p[name] for name in effect.keywords})
         if effect.decay is None:
             return term
         n = len(next(iter(q.values())))
         if not np.any(term):
             return np.zeros(n)
         keywords = {name: p[name] for name in effect.decay_keywords}
-        factor = effect.decay(dt, *[q[name] for name in effect.decay_quantities], **keywords)
+        read = [q[name] if name in q else typical(q, name) for name in effect.decay_quantities]
+        factor = effect.decay(dt, *read, **keywords)
         return recursion(np.broadcast_to(factor, n), np.broadcast_to(term, n))
+
+
+def typical(q: Mapping[str, Array], name: str) -> Array:
+    """A quantity that a ride did not measure, shape of its others; InputError for one that nothing stands in for."""
+    if name != "vibration":
+        raise InputError(f"no ride measures {name}, which an effect reads")
+    return np.where(np.abs(q["speed"]) > MOVING, VIBRATION, 0.0)
 
 
 def recursion(decay: Array, target: Array, start: float = 0.0) -> Array:

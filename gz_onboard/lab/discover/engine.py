@@ -13,6 +13,7 @@ import numpy as np
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.alone import NOTE, alone
 from gz_onboard.lab.discover.channels import BY_NAME, usable, voltage_timing
+from gz_onboard.lab.discover.converge import about
 from gz_onboard.lab.discover.gain import measure_gain
 from gz_onboard.lab.discover.grid import Array, Ride
 from gz_onboard.lab.discover.linear import (
@@ -32,7 +33,7 @@ from gz_onboard.lab.discover.search import Search, evidence
 from gz_onboard.lab.discover.shapes import with_inflation
 from gz_onboard.lab.discover.state import State, initial, restore
 from gz_onboard.lab.discover.terms import FIXED, LOG, WEATHER
-from gz_onboard.lab.discover.verdict import about, reach
+from gz_onboard.lab.discover.verdict import reach
 from gz_onboard.physics.parameters import Parameters, Value, declared_parameters
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
@@ -74,7 +75,8 @@ def adopted(vehicle: Vehicle, state: State) -> Vehicle:
             source = f"{old.source}; refitted on {state.healthy} healthy rides"
             bounds = declared[name]
             known[name] = Value(float(np.clip(at[name], bounds.low, bounds.high)), wide, old.unit, "measured", source)
-    return replace(vehicle, parameters=Parameters(known, vehicle.parameters.correlations), healthy=state)
+    learned = replace(vehicle, parameters=Parameters(known, vehicle.parameters.correlations))
+    return replace(learned, healthy=replace(state, vehicle=learned))
 
 
 def _linearised(job: tuple[Ride, State]) -> Linear:
@@ -88,9 +90,10 @@ def _linearised(job: tuple[Ride, State]) -> Linear:
     return spread_out(line, state.noise, state.mean, wide) if state.healthy else line
 
 
-def linearise_all(rides: Sequence[Ride], state: State, workers: int = 1) -> list[Linear]:
-    """All rides, in `workers` processes."""
-    jobs = [(ride, state) for ride in rides]
+def linearise_all(rides: Sequence[Ride], state: State | Sequence[State], workers: int = 1) -> list[Linear]:
+    """All rides at a state, or each at its own, in `workers` processes."""
+    states = [state] * len(rides) if isinstance(state, State) else state
+    jobs = list(zip(rides, states, strict=True))
     if workers < 2 or len(rides) < 2:
         return [_linearised(job) for job in jobs]
     os.environ.setdefault("OMP_NUM_THREADS", "1")

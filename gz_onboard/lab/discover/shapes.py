@@ -43,8 +43,8 @@ SHARE = 0.15  # sd before of a coefficient, over the residual's own standard dev
 
 
 ROUND = ("heading",)
-NO_LINE = (*ROUND, "motor_temperature", "soc", "since_braking")
-"""Quantities whose zero means nothing: what goes in proportion to them is no likely effect."""
+IN_PROPORTION = ("time", "current_change", "steering", "vibration", "suspension_speed")
+"""Quantities that something may be in proportion to and that no candidate is: each is a try of its own."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,9 @@ class Form:
 
 
 def forms() -> list[Form]:
-    """A curve for every pair of channel and quantity, and a line where zero means none."""
+    """A curve for every pair of channel and quantity, and what is in proportion to some."""
     every = [Form(channel, quantity) for channel, quantities in PAIRS for quantity in quantities]
-    return [*every, *(replace(form, straight=True) for form in every if form.quantity not in NO_LINE)]
+    return [*every, *(replace(form, straight=True) for form in every if form.quantity in IN_PROPORTION)]
 
 
 def quantity(ride: Ride, name: str, table: Table) -> Array | None:

@@ -11,18 +11,20 @@ from scipy.stats import t as student
 
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.constancy import splits
+from gz_onboard.lab.discover.converge import Known, Linearised, about, converged
 from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, normal
 from gz_onboard.lab.discover.result import Cause, Report
-from gz_onboard.lab.discover.search import Evidence, Search, evidence, one_degree
+from gz_onboard.lab.discover.search import Evidence, Search, evidence
 from gz_onboard.lab.discover.shapes import forms
 from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.terms import LOG
 from gz_onboard.lab.discover.unknown import RIDES, unexplained
+from gz_onboard.lab.discover.winds import NAME as WIND
+from gz_onboard.lab.discover.winds import about_winds, own_winds
 from gz_onboard.lab.discover.worth import energy_share, sizes
 
 FALSE_ALARMS = 0.05  # of sets of healthy rides, all candidates and curves together
-AGAIN = 5  # times at most that all is linearised about what was found: large changes are not linear
 DISCREPANCY = 0.05  # of a change, sd: the form of an effect is not exactly the real one's
 LUMPED = {"cell_voltage": 1, "voltage_timing": 1, "motor_temperature": 3, "inverter_temperature": 3,
           "cell_temperature": 3}  # fmt: skip
@@ -49,59 +51,39 @@ def threshold(state: State, tried: float) -> float:
     return float(student.ppf(1 - one / 2, freedom) ** 2)
 
 
-def reach(
-    state: State, notes: list[str], say: Callable[[str], None], linearised: Callable[[State], list[Linear]],
-    start: Array,
-) -> Report:  # fmt: skip
-    """The verdict. linearised: the rides at a state. start (p,): where to linearise first, in scales."""
-
+def reach(state: State, notes: list[str], say: Callable[[str], None], linearised: Linearised, start: Array) -> Report:
+    """The verdict. linearised: each ride at its state. start (p,): where to linearise first, in scales."""
     lines = about(state, start, linearised)
     normals = [normal(line, state.noise) for line in lines]
     e = evidence(state, normals)
     causes = seen(state, e, notes)
-    proportions = sum(form.straight and form.channel in {c for line in lines for c in line.tables} for form in forms())
+    channels = {name for line in lines for name in line.tables}
+    proportions = sum(form.straight and form.channel in channels for form in forms())
     limit = threshold(state, tries(e, [i for c in causes for i in state.index(c.names)]) + proportions)
     shares = channel_shares(state, lines, causes)
-    search = Search(state, e, causes, shares)
     say(f"{len(causes)} candidates")
-    choice = search.select(limit)
-    offset = start
-    chosen = choice.names
-    for _ in range(AGAIN):
-        if not chosen:
-            break
-        before = offset
-        index = search.index(chosen)
-        target = np.zeros(len(offset))
-        target[index] = search.evidence.estimate(index)
-        offset = target
-        for name in chosen:
-            for i in search.place[name]:
-                offset[i] = kept(state, i, offset[i])
-        lines = about(state, offset, linearised)
-        normals = [normal(line, state.noise) for line in lines]
-        e = evidence(state, normals)
-        search = Search(state, e, causes, shares)
-        chosen = search.select(limit).names
-        if np.all(np.abs(offset - before) < 0.03 * np.abs(offset) + 1e-9):
-            break
+    known = Known(state, causes, shares, limit, linearised)
+    now = converged(known, lines, start, np.zeros_like(start))
+    winds = own_winds(now) if WIND in now.search.place and WIND not in now.chosen else None
+    if winds is not None and winds.score > limit:
+        now = about_winds(known, winds, start, [line.ride for line in lines])
+    state, lines, normals, search, chosen = now.state, now.lines, now.normals, now.search, now.chosen
     say("curves over quantities")
-    change = np.zeros(len(state.mean))
-    change[search.index(chosen)] = search.evidence.estimate(search.index(chosen))
+    change = now.change
     constancy = splits(state, lines, normals, search.place, chosen, change) if chosen else []
     unknown = unexplained(state, search, lines, normals, chosen, change, constancy, limit)
     if unknown is not None:
         chosen = tuple(name for name in chosen if name not in unknown["denies"])
+    every = Search(state, search.evidence, causes, shares)
     found = causes_of(state, search, chosen, lines)
     sets = [list(s) for s in search.stand_ins(chosen, MARGIN, LEAST * limit)]
-    scores = {c.name: search.step([n for n in chosen if n != c.name], c.name) for c in causes}
-    if "headwind" in search.place and "headwind" not in chosen:
-        score, words = own_winds(state, lines, normals, search.place["headwind"], change)
-        scores["headwind"] = max(scores["headwind"], score)
-        if score > limit:
-            (wind,) = causes_of(state, search, [*chosen, "headwind"], lines)[-1:]
-            found = [*found, replace(wind, evidence=round(score, 2), varies=True)]
-            notes.append("the wind differed from ride to ride: " + words)
+    scores = {name: search.step([n for n in chosen if n != name], name) for name in search.causes}
+    if winds is not None:
+        scores[WIND] = max(scores.get(WIND, 0.0), winds.score)
+        if winds.score > limit:
+            (wind,) = causes_of(state, every, [*chosen, WIND], lines)[-1:]
+            found = [*found, replace(wind, evidence=round(winds.score, 2), varies=True)]
+            notes.append("the wind differed from ride to ride: " + winds.words)
     verdict = "none"
     if unknown is not None and not found:
         verdict = "unknown"
@@ -112,42 +94,9 @@ def reach(
     ranking = sorted(((name, round(score, 2)) for name, score in scores.items()), key=lambda pair: -pair[1])
     return Report(
         verdict, found, sets, unknown, ranking, sizes(lines), {}, advice(search, sets, unknown), notes,
-        isolability(search), limit, constancy=constancy, state=state, at=offset, lines=list(lines),
+        isolability(every), limit, constancy=constancy, state=state, at=now.offset, lines=list(lines),
         normals=normals,
     )  # fmt: skip
-
-
-def about(state: State, offset: Array, linearised: Callable[[State], list[Linear]]) -> list[Linear]:
-    """The rides linearised at `offset` (p,) in scales, their residuals as seen from the values of `state`."""
-    moved = replace(state, values=state.unit_value(offset)) if np.any(offset) else state
-    return [line.seen_from(offset) for line in linearised(moved)]
-
-
-def own_winds(
-    state: State, lines: Sequence[Linear], normals: Sequence[Any], index: Sequence[int], change: Array
-) -> tuple[float, str]:
-    """(evidence that the winds of these rides are more than healthy ones show, whatever their directions; in words).
-
-    change (p,): what causes explain. A wind blows as it likes on another day, so that a common vector misses it.
-    """
-    w = list(index)
-    rest = [i for i in range(len(state.mean)) if i not in w]
-    spread = state.prior + np.diag(state.scatter)
-    inside = np.zeros_like(spread)
-    inside[np.ix_(rest, rest)] = np.linalg.inv(spread[np.ix_(rest, rest)])
-    mean = state.mean + change
-    total, words = 0.0, []
-    for line, ride in zip(lines, normals, strict=True):
-        if np.any(np.diag(ride.n)[w] < 1e-6):
-            continue
-        covariance = np.linalg.inv(inside + ride.n)
-        wind = (covariance @ (ride.b + inside @ mean))[w] - mean[w]
-        total += float(wind @ np.linalg.solve(spread[np.ix_(w, w)] + covariance[np.ix_(w, w)], wind))
-        north, east = (wind * state.scale[w]).tolist()
-        words.append(
-            f"{line.ride.name} {np.hypot(north, east):.1f} m/s from {np.degrees(np.arctan2(east, north)) % 360:.0f}°"
-        )
-    return one_degree(total, 2 * len(words)) if words else 0.0, ", ".join(words)
 
 
 def channel_shares(state: State, lines: Sequence[Linear], causes: Sequence[Candidate]) -> dict[str, dict[str, float]]:
@@ -163,19 +112,6 @@ def channel_shares(state: State, lines: Sequence[Linear], causes: Sequence[Candi
         whole = sum(seen_in.values()) or 1.0
         found[cause.name] = {name: value / whole for name, value in seen_in.items()}
     return found
-
-
-def kept(state: State, i: int, x: float) -> float:
-    """A change `x` of the parameter at `i`, in scales, that stays within the bounds of what it is, and does not take
-    more than two thirds of it at once.
-    """
-    name, value = state.names[i], state.values[state.names[i]]
-    bounds = next((p for c in state.causes for p in c.parameters if p.name == name), None)
-    if name in LOG or bounds is None:
-        return x
-    low = max(bounds.low, value / 3) if bounds.low > 0 else bounds.low
-    moved = float(np.clip(value + x * float(state.scale[i]), low, bounds.high))
-    return (moved - value) / float(state.scale[i])
 
 
 def seen(state: State, e: Evidence, notes: list[str]) -> list[Candidate]:
@@ -282,4 +218,4 @@ def advice(search: Search, sets: Sequence[Sequence[str]], unknown: dict[str, Any
     return lines
 
 
-__all__ = ["about", "own_value", "reach", "threshold"]
+__all__ = ["own_value", "reach", "threshold"]

@@ -7,15 +7,24 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.trial import Row, interval, judge_scooter, reported, right, summary
+from benchmarks.trial import Row, interval, judge, reported, right, summary
+from gz_onboard.lab.discover.engine import baseline, discover
+from gz_onboard.vehicle import Vehicle, read_vehicle
+from tests.plant import cases as plant
 
 FIRST = 200_000
 CASES = 8
+SCOOTER = FIRST // plant.CASES_OF_A_SCOOTER
 
 
 @pytest.fixture(scope="module")
-def rows() -> list[Row]:
-    return judge_scooter(range(FIRST, FIRST + CASES))
+def base() -> Vehicle:
+    return baseline(read_vehicle("reference"), plant.commissioning(SCOOTER))
+
+
+@pytest.fixture(scope="module")
+def rows(base: Vehicle) -> list[Row]:
+    return [judge(base, case) for case in plant.draw_many(range(FIRST, FIRST + CASES))]
 
 
 def test_every_case_is_judged(rows):
@@ -39,6 +48,29 @@ def test_what_is_clear_is_in_the_reported_set(rows):
 def test_what_has_no_name_is_given_none(rows):
     wrong = [(row["seed"], reported(row)) for row in rows if row["kind"] == "unknown" and reported(row)]
     assert len(wrong) <= sum(row["kind"] == "unknown" for row in rows) / 2, wrong
+
+
+def test_what_rough_roads_take_is_found_over_vibration_and_mended(base):
+    (case,) = plant.draw_many([FIRST + 9], "unknown", ("rough_drag",), truths=False)
+    report = discover(base, case.rides).to_json()
+    assert (report["verdict"], report["causes"]) == ("unknown", [])
+    assert (report["unknown"]["channel"], report["unknown"]["quantity"]) == ("road_force", "vibration")
+    gain = report["gain"]["energy_per_way"]
+    assert gain["after"] < 0.6 * gain["control"]  # on rides that the curve was not fitted to
+
+
+def test_windy_days_are_named_but_no_model_is_extended_with_them(base):
+    report = discover(base, plant.windy(FIRST + 9, 4.5)).to_json()
+    assert [cause["name"] for cause in report["causes"]] == ["headwind"]
+    assert report["causes"][0]["varies"]
+    assert any("from ride to ride" in note for note in report["notes"])
+    for metric in ("power", "energy_per_way", "range"):
+        assert report["gain"][metric]["after"] == report["gain"][metric]["control"]
+
+
+def test_a_cause_counts_from_what_healthy_rides_taught(base):
+    """In one process as from files: the vehicle that was learned, not that of the file before."""
+    assert base.healthy.vehicle.parameters.known == base.parameters.known
 
 
 def test_the_counting_itself():
