@@ -18,6 +18,7 @@ from gz_onboard.errors import InputError, nearest
 from gz_onboard.lab.calibrate import (
     auxiliary,
     cooling,
+    cooling_run,
     losses,
     manifest,
     motor,
@@ -181,9 +182,9 @@ def _cooling(given: Given) -> Result:
     return result
 
 
-def _cooling_runs(given: Given, slot: str) -> list[cooling.Run]:
-    bench = [cooling.bench_run(table, given.vehicle) for table in given.tables.get(slot, [])]
-    return bench + [cooling.ride_run(ride, given.vehicle) for ride in given.rides.get(slot, [])]
+def _cooling_runs(given: Given, slot: str) -> list[cooling_run.Run]:
+    bench = [cooling_run.bench_run(table, given.vehicle) for table in given.tables.get(slot, [])]
+    return bench + [cooling_run.ride_run(ride, given.vehicle) for ride in given.rides.get(slot, [])]
 
 
 def _coastdown(given: Given) -> Result:

@@ -97,6 +97,8 @@ def pulse_test(temperature=25.0, levels=10, **plant):
 
 # As the pulse test of the bench cell shows at 25 degC; no time is one of those that the calibration uses.
 MANY = ((0.007, 2.4), (0.008, 24.0), (0.010, 70.0), (0.014, 1200.0))
+# A strong slow pair: the one nearest to all, of some 106 s, is none of them.
+SLOW = ((0.008, 0.6), (0.012, 9.0), (0.012, 90.0), (0.030, 900.0))
 
 
 def nearest_pair(pairs, r0, loads):

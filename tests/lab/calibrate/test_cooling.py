@@ -7,15 +7,8 @@ import pytest
 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate import cooling
-from gz_onboard.lab.calibrate.cooling import (
-    Run,
-    bench_run,
-    bms_cooling,
-    inverter_cooling,
-    motor_cooling,
-    pack_cooling,
-    ride_run,
-)
+from gz_onboard.lab.calibrate.cooling import bms_cooling, inverter_cooling, motor_cooling, pack_cooling
+from gz_onboard.lab.calibrate.cooling_run import Run, bench_run, ride_run
 from gz_onboard.lab.calibrate.table import read_table
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.simulation.samples import Samples

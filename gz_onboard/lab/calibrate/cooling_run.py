@@ -1,0 +1,160 @@
+"""Runs that warm up and cool down, as the cooling networks take them: temperatures, and the heat that drives them.
+
+On a bench the heat is measured; of a ride it is what the vehicle's own losses give.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from gz_onboard.errors import InputError
+from gz_onboard.lab.calibrate.result import Array
+from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.physics.effect import Port
+from gz_onboard.physics.model import Bound
+from gz_onboard.simulation.parts.cooling import PERIOD
+from gz_onboard.simulation.samples import Samples
+from gz_onboard.vehicle import Vehicle
+
+SHORTEST = 300.0  # s: less tells nothing of time constants of minutes
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run at `PERIOD` spacing, every array of shape (n,); powers in W, temperatures in degC.
+
+    still: on a bench or a roller, without the airflow of riding. iron: the part of the motor's heat that grows with
+    speed. measured: the temperatures there are, by ``motor_temperature``, ``inverter_temperature``,
+    ``inverter_box_temperature``, ``cell_temperature``, ``bms_temperature``.
+    """
+
+    name: str
+    still: bool
+    time: Array
+    ambient: Array
+    speed: Array  # m/s, of the wheel
+    motor_heat: Array
+    iron: Array
+    inverter_heat: Array
+    pack_heat: Array
+    pack_square: Array  # A²: mean square of the pack's current
+    measured: dict[str, Array]
+
+
+def bench_run(table: Table, vehicle: Vehicle) -> Run:
+    """A run of motor and inverter in a closed room with their losses measured. InputError naming what is missing."""
+    time = table["time"]
+    grid = _grid(time, table.file.name)
+
+    def column(name: str) -> Array:
+        return _means(time, table[name], grid)
+
+    speed, current = column("motor_speed"), column("motor_current")
+    motor_heat = column("ac_power") - _means(time, table["shaft_torque"] * table["motor_speed"], grid)
+    inverter_heat = column("dc_power") - column("ac_power")
+    if motor_heat.sum() <= 0 or inverter_heat.sum() <= 0:
+        raise table.error(
+            "ac_power less shaft_torque times motor_speed, or dc_power less ac_power, is no heat but cold"
+        )
+    measured = {name: np.interp(grid, time, table[name]) for name in SENSORS if name in table}
+    turning = speed * (np.abs(current) > 1.0)  # the bench's own drive stops with the current
+    iron = _iron(vehicle, turning)
+    nothing = np.zeros_like(grid)
+    radius = vehicle.parameters["wheel_radius"] * vehicle.parameters["gear_ratio"]
+    return Run(table.file.name, True, grid, np.interp(grid, time, table["ambient_temperature"]), speed * radius,
+               motor_heat, iron, inverter_heat, nothing, nothing, measured)  # fmt: skip
+
+
+def ride_run(ride: Samples, vehicle: Vehicle) -> Run:
+    """A ride or dynamometer run with the heat that the vehicle's own losses give. InputError for signals it lacks."""
+    for role in ("motor_speed", "motor_current", "motor_temperature", "ambient_temperature", "pack_current"):
+        if role not in ride.columns:
+            raise InputError(f"{ride.name}: no {role}, without which no heat is known")
+    start = max(t[0] for t, _ in ride.columns.values())
+    end = min(t[-1] for t, _ in ride.columns.values())
+    grid = _grid(np.array([start, end]), ride.name)
+
+    def at(role: str) -> Array:
+        return np.interp(grid, *ride.columns[role])
+
+    time, current = ride.columns["motor_current"]
+    speed = np.interp(time, *ride.columns["motor_speed"])
+    quantities = {
+        "motor_current": current, "motor_speed": speed,
+        "motor_temperature": np.interp(time, *ride.columns["motor_temperature"]),
+    }  # fmt: skip
+    heat = {port: np.zeros_like(time) for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS)}
+    for effect in vehicle.model.effects:
+        if effect.port in heat:
+            values = {name: vehicle.parameters[name] for name in effect.keywords}
+            heat[effect.port] = heat[effect.port] + Bound(effect, values)(quantities)
+    pack_time, pack_current = ride.columns["pack_current"]
+    amperes = (pack_current - vehicle.parameters["pack_current_offset"]) / vehicle.parameters["pack_current_gain"]
+    measured = {name: at(name) for name in SENSORS if name in ride.columns}
+    inside = [at(role) for role in ride.columns if role.startswith("pack_temperature_")]
+    if inside:  # the mean of thermocouples tells more than the BMS's whole degrees
+        measured["cell_temperature"] = np.mean(inside, axis=0)
+    mean, square = _means(pack_time, amperes, grid), _means(pack_time, amperes**2, grid)
+    radius = vehicle.parameters["wheel_radius"] * vehicle.parameters["gear_ratio"]
+    pack_heat = np.zeros_like(grid)
+    if vehicle.battery and "cell_temperature" in measured and "pack_voltage" in ride.columns:
+        pack_heat = _pack_heat(vehicle, mean, square, measured["cell_temperature"], at("pack_voltage")[:5].mean())
+    return Run(ride.name, "roller_speed" in ride.columns, grid, at("ambient_temperature"),
+               np.abs(_means(*ride.columns["motor_speed"], grid)) * radius,
+               _means(time, heat[Port.MOTOR_LOSS], grid), _means(time, _iron(vehicle, speed), grid),
+               _means(time, heat[Port.INVERTER_LOSS], grid), pack_heat, square, measured)  # fmt: skip
+
+
+SENSORS = (
+    "motor_temperature", "inverter_temperature", "inverter_box_temperature", "cell_temperature", "bms_temperature",
+)  # fmt: skip
+
+
+def _grid(time: Array, name: str) -> Array:
+    if time[-1] - time[0] < SHORTEST:
+        raise InputError(
+            f"{name}: {time[-1] - time[0]:.0f} s are too short for a cooling network; {SHORTEST:.0f} s are needed"
+        )
+    return np.arange(np.ceil(time[0]), np.floor(time[-1]), PERIOD)
+
+
+def _means(time: Array, value: Array, grid: Array) -> Array:
+    """The mean of `value`, held from each of its times to the next, over each period of `grid`."""
+    sums = np.concatenate([[0.0], np.cumsum(np.diff(time) * value[:-1])])
+    edges = np.append(grid, grid[-1] + PERIOD)
+    result: Array = np.diff(np.interp(edges, time, sums)) / PERIOD
+    if edges[-1] > time[-1]:
+        result[-1] = value[-1]
+    return result
+
+
+def _iron(vehicle: Vehicle, speed: Array) -> Array:
+    """The motor's loss without current [W]."""
+    total: Array = np.zeros_like(speed)
+    nothing = {
+        "motor_current": np.zeros_like(speed),
+        "motor_speed": speed,
+        "motor_temperature": np.full_like(speed, 25.0),
+    }
+    for effect in vehicle.model.effects:
+        if effect.port is Port.MOTOR_LOSS:
+            total = total + Bound(effect, {name: vehicle.parameters[name] for name in effect.keywords})(nothing)
+    return total
+
+
+def _pack_heat(vehicle: Vehicle, mean: Array, square: Array, temperature: Array, rest: float) -> Array:
+    """What the cells turn to heat [W]: R0 with the mean square of current, R1 with what its pair lets through."""
+    battery = vehicle.pack
+    n, m = battery.cells_series, battery.cells_parallel
+    soc = battery.soc_at((rest - vehicle.parameters["pack_voltage_offset"]) / n)
+    heat, v1 = np.empty_like(mean), 0.0
+    for k, (i, i2, t) in enumerate(
+        zip((mean / m).tolist(), (square / m**2).tolist(), temperature.tolist(), strict=True)
+    ):
+        r0, r1, c1 = (mesh.at(soc, t)[0] for mesh in (battery.r0, battery.r1, battery.c1))
+        v1 = battery.relax(PERIOD, v1, i, r1, c1)[0]
+        heat[k] = n * m * (r0 * i2 + v1 * v1 / r1)
+        soc -= i * PERIOD / (3600 * battery.cell_capacity(t))
+    return heat
