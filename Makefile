@@ -4,7 +4,7 @@ RIDE ?= $(firstword $(wildcard replay_logs/*.blf))
 SPEED ?= 1
 SECONDS ?= 60
 CASES ?= 120
-FIRST ?= 100120
+FIRST ?= 100240
 PYTHON_IN_VENV := .venv/bin/python
 DEMO = replay_logs/demo.py "$(RIDE)" --speed $(SPEED) --seconds $(SECONDS)
 

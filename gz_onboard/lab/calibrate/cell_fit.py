@@ -30,7 +30,7 @@ SOC_SD = 0.003  # how far the state of charge may be off, which matters where th
 CORRELATED = 20
 BEND_SD = 0.3  # relative: how far a table may bend from node to node, per 0.05 of SOC
 LEAST = 1e-6  # ohm
-LEFT_OUT = 0.5  # of a piece's weight, to see how much hangs on it
+LEFT_OUT = (0.1, 1.0)  # of a piece's weight, to see how much hangs on it: see `jackknife`
 TIME_BEND = 0.5  # of ln τ, as BEND_SD
 TURNS = 8  # of Gauss and Newton
 SHIFT_SD, SHIFT_SD_EMPTY = 0.01, 0.05  # V: rest voltage of this test against the OCV; below 10 % SOC
@@ -60,7 +60,7 @@ class Branches:
     resistance: (1 + len(TIMES), n) [ohm], R0 first; shift: (n,) [V] of the rest voltage against the OCV.
     covariance: (n,) of those of the resistances at a node, from the scatter of what the pieces leave over, as if a
     resistance could be negative; it weighs nodes against each other. without:
-    (pieces, 2 + len(TIMES), n), both as they are with half of each piece left out, if that was asked for.
+    (2, pieces, 2 + len(TIMES), n), both as they are with `LEFT_OUT` of each piece left out, if that was asked for.
     shift_prior: (n,) [V], the sd of the shift that the priors' own doubt leaves. covered: (n,), False at nodes without
     a pulse near.
     """
@@ -132,8 +132,8 @@ def fit_branches(of: Pieces, keep: NDArray[np.bool_] | None = None, leave_out: b
         p = _positive(gram + prior, right, n)
         scale = np.maximum(np.median(p[:-n].reshape(branches, n), axis=1), 2e-3)
     without = [
-        _positive(gram + prior - LEFT_OUT * of.gram[k], right - LEFT_OUT * of.right[k], n)
-        for k in np.flatnonzero(used)
+        [_positive(gram + prior - part * of.gram[k], right - part * of.right[k], n) for k in np.flatnonzero(used)]
+        for part in LEFT_OUT
         if leave_out
     ]
     bread = np.linalg.inv(gram + prior)
@@ -142,7 +142,7 @@ def fit_branches(of: Pieces, keep: NDArray[np.bool_] | None = None, leave_out: b
     shift_prior = np.sqrt(np.diag(bread @ prior @ bread)[-n:])
     at_node = np.array([covariance[:-1, k, :-1, k] for k in range(n)])
     return Branches(of.soc, of.temperature, p[:-n].reshape(branches, n), p[-n:], at_node,
-                    np.reshape(without, (-1, branches + 1, n)), shift_prior,
+                    np.reshape(without, (2, -1, branches + 1, n)), shift_prior,
                     of.samples[used].sum(axis=0) > 3)  # fmt: skip
 
 
@@ -154,14 +154,14 @@ def _positive(normal: Array, right: Array, n: int) -> Array:
 
 
 def jackknife(whole: Array, without: Array) -> Array:
-    """The sd of `whole` (...) from what it is with `LEFT_OUT` of each piece of the data left out, (pieces, ...).
+    """The sd of `whole` (...) from what it is with `LEFT_OUT` of each piece of the data left out, (2, pieces, ...).
 
-    The scatter of what is left over tells too little where pieces are few, each of which pulls the fit towards itself;
-    leaving out whole pieces (the jackknife, Efron 1982, eq. 3.13) tells too much. Half of each is right to the first
-    order of a piece's leverage, as CR2 of Bell & McCaffrey 2002 is.
+    A piece pulls the fit towards itself, by its leverage h. Leaving out a little of it moves the fit by what the piece
+    leaves over, whose variance is (1 - h)·σ²: too little. Leaving it out whole, as the jackknife does, moves it by
+    1/(1 - h) of that: too much. The product of both has the mean σ² (HC2 of MacKinnon & White 1985).
     """
-    count = max(len(without), 1)
-    return np.asarray(np.sqrt((count - 1) / count * np.sum(((without - whole) / LEFT_OUT) ** 2, axis=0)))
+    little, all_of_it = ((x - whole) / part for x, part in zip(without, LEFT_OUT, strict=True))
+    return np.asarray(np.sqrt(np.maximum(np.sum(little * all_of_it, axis=0), 0.0)))
 
 
 def left_out(a: Array, residual: Array, labels: NDArray[Any], normal: Array) -> Array:
@@ -238,8 +238,10 @@ class Reduction:
 
     def __call__(self, resistance: Array) -> Pairs:
         """The pairs nearest to the many of `resistance` (1 + len(TIMES),) [ohm]."""
-        cost = np.einsum("i,kij,j->k", resistance, self._left, resistance)
-        best = self._solved @ resistance
+        return self._nearest(np.einsum("i,kij,j->k", resistance, self._left, resistance), self._solved @ resistance)
+
+    def _nearest(self, cost: Array, best: Array) -> Pairs:
+        """The pairs of the least `cost` (times,) among the `best` (times, 1 + count) of each of the times tried."""
         positive = np.all(best > 0, axis=1)
         if np.any(positive):
             cost = np.where(positive, cost, np.inf)
@@ -265,7 +267,9 @@ class Reduction:
 
     def logs(self, resistances: Array) -> Array:
         """(n, 1 + 2 count): ln of R0, R of each pair, τ of each pair, for `resistances` (1 + len(TIMES), n) [ohm]."""
-        found = [self(r) for r in resistances.T]
+        costs = np.einsum("kin,in->nk", self._left @ resistances, resistances)
+        every = np.moveaxis(self._solved @ resistances, -1, 0)
+        found = [self._nearest(cost, best) for cost, best in zip(costs, every, strict=True)]
         return np.log([[pairs.r0, *pairs.resistance, *pairs.time] for pairs in found])
 
 

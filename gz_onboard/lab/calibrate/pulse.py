@@ -266,17 +266,18 @@ def _ocv(nodes: Array, volts: Array, level: Array) -> tuple[Array, Array]:
 def _meshes(fitted: list[Branches], reduction: Reduction) -> tuple[list[Array], list[Array]]:
     """(R0, R of each pair, τ of each pair), each (temperatures, soc), smooth; their relative sd, and last that of C1.
 
-    The sd is that of the whole way from pulses to smooth tables, half of each pulse left out in turn.
+    The sd is that of the whole way from pulses to smooth tables, a part of each pulse left out in turn.
     """
     tables, sds = [], []
     for f in fitted:
         raw = reduction.logs(f.resistance)
-        others = np.array([reduction.logs(x[:-1]) for x in f.without])
+        others = np.array([[reduction.logs(x[:-1]) for x in part] for part in f.without])
         weights = np.array(
             [np.sqrt(np.diag(reduction.spread(r, c))) for r, c in zip(f.resistance.T, f.covariance, strict=True)]
         )
         smooth = _with_c1(_smooth(f.soc, raw, weights))
-        without = np.array([_with_c1(_smooth(f.soc, x, weights)) for x in others]).reshape(-1, *smooth.shape)
+        without = np.array([[_with_c1(_smooth(f.soc, x, weights)) for x in part] for part in others])
+        without = without.reshape(len(others), -1, *smooth.shape)
         tables.append(np.exp(smooth))
         sds.append(_pooled(f.soc, jackknife(smooth, without), f.covered))
     return list(np.array(tables).transpose(2, 0, 1)[:-1]), list(np.array(sds).transpose(2, 0, 1))
@@ -334,7 +335,7 @@ def _rest_shift(fitted: list[Branches], tested: list[Tested], nodes: Array, ocv:
 def _rests_over_soc(fitted: list[Branches], tested: list[Tested], names: str) -> Curve:
     """How much higher the cell rests at each temperature and SOC than near 25 degC."""
     shifts = np.array([f.shift for f in fitted])
-    sd = np.array([np.hypot(jackknife(f.shift, f.without[:, -1]), f.shift_prior) for f in fitted])
+    sd = np.array([np.hypot(jackknife(f.shift, f.without[:, :, -1]), f.shift_prior) for f in fitted])
     axes = {"soc": fitted[0].soc, "temperature": np.array([t.temperature for t in tested])}
     covered = np.array([f.covered for f in fitted])
     return Curve(axes, shifts - shifts[_nearest(tested)], np.where(covered, sd, np.nan), "V",
