@@ -28,10 +28,11 @@ from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 KEYS = {
     "verdict": "cause, none, ambiguous or unknown",
     "causes": "name, parameter, value, unit, ci95, change (over the healthy value), energy_share, evidence "
-    "(chi-squared of one degree of freedom), parameters (all of them: value, ci95)",
+    "(chi-squared of one degree of freedom), varies (from ride to ride: no model is extended with it), parameters (all "
+    "of them: value, ci95)",
     "ambiguous": "sets of names that these rides cannot tell apart, the likeliest first",
-    "unknown": "what has no name: channel, quantity, unit, share of the energy, curve [[at, value, sd], ...], denies "
-    "(causes that it shows to be none); or null",
+    "unknown": "what has no name: channel, quantity, unit, straight (in proportion), share of the energy, curve "
+    "[[at, value, sd], ...], denies (causes that it shows to be none); or null",
     "ranking": "name, score of every candidate beside the causes named",
     "residuals": "per channel: mean, rms, autocorrelation, blocks, energy_share, range_share",
     "gain": "on rides held out: holdout, and per metric before, control (present parameters refitted), after, "
