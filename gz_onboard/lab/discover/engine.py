@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -229,7 +230,22 @@ def discover(
     assert report.at is not None
     held = about(state, report.at, lambda s: linearise_all(apart, s, workers)) if apart else []
     report.gain = measure_gain(report, seed, held)
+    if report.unknown is not None and report.causes and not report.unknown["denies"]:
+        without_curve(report, measure_gain(replace(report, unknown=None), seed, held))
     return report
+
+
+def without_curve(report: Report, gain: dict[str, Any]) -> None:
+    """Drop the curve beside the causes of `report` if `gain`, which is without it, is better in what it is about."""
+    assert report.unknown is not None
+    channel, quantity = report.unknown["channel"], report.unknown["quantity"]
+    metric = "voltage" if channel == "cell_voltage" else "power"
+    if metric in gain and gain[metric]["after"] <= report.gain[metric]["after"]:
+        report.unknown, report.gain = None, gain
+        report.advice.pop()  # the last is on what has no name
+        report.notes.append(
+            f"what {channel} leaves over {quantity} beside the causes is no better known on rides held out: left alone"
+        )
 
 
 __all__ = ["Array", "Search", "adopted", "baseline", "discover", "learn", "left_out"]
