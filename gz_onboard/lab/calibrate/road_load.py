@@ -34,6 +34,7 @@ class RoadLoad:
         self._road = [(e, values) for e, values in bound
                       if e.port in (Port.WHEEL_FORCE, Port.TYRE) and "acceleration" not in e.quantities]  # fmt: skip
         self._motor = [(e, values) for e, values in bound if e.port is Port.MOTOR_LOSS]
+        self._vibration = vehicle.riding.vibration  # a coast-down shows no road that is rougher than others
         self.rotating = (p["wheel_inertia_front"] + p["wheel_inertia_rear"]) / p["wheel_radius"] ** 2
 
     def __call__(self, speed: Any, run: Coast, slope: float, wind: float, density: float = 1.0) -> Any:
@@ -52,6 +53,7 @@ class RoadLoad:
             "motor_speed": speed / (self.p["wheel_radius"] * self.p["gear_ratio"]),
             "motor_temperature": run.temperature,
             "ambient_temperature": run.temperature,
+            "vibration": self._vibration,
         }
         return _sum(self._road, q) + _sum(self._motor, q) / speed
 

@@ -294,7 +294,7 @@ def overview(
     width, height = 12.5, 1.5 + 0.3 * len(channels)
     figure = new_figure(width, height)
     for i, (grid, title) in enumerate(zip(grids, ("before", "after"), strict=False)):
-        axis = figure.add_axes((0.13 + 0.44 * i, 0.02, 0.42, 1 - 1.35 / height))
+        axis = figure.add_axes((0.12 + 0.43 * i, 0.02, 0.385, 1 - 1.35 / height))
         axis.imshow(grid, cmap="Oranges" if i == 0 else "Blues", vmin=0, vmax=60, aspect="auto")
         for r in range(len(channels)):
             for c in range(len(quantities)):
