@@ -80,7 +80,8 @@ def both(log: Path, payload: float, chassis: str, figures: Path | None) -> dict[
         }
         if figures:
             title = f"{plan.name}, {planned.kind} · {vehicle.name}, payload {payload:g} kg"
-            save(comparison(run, measured, title), figures / f"{plan.name}_{form.replace(' ', '_')}.png")
+            name = f"{log.parent.name}_{plan.name}_{form.replace(' ', '_')}.png"
+            save(comparison(run, measured, title), figures / name)
     return found
 
 
