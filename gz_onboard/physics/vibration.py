@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from math import exp
 
-FAST, SLOW = (
-    0.1,
-    2.0,
-)  # s: what is slower than the first is the vehicle's motion; the square's mean goes over the second
+FAST = 0.1  # s: what is slower is the vehicle's motion
+SLOW = 2.0  # s: over which the mean of the square goes
 
 
 class Vibration:

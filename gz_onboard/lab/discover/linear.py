@@ -18,6 +18,7 @@ from gz_onboard.lab.discover.channels import CHANNELS, Channel, System, blocks, 
 from gz_onboard.lab.discover.grid import Array, Mask, Ride
 from gz_onboard.lab.discover.terms import stepped
 
+LEAST = 0.02  # of the variance before, down to which the scatter between rides is learned
 Noise = dict[str, tuple[float, float, float]]  # by channel: white sd, correlated sd, correlation time [s]
 
 
@@ -217,12 +218,12 @@ class Posterior:
 
 def fit_mixed(
     rides: Sequence[Normal], mean: Array, prior: Array, scatter: Array, weight: Array | float, free: Mask,
-    rounds: int = 60, least: float = 0.02,
+    rounds: int = 60,
 ) -> Posterior:  # fmt: skip
     """Common part, and the scatter between rides by expectation and maximisation (Dempster, Laird & Rubin 1977).
 
     mean, prior: (p,), (p, p) of the common part before. scatter: (p,) variances before, worth `weight` (p,) rides;
-    only those of `free` (p,) are learned, down to `least` of what they were.
+    only those of `free` (p,) are learned, down to `LEAST` of what they were.
     """
     before = scatter.copy()
     now = scatter.copy()
@@ -240,7 +241,7 @@ def fit_mixed(
             total = total + u**2 + np.diag(v) + np.einsum("ij,jk,ik->i", vn, after, vn)
             own.append(u)
         if rounds > 0:
-            now = np.where(free, np.clip(total / (weight + len(rides)), least * before, 9 * before), before)
+            now = np.where(free, np.clip(total / (weight + len(rides)), LEAST * before, 9 * before), before)
     return Posterior(common, after, now, np.array(own))
 
 

@@ -106,8 +106,9 @@ def of_rides(
     channel = max(channels, key=lambda name: weight(state, lines, name, change)[1])
     mine = [s for s in constancy if s.cause == worst.cause and s.quantity.startswith(RIDE)]
     rows = [[float(i), s.ratio, abs(s.ratio) / max(s.chi2, 1e-9) ** 0.5] for i, s in enumerate(mine)]
-    return {"channel": channel, "quantity": RIDES, "unit": "", "score": worst.chi2, "chi2": worst.chi2, "curve": rows,
-            "denies": [worst.cause], "share": energy_share(state, lines, change)}  # fmt: skip
+    share = energy_share(state, lines, change)
+    return {"channel": channel, "quantity": RIDES, "straight": False, "unit": "", "score": worst.chi2,
+            "chi2": worst.chi2, "curve": rows, "denies": [worst.cause], "share": share}  # fmt: skip
 
 
 def inflated(state: State, form: Form) -> float:

@@ -31,7 +31,7 @@ class Winds:
 def own_winds(now: Converged) -> Winds:
     """The winds beside the causes. One blows as it likes on another day, so that a common vector misses it."""
     state, change = now.state, now.change
-    w = list(now.search.place["headwind"])
+    w = list(now.search.place[NAME])
     blown = np.zeros((len(now.lines), len(state.mean)))
     rest = [i for i in range(len(state.mean)) if i not in w]
     spread = state.prior + np.diag(state.scatter)
