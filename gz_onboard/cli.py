@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import re
 import sys
 from collections.abc import Sequence
@@ -54,6 +55,8 @@ class _Parser(argparse.ArgumentParser):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv`; gives the exit status: 0 good, 1 failed, 2 wrong use or input, 130 interrupted."""
+    # Our matrices are small, and what is large runs in processes of its own: threads would stand in each other's way.
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
     argv = list(sys.argv[1:] if argv is None else argv)
     parser = _Parser(prog="gz-onboard", description="The range a scooter's rider can trust.")
     parser.add_argument("--version", action="version", version=f"gz-onboard {__version__}")

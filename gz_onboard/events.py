@@ -76,6 +76,21 @@ ROLES: dict[str, str] = {
     "brake_switch": "1",
 }
 
+# What a road vehicle can have at most, by unit, whatever its DBC allows: many give no limits.
+PLAUSIBLE: dict[str, tuple[float, float]] = {
+    "V": (0.0, 1500.0),
+    "A": (-5000.0, 5000.0),
+    "degC": (-80.0, 400.0),
+    "rad/s": (-10_000.0, 10_000.0),
+    "N·m": (-20_000.0, 20_000.0),
+    "m": (-1000.0, 1e10),
+    "m/s": (-150.0, 150.0),
+    "m/s^2": (-2000.0, 2000.0),
+    "rad": (-10.0, 10.0),
+    "deg": (-360.0, 360.0),
+    "1": (-10.0, 1000.0),
+}
+
 
 class State(IntEnum):
     """How far the published range can be trusted."""

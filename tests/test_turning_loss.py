@@ -29,7 +29,7 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[tuple[str,
     """The folder in which the commands ran, and (shown, printed) of each."""
     folder = tmp_path_factory.mktemp("turning")
     (folder / "replay_logs").symlink_to(ROOT / "replay_logs")
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "utf-8", "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "utf-8"}
     ours = f'gz-onboard() {{ {shlex.quote(sys.executable)} -m gz_onboard "$@"; }}\n'
     result = []
     for command, shown in steps():

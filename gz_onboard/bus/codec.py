@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.checksum import sae_j1850_tables
 from gz_onboard.bus.mapping import Mapping, Protection, Source, pgn
-from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, STALE_PERIODS, Event, Frame, Group
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, PLAUSIBLE, ROLES, RTR_FLAG, STALE_PERIODS, Event, Frame, Group
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -227,7 +227,10 @@ class Codec:
         group = len(self.groups)
         self.groups.append(Group(message.name, tuple(source.role for source in sources), period))
         signals = [message.get_signal_by_name(source.signal) for source in sources]
-        limits = [raw_range(signal, self.mapping.not_available) for signal in signals]
+        limits = [
+            _plausible(source, *raw_range(signal, self.mapping.not_available))
+            for source, signal in zip(sources, signals, strict=True)
+        ]
         plain = all(_is_plain(signal) for signal in signals)
         code = _generate(message, sources, signals, limits, protection, period, self.mapping.not_available, plain)
         scope: dict[str, Any] = {}
@@ -316,6 +319,14 @@ def raw_range(signal: Signal, not_available: bool) -> tuple[float, float]:
         if not conversion.is_float:
             low, high = -int(-low // 1), int(high // 1)
     return low, high
+
+
+def _plausible(source: Source, low: float, high: float) -> tuple[float, float]:
+    """The raw values from `low` to `high` that a road vehicle can have, too."""
+    if source.role not in ROLES:  # of an instrument that is not on board
+        return low, high
+    ends = sorted((value - source.offset) / source.factor for value in PLAUSIBLE[ROLES[source.role]])
+    return (low if low >= ends[0] else ends[0]), (high if high <= ends[1] else ends[1])
 
 
 def _representable(signal: Signal) -> tuple[float, float]:

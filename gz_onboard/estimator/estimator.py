@@ -29,6 +29,9 @@ FORECAST_PERIOD = 1.0  # s
 START_WAIT = 1.5  # s to wait for the temperature of the cells before the first estimate
 ERROR_TIME = 600.0  # s: over so long the cell model errs the same way; its error does not average out faster
 EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
+SOC_BOUNDS = -0.05, 1.05  # what a linear update, over a curve that is not, may make of it
+SOC_UNKNOWN_SD = 0.5  # after however long a pause
+RELAXED = 600.0  # s: V1 is no less known than after so long
 RESISTANCE_SD = 0.12  # relative: R0 of this pack at this place and temperature
 RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
 GATE = 5.0  # sd: a voltage further off is a glitch, unless it persists
@@ -235,14 +238,16 @@ class Estimator:
             if dt > 1.0:  # a pause: nobody knows what flowed, the last current is believed for a second
                 mean /= dt
                 q += (CURRENT_SD["none"] * (dt - 1.0) / charge) ** 2
-            filter_.predict(dt, mean / battery.cells_parallel, temperature, (q, 1e-8 * dt))
+            filter_.predict(dt, mean / battery.cells_parallel, temperature, (q, 1e-8 * min(dt, RELAXED)))
+            p00, p01, p11 = filter_.covariance
+            if p00 > SOC_UNKNOWN_SD**2:
+                filter_.covariance = SOC_UNKNOWN_SD**2, p01 * SOC_UNKNOWN_SD / sqrt(p00), p11
             if self._in_cells:
                 if self._reads_vibration:
                     self._cell_quantities["vibration"] = self.vibration(now)
                 self._cell_quantities["time_moving"] = self.forecaster.riding.time_moving
                 self._move_cells(dt, mean / battery.cells_parallel, filter_.soc, temperature)
-            if filter_.soc < -0.05 or filter_.soc > 1.05:
-                filter_.soc = min(max(filter_.soc, -0.05), 1.05)
+            filter_.soc = min(max(filter_.soc, SOC_BOUNDS[0]), SOC_BOUNDS[1])
         self._current = current
         if voltage is None or current is None:
             self._innovation = None
@@ -280,6 +285,7 @@ class Estimator:
             self._off_gate = 0
         # What errs the same way for ERROR_TIME is worth one sample in that time, not one each step.
         filter_.update(cell_voltage, cell_current, temperature, slow * max(2 * ERROR_TIME / max(dt, 0.02), 1.0))
+        filter_.soc = min(max(filter_.soc, SOC_BOUNDS[0]), SOC_BOUNDS[1])
 
     def _move_cells(self, dt: float, current: float, soc: float, temperature: float) -> None:
         """The effects in the cells, `dt` [s] on at a mean cell current [A]."""
@@ -315,7 +321,7 @@ class Estimator:
 
         Riders pull away within a second: the first voltage is the one at rest, what flows meanwhile is counted.
         """
-        if self._first is None:
+        if self._first is None or now - self._first[0] > 2 * START_WAIT:  # a pause: nobody knows what flowed in it
             self._first = now, voltage, current
         began, first_voltage, first_current = self._first
         signal = self.signals.cell_temperature
@@ -338,7 +344,7 @@ class Estimator:
         soc = min(max(soc, -0.02), 1.02)
         r0, r1 = battery.r0.at(soc, temperature)[0], battery.r1.at(soc, temperature)[0]
         v1_sd = 0.005 + 0.5 * r1 * abs(cell_current)
-        filter_ = self._make(battery, soc, 0.0, (0.25, 0.0, v1_sd**2))
+        filter_ = self._make(battery, soc, 0.0, (SOC_UNKNOWN_SD**2, 0.0, v1_sd**2))
         variance = self._rest_sd**2 + self._voltage_sd**2 + (RESISTANCE_SD * r0 * cell_current) ** 2
         filter_.update(cell_voltage, cell_current, temperature, variance)
         filter_.soc, filter_.v1 = soc, 0.0

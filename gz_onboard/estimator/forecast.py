@@ -53,6 +53,10 @@ HEADINGS = tuple(
 BASE = {"speed", "acceleration", "grade", "grade_cosine", "headwind", "mass", "air_density", "motor_temperature",
         "motor_speed", "motor_current", "torque"}  # fmt: skip
 """Quantities that need nothing beyond speed, grade and air."""
+ACCELERATION = 15.0  # m/s²: no road gives more; a second that shows more is left out
+SPEEDS = -5.0, 70.0  # m/s: the same
+LEAST = 0.2  # of the prior's consumption: no way of any length takes less
+MOST_SD = 3.0  # of the logarithm of the range: beyond, it is not known at all
 DECILE = 1.2815515655446004
 
 
@@ -177,6 +181,9 @@ class Forecaster:
             return
         mean = r.way / r.seconds
         acceleration = (speed - r.speed_before) / r.seconds
+        if abs(acceleration) > ACCELERATION or not SPEEDS[0] < mean < SPEEDS[1]:  # a sensor errs, or the wheel spins
+            self.pause()
+            return
         q = self.quantities(mean, acceleration, ambient, altitude, motor_temperature)
         if abs(r.way) > 0.1:
             q["grade"] = max(min(r.climb / abs(r.way), 0.3), -0.3)
@@ -290,13 +297,13 @@ class Forecaster:
         prior = prior_power / prior_speed
         fade = exp(-now.distance / MEMORY)
         way = PRIOR_LENGTH + fade * past.distance + now.distance
-        modelled = (PRIOR_LENGTH * prior + fade * past.level + now.level) / way
+        modelled = max((PRIOR_LENGTH * prior + fade * past.level + now.level) / way, LEAST * prior)
         speed = way / (PRIOR_LENGTH / prior_speed + fade * past.duration + now.duration)
         consumption = r.factor * modelled
         power = consumption * speed
 
         prior_time = PRIOR_LENGTH / prior_speed
-        mean = prior_power * prior_time + past.measured
+        mean = max(prior_power * prior_time + past.measured, LEAST * prior_power * prior_time)
         form = (PRIOR_FORM * prior_power**2 * prior_time + past.power_squares) * (prior_time + past.duration) / mean**2
         form = min(max(form, 1.0), 6.0)
 
@@ -309,7 +316,7 @@ class Forecaster:
         squares = (PRIOR_LENGTH * prior**2 * (1 + PRIOR_SCATTER**2) + fade * past.squares) / (
             PRIOR_LENGTH + fade * past.distance
         )
-        mean = (PRIOR_LENGTH * prior + fade * past.level) / (PRIOR_LENGTH + fade * past.distance)
+        mean = max((PRIOR_LENGTH * prior + fade * past.level) / (PRIOR_LENGTH + fade * past.distance), LEAST * prior)
         scatter = max(squares / mean**2 - 1, 0.1**2)
         variance = (
             loss_variance
@@ -317,6 +324,7 @@ class Forecaster:
             + DRIFT**2
             + r.factor_variance / r.factor**2
         )
+        variance = min(variance, MOST_SD**2)
         sd = sqrt(variance)
         if left.energy > energy_sd:
             spread = sqrt(variance + (energy_sd / left.energy) ** 2)

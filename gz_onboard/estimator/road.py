@@ -21,6 +21,7 @@ ALTITUDE_LENGTH = 150.0  # m: how fast the observer follows the altitude where i
 ALTITUDE_LENGTH_ALONE = 60.0  # m: the same where the altitude is all there is
 BIAS_TIME = 5.0  # s of standing to know the offset of a rate sensor
 MOVING = 0.5  # m/s
+ALTITUDES = -500.0, 9000.0  # m: where there are roads
 
 
 @dataclass(slots=True)
@@ -112,7 +113,7 @@ class Road:
             self.grade = None
             return
         if forward is not None and self.acceleration is not None:
-            sine = (forward - self.acceleration) / G
+            sine = min(max((forward - self.acceleration) / G, -1.0), 1.0)
             self.accelerometer_grade += (sine - self.accelerometer_grade) * min(dt / GRADE_TIME, 1.0)
         else:
             self.accelerometer_grade = 0.0
@@ -127,4 +128,6 @@ class Road:
             share = min(way / length, 0.5)  # critically damped over distance
             self.altitude += 2 * share * error
             self.grade_offset += share * error / length
+        if self.altitude is not None:
+            self.altitude = min(max(self.altitude, ALTITUDES[0]), ALTITUDES[1])
         self.grade = min(max(self.accelerometer_grade + self.grade_offset, -0.3), 0.3)

@@ -80,23 +80,34 @@ def cell_test(table: Table) -> CellTest:
                 row,
             )
         drawn = np.cumsum(flowed * dt) / 3600
-    _check_sign(table, current, volts, dt, largest)
+    _check_sign(table, current, volts, dt, drawn, largest)
     _check_clipped(table, current, volts, on)
     starts = on & ~np.concatenate([[False], on[:-1]])
     return CellTest(table, time, dt, flowed, current, volts, temperature, drawn, np.cumsum(starts), ~on)
 
 
-def _check_sign(table: Table, current: Array, volts: Array, dt: Array, largest: float) -> None:
-    """Discharging must lower the voltage: at the steps of the current, or over all samples if there are none."""
+def _check_sign(table: Table, current: Array, volts: Array, dt: Array, drawn: Array, largest: float) -> None:
+    """Discharging must lower the voltage: at once at the steps of the current, or by and by if those are lost in noise.
+
+    drawn: the charge [Ah] at each sample, positive when discharging.
+    """
     step, change = np.diff(current), np.diff(volts)
     steps = (np.abs(step) > 0.2 * largest) & (dt[1:] < LONGEST_GAP)
-    if np.any(steps) and float(np.median(change[steps] / step[steps])) > 0:
-        row = int(np.flatnonzero(steps)[0]) + 1
-        way = "rises" if change[row - 1] > 0 else "falls"
+    jumps = change[steps] * np.sign(step[steps])
+    noise = 1.4826 * float(np.median(np.abs(change - np.median(change))))  # as an sd (Hampel 1974)
+    if jumps.size and abs(float(np.median(jumps))) > 4 * noise / np.sqrt(jumps.size):
+        if float(np.median(jumps)) > 0:
+            row = int(np.flatnonzero(steps)[jumps > 0][0]) + 1
+            way = "rises" if change[row - 1] > 0 else "falls"
+            raise table.error(
+                f"the voltage {way} by {abs(change[row - 1]):.3g} V as the current goes from {current[row - 1]:.3g} to "
+                f"{current[row]:.3g} A, and so at most steps: discharging must be positive (scale = -1 turns it)",
+                row,
+            )
+    elif float(np.dot(drawn - drawn.mean(), volts - volts.mean())) > 0:
         raise table.error(
-            f"the voltage {way} by {abs(change[row - 1]):.3g} V as the current goes from {current[row - 1]:.3g} to "
-            f"{current[row]:.3g} A, and so at most steps: discharging must be positive (scale = -1 turns it)",
-            row,
+            "the voltage rises as charge is drawn, and falls as it is charged: discharging must be positive "
+            "(scale = -1 turns it)"
         )
 
 

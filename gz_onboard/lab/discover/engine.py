@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -97,7 +96,6 @@ def linearise_all(rides: Sequence[Ride], state: State | Sequence[State], workers
     jobs = list(zip(rides, states, strict=True))
     if workers < 2 or len(rides) < 2:
         return [_linearised(job) for job in jobs]
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     with ProcessPoolExecutor(workers) as pool:
         return list(pool.map(_linearised, jobs))
 
