@@ -8,6 +8,7 @@ import os
 import signal
 import time
 from bisect import bisect_left
+from operator import itemgetter
 from pathlib import Path
 
 from gz_onboard import notify, state
@@ -76,6 +77,7 @@ class Daemon:
                 self._save_at = now + SAVE_PERIOD
                 self._save()
         notify.stopping()
+        self.round()  # what waited for its tick
         self._save()
         if self.recorder:
             self.recorder.close()
@@ -84,17 +86,18 @@ class Daemon:
 
     def round(self) -> int:
         """One tick; gives the number of frames that came."""
-        now_ns = time.time_ns()
+        boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         frames, self._later = self._later, []
         for channel in self.channels:
             frames += channel.drain()
-        if len(self.channels) > 1:
-            # What came after the first channel was read waits for the next tick: of that channel some is missing.
-            frames.sort(key=_time_of)
-            end = bisect_left(frames, (now_ns,))
-            frames, self._later = frames[:end], frames[end:]
-        pipeline = self.pipeline
         offset = _wall_offset()
+        now_ns = boot_ns + offset  # by the same clock as `offset`, whenever that was set
+        # What came while we read, or were held up, waits for its own tick: of a channel read before, some is missing.
+        frames.sort(key=itemgetter(0))
+        ahead = time.clock_gettime_ns(time.CLOCK_BOOTTIME) + offset + CLOCK_STEP_NS  # for the codec to drop
+        end, beyond = bisect_left(frames, (now_ns,)), bisect_left(frames, (ahead,))
+        frames, self._later = frames[:end] + frames[beyond:], frames[end:beyond]
+        pipeline = self.pipeline
         step = offset - self._offset
         self._offset = offset
         if abs(step) > CLOCK_STEP_NS:  # by the network's or the GPS' time; what came meanwhile has either time
@@ -166,13 +169,13 @@ class Daemon:
             self._state_failing = False
 
 
-def _time_of(frame: Frame) -> int:
-    return frame[0]
-
-
 def _wall_offset() -> int:
     """The wall clock less the time since boot, suspended or not [ns]: changes only when the clock is set."""
-    return time.time_ns() - time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+    for _ in range(10):
+        before, wall = time.clock_gettime_ns(time.CLOCK_BOOTTIME), time.time_ns()
+        if time.clock_gettime_ns(time.CLOCK_BOOTTIME) - before < 1_000_000:  # else we were held up between the two
+            break
+    return wall - before
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import count
+from itertools import count, pairwise
 from pathlib import Path
 
 import can
@@ -262,6 +262,67 @@ def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, ca
         assert last.state is State.VALID
     assert caplog.text.count("cannot save the state") == 1
     assert "not used" in caplog.text or "cannot be read" in caplog.text
+
+
+@pytest.mark.parametrize("delta", [3600.0, -7200.0, 40.0])
+def test_the_clock_is_set_in_the_middle_of_a_round(bus: str, monkeypatch: pytest.MonkeyPatch, delta: float):
+    """Between the reading of the clock and that of the frames: no time is left out, none comes twice."""
+    channel = Channel("virtual", bus)
+    channel.open()
+    daemon = Daemon(reference(), [channel], recorder=None, state_file=None)
+    ticks: list[float] = []
+    rounds, ahead = count(), 0
+    wall, drain = time.time_ns, channel.drain
+
+    def drain_and_set() -> list[Frame]:
+        nonlocal ahead
+        if next(rounds) == 5:
+            ahead = round(delta * S)
+        return drain()
+
+    monkeypatch.setattr(time, "time_ns", lambda: wall() + ahead)
+    monkeypatch.setattr(channel, "drain", drain_and_set)
+    with can.Bus(interface="virtual", channel=bus) as other:  # time begins with the first frame
+        other.send(can.Message(arbitration_id=0x413, data=bytes(2), is_extended_id=False))
+    for _ in range(12):
+        time.sleep(0.1)
+        daemon.round()
+        last = daemon.pipeline.last
+        ticks += [last.time] if last else []
+    channel.close()
+    ticks = ticks[1:]
+    steps = [b - a for a, b in pairwise(ticks)]
+    assert ahead
+    assert all(-1e-6 <= step < 0.5 for step in steps), steps
+    assert ticks[-1] - ticks[0] == pytest.approx(0.1 * len(steps), abs=0.3)
+
+
+def test_held_up_while_it_reads_it_tells_the_same(bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Frames that came after a tick do not count before it, however long the reading took: as of the log offline."""
+    recorder = Recorder(tmp_path, "v")
+    with Scene(bus, recorder=recorder) as scene:
+        (channel,) = scene.daemon.channels
+        drain, rounds = channel.drain, count(1)
+
+        def held_up() -> list[Frame]:
+            if next(rounds) % 5 == 0:
+                time.sleep(0.33)
+            return drain()
+
+        monkeypatch.setattr(channel, "drain", held_up)
+        sent = scene.ride(6.0)
+    (path,) = recorder.paths
+    logged = [frame for batch in read_frames(path) for frame in batch if not frame[3] & TRANSMITTED]
+    assert [frame[1:3] for frame in logged] == [frame[1:3] for frame in sent]
+    live = {values["time"]: values for name, _, values in read_samples(path) if name == "/estimate"}
+    offline = {float(f"{e.time:.7g}"): e for e in ridden(logged).estimates}
+    shared = sorted(set(live) & set(offline))
+    assert len(shared) >= 5
+    for at in shared:
+        for name in ("soc", "v1", "distance"):
+            was, ought = live[at][name], getattr(offline[at], name)
+            assert (was is None) == (ought is None), f"{name} at {at} s"
+            assert was is None or was == pytest.approx(ought, rel=1e-5), f"{name} at {at} s"
 
 
 def test_what_changes_is_said_once(bus: str, caplog: pytest.LogCaptureFixture):
