@@ -270,7 +270,7 @@ def test_the_clock_is_set_in_the_middle_of_a_round(bus: str, monkeypatch: pytest
     channel = Channel("virtual", bus)
     channel.open()
     daemon = Daemon(reference(), [channel], recorder=None, state_file=None)
-    ticks: list[float] = []
+    ticks: list[tuple[float, float]] = []  # s: of the estimate, of a clock that nobody sets
     rounds, ahead = count(), 0
     wall, drain = time.time_ns, channel.drain
 
@@ -288,13 +288,11 @@ def test_the_clock_is_set_in_the_middle_of_a_round(bus: str, monkeypatch: pytest
         time.sleep(0.1)
         daemon.round()
         last = daemon.pipeline.last
-        ticks += [last.time] if last else []
+        ticks += [(last.time, time.monotonic())] if last else []
     channel.close()
-    ticks = ticks[1:]
-    steps = [b - a for a, b in pairwise(ticks)]
+    steps = [(b[0] - a[0], b[1] - a[1]) for a, b in pairwise(ticks[1:])]
     assert ahead
-    assert all(-1e-6 <= step < 0.5 for step in steps), steps
-    assert ticks[-1] - ticks[0] == pytest.approx(0.1 * len(steps), abs=0.3)
+    assert all(0 <= told == pytest.approx(passed, abs=0.21) for told, passed in steps), steps
 
 
 def test_held_up_while_it_reads_it_tells_the_same(bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

@@ -195,9 +195,11 @@ class Listener:
 
         wait_for(enough, seconds, f"{count:g} valid estimates on {self.channel}")
 
-    def wait_for_new(self, name: str, seconds: float = 10.0, **values: float) -> dict[str, Any]:
-        """The next frame of a message, from now on, that has these values."""
-        begin = len(self.messages)
+    def wait_for_new(
+        self, name: str, seconds: float = 10.0, since: int | None = None, **values: float
+    ) -> dict[str, Any]:
+        """The next frame of a message that has these values, from now on or `since` so many messages were heard."""
+        begin = len(self.messages) if since is None else since
         wanted = range_database().get_message_by_name(name)
         deadline = time.monotonic() + seconds
         at = begin
