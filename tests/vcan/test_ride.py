@@ -117,83 +117,40 @@ def test_the_dashboard_writes_a_line_each_second(ride: Ride):
     assert "Traceback" not in ride.dashboard
 
 
-# How far an estimate over vcan may be from that of the same log offline, at the same time since the first frame.
-# Frames arrive with the jitter of the sender, so one on the border of a tenth of a second may count before or after
-# it: what follows the frames at once is held against what the offline estimate had from 0.2 s before to 0.2 s after.
-# The forecast is made once a second, and learns when 250 m are ridden: 1 s before to 1 s after.
-TOLERANCE: dict[str, tuple[float, int]] = {  # in the field's SI unit; tenths of a second before and after
-    "time": (1e-6, 0),
-    "soc": (5e-5, 0),
-    "soc_sd": (2e-5, 0),
-    "v1": (3e-4, 0),
-    "innovation_rms": (3e-4, 0),
-    "cell_temperature": (0.0, 0),
-    "grade": (0.002, 0),
-    "distance": (0.5, 0),
-    "innovation": (0.002, 2),
-    "pack_voltage": (0.02, 2),
-    "pack_current": (0.2, 2),
-    "speed": (0.05, 2),
-    "acceleration": (0.05, 2),
-    "lean": (0.01, 2),
-    "yaw_rate": (0.02, 2),
-    "heading": (0.02, 2),
-    "range": (150.0, 10),
-    "range_p10": (150.0, 10),
-    "range_p90": (200.0, 10),
-    "energy_left": (3000.0, 10),
-    "energy_left_sd": (1000.0, 10),
-    "consumption_recent": (2.0, 10),
-    "consumption_expected": (0.4, 10),
-    "consumption_expected_sd": (0.1, 10),
-    "consumption_factor": (0.003, 10),
-    "consumption_factor_sd": (0.0005, 10),
-}
-
-
 def test_live_and_offline_agree_field_by_field(ride: Ride):
-    assert set(TOLERANCE) | {"state", "reasons"} == {field.name for field in fields(Estimate)}
-    live = raw_frames(ride.daemon.logs[0])
-    sent = recorded("coastdown")
-    # The replay had to start: its first frame was late, and from it all times count.
-    late = sorted((a[0] - live[0][0]) - (b[0] - sent[0][0]) for a, b in zip(live, sent, strict=True))
-    begin = sent[0][0] - min(late[len(late) // 2], 0)
-    offline = ridden([(max(frame[0], begin), *frame[1:]) for frame in sent]).estimates
-    compared = 0
-    worst: dict[str, float] = {}
-    for row in ride.daemon.estimates():
-        index = round(10 * (row["time_ns"] - live[0][0]) / S) - 1
-        if row["time_ns"] <= live[0][0] or not 0 <= index < len(offline) - 2:
-            continue
-        compared += 1
-        there = offline[index]
-        assert row["state"] == there.state.name, f"at {there.time:.1f} s"
-        for name, (_, span) in TOLERANCE.items():
-            near = [getattr(e, name) for e in offline[max(index - span, 0) : index + span + 1]]
-            worst[name] = max(worst.get(name, 0.0), off(row[name], near))
-    assert compared >= 55
-    beyond = [name for name, value in worst.items() if value > TOLERANCE[name][0]]
-    assert not beyond, {name: f"{value:.2g}" for name, value in worst.items()}
-
-
-def off(live: float | None, offline: list[float | None]) -> float:
-    """How far a number is from the nearest of a span; infinite if it is known on one side only."""
-    known = [value for value in offline if value is not None]
-    if live is None:
-        return 0.0 if len(known) < len(offline) else float("inf")
-    return max(min(known) - live, live - max(known), 0.0) if known else float("inf")
-
-
-def test_the_log_again_offline_gives_the_same(ride: Ride):
-    """What the daemon logged, estimated again: the same frames with the same stamps, so the same numbers."""
-    again = ridden(raw_frames(ride.daemon.logs[0]))
-    live = {row["time"]: row for row in ride.daemon.estimates()}
-    ends = {float(f"{e.time:.7g}"): e for e in again.estimates}
-    shared = sorted(set(live) & set(ends))
+    """What the daemon logged, estimated again: the same frames with the same stamps, so the same in every field."""
+    offline = {float(f"{e.time:.7g}"): e for e in ridden(raw_frames(ride.daemon.logs[0])).estimates}
+    live = {row["time"]: row for row in ride.daemon.estimates() if row["state"] != State.STARTING.name}
+    shared = sorted(set(live) & set(offline))
     assert len(shared) >= 55
-    for time_s in shared[2:]:
-        for name in ("soc", "soc_sd", "v1", "range", "consumption_factor", "distance"):
-            assert live[time_s][name] == pytest.approx(getattr(ends[time_s], name), rel=1e-4), f"{name} at {time_s} s"
+    names = [field.name for field in fields(Estimate) if field.name not in ("state", "reasons")]
+    assert set(names) <= set(live[shared[-1]])
+    off = {
+        at: wrong
+        for at in shared
+        if (wrong := [name for name in names if not same(live[at][name], getattr(offline[at], name))])
+        or live[at]["state"] != offline[at].state.name
+    }
+    # The kernel stamps a frame before it hands it on: held up between the two, it comes after the tick it belongs to.
+    assert len(off) <= 1, off
+
+
+def same(live: float | None, offline: float | None) -> bool:
+    """Equal as far as a log keeps digits."""
+    if live is None or offline is None:
+        return live is offline
+    return live == pytest.approx(offline, rel=1e-5, abs=1e-9)
+
+
+def test_it_agrees_with_the_ride_as_it_was_recorded(ride: Ride):
+    """Frames come with the jitter of the sender, and of a machine that has other things to do."""
+    offline = ridden(recorded("coastdown")).at(RIDE - 2)
+    near = [row for row in ride.daemon.estimates() if row["time"] is not None and RIDE - 5 < row["time"] < RIDE]
+    assert near
+    assert near[-1]["state"] == offline.state.name
+    assert near[-1]["soc"] == pytest.approx(offline.soc, abs=5e-4)
+    assert near[-1]["range"] == pytest.approx(offline.range, rel=0.02)
+    assert near[-1]["consumption_factor"] == pytest.approx(offline.consumption_factor, abs=0.02)
 
 
 def test_coastdown_is_what_was_replayed():
