@@ -8,11 +8,11 @@ FIRST ?= 100240
 PYTHON_IN_VENV := .venv/bin/python
 DEMO = replay_logs/demo.py "$(RIDE)" --speed $(SPEED) --seconds $(SECONDS)
 
-.PHONY: help setup run test lint format bench trial clean
+.PHONY: help setup run test lint format bench trial hardening clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
-	@sed -n 's/^\([a-z]*\):.*##/\1:/p' $(MAKEFILE_LIST) | awk -F: '{printf "make %-8s%s\n", $$1, $$2}'
+	@sed -n 's/^\([a-z]*\):.*##/\1:/p' $(MAKEFILE_LIST) | awk -F: '{printf "make %-10s%s\n", $$1, $$2}'
 
 setup: .venv/.ready  ## virtual environment .venv with the pinned dependencies
 
@@ -44,6 +44,9 @@ bench: setup  ## cost per frame, start-up, memory, beside the obvious pipeline o
 
 trial: setup  ## does discover name hidden effects in rides of a scooter that is not the model's? rewrites docs/trial.md (CASES=n FIRST=seed)
 	$(PYTHON_IN_VENV) -m benchmarks.trial --cases $(CASES) --first $(FIRST)
+
+hardening: setup  ## hostile frames, sensors that lie, power cuts, damaged states, malformed files by the thousand; rewrites docs/reliability.md
+	$(PYTHON_IN_VENV) -m tests.hardening
 
 clean:  ## remove what the other targets made, except runs/
 	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info

@@ -101,8 +101,17 @@ class State(IntEnum):
     INVALID = 3  # no number is published
 
 
+class Activity(IntEnum):
+    """What the vehicle does; only riding teaches what a kilometre costs."""
+
+    UNKNOWN = 0  # neither speed nor charge plug
+    RIDING = 1
+    STANDING = 2
+    CHARGING = 3
+
+
 class Reason(IntFlag):
-    """Why the estimate is not what it could be. The bits of RANGE_Status in dbc/range.dbc, in this order."""
+    """Why the estimate is not what it could be. The bits of RANGE_Status in dbc/range.dbc have these names."""
 
     NO_PACK_VOLTAGE = 1 << 0  # the inverter's voltage stands in, or none
     NO_PACK_CURRENT = 1 << 1  # the inverter's current and the auxiliary load stand in, or the model
@@ -120,6 +129,9 @@ class Reason(IntFlag):
     FRAMES_LOST = 1 << 13  # the kernel or the bus lost frames within the last second
     BUS_DOWN = 1 << 14
     LOG_FAILED = 1 << 15  # the log cannot be written
+    SENSOR_DISTRUSTED = 1 << 16  # a sensor contradicts the others and is left out; RANGE_Sensors says which
+    SIGNALS_SLOW = 1 << 17  # pack current or voltage comes too slowly to be integrated
+    SOC_RESTARTED = 1 << 18  # the state of charge was contradicted for long and was begun anew from the voltage
 
 
 @dataclass(slots=True)
@@ -129,6 +141,8 @@ class Estimate:
     time: float  # s, on the codec's timeline
     state: State = State.STARTING
     reasons: Reason = field(default=Reason(0))
+    activity: Activity = Activity.UNKNOWN
+    distrusted: tuple[str, ...] = ()  # roles whose sensors contradict the others and are left out
     soc: float | None = None  # 0..1
     soc_sd: float | None = None
     v1: float | None = None  # V, of a cell

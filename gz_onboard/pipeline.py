@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields
 from math import isfinite
 from pathlib import Path
 from typing import Any, Protocol
@@ -211,24 +210,21 @@ def reason_names(reasons: Reason) -> list[str]:
 def estimate_row(estimate: Estimate) -> dict[str, object]:
     """An estimate as it stands in logs: SI units, state and reasons by name, None for what is not known."""
     row: dict[str, object] = {}
-    for name in _FIELDS:
+    for name in ESTIMATE_UNITS:
         value = getattr(estimate, name)
         # Seven digits are more than any sensor gives, and compress to half the size of seventeen.
         row[name] = float(f"{value:.7g}") if value is not None and isfinite(value) else None
     row["state"] = estimate.state.name
     row["reasons"] = " ".join(reason_names(estimate.reasons))
+    row["activity"] = estimate.activity.name
+    row["distrusted"] = " ".join(estimate.distrusted)
     return row
-
-
-_FIELDS = tuple(field.name for field in fields(Estimate))
 
 
 def _declare(log: Log, codec: Codec, signals: bool) -> None:
     number = ["number", "null"]
-    properties: dict[str, Any] = {
-        name: {"type": number, "description": ESTIMATE_UNITS[name]} for name in _FIELDS if name in ESTIMATE_UNITS
-    }
-    properties |= {"state": {"type": "string"}, "reasons": {"type": "string"}}
+    properties: dict[str, Any] = {name: {"type": number, "description": unit} for name, unit in ESTIMATE_UNITS.items()}
+    properties |= {name: {"type": "string"} for name in ("state", "reasons", "activity", "distrusted")}
     log.channel(ESTIMATE_TOPIC, {"title": "gz_onboard.Estimate", "type": "object", "properties": properties})
     counts = {name: {"type": "integer"} for name in COUNTS}
     maps = {name: {"type": "object"} for name in ("faults", "lost", "unknown")}

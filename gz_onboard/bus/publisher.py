@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.codec import raw_range
 from gz_onboard.bus.mapping import find_dbc, load_database
-from gz_onboard.events import TRANSMITTED, Estimate, Frame, Reason, State
+from gz_onboard.events import ROLES, TRANSMITTED, Estimate, Frame, Reason, State
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -36,6 +36,8 @@ class Publisher:
     def __init__(self) -> None:
         self.database = load_database([find_dbc("range.dbc")])
         self._counters = {message.name: 0 for message in self.database.messages}
+        names = {s.name for s in self.database.get_message_by_name("RANGE_Sensors").signals}
+        self._sensor_signals = [(role, sensor_signal(role)) for role in ROLES if sensor_signal(role) in names]
         self._layouts = {message.name: _layout(message) for message in self.database.messages}
 
     def range(self, estimate: Estimate, counts: Counts, time_ns: int, channel: int = 0) -> list[Frame]:
@@ -60,6 +62,7 @@ class Publisher:
                 "RANGE_CountLost": counts.lost,
                 "RANGE_CountUnknown": counts.unknown,
             },
+            "RANGE_Sensors": {signal: role in e.distrusted for role, signal in self._sensor_signals},
         }
         return [self._frame(name, values, time_ns, channel) for name, values in frames.items()]
 
@@ -70,6 +73,7 @@ class Publisher:
             "RANGE_StateOfCharge": _scaled(estimate.soc, 100) if known else None,
             "RANGE_StateOfChargeSigma": _scaled(estimate.soc_sd, 100) if known else None,
             "RANGE_StatusState": estimate.state,
+            "RANGE_Activity": estimate.activity,
         }
         reasons = int(estimate.reasons)
         for bit, signal in _REASON_SIGNALS:
@@ -86,6 +90,11 @@ class Publisher:
             word |= field.bits(values[field.name])
         data = word.to_bytes(7, "little")
         return time_ns, identifier, data + bytes((crc8_sae_j1850(data),)), channel | TRANSMITTED
+
+
+def sensor_signal(role: str) -> str:
+    """The signal that says that the sensor of `role` is left out: gps_altitude is RANGE_BadGpsAltitude."""
+    return "RANGE_Bad" + "".join(word.capitalize() for word in role.split("_"))
 
 
 def reason_signal(reason: Reason) -> str:

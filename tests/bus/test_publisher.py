@@ -3,6 +3,7 @@ from __future__ import annotations
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -11,8 +12,8 @@ from hypothesis import strategies as st
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.mapping import find_dbc, load_database, read_mapping
-from gz_onboard.bus.publisher import Counts, Publisher, reason_signal
-from gz_onboard.events import TRANSMITTED, Estimate, Reason, State
+from gz_onboard.bus.publisher import Counts, Publisher, reason_signal, sensor_signal
+from gz_onboard.events import ROLES, TRANSMITTED, Activity, Estimate, Reason, State
 from gz_onboard.toml import Table
 
 DATABASE = load_database([find_dbc("range.dbc")])
@@ -88,16 +89,33 @@ def test_each_reason_has_its_bit(bits):
         assert got[reason_signal(reason)] == bool(bits & reason)
 
 
-def test_reasons_stand_in_the_dbc_in_their_order():
+def test_reasons_and_sensors_stand_in_the_dbc_in_their_order():
     message = DATABASE.get_message_by_name("RANGE_Status")
     starts = [message.get_signal_by_name(reason_signal(reason)).start for reason in Reason]
-    assert starts == list(range(starts[0], starts[0] + len(Reason)))
+    assert starts == sorted(set(starts))
+    sensors = [s.name for s in DATABASE.get_message_by_name("RANGE_Sensors").signals if s.length == 1]
+    assert sensors == [name for role in ROLES if (name := sensor_signal(role)) in sensors]
+
+
+def test_a_distrusted_sensor_is_sent_by_name():
+    estimate = Estimate(0.0, State.DEGRADED, Reason.SENSOR_DISTRUSTED, distrusted=("motor_speed", "gps_altitude"))
+    publisher = Publisher()
+    frames = publisher.range(estimate, Counts(), 0) + publisher.status(estimate, 0)
+    decoded: dict[str, Any] = {}
+    for _, identifier, data, _ in frames:
+        decoded.update(DATABASE.get_message_by_frame_id(identifier).decode_simple(data, decode_choices=False))
+    assert {name for name, value in decoded.items() if name.startswith("RANGE_Bad") and value} == {
+        "RANGE_BadMotorSpeed", "RANGE_BadGpsAltitude",
+    }  # fmt: skip
+    assert decoded["RANGE_SensorDistrusted"] == 1
 
 
 def test_states_are_named_in_the_dbc_as_in_the_code():
     for name in ("RANGE_EstimateState", "RANGE_StatusState"):
         choices = {int(value): str(text).upper() for value, text in signal_of(name).choices.items()}
         assert choices == {state.value: state.name for state in State}
+    choices = {int(value): str(text).upper() for value, text in signal_of("RANGE_Activity").choices.items()}
+    assert choices == {activity.value: activity.name for activity in Activity}
 
 
 def test_counters_and_checksums_as_a_receiver_checks_them():
@@ -106,7 +124,7 @@ def test_counters_and_checksums_as_a_receiver_checks_them():
     counters: dict[int, list[int]] = {}
     for i in range(40):
         frames = publisher.range(estimate, Counts(), i) + publisher.status(estimate, i, channel=1)
-        assert [f[3] for f in frames] == [TRANSMITTED] * 3 + [1 | TRANSMITTED]
+        assert [f[3] for f in frames] == [TRANSMITTED] * 4 + [1 | TRANSMITTED]
         for time_ns, identifier, data, _ in frames:
             assert time_ns == i
             assert len(data) == 8

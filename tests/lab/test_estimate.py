@@ -132,7 +132,7 @@ def test_what_goes_into_the_log(tmp_path, frames):
     assert run(tmp_path / "a.log", "--output", tmp_path, "--no-plot", "--frames", "--signals") == 0
     topics = {topic for topic, _, _ in read_samples(log)}
     assert {"/can/BMS_Pack", "/can/INV_Motion"} <= topics
-    written = [(t, i, d) for t, i, d, _ in chain.from_iterable(read_frames(log)) if not 0x600 <= i <= 0x603]
+    written = [(t, i, d) for t, i, d, _ in chain.from_iterable(read_frames(log)) if not 0x600 <= i <= 0x604]
     read = [(t, i, d) for t, i, d, _ in chain.from_iterable(read_frames(tmp_path / "a.log"))]
     assert sorted(written) == sorted(read)
 

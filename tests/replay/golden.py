@@ -37,6 +37,7 @@ TOLERANCE = {
     "range_p90": 0.5, "energy_left": 20.0, "energy_left_sd": 20.0, "consumption_recent": 1e-3,
     "consumption_expected": 1e-3, "consumption_expected_sd": 1e-3, "consumption_factor": 1e-5,
     "consumption_factor_sd": 1e-5, "state": 0.0, "reasons": 0.0,
+    "activity": 0.0, "distrusted": 0.0,
 }  # fmt: skip
 
 
