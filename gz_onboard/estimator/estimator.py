@@ -8,34 +8,63 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from math import exp, isfinite, sqrt
+from math import exp, hypot, inf, isfinite, sqrt
 from typing import Any
 
+from gz_onboard.estimator.activity import Activities
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
 from gz_onboard.estimator.forecast import Forecast, Forecaster, Turn
+from gz_onboard.estimator.rest import RATE as REST_RATE
+from gz_onboard.estimator.rest import Rest
 from gz_onboard.estimator.road import Road
 from gz_onboard.estimator.shaking import Shaking
-from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
-from gz_onboard.events import STALE_PERIODS, Estimate, Event, Group, Reason, State
+from gz_onboard.estimator.signals import DEFAULT_STALE, Signal, Signals
+from gz_onboard.estimator.start import (
+    SOC_UNKNOWN_SD,
+    Saved,
+    flowed,
+    from_voltage,
+    parked,
+    plausible,
+    soc_width,
+    take_in,
+)
+from gz_onboard.events import STALE_PERIODS, Activity, Estimate, Event, Group, Reason, State
 from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.effect import QUANTITIES
+from gz_onboard.physics.effect import MOVING, QUANTITIES
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.riding import PriorRiding
 
-SNAPSHOT_VERSION = 2  # 2: the states of effects with memory
+SNAPSHOT_VERSION = 3  # 2: the states of effects with memory; 3: what tells what flowed while nobody counted
 PACE = ("pack_voltage", "inverter_voltage", "motor_speed")  # the message of the first that is mapped sets the pace
 STEP_AT_LEAST = 0.25  # s: without the message that sets the pace, a step is made after so long
 FORECAST_PERIOD = 1.0  # s
-START_WAIT = 1.5  # s to wait for the temperature of the cells before the first estimate
+START_WAIT = 1.5  # s to wait for what comes once a second before the first estimate
+STEADY_TIME = 0.5  # s over which the first voltage must hold still; an inverter that is being charged does not
+STOPPED_SHARE = 0.5  # of a ride's polarisation: sd of what a vehicle that stands still has, long parked or just stopped
+STEADY_SHARE = 0.01  # of the span of the rest voltage: by more no cell moves meanwhile, but for the drop over R0,
+STEADY_DROP = 0.3  # and this share of that
+STEADY_WAIT = 10.0  # s after which it is begun with whatever there is
+STEADY_SD = 4.0  # of the movement: how much may be still to come
+SLOW_GAP = 0.5  # s: messages with longer gaps are watched for their real period
+SLOWEST = 5.0  # s: pack current and voltage that come less often are not integrated
+PAUSE = 1.0  # s: without messages of a longer period a longer gap is a pause, in which nobody knows what flowed
+PAUSE_PERIODS = 2.5  # the same in real periods of the pack current
+SLOW_STALE_PERIODS = 3.0  # a slow signal is stale after so many of its real periods
+LONGEST_STALE = 300.0  # s
+SAMPLING_RATE = 0.15  # 1/h: sd of the mean current over capacity between two samples that are seconds apart
+CONTRADICTED = 60.0  # s: a filter whose voltage is off its gate for so long begins anew
+RESTARTED_FOR = 600.0  # s: for so long it is said
 ERROR_TIME = 600.0  # s: over so long the cell model errs the same way; its error does not average out faster
 EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
 SOC_BOUNDS = -0.05, 1.05  # what a linear update, over a curve that is not, may make of it
-SOC_UNKNOWN_SD = 0.5  # after however long a pause
 RELAXED = 600.0  # s: V1 is no less known than after so long
 RESISTANCE_SD = 0.12  # relative: R0 of this pack at this place and temperature
 RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
 GATE = 5.0  # sd: a voltage further off is a glitch, unless it persists
 GATE_COUNT = 20  # so many in a row are no glitch
+CONFLICT = 4.0  # sd between the saved SOC and that of the voltage: beyond, one of the two is wrong
+REST_NEWS = 0.8  # a rest is taken in again when its variance fell below this share
 CURRENT_SD = {"pack": 0.0, "inverter": 0.5, "model": 3.0, "none": 15.0}  # A, beside the sensor's own offset
 CURRENT_TIME = {"pack": 3600.0, "inverter": 3600.0, "model": 600.0, "none": 60.0}  # s that such an error stays the same
 UNCHECKED_CURRENT_SD = 0.2  # A, beside the offset's, while no second sensor confirms the first
@@ -89,7 +118,20 @@ class Estimator:
         self._deadline = float("-inf")
         self._current: float | None = None  # A of the pack, at the last step
         self._first: tuple[float, float, float] | None = None  # s, V, A of the pack: the first that was measured
+        self._waited = inf  # s: since when a first voltage has been looked at
         self._off_gate = 0
+        self._contradicted = 0.0  # s
+        self._restarted_at = -inf
+        self._rest = Rest()
+        self._rest_variance = inf  # V² of a cell, of what was taken in of this rest
+        self._activities = Activities()
+        self._heard = [-inf] * len(groups)  # s, of each group's last message
+        self._gaps = [0.0] * len(groups)  # s, between the two before that
+        self._periods = [group.period or 0.0 for group in groups]  # s, where slow: declared, then as they really are
+        self._stale = [signals[0].stale_after if signals else 0.0 for signals in self._slots]
+        self._integrated = [
+            i for i, group in enumerate(groups) if {"pack_current", "pack_voltage"} & set(group.roles)
+        ]  # fmt: skip
         self._innovation: float | None = None
         self._innovation_square = self._error_square = 0.0
         self._mismatch = 0.0  # A, low-passed
@@ -97,7 +139,7 @@ class Estimator:
         self._pack: tuple[float | None, float | None, str] = (None, None, "none")
         self._forecast: Forecast | None = None
         self._forecast_time = float("-inf")
-        self._saved: Mapping[str, Any] | None = None
+        self._saved: Saved | None = None
         self._saved_age: float | None = None
         p = model.parameters
         self._offset_sd = p.sd("pack_current_offset")
@@ -110,6 +152,7 @@ class Estimator:
         self._empty_sd = p.sd("cell_voltage_error_empty")
         self._rest_sd = sqrt(p.sd("rest_voltage_error") ** 2 + battery.ocv_sd**2 + battery.rest_shift_sd**2)
         self._cell_scatter = p.sd("cell_capacity") / p["cell_capacity"]
+        self._ocv_span = battery.ocv(1.0)[0] - battery.ocv(0.0)[0]
         self._charge_sd = sqrt(self._cell_scatter**2 + gain_sd**2)
         self._cable = p["cable_resistance"]
         self._radius, self._gear = p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"]
@@ -127,6 +170,10 @@ class Estimator:
     def handle(self, event: Event) -> None:
         """Take in one event; the pace-setting message (pack voltage and current) also makes a step."""
         time, group, values = event
+        gap = time - self._heard[group]
+        self._heard[group] = time
+        if gap > SLOW_GAP or self._gaps[group]:
+            self._watch(group, gap)
         for signal, value in zip(self._slots[group], values):  # noqa: B905 - hot, equal by construction
             if value is not None:
                 signal.value = value
@@ -141,6 +188,30 @@ class Estimator:
                 return
             self._step(time)
 
+    def _watch(self, group: int, gap: float) -> None:
+        """Learn the real period of a message that comes with long gaps: two alike are no coincidence."""
+        before, self._gaps[group] = self._gaps[group], gap if gap > SLOW_GAP else 0.0
+        if gap <= SLOW_GAP:
+            self._periods[group], stale = 0.0, self._stale[group]
+        elif before and 0.5 < gap / before < 2 and gap < LONGEST_STALE:
+            self._periods[group] = max(gap, before)
+            stale = max(self._stale[group], min(SLOW_STALE_PERIODS * self._periods[group], LONGEST_STALE))
+        else:
+            return
+        for signal in self._slots[group]:
+            signal.stale_after = stale
+
+    @property
+    def _sampled(self) -> float:
+        """The longest real period of pack current and voltage [s]; 0 where they are not slow."""
+        return max((self._periods[i] for i in self._integrated), default=0.0)
+
+    @property
+    def _pause(self) -> float:
+        """A gap that is longer [s] is a pause, in which nobody knows what flowed."""
+        period = self._sampled
+        return max(PAUSE, PAUSE_PERIODS * period) if period <= SLOWEST else PAUSE
+
     def _step(self, now: float) -> None:
         dt = 0.0 if self._time is None else now - self._time
         if dt < 0.02 and self._time is not None:
@@ -148,11 +219,12 @@ class Estimator:
         self._time = now
         self._deadline = now + STEP_AT_LEAST
         signals = self.signals
-        self.road.step(now, min(dt, 1.0), signals, self._radius, self._gear)
+        self.road.step(now, min(dt, self._pause), signals, self._radius, self._gear)
         voltage, current, source = self._measured(now)
         self._pack = voltage, current, source
         temperature = self._temperature(now, dt)
         self._battery_step(now, dt, voltage, current, source, temperature)
+        self._act(now, dt, current, source)
         self._ride(now, dt, voltage, current)
         signals.next_step()
         if now - self._forecast_time >= FORECAST_PERIOD - 0.05:
@@ -222,6 +294,8 @@ class Estimator:
     ) -> None:
         battery = self.battery
         filter_ = self.filter
+        if voltage is not None and not self._plausible(voltage, current or 0.0, temperature):
+            voltage, self._off_gate = None, self._off_gate + 1
         if filter_ is None:
             if voltage is not None:
                 self._wait(now, voltage, current or 0.0, temperature)
@@ -235,9 +309,14 @@ class Estimator:
             sd = sqrt(self._offset_sd**2 + CURRENT_SD[source] ** 2 + unchecked**2)
             q = (sd / charge) ** 2 * 2 * CURRENT_TIME[source] * min(dt, 1.0)
             q += self._charge_sd**2 * abs(mean * dt / charge)
-            if dt > 1.0:  # a pause: nobody knows what flowed, the last current is believed for a second
-                mean /= dt
-                q += (CURRENT_SD["none"] * (dt - 1.0) / charge) ** 2
+            sampled = self._sampled
+            if sampled > SLOW_GAP:
+                q += (SAMPLING_RATE / 3600) ** 2 * dt * sampled
+            if dt > self._pause:  # nobody knows what flowed, the last current is believed for a second
+                mean *= PAUSE / dt
+                q += (CURRENT_SD["none"] * (dt - PAUSE) / charge) ** 2
+                self._rest.interrupt()
+                self._rest_variance = inf
             filter_.predict(dt, mean / battery.cells_parallel, temperature, (q, 1e-8 * min(dt, RELAXED)))
             p00, p01, p11 = filter_.covariance
             if p00 > SOC_UNKNOWN_SD**2:
@@ -260,6 +339,8 @@ class Estimator:
         # What effects in the cells take is known: the filter sees the voltage that there would be without them.
         cell_voltage = battery.cell_voltage(voltage, current) + self._lacking
         cell_current = current / battery.cells_parallel
+        if self._rested(dt, cell_voltage, cell_current, temperature):
+            return
         r0 = battery.r0.at(filter_.soc, temperature)[0]
         resistance_sd = RESISTANCE_SD if self.signals.cell_temperature.fresh(now) else RESISTANCE_SD_COLD
         by_inverter = not self.signals.pack_voltage.fresh(now)
@@ -270,13 +351,20 @@ class Estimator:
         # The pack's cells are not the bench's: where SOC lies on their curve is known to their capacity's scatter.
         axis_sd = self._cell_scatter * (1 - filter_.soc) * battery.ocv(filter_.soc)[1]
         resistance = (resistance_sd * r0 * cell_current) ** 2 + (r0 * current_sd) ** 2
-        slow = model_sd**2 + voltage_sd**2 + axis_sd**2 + resistance
+        slow = own_slow = model_sd**2 + voltage_sd**2 + axis_sd**2 + resistance
         error, own = filter_.innovation(cell_voltage, cell_current, temperature)
         self._innovation = error
         # A model that errs more than its file says is believed less (Mehra 1970: covariance matching).
         slow = max(slow, self._error_square)
         self._error_square += (error * error - self._error_square) * min(dt / ERROR_TIME, 1.0)
         self._innovation_square += (error * error - self._innovation_square) * min(dt / 10.0, 1.0)
+        if error * error > GATE * GATE * (own + own_slow):
+            self._contradicted += dt
+            if self._contradicted >= CONTRADICTED:
+                self._begin_anew(now)
+                return
+        else:
+            self._contradicted = 0.0
         if error * error > GATE * GATE * (own + slow):
             self._off_gate += 1
             if self._off_gate < GATE_COUNT:
@@ -316,68 +404,133 @@ class Estimator:
             return voltage, i0 + share * (i1 - i0)
         return v0 + share * (v1 - v0), current
 
+    def _plausible(self, voltage: float, current: float, temperature: float) -> bool:
+        battery = self.battery
+        r0 = battery.r0.at(self.filter.soc if self.filter else 0.5, temperature)[0]
+        return plausible(battery, battery.cell_voltage(voltage, current) + r0 * current / battery.cells_parallel)
+
+    def _rested(self, dt: float, voltage: float, current: float, temperature: float) -> bool:
+        """Take in the voltage of a rest that is better proven than before; gives whether it did."""
+        filter_, battery, rest = self.filter, self.battery, self._rest
+        if filter_ is None or dt > self._pause:
+            return False
+        emf = voltage + battery.r0.at(filter_.soc, temperature)[0] * current
+        fast = battery.r1.at(filter_.soc, temperature)[0] * battery.c1.at(filter_.soc, temperature)[0]
+        rest.step(dt, voltage, emf, current / battery.cell_capacity(temperature), fast, self._model_sd)
+        if rest.sd is None:
+            self._rest_variance = inf
+            return False
+        variance = rest.sd**2 + self._rest_sd**2 + self._voltage_sd**2
+        if not rest.fresh or variance > REST_NEWS * self._rest_variance:
+            return False
+        soc = battery.soc_at(emf, temperature)
+        if filter_.covariance[0] < (soc_width(battery, emf, sqrt(variance), temperature) / 2) ** 2:
+            return False  # the curve's own error is the same at every rest: it does not average out
+        # The same rest again, only better known: what is new is the difference of what both tell.
+        new = 1 / (1 / variance - (0.0 if self._rest_variance == inf else 1 / self._rest_variance))
+        self._rest_variance = variance
+        sd = sqrt(new)
+        take_in(filter_, soc, (soc_width(battery, emf, sd, temperature) / 2) ** 2)
+        filter_.soc = min(max(filter_.soc, SOC_BOUNDS[0]), SOC_BOUNDS[1])
+        return True
+
+    def _begin_anew(self, now: float) -> None:
+        """The voltage has contradicted the state of charge for long: begin again from it."""
+        self.filter = self._first = self._saved = self._innovation = None
+        self._contradicted = self._error_square = self._innovation_square = 0.0
+        self._off_gate = 0
+        self._restarted_at = now
+        self._rest, self._rest_variance = Rest(), inf
+
     def _wait(self, now: float, voltage: float, current: float, temperature: float) -> None:
-        """Start from the first voltage, as soon as the cells' temperature, sent once a second, is known or overdue.
+        """Start from the first voltage that holds still, as soon as what comes once a second is known or overdue.
 
         Riders pull away within a second: the first voltage is the one at rest, what flows meanwhile is counted.
         """
-        if self._first is None or now - self._first[0] > 2 * START_WAIT:  # a pause: nobody knows what flowed in it
+        if self._first is None or now - self._first[0] > max(2 * START_WAIT, self._pause):  # a pause
             self._first = now, voltage, current
         began, first_voltage, first_current = self._first
-        signal = self.signals.cell_temperature
-        if signal.stale_after and not signal.fresh(now) and now - began < START_WAIT:
+        battery, parallel = self.battery, self.battery.cells_parallel
+        r0 = battery.r0.at(0.5, temperature)[0]
+        drop = r0 * (current - first_current) / parallel
+        moved = abs(battery.cell_voltage(voltage - first_voltage, current - first_current) + drop)
+        self._waited = min(self._waited, now)
+        if moved > STEADY_SHARE * self._ocv_span + STEADY_DROP * abs(drop) and now - self._waited < STEADY_WAIT:
+            if now - began >= STEADY_TIME:
+                self._first = now, voltage, current
             return
-        self._start(first_voltage, first_current, temperature)
-        if self.filter and now > began:
-            mean = (first_current + current) / 2 / self.battery.cells_parallel
+        awaited = [self.signals.cell_temperature]
+        if self._saved:
+            awaited += [self.signals.odometer, self.signals.bms_state_of_charge]
+        missing = any(signal.stale_after and not signal.fresh(now) for signal in awaited)
+        if now - began < (START_WAIT if missing else STEADY_TIME):
+            return
+        self._start(now, first_voltage, first_current, temperature, STEADY_SD * max(moved - abs(drop), 0.0))
+        self._waited = inf
+        if self.filter:
+            mean = (first_current + current) / 2 / parallel
             self.filter.predict(now - began, mean, temperature, (1e-9, 1e-7))
 
-    def _start(self, voltage: float, current: float, temperature: float) -> None:
-        """The first SOC: from the voltage, taken as at rest, with what is not known about that in its variance."""
+    def _start(self, now: float, voltage: float, current: float, temperature: float, unsteady: float) -> None:
+        """The first SOC: from the voltage, and from what was saved before, each with what is not known about it.
+
+        unsteady: sd of a cell's voltage [V] from its movement meanwhile.
+        """
         battery = self.battery
         cell_current = current / battery.cells_parallel
         cell_voltage = battery.cell_voltage(voltage, current) + self._lacking  # of before a restart
-        soc = 0.5
-        for _ in range(5):  # R0 depends on SOC
-            rest = cell_voltage + battery.r0.at(soc, temperature)[0] * cell_current
-            soc = battery.soc_at(rest, temperature)
-        soc = min(max(soc, -0.02), 1.02)
+        soc, _ = from_voltage(battery, cell_voltage, cell_current, temperature, 0.0, 0.01, 0.01)
         r0, r1 = battery.r0.at(soc, temperature)[0], battery.r1.at(soc, temperature)[0]
-        v1_sd = 0.005 + 0.5 * r1 * abs(cell_current)
-        filter_ = self._make(battery, soc, 0.0, (SOC_UNKNOWN_SD**2, 0.0, v1_sd**2))
-        variance = self._rest_sd**2 + self._voltage_sd**2 + (RESISTANCE_SD * r0 * cell_current) ** 2
-        filter_.update(cell_voltage, cell_current, temperature, variance)
-        filter_.soc, filter_.v1 = soc, 0.0
+        # The polarisation of a ride that was not seen: at once if the vehicle rides, perhaps if it stands.
+        power, _ = self.forecaster.prior_ride(self._ambient(now)[0], self.road.altitude or 0.0)
+        v1_sd = r1 * power / voltage / battery.cells_parallel
+        capacity = battery.pack_capacity(temperature)
+        loaded = abs(current) > REST_RATE * capacity or (self.road.speed or 0.0) > MOVING
+        v1, v1_sd = (v1_sd, v1_sd) if loaded else (0.0, STOPPED_SHARE * v1_sd)
+        drop_sd, model_sd = RESISTANCE_SD * r0 * cell_current, self._model_sd if loaded else 0.0
+        voltage_sd = hypot(self._rest_sd, self._voltage_sd, drop_sd, model_sd, unsteady)
+        saved, age = self._saved, self._saved_age
+        self._saved = None
+        drawn = None
+        if saved:
+            own = self.signals.bms_state_of_charge.get(now), self.signals.odometer.get(now)
+            drawn = flowed(saved, age, capacity, voltage, current, own[1], own[0])
+            if not loaded:
+                v1_sd *= 1 - parked(saved, age, own[1], own[0])
+            if age is not None and age < RELAXED:
+                decay = exp(-age / (r1 * battery.c1.at(soc, temperature)[0]))
+                v1 += (saved.v1 - v1) * decay
+                v1_sd = sqrt(saved.covariance[2] * decay**2 + v1_sd**2 * (1 - decay**2))
+            # The cell model errs the same way for ERROR_TIME: after a shorter gap the voltage says nothing new.
+            if age is not None:
+                voltage_sd *= sqrt(max(2 * ERROR_TIME / max(age, 0.1), 1.0))
+        soc, covariance = from_voltage(battery, cell_voltage, cell_current, temperature, v1, v1_sd, voltage_sd)
+        filter_ = self._make(battery, soc, v1, covariance)
+        if saved and drawn:
+            before, variance = saved.soc - drawn[0], saved.covariance[0] + drawn[1] ** 2
+            apart = (before - soc) ** 2
+            if apart > CONFLICT**2 * (variance + covariance[0]):  # nobody knows which of the two is wrong
+                variance += apart
+            take_in(filter_, before, variance)
+        filter_.soc = min(max(filter_.soc, SOC_BOUNDS[0]), SOC_BOUNDS[1])
         self.filter = filter_
-        if self._saved:
-            self._resume(self._saved, filter_, temperature)
-            self._saved = None
-
-    def _resume(self, saved: Mapping[str, Any], rest: SocFilter, temperature: float) -> None:
-        """Join the saved SOC with that of the rest voltage, unless the pack was charged or used meanwhile."""
-        age = self._saved_age
-        variance = saved["covariance"][0] + (0.002 if age is None else 1e-8 * age + 1e-6)
-        difference = rest.soc - saved["soc"]
-        p00, p01, p11 = rest.covariance
-        if difference * difference > 16 * (variance + p00):
-            return
-        if age is not None and age < 600:  # the RC pair has not settled: go on from where it was
-            r1 = self.battery.r1.at(saved["soc"], temperature)[0]
-            decay = exp(-age / (r1 * self.battery.c1.at(saved["soc"], temperature)[0]))
-            _, c01, c11 = saved["covariance"]
-            rest.soc, rest.v1 = saved["soc"], saved["v1"] * decay
-            rest.covariance = variance, c01 * decay, c11 * decay**2 + 1e-6
-            return
-        gain = p00 / (p00 + variance)  # the saved SOC as a measurement of the first state
-        rest.soc -= gain * difference
-        rest.v1 -= p01 / (p00 + variance) * difference
-        rest.covariance = p00 * (1 - gain), p01 * (1 - gain), p11 - p01 * p01 / (p00 + variance)
 
     # --- riding and range -------------------------------------------------------------------------------------
 
+    def _act(self, now: float, dt: float, current: float | None, source: str) -> None:
+        """Follow what the vehicle does."""
+        signals = self.signals
+        known = current if source in ("pack", "inverter") else None
+        rate = None if known is None else known / self.battery.pack_capacity(self._cell_temperature or 25.0)
+        inverter = (signals.inverter_current, signals.inverter_voltage, signals.motor_speed)
+        mapped = [signal for signal in inverter if signal.stale_after]
+        silent = bool(mapped) and not any(signal.fresh(now) for signal in mapped)
+        self._activities.step(dt, self.road.speed, rate, signals.charge_plug.get(now), silent)
+
     def _ride(self, now: float, dt: float, voltage: float | None, current: float | None) -> None:
         speed = self.road.speed
-        if speed is None or voltage is None or current is None or not 0 < dt <= 1.0 or self._pack[2] == "model":
+        known = 0 < dt <= self._pause and self._pack[2] != "model"
+        if speed is None or voltage is None or current is None or not known or not self._activities.teaches:
             self.forecaster.pause()
             return
         motor = self.signals.motor_temperature.get(now)
@@ -418,7 +571,8 @@ class Estimator:
         estimate = Estimate(time=now, reasons=self._reasons(now))
         road, filter_, forecast = self.road, self.filter, self._forecast
         estimate.distance = road.distance
-        silent = self._time is None or now - self._time > 2.0
+        estimate.activity = Activity.UNKNOWN if self._time is None else self._activities.now
+        silent = self._time is None or now - self._time > max(2.0, self._pause)
         if not silent:
             estimate.speed, estimate.acceleration, estimate.grade = road.speed, road.acceleration, road.grade
             estimate.lean, estimate.yaw_rate, estimate.heading = road.lean, road.yaw_rate, road.heading
@@ -448,7 +602,7 @@ class Estimator:
             if forecast.mostly_prior:
                 estimate.reasons |= Reason.PRIOR_RIDING
         estimate.state = State.DEGRADED if estimate.reasons & WEIGHTY else State.VALID
-        if silent and estimate.reasons & NO_PACK == NO_PACK:
+        if (silent and estimate.reasons & NO_PACK == NO_PACK) or estimate.reasons & Reason.SIGNALS_SLOW:
             estimate.state = State.INVALID
         return estimate
 
@@ -476,6 +630,10 @@ class Estimator:
             reasons |= Reason.CURRENT_MISMATCH
         if self._off_gate or self._innovation_square > 0.08**2:
             reasons |= Reason.VOLTAGE_MISMATCH
+        if self._sampled > SLOWEST:
+            reasons |= Reason.SIGNALS_SLOW
+        if now - self._restarted_at < RESTARTED_FOR:
+            reasons |= Reason.SOC_RESTARTED
         return reasons
 
     # --- saving -----------------------------------------------------------------------------------------------
@@ -490,6 +648,10 @@ class Estimator:
             "soc": self.filter.soc,
             "v1": self.filter.v1,
             "covariance": list(self.filter.covariance),
+            "current": self._current,
+            "odometer": _last(self.signals.odometer),
+            "own_soc": _last(self.signals.bms_state_of_charge),
+            "consumption": self._forecast.consumption if self._forecast else None,
             "cell_temperature": self._cell_temperature,
             "cell_effects": dict(self._cell_states),
             "gyro_bias": [self.road.bias_x, self.road.bias_z],
@@ -515,18 +677,34 @@ class Estimator:
                 and p01 * p01 <= p00 * p11
             ):
                 raise ValueError("holds implausible numbers")
+            extra = {name: _optional(saved[name]) for name in ("current", "odometer", "own_soc", "consumption")}
             states = {name: float(saved["cell_effects"][name]) for name in self._cell_states}
             if not all(abs(x) < 1 for x in states.values()):
                 raise ValueError("holds implausible voltages of effects in the cells")
             self.forecaster.restore(saved["riding"])
-        except (KeyError, TypeError, OverflowError) as error:
+        except (KeyError, TypeError, AttributeError, OverflowError) as error:
             raise ValueError(f"is damaged: {error!r}") from error
         self.road.bias_x, self.road.bias_z = bias_x, bias_z
         cells = saved.get("cell_temperature")
         if isinstance(cells, int | float) and -50 < cells < 120 and age is not None and age < 3600:
             self._cell_temperature = float(cells)
-        self._saved = {"soc": soc, "v1": v1, "covariance": (p00, p01, p11)}
+        self._saved = Saved(soc, v1, (p00, p01, p11), **extra)
         self._saved_age = age
         if states:  # at rest meanwhile; for how long if that is not known: for long
             self._cell_states = states
             self._move_cells(1e9 if age is None else age, 0.0, soc, 20.0)
+
+
+def _last(signal: Signal) -> float | None:
+    """The last value that ever came."""
+    return signal.value if signal.time > -inf else None
+
+
+def _optional(value: object) -> float | None:
+    """A saved number, or None. ValueError, TypeError if it is neither."""
+    if value is None:
+        return None
+    number = float(value)  # type: ignore[arg-type]
+    if not isfinite(number):
+        raise ValueError("holds implausible numbers")
+    return number

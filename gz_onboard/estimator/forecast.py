@@ -293,7 +293,7 @@ class Forecaster:
         add to the consumption.
         """
         r, past, now = self.riding, self._past, self.riding.current
-        prior_power, prior_speed = self._prior(round(ambient), round(altitude, -2))
+        prior_power, prior_speed = self.prior_ride(ambient, altitude)
         prior = prior_power / prior_speed
         fade = exp(-now.distance / MEMORY)
         way = PRIOR_LENGTH + fade * past.distance + now.distance
@@ -361,8 +361,11 @@ class Forecaster:
                 past.recent_distance += segment.distance
         self._past = past
 
+    def prior_ride(self, ambient: float, altitude: float) -> tuple[float, float]:
+        """(power [W], speed [m/s]) of the prior riding at `ambient` [degC] and `altitude` [m]."""
+        return self._prior(round(ambient), round(altitude, -2))
+
     def _prior(self, ambient: float, altitude: float) -> tuple[float, float]:
-        """(power [W], speed [m/s]) of the prior riding."""
         if self._prior_at[0] != (ambient, altitude):
             power = 0.0
             for share, speed, acceleration in self.prior.points:

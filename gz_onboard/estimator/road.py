@@ -20,7 +20,7 @@ GRADE_TIME = 5.0  # s: low pass of the accelerometer's grade; at 2 s its noise a
 ALTITUDE_LENGTH = 150.0  # m: how fast the observer follows the altitude where it seeks an offset only
 ALTITUDE_LENGTH_ALONE = 60.0  # m: the same where the altitude is all there is
 BIAS_TIME = 5.0  # s of standing to know the offset of a rate sensor
-MOVING = 0.5  # m/s
+
 ALTITUDES = -500.0, 9000.0  # m: where there are roads
 
 

@@ -58,7 +58,7 @@ def slow_plant(resistance, seconds=700.0):
         volts = battery.ocv(soc)[0] - battery.r0.at(soc, 25.0)[0] * cell - fast - slow
         pack = battery.cells_series * volts - battery.series_resistance * current
         yield t, PACK, (pack, p["pack_current_gain"] * current + p["pack_current_offset"])
-        yield t + 0.01, MOTOR, (20.0,)
+        yield t + 0.01, MOTOR, (0.0 if t < 3 else 20.0,)
         if step % 10 == 0:
             yield t + 0.02, CELLS, (25.0, 20.0)
         fade = math.exp(-0.1 / (battery.r1.at(soc, 25.0)[0] * battery.c1.at(soc, 25.0)[0]))

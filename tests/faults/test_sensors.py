@@ -33,7 +33,7 @@ VOLTAGES = both(absent("BMS_Pack", "BMS_PackVoltage"), absent("INV_Power", "INV_
 LOSSES: dict[str, tuple[Spoil, Reason, float, str, float, float]] = {
     "imu": (without("IMU_Acceleration", "IMU_AngularRate"), Reason.NO_IMU, 0.3, "range", 0.0005, 0.03),
     "gps": (without("GPS_Position", "GPS_Motion"), Reason.NO_GPS, 2.3, "range", 0.0005, 0.03),
-    "cells": (without("BMS_Cells"), Reason.NO_CELL_TEMPERATURE, 10.3, "range", 0.0005, 0.01),
+    "cells": (without("BMS_Cells"), Reason.NO_CELL_TEMPERATURE, 10.3, "range", 0.001, 0.01),
     "ambient": (without("TC_Ambient"), Reason.NO_AMBIENT_TEMPERATURE, 10.3, "range", 0.0005, 0.03),
     "pack current": (absent("BMS_Pack", "BMS_PackCurrent"), Reason.NO_PACK_CURRENT, 1.3, "both", 0.001, 0.03),
     "inverter current": (absent("INV_Power", "INV_DcCurrent"), Reason.NO_INVERTER_CURRENT, 1.3, "soc", 0.0005, 0.03),

@@ -1,0 +1,54 @@
+"""What the vehicle does: riding, standing or charging. Only riding teaches what a kilometre costs.
+
+A charge plug that is in says charging, unless the vehicle moves. Without a plug signal, or with one that says no, a
+charging current that lasts says it too, where it cannot be a brake's: at standstill, or while the inverter is silent.
+"""
+
+from __future__ import annotations
+
+from math import inf
+
+from gz_onboard.events import Activity
+from gz_onboard.physics.effect import MOVING
+
+STOP_TIME = 120.0  # s: a stop of up to this belongs to the ride, as at a traffic light; beyond, the vehicle stands
+STANDING_AFTER = 2.0  # s without motion
+CHARGING_RATE = 0.02  # 1/h: a charging current of a fiftieth of the capacity; current sensors' offsets are smaller
+CHARGING_AFTER = 3.0  # s of it at standstill: the last of a regenerative brake is over
+SILENT_CHARGING_AFTER = 30.0  # s of it with no speed known and a silent inverter
+
+
+class Activities:
+    """Follows the activity from step to step."""
+
+    def __init__(self) -> None:
+        self.now = Activity.UNKNOWN
+        self._still = inf  # s since the last motion; none yet
+        self._charging = 0.0  # s of a charging current without motion
+
+    def step(
+        self, dt: float, speed: float | None, c_rate: float | None, plug: float | None, inverter_silent: bool
+    ) -> None:
+        """Go `dt` [s] on.
+
+        speed: [m/s]. c_rate: current over capacity [1/h], positive discharging. plug: whether the charge plug is in.
+        Each None where it is not known. inverter_silent: the vehicle has signals of its inverter and none comes.
+        """
+        moving = speed is not None and abs(speed) > MOVING
+        self._still = 0.0 if moving else self._still + dt
+        charged = c_rate is not None and c_rate < -CHARGING_RATE and not moving
+        self._charging = self._charging + dt if charged else 0.0
+        enough = CHARGING_AFTER if speed is not None else SILENT_CHARGING_AFTER if inverter_silent else inf
+        if not moving and ((plug is not None and plug > 0.5) or self._charging >= enough):
+            self.now = Activity.CHARGING
+        elif speed is None:
+            self.now = Activity.UNKNOWN
+        elif self._still < STANDING_AFTER:
+            self.now = Activity.RIDING
+        else:
+            self.now = Activity.STANDING
+
+    @property
+    def teaches(self) -> bool:
+        """Whether what flows now is part of a ride: motion, or a stop on the way."""
+        return self.now is not Activity.CHARGING and self._charging == 0 and self._still <= STOP_TIME

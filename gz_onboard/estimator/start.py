@@ -1,0 +1,123 @@
+"""The first state of charge: from a voltage of which nobody knows whether it rests, and from what was saved before.
+
+Nothing here is believed for more than it is worth: a loaded voltage carries the polarisation of a past that was not
+seen, and a saved state of charge carries whatever flowed while nobody counted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import exp, hypot, sqrt
+
+from gz_onboard.estimator.ekf import Covariance, SocFilter
+from gz_onboard.estimator.rest import SLOW_TIME
+from gz_onboard.physics.battery import Battery
+
+SOC_UNKNOWN_SD = 0.5  # whatever has flowed
+BEYOND = 0.5  # of the span of the rest voltage: no cell at work is further beyond full or empty than this
+BRIDGE = 60.0  # s: over so short a gap the current before and after tells what flowed
+RIDING_RATE = 0.5  # 1/h: sd of the mean current over capacity in a gap that may have been ridden or charged
+BURST_RATE = 1.0  # 1/h: the same in addition, over `BRIDGE`: nobody rides at full power for longer
+CHARGING_FROM = 120.0  # s: in a shorter gap nobody plugs in, charges and leaves
+CONSUMPTION_SD = 0.3  # relative: of a way that was not seen
+ODOMETER_STEP = 100.0  # m: odometers on the bus count in steps of up to this
+FASTEST = 70.0  # m/s
+OWN_SOC_SD = 0.015  # of a change of the vehicle's own state of charge: its steps
+OWN_SOC_GAIN_SD = 0.2  # relative, of the same: its window and its errors
+
+
+@dataclass(frozen=True)
+class Saved:
+    """What is kept of the battery over a restart; None where the vehicle has no such signal."""
+
+    soc: float
+    v1: float  # V
+    covariance: Covariance
+    current: float | None = None  # A of the pack
+    odometer: float | None = None  # m
+    own_soc: float | None = None  # the vehicle's own state of charge, 0..1
+    consumption: float | None = None  # J/m that was expected
+
+
+def plausible(battery: Battery, emf: float) -> bool:
+    """Whether a cell can have this voltage [V] without load: an inverter that is not yet charged shows a few volts."""
+    empty, full = battery.ocv(0.0)[0], battery.ocv(1.0)[0]
+    margin = BEYOND * (full - empty)
+    return empty - margin < emf < full + margin
+
+
+def from_voltage(
+    battery: Battery, voltage: float, current: float, temperature: float, v1: float, v1_sd: float, voltage_sd: float
+) -> tuple[float, Covariance]:
+    """(SOC, covariance of SOC and V1) of a cell with this voltage [V] at this current [A], `temperature` in degC.
+
+    v1, v1_sd: polarisation that is expected, and its sd [V]; voltage_sd: of everything else [V]. The sd of SOC is the
+    chord of the rest voltage over its uncertainty: near empty a tangent would promise far too much.
+    """
+    soc = 0.5
+    for _ in range(5):  # R0 depends on SOC
+        emf = voltage + battery.r0.at(soc, temperature)[0] * current + v1
+        soc = min(max(battery.soc_at(emf, temperature), -0.02), 1.02)
+    sd = hypot(v1_sd, voltage_sd)
+    slope = 2 * sd / soc_width(battery, emf, sd, temperature)
+    return soc, (min((sd / slope) ** 2, SOC_UNKNOWN_SD**2), v1_sd**2 / slope, v1_sd**2)
+
+
+def soc_width(battery: Battery, emf: float, sd: float, temperature: float) -> float:
+    """How far apart the states of charge at a rest voltage `emf` ± `sd` [V] are."""
+    return battery.soc_at(emf + sd, temperature) - battery.soc_at(emf - sd, temperature)
+
+
+def take_in(filter_: SocFilter, soc: float, variance: float) -> None:
+    """A state of charge that is known from elsewhere, as a measurement of the first state."""
+    p00, p01, p11 = filter_.covariance
+    total = p00 + variance
+    difference = soc - filter_.soc
+    filter_.soc += p00 / total * difference
+    filter_.v1 += p01 / total * difference
+    share = variance / total
+    filter_.covariance = p00 * share, p01 * share, p11 - p01 * p01 / total
+
+
+def parked(saved: Saved, age: float | None, odometer: float | None, own_soc: float | None) -> float:
+    """The share of a polarisation that is gone by the clock: 0 if the vehicle may have been used or charged."""
+    if age is None or odometer is None or saved.odometer is None or odometer != saved.odometer:
+        return 0.0
+    if own_soc is not None and saved.own_soc is not None and abs(own_soc - saved.own_soc) > OWN_SOC_SD:
+        return 0.0
+    return 1 - exp(-age / SLOW_TIME)
+
+
+def flowed(
+    saved: Saved, age: float | None, charge: float, voltage: float, current: float,
+    odometer: float | None, own_soc: float | None,
+) -> tuple[float, float]:  # fmt: skip
+    """(SOC that was drawn while nobody counted, its sd).
+
+    age: of what was saved [s], None if not known; charge: of the pack [A·h]; voltage, current: of the pack now
+    [V], [A]; odometer [m] and own_soc: as the vehicle shows them now, None if it does not.
+    """
+    gap = 86_400.0 if age is None else age
+    mean, sd = 0.0, (RIDING_RATE * gap + BURST_RATE * min(gap, BRIDGE)) / 3600
+    if odometer is not None and saved.odometer is not None and saved.consumption is not None:
+        way = odometer - saved.odometer
+        if -ODOMETER_STEP <= way <= FASTEST * gap + ODOMETER_STEP:
+            price = saved.consumption / (3600 * charge * voltage)  # SOC per metre
+            mean = max(way, 0.0) * price
+            charged = RIDING_RATE * max(gap - CHARGING_FROM, 0.0) / 3600
+            step = min(ODOMETER_STEP, FASTEST * gap) * price
+            sd = min(hypot(CONSUMPTION_SD * mean, hypot(charged, step)), sd)
+    elif gap <= BRIDGE and saved.current is not None:
+        mean = (saved.current + current) / 2 * gap / (3600 * charge)
+    if own_soc is not None and saved.own_soc is not None:
+        own = saved.own_soc - own_soc
+        own_sd = OWN_SOC_SD + OWN_SOC_GAIN_SD * abs(own)
+        apart = abs(own - mean)
+        if apart > 3 * hypot(sd, own_sd):  # one of the two is wrong
+            sd = hypot(sd, apart)
+        elif apart <= own_sd:  # confirmed, to no better than its steps
+            sd = min(sd, own_sd)
+        else:
+            share = sd * sd / (sd * sd + own_sd * own_sd)
+            mean, sd = mean + share * (own - mean), sd * sqrt(1 - share)
+    return mean, min(sd, SOC_UNKNOWN_SD)

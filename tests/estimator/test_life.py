@@ -1,0 +1,253 @@
+"""Ordinary life: standing, charging, joining a ride, restarts, power cuts, slow messages."""
+
+from __future__ import annotations
+
+import json
+from math import exp
+
+import pytest
+
+from gz_onboard.events import Activity, Group, Reason, State
+from tests.estimator.life import GROUPS, PACK, Scooter, estimator, follow, worst
+
+
+def restarted(e, age):
+    """A new daemon with what the old one saved `age` [s] ago."""
+    fresh = estimator()
+    fresh.restore(json.loads(json.dumps(e.snapshot("key"))), "key", age)
+    return fresh
+
+
+# --- standing and charging ------------------------------------------------------------------------------------------
+
+
+def test_an_hour_of_standing_costs_its_energy_and_no_more():
+    scooter, e = Scooter(), estimator()
+    follow(e, scooter.live(20), scooter)
+    _, before = follow(e, scooter.live(540, 11.0), scooter)[-1]
+    energy = scooter.energy
+    rows = follow(e, scooter.live(3600), scooter)
+    _, after = rows[-1]
+    standing = (scooter.energy - energy) / before.consumption_expected  # m
+    assert rows[60][1].activity is Activity.STANDING
+    assert before.range - after.range == pytest.approx(standing, abs=1000)
+    assert after.consumption_expected == pytest.approx(before.consumption_expected, rel=0.03)
+    _, later = follow(e, scooter.live(540, 11.0), scooter)[-1]
+    assert later.consumption_expected == pytest.approx(before.consumption_expected, rel=0.05)
+
+
+@pytest.mark.parametrize("plug", [0.0, None], ids=["plug signal", "none"])
+def test_charging_is_no_riding(plug):
+    scooter, e = Scooter(soc=0.56, plug=plug), estimator()
+    follow(e, scooter.live(20), scooter)
+    _, ridden = follow(e, scooter.live(600, 10.0), scooter)[-1]
+    hours = 0.4 * scooter.capacity / 10.0
+    rows = follow(e, scooter.live(3600 * hours, charge=10.9), scooter)
+    assert all(row.activity is Activity.CHARGING for _, row in rows[10:])
+    _, charged = rows[-1]
+    assert charged.consumption_factor == pytest.approx(ridden.consumption_factor, abs=0.01)
+    rows = follow(e, scooter.live(200, 10.0), scooter)
+    _, end = rows[-1]
+    assert end.activity is Activity.RIDING
+    assert end.range / end.soc == pytest.approx(ridden.range / ridden.soc, rel=0.12)
+    assert worst(rows) < 3
+
+
+def test_a_plug_that_says_yes_for_ever_does_not_stop_the_learning():
+    scooter, e = Scooter(), estimator()
+    stuck = ((t, g, (v[0], 1.0) if g == 4 else v) for t, g, v in scooter.live(900, 10.0))
+    rows = follow(e, stuck, scooter)
+    assert rows[-1][1].activity is Activity.RIDING
+    assert not rows[-1][1].reasons & Reason.PRIOR_RIDING
+
+
+def test_a_stop_at_a_traffic_light_belongs_to_the_ride():
+    scooter, e = Scooter(), estimator()
+    follow(e, scooter.live(400, 10.0), scooter)
+    duration = e.forecaster.riding.current.duration
+    follow(e, scooter.live(60), scooter)
+    assert e.forecaster.riding.current.duration > duration + 40 or len(e.forecaster.riding.segments) > 0
+    duration = e.forecaster.riding.current.duration
+    follow(e, scooter.live(600), scooter)
+    assert e.forecaster.riding.current.duration < duration + 80
+
+
+# --- the first state of charge --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("soc", [0.9, 0.6, 0.35, 0.2])
+@pytest.mark.parametrize("temperature", [5.0, 25.0])
+def test_joined_mid_ride_the_sd_covers_the_polarisation(soc, temperature):
+    scooter = Scooter(soc=soc, temperature=temperature, seed=7)
+    scooter.away(20)
+    scooter.away(700, 11.0)
+    for _ in range(3):
+        e = estimator()
+        rows = follow(e, scooter.live(130, 11.0), scooter)
+        assert worst(rows) < 3
+        first = next(row for _, row in rows if row.soc is not None)
+        assert first.soc_sd > 0.02
+        scooter.away(17, 11.0)
+
+
+def test_a_rest_is_believed_the_more_the_longer_it_is():
+    scooter, e = Scooter(soc=0.6), estimator()
+    rows = follow(e, scooter.live(600), scooter)
+    at_once, proven, long = rows[2][1], rows[15][1], rows[-1][1]
+    assert at_once.soc_sd > proven.soc_sd > long.soc_sd
+    assert proven.soc_sd < 0.03
+    assert long.soc_sd < 0.015
+    assert worst(rows) < 2
+
+
+def test_after_a_load_a_short_stop_proves_nothing():
+    scooter = Scooter(soc=0.6)
+    scooter.away(900, 11.0)
+    scooter.speed = 0.0
+    e = estimator()
+    follow(e, scooter.live(20, 11.0), scooter)
+    before = e.filter.covariance[0]
+    rows = follow(e, scooter.live(40), scooter)
+    assert e.filter.covariance[0] > 0.5 * before
+    assert worst(rows) < 3
+
+
+def test_a_voltage_that_never_changes_proves_no_rest():
+    e = estimator()
+    for i in range(3000):
+        e.handle((0.1 * i, PACK, (52.0, 0.9, 0.5)))
+    assert e.estimate(300.0).soc_sd > 0.02
+
+
+@pytest.mark.parametrize("time_constant", [0.3, 2.0])
+def test_an_inverter_that_is_being_charged_is_no_empty_pack(time_constant):
+    """The pack's own voltage is missing, the inverter's stands in: it comes up from 4 V."""
+    scooter, e = Scooter(soc=0.6), estimator()
+    for t, group, values in scooter.live(60):
+        if group == PACK:
+            continue
+        if group == 2:
+            values = (values[0] - (values[0] - 4.0) * exp(-t / time_constant), values[1])  # noqa: PLW2901
+        e.handle((t, group, values))
+        now = e.estimate(t)
+        assert now.soc is None or abs(now.soc - scooter.soc) < 3 * now.soc_sd
+    assert now.soc is not None
+
+
+def test_a_filter_that_is_contradicted_for_a_minute_begins_anew_and_says_so():
+    scooter, e = Scooter(soc=0.8), estimator()
+    follow(e, scooter.live(30), scooter)
+    e.filter.soc, e.filter.covariance = 0.1, (0.005**2, 0.0, 1e-6)
+    rows = follow(e, scooter.live(300, 8.0), scooter)
+    true, end = rows[-1]
+    assert end.reasons & Reason.SOC_RESTARTED
+    assert end.state is State.DEGRADED
+    assert abs(end.soc - true) < 3 * end.soc_sd
+    assert abs(end.soc - true) < 0.1
+    rows = follow(e, scooter.live(700, 8.0), scooter)
+    assert not rows[-1][1].reasons & Reason.SOC_RESTARTED
+
+
+# --- restarts -------------------------------------------------------------------------------------------------------
+
+AWAY = [
+    pytest.param(590, 10.0, 0.0, id="ridden 590 s"),
+    pytest.param(1200, 10.0, 0.0, id="ridden 1200 s"),
+    pytest.param(600, 0.0, 10.0, id="charged by 5 %"),
+    pytest.param(7200, 0.0, 3.5, id="charged for two hours"),
+    pytest.param(7200, 0.0, 0.0, id="parked"),
+    pytest.param(20, 11.0, 0.0, id="ridden 20 s"),
+    pytest.param(3, 11.0, 0.0, id="crashed"),
+]
+
+
+@pytest.mark.parametrize(("seconds", "speed", "charge"), AWAY)
+@pytest.mark.parametrize(("told", "clock"), [("all", True), ("all", False), ("neither", True), ("no own", True)])
+def test_a_restart_knows_what_it_does_not_know(seconds, speed, charge, told, clock):
+    drop = {"all": (), "no own": (0,), "neither": (0, 4)}[told]
+
+    def heard(events):
+        for t, group, values in events:
+            if group == 4 and 4 in drop:
+                continue
+            yield (t, group, (*values[:2], None)) if group == PACK and 0 in drop else (t, group, values)
+
+    scooter, e = Scooter(soc=0.75), estimator()
+    follow(e, heard(scooter.live(30)), scooter)
+    follow(e, heard(scooter.live(400, 10.0)), scooter)
+    scooter.away(seconds, speed, charge)
+    e = restarted(e, seconds if clock else None)
+    rows = follow(e, heard(scooter.live(60, 10.0)), scooter)
+    assert worst(rows) < 3
+    if told == "all" and clock:
+        first = next(row for _, row in rows if row.soc is not None)
+        assert first.soc_sd < 0.1
+
+
+def test_an_odometer_tells_what_was_ridden():
+    scooter, e = Scooter(soc=0.75), estimator()
+    follow(e, scooter.live(30), scooter)
+    follow(e, scooter.live(400, 10.0), scooter)
+    scooter.away(590, 10.0)
+    e = restarted(e, 590.0)
+    rows = follow(e, scooter.live(30, 10.0), scooter)
+    true, first = next(row for row in rows if row[1].soc is not None)
+    assert abs(first.soc - true) < 0.025
+
+
+def test_twenty_one_power_cuts_cost_little():
+    """Each loses up to a second that was not yet saved, and two while the daemon starts."""
+    scooter, whole, e = Scooter(soc=0.8, seed=3), estimator(), estimator()
+    errors = []
+    for cut in range(22):
+        e = restarted(e, 3.0) if cut else e
+        for event in scooter.live(40, 10.0 if cut else 0.0):
+            e.handle(event)
+            whole.handle(event)
+        now = scooter.time
+        for event in scooter.live(3.0, 10.0):
+            whole.handle(event)
+        errors.append(e.estimate(now).soc - whole.estimate(now).soc)
+    assert abs(errors[-1]) < 0.003
+    assert e.estimate(now).soc_sd < 1.5 * whole.estimate(now).soc_sd
+
+
+# --- slow messages --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("declared", [True, False])
+def test_messages_every_three_seconds_are_integrated_over_three_seconds(declared):
+    groups = [Group(g.message, g.roles, 3.0 if declared else None) for g in GROUPS]
+    scooter, e = Scooter(soc=0.8, period=3.0), estimator(groups)
+    often, other = Scooter(soc=0.8), estimator()
+    follow(other, often.live(60), often)
+    _, usual = follow(other, often.live(1400, 11.0), often)[-1]
+    begin = scooter.distance
+    follow(e, scooter.live(60), scooter)
+    rows = follow(e, scooter.live(1400, 11.0), scooter)
+    _, end = rows[-1]
+    assert end.distance == pytest.approx(scooter.distance - begin, rel=0.03)
+    assert abs(end.soc - usual.soc) < 0.01
+    assert worst(rows) < 3
+    assert not end.reasons & Reason.SIGNALS_SLOW
+    assert end.range is not None
+
+
+def test_slower_than_the_limit_is_refused_and_said():
+    groups = [Group(g.message, g.roles, None) for g in GROUPS]
+    scooter, e = Scooter(soc=0.8, period=8.0), estimator(groups)
+    rows = follow(e, scooter.live(600, 10.0), scooter)
+    assert rows[-1][1].reasons & Reason.SIGNALS_SLOW
+    assert rows[-1][1].state is State.INVALID
+
+
+def test_a_message_that_becomes_slow_is_noticed_and_forgiven():
+    scooter, e = Scooter(soc=0.8), estimator()
+    follow(e, scooter.live(100, 10.0), scooter)
+    scooter.period = 8.0
+    rows = follow(e, scooter.live(100, 10.0), scooter)
+    assert rows[-1][1].reasons & Reason.SIGNALS_SLOW
+    scooter.period = 0.1
+    rows = follow(e, scooter.live(100, 10.0), scooter)
+    assert not rows[-1][1].reasons & Reason.SIGNALS_SLOW
+    assert rows[-1][1].range is not None
