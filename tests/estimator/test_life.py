@@ -127,7 +127,8 @@ def test_an_inverter_that_is_being_charged_is_no_empty_pack(time_constant):
         if group == PACK:
             continue
         if group == 2:
-            values = (values[0] - (values[0] - 4.0) * exp(-t / time_constant), values[1])  # noqa: PLW2901
+            volts = values[0] or 0.0
+            values = (volts - (volts - 4.0) * exp(-t / time_constant), values[1])  # noqa: PLW2901
         e.handle((t, group, values))
         now = e.estimate(t)
         assert now.soc is None or abs(now.soc - scooter.soc) < 3 * now.soc_sd
