@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from math import exp, hypot, inf, isfinite, sqrt
 from typing import Any
 
@@ -41,9 +42,10 @@ STEP_AT_LEAST = 0.25  # s: without the message that sets the pace, a step is mad
 FORECAST_PERIOD = 1.0  # s
 START_WAIT = 1.5  # s to wait for what comes once a second before the first estimate
 STEADY_TIME = 0.5  # s over which the first voltage must hold still; an inverter that is being charged does not
+PULLING_RATE = 0.5  # 1/h: current over capacity from which a vehicle that does not move yet has been under load already
 STOPPED_SHARE = 0.5  # of a ride's polarisation: sd of what a vehicle that stands still has, long parked or just stopped
-STEADY_SHARE = 0.01  # of the span of the rest voltage: by more no cell moves meanwhile, but for the drop over R0,
-STEADY_DROP = 0.3  # and this share of that
+STEADY_SHARE = 0.01  # of the span of the rest voltage: by more no cell's voltage moves meanwhile without a load,
+STEADY_DROP = 3.0  # and with one by no more than so many times the drop over R0, cold and aged cells included
 STEADY_WAIT = 10.0  # s after which it is begun with whatever there is
 STEADY_SD = 4.0  # of the movement: how much may be still to come
 SLOW_GAP = 0.5  # s: messages with longer gaps are watched for their real period
@@ -84,6 +86,16 @@ NO_PACK = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT
 MISMATCH = 3.0  # A between the two current sensors, over ten seconds or so
 
 
+@dataclass(slots=True)
+class First:
+    """The pack as it was measured first."""
+
+    time: float  # s
+    voltage: float  # V
+    current: float  # A
+    moving: bool | None = None  # whether the vehicle moved then; None while no speed is known
+
+
 class Estimator:
     """The estimator of one vehicle."""
 
@@ -117,7 +129,7 @@ class Estimator:
         self._time: float | None = None  # s, of the last step
         self._deadline = float("-inf")
         self._current: float | None = None  # A of the pack, at the last step
-        self._first: tuple[float, float, float] | None = None  # s, V, A of the pack: the first that was measured
+        self._first: First | None = None
         self._waited = inf  # s: since when a first voltage has been looked at
         self._off_gate = 0
         self._contradicted = 0.0  # s
@@ -447,36 +459,38 @@ class Estimator:
 
         Riders pull away within a second: the first voltage is the one at rest, what flows meanwhile is counted.
         """
-        if self._first is None or now - self._first[0] > max(2 * START_WAIT, self._pause):  # a pause
-            self._first = now, voltage, current
-        began, first_voltage, first_current = self._first
+        if self._first is None or now - self._first.time > max(2 * START_WAIT, self._pause):  # a pause
+            self._first = First(now, voltage, current)
+        first = self._first
+        if first.moving is None and self.road.speed is not None:
+            first.moving = abs(self.road.speed) > MOVING
         battery, parallel = self.battery, self.battery.cells_parallel
         r0 = battery.r0.at(0.5, temperature)[0]
-        drop = r0 * (current - first_current) / parallel
-        moved = abs(battery.cell_voltage(voltage - first_voltage, current - first_current) + drop)
+        drop = battery.cell_voltage(r0 * battery.cells_series / parallel, 1.0) * abs(current - first.current)
+        moved = max(abs(voltage - first.voltage) / battery.cells_series - STEADY_DROP * drop, 0.0)  # by no load
         self._waited = min(self._waited, now)
-        if moved > STEADY_SHARE * self._ocv_span + STEADY_DROP * abs(drop) and now - self._waited < STEADY_WAIT:
-            if now - began >= STEADY_TIME:
-                self._first = now, voltage, current
+        if moved > STEADY_SHARE * self._ocv_span and now - self._waited < STEADY_WAIT:
+            if now - first.time >= STEADY_TIME:
+                self._first = First(now, voltage, current)
             return
         awaited = [self.signals.cell_temperature]
         if self._saved:
             awaited += [self.signals.odometer, self.signals.bms_state_of_charge]
         missing = any(signal.stale_after and not signal.fresh(now) for signal in awaited)
-        if now - began < (START_WAIT if missing else STEADY_TIME):
+        if now - first.time < (START_WAIT if missing else STEADY_TIME):
             return
-        self._start(now, first_voltage, first_current, temperature, STEADY_SD * max(moved - abs(drop), 0.0))
+        self._start(now, first, temperature, STEADY_SD * moved)
         self._waited = inf
         if self.filter:
-            mean = (first_current + current) / 2 / parallel
-            self.filter.predict(now - began, mean, temperature, (1e-9, 1e-7))
+            mean = (first.current + current) / 2 / parallel
+            self.filter.predict(now - first.time, mean, temperature, (1e-9, 1e-7))
 
-    def _start(self, now: float, voltage: float, current: float, temperature: float, unsteady: float) -> None:
+    def _start(self, now: float, first: First, temperature: float, unsteady: float) -> None:
         """The first SOC: from the voltage, and from what was saved before, each with what is not known about it.
 
         unsteady: sd of a cell's voltage [V] from its movement meanwhile.
         """
-        battery = self.battery
+        battery, voltage, current = self.battery, first.voltage, first.current
         cell_current = current / battery.cells_parallel
         cell_voltage = battery.cell_voltage(voltage, current) + self._lacking  # of before a restart
         soc, _ = from_voltage(battery, cell_voltage, cell_current, temperature, 0.0, 0.01, 0.01)
@@ -485,7 +499,7 @@ class Estimator:
         power, _ = self.forecaster.prior_ride(self._ambient(now)[0], self.road.altitude or 0.0)
         v1_sd = r1 * power / voltage / battery.cells_parallel
         capacity = battery.pack_capacity(temperature)
-        loaded = abs(current) > REST_RATE * capacity or (self.road.speed or 0.0) > MOVING
+        loaded = abs(current) > (REST_RATE if first.moving is None else PULLING_RATE) * capacity or bool(first.moving)
         v1, v1_sd = (v1_sd, v1_sd) if loaded else (0.0, STOPPED_SHARE * v1_sd)
         drop_sd, model_sd = RESISTANCE_SD * r0 * cell_current, self._model_sd if loaded else 0.0
         voltage_sd = hypot(self._rest_sd, self._voltage_sd, drop_sd, model_sd, unsteady)
