@@ -13,7 +13,7 @@ from gz_onboard.physics.derating import Derating, read_derating
 from gz_onboard.physics.effect import Effect
 from gz_onboard.physics.model import Model, read_model
 from gz_onboard.physics.parameters import Parameters, read_parameters
-from gz_onboard.physics.riding import PriorRiding, read_riding
+from gz_onboard.physics.riding import PriorRiding, check_riding, read_riding
 from gz_onboard.toml import Table
 
 OWN = Path(__file__).resolve().parent / "vehicles"
@@ -99,14 +99,16 @@ def read_vehicle(name: str, payload: float | None = None, effects_folder: Path |
     parameters = read_parameters(table, effects)
     if payload is not None:
         parameters = parameters.replaced(payload_mass=payload)
+    model, riding = Model(effects, parameters), read_riding(table)
+    check_riding(table, riding, model)
     return Vehicle(
         name=table.text("name"),
         file=table.file,
         mapping=read_mapping(table),
         parameters=parameters,
         battery=read_battery(table, parameters) if "battery" in table.values else None,
-        model=Model(effects, parameters),
-        riding=read_riding(table),
+        model=model,
+        riding=riding,
         derating=read_derating(table),
         healthy=_healthy(table.table("healthy")),
     )
