@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gz_onboard.bus.mapping import Mapping, read_mapping
+from gz_onboard.bus.mapping import Mapping, find_dbc, read_mapping
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.physics.battery import Battery, read_battery
 from gz_onboard.physics.derating import Derating, read_derating
@@ -31,6 +31,7 @@ class Vehicle:
     model: Model
     riding: PriorRiding
     derating: Derating = field(default_factory=Derating)
+    range_dbc: Path | None = None  # of the range frames; the package's range.dbc if none is given
     healthy: object = None  # what the discovery learned of it on healthy rides
 
     @property
@@ -82,6 +83,7 @@ def read_vehicle(name: str, payload: float | None = None, effects_folder: Path |
             "schema",
             "name",
             "dbc",
+            "range_dbc",
             "bus",
             "roles",
             "model",
@@ -110,8 +112,19 @@ def read_vehicle(name: str, payload: float | None = None, effects_folder: Path |
         model=model,
         riding=riding,
         derating=read_derating(table),
+        range_dbc=_range_dbc(table),
         healthy=_healthy(table.table("healthy")),
     )
+
+
+def _range_dbc(table: Table) -> Path | None:
+    """The DBC file of the range frames, found as those of the bus are."""
+    if "range_dbc" not in table.values:
+        return None
+    try:
+        return find_dbc(table.text("range_dbc"), table.file.parent)
+    except InputError as error:
+        raise table.error(str(error), "range_dbc") from error
 
 
 def _healthy(table: Table) -> Path | None:
