@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE, Codec
-from gz_onboard.bus.mapping import find_dbc, pgn
-from gz_onboard.bus.publisher import RANGE_DBC, WH, Counts, Publisher
+from gz_onboard.bus.mapping import pgn
+from gz_onboard.bus.publisher import WH, Counts, Publisher
 from gz_onboard.estimator.ekf import filter_maker
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
@@ -259,5 +259,5 @@ def _declare(log: Log, codec: Codec, signals: bool) -> None:
 
 def dbc_texts(vehicle: Vehicle) -> dict[str, bytes]:
     """The DBC files that a log of this vehicle can be decoded by, by name."""
-    files: list[Path] = [*vehicle.mapping.dbc_files, vehicle.range_dbc or find_dbc(RANGE_DBC)]
+    files: list[Path] = [*vehicle.mapping.dbc_files, vehicle.range_dbc]
     return {file.name: file.read_bytes() for file in files}

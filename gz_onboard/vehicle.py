@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gz_onboard.bus.mapping import Mapping, find_dbc, read_mapping
+from gz_onboard.bus.publisher import RANGE_DBC
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.physics.battery import Battery, read_battery
 from gz_onboard.physics.derating import Derating, read_derating
@@ -30,8 +31,8 @@ class Vehicle:
     battery: Battery | None
     model: Model
     riding: PriorRiding
+    range_dbc: Path  # of the range frames
     derating: Derating = field(default_factory=Derating)
-    range_dbc: Path | None = None  # of the range frames; the package's range.dbc if none is given
     healthy: object = None  # what the discovery learned of it on healthy rides
 
     @property
@@ -117,12 +118,10 @@ def read_vehicle(name: str, payload: float | None = None, effects_folder: Path |
     )
 
 
-def _range_dbc(table: Table) -> Path | None:
+def _range_dbc(table: Table) -> Path:
     """The DBC file of the range frames, found as those of the bus are."""
-    if "range_dbc" not in table.values:
-        return None
     try:
-        return find_dbc(table.text("range_dbc"), table.file.parent)
+        return find_dbc(table.text("range_dbc", RANGE_DBC), table.file.parent)
     except InputError as error:
         raise table.error(str(error), "range_dbc") from error
 
