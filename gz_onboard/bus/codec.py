@@ -149,14 +149,15 @@ class Codec:
 
     def _unknown(self, identifier: int) -> Handler:
         """The handler of an identifier that is not in the database as such; kept for the next frame of it."""
-        handler = self._by_pgn.get(pgn(identifier)) if identifier & EFF_FLAG and not identifier & RTR_FLAG else None
+        known = self._by_pgn.get(pgn(identifier)) if identifier & EFF_FLAG and not identifier & RTR_FLAG else None
+        handler: Handler = known or self._count_unknown(identifier)
         if identifier & ERR_FLAG:
-            handler = self._count_error
-        elif handler is None:
-            handler = self._count_unknown(identifier)
+            known, handler = None, self._count_error
         if len(self._handlers) < _MOST_IDENTIFIERS:
             self._handlers[identifier] = handler
             return handler
+        if known:
+            return lambda time, data: known(time, data) or True  # used, but not kept as the latest of its identifier
         return handler if identifier & ERR_FLAG else self._count_others
 
     def _count_error(self, _time: float, _data: bytes) -> bool:
