@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, TextIO
 
 from gz_onboard.bus.channel import Channel
 from gz_onboard.bus.checksum import crc8_sae_j1850
@@ -210,6 +210,8 @@ _STATE_WORDS = {
     State.INVALID: "invalid: no range can be told",
 }
 
+_NONE_YET = "Is the daemon on this bus? Is --dbc its range_dbc?"
+
 Span = tuple[str, str]
 """(text, ANSI codes or nothing)"""
 Line = list[Span]
@@ -248,14 +250,14 @@ def screen(view: View, now: float, source: str, width: int) -> list[Line]:
     left_out = ", ".join(words(role) for role in view.distrusted(now))
     for i, text in enumerate(textwrap.wrap(left_out, max(width - 20, 20))):
         lines.append([("  Sensors left out  " if i == 0 else " " * 20, ""), (text, "33")])
-    for i, (name, age) in enumerate(view.stale(now).items()):
-        how = "never came" if math.isinf(age) else f"last came {_duration(age)} ago"
-        lines.append([("  Stale             " if i == 0 else " " * 20, ""), (f"{name}: {how}", "31")])
-    lines += [[], *_counts(view, now)]
     if math.isinf(view.age(now)):
-        lines.append(
-            [(f"  Expected are those of {view.file.name}: is the daemon on this bus, is --dbc its range_dbc?", _DIM)]
-        )
+        lines.append([("  No frame of       ", ""), (view.file.name, "31")])
+        lines.append([(f"                    {_NONE_YET}", _DIM)])
+    else:
+        for i, (name, age) in enumerate(view.stale(now).items()):
+            how = "never came" if math.isinf(age) else f"last came {_duration(age)} ago"
+            lines.append([("  Stale             " if i == 0 else " " * 20, ""), (f"{name}: {how}", "31")])
+    lines += [[], *_counts(view, now)]
     return [_cropped(line, min(room, width)) for line in lines]
 
 
@@ -340,6 +342,9 @@ def rendered(line: Line, style: Style) -> str:
 
 def summary_line(view: View, now: float) -> str:
     """Everything that matters on one line, for where there is no terminal."""
+    if math.isinf(view.age(now)):
+        bad = sum(entry.bad for entry in view.messages.values())
+        return f"no frame of {view.file.name}{f' but {bad} bad ones' if bad else ''}. {_NONE_YET}"
     text = partial(view.text, now=now)
     state = view.state(now)
     parts = [
@@ -384,12 +389,14 @@ def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard dashboard``: 0, also when ended by Ctrl-C; 1 if --once found no range frames."""
     if arguments.duration is not None and not arguments.duration > 0:
         raise InputError(f"--duration {arguments.duration:g}: must be more than 0 s")
+    out: TextIO | None = sys.stdout
+    if out is None:  # closed by who called us
+        raise InputError("there is no standard output to show anything on")
     view = View(find_dbc(arguments.dbc, Path.cwd()))
     channel = Channel(arguments.interface, arguments.channel, identifiers=view.identifiers)
     channel.open()
     source = f"{arguments.channel} ({arguments.interface})"
     duration = arguments.duration or (ONCE_WITHIN if arguments.once else math.inf)
-    out = sys.stdout
     style = Style(
         colour=_is_screen(out) and "NO_COLOR" not in os.environ, unicode="utf" in (out.encoding or "").lower()
     )
@@ -404,9 +411,11 @@ def run(arguments: argparse.Namespace) -> int:
             else:
                 _show_lines(view, channel, style, duration, stopped, out)
     except OSError as error:
-        if error.errno != errno.EIO:  # the terminal was closed: there is nobody to tell
+        if error.errno == errno.EIO:  # the terminal was closed: there is nobody to tell
+            return 1
+        if isinstance(error, BrokenPipeError):
             raise
-        return 1
+        raise InputError(f"standard output: {error.strerror}") from error
     finally:
         channel.close()
     return 1 if arguments.once and math.isinf(view.age(time.monotonic())) else 0

@@ -111,8 +111,9 @@ def test_a_late_number_is_grey():
 def test_nothing_yet():
     text = picture(View(), 5.0)
     assert "none yet" in text
-    assert text.count("never came") == 5
-    assert "Expected are those of range.dbc" in text
+    assert "No frame of       range.dbc" in text
+    assert "Is --dbc its range_dbc?" in text
+    assert terminal.summary_line(View(), 5.0).startswith("no frame of range.dbc. Is the daemon on this bus?")
     assert not numbers(text)
 
 
@@ -182,7 +183,7 @@ def test_by_the_wrong_file_there_is_nothing_rather_than_wrong_numbers(sent, read
         view.take(frame, 100.0)
     text = picture(view, 100.0)
     assert not numbers(text)
-    assert f"Expected are those of {read}" in text
+    assert f"No frame of       {read}" in text
 
 
 def test_29_bits_and_a_counter_of_16(tmp_path):
@@ -462,6 +463,16 @@ def test_lines_where_there_is_no_terminal(tmp_path):
     assert "range 34.2 km (26.5 km to 44.3 km)" in lines[-1]
 
 
+@pytest.mark.parametrize(("redirection", "told"), [(">&-", "no standard output"), (">/dev/full", "No space left")])
+def test_an_output_that_takes_nothing_is_told(redirection, told):
+    command = f'"$0" -m gz_onboard dashboard --interface virtual --channel none --duration 1.5 {redirection}'
+    run = subprocess.run(["sh", "-c", command, sys.executable], stderr=subprocess.PIPE, text=True, check=False)
+    assert run.returncode == 2
+    assert run.stderr.startswith("gz-onboard dashboard: ")
+    assert told in run.stderr
+    assert len(run.stderr.splitlines()) == 1
+
+
 def test_a_dumb_terminal_gets_lines(tty):
     child = start("--duration", "2.5", out=tty.slave, TERM="dumb")
     tty.until(r"range 34\.2 km")
@@ -486,7 +497,7 @@ def test_in_a_thread_it_leaves_terminal_and_signals_alone(monkeypatch):
     thread.join(10)
     assert not thread.is_alive()
     assert "\x1b" not in out.getvalue()
-    assert "state not known" in out.getvalue()
+    assert "no frame of range.dbc" in out.getvalue()
     assert signal.getsignal(signal.SIGINT) is before
 
 
