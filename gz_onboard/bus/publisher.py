@@ -212,7 +212,12 @@ def _unfit_signal(signal: Signal, model: Signal) -> str:
             return (
                 f"has unit {signal.unit or ''!r}, must have {model.unit or ''!r}; only its scale and place may differ"
             )
-        return "" if signal.length >= 8 else f"needs 8 bits or more for the code 'not available', has {signal.length}"
+        if signal.length < 8:
+            return f"needs 8 bits or more for the code 'not available', has {signal.length}"
+        needed = (0, 100) if model.name == SOC else (0,)
+        field = _field(signal, 0)
+        missing = [value for value in needed if field.raw(value) is None]
+        return f"must be able to say {missing[0]} {model.unit or ''}".rstrip() if missing else ""
     most = max(model.choices) if model.choices else 2 if model.name.endswith("Counter") else 1
     low, high = raw_range(signal, not_available=False)
     if (signal.conversion.scale, signal.conversion.offset, low) != (1, 0, 0) or high < most:
@@ -258,6 +263,14 @@ class _Layout:
     counts: int
 
 
+def _field(signal: Signal, shift: int) -> _Field:
+    low, high = raw_range(signal, not_available=True)
+    mask = 2**signal.length - 1
+    absent = 2 ** (signal.length - 1) if signal.is_signed else mask
+    conversion = signal.conversion
+    return _Field(signal.name, shift, mask, low, high, float(conversion.offset), float(conversion.scale), absent)
+
+
 def _layout(message: Message) -> _Layout:
     """The places of all signals but the CRC, which is the last of the eight bytes.
 
@@ -269,17 +282,11 @@ def _layout(message: Message) -> _Layout:
     unused = 2**56 - 1
     counts = 0
     for signal in message.signals:
-        low, high = raw_range(signal, not_available=True)
         if signal.name == counter:
-            counts = int(high) + 1
+            counts = int(raw_range(signal, not_available=True)[1]) + 1
         if signal.name.endswith("CRC"):
             continue
-        mask = 2**signal.length - 1
-        shift = first_bit(signal) if little else 56 - first_bit(signal) - signal.length
-        absent = 2 ** (signal.length - 1) if signal.is_signed else mask
-        conversion = signal.conversion
-        scaling = float(conversion.offset), float(conversion.scale)
-        fields.append(_Field(signal.name, shift, mask, low, high, *scaling, absent))
-        unused &= ~(mask << shift)
+        fields.append(_field(signal, first_bit(signal) if little else 56 - first_bit(signal) - signal.length))
+        unused &= ~(fields[-1].mask << fields[-1].shift)
     identifier = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
     return _Layout(identifier, "little" if little else "big", unused, fields, counter, counts)

@@ -209,7 +209,7 @@ OWNERS = {
     .replace("ConsumptionRecent : 16|16@1- (0.01,0)", "ConsumptionRecent : 20|10@1- (1,0)")
     .replace("[-327.67|327.67]", "[-511|511]")
     .replace("ConsumptionExpected : 32|16", "ConsumptionExpected : 30|16"),
-    "an offset": TEXT.replace("(0.1,0) [0|25.4]", "(0.1,10) [0|35.4]"),
+    "an offset": TEXT.replace("(0.1,0) [0|25.4]", "(0.2,-10) [0|40]"),
     "more in it": TEXT.replace("\nBO_ 1537", '\nBO_ 7 Brake: 2 DASH\n SG_ P : 0|8@1+ (1,0) [0|0] "" RANGE\n\nBO_ 1537')
     .replace(" SG_ RANGE_EnergyCounter", ' SG_ Mine : 48|4@1- (1,0) [0|0] "" DASH\n SG_ RANGE_EnergyCounter'),
 }  # fmt: skip
@@ -244,6 +244,8 @@ def test_an_owners_file(text, tmp_path):
         ("EnergyLeft : 0|16@1+", "EnergyLeft : 7|16@0+", "RANGE_Energy: its signals must all have the same byte order"),
         ("EnergyLeft : 0|16", "EnergyLeft : 0|7", "RANGE_EnergyLeft needs 8 bits or more .*has 7"),
         ('(0.1,0) [0|6553.4] "Wh"', '(0.1,0) [0|6553.4] "kWh"', "RANGE_EnergyLeft has unit 'kWh', must have 'Wh'"),
+        ('(0.1,0) [0|6553.4] "Wh"', '(0.1,9) [9|6553.4] "Wh"', "RANGE_EnergyLeft must be able to say 0 Wh"),
+        ('(0.01,0) [0|100] "%"', '(0.01,0) [0|99] "%"', "RANGE_StateOfCharge must be able to say 100 %"),
         ("RANGE_Activity : 44|4", "RANGE_Activity : 44|1", "RANGE_Activity must hold the whole numbers from 0 to 3"),
         ("RANGE_Activity : 44|4@1+ (1,0)", "RANGE_Activity : 44|4@1+ (2,0)", "RANGE_Activity must hold .*scale 1"),
         ("RANGE_NoImu : 29|1@1+", "RANGE_NoImu : 29|1@1-", "RANGE_NoImu must hold the whole numbers from 0 to 1"),
