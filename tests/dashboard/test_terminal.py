@@ -441,6 +441,23 @@ def test_no_picture_is_larger_than_the_terminal():
     small.close()
 
 
+def test_a_terminal_that_is_resized(tty):
+    child = start("--duration", "30", out=tty.slave)
+    tty.until(r"34\.2 km")
+    fcntl.ioctl(tty.slave, termios.TIOCSWINSZ, struct.pack("HHHH", 5, 11, 0, 0))
+    tty.read(0.5)
+    tty.text = ""
+    tty.until(r"(?s)\x1b\[H.*\x1b\[H.*\x1b\[H")  # whole pictures after the first, which may be of the old size
+    child.send_signal(signal.SIGINT)
+    tty.until(r"\x1b\[\?1049l")
+    assert child.wait(10) == 0
+    drawn = tty.text.split("\x1b[?1049l")[0].split("\x1b[H")[2:]
+    for lines in (re.split(r"\r*\n", re.sub(r"\x1b\[[?\d;]*[A-Za-z]", "", picture)) for picture in drawn):
+        assert len(lines) <= 5
+        assert max(map(len, lines)) <= 11
+    child.stderr.close()
+
+
 def test_no_color_and_a_daemon_that_goes_silent(tty):
     child = start("--duration", "4", out=tty.slave, sending=0.3, NO_COLOR="1")
     tty.until(r"RANGE_Status: last came \d s ago", within=30)
