@@ -88,11 +88,16 @@ numbers = st.one_of(st.none(), st.floats(-1e7, 1e7), st.floats(0, 2000), st.floa
 KNOWN = (State.VALID, State.DEGRADED)
 
 
+@cache
+def publisher_of(file: str) -> Publisher:
+    return Publisher(find_dbc(file))
+
+
 def check_what_is_sent(file: str, given_values: dict[str, float | None], state: State) -> None:
     """Each number to the nearest that its signal can say, or not at all; valid only with a whole range."""
     values = {name: None if (v := given_values[f]) is None else v / unit for name, (f, unit) in QUANTITIES.items()}
     assume(not any(on_the_edge(name, value, file) for name, value in values.items()))
-    got = sent(Publisher(find_dbc(file)), Estimate(0.0, state, **given_values))  # type: ignore[arg-type]
+    got = sent(publisher_of(file), Estimate(0.0, state, **given_values))  # type: ignore[arg-type]
     median, p10, p90 = (values[f"RANGE_Remaining{part}"] for part in ("", "P10", "P90"))
     ordered = None not in (median, p10, p90) and 0 <= p10 <= median <= p90  # type: ignore[operator]
     told = state in KNOWN and ordered and sayable("RANGE_Remaining", median, file)
