@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE, Codec
-from gz_onboard.bus.publisher import Counts, Publisher
+from gz_onboard.bus.mapping import pgn
+from gz_onboard.bus.publisher import WH, Counts, Publisher
 from gz_onboard.estimator.ekf import filter_maker
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
+from gz_onboard.physics.battery import drawable
 from gz_onboard.vehicle import Vehicle
 
 TICK_NS = 100_000_000  # status at 10 Hz
@@ -72,13 +74,7 @@ class Pipeline:
         self.estimator = Estimator(
             self.codec.groups, vehicle.pack, vehicle.model, vehicle.riding, filter_maker(filter_name)
         )
-        self.publisher = Publisher()
-        clash = {m.frame_id for m in vehicle.mapping.database.messages} & {
-            m.frame_id for m in self.publisher.database.messages
-        }
-        if clash:
-            names = ", ".join(f"{identifier:#x}" for identifier in sorted(clash))
-            raise vehicle.error(f"its DBC files take the identifiers of our own range frames (dbc/range.dbc): {names}")
+        self.publisher = range_publisher(vehicle)
         self.kernel_lost = 0  # frames; set by the daemon
         self.send_failures = 0  # frames that a channel did not take; set by the daemon
         self.extra_reasons = Reason(0)  # set by the daemon: bus down, log failed
@@ -202,6 +198,32 @@ class Pipeline:
         }
 
 
+def range_publisher(vehicle: Vehicle) -> Publisher:
+    """What sends the vehicle's range frames.
+
+    InputError if its own messages take their identifiers, or if they cannot say what its battery holds.
+    """
+    publisher = Publisher(vehicle.range_dbc)
+    known = {_frame_key(vehicle, m.frame_id, m.is_extended_frame) for m in vehicle.mapping.database.messages}
+    clash = [i for i in publisher.identifiers if _frame_key(vehicle, i & ~EFF_FLAG, bool(i & EFF_FLAG)) in known]
+    if clash:
+        names = ", ".join(f"{identifier & ~EFF_FLAG:#x}" for identifier in sorted(clash))
+        raise vehicle.error(f"its DBC files take the identifiers of our own range frames ({publisher.file}): {names}")
+    if vehicle.battery:
+        full, most = drawable(vehicle.battery, 1.0, 25.0, 1.0).energy / WH, publisher.greatest("RANGE_EnergyLeft")
+        if full > most:
+            raise vehicle.error(
+                f"the battery holds {full:.0f} Wh, but RANGE_EnergyLeft of {publisher.file} says at most {most:g} Wh: "
+                'give range frames of a larger scale, such as range_dbc = "range_large.dbc"'
+            )
+    return publisher
+
+
+def _frame_key(vehicle: Vehicle, identifier: int, extended: bool) -> tuple[bool, int]:
+    """What the vehicle's codec tells a frame by."""
+    return extended, pgn(identifier) if extended and vehicle.mapping.j1939 else identifier
+
+
 def reason_names(reasons: Reason) -> list[str]:
     """The names of the reasons in a set."""
     return [str(reason.name) for reason in Reason if reason & reasons]
@@ -237,7 +259,5 @@ def _declare(log: Log, codec: Codec, signals: bool) -> None:
 
 def dbc_texts(vehicle: Vehicle) -> dict[str, bytes]:
     """The DBC files that a log of this vehicle can be decoded by, by name."""
-    from gz_onboard.bus.mapping import find_dbc
-
-    files: list[Path] = [*vehicle.mapping.dbc_files, find_dbc("range.dbc")]
+    files: list[Path] = [*vehicle.mapping.dbc_files, vehicle.range_dbc]
     return {file.name: file.read_bytes() for file in files}

@@ -6,14 +6,15 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gz_onboard.bus.mapping import Mapping, read_mapping
+from gz_onboard.bus.mapping import Mapping, find_dbc, read_mapping
+from gz_onboard.bus.publisher import RANGE_DBC
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.physics.battery import Battery, read_battery
 from gz_onboard.physics.derating import Derating, read_derating
 from gz_onboard.physics.effect import Effect
 from gz_onboard.physics.model import Model, read_model
 from gz_onboard.physics.parameters import Parameters, read_parameters
-from gz_onboard.physics.riding import PriorRiding, read_riding
+from gz_onboard.physics.riding import PriorRiding, check_riding, read_riding
 from gz_onboard.toml import Table
 
 OWN = Path(__file__).resolve().parent / "vehicles"
@@ -30,6 +31,7 @@ class Vehicle:
     battery: Battery | None
     model: Model
     riding: PriorRiding
+    range_dbc: Path  # of the range frames
     derating: Derating = field(default_factory=Derating)
     healthy: object = None  # what the discovery learned of it on healthy rides
 
@@ -82,6 +84,7 @@ def read_vehicle(name: str, payload: float | None = None, effects_folder: Path |
             "schema",
             "name",
             "dbc",
+            "range_dbc",
             "bus",
             "roles",
             "model",
@@ -99,17 +102,28 @@ def read_vehicle(name: str, payload: float | None = None, effects_folder: Path |
     parameters = read_parameters(table, effects)
     if payload is not None:
         parameters = parameters.replaced(payload_mass=payload)
+    model, riding = Model(effects, parameters), read_riding(table)
+    check_riding(table, riding, model)
     return Vehicle(
         name=table.text("name"),
         file=table.file,
         mapping=read_mapping(table),
         parameters=parameters,
         battery=read_battery(table, parameters) if "battery" in table.values else None,
-        model=Model(effects, parameters),
-        riding=read_riding(table),
+        model=model,
+        riding=riding,
         derating=read_derating(table),
+        range_dbc=_range_dbc(table),
         healthy=_healthy(table.table("healthy")),
     )
+
+
+def _range_dbc(table: Table) -> Path:
+    """The DBC file of the range frames, found as those of the bus are."""
+    try:
+        return find_dbc(table.text("range_dbc", RANGE_DBC), table.file.parent)
+    except InputError as error:
+        raise table.error(str(error), "range_dbc") from error
 
 
 def _healthy(table: Table) -> Path | None:

@@ -21,10 +21,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import can
-from cantools.database import Database, load_file
+
+from gz_onboard.bus.publisher import Publisher
+from gz_onboard.events import EFF_FLAG
+from gz_onboard.vehicle import read_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]
-RANGE_DBC = ROOT / "dbc" / "range.dbc"
 BIN = Path(sys.executable).parent
 READY_WITHIN = 30.0  # s
 STOPPED_WITHIN = 15.0  # s
@@ -51,19 +53,20 @@ def main() -> int:
     own_directories = ["--log-dir", str(directory), "--state-dir", str(directory)]
     daemon = ["run", "--vehicle", args.vehicle, *bus, *own_directories]
     replay = ["replay", str(args.ride), *bus, "--speed", str(args.speed)]
-    dashboard = ["dashboard", *bus]
+    dbc = read_vehicle(args.vehicle).range_dbc
+    dashboard = ["dashboard", *bus, "--dbc", str(dbc)]
 
     where = "in-process virtual bus" if args.interface == "virtual" else f"{args.channel} of Linux {os.uname().release}"
     print(f"=== {args.ride.name} on the {where}, for at most {args.seconds:g} s")
     frames = directory / "range.log"
     play = play_in_threads if args.interface == "virtual" else play_in_processes
-    with recording(args.interface, args.channel, frames), listening_for_ready() as wait_until_ready:
+    with recording(args.interface, args.channel, frames, dbc), listening_for_ready() as wait_until_ready:
         status = play(daemon, replay, dashboard, wait_until_ready, args.seconds)
     if status:
         print(f"demo: ended with status {status}", file=sys.stderr)
         return status
 
-    show_decoded(frames)
+    show_decoded(frames, dbc)
     (log,) = directory.glob("*.mcap")
     overview = directory / "overview.png"
     subprocess.run([BIN / "gz-onboard", "plot", log, overview], check=True)
@@ -74,11 +77,12 @@ def main() -> int:
 
 
 @contextlib.contextmanager
-def recording(interface: str, channel: str, file: Path) -> Iterator[None]:
+def recording(interface: str, channel: str, file: Path, dbc: Path) -> Iterator[None]:
     """Record the range frames, and nothing else, as candump does."""
-    database = load_file(RANGE_DBC)
-    assert isinstance(database, Database)
-    filters = [can.typechecking.CanFilter(can_id=m.frame_id, can_mask=0x7FF) for m in database.messages]
+    filters = [
+        can.typechecking.CanFilter(can_id=i & ~EFF_FLAG, can_mask=0x1FFFFFFF, extended=bool(i & EFF_FLAG))
+        for i in Publisher(dbc).identifiers
+    ]
     with can.Bus(interface=interface, channel=channel, can_filters=filters) as bus:
         writer = can.CanutilsLogWriter(file, channel=channel)
         notifier = can.Notifier(bus, [writer])
@@ -145,11 +149,11 @@ def play_in_threads(
     return cli.main(daemon)
 
 
-def show_decoded(frames: Path) -> None:
+def show_decoded(frames: Path, dbc: Path) -> None:
     """Print the last frame of each kind, decoded by the cantools command."""
     last = {line.split()[2].partition("#")[0]: line for line in frames.read_text().splitlines()}
-    print(f"\n=== The last range frames on the bus: cantools decode {RANGE_DBC.relative_to(ROOT)} <{frames.name}")
-    decode = [str(BIN / "cantools"), "decode", str(RANGE_DBC)]
+    print(f"\n=== The last range frames on the bus: cantools decode {dbc.name} <{frames.name}")
+    decode = [str(BIN / "cantools"), "decode", str(dbc)]
     text = subprocess.run(decode, input="\n".join(last.values()), check=True, capture_output=True, text=True).stdout
     print(text.strip())
 

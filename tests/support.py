@@ -14,7 +14,7 @@ from cantools.database.can import Database, Message
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.mapping import find_dbc, load_database
-from gz_onboard.events import TRANSMITTED, Estimate, Frame, Reason
+from gz_onboard.events import EFF_FLAG, TRANSMITTED, Estimate, Frame, Reason, State
 from gz_onboard.lab.estimate import feed
 from gz_onboard.pipeline import TICK_NS, Pipeline
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -32,8 +32,9 @@ def reference() -> Vehicle:
 
 
 @cache
-def range_database() -> Database:
-    return load_database([find_dbc("range.dbc")])
+def range_database(file: Path | None = None) -> Database:
+    """What decodes range frames: by the package's range.dbc, or by another file."""
+    return load_database([file or find_dbc("range.dbc")])
 
 
 def message(name: str) -> Message:
@@ -220,15 +221,18 @@ def check_sound(run: Run) -> None:
             assert e.range_p10 is not None
             assert e.range_p90 is not None
             assert 0 <= e.range_p10 <= e.range <= e.range_p90
-    check_frames(run.sent)
+    check_frames(run.sent, run.pipeline.vehicle.range_dbc)
 
 
-def check_frames(frames: Sequence[Frame]) -> dict[str, list[dict[str, float]]]:
-    """Decode range frames by cantools: right checksums, counters that run, values within their limits or absent."""
-    database = range_database()
+def check_frames(frames: Sequence[Frame], file: Path | None = None) -> dict[str, list[dict[str, float]]]:
+    """Decode range frames by cantools: right checksums, counters that run, values within their limits or absent.
+
+    Never valid without range, P10 and P90 in their order.
+    """
+    database = range_database(file)
     decoded: dict[str, list[dict[str, float]]] = {}
     for _, can_id, data, _ in frames:
-        definition = database.get_message_by_frame_id(can_id)
+        definition = database.get_message_by_frame_id(can_id & ~EFF_FLAG)
         assert data == sealed(data), f"{definition.name}: wrong checksum in {data.hex()}"
         raw: Any = definition.decode(data, decode_choices=False, scaling=False)
         values: Any = definition.decode(data, decode_choices=False)
@@ -241,6 +245,11 @@ def check_frames(frames: Sequence[Frame]) -> dict[str, list[dict[str, float]]]:
                 low, high = float(signal.minimum) - slack, float(signal.maximum) + slack
                 assert low <= values[signal.name] <= high, signal.name
         decoded.setdefault(definition.name, []).append(values)
+    for row in decoded.get("RANGE_Estimate", []):
+        if row["RANGE_EstimateState"] == State.VALID:
+            most = database.get_message_by_name("RANGE_Estimate").get_signal_by_name("RANGE_Remaining").maximum
+            assert most is not None
+            assert 0 <= row["RANGE_RemainingP10"] <= row["RANGE_Remaining"] <= row["RANGE_RemainingP90"] <= most + 1e-6
     for name, rows in decoded.items():
         counter = f"{name}Counter" if f"{name}Counter" in rows[0] else next(k for k in rows[0] if k.endswith("Counter"))
         assert all(b[counter] == (a[counter] + 1) % 15 for a, b in pairwise(rows)), f"{name}: the counter jumps"

@@ -149,14 +149,15 @@ class Codec:
 
     def _unknown(self, identifier: int) -> Handler:
         """The handler of an identifier that is not in the database as such; kept for the next frame of it."""
-        handler = self._by_pgn.get(pgn(identifier)) if identifier & EFF_FLAG and not identifier & RTR_FLAG else None
+        known = self._by_pgn.get(pgn(identifier)) if identifier & EFF_FLAG and not identifier & RTR_FLAG else None
+        handler: Handler = known or self._count_unknown(identifier)
         if identifier & ERR_FLAG:
-            handler = self._count_error
-        elif handler is None:
-            handler = self._count_unknown(identifier)
+            known, handler = None, self._count_error
         if len(self._handlers) < _MOST_IDENTIFIERS:
             self._handlers[identifier] = handler
             return handler
+        if known:
+            return lambda time, data: known(time, data) or True  # used, but not kept as the latest of its identifier
         return handler if identifier & ERR_FLAG else self._count_others
 
     def _count_error(self, _time: float, _data: bytes) -> bool:
@@ -355,7 +356,7 @@ def _is_plain(signal: Signal) -> bool:
     return not signal.is_multiplexer and signal.multiplexer_ids is None and not signal.conversion.is_float
 
 
-def _first_bit(signal: Signal) -> int:
+def first_bit(signal: Signal) -> int:
     """The place of the first bit: in little-endian order the least significant, in big-endian the most.
 
     The DBC counts bits from the right within each byte; the most significant first they are counted from the left.
@@ -372,7 +373,7 @@ def _words(signals: list[Signal], length: int) -> tuple[str, list[str]] | None:
     """
     orders = {signal.byte_order for signal in signals}
     spans: list[list[int]] = []  # first byte, byte after the last
-    for begin, end in sorted((_first_bit(s) // 8, (_first_bit(s) + s.length - 1) // 8 + 1) for s in signals):
+    for begin, end in sorted((first_bit(s) // 8, (first_bit(s) + s.length - 1) // 8 + 1) for s in signals):
         if spans and begin < spans[-1][1]:
             spans[-1][1] = max(spans[-1][1], end)
         else:
@@ -382,7 +383,7 @@ def _words(signals: list[Signal], length: int) -> tuple[str, list[str]] | None:
     codes, at = "", 0
     expressions = {}
     for i, (begin, end) in enumerate(spans):
-        inside = [s for s in signals if begin <= _first_bit(s) // 8 < end]
+        inside = [s for s in signals if begin <= first_bit(s) // 8 < end]
         code = {1: "B", 2: "H", 4: "I", 8: "Q"}[end - begin]
         whole = inside[0].length == 8 * (end - begin)
         if whole and inside[0].is_signed:
@@ -397,7 +398,7 @@ def _words(signals: list[Signal], length: int) -> tuple[str, list[str]] | None:
 
 def _extract(signal: Signal, word: str, begin: int, end: int) -> str:
     """An expression for the raw value of `signal` in `word`, the integer of the bytes from `begin` up to `end`."""
-    first = _first_bit(signal)
+    first = first_bit(signal)
     shift = first - 8 * begin if signal.byte_order == "little_endian" else 8 * end - first - signal.length
     mask = 2**signal.length - 1
     masked = f"({word} >> {shift} & {mask:#x})" if shift else f"({word} & {mask:#x})"

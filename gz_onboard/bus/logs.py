@@ -36,6 +36,9 @@ _READERS: dict[str, Reader] = {
 }
 
 
+_NO_TIME = 1 << 63  # ns: beyond what our own log can hold
+
+
 @dataclass(frozen=True)
 class LogDamage:
     """What could not be read of a log: how many pieces (lines, objects, chunks), and the first of them."""
@@ -146,12 +149,14 @@ def _filtered(
     on_damage: Callable[[LogDamage], None],
 ) -> Iterator[list[Frame]]:
     damage = Damage()
-    earliest = start_ns if start_ns is not None else -(1 << 63)
-    latest = end_ns if end_ns is not None else 1 << 63
+    earliest = 0 if start_ns is None else max(start_ns, 0)
+    latest = _NO_TIME if end_ns is None else min(end_ns, _NO_TIME)
     for batch in reader(path, unpacked(path, data, damage), damage, start_ns, end_ns):
-        if start_ns is None and end_ns is None:
-            yield batch
-        elif wanted := [frame for frame in batch if earliest <= frame[0] < latest]:
+        times = [frame[0] for frame in batch]
+        for time_ns in times if times and (min(times) < 0 or max(times) >= _NO_TIME) else ():
+            if not 0 <= time_ns < _NO_TIME:
+                damage.add(f"a frame at {time_ns / 1e9:.9g} s", "no time since 1970 that fits into 63 bits of ns")
+        if wanted := [frame for frame in batch if earliest <= frame[0] < latest]:
             yield wanted
     if damage.count:
         on_damage(LogDamage(path, damage.count, damage.place, damage.reason))

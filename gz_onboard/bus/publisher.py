@@ -1,21 +1,27 @@
-"""From estimates to CAN frames, by ``dbc/range.dbc``: the range at 1 Hz, the status at 10 Hz.
+"""From estimates to CAN frames: the range at 1 Hz, the status at 10 Hz.
 
-What is not known is sent as not available, never as a number; what is beyond a signal's range as its greatest value.
+By ``dbc/range.dbc``, or by another DBC file with messages and signals of the same names: other scales, identifiers and
+places. What is not known, and what a signal cannot say, is sent as not available, never as a number; only counts
+stay at their greatest.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
-from gz_onboard.bus.codec import raw_range
+from gz_onboard.bus.codec import first_bit, raw_range
 from gz_onboard.bus.mapping import find_dbc, load_database
-from gz_onboard.events import ROLES, TRANSMITTED, Estimate, Frame, Reason, State
+from gz_onboard.errors import InputError, nearest
+from gz_onboard.events import EFF_FLAG, ROLES, TRANSMITTED, Estimate, Frame, Reason, State
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
+    from cantools.database.can.signal import Signal
 
+RANGE_DBC = "range.dbc"
 WH = 3600.0  # J
 WH_PER_KM = 3.6  # J/m
 
@@ -31,25 +37,40 @@ class Counts:
 
 
 class Publisher:
-    """Encodes estimates; its state is the counters of its messages."""
+    """Encodes estimates by a DBC file, `dbc/range.dbc` if none is given; its state is the counters of its messages.
 
-    def __init__(self) -> None:
-        self.database = load_database([find_dbc("range.dbc")])
-        self._counters = {message.name: 0 for message in self.database.messages}
-        names = {s.name for s in self.database.get_message_by_name("RANGE_Sensors").signals}
-        self._sensor_signals = [(role, sensor_signal(role)) for role in ROLES if sensor_signal(role) in names]
-        self._layouts = {message.name: _layout(message) for message in self.database.messages}
+    InputError if the file does not hold what is to be sent.
+    """
+
+    def __init__(self, file: Path | None = None) -> None:
+        self.file = file or find_dbc(RANGE_DBC)
+        self.messages = range_messages(self.file)
+        self._counters = dict.fromkeys(self.messages, 0)
+        self._layouts = {name: _layout(message) for name, message in self.messages.items()}
+        self._fields = {field.name: field for layout in self._layouts.values() for field in layout.fields}
+        self._sensor_signals = [(role, sensor_signal(role)) for role in ROLES if sensor_signal(role) in self._fields]
+
+    @property
+    def identifiers(self) -> set[int]:
+        """Of the frames that are sent; EFF_FLAG is set in those of 29 bits."""
+        return {layout.identifier for layout in self._layouts.values()}
+
+    def greatest(self, signal: str) -> float:
+        """The most that `signal` can say, in the unit of the DBC."""
+        field = self._fields[signal]
+        return max(limit * field.scale + field.offset for limit in (field.low, field.high))
 
     def range(self, estimate: Estimate, counts: Counts, time_ns: int, channel: int = 0) -> list[Frame]:
         """The frames of every second."""
         e = estimate
-        known = e.state in (State.VALID, State.DEGRADED)
+        state, remaining, p10, p90 = self._told(e)
+        known = state in _KNOWN
         frames: dict[str, dict[str, float | None]] = {
             "RANGE_Estimate": {
-                "RANGE_Remaining": _scaled(e.range, 1e-3) if known else None,
-                "RANGE_RemainingP10": _scaled(e.range_p10, 1e-3) if known else None,
-                "RANGE_RemainingP90": _scaled(e.range_p90, 1e-3) if known else None,
-                "RANGE_EstimateState": e.state,
+                "RANGE_Remaining": remaining,
+                "RANGE_RemainingP10": p10,
+                "RANGE_RemainingP90": p90,
+                "RANGE_EstimateState": state,
             },
             "RANGE_Energy": {
                 "RANGE_EnergyLeft": _scaled(e.energy_left, 1 / WH) if known else None,
@@ -57,10 +78,10 @@ class Publisher:
                 "RANGE_ConsumptionExpected": _scaled(e.consumption_expected, 1 / WH_PER_KM) if known else None,
             },
             "RANGE_Diagnosis": {
-                "RANGE_CountDropped": counts.dropped,
-                "RANGE_CountImplausible": counts.implausible,
-                "RANGE_CountLost": counts.lost,
-                "RANGE_CountUnknown": counts.unknown,
+                "RANGE_CountDropped": self._count("RANGE_CountDropped", counts.dropped),
+                "RANGE_CountImplausible": self._count("RANGE_CountImplausible", counts.implausible),
+                "RANGE_CountLost": self._count("RANGE_CountLost", counts.lost),
+                "RANGE_CountUnknown": self._count("RANGE_CountUnknown", counts.unknown),
             },
             "RANGE_Sensors": {signal: role in e.distrusted for role, signal in self._sensor_signals},
         }
@@ -68,11 +89,14 @@ class Publisher:
 
     def status(self, estimate: Estimate, time_ns: int, channel: int = 0) -> list[Frame]:
         """The frame of every tenth of a second."""
-        known = estimate.state in (State.VALID, State.DEGRADED)
+        state = self._told(estimate)[0]
+        soc, sigma = _scaled(estimate.soc, 100), _scaled(estimate.soc_sd, 100)
+        if state not in _KNOWN or not (self._can_say(SOC, soc) and self._can_say(SIGMA, sigma)):
+            soc = sigma = None  # neither is of use without the other
         values: dict[str, float | None] = {
-            "RANGE_StateOfCharge": _scaled(estimate.soc, 100) if known else None,
-            "RANGE_StateOfChargeSigma": _scaled(estimate.soc_sd, 100) if known else None,
-            "RANGE_StatusState": estimate.state,
+            SOC: soc,
+            SIGMA: sigma,
+            "RANGE_StatusState": state,
             "RANGE_Activity": estimate.activity,
         }
         reasons = int(estimate.reasons)
@@ -80,16 +104,44 @@ class Publisher:
             values[signal] = reasons & bit != 0
         return [self._frame("RANGE_Status", values, time_ns, channel)]
 
+    def _told(self, e: Estimate) -> tuple[State, float | None, float | None, float | None]:
+        """(state, range, P10, P90) [km] as they are sent: never valid unless all three are there and in their order."""
+        if e.state not in _KNOWN:
+            return e.state, None, None, None
+        remaining, p10, p90 = _scaled(e.range, 1e-3), _scaled(e.range_p10, 1e-3), _scaled(e.range_p90, 1e-3)
+        if (
+            remaining is None
+            or p10 is None
+            or p90 is None
+            or not 0 <= p10 <= remaining <= p90  # so for NaN
+            or not self._can_say("RANGE_Remaining", remaining)
+            or not self._can_say("RANGE_RemainingP10", p10)
+        ):
+            return State.INVALID, None, None, None
+        if not self._can_say("RANGE_RemainingP90", p90):
+            return State.DEGRADED, remaining, p10, None
+        return e.state, remaining, p10, p90
+
+    def _can_say(self, signal: str, value: float | None) -> bool:
+        return self._fields[signal].raw(value) is not None
+
+    def _count(self, signal: str, count: int) -> float:
+        return min(count, self.greatest(signal))
+
     def _frame(self, name: str, values: dict[str, float | None], time_ns: int, channel: int) -> Frame:
-        part = name.removeprefix("RANGE_")
+        layout = self._layouts[name]
         counter = self._counters[name]
-        self._counters[name] = (counter + 1) % 15
-        values[f"RANGE_{part}Counter"] = counter
-        identifier, word, fields = self._layouts[name]
-        for field in fields:
-            word |= field.bits(values[field.name])
-        data = word.to_bytes(7, "little")
-        return time_ns, identifier, data + bytes((crc8_sae_j1850(data),)), channel | TRANSMITTED
+        self._counters[name] = (counter + 1) % layout.counts
+        values[layout.counter] = counter
+        word = layout.unused
+        for field in layout.fields:
+            word |= field.bits(values.get(field.name))  # None: not one of ours
+        data = word.to_bytes(7, layout.order)
+        return time_ns, layout.identifier, data + bytes((crc8_sae_j1850(data),)), channel | TRANSMITTED
+
+
+SOC, SIGMA = "RANGE_StateOfCharge", "RANGE_StateOfChargeSigma"
+_KNOWN = (State.VALID, State.DEGRADED)
 
 
 def sensor_signal(role: str) -> str:
@@ -109,12 +161,76 @@ def _scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else value * factor
 
 
+# --- what a DBC file must hold, and the places of its signals ---------------------------------------------------------
+
+
+def range_messages(file: Path) -> dict[str, Message]:
+    """The messages of our own frames in a DBC file, by name; there may be others in it.
+
+    InputError for what is missing that ``dbc/range.dbc`` has, and for what cannot be sent.
+    """
+    own = find_dbc(RANGE_DBC)
+    standard = load_database([own])
+    database = standard if file == own else load_database([file])
+    found = {message.name: message for message in database.messages}
+    for wanted in standard.messages:
+        message = found.get(wanted.name)
+        if message is None:
+            raise InputError(
+                f"{file}: has no message {wanted.name}, which {RANGE_DBC} has{nearest(wanted.name, found)}"
+            )
+        if problem := _unfit(message, wanted):
+            raise InputError(f"{file}: message {wanted.name}: {problem}")
+    return {wanted.name: found[wanted.name] for wanted in standard.messages}
+
+
+def _unfit(message: Message, wanted: Message) -> str:
+    """What is wrong with `message`, which shall carry what `wanted` of ``dbc/range.dbc`` does; else nothing."""
+    if message.length != 8 or message.is_fd:
+        return f"must have 8 bytes in a classic frame, has {message.length}{' in a CAN FD frame' * message.is_fd}"
+    signals = {signal.name: signal for signal in message.signals}
+    if len({signal.byte_order for signal in message.signals}) > 1:
+        return "its signals must all have the same byte order"
+    for model in wanted.signals:
+        signal = signals.get(model.name)
+        if signal is None:
+            return f"has no signal {model.name}{nearest(model.name, signals)}"
+        if problem := _unfit_signal(signal, model):
+            return f"signal {signal.name} {problem}"
+    return ""
+
+
+def _unfit_signal(signal: Signal, model: Signal) -> str:
+    if signal.conversion.is_float or signal.is_multiplexer or signal.multiplexer_ids is not None:
+        return "must be an integer that is in every frame (not floating point, not multiplexed)"
+    if model.name.endswith("CRC"):
+        return "" if (signal.length, first_bit(signal)) == (8, 56) else "must be the last byte, all 8 bits of it"
+    if first_bit(signal) + signal.length > 56:
+        return "stands in the last byte, which is the checksum's"
+    if model.length >= 8:  # a quantity, with a code for not available
+        if (signal.unit or "") != (model.unit or ""):
+            return (
+                f"has unit {signal.unit or ''!r}, must have {model.unit or ''!r}; only its scale and place may differ"
+            )
+        if signal.length < 8:
+            return f"needs 8 bits or more for the code 'not available', has {signal.length}"
+        needed = (0, 100) if model.name == SOC else (0,)
+        field = _field(signal, 0)
+        missing = [value for value in needed if field.raw(value) is None]
+        return f"must be able to say {missing[0]} {model.unit or ''}".rstrip() if missing else ""
+    most = max(model.choices) if model.choices else 2 if model.name.endswith("Counter") else 1
+    low, high = raw_range(signal, not_available=False)
+    if (signal.conversion.scale, signal.conversion.offset, low) != (1, 0, 0) or high < most:
+        return f"must hold the whole numbers from 0 to {most} (scale 1, offset 0)"
+    return ""
+
+
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """A signal's place in its message, an integer of little-endian bytes, and what can stand in it."""
+    """A signal's place in its message, an integer of the first seven bytes, and what can stand in it."""
 
     name: str
-    start: int
+    shift: int
     mask: int
     low: float
     high: float
@@ -122,30 +238,55 @@ class _Field:
     scale: float
     absent: int
 
-    def bits(self, value: float | None) -> int:
-        """The nearest raw value within the limits, or the code for not available, at its place."""
+    def raw(self, value: float | None) -> int | None:
+        """The nearest raw value; None if `value` is not known, not finite, or beyond what the signal can say."""
         if value is None or not abs(value) < 1e12:  # infinity and NaN too
-            return self.absent << self.start
-        wanted = (value - self.offset) / self.scale
-        return (round(min(max(wanted, self.low), self.high)) & self.mask) << self.start
+            return None
+        raw = round((value - self.offset) / self.scale)
+        return raw if self.low <= raw <= self.high else None
+
+    def bits(self, value: float | None) -> int:
+        """The nearest raw value, or the code for not available, at its place."""
+        raw = self.raw(value)
+        return (self.absent if raw is None else raw & self.mask) << self.shift
 
 
-def _layout(message: Message) -> tuple[int, int, list[_Field]]:
-    """Identifier, unused bits (they are ones), and all signals but the CRC, which is the last of the eight bytes.
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """A message: its counter counts 0 to `counts` - 1; `unused` bits are ones."""
+
+    identifier: int
+    order: Literal["little", "big"]
+    unused: int
+    fields: list[_Field]
+    counter: str
+    counts: int
+
+
+def _field(signal: Signal, shift: int) -> _Field:
+    low, high = raw_range(signal, not_available=True)
+    mask = 2**signal.length - 1
+    absent = 2 ** (signal.length - 1) if signal.is_signed else mask
+    conversion = signal.conversion
+    return _Field(signal.name, shift, mask, low, high, float(conversion.offset), float(conversion.scale), absent)
+
+
+def _layout(message: Message) -> _Layout:
+    """The places of all signals but the CRC, which is the last of the eight bytes.
 
     cantools would take five times as long to encode them.
     """
+    little = message.signals[0].byte_order == "little_endian"
+    counter = f"{message.name}Counter"
     fields = []
     unused = 2**56 - 1
+    counts = 0
     for signal in message.signals:
+        if signal.name == counter:
+            counts = int(raw_range(signal, not_available=True)[1]) + 1
         if signal.name.endswith("CRC"):
             continue
-        assert signal.byte_order == "little_endian" and message.length == 8, message.name
-        low, high = raw_range(signal, not_available=True)
-        absent = 2 ** (signal.length - 1) if signal.is_signed else 2**signal.length - 1
-        mask = 2**signal.length - 1
-        conversion = signal.conversion
-        scaling = float(conversion.offset), float(conversion.scale)
-        fields.append(_Field(signal.name, signal.start, mask, low, high, *scaling, absent))
-        unused &= ~(mask << signal.start)
-    return message.frame_id, unused, fields
+        fields.append(_field(signal, first_bit(signal) if little else 56 - first_bit(signal) - signal.length))
+        unused &= ~(fields[-1].mask << fields[-1].shift)
+    identifier = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
+    return _Layout(identifier, "little" if little else "big", unused, fields, counter, counts)

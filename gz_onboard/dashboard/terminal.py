@@ -13,31 +13,32 @@ import os
 import shutil
 import signal
 import sys
+import textwrap
 import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import IO, TYPE_CHECKING
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, TextIO
 
 from gz_onboard.bus.channel import Channel
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.codec import raw_range
-from gz_onboard.bus.mapping import find_dbc, load_database
-from gz_onboard.bus.publisher import reason_signal
+from gz_onboard.bus.mapping import find_dbc
+from gz_onboard.bus.publisher import RANGE_DBC, range_messages, reason_signal, sensor_signal
 from gz_onboard.errors import InputError
-from gz_onboard.events import STALE_PERIODS, Frame, Reason, State
+from gz_onboard.events import EFF_FLAG, ROLES, STALE_PERIODS, Activity, Frame, Reason, State
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
 
 LATE_PERIODS = 3  # after so many the numbers are shown in grey, after STALE_PERIODS not at all
-COUNTS = 15  # values of a counter
 POLL = 0.05  # s
 REDRAW = 0.2  # s
+PERIODS = {"RANGE_Status": 100}  # ms, where the DBC does not say; of the others 1000
 ONCE_WITHIN = 5.0  # s: how long --once waits for every message
-_MESSAGES = ("RANGE_Estimate", "RANGE_Energy", "RANGE_Status", "RANGE_Diagnosis")
 _NUMBERS = {  # how each is written: format, unit
     "RANGE_Remaining": (".1f", "km"),
     "RANGE_RemainingP10": (".1f", "km"),
@@ -74,17 +75,23 @@ class Received:
 
 
 class View:
-    """What the range frames say. No clock: times [s, monotonic] come with the frames."""
+    """What the range frames of a DBC file say, of the package's ``range.dbc`` if none is given.
 
-    def __init__(self) -> None:
-        database = load_database([find_dbc("range.dbc")])
+    No clock: times [s, monotonic] come with the frames. InputError if the file has not what ``range.dbc`` has.
+    """
+
+    def __init__(self, file: Path | None = None) -> None:
+        self.file = file or find_dbc(RANGE_DBC)
+        messages = range_messages(self.file)
         self.messages: dict[str, Received] = {}
-        self.comments = {s.name: s.comment or "" for m in database.messages for s in m.signals}
-        for name in _MESSAGES:
-            message = database.get_message_by_name(name)
+        self.comments = {s.name: s.comment or "" for m in messages.values() for s in m.signals}
+        for name, message in messages.items():
             limits = {s.name: raw_range(s, not_available=True) for s in message.signals}
-            self.messages[name] = Received(message, (message.cycle_time or 1000) / 1000, limits)
-        self._by_identifier = {entry.definition.frame_id: entry for entry in self.messages.values()}
+            self.messages[name] = Received(message, (message.cycle_time or PERIODS.get(name, 1000)) / 1000, limits)
+        self._by_identifier = {
+            entry.definition.frame_id | (EFF_FLAG if entry.definition.is_extended_frame else 0): entry
+            for entry in self.messages.values()
+        }
 
     @property
     def identifiers(self) -> list[int]:
@@ -102,9 +109,9 @@ class View:
             entry.bad += 1
             return
         raw = message.decode_simple(data, decode_choices=False, scaling=False)
-        counter = int(str(raw[_part(message, "Counter")]))
+        counter = int(str(raw[f"{message.name}Counter"]))
         if entry.counter is not None and not entry.stale(now):
-            step = (counter - entry.counter) % COUNTS
+            step = (counter - entry.counter) % (int(entry.limits[f"{message.name}Counter"][1]) + 1)
             if step == 0:  # the same frame again: who sends it may hang
                 entry.bad += 1
                 return
@@ -143,6 +150,16 @@ class View:
         """Why the estimate is not what it could be."""
         return [reason for reason in Reason if self.value(reason_signal(reason), now)]
 
+    def activity(self, now: float) -> str:
+        """What the vehicle does, in a word; nothing if it is not known."""
+        value = self.value("RANGE_Activity", now)
+        return Activity(int(value)).name.lower() if value and value in tuple(Activity) else ""
+
+    def distrusted(self, now: float) -> list[str]:
+        """The roles whose sensors contradict the others and are left out."""
+        signals = self.messages["RANGE_Sensors"].limits
+        return [role for role in ROLES if sensor_signal(role) in signals and self.value(sensor_signal(role), now)]
+
     def stale(self, now: float) -> dict[str, float]:
         """Age [s] of each message that is stale, infinite if it never came."""
         return {name: now - entry.time for name, entry in self.messages.items() if entry.stale(now)}
@@ -156,14 +173,12 @@ class View:
         return all(entry.received for entry in self.messages.values())
 
 
-def _part(message: Message, part: str) -> str:
-    return f"{message.name}{part}"
+def words(name: str) -> str:
+    """The name of a reason or a role in words, such as ``no IMU``, ``GPS altitude``, ``acceleration x``."""
+    return " ".join(_WORDS.get(word, word) for word in name.lower().split("_"))
 
 
-def reason_words(reason: Reason) -> str:
-    """The reason's name in words, such as ``no IMU``."""
-    words = str(reason.name).split("_")
-    return " ".join(word if word in ("IMU", "GPS", "SOC") else word.lower() for word in words)
+_WORDS = {"imu": "IMU", "gps": "GPS", "soc": "SOC", "bms": "BMS", "accel": "acceleration", "rate": "rate of rotation"}
 
 
 # --- drawing ------------------------------------------------------------------------------------------------------
@@ -195,6 +210,8 @@ _STATE_WORDS = {
     State.INVALID: "invalid: no range can be told",
 }
 
+_NONE_YET = "Is the daemon on this bus? Is --dbc its range_dbc?"
+
 Span = tuple[str, str]
 """(text, ANSI codes or nothing)"""
 Line = list[Span]
@@ -202,7 +219,7 @@ Line = list[Span]
 
 def screen(view: View, now: float, source: str, width: int) -> list[Line]:
     """The whole picture, at most `width` columns wide."""
-    width = max(min(width, 78), 24)
+    room, width = width, max(min(width, 78), 24)
     number = partial(_number, view, now)
     state = view.state(now)
     colour = _STATE_COLOURS[state] if state is not None else _DIM
@@ -223,16 +240,25 @@ def screen(view: View, now: float, source: str, width: int) -> list[Line]:
         [("  State             ", ""),
          (_STATE_WORDS[state], f"{_BOLD};{_STATE_COLOURS[state]}") if state is not None else ("not known", _DIM)],
     ]  # fmt: skip
+    if activity := view.activity(now):
+        lines.append([("  Activity          ", ""), (activity, "")])
     for i, reason in enumerate(view.reasons(now)):
-        comment = view.comments[reason_signal(reason)]
-        lines.append([("  Because           " if i == 0 else " " * 20, ""), (reason_words(reason), "33")])
-        if len(reason_words(reason)) + len(comment) + 24 <= width:
+        name, comment = words(str(reason.name)), view.comments[reason_signal(reason)]
+        lines.append([("  Because           " if i == 0 else " " * 20, ""), (name, "33")])
+        if len(name) + len(comment) + 24 <= width:
             lines[-1].append((f": {comment.rstrip('.')}", _DIM))
-    for i, (name, age) in enumerate(view.stale(now).items()):
-        how = "never came" if math.isinf(age) else f"last came {_duration(age)} ago"
-        lines.append([("  Stale             " if i == 0 else " " * 20, ""), (f"{name}: {how}", "31")])
+    left_out = ", ".join(words(role) for role in view.distrusted(now))
+    for i, text in enumerate(textwrap.wrap(left_out, max(width - 20, 20))):
+        lines.append([("  Sensors left out  " if i == 0 else " " * 20, ""), (text, "33")])
+    if math.isinf(view.age(now)):
+        lines.append([("  No frame of       ", ""), (view.file.name, "31")])
+        lines.append([(f"                    {_NONE_YET}", _DIM)])
+    else:
+        for i, (name, age) in enumerate(view.stale(now).items()):
+            how = "never came" if math.isinf(age) else f"last came {_duration(age)} ago"
+            lines.append([("  Stale             " if i == 0 else " " * 20, ""), (f"{name}: {how}", "31")])
     lines += [[], *_counts(view, now)]
-    return [_cropped(line, width) for line in lines]
+    return [_cropped(line, min(room, width)) for line in lines]
 
 
 def _band(view: View, now: float, width: int, colour: str) -> list[Line]:
@@ -316,6 +342,9 @@ def rendered(line: Line, style: Style) -> str:
 
 def summary_line(view: View, now: float) -> str:
     """Everything that matters on one line, for where there is no terminal."""
+    if math.isinf(view.age(now)):
+        bad = sum(entry.bad for entry in view.messages.values())
+        return f"no frame of {view.file.name}{f' but {bad} bad ones' if bad else ''}. {_NONE_YET}"
     text = partial(view.text, now=now)
     state = view.state(now)
     parts = [
@@ -325,10 +354,14 @@ def summary_line(view: View, now: float) -> str:
         f"{text('RANGE_ConsumptionRecent')} recent, {text('RANGE_ConsumptionExpected')} expected",
         state.name.lower() if state is not None else "state not known",
     ]
-    reasons = ", ".join(reason_words(reason) for reason in view.reasons(now))
+    activity = view.activity(now)
+    reasons = ", ".join(words(str(reason.name)) for reason in view.reasons(now))
+    left_out = ", ".join(words(role) for role in view.distrusted(now))
     stale = ", ".join(view.stale(now))
     bad = sum(entry.bad for entry in view.messages.values())
+    parts += [activity] if activity else []
     parts += [f"because: {reasons}"] if reasons else []
+    parts += [f"left out: {left_out}"] if left_out else []
     parts += [f"stale: {stale}"] if stale else []
     parts += [f"{bad} bad range frames"] if bad else []
     return "; ".join(parts)
@@ -342,6 +375,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--interface", default="socketcan", help="python-can's interface (%(default)s)")
     add("--channel", default="vcan0", metavar="NAME", help="channel (%(default)s)")
+    add(
+        "--dbc",
+        default=RANGE_DBC,
+        metavar="FILE",
+        help="DBC file of the range frames, the vehicle's range_dbc (%(default)s)",
+    )
     add("--once", action="store_true", help="print one picture as soon as every message has come, and end")
     add("--duration", type=float, metavar="S", help="end after this long")
 
@@ -350,12 +389,14 @@ def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard dashboard``: 0, also when ended by Ctrl-C; 1 if --once found no range frames."""
     if arguments.duration is not None and not arguments.duration > 0:
         raise InputError(f"--duration {arguments.duration:g}: must be more than 0 s")
-    view = View()
+    out: TextIO | None = sys.stdout
+    if out is None:  # closed by who called us
+        raise InputError("there is no standard output to show anything on")
+    view = View(find_dbc(arguments.dbc, Path.cwd()))
     channel = Channel(arguments.interface, arguments.channel, identifiers=view.identifiers)
     channel.open()
     source = f"{arguments.channel} ({arguments.interface})"
     duration = arguments.duration or (ONCE_WITHIN if arguments.once else math.inf)
-    out = sys.stdout
     style = Style(
         colour=_is_screen(out) and "NO_COLOR" not in os.environ, unicode="utf" in (out.encoding or "").lower()
     )
@@ -370,9 +411,11 @@ def run(arguments: argparse.Namespace) -> int:
             else:
                 _show_lines(view, channel, style, duration, stopped, out)
     except OSError as error:
-        if error.errno != errno.EIO:  # the terminal was closed: there is nobody to tell
+        if error.errno == errno.EIO:  # the terminal was closed: there is nobody to tell
+            return 1
+        if isinstance(error, BrokenPipeError):
             raise
-        return 1
+        raise InputError(f"standard output: {error.strerror}") from error
     finally:
         channel.close()
     return 1 if arguments.once and math.isinf(view.age(time.monotonic())) else 0
@@ -426,8 +469,10 @@ def _show_screen(
             drawn = now
             size = shutil.get_terminal_size()
             lines = screen(view, now, source if channel.up else f"{source} is down", size.columns)
-            text = "\x1b[K\r\n".join(rendered(line, style) for line in lines[: size.lines])
-            out.write(f"\x1b[H{text}\x1b[J")  # over the old picture, not after clearing it: no flicker
+            # Over the old picture, not after clearing it: no flicker. What is erased is erased before a line is
+            # written: behind one that is as wide as the terminal, its last letter would go.
+            text = "\r\n".join(f"\x1b[K{rendered(line, style)}" for line in lines[: size.lines])
+            out.write(f"\x1b[H{text}" + ("\r\n\x1b[J" if len(lines) < size.lines else ""))
             out.flush()
     finally:
         out.write("\x1b[0m\x1b[?25h\x1b[?1049l")

@@ -27,7 +27,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log, reason_words
 from gz_onboard.lab.processes import Progress, over_rides, progress_bar
-from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, reason_names
+from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, range_publisher, reason_names
 from gz_onboard.simulation.telling import check_json, clock, explain_keys, number, output_names, times, write_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -208,8 +208,7 @@ def estimate_log(task: Task, progress: Progress | None = None) -> dict[str, Any]
     damages: list[LogDamage] = []
     cpu, wall = time.process_time(), time.perf_counter()
     batches = read_frames(task.path, on_damage=damages.append)
-    own = {message.frame_id for message in Publisher().database.messages}
-    own -= {message.frame_id for message in vehicle.mapping.database.messages}
+    own = range_publisher(vehicle).identifiers
     ours = ([frame for frame in batch if frame[1] not in own] for batch in batches)  # an earlier run's estimates
     batch = next((batch for batch in ours if batch), None)
     if batch is None:

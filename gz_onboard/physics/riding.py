@@ -5,7 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from gz_onboard.physics.effect import QUANTITIES
+from gz_onboard.physics.model import air_density
+
 if TYPE_CHECKING:
+    from gz_onboard.physics.model import Model
     from gz_onboard.toml import Table
 
 
@@ -66,4 +70,25 @@ def read_riding(vehicle: Table) -> PriorRiding:
         table.number("factor_sd", town.factor_sd, 0.001, 1.0),
         table.number("lateral_acceleration", town.lateral_acceleration, 0.0, 9.0),
         table.number("vibration", town.vibration, 0.0, 20.0),
+    )
+
+
+def check_riding(vehicle: Table, riding: PriorRiding, model: Model) -> None:
+    """InputError if `riding` costs no energy by `model`, on a level road at 20 degC: then there would be no range."""
+    ordinary = dict.fromkeys(QUANTITIES, 0.0) | {
+        "grade_cosine": 1.0, "mass": model.mass, "air_density": air_density(20.0), "motor_temperature": 20.0,
+        "ambient_temperature": 20.0, "cell_temperature": 20.0, "cell_capacity": model.parameters["cell_capacity"],
+        "soc": 0.5, "lateral_acceleration": riding.lateral_acceleration, "vibration": riding.vibration,
+    }  # fmt: skip
+    power = sum(
+        share * sum(model.power(ordinary | {"speed": speed, "acceleration": acceleration}).values())
+        for share, speed, acceleration in riding.points
+    )
+    if power > 0:
+        return
+    acceleration = sum(share * acceleration for share, _, acceleration in riding.points)
+    raise vehicle.table("forecast").error(
+        f"by the model this riding costs {power / riding.speed / 3.6:.3g} Wh/km on a level road: it must cost energy. "
+        f"Its mean acceleration is {acceleration:.2g} m/s² (of a whole ride 0); see [parameters] too",
+        "riding",
     )

@@ -437,9 +437,20 @@ def test_j1939_goes_by_the_parameter_group(tmp_path):
 def test_j1939_senders_without_end_do_not_fill_the_memory(tmp_path):
     codec = Codec(mapping_of(tmp_path, J1939, 'throttle = "Group"', 'identifiers = "j1939"'))
     count = 20_000
-    codec.decode([(0, 0x18EA0000 | EFF_FLAG | i % 65536, bytes(3), 0) for i in range(count)])
+    events = codec.decode([(0, 0x18EA0000 | EFF_FLAG | i % 65536, bytes(3), 0) for i in range(count)])
     assert len(codec._handlers) < 5000 and len(codec.latest) < 5000
-    assert len(codec.latest) + codec.unknown_others == count
+    assert len(events) == count
+    assert not codec.unknown and not codec.unknown_others
+
+
+def test_j1939_one_that_babbles_first_keeps_no_known_group_out(tmp_path):
+    codec = Codec(mapping_of(tmp_path, J1939, 'throttle = "Group"', 'identifiers = "j1939"'))
+    codec.decode([(0, 0x18F10000 | EFF_FLAG | i, bytes(3), 0) for i in range(10_000)])
+    (event,) = codec.decode([(0, 0x18EA0021 | EFF_FLAG, b"\x05\x00\x00", 0)])
+    assert value_of(codec, event, "throttle") == 5.0
+    assert codec.decode([(0, 0x18EA0021 | EFF_FLAG, b"\x05\x00", 0)]) == []
+    assert codec.faults == {("Request", LENGTH): 1}
+    assert sum(codec.unknown.values()) + codec.unknown_others == 10_000
 
 
 def test_known_identifiers_are_those_of_the_database(tmp_path):

@@ -239,6 +239,20 @@ def test_batches_stay_small(tmp_path: Path, suffix: str) -> None:
 # --- damage ----------------------------------------------------------------------------------------------------
 
 
+def test_times_that_no_log_can_hold_are_left_out_and_told(tmp_path):
+    stamps = ["1.0", "-5.0", "-5.0", "2.0", "99999999999999.0", "3.0"]
+    path = tmp_path / "odd.log"
+    path.write_text("".join(f"({stamp}) can0 123#11\n" for stamp in stamps))
+    frames, damages = read(path)
+    assert [frame[0] for frame in frames] == [10**9, 2 * 10**9, 3 * 10**9]
+    assert [damage.count for damage in damages] == [len(stamps) - len(frames)]
+    with (tmp_path / "odd.mcap").open("wb") as file:  # as the log of an estimate of it is written
+        log = LogFile(file, frames[0][0], {}, {})
+        log.frames(frames)
+        log.close()
+    assert read(tmp_path / "odd.mcap") == (frames, [])
+
+
 @pytest.mark.parametrize("suffix", [".mcap", ".blf", ".log"])
 @given(st.floats(0.05, 0.999))
 @settings(deadline=None, max_examples=30)

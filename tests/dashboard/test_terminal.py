@@ -13,6 +13,7 @@ import subprocess
 import sys
 import termios
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -21,14 +22,16 @@ from hypothesis import strategies as st
 
 from gz_onboard import cli
 from gz_onboard.bus._can import can
+from gz_onboard.bus.mapping import find_dbc
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.dashboard import terminal
 from gz_onboard.dashboard.terminal import Style, View
-from gz_onboard.events import Estimate, Frame, Reason, State
+from gz_onboard.events import ROLES, Activity, Estimate, Frame, Reason, State
 
 REASONS = Reason.NO_IMU | Reason.PRIOR_RIDING
 ESTIMATE = Estimate(
-    time=1.0, state=State.DEGRADED, reasons=REASONS, soc=0.624, soc_sd=0.012, range=34_210.0, range_p10=26_540.0,
+    time=1.0, activity=Activity.RIDING,
+    state=State.DEGRADED, reasons=REASONS, soc=0.624, soc_sd=0.012, range=34_210.0, range_p10=26_540.0,
     range_p90=44_340.0, energy_left=895 * 3600.0, consumption_recent=24.6 * 3.6, consumption_expected=26.2 * 3.6,
 )  # fmt: skip
 COUNTS = Counts(dropped=7, implausible=3, lost=24, unknown=2)
@@ -62,14 +65,14 @@ def numbers(text: str) -> list[str]:
 def test_it_shows_what_the_daemon_sends():
     text = picture(seen(), 100.0)
     for shown in ("34.2 km", "26.5 km to 44.3 km", "62.4 ± 1.2 %", "895 Wh", "26.2 Wh/km expected", "24.6 Wh/km over",
-                  "degraded", "no IMU: No lean", "prior riding", "0.0 s old, 13 received, 0 lost, 0 bad",
-                  "7 dropped, 3 implausible, 24 lost, 2 unknown"):  # fmt: skip
+                  "degraded", "no IMU: No lean", "prior riding", "0.0 s old, 14 received, 0 lost, 0 bad",
+                  "Activity          riding", "7 dropped, 3 implausible, 24 lost, 2 unknown"):  # fmt: skip
         assert shown in text
     assert "Stale" not in text
     line = terminal.summary_line(seen(), 100.0)
     assert line == (
         "range 34.2 km (26.5 km to 44.3 km); SOC 62.4 % ± 1.2 %; 895 Wh left; 24.6 Wh/km recent, "
-        "26.2 Wh/km expected; degraded; because: no IMU, prior riding"
+        "26.2 Wh/km expected; degraded; riding; because: no IMU, prior riding"
     )
 
 
@@ -108,7 +111,9 @@ def test_a_late_number_is_grey():
 def test_nothing_yet():
     text = picture(View(), 5.0)
     assert "none yet" in text
-    assert text.count("never came") == 4
+    assert "No frame of       range.dbc" in text
+    assert "Is --dbc its range_dbc?" in text
+    assert terminal.summary_line(View(), 5.0).startswith("no frame of range.dbc. Is the daemon on this bus?")
     assert not numbers(text)
 
 
@@ -117,6 +122,82 @@ def test_without_an_estimate_there_are_dashes(state):
     text = picture(seen(Estimate(time=1.0, state=state)), 100.0)
     assert not numbers(text)
     assert state.name.lower() in text
+
+
+@pytest.mark.parametrize("activity", Activity)
+def test_what_the_vehicle_does(activity):
+    view = seen(replace(ESTIMATE, activity=activity))
+    text, line = picture(view, 100.0), terminal.summary_line(view, 100.0)
+    if activity is Activity.UNKNOWN:
+        assert "Activity" not in text
+    else:
+        assert f"Activity          {activity.name.lower()}\n" in text
+        assert f"; {activity.name.lower()};" in line
+    assert "Activity" not in picture(view, 1e4)
+
+
+def test_sensors_left_out_are_named():
+    reasons = Reason.SENSOR_DISTRUSTED | Reason.SIGNALS_SLOW | Reason.SOC_RESTARTED
+    view = seen(replace(ESTIMATE, reasons=reasons, distrusted=("accel_x", "gps_altitude", "bms_state_of_charge")))
+    text = picture(view, 100.0)
+    assert "Sensors left out  acceleration x, GPS altitude, BMS state of charge\n" in text
+    for shown in "sensor distrusted", "signals slow", "SOC restarted":
+        assert shown in text
+    assert terminal.summary_line(view, 100.0).endswith(
+        "; because: sensor distrusted, signals slow, SOC restarted; "
+        "left out: acceleration x, GPS altitude, BMS state of charge"
+    )
+    assert "GPS altitude" not in picture(view, 111.0)  # stale
+
+
+def test_all_sensors_left_out_take_several_lines():
+    sendable = [s.name for s in View().messages["RANGE_Sensors"].definition.signals if s.length == 1]
+    view = seen(replace(ESTIMATE, distrusted=tuple(ROLES)))
+    assert len(view.distrusted(100.0)) == len(sendable) > 20
+    text = picture(view, 100.0)
+    assert "…" not in text
+    assert all(terminal.words(role) in re.sub(r"\s+", " ", text) for role in view.distrusted(100.0))
+
+
+# --- range frames of another file ---------------------------------------------------------------------------------
+
+
+VAN = replace(ESTIMATE, range=412e3, range_p10=365e3, range_p90=466e3, energy_left=54_500 * 3600.0,
+              consumption_recent=718 * 3.6, consumption_expected=132 * 3.6)  # fmt: skip
+
+
+def test_large_frames_by_their_own_file():
+    file = find_dbc("range_large.dbc")
+    view = View(file)
+    for frame in second(Publisher(file), VAN):
+        view.take(frame, 100.0)
+    text = picture(view, 100.0)
+    for shown in "412.0 km", "365.0 km to 466.0 km", "54500 Wh", "132.0 Wh/km expected", "718.0 Wh/km over":
+        assert shown in text
+
+
+@pytest.mark.parametrize(("sent", "read"), [("range.dbc", "range_large.dbc"), ("range_large.dbc", "range.dbc")])
+def test_by_the_wrong_file_there_is_nothing_rather_than_wrong_numbers(sent, read):
+    view = View(find_dbc(read))
+    for frame in second(Publisher(find_dbc(sent))):
+        view.take(frame, 100.0)
+    text = picture(view, 100.0)
+    assert not numbers(text)
+    assert f"No frame of       {read}" in text
+
+
+def test_29_bits_and_a_counter_of_16(tmp_path):
+    file = tmp_path / "mine.dbc"
+    text = find_dbc("range.dbc").read_text().replace("1536", str(0x18FF6000 | 1 << 31)).replace("[0|14]", "[0|15]")
+    file.write_text(text.replace('BA_ "GenMsgCycleTime" BO_ 1538 100;', ""))
+    publisher, view = Publisher(file), View(file)
+    for i in range(40):
+        for frame in second(publisher):
+            view.take(frame, 100.0 + i)
+    assert {entry.lost for entry in view.messages.values()} == {0}
+    assert {entry.bad for entry in view.messages.values()} == {0}
+    assert view.value("RANGE_Remaining", 140.0) == pytest.approx(34.21)
+    assert view.messages["RANGE_Status"].period == 0.1  # though its file does not say so
 
 
 def test_a_broken_frame_is_counted_and_not_shown():
@@ -172,7 +253,7 @@ def test_nothing_on_the_bus_breaks_it(frames, checksum):
         view.take((0, identifier, data, 0), now)
         for width in 10, 80, 300:
             for line in picture(view, now, width).splitlines():
-                assert len(line) <= max(width, 24)
+                assert len(line) <= width
         terminal.summary_line(view, now)
 
 
@@ -182,10 +263,11 @@ def test_the_scale_is_a_round_number_just_beyond(value):
     assert value <= end <= max(2 * value, 1)
 
 
-@given(st.floats(0, 1), st.floats(0, 0.3), st.floats(0, 700e3), st.integers(24, 120))
+@given(st.floats(0, 1), st.floats(0, 0.3), st.floats(0, 700e3), st.integers(1, 120))
 def test_every_line_fits(soc, sd, metres, width):
-    estimate = Estimate(time=1.0, state=State.VALID, reasons=Reason(0xFFFF), soc=soc, soc_sd=sd, range=metres,
-                        range_p10=metres * 0.7, range_p90=metres * 1.4, energy_left=metres * 90)  # fmt: skip
+    estimate = Estimate(time=1.0, state=State.VALID, reasons=~Reason(0), distrusted=tuple(ROLES), soc=soc,
+                        soc_sd=sd, range=metres, range_p10=metres * 0.7, range_p90=metres * 1.4,
+                        energy_left=metres * 90)  # fmt: skip
     for line in picture(seen(estimate), 100.0, width).splitlines():
         assert len(line) <= min(width, 78)
 
@@ -246,7 +328,8 @@ def test_once_without_frames(capsys):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [(["--duration", "0"], "--duration 0"), (["--interface", "nonesuch"], "--interface nonesuch"),
-     (["--interface", "virtual", "--onse"], "--once")],
+     (["--interface", "virtual", "--onse"], "--once"), (["--dbc", "range_larg.dbc"], "did you mean 'range_large.dbc'"),
+     (["--dbc", "vehicle.dbc"], "vehicle.dbc: has no message RANGE_Estimate"), (["--dbc", "."], "no such DBC file")],
 )  # fmt: skip
 def test_wrong_use_is_told(arguments, told, capsys):
     try:
@@ -358,6 +441,23 @@ def test_no_picture_is_larger_than_the_terminal():
     small.close()
 
 
+def test_a_terminal_that_is_resized(tty):
+    child = start("--duration", "30", out=tty.slave)
+    tty.until(r"34\.2 km")
+    fcntl.ioctl(tty.slave, termios.TIOCSWINSZ, struct.pack("HHHH", 5, 11, 0, 0))
+    tty.read(0.5)
+    tty.text = ""
+    tty.until(r"(?s)\x1b\[H.*\x1b\[H.*\x1b\[H")  # whole pictures after the first, which may be of the old size
+    child.send_signal(signal.SIGINT)
+    tty.until(r"\x1b\[\?1049l")
+    assert child.wait(10) == 0
+    drawn = tty.text.split("\x1b[?1049l")[0].split("\x1b[H")[2:]
+    for lines in (re.split(r"\r*\n", re.sub(r"\x1b\[[?\d;]*[A-Za-z]", "", picture)) for picture in drawn):
+        assert len(lines) <= 5
+        assert max(map(len, lines)) <= 11
+    child.stderr.close()
+
+
 def test_no_color_and_a_daemon_that_goes_silent(tty):
     child = start("--duration", "4", out=tty.slave, sending=0.3, NO_COLOR="1")
     tty.until(r"RANGE_Status: last came \d s ago", within=30)
@@ -378,6 +478,16 @@ def test_lines_where_there_is_no_terminal(tmp_path):
     assert "\x1b" not in "".join(lines)
     assert all(re.match(r"\d\d:\d\d:\d\d range ", line) for line in lines)
     assert "range 34.2 km (26.5 km to 44.3 km)" in lines[-1]
+
+
+@pytest.mark.parametrize(("redirection", "told"), [(">&-", "no standard output"), (">/dev/full", "No space left")])
+def test_an_output_that_takes_nothing_is_told(redirection, told):
+    command = f'"$0" -m gz_onboard dashboard --interface virtual --channel none --duration 1.5 {redirection}'
+    run = subprocess.run(["sh", "-c", command, sys.executable], stderr=subprocess.PIPE, text=True, check=False)
+    assert run.returncode == 2
+    assert run.stderr.startswith("gz-onboard dashboard: ")
+    assert told in run.stderr
+    assert len(run.stderr.splitlines()) == 1
 
 
 def test_a_dumb_terminal_gets_lines(tty):
@@ -404,7 +514,7 @@ def test_in_a_thread_it_leaves_terminal_and_signals_alone(monkeypatch):
     thread.join(10)
     assert not thread.is_alive()
     assert "\x1b" not in out.getvalue()
-    assert "state not known" in out.getvalue()
+    assert "no frame of range.dbc" in out.getvalue()
     assert signal.getsignal(signal.SIGINT) is before
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import time
@@ -25,6 +26,7 @@ from tests.service.support import (
     wait_for_another,
 )
 
+README = ROOT / "systemd" / "README.md"
 SOC = "RANGE_StateOfCharge"
 SIGMA = "RANGE_StateOfChargeSigma"
 
@@ -40,6 +42,14 @@ def first_soc(listener: Listener) -> dict[str, float]:
 
 def test_unit_is_valid(installed):
     assert output("systemd-analyze", "verify", f"/etc/systemd/system/{UNIT}") == ""
+
+
+def test_is_closed_to_all_that_it_does_not_need(service):
+    """What systemd says of the unit as it is loaded; the other tests show that it runs so."""
+    report = output("systemd-analyze", "security", "--no-pager", UNIT)
+    level = re.search(r"Overall exposure level for \S+: ([\d.]+)", report)
+    assert level, report
+    assert float(level[1]) <= 1.5, report
 
 
 def test_networkd_takes_the_network_files():
@@ -93,6 +103,21 @@ def test_has_no_rights(service):
     assert fields["Uid"].split()[0] != "0"
     assert int(fields["CapEff"], 16) == 0
     assert fields["NoNewPrivs"] == "1"
+    assert fields["Seccomp"] == "2"  # the kernel filters its system calls
+    assert Path(f"/proc/{main_pid()}/uid_map").read_text().split()[:3] != ["0", "0", "4294967295"]  # users of its own
+
+
+def test_logs_and_state_are_for_root_only(service, listener, ride):
+    first_soc(listener)
+    systemctl("stop", UNIT)
+    files = [*Path("/var/log/gz-onboard").iterdir(), *Path("/var/lib/gz-onboard").iterdir()]
+    assert {file.suffix for file in files} >= {".mcap", ".json"}
+    assert {file.stat().st_mode & 0o077 for file in files} == {0}
+    for line in README.read_text(encoding="utf-8").splitlines():  # how to have a copy
+        if line.strip().startswith("sudo sh -c"):
+            output("sh", "-c", f"cd /run/tmp && SUDO_USER=nobody {line.strip().removeprefix('sudo ')}")
+    (copy,) = Path("/run/tmp").glob("*.mcap")
+    assert (copy.owner(), copy.stat().st_mode & 0o777) == ("nobody", 0o644)
 
 
 def test_state_of_charge_on_the_bus_during_a_ride(service, listener, ride):
@@ -111,7 +136,7 @@ def test_killed_it_goes_on_where_it_was(service, listener, ride):
     assert show("NRestarts") == "1"
     assert "going on from the state saved" in journal()
     after = first_soc(listener)
-    assert after[SOC] == pytest.approx(before[SOC], abs=0.3)
+    assert after[SOC] == pytest.approx(before[SOC], abs=1.5)  # it rides on: 3 kW for half a minute take that
     assert after[SIGMA] == pytest.approx(before[SIGMA], abs=0.3)
 
 

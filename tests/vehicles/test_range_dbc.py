@@ -1,0 +1,88 @@
+"""A vehicle that names its range frames: a van with a large battery, from its file to the bus and the log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gz_onboard.bus.mapping import find_dbc, load_database
+from gz_onboard.errors import InputError
+from gz_onboard.events import EFF_FLAG, State
+from gz_onboard.lab.estimate import feed
+from gz_onboard.pipeline import Pipeline, dbc_texts
+from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
+from tests.support import Run, Scooter, check_sound
+
+REFERENCE = (OWN / "reference.toml").read_text(encoding="utf-8")
+LARGE = 'range_dbc = "range_large.dbc"'
+
+
+def van(folder: Path, line: str, dbc: str = "", parallel: int = 400) -> Vehicle:
+    """The reference scooter with many more cells, of 55 kWh."""
+    assert "cells_parallel = 12" in REFERENCE
+    text = REFERENCE.replace("cells_parallel = 12", f"cells_parallel = {parallel}")
+    (folder / "van.toml").write_text(f"{line}\n{text}", encoding="utf-8")
+    if dbc:
+        (folder / "mine.dbc").write_text(dbc, encoding="utf-8")
+    return read_vehicle(str(folder / "van.toml"))
+
+
+def test_a_battery_too_large_for_its_range_frames_is_refused(tmp_path):
+    told = r"van\.toml: the battery holds \d{5} Wh, .*EnergyLeft of .*range\.dbc says at most 6553\.4 Wh.*range_large"
+    with pytest.raises(InputError, match=told):
+        Pipeline(van(tmp_path, ""))
+
+
+def test_the_large_frames_all_the_way(tmp_path):
+    vehicle = van(tmp_path, LARGE)
+    run = Run(vehicle)
+    feed(run.pipeline, [Scooter().steady(20.0, current=80.0)])
+    check_sound(run)
+    database = load_database([find_dbc("range_large.dbc")])
+    last = {identifier: data for _, identifier, data, _ in run.sent}
+    assert sorted(last) == [0x610, 0x611, 0x612, 0x613, 0x614]
+    estimate = run.estimates[-1]
+    assert estimate.energy_left is not None
+    assert estimate.energy_left > 20e3 * 3600
+    energy = database.decode_message(0x611, last[0x611])
+    assert energy["RANGE_EnergyLeft"] == pytest.approx(estimate.energy_left / 3600, rel=0.02)  # type: ignore[call-overload]
+    assert dbc_texts(vehicle)["range_large.dbc"] == find_dbc("range_large.dbc").read_bytes()
+
+
+def test_a_file_of_ones_own_beside_the_vehicle_file(tmp_path):
+    text = find_dbc("range_large.dbc").read_text(encoding="utf-8").replace("1552", str(0x18FF6000 | EFF_FLAG))
+    run = Run(van(tmp_path, 'range_dbc = "mine.dbc"', text))
+    feed(run.pipeline, [Scooter().steady(5.0, current=80.0)])
+    assert {frame[1] for frame in run.sent} == {0x18FF6000 | EFF_FLAG, 0x611, 0x612, 0x613, 0x614}
+    assert run.estimates[-1].state in (State.VALID, State.DEGRADED)
+    assert "mine.dbc" in dbc_texts(run.pipeline.vehicle)
+
+
+@pytest.mark.parametrize(
+    ("line", "dbc", "told"),
+    [
+        ('range_dbc = "range_larg.dbc"', "", r"van\.toml:1: range_dbc: .*no such DBC file.*mean 'range_large\.dbc'"),
+        ("range_dbc = 3", "", r"van\.toml:1: range_dbc: must be a string"),
+        ('range_dbc = "vehicle.dbc"', "", r"vehicle\.dbc: has no message RANGE_Estimate, which range\.dbc has"),
+        ('range_dbc = "mine.dbc"', "1552 512", r"van\.toml: .*take the identifiers .*mine\.dbc\): 0x200"),
+    ],
+)
+def test_a_file_that_does_not_do_is_refused(line, dbc, told, tmp_path):
+    if dbc:
+        dbc = find_dbc("range_large.dbc").read_text(encoding="utf-8").replace(*dbc.split())
+    with pytest.raises(InputError, match=told):
+        Pipeline(van(tmp_path, line, dbc))
+
+
+def test_by_parameter_group_an_own_frame_may_not_be_the_vehicles(tmp_path):
+    """A J1939 vehicle takes any sender and priority of a group: also ours."""
+    (tmp_path / "truck.dbc").write_bytes((Path(__file__).parent / "truck" / "truck.dbc").read_bytes())
+    own = find_dbc("range.dbc").read_text(encoding="utf-8").replace("1536", str(0x18F00477 | EFF_FLAG))
+    roles = 'dbc = ["truck.dbc"]\n[bus]\nidentifiers = "j1939"\n[roles]\nmotor_speed = "EngineSpeed"\n'
+    bus = REFERENCE[REFERENCE.index("dbc = ") : REFERENCE.index("[model]")]
+    (tmp_path / "mine.dbc").write_text(own, encoding="utf-8")
+    file = tmp_path / "van.toml"
+    file.write_text(f'range_dbc = "mine.dbc"\n{REFERENCE.replace(bus, roles)}', encoding="utf-8")
+    with pytest.raises(InputError, match=r"take the identifiers of our own range frames .*0x18f00477"):
+        Pipeline(read_vehicle(str(file)))
