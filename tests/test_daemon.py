@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
 import resource
@@ -11,14 +12,17 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import count, pairwise
 from pathlib import Path
+from typing import Any
 
 import can
 import pytest
 
+from gz_onboard import state
 from gz_onboard.bus.channel import Channel
 from gz_onboard.bus.logs import read_frames, read_samples
 from gz_onboard.bus.recorder import Recorder
 from gz_onboard.daemon import Daemon
+from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame, Reason, State
 from tests.support import S, Scooter, check_frames, reference, ridden
 
@@ -179,76 +183,129 @@ def test_it_goes_on_where_it_was(bus: str, tmp_path: Path, caplog: pytest.LogCap
     assert state_of(file)["saved_at"] > saved["saved_at"]  # type: ignore[operator]
 
 
-def damaged(text: str) -> str:
-    return text[: len(text) // 2]
+Snapshot = dict[str, Any]
 
 
-def no_object(text: str) -> str:
-    return "[]"
+def foreign(snapshot: Snapshot) -> None:
+    snapshot["key"] = "another scooter|10s4p"
 
 
-def foreign(text: str) -> str:
-    document = json.loads(text)
-    document["estimator"]["key"] = "another scooter|10s4p"
-    return json.dumps(document)
+def other_version(snapshot: Snapshot) -> None:
+    snapshot["version"] = 99
 
 
-def other_version(text: str) -> str:
-    document = json.loads(text)
-    document["estimator"]["version"] = 99
-    return json.dumps(document)
+def implausible(snapshot: Snapshot) -> None:
+    snapshot["soc"] = 5.0
 
 
-def implausible(text: str) -> str:
-    document = json.loads(text)
-    document["estimator"]["soc"] = 5.0
-    return json.dumps(document)
+def incomplete(snapshot: Snapshot) -> None:
+    del snapshot["riding"]
 
 
-def incomplete(text: str) -> str:
-    document = json.loads(text)
-    del document["estimator"]["riding"]
-    return json.dumps(document)
+def without_numbers(snapshot: Snapshot) -> None:
+    snapshot["covariance"] = ["a", None, {}]
 
 
-def without_numbers(text: str) -> str:
-    document = json.loads(text)
-    document["estimator"]["covariance"] = ["a", None, {}]
-    return json.dumps(document)
+def without_states(snapshot: Snapshot) -> None:
+    snapshot["riding"]["states"] = None
+
+
+@pytest.fixture(scope="module")
+def learned() -> Snapshot:
+    """What five seconds of riding have taught, with a bias that no fresh estimator has."""
+    estimator = ridden(Scooter().steady(5.0)).pipeline.estimator
+    estimator.road.bias_x = 0.01
+    snapshot = estimator.snapshot(reference().key)
+    assert snapshot is not None
+    return snapshot
+
+
+def is_fresh(daemon: Daemon) -> bool:
+    ours, new = daemon.pipeline.estimator, Daemon(reference(), [], None, None).pipeline.estimator
+    return ours.snapshot("") == new.snapshot("") is None and ours.road == new.road and ours._saved is None
 
 
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (damaged, "cannot be read"),
-        (no_object, "is not a saved state"),
         (foreign, "is of 'another scooter|10s4p', this is 'reference-scooter"),
         (other_version, "is of version 99"),
         (implausible, "implausible numbers"),
         (incomplete, "is damaged: KeyError"),
         (without_numbers, "not used"),
+        (without_states, "not used"),
     ],
 )
-def test_a_state_that_does_not_fit_is_refused_whole_and_said_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, spoil: Callable[[str], str], said: str
+def test_a_state_that_does_not_fit_is_refused_whole_said_so_and_set_aside(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, spoil: Callable[[Snapshot], None], said: str
 ):
     caplog.set_level(logging.INFO)
     file = tmp_path / "scooter.json"
-    first = ridden(Scooter().steady(5.0)).pipeline.estimator
-    first.road.bias_x = 0.01
-    text = json.dumps({"saved_at": time.time(), "estimator": first.snapshot(reference().key)})
-    file.write_text(spoil(text))
+    snapshot = copy.deepcopy(learned)
+    spoil(snapshot)
+    state.save(file, snapshot, time.time())
+    text = file.read_bytes()
     daemon = Daemon(reference(), [], None, file)
-    fresh = Daemon(reference(), [], None, None)
     daemon.stop()
     daemon.run()
     assert said in caplog.text
-    assert "not used" in caplog.text
-    ours, new = daemon.pipeline.estimator, fresh.pipeline.estimator
-    assert ours.road == new.road
-    assert ours.forecaster.riding == new.forecaster.riding
-    assert ours._saved is None
-    assert file.read_text() == spoil(text)  # nothing is known yet, so nothing is saved over it
+    assert "not used, kept as" in caplog.text
+    assert is_fresh(daemon)
+    (aside,) = tmp_path.iterdir()  # nothing is known yet, so nothing is saved
+    assert aside.read_bytes() == text
+
+
+def test_whatever_restoring_raises_it_begins_afresh(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, monkeypatch: pytest.MonkeyPatch
+):
+    file = tmp_path / "scooter.json"
+    state.save(file, learned, time.time())
+
+    def half(self: Estimator, *_: object) -> None:
+        self.road.bias_x = 7.0
+        raise ZeroDivisionError("in the middle")
+
+    monkeypatch.setattr(Estimator, "restore", half)
+    daemon = Daemon(reference(), [], None, file)
+    assert daemon.restore() is None
+    assert "in the middle: not used" in caplog.text
+    assert is_fresh(daemon)
+
+
+def test_where_the_latest_state_is_damaged_the_one_before_is_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot
+):
+    caplog.set_level(logging.INFO)
+    file = tmp_path / "scooter.json"
+    state.save(file, {**learned, "soc": 0.41}, time.time())
+    state.save(file, {**learned, "soc": 0.42}, time.time())
+    unfinished, latest, _ = state.copies(file)
+    unfinished.write_bytes(latest.read_bytes()[:100])  # the power was cut while it was written
+    data = bytearray(latest.read_bytes())
+    data[150] ^= 4
+    latest.write_bytes(data)
+    daemon = Daemon(reference(), [], None, file)
+    found = daemon.restore()
+    assert found is not None
+    assert found["soc"] == 0.41
+    assert caplog.text.count("not used, kept as") == 2
+    assert "going on from the state saved" in caplog.text
+    assert [path.suffixes[-2:] for path in sorted(tmp_path.iterdir())] == [
+        [".previous", ".json"], [".refused-1", ".json"], [".refused-2", ".json"],
+    ]  # fmt: skip
+
+
+def test_a_cut_between_two_names_loses_nothing(tmp_path: Path, learned: Snapshot):
+    """The new state is whole, and not yet in the place of the old one."""
+    file = tmp_path / "scooter.json"
+    state.save(file, {**learned, "soc": 0.41}, time.time())
+    state.save(tmp_path / "other.json", {**learned, "soc": 0.42}, time.time())
+    unfinished, _, before = state.copies(file)
+    (tmp_path / "other.json").replace(unfinished)
+    file.replace(before)
+    found = Daemon(reference(), [], None, file).restore()
+    assert found is not None
+    assert found["soc"] == 0.42
 
 
 def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -256,12 +313,12 @@ def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, ca
     (tmp_path / "file").write_text("in the way")
     with Scene(bus, state_file=tmp_path / "file" / "state" / "scooter.json") as scene:
         scene.ride(1.0)
-        scene.daemon._save()
+        assert scene.daemon._keeper is not None
+        scene.daemon._keeper.save(scene.daemon.pipeline, time.time_ns())
         last = scene.daemon.pipeline.last
         assert last is not None
         assert last.state is State.VALID
     assert caplog.text.count("cannot save the state") == 1
-    assert "not used" in caplog.text or "cannot be read" in caplog.text
 
 
 @pytest.mark.parametrize("delta", [3600.0, -7200.0, 40.0])

@@ -534,7 +534,7 @@ def test_a_time_beyond_all_formats_in_a_candump(tmp_path: Path, line: str) -> No
     assert damages[0].count == 1
 
 
-def chunk_at(data: bytes, number: int) -> int:
+def chunk_at(data: bytes | bytearray, number: int) -> int:
     """Where the content of a chunk record begins, by the name of its compression."""
     at = -1
     for _ in range(number + 1):

@@ -18,7 +18,7 @@ from gz_onboard.bus.readers.common import TIME_LIMIT_NS, Contents, Damage
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
 
-_MCAP_MAGIC = b"\x89MCAP0\r\n"
+MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQLL")  # start, end, size and CRC of the unpacked records, length of the compression's name
 _MESSAGE = struct.Struct("<HLQQ")  # channel, sequence, log time, publish time
@@ -37,7 +37,7 @@ def read(path: Path, data: Contents, damage: Damage, start: int | None, end: int
     """The raw frames of one of our logs; what cannot be read, or is missing at its end, is noted as damage."""
     channels: set[int] = set()
     topics: set[str] = set()
-    for opcode, position, limit in _records(path, data, damage):
+    for opcode, position, limit in records(path, data, damage):
         blocks = []
         try:
             if opcode == _CHANNEL:
@@ -48,13 +48,13 @@ def read(path: Path, data: Contents, damage: Damage, start: int | None, end: int
                 wanted = (start is None or last + _MARGIN_NS >= start) and (end is None or first - _MARGIN_NS < end)
                 if not wanted and channels:
                     continue
-                records = unpack_chunk(data, position, limit)
-                for inner, at, until in records_in(records):
+                content = unpack_chunk(data, position, limit)
+                for inner, at, until in records_in(content):
                     if inner == MESSAGE:
-                        if _U16.unpack_from(records, at)[0] in channels:
-                            blocks.append(records[at + _MESSAGE.size : until])
+                        if _U16.unpack_from(content, at)[0] in channels:
+                            blocks.append(content[at + _MESSAGE.size : until])
                     elif inner == _CHANNEL:
-                        _channel(records, at, channels, topics)
+                        _channel(content, at, channels, topics)
         except BROKEN as error:
             damage.add(f"byte {position}", f"a {'chunk' if opcode == _CHUNK_OP else 'record'} is broken ({error})")
         for block in blocks:
@@ -72,7 +72,7 @@ def read(path: Path, data: Contents, damage: Damage, start: int | None, end: int
 def attachments(path: Path, data: Contents) -> dict[str, bytes]:
     """The attached files by name."""
     found = {}
-    for opcode, start, end in _records(path, data, Damage()):
+    for opcode, start, end in records(path, data, Damage()):
         if opcode == _ATTACHMENT:
             with contextlib.suppress(*BROKEN):
                 name, position = _string(data, start + 16)
@@ -86,7 +86,7 @@ def attachments(path: Path, data: Contents) -> dict[str, bytes]:
 def metadata(path: Path, data: Contents) -> dict[str, str]:
     """The entries of the metadata record ``gz_onboard``."""
     entries: dict[str, str] = {}
-    for opcode, start, _ in _records(path, data, Damage()):
+    for opcode, start, _ in records(path, data, Damage()):
         if opcode == _METADATA:
             with contextlib.suppress(*BROKEN):
                 name, position = _string(data, start)
@@ -140,23 +140,23 @@ def samples(
 
 def _unpacked_records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, bytes]]:
     """Opcode and content of all records, those in chunks among them."""
-    for opcode, start, end in _records(path, data, damage):
+    for opcode, start, end in records(path, data, damage):
         if opcode != _CHUNK_OP:
             yield opcode, data[start:end]
             continue
         try:
-            records = unpack_chunk(data, start, end)
-            for inner, at, until in records_in(records):
-                yield inner, records[at:until]
+            content = unpack_chunk(data, start, end)
+            for inner, at, until in records_in(content):
+                yield inner, content[at:until]
         except BROKEN as error:
             damage.add(f"byte {start}", f"a chunk is broken ({error})")
 
 
-def _records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, int, int]]:
+def records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and end of the records of the data section; after damage it goes on with the next chunk."""
-    if data[: len(_MCAP_MAGIC)] != _MCAP_MAGIC:
+    if data[: len(MAGIC)] != MAGIC:
         raise InputError(f"{path}: not an MCAP file: it does not begin with the format's magic bytes")
-    position = len(_MCAP_MAGIC)
+    position = len(MAGIC)
     while position + _RECORD.size <= len(data):
         opcode, length = _RECORD.unpack_from(data, position)
         content = position + _RECORD.size
@@ -235,27 +235,27 @@ def unpack_chunk(data: Contents, position: int, limit: int) -> bytes:
             inside = zstandard.frame_content_size(packed)
             if inside not in (size, -1):
                 raise ValueError(f"it unpacks to {inside} bytes, not {size}")
-            records = zstandard.ZstdDecompressor(max_window_size=_LARGEST_CHUNK).decompress(packed, size)
+            content = zstandard.ZstdDecompressor(max_window_size=_LARGEST_CHUNK).decompress(packed, size)
         except zstandard.ZstdError as error:
             raise ValueError(str(error)) from None
     elif name == b"":
-        records = packed
+        content = packed
     else:
         raise ValueError(f"compression {name.decode('ascii', 'replace')!r} is not supported")
-    if len(records) != size or (crc and zlib.crc32(records) != crc):
+    if len(content) != size or (crc and zlib.crc32(content) != crc):
         raise ValueError("its checksum is wrong")
-    return bytes(records)
+    return content
 
 
-def records_in(records: bytes) -> Iterator[tuple[int, int, int]]:
+def records_in(content: bytes) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and end of the records of an unpacked chunk. Raises ValueError where one is cut off."""
     position = 0
-    while position < len(records):
-        if position + _RECORD.size > len(records):
+    while position < len(content):
+        if position + _RECORD.size > len(content):
             raise ValueError("it ends within a record")
-        opcode, length = _RECORD.unpack_from(records, position)
+        opcode, length = _RECORD.unpack_from(content, position)
         position += _RECORD.size
-        if length > len(records) - position:
+        if length > len(content) - position:
             raise ValueError("it ends within a record")
         yield opcode, position, position + length
         position += length
