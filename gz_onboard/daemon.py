@@ -14,6 +14,7 @@ import os
 import re
 import signal
 import socket
+import sys
 import time
 from bisect import bisect_left
 from collections import Counter
@@ -53,6 +54,7 @@ class Daemon:
                  filter_name: str = "scalar", tick: float = TICK) -> None:  # fmt: skip
         self.channels = channels
         self.recorder = recorder
+        self.finished = True  # whether log and state were written to their end
         self._log = BackgroundRecorder(recorder) if recorder else None
         self._make_pipeline: Callable[[], Pipeline] = lambda: Pipeline(vehicle, filter_name=filter_name, log=self._log)
         self.pipeline = self._make_pipeline()
@@ -103,8 +105,10 @@ class Daemon:
             self._keeper.save(self.pipeline, time.time_ns())
         if self._log and not self._log.close(until - time.monotonic()):
             log.warning("the disk does not take the log in time: its end is lost")
+            self.finished = False
         if self._keeper and not self._keeper.close(until - time.monotonic()):
             log.warning("the disk does not take the state in time")
+            self.finished = False
         for channel in self.channels:
             channel.close()
 
@@ -128,12 +132,14 @@ class Daemon:
             self.pipeline.clock_set(step)
             frames, self._later = [], []
         count = len(frames)
-        kept = fair_share(frames, int(WORK_S / self._frame_s))
+        kept = fair_share(frames, max(int(WORK_S / self._frame_s), 2 * BUSY))
         self._overrun += count - len(kept)
         began = time.thread_time()
         self.step(kept, now_ns)
-        if len(kept) > BUSY:  # else it is the estimates that cost
+        if len(kept) > BUSY:
             self._frame_s += 0.2 * ((time.thread_time() - began) / len(kept) - self._frame_s)
+        else:  # so few tell nothing: it is the estimates that cost
+            self._frame_s = max(0.98 * self._frame_s, FRAME_S)
         return count
 
     def step(self, frames: list[Frame], now_ns: int) -> None:
@@ -378,6 +384,10 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
     signal.signal(signal.SIGINT, daemon.stop)
     daemon.run()
     _summary(daemon)
+    if not daemon.finished:  # a thread still waits for its disk: the interpreter would abort over its files
+        sys.stdout.flush()
+        logging.shutdown()
+        os._exit(1)
     return 0
 
 
