@@ -452,6 +452,26 @@ def test_what_cannot_be_decoded_in_time_is_left_out_fairly_counted_and_flagged(
     assert daemon.pipeline.status()["overrun"] == daemon.pipeline.overrun
 
 
+@pytest.mark.parametrize("lag_s", [1.5, 10.0])
+def test_an_estimate_of_old_frames_does_not_count_as_good(bus: str, lag_s: float):
+    """As they come from a buffer that is read too slowly."""
+    channel = Channel("virtual", bus)
+    channel.open()
+    daemon = Daemon(reference(), [channel], None, None)
+    frames = Scooter().steady(10.0)
+    for lag_ns in (0, round(lag_s * S)):
+        at = 0
+        for now_ns in range(frames[0][0], frames[-1][0], TICK_NS):
+            end = bisect_left(frames, (now_ns,))
+            daemon.step(frames[at:end], now_ns + lag_ns)
+            at = end
+        last = daemon.pipeline.last
+        assert last is not None
+        assert (last.state is State.VALID) == (not lag_ns)
+        frames = [(frame[0] + 10 * S, *frame[1:]) for frame in frames]
+    daemon.close()
+
+
 @given(st.lists(st.integers(0, 6), max_size=300), st.integers(1, 200))
 def test_fair_shares(kinds: list[int], most: int):
     frames: list[Frame] = [(i, kind % 5, b"", kind // 5) for i, kind in enumerate(kinds)]
@@ -592,3 +612,30 @@ def test_the_command_says_so_and_ends_with_2(tmp_path: Path, capsys: pytest.Capt
         arguments = ["run", "--interface", "virtual", "--channel", "x", "--state-dir", str(tmp_path)]
         assert main(arguments) == 2
     assert "another gz-onboard run uses it" in capsys.readouterr().err
+
+
+HANGING = """
+import os, sys, threading
+def hang(descriptor):
+    print("hangs", flush=True)
+    threading.Event().wait()
+from gz_onboard import daemon
+from gz_onboard.cli import main
+os.fdatasync = hang
+daemon.STOP_S = 0.5
+sys.exit(main(["run", "--interface", "virtual", "--channel", "x", "--log-dir", sys.argv[1]]))
+"""
+
+
+def test_it_ends_though_a_disk_does_not_answer(tmp_path: Path):
+    command = [sys.executable, "-c", HANGING, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "hangs\n"
+        process.terminate()
+        out, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "received 0 frames" in out
+    assert "its end is lost" in errors
+    assert "Traceback" not in errors
+    assert "Fatal" not in errors
