@@ -21,7 +21,7 @@ from typing import Any
 
 import can
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard import state
@@ -473,6 +473,7 @@ def test_an_estimate_of_old_frames_does_not_count_as_good(bus: str, lag_s: float
 
 
 @given(st.lists(st.integers(0, 6), max_size=300), st.integers(1, 200))
+@settings(deadline=None)
 def test_fair_shares(kinds: list[int], most: int):
     frames: list[Frame] = [(i, kind % 5, b"", kind // 5) for i, kind in enumerate(kinds)]
     kept = fair_share(frames, most)

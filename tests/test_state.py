@@ -11,7 +11,7 @@ import zlib
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard import state
@@ -31,6 +31,7 @@ JSON = st.recursive(
 
 
 @given(st.dictionaries(st.text(), JSON, max_size=6))
+@settings(deadline=None)
 def test_what_is_saved_is_loaded(tmp_path_factory: pytest.TempPathFactory, snapshot: dict[str, object]):
     file = tmp_path_factory.mktemp("state") / "scooter.json"
     state.save(file, snapshot, NOW - 30)
