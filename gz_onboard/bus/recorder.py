@@ -191,6 +191,10 @@ class Recorder:
         """Whether the last attempt to write failed, and none has succeeded since."""
         return self._failed_ns is not None
 
+    @property
+    def _writing(self) -> Path | None:
+        return self.path if self._file else None
+
     def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
         """Declare a topic of JSON objects (a JSON schema of type object), for this file and all later ones."""
         self._channels[topic] = (json_schema, dict(metadata or {}))
@@ -252,7 +256,7 @@ class Recorder:
         if self._cut_off is None:
             self._cut_off = []
             with contextlib.suppress(OSError):
-                self._cut_off = [path for _, _, path in self._own() if path != self.path and not is_complete(path)]
+                self._cut_off = [path for _, _, path in self._own() if path != self._writing and not is_complete(path)]
         if not self._cut_off:
             return False
         path = self._cut_off.pop()  # the latest first
@@ -347,7 +351,7 @@ class Recorder:
         if free >= keep:
             return True
         for _, _, path in self._own():
-            if path != self.path and _delete(path):
+            if path != self._writing and _delete(path):
                 free, keep = free_space(self._directory)
                 if free >= keep:
                     return True

@@ -508,6 +508,20 @@ def test_a_recorder_completes_what_was_left_of_before_and_nothing_else(tmp_path:
     assert {name: (folder / name).read_bytes() for name in others} == others
 
 
+def test_a_file_that_an_error_has_cut_off_is_completed_at_once(tmp_path: Path) -> None:
+    log = Recorder(tmp_path, "ref", sync_s=1, retry_s=1000)
+    assert not log.complete_one()
+    with files_of_at_most(5_000):
+        drive(log, ticks(30))
+    assert log.errors == 1
+    assert log.path is not None
+    before = [frame for batch in logs.read_frames(log.path, on_damage=print) for frame in batch]
+    assert before
+    assert log.complete_one()
+    assert is_complete(log.path)
+    assert read(log.path) == before
+
+
 # --- in the background -----------------------------------------------------------------------------------------
 
 
