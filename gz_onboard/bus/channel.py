@@ -26,7 +26,7 @@ SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
 SO_RCVBUFFORCE = 33
 BUFFER = 4 << 20  # bytes; a frame takes some 800 of them in the kernel: 5000 frames
-MOST, READ_S = 5000, 0.04
+MOST, READ_S = 5000, 0.08
 """Frames, and time [s], that one call of `drain` takes at most: what more comes waits, and is dropped by the kernel."""
 RETRY = 1.0  # s between attempts to open a bus that is down
 _FRAME = struct.Struct("=IB3x8s")
