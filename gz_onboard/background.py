@@ -33,10 +33,10 @@ class Background:
     def call(self, function: Callable[..., object], *arguments: Any, weight: int = 1) -> bool:
         """Have `function` called with the arguments, soon; False if too much waits and it will not be.
 
-        Of what has any weight one call is always taken, however large.
+        What weighs nothing is always taken, and while nothing waits, any weight.
         """
         with self._changed:
-            if self._closing or (self._weight and self._weight + weight > self._limit):
+            if self._closing or (weight and self._weight and self._weight + weight > self._limit):
                 return False
             self._weight += weight
             self._calls.append((function, arguments, weight))
