@@ -106,7 +106,7 @@ class Daemon:
         if self._log and not self._log.close(until - time.monotonic()):
             log.warning("the disk does not take the log in time: its end is lost")
             self.finished = False
-        if self._keeper and not self._keeper.close(until - time.monotonic()):
+        if self._keeper and not self._keeper.close(max(until - time.monotonic(), 1.0)):
             log.warning("the disk does not take the state in time")
             self.finished = False
         for channel in self.channels:

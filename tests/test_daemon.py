@@ -615,6 +615,40 @@ def test_the_command_says_so_and_ends_with_2(tmp_path: Path, capsys: pytest.Capt
     assert "another gz-onboard run uses it" in capsys.readouterr().err
 
 
+def test_at_the_end_a_log_that_hangs_does_not_cost_the_state(
+    bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    asked, answer = threading.Event(), threading.Event()
+
+    def hang(_: int) -> None:
+        asked.set()
+        answer.wait(60)
+
+    monkeypatch.setattr(os, "fdatasync", hang)
+    monkeypatch.setattr("gz_onboard.daemon.STOP_S", 0.2)
+    channel = Channel("virtual", bus)
+    channel.open()
+    file = tmp_path / "scooter.json"
+    daemon = Daemon(reference(), [channel], Recorder(tmp_path / "log", "v", sync_s=0.1), file)
+    frames = Scooter().steady(2.0)
+    daemon.step(frames[: len(frames) // 2], frames[len(frames) // 2][0])
+    daemon.step(frames[len(frames) // 2 :], frames[-1][0] + S)
+    assert daemon._log is not None
+    for seconds in range(2, 300):
+        daemon._log.sync(frames[-1][0] + seconds * S)
+        if asked.wait(0.1):
+            break
+    daemon.close()
+    assert "its end is lost" in caplog.text
+    assert "state in time" not in caplog.text
+    answer.set()
+    last = daemon.pipeline.last
+    found = state.load(file, time.time())
+    assert last is not None
+    assert found is not None
+    assert found[0]["soc"] == last.soc
+
+
 HANGING = """
 import os, sys, threading
 def hang(descriptor):
