@@ -35,7 +35,7 @@ from tests.support import S, Scooter, reference
 
 TITLE = "Power cuts while log and state are written"
 COUNT = 200
-FULL_COUNT = 4000
+FULL_COUNT = 1000
 
 LOG_S = 2.0  # at most so much of the log is lost
 SOC = 0.003  # and so much of the state of charge
