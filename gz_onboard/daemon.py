@@ -1,19 +1,33 @@
-"""The daemon: channels, clock, recorder and pipeline together. All that systemd runs."""
+"""The daemon: channels, clock, recorder and pipeline together. All that systemd runs.
+
+The loop never waits for a disk: the log and the state are written by a thread each. Nor for the bus: what one tick
+reads and decodes is bounded, so that the status goes out ten times a second whatever comes.
+"""
 
 from __future__ import annotations
 
 import argparse
+import errno
+import fcntl
 import logging
 import os
+import re
 import signal
+import socket
+import sys
 import time
 from bisect import bisect_left
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack
 from operator import itemgetter
 from pathlib import Path
+from typing import Any
 
 from gz_onboard import notify, state
+from gz_onboard.background import Background
 from gz_onboard.bus.channel import Channel
-from gz_onboard.bus.recorder import Recorder
+from gz_onboard.bus.recorder import BackgroundRecorder, Recorder
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame, Reason
 from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, reason_names
@@ -21,7 +35,13 @@ from gz_onboard.vehicle import Vehicle, read_vehicle
 
 TICK = 0.1  # s: as often as a status is sent; each wake-up costs as much as ten frames
 BUSY = 200  # frames in a tick from which the next is half as long: what waits in the kernel must fit its buffer
-SAVE_PERIOD = 10.0  # s
+WORK_S = 0.06  # s of CPU that the frames of one tick may cost
+FRAME_S = 20e-6  # s of CPU for a frame, until it is measured
+SAVE_PERIOD_NS, SAVE_AT_MOST_NS = 10_000_000_000, 1_000_000_000
+SAVE_SOC = 0.001  # a change that is saved before the period is over: what a power cut may cost, and the next save
+STATE_STUCK_S = 10.0
+STOP_S = 6.0  # to write what waits when stopped; systemd kills after 10 s
+LOCK_S = 3.0  # to wait for one that is ending
 CLOCK_STEP_NS = 500_000_000
 
 log = logging.getLogger("gz-onboard")
@@ -34,17 +54,19 @@ class Daemon:
                  filter_name: str = "scalar", tick: float = TICK) -> None:  # fmt: skip
         self.channels = channels
         self.recorder = recorder
-        self.pipeline = Pipeline(vehicle, filter_name=filter_name, log=recorder)
-        self._key = vehicle.key
-        self._state_file = state_file
+        self.finished = True  # whether log and state were written to their end
+        self._log = BackgroundRecorder(recorder) if recorder else None
+        self._make_pipeline: Callable[[], Pipeline] = lambda: Pipeline(vehicle, filter_name=filter_name, log=self._log)
+        self.pipeline = self._make_pipeline()
+        self._keeper = _Keeper(state_file, vehicle.key) if state_file else None
         self._tick = tick
         self._stopping = False
         self._later: list[Frame] = []
+        self._overrun = 0
+        self._frame_s = FRAME_S
         self._offset = _wall_offset()
-        self._save_at = 0.0
         self._said_at = 0.0
         self._said = ""
-        self._state_failing = False
         self._log_error = ""
 
     def stop(self, *_: object) -> None:
@@ -53,11 +75,10 @@ class Daemon:
 
     def run(self) -> None:
         """Loop until stopped: each tick drain, estimate, send, record, save, feed the watchdog."""
-        self._restore()
+        self.restore()
         watchdog = notify.watchdog_interval()
         fed = next_tick = time.monotonic()
         busy = False
-        self._save_at = next_tick + SAVE_PERIOD
         notify.ready("waiting for frames")
         log.info("ready after %.2f s of CPU", time.process_time())
         while not self._stopping:
@@ -73,14 +94,21 @@ class Daemon:
                 fed = now
                 notify.alive()
             self._say(now)
-            if now >= self._save_at:
-                self._save_at = now + SAVE_PERIOD
-                self._save()
         notify.stopping()
         self.round()  # what waited for its tick
-        self._save()
-        if self.recorder:
-            self.recorder.close()
+        self.close()
+
+    def close(self) -> None:
+        """Save the state, write the log to its end as far as the disks allow it in time, and close the channels."""
+        until = time.monotonic() + STOP_S
+        if self._keeper:
+            self._keeper.save(self.pipeline, time.time_ns())
+        if self._log and not self._log.close(until - time.monotonic()):
+            log.warning("the disk does not take the log in time: its end is lost")
+            self.finished = False
+        if self._keeper and not self._keeper.close(max(until - time.monotonic(), 1.0)):
+            log.warning("the disk does not take the state in time")
+            self.finished = False
         for channel in self.channels:
             channel.close()
 
@@ -97,36 +125,55 @@ class Daemon:
         ahead = time.clock_gettime_ns(time.CLOCK_BOOTTIME) + offset + CLOCK_STEP_NS  # for the codec to drop
         end, beyond = bisect_left(frames, (now_ns,)), bisect_left(frames, (ahead,))
         frames, self._later = frames[:end] + frames[beyond:], frames[end:beyond]
-        pipeline = self.pipeline
         step = offset - self._offset
         self._offset = offset
         if abs(step) > CLOCK_STEP_NS:  # by the network's or the GPS' time; what came meanwhile has either time
             log.warning("the clock was set by %.1f s", step * 1e-9)
-            pipeline.clock_set(step)
+            self.pipeline.clock_set(step)
             frames, self._later = [], []
+        count = len(frames)
+        kept = fair_share(frames, max(int(WORK_S / self._frame_s), 2 * BUSY))
+        self._overrun += count - len(kept)
+        began = time.thread_time()
+        self.step(kept, now_ns)
+        if len(kept) > BUSY:
+            self._frame_s += 0.2 * ((time.thread_time() - began) / len(kept) - self._frame_s)
+        else:  # so few tell nothing: it is the estimates that cost
+            self._frame_s = max(0.98 * self._frame_s, FRAME_S)
+        return count
+
+    def step(self, frames: list[Frame], now_ns: int) -> None:
+        """Take in frames, in the order of their times, up to `now_ns`; send, record and save what comes of them."""
+        pipeline = self.pipeline
         pipeline.kernel_lost = sum(channel.overflow for channel in self.channels)
         pipeline.send_failures = sum(channel.send_failures for channel in self.channels)
+        pipeline.overrun = self._overrun
         reasons = Reason(0)
         if not all(channel.up for channel in self.channels):
             reasons |= Reason.BUS_DOWN
-        if self.recorder and self.recorder.failing:
-            reasons |= Reason.LOG_FAILED
+        if self._log:
+            pipeline.log_lost = self._log.lost_frames
+            if self._log.failing:
+                reasons |= Reason.LOG_FAILED
         pipeline.extra_reasons = reasons
         for frame in pipeline.advance(frames, now_ns):
             self.channels[0].send(frame)
-        if self.recorder:
-            self.recorder.sync(now_ns)
-        return len(frames)
+        if self._log:
+            self._log.sync(now_ns)
+        if self._keeper:
+            self._keeper.save_if_due(pipeline, now_ns)
 
     def _say(self, now: float) -> None:
         """Tell systemd how it stands and the journal what changed, at most once a second."""
         if now - self._said_at < 1.0:
             return
         self._said_at = now
-        error = self.recorder.last_error if self.recorder and self.recorder.failing else ""
+        error = self._log.last_error if self._log and self._log.failing else ""
         if error and error != self._log_error:
             log.warning("cannot write the log: %s", error)
         self._log_error = error
+        if self._keeper:
+            self._keeper.say()
         last = self.pipeline.last
         if last is None:
             return
@@ -139,34 +186,121 @@ class Daemon:
             text = f"{last.range / 1000:.1f} km, {100 * last.soc:.0f} %, {text}"
         notify.status(text)
 
-    def _restore(self) -> None:
-        if self._state_file is None:
-            return
-        try:
-            found = state.load(self._state_file, time.time())
-            if found:
+    def restore(self) -> dict[str, Any] | None:
+        """Go on from the latest saved state that can be used; gives it. Others are set aside. Nothing is raised."""
+        keeper = self._keeper
+        if keeper is None:
+            return None
+        for copy in state.copies(keeper.file):
+            try:
+                found = state.load(copy, time.time())
+                if found is None:
+                    continue
                 snapshot, age = found
-                self.pipeline.estimator.restore(snapshot, self._key, age)
+                self.pipeline.estimator.restore(snapshot, keeper.key, age)
+            except Exception as error:  # whatever it holds: an estimate from nothing is better than none
+                if not isinstance(error, ValueError):  # it may have been taken over in part
+                    self.pipeline = self._make_pipeline()
+                aside = state.set_aside(keeper.file, copy)
+                log.warning(
+                    "saved state %s %s: not used%s",
+                    copy,
+                    str(error) or repr(error),
+                    f", kept as {aside}" if aside else "",
+                )
+            else:
                 log.info(
                     "going on from the state saved %s", "at an unknown time" if age is None else f"{age:.0f} s ago"
                 )
-        except ValueError as error:
-            log.warning("saved state %s %s: not used", self._state_file, error)
+                return dict(snapshot)
+        return None
 
-    def _save(self) -> None:
-        snapshot = self.pipeline.estimator.snapshot(self._key) if self._state_file else None
-        if snapshot is None or self._state_file is None:
+
+class _Keeper:
+    """Saves what the estimator knows, as often as it is worth it, on a thread of its own."""
+
+    def __init__(self, file: Path, key: str) -> None:
+        self.file = file
+        self.key = key
+        self._thread = Background("state")
+        self._saved_ns: int | None = None
+        self._saved_soc: float | None = None
+        self._failing = self._stuck = False
+
+    def save_if_due(self, pipeline: Pipeline, now_ns: int) -> None:
+        """Save once in the period, or when the state of charge has moved; not while the last save is under way."""
+        if self._thread.load:
             return
+        soc = pipeline.last.soc if pipeline.last else None
+        if self._saved_ns is not None:
+            since = abs(now_ns - self._saved_ns)  # the clock may be set back
+            before = self._saved_soc
+            moved = soc is not None and (before is None or abs(soc - before) >= SAVE_SOC)
+            if since < (SAVE_AT_MOST_NS if moved else SAVE_PERIOD_NS):
+                return
+        elif soc is None:
+            return
+        self.save(pipeline, now_ns)
+
+    def save(self, pipeline: Pipeline, now_ns: int) -> None:
+        """Save now."""
+        snapshot = pipeline.estimator.snapshot(self.key)
+        if snapshot is None:
+            return
+        self._saved_ns, self._saved_soc = now_ns, pipeline.last.soc if pipeline.last else None
         try:
-            state.save(self._state_file, snapshot, time.time())
-        except OSError as error:
-            if not self._state_failing:
-                log.warning("cannot save the state: %s", error)
-            self._state_failing = True
+            text = state.encode(snapshot, now_ns * 1e-9)
+        except (ValueError, TypeError) as error:
+            self._failed(error)
         else:
-            if self._state_failing:
+            self._thread.call(self._write, text, weight=0 if self._thread.load else 1)
+
+    def say(self) -> None:
+        """Tell once of a disk that does not answer."""
+        stuck = self._thread.stuck > STATE_STUCK_S
+        if stuck and not self._stuck:
+            log.warning("cannot save the state: the disk does not answer")
+        self._stuck = stuck
+
+    def close(self, seconds: float) -> bool:
+        """Wait until all is saved; False if that takes longer than `seconds`."""
+        return self._thread.close(seconds)
+
+    def _write(self, text: bytes) -> None:
+        try:
+            state.write(self.file, text)
+        except OSError as error:
+            self._failed(error)
+        else:
+            if self._failing:
                 log.info("the state is saved again")
-            self._state_failing = False
+            self._failing = False
+
+    def _failed(self, error: Exception) -> None:
+        if not self._failing:
+            log.warning("cannot save the state: %s", error)
+        self._failing = True
+
+
+def fair_share(frames: list[Frame], most: int) -> list[Frame]:
+    """About `most` of the frames, the latest of each identifier: one that floods the bus takes no other's place."""
+    if len(frames) <= most:
+        return frames
+    counts = Counter(itemgetter(1, 3)(frame) for frame in frames)
+    left = most
+    for done, count in enumerate(sorted(counts.values())):
+        share = max(left // (len(counts) - done), 1)
+        if count > share:
+            break
+        left -= count
+    taken: Counter[tuple[int, int]] = Counter()
+    kept = []
+    for frame in reversed(frames):
+        kind = frame[1], frame[3]
+        taken[kind] += 1
+        if taken[kind] <= share:
+            kept.append(frame)
+    return kept[::-1]
 
 
 def _wall_offset() -> int:
@@ -223,6 +357,12 @@ def run(arguments: argparse.Namespace) -> int:
         if names.count(name) > 1:
             raise InputError(f"--channel {name}: given twice; each of its frames would come twice")
     vehicle = read_vehicle(arguments.vehicle, arguments.payload)
+    with ExitStack() as locks:
+        _lock(locks, arguments.interface, names, arguments.state_dir)
+        return _run(arguments, vehicle, names)
+
+
+def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> int:
     recorder = None
     if arguments.log_dir:
         recorder = Recorder(
@@ -232,7 +372,7 @@ def run(arguments: argparse.Namespace) -> int:
         )  # fmt: skip
     state_file = None
     if arguments.state_dir:
-        state_file = arguments.state_dir / f"{vehicle.name}.json"
+        state_file = arguments.state_dir / (re.sub(r"[^\w.+-]+", "-", vehicle.name) + ".json")
     from gz_onboard.bus.codec import known_identifiers
 
     wanted = None if arguments.all_frames else known_identifiers(vehicle.mapping)
@@ -244,7 +384,52 @@ def run(arguments: argparse.Namespace) -> int:
     signal.signal(signal.SIGINT, daemon.stop)
     daemon.run()
     _summary(daemon)
+    if not daemon.finished:  # a thread still waits for its disk: the interpreter would abort over its files
+        sys.stdout.flush()
+        logging.shutdown()
+        os._exit(1)
     return 0
+
+
+def _lock(locks: ExitStack, interface: str, names: list[str], state_dir: Path | None) -> None:
+    """Hold the channels and the state directory until `locks` is left, or the process ends, however it does.
+
+    InputError if another daemon has one of them and does not give it back soon, as one that is being restarted does.
+    """
+    until = time.monotonic() + LOCK_S
+    # The names of abstract sockets are those of the network namespace, as the interfaces are; a virtual bus is the
+    # process' own.
+    for name in names if interface != "virtual" else ():
+        holder = locks.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+        address = f"\0gz-onboard:{interface}:{name}"[:107]
+        if not _retried(lambda holder=holder, address=address: holder.bind(address), until):  # type: ignore[misc]
+            raise InputError(f"--channel {name}: another gz-onboard run has it; two would send the same identifiers")
+    if state_dir is None:
+        return
+    try:
+        state_dir.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(state_dir, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:  # then nothing can be saved there either, and the daemon says so
+        return
+    locks.callback(os.close, descriptor)
+    if not _retried(lambda: fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB), until):
+        raise InputError(f"--state-dir {state_dir}: another gz-onboard run uses it; give each its own")
+
+
+def _retried(take: Callable[[], None], until: float) -> bool:
+    """Take a lock, again and again `until` a monotonic time [s]; False if another holds it. True without locks."""
+    while True:
+        try:
+            take()
+        except OSError as error:
+            if error.errno not in (errno.EADDRINUSE, errno.EWOULDBLOCK):
+                log.warning("without a lock: %s", error)
+                return True
+        else:
+            return True
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.1)
 
 
 def _summary(daemon: Daemon) -> None:

@@ -25,7 +25,7 @@ TICK_NS = 100_000_000  # status at 10 Hz
 TICKS_PER_RANGE = 10  # range at 1 Hz
 ESTIMATE_TOPIC = "/estimate"
 STATUS_TOPIC = "/status"
-COUNTS = ("received", "error_frames", "kernel_lost", "send_failures", "unknown_others")
+COUNTS = ("received", "error_frames", "kernel_lost", "overrun", "send_failures", "log_lost", "unknown_others")
 DROPPING = (LENGTH, CRC, COUNTER, TIME, UNDECODABLE)  # reasons that drop a frame
 
 ESTIMATE_UNITS = {
@@ -76,6 +76,8 @@ class Pipeline:
         )
         self.publisher = range_publisher(vehicle)
         self.kernel_lost = 0  # frames; set by the daemon
+        self.overrun = 0  # frames left out because more came than can be decoded; set by the daemon
+        self.log_lost = 0  # frames that are in no log; set by the daemon
         self.send_failures = 0  # frames that a channel did not take; set by the daemon
         self.extra_reasons = Reason(0)  # set by the daemon: bus down, log failed
         self.last: Estimate | None = None
@@ -162,7 +164,7 @@ class Pipeline:
         return Counts(
             dropped=sum(n for (_, reason), n in codec.faults.items() if reason in DROPPING),
             implausible=sum(n for (_, reason), n in codec.faults.items() if reason == RANGE),
-            lost=self.kernel_lost + sum(codec.lost.values()),
+            lost=self.kernel_lost + self.overrun + sum(codec.lost.values()),
             unknown=len(codec.unknown),
         )
 
@@ -189,7 +191,9 @@ class Pipeline:
             "received": codec.received,
             "error_frames": codec.error_frames,
             "kernel_lost": self.kernel_lost,
+            "overrun": self.overrun,
             "send_failures": self.send_failures,
+            "log_lost": self.log_lost,
             "unknown_others": codec.unknown_others,
             "faults": faults,
             "lost": dict(sorted(codec.lost.items())),

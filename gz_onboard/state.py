@@ -1,43 +1,115 @@
-"""The saved state of the estimator: one JSON file, written whole or not at all."""
+"""The saved state of the estimator: a JSON file with a checksum, written whole or not at all, and the one before it.
+
+NAME.json is the state, NAME.previous.json the one saved before. What cannot be used is set aside as NAME.refused-1.json
+(the latest) to NAME.refused-3.json, so that it can be looked into and a restart does not meet it again.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import re
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+FORMAT = 2
+REFUSED = 3
+"""So many refused states are kept."""
+
+_LARGEST = 1 << 20  # bytes; a state has some thousand
+_HEAD = re.compile(rb'\{"format": (\d{1,9}), "crc32": "([0-9a-f]{8})", ')
+
+
+def encode(snapshot: Mapping[str, Any], time: float) -> bytes:
+    """The text of a state file of `snapshot`, taken at `time` [s since the epoch].
+
+    ValueError or TypeError if the snapshot holds what JSON has no word for: not-a-number, infinities, objects.
+    """
+    text = json.dumps({"saved_at": time, "estimator": snapshot}, allow_nan=False).encode("ascii")
+    body = text[1:]  # behind the brace: what the checksum is of
+    return b'{"format": %d, "crc32": "%08x", %s\n' % (FORMAT, zlib.crc32(body), body)
+
+
+def decode(text: bytes, time: float) -> tuple[Mapping[str, Any], float | None]:
+    """(snapshot, its age [s] at `time` if the clock can be believed). ValueError unless it is as it was saved."""
+    head = _HEAD.match(text)
+    if not head:
+        raise ValueError("is not a saved state" if text else "is empty")
+    if int(head[1]) != FORMAT:
+        raise ValueError(f"is of format {int(head[1])}, not {FORMAT}")
+    body = text[head.end() :]
+    if not body.endswith(b"}\n") or zlib.crc32(body[:-1]) != int(head[2], 16):
+        raise ValueError("is damaged: its checksum is wrong")
+    try:
+        document = json.loads(b"{" + body)
+        snapshot, saved_at = document["estimator"], document["saved_at"]
+    except (ValueError, LookupError, TypeError, RecursionError) as error:  # the checksum is right: not written by us
+        raise ValueError(f"is not a saved state: {error!r}") from error
+    age = time - saved_at if isinstance(saved_at, int | float) and saved_at > 1e9 and time >= saved_at else None
+    return snapshot, age
+
 
 def save(file: Path, snapshot: Mapping[str, Any], time: float) -> None:
-    """Write `snapshot`, taken at `time` [s since the epoch], so that a power cut leaves the old file or the new one.
+    """Write `snapshot`, taken at `time` [s since the epoch]; `encode` and `write` in one."""
+    write(file, encode(snapshot, time))
+
+
+def write(file: Path, text: bytes) -> None:
+    """Write the text of a state file, so that a power cut leaves the old one or the new one.
 
     The directory is made if it is not there. OSError if it cannot be written.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
-    temporary = file.with_suffix(".new")
-    with temporary.open("w", encoding="ascii") as stream:
-        json.dump({"saved_at": time, "estimator": snapshot}, stream)
+    unfinished, _, previous = copies(file)
+    with unfinished.open("wb") as stream:
+        stream.write(text)
         stream.flush()
         os.fsync(stream.fileno())
-    temporary.replace(file)
-    folder = os.open(file.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    with contextlib.suppress(FileNotFoundError):
+        file.replace(previous)
+    unfinished.replace(file)
+    sync_directory(file.parent)
+
+
+def copies(file: Path) -> tuple[Path, Path, Path]:
+    """Where states are, the latest first: one not yet in its place (whole or cut off), the state, the one before."""
+    return file.with_suffix(".new"), file, file.with_suffix(".previous.json")
 
 
 def load(file: Path, time: float) -> tuple[Mapping[str, Any], float | None] | None:
-    """(snapshot, its age [s] if the clock can be believed); None if there is none. ValueError if it is damaged."""
+    """(snapshot, its age [s] at `time` if the clock can be believed) in one file; None if there is no such file.
+
+    ValueError if it cannot be read or is damaged.
+    """
     try:
-        document = json.loads(file.read_text(encoding="ascii"))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, RecursionError) as error:  # not there, no text, no JSON, or JSON without end
+        if not file.exists():
+            return None
+        if not file.is_file():
+            raise ValueError("cannot be read: it is not a file")
+        with file.open("rb") as stream:
+            return decode(stream.read(_LARGEST), time)
+    except OSError as error:
         raise ValueError(f"cannot be read: {error}") from error
-    if not isinstance(document, dict) or "estimator" not in document:
-        raise ValueError("is not a saved state")
-    saved_at = document.get("saved_at")
-    age = time - saved_at if isinstance(saved_at, int | float) and saved_at > 1e9 and time >= saved_at else None
-    return document["estimator"], age
+
+
+def set_aside(file: Path, copy: Path) -> Path | None:
+    """Rename `copy` of the state `file`, which cannot be used; gives its new name, None if it cannot be renamed."""
+    names = [file.with_suffix(f".refused-{number}.json") for number in range(1, REFUSED + 1)]
+    with contextlib.suppress(OSError):
+        for newer, older in zip(names[-2::-1], names[:0:-1], strict=True):
+            if newer.exists():
+                newer.replace(older)
+        return copy.replace(names[0])
+    return None
+
+
+def sync_directory(directory: Path) -> None:
+    """Bring the names of a directory onto the disk: else a new file may be gone after a power cut."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

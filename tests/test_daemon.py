@@ -2,24 +2,38 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import logging
+import os
 import resource
+import subprocess
+import sys
 import threading
 import time
+from bisect import bisect_left
+from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from itertools import count, pairwise
 from pathlib import Path
+from typing import Any
 
 import can
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from gz_onboard import state
 from gz_onboard.bus.channel import Channel
 from gz_onboard.bus.logs import read_frames, read_samples
 from gz_onboard.bus.recorder import Recorder
-from gz_onboard.daemon import Daemon
+from gz_onboard.cli import main
+from gz_onboard.daemon import Daemon, _lock, fair_share
+from gz_onboard.errors import InputError
+from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame, Reason, State
+from gz_onboard.pipeline import TICK_NS
 from tests.support import S, Scooter, check_frames, reference, ridden
 
 _NUMBERS = count()
@@ -179,76 +193,129 @@ def test_it_goes_on_where_it_was(bus: str, tmp_path: Path, caplog: pytest.LogCap
     assert state_of(file)["saved_at"] > saved["saved_at"]  # type: ignore[operator]
 
 
-def damaged(text: str) -> str:
-    return text[: len(text) // 2]
+Snapshot = dict[str, Any]
 
 
-def no_object(text: str) -> str:
-    return "[]"
+def foreign(snapshot: Snapshot) -> None:
+    snapshot["key"] = "another scooter|10s4p"
 
 
-def foreign(text: str) -> str:
-    document = json.loads(text)
-    document["estimator"]["key"] = "another scooter|10s4p"
-    return json.dumps(document)
+def other_version(snapshot: Snapshot) -> None:
+    snapshot["version"] = 99
 
 
-def other_version(text: str) -> str:
-    document = json.loads(text)
-    document["estimator"]["version"] = 99
-    return json.dumps(document)
+def implausible(snapshot: Snapshot) -> None:
+    snapshot["soc"] = 5.0
 
 
-def implausible(text: str) -> str:
-    document = json.loads(text)
-    document["estimator"]["soc"] = 5.0
-    return json.dumps(document)
+def incomplete(snapshot: Snapshot) -> None:
+    del snapshot["riding"]
 
 
-def incomplete(text: str) -> str:
-    document = json.loads(text)
-    del document["estimator"]["riding"]
-    return json.dumps(document)
+def without_numbers(snapshot: Snapshot) -> None:
+    snapshot["covariance"] = ["a", None, {}]
 
 
-def without_numbers(text: str) -> str:
-    document = json.loads(text)
-    document["estimator"]["covariance"] = ["a", None, {}]
-    return json.dumps(document)
+def without_states(snapshot: Snapshot) -> None:
+    snapshot["riding"]["states"] = None
+
+
+@pytest.fixture(scope="module")
+def learned() -> Snapshot:
+    """What five seconds of riding have taught, with a bias that no fresh estimator has."""
+    estimator = ridden(Scooter().steady(5.0)).pipeline.estimator
+    estimator.road.bias_x = 0.01
+    snapshot = estimator.snapshot(reference().key)
+    assert snapshot is not None
+    return snapshot
+
+
+def is_fresh(daemon: Daemon) -> bool:
+    ours, new = daemon.pipeline.estimator, Daemon(reference(), [], None, None).pipeline.estimator
+    return ours.snapshot("") == new.snapshot("") is None and ours.road == new.road and ours._saved is None
 
 
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (damaged, "cannot be read"),
-        (no_object, "is not a saved state"),
         (foreign, "is of 'another scooter|10s4p', this is 'reference-scooter"),
         (other_version, "is of version 99"),
         (implausible, "implausible numbers"),
         (incomplete, "is damaged: KeyError"),
         (without_numbers, "not used"),
+        (without_states, "not used"),
     ],
 )
-def test_a_state_that_does_not_fit_is_refused_whole_and_said_so(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture, spoil: Callable[[str], str], said: str
+def test_a_state_that_does_not_fit_is_refused_whole_said_so_and_set_aside(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, spoil: Callable[[Snapshot], None], said: str
 ):
     caplog.set_level(logging.INFO)
     file = tmp_path / "scooter.json"
-    first = ridden(Scooter().steady(5.0)).pipeline.estimator
-    first.road.bias_x = 0.01
-    text = json.dumps({"saved_at": time.time(), "estimator": first.snapshot(reference().key)})
-    file.write_text(spoil(text))
+    snapshot = copy.deepcopy(learned)
+    spoil(snapshot)
+    state.save(file, snapshot, time.time())
+    text = file.read_bytes()
     daemon = Daemon(reference(), [], None, file)
-    fresh = Daemon(reference(), [], None, None)
     daemon.stop()
     daemon.run()
     assert said in caplog.text
-    assert "not used" in caplog.text
-    ours, new = daemon.pipeline.estimator, fresh.pipeline.estimator
-    assert ours.road == new.road
-    assert ours.forecaster.riding == new.forecaster.riding
-    assert ours._saved is None
-    assert file.read_text() == spoil(text)  # nothing is known yet, so nothing is saved over it
+    assert "not used, kept as" in caplog.text
+    assert is_fresh(daemon)
+    (aside,) = tmp_path.iterdir()  # nothing is known yet, so nothing is saved
+    assert aside.read_bytes() == text
+
+
+def test_whatever_restoring_raises_it_begins_afresh(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, monkeypatch: pytest.MonkeyPatch
+):
+    file = tmp_path / "scooter.json"
+    state.save(file, learned, time.time())
+
+    def half(self: Estimator, *_: object) -> None:
+        self.road.bias_x = 7.0
+        raise ZeroDivisionError("in the middle")
+
+    monkeypatch.setattr(Estimator, "restore", half)
+    daemon = Daemon(reference(), [], None, file)
+    assert daemon.restore() is None
+    assert "in the middle: not used" in caplog.text
+    assert is_fresh(daemon)
+
+
+def test_where_the_latest_state_is_damaged_the_one_before_is_used(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot
+):
+    caplog.set_level(logging.INFO)
+    file = tmp_path / "scooter.json"
+    state.save(file, {**learned, "soc": 0.41}, time.time())
+    state.save(file, {**learned, "soc": 0.42}, time.time())
+    unfinished, latest, _ = state.copies(file)
+    unfinished.write_bytes(latest.read_bytes()[:100])  # the power was cut while it was written
+    data = bytearray(latest.read_bytes())
+    data[150] ^= 4
+    latest.write_bytes(data)
+    daemon = Daemon(reference(), [], None, file)
+    found = daemon.restore()
+    assert found is not None
+    assert found["soc"] == 0.41
+    assert caplog.text.count("not used, kept as") == 2
+    assert "going on from the state saved" in caplog.text
+    assert [path.suffixes[-2:] for path in sorted(tmp_path.iterdir())] == [
+        [".previous", ".json"], [".refused-1", ".json"], [".refused-2", ".json"],
+    ]  # fmt: skip
+
+
+def test_a_cut_between_two_names_loses_nothing(tmp_path: Path, learned: Snapshot):
+    """The new state is whole, and not yet in the place of the old one."""
+    file = tmp_path / "scooter.json"
+    state.save(file, {**learned, "soc": 0.41}, time.time())
+    state.save(tmp_path / "other.json", {**learned, "soc": 0.42}, time.time())
+    unfinished, _, before = state.copies(file)
+    (tmp_path / "other.json").replace(unfinished)
+    file.replace(before)
+    found = Daemon(reference(), [], None, file).restore()
+    assert found is not None
+    assert found["soc"] == 0.42
 
 
 def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, caplog: pytest.LogCaptureFixture):
@@ -256,12 +323,12 @@ def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, ca
     (tmp_path / "file").write_text("in the way")
     with Scene(bus, state_file=tmp_path / "file" / "state" / "scooter.json") as scene:
         scene.ride(1.0)
-        scene.daemon._save()
+        assert scene.daemon._keeper is not None
+        scene.daemon._keeper.save(scene.daemon.pipeline, time.time_ns())
         last = scene.daemon.pipeline.last
         assert last is not None
         assert last.state is State.VALID
     assert caplog.text.count("cannot save the state") == 1
-    assert "not used" in caplog.text or "cannot be read" in caplog.text
 
 
 @pytest.mark.parametrize("delta", [3600.0, -7200.0, 40.0])
@@ -330,3 +397,280 @@ def test_what_changes_is_said_once(bus: str, caplog: pytest.LogCaptureFixture):
     said = [record.getMessage() for record in caplog.records if "dropped" in record.getMessage()]
     assert any(line.startswith("valid: ") for line in said)
     assert len(said) <= 4
+
+
+# --- more than it can take, and disks that do not answer ---------------------------------------------------------
+
+
+def gaps(heard: list[Frame]) -> list[float]:
+    """The times [s] between the status frames heard."""
+    times = [frame[0] / S for frame in heard if frame[1] == 0x602]
+    return [b - a for a, b in pairwise(times)]
+
+
+def test_a_bus_that_never_runs_dry_does_not_silence_it(bus: str, monkeypatch: pytest.MonkeyPatch):
+    """Frames come faster than they can be read, without end: each round reads some of them, and tells."""
+    with Scene(bus) as scene:
+        message = can.Message(arbitration_id=0x413, data=bytes(2), is_extended_id=False)
+        (channel,) = scene.daemon.channels
+        monkeypatch.setattr(channel._bus, "recv", lambda timeout: message)
+        begin = len(scene.heard)
+        time.sleep(3.0)
+        heard = scene.heard[begin:]
+    assert scene.daemon.pipeline.codec.received > 1000
+    assert len(check_frames(heard)["RANGE_Status"]) >= 8  # 30 on a machine with nothing else to do
+
+
+def test_what_cannot_be_decoded_in_time_is_left_out_fairly_counted_and_flagged(
+    bus: str, monkeypatch: pytest.MonkeyPatch
+):
+    """One identifier floods the bus; the others' frames are all taken, and the estimate stays good."""
+    with Scene(bus) as scene:
+        daemon = scene.daemon
+        monkeypatch.setattr("gz_onboard.daemon.WORK_S", 0.0)  # as on a slow board: 400 frames a tick
+        stop = threading.Event()
+
+        def flood() -> None:
+            with can.Bus(interface="virtual", channel=bus) as other:
+                message = can.Message(arbitration_id=0x5FF, data=bytes(2), is_extended_id=False)
+                while not stop.is_set():
+                    for _ in range(400):
+                        other.send(message)
+                    time.sleep(0.05)
+
+        thread = threading.Thread(target=flood)
+        thread.start()
+        try:
+            scene.ride(5.0)
+        finally:
+            stop.set()
+            thread.join()
+    last = [row for row in check_frames(scene.heard)["RANGE_Status"] if row["RANGE_FramesLost"]]
+    assert any(row["RANGE_StatusState"] == State.VALID for row in last)
+    assert daemon.pipeline.overrun > 1000
+    assert daemon.pipeline.counts().lost >= daemon.pipeline.overrun
+    assert daemon.pipeline.status()["overrun"] == daemon.pipeline.overrun
+
+
+@pytest.mark.parametrize("lag_s", [1.5, 10.0])
+def test_an_estimate_of_old_frames_does_not_count_as_good(bus: str, lag_s: float):
+    """As they come from a buffer that is read too slowly."""
+    channel = Channel("virtual", bus)
+    channel.open()
+    daemon = Daemon(reference(), [channel], None, None)
+    frames = Scooter().steady(10.0)
+    for lag_ns in (0, round(lag_s * S)):
+        at = 0
+        for now_ns in range(frames[0][0], frames[-1][0], TICK_NS):
+            end = bisect_left(frames, (now_ns,))
+            daemon.step(frames[at:end], now_ns + lag_ns)
+            at = end
+        last = daemon.pipeline.last
+        assert last is not None
+        assert (last.state is State.VALID) == (not lag_ns)
+        frames = [(frame[0] + 10 * S, *frame[1:]) for frame in frames]
+    daemon.close()
+
+
+@given(st.lists(st.integers(0, 6), max_size=300), st.integers(1, 200))
+@settings(deadline=None)
+def test_fair_shares(kinds: list[int], most: int):
+    frames: list[Frame] = [(i, kind % 5, b"", kind // 5) for i, kind in enumerate(kinds)]
+    kept = fair_share(frames, most)
+    assert kept == sorted(kept)
+    assert set(kept) <= set(frames)
+    came, stayed = Counter(kinds), Counter(channel * 5 + identifier for _, identifier, _, channel in kept)
+    assert len(kept) <= max(most, len(came))
+    assert len(kept) >= min(len(frames), most) - len(came)
+    least = min((n for kind, n in stayed.items() if n < came[kind]), default=len(frames))
+    assert set(stayed) == set(came)
+    assert all(n >= min(came[kind], least) for kind, n in stayed.items())  # who has more had more
+    for kind, n in stayed.items():  # the latest of each
+        assert [f for f in kept if f[3] * 5 + f[1] == kind] == [f for f in frames if f[3] * 5 + f[1] == kind][-n:]
+
+
+def test_disks_that_do_not_answer_do_not_silence_it(bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    answer = threading.Event()
+    real = os.fdatasync, os.fsync
+
+    def late(number: int, descriptor: int) -> None:
+        answer.wait(60)
+        real[number](descriptor)
+
+    file = tmp_path / "scooter.json"
+    recorder = Recorder(tmp_path / "log", "v", sync_s=0.3)
+    with Scene(bus, recorder=recorder, state_file=file) as scene:
+        log = scene.daemon._log
+        assert log is not None
+        log._thread._limit = 2000
+        scene.ride(2.0)
+        monkeypatch.setattr(os, "fdatasync", lambda descriptor: late(0, descriptor))
+        monkeypatch.setattr(os, "fsync", lambda descriptor: late(1, descriptor))
+        begin = len(scene.heard)
+        scene.ride(20.0, lambda: log._left_out > 500)
+        during = scene.heard[begin:]
+        assert scene.reasons() & Reason.LOG_FAILED
+        answer.set()
+        scene.ride(10.0, lambda: not scene.reasons() & Reason.LOG_FAILED)
+        assert not scene.reasons() & Reason.LOG_FAILED
+        scene.ride(1.2)
+    assert max(gaps(during)) < 2.0  # were it to wait for a disk, it would be for as long as that does not answer
+    status = [values for topic, _, values in read_samples(recorder.paths[-1]) if topic == "/status"]
+    assert status[-1]["log_lost"] == log.lost_frames > 500
+    last = scene.daemon.pipeline.last
+    found = state.load(file, time.time())
+    assert last is not None
+    assert found is not None
+    assert found[0]["soc"] == pytest.approx(last.soc, abs=1e-3)
+
+
+@pytest.mark.parametrize(("current", "voltage", "least", "most"), [(100.0, 46.0, 15, 41), (1.0, 50.0, 4, 6)])
+def test_the_state_is_saved_when_the_charge_has_moved(
+    bus: str, tmp_path: Path, current: float, voltage: float, least: int, most: int
+):
+    """Ridden hard, what a cut costs is a tenth of a point; else it is saved once in ten seconds."""
+    file = tmp_path / "scooter.json"
+    channel = Channel("virtual", bus)
+    channel.open()
+    daemon = Daemon(reference(), [channel], None, file)
+    keeper = daemon._keeper
+    assert keeper is not None
+    frames = Scooter().steady(40.0, current=current, voltage=voltage)
+    texts: list[bytes] = []
+    at = 0
+    for now_ns in range(frames[0][0], frames[-1][0], TICK_NS):
+        end = bisect_left(frames, (now_ns,))
+        daemon.step(frames[at:end], now_ns)
+        at = end
+        assert keeper._thread.wait(20)
+        last = daemon.pipeline.last
+        if last and last.soc is not None:
+            texts += [] if texts and texts[-1] == file.read_bytes() else [file.read_bytes()]
+            snapshot, _ = state.decode(texts[-1], now_ns / S)
+            assert snapshot["soc"] == pytest.approx(last.soc, abs=0.0012)
+    daemon.close()
+    assert least <= len(texts) <= most
+
+
+# --- alone -------------------------------------------------------------------------------------------------------
+
+HOLDING = """
+import sys, time
+from contextlib import ExitStack
+from pathlib import Path
+from gz_onboard import daemon
+with ExitStack() as locks:
+    daemon._lock(locks, sys.argv[1], [sys.argv[2]], Path(sys.argv[3]))
+    print("held", flush=True)
+    time.sleep(float(sys.argv[4]))
+    if len(sys.argv) > 5:
+        import os, signal
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@contextmanager
+def holder(*arguments: object) -> Iterator[subprocess.Popen[str]]:
+    """Another daemon, as far as its locks go."""
+    command = [sys.executable, "-c", HOLDING, *map(str, arguments)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        yield process
+        process.kill()
+
+
+def take(interface: str, name: str, folder: Path) -> None:
+    with ExitStack() as locks:
+        _lock(locks, interface, [name], folder)
+
+
+def test_of_two_daemons_on_one_bus_or_state_directory_the_second_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("gz_onboard.daemon.LOCK_S", 0.3)
+    name = f"can{os.getpid()}"  # the names are those of the whole machine
+    with holder("socketcan", name, tmp_path / "a", 60):
+        with pytest.raises(InputError, match=f"--channel {name}: another gz-onboard run has it"):
+            take("socketcan", name, tmp_path / "b")
+        with pytest.raises(InputError, match=r"--state-dir .*another gz-onboard run uses it"):
+            take("socketcan", f"{name}x", tmp_path / "a")
+        take("socketcan", f"{name}x", tmp_path / "b")
+        take("virtual", name, tmp_path / "b")
+    take("socketcan", name, tmp_path / "a")
+
+
+@pytest.mark.parametrize("crash", [(), ("crash",)])
+def test_one_that_is_ending_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, crash: tuple[str, ...]):
+    monkeypatch.setattr("gz_onboard.daemon.LOCK_S", 60.0)
+    name = f"can{os.getpid()}"
+    with holder("socketcan", name, tmp_path, 1.0, *crash):
+        take("socketcan", name, tmp_path)
+
+
+def test_the_command_says_so_and_ends_with_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    with holder("udp_multicast", "239.0.0.77", tmp_path, 60):
+        arguments = ["run", "--interface", "virtual", "--channel", "x", "--state-dir", str(tmp_path)]
+        assert main(arguments) == 2
+    assert "another gz-onboard run uses it" in capsys.readouterr().err
+
+
+def test_at_the_end_a_log_that_hangs_does_not_cost_the_state(
+    bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    asked, answer = threading.Event(), threading.Event()
+
+    def hang(_: int) -> None:
+        asked.set()
+        answer.wait(60)
+
+    monkeypatch.setattr(os, "fdatasync", hang)
+    monkeypatch.setattr("gz_onboard.daemon.STOP_S", 0.2)
+    channel = Channel("virtual", bus)
+    channel.open()
+    file = tmp_path / "scooter.json"
+    daemon = Daemon(reference(), [channel], Recorder(tmp_path / "log", "v", sync_s=0.1), file)
+    frames = Scooter().steady(2.0)
+    daemon.step(frames[: len(frames) // 2], frames[len(frames) // 2][0])
+    daemon.step(frames[len(frames) // 2 :], frames[-1][0] + S)
+    assert daemon._log is not None
+    for seconds in range(2, 300):
+        daemon._log.sync(frames[-1][0] + seconds * S)
+        if asked.wait(0.1):
+            break
+    daemon.close()
+    assert "its end is lost" in caplog.text
+    assert "state in time" not in caplog.text
+    answer.set()
+    last = daemon.pipeline.last
+    found = state.load(file, time.time())
+    assert last is not None
+    assert found is not None
+    assert found[0]["soc"] == last.soc
+
+
+HANGING = """
+import os, sys, threading
+def hang(descriptor):
+    print("hangs", flush=True)
+    threading.Event().wait()
+from gz_onboard import daemon
+from gz_onboard.cli import main
+os.fdatasync = hang
+daemon.STOP_S = 0.5
+sys.exit(main(["run", "--interface", "virtual", "--channel", "x", "--log-dir", sys.argv[1]]))
+"""
+
+
+def test_it_ends_though_a_disk_does_not_answer(tmp_path: Path):
+    command = [sys.executable, "-c", HANGING, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "hangs\n"
+        process.terminate()
+        out, errors = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "received 0 frames" in out
+    assert "its end is lost" in errors
+    assert "Traceback" not in errors
+    assert "Fatal" not in errors

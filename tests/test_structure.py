@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 
 # The parts of the package, lowest first. A part imports itself and those in the lines above its own.
 LAYERS = [
-    ["__init__", "errors", "events", "notify", "state"],
+    ["__init__", "background", "errors", "events", "notify", "state"],
     ["toml"],
     ["bus", "physics"],
     ["vehicle"],

@@ -26,6 +26,8 @@ SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
 SO_RCVBUFFORCE = 33
 BUFFER = 4 << 20  # bytes; a frame takes some 800 of them in the kernel: 5000 frames
+MOST, READ_S = 5000, 0.08
+"""Frames, and time [s], that one call of `drain` takes at most: what more comes waits, and is dropped by the kernel."""
 RETRY = 1.0  # s between attempts to open a bus that is down
 _FRAME = struct.Struct("=IB3x8s")
 _FD_FRAME = struct.Struct("=IBB2x64s")
@@ -120,7 +122,7 @@ class Channel:
         return self._socket.fileno() if self._socket else None
 
     def drain(self) -> list[Frame]:
-        """Every frame that has come since the last call, without waiting."""
+        """The frames that have come since the last call, without waiting, as far as `READ_S` and `MOST` allow."""
         if not self.up and not self.reopen():
             return []
         frames: list[Frame] = []
@@ -134,10 +136,11 @@ class Channel:
         return frames
 
     def _drain_socket(self, source: socket.socket, frames: list[Frame]) -> None:
-        receive, index = source.recvmsg, self.index
+        receive, index, now = source.recvmsg, self.index, time.monotonic
         flags = socket.MSG_DONTWAIT
         unpack, unpack_time = _FRAME.unpack, _TIMESPEC.unpack
-        while True:
+        until = now() + READ_S
+        for number in range(MOST):
             try:
                 data, ancillary, _, _ = receive(72, _ANCILLARY, flags)
             except BlockingIOError:
@@ -158,9 +161,14 @@ class Channel:
             if length < len(payload):
                 payload = payload[:length]
             frames.append((time_ns or self._wall(), identifier, payload, index))
+            if not number & 31 and now() > until:
+                return
 
     def _drain_bus(self, frames: list[Frame]) -> None:
-        while (message := self._bus.recv(0)) is not None:
+        until = time.monotonic() + READ_S
+        for _ in range(MOST):
+            if time.monotonic() > until or (message := self._bus.recv(0)) is None:
+                return
             identifier = message.arbitration_id
             identifier |= EFF_FLAG if message.is_extended_id else 0
             identifier |= RTR_FLAG if message.is_remote_frame else 0

@@ -6,6 +6,9 @@ What is written is told by the name of the output:
 - a directory (a name without a suffix): one table for each message, a row for each frame, a column for each signal;
 - .mcap: everything that is in the log, and besides one JSON channel for each message at its full rate.
 
+With --estimates, and of a log that holds nothing else (that of ``gz-onboard estimate``), the estimates: .csv, .parquet
+or a directory, a row for each estimate.
+
 Signals have the units of the DBC files, in their names: ``BMS_PackVoltage[V]``. What was not available is null.
 """
 
@@ -17,12 +20,22 @@ import gzip
 import heapq
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
+from itertools import chain
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, Any, Protocol, cast
 
-from gz_onboard.bus.logs import LogDamage, json_channels, read_attachments, read_frames, read_metadata, read_samples
+from gz_onboard.bus.logs import (
+    LogDamage,
+    json_channels,
+    log_suffix,
+    read_attachments,
+    read_frames,
+    read_metadata,
+    read_samples,
+)
 from gz_onboard.bus.recorder import LogFile
 from gz_onboard.bus.replay import log_section
 from gz_onboard.bus.writers import write_blf, write_candump
@@ -37,6 +50,7 @@ Values = dict[str, "float | int | None"]
 Decoded = tuple[int, str, Values]
 """(time [ns], message, value by column): one frame's signals."""
 
+ESTIMATE_TOPIC = "/estimate"  # as in gz_onboard.pipeline, which a part of bus may not import
 _ROWS = 20_000
 _TEXT_FORMATS = (".log", ".asc", ".trc", ".csv")
 _FORMATS = (*_TEXT_FORMATS, ".blf", ".mf4", ".parquet", ".mcap")
@@ -289,6 +303,57 @@ def _message_schema(message: Message, columns: Mapping[str, str]) -> dict[str, A
     return {"title": message.name, "type": "object", "properties": properties}
 
 
+# --- estimates -------------------------------------------------------------------------------------------------
+
+
+def _write_estimates(log: Path, out: Path, suffix: str, table_format: str, section: tuple[float, float | None]) -> int:
+    """The rows of the topic of estimates, a column for each field, with its unit; gives how many."""
+    if suffix not in (".csv", ".parquet", ""):
+        raise InputError(f"{out}: estimates can be written into .csv, .parquet or a directory")
+    found = [(time_ns, values) for topic, time_ns, values in read_samples(log) if topic == ESTIMATE_TOPIC]
+    if not found:
+        raise InputError(f"{log}: holds no estimates ({ESTIMATE_TOPIC})")
+    start_s, end_s = section
+    low = found[0][0] + round(start_s * 1e9)
+    high = math.inf if end_s is None else found[0][0] + round(end_s * 1e9)
+    rows = [(time_ns, values) for time_ns, values in found if low <= time_ns < high]
+    columns = _estimate_columns(log)
+    if suffix == "":
+        out.mkdir(parents=True, exist_ok=True)
+        suffix = f".{table_format}"
+        out /= f"estimate{suffix}"
+    if suffix == ".csv":
+        with _open_text(out) as stream:
+            writer = csv.writer(stream)
+            writer.writerow(["time[s]", *columns.values()])
+            writer.writerows([_seconds(t), *(values.get(name) for name in columns)] for t, values in rows)
+        return len(rows)
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    arrays = {"time": pa.array([t for t, _ in rows], pa.timestamp("ns", "UTC"))}
+    for name, column in columns.items():
+        values = [row.get(name) for _, row in rows]
+        if any(isinstance(value, str) for value in values):
+            arrays[column] = pa.array([None if value is None else str(value) for value in values], pa.string())
+        else:
+            numbers = [float(v) if isinstance(v, int | float) else None for v in values]
+            arrays[column] = pa.array(numbers, pa.float64())
+    pq.write_table(pa.table(arrays), out)
+    return len(rows)
+
+
+def _estimate_columns(log: Path) -> dict[str, str]:
+    """Field -> column of the table, ``name[unit]``: the unit is the first word of the schema's description."""
+    try:
+        properties = json.loads(json_channels(log)[ESTIMATE_TOPIC][0])["properties"]
+        units = {name: str(about.get("description", "")) for name, about in properties.items()}
+    except (ValueError, LookupError, AttributeError, TypeError) as error:
+        raise InputError(f"{log}: the schema of {ESTIMATE_TOPIC} is not one of ours: {error!r}") from None
+    words = {name: re.split(r"[ ,]", unit)[0] for name, unit in units.items()}
+    return {name: f"{name}[{unit}]" if unit not in ("", "1") else name for name, unit in words.items()}
+
+
 # --- the command -----------------------------------------------------------------------------------------------
 
 
@@ -301,6 +366,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="frames: .log .blf .asc .trc .csv .mf4; signals: .parquet (one long table), .mcap (for Foxglove), or the"
         " name of a directory (one table for each message)",
     )
+    parser.add_argument("--estimates", action="store_true", help="write what was estimated, a row for each time")
     parser.add_argument("--signals", action="store_true", help="write signals into .csv, where it could be frames")
     parser.add_argument(
         "--table-format", choices=["parquet", "csv"], default="parquet", help="of the tables in a directory"
@@ -318,23 +384,45 @@ def run(args: argparse.Namespace) -> int:
     suffix = out_suffix(out)
     if out.exists() and out.resolve() == log.resolve():
         raise InputError(f"{out}: is the log itself")
+    if args.estimates or _holds_only_estimates(log):
+        count = _written(out, lambda: _write_estimates(log, out, suffix, args.table_format, (args.start, args.end)))
+        print(f"wrote {out}: {count} estimates")
+        return 0
     section = log_section(log, args.start, args.end)
     damages: list[LogDamage] = []
-    batches = read_frames(log, *section, damages.append)
-    try:
-        if suffix in (".parquet", ".mcap", "") or args.signals:
-            decoder = Decoder(_database(log, args.dbc))
-            count = _export_signals(log, out, suffix, args.table_format, decoder, batches, section)
-            left = f"; {decoder.unknown} frames are in no DBC file, {decoder.undecodable} do not fit theirs"
-        else:
-            count = write_frames_as(out, suffix, batches)
-            left = ""
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror or error}") from None
+    rest = read_frames(log, *section, damages.append)
+    first = next(rest, None)
+    if first is None:
+        where = "this log" if section == (None, None) else "the chosen part"
+        why = "".join(f"; damaged at {damage.place}: {damage.reason}" for damage in damages)
+        raise InputError(f"{log}: no frames in {where}{why}")
+    batches = chain([first], rest)
+    if suffix in (".parquet", ".mcap", "") or args.signals:
+        decoder = Decoder(_database(log, args.dbc))
+        count = _written(out, lambda: _export_signals(log, out, suffix, args.table_format, decoder, batches, section))
+        left = f"; {decoder.unknown} frames are in no DBC file, {decoder.undecodable} do not fit theirs"
+    else:
+        count = _written(out, lambda: write_frames_as(out, suffix, batches))
+        left = ""
     for damage in damages:
         print(f"damaged log: {damage}")
     print(f"wrote {out}: {count} {'samples' if suffix == '.mcap' else 'frames'}{left}")
     return 0
+
+
+def _written(out: Path, write: Callable[[], int]) -> int:
+    """What `write` gives; InputError for what the operating system refuses."""
+    try:
+        return write()
+    except OSError as error:
+        raise InputError(f"{out}: cannot be written: {error.strerror or error}") from None
+
+
+def _holds_only_estimates(log: Path) -> bool:
+    """Whether it is a log of ours that holds estimates and not a single frame."""
+    if log_suffix(log) != ".mcap" or ESTIMATE_TOPIC not in json_channels(log):
+        return False
+    return next(read_frames(log, on_damage=lambda _: None), None) is None
 
 
 def _export_signals(

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard.bus.readers import blf, candump, mcap, pycan
-from gz_onboard.bus.readers.common import Contents, Damage, Reader, unpacked
+from gz_onboard.bus.readers.common import TIME_LIMIT_NS, Contents, Damage, Reader, unpacked
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import Frame
 
@@ -34,9 +34,6 @@ _READERS: dict[str, Reader] = {
     ".trc": pycan.text_reader(".trc"),
     ".mf4": pycan.read_mf4,
 }
-
-
-_NO_TIME = 1 << 63  # ns: beyond what our own log can hold
 
 
 @dataclass(frozen=True)
@@ -123,7 +120,12 @@ def read_samples(
         return
     data = unpacked(path, _load(path), Damage())
     for topic, time_ns, text in mcap.samples(path, data, Damage(), start_ns, end_ns):
-        yield topic, time_ns, json.loads(text)
+        try:
+            values = json.loads(text)
+        except (ValueError, RecursionError):
+            continue
+        if isinstance(values, dict):
+            yield topic, time_ns, values
 
 
 def _warn(damage: LogDamage) -> None:
@@ -149,14 +151,17 @@ def _filtered(
     on_damage: Callable[[LogDamage], None],
 ) -> Iterator[list[Frame]]:
     damage = Damage()
-    earliest = 0 if start_ns is None else max(start_ns, 0)
-    latest = _NO_TIME if end_ns is None else min(end_ns, _NO_TIME)
+    earliest = start_ns if start_ns is not None else 0
+    latest = end_ns if end_ns is not None else TIME_LIMIT_NS
     for batch in reader(path, unpacked(path, data, damage), damage, start_ns, end_ns):
-        times = [frame[0] for frame in batch]
-        for time_ns in times if times and (min(times) < 0 or max(times) >= _NO_TIME) else ():
-            if not 0 <= time_ns < _NO_TIME:
-                damage.add(f"a frame at {time_ns / 1e9:.9g} s", "no time since 1970 that fits into 63 bits of ns")
-        if wanted := [frame for frame in batch if earliest <= frame[0] < latest]:
-            yield wanted
+        frames = batch
+        if batch and (min(batch)[0] < 0 or max(batch)[0] >= TIME_LIMIT_NS):
+            frames = [frame for frame in batch if 0 <= frame[0] < TIME_LIMIT_NS]
+            wrong = next(frame[0] for frame in batch if not 0 <= frame[0] < TIME_LIMIT_NS)
+            damage.add("a frame", f"{wrong} ns is no time", len(batch) - len(frames))
+        if start_ns is not None or end_ns is not None:
+            frames = [frame for frame in frames if earliest <= frame[0] < latest]
+        if frames:
+            yield frames
     if damage.count:
         on_damage(LogDamage(path, damage.count, damage.place, damage.reason))

@@ -1,13 +1,14 @@
 """Writing logs: MCAP files with the raw frames in blocks and JSON channels for everything else.
 
-`LogFile` writes one file and lets errors through; `Recorder` keeps a directory of them, rotates and deletes them,
-and never raises for a full disk or a broken one. Neither has a clock: times come with the frames and samples.
-What stands in a file: docs/log-format.md.
+`LogFile` writes one file and lets errors through; `Recorder` keeps a directory of them, rotates, completes and deletes
+them, and never raises for a full disk or a broken one; `BackgroundRecorder` does so on a thread of its own. None of
+them has a clock: times come with the frames and samples. What stands in a file: docs/log-format.md.
 """
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import math
 import os
@@ -20,16 +21,22 @@ from typing import IO, Any
 from mcap.writer import CompressionType, Writer
 
 from gz_onboard import __version__
+from gz_onboard.background import Background
 from gz_onboard.bus import framelog
+from gz_onboard.bus.completion import complete, is_complete, lock
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
+from gz_onboard.state import sync_directory
 
 BLOCK_FRAMES = 512
 BLOCK_NS = 1_000_000_000
 """A block holds at most this many frames and this much time: a reader that looks for a time relies on it."""
 
 _CHUNK_BYTES = 256 * 1024
-_NAME = re.compile(r"(\d{8}T\d{6}Z)_(.+?)(?:~(\d+))?\.mcap")
+_NAME = re.compile(r"(\d{8}T\d{6}Z)_(.+?)(?:~(\d{1,9}))?\.mcap")
+_LEFT_FREE = 64 << 20  # bytes
+_LEAST_ROOM = 64 << 10  # bytes: the beginning of a file has some 20 kB, with the DBC files
+_STUCK = 10.0  # s: no disk takes as long
 
 
 class LogFile:
@@ -99,6 +106,14 @@ class LogFile:
         """Bytes written so far, without what still waits for a chunk to be full."""
         return self._stream.tell()
 
+    def vanished(self, path: Path) -> bool:
+        """Whether the file is no longer at `path`: deleted or moved, itself or its directory."""
+        try:
+            there = path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return True
+        return not os.path.samestat(there, os.fstat(self._stream.fileno()))
+
     def close(self) -> None:
         """Write the rest and the summary that lets readers jump to a time."""
         try:
@@ -123,13 +138,14 @@ class LogFile:
 
 
 class Recorder:
-    """Logs into a directory of MCAP files named by their start in UTC and the vehicle, never raising for I/O errors.
+    """Logs into a directory of MCAP files named by their start in UTC, the vehicle and a running number.
 
-    An error closes the file and is counted in `errors` (its text in `last_error`); recording goes on with a new
-    file `retry_s` later, and `lost_frames` counts the frames not known to be in a file. A file is closed at
-    `max_file_bytes` or `max_age_s`. Before a new one is begun, the oldest of the files named as ours are deleted
-    until all together, with the new one, stay below `max_total_bytes`; other files are not touched.
-    Raises InputError for limits that cannot be kept.
+    Nothing is raised for an error in writing: it closes the file and is counted in `errors` (its text in `last_error`);
+    recording goes on with a new file `retry_s` later, and `lost_frames` counts the frames not known to be in a file. A
+    file is closed at `max_file_bytes` or `max_age_s`. Before a new one is begun, the oldest of the files named as ours
+    (by their running numbers: clocks are set) are deleted until all together, with the new one, stay below
+    `max_total_bytes`, and leave free on the file system what `left_free` says; other files are not touched, nor are
+    files that are being written. Raises InputError for limits that cannot be kept.
     """
 
     def __init__(
@@ -139,7 +155,7 @@ class Recorder:
         metadata: Mapping[str, str] | None = None,
         attachments: Mapping[str, bytes] | None = None,
         *,
-        sync_s: float = 1.6,
+        sync_s: float = 1.5,
         max_file_bytes: int = 64 << 20,
         max_age_s: float = 3600.0,
         max_total_bytes: int = 1 << 30,
@@ -163,16 +179,21 @@ class Recorder:
         self._sync_ns = round(sync_s * 1e9)
         self._retry_ns = round(retry_s * 1e9)
         self._max_age_ns = round(max_age_s * 1e9)
-        self._max_file_bytes = max_file_bytes
+        self._max_file_bytes = self._file_bytes = max_file_bytes
         self._max_total_bytes = max_total_bytes
         self._file: LogFile | None = None
         self._synced_ns: int | None = None
         self._failed_ns: int | None = None
+        self._cut_off: list[Path] | None = None  # files without an end; None: to be looked for
 
     @property
     def failing(self) -> bool:
         """Whether the last attempt to write failed, and none has succeeded since."""
         return self._failed_ns is not None
+
+    @property
+    def _writing(self) -> Path | None:
+        return self.path if self._file else None
 
     def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
         """Declare a topic of JSON objects (a JSON schema of type object), for this file and all later ones."""
@@ -191,7 +212,7 @@ class Recorder:
             return
         try:
             file.frames(batch)
-        except OSError as error:
+        except Exception as error:  # of the disk; whatever else it may be, it costs this file and nothing more
             self._fail(error, now_ns)
 
     def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
@@ -202,7 +223,7 @@ class Recorder:
             return
         try:
             file.sample(topic, time_ns, values)
-        except OSError as error:
+        except Exception as error:
             self._fail(error, time_ns)
 
     def sync(self, now_ns: int) -> None:
@@ -217,17 +238,41 @@ class Recorder:
         self._synced_ns = now_ns
         try:
             file.flush(to_disk=True)
-            if file.size() >= self._max_file_bytes or abs(now_ns - file.start_ns) >= self._max_age_ns:
+            if self.path is not None and file.vanished(self.path):
+                file.close()  # whole, wherever it was moved to
+                self._file = None
+                self._note(OSError(errno.ENOENT, "was deleted or moved while it was written", str(self.path)), now_ns)
+                self._failed_ns = now_ns - self._retry_ns
+            elif file.size() >= self._file_bytes or abs(now_ns - file.start_ns) >= self._max_age_ns:
                 self._close_file(file)
-        except OSError as error:
+            elif not self._free():
+                self._close_file(file)
+                self._note(OSError(errno.ENOSPC, "the disk is full", str(self._directory)), now_ns)
+        except Exception as error:
             self._fail(error, now_ns)
+
+    def complete_one(self) -> bool:
+        """Complete the next of the files that a power cut or an error has cut off; False if there is none."""
+        if self._cut_off is None:
+            self._cut_off = []
+            with contextlib.suppress(OSError):
+                self._cut_off = [path for _, _, path in self._own() if path != self._writing and not is_complete(path)]
+        if not self._cut_off:
+            return False
+        path = self._cut_off.pop()  # the latest first
+        with contextlib.suppress(OSError):  # it can still be read as it is
+            if path.stat().st_size:
+                complete(path)
+            else:
+                _delete(path)
+        return True
 
     def close(self) -> None:
         """Close the file; frames and samples logged later begin a new one."""
         if self._file is not None:
             try:
                 self._close_file(self._file)
-            except OSError as error:
+            except Exception as error:
                 self._fail(error, self._file.start_ns)
 
     def _close_file(self, file: LogFile) -> None:
@@ -245,15 +290,16 @@ class Recorder:
             self._directory.mkdir(parents=True, exist_ok=True)
             self._make_room()
             path, stream = self._create(start_ns)
-        except OSError as error:
+        except (OSError, ValueError, OverflowError) as error:  # of the disk, or the time is no date
             self._note(error, start_ns)
             return None
         self.path = path
         try:
+            lock(stream)
             file = LogFile(stream, start_ns, self._metadata, self._attachments)
             for topic, (schema, metadata) in self._channels.items():
                 file.channel(topic, schema, metadata)
-        except OSError as error:
+        except Exception as error:
             with contextlib.suppress(OSError):
                 stream.close()
             self._note(error, start_ns)
@@ -266,7 +312,7 @@ class Recorder:
 
     def _create(self, start_ns: int) -> tuple[Path, IO[bytes]]:
         start = datetime.fromtimestamp(start_ns // 1_000_000_000, UTC).strftime("%Y%m%dT%H%M%SZ")
-        number = 1
+        number = max((number for number, _, _ in self._own()), default=0) + 1
         while True:
             suffix = "" if number == 1 else f"~{number}"
             path = self._directory / f"{start}_{self._vehicle}{suffix}.mcap"
@@ -275,34 +321,56 @@ class Recorder:
             except FileExistsError:
                 number += 1
                 continue
-            _sync_directory(self._directory)  # else the name may be gone after a power cut, whatever the file holds
+            sync_directory(self._directory)  # else the name may be gone after a power cut, whatever the file holds
             return path, stream
 
-    def _make_room(self) -> None:
-        """Delete our oldest files until a new one of full size fits under the total."""
+    def _own(self) -> list[tuple[int, str, Path]]:
+        """Running number, start and path of the files named as ours, the oldest first."""
         found = [(match, path) for path in self._directory.iterdir() if (match := _NAME.fullmatch(path.name))]
-        own = [(match[1], int(match[3] or 1), path) for match, path in found if path.is_file()]
-        sizes = {path: path.stat().st_size for _, _, path in own}
-        total = sum(sizes.values())
-        for _, _, path in sorted(own):
-            if total + self._max_file_bytes <= self._max_total_bytes:
-                return
-            path.unlink()
-            total -= sizes[path]
+        return sorted((int(match[3] or 1), match[1], path) for match, path in found if path.is_file())
 
-    def _fail(self, error: OSError, now_ns: int) -> None:
+    def _make_room(self) -> None:
+        """Delete our oldest files until a new one of full size fits. OSError if it cannot, on a full disk."""
+        sizes = {path: path.stat().st_size for _, _, path in self._own()}
+        total = sum(sizes.values())
+        free, keep = free_space(self._directory)
+        room = free - keep + total  # that all of ours may take together
+        if room < _LEAST_ROOM:
+            raise OSError(errno.ENOSPC, f"no room for a log: {max(free, 0) >> 10} kB are free", str(self._directory))
+        self._file_bytes = min(self._max_file_bytes, room // 4)  # on a small disk small ones: the oldest goes whole
+        allowed = min(self._max_total_bytes, room) - self._file_bytes
+        for path, size in sizes.items():
+            if total <= allowed:
+                return
+            if _delete(path):
+                total -= size
+
+    def _free(self) -> bool:
+        """Whether enough is free on the disk, after deleting as many of our oldest files as need be."""
+        free, keep = free_space(self._directory)
+        if free >= keep:
+            return True
+        for _, _, path in self._own():
+            if path != self._writing and _delete(path):
+                free, keep = free_space(self._directory)
+                if free >= keep:
+                    return True
+        return False
+
+    def _fail(self, error: Exception, now_ns: int) -> None:
         file = self._file
         self._file = None
         self._note(error, now_ns)
         if file is not None:
             self.lost_frames += file.unsynced_frames
             file.abandon()
+            self._cut_off = None
             if not file.flushed and self.path is not None:
                 self._discard(self.path)
 
-    def _note(self, error: OSError, now_ns: int) -> None:
+    def _note(self, error: Exception, now_ns: int) -> None:
         self.errors += 1
-        self.last_error = str(error)
+        self.last_error = str(error) or repr(error)
         self._failed_ns = now_ns
 
     def _discard(self, path: Path) -> None:
@@ -312,6 +380,95 @@ class Recorder:
         if path in self.paths:
             self.paths.remove(path)
         self.path = self.paths[-1] if self.paths else None
+
+
+class BackgroundRecorder:
+    """A `Recorder` on a thread of its own, for one that may not wait for a disk. The recorder is its alone.
+
+    limit: how many frames may wait for the disk (a value of a sample counts as one); what does not fit is left out,
+    whole portions of it, and counted in `lost_frames`.
+    """
+
+    def __init__(self, recorder: Recorder, limit: int = 40_000) -> None:
+        self._recorder = recorder
+        self._thread = Background("log", limit, recorder.complete_one)
+        self._left_out = 0
+        self._full = False
+        self._now_ns = 0
+        self._syncing = False
+
+    @property
+    def failing(self) -> bool:
+        """Whether frames are lost: errors, or a disk that is too slow or does not answer."""
+        return self._recorder.failing or self._full or self._thread.stuck > _STUCK
+
+    @property
+    def last_error(self) -> str:
+        """Why it is failing."""
+        if self._recorder.failing:
+            return self._recorder.last_error
+        return "the disk is too slow" if self._full else "the disk does not answer"
+
+    @property
+    def lost_frames(self) -> int:
+        """Frames not known to be in a file."""
+        return self._recorder.lost_frames + self._left_out
+
+    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
+        """As that of `Recorder`; to be called before anything is logged."""
+        self._recorder.channel(topic, json_schema, metadata)
+
+    def frames(self, batch: Sequence[Frame]) -> None:
+        """As that of `Recorder`; `batch` may not be changed afterwards."""
+        if batch and not self._thread.call(self._recorder.frames, batch, weight=len(batch)):
+            self._left_out += len(batch)
+            self._full = True
+
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
+        """As that of `Recorder`; `values` may not be changed afterwards."""
+        if not self._thread.call(self._recorder.sample, topic, time_ns, values, weight=len(values)):
+            self._full = True
+
+    def sync(self, now_ns: int) -> None:
+        """As that of `Recorder`."""
+        self._now_ns = now_ns
+        if self._full and self._thread.load < 0.5:
+            self._full = False
+        if not self._syncing:
+            self._syncing = self._thread.call(self._sync, weight=0)
+
+    def close(self, seconds: float) -> bool:
+        """Write what waits and close the file; False if that takes longer than `seconds`: the rest is lost then."""
+        self._thread.call(self._recorder.close, weight=0)
+        return self._thread.close(seconds)
+
+    def _sync(self) -> None:
+        self._syncing = False
+        self._recorder.sync(self._now_ns)
+
+
+def free_space(directory: Path) -> tuple[int, int]:
+    """Bytes free on the file system of a directory, and how many of them our logs leave to others.
+
+    That is a twentieth of it, but 64 MiB on one below 1.3 GB, and a quarter on one below 256 MiB.
+    """
+    there = os.statvfs(directory)
+    size = there.f_blocks * there.f_frsize
+    if not size:  # some file systems do not tell
+        return 1 << 62, 0
+    return there.f_bavail * there.f_frsize, min(max(size // 20, _LEFT_FREE), size // 4)
+
+
+def _delete(path: Path) -> bool:
+    """Delete a log, unless it is being written."""
+    try:
+        with path.open("rb") as stream:
+            if not lock(stream):
+                return False
+            path.unlink()
+    except OSError:  # not ours to delete, or gone
+        return False
+    return True
 
 
 def object_schema(title: str, units: Mapping[str, str]) -> dict[str, Any]:
@@ -337,11 +494,3 @@ def _without_nan(value: object) -> object:
     if isinstance(value, list | tuple):
         return [_without_nan(item) for item in value]
     return value
-
-
-def _sync_directory(directory: Path) -> None:
-    descriptor = os.open(directory, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

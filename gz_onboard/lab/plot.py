@@ -14,7 +14,7 @@ from gz_onboard.bus.logs import read_metadata, read_samples
 from gz_onboard.bus.publisher import WH_PER_KM
 from gz_onboard.errors import InputError
 from gz_onboard.events import Reason, State
-from gz_onboard.pipeline import ESTIMATE_TOPIC, STATUS_TOPIC
+from gz_onboard.pipeline import ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
 from gz_onboard.simulation.style import (
     BLUE,
     GREEN,
@@ -53,15 +53,43 @@ def read_ride(log: Path) -> tuple[list[Row], list[int], Row]:
     status: Row = {}
     for topic, time_ns, values in read_samples(log):
         if topic == ESTIMATE_TOPIC:
-            rows.append(values)
-            times.append(time_ns)
-        elif topic == STATUS_TOPIC:
+            if _is_estimate(values):
+                rows.append(values)
+                times.append(time_ns)
+        elif topic == STATUS_TOPIC and _is_status(values):
             status = values
     if not rows:
         raise InputError(
             f"{log}: holds no estimates ({ESTIMATE_TOPIC}): gz-onboard estimate makes such a log of a recorded ride"
         )
     return rows, times, status
+
+
+def _is_estimate(values: Row) -> bool:
+    """Whether it is a row as we write them: others may write to a topic of this name, too."""
+    if values.get("state") not in State.__members__ or not isinstance(values.get("reasons"), str):
+        return False
+    numbers = {name: values.get(name) for name in ESTIMATE_UNITS}
+    if not all(_is_number(value) for value in numbers.values() if value is not None):
+        return False
+    for together in (("soc", "soc_sd"), ("range", "range_p10", "range_p90")):
+        if len({values.get(name, "") is None for name in together}) > 1 or not set(together) <= values.keys():
+            return False
+    return _is_number(numbers["time"]) and _is_number(numbers["distance"])
+
+
+def _is_status(values: Row) -> bool:
+    faults, lost, unknown = (values.get(name, {}) for name in ("faults", "lost", "unknown"))
+    if not all(isinstance(counts, dict) for counts in (faults, lost, unknown)):
+        return False
+    places = faults.values()
+    return all(isinstance(counts, dict) for counts in places) and all(
+        _is_number(n) for counts in (lost, *places) for n in counts.values()
+    )
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and isfinite(value) and abs(value) < 1e15
 
 
 def naive_range(rows: Sequence[Row]) -> list[float | None]:

@@ -230,9 +230,90 @@ def test_what_was_left_out_is_counted(tmp_path: Path, log: Path, capsys: pytest.
 
 
 def test_damage_is_told(tmp_path: Path, log: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    log.write_bytes(log.read_bytes()[:-2500])
-    run(log, tmp_path / "out.blf")
+    file = LogFile(log.open("wb"), START)
+    for frame in recorded():
+        file.frames([frame])
+    file.flush()
+    whole = log.stat().st_size
+    file.frames(recorded())
+    file.close()
+    log.write_bytes(log.read_bytes()[: whole + 200])
+    assert run(log, tmp_path / "out.blf") == 0
     assert "damaged log" in capsys.readouterr().out
+    assert read(tmp_path / "out.blf")
+    log.write_bytes(log.read_bytes()[:500])
+    with pytest.raises(InputError, match=r"no frames in this log; damaged at byte \d+"):
+        run(log, tmp_path / "none.blf")
+    assert not (tmp_path / "none.blf").exists()
+
+
+@pytest.fixture
+def estimated(tmp_path: Path) -> Path:
+    """A log as ``gz-onboard estimate`` writes it: no frames."""
+    path = tmp_path / "ride.estimate.mcap"
+    file = LogFile(path.open("wb"), START, {"vehicle": "ref"}, {"dbc/a.dbc": DBC.encode()})
+    properties = {
+        "time": {"type": ["number", "null"], "description": "s since the first frame"},
+        "soc": {"type": ["number", "null"], "description": "1"},
+        "range": {"type": ["number", "null"], "description": "m"},
+        "state": {"type": "string"},
+    }
+    file.channel("/estimate", {"title": "e", "type": "object", "properties": properties})
+    file.channel("/status", {"title": "s", "type": "object"})
+    for i in range(10):
+        row = {"time": float(i), "soc": 0.5, "range": None if i == 3 else 1000.0 - i, "state": "VALID"}
+        file.sample("/estimate", START + i * 10**9, row)
+        file.sample("/status", START + i * 10**9, {"received": i})
+    file.close()
+    return path
+
+
+COLUMNS = ["time[s]", "soc", "range[m]", "state"]
+
+
+@pytest.mark.parametrize(("name", "more"), [("out.csv", []), ("out.csv.gz", []), ("tables", ["--table-format", "csv"])])
+def test_a_log_of_estimates_gives_their_table(tmp_path: Path, estimated: Path, name: str, more: list[str]) -> None:
+    assert run(estimated, tmp_path / name, *more) == 0
+    out = tmp_path / "tables" / "estimate.csv" if name == "tables" else tmp_path / name
+    with gzip.open(out, "rt") if name.endswith("gz") else out.open() as stream:
+        rows = list(csv.reader(stream))
+    assert rows[0] == ["time[s]", *COLUMNS]
+    assert rows[3] == [f"{START // 10**9 + 2}.000000000", "2.0", "0.5", "998.0", "VALID"]
+    assert rows[4][3] == ""
+    assert len(rows) == 11
+
+
+def test_estimates_in_parquet(tmp_path: Path, estimated: Path) -> None:
+    pq = pytest.importorskip("pyarrow.parquet")
+    assert run(estimated, tmp_path / "out.parquet", "--from", "2", "--to", "5") == 0
+    table = pq.read_table(tmp_path / "out.parquet")
+    assert table.column_names == ["time", *COLUMNS]
+    assert table["range[m]"].to_pylist() == [998.0, None, 996.0]
+    assert table["state"].to_pylist() == ["VALID"] * 3
+
+
+def test_estimates_beside_frames_are_asked_for(tmp_path: Path, log: Path) -> None:
+    assert run(log, tmp_path / "out.csv", "--estimates") == 0
+    with (tmp_path / "out.csv").open() as stream:
+        rows = list(csv.reader(stream))
+    assert rows[0] == ["time[s]", "range[km]"]
+    assert len(rows) > 5
+
+
+@pytest.mark.parametrize("name", ["out.blf", "out.log", "out.mcap", "out.asc"])
+def test_a_log_of_estimates_has_no_frames_to_export(tmp_path: Path, estimated: Path, name: str) -> None:
+    with pytest.raises(InputError, match=r"estimates can be written into .csv"):
+        run(estimated, tmp_path / name)
+    assert not (tmp_path / name).exists()
+
+
+def test_a_log_without_estimates_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    file = LogFile(path.open("wb"), START)
+    file.frames(recorded())
+    file.close()
+    with pytest.raises(InputError, match="holds no estimates"):
+        run(path, tmp_path / "out.csv", "--estimates")
 
 
 def test_a_log_without_dbc_files_asks_for_them(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import argparse
+import contextlib
 import gzip
 import os
 import struct
@@ -11,11 +13,20 @@ from tempfile import TemporaryDirectory
 
 import can
 import pytest
+import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.bus import logs
-from gz_onboard.bus.logs import LogDamage, read_frames
+from gz_onboard.bus import export, logs
+from gz_onboard.bus.logs import (
+    LogDamage,
+    json_channels,
+    read_attachments,
+    read_frames,
+    read_metadata,
+    read_samples,
+)
+from gz_onboard.bus.mapping import find_dbc
 from gz_onboard.bus.readers.common import ChannelNumbers
 from gz_onboard.bus.readers.pycan import frame_of
 from gz_onboard.bus.recorder import LogFile
@@ -477,3 +488,155 @@ def test_what_is_lost_is_logged_where_nobody_listens(tmp_path: Path, caplog: pyt
     assert "cut off" in caplog.text
     assert zlib.crc32(path.read_bytes())  # reading has not touched the file's lock or content
     assert logs.read_metadata(path) == {}
+
+
+# --- hostile ---------------------------------------------------------------------------------------------------
+
+LAST_NS = (1 << 63) - 1
+
+
+def hostile_block(first: int, steps: list[int], unit: int = 1) -> bytes:
+    """A block of frames that begins at `first` [ns], with these steps between them [units], whatever they are."""
+    packed = b"".join(step.to_bytes(8, "little", signed=True) for step in steps)
+    count = len(steps) + 1
+    head = struct.pack("<BBHIqI", 1, 8, 1, count, first, unit) + struct.pack("<IBB", 1, 0, 2) + bytes(count)
+    return head + b"".join(packed[i::8] for i in range(8)) + bytes(2 * count)
+
+
+def with_messages(path: Path, *messages: tuple[int, bytes]) -> None:
+    """One of our logs with ordinary frames, and besides messages of any content on its topic of frames."""
+    file = LogFile(path.open("wb"), START_S * 10**9)
+    file.frames(ordinary(50))
+    file.flush()
+    for stamp, data in messages:
+        file._writer.add_message(file._frames_channel, stamp, data, stamp)
+    file.close()
+
+
+@pytest.mark.parametrize(
+    ("first", "steps", "unit", "kept"),
+    [
+        (-5, [10], 1, [5]),
+        (-(1 << 63), [(1 << 63) - 1, 7], 1, [6]),
+        (LAST_NS - 1, [1, 1], 1, [LAST_NS - 1, LAST_NS]),
+        (1, [1 << 62], 0xFFFF_FFFF, [1]),
+    ],
+)
+def test_a_time_that_is_none_is_left_out_and_told(
+    tmp_path: Path, first: int, steps: list[int], unit: int, kept: list[int]
+) -> None:
+    path = tmp_path / "a.mcap"
+    with_messages(path, (START_S, hostile_block(first, steps, unit)))
+    there, damages = read(path)
+    assert there[:50] == ordinary(50)
+    assert [frame[0] for frame in there[50:]] == kept
+    assert damages[0].count == len(steps) + 1 - len(kept)
+    assert "is no time" in str(damages[0])
+    for name in ("out.log", "out.blf", "out.mcap", "out.asc", "out.trc", "out.csv"):
+        arguments = argparse.ArgumentParser()
+        export.add_arguments(arguments)
+        dbc = ["--dbc", str(find_dbc("range.dbc"))] if name == "out.mcap" else []
+        assert export.run(arguments.parse_args([str(path), str(tmp_path / name), *dbc])) == 0
+
+
+@pytest.mark.parametrize("line", ["(18446744073709.551616) can0 123#00", "(99999999999999999999.0) can0 123#00"])
+def test_a_time_beyond_all_formats_in_a_candump(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "a.log"
+    path.write_text(f"(1.000000) can0 123#00\n{line}\n(2.000000) can0 123#00\n")
+    there, damages = read(path)
+    assert [frame[0] for frame in there] == [10**9, 2 * 10**9]
+    assert damages[0].count == 1
+
+
+def chunk_at(data: bytes | bytearray, number: int) -> int:
+    """Where the content of a chunk record begins, by the name of its compression."""
+    at = -1
+    for _ in range(number + 1):
+        at = data.index(b"\x04\0\0\0zstd", at + 1)
+    return at - 28
+
+
+def three_chunks(path: Path) -> list[Frame]:
+    frames = ordinary(1500)
+    write_mcap(path, [frames[:500], frames[500:1000], frames[1000:]])
+    return frames
+
+
+@pytest.mark.parametrize("size", [1 << 63, (1 << 64) - 1, 1 << 40, 100 << 30, 0, 1])
+def test_a_chunk_of_another_size_than_it_says_is_left_out(tmp_path: Path, size: int) -> None:
+    path = tmp_path / "a.mcap"
+    frames = three_chunks(path)
+    data = bytearray(path.read_bytes())
+    at = chunk_at(data, 1)
+    data[at + 16 : at + 24] = size.to_bytes(8, "little")
+    path.write_bytes(data)
+    there, damages = read(path)
+    assert there == frames[:500] + frames[1000:]
+    assert damages[0].count == 1
+    assert list(read_samples(path)) == []
+
+
+BOMB = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
+from gz_onboard.bus.logs import read_frames, read_samples
+from gz_onboard.errors import InputError
+frames = [f for batch in read_frames(sys.argv[1], on_damage=print) for f in batch]
+list(read_samples(sys.argv[1]))
+print(len(frames))
+"""
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_bomb_does_not_go_off(tmp_path: Path, told: bool) -> None:
+    """A chunk of some kB that unpacks to 3 GiB, in a process that has 2: the others are read."""
+    path = tmp_path / "a.mcap"
+    three_chunks(path)
+    data = path.read_bytes()
+    at = chunk_at(data, 1)
+    length = int.from_bytes(data[at - 8 : at], "little")
+    packer = zstandard.ZstdCompressor(level=1).compressobj(size=3 << 30 if told else -1)
+    packed = b"".join(packer.compress(bytes(1 << 24)) for _ in range(192)) + packer.flush()
+    chunk = data[at : at + 16] + (3 << 30 if told else 1 << 20).to_bytes(8, "little") + data[at + 24 : at + 36]
+    chunk += len(packed).to_bytes(8, "little") + packed
+    path.write_bytes(data[: at - 8] + len(chunk).to_bytes(8, "little") + chunk + data[at + length :])
+    out = subprocess.run([sys.executable, "-c", BOMB, path], capture_output=True, text=True, check=False)
+    assert not out.stderr
+    assert out.stdout.split()[-1] == "1000"
+    assert "a chunk is broken" in out.stdout
+
+
+@pytest.mark.parametrize(
+    "text", [b"{", b"[1]", b"\xff", b'{"a": ' + b"9" * 5000 + b"}", b"[" * 100_000, b"3", b'{"a": 1}']
+)
+def test_samples_that_are_no_json_objects_are_passed_over(tmp_path: Path, text: bytes) -> None:
+    path = tmp_path / "a.mcap"
+    file = LogFile(path.open("wb"), START_S)
+    file.channel("/estimate", {"type": "object"})
+    file.sample("/estimate", 1, {"a": 0})
+    file._writer.add_message(file._channels["/estimate"], 2, text, 2)
+    file._writer.add_message(file._channels["/estimate"], 1 << 63, b"{}", 2)
+    file.sample("/estimate", 3, {"a": 2})
+    file.close()
+    found = [values for _, _, values in read_samples(path)]
+    assert found == [{"a": 0}, *([{"a": 1}] if text == b'{"a": 1}' else []), {"a": 2}]
+
+
+@given(st.integers(0, 10**9), st.binary(min_size=1, max_size=20))
+@settings(deadline=None, max_examples=150)
+def test_rubbish_anywhere_ends_in_no_traceback(place: int, rubbish: bytes) -> None:
+    with TemporaryDirectory() as directory:
+        path = Path(directory) / "a.mcap"
+        file = LogFile(path.open("wb"), START_S * 10**9, {"a": "b"}, {"a.dbc": b"text"})
+        file.channel("/estimate", {"type": "object"})
+        file.frames(ordinary(600))
+        file.sample("/estimate", START_S * 10**9, {"a": 0})
+        file.close()
+        data = bytearray(path.read_bytes())
+        at = 8 + place % (len(data) - 28)
+        data[at : at + len(rubbish)] = rubbish
+        path.write_bytes(data)
+        with contextlib.suppress(InputError):
+            read(path)
+        for get in (read_attachments, read_metadata, json_channels, lambda path: list(read_samples(path))):
+            get(path)

@@ -4,15 +4,20 @@ import json
 import os
 import random
 import resource
+import shutil
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from mcap.reader import make_reader
 
 from gz_onboard.bus import framelog, logs, recorder
-from gz_onboard.bus.recorder import LogFile, Recorder, object_schema
+from gz_onboard.bus.completion import complete, is_complete
+from gz_onboard.bus.recorder import BackgroundRecorder, LogFile, Recorder, object_schema
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
 
@@ -279,3 +284,290 @@ def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
         log.close()
         written.append(log.paths[0].read_bytes())
     assert written[0] == written[1]
+
+
+# --- what happens to a disk ------------------------------------------------------------------------------------
+
+YEAR = 365 * 86400 * SECOND
+
+
+def test_with_the_clock_set_back_the_oldest_go_first_and_never_the_one_being_written(tmp_path: Path) -> None:
+    log = Recorder(tmp_path, "ref", sync_s=0.5, max_file_bytes=20_000, max_total_bytes=60_000)
+    noise = random.Random(1)
+    batches = [[(t, i, noise.randbytes(8), c) for t, i, _, c in batch] for batch in ticks(90)]
+    for number, batch in enumerate(batches):
+        back = YEAR if number > len(batches) // 2 else 0
+        drive(log, [[(t - back, i, data, c) for t, i, data, c in batch]])
+        assert log.path is None or log.path.exists()
+    log.close()
+    left = [path for path in log.paths if path.exists()]
+    assert left == log.paths[-len(left) :]
+    assert {path.name[:4] for path in log.paths} == {"2024", "2025"}
+    assert sum(path.stat().st_size for path in left) > 40_000
+
+
+def test_the_running_number_goes_on_after_a_restart(tmp_path: Path) -> None:
+    (tmp_path / "20250101T000000Z_other~41.mcap").write_bytes(b"x")
+    for year in (1, 0):
+        log = Recorder(tmp_path, "ref")
+        drive(log, ticks(0.1, START - year * YEAR))
+        log.close()
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names[0] == "20240615T150640Z_ref~42.mcap"
+    assert names[2] == "20250615T150640Z_ref~43.mcap"
+
+
+def test_a_log_that_another_writes_is_neither_deleted_nor_completed(tmp_path: Path) -> None:
+    other = Recorder(tmp_path, "other")
+    drive(other, ticks(3))
+    assert other.path is not None
+    log = Recorder(tmp_path, "ref", max_file_bytes=5000, max_total_bytes=5000)
+    assert not recorder._delete(other.path)
+    while log.complete_one():
+        pass
+    assert not is_complete(other.path)
+    drive(log, ticks(1))
+    log.close()
+    other.close()
+    assert read(other.path) == flat(ticks(3))
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_directory_that_is_taken_away_is_noticed_and_made_again(tmp_path: Path, moved: bool) -> None:
+    folder, elsewhere = tmp_path / "logs", tmp_path / "elsewhere"
+    log = Recorder(folder, "ref", sync_s=1)
+    drive(log, ticks(3))
+    if moved:
+        folder.rename(elsewhere)
+    else:
+        shutil.rmtree(folder)
+    later = ticks(5, START + 3 * SECOND)
+    drive(log, later)
+    log.close()
+    assert log.errors == 1
+    assert "deleted or moved" in log.last_error
+    assert not log.failing
+    (path,) = folder.iterdir()
+    assert read(path)[-1] == later[-1][-1]
+    assert read(path)[0][0] < later[0][0][0] + 2 * SECOND
+    if moved:
+        (old,) = elsewhere.iterdir()
+        assert is_complete(old)
+        assert read(old) + read(path) == flat(ticks(3)) + flat(later)
+
+
+class Disk:
+    """A small file system, of which the kernel tells what this says."""
+
+    def __init__(self, size: int, folder: Path) -> None:
+        self.size = size
+        self.others = 0
+        self.folder = folder
+
+    def statvfs(self, _: object) -> SimpleNamespace:
+        ours = sum(path.stat().st_size for path in self.folder.iterdir())
+        free = self.size - self.others - ours
+        return SimpleNamespace(f_blocks=self.size, f_bavail=free, f_frsize=1)
+
+
+def test_on_a_disk_smaller_than_their_limit_logs_leave_room_for_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    disk = Disk(400_000, tmp_path)
+    monkeypatch.setattr(os, "statvfs", disk.statvfs)
+    log = Recorder(tmp_path, "ref", sync_s=0.5, retry_s=1)
+    noise = random.Random(1)
+    least = disk.size
+    failing = []
+    for number, batch in enumerate(ticks(240)):
+        disk.others = 0 if number < 6000 else 200_000 if number < 8000 else 380_000 if number < 10_000 else 0
+        drive(log, [[(t, i, noise.randbytes(8), c) for t, i, _, c in batch]])
+        failing.append(log.failing)
+        if number % 100 == 99 and number // 100 not in (60, 80):  # what others take is noticed at the next sync
+            least = min(least, disk.statvfs(None).f_bavail if number < 8000 else least)
+    log.close()
+    assert least > 90_000  # a quarter of so small a disk, less what is written between two looks
+    assert not any(failing[:8000])
+    assert all(failing[8100:10_000])  # nothing of ours is left that could be deleted
+    assert not any(failing[10_100:])
+    assert "are free" in log.last_error or "full" in log.last_error
+    left = [path for path in log.paths if path.exists()]
+    assert left == log.paths[-len(left) :]
+    assert all(is_complete(path) for path in left)
+
+
+# --- completing ------------------------------------------------------------------------------------------------
+
+
+def cut_off(tmp_path: Path, seconds: float = 8) -> tuple[bytes, int]:
+    """A log with frames, samples and attachments, and how much of it is on the disk before it is closed."""
+    log = Recorder(tmp_path / "whole", "ref", {"k": "v"}, {"a.dbc": b"text"}, sync_s=1)
+    log.channel("/estimate", SCHEMA, {"rate": "1 Hz"})
+    for number, batch in enumerate(ticks(seconds)):
+        log.frames(batch)
+        if number % 25 == 0:
+            log.sample("/estimate", batch[0][0], {"range": number, "soc": None})
+        log.sync(batch[-1][0])
+    assert log.path is not None
+    there = log.path.stat().st_size
+    log.close()
+    return log.path.read_bytes(), there
+
+
+def contents(path: Path) -> tuple[list[bytes], list[str], dict[str, Any]]:
+    """What another reader, which needs the summary, finds: messages, topics, attachments and metadata."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        messages = [message.data for _, _, message in reader.iter_messages(log_time_order=False)]
+        assert summary.statistics.message_count == len(messages)
+        assert sum(summary.statistics.channel_message_counts.values()) == len(messages)
+        assert summary.statistics.chunk_count == len(summary.chunk_indexes)
+        topics = sorted(channel.topic for channel in summary.channels.values())
+        extra = {a.name: a.data for a in reader.iter_attachments()} | {
+            m.name: m.metadata for m in reader.iter_metadata()
+        }
+        for chunk in summary.chunk_indexes:
+            assert chunk.message_index_offsets
+            for offset in chunk.message_index_offsets.values():
+                stream.seek(offset)
+                assert stream.read(1) == b"\x07"
+    return messages, topics, extra
+
+
+def test_a_log_cut_off_anywhere_is_completed_for_any_reader(tmp_path: Path) -> None:
+    data, there = cut_off(tmp_path)
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(data)
+    whole = contents(path)
+    complete_data = int.from_bytes(data[-28:-20], "little") - 13  # where the record of the data's end begins
+    source = random.Random(2)
+    lengths = [there, there - 1, len(data) - 1, len(data) - 8, *(source.randrange(9, len(data)) for _ in range(150))]
+    for number, length in enumerate(lengths):
+        tail = (b"", bytes(3000), source.randbytes(3000))[number % 3]
+        path.write_bytes(data[:length] + tail)
+        os.utime(path, (1e9, 1e9))
+        before = [frame for batch in logs.read_frames(path, on_damage=print) for frame in batch] if length > 400 else []
+        assert complete(path)
+        assert is_complete(path)
+        assert path.stat().st_mtime == 1e9
+        messages, topics, extra = contents(path)
+        assert messages == whole[0][: len(messages)]
+        if length >= complete_data:
+            assert (messages, topics, extra) == whole
+        damages: list[logs.LogDamage] = []
+        after = (
+            [frame for batch in logs.read_frames(path, on_damage=damages.append) for frame in batch] if topics else []
+        )
+        assert after == before
+        assert not damages
+        once = path.read_bytes()
+        assert complete(path)
+        assert path.read_bytes() == once  # nothing to be done the second time
+
+
+def test_what_is_broken_in_the_middle_stays_and_the_rest_is_indexed(tmp_path: Path) -> None:
+    data, there = cut_off(tmp_path)
+    path = tmp_path / "cut.mcap"
+    broken = bytearray(data[:there])
+    broken[there // 2] ^= 0xFF
+    path.write_bytes(broken)
+    before = [frame for batch in logs.read_frames(path, on_damage=print) for frame in batch]
+    assert complete(path)
+    assert path.read_bytes()[: there // 2] == bytes(broken[: there // 2])
+    assert [frame for batch in logs.read_frames(path, on_damage=print) for frame in batch] == before
+    messages, _, _ = contents(path)
+    assert flat([framelog.decode_block(m) for m in messages if m[:1] == b"\1"]) == before
+
+
+def test_a_recorder_completes_what_was_left_of_before_and_nothing_else(tmp_path: Path) -> None:
+    data, there = cut_off(tmp_path)
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    names = ["20250615T150640Z_ref.mcap", "20250615T150740Z_ref~2.mcap", "20250615T150840Z_ref~3.mcap"]
+    (folder / names[0]).write_bytes(data[:there])
+    (folder / names[1]).write_bytes(b"")
+    (folder / names[2]).write_bytes(data)
+    others = {"ride.mcap": data[:there], "20250615T150640Z_ref~4.mcap": b"no MCAP file at all, named like one"}
+    for name, content in others.items():
+        (folder / name).write_bytes(content)
+    log = Recorder(folder, "ref")
+    drive(log, ticks(1, START + 900 * SECOND))
+    steps = 0
+    while log.complete_one():
+        steps += 1
+    assert steps == 3
+    assert log.path is not None
+    assert not is_complete(log.path)
+    log.close()
+    assert contents(folder / names[0])[0]
+    assert not (folder / names[1]).exists()
+    assert (folder / names[2]).read_bytes() == data
+    assert {name: (folder / name).read_bytes() for name in others} == others
+
+
+def test_a_file_that_an_error_has_cut_off_is_completed_at_once(tmp_path: Path) -> None:
+    log = Recorder(tmp_path, "ref", sync_s=1, retry_s=1000)
+    assert not log.complete_one()
+    with files_of_at_most(5_000):
+        drive(log, ticks(30))
+    assert log.errors == 1
+    assert log.path is not None
+    before = [frame for batch in logs.read_frames(log.path, on_damage=print) for frame in batch]
+    assert before
+    assert log.complete_one()
+    assert is_complete(log.path)
+    assert read(log.path) == before
+
+
+# --- in the background -----------------------------------------------------------------------------------------
+
+
+def test_in_the_background_it_writes_the_same(tmp_path: Path) -> None:
+    plain = Recorder(tmp_path / "a", "ref")
+    drive(plain, ticks(4))
+    plain.close()
+    behind = BackgroundRecorder(Recorder(tmp_path / "b", "ref"), limit=10**9)
+    for batch in ticks(4):
+        behind.frames(batch)
+        behind.sync(batch[-1][0])
+    assert behind.close(30)
+    (path,) = (tmp_path / "b").iterdir()
+    assert read(path) == read(plain.paths[0])
+    assert behind.lost_frames == 0
+
+
+def test_a_disk_that_does_not_answer_holds_up_nobody_and_what_is_lost_is_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, answer = threading.Event(), threading.Event()
+    real = os.fdatasync
+
+    def late(descriptor: int) -> None:
+        asked.set()
+        answer.wait(60)
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fdatasync", late)
+    log = Recorder(tmp_path, "ref", sync_s=0.5)
+    behind = BackgroundRecorder(log, limit=2000)
+    batches = ticks(20)  # 10000 frames; were it to wait with the disk, it would be for a minute at each sync
+    for batch in batches:
+        behind.frames(batch)
+        behind.sync(batch[-1][0])
+        while not asked.is_set() and not behind._thread.wait(0.01):
+            pass
+    assert behind.failing
+    assert "slow" in behind.last_error
+    lost = behind.lost_frames
+    assert 0 < lost < 10_000
+    assert not behind.close(0.2)
+    answer.set()
+    assert behind.close(30)
+    behind.sync(batches[-1][-1][0])
+    assert not behind.failing
+    there = read(log.paths[0])
+    assert len(there) + lost == len(flat(batches))
+    assert set(there) <= set(flat(batches))

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard import cli
+from gz_onboard.bus.recorder import LogFile
 from gz_onboard.errors import InputError
 from gz_onboard.events import Reason
 from gz_onboard.lab import plot
@@ -98,9 +100,37 @@ def test_nothing_known_can_be_drawn_too():
     figure.savefig(io.BytesIO(), format="png", dpi=30)
 
 
-def test_an_empty_log_is_told(tmp_path):
-    from gz_onboard.bus.recorder import LogFile
+def test_rows_that_are_none_of_ours_are_passed_over(tmp_path):
+    path = tmp_path / "e.mcap"
+    ranges = {"range": 5.0, "range_p10": 4.0, "range_p90": 6.0}
+    good: dict[str, Any] = {"time": 0.1, "distance": 0.0, "soc": None, "soc_sd": None, **ranges}
+    good |= {"state": "VALID", "reasons": "NO_IMU"}
+    wrong: list[dict[str, Any]] = [
+        {},
+        {**good, "time": None},
+        {**good, "time": "late"},
+        {**good, "distance": [1]},
+        {**good, "speed": 1e300},
+        {**good, "state": "GOOD"},
+        {**good, "reasons": 7},
+        {**good, "range_p90": None},
+        {name: value for name, value in good.items() if name != "range"},
+    ]
+    file = LogFile(path.open("wb"), 0)
+    file.channel("/estimate", {})
+    file.channel("/status", {})
+    for number, row in enumerate([*wrong, good, *wrong]):
+        file.sample("/estimate", number * 10**9, row)
+    statuses: list[dict[str, Any]] = [{"faults": 3}, {"lost": {"a": "b"}}, {"faults": {"crc": 3}}, {"unknown": None}]
+    for status in statuses:
+        file.sample("/status", 0, status)
+    file.close()
+    rows, times, last = plot.read_ride(path)
+    assert (rows, times, last) == ([good], [len(wrong) * 10**9], {})
+    plot.plot_log(path, tmp_path / "e.png")
 
+
+def test_an_empty_log_is_told(tmp_path):
     with pytest.raises(InputError, match="holds no estimates"):
         LogFile((tmp_path / "e.mcap").open("wb"), 0).close()
         plot.plot_log(tmp_path / "e.mcap", tmp_path / "e.png")

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from gz_onboard import state
+from gz_onboard.bus.completion import is_complete
 from gz_onboard.events import EFF_FLAG, State
 from tests.support import LOGS, S, Scooter, recorded, reference, ridden
 from tests.vcan.support import Listener, Running, ip, number, raw_frames, wait_for
@@ -84,14 +85,14 @@ def test_killed_it_goes_on_from_the_saved_state(running: Running, listener: List
     assert "going on from the state saved" in daemon.journal
     replay = running.replay(city, "--from", "200")
     listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
-    time.sleep(14)  # the state is saved every 10 s
+    time.sleep(14)  # the state is saved at least every 10 s
     before = listener.decoded("RANGE_Status")[-1]
     killed_ns = time.time_ns()
     daemon.process.kill()
     daemon.process.wait()
 
     frames = raw_frames(daemon.logs[-1])
-    assert killed_ns - frames[-1][0] < 2 * S  # what is lost
+    assert killed_ns - frames[-1][0] < 3 * S  # what is lost: 2 s on a machine that has the time
     first_log = daemon.logs[-1]
     rows = daemon.estimates(first_log)
     factor = snapshot["riding"]["factor"]
@@ -104,7 +105,7 @@ def test_killed_it_goes_on_from_the_saved_state(running: Running, listener: List
     time.sleep(3)
     replay.kill()
     daemon.stop()
-    # Up to 10 s of riding before the kill and 2 s after it are not in the saved state: at 30 A 0.3 % of the pack.
+    # A tenth of a point, and 2 s of riding after the kill, are not in the saved state; the filter moves, too.
     assert status["RANGE_StateOfCharge"] == pytest.approx(before["RANGE_StateOfCharge"], abs=0.4)
     assert status["RANGE_StateOfChargeSigma"] == pytest.approx(before["RANGE_StateOfChargeSigma"], abs=0.2)
     assert after["RANGE_RemainingP10"] < after["RANGE_Remaining"] < after["RANGE_RemainingP90"]
@@ -321,27 +322,82 @@ def test_the_log_directory_cannot_be_written(running: Running, listener: Listene
 
 @pytest.mark.administers
 def test_a_full_disk(running: Running, listener: Listener, tmp_path: Path):
-    """And room again: the log goes on in a new file."""
+    """Others fill it, and room again: the log leaves them their share, and goes on in a new file."""
     disk = tmp_path / "disk"
     disk.mkdir()
     mount = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=400k", "tmpfs", str(disk)], check=False, capture_output=True
+        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", str(disk)], check=False, capture_output=True
     )
     if mount.returncode:
         pytest.skip(f"no mount here: {mount.stderr.decode()}")
     try:
-        ballast = disk / "ballast"
-        ballast.write_bytes(bytes(345_000))
         daemon = running.daemon("--log-dir", str(disk))
         with steady_ride():
+            listener.wait_for_valid(4)
+            assert not listener.decoded("RANGE_Status")[-1]["RANGE_LogFailed"]
+            (disk / "ballast").write_bytes(bytes(1_800_000))
             listener.wait_for_new("RANGE_Status", 60, RANGE_LogFailed=1)
-            ballast.unlink()
-            listener.wait_for_new("RANGE_Status", 20, RANGE_LogFailed=0, RANGE_StatusState=State.VALID)
+            wait_for(lambda: "cannot write the log" in daemon.journal, 10, "it says that the disk is full")
+            (disk / "ballast").unlink()
+            listener.wait_for_new("RANGE_Status", 30, RANGE_LogFailed=0, RANGE_StatusState=State.VALID)
             time.sleep(3)
         daemon.stop()
         logs = sorted(disk.glob("*.mcap"), key=lambda path: path.stat().st_mtime)
         assert len(logs) >= 2
-        assert all(len(raw_frames(log)) > 500 for log in (logs[0], logs[-1]))  # both can be read
+        assert all(is_complete(log) for log in logs)
+        assert all(len(raw_frames(log)) > 500 for log in (logs[0], logs[-1]))
     finally:
         running.kill()
         subprocess.run(["umount", str(disk)], check=False)
+
+
+def test_two_daemons_on_one_bus(running: Running, tmp_path: Path):
+    """The second is refused and the first goes on; killed, it is followed at once."""
+    daemon = running.daemon()
+    for options, said in (
+        (["--channel", "vcan0"], "--channel vcan0: another gz-onboard run has it"),
+        (["--channel", "vcan1", "--state-dir", str(daemon.state_dir)], "another gz-onboard run uses it"),
+    ):
+        second = running.start("run", *options, stderr=subprocess.PIPE, text=True)
+        _, errors = second.communicate(timeout=60)
+        assert second.returncode == 2
+        assert said in errors
+    assert daemon.process.poll() is None
+    for _ in range(3):
+        daemon.process.kill()
+        daemon = running.daemon()
+    daemon.stop()
+
+
+def test_stopped_for_long_it_tells_nothing_old(running: Running, listener: Listener):
+    """The kernel keeps the oldest frames for it: none of them makes an estimate that counts as good."""
+    daemon = running.daemon()
+    with steady_ride():
+        listener.wait_for_valid(2)
+        os.kill(daemon.process.pid, signal.SIGSTOP)
+        time.sleep(12)
+        heard = len(listener.messages)
+        os.kill(daemon.process.pid, signal.SIGCONT)
+        listener.wait_for_new("RANGE_Status", 20, heard, RANGE_StatusState=State.VALID)
+    daemon.stop()
+    soc = [row["soc"] for row in daemon.estimates() if row["soc"] is not None]
+    assert all(abs(b - a) < 0.002 for a, b in pairwise(soc))
+
+
+def test_killed_again_and_again_every_log_is_whole(running: Running, listener: Listener):
+    with steady_ride():
+        for number in range(4):
+            daemon = running.daemon()
+            listener.wait_for_new("RANGE_Estimate", 20, RANGE_EstimateState=State.VALID)
+            time.sleep(1 + number % 3)
+            daemon.process.kill()
+            daemon.process.wait()
+        daemon = running.daemon()
+        listener.wait_for_new("RANGE_Estimate", 20, RANGE_EstimateState=State.VALID)
+        before = [log for log in daemon.logs if not is_complete(log)]
+        wait_for(lambda: sum(not is_complete(log) for log in daemon.logs) <= 1, 20, "the files cut off are completed")
+        assert len(before) <= 5
+    daemon.stop()
+    assert len(daemon.logs) == 5
+    assert all(is_complete(log) for log in daemon.logs)
+    assert daemon.journal.count("going on from the state saved") == 4

@@ -22,6 +22,7 @@ _FD_64 = struct.Struct("<BBBBLLLLLLLHBBL")
 _ERROR = struct.Struct("<HHLBBBxLLH2x8s")
 _CONTAINER, _CAN_1, _ERROR_EXT, _CAN_2, _FD_1, _FD_2 = 10, 1, 73, 86, 100, 101
 _TEN_MICROSECONDS = 1
+_LARGEST_CONTAINER = 64 << 20  # bytes, unpacked; usual are 128 kB
 _ID_MASK = EFF_FLAG | 0x1FFF_FFFF
 
 
@@ -90,7 +91,7 @@ def _unpack(data: Contents, position: int, end: int) -> tuple[bytes, bool]:
         return packed, len(packed) >= size
     unpacker = zlib.decompressobj()
     try:
-        content = unpacker.decompress(packed)
+        content = unpacker.decompress(packed, _LARGEST_CONTAINER)
     except zlib.error:  # what was unpacked before the error was found may be wrong
         return b"", False
     return content, unpacker.eof and len(unpacker.unused_data) < 4

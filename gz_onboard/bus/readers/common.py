@@ -15,8 +15,12 @@ from gz_onboard.events import TRANSMITTED, Frame
 BATCH = 1000
 """About how many frames a reader hands out at once."""
 
+TIME_LIMIT_NS = 1 << 63
+"""A time is from 0 to before this [ns since the epoch], the year 2262: what all the formats that we write can hold."""
+
 Contents: TypeAlias = bytes | mmap.mmap
 
+_MOST_UNPACKED = 4 << 30  # bytes: it is all in memory
 _PIECE = 48 * BATCH
 
 
@@ -28,11 +32,11 @@ class Damage:
         self.place = ""
         self.reason = ""
 
-    def add(self, place: str, reason: str) -> None:
-        """Count one piece that cannot be read; the first one's place and reason are kept."""
+    def add(self, place: str, reason: str, count: int = 1) -> None:
+        """Count a piece (or several) that cannot be read; the first one's place and reason are kept."""
         if not self.count:
             self.place, self.reason = place, reason
-        self.count += 1
+        self.count += count
 
 
 class ChannelNumbers(dict[str, int]):
@@ -52,7 +56,7 @@ def unpacked(path: Path, data: Contents, damage: Damage) -> Contents:
     if path.suffix.lower() != ".gz":
         return data
     parts = []
-    position = 0
+    position = size = 0
     while position < len(data):
         unpacker = zlib.decompressobj(wbits=31)
         try:
@@ -60,6 +64,10 @@ def unpacked(path: Path, data: Contents, damage: Damage) -> Contents:
                 piece = data[position : position + 16384]
                 parts.append(unpacker.decompress(piece))
                 position += len(piece) - len(unpacker.unused_data)
+                size += len(parts[-1])
+                if size > _MOST_UNPACKED:
+                    damage.add(f"byte {position}", f"it unpacks to more than {_MOST_UNPACKED >> 30} GiB; the rest")
+                    return b"".join(parts)
         except zlib.error as error:
             if not parts:
                 raise InputError(f"{path}: not a gzip file ({error})") from None

@@ -7,26 +7,29 @@ streams.
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
 from gz_onboard.bus import framelog
-from gz_onboard.bus.readers.common import Contents, Damage
+from gz_onboard.bus.readers.common import TIME_LIMIT_NS, Contents, Damage
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
 
-_MCAP_MAGIC = b"\x89MCAP0\r\n"
+MAGIC = b"\x89MCAP0\r\n"
 _RECORD = struct.Struct("<BQ")
 _CHUNK = struct.Struct("<QQQLL")  # start, end, size and CRC of the unpacked records, length of the compression's name
 _MESSAGE = struct.Struct("<HLQQ")  # channel, sequence, log time, publish time
 _U16 = struct.Struct("<H")
 _U32 = struct.Struct("<L")
 _U64 = struct.Struct("<Q")
-_FOOTER, _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP = 0x02, 0x03, 0x04, 0x05, 0x06
+_FOOTER, _SCHEMA, _CHANNEL, MESSAGE, _CHUNK_OP = 0x02, 0x03, 0x04, 0x05, 0x06
 _ATTACHMENT, _METADATA, _DATA_END = 0x09, 0x0C, 0x0F
 _ZSTD_CHUNK = b"\x04\x00\x00\x00zstd"
+BROKEN = (ValueError, struct.error)  # what reading a broken record raises
+_LARGEST_CHUNK = 64 << 20  # bytes, unpacked; ours have 300 kB
 _MARGIN_NS = 1_000_000_000  # a block is stamped with its first frame and holds at most this much time
 
 
@@ -34,23 +37,26 @@ def read(path: Path, data: Contents, damage: Damage, start: int | None, end: int
     """The raw frames of one of our logs; what cannot be read, or is missing at its end, is noted as damage."""
     channels: set[int] = set()
     topics: set[str] = set()
-    for opcode, position, limit in _records(path, data, damage):
-        if opcode == _CHANNEL:
-            _channel(data, position, channels, topics)
-            continue
-        if opcode != _CHUNK_OP:
-            continue
-        first, last, _, _, _ = _CHUNK.unpack_from(data, position)
-        # The first chunk declares the channels, so it is always unpacked.
-        wanted = (start is None or last + _MARGIN_NS >= start) and (end is None or first - _MARGIN_NS < end)
-        if not wanted and channels:
-            continue
+    for opcode, position, limit in records(path, data, damage):
+        blocks = []
         try:
-            records = _unpack(data, position, limit)
-            blocks = list(_blocks(records, channels, topics))
-        except (ValueError, struct.error) as error:
-            damage.add(f"byte {position}", f"a chunk is broken ({error})")
-            continue
+            if opcode == _CHANNEL:
+                _channel(data, position, channels, topics)
+            elif opcode == _CHUNK_OP:
+                first, last, _, _, _ = _CHUNK.unpack_from(data, position)
+                # The first chunk declares the channels, so it is always unpacked.
+                wanted = (start is None or last + _MARGIN_NS >= start) and (end is None or first - _MARGIN_NS < end)
+                if not wanted and channels:
+                    continue
+                content = unpack_chunk(data, position, limit)
+                for inner, at, until in records_in(content):
+                    if inner == MESSAGE:
+                        if _U16.unpack_from(content, at)[0] in channels:
+                            blocks.append(content[at + _MESSAGE.size : until])
+                    elif inner == _CHANNEL:
+                        _channel(content, at, channels, topics)
+        except BROKEN as error:
+            damage.add(f"byte {position}", f"a {'chunk' if opcode == _CHUNK_OP else 'record'} is broken ({error})")
         for block in blocks:
             try:
                 yield framelog.decode_block(block)
@@ -66,24 +72,26 @@ def read(path: Path, data: Contents, damage: Damage, start: int | None, end: int
 def attachments(path: Path, data: Contents) -> dict[str, bytes]:
     """The attached files by name."""
     found = {}
-    for opcode, start, _ in _records(path, data, Damage()):
+    for opcode, start, end in records(path, data, Damage()):
         if opcode == _ATTACHMENT:
-            name, position = _string(data, start + 16)
-            _, position = _string(data, position)
-            (size,) = _U64.unpack_from(data, position)
-            found[name] = bytes(data[position + 8 : position + 8 + size])
+            with contextlib.suppress(*BROKEN):
+                name, position = _string(data, start + 16)
+                _, position = _string(data, position)
+                (size,) = _U64.unpack_from(data, position)
+                if position + 8 + size <= end:
+                    found[name] = bytes(data[position + 8 : position + 8 + size])
     return found
 
 
 def metadata(path: Path, data: Contents) -> dict[str, str]:
     """The entries of the metadata record ``gz_onboard``."""
     entries: dict[str, str] = {}
-    for opcode, start, _ in _records(path, data, Damage()):
-        if opcode != _METADATA:
-            continue
-        name, position = _string(data, start)
-        if name == "gz_onboard":
-            entries = _string_map(data, position)
+    for opcode, start, _ in records(path, data, Damage()):
+        if opcode == _METADATA:
+            with contextlib.suppress(*BROKEN):
+                name, position = _string(data, start)
+                if name == "gz_onboard":
+                    entries = _string_map(data, position)
     return entries
 
 
@@ -92,16 +100,17 @@ def json_channels(path: Path, data: Contents) -> dict[str, tuple[bytes, dict[str
     schemas: dict[int, bytes] = {}
     found = {}
     for opcode, content in _unpacked_records(path, data, Damage()):
-        if opcode == _SCHEMA:
-            _, position = _string(content, 2)
-            _, position = _string(content, position)
-            schemas[_U16.unpack_from(content)[0]] = content[position + 4 :]
-        elif opcode == _CHANNEL:
-            topic, position = _string(content, 4)
-            encoding, position = _string(content, position)
-            schema = schemas.get(_U16.unpack_from(content, 2)[0], b"{}")
-            if encoding == "json":
-                found[topic] = (schema, _string_map(content, position))
+        with contextlib.suppress(*BROKEN):
+            if opcode == _SCHEMA:
+                _, position = _string(content, 2)
+                _, position = _string(content, position)
+                schemas[_U16.unpack_from(content)[0]] = content[position + 4 :]
+            elif opcode == _CHANNEL:
+                topic, position = _string(content, 4)
+                encoding, position = _string(content, position)
+                schema = schemas.get(_U16.unpack_from(content, 2)[0], b"{}")
+                if encoding == "json":
+                    found[topic] = (schema, _string_map(content, position))
     return found
 
 
@@ -111,40 +120,43 @@ def samples(
     """Topic, time [ns] and JSON text of the messages of the JSON topics."""
     topics: dict[int, str] = {}
     for opcode, content in _unpacked_records(path, data, damage):
-        if opcode == _MESSAGE_OP:
-            channel, _, time_ns, _ = _MESSAGE.unpack_from(content)
-            if channel in topics and (start is None or time_ns >= start) and (end is None or time_ns < end):
+        try:
+            if opcode == MESSAGE:
+                channel, _, time_ns, _ = _MESSAGE.unpack_from(content)
+            elif opcode == _CHANNEL:
+                topic, position = _string(content, 4)
+                encoding, _ = _string(content, position)
+                if encoding == "json":
+                    topics[_U16.unpack_from(content)[0]] = topic
+        except BROKEN as error:
+            damage.add("a record", str(error))
+            continue
+        if opcode == MESSAGE and channel in topics:
+            if time_ns >= TIME_LIMIT_NS:
+                damage.add(f"a sample of {topics[channel]}", f"{time_ns} ns is no time")
+            elif (start is None or time_ns >= start) and (end is None or time_ns < end):
                 yield topics[channel], time_ns, content[_MESSAGE.size :]
-        elif opcode == _CHANNEL:
-            topic, position = _string(content, 4)
-            encoding, _ = _string(content, position)
-            if encoding == "json":
-                topics[_U16.unpack_from(content)[0]] = topic
 
 
 def _unpacked_records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, bytes]]:
     """Opcode and content of all records, those in chunks among them."""
-    for opcode, start, end in _records(path, data, damage):
+    for opcode, start, end in records(path, data, damage):
         if opcode != _CHUNK_OP:
             yield opcode, data[start:end]
             continue
         try:
-            records = _unpack(data, start, end)
-        except (ValueError, struct.error) as error:
+            content = unpack_chunk(data, start, end)
+            for inner, at, until in records_in(content):
+                yield inner, content[at:until]
+        except BROKEN as error:
             damage.add(f"byte {start}", f"a chunk is broken ({error})")
-            continue
-        position = 0
-        while position < len(records):
-            inner, length = _RECORD.unpack_from(records, position)
-            position += _RECORD.size + length
-            yield inner, records[position - length : position]
 
 
-def _records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, int, int]]:
+def records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and end of the records of the data section; after damage it goes on with the next chunk."""
-    if data[: len(_MCAP_MAGIC)] != _MCAP_MAGIC:
+    if data[: len(MAGIC)] != MAGIC:
         raise InputError(f"{path}: not an MCAP file: it does not begin with the format's magic bytes")
-    position = len(_MCAP_MAGIC)
+    position = len(MAGIC)
     while position + _RECORD.size <= len(data):
         opcode, length = _RECORD.unpack_from(data, position)
         content = position + _RECORD.size
@@ -176,9 +188,11 @@ def _next_chunk(data: Contents, position: int) -> int:
 
 
 def _string(data: Contents, position: int) -> tuple[str, int]:
-    """A string with its length before it, and where it ends."""
+    """A string with its length before it, and where it ends. Raises ValueError or struct.error if it is cut off."""
     (length,) = _U32.unpack_from(data, position)
     end = position + 4 + length
+    if end > len(data):
+        raise ValueError("a text is cut off")
     return str(data[position + 4 : end], "utf-8", "replace"), end
 
 
@@ -201,37 +215,47 @@ def _channel(data: Contents, position: int, channels: set[int], topics: set[str]
         channels.add(_U16.unpack_from(data, position)[0])
 
 
-def _unpack(data: Contents, position: int, limit: int) -> bytes:
-    """The records in a chunk. Raises ValueError if it is broken."""
+def unpack_chunk(data: Contents, position: int, limit: int) -> bytes:
+    """The records in the chunk whose content is from `position` to `limit`. Raises ValueError if it is broken."""
     import zstandard
 
+    if position + _CHUNK.size > limit:
+        raise ValueError("it is too short")
     _, _, size, crc, name_length = _CHUNK.unpack_from(data, position)
     position += _CHUNK.size
+    if size > _LARGEST_CHUNK:
+        raise ValueError(f"it says that it unpacks to {size} bytes")
+    if position + name_length + 8 > limit:
+        raise ValueError("the name of its compression is cut off")
     name = bytes(data[position : position + name_length])
-    position += name_length + 8
-    packed = data[position:limit]
+    packed = data[position + name_length + 8 : limit]
     if name == b"zstd":
         try:
-            records = zstandard.decompress(packed, size)
+            # The decompressor would make room for whatever the packed data say of themselves.
+            inside = zstandard.frame_content_size(packed)
+            if inside not in (size, -1):
+                raise ValueError(f"it unpacks to {inside} bytes, not {size}")
+            content = zstandard.ZstdDecompressor(max_window_size=_LARGEST_CHUNK).decompress(packed, size)
         except zstandard.ZstdError as error:
             raise ValueError(str(error)) from None
     elif name == b"":
-        records = packed
+        content = packed
     else:
         raise ValueError(f"compression {name.decode('ascii', 'replace')!r} is not supported")
-    if len(records) != size or (crc and zlib.crc32(records) != crc):
+    if len(content) != size or (crc and zlib.crc32(content) != crc):
         raise ValueError("its checksum is wrong")
-    return records
+    return content
 
 
-def _blocks(records: bytes, channels: set[int], topics: set[str]) -> Iterator[bytes]:
+def records_in(content: bytes) -> Iterator[tuple[int, int, int]]:
+    """Opcode, start and end of the records of an unpacked chunk. Raises ValueError where one is cut off."""
     position = 0
-    while position < len(records):
-        opcode, length = _RECORD.unpack_from(records, position)
+    while position < len(content):
+        if position + _RECORD.size > len(content):
+            raise ValueError("it ends within a record")
+        opcode, length = _RECORD.unpack_from(content, position)
         position += _RECORD.size
-        if opcode == _MESSAGE_OP:
-            if _U16.unpack_from(records, position)[0] in channels:
-                yield records[position + _MESSAGE.size : position + length]
-        elif opcode == _CHANNEL:
-            _channel(records, position, channels, topics)
+        if length > len(content) - position:
+            raise ValueError("it ends within a record")
+        yield opcode, position, position + length
         position += length

@@ -1,0 +1,100 @@
+"""Calls that may have to wait for a disk, on a thread of their own: an fsync to an SD card can take seconds."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+log = logging.getLogger("gz-onboard")
+
+
+class Background:
+    """Calls one after the other on a thread of its own; whoever asks for them never waits.
+
+    limit: how much may wait, in the weights that `call` is given. when_idle: called while nothing waits, as long as it
+    returns True. Neither it nor a call should raise: what they raise is logged, and the next call is made.
+    """
+
+    def __init__(self, name: str, limit: int = 1, when_idle: Callable[[], bool] = lambda: False) -> None:
+        self._limit = limit
+        self._when_idle = when_idle
+        self._calls: deque[tuple[Callable[..., object], tuple[Any, ...], int]] = deque()
+        self._weight = 0
+        self._changed = threading.Condition()
+        self._closing = False
+        self._began: float | None = None
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._started = False
+
+    def call(self, function: Callable[..., object], *arguments: Any, weight: int = 1) -> bool:
+        """Have `function` called with the arguments, soon; False if too much waits and it will not be.
+
+        What weighs nothing is always taken, and while nothing waits, any weight.
+        """
+        with self._changed:
+            if self._closing or (weight and self._weight and self._weight + weight > self._limit):
+                return False
+            self._weight += weight
+            self._calls.append((function, arguments, weight))
+            self._changed.notify_all()
+            if not self._started:
+                self._started = True
+                self._thread.start()
+        return True
+
+    @property
+    def load(self) -> float:
+        """How much of the limit is taken; 0 when all is done."""
+        return self._weight / self._limit
+
+    @property
+    def stuck(self) -> float:
+        """For how long [s] the present call has been running; 0 if there is none."""
+        began = self._began
+        return 0.0 if began is None else time.monotonic() - began
+
+    def wait(self, seconds: float) -> bool:
+        """Until all calls asked for are done; False if they are not within `seconds`."""
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._calls, seconds)
+
+    def close(self, seconds: float) -> bool:
+        """Take no more calls, and wait until the rest is done; False if it is not within `seconds`."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        if self._started:
+            self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        idle_work = True
+        while True:
+            with self._changed:
+                if not self._calls:
+                    if self._closing:
+                        return
+                    if not idle_work:
+                        self._changed.wait_for(lambda: self._calls or self._closing)
+                        idle_work = True
+                        continue
+                function, arguments, weight = self._calls[0] if self._calls else (None, (), 0)
+            self._began = time.monotonic()
+            try:
+                if function is None:
+                    idle_work = self._when_idle()
+                else:
+                    function(*arguments)
+            except Exception:
+                log.exception("in the background")
+                idle_work = False
+            self._began = None
+            if function is not None:
+                with self._changed:
+                    self._calls.popleft()
+                    self._weight -= weight
+                    self._changed.notify_all()

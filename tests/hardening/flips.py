@@ -1,0 +1,119 @@
+"""A saved state that is damaged: on the card, or whole and with other values than an estimator would save."""
+
+from __future__ import annotations
+
+import json
+import logging
+import tempfile
+import time
+from pathlib import Path
+from random import Random
+from typing import Any
+
+from gz_onboard import state
+from gz_onboard.daemon import Daemon
+from tests.hardening.report import Report
+from tests.support import Scooter, reference, ridden
+
+TITLE = "A damaged saved state"
+COUNT = 3000
+FULL_COUNT = 24_000
+
+ODD: tuple[Any, ...] = (None, True, -1, 0, 1e308, 2**70, "", "a", [], [None], {}, {"a": {}}, [[[]]], -0.5)
+
+
+def damaged(text: bytes, source: Random) -> bytes:
+    """The bytes of a file with some of them changed, cut off, left out, doubled or moved."""
+    data = bytearray(text)
+    at = source.randrange(len(data))
+    match source.randrange(7):
+        case 0 | 1:
+            for _ in range(source.randrange(1, 5)):
+                data[source.randrange(len(data))] ^= 1 << source.randrange(8)
+        case 2:
+            data[at] = source.randrange(256)
+        case 3:
+            del data[at : at + source.choice((1, 16, 4096))]
+        case 4:
+            length = source.choice((1, 16, 512, 4096))
+            data[at : at + length] = bytes(min(length, len(data) - at))
+        case 5:
+            data[at:at] = data[source.randrange(len(data)) :][: source.choice((1, 20, 1000))]
+        case 6:
+            digits = [i for i, byte in enumerate(data) if chr(byte).isdigit()]
+            data[source.choice(digits)] = ord(source.choice("0123456789"))
+    return bytes(data)
+
+
+def with_odd_values(snapshot: dict[str, Any], source: Random) -> dict[str, Any]:
+    """A snapshot with an odd value somewhere in it, or something missing."""
+    changed: dict[str, Any] = json.loads(json.dumps(snapshot))
+    part: Any = changed
+    while True:
+        key = source.choice(list(part) if isinstance(part, dict) else range(len(part)))
+        inner = part[key]
+        if not (isinstance(inner, dict | list) and inner and source.random() < 0.7):
+            break
+        part = inner
+    if source.random() < 0.2:
+        del part[key]
+    else:
+        part[key] = source.choice(ODD)
+    return changed
+
+
+def run(count: int, seed: int) -> Report:
+    """`count` cases: three of four have damaged bytes, one has odd values under a right checksum."""
+    source = Random(seed)
+    estimator = ridden(Scooter().steady(5.0)).pipeline.estimator
+    snapshot = estimator.snapshot(reference().key)
+    assert snapshot is not None
+    snapshot = json.loads(json.dumps(snapshot))
+    older = {**snapshot, "soc": 0.123}
+    report = Report()
+    refused = before = odd_used = 0
+    logger = logging.getLogger("gz-onboard")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / "scooter.json"
+            daemon = Daemon(reference(), [], None, file)
+            fresh = Daemon(reference(), [], None, file)
+            text, text_before = (state.encode(s, time.time()) for s in (snapshot, older))
+            for number in range(count):
+                case = f"seed {seed}, case {number}"
+                unfinished, latest, previous = state.copies(file)
+                odd = number % 4 == 3
+                there = state.encode(with_odd_values(snapshot, source), time.time()) if odd else damaged(text, source)
+                same = not odd and there == text
+                latest.write_bytes(there)
+                keep = source.random() < 0.5
+                (previous.write_bytes(text_before) if keep else previous.unlink(missing_ok=True))
+                if source.random() < 0.3:
+                    unfinished.write_bytes(text[: source.randrange(len(text))])
+                try:
+                    found = (fresh if odd else daemon).restore()
+                except Exception as error:
+                    report.failures.append(f"{case}: raised {error!r}")
+                    continue
+                if odd:
+                    odd_used += found not in (None, older)
+                elif found is None:
+                    refused += 1
+                    if keep:
+                        report.failures.append(f"{case}: the state before was not used")
+                elif found == older and keep:
+                    before += 1
+                elif found != snapshot or not same:
+                    report.failures.append(f"{case}: values that were not saved were used")
+    finally:
+        logger.setLevel(level)
+    report.rows = {
+        "cases": f"{count:,}",
+        "damaged bytes, refused": f"{refused:,}",
+        "damaged bytes, went on from the state before": f"{before:,}",
+        "odd values under a right checksum, plausible and used": f"{odd_used:,} of {count // 4:,}",
+        "altered values used, exceptions": str(len(report.failures)),
+    }
+    return report

@@ -1,0 +1,80 @@
+"""Calls on a thread of their own: in order, bounded, and whatever they raise."""
+
+from __future__ import annotations
+
+import logging
+import threading
+
+import pytest
+
+from gz_onboard.background import Background
+
+
+def test_calls_are_made_in_their_order_and_elsewhere():
+    made: list[object] = []
+    background = Background("test", limit=1000)
+    for number in range(100):
+        assert background.call(lambda n: made.append((n, threading.current_thread().name)), number)
+    assert background.close(30)
+    assert made == [(number, "test") for number in range(100)]
+    assert not background.call(print)
+
+
+def test_no_more_waits_than_the_limit_and_what_weighs_nothing_always_may():
+    going = threading.Event()
+    background = Background("test", limit=10)
+    made: list[int] = []
+    assert background.call(going.wait, 30, weight=25)  # alone, one is taken however much it weighs
+    assert not background.call(made.append, 1, weight=1)
+    assert background.call(made.append, 2, weight=0)
+    assert background.load == 2.5
+    while not background.stuck:
+        assert not background.wait(0.01)
+    going.set()
+    assert background.wait(30)
+    assert background.load == background.stuck == 0.0
+    assert background.call(made.append, 3, weight=10)
+    assert background.close(30)
+    assert made == [2, 3]
+
+
+def test_what_a_call_raises_is_told_and_the_next_is_made(caplog: pytest.LogCaptureFixture):
+    caplog.set_level(logging.ERROR)
+    made: list[int] = []
+    background = Background("test", limit=10)
+    background.call(divmod, 1, 0)
+    background.call(made.append, 1)
+    assert background.close(30)
+    assert made == [1]
+    assert "ZeroDivisionError" in caplog.text
+
+
+def test_while_nothing_waits_it_does_what_else_there_is():
+    done = threading.Event()
+    left = [3, 2, 1]
+
+    def one() -> bool:
+        if left:
+            left.pop()
+            return True
+        done.set()
+        return False
+
+    background = Background("test", 1, one)
+    background.call(bool)
+    assert done.wait(30)
+    assert not left
+    assert background.close(30)
+
+
+def test_closing_does_not_wait_for_ever():
+    going = threading.Event()
+    background = Background("test")
+    background.call(going.wait, 30)
+    assert not background.close(0.05)
+    going.set()
+    assert background.close(30)
+
+
+def test_never_used_it_closes_at_once():
+    assert Background("test").close(0.0)
