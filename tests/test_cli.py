@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from gz_onboard.cli import main
+from gz_onboard.cli import COMMANDS, command_line, main
+from gz_onboard.lab import plot
 from tests.support import LOGS, ROOT
 
 RIDE = str(LOGS / "coastdown.blf")
@@ -163,8 +166,41 @@ def test_as_a_process():
     assert line.startswith("gz-onboard run: refrence: ")
 
 
-def test_help_and_version(capsys: pytest.CaptureFixture[str]):
-    for command in ("run", "replay", "estimate", "export", "plot", "dashboard"):
-        assert status(command, "--help") == 0
-        assert f"gz-onboard {command}" in capsys.readouterr().out
+def test_ctrl_c_before_anything_is_read(monkeypatch: pytest.MonkeyPatch):
+    """What a command imports takes a second or two."""
+
+    def interrupted(_: argparse.ArgumentParser) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(plot, "add_arguments", interrupted)
+    assert status("plot", "a.mcap") == 130
+
+
+def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """It and all its subcommands'."""
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for child in action.choices.values():
+                yield from parsers(child)
+
+
+HELP = {parser.prog: parser.format_help for parser in parsers(command_line(COMMANDS))}
+
+
+@pytest.mark.parametrize("command", HELP)
+def test_every_page_of_help(command: str):
+    page = HELP[command]()
+    assert page.startswith(f"usage: {command} ")
+    assert "%%" not in page
+    assert "%(" not in page
+
+
+def test_help_as_it_is_asked_for(capsys: pytest.CaptureFixture[str]):
+    assert status("--help") == 0
+    page = capsys.readouterr().out
+    assert all(re.search(rf"^    {name}\b", page, re.M) for name in COMMANDS)
+    for name in COMMANDS:
+        assert status(name, "--help") == 0
+        assert capsys.readouterr().out == HELP[f"gz-onboard {name}"]()
     assert status("--version") == 0
