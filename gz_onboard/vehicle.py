@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -61,20 +61,34 @@ class Vehicle:
         return InputError(f"{self.file}: {message}")
 
 
-def find_vehicle(name: str) -> Path:
-    """The vehicle file `name`: a path, or the name of one of the package's own."""
-    if Path(name).is_file():
-        return Path(name)
+def find_vehicle(name: str | Path, beside: Path | None = None) -> Path:
+    """The vehicle file `name`: one of the package's own, or a path, which has a slash or ends in ``.toml``.
+
+    beside: the folder from which a path is; the working directory if not given. InputError if there is none.
+    """
     own = sorted(file.stem for file in OWN.glob("*.toml"))
+    there_are = f"the package's own are {', '.join(own)}"
+    path = (beside or Path()) / name
+    if isinstance(name, Path) or "/" in name or name.endswith(".toml"):
+        if path.is_file():
+            return path
+        raise InputError(f"{path if beside else name}: no such vehicle file; {there_are}{nearest(str(name), own)}")
     if name in own:
         return OWN / f"{name}.toml"
-    raise InputError(f"{name}: no such vehicle file; the package's own are {', '.join(own)}{nearest(name, own)}")
+    meant = f" (did you mean './{name}'?)" if path.is_file() else nearest(name, own)
+    raise InputError(f"{name}: no such vehicle file; {there_are}{meant}")
 
 
-def read_vehicle(name: str, payload: float | None = None, effects_folder: Path | None = None) -> Vehicle:
+def read_vehicle(
+    name: str | Path,
+    payload: float | None = None,
+    effects_folder: Path | None = None,
+    users: Collection[int] | None = None,
+) -> Vehicle:
     """The vehicle `name` (file or one of the package's own), with the rider's mass [kg] if it is known.
 
-    effects_folder: where effects of the user's own are, beside the file's own ``effects_folder``.
+    effects_folder: where effects of the user's own are, beside the file's own ``effects_folder``, of which only those
+    run that nobody but `users` can change (see `read_model`).
     """
     table = Table.read(find_vehicle(name))
     table.only(
@@ -95,7 +109,7 @@ def read_vehicle(name: str, payload: float | None = None, effects_folder: Path |
     )
     if table.number("schema") != 1:
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
-    effects = read_model(table, effects_folder)
+    effects = read_model(table, effects_folder, users)
     parameters = read_parameters(table, effects)
     if payload is not None:
         parameters = parameters.replaced(payload_mass=payload)

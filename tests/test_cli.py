@@ -15,6 +15,7 @@ import pytest
 from gz_onboard.cli import COMMANDS, command_line, main
 from gz_onboard.lab import plot
 from tests.support import LOGS, ROOT
+from tests.test_vehicle import with_effect
 
 RIDE = str(LOGS / "coastdown.blf")
 
@@ -121,6 +122,19 @@ def test_vehicle_file(
     assert "mine.toml" in err
     for words in said:
         assert words in err
+
+
+def test_the_daemon_runs_no_effects_but_roots(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    file = with_effect(tmp_path)
+    monkeypatch.setattr("gz_onboard.daemon.ROOT", 12345)  # root may run the tests, and the file be root's
+    arguments = ["run", "--interface", "none", "--vehicle", str(file)]
+    assert "horn.py beside the file is code, and not run" in refused(capsys, *arguments)
+    assert not list(tmp_path.rglob("*.ran"))
+    assert "--interface none" in refused(capsys, *arguments, "--effects", str(file.parent / "effects"))
+    assert list(tmp_path.rglob("*.ran"))
+    assert "no such folder" in refused(capsys, *arguments, "--effects", str(tmp_path / "none"))
 
 
 @pytest.mark.parametrize(

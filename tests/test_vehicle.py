@@ -51,8 +51,99 @@ def test_a_vehicle_without_a_battery_has_none(tmp_path):
 
 
 def test_a_vehicle_that_is_not_there():
-    with pytest.raises(InputError, match=r"refrence: no such vehicle file.*reference.*did you mean 'reference'"):
+    with pytest.raises(InputError, match=r"refrence: no such vehicle file; .*reference.*did you mean 'reference'"):
         find_vehicle("refrence")
+    with pytest.raises(InputError, match=r"\./reference: no such vehicle file; .*did you mean 'reference'"):
+        find_vehicle("./reference")
+
+
+def test_a_name_is_never_a_file_that_happens_to_be_there(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("reference", "mine", "mine.toml"):
+        (tmp_path / name).write_text(REFERENCE, encoding="utf-8")
+    assert find_vehicle("reference") == OWN / "reference.toml"
+    assert find_vehicle("./reference") == find_vehicle(Path("reference")) == Path("reference")
+    assert find_vehicle("mine.toml") == Path("mine.toml")
+    with pytest.raises(InputError, match=r"did you mean '\./mine'"):
+        find_vehicle("mine")
+    assert find_vehicle("mine.toml", beside=tmp_path) == tmp_path / "mine.toml"
+    assert find_vehicle("reference", beside=tmp_path) == OWN / "reference.toml"
+
+
+# --- effects that come with a file are code -----------------------------------------------------------------------
+
+EFFECT = """
+from gz_onboard.physics.effect import Parameter, Port
+open(__file__ + ".ran", "w").close()
+PORT = Port.DC_POWER
+PARAMETERS = (Parameter("horn_power", "W", 5.0, 1.0, 0.0, 50.0, "a guess"),)
+def term(*, horn_power):
+    return horn_power
+"""
+
+
+def with_effect(folder: Path, effects_folder: str = "effects", where: str = "effects") -> Path:
+    """A vehicle file with an effect of its own, `horn`."""
+    (folder / where).mkdir(parents=True, exist_ok=True)
+    (folder / where / "horn.py").write_text(EFFECT)
+    file = folder / "v.toml"
+    listed = f'[model]\neffects_folder = "{effects_folder}"\neffects = ["horn", '
+    file.write_text(REFERENCE.replace("[model]\neffects = [", listed))
+    return file
+
+
+def refusal(file: Path, **options) -> str:
+    """Why the file is refused, with nothing of it run."""
+    with pytest.raises(InputError) as caught:
+        read_vehicle(file, **options)
+    assert not list(file.parent.parent.rglob("*.ran"))
+    return str(caught.value)
+
+
+def test_the_effects_of_ones_own_file_run(tmp_path):
+    assert "horn" in read_vehicle(with_effect(tmp_path)).key
+
+
+@pytest.mark.parametrize("others", ["effects/horn.py", "effects", "v.toml", "."])
+def test_effects_that_others_can_change_do_not_run(tmp_path, others):
+    file = with_effect(tmp_path / "a")
+    place = file.parent / others
+    place.chmod(place.stat().st_mode | 0o002)
+    said = refusal(file)
+    assert f"{place} can be written by others" in said
+    assert re.search(r"v\.toml:\d+: model\.effects: horn\.py", said)
+    assert "--effects" in said
+    assert "horn" in read_vehicle(file, effects_folder=file.parent / "effects").key
+
+
+def test_effects_of_another_user_do_not_run(tmp_path):
+    file = with_effect(tmp_path / "a")
+    assert "belongs to" in refusal(file, users={file.stat().st_uid + 1})
+
+
+@pytest.mark.parametrize("folder", ["/tmp", "../elsewhere", "effects/../../elsewhere", "link"])
+def test_effects_from_elsewhere_do_not_run(tmp_path, folder):
+    file = with_effect(tmp_path / "a", folder, where="../elsewhere")
+    (tmp_path / "a" / "link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "a" / "effects").mkdir()
+    assert "is not below the vehicle file's own folder" in refusal(file)
+
+
+def test_an_effect_that_is_a_link_to_elsewhere_does_not_run(tmp_path):
+    file = with_effect(tmp_path / "a")
+    effect = file.parent / "effects" / "horn.py"
+    effect.rename(tmp_path / "horn.py")
+    effect.symlink_to(tmp_path / "horn.py")
+    assert "a link that leads out" in refusal(file)
+
+
+@pytest.mark.parametrize("name", ["../effects/horn", "/etc/horn", "effects/horn", ""])
+def test_the_name_of_an_effect_is_no_path(tmp_path, name):
+    file = with_effect(tmp_path / "a")
+    file.write_text(file.read_text().replace('["horn"', f'["{name}"'))
+    assert f"no effect is called '{name}'" in refusal(file)
+    (tmp_path / "none").mkdir()
+    assert f"no effect is called '{name}'" in refusal(file, effects_folder=tmp_path / "none")
 
 
 # line: where the error must point to, counted from the change

@@ -74,14 +74,10 @@ def read_manifest(
     ]
     if not steps:
         raise table.error(f"names no procedure; there are {', '.join(slots)}")
-    name = table.text("vehicle", "reference")
-    beside = file.parent / name
-    if beside.is_file():
-        return beside, steps
     try:
-        return find_vehicle(name), steps
+        return find_vehicle(table.text("vehicle", "reference"), beside=file.parent), steps
     except InputError as error:
-        raise table.error(f"no file {beside}: {error}", "vehicle") from error
+        raise table.error(str(error), "vehicle") from error
 
 
 def _step(table: Table, name: str, slots: Mapping[str, Slot], options: Mapping[str, Option]) -> Step:
