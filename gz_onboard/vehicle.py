@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gz_onboard.bus.mapping import Mapping, read_mapping
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.physics.battery import Battery, read_battery
 from gz_onboard.physics.derating import Derating, read_derating
 from gz_onboard.physics.effect import Effect
@@ -114,7 +115,7 @@ def read_vehicle(
     if payload is not None:
         parameters = parameters.replaced(payload_mass=payload)
     return Vehicle(
-        name=table.text("name"),
+        name=_name(table),
         file=table.file,
         mapping=read_mapping(table),
         parameters=parameters,
@@ -126,12 +127,22 @@ def read_vehicle(
     )
 
 
+def _name(table: Table) -> str:
+    """The vehicle's name, which becomes part of the names of files: no path, nothing that a shell would take apart."""
+    name = table.text("name")
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", name):
+        raise table.error(
+            f"must be 1 to 64 letters, digits and - _ . with a letter or digit first, is {shown(name)}", "name"
+        )
+    return name
+
+
 def _healthy(table: Table) -> Path | None:
     """The file of what the discovery learned on healthy rides, beside the vehicle file."""
     table.only(["file", "rides"])
     if "file" not in table.values:
         return None
-    file = table.file.parent / table.text("file")
+    file = table.file.parent / table.check_path("file", table.text("file"))
     if not file.is_file():
         raise table.error(f"no file {file}", "file")
     return file

@@ -141,9 +141,9 @@ def test_an_effect_that_is_a_link_to_elsewhere_does_not_run(tmp_path):
 def test_the_name_of_an_effect_is_no_path(tmp_path, name):
     file = with_effect(tmp_path / "a")
     file.write_text(file.read_text().replace('["horn"', f'["{name}"'))
-    assert f"no effect is called '{name}'" in refusal(file)
-    (tmp_path / "none").mkdir()
-    assert f"no effect is called '{name}'" in refusal(file, effects_folder=tmp_path / "none")
+    for folder in (None, tmp_path):
+        said = refusal(file, effects_folder=folder)
+        assert f"no effect is called '{name}'" in said or "cannot be the name of a file" in said
 
 
 # line: where the error must point to, counted from the change
@@ -171,16 +171,43 @@ def test_the_name_of_an_effect_is_no_path(tmp_path, name):
         ('"aerodynamic_drag"', '"areodynamic_drag"', -1, ["model.effects", "did you mean 'aerodynamic_drag'"]),
         (r"\[model\]\n", '[model]\neffects_folder = "none"\n', 1, ["model.effects_folder", "no folder", "none"]),
         ("cells_series = 14", "cells_series = 0", 0, ["battery.cells_series", "0 is outside 1 to"]),
+        ("cells_series = 14", "cells_series = 14.5", 0, ["battery.cells_series", "whole number", "14.5"]),
+        ('"vehicle.dbc"', f'"{"x" * 5000}"', 0, ["dbc", "cannot be the name of a file"]),
+        (
+            r"\[model\]\n",
+            '[model]\neffects_folder = "\\\\u0000"\n',
+            1,
+            ["effects_folder", "cannot be the name of a file"],
+        ),
+        ('"aerodynamic_drag"', f'"{"x" * 5000}"', -1, ["model.effects", "cannot be the name of a file"]),
+        ('"reference-scooter"', '"../../etc"', 0, ["name", "'../../etc'", "letter or digit first"]),
+        ('"reference-scooter"', '"a\\\\u0000"', 0, ["name"]),
+        (r"effects = \[[^]]*\]", "effects = []", 0, ["model.effects", "list of names"]),
+        (DRAG, rf"\g<1>1{'0' * 400}", 0, ["drag_area.value", "finite"]),
+        (r"(drag_area = .*), sd = [\d.]+", r"\1, sd = 1e300", 0, ["drag_area.sd", "outside 0 to 1e+09"]),
+        (r"(\[battery.ocv\]\nsoc = \[[\d.]+), [\d.]+", r"\1, 5e-324", 1, ["battery.ocv.soc", "increase by 1e-06"]),
+        (
+            r"\[battery.ocv\]\nsoc = .*\nvalue = .*",
+            "[battery.ocv]\nsoc = [0.4, 0.9]\nvalue = [3.0, 4.0]",
+            1,
+            ["battery.ocv.soc", "0.1 or less"],
+        ),
+        (r"(\[battery.capacity\]\n.*\nvalue = \[)[\d.]+", r"\g<1>900.0", 2, ["capacity.value", "0.05 to 2 times"]),
         ("cells_series = 14", "cell_series = 14", 0, ["battery.cell_series", "did you mean 'cells_series'"]),
         ("cells_series = 14", "", -1, ["battery.cells_series", "is missing"]),
         (r"(\[battery.ocv\]\nsoc = \[[\d.]+), [\d.]+", r"\1, 0.0", 1, ["battery.ocv.soc", "increase"]),
         (OCV, r"\g<1>2.95, ", 2, ["ocv.value", "must increase, but 2.", "follows 2.95"]),
         (OCV, r"\1", 2, ["battery.ocv.value", "28 numbers for 29 of soc"]),
-        (r"(\[battery.ocv\]\n.*\nvalue = \[.*), [\d.]+\]", r"\1, 5.1]", 2, ["battery.ocv.value", "within 0.5 to 5"]),
+        (
+            r"(\[battery.ocv\]\n.*\nvalue = \[.*), [\d.]+\]",
+            r"\1, 5.1]",
+            2,
+            ["battery.ocv.value", "5.1 is outside 0.5 to 5"],
+        ),
         ('unit = "A·h"\nsd_relative', 'unit = "Ah"\nsd_relative', 0, ["battery.capacity.unit", "'Ah'", "A·h"]),
         (r"\[battery.c1\]", "[battery.c2]", 0, ["battery.c2", "unknown key", "did you mean 'c1'"]),
-        (R0, r"\1", 3, ["battery.r0.value", "14 positive numbers"]),
-        (R0, r"\1-0.2769, ", 3, ["battery.r0.value", "14 positive numbers"]),
+        (R0, r"\1", 3, ["battery.r0.value", "14 numbers (in ohm, one for each soc)"]),
+        (R0, r"\1-0.2769, ", 3, ["battery.r0.value", "-0.2769 is outside"]),
         ('pack_voltage = "BMS_PackVoltage"', 'pack_voltage = "BMS_PackVolts"', 0, ["did you mean 'BMS_PackVoltage'"]),
     ],
 )
@@ -225,9 +252,15 @@ def test_parameters_that_were_found_together_are_tied(tmp_path):
     [
         ('"drag_area"', '"drag_aera"', "no parameter is called 'drag_aera' (did you mean 'drag_area'?)"),
         ("[0.86, 1.0]]", "[0.85, 1.0]]", "not symmetric"),
-        ("[[1.0, 0.86]", "[[1.0, 1.86]", "1.86 is no correlation"),
+        ("[[1.0, 0.86]", "[[1.0, 1.86]", "1.86 is outside -1 to 1"),
         ("[[1.0, 0.86], ", "[", "must be 2 rows of 2 numbers"),
         ("[[1.0", "[[0.9", "diagonal must be 1"),
+        ('"rolling_resistance_constant"]', '"drag_area"]', "names 'drag_area' twice"),
+        (
+            'constant"]\nvalue = [[1.0, 0.86], [0.86, 1.0]]',
+            'constant", "wheelbase"]\nvalue = [[1, 0.9, 0.9], [0.9, 1, -0.9], [0.9, -0.9, 1]]',
+            "a variance is negative",
+        ),
     ],
 )
 def test_a_correlation_that_is_none_is_refused(tmp_path, old, new, says):

@@ -39,7 +39,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, nearest, shown
 
 
 class Port(Enum):
@@ -172,7 +172,7 @@ def load_effect(name: str, folder: Path | None = None) -> Effect:
         return _effect(name, _import_file(name, file))
     if name not in known_effects():
         known = [*known_effects(), *effects_in(folder)] if folder else known_effects()
-        raise InputError(f"no effect is called {name!r}{nearest(name, known)}")
+        raise InputError(f"no effect is called {shown(name)}{nearest(name, known)}")
     return _effect(name, importlib.import_module(f"gz_onboard.physics.effects.{name}"))
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.errors import InputError
+from gz_onboard.errors import InputError, shown
 from gz_onboard.physics.battery import Battery, Lacks
 from gz_onboard.physics.effect import QUANTITIES, Effect, Port, effect_file, load_effect
 from gz_onboard.physics.parameters import Parameters
@@ -200,16 +200,13 @@ def read_model(vehicle: Table, folder: Path | None = None, users: Collection[int
     table = vehicle.table("model")
     table.only(["effects", "effects_folder"])
     own = _own_folder(table)
-    names = table.values.get("effects", list(BASE_EFFECTS))
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise table.error("must be a list of names of effects", "effects")
-    if not names:
-        raise table.error("must name an effect; without this key there are those that every vehicle has", "effects")
+    names = table.texts("effects", "names of effects") if "effects" in table.values else BASE_EFFECTS
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise table.error(f"{twice!r} is there twice", "effects")
+        raise table.error(f"{shown(twice)} is there twice", "effects")
     effects = []
     for name in names:
+        table.check_path("effects", name)
         try:
             given = effect_file(name, folder) if folder else None
             if own and not given and (file := effect_file(name, own)):
@@ -226,7 +223,7 @@ def _own_folder(model: Table) -> Path | None:
     """The file's own ``effects_folder``, which must lie in the file's."""
     if "effects_folder" not in model.values:
         return None
-    name = model.text("effects_folder")
+    name = model.check_path("effects_folder", model.text("effects_folder"))
     folder = model.file.parent / name
     if Path(name).is_absolute() or not folder.resolve().is_relative_to(model.file.parent.resolve()):
         raise model.error(f"{name!r} is not below the vehicle file's own folder", "effects_folder")

@@ -469,9 +469,12 @@ def _options(texts: Sequence[str], procedure: Procedure) -> dict[str, Option]:
             found[name] = value
             continue
         try:
-            found[name] = float(value)
+            number = float(value)
         except ValueError as error:
             raise InputError(f"--set {text}: {value!r} is not a number") from error
+        if not manifest.LEAST <= number <= manifest.MOST:
+            raise InputError(f"--set {text}: must be {manifest.LEAST:g} to {manifest.MOST:g}")
+        found[name] = number
     return found
 
 
