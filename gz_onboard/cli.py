@@ -76,6 +76,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         arguments = command_line([called]).parse_args(argv)
         status: int = importlib.import_module(COMMANDS[arguments.command][0]).run(arguments)
+        sys.stdout.flush()  # here, where a full disk is a message
         return status
     except InputError as error:
         print(f"gz-onboard {called}: {error}", file=sys.stderr)
@@ -84,6 +85,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
     except BrokenPipeError:  # the reader of our output went away
         sys.stderr.close()
+        return 1
+    except OSError as error:  # what is left is mostly a disk that is full
+        print(f"gz-onboard {called}: {error}", file=sys.stderr)
         return 1
 
 

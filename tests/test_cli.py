@@ -188,6 +188,15 @@ def test_as_a_process():
     assert line.startswith("gz-onboard run: refrence: ")
 
 
+def test_a_disk_that_is_full():
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "gz_onboard", "discover", "--list"]
+        run = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert run.returncode
+    assert "gz-onboard discover: [Errno 28] No space left on device" in run.stderr
+    assert "Traceback" not in run.stderr
+
+
 def test_ctrl_c_before_anything_is_read(monkeypatch: pytest.MonkeyPatch):
     """What a command imports takes a second or two."""
 
