@@ -16,7 +16,7 @@ help:  ## this list
 
 setup: .venv/.ready  ## virtual environment .venv with the pinned dependencies
 
-.venv/.ready: pyproject.toml .ci/constraints.txt .ci/setup
+.venv/.ready: pyproject.toml .ci/requirements.txt .ci/setup
 	@.ci/setup venv
 
 run: setup  ## a recorded ride through the daemon on a CAN bus, with the live range (RIDE=file SPEED=factor SECONDS=n)

@@ -7,7 +7,7 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NoReturn
 
 from gz_onboard import __version__
@@ -53,30 +53,41 @@ class _Parser(argparse.ArgumentParser):
         return options
 
 
+def command_line(called: Collection[str]) -> argparse.ArgumentParser:
+    """The command line with the arguments of the commands `called`; the others' would only cost their import."""
+    parser = _Parser(prog="gz-onboard", description="The range a scooter's rider can trust.")
+    parser.add_argument("--version", action="version", version=f"gz-onboard {__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
+    for name, (module, text) in COMMANDS.items():
+        command = commands.add_parser(
+            name, help=text.replace("%", "%%"), description=text, allow_abbrev=False
+        )  # argparse expands % in the former only
+        if name in called:
+            importlib.import_module(module).add_arguments(command)
+    return parser
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv`; gives the exit status: 0 good, 1 failed, 2 wrong use or input, 130 interrupted."""
     # Our matrices are small, and what is large runs in processes of its own: threads would stand in each other's way.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     argv = list(sys.argv[1:] if argv is None else argv)
-    parser = _Parser(prog="gz-onboard", description="The range a scooter's rider can trust.")
-    parser.add_argument("--version", action="version", version=f"gz-onboard {__version__}")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
     called = next((word for word in argv if not word.startswith("-")), "")
-    for name, (module, text) in COMMANDS.items():
-        command = commands.add_parser(name, help=text, description=text, allow_abbrev=False)
-        if name == called:  # the others would only cost their import
-            importlib.import_module(module).add_arguments(command)
-    arguments = parser.parse_args(argv)
     try:
+        arguments = command_line([called]).parse_args(argv)
         status: int = importlib.import_module(COMMANDS[arguments.command][0]).run(arguments)
+        sys.stdout.flush()  # here, where a full disk is a message
         return status
     except InputError as error:
-        print(f"gz-onboard {arguments.command}: {error}", file=sys.stderr)
+        print(f"gz-onboard {called}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # the reader of our output went away
         sys.stderr.close()
+        return 1
+    except OSError as error:  # what is left is mostly a disk that is full
+        print(f"gz-onboard {called}: {error}", file=sys.stderr)
         return 1
 
 

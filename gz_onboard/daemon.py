@@ -30,6 +30,7 @@ from gz_onboard.bus.channel import Channel
 from gz_onboard.bus.recorder import BackgroundRecorder, Recorder
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame, Reason
+from gz_onboard.physics.trust import ROOT
 from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, reason_names
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -324,6 +325,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--interface", default="socketcan", help="python-can's interface (%(default)s)")
     add("--channel", action="append", metavar="NAME", help="channel; twice, for a second bus (can0)")
     add("--payload", type=float, metavar="KG", help="mass of rider and luggage, where it is known")
+    add("--effects", type=Path, metavar="DIR", help="folder with effects of your own, Python that you trust")
     add("--filter", default="scalar", choices=("scalar", "filterpy"), help="backend of the SOC filter (%(default)s)")
     add("--log-dir", type=Path, default=_directory("LOGS_DIRECTORY"), metavar="DIR", help="write MCAP logs here")
     add("--log-file-mb", type=float, default=64, metavar="MB", help="begin a new log at this size (%(default)g)")
@@ -356,7 +358,8 @@ def run(arguments: argparse.Namespace) -> int:
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"--channel {name}: given twice; each of its frames would come twice")
-    vehicle = read_vehicle(arguments.vehicle, arguments.payload)
+    # Nobody watches a daemon: the vehicle file's own code runs only if it is root's.
+    vehicle = read_vehicle(arguments.vehicle, arguments.payload, arguments.effects, users={ROOT})
     with ExitStack() as locks:
         _lock(locks, arguments.interface, names, arguments.state_dir)
         return _run(arguments, vehicle, names)

@@ -3,7 +3,13 @@
 from __future__ import annotations
 
 import difflib
+import reprlib
 from collections.abc import Iterable
+
+LONGEST_NAME = 100  # beyond it no near name is looked for, which takes the square of the length
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict = 3, 8, 4
+_SHORT.maxstring = _SHORT.maxother = 100
 
 
 class InputError(Exception):
@@ -16,8 +22,18 @@ class InputError(Exception):
 
 def nearest(name: str, known: Iterable[str]) -> str:
     """`` (did you mean 'x'?)`` for the known name nearest to `name`, or an empty string."""
+    if not 0 < len(name) <= LONGEST_NAME:
+        return ""
     names = list(known)
     match = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
     if not match:  # the same letters in another case, or a part of a name
         match = [n for n in names if name.lower() in n.lower() or n.lower() in name.lower()][:1]
     return f" (did you mean {match[0]!r}?)" if match else ""
+
+
+def shown(value: object) -> str:
+    """`value` as Python writes it, in a length that fits into a message."""
+    try:
+        return _SHORT.repr(value)
+    except ValueError:  # Python does not write out an integer of thousands of digits
+        return "a number of thousands of digits"

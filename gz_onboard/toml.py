@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-import math
+import contextlib
 import re
 import tomllib
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import LONGEST_NAME, InputError, nearest, shown
+
+LARGEST_FILE = 1_000_000  # bytes; that of the reference scooter has 20 000
+LONGEST_LIST = 1000
+LONGEST_PATH = 200  # letters, of up to four bytes: no file system takes much more
+FEW = 30  # names that a message lists
 
 _HEADER = re.compile(r"^[ \t]*\[\[?[ \t]*[A-Za-z_\"']", re.M)  # not a row of a list of numbers
 
@@ -33,20 +38,20 @@ class Table:
 
     @classmethod
     def read(cls, file: Path) -> Table:
-        """Read `file`; InputError if it is missing or not TOML."""
+        """Read `file`; InputError if it is missing, larger than `LARGEST_FILE`, or not TOML."""
+        text = read_text(file, LARGEST_FILE)
         try:
-            text = file.read_text(encoding="utf-8")
             return cls(tomllib.loads(text), file, text)
-        except OSError as error:
-            raise InputError(f"{file}: {error.strerror}") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except ValueError as error:  # not TOML, or a number of thousands of digits
             raise InputError(f"{file}: not valid TOML: {error}") from error
+        except RecursionError as error:
+            raise InputError(f"{file}: not valid TOML: brackets in brackets without end") from error
 
     def error(self, message: str, key: str = "") -> InputError:
         """The error to raise about `key` (or about the table as a whole)."""
         line = self._line(key)
         place = f"{self.file}:{line}" if line else str(self.file)
-        inside = ".".join(part for part in (self.name, key) if part)
+        inside = ".".join(part[:LONGEST_NAME] for part in (self.name, key) if part)
         return InputError(f"{place}: {inside}: {message}" if inside else f"{place}: {message}")
 
     def _line(self, key: str) -> int | None:
@@ -81,41 +86,92 @@ class Table:
         """Refuse keys that are not in `known`."""
         for key in self.values:
             if key not in known:
-                raise self.error(f"unknown key{nearest(key, known)}; known are {', '.join(sorted(known))}", key)
+                there_are = f"; known are {', '.join(sorted(known))}" if len(known) <= FEW else ""
+                raise self.error(f"unknown key{nearest(key, known)}{there_are}", key)
 
     def table(self, key: str) -> Table:
         """The sub-table `key`; an empty one if it is not there."""
         value = self.values.get(key, {})
         if not isinstance(value, Mapping):
-            raise self.error(f"must be a table, is {value!r}", key)
+            raise self.error(f"must be a table, is {shown(value)}", key)
         return Table(value, self.file, self._text, f"{self.name}.{key}" if self.name else key)
 
     def text(self, key: str, default: str | None = None, choices: Collection[str] = ()) -> str:
         """The string `key`, one of `choices` if these are given."""
         value = self.values.get(key, default)
         if not isinstance(value, str):
-            raise self.error("is missing" if value is None else f"must be a string, is {value!r}", key)
+            raise self.error("is missing" if value is None else f"must be a string, is {shown(value)}", key)
         if choices and value not in choices:
-            raise self.error(f"{value!r} is not one of {', '.join(choices)}{nearest(value, choices)}", key)
+            raise self.error(f"{shown(value)} is not one of {', '.join(choices)}{nearest(value, choices)}", key)
         return value
+
+    def texts(self, key: str, what: str) -> list[str]:
+        """The list of strings `key`, at least one, at most `LONGEST_LIST`; `what` they are, for the complaint."""
+        value: Any = self.values.get(key)
+        if value is None:
+            raise self.error("is missing", key)
+        texts = [text for text in value if isinstance(text, str)] if isinstance(value, list) else []
+        if not 0 < len(texts) <= LONGEST_LIST or len(texts) < len(value):
+            raise self.error(f"must be a list of {what}, is {shown(value)}", key)
+        return texts
+
+    def check_path(self, key: str, text: str) -> str:
+        """`text`, of the value `key`, if the system takes it for a path; InputError."""
+        if not text or len(text) > LONGEST_PATH or not text.isprintable():
+            raise self.error(f"{shown(text)} cannot be the name of a file", key)
+        return text
 
     def number(self, key: str, default: float | None = None, low: float = -1e300, high: float = 1e300) -> float:
         """The number `key`, within [low, high]."""
         value = self.values.get(key, default)
+        if value is None:
+            raise self.error("is missing", key)
+        return self._number_of(value, key, low, high)
+
+    def integer(self, key: str, low: int, high: int) -> int:
+        """The whole number `key`, within [low, high]."""
+        value = self.number(key, low=low, high=high)
+        if value != int(value):
+            raise self.error(f"must be a whole number, is {value:g}", key)
+        return int(value)
+
+    def numbers(self, key: str, low: float = -1e300, high: float = 1e300) -> tuple[float, ...]:
+        """The list of numbers `key`, each within [low, high]; at least one, at most `LONGEST_LIST`."""
+        value = self.values.get(key)
+        if not isinstance(value, list) or not 0 < len(value) <= LONGEST_LIST:
+            raise self.error("is missing" if value is None else f"must be a list of numbers, 1 to {LONGEST_LIST}", key)
+        return tuple(self._number_of(number, key, low, high) for number in value)
+
+    def rows(self, key: str, columns: int, of: str, low: float, high: float) -> tuple[tuple[float, ...], ...]:
+        """The list of rows of `columns` numbers `key`, each within [low, high]; `of` says what they are."""
+        value = self.values.get(key)
+        if not isinstance(value, list) or not 0 < len(value) <= LONGEST_LIST:
+            raise self.error("is missing" if value is None else "must be a list of rows of numbers", key)
+        for row in value:
+            if not isinstance(row, list) or len(row) != columns:
+                raise self.error(f"each row must be {columns} numbers ({of}), not {shown(row)}", key)
+        return tuple(tuple(self._number_of(number, key, low, high) for number in row) for row in value)
+
+    def _number_of(self, value: object, key: str, low: float, high: float) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.error("is missing" if value is None else f"must be a number, is {value!r}", key)
-        if not math.isfinite(value):
-            raise self.error(f"must be a finite number, is {value}", key)
+            raise self.error(f"must be a number, is {shown(value)}", key)
+        if not abs(value) <= 1e300:  # nan is not
+            raise self.error(f"must be a finite number, is {shown(value)}", key)
         if not low <= value <= high:
             raise self.error(f"{value:g} is outside {low:g} to {high:g}", key)
         return float(value)
 
-    def numbers(self, key: str) -> tuple[float, ...]:
-        """The list of numbers `key`."""
-        value = self.values.get(key)
-        if not isinstance(value, list) or not value:
-            raise self.error("is missing" if value is None else "must be a list of numbers", key)
-        for number in value:
-            if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
-                raise self.error(f"must hold numbers only, holds {number!r}", key)
-        return tuple(float(number) for number in value)
+
+def read_text(file: Path, most: int, encodings: tuple[str, ...] = ("utf-8",)) -> str:
+    """The text of `file`, of at most `most` bytes, in the first of `encodings` that fits. InputError."""
+    try:
+        with file.open("rb") as stream:
+            data = stream.read(most + 1)
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read: {error.strerror}") from error
+    if len(data) > most:
+        raise InputError(f"{file}: is larger than {most / 1e6:g} MB; such a file is read no further")
+    for encoding in encodings:
+        with contextlib.suppress(UnicodeDecodeError):
+            return data.decode(encoding)
+    raise InputError(f"{file}: is no text in {encodings[0]}")

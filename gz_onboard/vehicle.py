@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import re
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from gz_onboard.bus.mapping import Mapping, find_dbc, read_mapping
 from gz_onboard.bus.publisher import RANGE_DBC
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.physics.battery import Battery, read_battery
 from gz_onboard.physics.derating import Derating, read_derating
 from gz_onboard.physics.effect import Effect
@@ -63,20 +64,34 @@ class Vehicle:
         return InputError(f"{self.file}: {message}")
 
 
-def find_vehicle(name: str) -> Path:
-    """The vehicle file `name`: a path, or the name of one of the package's own."""
-    if Path(name).is_file():
-        return Path(name)
+def find_vehicle(name: str | Path, beside: Path | None = None) -> Path:
+    """The vehicle file `name`: one of the package's own, or a path, which has a slash or ends in ``.toml``.
+
+    beside: the folder from which a path is; the working directory if not given. InputError if there is none.
+    """
     own = sorted(file.stem for file in OWN.glob("*.toml"))
+    there_are = f"the package's own are {', '.join(own)}"
+    path = (beside or Path()) / name
+    if isinstance(name, Path) or "/" in name or name.endswith(".toml"):
+        if path.is_file():
+            return path
+        raise InputError(f"{path if beside else name}: no such vehicle file; {there_are}{nearest(str(name), own)}")
     if name in own:
         return OWN / f"{name}.toml"
-    raise InputError(f"{name}: no such vehicle file; the package's own are {', '.join(own)}{nearest(name, own)}")
+    meant = f" (did you mean './{name}'?)" if path.is_file() else nearest(name, own)
+    raise InputError(f"{name}: no such vehicle file; {there_are}{meant}")
 
 
-def read_vehicle(name: str, payload: float | None = None, effects_folder: Path | None = None) -> Vehicle:
+def read_vehicle(
+    name: str | Path,
+    payload: float | None = None,
+    effects_folder: Path | None = None,
+    users: Collection[int] | None = None,
+) -> Vehicle:
     """The vehicle `name` (file or one of the package's own), with the rider's mass [kg] if it is known.
 
-    effects_folder: where effects of the user's own are, beside the file's own ``effects_folder``.
+    effects_folder: where effects of the user's own are, beside the file's own ``effects_folder``, of which only those
+    run that nobody but `users` can change (see `read_model`).
     """
     table = Table.read(find_vehicle(name))
     table.only(
@@ -98,14 +113,14 @@ def read_vehicle(name: str, payload: float | None = None, effects_folder: Path |
     )
     if table.number("schema") != 1:
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
-    effects = read_model(table, effects_folder)
+    effects = read_model(table, effects_folder, users)
     parameters = read_parameters(table, effects)
     if payload is not None:
         parameters = parameters.replaced(payload_mass=payload)
     model, riding = Model(effects, parameters), read_riding(table)
     check_riding(table, riding, model)
     return Vehicle(
-        name=table.text("name"),
+        name=_name(table),
         file=table.file,
         mapping=read_mapping(table),
         parameters=parameters,
@@ -126,12 +141,22 @@ def _range_dbc(table: Table) -> Path:
         raise table.error(str(error), "range_dbc") from error
 
 
+def _name(table: Table) -> str:
+    """The vehicle's name, which becomes part of the names of files: no path, nothing that a shell would take apart."""
+    name = table.text("name")
+    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", name):
+        raise table.error(
+            f"must be 1 to 64 letters, digits and - _ . with a letter or digit first, is {shown(name)}", "name"
+        )
+    return name
+
+
 def _healthy(table: Table) -> Path | None:
     """The file of what the discovery learned on healthy rides, beside the vehicle file."""
     table.only(["file", "rides"])
     if "file" not in table.values:
         return None
-    file = table.file.parent / table.text("file")
+    file = table.file.parent / table.check_path("file", table.text("file"))
     if not file.is_file():
         raise table.error(f"no file {file}", "file")
     return file

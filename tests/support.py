@@ -24,6 +24,8 @@ LOGS = ROOT / "replay_logs"
 MS = 1_000_000
 S = 1_000_000_000
 EPOCH = 1_700_000_000 * S
+HEARS_CTRL_C = ("env", "--default-signal=INT")
+"""Before a command: a shell that runs the tests in the background has them, and all that they start, ignore SIGINT."""
 
 
 @cache

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
 import re
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from gz_onboard.cli import main
+from gz_onboard.cli import COMMANDS, command_line, main
+from gz_onboard.lab import plot
 from tests.support import LOGS, ROOT
+from tests.test_vehicle import with_effect
 
 RIDE = str(LOGS / "coastdown.blf")
 
@@ -69,6 +73,14 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["replay", RIDE + "x"], "did you mean '.blf'"),
         (["replay", RIDE, "--speed", "-1"], "--speed -1"),
         (["replay", RIDE, "--from", "-1"], "--from -1"),
+        (["replay", RIDE, "--from", "inf"], "--from inf"),
+        (["replay", RIDE, "--from", "1e300"], "--from 1e+300"),
+        (["replay", RIDE, "--from", "1", "--to", "inf"], "--to inf"),
+        (["replay", RIDE, "--from", "1", "--to", "nan"], "--to nan"),
+        (["replay", RIDE, "--speed", "1e-300"], "--speed 1e-300"),
+        (["replay", RIDE, "--speed", "nan"], "--speed nan"),
+        (["export", RIDE, "x.log", "--to", "inf", "--from", "1"], "--to inf"),
+        (["calibrate", "motor", RIDE, "--set", "largest_current=nan"], "largest_current=nan"),
         (["replay", RIDE, "--from", "20", "--to", "10"], "--to 10 s"),
         (["replay", RIDE, "--interface", "virtul"], "did you mean 'virtual'"),
         (["estimate"], "FILE"),
@@ -120,6 +132,19 @@ def test_vehicle_file(
         assert words in err
 
 
+def test_the_daemon_runs_no_effects_but_roots(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    file = with_effect(tmp_path)
+    monkeypatch.setattr("gz_onboard.daemon.ROOT", 12345)  # root may run the tests, and the file be root's
+    arguments = ["run", "--interface", "none", "--vehicle", str(file)]
+    assert "horn.py beside the file is code, and not run" in refused(capsys, *arguments)
+    assert not list(tmp_path.rglob("*.ran"))
+    assert "--interface none" in refused(capsys, *arguments, "--effects", str(file.parent / "effects"))
+    assert list(tmp_path.rglob("*.ran"))
+    assert "no such folder" in refused(capsys, *arguments, "--effects", str(tmp_path / "none"))
+
+
 @pytest.mark.parametrize(
     ("right", "wrong", "said"),
     [
@@ -163,8 +188,50 @@ def test_as_a_process():
     assert line.startswith("gz-onboard run: refrence: ")
 
 
-def test_help_and_version(capsys: pytest.CaptureFixture[str]):
-    for command in ("run", "replay", "estimate", "export", "plot", "dashboard"):
-        assert status(command, "--help") == 0
-        assert f"gz-onboard {command}" in capsys.readouterr().out
+def test_a_disk_that_is_full():
+    with Path("/dev/full").open("w") as full:
+        command = [sys.executable, "-m", "gz_onboard", "discover", "--list"]
+        run = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert run.returncode
+    assert "gz-onboard discover: [Errno 28] No space left on device" in run.stderr
+    assert "Traceback" not in run.stderr
+
+
+def test_ctrl_c_before_anything_is_read(monkeypatch: pytest.MonkeyPatch):
+    """What a command imports takes a second or two."""
+
+    def interrupted(_: argparse.ArgumentParser) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(plot, "add_arguments", interrupted)
+    assert status("plot", "a.mcap") == 130
+
+
+def parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """It and all its subcommands'."""
+    yield parser
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for child in action.choices.values():
+                yield from parsers(child)
+
+
+HELP = {parser.prog: parser.format_help for parser in parsers(command_line(COMMANDS))}
+
+
+@pytest.mark.parametrize("command", HELP)
+def test_every_page_of_help(command: str):
+    page = HELP[command]()
+    assert page.startswith(f"usage: {command} ")
+    assert "%%" not in page
+    assert "%(" not in page
+
+
+def test_help_as_it_is_asked_for(capsys: pytest.CaptureFixture[str]):
+    assert status("--help") == 0
+    page = capsys.readouterr().out
+    assert all(re.search(rf"^    {name}\b", page, re.M) for name in COMMANDS)
+    for name in COMMANDS:
+        assert status(name, "--help") == 0
+        assert capsys.readouterr().out == HELP[f"gz-onboard {name}"]()
     assert status("--version") == 0

@@ -36,7 +36,11 @@ numbers = [1, 2.5]
 bad = [1, "2"]
 infinite = [1.0, inf]
 empty = []
+grid = [[1, 2], [3]]
+grid2 = [[1, 2], [3, 4]]
+half = 0.5
 """
+TEXT += f"huge = 1{'0' * 400}\nhexadecimal = 0x{'f' * 5000}\n"
 
 
 @pytest.fixture
@@ -97,9 +101,20 @@ def test_a_complaint_names_the_line(table, path, key, line):
         (lambda t: t.table("name"), [":1:", "must be a table", "'x'"]),
         (lambda t: t.numbers("name"), [":1:", "list of numbers"]),
         (lambda t: t.numbers("absent"), ["absent", "is missing"]),
-        (lambda t: t.table("many").numbers("bad"), [":26:", "many.bad", "numbers only", "'2'"]),
-        (lambda t: t.table("many").numbers("infinite"), [":27:", "many.infinite", "numbers only", "inf"]),
+        (lambda t: t.table("many").numbers("bad"), [":26:", "many.bad", "must be a number", "'2'"]),
+        (lambda t: t.table("many").numbers("infinite"), [":27:", "many.infinite", "must be a finite number", "inf"]),
         (lambda t: t.table("many").numbers("empty"), [":28:", "many.empty", "list of numbers"]),
+        (lambda t: t.table("many").integer("half", 0, 9), ["half", "whole number", "0.5"]),
+        (lambda t: t.table("many").number("huge"), ["huge", "must be a finite number"]),
+        (
+            lambda t: t.table("many").number("hexadecimal"),
+            ["hexadecimal", "thousands of digits"],
+        ),
+        (lambda t: t.texts("name", "words"), [":1:", "name", "must be a list of words", "'x'"]),
+        (lambda t: t.texts("absent", "words"), ["absent", "is missing"]),
+        (lambda t: t.rows("absent", 2, "x and y", 0, 9), ["absent", "is missing"]),
+        (lambda t: t.table("many").rows("grid", 2, "x and y", 0, 9), ["many.grid", "2 numbers (x and y), not [3]"]),
+        (lambda t: t.table("many").rows("grid2", 2, "x and y", 0, 3), ["many.grid2", "4 is outside 0 to 3"]),
         (lambda t: t.table("a").only(["value", "units"]), [":11:", "a.unit", "unknown key", "did you mean 'units'"]),
     ],
 )
@@ -133,7 +148,10 @@ def test_no_number_that_is_none(tmp_path, value):
     [
         (b"a = 1\nb = \n", ["not valid TOML", "line 2"]),
         (b"a = 1\na = 2\n", ["not valid TOML", "line 2"]),
-        (b"a = '\xff'\n", ["not valid TOML"]),
+        (b"a = '\xff'\n", ["no text in utf-8"]),
+        (b"a = " + b"[" * 5000, ["not valid TOML", "brackets"]),
+        (b"a = " + b"9" * 5000, ["not valid TOML"]),
+        (b"# " + b"x" * 1_000_000, ["larger than 1 MB"]),
     ],
 )
 def test_a_file_that_is_not_toml(tmp_path, content, parts):
@@ -145,7 +163,7 @@ def test_a_file_that_is_not_toml(tmp_path, content, parts):
 
 
 def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(InputError, match=r"none\.toml: No such file"):
+    with pytest.raises(InputError, match=r"none\.toml: cannot be read: No such file"):
         Table.read(tmp_path / "none.toml")
 
 

@@ -51,8 +51,99 @@ def test_a_vehicle_without_a_battery_has_none(tmp_path):
 
 
 def test_a_vehicle_that_is_not_there():
-    with pytest.raises(InputError, match=r"refrence: no such vehicle file.*reference.*did you mean 'reference'"):
+    with pytest.raises(InputError, match=r"refrence: no such vehicle file; .*reference.*did you mean 'reference'"):
         find_vehicle("refrence")
+    with pytest.raises(InputError, match=r"\./reference: no such vehicle file; .*did you mean 'reference'"):
+        find_vehicle("./reference")
+
+
+def test_a_name_is_never_a_file_that_happens_to_be_there(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("reference", "mine", "mine.toml"):
+        (tmp_path / name).write_text(REFERENCE, encoding="utf-8")
+    assert find_vehicle("reference") == OWN / "reference.toml"
+    assert find_vehicle("./reference") == find_vehicle(Path("reference")) == Path("reference")
+    assert find_vehicle("mine.toml") == Path("mine.toml")
+    with pytest.raises(InputError, match=r"did you mean '\./mine'"):
+        find_vehicle("mine")
+    assert find_vehicle("mine.toml", beside=tmp_path) == tmp_path / "mine.toml"
+    assert find_vehicle("reference", beside=tmp_path) == OWN / "reference.toml"
+
+
+# --- effects that come with a file are code -----------------------------------------------------------------------
+
+EFFECT = """
+from gz_onboard.physics.effect import Parameter, Port
+open(__file__ + ".ran", "w").close()
+PORT = Port.DC_POWER
+PARAMETERS = (Parameter("horn_power", "W", 5.0, 1.0, 0.0, 50.0, "a guess"),)
+def term(*, horn_power):
+    return horn_power
+"""
+
+
+def with_effect(folder: Path, effects_folder: str = "effects", where: str = "effects") -> Path:
+    """A vehicle file with an effect of its own, `horn`."""
+    (folder / where).mkdir(parents=True, exist_ok=True)
+    (folder / where / "horn.py").write_text(EFFECT)
+    file = folder / "v.toml"
+    listed = f'[model]\neffects_folder = "{effects_folder}"\neffects = ["horn", '
+    file.write_text(REFERENCE.replace("[model]\neffects = [", listed))
+    return file
+
+
+def refusal(file: Path, **options) -> str:
+    """Why the file is refused, with nothing of it run."""
+    with pytest.raises(InputError) as caught:
+        read_vehicle(file, **options)
+    assert not list(file.parent.parent.rglob("*.ran"))
+    return str(caught.value)
+
+
+def test_the_effects_of_ones_own_file_run(tmp_path):
+    assert "horn" in read_vehicle(with_effect(tmp_path)).key
+
+
+@pytest.mark.parametrize("others", ["effects/horn.py", "effects", "v.toml", "."])
+def test_effects_that_others_can_change_do_not_run(tmp_path, others):
+    file = with_effect(tmp_path / "a")
+    place = file.parent / others
+    place.chmod(place.stat().st_mode | 0o002)
+    said = refusal(file)
+    assert f"{place} can be written by others" in said
+    assert re.search(r"v\.toml:\d+: model\.effects: horn\.py", said)
+    assert "--effects" in said
+    assert "horn" in read_vehicle(file, effects_folder=file.parent / "effects").key
+
+
+def test_effects_of_another_user_do_not_run(tmp_path):
+    file = with_effect(tmp_path / "a")
+    assert "belongs to" in refusal(file, users={file.stat().st_uid + 1})
+
+
+@pytest.mark.parametrize("folder", ["/tmp", "../elsewhere", "effects/../../elsewhere", "link"])
+def test_effects_from_elsewhere_do_not_run(tmp_path, folder):
+    file = with_effect(tmp_path / "a", folder, where="../elsewhere")
+    (tmp_path / "a" / "link").symlink_to(tmp_path / "elsewhere")
+    (tmp_path / "a" / "effects").mkdir()
+    assert "is not below the vehicle file's own folder" in refusal(file)
+
+
+def test_an_effect_that_is_a_link_to_elsewhere_does_not_run(tmp_path):
+    file = with_effect(tmp_path / "a")
+    effect = file.parent / "effects" / "horn.py"
+    effect.rename(tmp_path / "horn.py")
+    effect.symlink_to(tmp_path / "horn.py")
+    assert "a link that leads out" in refusal(file)
+
+
+@pytest.mark.parametrize("name", ["../effects/horn", "/etc/horn", "effects/horn", ""])
+def test_the_name_of_an_effect_is_no_path(tmp_path, name):
+    file = with_effect(tmp_path / "a")
+    file.write_text(file.read_text().replace('["horn"', f'["{name}"'))
+    for folder in (None, tmp_path):
+        said = refusal(file, effects_folder=folder)
+        assert f"no effect is called '{name}'" in said or "cannot be the name of a file" in said
 
 
 # line: where the error must point to, counted from the change
@@ -80,16 +171,43 @@ def test_a_vehicle_that_is_not_there():
         ('"aerodynamic_drag"', '"areodynamic_drag"', -1, ["model.effects", "did you mean 'aerodynamic_drag'"]),
         (r"\[model\]\n", '[model]\neffects_folder = "none"\n', 1, ["model.effects_folder", "no folder", "none"]),
         ("cells_series = 14", "cells_series = 0", 0, ["battery.cells_series", "0 is outside 1 to"]),
+        ("cells_series = 14", "cells_series = 14.5", 0, ["battery.cells_series", "whole number", "14.5"]),
+        ('"vehicle.dbc"', f'"{"x" * 5000}"', 0, ["dbc", "cannot be the name of a file"]),
+        (
+            r"\[model\]\n",
+            '[model]\neffects_folder = "\\\\u0000"\n',
+            1,
+            ["effects_folder", "cannot be the name of a file"],
+        ),
+        ('"aerodynamic_drag"', f'"{"x" * 5000}"', -1, ["model.effects", "cannot be the name of a file"]),
+        ('"reference-scooter"', '"../../etc"', 0, ["name", "'../../etc'", "letter or digit first"]),
+        ('"reference-scooter"', '"a\\\\u0000"', 0, ["name"]),
+        (r"effects = \[[^]]*\]", "effects = []", 0, ["model.effects", "list of names"]),
+        (DRAG, rf"\g<1>1{'0' * 400}", 0, ["drag_area.value", "finite"]),
+        (r"(drag_area = .*), sd = [\d.]+", r"\1, sd = 1e300", 0, ["drag_area.sd", "outside 0 to 1e+09"]),
+        (r"(\[battery.ocv\]\nsoc = \[[\d.]+), [\d.]+", r"\1, 5e-324", 1, ["battery.ocv.soc", "increase by 1e-06"]),
+        (
+            r"\[battery.ocv\]\nsoc = .*\nvalue = .*",
+            "[battery.ocv]\nsoc = [0.4, 0.9]\nvalue = [3.0, 4.0]",
+            1,
+            ["battery.ocv.soc", "0.1 or less"],
+        ),
+        (r"(\[battery.capacity\]\n.*\nvalue = \[)[\d.]+", r"\g<1>900.0", 2, ["capacity.value", "0.05 to 2 times"]),
         ("cells_series = 14", "cell_series = 14", 0, ["battery.cell_series", "did you mean 'cells_series'"]),
         ("cells_series = 14", "", -1, ["battery.cells_series", "is missing"]),
         (r"(\[battery.ocv\]\nsoc = \[[\d.]+), [\d.]+", r"\1, 0.0", 1, ["battery.ocv.soc", "increase"]),
         (OCV, r"\g<1>2.95, ", 2, ["ocv.value", "must increase, but 2.", "follows 2.95"]),
         (OCV, r"\1", 2, ["battery.ocv.value", "28 numbers for 29 of soc"]),
-        (r"(\[battery.ocv\]\n.*\nvalue = \[.*), [\d.]+\]", r"\1, 5.1]", 2, ["battery.ocv.value", "within 0.5 to 5"]),
+        (
+            r"(\[battery.ocv\]\n.*\nvalue = \[.*), [\d.]+\]",
+            r"\1, 5.1]",
+            2,
+            ["battery.ocv.value", "5.1 is outside 0.5 to 5"],
+        ),
         ('unit = "A·h"\nsd_relative', 'unit = "Ah"\nsd_relative', 0, ["battery.capacity.unit", "'Ah'", "A·h"]),
         (r"\[battery.c1\]", "[battery.c2]", 0, ["battery.c2", "unknown key", "did you mean 'c1'"]),
-        (R0, r"\1", 3, ["battery.r0.value", "14 positive numbers"]),
-        (R0, r"\1-0.2769, ", 3, ["battery.r0.value", "14 positive numbers"]),
+        (R0, r"\1", 3, ["battery.r0.value", "14 numbers (in ohm, one for each soc)"]),
+        (R0, r"\1-0.2769, ", 3, ["battery.r0.value", "-0.2769 is outside"]),
         ('pack_voltage = "BMS_PackVoltage"', 'pack_voltage = "BMS_PackVolts"', 0, ["did you mean 'BMS_PackVoltage'"]),
     ],
 )
@@ -134,9 +252,15 @@ def test_parameters_that_were_found_together_are_tied(tmp_path):
     [
         ('"drag_area"', '"drag_aera"', "no parameter is called 'drag_aera' (did you mean 'drag_area'?)"),
         ("[0.86, 1.0]]", "[0.85, 1.0]]", "not symmetric"),
-        ("[[1.0, 0.86]", "[[1.0, 1.86]", "1.86 is no correlation"),
+        ("[[1.0, 0.86]", "[[1.0, 1.86]", "1.86 is outside -1 to 1"),
         ("[[1.0, 0.86], ", "[", "must be 2 rows of 2 numbers"),
         ("[[1.0", "[[0.9", "diagonal must be 1"),
+        ('"rolling_resistance_constant"]', '"drag_area"]', "names 'drag_area' twice"),
+        (
+            'constant"]\nvalue = [[1.0, 0.86], [0.86, 1.0]]',
+            'constant", "wheelbase"]\nvalue = [[1, 0.9, 0.9], [0.9, 1, -0.9], [0.9, -0.9, 1]]',
+            "a variance is negative",
+        ),
     ],
 )
 def test_a_correlation_that_is_none_is_refused(tmp_path, old, new, says):

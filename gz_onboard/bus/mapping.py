@@ -22,19 +22,29 @@ from __future__ import annotations
 import logging
 import re
 from dataclasses import dataclass, field
-from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.units import known_units, to_si
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.events import ROLES
+from gz_onboard.toml import read_text
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
     from cantools.database.can.signal import Signal
 
     from gz_onboard.toml import Table
+
+LARGEST_DBC = 8_000_000  # bytes; those of whole cars have one or two million
+MOST_FILES = 20
+LONGEST_FRAME = 64  # bytes, of CAN FD
+SMALLEST, LARGEST = 1e-12, 1e12  # a scale or an offset
+FARTHEST = 1e30  # a limit of a signal; those of 64 bits are written out by some editors
+LONGEST_PROBLEM = 400  # letters of what cantools says, which may quote a whole line
+_END = '\nCM_ "";\n'  # an empty comment: a last statement that is cut off is none to cantools, one in between is wrong
+_MESSAGE_SIZE = re.compile(r"^[ \t]*BO_[ \t]+\d+[ \t]+(\w+)[ \t]*:[ \t]*(\d+)", re.M)
+_SIGNAL_SIZE = re.compile(r"^[ \t]*SG_[ \t]+(\w+)[^:\n\"]*:[ \t]*(\d+)[ \t]*\|[ \t]*(\d+)", re.M)
 
 _PACKAGE = Path(__file__).resolve().parent.parent
 
@@ -96,11 +106,14 @@ def load_database(files: list[Path]) -> Database:
     origin: dict[str, tuple[Path, str]] = {}  # by name and by identifier
     for file in files:
         text = _read_text(file)
+        _check_sizes(file, text)
         before = len(database.messages)
         try:
-            database.add_dbc_string(text)
+            database.add_dbc_string(text + _END)
         except Exception as error:  # cantools and textparser raise a dozen types on what is not valid
-            raise _invalid(file, text, str(error)) from error
+            raise _invalid(file, text, str(error) or type(error).__name__) from error
+        if len(database.messages) == before:
+            raise InputError(f"{file}:1: not a valid DBC file: it has no message")
         for message in database.messages[before:]:
             identifier = f"identifier {message.frame_id:#x}{' (29 bits)' if message.is_extended_frame else ''}"
             for key in (f"name {message.name!r}", identifier):
@@ -109,22 +122,43 @@ def load_database(files: list[Path]) -> Database:
                     where = f"{other}:{_message_line(_read_text(other), name)}"
                     raise _invalid(file, text, f"{key} of message {message.name} is also that of {name} in {where}")
                 origin[key] = file, message.name
-            for signal in message.signals:
-                if not signal.conversion.scale or not isfinite(signal.conversion.scale):
-                    problem = f"signal {signal.name} has a scale of {signal.conversion.scale} in message {message.name}"
-                    raise _invalid(file, text, problem)
+            if problem := _problem(message):
+                raise _invalid(file, text, f"{problem} in message {message.name}")
     return database
 
 
 def _read_text(file: Path) -> str:
-    try:
-        data = file.read_bytes()
-    except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror}") from error
-    try:
-        return data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        return data.decode("cp1252", errors="replace")  # what most DBC editors write
+    return read_text(file, LARGEST_DBC, ("utf-8-sig", "cp1252", "latin-1"))  # most DBC editors write the second
+
+
+def _check_sizes(file: Path, text: str) -> None:
+    """InputError for a layout that no frame can have; cantools would take minutes and gigabytes over it."""
+    for found in _MESSAGE_SIZE.finditer(text):
+        if len(found[2]) > 2 or int(found[2]) > LONGEST_FRAME:
+            raise _invalid(file, text, f"message {found[1]} has {shown(found[2])} bytes, the most are {LONGEST_FRAME}")
+    for found in _SIGNAL_SIZE.finditer(text):
+        if any(len(number) > 3 or int(number) > 8 * LONGEST_FRAME for number in (found[2], found[3])):
+            line = text.count("\n", 0, found.start()) + 1
+            raise _invalid(file, text, f"signal {found[1]} at line {line} reaches beyond the longest frame")
+
+
+def _problem(message: Message) -> str | None:
+    """What of a message's times and scales is no number that could be calculated with."""
+    period = message.cycle_time
+    if period and not (isinstance(period, int | float) and 0.1 <= period <= 3.6e6):
+        return f"the cycle time is {shown(period)} ms, outside 0.1 to 3600000,"
+    for signal in message.signals:
+        if signal.start < 0 or signal.length < 1:
+            return f"signal {signal.name} has {signal.length} bits from bit {signal.start} on"
+        scale, offset = signal.conversion.scale, signal.conversion.offset
+        if not SMALLEST <= abs(scale) <= LARGEST:
+            return f"signal {signal.name} has a scale of {shown(scale)}"
+        if not abs(offset) <= LARGEST:
+            return f"signal {signal.name} has an offset of {shown(offset)}"
+        low, high = signal.minimum, signal.maximum
+        if low is not None and high is not None and not -FARTHEST <= low <= high <= FARTHEST:
+            return f"signal {signal.name} has the limits {shown(low)} to {shown(high)}"
+    return None
 
 
 def _invalid(file: Path, text: str, problem: str) -> InputError:
@@ -134,6 +168,8 @@ def _invalid(file: Path, text: str, problem: str) -> InputError:
     line = told[1] if told else _message_line(text, named[1]) if named else None
     if wide := re.search(r"Standard frame id (0x[0-9a-f]+) is more than 11 bits", problem):
         problem += f" A DBC writes a 29-bit identifier with bit 31 set: {int(wide[1], 16) | 1 << 31}."
+    if len(problem) > LONGEST_PROBLEM:
+        problem = f"{problem[:LONGEST_PROBLEM]} ..."
     return InputError(f"{file}{f':{line}' if line else ''}: not a valid DBC file: {problem}")
 
 
@@ -145,9 +181,11 @@ def _message_line(text: str, name: str) -> int | None:
 
 def read_mapping(vehicle: Table) -> Mapping:
     """The bus part of the vehicle file `vehicle`; InputError for whatever does not fit its DBC files."""
-    names = vehicle.values.get("dbc")
-    if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
-        raise vehicle.error("must be a list of DBC file names", "dbc")
+    names = vehicle.texts("dbc", "DBC file names")
+    if len(names) > MOST_FILES:
+        raise vehicle.error(f"names {len(names)} files, the most are {MOST_FILES}", "dbc")
+    for name in names:
+        vehicle.check_path("dbc", name)
     try:
         files = [find_dbc(name, vehicle.file.parent) for name in names]
     except InputError as error:
@@ -210,23 +248,25 @@ def _source(database: Database, roles: Table, role: str) -> Source:
         found = [(m, s) for m in database.messages for s in m.signals if s.name == name]
         if not found:
             known = [s.name for m in database.messages for s in m.signals]
-            raise where.error(f"no message has a signal {name!r}{nearest(name, known)}", key)
+            raise where.error(f"no message has a signal {shown(name)}{nearest(name, known)}", key)
         if len(found) > 1:
             among = ", ".join(m.name for m, _ in found)
-            raise where.error(f"signal {name!r} stands in several messages ({among}): say which, by message = ...", key)
+            raise where.error(
+                f"signal {shown(name)} stands in several messages ({among}): say which, by message = ...", key
+            )
         message, signal = found[0]
     unit = options.text("unit", signal.unit or "") if options else signal.unit or ""
     si = to_si(unit, role)
     if si is None:
         raise where.error(
-            f"{name!r} has unit {unit!r}, from which {role} [{ROLES[role]}] cannot be had; "
+            f"{name!r} has unit {shown(unit)}, from which {role} [{ROLES[role]}] cannot be had; "
             f"give unit = one of {', '.join(known_units(role))}{nearest(unit, known_units(role)) if unit else ''}",
             key,
         )
-    scale = options.number("scale", 1.0, -1e9, 1e9) if options else 1.0
-    shift = options.number("offset", 0.0, -1e9, 1e9) if options else 0.0
-    if not scale and options:
-        raise options.error("must not be 0", "scale")
+    scale = options.number("scale", 1.0, -LARGEST, LARGEST) if options else 1.0
+    shift = options.number("offset", 0.0, -LARGEST, LARGEST) if options else 0.0
+    if abs(scale) < SMALLEST and options:
+        raise options.error(f"must not be 0, nor within {SMALLEST:g} of it, is {scale:g}", "scale")
     conversion = signal.conversion
     factor = float(conversion.scale) * si[0] * scale
     return Source(role, message.name, signal.name, factor, (float(conversion.offset) * si[0] + si[1]) * scale + shift)
@@ -235,14 +275,14 @@ def _source(database: Database, roles: Table, role: str) -> Source:
 def _message(database: Database, where: Table, key: str, name: str) -> Message:
     known = [message.name for message in database.messages]
     if name not in known:
-        raise where.error(f"the DBC files have no message {name!r}{nearest(name, known)}", key)
+        raise where.error(f"the DBC files have no message {shown(name)}{nearest(name, known)}", key)
     return database.get_message_by_name(name)
 
 
 def _signal(message: Message, where: Table, key: str, name: str) -> Signal:
     known = [signal.name for signal in message.signals]
     if name not in known:
-        raise where.error(f"message {message.name} has no signal {name!r}{nearest(name, known)}", key)
+        raise where.error(f"message {message.name} has no signal {shown(name)}{nearest(name, known)}", key)
     return message.get_signal_by_name(name)
 
 

@@ -24,6 +24,8 @@ from gz_onboard.events import ERR_FLAG, TRANSMITTED, Frame
 if TYPE_CHECKING:
     import can
 
+SLOWEST = 1e-3  # a second in a quarter of an hour
+LONGEST_LOG = 1e9  # s, thirty years
 Send = Callable[[Frame], bool]
 """Puts one frame on the bus; False if it could not."""
 
@@ -172,8 +174,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run ``gz-onboard replay``: 0, or 130 when interrupted. Raises InputError for what cannot be used."""
-    if not 0 <= args.speed < float("inf"):
-        raise InputError(f"--speed {args.speed:g}: must be 0 (as fast as possible) or a positive factor")
+    if args.speed and not SLOWEST <= args.speed < float("inf"):
+        raise InputError(f"--speed {args.speed:g}: must be 0 (as fast as possible) or a factor of {SLOWEST:g} or more")
     start_ns, end_ns = log_section(args.file, args.start, args.end)
     received_only = log_suffix(args.file) == ".mcap" and not args.all
     names = [name for name in args.channel.split(",") if name]
@@ -209,6 +211,9 @@ def log_section(path: Path, start_s: float, end_s: float | None) -> tuple[int | 
     """--from and --to [s from the first frame] as times [ns] for `read_frames`; InputError if they are none."""
     if not start_s >= 0:
         raise InputError(f"--from {start_s:g} s: must not be before the start of the log")
+    for option, seconds in (("--from", start_s), ("--to", end_s or 0.0)):
+        if seconds > LONGEST_LOG:
+            raise InputError(f"{option} {seconds:g} s: is beyond any log")
     if end_s is not None and not end_s > start_s:
         raise InputError(f"--to {end_s:g} s: must be after --from {start_s:g} s")
     if not start_s and end_s is None:

@@ -75,7 +75,8 @@ def _begin(done: Any) -> None:
     """In each process of the pool: Ctrl-C ends it without a word; the parent process tells."""
     global _done  # noqa: PLW0603 - the only way into a process of the pool
     _done = done
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as a shell has it that started us in the background
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def _count(work: float) -> None:

@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 Row = tuple[float, ...]
 Lacks = Callable[[float, float, float], float]
 """What a cell's voltage lacks [V] beside R0 and the RC pair, at a cell's current [A], SOC and temperature [degC]."""
+TEMPERATURE = (-60.0, 100.0)  # degC, of a cell
+RESISTANCE = (1e-6, 10.0)  # ohm, of a cell: from the largest to a frozen one of a watch
+CAPACITANCE = (1e-3, 1e8)  # F, of a cell's RC pair
+SMALLEST_STEP = 1e-6  # of SOC, V or degC, from point to point: a slope must stay a number
 LARGEST_SHIFT = 0.2  # V: real cells rest tens of mV apart from -20 to 25 degC; more is a mistyped unit
 
 
@@ -242,6 +246,8 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
     ocv.only(["soc", "value", "unit", "sd", "source", "status"])
     ocv.text("unit", choices=["V"])
     soc, volts = _axis(ocv, "soc", -0.01, 1.01), _axis(ocv, "value", 0.5, 5.0)
+    if soc[0] > 0.1 or soc[-1] < 0.9:
+        raise ocv.error(f"must reach from 0.1 or less to 0.9 or more, is {soc[0]:g} to {soc[-1]:g}", "soc")
     if len(soc) != len(volts):
         raise ocv.error(f"has {len(volts)} numbers for {len(soc)} of soc", "value")
     temperatures: Row
@@ -251,15 +257,17 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         capacity = table.table("capacity")
         capacity.only(["temperature", "value", "unit", "sd_relative", "source", "status"])
         capacity.text("unit", choices=["A·h"])
-        temperatures, capacities = _axis(capacity, "temperature", -60, 100), capacity.numbers("value")
-        if len(temperatures) != len(capacities) or min(capacities) <= 0:
+        temperatures, capacities = _axis(capacity, "temperature", *TEMPERATURE), capacity.numbers("value", 0.01, 1000)
+        if len(temperatures) != len(capacities):
             raise capacity.error(f"must be {len(temperatures)} positive numbers, one for each temperature", "value")
         at_25 = _linear(temperatures, capacities, 25.0)
         capacities = tuple(value / at_25 for value in capacities)
+        if min(capacities) < 0.05 or max(capacities) > 2:
+            raise capacity.error("must be within 0.05 to 2 times what it is at 25 degC", "value")
     shift_temperatures, shifts, shift_sd = _rest_shift(table)
     battery = Battery(
-        cells_series=round(table.number("cells_series", low=1, high=1000)),
-        cells_parallel=round(table.number("cells_parallel", low=1, high=1000)),
+        cells_series=table.integer("cells_series", 1, 1000),
+        cells_parallel=table.integer("cells_parallel", 1, 1000),
         capacity=parameters["cell_capacity"],
         capacity_temperature=temperatures,
         capacity_share=capacities,
@@ -268,9 +276,9 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         ocv_soc=soc,
         ocv_value=volts,
         ocv_sd=ocv.number("sd", 0.005, low=1e-4, high=0.5),
-        r0=_mesh(table.table("r0"), "ohm"),
-        r1=_mesh(table.table("r1"), "ohm"),
-        c1=_mesh(table.table("c1"), "F"),
+        r0=_mesh(table.table("r0"), "ohm", *RESISTANCE),
+        r1=_mesh(table.table("r1"), "ohm", *RESISTANCE),
+        c1=_mesh(table.table("c1"), "F", *CAPACITANCE),
         rest_shift_temperature=shift_temperatures,
         rest_shift_value=shifts,
         rest_shift_sd=shift_sd,
@@ -285,35 +293,31 @@ def _rest_shift(battery: Table) -> tuple[Row, Row, float]:
     table = battery.table("rest_shift")
     table.only(["temperature", "value", "unit", "sd", "source", "status"])
     table.text("unit", choices=["V"])
-    temperatures, shifts = _axis(table, "temperature", -60, 100), table.numbers("value")
+    temperatures, shifts = _axis(table, "temperature", *TEMPERATURE), table.numbers("value")
     if len(shifts) != len(temperatures) or max(map(abs, shifts)) > LARGEST_SHIFT:
         wanted = f"must be {len(temperatures)} numbers within {-LARGEST_SHIFT:g} to {LARGEST_SHIFT:g} V"
         raise table.error(f"{wanted}, one for each temperature", "value")
     return temperatures, shifts, table.number("sd", 0.005, low=0.0, high=LARGEST_SHIFT)
 
 
-def _axis(table: Table, key: str, low: float, high: float) -> Row:
-    row = table.numbers(key)
+def _axis(table: Table, key: str, low: float, high: float, least: int = 2) -> Row:
+    row = table.numbers(key, low, high)
     for a, b in pairwise(row):
         if not a < b:
             raise table.error(f"must increase, but {b:g} follows {a:g}", key)
-    if len(row) < 2 or row[0] < low or row[-1] > high:
+        if b - a < SMALLEST_STEP:
+            raise table.error(f"must increase by {SMALLEST_STEP:g} or more, but {b!r} follows {a!r}", key)
+    if len(row) < least:
         raise table.error(f"must be two numbers or more within {low:g} to {high:g}", key)
     return row
 
 
-def _mesh(table: Table, unit: str) -> Mesh:
+def _mesh(table: Table, unit: str, low: float, high: float) -> Mesh:
     table.only(["soc", "temperature", "value", "unit", "sd_relative", "source", "status"])
     table.text("unit", choices=[unit])
     soc = _axis(table, "soc", -0.01, 1.01)
-    temperature = table.numbers("temperature")
-    rows = table.values.get("value")
-    if not isinstance(rows, list) or len(rows) != len(temperature):
+    temperature = _axis(table, "temperature", *TEMPERATURE, least=1)
+    rows = table.rows("value", len(soc), f"in {unit}, one for each soc", low, high)
+    if len(rows) != len(temperature):
         raise table.error(f"must be {len(temperature)} rows, one for each temperature", "value")
-    if any(not a < b for a, b in pairwise(temperature)):
-        raise table.error("must increase", "temperature")
-    for row in rows:
-        good = isinstance(row, list) and len(row) == len(soc)
-        if not good or not all(isinstance(v, int | float) and v > 0 for v in row):
-            raise table.error(f"each row must be {len(soc)} positive numbers, one for each soc", "value")
-    return Mesh(soc, temperature, tuple(tuple(float(v) for v in row) for row in rows))
+    return Mesh(soc, temperature, rows)

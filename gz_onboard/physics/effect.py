@@ -39,7 +39,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, nearest, shown
 
 
 class Port(Enum):
@@ -75,6 +75,7 @@ QUANTITIES: dict[str, str] = {
     "cell_capacity": "A·h, of one cell at its temperature",
     "soc": "1, state of charge",
 }
+PACKAGE_EFFECTS = Path(__file__).resolve().parent / "effects"
 MOVING = 0.5  # m/s: what counts for time_moving
 
 
@@ -142,9 +143,14 @@ class Effect:
         """The quantities that it needs, for its term and its decay."""
         return frozenset((*self.quantities, *self.decay_quantities))
 
+    @property
+    def file(self) -> Path:
+        """The Python file that it was loaded from."""
+        return Path(inspect.getfile(self.term))
+
     def __reduce__(self) -> tuple[Callable[..., Effect], tuple[str, str]]:
         """Pickled as its file: another process does not know the modules of a user's own."""
-        return _again, (self.name, inspect.getfile(self.term))
+        return _again, (self.name, str(self.file))
 
 
 def _again(name: str, file: str) -> Effect:
@@ -162,12 +168,18 @@ def known_effects() -> tuple[str, ...]:
 
 def load_effect(name: str, folder: Path | None = None) -> Effect:
     """The effect `name`, from `folder` if it has one of that name, else the package's own."""
-    if folder and (folder / f"{name}.py").is_file():
-        return _effect(name, _import_file(name, folder / f"{name}.py"))
+    if folder and (file := effect_file(name, folder)):
+        return _effect(name, _import_file(name, file))
     if name not in known_effects():
         known = [*known_effects(), *effects_in(folder)] if folder else known_effects()
-        raise InputError(f"no effect is called {name!r}{nearest(name, known)}")
+        raise InputError(f"no effect is called {shown(name)}{nearest(name, known)}")
     return _effect(name, importlib.import_module(f"gz_onboard.physics.effects.{name}"))
+
+
+def effect_file(name: str, folder: Path) -> Path | None:
+    """The file of the effect `name` in `folder` itself; None if there is none."""
+    file = folder / f"{name}.py"
+    return file if file.name == f"{name}.py" and file.is_file() else None
 
 
 def effects_in(folder: Path) -> tuple[str, ...]:

@@ -5,17 +5,18 @@ Backward in the sense of simulation (speed in, power out), light enough for on b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Callable, Collection, Mapping, MutableMapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gz_onboard.errors import InputError, shown
 from gz_onboard.physics.battery import Battery, Lacks
-from gz_onboard.physics.effect import QUANTITIES, Effect, Port, load_effect
+from gz_onboard.physics.effect import QUANTITIES, Effect, Port, effect_file, load_effect
 from gz_onboard.physics.parameters import Parameters
+from gz_onboard.physics.trust import changeable, trusted_users
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from gz_onboard.toml import Table
 
 G = 9.80665  # m/s²
@@ -187,29 +188,57 @@ class Model:
         return lacks
 
 
-def read_model(vehicle: Table, folder: Path | None = None) -> tuple[Effect, ...]:
+def read_model(vehicle: Table, folder: Path | None = None, users: Collection[int] | None = None) -> tuple[Effect, ...]:
     """The effects that the vehicle file lists, `BASE_EFFECTS` if it lists none.
 
-    An effect is looked for in `folder`, in the file's own ``effects_folder``, and among the package's.
+    An effect is looked for in `folder`, in the file's own ``effects_folder``, and among the package's. That of the file
+    is code that came with data: it runs only if nobody but `users` (their ids; root and who runs us if not given) can
+    change the file or the effect. InputError otherwise.
     """
+    if folder and not folder.is_dir():
+        raise InputError(f"{folder}: no such folder of effects")
     table = vehicle.table("model")
     table.only(["effects", "effects_folder"])
-    folders = [folder] if folder else []
-    if "effects_folder" in table.values:
-        folders.append(vehicle.file.parent / table.text("effects_folder"))
-        if not folders[-1].is_dir():
-            raise table.error(f"no folder {folders[-1]}", "effects_folder")
-    names = table.values.get("effects", list(BASE_EFFECTS))
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        raise table.error("must be a list of names of effects", "effects")
+    own = _own_folder(table)
+    names = table.texts("effects", "names of effects") if "effects" in table.values else BASE_EFFECTS
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise table.error(f"{twice!r} is there twice", "effects")
+        raise table.error(f"{shown(twice)} is there twice", "effects")
     effects = []
     for name in names:
-        where = next((place for place in folders if (place / f"{name}.py").is_file()), folders[0] if folders else None)
+        table.check_path("effects", name)
         try:
-            effects.append(load_effect(name, where))
+            given = effect_file(name, folder) if folder else None
+            if own and not given and (file := effect_file(name, own)):
+                _check_trust(vehicle.file, file, trusted_users() if users is None else users)
+                effects.append(load_effect(name, own))
+            else:
+                effects.append(load_effect(name, folder or own))
         except Exception as error:
             raise table.error(str(error), "effects") from error
     return tuple(effects)
+
+
+def _own_folder(model: Table) -> Path | None:
+    """The file's own ``effects_folder``, which must lie in the file's."""
+    if "effects_folder" not in model.values:
+        return None
+    name = model.check_path("effects_folder", model.text("effects_folder"))
+    folder = model.file.parent / name
+    if Path(name).is_absolute() or not folder.resolve().is_relative_to(model.file.parent.resolve()):
+        raise model.error(f"{name!r} is not below the vehicle file's own folder", "effects_folder")
+    if not folder.is_dir():
+        raise model.error(f"no folder {folder}", "effects_folder")
+    return folder
+
+
+def _check_trust(vehicle: Path, effect: Path, users: Collection[int]) -> None:
+    """InputError if `effect` leaves the vehicle file's folder by a link, or others can change it or the file."""
+    if not effect.resolve().is_relative_to(vehicle.parent.resolve()):
+        raise InputError(f"{effect} is a link that leads out of the vehicle file's folder")
+    for file in (vehicle, effect):
+        if reason := changeable(file, users):
+            raise InputError(
+                f"{effect.name} beside the file is code, and not run: {reason}; "
+                "`run` and `discover` take a folder that you trust by --effects"
+            )

@@ -17,7 +17,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.physics.effect import VEHICLE_PARAMETERS, Effect, Parameter, known_effects, load_effect
 
 if TYPE_CHECKING:
@@ -176,12 +176,12 @@ def read_parameters(vehicle: Table, effects: Iterable[Effect] = ()) -> Parameter
         entry.only(["value", "unit", "sd", "status", "source"])
         unit = entry.text("unit")
         if unit != parameter.unit:
-            raise entry.error(f"unit {unit!r} is wrong: {name} is in {parameter.unit!r}", "unit")
+            raise entry.error(f"unit {shown(unit)} is wrong: {name} is in {parameter.unit!r}", "unit")
         value = entry.number("value")
         if not parameter.low <= value <= parameter.high:
             raise entry.error(f"{value:g} {unit} is outside {parameter.low:g} to {parameter.high:g} {unit}", "value")
         known[name] = Value(
-            value, entry.number("sd", low=0), unit, entry.text("status", choices=STATUS), entry.text("source")
+            value, entry.number("sd", low=0, high=1e9), unit, entry.text("status", choices=STATUS), entry.text("source")
         )
     return Parameters(known, _read_correlations(vehicle, known), declared)
 
@@ -193,24 +193,43 @@ def _read_correlations(vehicle: Table, known: Collection[str]) -> dict[frozenset
     for group in every.values:
         table = every.table(group)
         table.only(["parameters", "value", "source"])
-        names, rows = table.values.get("parameters"), table.values.get("value")
-        if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
-            raise table.error("must be a list of names of parameters", "parameters")
+        names = table.texts("parameters", "names of parameters")
         for name in names:
             if name not in known:
-                raise table.error(f"no parameter is called {name!r}{nearest(name, known)}", "parameters")
+                raise table.error(f"no parameter is called {shown(name)}{nearest(name, known)}", "parameters")
+            if names.count(name) > 1:
+                raise table.error(f"names {name!r} twice", "parameters")
         n = len(names)
-        square = isinstance(rows, list) and len(rows) == n and all(isinstance(r, list) and len(r) == n for r in rows)
-        if not square or not isinstance(rows, list):
+        rows = table.rows("value", n, "as many as parameters", -1, 1)
+        if len(rows) != n:
             raise table.error(f"must be {n} rows of {n} numbers, as many as parameters", "value")
         for i, row in enumerate(rows):
             for j, r in enumerate(row):
-                if isinstance(r, bool) or not isinstance(r, int | float) or not -1 <= r <= 1 or r != rows[j][i]:
-                    raise table.error(
-                        f"row {i + 1}, column {j + 1}: {r!r} is no correlation, or not symmetric", "value"
-                    )
+                if r != rows[j][i]:
+                    raise table.error(f"row {i + 1}, column {j + 1}: {r:g} is not symmetric", "value")
                 if i == j and r != 1:
-                    raise table.error(f"the diagonal must be 1, is {r}", "value")
+                    raise table.error(f"the diagonal must be 1, is {r:g}", "value")
                 if i != j:
-                    correlations[frozenset((names[i], names[j]))] = float(r)
+                    correlations[frozenset((names[i], names[j]))] = r
+        if not _can_be(rows):
+            raise table.error("no parameters can have these correlations together: a variance is negative", "value")
     return correlations
+
+
+def _can_be(rows: Sequence[Sequence[float]]) -> bool:
+    """Whether a symmetric matrix with ones on its diagonal has no negative variance, but for rounding (Cholesky)."""
+    factor: list[list[float]] = []
+    for i, row in enumerate(rows):
+        mine: list[float] = []
+        for j in range(i):
+            rest = row[j] - sum(a * b for a, b in zip(mine, factor[j], strict=False))
+            if factor[j][j] < 1e-3:  # the parameter follows from those before it: what is left must be rounding
+                if abs(rest) > 1e-2:
+                    return False
+                rest = 0.0
+            mine.append(rest / (factor[j][j] or 1.0))
+        left = 1.0 - sum(a * a for a in mine)
+        if left < -1e-4:
+            return False
+        factor.append([*mine, max(left, 0.0) ** 0.5])
+    return True

@@ -44,18 +44,18 @@ class PriorRiding:
 
 
 def read_riding(vehicle: Table) -> PriorRiding:
-    """The table ``[forecast]`` of a vehicle file; without one, town riding as in the first part of the WMTC."""
+    """The table ``[forecast]`` of a vehicle file; without one, town riding as in the first part of the WMTC.
+
+    ``riding`` has rows of share of time, speed [m/s], acceleration [m/s²].
+    """
     table = vehicle.table("forecast")
     table.only(["riding", "unevenness", "factor", "factor_sd", "lateral_acceleration", "vibration", "source"])
     town = PriorRiding()
     if "riding" not in table.values:
         points = town.points
     else:
-        try:
-            points = tuple((float(a), float(b), float(c)) for a, b, c in table.values["riding"])
-        except (TypeError, ValueError) as error:
-            message = "must be rows of [share of time, speed in m/s, acceleration in m/s²]"
-            raise table.error(message, "riding") from error
+        rows = table.rows("riding", 3, "share of time, speed in m/s, acceleration in m/s²", -100, 100)
+        points = tuple((share, speed, acceleration) for share, speed, acceleration in rows)
         shares = sum(share for share, _, _ in points)
         if not (all(share >= 0 and speed >= 0 for share, speed, _ in points) and 0.98 < shares < 1.02):
             raise table.error(

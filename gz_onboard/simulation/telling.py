@@ -14,7 +14,7 @@ from gz_onboard.errors import InputError
 def explain_keys(parser: argparse.ArgumentParser, of: str, version: int, keys: Mapping[str, str]) -> None:
     """The keys of a JSON summary and their meaning, below the options in the help."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    rows = "\n".join(f"  {key:20} {meaning.replace('%', '%%')}" for key, meaning in keys.items())
+    rows = "\n".join(f"  {key:20} {meaning}" for key, meaning in keys.items())
     parser.epilog = f"keys of {of} JSON summary, version {version}:\n{rows}"
 
 

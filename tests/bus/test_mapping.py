@@ -238,6 +238,8 @@ def test_bus_tables_that_do_not_fit(tmp_path, bus, parts):
         ('"v.dbc"', [":1: dbc:", "list of DBC file names"]),
         ("[]", [":1: dbc:", "list of DBC file names"]),
         ("[1]", [":1: dbc:", "list of DBC file names"]),
+        ("[" + '"v.dbc", ' * 21 + "]", [":1: dbc:", "names 21 files, the most are 20"]),
+        ('["v.dbc\\u0000"]', [":1: dbc:", "cannot be the name of a file"]),
         ('["v.dbc", "v.dbc"]', ["v.dbc:5", "name 'Pack'", "also that of Pack"]),
     ],
 )
@@ -261,6 +263,20 @@ def test_dbc_files_that_cannot_be_had(tmp_path, names, parts):
         (("16|16@1- (0.1,0)", "16|16@1- (0,0)"), [":5:", "Current", "scale of 0", "Pack"]),
         ((DBC, ""), [":1:", "not a valid DBC file"]),
         ((DBC, "\x00\x01"), [":1:", "not a valid DBC file"]),
+        ((DBC, 'VERSION "1"\n'), [":1:", "it has no message"]),
+        (("Motor: 4", "Motor: 1000000"), [":12:", "Motor has '1000000' bytes, the most are 64"]),
+        (("0|16@1- (1", "100000|16@1- (1"), [":13:", "Speed", "beyond the longest frame"]),
+        (("0|16@1- (1", "0|100000@1- (1"), [":13:", "Speed", "beyond the longest frame"]),
+        (("0|16@1- (1", "-1|16@1- (1"), [":12:", "Speed has 16 bits from bit -1 on"]),
+        (("(1,-40)", "(1,1e400)"), [":12:", "Heat has an offset of inf"]),
+        (("(1,-40)", f"(1,{'9' * 400})"), [":12:", "Heat has an offset of 999"]),
+        (("(1,-40)", "(1e-300,-40)"), [":12:", "Heat has a scale of 1e-300"]),
+        (("[-40|214]", "[214|-40]"), [":12:", "Heat has the limits 214 to -40"]),
+        (("[-40|214]", "[-40|1e400]"), [":12:", "Heat has the limits -40 to inf"]),
+        (("BO_ 256 100;", "BO_ 256 1e400;"), [":5:", "the cycle time is 1000"]),
+        (("BO_ 256 100;", "BO_ 256 -5;"), [":5:", "the cycle time is -5 ms"]),
+        (("BO_ 256 100;\n", "BO_ 256 100"), [":20:", "not a valid DBC file"]),  # cut off
+        (("BO_ 256 100;\n", 'BO_ 256 100;\nCM_ "'), [":21:", "not a valid DBC file"]),
     ],
 )
 def test_a_broken_dbc(tmp_path, change, parts):

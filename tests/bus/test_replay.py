@@ -19,6 +19,7 @@ from gz_onboard.bus.replay import Summary, bus_sender, replay
 from gz_onboard.bus.writers import write_candump
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
+from tests.support import HEARS_CTRL_C
 
 START = 1_750_000_000_000_000_000
 
@@ -165,16 +166,16 @@ def test_error_frames_are_left_out_and_counted(
 def test_looping_ends_cleanly_on_an_interrupt(tmp_path: Path) -> None:
     path = log(tmp_path, frames(20))
     code = (
-        "import argparse, sys; from gz_onboard.bus import replay as r; p = argparse.ArgumentParser();"
-        " r.add_arguments(p); sys.exit(r.run(p.parse_args(sys.argv[1:])))"
+        "import sys, threading, can; from gz_onboard.cli import main; bus = can.Bus(interface='virtual', channel='x');"
+        " threading.Thread(target=lambda: [print(m, flush=True) for m in bus], daemon=True).start();"
+        " sys.exit(main(['replay', *sys.argv[1:]]))"
     )
     arguments = [str(path), "--interface", "virtual", "--channel", "x", "--loop", "--speed", "2"]
-    process = subprocess.Popen(
-        [sys.executable, "-c", code, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
-    time.sleep(2.0)
+    command = [*HEARS_CTRL_C, sys.executable, "-c", code, *arguments]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout and all(process.stdout.readline() for _ in range(21))  # it sends, in the second round
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=10)
+    out, err = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "rounds" in out
     assert "Traceback" not in err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -173,7 +174,8 @@ def test_the_battery_alone_has_the_measured_and_the_time_moving(folder: Path, re
 
 def test_a_vehicle_file_says_how_rough_roads_are(tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]):
     text = (OWN / "reference.toml").read_text(encoding="utf-8")
-    listed = text.replace('"auxiliary_load",\n]', f'"auxiliary_load", "rough_road",\n]\neffects_folder = "{folder}"')
+    listed = text.replace('"auxiliary_load",\n]', '"auxiliary_load", "rough_road",\n]\neffects_folder = "."')
+    shutil.copy(folder / "rough_road.py", tmp_path)
     assert listed.count("[forecast]\n") == listed.count("rough_road") == 1
     cycle, file, summary = tmp_path / "cycle.csv", tmp_path / "rough.toml", tmp_path / "summary.json"
     cycle.write_text("time_s,speed_mps\n0,0\n10,8\n20,8\n30,8\n40,8\n50,0\n")

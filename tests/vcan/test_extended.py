@@ -53,7 +53,8 @@ def extended(folder: Path) -> Path:
 def pair(running: Running, tmp_path: Path):
     """The extended daemon on vcan0 and the base one on vcan1, the same ride on both."""
     with Listener() as listener, Listener("vcan1") as other:
-        more = running.daemon("--vehicle", str(extended(tmp_path)), name="extended")
+        file = extended(tmp_path)
+        more = running.daemon("--vehicle", str(file), "--effects", str(file.parent / "effects"), name="extended")
         base = running.daemon(channels=("vcan1",), name="base")
         replays = [running.replay(CITY, channel=channel) for channel in ("vcan0", "vcan1")]
         listener.wait_for_valid(SECONDS)
@@ -78,10 +79,10 @@ def test_an_extended_model_runs_as_it_is_and_expects_less_range(running: Running
     # A restart goes on with the own state, in the cells too; that of the other model is refused, whole.
     (file,) = (path for path in more.state_dir.glob("*.json") if not path.stem.endswith(".previous"))
     assert json.loads(file.read_text())["estimator"]["cell_effects"]["slow_relaxation"] > 0
-    vehicle = str(more.state_dir.parent / "extended.toml")
+    file = more.state_dir.parent / "extended.toml"
     journals = [daemon.journal for daemon in (more, base)]
     for name in ("extended", "base"):
-        running.daemon("--vehicle", vehicle, name=name).stop()
+        running.daemon("--vehicle", str(file), "--effects", str(file.parent / "effects"), name=name).stop()
     own, foreign = (daemon.journal.removeprefix(old) for daemon, old in zip((more, base), journals, strict=True))
     assert "going on from the state" in own
     assert "not used" in foreign

@@ -339,9 +339,9 @@ def for_file(results: Sequence[Result], vehicle: Vehicle) -> list[Result]:
 def _known_by_now(base: Path, results: Sequence[Result], file: Path) -> Vehicle:
     """The vehicle with what was found so far; its complaints name the base file."""
     if not results:
-        return read_vehicle(str(base))
-    write_vehicle(base, for_file(results, read_vehicle(str(base))), file)
-    return replace(read_vehicle(str(file)), file=base)
+        return read_vehicle(base)
+    write_vehicle(base, for_file(results, read_vehicle(base)), file)
+    return replace(read_vehicle(file), file=base)
 
 
 # --- command line -------------------------------------------------------------------------------------------------
@@ -404,10 +404,10 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"{report.text(result)}\n  ({seconds[result.procedure]:.1f} s)")
     try:
         if arguments.out:
-            write_vehicle(base, for_file(results, read_vehicle(str(base))), arguments.out)
-            read_vehicle(str(arguments.out))
+            write_vehicle(base, for_file(results, read_vehicle(base)), arguments.out)
+            read_vehicle(arguments.out)
         if arguments.report:
-            report.write_report(arguments.report, f"Calibration of {read_vehicle(str(base)).name}", results)
+            report.write_report(arguments.report, f"Calibration of {read_vehicle(base).name}", results)
         _write_json(arguments, report.document(results, str(base), str(arguments.out) if arguments.out else None))
     except OSError as error:
         raise InputError(f"{error.filename}: {error.strerror}") from error
@@ -469,9 +469,12 @@ def _options(texts: Sequence[str], procedure: Procedure) -> dict[str, Option]:
             found[name] = value
             continue
         try:
-            found[name] = float(value)
+            number = float(value)
         except ValueError as error:
             raise InputError(f"--set {text}: {value!r} is not a number") from error
+        if not manifest.LEAST <= number <= manifest.MOST:
+            raise InputError(f"--set {text}: must be {manifest.LEAST:g} to {manifest.MOST:g}")
+        found[name] = number
     return found
 
 

@@ -22,10 +22,11 @@ from pathlib import Path
 
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.lab.calibrate.table import Named, read_columns
-from gz_onboard.toml import Table
+from gz_onboard.toml import LONGEST_LIST, Table
 from gz_onboard.vehicle import find_vehicle
 
 NAME = "calibration.toml"
+LEAST, MOST = 1e-6, 1e6  # a number that is an option of a procedure
 _OWN = ("schema", "vehicle", "source")
 
 Option = float | str
@@ -74,14 +75,10 @@ def read_manifest(
     ]
     if not steps:
         raise table.error(f"names no procedure; there are {', '.join(slots)}")
-    name = table.text("vehicle", "reference")
-    beside = file.parent / name
-    if beside.is_file():
-        return beside, steps
     try:
-        return find_vehicle(name), steps
+        return find_vehicle(table.check_path("vehicle", table.text("vehicle", "reference")), beside=file.parent), steps
     except InputError as error:
-        raise table.error(f"no file {beside}: {error}", "vehicle") from error
+        raise table.error(str(error), "vehicle") from error
 
 
 def _step(table: Table, name: str, slots: Mapping[str, Slot], options: Mapping[str, Option]) -> Step:
@@ -113,8 +110,11 @@ def _files(table: Table, slot: str) -> tuple[Path, ...]:
     names = [value] if isinstance(value, str) else value
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
         raise table.error("must be the name of a file, or a list of them", slot)
+    if len(names) > LONGEST_LIST:
+        raise table.error(f"names {len(names)} files, the most are {LONGEST_LIST}", slot)
     folder = table.file.parent
     for i, name in enumerate(names):
+        table.check_path(slot, name)
         if not (folder / name).is_file():
             there = sorted(p.name for p in (folder / name).parent.glob("*")) if (folder / name).parent.is_dir() else []
             raise table.error(f"no file {folder / name}{nearest(Path(name).name, there)}", slot)
@@ -127,5 +127,5 @@ def _options(table: Table, options: Mapping[str, Option]) -> dict[str, Option]:
     found: dict[str, Option] = {}
     for key, default in options.items():
         if key in table.values:
-            found[key] = table.text(key) if isinstance(default, str) else table.number(key)
+            found[key] = table.text(key) if isinstance(default, str) else table.number(key, low=LEAST, high=MOST)
     return found

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,9 @@ import numpy as np
 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.result import Array, Curve, Found, Result
+from gz_onboard.physics.effect import PACKAGE_EFFECTS, Effect
 from gz_onboard.physics.parameters import declared_parameters
+from gz_onboard.vehicle import read_vehicle
 
 DIGITS = 6  # significant ones of a number in the file: far below every standard deviation
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
@@ -39,6 +42,8 @@ class _Entry:
 def write_vehicle(base: Path, results: Sequence[Result], out: Path) -> None:
     """Write the vehicle file `base` with what `results` found to `out`, whole or not at all. InputError, OSError."""
     text = merged(base.read_text(encoding="utf-8"), results, base, out)
+    if base.resolve().parent != out.resolve().parent:
+        text = with_keys(text, copied_effects(read_vehicle(base).model.effects, out), out)
     temporary = out.with_name(out.name + ".new")
     temporary.write_text(text, encoding="utf-8")
     temporary.replace(out)
@@ -47,8 +52,8 @@ def write_vehicle(base: Path, results: Sequence[Result], out: Path) -> None:
 def merged(text: str, results: Sequence[Result], base: Path, out: Path) -> str:
     """The text of a vehicle file `text` (of the file `base`) with what `results` found, to stand at `out`.
 
-    A later result overrides an earlier one. Values are written with 6 significant digits. Paths to DBC files and
-    effects beside `base` are written as seen from `out`. Raises InputError for what the file could not hold.
+    A later result overrides an earlier one. Values are written with 6 significant digits. Paths to DBC files beside
+    `base` are written as seen from `out`. Raises InputError for what the file could not hold.
     """
     document = tomllib.loads(text)
     parameters = {name: found for result in results for name, found in result.parameters.items()}
@@ -73,6 +78,22 @@ def with_keys(text: str, keys: Mapping[KeyPath, str], file: Path, without: Itera
     """The text of the vehicle file `file` with the TOML values `keys` at these paths, and without these tables."""
     new = {path: f"{_key(path[-1])} = {value}\n" for path, value in keys.items()}
     return _spliced(list(_entries(text, file)), new, {}, set(without), file)
+
+
+def copied_effects(effects: Iterable[Effect], out: Path) -> dict[KeyPath, str]:
+    """Copy the files of those `effects` that are not the package's into a folder beside the vehicle file `out`.
+
+    Gives the key for `with_keys` that names the folder; nothing if all are the package's.
+    """
+    own = [file for file in (effect.file for effect in effects) if file.resolve().parent != PACKAGE_EFFECTS]
+    if not own:
+        return {}
+    folder = out.with_name(f"{out.stem}_effects")
+    folder.mkdir(exist_ok=True)
+    for file in own:
+        if file.resolve().parent != folder.resolve():
+            shutil.copyfile(file, folder / file.name)
+    return {("model", "effects_folder"): string(folder.name)}
 
 
 def _check(parameters: Mapping[str, Found], curves: Mapping[str, Curve], base: Path) -> None:
@@ -235,9 +256,6 @@ def _moved(document: Mapping[str, Any], base: Path, out: Path) -> dict[KeyPath, 
     names = document.get("dbc", [])
     if isinstance(names, list) and all(isinstance(n, str) for n in names) and [seen(n) for n in names] != names:
         moved["dbc",] = f"dbc = [{', '.join(string(seen(name)) for name in names)}]\n"
-    folder = document.get("model", {}).get("effects_folder")
-    if isinstance(folder, str) and seen(folder) != folder:
-        moved["model", "effects_folder"] = f"effects_folder = {string(seen(folder))}\n"
     return moved
 
 

@@ -196,10 +196,11 @@ class _Reading:
     path: Path
     vehicle: str
     payload: float | None  # kg, where none is noted
+    effects: Path | None  # folder of the user's own
 
 
 def _read(task: _Reading, _: Progress) -> Samples:
-    samples = read_samples(task.path, read_vehicle(task.vehicle))
+    samples = read_samples(task.path, read_vehicle(task.vehicle, effects_folder=task.effects))
     if task.payload is not None and samples.rider_mass is None:
         samples = replace(samples, facts={**samples.facts, "rider_mass_kg": task.payload})
     return samples
@@ -209,7 +210,7 @@ def read_rides(logs: Sequence[Path], arguments: argparse.Namespace) -> tuple[lis
     """The rides, and why a log is none. InputError if no log is one."""
     from tqdm import tqdm
 
-    tasks = [_Reading(log, arguments.vehicle, arguments.payload) for log in logs]
+    tasks = [_Reading(log, arguments.vehicle, arguments.payload, arguments.effects) for log in logs]
     rides: list[Samples] = []
     refused: list[str] = []
     with tqdm(total=len(tasks), desc="reading", unit=" rides", leave=False, disable=arguments.quiet or None) as bar:

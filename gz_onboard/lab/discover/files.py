@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import inspect
-import shutil
 import tomllib
+import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from scipy.stats import t as student
 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.result import Found, Result
-from gz_onboard.lab.calibrate.vehicle_file import merged, number, string, with_keys
+from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged, number, string, with_keys
 from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.limits import amount
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.state import Shape, State
 from gz_onboard.lab.discover.worth import energy, power_of, share_of_time
-from gz_onboard.physics.effect import QUANTITIES, Effect, known_effects
+from gz_onboard.physics.effect import QUANTITIES, Effect
 from gz_onboard.vehicle import Vehicle
 
 PORTS = {
@@ -47,7 +47,7 @@ def write_baseline(vehicle: Vehicle, base: Path, out: Path) -> None:
     text = merged(base.read_text(encoding="utf-8"), [Result("baseline", parameters=found)], base, out)
     beside = out.with_suffix(".healthy.npz")
     save(state, beside)
-    keys: dict[tuple[str, ...], str] = {
+    keys = copied_effects(vehicle.model.effects, out) | {
         ("healthy", "file"): string(beside.name),
         ("healthy", "rides"): str(state.healthy),
     }
@@ -106,7 +106,7 @@ def load(state: State, file: Path) -> State:
                 shapes={pair: Shape(data[f"shape_{i}_mean"], data[f"shape_{i}_covariance"],
                                     float(data[f"shape_{i}_inflation"])) for i, pair in enumerate(pairs)},
             )  # fmt: skip
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
         raise InputError(f"{file}: cannot be read as what healthy rides taught: {error}") from error
 
 
@@ -130,7 +130,6 @@ def write_model(report: Report, vehicle: Vehicle, base: Path, out: Path) -> list
     words = [f"{name} = {f.value:.4g} ± {amount(f.sd, f.unit, '.2g')}" for name, f in found.items()]
     folder = out.with_name(f"{out.stem}_effects")
     names = [effect.name for effect in (*vehicle.model.effects, *added)]
-    own = [effect for effect in (*vehicle.model.effects, *added) if effect.name not in known_effects()]
     curve = None
     if report.unknown is not None:
         curve = curve_text(report)
@@ -142,16 +141,11 @@ def write_model(report: Report, vehicle: Vehicle, base: Path, out: Path) -> list
             names.append(curve[0])
     if not found and not added and curve is None:
         return words
-    if own or curve:
-        folder.mkdir(exist_ok=True)
-    for effect in own:
-        file = Path(inspect.getfile(effect.term))
-        if file.parent.resolve() != folder.resolve():
-            shutil.copy(file, folder / file.name)
+    keys = copied_effects((*vehicle.model.effects, *added), out)
+    keys["model", "effects"] = "[" + ", ".join(map(string, names)) + "]"
     if curve:
+        folder.mkdir(exist_ok=True)
         (folder / f"{curve[0]}.py").write_text(curve[1], encoding="utf-8")
-    keys: dict[tuple[str, ...], str] = {("model", "effects"): "[" + ", ".join(map(string, names)) + "]"}
-    if own or curve:
         keys["model", "effects_folder"] = string(folder.name)
     if not state.healthy and (factor := lowered(report, vehicle, curve is not None)):
         value, reason = factor

@@ -16,6 +16,7 @@ from gz_onboard.lab.calibrate.result import Curve, Found, Result
 from gz_onboard.lab.calibrate.vehicle_file import correlation, merged, number, string, write_vehicle
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import OWN, read_vehicle
+from tests.test_vehicle import with_effect
 
 REFERENCE = OWN / "reference.toml"
 DECLARED = declared_parameters()
@@ -171,6 +172,16 @@ def test_files_beside_the_base_are_found_from_the_new_place(tmp_path):
     write_vehicle(base, [Result("t", {"drag_area": found("drag_area", 0.6)})], out)
     assert tomllib.loads(out.read_text())["dbc"] == ["../base/my.dbc", "hbm.dbc"]
     assert read_vehicle(str(out)).parameters["drag_area"] == 0.6
+
+
+def test_effects_of_ones_own_go_along(tmp_path):
+    (tmp_path / "new").mkdir()
+    base = with_effect(tmp_path / "base")
+    for out in (tmp_path / "new" / "v2.toml", tmp_path / "base" / "v2.toml"):
+        write_vehicle(base, [Result("t", {"drag_area": found("drag_area", 0.6)})], out)
+        assert "horn" in read_vehicle(out).key
+    assert {file.name for file in (tmp_path / "new").iterdir()} == {"v2_effects", "v2.toml"}
+    assert not (tmp_path / "base" / "v2_effects").exists()  # there they are already
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from gz_onboard.lab.discover.engine import discover
 from gz_onboard.simulation.samples import read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS, ROOT
+from tests.test_vehicle import with_effect
 
 RIDE = LOGS / "city_14C.blf"
 CAR = ROOT / "tests" / "vehicles" / "car" / "car.toml"
@@ -53,6 +54,14 @@ def test_what_cannot_be_is_refused(capsys, monkeypatch, tmp_path, arguments: lis
     monkeypatch.chdir(tmp_path)
     assert words in said(capsys, *arguments)
     assert not list(tmp_path.iterdir())
+
+
+def test_the_model_may_have_an_effect_that_only_the_option_knows(capsys, tmp_path):
+    file = with_effect(tmp_path)
+    file.write_text(file.read_text().replace('effects_folder = "effects"\n', ""))
+    arguments = [str(LOGS / "calibration" / "dyno_02.blf"), "--quiet", "--vehicle", str(file)]
+    assert "no effect is called 'horn'" in said(capsys, *arguments)
+    assert "is a ride on a roller" in said(capsys, *arguments, "--effects", str(file.parent / "effects"))
 
 
 def test_the_vehicle_file_itself_is_not_overwritten(capsys):

@@ -251,9 +251,11 @@ def test_statistics_that_cannot_be_read_are_refused(learned: State, state: State
     fewer = replace(state, names=state.names[:-3])
     with pytest.raises(InputError, match="another model"):
         load(fewer, beside)
-    beside.write_bytes(b"no zip")
-    with pytest.raises(InputError, match="cannot be read"):
-        restore(read_vehicle(str(base)))
+    whole = beside.read_bytes()
+    for damaged in (b"", b"no zip", whole[: len(whole) // 2], whole[:200] + bytes(50) + whole[250:]):
+        beside.write_bytes(damaged)
+        with pytest.raises(InputError, match="cannot be read"):
+            restore(read_vehicle(str(base)))
     beside.unlink()
     with pytest.raises(InputError, match="no file"):
         read_vehicle(str(base))

@@ -1,0 +1,50 @@
+"""What `make setup` installs: each version once, each file by hash, from no place that is named, all that is needed."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).resolve().parents[1]
+LOCK = (ROOT / ".ci" / "requirements.txt").read_text(encoding="utf-8")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+PINNED = re.compile(r"^([A-Za-z0-9._-]+)==([^\s;]+)", re.M)
+
+
+def versions(text: str) -> dict[str, str]:
+    found = PINNED.findall(text)
+    assert len({canonicalize_name(name) for name, _ in found}) == len(found)
+    return {canonicalize_name(name): version for name, version in found}
+
+
+def test_every_file_has_its_hash():
+    requirements = re.split(r"\n(?=\S)", LOCK.rstrip())[1:]  # the first line is a comment
+    assert len(requirements) == len(versions(LOCK)) > 30
+    for requirement in requirements:
+        lines = requirement.replace(" \\\n", "\n").splitlines()
+        assert PINNED.match(lines[0])
+        assert lines[1:], requirement
+        assert all(re.fullmatch(r"    --hash=sha256:[0-9a-f]{64}", line) for line in lines[1:]), requirement
+
+
+def test_no_place_is_named():
+    assert not re.search(r"://|index|find-links", LOCK)
+
+
+def test_it_is_what_the_constraints_say():
+    lock, constraints = versions(LOCK), versions((ROOT / ".ci" / "constraints.txt").read_text(encoding="utf-8"))
+    assert {name: lock.get(name) for name in constraints} == constraints
+
+
+def test_it_has_all_that_the_project_needs():
+    project, lock = PROJECT["project"], versions(LOCK)
+    needed = [*project["dependencies"], *PROJECT["build-system"]["requires"], "editables"]
+    for extra in project["optional-dependencies"].values():
+        needed += extra
+    for text in needed:
+        requirement = Requirement(text)
+        assert requirement.specifier.contains(lock[canonicalize_name(requirement.name)]), text
