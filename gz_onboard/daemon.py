@@ -194,7 +194,7 @@ class Daemon:
             return None
         for copy in state.copies(keeper.file):
             try:
-                found = state.load(copy, time.time())
+                found = state.load(copy, time.time(), _uptime(), state.clock_is_kept())
                 if found is None:
                     continue
                 snapshot, age = found
@@ -215,6 +215,11 @@ class Daemon:
                 )
                 return dict(snapshot)
         return None
+
+
+def _uptime() -> float:
+    """Time since the system was started, suspended or not [s]."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
 
 
 class _Keeper:
@@ -250,7 +255,7 @@ class _Keeper:
             return
         self._saved_ns, self._saved_soc = now_ns, pipeline.last.soc if pipeline.last else None
         try:
-            text = state.encode(snapshot, now_ns * 1e-9)
+            text = state.encode(snapshot, now_ns * 1e-9, _uptime())
         except (ValueError, TypeError) as error:
             self._failed(error)
         else:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 FORMAT = 2
+CLOCKS_AGREE = 2.0  # s
 REFUSED = 3
 """So many refused states are kept."""
 
@@ -23,18 +24,24 @@ _LARGEST = 1 << 20  # bytes; a state has some thousand
 _HEAD = re.compile(rb'\{"format": (\d{1,9}), "crc32": "([0-9a-f]{8})", ')
 
 
-def encode(snapshot: Mapping[str, Any], time: float) -> bytes:
-    """The text of a state file of `snapshot`, taken at `time` [s since the epoch].
+def encode(snapshot: Mapping[str, Any], time: float, uptime: float | None = None) -> bytes:
+    """The text of a state file of `snapshot`, taken at `time` [s since the epoch], `uptime` [s] since the system began.
 
     ValueError or TypeError if the snapshot holds what JSON has no word for: not-a-number, infinities, objects.
     """
-    text = json.dumps({"saved_at": time, "estimator": snapshot}, allow_nan=False).encode("ascii")
+    document = {"saved_at": time, "uptime": uptime, "estimator": snapshot}
+    text = json.dumps(document, allow_nan=False).encode("ascii")
     body = text[1:]  # behind the brace: what the checksum is of
     return b'{"format": %d, "crc32": "%08x", %s\n' % (FORMAT, zlib.crc32(body), body)
 
 
-def decode(text: bytes, time: float) -> tuple[Mapping[str, Any], float | None]:
-    """(snapshot, its age [s] at `time` if the clock can be believed). ValueError unless it is as it was saved."""
+def decode(
+    text: bytes, time: float, uptime: float | None = None, kept: bool = True
+) -> tuple[Mapping[str, Any], float | None]:
+    """(snapshot, its age [s] at `time` and `uptime` if the clock can be believed).
+
+    kept: the clock goes on while the power is off. ValueError unless it is as it was saved.
+    """
     head = _HEAD.match(text)
     if not head:
         raise ValueError("is not a saved state" if text else "is empty")
@@ -45,11 +52,20 @@ def decode(text: bytes, time: float) -> tuple[Mapping[str, Any], float | None]:
         raise ValueError("is damaged: its checksum is wrong")
     try:
         document = json.loads(b"{" + body)
-        snapshot, saved_at = document["estimator"], document["saved_at"]
+        snapshot, saved_at, began = document["estimator"], document["saved_at"], document.get("uptime")
     except (ValueError, LookupError, TypeError, RecursionError) as error:  # the checksum is right: not written by us
         raise ValueError(f"is not a saved state: {error!r}") from error
     age = time - saved_at if isinstance(saved_at, int | float) and saved_at > 1e9 and time >= saved_at else None
+    # A board without a clock of its own goes on from the last time it knew, however long it was off. What two clocks
+    # say of the same boot is believed all the same.
+    if age is not None and not kept and not (uptime and began and abs(uptime - began - age) < CLOCKS_AGREE):
+        age = None
     return snapshot, age
+
+
+def clock_is_kept() -> bool:
+    """Whether the machine has a clock that goes on while the power is off."""
+    return any(Path("/sys/class/rtc").glob("rtc*"))
 
 
 def save(file: Path, snapshot: Mapping[str, Any], time: float) -> None:
@@ -79,18 +95,17 @@ def copies(file: Path) -> tuple[Path, Path, Path]:
     return file.with_suffix(".new"), file, file.with_suffix(".previous.json")
 
 
-def load(file: Path, time: float) -> tuple[Mapping[str, Any], float | None] | None:
-    """(snapshot, its age [s] at `time` if the clock can be believed) in one file; None if there is no such file.
-
-    ValueError if it cannot be read or is damaged.
-    """
+def load(
+    file: Path, time: float, uptime: float | None = None, kept: bool = True
+) -> tuple[Mapping[str, Any], float | None] | None:
+    """What `decode` makes of one file; None if there is no such file. ValueError if it cannot be read or is damaged."""
     try:
         if not file.exists():
             return None
         if not file.is_file():
             raise ValueError("cannot be read: it is not a file")
         with file.open("rb") as stream:
-            return decode(stream.read(_LARGEST), time)
+            return decode(stream.read(_LARGEST), time, uptime, kept)
     except OSError as error:
         raise ValueError(f"cannot be read: {error}") from error
 

@@ -56,6 +56,20 @@ def test_age(tmp_path: Path, saved_at: float, age: float | None):
     assert state.load(file, NOW) == (SNAPSHOT, age)
 
 
+@pytest.mark.parametrize(
+    ("uptime", "kept", "age"),
+    [
+        (1030.0, False, 30.0),  # the same boot: both clocks say so
+        (12.0, False, None),  # off for nobody knows how long: the wall clock went on from where it was
+        (5000.0, False, None),  # set meanwhile, or another boot
+        (12.0, True, 30.0),  # a clock of its own
+    ],
+)
+def test_age_on_a_board_without_a_clock_of_its_own(uptime: float, kept: bool, age: float | None):
+    text = state.encode(SNAPSHOT, NOW - 30, 1000.0)
+    assert state.decode(text, NOW, uptime, kept) == (SNAPSHOT, age)
+
+
 def sealed(text: bytes) -> bytes:
     """As `state` writes it, whatever it is."""
     return b'{"format": 2, "crc32": "%08x", %s\n' % (zlib.crc32(text), text)

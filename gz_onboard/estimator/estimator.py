@@ -435,6 +435,7 @@ class Estimator:
         variance = rest.sd**2 + self._rest_sd**2 + self._voltage_sd**2
         if not rest.fresh or variance > REST_NEWS * self._rest_variance:
             return False
+        emf += rest.coming
         soc = battery.soc_at(emf, temperature)
         if filter_.covariance[0] < (soc_width(battery, emf, sqrt(variance), temperature) / 2) ** 2:
             return False  # the curve's own error is the same at every rest: it does not average out

@@ -17,6 +17,7 @@ RATE = 0.05  # 1/h: current over capacity below which a cell counts as unloaded;
 BLOCK = 2.0  # s over which the voltage is averaged
 LONGEST = 900  # blocks: half an hour
 SLOW_TIME = 1000.0  # s: time constant of slow diffusion in lithium-ion cells, a quarter of an hour or so
+SLOW_SHARE = 0.7  # relative sd of that: it is from ten minutes to an hour
 FAST_TIMES = 3.0  # time constants of the RC pair: the fast part is a mixture of some, too
 
 
@@ -24,7 +25,8 @@ class Rest:
     """Follows the voltage of a cell, less what its resistance takes, while there is no load."""
 
     def __init__(self) -> None:
-        self.sd: float | None = None  # V of a cell that relaxation may still add; None while nothing is proven
+        self.coming = 0.0  # V of a cell that relaxation will still add
+        self.sd: float | None = None  # V of a cell, of what it adds; None while nothing is proven
         self.fresh = False  # whether `sd` is of this step
         self._loaded = False  # ever
         self._resolution: float | None = None  # V: the smallest change ever seen
@@ -62,10 +64,11 @@ class Rest:
         self._blocks.append((mean, variance + self._resolution**2 / 12))
         self._begin()
         if len(self._blocks) >= 2:
-            rate = slope(self._blocks)
-            self.sd = SLOW_TIME * rate
-            if not self._loaded:
-                self.sd = min(self.sd, hypot(FAST_TIMES * fast_time * rate, unnamed))
+            rate, noise = slope(self._blocks)
+            self.coming, self.sd = SLOW_TIME * rate, SLOW_TIME * hypot(SLOW_SHARE * rate, noise)
+            at_first = hypot(FAST_TIMES * fast_time * hypot(rate, noise), unnamed)
+            if not self._loaded and at_first < self.sd:
+                self.coming, self.sd = 0.0, at_first
             self.fresh = True
 
     def interrupt(self) -> None:
@@ -76,12 +79,12 @@ class Rest:
             self.sd = None
 
 
-def slope(blocks: Sequence[tuple[float, float]]) -> float:
-    """How fast the voltage may be moving [V/s]: from (mean [V], variance [V²]) of the later half of the blocks."""
+def slope(blocks: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    """How fast the voltage moves, and its sd [V/s]: from (mean [V], variance [V²]) of the later half of the blocks."""
     later = list(blocks)[len(blocks) // 2 if len(blocks) >= 6 else 0 :]
     n = len(later)
     middle = (n - 1) / 2
     spread = n * (n * n - 1) / 12  # Σ (i - middle)²
     line = sum((i - middle) * mean for i, (mean, _) in enumerate(later)) / spread
     noise = sqrt(sum(variance for _, variance in later) / n / spread)
-    return hypot(line, noise) / BLOCK
+    return line / BLOCK, noise / BLOCK

@@ -228,7 +228,7 @@ def test_messages_every_three_seconds_are_integrated_over_three_seconds(declared
     rows = follow(e, scooter.live(1400, 11.0), scooter)
     _, end = rows[-1]
     assert end.distance == pytest.approx(scooter.distance - begin, rel=0.03)
-    assert abs(end.soc - usual.soc) < 0.01
+    assert abs(end.soc - usual.soc) < 0.015  # of sampling; a sd is as much
     assert worst(rows) < 3
     assert not end.reasons & Reason.SIGNALS_SLOW
     assert end.range is not None
