@@ -7,15 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.lab.discover.constancy import RIDE, Split
+from gz_onboard.lab.discover.constancy import Split
+from gz_onboard.lab.discover.folds import Fold, better, folds
 from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear
 from gz_onboard.lab.discover.search import Search, one_degree
 from gz_onboard.lab.discover.shapes import QUANTITIES, Curve, Form, forms, shape_evidence
+from gz_onboard.lab.discover.stands import widened
 from gz_onboard.lab.discover.state import State
-from gz_onboard.lab.discover.worth import energy_share, shape_share
+from gz_onboard.lab.discover.worth import shape_share
 
-RIDES = "ride"  # the quantity of what differs from ride to ride
 LEFT = 0.1  # of what causes explain: a curve beside them that takes less is the bend of a large effect
 CURVE = 1.5  # a curve's evidence over that of a cause: their knots are chosen by eye; lines count as tries instead
 UNLIKE = 0.5  # of a cause's effect in a channel: a curve beside it that takes more is not the cause's bend
@@ -45,7 +46,7 @@ def unexplained(
         if curve is None:
             continue
         inflation = inflated(state, form)
-        score = one_degree(curve.chi2 / inflation, curve.k)
+        score = one_degree(curve.chi2 / inflation, curve.k, state.freedom)
         if score < limit * (1.0 if form.straight else CURVE):
             continue
         mine = [name for name in chosen if search.shares.get(name, {}).get(form.channel, 0.0) > 0.3]
@@ -54,14 +55,17 @@ def unexplained(
         unlike = unlike or bool(mine and curve.chi2 / inflation > RIVAL * theirs)
         if chosen and curve.chi2 < (UNLIKE_LEFT if unlike else LEFT) * total:
             continue
-        if best is None or (unlike, score) > (bool(best["denies"]), best["score"]):
+        if best is not None and (unlike, score) <= (bool(best["denies"]), best["score"]):
+            continue
+        rest = [name for name in chosen if not (unlike and name in mine)]
+        if stands(state, search, lines, normals, form, rest, limit):
             best = described(form, curve, score) | {"denies": mine if unlike else []}
     if best is None or not best["denies"]:
-        best = instead(state, search, lines, normals, chosen) or best
+        best = instead(state, search, lines, normals, chosen, limit) or best
     unequal = [s for s in constancy if s.unequal]
     if unequal and (best is None or not best["denies"]):
         worst = max(unequal, key=lambda s: s.chi2)
-        best = halves(state, lines, normals, worst) or of_rides(state, lines, change, worst, constancy)
+        best = halves(state, lines, normals, worst) or best
     if best is None:
         return None
     if best["denies"]:
@@ -75,8 +79,25 @@ def unexplained(
     return best
 
 
+def stands(
+    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], form: Form, rest: Sequence[str],
+    limit: float,
+) -> bool:  # fmt: skip
+    """Whether the curve `form` beside the causes `rest` is more than what differs between these rides, and mends its
+    channel on rides held out of the fit.
+    """
+    curve = shape_evidence(widened(state, normals), lines, normals, form, search.index(rest), own=True)
+    if curve is None:
+        return False
+    score = one_degree(curve.chi2 / inflated(state, form), curve.k, state.freedom)
+    if score < limit * (1.0 if form.straight else CURVE):
+        return False
+    causes = [search.causes[name] for name in rest]
+    return len(lines) < 2 or better(folds(state, lines, normals, Fold(causes, form), Fold(causes)), {form.channel: 1.0})
+
+
 def instead(
-    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str]
+    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str], limit: float
 ) -> dict[str, Any] | None:
     """The curve that explains much better than one of the causes chosen what that one explains, in its own channel."""
     best: dict[str, Any] | None = None
@@ -92,23 +113,12 @@ def instead(
                 continue
             inflation = inflated(state, form)
             ahead = curve.chi2 / inflation - 2 * (curve.k - 1) - own * max(state.inflation.get(name, 1.0), 1.0)
-            if ahead > max(most, UNLIKE_LEFT * own):
+            if ahead > max(most, UNLIKE_LEFT * own) and stands(state, search, lines, normals, form, rest, limit):
                 most = ahead
-                best = described(form, curve, one_degree(curve.chi2 / inflation, curve.k)) | {"denies": [name]}
+                best = described(form, curve, one_degree(curve.chi2 / inflation, curve.k, state.freedom)) | {
+                    "denies": [name]
+                }
     return best
-
-
-def of_rides(
-    state: State, lines: Sequence[Linear], change: Array, worst: Split, constancy: Sequence[Split]
-) -> dict[str, Any]:
-    """What no cause is that acts in some rides and not in others: by how much more or less in each."""
-    channels = {name for line in lines for name in line.tables}
-    channel = max(channels, key=lambda name: weight(state, lines, name, change)[1])
-    mine = [s for s in constancy if s.cause == worst.cause and s.quantity.startswith(RIDE)]
-    rows = [[float(i), s.ratio, abs(s.ratio) / max(s.chi2, 1e-9) ** 0.5] for i, s in enumerate(mine)]
-    share = energy_share(state, lines, change)
-    return {"channel": channel, "quantity": RIDES, "straight": False, "unit": "", "score": worst.chi2,
-            "chi2": worst.chi2, "curve": rows, "denies": [worst.cause], "share": share}  # fmt: skip
 
 
 def inflated(state: State, form: Form) -> float:
@@ -163,7 +173,7 @@ def halves(state: State, lines: Sequence[Linear], normals: Sequence[Any], split:
         curve = shape_evidence(state, lines, normals, form, [])
         if curve is None:
             continue
-        score = one_degree(curve.chi2 / inflated(state, form), curve.k)
+        score = one_degree(curve.chi2 / inflated(state, form), curve.k, state.freedom)
         if best is None or score > best["score"]:
             best = described(form, curve, score) | {"denies": [split.cause]}
     return best
