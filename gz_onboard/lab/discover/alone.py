@@ -14,6 +14,7 @@ import numpy as np
 from gz_onboard.lab.discover.grid import Array, Ride
 from gz_onboard.lab.discover.linear import Linear, Noise, fit_mixed, learn_noise, normal
 from gz_onboard.lab.discover.state import State
+from gz_onboard.physics.effect import Port
 
 FREE = 25.0  # variance in scales that is added to that of every parameter while noise and scatter are learned
 ROUNDS = 2
@@ -71,8 +72,11 @@ def as_the_file_says(state: State) -> Array:
         prior[i, i] = (known.sd(name) / float(state.scale[i])) ** 2
     for cause in state.causes:
         if cause.effect and cause.effect.name not in has:
-            for name in set(cause.names) & set(state.names):
-                i = state.names.index(name)
+            for parameter in (p for p in cause.parameters if p.name in state.names):
+                i = state.names.index(parameter.name)
                 prior[i, :] = prior[:, i] = 0.0
                 prior[i, i] = ABSENT**2
+                if cause.effect.port is Port.CELL_VOLTAGE:  # every cell has some, in the error that its circuit states
+                    usual = float(np.hypot(parameter.prior, parameter.prior_sd))
+                    prior[i, i] = (usual / float(state.scale[i])) ** 2
     return prior

@@ -12,6 +12,7 @@ from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, fit_mixed, normal
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.shapes import Form
+from gz_onboard.lab.discover.unknown import RIDES
 from gz_onboard.lab.discover.worth import energy, power_of, share_of_time
 
 WHOLE = {"pack_voltage", "pack_current"}  # without which no one knows what a ride took out of the pack
@@ -66,8 +67,10 @@ def measure_gain(report: Report, seed: int, apart: Sequence[Linear] = ()) -> dic
     return result
 
 
-def form_of(unknown: dict[str, Any]) -> Form:
-    """The curve of what has no name."""
+def form_of(unknown: dict[str, Any]) -> Form | None:
+    """The curve of what has no name; None if it is one of rides."""
+    if unknown["quantity"] == RIDES:
+        return None
     return Form(unknown["channel"], unknown["quantity"], unknown["straight"])
 
 

@@ -16,6 +16,7 @@ from gz_onboard.lab.discover.limits import amount, limits, size, words
 from gz_onboard.lab.discover.linear import Linear
 from gz_onboard.lab.discover.parts import QUANTITIES, Over, before_and_after, binned, edges, gathered, share_over
 from gz_onboard.lab.discover.result import METRICS, VERDICTS, Report
+from gz_onboard.lab.discover.unknown import RIDES
 from gz_onboard.lab.discover.worth import sizes
 from gz_onboard.simulation.style import BLUE, GRID, INK, MUTED, ORANGE, headline, legend, new_figure, rule
 from gz_onboard.simulation.telling import clock
@@ -390,6 +391,8 @@ def curve(unknown: dict[str, Any]) -> Figure:
     axis.axhline(0, color=INK, linewidth=0.6)
     axis.set_xlabel(f"{words(unknown['quantity'])} [{unknown['unit']}]", fontsize=9, color=INK)
     left = f"{words(unknown['channel'])} [{BY_NAME[unknown['channel']].unit}]"
+    if unknown["quantity"] == RIDES:
+        left = f"{words(unknown['denies'][0])}, over its mean [1]"
     axis.set_ylabel(left, fontsize=9, color=INK)
     return figure
 

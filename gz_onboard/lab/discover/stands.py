@@ -70,8 +70,9 @@ def refused(now: Converged, limit: float) -> tuple[str, str] | None:
     strict = Search(wide, evidence(wide, now.normals), list(search.causes.values()), search.shares)
     index = search.index(now.chosen)
     estimate, sd = search.evidence.estimate(index), np.sqrt(np.diag(search.evidence.covariance(index)))
-    every = splits(state, now.lines, now.normals, search.place, now.chosen, now.change)
-    uneven = {split.cause for split in every if split.unequal and split.quantity.startswith(RIDE)}
+    # against a file what differs between rides cannot be told from what its model lacks; healthy rides have told
+    parts = [] if state.healthy else splits(state, now.lines, now.normals, search.place, now.chosen, now.change)
+    uneven = {split.cause for split in parts if split.unequal and split.quantity.startswith(RIDE)}
     found: list[tuple[float, str, str]] = []
     at = 0
     for name in now.chosen:

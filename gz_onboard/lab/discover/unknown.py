@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.lab.discover.constancy import Split
+from gz_onboard.lab.discover.constancy import RIDE, Split
 from gz_onboard.lab.discover.folds import Fold, better, folds
 from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear
@@ -15,8 +15,9 @@ from gz_onboard.lab.discover.search import Search, one_degree
 from gz_onboard.lab.discover.shapes import QUANTITIES, Curve, Form, forms, shape_evidence
 from gz_onboard.lab.discover.stands import widened
 from gz_onboard.lab.discover.state import State
-from gz_onboard.lab.discover.worth import shape_share
+from gz_onboard.lab.discover.worth import energy_share, shape_share
 
+RIDES = "ride"  # the quantity of what differs from ride to ride
 LEFT = 0.1  # of what causes explain: a curve beside them that takes less is the bend of a large effect
 CURVE = 1.5  # a curve's evidence over that of a cause: their knots are chosen by eye; lines count as tries instead
 UNLIKE = 0.5  # of a cause's effect in a channel: a curve beside it that takes more is not the cause's bend
@@ -65,7 +66,7 @@ def unexplained(
     unequal = [s for s in constancy if s.unequal]
     if unequal and (best is None or not best["denies"]):
         worst = max(unequal, key=lambda s: s.chi2)
-        best = halves(state, lines, normals, worst) or best
+        best = halves(state, lines, normals, worst) or of_rides(state, lines, change, worst, constancy)
     if best is None:
         return None
     if best["denies"]:
@@ -119,6 +120,19 @@ def instead(
                     "denies": [name]
                 }
     return best
+
+
+def of_rides(
+    state: State, lines: Sequence[Linear], change: Array, worst: Split, constancy: Sequence[Split]
+) -> dict[str, Any]:
+    """What no cause is that acts in some rides and not in others: by how much more or less in each."""
+    channels = {name for line in lines for name in line.tables}
+    channel = max(channels, key=lambda name: weight(state, lines, name, change)[1])
+    mine = [s for s in constancy if s.cause == worst.cause and s.quantity.startswith(RIDE)]
+    rows = [[float(i), s.ratio, abs(s.ratio) / max(s.chi2, 1e-9) ** 0.5] for i, s in enumerate(mine)]
+    share = energy_share(state, lines, change)
+    return {"channel": channel, "quantity": RIDES, "straight": False, "unit": "", "score": worst.chi2,
+            "chi2": worst.chi2, "curve": rows, "denies": [worst.cause], "share": share}  # fmt: skip
 
 
 def inflated(state: State, form: Form) -> float:

@@ -20,7 +20,7 @@ from gz_onboard.lab.discover.shapes import forms
 from gz_onboard.lab.discover.stands import possible, standing
 from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.terms import LOG
-from gz_onboard.lab.discover.unknown import unexplained
+from gz_onboard.lab.discover.unknown import RIDES, unexplained
 from gz_onboard.lab.discover.winds import NAME as WIND
 from gz_onboard.lab.discover.winds import about_winds, own_winds
 from gz_onboard.lab.discover.worth import energy_share, sizes
@@ -230,7 +230,9 @@ def advice(search: Search, sets: Sequence[Sequence[str]], unknown: dict[str, Any
         )
     if unknown is not None:
         lines.append(
-            f"Ride over the whole span of {unknown['quantity']} with all else the same, twice: what "
+            f"Ride one and the same way several times: what {unknown['channel']} leaves differs from ride to ride."
+            if unknown["quantity"] == RIDES
+            else f"Ride over the whole span of {unknown['quantity']} with all else the same, twice: what "
             f"{unknown['channel']} leaves goes with it, or with what changes along with it."
         )
     return lines
