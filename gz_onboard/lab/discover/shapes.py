@@ -159,7 +159,7 @@ def extended(linear: Linear, normal: Normal, form: Form, noise: Noise) -> Normal
 SIZES = {"road_force": 5.0, "inverter_power": 10.0, "auxiliary": 2.0, "pack_balance": 0.1, "cell_voltage": 0.005}
 """Unit of a curve's coefficients, in the channel's; `SCATTER` of it is taken to differ between rides."""
 SCATTER = 0.3
-ENOUGH = 5.0  # blocks of a ride at a knot, from which on it counts as visited
+ENOUGH = 1.0  # sum of squared weights of a ride's blocks at a knot, from which on it counts as visited
 OWN_FREE = 100.0  # variance in `Form.size` of the common curve while its scatter between rides is sought
 SCATTERS = {"cell_voltage": 1.0}  # whose model lacks more
 
@@ -190,8 +190,8 @@ class Curve:
 
 
 def supported(form: Form, linears: Sequence[Linear]) -> Array:
-    """The coefficients of `form` that these rides can tell, (k, free): a knot that fewer than `ENOUGH` blocks of two
-    rides are at goes with the nearest that has them, so that no curve bends where hardly anything was measured.
+    """The coefficients of `form` that these rides can tell, (k, free): a knot that less than `ENOUGH` of two rides is
+    at goes with the nearest that has it, so that no curve bends where hardly anything was measured.
     """
     k = form.basis.shape[1]
     if form.straight:
@@ -201,7 +201,7 @@ def supported(form: Form, linears: Sequence[Linear]) -> Array:
         table = line.tables.get(form.channel)
         knots = columns(line.ride, form.quantity, table) if table is not None else None
         if knots is not None:
-            at += knots.sum(axis=0) >= ENOUGH
+            at += (knots**2).sum(axis=0) >= ENOUGH
     good = np.flatnonzero(at >= min(2, len(linears)))
     if not len(good):
         return np.zeros((k, 0))
