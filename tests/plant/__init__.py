@@ -3,6 +3,6 @@
 Its own equations, its own integrator, its own sensors; of the package it knows only `Samples`, the form of a ride.
 """
 
-from tests.plant.cases import Case, Truth, commissioning, commissioning_many, draw, draw_many, trial
+from tests.plant.cases import Case, Truth, commissioning, commissioning_many, draw, draw_many, healthy, trial
 
-__all__ = ["Case", "Truth", "commissioning", "commissioning_many", "draw", "draw_many", "trial"]
+__all__ = ["Case", "Truth", "commissioning", "commissioning_many", "draw", "draw_many", "healthy", "trial"]

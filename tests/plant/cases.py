@@ -13,7 +13,8 @@ import numpy as np
 from gz_onboard.simulation.samples import Samples
 from tests.plant.machine import Machine, scooter
 from tests.plant.ride import STEP, Hidden, Ridden, ride
-from tests.plant.roads import Plan, plan
+from tests.plant.roads import KINDS as ROADS
+from tests.plant.roads import Plan, Rider, plan
 from tests.plant.sensors import measure
 
 CASES_OF_A_SCOOTER = 10
@@ -417,3 +418,67 @@ def commissioning_many(numbers: Sequence[int]) -> list[list[Samples]]:
 def commissioning(number: int) -> list[Samples]:
     """Ten healthy rides of the scooter `number`: all kinds of road, 1 to 33 degC, five riders."""
     return commissioning_many([number])[0]
+
+
+# --- healthy scooters as strangers ride them -----------------------------------------------------------------------
+
+RIDES_OF_A_SET = 5
+
+
+def _stranger(rng: np.random.Generator) -> Rider:
+    """Somebody who did not ride when the scooter was commissioned: lighter or heavier, gentler or harsher than they."""
+    return Rider(
+        "S",
+        float(rng.uniform(48, 118)),  # with luggage, as entered
+        acceleration=rng.uniform(0.75, 1.6),
+        braking=rng.uniform(0.75, 1.5),
+        lateral=rng.uniform(1.9, 4.6),
+        keenness=rng.uniform(0.86, 1.08),
+        lag=rng.uniform(0.1, 0.35),
+        preview=rng.uniform(0.3, 1.2),
+    )
+
+
+def _strange_runs(number: int, seed: int) -> list[Run]:
+    """A set of healthy rides that no baseline has seen the like of: five strangers, any road, SOC 0.2 to 1, -5 to
+    35 degC. Nothing is balanced: all five may be cold, or nearly empty, or in town.
+    """
+    rng = np.random.default_rng([seed, 11])
+    machine = scooter(number)
+    return [
+        (
+            plan(
+                2_000_000_000 + seed * 64 + i,
+                str(rng.choice(sorted(ROADS))),
+                _stranger(rng),
+                float(rng.uniform(-5, 35)),
+                float(rng.uniform(0.2, 1.0)),
+                hilly=float(rng.uniform(0.2, 1.7)),
+            ),
+            machine,
+            Hidden(),
+        )
+        for i in range(RIDES_OF_A_SET)
+    ]
+
+
+def _first_runs(number: int) -> list[Run]:
+    """Eight rides of the new scooter, as the reference scooter was commissioned: four riders, 2 to 32 degC."""
+    rng = np.random.default_rng([number, 13])
+    kinds = rng.permutation(["mixed", "city", "suburban", "arterial", "mixed", "oval", "suburban", "city"])
+    air = rng.permutation(np.linspace(2, 32, 8)) + rng.uniform(-1, 1, 8)
+    charge = rng.permutation(np.linspace(0.18, 0.99, 8))
+    seed = 3_000_000_000 + number * 64
+    return [
+        (plan(seed + i, str(kinds[i]), str(rng.choice(list("ABCD"))), float(air[i]), float(charge[i])), scooter(number),
+         Hidden())
+        for i in range(8)
+    ]  # fmt: skip
+
+
+def healthy(number: int, seeds: Sequence[int]) -> tuple[list[Samples], list[list[Samples]]]:
+    """The first eight rides of the scooter `number`, and a later set of rides for each of `seeds`; nothing is wrong."""
+    first, later = _first_runs(number), [_strange_runs(number, seed) for seed in seeds]
+    ridden = iter(_ride_all([run for runs in (first, *later) for run in runs]))
+    rides = [measure(next(ridden), f"commissioning_{i:03d}") for i in range(len(first))]
+    return rides, [[measure(next(ridden), f"ride_{i:03d}") for i in range(len(runs))] for runs in later]

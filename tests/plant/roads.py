@@ -86,7 +86,7 @@ def make_rider(rng: np.random.Generator, name: str) -> Rider:
 def plan(
     seed: int,
     kind: str,
-    rider: str,
+    rider: str | Rider,
     ambient: float,
     soc: float,
     wind: tuple[float, float] | None = None,
@@ -94,7 +94,7 @@ def plan(
 ) -> Plan:
     """A ride; `wind` [m/s] from north and east, drawn with 1 m/s standard deviation if not given."""
     rng = np.random.default_rng([seed, 19])
-    person = make_rider(rng, rider)
+    person = make_rider(rng, rider) if isinstance(rider, str) else rider
     duration = float(rng.uniform(*DURATION))
     curvature, speed, stops = _way(rng, kind, person, 14.0 * duration)
     own_wind = rng.normal(0, 1.0, 2)

@@ -326,7 +326,8 @@ def voltage_timing(ride: Ride, p: Values, system: System) -> Array:
     r0 = mesh_at(battery.r0, soc, ride.quantities["cell_temperature"])
     resistance = r0 * p.get("cell_resistance_factor", 1.0) / battery.cells_parallel
     resistance = resistance + p["pack_series_resistance"] / battery.cells_series
-    resistance = resistance * (1 + p["fast_resistance"])
+    colder = (20 - ride.quantities["cell_temperature"]) / 20
+    resistance = resistance * (1 + p["fast_resistance"] + p["fast_cold"] * colder)
     step = np.diff(ride.signals["pack_voltage"]) / battery.cells_series + resistance[1:] * np.diff(amperes)
     return np.append(step, 0.0)
 
@@ -520,7 +521,7 @@ CHANNELS = (
     ),
     Channel(
         "voltage_timing", "V", 0.1, 1, ("pack_voltage", "pack_current"), voltage_timing, _always,
-        ("pack_current_gain", "pack_voltage_latency", "fast_resistance", "cell_resistance_factor",
+        ("pack_current_gain", "pack_voltage_latency", "fast_resistance", "fast_cold", "cell_resistance_factor",
          "pack_series_resistance"), (), (0.002, 0.0, 10.0), True, False, rough=3.0,
     ),
     Channel(

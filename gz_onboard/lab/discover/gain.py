@@ -3,21 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from gz_onboard.lab.discover.folds import extended_mean, started, with_curve, with_start, without
 from gz_onboard.lab.discover.grid import Array
-from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed, normal
+from gz_onboard.lab.discover.linear import Linear, fit_mixed, normal
 from gz_onboard.lab.discover.result import Report
-from gz_onboard.lab.discover.shapes import Form, columns, extended
-from gz_onboard.lab.discover.state import State
-from gz_onboard.lab.discover.terms import STARTS
+from gz_onboard.lab.discover.shapes import Form
 from gz_onboard.lab.discover.unknown import RIDES
 from gz_onboard.lab.discover.worth import energy, power_of, share_of_time
 
-WIDE = 100.0  # variance of a curve's coefficients, in units of `Form.size`
+WHOLE = {"pack_voltage", "pack_current"}  # without which no one knows what a ride took out of the pack
 
 
 def measure_gain(report: Report, seed: int, apart: Sequence[Linear] = ()) -> dict[str, Any]:
@@ -69,65 +67,11 @@ def measure_gain(report: Report, seed: int, apart: Sequence[Linear] = ()) -> dic
     return result
 
 
-def started(state: State, line: Linear) -> Normal:
-    """What tells how a ride began: not the road force, whose mean would be taken for the accelerometer's bias."""
-    return normal(line, state.noise, [name for name in line.tables if name != "road_force"])
-
-
 def form_of(unknown: dict[str, Any]) -> Form | None:
     """The curve of what has no name; None if it is one of rides."""
     if unknown["quantity"] == RIDES:
         return None
     return Form(unknown["channel"], unknown["quantity"], unknown["straight"])
-
-
-def with_curve(
-    state: State, fitted: Sequence[tuple[Linear, Normal]], causes: Sequence[Any], form: Form
-) -> tuple[Array, Array]:
-    """(the common part (p,), the coefficients of `form` (k,)) from the rides `fitted`, the `causes` free."""
-    p, k = len(state.mean), form.basis.shape[1]
-    shape = state.shapes.get(form.name)
-    mean = np.concatenate([state.mean, shape.mean if shape else np.zeros(k)])
-    prior = np.diag(np.full(p + k, WIDE))
-    prior[:p, :p] = state.prior
-    for i in (i for cause in causes for i in state.index(cause.names)):
-        prior[i, i] += 1e6
-    scatter = np.concatenate([state.scatter, np.full(k, form.scatter**2)])
-    rides = []
-    for line, plain in fitted:
-        more = extended(line, plain, form, state.noise)
-        rides.append(more or Normal(np.pad(plain.n, (0, k)), np.pad(plain.b, (0, k))))
-    both = fit_mixed(rides, mean, prior, scatter, 1.0, np.zeros(p + k, dtype=bool), 0).mean
-    return both[:p], both[p:]
-
-
-def without(line: Linear, form: Form, coefficients: Array) -> Linear:
-    """`line` less the curve."""
-    table = line.tables.get(form.channel)
-    knots = columns(line.ride, form.quantity, table) if table else None
-    if table is None or knots is None:
-        return line
-    less = knots @ form.basis @ coefficients * form.size / table.unit
-    return Linear(line.ride, {**line.tables, form.channel: replace(table, y=table.y - less)})
-
-
-def with_start(state: State, ride: Normal, theta: Array) -> Array:
-    """`theta` (p,) with what is the ride's own of `terms.STARTS`, which is no merit or fault of a model."""
-    m = [i for i, name in enumerate(state.names) if name in STARTS]
-    variance = state.scatter[m] + np.diag(state.prior)[m]
-    rest = ride.b[m] - ride.n[m] @ theta
-    moved = theta.copy()
-    moved[m] += np.linalg.solve(np.diag(1 / variance) + ride.n[np.ix_(m, m)], rest)
-    return moved
-
-
-def extended_mean(state: State, rest: Sequence[Normal], causes: Sequence[Any]) -> Array:
-    """The common part from `rest` with the parameters of `causes` free."""
-    wide = state.prior.copy()
-    index = [i for cause in causes for i in state.index(cause.names)]
-    for i in index:
-        wide[i, i] += 1e6
-    return fit_mixed(rest, state.mean, wide, state.scatter, 1.0, state.free, 0).mean
 
 
 def errors(line: Linear, theta: Array) -> dict[str, float]:
@@ -144,9 +88,9 @@ def errors(line: Linear, theta: Array) -> dict[str, float]:
             found["voltage"] = float(np.sqrt(np.mean(rest**2)))
     found["power"] = float(np.sqrt(square))
     found["energy_per_way"] = abs(more) / max(line.ride.distance, 1.0)
-    drawn = energy(line)
-    model = drawn - more
-    found["range"] = abs(more) / model if model > 0 else float("nan")
+    model = energy(line) - more
+    if line.ride.have >= WHOLE and model > 0:
+        found["range"] = abs(more) / model
     return found
 
 

@@ -9,6 +9,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.stats import f as fisher
+from scipy.stats import t as student
 
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.grid import Array
@@ -110,12 +112,12 @@ class Search:
     def step(self, base: Sequence[str], name: str) -> float:
         """What `name` adds to `base`, over what it adds on healthy rides that were left out: chi-squared if healthy.
 
-        A cause of two parameters is brought to the scale of one by the Wilson-Hilferty approximation.
+        A cause of two parameters is brought to the scale of one: see `one_degree`.
         """
         more = self.gain([*base, name]) - (self.evidence.gain(self.index(base)) if base else 0.0)
         more /= self.state.inflation.get(name, 1.0)
         k = len(self.place[name])
-        return one_degree(more, k) if k > 1 else more
+        return one_degree(more, k, self.state.freedom) if k > 1 else more
 
     def overlap(self, a: str, b: str) -> float:
         """How much of the evidence for `a` and for `b` comes from the same channels, 0 to 1."""
@@ -171,9 +173,13 @@ class Search:
         return sets
 
 
-def one_degree(chi2: float, k: int) -> float:
-    """The value that is as unlikely with one degree of freedom as `chi2` with `k` (Wilson & Hilferty 1931)."""
+def one_degree(chi2: float, k: int, freedom: float) -> float:
+    """The square of Student's t that is as unlikely as `chi2` of `k` coefficients, where their common scatter is known
+    with so many degrees of `freedom`: a quantile of F, whose tail is the longer the more coefficients there are.
+    """
     if chi2 <= 0:
         return 0.0
-    z = ((chi2 / k) ** (1 / 3) - (1 - 2 / (9 * k))) / np.sqrt(2 / (9 * k))
-    return float(max(z, 0.0) ** 2) if z > 1 else float(min(chi2 / k, 1.0))
+    near = chi2
+    while (log_p := float(fisher.logsf(near / k, k, freedom))) < -500:
+        near /= 2  # as far out as this both go in proportion
+    return float(student.isf(np.exp(log_p) / 2, freedom)) ** 2 * chi2 / near

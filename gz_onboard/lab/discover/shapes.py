@@ -9,7 +9,7 @@ import numpy as np
 
 from gz_onboard.lab.discover.channels import BY_NAME, over_blocks
 from gz_onboard.lab.discover.grid import STEP, Array, Ride, smooth
-from gz_onboard.lab.discover.linear import Linear, Noise, Normal, Table, marginal, whitened
+from gz_onboard.lab.discover.linear import Linear, Noise, Normal, Table, fit_mixed, marginal, whitened
 from gz_onboard.lab.discover.search import _evidence
 from gz_onboard.lab.discover.state import Shape, State
 
@@ -159,6 +159,8 @@ def extended(linear: Linear, normal: Normal, form: Form, noise: Noise) -> Normal
 SIZES = {"road_force": 5.0, "inverter_power": 10.0, "auxiliary": 2.0, "pack_balance": 0.1, "cell_voltage": 0.005}
 """Unit of a curve's coefficients, in the channel's; `SCATTER` of it is taken to differ between rides."""
 SCATTER = 0.3
+ENOUGH = 1.0  # sum of squared weights of a ride's blocks at a knot, from which on it counts as visited
+OWN_FREE = 100.0  # variance in `Form.size` of the common curve while its scatter between rides is sought
 SCATTERS = {"cell_voltage": 1.0}  # whose model lacks more
 
 
@@ -187,10 +189,37 @@ class Curve:
         return d @ self.values, np.sqrt(np.abs(np.diag(d @ self.covariance @ d.T)))
 
 
+def supported(form: Form, linears: Sequence[Linear]) -> Array:
+    """The coefficients of `form` that these rides can tell, (k, free): a knot that less than `ENOUGH` of two rides is
+    at goes with the nearest that has it, so that no curve bends where hardly anything was measured.
+    """
+    k = form.basis.shape[1]
+    if form.straight:
+        return np.eye(1)
+    at = np.zeros(k)
+    for line in linears:
+        table = line.tables.get(form.channel)
+        knots = columns(line.ride, form.quantity, table) if table is not None else None
+        if knots is not None:
+            at += (knots**2).sum(axis=0) >= ENOUGH
+    good = np.flatnonzero(at >= min(2, len(linears)))
+    if not len(good):
+        return np.zeros((k, 0))
+    nearest = np.abs(np.arange(k)[:, None] - good).argmin(axis=1)
+    return np.asarray(np.eye(len(good))[nearest])
+
+
 def shape_evidence(
-    state: State, linears: Sequence[Linear], normals: Sequence[Normal], form: Form, fixed: Sequence[int]
-) -> Curve | None:
-    """What `form` is beside changes at `fixed`; None where no ride has it."""
+    state: State, linears: Sequence[Linear], normals: Sequence[Normal], form: Form, fixed: Sequence[int],
+    own: bool = False,
+) -> Curve | None:  # fmt: skip
+    """What `form` is beside changes at `fixed`; None where no ride has it, or not enough of it.
+
+    own: with the scatter of its coefficients that these rides show, where it is more than `Form.scatter`.
+    """
+    free = supported(form, linears)
+    if not free.shape[1]:
+        return None
     found = [extended(line, normal, form, state.noise) for line, normal in zip(linears, normals, strict=True)]
     rides = [ride for ride in found if ride is not None]
     if not rides:
@@ -203,8 +232,13 @@ def shape_evidence(
     prior[:p, :p] = state.prior
     prior[p:, p:] = shape.covariance if shape else np.eye(k) * form.scatter**2
     scatter = np.concatenate([state.scatter, np.full(k, form.scatter**2)])
-    e = _evidence(mean, prior, scatter, rides)
     mine = list(range(p, p + k))
+    if own and len(rides) > 1:
+        wide = prior.copy()
+        wide[p:, p:] += np.eye(k) * OWN_FREE
+        learns = np.arange(p + k) >= p
+        scatter = np.maximum(scatter, fit_mixed(rides, mean, wide, scatter, 1.0, learns, 10).scatter)
+    e = _evidence(mean, prior, scatter, rides)
     inner = e.information[np.ix_(mine, mine)] + 1e-3 * np.eye(k)
     score = e.score[mine]
     if fixed:
@@ -213,15 +247,16 @@ def shape_evidence(
             [e.information[np.ix_(f, mine)], e.score[f]]))  # fmt: skip
         inner = inner - e.information[np.ix_(mine, f)] @ cross[:, :-1]
         score = score - e.information[np.ix_(mine, f)] @ cross[:, -1]
-    inner = inner + 1e-3 * np.eye(k)
+    inner = free.T @ (inner + 1e-3 * np.eye(k)) @ free
+    score = free.T @ score
     estimate = np.linalg.solve(inner, score)
-    at = form.basis * form.size
+    at = form.basis @ free * form.size
     weights = np.zeros(len(at))
     for line in linears:
         if form.channel in line.tables:
             knots = columns(line.ride, form.quantity, line.tables[form.channel])
             weights += 0.0 if knots is None else (knots**2).sum(axis=0)
-    return Curve(float(score @ estimate), k, at @ estimate, at @ np.linalg.inv(inner) @ at.T,
+    return Curve(float(score @ estimate), free.shape[1], at @ estimate, at @ np.linalg.inv(inner) @ at.T,
                  weights / np.sum(weights))  # fmt: skip
 
 

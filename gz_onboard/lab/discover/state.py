@@ -64,6 +64,11 @@ class State:
     )  # of a cause's score on healthy rides left out, 1 if right
     shapes: dict[str, Shape] = field(default_factory=dict)  # what healthy rides show over quantities, by name
 
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom that the scatter between rides is known with; four are for what is known without any."""
+        return float(max(2 * (self.healthy + 3), 8))
+
     def index(self, names: Sequence[str]) -> list[int]:
         """Where `names` stand."""
         return [self.names.index(name) for name in names]
@@ -108,7 +113,7 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> State:
     of_effects = {p.name for e in vehicle.model.effects for p in e.parameters}
     names = sorted((needed & (set(BASE) | of_effects | strengths | set(nuisances))) - held)
     names = [name for name in names if name in nuisances or name in values]
-    scale, sd, ride_sd = [], [], []
+    scale, sd, ride_sd, bench = [], [], [], []
     for name in names:
         if name in nuisances:
             scatter, spread = nuisances[name].ride_sd, nuisances[name].sd
@@ -118,22 +123,23 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> State:
                 name in MEAN_SD and (name in absent or name not in vehicle_file_names(vehicle))
             ) or name == "payload_mass":
                 spread = MEAN_SD[name]
-            if name in TRANSFER:
-                spread *= TRANSFERRED
             scatter = RIDE_SD.get(name, RIDE_SD_SHARE * declared[name].prior_sd)
         if name in LOG:
             spread = min(spread / values[name], 0.5)
             scatter = 0.1 if name != "pack_heat_capacity" else 0.05
-        step = max(scatter, 0.05 * spread)
+        wide = spread * (TRANSFERRED if name in TRANSFER else 1.0)
+        step = max(scatter, 0.05 * wide)
         scale.append(step)
-        sd.append(max(spread / step, 1e-3))
+        sd.append(max(wide / step, 1e-3))
+        bench.append(spread / step)
         ride_sd.append(max(scatter / step, 1e-3))
     prior = np.diag(np.array(sd) ** 2)
     place = {name: i for i, name in enumerate(names)}
     for pair, r in known.correlations.items():
         a, b = tuple(pair)
         if a in place and b in place:
-            prior[place[a], place[b]] = prior[place[b], place[a]] = r * sd[place[a]] * sd[place[b]]
+            # what the bench leaves open goes together; by how much the road differs from the bench does not
+            prior[place[a], place[b]] = prior[place[b], place[a]] = r * bench[place[a]] * bench[place[b]]
     noise = {channel.name: channel.noise for channel in CHANNELS}
     free = np.array([name not in FIXED for name in names])
     return State(vehicle, system, causes, tuple(names), np.array(scale), values, np.zeros(len(names)), prior,

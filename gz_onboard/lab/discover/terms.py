@@ -59,6 +59,7 @@ NUISANCES = (
     Nuisance("resistance_cold", "1/(20 K)", 0.0, 0.15, 0.03, "cell resistance below 20 degC beyond the tables"),
     Nuisance("resistance_empty_cold", "1", 0.0, 0.3, 0.03, "at SOC 0.6 and 0 degC more than either alone"),
     Nuisance("fast_resistance", "1", 0.0, 0.2, 0.05, "resistance at 0.1 s over that of the tables"),
+    Nuisance("fast_cold", "1/(20 K)", 0.0, 0.2, 0.05, "the same, below 20 degC"),
     Nuisance("slip_per_force", "1/(100 N)", 0.0, 0.02, 0.003, "slip of the driven wheel"),
     Nuisance("lean_radius", "1", 0.0, 0.3, 0.05, "rolling radius falls with lean"),
     Nuisance("front_lean", "1", 0.0, 0.3, 0.05, "the same, front against rear"),

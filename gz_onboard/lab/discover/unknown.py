@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.lab.discover.constancy import RIDE, Split
+from gz_onboard.lab.discover.folds import Fold, better, folds
 from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear
 from gz_onboard.lab.discover.search import Search, one_degree
 from gz_onboard.lab.discover.shapes import QUANTITIES, Curve, Form, forms, shape_evidence
+from gz_onboard.lab.discover.stands import widened
 from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.worth import energy_share, shape_share
 
@@ -45,7 +47,7 @@ def unexplained(
         if curve is None:
             continue
         inflation = inflated(state, form)
-        score = one_degree(curve.chi2 / inflation, curve.k)
+        score = one_degree(curve.chi2 / inflation, curve.k, state.freedom)
         if score < limit * (1.0 if form.straight else CURVE):
             continue
         mine = [name for name in chosen if search.shares.get(name, {}).get(form.channel, 0.0) > 0.3]
@@ -54,10 +56,13 @@ def unexplained(
         unlike = unlike or bool(mine and curve.chi2 / inflation > RIVAL * theirs)
         if chosen and curve.chi2 < (UNLIKE_LEFT if unlike else LEFT) * total:
             continue
-        if best is None or (unlike, score) > (bool(best["denies"]), best["score"]):
+        if best is not None and (unlike, score) <= (bool(best["denies"]), best["score"]):
+            continue
+        rest = [name for name in chosen if not (unlike and name in mine)]
+        if stands(state, search, lines, normals, form, rest, limit):
             best = described(form, curve, score) | {"denies": mine if unlike else []}
     if best is None or not best["denies"]:
-        best = instead(state, search, lines, normals, chosen) or best
+        best = instead(state, search, lines, normals, chosen, limit) or best
     unequal = [s for s in constancy if s.unequal]
     if unequal and (best is None or not best["denies"]):
         worst = max(unequal, key=lambda s: s.chi2)
@@ -75,8 +80,25 @@ def unexplained(
     return best
 
 
+def stands(
+    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], form: Form, rest: Sequence[str],
+    limit: float,
+) -> bool:  # fmt: skip
+    """Whether the curve `form` beside the causes `rest` is more than what differs between these rides, and mends its
+    channel on rides held out of the fit.
+    """
+    curve = shape_evidence(widened(state, normals), lines, normals, form, search.index(rest), own=True)
+    if curve is None:
+        return False
+    score = one_degree(curve.chi2 / inflated(state, form), curve.k, state.freedom)
+    if score < limit * (1.0 if form.straight else CURVE):
+        return False
+    causes = [search.causes[name] for name in rest]
+    return len(lines) < 2 or better(folds(state, lines, normals, Fold(causes, form), Fold(causes)), {form.channel: 1.0})
+
+
 def instead(
-    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str]
+    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str], limit: float
 ) -> dict[str, Any] | None:
     """The curve that explains much better than one of the causes chosen what that one explains, in its own channel."""
     best: dict[str, Any] | None = None
@@ -92,9 +114,11 @@ def instead(
                 continue
             inflation = inflated(state, form)
             ahead = curve.chi2 / inflation - 2 * (curve.k - 1) - own * max(state.inflation.get(name, 1.0), 1.0)
-            if ahead > max(most, UNLIKE_LEFT * own):
+            if ahead > max(most, UNLIKE_LEFT * own) and stands(state, search, lines, normals, form, rest, limit):
                 most = ahead
-                best = described(form, curve, one_degree(curve.chi2 / inflation, curve.k)) | {"denies": [name]}
+                best = described(form, curve, one_degree(curve.chi2 / inflation, curve.k, state.freedom)) | {
+                    "denies": [name]
+                }
     return best
 
 
@@ -163,7 +187,7 @@ def halves(state: State, lines: Sequence[Linear], normals: Sequence[Any], split:
         curve = shape_evidence(state, lines, normals, form, [])
         if curve is None:
             continue
-        score = one_degree(curve.chi2 / inflated(state, form), curve.k)
+        score = one_degree(curve.chi2 / inflated(state, form), curve.k, state.freedom)
         if best is None or score > best["score"]:
             best = described(form, curve, score) | {"denies": [split.cause]}
     return best

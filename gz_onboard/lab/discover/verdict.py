@@ -17,6 +17,7 @@ from gz_onboard.lab.discover.linear import Linear, normal
 from gz_onboard.lab.discover.result import Cause, Report
 from gz_onboard.lab.discover.search import Evidence, Search, evidence
 from gz_onboard.lab.discover.shapes import forms
+from gz_onboard.lab.discover.stands import possible, standing
 from gz_onboard.lab.discover.state import State
 from gz_onboard.lab.discover.terms import LOG
 from gz_onboard.lab.discover.unknown import RIDES, unexplained
@@ -47,8 +48,7 @@ def threshold(state: State, tried: float) -> float:
     Student's t, for the scatter between rides is known from the healthy rides alone; Šidák over the candidates.
     """
     one = 1 - (1 - FALSE_ALARMS) ** (1 / tried)
-    freedom = max(2 * (state.healthy + 3), 8)
-    return float(student.ppf(1 - one / 2, freedom) ** 2)
+    return float(student.ppf(1 - one / 2, state.freedom) ** 2)
 
 
 def reach(state: State, notes: list[str], say: Callable[[str], None], linearised: Linearised, start: Array) -> Report:
@@ -63,10 +63,15 @@ def reach(state: State, notes: list[str], say: Callable[[str], None], linearised
     shares = channel_shares(state, lines, causes)
     say(f"{len(causes)} candidates")
     known = Known(state, causes, shares, limit, linearised)
-    now = converged(known, lines, start, np.zeros_like(start))
+    still = np.zeros_like(start)
+    now, known, told = standing(known, converged(known, lines, start, still), lines, start, still)
     winds = own_winds(now) if WIND in now.search.place and WIND not in now.chosen else None
     if winds is not None and winds.score > limit:
         now = about_winds(known, winds, start, [line.ride for line in lines])
+        known = replace(known, state=now.state, causes=list(now.search.causes.values()))
+        now, known, more = standing(known, now, now.lines, start, winds.blown)
+        told += more
+    notes += told
     state, lines, normals, search, chosen = now.state, now.lines, now.normals, now.search, now.chosen
     say("curves over quantities")
     change = now.change
@@ -76,8 +81,8 @@ def reach(state: State, notes: list[str], say: Callable[[str], None], linearised
         chosen = tuple(name for name in chosen if name not in unknown["denies"])
     every = Search(state, search.evidence, causes, shares)
     found = causes_of(state, search, chosen, lines)
-    sets = [list(s) for s in search.stand_ins(chosen, MARGIN, LEAST * limit)]
-    scores = {name: search.step([n for n in chosen if n != name], name) for name in search.causes}
+    sets = [able for s in search.stand_ins(chosen, MARGIN, LEAST * limit) if len(able := likely(search, chosen, s)) > 1]
+    scores = {name: every.step([n for n in chosen if n != name], name) for name in every.causes}
     if winds is not None:
         scores[WIND] = max(scores.get(WIND, 0.0), winds.score)
         if winds.score > limit:
@@ -150,16 +155,17 @@ def causes_of(state: State, search: Search, chosen: Sequence[str], lines: Sequen
             i = index[at]
             healthy = own_value(state, parameter.name)
             x = float(estimate[at])
-            own = DISCREPANCY * (
+            shape = DISCREPANCY * (
                 1 + sum(more * search.shares.get(name, {}).get(channel, 0.0) for channel, more in LUMPED.items())
             )
-            sd = float(np.hypot(np.sqrt(covariance[at, at] * inflation), own * x))
+            sd = float(np.hypot(np.sqrt(covariance[at, at] * inflation), shape * x))
             change[i] = x
             step = float(state.scale[i])
             if parameter.name in LOG:
                 ends = [healthy * np.exp(step * (x + s * quantile * sd)) for s in (0, -1, 1)]
             else:
                 ends = [healthy + step * (x + s * quantile * sd) for s in (0, -1, 1)]
+            ends = [float(np.clip(end, parameter.low, parameter.high)) for end in ends]  # nothing that cannot be
             rows.append((parameter.name, float(ends[0]), (float(ends[1]), float(ends[2])), float(ends[0] - healthy)))
             at += 1
         first = rows[0]
@@ -169,6 +175,20 @@ def causes_of(state: State, search: Search, chosen: Sequence[str], lines: Sequen
             tuple((n, v, ci) for n, v, ci, _ in rows[1:]),
         ))  # fmt: skip
     return result
+
+
+def likely(search: Search, chosen: Sequence[str], group: Sequence[str]) -> list[str]:
+    """Those of `group`, stand-ins of its first, whose parameters could be what they would have to be."""
+    rest = [name for name in chosen if name != group[0]]
+    found = []
+    for name in group:
+        index = search.index([*rest, name])
+        k = len(search.place[name])
+        change = search.evidence.estimate(index)[-k:]
+        sd = np.sqrt(np.diag(search.evidence.covariance(index)))[-k:]
+        if possible(search.state, search.causes[name], change.tolist(), sd.tolist()):
+            found.append(name)
+    return found
 
 
 def own_value(state: State, name: str) -> float:

@@ -50,7 +50,7 @@ def own_winds(now: Converged) -> Winds:
         words.append(
             f"{line.ride.name} {np.hypot(north, east):.1f} m/s from {np.degrees(np.arctan2(east, north)) % 360:.0f}°"
         )
-    return Winds(one_degree(total, 2 * len(words)) if words else 0.0, ", ".join(words), blown, w)
+    return Winds(one_degree(total, 2 * len(words), state.freedom) if words else 0.0, ", ".join(words), blown, w)
 
 
 def about_winds(known: Known, winds: Winds, start: Array, rides: Sequence[Ride]) -> Converged:

@@ -1,0 +1,129 @@
+"""Rides held out of the fit: what a model that was fitted to the others leaves of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from gz_onboard.lab.discover.grid import Array
+from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed, normal
+from gz_onboard.lab.discover.shapes import Form, columns, extended
+from gz_onboard.lab.discover.state import State
+from gz_onboard.lab.discover.terms import STARTS
+
+WIDE = 100.0  # variance of a curve's coefficients, in units of `Form.size`
+
+
+@dataclass(frozen=True)
+class Fold:
+    """What is free on the rides that a model is fitted to: causes, and the curve of what has no name."""
+
+    causes: Sequence[Any] = ()
+    form: Form | None = None
+
+    def fit(self, state: State, lines: Sequence[Linear], normals: Sequence[Normal]) -> tuple[Array, Array]:
+        """(the common part (p,), the curve's coefficients (k,)) from these rides."""
+        if self.form is not None:
+            return with_curve(state, list(zip(lines, normals, strict=True)), self.causes, self.form)
+        return extended_mean(state, normals, self.causes), np.zeros(0)
+
+    def shown(self, line: Linear, curve: Array) -> Linear:
+        """`line` less the curve."""
+        return line if self.form is None else without(line, self.form, curve)
+
+
+Squares = dict[str, tuple[float, float, float]]  # by channel: mean square before, with the control, after
+
+
+def folds(
+    state: State, lines: Sequence[Linear], normals: Sequence[Normal], after: Fold, control: Fold
+) -> Iterator[Squares]:
+    """Of each ride in turn, held out of the fit, the mean squares of its residuals: before (the causes of `control`
+    alone moved), with `control` refitted, with `after`; each with its own start.
+    """
+    for i, line in enumerate(lines):
+        rest = [j for j in range(len(lines)) if j != i]
+        some, theirs = [lines[j] for j in rest], [normals[j] for j in rest]
+        plain, _ = control.fit(state, some, theirs)
+        before = state.mean.copy()
+        index = [k for cause in control.causes for k in state.index(cause.names)]
+        before[index] = plain[index]
+        full, curve = after.fit(state, some, theirs)
+        models = ((line, before), (line, plain), (after.shown(line, curve), full))
+        begun = [(shown, with_start(state, started(state, shown), theta)) for shown, theta in models]
+        squares = [
+            {name: float(np.mean((table.y - table.a @ theta) ** 2)) for name, table in shown.tables.items()}
+            for shown, theta in begun
+        ]
+        yield {name: (squares[0][name], squares[1][name], squares[2][name]) for name in squares[0]}
+
+
+def better(held: Iterator[Squares], shares: Mapping[str, float]) -> bool:
+    """Whether rides held out are known better after than before and than with the control, in the channels that have
+    a part of the evidence (`shares`), each by its share.
+    """
+    rows = list(held)
+    total = 0.0
+    for channel, part in shares.items():
+        mine = [row[channel] for row in rows if channel in row]
+        if part > 0.1 and mine:
+            before, control, after = (sum(column) for column in zip(*mine, strict=True))
+            total += part * float(np.log(after / min(before, control)))
+    return total < 0
+
+
+def started(state: State, line: Linear) -> Normal:
+    """What tells how a ride began: not the road force, whose mean would be taken for the accelerometer's bias."""
+    return normal(line, state.noise, [name for name in line.tables if name != "road_force"])
+
+
+def with_curve(
+    state: State, fitted: Sequence[tuple[Linear, Normal]], causes: Sequence[Any], form: Form
+) -> tuple[Array, Array]:
+    """(the common part (p,), the coefficients of `form` (k,)) from the rides `fitted`, the `causes` free."""
+    p, k = len(state.mean), form.basis.shape[1]
+    shape = state.shapes.get(form.name)
+    mean = np.concatenate([state.mean, shape.mean if shape else np.zeros(k)])
+    prior = np.diag(np.full(p + k, WIDE))
+    prior[:p, :p] = state.prior
+    for i in (i for cause in causes for i in state.index(cause.names)):
+        prior[i, i] += 1e6
+    scatter = np.concatenate([state.scatter, np.full(k, form.scatter**2)])
+    rides = []
+    for line, plain in fitted:
+        more = extended(line, plain, form, state.noise)
+        rides.append(more or Normal(np.pad(plain.n, (0, k)), np.pad(plain.b, (0, k))))
+    both = fit_mixed(rides, mean, prior, scatter, 1.0, np.zeros(p + k, dtype=bool), 0).mean
+    return both[:p], both[p:]
+
+
+def without(line: Linear, form: Form, coefficients: Array) -> Linear:
+    """`line` less the curve."""
+    table = line.tables.get(form.channel)
+    knots = columns(line.ride, form.quantity, table) if table else None
+    if table is None or knots is None:
+        return line
+    less = knots @ form.basis @ coefficients * form.size / table.unit
+    return Linear(line.ride, {**line.tables, form.channel: replace(table, y=table.y - less)})
+
+
+def with_start(state: State, ride: Normal, theta: Array) -> Array:
+    """`theta` (p,) with what is the ride's own of `terms.STARTS`, which is no merit or fault of a model."""
+    m = [i for i, name in enumerate(state.names) if name in STARTS]
+    variance = state.scatter[m] + np.diag(state.prior)[m]
+    rest = ride.b[m] - ride.n[m] @ theta
+    moved = theta.copy()
+    moved[m] += np.linalg.solve(np.diag(1 / variance) + ride.n[np.ix_(m, m)], rest)
+    return moved
+
+
+def extended_mean(state: State, rest: Sequence[Normal], causes: Sequence[Any]) -> Array:
+    """The common part from `rest` with the parameters of `causes` free."""
+    wide = state.prior.copy()
+    index = [i for cause in causes for i in state.index(cause.names)]
+    for i in index:
+        wide[i, i] += 1e6
+    return fit_mixed(rest, state.mean, wide, state.scatter, 1.0, state.free, 0).mean

@@ -1,0 +1,110 @@
+"""What a cause must stand before it is named: its bounds, the spread of these very rides, and rides held out.
+
+The spread that healthy rides showed is not that of the healthy world: where they hardly went, and what they happened
+not to vary, the next rides show for the first time. So what differs between the rides at hand by more than healthy ones
+did widens the scatter, beside a common part that is free; and what was found on some rides must foretell the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gz_onboard.lab.discover.candidates import Candidate
+from gz_onboard.lab.discover.constancy import RIDE, splits
+from gz_onboard.lab.discover.converge import Converged, Known, Linearised, converged
+from gz_onboard.lab.discover.folds import Fold, better, folds
+from gz_onboard.lab.discover.grid import Array
+from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed
+from gz_onboard.lab.discover.search import Search, evidence
+from gz_onboard.lab.discover.state import State
+from gz_onboard.lab.discover.terms import LOG
+
+FREE = 25.0  # variance in scales of the common part while the scatter of these rides is sought
+ROUNDS = 25
+SURE = 2.0  # standard deviations: an estimate further beyond a bound is none of its cause
+REFUSALS = 6  # names at most that are tried and refused
+
+
+def widened(state: State, normals: Sequence[Normal]) -> State:
+    """`state` with the scatter between rides that these show, where it is more than healthy ones did."""
+    if len(normals) < 2:
+        return state
+    free = state.prior + FREE * np.eye(len(state.names))
+    weight = float(state.healthy + 1)
+    found = fit_mixed(normals, state.mean, free, state.scatter, weight, state.free, ROUNDS).scatter
+    return replace(state, scatter=np.maximum(found, state.scatter))
+
+
+def possible(state: State, cause: Candidate, change: Sequence[float], sd: Sequence[float]) -> bool:
+    """Whether the parameters of `cause` can have changed by `change` [scales], known within `sd`."""
+    for parameter, x, s in zip(cause.parameters, change, sd, strict=True):
+        (i,) = state.index([parameter.name])
+        if parameter.name in LOG:
+            continue
+        step = float(state.scale[i])
+        value, spread = state.values[parameter.name] + x * step, SURE * s * step
+        if not parameter.low - spread <= value <= parameter.high + spread:
+            return False
+    return True
+
+
+def foretold(
+    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Normal], chosen: Sequence[str], name: str
+) -> bool:
+    """Whether `name` beside the other causes `chosen` mends its own channels on rides held out of the fit."""
+    if len(lines) < 2:
+        return True
+    every = [search.causes[n] for n in chosen]
+    others = [c for c in every if c.name != name]
+    shares = search.shares.get(name, {})
+    return better(folds(state, lines, normals, Fold(every), Fold(others)), shares)
+
+
+def refused(now: Converged, limit: float) -> tuple[str, str] | None:
+    """(the cause among those chosen that stands least, why); None if all stand."""
+    state, search = now.state, now.search
+    wide = widened(state, now.normals)
+    strict = Search(wide, evidence(wide, now.normals), list(search.causes.values()), search.shares)
+    index = search.index(now.chosen)
+    estimate, sd = search.evidence.estimate(index), np.sqrt(np.diag(search.evidence.covariance(index)))
+    # against a file what differs between rides cannot be told from what its model lacks; healthy rides have told
+    parts = [] if state.healthy else splits(state, now.lines, now.normals, search.place, now.chosen, now.change)
+    uneven = {split.cause for split in parts if split.unequal and split.quantity.startswith(RIDE)}
+    found: list[tuple[float, str, str]] = []
+    at = 0
+    for name in now.chosen:
+        cause = search.causes[name]
+        own = slice(at, at + len(cause.parameters))
+        at = own.stop
+        score = strict.step([n for n in now.chosen if n != name], name)
+        if not possible(state, cause, estimate[own].tolist(), sd[own].tolist()):
+            found.append((score, name, "would be beyond what it can be"))
+        elif score < limit:
+            found.append((score, name, "differs from ride to ride as much as it is"))
+        elif name in uneven:
+            found.append((score, name, "acts in some rides and not in others"))
+        elif not foretold(state, search, now.lines, now.normals, now.chosen, name):
+            found.append((score, name, "does not foretell rides held out"))
+    return min(found)[1:] if found else None
+
+
+def standing(
+    known: Known, now: Converged, lines: list[Linear], start: Array, own: Array
+) -> tuple[Converged, Known, list[str]]:
+    """`now` searched again without each cause that does not stand, what is known less these, and what was refused."""
+    told: list[str] = []
+    while now.chosen and len(told) < REFUSALS:
+        bad = refused(now, known.limit)
+        if bad is None:
+            break
+        name, why = bad
+        told.append(f"{name} {why}: not named")
+        known = replace(known, causes=[c for c in known.causes if c.name != name])
+        now = converged(known, lines, start, own)
+    return now, known, told
+
+
+__all__ = ["Linearised", "foretold", "possible", "refused", "standing", "widened"]
