@@ -13,6 +13,7 @@ from typing import Any
 
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
 from gz_onboard.estimator.forecast import Forecast, Forecaster, Turn
+from gz_onboard.estimator.redundancy import Redundancy
 from gz_onboard.estimator.road import Road
 from gz_onboard.estimator.shaking import Shaking
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
@@ -49,6 +50,7 @@ LOSS_SD = {
     Reason.NO_CELL_TEMPERATURE: 0.02,
     Reason.NO_PACK_CURRENT: 0.03,
     Reason.NO_PACK_VOLTAGE: 0.02,
+    Reason.SENSOR_DISTRUSTED: 0.05,  # what was learned from it before it was found out
 }
 WEIGHTY = ~(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)  # reasons that degrade an estimate
 NO_PACK = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT
@@ -113,6 +115,7 @@ class Estimator:
         self._charge_sd = sqrt(self._cell_scatter**2 + gain_sd**2)
         self._cable = p["cable_resistance"]
         self._radius, self._gear = p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"]
+        self.redundancy = Redundancy(self._radius, self._gear)
         self._latency = p["pack_voltage_latency"]
         self._recent: deque[tuple[float, float, float]] = (
             deque()
@@ -148,6 +151,7 @@ class Estimator:
         self._time = now
         self._deadline = now + STEP_AT_LEAST
         signals = self.signals
+        self.redundancy.speeds.step(now, min(dt, 1.0), signals)
         self.road.step(now, min(dt, 1.0), signals, self._radius, self._gear)
         voltage, current, source = self._measured(now)
         self._pack = voltage, current, source
@@ -377,7 +381,8 @@ class Estimator:
 
     def _ride(self, now: float, dt: float, voltage: float | None, current: float | None) -> None:
         speed = self.road.speed
-        if speed is None or voltage is None or current is None or not 0 < dt <= 1.0 or self._pack[2] == "model":
+        unsure = self._pack[2] == "model" or self.redundancy.speeds.unsettled
+        if speed is None or voltage is None or current is None or not 0 < dt <= 1.0 or unsure:
             self.forecaster.pause()
             return
         motor = self.signals.motor_temperature.get(now)
@@ -415,7 +420,7 @@ class Estimator:
 
     def estimate(self, now: float) -> Estimate:
         """What is known at `now` [s]; cheap, and changes nothing."""
-        estimate = Estimate(time=now, reasons=self._reasons(now))
+        estimate = Estimate(time=now, reasons=self._reasons(now), distrusted=self.redundancy.distrusted)
         road, filter_, forecast = self.road, self.filter, self._forecast
         estimate.distance = road.distance
         silent = self._time is None or now - self._time > 2.0
@@ -476,6 +481,8 @@ class Estimator:
             reasons |= Reason.CURRENT_MISMATCH
         if self._off_gate or self._innovation_square > 0.08**2:
             reasons |= Reason.VOLTAGE_MISMATCH
+        if self.redundancy.distrusted:
+            reasons |= Reason.SENSOR_DISTRUSTED
         return reasons
 
     # --- saving -----------------------------------------------------------------------------------------------
