@@ -52,6 +52,8 @@ LOSS_SD = {
     Reason.NO_PACK_VOLTAGE: 0.02,
     Reason.SENSOR_DISTRUSTED: 0.05,  # what was learned from it before it was found out
 }
+LEARNED_FROM = {"motor_speed", "accel_x", "gps_altitude", "pack_current", "pack_voltage"}
+UNLEARNED = 1500.0  # m: so far a sensor can have lied before it is found out
 WEIGHTY = ~(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)  # reasons that degrade an estimate
 NO_PACK = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT
 MISMATCH = 3.0  # A between the two current sensors, over ten seconds or so
@@ -115,7 +117,8 @@ class Estimator:
         self._charge_sd = sqrt(self._cell_scatter**2 + gain_sd**2)
         self._cable = p["cable_resistance"]
         self._radius, self._gear = p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"]
-        self.redundancy = Redundancy(self._radius, self._gear)
+        self.redundancy = Redundancy(self._radius, self._gear, model.mass, self.forecaster.usual_force())
+        self._distrusted: tuple[str, ...] = ()
         self._latency = p["pack_voltage_latency"]
         self._recent: deque[tuple[float, float, float]] = (
             deque()
@@ -152,9 +155,11 @@ class Estimator:
         self._deadline = now + STEP_AT_LEAST
         signals = self.signals
         self.redundancy.speeds.step(now, min(dt, 1.0), signals)
+        self.redundancy.slopes.hear_altitude(now, min(dt, 1.0), signals, self.road.speed)
         self.road.step(now, min(dt, 1.0), signals, self._radius, self._gear)
         voltage, current, source = self._measured(now)
         self._pack = voltage, current, source
+        self._hear_slopes(now, min(dt, 1.0))
         temperature = self._temperature(now, dt)
         self._battery_step(now, dt, voltage, current, source, temperature)
         self._ride(now, dt, voltage, current)
@@ -188,12 +193,30 @@ class Estimator:
             return voltage, self._model_power(now) / voltage, "model"
         return voltage, None, "none"
 
+    def _hear_slopes(self, now: float, dt: float) -> None:
+        road, slopes = self.road, self.redundancy.slopes
+        voltage, current, source = self._pack
+        power = None if voltage is None or current is None or source == "model" else voltage * current
+        before = slopes.guilty
+        speeds = self.redundancy.speeds
+        speed = None if speeds.unsettled else road.speed
+        slopes.step(now, dt, self.signals, speed, road.acceleration, speeds.on_road, power,
+                    lambda speed, acceleration: self._power_at(now, speed, acceleration, 0.0))  # fmt: skip
+        if slopes.guilty != before:
+            road.forget_slope(slopes.offset)
+        distrusted = self.redundancy.distrusted
+        if any(role in LEARNED_FROM and role not in self._distrusted for role in distrusted):
+            self.forecaster.forget(UNLEARNED)
+        self._distrusted = distrusted
+
     def _model_power(self, now: float) -> float:
         road = self.road
-        quantities = self.forecaster.quantities(
-            road.speed or 0.0, road.acceleration or 0.0, self._ambient(now)[0], road.altitude or 0.0, 40.0
-        )
-        quantities["grade"] = road.grade or 0.0
+        return self._power_at(now, road.speed or 0.0, road.acceleration or 0.0, road.grade or 0.0)
+
+    def _power_at(self, now: float, speed: float, acceleration: float, grade: float) -> float:
+        ambient, altitude = self._ambient(now)[0], self.road.altitude or 0.0
+        quantities = self.forecaster.quantities(speed, acceleration, ambient, altitude, 40.0)
+        quantities["grade"] = grade
         if self.forecaster.extended:
             self.forecaster.add(quantities, self._turn(now), self._ambient(now)[0])
         return float(sum(self.model.power(quantities).values()))
@@ -420,7 +443,7 @@ class Estimator:
 
     def estimate(self, now: float) -> Estimate:
         """What is known at `now` [s]; cheap, and changes nothing."""
-        estimate = Estimate(time=now, reasons=self._reasons(now), distrusted=self.redundancy.distrusted)
+        estimate = Estimate(time=now, reasons=self._reasons(now), distrusted=self._distrusted)
         road, filter_, forecast = self.road, self.filter, self._forecast
         estimate.distance = road.distance
         silent = self._time is None or now - self._time > 2.0
@@ -481,7 +504,7 @@ class Estimator:
             reasons |= Reason.CURRENT_MISMATCH
         if self._off_gate or self._innovation_square > 0.08**2:
             reasons |= Reason.VOLTAGE_MISMATCH
-        if self.redundancy.distrusted:
+        if self._distrusted:
             reasons |= Reason.SENSOR_DISTRUSTED
         return reasons
 

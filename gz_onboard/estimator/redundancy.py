@@ -12,7 +12,8 @@ sensor were silent.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import deque
+from collections.abc import Callable, Mapping
 from statistics import median
 
 from gz_onboard.estimator.signals import Signals
@@ -28,7 +29,24 @@ DRIFT_APART, DRIFT_APART_RELATIVE = 0.2, 0.08  # the same for the low-passed: ty
 STILL = 1.0  # s of one and the same value while others move: stuck
 NOBODY: frozenset[str] = frozenset()
 AXLE = frozenset({"motor_speed", "wheel_speed_rear"})  # what turns on a roller bench or spins while the ground stands
+GROUND = "wheel_speed_front", "gps_speed"
 ODOMETRY = frozenset({"motor_speed", "wheel_speed_rear", "wheel_speed_front"})  # what a vehicle speed is made from
+
+# Grades are sines of the road's angle. The commissioning rides' greatest differences of accelerometer and altitude are
+# 0.026 over 300 m and 0.010 over 1000 m; those of the energy 0.05, most of it wind that stays for the ride.
+NEAR, FAR, USUAL = 300.0, 1000.0, 3000.0  # m
+APART_NEAR, APART_FAR, APART_UNKNOWN = 0.05, 0.022, 0.08
+ALONE_NEAR, ALONE_FAR, ALONE_UNKNOWN = 0.09, 0.06, 0.10  # of one witness against the energy
+MOST_USUAL = 0.05  # 3 degrees of mounting
+DECIDES = 0.4  # of what two are apart: by so much one must be nearer to the energy than the other
+DOWNHILL = -0.02
+FREE = 0.4  # of what the usual riding takes: neither wind nor a light rider saves so much over a kilometre
+STEEPEST = 0.3
+JUMP, WEATHER = 6.0, 1.0  # m, m/s: how far and how fast an altitude wanders by the receiver alone
+STANDING_TIME, STANDING_RATE = 20.0, 0.6  # s, m/s: a standing vehicle does not climb
+GAIN = 0.6, 1.5  # of the accelerometer over the wheels' acceleration, over `GAIN_TIME` if there is enough of it
+GAIN_TIME, GAIN_LEAST = 60.0, 10.0  # s, m²/s³
+G = 9.80665  # m/s²
 
 
 class Trial:
@@ -92,6 +110,7 @@ class Speeds:
         self._still = dict.fromkeys(self.ROLES, 0.0)  # s without a change
         self._apart = dict.fromkeys(self.ROLES, 0.0)  # m/s, low-passed, from the median
         self._median = 0.0  # m/s, low-passed
+        self.on_road = False  # the ground goes by as fast as the driven wheel turns: another sensor has seen it
         self.unsettled = False  # two contradict each other, and it is not known which of them is right
 
     def step(self, now: float, dt: float, signals: Signals) -> None:
@@ -108,7 +127,7 @@ class Speeds:
             apart[role] = SPEED_APART + SPEED_APART_RELATIVE * abs(speed) + BRAKING * max(now - signal.time, 0.0)
             self._still[role] = 0.0 if speed != self._said[role] else self._still[role] + dt
             self._said[role] = speed
-        self.unsettled = False
+        self.unsettled = self.on_road = False
         if len(speeds) < 2:
             return
         middle = median(speeds.values())
@@ -122,6 +141,9 @@ class Speeds:
             if stuck and stuck != tied:
                 outvoted, tied = stuck, NOBODY
         self.unsettled = bool(tied)
+        self.on_road = not tied and any(
+            role in speeds and role not in outvoted and abs(speeds[role] - middle) <= apart[role] for role in GROUND
+        )
         moving = middle > MOVING
         for role in speeds:
             trial = self.trials[role]
@@ -138,13 +160,240 @@ class Speeds:
         return frozenset(role for role in speeds if abs(self._apart[role]) > most)
 
 
-class Redundancy:
-    """All that sensors are held against each other for."""
+class Running:
+    """A mean over distance that forgets over `length` [m]; with `whole`, the plain mean until so much was ridden."""
 
-    def __init__(self, radius: float, gear: float) -> None:
+    __slots__ = ("length", "value", "way", "whole")
+
+    def __init__(self, length: float, whole: bool = False) -> None:
+        self.length, self.whole = length, whole
+        self.value = self.way = 0.0
+
+    def add(self, way: float, total: float) -> None:
+        """`total` over the next `way` [m]."""
+        self.way += way
+        self.value += (total - self.value * way) / (min(self.way, self.length) if self.whole else self.length)
+
+
+class Gap:
+    """How far two witnesses of the grade are apart, over some hundred metres and over a kilometre."""
+
+    def __init__(self) -> None:
+        self.near, self.far = Running(NEAR), Running(FAR)
+        self._usual = Running(USUAL, whole=True)
+        self._waiting: deque[tuple[float, float]] = deque()  # what is not yet usual: (way, climb)
+        self._way = 0.0  # m of it
+
+    @property
+    def usual(self) -> float:
+        """What it usually is: how the accelerometer is mounted, what the model and the wind make."""
+        return min(max(self._usual.value, -MOST_USUAL), MOST_USUAL) if self.known else 0.0
+
+    @property
+    def known(self) -> bool:
+        """Whether it is known what is usual."""
+        return self._usual.way >= FAR
+
+    def add(self, way: float, climb: float) -> None:
+        """`climb` [m]: of the one less that of the other over `way` [m]."""
+        self.near.add(way, climb)
+        self.far.add(way, climb)
+
+    def learn(self, way: float, climb: float) -> None:
+        """Take this for usual, once `FAR` more was ridden and nothing was wrong with it."""
+        self._waiting.append((way, climb))
+        self._way += way
+        while self._way > FAR:
+            old = self._waiting.popleft()
+            self._way -= old[0]
+            self._usual.add(*old)
+
+    def doubt(self) -> None:
+        """What was to become usual is doubted."""
+        self._waiting.clear()
+        self._way = 0.0
+
+    def beyond(self, near: float, far: float, unknown: float) -> float:
+        """By how much it is beyond what is allowed [grade], else 0; `unknown`: allowed over `NEAR` at first."""
+        if abs(self.near.value - self.usual) > (near if self.known else unknown):
+            return self.near.value - self.usual
+        far = far if self.known else MOST_USUAL
+        return self.far.value - self.usual if abs(self.far.value - self.usual) > far else 0.0
+
+
+class Slopes:
+    """The grade by accelerometer, by GPS altitude, and by the energy that riding takes more than on the level."""
+
+    ROLES = ("accel_x", "gps_altitude")
+
+    def __init__(self, mass: float, level: float) -> None:
+        self._weight = mass * G
+        self._free = -FREE * level / self._weight
+        self.trials = {role: Trial() for role in self.ROLES}
+        self._inertial, self._energy, self._energy_altitude = Gap(), Gap(), Gap()  # accelerometer less altitude, ...
+        self._by_energy = Running(NEAR)
+        self._anew()
+        self._heard: float | None = None  # m, the altitude of this step
+        self._altitude: float | None = None  # m, the last that was possible
+        self._possible = 0.0  # m that it can have changed since
+        self._before: float | None = None  # m, at the end of the last second
+        self._standing_rate = 0.0  # m/s, low-passed
+        self._said = 0.0
+        self._still = 0.0
+        self._speed_before: float | None = None  # m/s, at the last step
+        self._product = self._square = 0.0
+        self._deaf = False  # it does not show what the wheels gain
+
+    def _anew(self) -> None:
+        """Begin a second."""
+        self._seconds = self._way = 0.0
+        self._climb: float | None = 0.0  # m, by accelerometer
+        self._work: float | None = 0.0  # J, out of the pack
+        self._speed: float | None = None  # m/s, at its begin
+
+    def step(self, now: float, dt: float, signals: Signals, speed: float | None, acceleration: float | None,
+             on_road: bool, power: float | None, level: Callable[[float, float], float]) -> None:  # fmt: skip
+        """Hear the witnesses of `dt` [s] at `speed` [m/s] and `acceleration` [m/s²].
+
+        on_road: the vehicle is known to move as its wheels turn. power: of the pack [W], None if that is not known.
+        level: what the model says for a speed and an acceleration on a level road [W].
+        """
+        forward = signals.accel_x.told(now)
+        if speed is None or acceleration is None:
+            self._anew()
+            return
+        way = abs(speed) * dt
+        if self._speed is None:
+            self._speed = speed
+        self._seconds += dt
+        self._way += way
+        if forward is None:
+            self._climb = None
+        elif self._climb is not None:
+            self._climb += (forward - acceleration) / G * way
+            self._hear_accelerometer(dt, forward, speed, acceleration, on_road)
+        self._work = None if self._work is None or power is None else self._work + power * dt
+        if self._seconds >= 1.0:
+            self._second(speed, self._heard, level)
+            self._anew()
+            self._speed = speed
+        signals.accel_x.trusted = not self.trials["accel_x"].guilty
+
+    def hear_altitude(self, now: float, dt: float, signals: Signals, speed: float | None) -> None:
+        """Before the altitude is used: whether a road and a receiver could have come to it since the last one."""
+        altitude = signals.gps_altitude.told(now)
+        if signals.gps_fix.fresh(now) and signals.gps_fix.value < 3:
+            altitude = None
+        self._possible += (STEEPEST * abs(speed or 0.0) + WEATHER) * dt
+        self._heard = altitude
+        if altitude is not None:
+            if self._altitude is not None and abs(altitude - self._altitude) > self._possible + JUMP:
+                self.trials["gps_altitude"].hear(dt, True)
+                self._heard = None
+            else:
+                self._altitude, self._possible = altitude, 0.0
+        jumped = altitude is not None and self._heard is None
+        signals.gps_altitude.trusted = not (jumped or self.trials["gps_altitude"].guilty)
+
+    def _hear_accelerometer(self, dt: float, forward: float, speed: float, acceleration: float, on_road: bool) -> None:
+        """An accelerometer that moves trembles, and shows what the wheels gain."""
+        self._still = self._still + dt if forward == self._said else 0.0
+        self._said = forward
+        keep = 1 - min(dt / GAIN_TIME, 1.0)
+        gained = 0.0 if self._speed_before is None else speed - self._speed_before
+        self._speed_before = speed
+        self._product = keep * self._product + forward * acceleration * dt
+        self._square = keep * self._square + acceleration * gained
+        self._deaf = self._square > GAIN_LEAST and not GAIN[0] < self._product / self._square < GAIN[1]
+        if on_road and abs(speed) > MOVING and (self._still > STILL or self._deaf):
+            self.trials["accel_x"].hear(dt, True)
+
+    def _second(self, speed: float, altitude: float | None, level: Callable[[float, float], float]) -> None:
+        way, seconds = self._way, self._seconds
+        rise = None if altitude is None or self._before is None else altitude - self._before
+        self._before = altitude
+        if way / seconds < MOVING:
+            if rise is not None and way / seconds < 0.1:
+                self._standing_rate += (rise / seconds - self._standing_rate) * min(seconds / STANDING_TIME, 1.0)
+                if abs(self._standing_rate) > STANDING_RATE:
+                    self.trials["gps_altitude"].hear(seconds, True)
+            return
+        energy = None
+        if self._work is not None and self._speed is not None:
+            gained = (speed - self._speed) / seconds
+            energy = (self._work - level(way / seconds, gained) * seconds) / self._weight
+            self._by_energy.add(way, energy)
+        climb = self._climb
+        pairs: list[tuple[Gap, float]] = []
+        if climb is not None and rise is not None:
+            pairs.append((self._inertial, climb - rise))
+        if energy is not None and climb is not None:
+            pairs.append((self._energy, energy - climb))
+        if energy is not None and rise is not None:
+            pairs.append((self._energy_altitude, energy - rise))
+        for gap, difference in pairs:
+            gap.add(way, difference)
+        accused = self._judge(climb is not None, rise is not None, energy is not None)
+        if accused is None:
+            return
+        for role in self.ROLES:
+            self.trials[role].hear(seconds, role in accused)
+        if not accused and not any(trial.guilty for trial in self.trials.values()):
+            for gap, difference in pairs:
+                gap.learn(way, difference)
+        elif accused:
+            for gap, _ in pairs:
+                gap.doubt()
+
+    def _judge(self, inertial: bool, altitude: bool, energy: bool) -> frozenset[str] | None:
+        """Who lies; None if that cannot be told now. The arguments: which of the witnesses speak."""
+        everyone = frozenset(self.ROLES)
+        if inertial and altitude:
+            apart = self._inertial.beyond(APART_NEAR, APART_FAR, APART_UNKNOWN)
+            if not apart and self._energy_altitude.far.value < self._free:  # riding takes less than it ever can
+                return frozenset({"gps_altitude"})
+            if not apart:
+                half = self._inertial.beyond(APART_NEAR / 2, APART_FAR / 2, APART_UNKNOWN / 2)
+                return None if half else NOBODY
+            if not energy:
+                return everyone
+            by_inertial = abs(self._energy.near.value - self._energy.usual)
+            by_altitude = abs(self._energy_altitude.near.value - self._energy_altitude.usual)
+            if self._deaf:
+                return frozenset({"accel_x"})
+            if abs(by_inertial - by_altitude) < DECIDES * abs(apart):
+                return everyone
+            return frozenset({"accel_x" if by_inertial > by_altitude else "gps_altitude"})
+        if not energy or not (inertial or altitude):
+            return None
+        apart = (self._energy if inertial else self._energy_altitude).beyond(ALONE_NEAR, ALONE_FAR, ALONE_UNKNOWN)
+        if apart > 0 and self._by_energy.value < DOWNHILL:  # brakes take what a descent gives: energy does not see it
+            return None
+        return frozenset({"accel_x" if inertial else "gps_altitude"}) if apart else NOBODY
+
+    @property
+    def guilty(self) -> frozenset[str]:
+        """Who is left out."""
+        return frozenset(role for role, trial in self.trials.items() if trial.guilty)
+
+    @property
+    def offset(self) -> float:
+        """What to add to the accelerometer's grade, as it was before anything was distrusted."""
+        return 0.0 if self.trials["accel_x"].guilty else -self._inertial.usual
+
+
+class Redundancy:
+    """All that sensors are held against each other for.
+
+    mass [kg]; level: the force [N] that the pack gives in the mean of the usual riding.
+    """
+
+    def __init__(self, radius: float, gear: float, mass: float, level: float) -> None:
         self.speeds = Speeds(radius, gear)
+        self.slopes = Slopes(mass, level)
+        self._trials = self.speeds.trials | self.slopes.trials
 
     @property
     def distrusted(self) -> tuple[str, ...]:
         """The roles that are left out."""
-        return tuple(role for role, trial in self.speeds.trials.items() if trial.guilty)
+        return tuple(role for role, trial in self._trials.items() if trial.guilty)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from math import sin
+from math import cos, sin
 
 import pytest
 
-from gz_onboard.estimator.redundancy import FORGIVEN_AFTER, NOBODY, Speeds, vote
+from gz_onboard.estimator.redundancy import FORGIVEN_AFTER, NOBODY, G, Slopes, Speeds, vote
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import ROLES
 
@@ -152,3 +152,97 @@ def test_votes():
     assert vote({"motor_speed": 5.0, "gps_speed": 9.5}, apart) == (NOBODY, frozenset({"motor_speed", "gps_speed"}))
     two_and_two = {"motor_speed": 5.0, "gps_speed": 5.2, "wheel_speed_rear": 0.0, "wheel_speed_front": 0.0}
     assert vote(two_and_two, apart) == (NOBODY, frozenset(two_and_two))
+
+
+# --- grade --------------------------------------------------------------------------------------------------------
+
+MASS, FORCE, WIND, MOUNTED = 200.0, 100.0, 25.0, 0.02  # kg; N that the level takes; N that nobody knows of; rad
+SLOPES = ("accel_x", "gps_altitude")
+
+
+def hills(seconds: float, lies: Mapping[str, Lie], roles: tuple[str, ...] = SLOPES, power: bool = True,
+          on_road: bool = True, begin: float = 300.0) -> Slopes:  # fmt: skip
+    """Riding over hills of 4 %, stopping now and then; the lies begin at `begin` [s]."""
+    signals, slopes = Signals((role, 2.0) for role in ROLES), Slopes(MASS, FORCE)
+    way, before, height = 0.0, town(0.0), 200.0
+    for step in range(round(seconds / STEP)):
+        t = step * STEP
+        speed = town(t)
+        grade = 0.04 * cos(way / 120.0)
+        acceleration = (speed - before) / STEP
+        before = speed
+        way += speed * STEP
+        height += grade * speed * STEP
+        honest = {
+            "accel_x": acceleration + G * (grade + MOUNTED) + 0.1 * sin(77 * t),
+            "gps_altitude": height + sin(t / 60),
+        }
+        for role in roles:
+            value: float | None = honest[role]
+            if role in lies and t >= begin:
+                value = lies[role](t - begin, honest[role])
+            if value is not None:
+                signals[role].value, signals[role].time = value, t
+        work = speed * (FORCE + WIND + MASS * (G * grade + acceleration)) if power else None
+        slopes.hear_altitude(t, STEP, signals, speed)
+        slopes.step(t, STEP, signals, speed, acceleration, on_road, work, lambda v, a: v * (FORCE + MASS * a))
+    return slopes
+
+
+def test_hills_wind_and_a_tilted_accelerometer_accuse_nobody():
+    for roles in (SLOPES, SLOPES[:1], SLOPES[1:]):
+        assert hills(1500.0, {}, roles).guilty == NOBODY
+        assert hills(1500.0, {}, roles, power=False).guilty == NOBODY
+
+
+SLOPE_LIES: dict[str, tuple[str, Lie]] = {
+    "climbs for ever": ("gps_altitude", lambda t, v: v + 1.0 * t),
+    "climbs slowly": ("gps_altitude", lambda t, v: v + 0.3 * t),
+    "sinks for ever": ("gps_altitude", lambda t, v: v - 1.0 * t),
+    "is noise": ("gps_altitude", lambda t, v: v + 40 * sin(11 * t)),
+    "full scale altitude": ("gps_altitude", lambda t, v: 6000.0),
+    "+2 m/s²": ("accel_x", lambda t, v: v + 2.0),
+    "-1 m/s²": ("accel_x", lambda t, v: v - 1.0),
+    "doubled": ("accel_x", lambda t, v: 2 * v),
+    "turned round": ("accel_x", lambda t, v: -v),
+    "stuck": ("accel_x", lambda t, v: 0.3),
+    "full scale": ("accel_x", lambda t, v: 60.0),
+}
+
+
+@pytest.mark.parametrize("name", SLOPE_LIES)
+def test_whoever_lies_about_the_grade_is_named_by_what_riding_takes(name: str):
+    role, lie = SLOPE_LIES[name]
+    assert hills(800.0, {role: lie}).guilty == {role}
+
+
+def test_without_the_energy_neither_is_believed():
+    for role, lie in (SLOPE_LIES["climbs for ever"], SLOPE_LIES["+2 m/s²"]):
+        assert hills(800.0, {role: lie}, power=False).guilty == set(SLOPES)
+
+
+def test_a_single_witness_of_the_grade_is_held_against_the_energy():
+    for name in ("climbs for ever", "sinks for ever", "+2 m/s²"):
+        role, lie = SLOPE_LIES[name]
+        assert hills(800.0, {role: lie}, (role,)).guilty == {role}
+
+
+def test_on_a_roller_bench_an_accelerometer_that_shows_nothing_is_right():
+    still: Lie = lambda t, v: 0.1 * sin(77 * t)  # noqa: E731
+    assert hills(800.0, {"accel_x": still}, ("accel_x",), on_road=False).guilty == NOBODY
+
+
+def test_the_mounting_is_kept_from_before_the_lie():
+    slopes = hills(800.0, {"gps_altitude": lambda t, v: v + t})
+    assert slopes.offset == pytest.approx(-MOUNTED, abs=0.006)
+
+
+def test_a_standing_vehicle_does_not_climb():
+    signals, slopes = Signals((role, 2.0) for role in ROLES), Slopes(MASS, FORCE)
+    for rate, guilty in ((0.1, False), (1.0, True)):
+        for step in range(600):
+            t = step * STEP
+            signals.gps_altitude.value, signals.gps_altitude.time = 200 + rate * t, t
+            slopes.hear_altitude(t, STEP, signals, 0.0)
+            slopes.step(t, STEP, signals, 0.0, 0.0, False, 50.0, lambda v, a: 50.0)
+        assert slopes.trials["gps_altitude"].guilty == guilty
