@@ -14,9 +14,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import sqrt
 from statistics import median
 
 from gz_onboard.estimator.signals import Signals
+from gz_onboard.physics.battery import Battery
 
 GUILTY_AFTER = 3.0  # s of contradiction: wheels spin and lock for a second or two
 FORGIVEN_AFTER = 60.0  # s of agreement
@@ -47,6 +50,19 @@ STANDING_TIME, STANDING_RATE = 20.0, 0.6  # s, m/s: a standing vehicle does not 
 GAIN = 0.6, 1.5  # of the accelerometer over the wheels' acceleration, over `GAIN_TIME` if there is enough of it
 GAIN_TIME, GAIN_LEAST = 60.0, 10.0  # s, m²/s³
 G = 9.80665  # m/s²
+
+# Currents in those that empty the pack in an hour; the voltages are a cell's.
+STANDS = 0.05  # m/s
+FAST_TIME, SKEW_TIME, CURRENT_TIME = 0.5, 2.0, 10.0  # s: low passes; the sensors do not sample at the same time
+CURRENT_APART, CURRENT_APART_RELATIVE = 0.10, 0.10  # 1/h and 1: two currents that differ by more contradict each other
+GROSS_CURRENT, GROSS_RELATIVE = 0.5, 0.3  # the same over `FAST_TIME`
+VOLTAGE_TIME, VOLTS_APART, GROSS_VOLTS = 10.0, 0.07, 0.3  # s, V
+AGREED_BEFORE = 30.0  # s: two voltages that agreed so long knew the state of charge, and one of them left it
+ERROR_TIME, ERROR_LEAST, GROSS_ERROR = 10.0, 0.04, 0.4  # s, V: what the cell model leaves, low-passed; at once
+ROAD_TIME, OFF_ROAD, OFF_ROAD_RELATIVE = 30.0, 0.15, 0.7  # s, 1/h, 1: by the road load a current is known to half
+PLAIN = 2.5  # of two mean squares: the greater one's reading lies
+STUCK_VOLTAGE = 5.0  # s
+LOWEST_CELL, HIGHEST_CELL = 0.6, 1.12  # of the cut-off, of full at rest
 
 
 class Trial:
@@ -382,16 +398,253 @@ class Slopes:
         return 0.0 if self.trials["accel_x"].guilty else -self._inertial.usual
 
 
+class Rival:
+    """Which of two readings the cells' voltage contradicts: mean squares of what the cell model leaves of each."""
+
+    def __init__(self) -> None:
+        self._first = self._second = 0.0  # V²
+        self._time = 0.0  # s
+
+    def forget(self) -> None:
+        """The two agree."""
+        self._first = self._second = self._time = 0.0
+
+    def hear(self, dt: float, first: float | None, second: float | None) -> int:
+        """0 while nothing decides, 1 or 2: which lies. first, second [V of a cell]: measured less predicted."""
+        if first is None or second is None:
+            return 0
+        self._time = min(self._time + dt, ERROR_TIME)
+        share = min(dt / self._time, 1.0) if self._time > 0 else 1.0
+        self._first += (first * first - self._first) * share
+        self._second += (second * second - self._second) * share
+        if max(self._first, self._second) < ERROR_LEAST**2:
+            return 0
+        return 1 if self._first > PLAIN * self._second else 2 if self._second > PLAIN * self._first else 0
+
+
+@dataclass(frozen=True)
+class Electric:
+    """What the electric sensors say at one time: A of the pack, positive discharging, and V; None if nothing."""
+
+    pack: float | None
+    inverter: float | None
+    auxiliary: float | None
+    usual_auxiliary: float
+    pack_voltage: float | None
+    inverter_voltage: float | None  # with the cable's drop
+    speed: float | None  # m/s
+
+    @property
+    def around(self) -> float | None:
+        """The pack's current by the inverter's and the auxiliary."""
+        if self.inverter is None:
+            return None
+        return self.inverter + (self.usual_auxiliary if self.auxiliary is None else self.auxiliary)
+
+    @property
+    def charging(self) -> bool:
+        """A charger's current does not pass the inverter."""
+        return self.pack is not None and self.pack < 0 and abs(self.speed or 0.0) < STANDS
+
+
+Error = Callable[[float, float], float | None]
+"""Measured less predicted voltage of a cell [V], for a voltage [V] and a current [A] of the pack."""
+
+
+class Currents:
+    """Pack current against inverter and auxiliary current; both against the cells' voltage and the road."""
+
+    ROLES = ("pack_current", "inverter_current", "auxiliary_current")
+
+    def __init__(self, capacity: float) -> None:
+        self._capacity = capacity  # A·h of the pack: an hour's current
+        self.trials = {role: Trial() for role in self.ROLES}
+        self.disputed = False  # the two differ, and it is not known which of them is right
+        self._rival, self._by_model, self._road = Rival(), Rival(), OffRoad(capacity)
+        self._difference = self._square = self._load = self._without = 0.0  # A, A², A, A²; low-passed
+        self._fast = 0.0  # A
+
+    def step(self, dt: float, said: Electric, error: Error, model: Callable[[], float | None],
+             innovation_rms: float) -> frozenset[str]:  # fmt: skip
+        """Who is not to be believed now.
+
+        error: see `Error`; model: the pack's current by the road [A]; innovation_rms [V]: of the last ten seconds.
+        """
+        pack, around, voltage = said.pack, said.around, said.pack_voltage
+        voltage = said.inverter_voltage if voltage is None else voltage
+        against: frozenset[str] = NOBODY
+        agree: bool | None = None
+        if pack is not None and around is not None and not said.charging:
+            against, agree = self._compare(dt, pack, around, voltage, said, error)
+        else:
+            self.disputed = False
+        if not against and voltage is not None and self._by_road(dt, said, voltage, error, model, innovation_rms):
+            against, agree = frozenset({"pack_current", "inverter_current"}), None
+            self.disputed = False
+        for role in self.ROLES:
+            self.trials[role].hear(dt, True if role in against else agree)
+        guilty = frozenset(role for role, trial in self.trials.items() if trial.guilty)
+        return (against if not self.disputed else NOBODY) | guilty
+
+    def _compare(self, dt: float, pack: float, around: float, voltage: float | None, said: Electric,
+                 error: Error) -> tuple[frozenset[str], bool | None]:  # fmt: skip
+        """(who lies, whether all agree; None if there is nothing to agree about)."""
+        hour = self._capacity
+        least = min(abs(pack), abs(around))
+        self._fast += (pack - around - self._fast) * min(dt / FAST_TIME, 1.0)
+        self._difference += (pack - around - self._difference) * min(dt / SKEW_TIME, 1.0)
+        share = min(dt / CURRENT_TIME, 1.0)
+        self._square += (self._difference**2 - self._square) * share
+        self._load += (least - self._load) * share
+        differ = sqrt(self._square) - CURRENT_APART_RELATIVE * self._load
+        gross = abs(self._fast) > GROSS_CURRENT * hour + GROSS_RELATIVE * least
+        self.disputed = False
+        if differ < CURRENT_APART * hour and not gross:
+            self._rival.forget()
+            self._without = self._square
+            small = differ < CURRENT_APART * hour / 2
+            return NOBODY, False if small and max(abs(pack), abs(around)) > CURRENT_APART * hour else None
+        if said.auxiliary is not None:  # without it all would agree
+            more = pack - around + said.auxiliary - said.usual_auxiliary
+            self._without += (more**2 - self._without) * share
+            if sqrt(self._without) < CURRENT_APART * hour / 2 + CURRENT_APART_RELATIVE * self._load:
+                return frozenset({"auxiliary_current"}), None
+        liar = self._rival.hear(dt, *((error(voltage, pack), error(voltage, around)) if voltage else (None, None)))
+        if not liar and said.speed is not None and abs(said.speed) < STANDS:
+            off = abs(pack - said.usual_auxiliary), abs(around - said.usual_auxiliary)
+            if max(off) > 2 * min(off) + CURRENT_APART * hour / 2:
+                liar = 1 if off[0] > off[1] else 2
+        self.disputed = not liar
+        known = self.trials["pack_current"].guilty, self.trials["inverter_current"].guilty
+        if self.disputed and known[0] != known[1]:  # nothing new: who was found out before is it
+            self.disputed = False
+            return frozenset({"pack_current" if known[0] else "inverter_current"}), None
+        return frozenset((self.ROLES[:1], self.ROLES[1:2])[liar - 1] if liar else self.ROLES[:2]), None
+
+    def _by_road(self, dt: float, said: Electric, voltage: float, error: Error, model: Callable[[], float | None],
+                 innovation_rms: float) -> bool:  # fmt: skip
+        """Whether the cells' voltage and the road both say that the currents are not what flows."""
+        used = said.around if said.pack is None else said.pack
+        first = None if used is None else error(voltage, used)
+        if used is None or first is None:
+            return False
+        doubted = self.trials["pack_current"].guilty or self.trials["inverter_current"].guilty
+        if not (doubted or innovation_rms > ERROR_LEAST or abs(first) > GROSS_ERROR):  # nearly always
+            self._road.forget()
+            self._by_model.forget()
+            return False
+        expected = model()
+        second = None if expected is None else error(voltage, expected)
+        if expected is None or second is None:
+            return False
+        if abs(first) > GROSS_ERROR and abs(first) > 2 * abs(second):
+            return True
+        return self._road.hear(dt, used, expected) & (self._by_model.hear(dt, first, second) == 1)
+
+
+class OffRoad:
+    """How far a current [A] is from that of the road, in the mean and in the mean square."""
+
+    def __init__(self, capacity: float) -> None:
+        self._capacity = capacity
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._time = 0.0
+        self._used = self._expected = self._square = self._used_square = self._expected_square = 0.0
+
+    def hear(self, dt: float, used: float, expected: float) -> bool:
+        """Whether it is further from it than wind, load or slip make it."""
+        self._time += dt
+        share, slow = (dt / max(min(self._time, time), dt) for time in (CURRENT_TIME, ROAD_TIME))
+        self._used += (used - self._used) * slow
+        self._expected += (expected - self._expected) * slow
+        self._square += ((used - expected) ** 2 - self._square) * share
+        self._used_square += (used * used - self._used_square) * share
+        self._expected_square += (expected * expected - self._expected_square) * share
+        if self._time < CURRENT_TIME:
+            return False
+        least = OFF_ROAD * self._capacity
+        if sqrt(self._square) > least + sqrt(min(self._used_square, self._expected_square)):
+            return True
+        least += OFF_ROAD_RELATIVE * min(abs(self._used), abs(self._expected))
+        return self._time > ROAD_TIME and abs(self._used - self._expected) > least
+
+
+class Voltages:
+    """Pack voltage against the inverter's, and both against what a cell can have."""
+
+    ROLES = ("pack_voltage", "inverter_voltage")
+
+    def __init__(self, series: int, lowest: float, highest: float, capacity: float) -> None:
+        self._series, self._lowest, self._highest, self._capacity = series, lowest, highest, capacity
+        self.trials = {role: Trial() for role in self.ROLES}
+        self.apart = 0.0  # V of a cell: by how much the two differ while it is not known which is right, else 0
+        self._rival = Rival()
+        self._square = 0.0  # V² of a cell, low-passed
+        self._agreed = 0.0  # s
+        self._said, self._still = 0.0, 0.0
+        self._least = self._most = 0.0  # A, since the pack voltage stands still
+
+    def step(self, dt: float, said: Electric, current: float | None, error: Error) -> frozenset[str]:
+        """Who is not to be believed now, at this `current` [A] of the pack."""
+        against = set()
+        pack, inverter = said.pack_voltage, said.inverter_voltage
+        for role, voltage in ((self.ROLES[0], pack), (self.ROLES[1], inverter)):
+            if voltage is not None and not self._lowest < voltage / self._series < self._highest:
+                against.add(role)
+        if pack is not None and current is not None and self._stuck(dt, pack, current):
+            against.add("pack_voltage")
+        agree: bool | None = None if inverter is None or pack is None else False
+        self.apart = 0.0
+        if not against and pack is not None and inverter is not None:
+            difference = (pack - inverter) / self._series
+            self._square += (difference * difference - self._square) * min(dt / VOLTAGE_TIME, 1.0)
+            if self._square < VOLTS_APART**2 and abs(difference) < GROSS_VOLTS:
+                self._agreed += dt
+                self._rival.forget()
+                agree = None if self._square > (VOLTS_APART / 2) ** 2 else False
+            else:
+                agree = None
+                liar = 0
+                if current is not None and self._agreed > AGREED_BEFORE:
+                    liar = self._rival.hear(dt, error(pack, current), error(inverter, current))
+                known = [role for role in self.ROLES if self.trials[role].guilty]
+                if liar or len(known) == 1:
+                    against.add(self.ROLES[liar - 1] if liar else known[0])
+                else:
+                    self.apart = abs(difference)
+        for role, trial in self.trials.items():
+            trial.hear(dt, True if role in against or self.apart else agree)
+        guilty = {role for role, trial in self.trials.items() if trial.guilty} if not self.apart else set()
+        return frozenset(against | guilty)
+
+    def _stuck(self, dt: float, voltage: float, current: float) -> bool:
+        """It is the same to the last bit while the current says that it must move."""
+        if voltage != self._said:
+            self._said, self._still = voltage, 0.0
+            self._least = self._most = current
+            return False
+        self._still += dt
+        self._least, self._most = min(self._least, current), max(self._most, current)
+        return self._still > STUCK_VOLTAGE and self._most - self._least > GROSS_CURRENT * self._capacity
+
+
 class Redundancy:
     """All that sensors are held against each other for.
 
     mass [kg]; level: the force [N] that the pack gives in the mean of the usual riding.
     """
 
-    def __init__(self, radius: float, gear: float, mass: float, level: float) -> None:
+    def __init__(self, radius: float, gear: float, mass: float, level: float, battery: Battery) -> None:
+        capacity = battery.pack_capacity(25.0)
         self.speeds = Speeds(radius, gear)
         self.slopes = Slopes(mass, level)
-        self._trials = self.speeds.trials | self.slopes.trials
+        self.currents = Currents(capacity)
+        lowest, highest = LOWEST_CELL * battery.cutoff_voltage, HIGHEST_CELL * battery.ocv_value[-1]
+        self.voltages = Voltages(battery.cells_series, lowest, highest, capacity)
+        self._trials = self.voltages.trials | self.currents.trials | self.speeds.trials | self.slopes.trials
 
     @property
     def distrusted(self) -> tuple[str, ...]:
