@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp, hypot, inf, isfinite, sqrt
 from typing import Any
 
 from gz_onboard.estimator.activity import Activities
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
 from gz_onboard.estimator.forecast import Forecast, Forecaster, Turn
+from gz_onboard.estimator.redundancy import Electric, Redundancy
 from gz_onboard.estimator.rest import RATE as REST_RATE
 from gz_onboard.estimator.rest import Rest
 from gz_onboard.estimator.road import Road
@@ -67,8 +68,20 @@ GATE = 5.0  # sd: a voltage further off is a glitch, unless it persists
 GATE_COUNT = 20  # so many in a row are no glitch
 CONFLICT = 4.0  # sd between the saved SOC and that of the voltage: beyond, one of the two is wrong
 REST_NEWS = 0.8  # a rest is taken in again when its variance fell below this share
-CURRENT_SD = {"pack": 0.0, "inverter": 0.5, "model": 3.0, "none": 15.0}  # A, beside the sensor's own offset
-CURRENT_TIME = {"pack": 3600.0, "inverter": 3600.0, "model": 600.0, "none": 60.0}  # s that such an error stays the same
+CURRENT_SD = {
+    "pack": 0.0,
+    "inverter": 0.5,
+    "disputed": 6.0,
+    "model": 3.0,
+    "none": 15.0,
+}  # A, beside the sensor's own offset
+CURRENT_TIME = {
+    "pack": 3600.0,
+    "inverter": 3600.0,
+    "disputed": 3600.0,
+    "model": 600.0,
+    "none": 60.0,
+}  # s that such an error stays the same
 UNCHECKED_CURRENT_SD = 0.2  # A, beside the offset's, while no second sensor confirms the first
 INVERTER_VOLTAGE_SD = 0.15  # V: the cable between pack and inverter
 # What is missing makes the consumption to come less certain; relative sd, judged by what each is worth on the rides.
@@ -80,7 +93,10 @@ LOSS_SD = {
     Reason.NO_CELL_TEMPERATURE: 0.02,
     Reason.NO_PACK_CURRENT: 0.03,
     Reason.NO_PACK_VOLTAGE: 0.02,
+    Reason.SENSOR_DISTRUSTED: 0.05,  # what was learned from it before it was found out
 }
+LEARNED_FROM = {"motor_speed", "accel_x", "gps_altitude", "pack_current", "pack_voltage"}
+UNLEARNED = 1500.0  # m: so far a sensor can have lied before it is found out
 WEIGHTY = ~(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)  # reasons that degrade an estimate
 NO_PACK = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT
 MISMATCH = 3.0  # A between the two current sensors, over ten seconds or so
@@ -159,7 +175,7 @@ class Estimator:
         self._gain = p["pack_current_gain"]
         gain_sd = p.sd("pack_current_gain")
         self._voltage_offset = p["pack_voltage_offset"]
-        self._voltage_sd = p.sd("pack_voltage_offset") / battery.cells_series
+        self._own_voltage_sd = self._voltage_sd = p.sd("pack_voltage_offset") / battery.cells_series
         self._model_sd = p.sd("cell_voltage_error")
         self._empty_sd = p.sd("cell_voltage_error_empty")
         self._rest_sd = sqrt(p.sd("rest_voltage_error") ** 2 + battery.ocv_sd**2 + battery.rest_shift_sd**2)
@@ -168,6 +184,8 @@ class Estimator:
         self._charge_sd = sqrt(self._cell_scatter**2 + gain_sd**2)
         self._cable = p["cable_resistance"]
         self._radius, self._gear = p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"]
+        self.redundancy = Redundancy(self._radius, self._gear, model.mass, self.forecaster.usual_force(), battery)
+        self._distrusted: tuple[str, ...] = ()
         self._latency = p["pack_voltage_latency"]
         self._recent: deque[tuple[float, float, float]] = (
             deque()
@@ -231,9 +249,13 @@ class Estimator:
         self._time = now
         self._deadline = now + STEP_AT_LEAST
         signals = self.signals
-        self.road.step(now, min(dt, self._pause), signals, self._radius, self._gear)
-        voltage, current, source = self._measured(now)
+        elapsed = min(dt, self._pause)
+        self.redundancy.speeds.step(now, elapsed, signals)
+        self.redundancy.slopes.hear_altitude(now, elapsed, signals, self.road.speed)
+        self.road.step(now, elapsed, signals, self._radius, self._gear)
+        voltage, current, source = self._measured(now, elapsed)
         self._pack = voltage, current, source
+        self._hear_slopes(now, elapsed)
         temperature = self._temperature(now, dt)
         self._battery_step(now, dt, voltage, current, source, temperature)
         self._act(now, dt, current, source)
@@ -242,38 +264,92 @@ class Estimator:
         if now - self._forecast_time >= FORECAST_PERIOD - 0.05:
             self._make_forecast(now, temperature)
 
-    def _measured(self, now: float) -> tuple[float | None, float | None, str]:
-        """(pack voltage [V], pack current [A], where the current comes from), by the best sensor that works."""
+    def _measured(self, now: float, dt: float) -> tuple[float | None, float | None, str]:
+        """(pack voltage [V], pack current [A], where the current comes from), by the best sensors that work."""
         signals = self.signals
-        voltage = signals.pack_voltage.mean(now)
-        inverter_voltage = signals.inverter_voltage.mean(now)
-        current = signals.pack_current.mean(now)
-        inverter = signals.inverter_current.mean(now)
+        voltage, inverter_voltage = signals.pack_voltage.told(now), signals.inverter_voltage.told(now)
+        current, inverter = signals.pack_current.told(now), signals.inverter_current.told(now)
         any_voltage = voltage if voltage is not None else inverter_voltage
-        auxiliary = signals.auxiliary_current.mean(now)
-        if auxiliary is None:
-            auxiliary = self.model.parameters["auxiliary_power"] / (any_voltage or 50.0)
+        usual = self.model.parameters["auxiliary_power"] / (any_voltage or 50.0)
+        auxiliary = signals.auxiliary_current.told(now)
         if current is not None:
             current = (current - self._offset) / self._gain
-            if inverter is not None:
-                self._mismatch += 0.01 * (current - inverter - auxiliary - self._mismatch)
-        through = current if current is not None else None if inverter is None else inverter + auxiliary
+        said = Electric(current, inverter, auxiliary, usual, voltage, inverter_voltage, self.road.speed)
+        current, source = self._believed_current(now, dt, said)
         if voltage is not None:
             voltage -= self._voltage_offset
-        elif inverter_voltage is not None:
-            voltage = inverter_voltage + self._cable * (through or 0.0)
-        if through is not None:
-            return voltage, through, "pack" if current is not None else "inverter"
-        if self.road.speed is not None and voltage:
+        if inverter_voltage is not None:
+            inverter_voltage += self._cable * (current or 0.0)
+        said = replace(said, pack_voltage=voltage, inverter_voltage=inverter_voltage)
+        voltages = self.redundancy.voltages
+        distrusted = voltages.step(dt, said, current, self._cell_error)
+        for role in voltages.ROLES:
+            signals[role].trusted = role not in distrusted
+        if voltages.apart and voltage is not None and inverter_voltage is not None:
+            voltage = (voltage + inverter_voltage) / 2
+        elif not signals.pack_voltage.trusted or voltage is None:
+            voltage = inverter_voltage if signals.inverter_voltage.trusted else None
+        self._voltage_sd = sqrt(self._own_voltage_sd**2 + voltages.apart**2)
+        if current is None and self.road.speed is not None and voltage:
             return voltage, self._model_power(now) / voltage, "model"
-        return voltage, None, "none"
+        return voltage, current, source
+
+    def _believed_current(self, now: float, dt: float, said: Electric) -> tuple[float | None, str]:
+        """(pack current [A], where it comes from): None if no sensor is to be believed."""
+        signals, currents = self.signals, self.redundancy.currents
+        voltage = said.pack_voltage or said.inverter_voltage
+
+        def by_road() -> float | None:
+            return self._model_power(now) / voltage if voltage and self.road.speed is not None else None
+
+        distrusted = currents.step(dt, said, self._cell_error, by_road, sqrt(self._innovation_square))
+        for role in currents.ROLES:
+            signals[role].trusted = role not in distrusted
+        if not signals.auxiliary_current.trusted:
+            said = replace(said, auxiliary=None)
+        pack, around = said.pack, said.around
+        if pack is not None and around is not None and not said.charging:
+            self._mismatch += 0.01 * (pack - around - self._mismatch)
+        if pack is not None and around is not None and currents.disputed:
+            return (pack + around) / 2, "disputed"
+        if pack is not None and signals.pack_current.trusted:
+            return pack, "pack"
+        if around is not None and signals.inverter_current.trusted:
+            return around, "inverter"
+        return None, "none"
+
+    def _cell_error(self, voltage: float, current: float) -> float | None:
+        """Measured less predicted voltage of a cell [V]; None before there is a state of charge."""
+        if self.filter is None:
+            return None
+        cell = self.battery.cell_voltage(voltage, current) + self._lacking
+        temperature = 25.0 if self._cell_temperature is None else self._cell_temperature
+        return self.filter.innovation(cell, current / self.battery.cells_parallel, temperature)[0]
+
+    def _hear_slopes(self, now: float, dt: float) -> None:
+        road, slopes = self.road, self.redundancy.slopes
+        voltage, current, source = self._pack
+        power = None if voltage is None or current is None or source == "model" else voltage * current
+        before = slopes.guilty
+        speeds = self.redundancy.speeds
+        speed = None if speeds.unsettled else road.speed
+        slopes.step(now, dt, self.signals, speed, road.acceleration, speeds.on_road, power,
+                    lambda speed, acceleration: self._power_at(now, speed, acceleration, 0.0))  # fmt: skip
+        if slopes.guilty != before:
+            road.forget_slope(slopes.offset)
+        distrusted = self.redundancy.distrusted
+        if any(role in LEARNED_FROM and role not in self._distrusted for role in distrusted):
+            self.forecaster.forget(UNLEARNED)
+        self._distrusted = distrusted
 
     def _model_power(self, now: float) -> float:
         road = self.road
-        quantities = self.forecaster.quantities(
-            road.speed or 0.0, road.acceleration or 0.0, self._ambient(now)[0], road.altitude or 0.0, 40.0
-        )
-        quantities["grade"] = road.grade or 0.0
+        return self._power_at(now, road.speed or 0.0, road.acceleration or 0.0, road.grade or 0.0)
+
+    def _power_at(self, now: float, speed: float, acceleration: float, grade: float) -> float:
+        ambient, altitude = self._ambient(now)[0], self.road.altitude or 0.0
+        quantities = self.forecaster.quantities(speed, acceleration, ambient, altitude, 40.0)
+        quantities["grade"] = grade
         if self.forecaster.extended:
             self.forecaster.add(quantities, self._turn(now), self._ambient(now)[0])
         return float(sum(self.model.power(quantities).values()))
@@ -544,7 +620,7 @@ class Estimator:
 
     def _ride(self, now: float, dt: float, voltage: float | None, current: float | None) -> None:
         speed = self.road.speed
-        known = 0 < dt <= self._pause and self._pack[2] != "model"
+        known = 0 < dt <= self._pause and self._pack[2] != "model" and not self.redundancy.speeds.unsettled
         if speed is None or voltage is None or current is None or not known or not self._activities.teaches:
             self.forecaster.pause()
             return
@@ -583,7 +659,7 @@ class Estimator:
 
     def estimate(self, now: float) -> Estimate:
         """What is known at `now` [s]; cheap, and changes nothing."""
-        estimate = Estimate(time=now, reasons=self._reasons(now))
+        estimate = Estimate(time=now, reasons=self._reasons(now), distrusted=self._distrusted)
         road, filter_, forecast = self.road, self.filter, self._forecast
         estimate.distance = road.distance
         estimate.activity = Activity.UNKNOWN if self._time is None else self._activities.now
@@ -649,6 +725,8 @@ class Estimator:
             reasons |= Reason.SIGNALS_SLOW
         if now - self._restarted_at < RESTARTED_FOR:
             reasons |= Reason.SOC_RESTARTED
+        if self._distrusted:
+            reasons |= Reason.SENSOR_DISTRUSTED
         return reasons
 
     # --- saving -----------------------------------------------------------------------------------------------

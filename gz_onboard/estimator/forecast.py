@@ -70,6 +70,7 @@ class Segment:
     squares: float = 0.0  # W²·s, of the measured power
     modelled: float = 0.0
     level: float = 0.0  # modelled, less what height and speed have stored: its hills and stops, but back where it began
+    learned: tuple[float, float] | None = None  # the factor and its variance before it; None after a restart
 
 
 @dataclass
@@ -209,6 +210,17 @@ class Forecaster:
         if segment.distance >= SEGMENT:
             self._close(segment)
 
+    def forget(self, way: float) -> None:
+        """Unlearn the last `way` [m] or a little more: a sensor that it was learned from has lied."""
+        r = self.riding
+        self.pause()
+        way -= r.current.distance
+        r.current = Segment()
+        while way > 0 and r.segments and (before := r.segments[-1].learned):
+            way -= r.segments.pop().distance
+            r.factor, r.factor_variance = before
+        self._sum_past()
+
     def pause(self) -> None:
         """Something was not known for a while: leave the second that was being gathered."""
         self._next_second()
@@ -270,6 +282,7 @@ class Forecaster:
 
     def _close(self, segment: Segment) -> None:
         r = self.riding
+        segment.learned = r.factor, r.factor_variance
         r.segments.append(segment)
         r.current = Segment()
         self._sum_past()
@@ -365,6 +378,11 @@ class Forecaster:
         """(power [W], speed [m/s]) of the prior riding at `ambient` [degC] and `altitude` [m]."""
         return self._prior(round(ambient), round(altitude, -2))
 
+    def usual_force(self) -> float:
+        """Mean force [N] of the prior riding: its energy at the pack over its way."""
+        power, speed = self._prior(20.0, 0.0)
+        return self.prior.factor * power / speed
+
     def _prior(self, ambient: float, altitude: float) -> tuple[float, float]:
         if self._prior_at[0] != (ambient, altitude):
             power = 0.0
@@ -392,7 +410,7 @@ class Forecaster:
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Take what `snapshot` gave; raises KeyError, TypeError or ValueError if it is not that."""
-        segments = [Segment(*(float(x) for x in row)) for row in saved["segments"]]
+        segments = [Segment(a, b, c, d, e, f) for a, b, c, d, e, f in (map(float, row) for row in saved["segments"])]
         riding = Riding(factor=float(saved["factor"]), factor_variance=float(saved["factor_variance"]))
         riding.segments.extend(segments)
         riding.time_moving = float(saved["time_moving"])

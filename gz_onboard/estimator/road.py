@@ -20,7 +20,7 @@ GRADE_TIME = 5.0  # s: low pass of the accelerometer's grade; at 2 s its noise a
 ALTITUDE_LENGTH = 150.0  # m: how fast the observer follows the altitude where it seeks an offset only
 ALTITUDE_LENGTH_ALONE = 60.0  # m: the same where the altitude is all there is
 BIAS_TIME = 5.0  # s of standing to know the offset of a rate sensor
-
+LOST = 15.0  # m: the observer is never so far from an altitude that it follows
 ALTITUDES = -500.0, 9000.0  # m: where there are roads
 
 
@@ -47,6 +47,10 @@ class Road:
         self._speed(now, dt, signals, wheel_radius, gear_ratio)
         self._turn(now, dt, signals)
         self._slope(now, dt, signals)
+
+    def forget_slope(self, grade_offset: float) -> None:
+        """Begin the grade anew: one that it was made from lied; `grade_offset` is what is known of it all the same."""
+        self.grade_offset, self.accelerometer_grade = grade_offset, 0.0
 
     def _speed(self, now: float, dt: float, signals: Signals, radius: float, gear: float) -> None:
         motor = signals.motor_speed.mean(now)
@@ -109,7 +113,9 @@ class Road:
         altitude = signals.gps_altitude.get(now)
         if signals.gps_fix.fresh(now) and signals.gps_fix.value < 3:
             altitude = None
-        if self.speed is None or (forward is None and altitude is None and self.altitude is None):
+        distrusted = not (signals.accel_x.trusted and signals.gps_altitude.trusted)
+        nothing = forward is None and altitude is None and (distrusted or self.altitude is None)
+        if self.speed is None or nothing:
             self.grade = None
             return
         if forward is not None and self.acceleration is not None:
@@ -124,6 +130,8 @@ class Road:
             if self.altitude is None:
                 self.altitude = altitude
             error = altitude - self.altitude
+            if abs(error) > LOST:  # it was away for long, or left out: no grade is to be learned from where it is now
+                self.altitude, error = altitude, 0.0
             length = ALTITUDE_LENGTH_ALONE if forward is None else ALTITUDE_LENGTH
             share = min(way / length, 0.5)  # critically damped over distance
             self.altitude += 2 * share * error

@@ -13,7 +13,7 @@ DEFAULT_STALE = 2.0  # s, for messages of unknown period
 class Signal:
     """One role."""
 
-    __slots__ = ("count", "stale_after", "time", "total", "value")
+    __slots__ = ("count", "stale_after", "time", "total", "trusted", "value")
 
     def __init__(self) -> None:
         self.value = 0.0
@@ -21,17 +21,22 @@ class Signal:
         self.total = 0.0
         self.count = 0
         self.stale_after = 0.0  # s; 0: the vehicle has no such signal
+        self.trusted = True  # False: other sensors contradict it, and it is taken as missing
 
     def fresh(self, now: float) -> bool:
-        """Whether it has a value that is not stale at `now` [s]."""
-        return now - self.time <= self.stale_after
+        """Whether it has a value that is not stale at `now` [s] and is trusted."""
+        return self.trusted and now - self.time <= self.stale_after
 
     def get(self, now: float) -> float | None:
-        """Its last value, or None if that is stale."""
-        return self.value if now - self.time <= self.stale_after else None
+        """Its last value, or None if that is stale or not trusted."""
+        return self.value if self.trusted and now - self.time <= self.stale_after else None
 
     def mean(self, now: float) -> float | None:
-        """Its mean since the last step; if nothing came, its last value; None if that is stale."""
+        """Its mean since the last step; if nothing came, its last value; None if that is stale or not trusted."""
+        return self.told(now) if self.trusted else None
+
+    def told(self, now: float) -> float | None:
+        """What `mean` gives, trusted or not."""
         if self.count:
             return self.total / self.count
         return self.value if now - self.time <= self.stale_after else None

@@ -148,3 +148,27 @@ def test_prior_length_is_what_it_says():
     f.riding.factor_variance = 1e-12  # the factor is known: what moves is the riding alone
     energy, way = ride(f, PRIOR_LENGTH / 1000, stop_every=250.0)
     assert forecast(f).consumption == pytest.approx((prior + energy / way) / 2, rel=0.08)
+
+
+def test_what_a_liar_taught_is_unlearned():
+    """A kilometre with a sensor that doubles the consumption, taken back: as it was before, but for half a segment."""
+    f = forecaster()
+    ride(f, 5, seed=1)
+    before, segments = f.riding.factor, len(f.riding.segments)
+    ride(f, 1, factor=2.5, seed=2)
+    assert f.riding.factor > 1.15 * before
+    f.forget(1000.0)
+    assert f.riding.factor == pytest.approx(before, rel=0.02)
+    assert segments - 1 <= len(f.riding.segments) <= segments
+    assert forecast(f).consumption == pytest.approx(before * forecast(f).consumption / f.riding.factor, rel=0.02)
+
+
+def test_nothing_from_before_a_restart_is_unlearned():
+    f = forecaster()
+    ride(f, 3)
+    again = forecaster()
+    again.restore(json.loads(json.dumps(f.snapshot())))
+    segments = len(again.riding.segments)
+    ride(again, 0.6)
+    again.forget(2000.0)
+    assert len(again.riding.segments) == segments

@@ -1,0 +1,248 @@
+"""Sensors held against each other: whoever lies is found, and nobody else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from math import cos, sin
+
+import pytest
+
+from gz_onboard.estimator.redundancy import FORGIVEN_AFTER, NOBODY, G, Slopes, Speeds, vote
+from gz_onboard.estimator.signals import Signals
+from gz_onboard.events import ROLES
+
+RADIUS, GEAR = 0.25, 0.5  # m; wheel speed over motor speed
+STEP = 0.1  # s
+HONEST: Mapping[str, float] = {  # what each sensor says at 1 m/s
+    "motor_speed": 1 / (RADIUS * GEAR), "wheel_speed_rear": 1 / RADIUS, "wheel_speed_front": 1 / RADIUS,
+    "vehicle_speed": 1.0, "gps_speed": 1.0,
+}  # fmt: skip
+FOUR = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "gps_speed")
+Lie = Callable[[float, float], float | None]
+
+
+def town(t: float) -> float:
+    """The true speed [m/s]: stops and goes."""
+    return max(0.0, 7.0 + 6.0 * sin(t / 9.0))
+
+
+def said(seconds: float, roles: tuple[str, ...], lies: Mapping[str, Lie], truth: Callable[[float], float] = town,
+         watch: Speeds | None = None, begin: float = 0.0) -> tuple[Speeds, Signals]:  # fmt: skip
+    """`seconds` of riding; a lie makes of (time [s], what the sensor should say) what it says, None being nothing."""
+    signals = Signals((role, 2.0) for role in ROLES)
+    speeds = watch or Speeds(RADIUS, GEAR)
+    for step in range(round(seconds / STEP)):
+        t = begin + step * STEP
+        for role in roles:
+            value: float | None = truth(t) * HONEST[role] * (1 + 1e-4 * sin(7.3 * t))
+            value = lies[role](t, value) if role in lies and value is not None else value
+            if value is not None:
+                signal = signals[role]
+                signal.value, signal.time, signal.total, signal.count = value, t, value, 1
+        speeds.step(t, STEP, signals)
+        signals.next_step()
+    return speeds, signals
+
+
+def guilty(speeds: Speeds) -> set[str]:
+    return {role for role, trial in speeds.trials.items() if trial.guilty}
+
+
+LIES: dict[str, Lie] = {
+    "stuck": lambda t, v: HONEST["motor_speed"] * 8,
+    "zero": lambda t, v: 0.0,
+    "doubled": lambda t, v: 2 * v,
+    "halved": lambda t, v: v / 2,
+    "backwards": lambda t, v: -v,
+    "drifting": lambda t, v: v + 0.4 * t,
+    "jumping": lambda t, v: v + (60.0 if t % 2 < 1 else 0.0),
+    "full scale": lambda t, v: 500.0,
+}
+
+
+@pytest.mark.parametrize("name", LIES)
+@pytest.mark.parametrize("liar", FOUR)
+def test_one_of_four_that_lies_is_named_and_left_out(liar: str, name: str):
+    speeds, signals = said(60.0, FOUR, {liar: LIES[name]})
+    assert guilty(speeds) == {liar}
+    assert not signals[liar].trusted
+    assert all(signals[role].trusted for role in FOUR if role != liar)
+    assert not speeds.unsettled
+
+
+@pytest.mark.parametrize("roles", [FOUR, FOUR[:3], ("motor_speed", "gps_speed"), ("motor_speed", "vehicle_speed")])
+def test_nobody_is_accused_who_errs_by_a_few_percent_or_is_late(roles: tuple[str, ...]):
+    late: Lie = lambda t, v: town(t - 0.6) * 1.03 + 0.1 * sin(3 * t)  # noqa: E731
+    speeds, _ = said(600.0, roles, {"motor_speed": lambda t, v: 1.05 * v, "gps_speed": late})
+    assert guilty(speeds) == set()
+
+
+def test_contradicted_it_is_not_believed_from_the_first_step():
+    _, signals = said(20.0, FOUR, {"motor_speed": lambda t, v: v if t < 19.85 else 2 * v})
+    assert not signals.motor_speed.trusted
+
+
+@pytest.mark.parametrize("role", ["motor_speed", "wheel_speed_rear", "wheel_speed_front"])
+def test_slip_and_a_locked_wheel_for_two_seconds_are_no_faults(role: str):
+    lies: tuple[Lie, Lie] = (lambda t, v: 0.0 if t % 30 < 2 else v), (lambda t, v: 2 * v if t % 30 < 2 else v)
+    for lie in lies:
+        speeds, signals = said(120.0, FOUR, {role: lie})
+        assert guilty(speeds) == set()
+        assert signals[role].trusted
+
+
+def test_a_roller_bench_and_a_spinning_wheel_are_no_faults():
+    """Motor and rear wheel agree, front wheel and GPS stand: no sensor of them can be told to lie."""
+    still: Lie = lambda t, v: 0.0  # noqa: E731
+    for roles in (FOUR, FOUR[:3], (*FOUR, "vehicle_speed")):
+        speeds, signals = said(300.0, roles, {"wheel_speed_front": still, "gps_speed": still})
+        assert guilty(speeds) == set()
+        assert signals.motor_speed.trusted
+
+
+def test_a_vehicle_speed_made_from_the_motors_does_not_outvote_the_gps():
+    roles = ("motor_speed", "vehicle_speed", "gps_speed")
+    double: Lie = lambda t, v: 2 * v  # noqa: E731
+    speeds, _ = said(60.0, roles, {"motor_speed": double, "vehicle_speed": double})
+    assert guilty(speeds) == set(roles)
+    assert guilty(said(60.0, roles, {"motor_speed": double})[0]) == {"motor_speed"}
+
+
+def test_of_two_that_disagree_the_stuck_one_lies():
+    for liar in ("motor_speed", "gps_speed"):
+        speeds, _ = said(60.0, ("motor_speed", "gps_speed"), {liar: lambda t, v: 40.0})
+        assert guilty(speeds) == {liar}
+
+
+def test_of_two_that_disagree_and_move_neither_is_believed():
+    roles = ("motor_speed", "gps_speed")
+    speeds, signals = said(60.0, roles, {"motor_speed": lambda t, v: 1.6 * v})
+    assert guilty(speeds) == set(roles)
+    assert speeds.unsettled
+    assert signals.motor_speed.mean(59.9) is None
+    assert signals.motor_speed.told(59.9) is not None
+
+
+def test_forgiven_only_after_a_minute_of_agreement_about_something():
+    speeds, _ = said(60.0, FOUR, {"motor_speed": LIES["doubled"]})
+    stands = lambda t: 0.0  # noqa: E731
+    said(3 * FORGIVEN_AFTER, FOUR, {}, stands, speeds, 60.0)
+    assert guilty(speeds) == {"motor_speed"}, "standing, all agree that they stand"
+    steady = lambda t: 9.0  # noqa: E731
+    said(0.9 * FORGIVEN_AFTER, FOUR, {}, steady, speeds, 300.0)
+    assert guilty(speeds) == {"motor_speed"}
+    said(0.2 * FORGIVEN_AFTER, FOUR, {}, steady, speeds, 400.0)
+    assert guilty(speeds) == set()
+
+
+def test_a_gps_without_a_fix_is_no_witness():
+    signals = Signals((role, 2.0) for role in ROLES)
+    speeds = Speeds(RADIUS, GEAR)
+    for step in range(300):
+        t = step * STEP
+        for role, value in {"motor_speed": 10 * HONEST["motor_speed"], "gps_speed": 0.0, "gps_fix": 0.0}.items():
+            signals[role].value, signals[role].time = value, t
+        speeds.step(t, STEP, signals)
+    assert guilty(speeds) == set()
+
+
+def test_votes():
+    apart = dict.fromkeys(HONEST, 1.0)
+    assert vote({"motor_speed": 5.0, "wheel_speed_rear": 9.0, "gps_speed": 9.5}, apart)[0] == {"motor_speed"}
+    assert vote({"motor_speed": 5.0, "gps_speed": 9.5}, apart) == (NOBODY, frozenset({"motor_speed", "gps_speed"}))
+    two_and_two = {"motor_speed": 5.0, "gps_speed": 5.2, "wheel_speed_rear": 0.0, "wheel_speed_front": 0.0}
+    assert vote(two_and_two, apart) == (NOBODY, frozenset(two_and_two))
+
+
+# --- grade --------------------------------------------------------------------------------------------------------
+
+MASS, FORCE, WIND, MOUNTED = 200.0, 100.0, 25.0, 0.02  # kg; N that the level takes; N that nobody knows of; rad
+SLOPES = ("accel_x", "gps_altitude")
+
+
+def hills(seconds: float, lies: Mapping[str, Lie], roles: tuple[str, ...] = SLOPES, power: bool = True,
+          on_road: bool = True, begin: float = 300.0) -> Slopes:  # fmt: skip
+    """Riding over hills of 4 %, stopping now and then; the lies begin at `begin` [s]."""
+    signals, slopes = Signals((role, 2.0) for role in ROLES), Slopes(MASS, FORCE)
+    way, before, height = 0.0, town(0.0), 200.0
+    for step in range(round(seconds / STEP)):
+        t = step * STEP
+        speed = town(t)
+        grade = 0.04 * cos(way / 120.0)
+        acceleration = (speed - before) / STEP
+        before = speed
+        way += speed * STEP
+        height += grade * speed * STEP
+        honest = {
+            "accel_x": acceleration + G * (grade + MOUNTED) + 0.1 * sin(77 * t),
+            "gps_altitude": height + sin(t / 60),
+        }
+        for role in roles:
+            value: float | None = honest[role]
+            if role in lies and t >= begin:
+                value = lies[role](t - begin, honest[role])
+            if value is not None:
+                signals[role].value, signals[role].time = value, t
+        work = speed * (FORCE + WIND + MASS * (G * grade + acceleration)) if power else None
+        slopes.hear_altitude(t, STEP, signals, speed)
+        slopes.step(t, STEP, signals, speed, acceleration, on_road, work, lambda v, a: v * (FORCE + MASS * a))
+    return slopes
+
+
+def test_hills_wind_and_a_tilted_accelerometer_accuse_nobody():
+    for roles in (SLOPES, SLOPES[:1], SLOPES[1:]):
+        assert hills(1500.0, {}, roles).guilty == NOBODY
+        assert hills(1500.0, {}, roles, power=False).guilty == NOBODY
+
+
+SLOPE_LIES: dict[str, tuple[str, Lie]] = {
+    "climbs for ever": ("gps_altitude", lambda t, v: v + 1.0 * t),
+    "climbs slowly": ("gps_altitude", lambda t, v: v + 0.3 * t),
+    "sinks for ever": ("gps_altitude", lambda t, v: v - 1.0 * t),
+    "is noise": ("gps_altitude", lambda t, v: v + 40 * sin(11 * t)),
+    "full scale altitude": ("gps_altitude", lambda t, v: 6000.0),
+    "+2 m/s²": ("accel_x", lambda t, v: v + 2.0),
+    "-1 m/s²": ("accel_x", lambda t, v: v - 1.0),
+    "doubled": ("accel_x", lambda t, v: 2 * v),
+    "turned round": ("accel_x", lambda t, v: -v),
+    "stuck": ("accel_x", lambda t, v: 0.3),
+    "full scale": ("accel_x", lambda t, v: 60.0),
+}
+
+
+@pytest.mark.parametrize("name", SLOPE_LIES)
+def test_whoever_lies_about_the_grade_is_named_by_what_riding_takes(name: str):
+    role, lie = SLOPE_LIES[name]
+    assert hills(800.0, {role: lie}).guilty == {role}
+
+
+def test_without_the_energy_neither_is_believed():
+    for role, lie in (SLOPE_LIES["climbs for ever"], SLOPE_LIES["+2 m/s²"]):
+        assert hills(800.0, {role: lie}, power=False).guilty == set(SLOPES)
+
+
+def test_a_single_witness_of_the_grade_is_held_against_the_energy():
+    for name in ("climbs for ever", "sinks for ever", "+2 m/s²"):
+        role, lie = SLOPE_LIES[name]
+        assert hills(800.0, {role: lie}, (role,)).guilty == {role}
+
+
+def test_on_a_roller_bench_an_accelerometer_that_shows_nothing_is_right():
+    still: Lie = lambda t, v: 0.1 * sin(77 * t)  # noqa: E731
+    assert hills(800.0, {"accel_x": still}, ("accel_x",), on_road=False).guilty == NOBODY
+
+
+def test_the_mounting_is_kept_from_before_the_lie():
+    slopes = hills(800.0, {"gps_altitude": lambda t, v: v + t})
+    assert slopes.offset == pytest.approx(-MOUNTED, abs=0.006)
+
+
+def test_a_standing_vehicle_does_not_climb():
+    signals, slopes = Signals((role, 2.0) for role in ROLES), Slopes(MASS, FORCE)
+    for rate, guilty in ((0.1, False), (1.0, True)):
+        for step in range(600):
+            t = step * STEP
+            signals.gps_altitude.value, signals.gps_altitude.time = 200 + rate * t, t
+            slopes.hear_altitude(t, STEP, signals, 0.0)
+            slopes.step(t, STEP, signals, 0.0, 0.0, False, 50.0, lambda v, a: 50.0)
+        assert slopes.trials["gps_altitude"].guilty == guilty
