@@ -250,8 +250,7 @@ class Estimator:
         self._deadline = now + STEP_AT_LEAST
         signals = self.signals
         elapsed = min(dt, self._pause)
-        self.redundancy.speeds.step(now, elapsed, signals)
-        self.redundancy.slopes.hear_altitude(now, elapsed, signals, self.road.speed)
+        self.redundancy.step(now, elapsed, signals, self.road.speed)
         self.road.step(now, elapsed, signals, self._radius, self._gear)
         voltage, current, source = self._measured(now, elapsed)
         self._pack = voltage, current, source
@@ -620,8 +619,9 @@ class Estimator:
 
     def _ride(self, now: float, dt: float, voltage: float | None, current: float | None) -> None:
         speed = self.road.speed
-        known = 0 < dt <= self._pause and self._pack[2] != "model" and not self.redundancy.speeds.unsettled
-        if speed is None or voltage is None or current is None or not known or not self._activities.teaches:
+        unsure = self._pack[2] in ("model", "disputed") or self.redundancy.speeds.unsettled
+        known = 0 < dt <= self._pause and not unsure and self._activities.teaches
+        if speed is None or voltage is None or current is None or not known:
             self.forecaster.pause()
             return
         motor = self.signals.motor_temperature.get(now)
@@ -719,7 +719,8 @@ class Estimator:
             reasons |= Reason.NO_GPS
         if abs(self._mismatch) > MISMATCH:
             reasons |= Reason.CURRENT_MISMATCH
-        if self._off_gate or self._innovation_square > 0.08**2:
+        differ = self.redundancy.voltages.apart or not (s.pack_voltage.trusted and s.inverter_voltage.trusted)
+        if differ or self._off_gate or self._innovation_square > 0.08**2:
             reasons |= Reason.VOLTAGE_MISMATCH
         if self._sampled > SLOWEST:
             reasons |= Reason.SIGNALS_SLOW

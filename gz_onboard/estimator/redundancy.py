@@ -48,6 +48,7 @@ STEEPEST = 0.3
 JUMP, WEATHER = 6.0, 1.0  # m, m/s: how far and how fast an altitude wanders by the receiver alone
 STANDING_TIME, STANDING_RATE = 20.0, 0.6  # s, m/s: a standing vehicle does not climb
 GAIN = 0.6, 1.5  # of the accelerometer over the wheels' acceleration, over `GAIN_TIME` if there is enough of it
+HARDEST = 10.0  # m/s²
 GAIN_TIME, GAIN_LEAST = 60.0, 10.0  # s, m²/s³
 G = 9.80665  # m/s²
 
@@ -63,6 +64,25 @@ ROAD_TIME, OFF_ROAD, OFF_ROAD_RELATIVE = 30.0, 0.15, 0.7  # s, 1/h, 1: by the ro
 PLAIN = 2.5  # of two mean squares: the greater one's reading lies
 STUCK_VOLTAGE = 5.0  # s
 LOWEST_CELL, HIGHEST_CELL = 0.6, 1.12  # of the cut-off, of full at rest
+
+# Temperatures [degC] that vehicles have, and how fast [K/s] they change at most.
+TEMPERATURES = {
+    "cell_temperature": (-40.0, 85.0, 0.05), "ambient_temperature": (-50.0, 65.0, 0.5),
+    "motor_temperature": (-50.0, 220.0, 3.0), "inverter_temperature": (-50.0, 180.0, 3.0),
+}  # fmt: skip
+LEAP = 6.0  # K: beside the rate; sensors of 1 K and what two messages in a row are apart
+COLDER = 45.0  # K: cells were never so much colder than the air
+# Means over `AXIS_TIME` [s] that a vehicle can have, leaning, on a side stand or on a hill; m/s² and rad/s.
+AXES = {
+    "accel_y": (-5.0, 5.0), "accel_z": (6.5, 13.0), "rate_x": (-0.15, 0.15), "rate_y": (-0.15, 0.15),
+    "rate_z": (-0.8, 0.8),
+}  # fmt: skip
+AXIS_TIME = 30.0
+
+
+def part(dt: float, time: float) -> float:
+    """The share of a new value in a mean over `time` [s], of which `dt` [s] are new."""
+    return min(dt / time, 1.0) if time > 0 else 1.0
 
 
 class Trial:
@@ -313,11 +333,13 @@ class Slopes:
 
     def _hear_accelerometer(self, dt: float, forward: float, speed: float, acceleration: float, on_road: bool) -> None:
         """An accelerometer that moves trembles, and shows what the wheels gain."""
-        self._still = self._still + dt if forward == self._said else 0.0
+        self._still = self._still + dt if forward == self._said != 0.0 else 0.0  # a plain zero: a simulation's
         self._said = forward
         keep = 1 - min(dt / GAIN_TIME, 1.0)
         gained = 0.0 if self._speed_before is None else speed - self._speed_before
         self._speed_before = speed
+        if max(abs(acceleration), abs(gained) / max(dt, 1e-3)) > HARDEST:  # another sensor took over
+            return
         self._product = keep * self._product + forward * acceleration * dt
         self._square = keep * self._square + acceleration * gained
         self._deaf = self._square > GAIN_LEAST and not GAIN[0] < self._product / self._square < GAIN[1]
@@ -414,7 +436,7 @@ class Rival:
         if first is None or second is None:
             return 0
         self._time = min(self._time + dt, ERROR_TIME)
-        share = min(dt / self._time, 1.0) if self._time > 0 else 1.0
+        share = part(dt, self._time)
         self._first += (first * first - self._first) * share
         self._second += (second * second - self._second) * share
         if max(self._first, self._second) < ERROR_LEAST**2:
@@ -462,7 +484,7 @@ class Currents:
         self.disputed = False  # the two differ, and it is not known which of them is right
         self._rival, self._by_model, self._road = Rival(), Rival(), OffRoad(capacity)
         self._difference = self._square = self._load = self._without = 0.0  # A, A², A, A²; low-passed
-        self._fast = 0.0  # A
+        self._fast = self._extra = 0.0  # A
 
     def step(self, dt: float, said: Electric, error: Error, model: Callable[[], float | None],
              innovation_rms: float) -> frozenset[str]:  # fmt: skip
@@ -493,6 +515,8 @@ class Currents:
         least = min(abs(pack), abs(around))
         self._fast += (pack - around - self._fast) * min(dt / FAST_TIME, 1.0)
         self._difference += (pack - around - self._difference) * min(dt / SKEW_TIME, 1.0)
+        extra = 0.0 if said.auxiliary is None else said.auxiliary - said.usual_auxiliary
+        self._extra += (extra - self._extra) * min(dt / SKEW_TIME, 1.0)
         share = min(dt / CURRENT_TIME, 1.0)
         self._square += (self._difference**2 - self._square) * share
         self._load += (least - self._load) * share
@@ -505,9 +529,9 @@ class Currents:
             small = differ < CURRENT_APART * hour / 2
             return NOBODY, False if small and max(abs(pack), abs(around)) > CURRENT_APART * hour else None
         if said.auxiliary is not None:  # without it all would agree
-            more = pack - around + said.auxiliary - said.usual_auxiliary
-            self._without += (more**2 - self._without) * share
-            if sqrt(self._without) < CURRENT_APART * hour / 2 + CURRENT_APART_RELATIVE * self._load:
+            self._without += ((self._difference + self._extra) ** 2 - self._without) * share
+            allowed = CURRENT_APART * hour + CURRENT_APART_RELATIVE * self._load
+            if self._without < min(allowed**2, self._square / 4):
                 return frozenset({"auxiliary_current"}), None
         liar = self._rival.hear(dt, *((error(voltage, pack), error(voltage, around)) if voltage else (None, None)))
         if not liar and said.speed is not None and abs(said.speed) < STANDS:
@@ -524,12 +548,12 @@ class Currents:
     def _by_road(self, dt: float, said: Electric, voltage: float, error: Error, model: Callable[[], float | None],
                  innovation_rms: float) -> bool:  # fmt: skip
         """Whether the cells' voltage and the road both say that the currents are not what flows."""
-        used = said.around if said.pack is None else said.pack
+        pack, inverter = (self.trials[role].guilty for role in self.ROLES[:2])
+        used = said.around if said.pack is None or (pack and not inverter) else said.pack
         first = None if used is None else error(voltage, used)
         if used is None or first is None:
             return False
-        doubted = self.trials["pack_current"].guilty or self.trials["inverter_current"].guilty
-        if not (doubted or innovation_rms > ERROR_LEAST or abs(first) > GROSS_ERROR):  # nearly always
+        if not (pack or inverter or innovation_rms > ERROR_LEAST or abs(first) > GROSS_ERROR):  # nearly always
             self._road.forget()
             self._by_model.forget()
             return False
@@ -557,7 +581,7 @@ class OffRoad:
     def hear(self, dt: float, used: float, expected: float) -> bool:
         """Whether it is further from it than wind, load or slip make it."""
         self._time += dt
-        share, slow = (dt / max(min(self._time, time), dt) for time in (CURRENT_TIME, ROAD_TIME))
+        share, slow = (part(dt, min(self._time, time)) for time in (CURRENT_TIME, ROAD_TIME))
         self._used += (used - self._used) * slow
         self._expected += (expected - self._expected) * slow
         self._square += ((used - expected) ** 2 - self._square) * share
@@ -631,6 +655,62 @@ class Voltages:
         return self._still > STUCK_VOLTAGE and self._most - self._least > GROSS_CURRENT * self._capacity
 
 
+class Temperatures:
+    """Temperatures against what can be, and against what they were: heat takes time."""
+
+    def __init__(self) -> None:
+        self.trials = {role: Trial() for role in TEMPERATURES}
+        self._last: dict[str, float] = {}  # degC, the last that was possible
+        self._elapsed = dict.fromkeys(TEMPERATURES, 0.0)  # s since then
+
+    def step(self, now: float, dt: float, signals: Signals) -> None:
+        """Trust each of them or not."""
+        ambient = signals.ambient_temperature.told(now)
+        for role, (low, high, rate) in TEMPERATURES.items():
+            signal = signals[role]
+            value = signal.told(now)
+            self._elapsed[role] += dt
+            if value is None:
+                continue
+            last = self._last.get(role, value)
+            far = COLDER if role == "cell_temperature" and ambient is not None and value < ambient - COLDER else 0.0
+            possible = low < value < high and not far and abs(value - last) <= LEAP + rate * self._elapsed[role]
+            if possible:
+                self._last[role], self._elapsed[role] = value, 0.0
+            trial = self.trials[role]
+            trial.hear(dt, not possible)
+            signal.trusted = possible and not trial.guilty
+
+
+class Inertial:
+    """Axes of the inertial unit against gravity and against what a vehicle can do for half a minute."""
+
+    def __init__(self) -> None:
+        self.trials = {role: Trial() for role in AXES}
+        self._mean = dict.fromkeys(AXES, 0.0)  # low-passed
+        self._said = dict.fromkeys(AXES, 0.0)
+        self._still = dict.fromkeys(AXES, 0.0)  # s without a change
+        self._time = 0.0  # s
+
+    def step(self, now: float, dt: float, signals: Signals, speed: float | None) -> None:
+        """Trust each of them or not, at `speed` [m/s]."""
+        self._time += dt
+        share = part(dt, min(self._time, AXIS_TIME))
+        for role, (low, high) in AXES.items():
+            signal = signals[role]
+            value = signal.told(now)
+            if value is None:
+                continue
+            self._mean[role] += (value - self._mean[role]) * share
+            self._still[role] = self._still[role] + dt if value == self._said[role] != 0.0 else 0.0
+            self._said[role] = value
+            moving = speed is not None and abs(speed) > MOVING
+            wrong = self._time > AXIS_TIME / 3 and not low < self._mean[role] < high
+            trial = self.trials[role]
+            trial.hear(dt, True if wrong or (moving and self._still[role] > STILL) else False if moving else None)
+            signal.trusted = not trial.guilty
+
+
 class Redundancy:
     """All that sensors are held against each other for.
 
@@ -644,7 +724,16 @@ class Redundancy:
         self.currents = Currents(capacity)
         lowest, highest = LOWEST_CELL * battery.cutoff_voltage, HIGHEST_CELL * battery.ocv_value[-1]
         self.voltages = Voltages(battery.cells_series, lowest, highest, capacity)
-        self._trials = self.voltages.trials | self.currents.trials | self.speeds.trials | self.slopes.trials
+        self.temperatures, self.inertial = Temperatures(), Inertial()
+        parts = (self.voltages, self.currents, self.temperatures, self.speeds, self.slopes, self.inertial)
+        self._trials = {role: trial for part in parts for role, trial in part.trials.items()}
+
+    def step(self, now: float, dt: float, signals: Signals, speed: float | None) -> None:
+        """What is told of `dt` [s] up to `now` [s], before any of it is used; `speed` [m/s] of the last step."""
+        self.speeds.step(now, dt, signals)
+        self.slopes.hear_altitude(now, dt, signals, speed)
+        self.temperatures.step(now, dt, signals)
+        self.inertial.step(now, dt, signals, speed)
 
     @property
     def distrusted(self) -> tuple[str, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import sqrt
+from math import log, sqrt
 
 import pytest
 
@@ -17,12 +17,15 @@ from tests.faults.support import (
     both,
     check_all,
     numbers,
+    of,
     ride,
     spoilt,
     unspoilt,
     without,
 )
-from tests.support import S, check_sound, identifier, reasons_in, ridden, spread
+from tests.hardening.liars import Lie
+from tests.hardening.liars import ridden as whole_ride
+from tests.support import S, changed, check_frames, check_sound, identifier, reasons_in, ridden, spread
 
 SPEEDS = both(
     absent("INV_Motion", "INV_MotorSpeed"), without("HBM_Wheels"), absent("GPS_Motion", "GPS_Speed", "GPS_Course")
@@ -135,3 +138,37 @@ def test_stale_after_ten_periods_and_not_before():
     missing = [e.time for e in run.estimates if e.time > BEGIN and e.reasons & Reason.NO_CELL_TEMPERATURE]
     assert missing[0] - since == pytest.approx(10.0, abs=0.11)
     assert all(e.cell_temperature is not None for e in run.between(5.0, RIDE))  # the last known stands in
+
+
+STRANGERS: dict[str, tuple[tuple[str, ...], Lie]] = {  # each of them was VALID once, or far off without being named
+    "motor speed stuck": (("motor_speed",), lambda t, v: 33.0),
+    "motor speed doubled": (("motor_speed",), lambda t, v: 2 * v),
+    "altitude climbs for ever": (("gps_altitude",), lambda t, v: v + t),
+    "accelerometer 2 m/s² off": (("accel_x",), lambda t, v: v + 2.0),
+    "both currents -300 A": (("pack_current", "inverter_current"), lambda t, v: -300.0),
+    "pack voltage stuck": (("pack_voltage",), lambda t, v: 51.0),
+}
+
+
+@pytest.mark.parametrize("name", STRANGERS)
+def test_a_sensor_that_lies_is_named_and_the_interval_holds_the_truth(name: str):
+    """Over a whole ride, against the same ride unspoilt."""
+    roles, lie = STRANGERS[name]
+    true, last = whole_ride(None)[-1], whole_ride((roles, name, lambda: lie))[-1]
+    assert set(last.distrusted) == set(roles)
+    assert last.reasons & Reason.SENSOR_DISTRUSTED
+    assert last.state is State.DEGRADED
+    soc, sd, _, p10, p90 = numbers(last)
+    true_soc, _, true_range, true_p10, true_p90 = numbers(true)
+    assert p10 < true_range < p90
+    assert abs(soc - true_soc) < sd
+    assert log(p90 / p10) > 1.05 * log(true_p90 / true_p10), "the range is said to be as certain as before"
+
+
+def test_a_sensor_that_lies_goes_onto_the_bus_by_name():
+    run = ridden(spoilt(of("INV_Motion", lambda frame: changed(frame, INV_MotorSpeed=6000))))
+    check_sound(run)
+    sent = check_frames(run.sent)
+    assert sent["RANGE_Sensors"][-1]["RANGE_BadMotorSpeed"] == 1
+    assert sum(value for name, value in sent["RANGE_Sensors"][-1].items() if "Bad" in name) == 1
+    assert sent["RANGE_Status"][-1]["RANGE_SensorDistrusted"] == 1
