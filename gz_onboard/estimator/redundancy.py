@@ -177,7 +177,8 @@ class Speeds:
             if stuck and stuck != tied:
                 outvoted, tied = stuck, NOBODY
         self.unsettled = bool(tied)
-        self.on_road = not tied and any(
+        doubted = tied | {role for role in outvoted if not self.trials[role].guilty}
+        self.on_road = not doubted and any(
             role in speeds and role not in outvoted and abs(speeds[role] - middle) <= apart[role] for role in GROUND
         )
         moving = middle > MOVING
@@ -336,6 +337,9 @@ class Slopes:
         self._still = self._still + dt if forward == self._said != 0.0 else 0.0  # a plain zero: a simulation's
         self._said = forward
         keep = 1 - min(dt / GAIN_TIME, 1.0)
+        if not on_road:  # which speed is right is not yet known, or the wheels turn on a bench
+            self._product = self._square = 0.0
+            self._deaf = False
         gained = 0.0 if self._speed_before is None else speed - self._speed_before
         self._speed_before = speed
         if max(abs(acceleration), abs(gained) / max(dt, 1e-3)) > HARDEST:  # another sensor took over
