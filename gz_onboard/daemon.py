@@ -66,6 +66,7 @@ class Daemon:
         self._overrun = 0
         self._frame_s = FRAME_S
         self._offset = _wall_offset()
+        self._boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         self._said_at = 0.0
         self._said = ""
         self._log_error = ""
@@ -121,6 +122,8 @@ class Daemon:
             frames += channel.drain()
         offset = _wall_offset()
         now_ns = boot_ns + offset  # by the same clock as `offset`, whenever that was set
+        self.pipeline.estimator.wait((boot_ns - self._boot_ns) * 1e-9)
+        self._boot_ns = boot_ns
         # What came while we read, or were held up, waits for its own tick: of a channel read before, some is missing.
         frames.sort(key=itemgetter(0))
         ahead = time.clock_gettime_ns(time.CLOCK_BOOTTIME) + offset + CLOCK_STEP_NS  # for the codec to drop

@@ -13,6 +13,7 @@ from gz_onboard.physics.effect import MOVING
 
 STOP_TIME = 120.0  # s: a stop of up to this belongs to the ride, as at a traffic light; beyond, the vehicle stands
 STANDING_AFTER = 2.0  # s without motion
+MOVING_AFTER = 1.0  # s of motion: a single sample of a noisy sensor is none
 CHARGING_RATE = 0.02  # 1/h: a charging current of a fiftieth of the capacity; current sensors' offsets are smaller
 CHARGING_AFTER = 3.0  # s of it at standstill: the last of a regenerative brake is over
 SILENT_CHARGING_AFTER = 30.0  # s of it with no speed known and a silent inverter
@@ -24,6 +25,7 @@ class Activities:
     def __init__(self) -> None:
         self.now = Activity.UNKNOWN
         self._still = inf  # s since the last motion; none yet
+        self._moving = 0.0  # s of motion
         self._charging = 0.0  # s of a charging current without motion
 
     def step(
@@ -35,7 +37,8 @@ class Activities:
         Each None where it is not known. inverter_silent: the vehicle has signals of its inverter and none comes.
         """
         moving = speed is not None and abs(speed) > MOVING
-        self._still = 0.0 if moving else self._still + dt
+        self._moving = self._moving + dt if moving else 0.0
+        self._still = 0.0 if self._moving >= MOVING_AFTER else self._still + dt
         charged = c_rate is not None and c_rate < -CHARGING_RATE and not moving
         self._charging = self._charging + dt if charged else 0.0
         enough = CHARGING_AFTER if speed is not None else SILENT_CHARGING_AFTER if inverter_silent else inf
@@ -43,7 +46,7 @@ class Activities:
             self.now = Activity.CHARGING
         elif speed is None:
             self.now = Activity.UNKNOWN
-        elif self._still < STANDING_AFTER:
+        elif moving or self._still < STANDING_AFTER:
             self.now = Activity.RIDING
         else:
             self.now = Activity.STANDING

@@ -45,16 +45,18 @@ START_WAIT = 1.5  # s to wait for what comes once a second before the first esti
 STEADY_TIME = 0.5  # s over which the first voltage must hold still; an inverter that is being charged does not
 PULLING_RATE = 0.5  # 1/h: current over capacity from which a vehicle that does not move yet has been under load already
 STOPPED_SHARE = 0.5  # of a ride's polarisation: sd of what a vehicle that stands still has, long parked or just stopped
-STEADY_SHARE = 0.01  # of the span of the rest voltage: by more no cell's voltage moves meanwhile without a load,
+STEADY_SHARE = 0.02  # of the span of the rest voltage: by more no cell's voltage moves meanwhile without a load,
 STEADY_DROP = 3.0  # and with one by no more than so many times the drop over R0, cold and aged cells included
-STEADY_WAIT = 10.0  # s after which it is begun with whatever there is
+STEADY_AFTER = 10.0  # s over which it must hold still after it has once been seen to move
+STEADY_WAIT = 60.0  # s after which it is begun with whatever there is, knowing nothing
 STEADY_SD = 4.0  # of the movement: how much may be still to come
 SLOW_GAP = 0.5  # s: messages with longer gaps are watched for their real period
 SLOWEST = 5.0  # s: pack current and voltage that come less often are not integrated
 PAUSE = 1.0  # s: without messages of a longer period a longer gap is a pause, in which nobody knows what flowed
 PAUSE_PERIODS = 2.5  # the same in real periods of the pack current
 SLOW_STALE_PERIODS = 3.0  # a slow signal is stale after so many of its real periods
-LONGEST_STALE = 300.0  # s
+LONGEST_STALE = 300.0  # s, of temperatures; of everything else so many of the slowest period
+FAST_COUNT = 20  # messages in a row without a long gap: the long ones are over
 SAMPLING_RATE = 0.15  # 1/h: sd of the mean current over capacity between two samples that are seconds apart
 CONTRADICTED = 60.0  # s: a filter whose voltage is off its gate for so long begins anew
 RESTARTED_FOR = 600.0  # s: for so long it is said
@@ -146,6 +148,8 @@ class Estimator:
         self._deadline = float("-inf")
         self._current: float | None = None  # A of the pack, at the last step
         self._first: First | None = None
+        self._looked = -inf  # s: the last time
+        self._unsteady = False  # a first voltage moved
         self._waited = inf  # s: since when a first voltage has been looked at
         self._off_gate = 0
         self._contradicted = 0.0  # s
@@ -155,6 +159,8 @@ class Estimator:
         self._activities = Activities()
         self._heard = [-inf] * len(groups)  # s, of each group's last message
         self._gaps = [0.0] * len(groups)  # s, between the two before that
+        self._fast = [0] * len(groups)  # short gaps in a row since the last long one
+        self._thermal = {i for i, group in enumerate(groups) if any("temperature" in role for role in group.roles)}
         self._periods = [group.period or 0.0 for group in groups]  # s, where slow: declared, then as they really are
         self._stale = [signals[0].stale_after if signals else 0.0 for signals in self._slots]
         self._integrated = [
@@ -220,14 +226,19 @@ class Estimator:
 
     def _watch(self, group: int, gap: float) -> None:
         """Learn the real period of a message that comes with long gaps: two alike are no coincidence."""
-        before, self._gaps[group] = self._gaps[group], gap if gap > SLOW_GAP else 0.0
+        before = self._gaps[group]
         if gap <= SLOW_GAP:
-            self._periods[group], stale = 0.0, self._stale[group]
-        elif before and 0.5 < gap / before < 2 and gap < LONGEST_STALE:
-            self._periods[group] = max(gap, before)
-            stale = max(self._stale[group], min(SLOW_STALE_PERIODS * self._periods[group], LONGEST_STALE))
+            self._fast[group] += 1
+            if self._fast[group] < FAST_COUNT:  # it may come in bursts
+                return
+            self._gaps[group], self._periods[group], stale = 0.0, 0.0, self._stale[group]
         else:
-            return
+            self._gaps[group], self._fast[group] = gap, 0
+            if not before or not 0.5 < gap / before < 2 or gap > LONGEST_STALE:
+                return
+            self._periods[group] = max(gap, before)
+            longest = LONGEST_STALE if group in self._thermal else SLOW_STALE_PERIODS * SLOWEST
+            stale = max(self._stale[group], min(SLOW_STALE_PERIODS * self._periods[group], longest))
         for signal in self._slots[group]:
             signal.stale_after = stale
 
@@ -535,8 +546,9 @@ class Estimator:
 
         Riders pull away within a second: the first voltage is the one at rest, what flows meanwhile is counted.
         """
-        if self._first is None or now - self._first.time > max(2 * START_WAIT, self._pause):  # a pause
+        if self._first is None or now - self._looked > max(2 * START_WAIT, self._pause):  # a pause
             self._first = First(now, voltage, current)
+        self._looked = now
         first = self._first
         if first.moving is None and self.road.speed is not None:
             first.moving = abs(self.road.speed) > MOVING
@@ -545,18 +557,19 @@ class Estimator:
         drop = battery.cell_voltage(r0 * battery.cells_series / parallel, 1.0) * abs(current - first.current)
         moved = max(abs(voltage - first.voltage) / battery.cells_series - STEADY_DROP * drop, 0.0)  # by no load
         self._waited = min(self._waited, now)
-        if moved > STEADY_SHARE * self._ocv_span and now - self._waited < STEADY_WAIT:
-            if now - first.time >= STEADY_TIME:
-                self._first = First(now, voltage, current)
+        late = now - self._waited >= STEADY_WAIT
+        if moved > STEADY_SHARE * self._ocv_span and not late:
+            self._first, self._unsteady = First(now, voltage, current), True
             return
         awaited = [self.signals.cell_temperature]
         if self._saved:
             awaited += [self.signals.odometer, self.signals.bms_state_of_charge]
         missing = any(signal.stale_after and not signal.fresh(now) for signal in awaited)
-        if now - first.time < (START_WAIT if missing else STEADY_TIME):
+        least = STEADY_AFTER if self._unsteady else START_WAIT if missing else STEADY_TIME
+        if now - first.time < least and not late:
             return
-        self._start(now, first, temperature, STEADY_SD * moved)
-        self._waited = inf
+        self._start(now, first, temperature, self._ocv_span if late else STEADY_SD * moved)
+        self._waited, self._unsteady = inf, False
         if self.filter:
             mean = (first.current + current) / 2 / parallel
             self.filter.predict(now - first.time, mean, temperature, (1e-9, 1e-7))
@@ -601,6 +614,7 @@ class Estimator:
             apart = (before - soc) ** 2
             if apart > CONFLICT**2 * (variance + covariance[0]):  # nobody knows which of the two is wrong
                 variance += apart
+                filter_.covariance = covariance[0] + apart, covariance[1], covariance[2]
             take_in(filter_, before, variance)
         filter_.soc = min(max(filter_.soc, SOC_BOUNDS[0]), SOC_BOUNDS[1])
         self.filter = filter_
@@ -752,8 +766,15 @@ class Estimator:
             "riding": self.forecaster.snapshot(),
         }
 
+    def wait(self, seconds: float) -> None:
+        """So much time has passed [s] in which no voltage came to go on with: what was restored is older by that."""
+        if self._saved and self._saved_age is not None:
+            self._saved_age += seconds
+
     def restore(self, saved: Mapping[str, Any], key: str, age: float | None) -> None:
         """Go on from a snapshot that is `age` [s] old (None: not known). ValueError if it does not fit, whole."""
+        if age is not None and not age >= 0:
+            age = None
         if not isinstance(saved, Mapping) or saved.get("version") != SNAPSHOT_VERSION:
             raise ValueError(f"is of version {saved.get('version') if isinstance(saved, Mapping) else saved!r}")
         if saved.get("key") != key:

@@ -624,7 +624,7 @@ class Voltages:
                 against.add(role)
         if pack is not None and current is not None and self._stuck(dt, pack, current):
             against.add("pack_voltage")
-        agree: bool | None = None if inverter is None or pack is None else False
+        agree: bool | None = False
         self.apart = 0.0
         if not against and pack is not None and inverter is not None:
             difference = (pack - inverter) / self._series
@@ -643,8 +643,8 @@ class Voltages:
                     against.add(self.ROLES[liar - 1] if liar else known[0])
                 else:
                     self.apart = abs(difference)
-        for role, trial in self.trials.items():
-            trial.hear(dt, True if role in against or self.apart else agree)
+        for (role, trial), voltage in zip(self.trials.items(), (pack, inverter), strict=True):
+            trial.hear(dt, True if role in against or self.apart else None if voltage is None else agree)
         guilty = {role for role, trial in self.trials.items() if trial.guilty} if not self.apart else set()
         return frozenset(against | guilty)
 

@@ -72,8 +72,12 @@ class Road:
         if self.speed is None:
             self.slow_speed = speed
         self.speed = speed
-        self.slow_speed += (speed - self.slow_speed) * min(dt / SPEED_TIME, 1.0)
-        self.acceleration = (speed - self.slow_speed) / SPEED_TIME
+        if dt < SPEED_TIME:
+            self.slow_speed += (speed - self.slow_speed) * dt / SPEED_TIME
+            self.acceleration = (speed - self.slow_speed) / SPEED_TIME
+        else:  # slow messages: the mean over the step
+            self.acceleration = (speed - self.slow_speed) / dt
+            self.slow_speed = speed
         self.distance += abs(speed) * dt
 
     def _turn(self, now: float, dt: float, signals: Signals) -> None:

@@ -22,6 +22,8 @@ CHARGING_FROM = 120.0  # s: in a shorter gap nobody plugs in, charges and leaves
 CONSUMPTION_SD = 0.3  # relative: of a way that was not seen
 ODOMETER_STEP = 100.0  # m: odometers on the bus count in steps of up to this
 FASTEST = 70.0  # m/s
+UNKNOWN_AGE = 86_400.0  # s
+STUCK_SHARE = 0.3  # of what may have flowed: remains though the vehicle's own state of charge says that nothing did
 OWN_SOC_SD = 0.015  # of a change of the vehicle's own state of charge: its steps
 OWN_SOC_GAIN_SD = 0.2  # relative, of the same: its window and its errors
 
@@ -59,8 +61,8 @@ def from_voltage(
         emf = voltage + battery.r0.at(soc, temperature)[0] * current + v1
         soc = min(max(battery.soc_at(emf, temperature), -0.02), 1.02)
     sd = hypot(v1_sd, voltage_sd)
-    slope = 2 * sd / soc_width(battery, emf, sd, temperature)
-    return soc, (min((sd / slope) ** 2, SOC_UNKNOWN_SD**2), v1_sd**2 / slope, v1_sd**2)
+    soc_sd = min(soc_width(battery, emf, sd, temperature) / 2, SOC_UNKNOWN_SD)
+    return soc, (soc_sd**2, v1_sd**2 * soc_sd / sd, v1_sd**2)
 
 
 def soc_width(battery: Battery, emf: float, sd: float, temperature: float) -> float:
@@ -83,7 +85,7 @@ def parked(saved: Saved, age: float | None, odometer: float | None, own_soc: flo
     """The share of a polarisation that is gone by the clock: 0 if the vehicle may have been used or charged."""
     if age is None or odometer is None or saved.odometer is None or odometer != saved.odometer:
         return 0.0
-    if own_soc is not None and saved.own_soc is not None and abs(own_soc - saved.own_soc) > OWN_SOC_SD:
+    if own_soc is None or saved.own_soc is None or abs(own_soc - saved.own_soc) > OWN_SOC_SD:
         return 0.0
     return 1 - exp(-age / SLOW_TIME)
 
@@ -97,10 +99,12 @@ def flowed(
     age: of what was saved [s], None if not known; charge: of the pack [A·h]; voltage, current: of the pack now
     [V], [A]; odometer [m] and own_soc: as the vehicle shows them now, None if it does not.
     """
-    gap = 86_400.0 if age is None else age
+    gap = UNKNOWN_AGE if age is None else age
+    way = None if odometer is None or saved.odometer is None else odometer - saved.odometer
+    if way is not None and way > FASTEST * gap + ODOMETER_STEP:  # so much longer than the clock says, or it was reset
+        gap = UNKNOWN_AGE
     mean, sd = 0.0, (RIDING_RATE * gap + BURST_RATE * min(gap, BRIDGE)) / 3600
-    if odometer is not None and saved.odometer is not None and saved.consumption is not None:
-        way = odometer - saved.odometer
+    if way is not None and saved.consumption is not None:
         if -ODOMETER_STEP <= way <= FASTEST * gap + ODOMETER_STEP:
             price = saved.consumption / (3600 * charge * voltage)  # SOC per metre
             mean = max(way, 0.0) * price
@@ -115,8 +119,8 @@ def flowed(
         apart = abs(own - mean)
         if apart > 3 * hypot(sd, own_sd):  # one of the two is wrong
             sd = hypot(sd, apart)
-        elif apart <= own_sd:  # confirmed, to no better than its steps
-            sd = min(sd, own_sd)
+        elif apart <= own_sd:  # confirmed, to no better than its steps; but it may be stuck
+            sd = min(sd, hypot(own_sd, STUCK_SHARE * sd))
         else:
             share = sd * sd / (sd * sd + own_sd * own_sd)
             mean, sd = mean + share * (own - mean), sd * sqrt(1 - share)

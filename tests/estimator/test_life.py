@@ -7,8 +7,9 @@ from math import exp
 
 import pytest
 
+from gz_onboard.estimator.start import from_voltage
 from gz_onboard.events import Activity, Group, Reason, State
-from tests.estimator.life import GROUPS, PACK, Scooter, estimator, follow, worst
+from tests.estimator.life import BATTERY, GROUPS, MOTOR, PACK, Scooter, estimator, follow, worst
 
 
 def restarted(e, age):
@@ -119,11 +120,11 @@ def test_a_voltage_that_never_changes_proves_no_rest():
     assert e.estimate(300.0).soc_sd > 0.02
 
 
-@pytest.mark.parametrize("time_constant", [0.3, 2.0])
+@pytest.mark.parametrize("time_constant", [0.3, 2.0, 5.0])
 def test_an_inverter_that_is_being_charged_is_no_empty_pack(time_constant):
     """The pack's own voltage is missing, the inverter's stands in: it comes up from 4 V."""
     scooter, e = Scooter(soc=0.6), estimator()
-    for t, group, values in scooter.live(60):
+    for t, group, values in scooter.live(60 + 6 * time_constant):
         if group == PACK:
             continue
         if group == 2:
@@ -252,3 +253,52 @@ def test_a_message_that_becomes_slow_is_noticed_and_forgiven():
     rows = follow(e, scooter.live(100, 10.0), scooter)
     assert not rows[-1][1].reasons & Reason.SIGNALS_SLOW
     assert rows[-1][1].range is not None
+
+
+def test_messages_that_come_in_bursts_are_integrated_over_their_long_gaps():
+    scooter, e = Scooter(soc=0.8), estimator()
+    begin = scooter.distance
+    follow(e, scooter.live(30), scooter)
+    rows = []
+    for _ in range(200):  # two samples 0.1 s apart, then 4 s of silence
+        rows += follow(e, scooter.live(0.2, 10.0), scooter)
+        scooter.away(3.9, 10.0)
+    _, end = rows[-1]
+    assert end.distance == pytest.approx(scooter.distance - begin, rel=0.1)
+    assert worst(rows) < 3
+
+
+def test_the_wait_for_a_first_voltage_counts_as_age():
+    scooter, e = Scooter(soc=0.75), estimator()
+    follow(e, scooter.live(400, 10.0), scooter)
+    e = restarted(e, 3.0)
+    scooter.away(1200, 10.0)
+    e.wait(1200.0)
+    assert worst(follow(e, scooter.live(30, 10.0), scooter)) < 3
+
+
+@pytest.mark.parametrize("age", [-5.0, float("nan"), float("inf"), -1e9])
+def test_an_age_that_is_none_is_not_known(age):
+    scooter, e = Scooter(soc=0.75), estimator()
+    follow(e, scooter.live(60), scooter)
+    e = restarted(e, age)
+    assert worst(follow(e, scooter.live(30), scooter)) < 3
+
+
+@pytest.mark.parametrize("temperature", [-20.0, -10.0])
+@pytest.mark.parametrize("volts", [2.4, 2.8, 3.1])
+def test_a_covariance_of_the_first_state_of_charge_can_exist(temperature, volts):
+    soc, (p00, p01, p11) = from_voltage(BATTERY, volts, 2.0, temperature, 0.8, 0.8, 0.05)
+    assert p01 * p01 <= p00 * p11
+    assert -0.02 <= soc <= 1.02
+
+
+def test_a_sensor_that_twitches_at_standstill_is_no_motion():
+    scooter, e = Scooter(soc=0.75), estimator()
+    follow(e, scooter.live(20), scooter)
+    follow(e, scooter.live(540, 10.0), scooter)
+    follow(e, scooter.live(130), scooter)
+    duration = e.forecaster.riding.current.duration
+    twitching = ((t, g, (4.0,) if g == MOTOR and t % 60 < 0.1 else v) for t, g, v in scooter.live(1200))
+    follow(e, twitching, scooter)
+    assert e.forecaster.riding.current.duration == duration
