@@ -108,7 +108,8 @@ class Scooter:
               INV_MotorTemperature=40, INV_CurrentLimit=150)  # fmt: skip
         every(100, 2, "BMS_Pack", BMS_PackVoltage=voltage, BMS_PackCurrent=current, BMS_StateOfCharge=70)
         every(1000, 3, "BMS_Cells", BMS_CellTempMean=25, BMS_CellVoltageMin=3.7, BMS_CellVoltageMax=3.72)
-        every(10, 4, "IMU_Acceleration", hbm, IMU_AccelZ=9.81)
+        for phase, accel_z in ((4, 9.83), (14, 9.79), (24, 9.82)):  # one that never changes on the road is stuck
+            every(30, phase, "IMU_Acceleration", hbm, IMU_AccelZ=accel_z)
         every(10, 4, "IMU_AngularRate", hbm)
         every(20, 5, "HBM_Wheels", hbm, HBM_WheelSpeedFront=turn / 6.2831853, HBM_WheelSpeedRear=turn / 6.2831853)
         every(100, 6, "HBM_Auxiliary", hbm, HBM_AuxCurrent=auxiliary)

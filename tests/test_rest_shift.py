@@ -105,11 +105,12 @@ def test_the_estimator_starts_from_the_cold_rest_voltage_and_doubts_it():
     for battery in (COLD, PLAIN):
         estimator = Estimator(groups, battery, VEHICLE.model, VEHICLE.riding)
         estimator.handle((0.9, 0, (0.0,)))
-        estimator.handle((1.0, 1, (14 * COLD.ocv(0.6, 0.0)[0], VEHICLE.parameters["pack_current_offset"])))
+        for time in (1.0, 2.0):
+            estimator.handle((time, 1, (14 * COLD.ocv(0.6, 0.0)[0], VEHICLE.parameters["pack_current_offset"])))
         assert estimator.filter
         expected = 0.6 if battery is COLD else PLAIN.soc_at(COLD.ocv(0.6, 0.0)[0])
         assert estimator.filter.soc == pytest.approx(expected, abs=1e-3)
-        sd[battery is COLD] = estimator.filter.covariance[0]
+        sd[battery is COLD] = estimator._rest_sd
     assert sd[True] > 1.01 * sd[False]
 
 

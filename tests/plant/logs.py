@@ -25,7 +25,7 @@ SIGNALS = {
     "INV_MotorTemperature": ("motor_temperature", 1), "BMS_PackVoltage": ("pack_voltage", 1),
     "BMS_PackCurrent": ("pack_current", 1), "BMS_StateOfCharge": ("bms_state_of_charge", 0.01),
     "BMS_CellTempMean": ("cell_temperature", 1), "VCU_Throttle": ("throttle", 0.01),
-    "VCU_BrakeSwitch": ("brake_switch", 1), "VCU_Odometer": ("odometer", 1000),
+    "VCU_BrakeSwitch": ("brake_switch", 1), "VCU_ChargePlug": ("charge_plug", 1), "VCU_Odometer": ("odometer", 1000),
     "IMU_AccelX": ("accel_x", 1), "IMU_AccelY": ("accel_y", 1), "IMU_AccelZ": ("accel_z", 1),
     "IMU_RateX": ("rate_x", DEGREE), "IMU_RateY": ("rate_y", DEGREE), "IMU_RateZ": ("rate_z", DEGREE),
     "HBM_WheelSpeedFront": ("wheel_speed_front", REVOLUTION), "HBM_WheelSpeedRear": ("wheel_speed_rear", REVOLUTION),

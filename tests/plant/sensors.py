@@ -92,6 +92,7 @@ def measure(ridden: Ridden, name: str) -> Samples:
     t = message(0.020, 0.15)
     put("throttle", t, np.clip(at(c["throttle"], t) + 0.003 * rng.normal(size=len(t)), 0, 1), 0.005)
     put("brake_switch", t, (at(c["brake"], t) > 0.5).astype(float), 1.0)
+    put("charge_plug", t, np.zeros(len(t)), 1.0)
     t = message(1.0, 1.0, 0.001)
     put("odometer", t, 1_843_200 + at(np.cumsum(c["rear"]) * STEP * ODOMETER_RADIUS, t), 1.0)
     # inertial unit, in the body that leans

@@ -94,8 +94,8 @@ def test_columns_of_other_people(tmp_path, capsys):
         (["motor", "motor_dyno.csv.gz", "--set", "largest=1"], "no option 'largest' .*; there are largest_current"),
         (["motor", "motor_dyno.csv.gz", "--set", "largest_current=x"], "'x' is not a number"),
         (
-            ["motor", "motor_dyno.csv.gz", "--set", "largest_current=0"],
-            "motor: .*motor_dyno.csv.gz: .* points up to 0 A",
+            ["motor", "motor_dyno.csv.gz", "--set", "largest_current=0.001"],
+            "motor: .*motor_dyno.csv.gz: .* points up to 0.001 A",
         ),
         (["pulse", "cell_pulse_25C.csv.gz", "--set", "method=dirct"], r"pulse: method 'dirct' .*did you mean 'direct'"),
         (["coastdown", "motor_dyno.csv.gz", "motor_emf_ramp.csv.gz"], "motor_dyno.csv.gz: no column for 'time'"),
