@@ -396,7 +396,7 @@ class Estimator:
             voltage, self._off_gate = None, self._off_gate + 1
         if filter_ is None:
             if voltage is not None:
-                self._wait(now, voltage, current or 0.0, temperature)
+                self._await_steady(now, voltage, current or 0.0, temperature)
             self._current = current
             return
         if dt > 0:
@@ -541,7 +541,7 @@ class Estimator:
         self._restarted_at = now
         self._rest, self._rest_variance = Rest(), inf
 
-    def _wait(self, now: float, voltage: float, current: float, temperature: float) -> None:
+    def _await_steady(self, now: float, voltage: float, current: float, temperature: float) -> None:
         """Start from the first voltage that holds still, as soon as what comes once a second is known or overdue.
 
         Riders pull away within a second: the first voltage is the one at rest, what flows meanwhile is counted.

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from math import sqrt
 from statistics import median
 
+from gz_onboard.estimator.road import G
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.physics.battery import Battery
 
@@ -50,7 +51,6 @@ STANDING_TIME, STANDING_RATE = 20.0, 0.6  # s, m/s: a standing vehicle does not 
 GAIN = 0.6, 1.5  # of the accelerometer over the wheels' acceleration, over `GAIN_TIME` if there is enough of it
 HARDEST = 10.0  # m/s²
 GAIN_TIME, GAIN_LEAST = 60.0, 10.0  # s, m²/s³
-G = 9.80665  # m/s²
 
 # Currents in those that empty the pack in an hour; the voltages are a cell's.
 STANDS = 0.05  # m/s
