@@ -68,9 +68,9 @@ def clock_is_kept() -> bool:
     return any(Path("/sys/class/rtc").glob("rtc*"))
 
 
-def save(file: Path, snapshot: Mapping[str, Any], time: float) -> None:
-    """Write `snapshot`, taken at `time` [s since the epoch]; `encode` and `write` in one."""
-    write(file, encode(snapshot, time))
+def save(file: Path, snapshot: Mapping[str, Any], time: float, uptime: float | None = None) -> None:
+    """Write `snapshot`, taken at `time` [s since the epoch] and `uptime` [s]; `encode` and `write` in one."""
+    write(file, encode(snapshot, time, uptime))
 
 
 def write(file: Path, text: bytes) -> None:

@@ -7,7 +7,8 @@ from math import cos, sin
 
 import pytest
 
-from gz_onboard.estimator.redundancy import FORGIVEN_AFTER, NOBODY, G, Slopes, Speeds, vote
+from gz_onboard.estimator.redundancy import FORGIVEN_AFTER, NOBODY, Slopes, Speeds, vote
+from gz_onboard.estimator.road import G
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import ROLES
 

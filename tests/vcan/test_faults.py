@@ -75,12 +75,13 @@ def steady_ride(*channels: str) -> Iterator[list[float]]:
 
 def test_killed_it_goes_on_from_the_saved_state(running: Running, listener: Listener):
     city = LOGS / "city_14C.blf"
-    # What 200 s of the same ride have taught, as the state file of the day before would have it.
+    # What 200 s of the same ride have taught, as a daemon that was killed then would have saved it.
     learned = ridden(recorded("city_14C", 0.0, 200.0))
     snapshot = learned.pipeline.estimator.snapshot(reference().key)
     assert snapshot is not None
     folder = running.folder("a")
-    state.save(folder / f"{reference().name}.json", snapshot, time.time())
+    uptime = time.clock_gettime(time.CLOCK_BOOTTIME)  # the guest has no clock of its own: without it no age is known
+    state.save(folder / f"{reference().name}.json", snapshot, time.time(), uptime)
     daemon = running.daemon()
     assert "going on from the state saved" in daemon.journal
     replay = running.replay(city, "--from", "200")
