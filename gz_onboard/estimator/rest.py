@@ -18,6 +18,7 @@ BLOCK = 2.0  # s over which the voltage is averaged
 LONGEST = 900  # blocks: half an hour
 SLOW_TIME = 1000.0  # s: time constant of slow diffusion in lithium-ion cells, a quarter of an hour or so
 SLOW_SHARE = 0.7  # relative sd of that: it is from ten minutes to an hour
+PROVEN = 1.5  # times what the cell model does not have: beyond, a slope proves no rest
 FAST_TIMES = 3.0  # time constants of the RC pair: the fast part is a mixture of some, too
 
 
@@ -69,7 +70,9 @@ class Rest:
             at_first = hypot(FAST_TIMES * fast_time * hypot(rate, noise), unnamed)
             if not self._loaded and at_first < self.sd:
                 self.coming, self.sd = 0.0, at_first
-            self.fresh = True
+            elif self.sd > PROVEN * unnamed:  # a fast tail, of which the slow one's time constant says nothing
+                self.sd = None
+            self.fresh = self.sd is not None
 
     def interrupt(self) -> None:
         """A load, or a pause in the data: begin anew."""

@@ -24,9 +24,9 @@ def run_kind(name: str, share: float, seed: int) -> tuple[str, Report, float]:
     return name, report, time.monotonic() - began
 
 
-def tables(reports: dict[str, Report], seed: int) -> str:
+def tables(reports: dict[str, Report], seed: int, share: float) -> str:
     """The tables in Markdown."""
-    text = f"\nSeed {seed}.\n"
+    text = f"\nSeed {seed}, {share:.0%} of the full counts.\n"
     for name, report in reports.items():
         text += f"\n### {kinds()[name].TITLE}\n\n| what | measured |\n| --- | --- |\n"
         text += "".join(f"| {what} | {value} |\n" for what, value in report.rows.items())
@@ -58,7 +58,8 @@ def main() -> int:
         page = PAGE.read_text(encoding="utf-8")
         before, _, rest = page.partition(BEGIN)
         PAGE.write_text(
-            before + BEGIN + tables(reports, arguments.seed) + END + rest.partition(END)[2], encoding="utf-8"
+            before + BEGIN + tables(reports, arguments.seed, arguments.share) + END + rest.partition(END)[2],
+            encoding="utf-8",
         )
         print(f"\nwritten: {PAGE}")
     return any(report.failures for report in reports.values())
