@@ -9,19 +9,20 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import exp, hypot, inf, isfinite, sqrt
+from math import exp, hypot, inf, isinf, sqrt
 from typing import Any
 
 from gz_onboard.estimator.activity import Activities
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
 from gz_onboard.estimator.forecast import Forecast, Forecaster, Turn
-from gz_onboard.estimator.redundancy import Electric, Redundancy
+from gz_onboard.estimator.redundancy import Electric, Redundancy, Speeds, lost
 from gz_onboard.estimator.rest import RATE as REST_RATE
 from gz_onboard.estimator.rest import Rest
-from gz_onboard.estimator.road import Road
+from gz_onboard.estimator.road import MOST_BIAS, Road
 from gz_onboard.estimator.shaking import Shaking
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signal, Signals
 from gz_onboard.estimator.start import (
+    BRIDGE,
     SOC_UNKNOWN_SD,
     Saved,
     flowed,
@@ -30,6 +31,7 @@ from gz_onboard.estimator.start import (
     plausible,
     soc_width,
     take_in,
+    unseen_sd,
 )
 from gz_onboard.events import STALE_PERIODS, Activity, Estimate, Event, Group, Reason, State
 from gz_onboard.physics.battery import Battery
@@ -101,6 +103,7 @@ LEARNED_FROM = {"motor_speed", "accel_x", "gps_altitude", "pack_current", "pack_
 UNLEARNED = 1500.0  # m: so far a sensor can have lied before it is found out
 WEIGHTY = ~(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)  # reasons that degrade an estimate
 NO_PACK = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT
+SAVED_MOST = {"current": 1e4, "odometer": 1e10, "own_soc": 1.1, "consumption": 1e5}  # A, m, 1, J/m
 MISMATCH = 3.0  # A between the two current sensors, over ten seconds or so
 
 
@@ -139,6 +142,7 @@ class Estimator:
         self._slots = [[self.signals[role] for role in group.roles] for group in groups]
         pace = [i for role in PACE for i, group in enumerate(groups) if role in group.roles]
         self._pace = pace[0] if pace else -1
+        self._speeds = [i for role in Speeds.ROLES for i, group in enumerate(groups) if role in group.roles][:1]
         # Every sample of accel_z is looked at, but only for a model that reads what it tells.
         self._reads_vibration = "vibration" in model.reads
         shaken = [(i, group.roles.index("accel_z")) for i, group in enumerate(groups) if "accel_z" in group.roles]
@@ -171,6 +175,7 @@ class Estimator:
         self._mismatch = 0.0  # A, low-passed
         self._cell_temperature: float | None = None
         self._pack: tuple[float | None, float | None, str] = (None, None, "none")
+        self._said_current: float | None = None  # A of the pack, trusted or not
         self._forecast: Forecast | None = None
         self._forecast_time = float("-inf")
         self._saved: Saved | None = None
@@ -186,6 +191,7 @@ class Estimator:
         self._empty_sd = p.sd("cell_voltage_error_empty")
         self._rest_sd = sqrt(p.sd("rest_voltage_error") ** 2 + battery.ocv_sd**2 + battery.rest_shift_sd**2)
         self._cell_scatter = p.sd("cell_capacity") / p["cell_capacity"]
+        self._usual_voltage = battery.ocv(0.5)[0] * battery.cells_series
         self._ocv_span = battery.ocv(1.0)[0] - battery.ocv(0.0)[0]
         self._charge_sd = sqrt(self._cell_scatter**2 + gain_sd**2)
         self._cable = p["cable_resistance"]
@@ -261,7 +267,7 @@ class Estimator:
         self._deadline = now + STEP_AT_LEAST
         signals = self.signals
         elapsed = min(dt, self._pause)
-        self.redundancy.step(now, elapsed, signals, self.road.speed)
+        self.redundancy.step(now, dt, elapsed, signals, self.road.speed)
         self.road.step(now, elapsed, signals, self._radius, self._gear)
         voltage, current, source = self._measured(now, elapsed)
         self._pack = voltage, current, source
@@ -280,7 +286,7 @@ class Estimator:
         voltage, inverter_voltage = signals.pack_voltage.told(now), signals.inverter_voltage.told(now)
         current, inverter = signals.pack_current.told(now), signals.inverter_current.told(now)
         any_voltage = voltage if voltage is not None else inverter_voltage
-        usual = self.model.parameters["auxiliary_power"] / (any_voltage or 50.0)
+        usual = self.model.parameters["auxiliary_power"] / (any_voltage or self._usual_voltage)
         auxiliary = signals.auxiliary_current.told(now)
         if current is not None:
             current = (current - self._offset) / self._gain
@@ -291,8 +297,10 @@ class Estimator:
         if inverter_voltage is not None:
             inverter_voltage += self._cable * (current or 0.0)
         said = replace(said, pack_voltage=voltage, inverter_voltage=inverter_voltage)
+        together = _together(signals.pack_voltage, signals.inverter_voltage)
+        compared = said if together else replace(said, inverter_voltage=None)
         voltages = self.redundancy.voltages
-        distrusted = voltages.step(dt, said, current, self._cell_error)
+        distrusted = voltages.step(dt, compared, current, self._cell_error)
         for role in voltages.ROLES:
             signals[role].trusted = role not in distrusted
         if voltages.apart and voltage is not None and inverter_voltage is not None:
@@ -310,15 +318,19 @@ class Estimator:
         voltage = said.pack_voltage or said.inverter_voltage
 
         def by_road() -> float | None:
-            return self._model_power(now) / voltage if voltage and self.road.speed is not None else None
+            known = voltage and self.road.speed is not None and self._sampled <= SLOW_GAP
+            return self._model_power(now) / voltage if voltage and known else None
 
-        distrusted = currents.step(dt, said, self._cell_error, by_road, sqrt(self._innovation_square))
+        self._said_current = said.pack if said.pack is not None else said.around
+        together = _together(signals.pack_current, signals.inverter_current)
+        compared = said if together else replace(said, inverter=None)
+        distrusted = currents.step(dt, compared, self._cell_error, by_road, sqrt(self._innovation_square))
         for role in currents.ROLES:
             signals[role].trusted = role not in distrusted
         if not signals.auxiliary_current.trusted:
             said = replace(said, auxiliary=None)
         pack, around = said.pack, said.around
-        if pack is not None and around is not None and not said.charging:
+        if pack is not None and around is not None and together and not said.charging:
             self._mismatch += 0.01 * (pack - around - self._mismatch)
         if pack is not None and around is not None and currents.disputed:
             return (pack + around) / 2, "disputed"
@@ -333,8 +345,11 @@ class Estimator:
         if self.filter is None:
             return None
         cell = self.battery.cell_voltage(voltage, current) + self._lacking
-        temperature = 25.0 if self._cell_temperature is None else self._cell_temperature
-        return self.filter.innovation(cell, current / self.battery.cells_parallel, temperature)[0]
+        return self.filter.innovation(cell, current / self.battery.cells_parallel, self._cells())[0]
+
+    def _cells(self) -> float:
+        """The cells' last temperature [degC], or that of the bench."""
+        return 25.0 if self._cell_temperature is None else self._cell_temperature
 
     def _hear_slopes(self, now: float, dt: float) -> None:
         road, slopes = self.road, self.redundancy.slopes
@@ -342,8 +357,7 @@ class Estimator:
         power = None if voltage is None or current is None or source == "model" else voltage * current
         before = slopes.guilty
         speeds = self.redundancy.speeds
-        speed = None if speeds.unsettled else road.speed
-        slopes.step(now, dt, self.signals, speed, road.acceleration, speeds.on_road, power,
+        slopes.step(now, dt, self.signals, speeds, power,
                     lambda speed, acceleration: self._power_at(now, speed, acceleration, 0.0))  # fmt: skip
         if slopes.guilty != before:
             road.forget_slope(slopes.offset)
@@ -404,15 +418,16 @@ class Estimator:
             mean = ((before or 0.0) + (current or 0.0)) / 2
             charge = 3600 * battery.pack_capacity(temperature)
             unchecked = 0.0 if self.signals.inverter_current.fresh(now) else UNCHECKED_CURRENT_SD
-            sd = sqrt(self._offset_sd**2 + CURRENT_SD[source] ** 2 + unchecked**2)
-            q = (sd / charge) ** 2 * 2 * CURRENT_TIME[source] * min(dt, 1.0)
-            q += self._charge_sd**2 * abs(mean * dt / charge)
             sampled = self._sampled
+            counted = source if sampled <= SLOWEST else "none"  # beyond, most of what flows is not seen
+            sd = sqrt(self._offset_sd**2 + CURRENT_SD[counted] ** 2 + unchecked**2)
+            q = (sd / charge) ** 2 * 2 * CURRENT_TIME[counted] * min(dt, self._pause)
+            q += self._charge_sd**2 * abs(mean * dt / charge)
             if sampled > SLOW_GAP:
                 q += (SAMPLING_RATE / 3600) ** 2 * dt * sampled
-            if dt > self._pause:  # nobody knows what flowed, the last current is believed for a second
-                mean *= PAUSE / dt
-                q += (CURRENT_SD["none"] * (dt - PAUSE) / charge) ** 2
+            if dt > self._pause:  # nobody knows what flowed
+                mean *= dt <= BRIDGE
+                q += unseen_sd(dt) ** 2
                 self._rest.interrupt()
                 self._rest_variance = inf
             filter_.predict(dt, mean / battery.cells_parallel, temperature, (q, 1e-8 * min(dt, RELAXED)))
@@ -437,9 +452,12 @@ class Estimator:
         # What effects in the cells take is known: the filter sees the voltage that there would be without them.
         cell_voltage = battery.cell_voltage(voltage, current) + self._lacking
         cell_current = current / battery.cells_parallel
+        r0 = battery.r0.at(filter_.soc, temperature)[0]
+        explaining = current if source in ("pack", "inverter") else self._said_current
+        if explaining is not None:
+            self.redundancy.currents.sag.hear(dt, cell_voltage, r0 * explaining / battery.cells_parallel)
         if self._rested(dt, cell_voltage, cell_current, temperature):
             return
-        r0 = battery.r0.at(filter_.soc, temperature)[0]
         resistance_sd = RESISTANCE_SD if self.signals.cell_temperature.fresh(now) else RESISTANCE_SD_COLD
         by_inverter = not self.signals.pack_voltage.fresh(now)
         voltage_sd = INVERTER_VOLTAGE_SD / battery.cells_series if by_inverter else self._voltage_sd
@@ -495,7 +513,7 @@ class Estimator:
         while recent[1][0] <= then:
             recent.popleft()
         (t0, v0, i0), (t1, v1, i1) = recent[0], recent[1]
-        if t1 - t0 > 1.0:  # a pause between
+        if t1 - t0 > self._pause:
             return None
         share = (then - t0) / (t1 - t0)
         if self._latency > 0:
@@ -625,7 +643,7 @@ class Estimator:
         """Follow what the vehicle does."""
         signals = self.signals
         known = current if source in ("pack", "inverter") else None
-        rate = None if known is None else known / self.battery.pack_capacity(self._cell_temperature or 25.0)
+        rate = None if known is None else known / self.battery.pack_capacity(self._cells())
         inverter = (signals.inverter_current, signals.inverter_voltage, signals.motor_speed)
         mapped = [signal for signal in inverter if signal.stale_after]
         silent = bool(mapped) and not any(signal.fresh(now) for signal in mapped)
@@ -639,16 +657,19 @@ class Estimator:
             self.forecaster.pause()
             return
         motor = self.signals.motor_temperature.get(now)
-        self.forecaster.ride(
+        learned = self.forecaster.ride(
             dt, speed, self.road.grade, voltage * current, self._ambient(now)[0], self.road.altitude or 0.0,
             40.0 if motor is None else motor, self._turn(now) if self.forecaster.extended else None,
+            max(self._periods[i] for i in self._speeds) if self._speeds else 0.0,
         )  # fmt: skip
+        if learned and self.signals.cell_temperature.fresh(now):  # R0 is known only with it
+            self.redundancy.currents.weigh(self.forecaster.recent_factor)
 
     def _turn(self, now: float) -> Turn:
         """What effects beyond the base's may read while riding."""
         road, filter_ = self.road, self.filter
         lateral = None if road.yaw_rate is None or road.speed is None else road.speed * road.yaw_rate
-        cells = (filter_.soc if filter_ else 0.5, self._cell_temperature or 20.0, self._current or 0.0)
+        cells = (filter_.soc if filter_ else 0.5, self._cells(), self._current or 0.0)
         return Turn(lateral, road.heading, *cells, self._shaking.value(now) if self._reads_vibration else None)
 
     def vibration(self, now: float) -> float:
@@ -729,7 +750,7 @@ class Estimator:
             reasons |= Reason.NO_SPEED
         if not (s.rate_x.fresh(now) and s.rate_z.fresh(now) and s.accel_x.fresh(now)):
             reasons |= Reason.NO_IMU
-        if not s.gps_speed.fresh(now) and not s.latitude.fresh(now):
+        if lost(now, s) or not (s.gps_speed.fresh(now) or s.latitude.fresh(now)):
             reasons |= Reason.NO_GPS
         if abs(self._mismatch) > MISMATCH:
             reasons |= Reason.CURRENT_MISMATCH
@@ -784,7 +805,8 @@ class Estimator:
             p00, p01, p11 = (float(x) for x in saved["covariance"])
             bias_x, bias_z = (float(x) for x in saved["gyro_bias"])
             if not (
-                isfinite(bias_x + bias_z)
+                abs(bias_x) < MOST_BIAS
+                and abs(bias_z) < MOST_BIAS
                 and -0.1 < soc < 1.1
                 and abs(v1) < 1
                 and 0 < p00 < 1
@@ -792,7 +814,7 @@ class Estimator:
                 and p01 * p01 <= p00 * p11
             ):
                 raise ValueError("holds implausible numbers")
-            extra = {name: _optional(saved[name]) for name in ("current", "odometer", "own_soc", "consumption")}
+            extra = {name: _optional(saved[name], most) for name, most in SAVED_MOST.items()}
             states = {name: float(saved["cell_effects"][name]) for name in self._cell_states}
             if not all(abs(x) < 1 for x in states.values()):
                 raise ValueError("holds implausible voltages of effects in the cells")
@@ -810,16 +832,21 @@ class Estimator:
             self._move_cells(1e9 if age is None else age, 0.0, soc, 20.0)
 
 
+def _together(first: Signal, second: Signal) -> bool:
+    """Whether two of which both speak do so at the same time; or one of them is silent."""
+    return isinf(first.time + second.time) or abs(first.time - second.time) <= SLOW_GAP
+
+
 def _last(signal: Signal) -> float | None:
     """The last value that ever came."""
     return signal.value if signal.time > -inf else None
 
 
-def _optional(value: object) -> float | None:
-    """A saved number, or None. ValueError, TypeError if it is neither."""
+def _optional(value: object, most: float) -> float | None:
+    """A saved number, in size at most `most`, or None. ValueError, TypeError if it is neither."""
     if value is None:
         return None
     number = float(value)  # type: ignore[arg-type]
-    if not isfinite(number):
+    if not abs(number) <= most:
         raise ValueError("holds implausible numbers")
     return number

@@ -43,6 +43,7 @@ ALIKE = 300.0  # m: over so much way segments are alike; those of the eight comm
 DRIFT = 0.055  # relative sd: the rest of the way is not the way so far; the eight rides differ by that
 FACTOR_WALK = 0.01  # sd of its change over a segment: wind, tyres, traffic
 SEGMENT_SD = 0.18  # relative: measured against modelled energy of one segment, of the eight commissioning rides
+HEIGHT_WALK = 0.75  # m per sqrt(m): roads climb or fall by 60 m on 6 km; of a way whose grade no sensor told
 PRIOR_FORM = 2.5  # mean square of the power over the square of its mean, of the eight commissioning rides
 PRIOR_SCATTER = 0.25  # relative sd of segments of a riding not yet known
 G = 9.80665  # m/s²
@@ -70,6 +71,7 @@ class Segment:
     squares: float = 0.0  # W²·s, of the measured power
     modelled: float = 0.0
     level: float = 0.0  # modelled, less what height and speed have stored: its hills and stops, but back where it began
+    unseen: float = 0.0  # m of which no sensor told the grade
     learned: tuple[float, float] | None = None  # the factor and its variance before it; None after a restart
 
 
@@ -105,6 +107,7 @@ class Past:
     measured: float = 0.0  # J
     power_squares: float = 0.0  # W²·s
     recent: float = 0.0  # J, measured over the last kilometre
+    recent_modelled: float = 0.0  # J
     recent_distance: float = 0.0  # m
     whole: float = 0.0  # m, unweighted
 
@@ -156,10 +159,11 @@ class Forecaster:
     # --- learning ---------------------------------------------------------------------------------------------
 
     def ride(self, dt: float, speed: float, grade: float | None, power: float, ambient: float, altitude: float,
-             motor_temperature: float, turn: Turn | None = None) -> None:  # fmt: skip
+             motor_temperature: float, turn: Turn | None = None, period: float = 0.0) -> bool:  # fmt: skip
         """Take in `dt` [s] of riding: speed [m/s], grade (sine), power at the pack [W], ambient and motor [degC].
 
-        `turn` is needed, and read, if the model is `extended`.
+        `turn` is needed, and read, if the model is `extended`. `period` [s]: how often the speed comes, if seldom;
+        between two of its messages it has no acceleration that means anything. Gives whether a segment was learned.
         """
         r = self.riding
         if r.speed_before is None:
@@ -169,6 +173,7 @@ class Forecaster:
         r.energy += power * dt
         r.squares += power * power * dt
         r.climb += (grade or 0.0) * speed * dt
+        r.current.unseen += abs(speed) * dt if grade is None else 0.0
         if turn:
             if turn.lateral_acceleration is not None:
                 r.lateral += turn.lateral_acceleration**2 * dt
@@ -178,13 +183,13 @@ class Forecaster:
                 r.shaken_seconds += dt
             if speed > MOVING:
                 r.time_moving += dt
-        if r.seconds < 1.0:
-            return
+        if r.seconds < max(1.0, period):
+            return False
         mean = r.way / r.seconds
         acceleration = (speed - r.speed_before) / r.seconds
         if abs(acceleration) > ACCELERATION or not SPEEDS[0] < mean < SPEEDS[1]:  # a sensor errs, or the wheel spins
             self.pause()
-            return
+            return False
         q = self.quantities(mean, acceleration, ambient, altitude, motor_temperature)
         if abs(r.way) > 0.1:
             q["grade"] = max(min(r.climb / abs(r.way), 0.3), -0.3)
@@ -207,8 +212,16 @@ class Forecaster:
         segment.level += to_come - self.model.mass * stored
         self._next_second()
         r.speed_before = speed
-        if segment.distance >= SEGMENT:
-            self._close(segment)
+        if segment.distance < SEGMENT:
+            return False
+        self._close(segment)
+        return True
+
+    @property
+    def recent_factor(self) -> float:
+        """Measured over modelled energy of the last kilometre or so; 1 while that is not known."""
+        past = self._past
+        return past.recent / past.recent_modelled if past.recent_distance >= 1000 and past.recent_modelled > 0 else 1.0
 
     def forget(self, way: float) -> None:
         """Unlearn the last `way` [m] or a little more: a sensor that it was learned from has lied."""
@@ -290,8 +303,10 @@ class Forecaster:
         # takes little tells little.
         r.factor_variance += FACTOR_WALK**2
         if segment.modelled > 0:
-            noise = SEGMENT_SD * self._past.level / self._past.distance * segment.distance / segment.modelled
-            gain = r.factor_variance / (r.factor_variance + noise * noise)
+            noise = SEGMENT_SD * self._past.level / self._past.distance * segment.distance
+            height = self.model.mass * G * HEIGHT_WALK * sqrt(segment.unseen)
+            variance = (noise * noise + height * height) / segment.modelled**2
+            gain = r.factor_variance / (r.factor_variance + variance)
             r.factor += gain * (segment.measured / segment.modelled - r.factor)
             r.factor = min(max(r.factor, 0.3), 3.0)
             r.factor_variance *= 1 - gain
@@ -371,6 +386,7 @@ class Forecaster:
             past.squares += share * segment.level**2 / segment.distance
             if past.recent_distance < 1000:
                 past.recent += segment.measured
+                past.recent_modelled += segment.modelled
                 past.recent_distance += segment.distance
         self._past = past
 

@@ -18,12 +18,13 @@ from dataclasses import dataclass
 from math import sqrt
 from statistics import median
 
-from gz_onboard.estimator.road import G
+from gz_onboard.estimator.road import STANDS, G, accelerated
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.physics.battery import Battery
 
 GUILTY_AFTER = 3.0  # s of contradiction: wheels spin and lock for a second or two
 FORGIVEN_AFTER = 60.0  # s of agreement
+SETTLED = 30.0  # s: a signal that has held so long is not replaced by what contradicts it
 MOVING = 2.0  # m/s: below, wheel sensors lose their teeth, and a dead sensor is as right as any
 REVERSE = 4.0  # m/s: no road vehicle goes back faster; slower, wheels and GPS do not tell the direction
 SPEED_APART, SPEED_APART_RELATIVE = 1.0, 0.12  # m/s and 1: two speeds that differ by more contradict each other
@@ -53,7 +54,6 @@ HARDEST = 10.0  # m/s²
 GAIN_TIME, GAIN_LEAST = 60.0, 10.0  # s, m²/s³
 
 # Currents in those that empty the pack in an hour; the voltages are a cell's.
-STANDS = 0.05  # m/s
 FAST_TIME, SKEW_TIME, CURRENT_TIME = 0.5, 2.0, 10.0  # s: low passes; the sensors do not sample at the same time
 CURRENT_APART, CURRENT_APART_RELATIVE = 0.10, 0.10  # 1/h and 1: two currents that differ by more contradict each other
 GROSS_CURRENT, GROSS_RELATIVE = 0.5, 0.3  # the same over `FAST_TIME`
@@ -64,6 +64,12 @@ ROAD_TIME, OFF_ROAD, OFF_ROAD_RELATIVE = 30.0, 0.15, 0.7  # s, 1/h, 1: by the ro
 PLAIN = 2.5  # of two mean squares: the greater one's reading lies
 STUCK_VOLTAGE = 5.0  # s
 LOWEST_CELL, HIGHEST_CELL = 0.6, 1.12  # of the cut-off, of full at rest
+# Both currents scaled alike: the cells' voltage sags by more (less) than they explain, and a kilometre takes less
+# (more) than the road does. The recorded rides show a sag of 0.6 to 1.3 of the predicted one, an aged pack's up to
+# twice; a frugal rider over the last kilometre 0.7 of the usual. Neither alone says that a sensor lies; both do.
+SAG_FAST, SAG_TIME, SAG_LEAST = 0.5, 120.0, 0.005  # s, s, V²·s of a cell
+SAGS_MORE, TAKES_LESS = 1.45, 0.67
+SAG_AGREES = 1.3  # by no more than this factor: the currents explain the voltage again
 
 # Temperatures [degC] that vehicles have, and how fast [K/s] they change at most.
 TEMPERATURES = {
@@ -83,6 +89,43 @@ AXIS_TIME = 30.0
 def part(dt: float, time: float) -> float:
     """The share of a new value in a mean over `time` [s], of which `dt` [s] are new."""
     return min(dt / time, 1.0) if time > 0 else 1.0
+
+
+class Anchor:
+    """The last value of a slow signal that could be, and whether the next one can follow it.
+
+    The first value is no better than any other: until the signal has held for `SETTLED` seconds, one that holds for
+    longer takes its place.
+    """
+
+    __slots__ = ("_other", "_other_room", "_other_seconds", "_room", "_seconds", "_value")
+
+    def __init__(self) -> None:
+        self._value: float | None = None
+        self._other: float | None = None  # the last value that could not follow it
+        self._room = self._other_room = 0.0  # by how much the signal can have changed since
+        self._seconds = self._other_seconds = 0.0  # for how long it has held
+
+    def hear(self, dt: float, value: float | None, change: float, jump: float) -> bool:
+        """Whether `value` can follow, `dt` [s] in which the signal changes by no more than `change`; None: silent.
+
+        jump: what two values in a row may differ by in addition.
+        """
+        self._room += change
+        self._other_room += change
+        if value is None:
+            return True
+        if self._value is None or abs(value - self._value) <= self._room + jump:
+            self._value, self._room, self._other = value, 0.0, None
+            self._seconds += dt
+            return True
+        follows = self._other is not None and abs(value - self._other) <= self._other_room + jump
+        self._other_seconds = self._other_seconds + dt if follows else 0.0
+        self._other, self._other_room = value, 0.0
+        if not self._seconds < min(self._other_seconds, SETTLED):
+            return False
+        self._value, self._room, self._seconds, self._other = value, 0.0, self._other_seconds, None
+        return True
 
 
 class Trial:
@@ -134,6 +177,11 @@ def vote(speeds: Mapping[str, float], apart: Mapping[str, float]) -> tuple[froze
     return others, NOBODY
 
 
+def lost(now: float, signals: Signals) -> bool:
+    """Whether the GPS says that it knows nothing."""
+    return signals.gps_fix.fresh(now) and signals.gps_fix.value < 2
+
+
 class Speeds:
     """The speeds of motor, wheels, vehicle and GPS."""
 
@@ -146,6 +194,9 @@ class Speeds:
         self._still = dict.fromkeys(self.ROLES, 0.0)  # s without a change
         self._apart = dict.fromkeys(self.ROLES, 0.0)  # m/s, low-passed, from the median
         self._median = 0.0  # m/s, low-passed
+        self.middle: float | None = None  # m/s, median
+        self.acceleration = 0.0  # m/s², of the median
+        self._slow = 0.0  # m/s
         self.on_road = False  # the ground goes by as fast as the driven wheel turns: another sensor has seen it
         self.unsettled = False  # two contradict each other, and it is not known which of them is right
 
@@ -156,7 +207,9 @@ class Speeds:
         for role in self.ROLES:
             signal = signals[role]
             said = signal.told(now)
-            if said is None or (role == "gps_speed" and signals.gps_fix.fresh(now) and signals.gps_fix.value < 2):
+            if role == "gps_speed":
+                signal.trusted = signals.gps_course.trusted = not lost(now, signals)
+            if said is None or (role == "gps_speed" and not signal.trusted):
                 continue
             speed = said * self._scale.get(role, 1.0)
             speeds[role] = speed if speed < -REVERSE else abs(speed)
@@ -164,9 +217,18 @@ class Speeds:
             self._still[role] = 0.0 if speed != self._said[role] else self._still[role] + dt
             self._said[role] = speed
         self.unsettled = self.on_road = False
-        if len(speeds) < 2:
+        if not speeds:
+            self.middle = None
             return
         middle = median(speeds.values())
+        if dt > 0:
+            before = middle if self.middle is None else self._slow
+            self._slow, self.acceleration = accelerated(before, middle, dt)
+        self.middle = middle
+        if len(speeds) < 2:
+            for role in speeds:
+                signals[role].trusted = not self.trials[role].guilty
+            return
         outvoted, tied = NOBODY, NOBODY
         if max(speeds.values()) - min(speeds.values()) > min(apart.values()):
             outvoted, tied = vote(speeds, apart)
@@ -271,8 +333,7 @@ class Slopes:
         self._by_energy = Running(NEAR)
         self._anew()
         self._heard: float | None = None  # m, the altitude of this step
-        self._altitude: float | None = None  # m, the last that was possible
-        self._possible = 0.0  # m that it can have changed since
+        self._altitudes = Anchor()
         self._before: float | None = None  # m, at the end of the last second
         self._standing_rate = 0.0  # m/s, low-passed
         self._said = 0.0
@@ -288,15 +349,16 @@ class Slopes:
         self._work: float | None = 0.0  # J, out of the pack
         self._speed: float | None = None  # m/s, at its begin
 
-    def step(self, now: float, dt: float, signals: Signals, speed: float | None, acceleration: float | None,
-             on_road: bool, power: float | None, level: Callable[[float, float], float]) -> None:  # fmt: skip
-        """Hear the witnesses of `dt` [s] at `speed` [m/s] and `acceleration` [m/s²].
+    def step(self, now: float, dt: float, signals: Signals, speeds: Speeds, power: float | None,
+             level: Callable[[float, float], float]) -> None:  # fmt: skip
+        """Hear the witnesses of `dt` [s].
 
-        on_road: the vehicle is known to move as its wheels turn. power: of the pack [W], None if that is not known.
-        level: what the model says for a speed and an acceleration on a level road [W].
+        speeds: where they are not unsettled, their median is the speed; one of them may be late or noisy. power: of
+        the pack [W], None if that is not known. level: what the model says for a speed and an acceleration on a level
+        road [W].
         """
-        forward = signals.accel_x.told(now)
-        if speed is None or acceleration is None:
+        forward, speed = signals.accel_x.told(now), speeds.middle
+        if speed is None or speeds.unsettled:
             self._anew()
             return
         way = abs(speed) * dt
@@ -307,8 +369,8 @@ class Slopes:
         if forward is None:
             self._climb = None
         elif self._climb is not None:
-            self._climb += (forward - acceleration) / G * way
-            self._hear_accelerometer(dt, forward, speed, acceleration, on_road)
+            self._climb += (forward - speeds.acceleration) / G * way
+            self._hear_accelerometer(dt, forward, speed, speeds)
         self._work = None if self._work is None or power is None else self._work + power * dt
         if self._seconds >= 1.0:
             self._second(speed, self._heard, level)
@@ -321,19 +383,16 @@ class Slopes:
         altitude = signals.gps_altitude.told(now)
         if signals.gps_fix.fresh(now) and signals.gps_fix.value < 3:
             altitude = None
-        self._possible += (STEEPEST * abs(speed or 0.0) + WEATHER) * dt
-        self._heard = altitude
-        if altitude is not None:
-            if self._altitude is not None and abs(altitude - self._altitude) > self._possible + JUMP:
-                self.trials["gps_altitude"].hear(dt, True)
-                self._heard = None
-            else:
-                self._altitude, self._possible = altitude, 0.0
-        jumped = altitude is not None and self._heard is None
+        possible = self._altitudes.hear(min(dt, 1.0), altitude, (STEEPEST * abs(speed or 0.0) + WEATHER) * dt, JUMP)
+        if not possible:
+            self.trials["gps_altitude"].hear(min(dt, 1.0), True)
+        self._heard = altitude if possible else None
+        jumped = not possible
         signals.gps_altitude.trusted = not (jumped or self.trials["gps_altitude"].guilty)
 
-    def _hear_accelerometer(self, dt: float, forward: float, speed: float, acceleration: float, on_road: bool) -> None:
+    def _hear_accelerometer(self, dt: float, forward: float, speed: float, speeds: Speeds) -> None:
         """An accelerometer that moves trembles, and shows what the wheels gain."""
+        acceleration, on_road = speeds.acceleration, speeds.on_road
         self._still = self._still + dt if forward == self._said != 0.0 else 0.0  # a plain zero: a simulation's
         self._said = forward
         keep = 1 - min(dt / GAIN_TIME, 1.0)
@@ -477,6 +536,32 @@ Error = Callable[[float, float], float | None]
 """Measured less predicted voltage of a cell [V], for a voltage [V] and a current [A] of the pack."""
 
 
+class Sag:
+    """The drop of the cells' voltage from one moment to the next, over what a current explains of it."""
+
+    def __init__(self) -> None:
+        self._voltage: float | None = None  # V of a cell, low-passed
+        self._drop = 0.0  # V, low-passed
+        self._product = self._square = 0.0  # V²·s
+
+    def hear(self, dt: float, voltage: float, drop: float) -> None:
+        """A cell's voltage and the drop over its R0 by the current [V], after `dt` [s]."""
+        if self._voltage is None or dt > SAG_FAST:  # what came between is not known
+            self._voltage, self._drop = voltage, drop
+            return
+        fast = voltage - self._voltage, drop - self._drop
+        share, keep = part(dt, SAG_FAST), 1 - part(dt, SAG_TIME)
+        self._voltage += fast[0] * share
+        self._drop += fast[1] * share
+        self._product = keep * self._product - fast[0] * fast[1] * dt
+        self._square = keep * self._square + fast[1] * fast[1] * dt
+
+    @property
+    def ratio(self) -> float | None:
+        """Measured over predicted; None while the current has hardly changed."""
+        return self._product / self._square if self._square > SAG_LEAST else None
+
+
 class Currents:
     """Pack current against inverter and auxiliary current; both against the cells' voltage and the road."""
 
@@ -486,6 +571,8 @@ class Currents:
         self._capacity = capacity  # A·h of the pack: an hour's current
         self.trials = {role: Trial() for role in self.ROLES}
         self.disputed = False  # the two differ, and it is not known which of them is right
+        self.sag = Sag()
+        self._scaled = False  # both are
         self._rival, self._by_model, self._road = Rival(), Rival(), OffRoad(capacity)
         self._difference = self._square = self._load = self._without = 0.0  # A, A², A, A²; low-passed
         self._fast = self._extra = 0.0  # A
@@ -507,10 +594,21 @@ class Currents:
         if not against and voltage is not None and self._by_road(dt, said, voltage, error, model, innovation_rms):
             against, agree = frozenset({"pack_current", "inverter_current"}), None
             self.disputed = False
+        if self._scaled and not against:
+            ratio = self.sag.ratio
+            self._scaled = ratio is None or not 1 / SAG_AGREES < ratio < SAG_AGREES
+            against, agree = frozenset({"pack_current", "inverter_current"}), None
         for role in self.ROLES:
             self.trials[role].hear(dt, True if role in against else agree)
         guilty = frozenset(role for role, trial in self.trials.items() if trial.guilty)
         return (against if not self.disputed else NOBODY) | guilty
+
+    def weigh(self, takes: float) -> None:
+        """Hear what the last kilometre took by the currents, over what the road takes by the model."""
+        ratio = self.sag.ratio
+        if ratio is not None:
+            more = ratio > SAGS_MORE and takes < TAKES_LESS
+            self._scaled |= more or (ratio < 1 / SAGS_MORE and takes > 1 / TAKES_LESS)
 
     def _compare(self, dt: float, pack: float, around: float, voltage: float | None, said: Electric,
                  error: Error) -> tuple[frozenset[str], bool | None]:  # fmt: skip
@@ -664,8 +762,7 @@ class Temperatures:
 
     def __init__(self) -> None:
         self.trials = {role: Trial() for role in TEMPERATURES}
-        self._last: dict[str, float] = {}  # degC, the last that was possible
-        self._elapsed = dict.fromkeys(TEMPERATURES, 0.0)  # s since then
+        self._anchors = {role: Anchor() for role in TEMPERATURES}
 
     def step(self, now: float, dt: float, signals: Signals) -> None:
         """Trust each of them or not."""
@@ -673,16 +770,13 @@ class Temperatures:
         for role, (low, high, rate) in TEMPERATURES.items():
             signal = signals[role]
             value = signal.told(now)
-            self._elapsed[role] += dt
+            coldest = ambient - COLDER if role == "cell_temperature" and ambient is not None else low
+            can_be = value is not None and max(low, coldest) < value < high
+            follows = self._anchors[role].hear(min(dt, 1.0), value if can_be else None, rate * dt, LEAP)
             if value is None:
                 continue
-            last = self._last.get(role, value)
-            far = COLDER if role == "cell_temperature" and ambient is not None and value < ambient - COLDER else 0.0
-            possible = low < value < high and not far and abs(value - last) <= LEAP + rate * self._elapsed[role]
-            if possible:
-                self._last[role], self._elapsed[role] = value, 0.0
-            trial = self.trials[role]
-            trial.hear(dt, not possible)
+            trial, possible = self.trials[role], can_be and follows
+            trial.hear(min(dt, 1.0), not possible)
             signal.trusted = possible and not trial.guilty
 
 
@@ -732,12 +826,15 @@ class Redundancy:
         parts = (self.voltages, self.currents, self.temperatures, self.speeds, self.slopes, self.inertial)
         self._trials = {role: trial for part in parts for role, trial in part.trials.items()}
 
-    def step(self, now: float, dt: float, signals: Signals, speed: float | None) -> None:
-        """What is told of `dt` [s] up to `now` [s], before any of it is used; `speed` [m/s] of the last step."""
-        self.speeds.step(now, dt, signals)
+    def step(self, now: float, dt: float, heard: float, signals: Signals, speed: float | None) -> None:
+        """What is told of `dt` [s] up to `now` [s], before any of it is used; `speed` [m/s] of the last step.
+
+        heard: of `dt`, the seconds in which something was heard; what can have changed has all of it.
+        """
+        self.speeds.step(now, heard, signals)
         self.slopes.hear_altitude(now, dt, signals, speed)
         self.temperatures.step(now, dt, signals)
-        self.inertial.step(now, dt, signals, speed)
+        self.inertial.step(now, heard, signals, speed)
 
     @property
     def distrusted(self) -> tuple[str, ...]:

@@ -19,9 +19,20 @@ LEAN_TIME = 2.0  # s: how fast the lean is drawn to that of the steady turn
 GRADE_TIME = 5.0  # s: low pass of the accelerometer's grade; at 2 s its noise adds 4 % to the energy modelled
 ALTITUDE_LENGTH = 150.0  # m: how fast the observer follows the altitude where it seeks an offset only
 ALTITUDE_LENGTH_ALONE = 60.0  # m: the same where the altitude is all there is
+STANDS = 0.05  # m/s
+QUIET, QUIET_TIME = 0.05, 1.0  # rad/s, s: a standing vehicle that nobody turns or leans: the rates hold still
+MOST_BIAS = 0.3  # rad/s: cheap MEMS sensors are specified to a third of it
 BIAS_TIME = 5.0  # s of standing to know the offset of a rate sensor
 LOST = 15.0  # m: the observer is never so far from an altitude that it follows
 ALTITUDES = -500.0, 9000.0  # m: where there are roads
+
+
+def accelerated(slow: float, speed: float, dt: float) -> tuple[float, float]:
+    """(low-passed speed [m/s], acceleration [m/s²]) after `dt` [s], from the low-passed speed before."""
+    if dt < SPEED_TIME:
+        slow += (speed - slow) * dt / SPEED_TIME
+        return slow, (speed - slow) / SPEED_TIME
+    return speed, (speed - slow) / dt  # slow messages: the mean over the step
 
 
 @dataclass(slots=True)
@@ -39,6 +50,8 @@ class Road:
     bias_x: float = 0.0  # rad/s, of the roll rate
     bias_z: float = 0.0  # rad/s, of the yaw rate
     slow_speed: float = 0.0  # m/s, low-passed
+    slow_roll: float = 0.0  # rad/s, low-passed
+    slow_yaw: float = 0.0  # rad/s, low-passed
     accelerometer_grade: float = 0.0
     grade_offset: float = 0.0
 
@@ -72,12 +85,7 @@ class Road:
         if self.speed is None:
             self.slow_speed = speed
         self.speed = speed
-        if dt < SPEED_TIME:
-            self.slow_speed += (speed - self.slow_speed) * dt / SPEED_TIME
-            self.acceleration = (speed - self.slow_speed) / SPEED_TIME
-        else:  # slow messages: the mean over the step
-            self.acceleration = (speed - self.slow_speed) / dt
-            self.slow_speed = speed
+        self.slow_speed, self.acceleration = accelerated(self.slow_speed, speed, dt)
         self.distance += abs(speed) * dt
 
     def _turn(self, now: float, dt: float, signals: Signals) -> None:
@@ -86,7 +94,11 @@ class Road:
         if roll is None or yaw is None or speed is None:
             self.lean = self.yaw_rate = None
         else:
-            if abs(speed) < 0.05 and abs(roll - self.bias_x) < 0.05 and abs(yaw - self.bias_z) < 0.05:
+            quiet = max(abs(roll - self.slow_roll), abs(yaw - self.slow_yaw)) < QUIET
+            share = min(dt / QUIET_TIME, 1.0)
+            self.slow_roll += (roll - self.slow_roll) * share
+            self.slow_yaw += (yaw - self.slow_yaw) * share
+            if abs(speed) < STANDS and quiet and max(abs(self.slow_roll), abs(self.slow_yaw)) < MOST_BIAS:
                 share = min(dt / BIAS_TIME, 1.0)
                 self.bias_x += (roll - self.bias_x) * share
                 self.bias_z += (yaw - self.bias_z) * share

@@ -90,6 +90,11 @@ def parked(saved: Saved, age: float | None, odometer: float | None, own_soc: flo
     return 1 - exp(-age / SLOW_TIME)
 
 
+def unseen_sd(gap: float) -> float:
+    """Sd of the SOC that flowed in `gap` [s] in which nobody counted, ridden or charged."""
+    return min((RIDING_RATE * gap + BURST_RATE * min(gap, BRIDGE)) / 3600, SOC_UNKNOWN_SD)
+
+
 def flowed(
     saved: Saved, age: float | None, charge: float, voltage: float, current: float,
     odometer: float | None, own_soc: float | None,
@@ -103,7 +108,7 @@ def flowed(
     way = None if odometer is None or saved.odometer is None else odometer - saved.odometer
     if way is not None and way > FASTEST * gap + ODOMETER_STEP:  # so much longer than the clock says, or it was reset
         gap = UNKNOWN_AGE
-    mean, sd = 0.0, (RIDING_RATE * gap + BURST_RATE * min(gap, BRIDGE)) / 3600
+    mean, sd = 0.0, unseen_sd(gap)
     if way is not None and saved.consumption is not None:
         if -ODOMETER_STEP <= way <= FASTEST * gap + ODOMETER_STEP:
             price = saved.consumption / (3600 * charge * voltage)  # SOC per metre

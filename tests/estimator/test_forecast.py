@@ -77,6 +77,20 @@ def test_a_climb_is_not_taken_for_consumption():
     assert forecast(climbing).consumption == pytest.approx(forecast(level).consumption, rel=0.25)
 
 
+def test_a_long_descent_that_no_sensor_tells_is_hardly_learned():
+    seen, unseen = forecaster(), forecaster()
+    for f, told in ((seen, True), (unseen, False)):
+        v, x = 10.0, 0.0
+        while x < 6000:
+            q = f.quantities(v, 0.0, 20.0, 0.0, 40.0)
+            q["grade"] = -0.05
+            f.ride(0.1, v, -0.05 if told else None, sum(f.model.power(q).values()), 20.0, 0.0, 40.0)
+            x += v * 0.1
+    assert forecast(seen).consumption == pytest.approx(forecast(forecaster()).consumption, rel=0.25)
+    assert unseen.riding.factor > 0.8
+    assert forecast(unseen).p10 < forecast(seen).range
+
+
 def test_uncertainty_of_soc_widens_the_interval():
     f = forecaster()
     narrow, wide = f.forecast(0.5, 0.005, 25.0, 1.0, 20.0, 0.0), f.forecast(0.5, 0.05, 25.0, 1.0, 20.0, 0.0)

@@ -7,7 +7,7 @@ from math import cos, sin
 
 import pytest
 
-from gz_onboard.estimator.redundancy import FORGIVEN_AFTER, NOBODY, Slopes, Speeds, vote
+from gz_onboard.estimator.redundancy import FORGIVEN_AFTER, NOBODY, Currents, Sag, Slopes, Speeds, vote
 from gz_onboard.estimator.road import G
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import ROLES
@@ -147,12 +147,47 @@ def test_a_gps_without_a_fix_is_no_witness():
     assert guilty(speeds) == set()
 
 
+def test_a_wheel_that_was_locked_is_believed_again_when_it_is_all_there_is():
+    speeds, _ = said(20.0, FOUR, {"wheel_speed_front": lambda t, v: 0.0 if t > 19 else v})
+    _, signals = said(20.0, ("wheel_speed_front",), {}, watch=speeds, begin=20.0)
+    assert signals.wheel_speed_front.trusted
+
+
 def test_votes():
     apart = dict.fromkeys(HONEST, 1.0)
     assert vote({"motor_speed": 5.0, "wheel_speed_rear": 9.0, "gps_speed": 9.5}, apart)[0] == {"motor_speed"}
     assert vote({"motor_speed": 5.0, "gps_speed": 9.5}, apart) == (NOBODY, frozenset({"motor_speed", "gps_speed"}))
     two_and_two = {"motor_speed": 5.0, "gps_speed": 5.2, "wheel_speed_rear": 0.0, "wheel_speed_front": 0.0}
     assert vote(two_and_two, apart) == (NOBODY, frozenset(two_and_two))
+
+
+# --- currents -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+def test_the_sag_tells_what_a_current_leaves_unexplained(scale: float):
+    sag = Sag()
+    for step in range(3000):
+        current = 40.0 * (1 + sin(step * STEP))
+        sag.hear(STEP, 3.7 - 0.002 * current - 1e-5 * step, 0.002 * scale * current)
+    assert sag.ratio == pytest.approx(1 / scale, rel=0.05)
+
+
+def test_a_steady_current_tells_no_sag():
+    sag = Sag()
+    for step in range(3000):
+        sag.hear(STEP, 3.7 - 1e-5 * step, 0.04)
+    assert sag.ratio is None
+
+
+def test_neither_a_frugal_rider_nor_an_aged_pack_is_a_lie():
+    for sags, takes, scaled in ((1.0, 0.4, False), (2.0, 1.0, False), (2.0, 0.5, True), (0.5, 2.0, True)):
+        currents = Currents(30.0)
+        for step in range(3000):
+            drop = 0.08 * (1 + sin(step * STEP))
+            currents.sag.hear(STEP, 3.7 - sags * drop, drop)
+        currents.weigh(takes)
+        assert currents._scaled == scaled
 
 
 # --- grade --------------------------------------------------------------------------------------------------------
@@ -164,7 +199,7 @@ SLOPES = ("accel_x", "gps_altitude")
 def hills(seconds: float, lies: Mapping[str, Lie], roles: tuple[str, ...] = SLOPES, power: bool = True,
           on_road: bool = True, begin: float = 300.0) -> Slopes:  # fmt: skip
     """Riding over hills of 4 %, stopping now and then; the lies begin at `begin` [s]."""
-    signals, slopes = Signals((role, 2.0) for role in ROLES), Slopes(MASS, FORCE)
+    signals, slopes, speeds = Signals((role, 2.0) for role in ROLES), Slopes(MASS, FORCE), Speeds(RADIUS, GEAR)
     way, before, height = 0.0, town(0.0), 200.0
     for step in range(round(seconds / STEP)):
         t = step * STEP
@@ -186,7 +221,8 @@ def hills(seconds: float, lies: Mapping[str, Lie], roles: tuple[str, ...] = SLOP
                 signals[role].value, signals[role].time = value, t
         work = speed * (FORCE + WIND + MASS * (G * grade + acceleration)) if power else None
         slopes.hear_altitude(t, STEP, signals, speed)
-        slopes.step(t, STEP, signals, speed, acceleration, on_road, work, lambda v, a: v * (FORCE + MASS * a))
+        speeds.middle, speeds.acceleration, speeds.on_road = speed, acceleration, on_road
+        slopes.step(t, STEP, signals, speeds, work, lambda v, a: v * (FORCE + MASS * a))
     return slopes
 
 
@@ -239,11 +275,12 @@ def test_the_mounting_is_kept_from_before_the_lie():
 
 
 def test_a_standing_vehicle_does_not_climb():
-    signals, slopes = Signals((role, 2.0) for role in ROLES), Slopes(MASS, FORCE)
+    signals, slopes, speeds = Signals((role, 2.0) for role in ROLES), Slopes(MASS, FORCE), Speeds(RADIUS, GEAR)
+    speeds.middle = 0.0
     for rate, guilty in ((0.1, False), (1.0, True)):
         for step in range(600):
             t = step * STEP
             signals.gps_altitude.value, signals.gps_altitude.time = 200 + rate * t, t
             slopes.hear_altitude(t, STEP, signals, 0.0)
-            slopes.step(t, STEP, signals, 0.0, 0.0, False, 50.0, lambda v, a: 50.0)
+            slopes.step(t, STEP, signals, speeds, 50.0, lambda v, a: 50.0)
         assert slopes.trials["gps_altitude"].guilty == guilty

@@ -53,6 +53,19 @@ def turning(t):
     return speed, 0.0, -atan(speed * yaw / G), yaw, 100.0
 
 
+def test_a_gyro_with_a_large_offset_is_learned_at_rest():
+    road = Road()
+    signals = Signals((role, 2.0) for role in ROLES)
+    for step in range(1, 300):
+        for role, value in (("motor_speed", 0.0), ("rate_x", 0.1), ("rate_z", -0.12), ("accel_y", 0.0)):
+            signal = signals[role]
+            signal.value, signal.time, signal.total, signal.count = value, step * 0.1, value, 1
+        road.step(step * 0.1, 0.1, signals, RADIUS, 1.0)
+        signals.next_step()
+    assert road.bias_x == pytest.approx(0.1, abs=0.005)
+    assert road.bias_z == pytest.approx(-0.12, abs=0.005)
+
+
 def test_lean_and_yaw_in_curves():
     _, rows = drive(180, turning)
     late = [r for r in rows if r[0] > 50]

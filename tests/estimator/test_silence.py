@@ -1,0 +1,173 @@
+"""Messages that come seldom, pauses, and sensors that say at first what is not so: nobody healthy is accused."""
+
+from __future__ import annotations
+
+import pytest
+
+from gz_onboard.estimator.redundancy import SETTLED, Anchor
+from gz_onboard.estimator.start import Saved, flowed, unseen_sd
+from gz_onboard.events import Activity, Group, Reason, State
+from tests.estimator.life import CELLS, GROUPS, PACK, Scooter, estimator, follow, worst
+
+MORE = [*GROUPS, Group("Temperatures", ("motor_temperature",), 1.0), Group("GPS", ("gps_altitude",), 1.0)]
+
+
+def beside(events, cells=28.0, motor=80.0, altitude=200.0):
+    """The events, with temperatures and an altitude that do not change."""
+    for event in events:
+        if event[1] != CELLS:
+            yield event
+            continue
+        yield event[0], CELLS, (cells, 15.0)
+        yield event[0] + 0.005, len(GROUPS), (motor,)
+        yield event[0] + 0.006, len(GROUPS) + 1, (altitude,)
+
+
+@pytest.mark.parametrize("declared", [True, False])
+@pytest.mark.parametrize("period", [0.5, 1.0, 2.0, 3.0, 5.0])
+def test_sensors_that_speak_seldom_are_not_accused(period, declared):
+    groups = [Group(group.message, group.roles, period if declared else None) for group in GROUPS]
+    scooter, e = Scooter(soc=0.8, period=period), estimator(groups)
+    follow(e, scooter.live(60), scooter)
+    rows = follow(e, scooter.live(1000, 11.0), scooter)
+    assert {role for _, row in rows for role in row.distrusted} == set()
+    assert not rows[-1][1].reasons & (Reason.VOLTAGE_MISMATCH | Reason.CURRENT_MISMATCH)
+    assert worst(rows) < 3
+
+
+def test_a_seldom_speed_does_not_make_the_riding_cheaper():
+    """Between two messages it has no acceleration that means anything: a stair of speeds would cost far more."""
+    factors = []
+    for period in (0.1, 3.0):
+        groups = [GROUPS[PACK], Group("Motor", ("motor_speed",), None), *GROUPS[2:]]
+        scooter, e = Scooter(soc=0.9), estimator(groups)
+        last = -10.0
+        for event in scooter.live(1200, 11.0):
+            if event[1] == 1:
+                if event[0] - last < period - 0.01:
+                    continue
+                last = event[0]
+            e.handle(event)
+        factors.append(e.forecaster.riding.factor)
+    assert factors[1] == pytest.approx(factors[0], rel=0.04)
+
+
+def test_what_is_refused_for_coming_too_seldom_is_not_known_either():
+    groups = [Group(group.message, group.roles, None) for group in GROUPS]
+    scooter, e = Scooter(soc=0.8), estimator(groups)
+    follow(e, scooter.live(60), scooter)
+    scooter.period = 8.0
+    rows = follow(e, scooter.live(1200, 11.0), scooter)
+    assert rows[-1][1].state is State.INVALID
+    scooter.period = 0.1
+    back = follow(e, scooter.live(300, 11.0), scooter)
+    assert not back[-1][1].reasons & Reason.SIGNALS_SLOW
+    assert worst(rows + back) < 3
+
+
+@pytest.mark.parametrize(
+    ("seconds", "after"),
+    [
+        (3600, {"motor": 20.0}),
+        (3600, {"cells": 16.0}),
+        (28_800, {"motor": 20.0, "cells": 5.0}),
+        (60, {"altitude": 220.0}),
+    ],
+    ids=["motor", "cells", "both", "altitude"],
+)
+def test_what_changes_while_the_bus_is_silent_accuses_nobody(seconds, after):
+    scooter, e = Scooter(soc=0.8), estimator(MORE)
+    follow(e, beside(scooter.live(20)), scooter)
+    follow(e, beside(scooter.live(200, 10.0)), scooter)
+    scooter.away(seconds)
+    rows = follow(e, beside(scooter.live(30), **after), scooter)
+    rows += follow(e, beside(scooter.live(60, 10.0), **after), scooter)
+    assert {role for _, row in rows for role in row.distrusted} == set()
+
+
+def test_a_first_value_that_is_none_accuses_nobody():
+    scooter, e, rows = Scooter(soc=0.8), estimator(MORE), []
+    rows += follow(e, beside(scooter.live(1.2), cells=0.0, altitude=0.0), scooter)
+    rows += follow(e, beside(scooter.live(30), cells=30.0, altitude=300.0), scooter)
+    rows += follow(e, beside(scooter.live(60, 10.0), cells=30.0, altitude=300.0), scooter)
+    assert {role for _, row in rows for role in row.distrusted} == set()
+
+
+def test_an_anchor_that_has_held_stays():
+    anchor = Anchor()
+    assert all(anchor.hear(1.0, 20.0, 0.1, 2.0) for _ in range(round(SETTLED) + 1))
+    assert not any(anchor.hear(1.0, 60.0, 0.1, 2.0) for _ in range(200))
+    assert anchor.hear(1.0, 21.0, 0.1, 2.0)
+
+
+def test_an_anchor_that_was_a_moment_ago_does_not():
+    anchor = Anchor()
+    heard = [anchor.hear(1.0, value, 0.1, 2.0) for value in (0.0, 30.0, 30.0, 30.0, 30.0)]
+    assert heard == [True, False, False, True, True]
+    assert not anchor.hear(1.0, 0.0, 0.1, 2.0)
+
+
+@pytest.mark.parametrize("gap", [5.0, 20.0, 60.0, 600.0])
+def test_a_pause_is_as_uncertain_as_a_restart(gap):
+    assert unseen_sd(gap) == flowed(Saved(0.5, 0.0, (1e-4, 0.0, 1e-6)), gap, 32.8, 52.0, 0.0, None, None)[1]
+
+
+@pytest.mark.parametrize("speed", [16.0, 20.0, 24.0])
+@pytest.mark.parametrize("gap", [10.0, 20.0, 40.0])
+def test_what_flowed_in_a_pause_is_covered(gap, speed):
+    scooter, e = Scooter(soc=0.7, seed=1), estimator()
+    follow(e, scooter.live(60), scooter)
+    e.filter.soc, e.filter.covariance = scooter.soc, (1e-8, 0.0, 1e-8)
+    scooter.away(gap, speed)
+    e.handle(next(scooter.live(0.1, speed)))
+    assert abs(e.filter.soc - scooter.soc) < 2 * e.filter.covariance[0] ** 0.5
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.2])
+@pytest.mark.parametrize("period", [0.1, 1.0, 3.0])
+def test_a_late_voltage_is_used_however_seldom_it_comes(period, latency):
+    groups = [Group(group.message, group.roles, period) for group in GROUPS]
+    scooter, e = Scooter(soc=0.8, period=period), estimator(groups)
+    e._latency = latency
+    follow(e, scooter.live(60), scooter)
+    e.filter.soc, e.filter.covariance = scooter.soc + 0.1, (0.01, 0.0, 1e-6)
+    rows = follow(e, scooter.live(600, 11.0), scooter)
+    assert abs(rows[-1][1].soc - scooter.soc) < 0.05
+    assert worst(rows) < 3
+
+
+def test_a_gps_without_a_fix_tells_no_speed():
+    groups = [GROUPS[PACK], Group("GPS", ("gps_speed", "gps_course", "gps_fix"), 1.0), GROUPS[CELLS]]
+    scooter, e = Scooter(soc=0.8), estimator(groups)
+
+    def with_fix(events, fix):
+        for event in events:
+            if event[1] == PACK:
+                yield event
+            elif event[1] == CELLS:
+                yield event[0], 2, event[2]
+                yield event[0] + 0.005, 1, (scooter.speed if fix > 1 else 0.0, 0.0, fix)
+
+    follow(e, with_fix(scooter.live(60, 10.0), 3.0), scooter)
+    assert e.estimate(scooter.time).speed == pytest.approx(scooter.speed, abs=1.5)
+    follow(e, with_fix(scooter.live(60, 10.0), 0.0), scooter)
+    lost = e.estimate(scooter.time)
+    assert lost.speed is None
+    assert lost.activity is Activity.UNKNOWN
+    assert lost.reasons & Reason.NO_SPEED
+    assert lost.reasons & Reason.NO_GPS
+    follow(e, with_fix(scooter.live(60, 10.0), 3.0), scooter)
+    assert e.estimate(scooter.time).speed == pytest.approx(scooter.speed, abs=1.5)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [{"consumption": 1e300}, {"consumption": -1e300}, {"odometer": 1e308}, {"current": 1e200}, {"own_soc": 1e200},
+     {"gyro_bias": [0.0, 0.5]}],
+    ids=str,
+)  # fmt: skip
+def test_a_saved_number_that_cannot_be_is_refused(damage):
+    scooter, e = Scooter(soc=0.75), estimator()
+    follow(e, scooter.live(60, 10.0), scooter)
+    with pytest.raises(ValueError, match="implausible"):
+        estimator().restore({**e.snapshot("key"), **damage}, "key", 10.0)
