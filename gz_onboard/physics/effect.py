@@ -169,7 +169,12 @@ def known_effects() -> tuple[str, ...]:
 def load_effect(name: str, folder: Path | None = None) -> Effect:
     """The effect `name`, from `folder` if it has one of that name, else the package's own."""
     if folder and (file := effect_file(name, folder)):
-        return _effect(name, _import_file(name, file))
+        try:
+            return _effect(name, _import_file(name, file))
+        except (InputError, KeyboardInterrupt):
+            raise
+        except BaseException as error:  # SystemExit too: a user's code does not end ours without a word
+            raise failed(file, error) from error
     if name not in known_effects():
         known = [*known_effects(), *effects_in(folder)] if folder else known_effects()
         raise InputError(f"no effect is called {shown(name)}{nearest(name, known)}")
@@ -201,11 +206,13 @@ def _import_file(name: str, file: Path) -> ModuleType:
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise InputError(f"{file}: {type(error).__name__}: {error}") from error
+    spec.loader.exec_module(module)
     return module
+
+
+def failed(file: Path, error: BaseException) -> InputError:
+    """The error to raise about an effect's file whose code raised `error`."""
+    return InputError(f"{file}: {type(error).__name__}: {error}")
 
 
 def _effect(name: str, module: ModuleType) -> Effect:
