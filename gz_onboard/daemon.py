@@ -28,7 +28,7 @@ from gz_onboard import notify, state
 from gz_onboard.background import Background
 from gz_onboard.bus.channel import Channel
 from gz_onboard.bus.recorder import BackgroundRecorder, Recorder
-from gz_onboard.errors import InputError
+from gz_onboard.errors import FAILED, InputError
 from gz_onboard.events import Frame, Reason
 from gz_onboard.physics.trust import ROOT
 from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, reason_names
@@ -398,7 +398,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
     if not daemon.finished:  # a thread still waits for its disk: the interpreter would abort over its files
         sys.stdout.flush()
         logging.shutdown()
-        os._exit(1)
+        os._exit(FAILED)
     return 0
 
 

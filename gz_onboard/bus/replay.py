@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.logs import LogDamage, log_suffix, read_frames
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import INTERRUPTED, InputError, nearest
 from gz_onboard.events import ERR_FLAG, TRANSMITTED, Frame
 
 if TYPE_CHECKING:
@@ -195,7 +195,7 @@ def run(args: argparse.Namespace) -> int:
                 break
             time.sleep(_LOOP_GAP_NS * 1e-9)
     except KeyboardInterrupt:
-        code = 130
+        code = INTERRUPTED
     finally:
         for bus in buses:
             bus.shutdown()

@@ -28,7 +28,7 @@ from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.codec import raw_range
 from gz_onboard.bus.mapping import find_dbc
 from gz_onboard.bus.publisher import RANGE_DBC, range_messages, reason_signal, sensor_signal
-from gz_onboard.errors import InputError
+from gz_onboard.errors import FAILED, InputError
 from gz_onboard.events import EFF_FLAG, ROLES, STALE_PERIODS, Activity, Frame, Reason, State
 
 if TYPE_CHECKING:
@@ -412,13 +412,13 @@ def run(arguments: argparse.Namespace) -> int:
                 _show_lines(view, channel, style, duration, stopped, out)
     except OSError as error:
         if error.errno == errno.EIO:  # the terminal was closed: there is nobody to tell
-            return 1
+            return FAILED
         if isinstance(error, BrokenPipeError):
             raise
         raise InputError(f"standard output: {error.strerror}") from error
     finally:
         channel.close()
-    return 1 if arguments.once and math.isinf(view.age(time.monotonic())) else 0
+    return FAILED if arguments.once and math.isinf(view.age(time.monotonic())) else 0
 
 
 def _is_screen(out: IO[str]) -> bool:

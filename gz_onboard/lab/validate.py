@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.errors import InputError
+from gz_onboard.bus.logs import logs_among
+from gz_onboard.errors import BAD_INPUT, FAILED, InputError
 from gz_onboard.lab.processes import Progress, over_rides, progress_bar
 from gz_onboard.lab.validate_components import Component, components
 from gz_onboard.lab.validate_score import (
@@ -325,7 +326,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard validate``."""
     explain_keys(parser, "a ride in the", SUMMARY_VERSION, KEYS)
     add = parser.add_argument
-    add("logs", nargs="+", type=Path, metavar="RIDE", help="logs of rides: .blf .log .asc .trc .mf4 .csv .mcap, or .gz")
+    add("logs", nargs="+", type=Path, metavar="RIDE", help="logs of rides: .blf .log .asc .trc .mf4 .csv .mcap, "
+        "or .gz; or folders of them (but .csv)")  # fmt: skip
     add(
         "--vehicle", default="reference", metavar="NAME|TOML", help="vehicle file or one of the package's (%(default)s)"
     )
@@ -339,7 +341,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """``gz-onboard validate``: 0 if every ride could be judged (and, with --gate, passed), else 1."""
+    """``gz-onboard validate``: 0; `BAD_INPUT` if a ride cannot be judged; `FAILED` if with --gate one fails."""
     tasks = _tasks(arguments)
     read_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
     rides: list[dict[str, Any]] = []
@@ -363,7 +365,9 @@ def run(arguments: argparse.Namespace) -> int:
         _write_tables(arguments, rides, together)
     if arguments.json:
         write_json(arguments.json, {"version": SUMMARY_VERSION, "rides": rides, "pooled": together, "failed": failed})
-    return 1 if failed or (arguments.gate and not all(ride["passed"] for ride in rides)) else 0
+    if failed:
+        return BAD_INPUT
+    return FAILED if arguments.gate and not all(ride["passed"] for ride in rides) else 0
 
 
 def _write_tables(arguments: argparse.Namespace, rides: list[dict[str, Any]], together: dict[str, Any]) -> None:
@@ -384,10 +388,8 @@ def _write_tables(arguments: argparse.Namespace, rides: list[dict[str, Any]], to
 
 
 def _tasks(arguments: argparse.Namespace) -> list[Task]:
-    if arguments.jobs is not None and arguments.jobs < 1:
-        raise InputError(f"--jobs {arguments.jobs}: at least 1")
     check_json(arguments.json)
-    paths = list(dict.fromkeys(arguments.logs))
+    paths = list(dict.fromkeys(logs_among(arguments.logs)))
     names = [Path(path.name.removesuffix(".gz")).stem for path in paths]
     stems = output_names(paths, names, ".validation.png")
     return [

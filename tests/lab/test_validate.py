@@ -285,7 +285,7 @@ def test_bad_input(tmp_path, capsys):
     other = tmp_path / "other.log"
     other.write_text("(1.000000) can0 7AB#0011223344556677\n(1.010000) can0 7AB#0011223344556677\n")
     none = tmp_path / "none.blf"
-    assert main(["validate", str(other), str(none), "--jobs", "1", "--no-plot", "--output", str(tmp_path)]) == 1
+    assert main(["validate", str(other), str(none), "--jobs", "1", "--no-plot", "--output", str(tmp_path)]) == 2
     said = capsys.readouterr().err
     assert "knows none" in said
     assert "none.blf" in said
