@@ -344,14 +344,20 @@ def _write_estimates(log: Path, out: Path, suffix: str, table_format: str, secti
 
 
 def _estimate_columns(log: Path) -> dict[str, str]:
-    """Field -> column of the table, ``name[unit]``: the unit is the first word of the schema's description."""
+    """Field -> column of the table, ``name[unit]``: the unit is the first word of the schema's description.
+
+    The field ``time``, since the first frame, is ``elapsed``: the table's first column is the time of the log.
+    """
     try:
         properties = json.loads(json_channels(log)[ESTIMATE_TOPIC][0])["properties"]
         units = {name: str(about.get("description", "")) for name, about in properties.items()}
     except (ValueError, LookupError, AttributeError, TypeError) as error:
         raise InputError(f"{log}: the schema of {ESTIMATE_TOPIC} is not one of ours: {error!r}") from None
     words = {name: re.split(r"[ ,]", unit)[0] for name, unit in units.items()}
-    return {name: f"{name}[{unit}]" if unit not in ("", "1") else name for name, unit in words.items()}
+    columns = {name: "elapsed" if name == "time" else name for name in words}
+    return {
+        name: f"{columns[name]}[{unit}]" if unit not in ("", "1") else columns[name] for name, unit in words.items()
+    }
 
 
 # --- the command -----------------------------------------------------------------------------------------------

@@ -268,7 +268,7 @@ def estimated(tmp_path: Path) -> Path:
     return path
 
 
-COLUMNS = ["time[s]", "soc", "range[m]", "state"]
+COLUMNS = ["elapsed[s]", "soc", "range[m]", "state"]
 
 
 @pytest.mark.parametrize(("name", "more"), [("out.csv", []), ("out.csv.gz", []), ("tables", ["--table-format", "csv"])])
