@@ -37,7 +37,7 @@ from gz_onboard.physics.model import G
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded, rest_soc
 from gz_onboard.simulation.route import read_route
 from gz_onboard.simulation.run import Command, Run, drive, follow, replay, road_table
-from gz_onboard.simulation.samples import read_facts
+from gz_onboard.simulation.samples import read_facts, rider_mass
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Place, Road, Scooter
 from gz_onboard.simulation.telling import check_json, explain_keys, output_names, write_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -97,8 +97,7 @@ class Task:
 def validate_ride(task: Task, progress: Progress = lambda _: None) -> dict[str, Any]:
     """The entry of one ride: see `KEYS`; `progress` is told bytes of the log. Raises InputError."""
     facts = read_facts(task.path.parent / "rides.json").get(task.name, {})
-    noted = facts.get("rider_mass_kg")
-    payload = task.payload if task.payload is not None else (float(noted) if isinstance(noted, int | float) else None)
+    payload = task.payload if task.payload is not None else rider_mass(facts)
     vehicle = read_vehicle(task.vehicle, payload)
     told = 0.0
 
