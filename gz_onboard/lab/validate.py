@@ -67,6 +67,13 @@ KEYS = {
 }
 """What ``--json`` holds of a ride: {"version", "rides", "pooled": splits of all rides, "failed": [{file, error}]}."""
 
+FORMS = {
+    "open_loop": ("open loop", "the same throttle gives another ride; small errors of force add up to another speed"),
+    "predictive": ("rider model", "the same speed takes another current or torque: road load, losses, or the way of "
+                   "opening the throttle"),
+    "components": ("components", "fed with what was measured, this part alone is off: its parameters or its equation"),
+}  # fmt: skip
+"""By entry of a ride: what people call it, and what it means if it does not pass."""
 AVERAGED = 0.5  # s: over which the measured speed is averaged: its noise is no ride for a rider model to follow
 STANDING = 0.3  # m/s: less is noise of a wheel that stands
 _READ, _RIDE = 0.4, 0.3  # shares of the work
@@ -407,7 +414,7 @@ def ride_text(ride: dict[str, Any]) -> str:
         f"  {where}, {ride['kind'] or 'kind not noted'}, {ride['distance_km']:.2f} km, {ride['duration_s']:.0f} s, "
         f"{ride['payload_kg']:g} kg{air}",
     ]
-    for form, name in (("open_loop", "open loop"), ("predictive", "rider model"), ("components", "components")):
+    for form, (name, meaning) in FORMS.items():
         entry = ride[form]
         if not entry:
             continue
@@ -416,8 +423,13 @@ def ride_text(ride: dict[str, Any]) -> str:
         for channel, e in entry["channels"].items():
             percent = "–" if e["percent"] is None else f"{e['percent']:5.1f} %"
             spread = "" if e["of_spread"] is None else f", {e['of_spread']:.2f} of its spread"
+            verdict = "ok" if e["passed"] else f"FAIL (limit {e['limit_percent']:g} %)"
             lines.append(
-                f"    {channel.replace('_', ' '):21} {percent} {'ok  ' if e['passed'] else 'FAIL'} "
+                f"    {channel.replace('_', ' '):21} {percent} {verdict:17} "
                 f"rms {e['rms']:7.2f}, max {e['max']:7.2f}, mean {e['mean_error']:+7.2f} {e['unit']}{spread}"
             )
+        if not entry["passed"]:
+            lines.append(f"    FAIL: {meaning}")
+    if not ride["passed"]:
+        lines.append("  what each percentage is of, and where the model is known to fail: docs/validation.md")
     return "\n".join([*lines, *(f"  {text}" for text in ride["missing"])])

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.cli import main
-from gz_onboard.lab.validate import KEYS, per_second, pool
+from gz_onboard.lab.validate import KEYS, per_second, pool, ride_text
 from gz_onboard.lab.validate_components import components
 from gz_onboard.lab.validate_report import COLUMNS, failures
 from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, conditions, errors, pooled, seconds, split
@@ -239,6 +239,16 @@ def test_pictures_and_page(two):
     assert "http" not in page
     assert "Where the model fails" in page
     assert "class=bad" in page
+
+
+def test_what_fails_is_told_with_its_limit_and_meaning(two):
+    text = ride_text(two[1]["rides"][0]).splitlines()
+    (torque,) = [line for line in text if "FAIL (" in line and "motor torque" in line]
+    assert "FAIL (limit 20 %) rms" in torque
+    (load,) = [line for line in text if "FAIL (" in line and "road load" in line]
+    assert "FAIL (limit 10 %) rms" in load
+    assert [line.split(":")[0] for line in text if "FAIL:" in line] == ["    FAIL"] * 3
+    assert any("docs/validation.md" in line for line in text)
 
 
 def test_tables_as_markdown(two):
