@@ -331,7 +331,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="vehicle file, or one of the package's (%(default)s)",
     )
     add("--interface", default="socketcan", help="python-can's interface (%(default)s)")
-    add("--channel", action="append", metavar="NAME", help="channel; twice, for a second bus (can0)")
+    add("--channel", action="append", metavar="NAME", help="channel (can0, the vehicle's bus); twice, for a second bus")
     add("--payload", type=float, metavar="KG", help="mass of rider and luggage, where it is known")
     add("--effects", type=Path, metavar="DIR", help="folder with effects of your own, Python that you trust")
     add("--filter", default="scalar", choices=("scalar", "filterpy"), help="backend of the SOC filter (%(default)s)")

@@ -161,7 +161,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--channel",
         default="vcan0",
-        help="where to send (default: %(default)s); several by commas: the log's channels 0, 1, ... in this order",
+        help="where to send (default: %(default)s, so that no recording gets onto a vehicle unasked); several by "
+        "commas: the log's channels 0, 1, ... in this order",
     )
     parser.add_argument("--speed", type=float, default=1.0, help="times as fast; 0: as fast as possible")
     parser.add_argument("--loop", action="store_true", help="begin again at the end, until interrupted")

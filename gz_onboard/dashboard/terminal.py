@@ -139,12 +139,20 @@ class View:
         return "–" if value is None else f"{value:{form}} {unit}"
 
     def state(self, now: float) -> State | None:
-        """How far the numbers can be trusted; None if nothing says so."""
+        """How far the numbers can be trusted; None if nothing says so.
+
+        The status comes ten times as often as the range: before the first of that there is nothing to be trusted.
+        """
         for name in ("RANGE_StatusState", "RANGE_EstimateState"):
             value = self.value(name, now)
             if value is not None and value in tuple(State):
-                return State(int(value))
+                state = State(int(value))
+                return state if self._has_estimate or state is State.INVALID else State.STARTING
         return None
+
+    @property
+    def _has_estimate(self) -> bool:
+        return self.messages["RANGE_Estimate"].received > 0
 
     def reasons(self, now: float) -> list[Reason]:
         """Why the estimate is not what it could be."""
@@ -152,7 +160,7 @@ class View:
 
     def activity(self, now: float) -> str:
         """What the vehicle does, in a word; nothing if it is not known."""
-        value = self.value("RANGE_Activity", now)
+        value = self.value("RANGE_Activity", now) if self._has_estimate else None
         return Activity(int(value)).name.lower() if value and value in tuple(Activity) else ""
 
     def distrusted(self, now: float) -> list[str]:
@@ -374,7 +382,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard dashboard``."""
     add = parser.add_argument
     add("--interface", default="socketcan", help="python-can's interface (%(default)s)")
-    add("--channel", default="vcan0", metavar="NAME", help="channel (%(default)s)")
+    add("--channel", default="can0", metavar="NAME", help="channel, as the daemon's (%(default)s)")
     add(
         "--dbc",
         default=RANGE_DBC,

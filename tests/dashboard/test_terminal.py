@@ -124,6 +124,23 @@ def test_without_an_estimate_there_are_dashes(state):
     assert state.name.lower() in text
 
 
+@pytest.mark.parametrize("state", [State.VALID, State.INVALID])
+def test_before_the_first_range_it_is_starting(state):
+    """The status comes first, mostly: it is sent ten times as often."""
+    view, publisher = View(), Publisher()
+    estimate = replace(ESTIMATE, state=state)
+    for frame in publisher.status(estimate, 0):
+        view.take(frame, 1.0)
+    shown = "starting" if state is State.VALID else "invalid"
+    assert f"; {shown};" in terminal.summary_line(view, 1.0)
+    assert f"State             {shown}" in picture(view, 1.0)
+    assert "; riding" not in terminal.summary_line(view, 1.0)
+    assert "Activity" not in picture(view, 1.0)
+    for frame in publisher.range(estimate, COUNTS, 0):
+        view.take(frame, 1.1)
+    assert f"; {state.name.lower()}; riding;" in terminal.summary_line(view, 1.1)
+
+
 @pytest.mark.parametrize("activity", Activity)
 def test_what_the_vehicle_does(activity):
     view = seen(replace(ESTIMATE, activity=activity))
