@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import importlib.util
+import os
+import py_compile
 import re
 from pathlib import Path
 
@@ -140,6 +143,18 @@ def test_an_effect_whose_term_fails_is_named_before_the_ride(tmp_path, body, tol
     effect.write_text(f"{EFFECT}def term(speed, *, horn_power):\n    {body}\n")
     with pytest.raises(InputError, match=re.escape(f"{effect}: {told}")):
         read_vehicle(file)
+
+
+def test_only_the_effects_source_is_run(tmp_path):
+    """Bytecode beside it can be another's: in a folder with the sticky bit, as /tmp, anybody may add some."""
+    file = with_effect(tmp_path)
+    effect = file.parent / "effects" / "horn.py"
+    other = tmp_path / "other.py"
+    other.write_text(EFFECT.replace("5.0, 1.0", "6.0, 1.0"))
+    stamp = effect.stat().st_mtime_ns
+    os.utime(other, ns=(stamp, stamp))
+    py_compile.compile(str(other), cfile=importlib.util.cache_from_source(str(effect)), doraise=True)
+    assert load_effect("horn", effect.parent).parameters[0].prior == 5.0
 
 
 @pytest.mark.parametrize("others", ["effects/horn.py", "effects", "v.toml", "."])

@@ -206,7 +206,8 @@ def _import_file(name: str, file: Path) -> ModuleType:
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
+    # Not `exec_module`, which would take bytecode from a folder beside the file that may be anybody's.
+    exec(compile(file.read_bytes(), file, "exec", dont_inherit=True), module.__dict__)
     return module
 
 
