@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE, Codec
 from gz_onboard.bus.mapping import pgn
-from gz_onboard.bus.publisher import WH, Counts, Publisher
+from gz_onboard.bus.publisher import KNOWN, WH, Counts, Publisher
 from gz_onboard.estimator.ekf import filter_maker
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
@@ -82,6 +82,7 @@ class Pipeline:
         self.send_failures = 0  # frames that a channel did not take; set by the daemon
         self.extra_reasons = Reason(0)  # set by the daemon: bus down, log failed
         self.last: Estimate | None = None
+        self.last_known: Estimate | None = None  # the last that had a range
         self._log = log
         self._log_frames = log_frames
         self._log_signals = log_signals
@@ -140,6 +141,8 @@ class Pipeline:
         if self.extra_reasons & Reason.BUS_DOWN and estimate.state is State.VALID:
             estimate.state = State.DEGRADED
         self.last = estimate
+        if estimate.range is not None and estimate.state in KNOWN:
+            self.last_known = estimate
         if self._observer:
             self._observer(estimate)
         sent = self.publisher.status(estimate, time_ns)
