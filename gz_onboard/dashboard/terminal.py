@@ -27,7 +27,7 @@ from gz_onboard.bus.channel import Channel
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.codec import raw_range
 from gz_onboard.bus.mapping import find_dbc
-from gz_onboard.bus.publisher import RANGE_DBC, range_messages, reason_signal, sensor_signal
+from gz_onboard.bus.publisher import KNOWN, RANGE_DBC, range_messages, reason_signal, sensor_signal
 from gz_onboard.errors import FAILED, InputError
 from gz_onboard.events import EFF_FLAG, ROLES, STALE_PERIODS, Activity, Frame, Reason, State
 
@@ -141,26 +141,27 @@ class View:
     def state(self, now: float) -> State | None:
         """How far the numbers can be trusted; None if nothing says so.
 
-        The status comes ten times as often as the range: before the first of that there is nothing to be trusted.
+        The status comes ten times as often as the range, and tells of one that has not come yet: until then the state
+        is that of the last range, or starting.
         """
-        for name in ("RANGE_StatusState", "RANGE_EstimateState"):
-            value = self.value(name, now)
-            if value is not None and value in tuple(State):
-                state = State(int(value))
-                return state if self._has_estimate or state is State.INVALID else State.STARTING
-        return None
+        status, estimate = (self._state(name, now) for name in ("RANGE_StatusState", "RANGE_EstimateState"))
+        if status in KNOWN and self.value("RANGE_Remaining", now) is None:
+            if not self.messages["RANGE_Estimate"].received:
+                return State.STARTING
+            status = estimate
+        return estimate if status is None else status
 
-    @property
-    def _has_estimate(self) -> bool:
-        return self.messages["RANGE_Estimate"].received > 0
+    def _state(self, signal_: str, now: float) -> State | None:
+        value = self.value(signal_, now)
+        return State(int(value)) if value is not None and value in tuple(State) else None
 
     def reasons(self, now: float) -> list[Reason]:
         """Why the estimate is not what it could be."""
         return [reason for reason in Reason if self.value(reason_signal(reason), now)]
 
     def activity(self, now: float) -> str:
-        """What the vehicle does, in a word; nothing if it is not known."""
-        value = self.value("RANGE_Activity", now) if self._has_estimate else None
+        """What the vehicle does, in a word; nothing if it is not known, or before there is an estimate."""
+        value = None if self.state(now) is State.STARTING else self.value("RANGE_Activity", now)
         return Activity(int(value)).name.lower() if value and value in tuple(Activity) else ""
 
     def distrusted(self, now: float) -> list[str]:
