@@ -105,7 +105,7 @@ VEHICLE_PARAMETERS = (
     Parameter("cg_height", "m", 0.63, 0.08, 0.1, 2, "centre of gravity over the road"),
     Parameter("wheel_inertia_front", "kg·m²", 0.11, 0.03, 0, 5, "wheel and tyre"),
     Parameter("wheel_inertia_rear", "kg·m²", 0.34, 0.08, 0, 5, "wheel, tyre and hub motor"),
-    Parameter("gear_ratio", "1", 1.0, 0.01, 0.02, 5, "wheel speed over motor speed; 1 for a hub motor"),
+    Parameter("gear_ratio", "1", 1.0, 0.01, 0.02, 5, "wheel speed over motor speed: 0.2 for a reduction of 5"),
     Parameter("torque_constant", "N·m/A", 0.47, 0.02, 0.01, 10, "Lord 2016, table 2.5"),
     Parameter("yaw_inertia", "kg·m²", 28, 6, 1, 300, "m·(0.39 m)²: Cossalter 2006, ch. 7, scooter with rider"),
     Parameter("caster_angle", "rad", 0.46, 0.04, 0.1, 0.8, "26 degrees: Cossalter 2006, sec. 1.3, scooters 24 to 28"),
