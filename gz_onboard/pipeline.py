@@ -15,6 +15,7 @@ from typing import Any, Protocol
 from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE, Codec
 from gz_onboard.bus.mapping import pgn
 from gz_onboard.bus.publisher import KNOWN, WH, Counts, Publisher
+from gz_onboard.errors import InputError
 from gz_onboard.estimator.ekf import filter_maker
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
@@ -212,7 +213,10 @@ def range_publisher(vehicle: Vehicle) -> Publisher:
     InputError if its own messages take their identifiers, or if they cannot say what its battery holds, or how far
     that takes it by the prior riding.
     """
-    publisher = Publisher(vehicle.range_dbc)
+    try:
+        publisher = Publisher(vehicle.range_dbc)
+    except InputError as error:
+        raise vehicle.error(f"range_dbc: {error}") from error
     known = {_frame_key(vehicle, m.frame_id, m.is_extended_frame) for m in vehicle.mapping.database.messages}
     clash = [i for i in publisher.identifiers if _frame_key(vehicle, i & ~EFF_FLAG, bool(i & EFF_FLAG)) in known]
     if clash:

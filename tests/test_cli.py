@@ -171,15 +171,18 @@ def test_dbc(capsys: pytest.CaptureFixture[str], tmp_path: Path, right: str, wro
 
 
 @pytest.mark.parametrize("name", ["none.blf", "empty.blf", "noise.blf", "noise.mcap", "noise.log.gz", "noise.log"])
-@pytest.mark.parametrize("command", ["replay", "estimate"])
+@pytest.mark.parametrize("command", ["replay", "estimate", "validate", "export", "simulate", "discover"])
 def test_log(capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str, name: str):
     file = tmp_path / name
     if name != "none.blf":
         file.write_bytes(b"" if name.startswith("empty") else b"\x07noise\xff\n" * 100)
-    if command == "replay":
-        assert name in refused(capsys, "replay", str(file), "--interface", "virtual", "--channel", "a")
-    else:
-        assert name in refused(capsys, "estimate", str(file), "--output", str(tmp_path / "out"))
+    options = {
+        "replay": ["--interface", "virtual", "--channel", "a"],
+        "estimate": ["--output", str(tmp_path / "out")],
+        "validate": ["--output", str(tmp_path / "out")],
+        "export": [str(tmp_path / "out.asc")],
+    }
+    assert name in refused(capsys, command, str(file), *options.get(command, []))
 
 
 def test_as_a_process():
