@@ -11,7 +11,7 @@ from collections.abc import Collection, Sequence
 from typing import NoReturn
 
 from gz_onboard import __version__
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import BAD_INPUT, FAILED, INTERRUPTED, InputError, nearest
 
 COMMANDS = {
     "run": ("gz_onboard.daemon", "estimate the range from a live bus and publish it (the daemon)"),
@@ -68,7 +68,7 @@ def command_line(called: Collection[str]) -> argparse.ArgumentParser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line `argv`; gives the exit status: 0 good, 1 failed, 2 wrong use or input, 130 interrupted."""
+    """Run the command line `argv`; gives the exit status: 0, or one of those in `errors`."""
     # Our matrices are small, and what is large runs in processes of its own: threads would stand in each other's way.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     argv = list(sys.argv[1:] if argv is None else argv)
@@ -80,15 +80,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         return status
     except InputError as error:
         print(f"gz-onboard {called}: {error}", file=sys.stderr)
-        return 2
+        return BAD_INPUT
     except KeyboardInterrupt:
-        return 130
+        return INTERRUPTED
     except BrokenPipeError:  # the reader of our output went away
         sys.stderr.close()
-        return 1
+        return FAILED
     except OSError as error:  # what is left is mostly a disk that is full
         print(f"gz-onboard {called}: {error}", file=sys.stderr)
-        return 1
+        return FAILED
 
 
 if __name__ == "__main__":

@@ -28,8 +28,8 @@ from gz_onboard import notify, state
 from gz_onboard.background import Background
 from gz_onboard.bus.channel import Channel
 from gz_onboard.bus.recorder import BackgroundRecorder, Recorder
-from gz_onboard.errors import InputError
-from gz_onboard.events import Frame, Reason
+from gz_onboard.errors import FAILED, InputError
+from gz_onboard.events import Frame, Reason, State
 from gz_onboard.physics.trust import ROOT
 from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, reason_names
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -182,12 +182,13 @@ class Daemon:
         if last is None:
             return
         counts = self.pipeline.counts()
-        text = f"{last.state.name.lower()}: {' '.join(reason_names(last.reasons)) or 'all inputs there'}"
+        state, remaining, _, _ = self.pipeline.publisher.told(last)
+        text = state_text(state, last.reasons)
         if text != self._said:
             log.info("%s; dropped %d, lost %d, unknown %d", text, counts.dropped, counts.lost, counts.unknown)
             self._said = text
-        if last.range is not None and last.soc is not None:
-            text = f"{last.range / 1000:.1f} km, {100 * last.soc:.0f} %, {text}"
+        if remaining is not None and last.soc is not None:
+            text = f"{remaining:.1f} km, {100 * last.soc:.0f} %, {text}"
         notify.status(text)
 
     def restore(self) -> dict[str, Any] | None:
@@ -331,7 +332,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="vehicle file, or one of the package's (%(default)s)",
     )
     add("--interface", default="socketcan", help="python-can's interface (%(default)s)")
-    add("--channel", action="append", metavar="NAME", help="channel; twice, for a second bus (can0)")
+    add("--channel", action="append", metavar="NAME", help="channel (can0, the vehicle's bus); twice, for a second bus")
     add("--payload", type=float, metavar="KG", help="mass of rider and luggage, where it is known")
     add("--effects", type=Path, metavar="DIR", help="folder with effects of your own, Python that you trust")
     add("--filter", default="scalar", choices=("scalar", "filterpy"), help="backend of the SOC filter (%(default)s)")
@@ -398,7 +399,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
     if not daemon.finished:  # a thread still waits for its disk: the interpreter would abort over its files
         sys.stdout.flush()
         logging.shutdown()
-        os._exit(1)
+        os._exit(FAILED)
     return 0
 
 
@@ -443,17 +444,34 @@ def _retried(take: Callable[[], None], until: float) -> bool:
         time.sleep(0.1)
 
 
+def state_text(state: State, reasons: Reason) -> str:
+    """A state with its reasons, on one line."""
+    return f"{state.name.lower()}: {' '.join(reason_names(reasons)) or 'all inputs there'}"
+
+
 def _summary(daemon: Daemon) -> None:
     """What a person wants to read when the daemon ends."""
-    pipeline, last = daemon.pipeline, daemon.pipeline.last
-    counts = pipeline.counts()
-    print(f"received {pipeline.codec.received} frames; dropped {counts.dropped}, lost {counts.lost}, "
-          f"implausible {counts.implausible}, unknown identifiers {counts.unknown}")  # fmt: skip
-    if last and last.soc is not None and last.soc_sd is not None:
-        print(
-            f"state of charge {100 * last.soc:.1f} % ± {100 * last.soc_sd:.1f} %, ridden {last.distance / 1000:.2f} km"
-        )
-    if last and last.range is not None and last.range_p10 is not None and last.range_p90 is not None:
-        print(f"range {last.range / 1000:.1f} km ({last.range_p10 / 1000:.1f} to {last.range_p90 / 1000:.1f})")
+    print("\n".join(summary(daemon.pipeline)))
     for path in [path for path in daemon.recorder.paths if path.exists()] if daemon.recorder else []:
         print(f"log {path}")
+
+
+def summary(pipeline: Pipeline) -> list[str]:
+    """What came, the last numbers and the last state, as they were sent: numbers may be older than the state."""
+    last, known, counts = pipeline.last, pipeline.last_known, pipeline.counts()
+    lines = [f"received {pipeline.codec.received} frames; dropped {counts.dropped}, lost {counts.lost}, "
+             f"implausible {counts.implausible}, unknown identifiers {counts.unknown}"]  # fmt: skip
+    if last is None:
+        return lines
+    ago = ""
+    if known and known.soc is not None and known.soc_sd is not None:
+        _, *told = pipeline.publisher.told(known)
+        remaining, p10, p90 = ("–" if value is None else f"{value:.1f}" for value in told)
+        lines += [
+            f"state of charge {100 * known.soc:.1f} % ± {100 * known.soc_sd:.1f} %, "
+            f"ridden {last.distance / 1000:.2f} km",
+            f"range {remaining} km ({p10} to {p90})",
+        ]
+        ago = f"; the numbers are of {last.time - known.time:.1f} s before" if known is not last else ""
+    state = pipeline.publisher.told(last)[0]
+    return [*lines, f"state at the end {state_text(state, last.reasons)}{ago}"]

@@ -6,6 +6,12 @@ import difflib
 import reprlib
 from collections.abc import Iterable
 
+FAILED = 1
+"""Exit status: the command was right and the answer is no (``validate --gate``, ``dashboard --once``), or the system
+failed it: a full disk, a reader that went away."""
+BAD_INPUT = 2
+"""Exit status: the command line, a file or a parameter cannot be used; of several logs, one is enough."""
+INTERRUPTED = 130
 LONGEST_NAME = 100  # beyond it no near name is looked for, which takes the square of the length
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict = 3, 8, 4
@@ -16,7 +22,7 @@ class InputError(Exception):
     """A command line, file or parameter that cannot be used.
 
     The message names the place (file, line, key), the value and its unit where it has one, and what would
-    be right. The command line prints it without a traceback and exits with status 2.
+    be right. The command line prints it without a traceback and exits with status `BAD_INPUT`.
     """
 
 

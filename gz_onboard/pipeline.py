@@ -14,9 +14,11 @@ from typing import Any, Protocol
 
 from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE, Codec
 from gz_onboard.bus.mapping import pgn
-from gz_onboard.bus.publisher import WH, Counts, Publisher
+from gz_onboard.bus.publisher import KNOWN, WH, Counts, Publisher
+from gz_onboard.errors import InputError
 from gz_onboard.estimator.ekf import filter_maker
 from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
 from gz_onboard.physics.battery import drawable
 from gz_onboard.vehicle import Vehicle
@@ -81,6 +83,7 @@ class Pipeline:
         self.send_failures = 0  # frames that a channel did not take; set by the daemon
         self.extra_reasons = Reason(0)  # set by the daemon: bus down, log failed
         self.last: Estimate | None = None
+        self.last_known: Estimate | None = None  # the last that had a range
         self._log = log
         self._log_frames = log_frames
         self._log_signals = log_signals
@@ -139,6 +142,8 @@ class Pipeline:
         if self.extra_reasons & Reason.BUS_DOWN and estimate.state is State.VALID:
             estimate.state = State.DEGRADED
         self.last = estimate
+        if estimate.range is not None and estimate.state in KNOWN:
+            self.last_known = estimate
         if self._observer:
             self._observer(estimate)
         sent = self.publisher.status(estimate, time_ns)
@@ -205,21 +210,30 @@ class Pipeline:
 def range_publisher(vehicle: Vehicle) -> Publisher:
     """What sends the vehicle's range frames.
 
-    InputError if its own messages take their identifiers, or if they cannot say what its battery holds.
+    InputError if its own messages take their identifiers, or if they cannot say what its battery holds, or how far
+    that takes it by the prior riding.
     """
-    publisher = Publisher(vehicle.range_dbc)
+    try:
+        publisher = Publisher(vehicle.range_dbc)
+    except InputError as error:
+        raise vehicle.error(f"range_dbc: {error}") from error
     known = {_frame_key(vehicle, m.frame_id, m.is_extended_frame) for m in vehicle.mapping.database.messages}
     clash = [i for i in publisher.identifiers if _frame_key(vehicle, i & ~EFF_FLAG, bool(i & EFF_FLAG)) in known]
     if clash:
         names = ", ".join(f"{identifier & ~EFF_FLAG:#x}" for identifier in sorted(clash))
         raise vehicle.error(f"its DBC files take the identifiers of our own range frames ({publisher.file}): {names}")
     if vehicle.battery:
-        full, most = drawable(vehicle.battery, 1.0, 25.0, 1.0).energy / WH, publisher.greatest("RANGE_EnergyLeft")
-        if full > most:
-            raise vehicle.error(
-                f"the battery holds {full:.0f} Wh, but RANGE_EnergyLeft of {publisher.file} says at most {most:g} Wh: "
-                'give range frames of a larger scale, such as range_dbc = "range_large.dbc"'
-            )
+        full = drawable(vehicle.battery, 1.0, 25.0, 1.0).energy / WH
+        way = Forecaster(vehicle.model, vehicle.battery, vehicle.riding).forecast(1.0, 0.0, 25.0, 0.0, 25.0, 0.0).range
+        for told, value, signal, unit in (
+            ("the battery holds", full, "RANGE_EnergyLeft", "Wh"),
+            ("the expected range from full is", way * 1e-3, "RANGE_Remaining", "km"),
+        ):
+            if value > (most := publisher.greatest(signal)):
+                raise vehicle.error(
+                    f"{told} {value:.0f} {unit}, but {signal} of {publisher.file} says at most {most:g} {unit}: "
+                    'give range frames of a larger scale, such as range_dbc = "range_large.dbc"'
+                )
     return publisher
 
 

@@ -162,6 +162,14 @@ class Table:
         return float(value)
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is such a file. InputError where the system does not look: name too long, folder closed."""
+    try:
+        return path.is_file()
+    except OSError as error:
+        raise InputError(f"{shown(str(path))}: cannot be read: {error.strerror}") from error
+
+
 def read_text(file: Path, most: int, encodings: tuple[str, ...] = ("utf-8",)) -> str:
     """The text of `file`, of at most `most` bytes, in the first of `encodings` that fits. InputError."""
     try:

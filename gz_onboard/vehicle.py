@@ -16,7 +16,7 @@ from gz_onboard.physics.effect import Effect
 from gz_onboard.physics.model import Model, read_model
 from gz_onboard.physics.parameters import Parameters, read_parameters
 from gz_onboard.physics.riding import PriorRiding, check_riding, read_riding
-from gz_onboard.toml import Table
+from gz_onboard.toml import Table, is_file
 
 OWN = Path(__file__).resolve().parent / "vehicles"
 
@@ -73,12 +73,12 @@ def find_vehicle(name: str | Path, beside: Path | None = None) -> Path:
     there_are = f"the package's own are {', '.join(own)}"
     path = (beside or Path()) / name
     if isinstance(name, Path) or "/" in name or name.endswith(".toml"):
-        if path.is_file():
+        if is_file(path):
             return path
         raise InputError(f"{path if beside else name}: no such vehicle file; {there_are}{nearest(str(name), own)}")
     if name in own:
         return OWN / f"{name}.toml"
-    meant = f" (did you mean './{name}'?)" if path.is_file() else nearest(name, own)
+    meant = f" (did you mean './{name}'?)" if is_file(path) else nearest(name, own)
     raise InputError(f"{name}: no such vehicle file; {there_are}{meant}")
 
 
@@ -135,8 +135,9 @@ def read_vehicle(
 
 def _range_dbc(table: Table) -> Path:
     """The DBC file of the range frames, found as those of the bus are."""
+    name = table.check_path("range_dbc", table.text("range_dbc", RANGE_DBC))
     try:
-        return find_dbc(table.text("range_dbc", RANGE_DBC), table.file.parent)
+        return find_dbc(name, table.file.parent)
     except InputError as error:
         raise table.error(str(error), "range_dbc") from error
 
@@ -157,6 +158,6 @@ def _healthy(table: Table) -> Path | None:
     if "file" not in table.values:
         return None
     file = table.file.parent / table.check_path("file", table.text("file"))
-    if not file.is_file():
+    if not is_file(file):
         raise table.error(f"no file {file}", "file")
     return file

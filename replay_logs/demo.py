@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import io
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -22,8 +23,9 @@ from pathlib import Path
 
 import can
 
+from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.publisher import Publisher
-from gz_onboard.events import EFF_FLAG
+from gz_onboard.events import EFF_FLAG, TRANSMITTED
 from gz_onboard.vehicle import read_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -66,8 +68,8 @@ def main() -> int:
         print(f"demo: ended with status {status}", file=sys.stderr)
         return status
 
-    show_decoded(frames, dbc)
     (log,) = directory.glob("*.mcap")
+    show_decoded(frames, log, dbc)
     overview = directory / "overview.png"
     subprocess.run([BIN / "gz-onboard", "plot", log, overview], check=True)
     print("\n=== What the ride left behind")
@@ -149,13 +151,18 @@ def play_in_threads(
     return cli.main(daemon)
 
 
-def show_decoded(frames: Path, dbc: Path) -> None:
-    """Print the last frame of each kind, decoded by the cantools command."""
-    last = {line.split()[2].partition("#")[0]: line for line in frames.read_text().splitlines()}
-    print(f"\n=== The last range frames on the bus: cantools decode {dbc.name} <{frames.name}")
+def show_decoded(frames: Path, log: Path, dbc: Path) -> None:
+    """Print the last frame of each kind while the vehicle still sent, decoded by the cantools command."""
+    ended = max(frame[0] for batch in read_frames(log) for frame in batch if not frame[3] & TRANSMITTED) * 1e-9
+    lines = [line for line in frames.read_text().splitlines() if float(line[1 : line.index(")")]) <= ended]
+    last = {line.split()[2].partition("#")[0]: line for line in lines}
+    print(
+        "\n=== The ride has ended. Of a bus that falls silent the daemon says degraded, and soon that nothing is known."
+    )
+    print(f"=== The last range frames of the ride: cantools decode {dbc.name} <{frames.name}")
     decode = [str(BIN / "cantools"), "decode", str(dbc)]
     text = subprocess.run(decode, input="\n".join(last.values()), check=True, capture_output=True, text=True).stdout
-    print(text.strip())
+    print(re.sub(r"\d+\.\d{9,}", lambda number: f"{float(number[0]):.9g}", text.strip()))  # not 2.8000000000000003
 
 
 if __name__ == "__main__":

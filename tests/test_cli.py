@@ -62,6 +62,8 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["run", "--payload", "nan"], "payload"),
         (["run", "--payload", "-20"], "payload"),
         (["run", "--vehicle", "refrence"], "did you mean 'reference'"),
+        (["run", "--vehicle", f"{'x' * 5000}.toml"], "cannot be read: File name too long"),
+        (["dashboard", "--dbc", "x" * 5000], "cannot be read: File name too long"),
         (["run", "--interface", "sockectan"], "did you mean 'socketcan'"),
         (["run", "--interface", "virtual", "--channel", "a", "--channel", "a"], "--channel a: given twice"),
         (["run", "--interface", "virtual", "--log-dir", "/tmp/x", "--log-file-mb", "0"], "--log-file-mb 0"),
@@ -84,12 +86,17 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["replay", RIDE, "--from", "20", "--to", "10"], "--to 10 s"),
         (["replay", RIDE, "--interface", "virtul"], "did you mean 'virtual'"),
         (["estimate"], "FILE"),
+        (["estimate", RIDE, RIDE, "--jobs", "100000"], "--jobs 100000: must be 1 to 256 processes"),
+        (["validate", RIDE, "--jobs", "0"], "--jobs 0: must be 1 to 256 processes"),
+        (["discover", RIDE, "--workers", "100000"], "--workers 100000: must be 1 to 256 processes"),
+        (["replay", str(LOGS)], "replay_logs: is a folder; give the log in it"),
+        (["estimate", str(ROOT / "dbc")], "dbc: this folder holds no log"),
         (["estimate", RIDE, "--vehicle", "referenz"], "did you mean 'reference'"),
         (["export", "nowhere.blf", "x.log"], "nowhere.blf"),
         (["plot", "nowhere.mcap"], "nowhere.mcap"),
         (["dashboard", "--interface", "virtul"], "virtul"),
     ],
-    ids=lambda value: " ".join(value).replace(RIDE, "RIDE") if isinstance(value, list) else "",
+    ids=lambda value: " ".join(value).replace(RIDE, "RIDE")[:60] if isinstance(value, list) else "",
 )
 def test_command_line(capsys: pytest.CaptureFixture[str], arguments: list[str], said: str):
     assert said in refused(capsys, *arguments)
@@ -164,18 +171,18 @@ def test_dbc(capsys: pytest.CaptureFixture[str], tmp_path: Path, right: str, wro
 
 
 @pytest.mark.parametrize("name", ["none.blf", "empty.blf", "noise.blf", "noise.mcap", "noise.log.gz", "noise.log"])
-@pytest.mark.parametrize("command", ["replay", "estimate"])
+@pytest.mark.parametrize("command", ["replay", "estimate", "validate", "export", "simulate", "discover"])
 def test_log(capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str, name: str):
     file = tmp_path / name
     if name != "none.blf":
         file.write_bytes(b"" if name.startswith("empty") else b"\x07noise\xff\n" * 100)
-    if command == "replay":
-        assert name in refused(capsys, "replay", str(file), "--interface", "virtual", "--channel", "a")
-    else:  # 1: of several logs the others would have been estimated
-        assert status("estimate", str(file), "--output", str(tmp_path / "out")) == 1
-        err = capsys.readouterr().err
-        assert name in err
-        assert "Traceback" not in err
+    options = {
+        "replay": ["--interface", "virtual", "--channel", "a"],
+        "estimate": ["--output", str(tmp_path / "out")],
+        "validate": ["--output", str(tmp_path / "out")],
+        "export": [str(tmp_path / "out.asc")],
+    }
+    assert name in refused(capsys, command, str(file), *options.get(command, []))
 
 
 def test_as_a_process():

@@ -6,6 +6,7 @@ import copy
 import json
 import logging
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -30,7 +31,7 @@ from gz_onboard.bus.channel import Channel
 from gz_onboard.bus.logs import read_frames, read_samples
 from gz_onboard.bus.recorder import Recorder
 from gz_onboard.cli import main
-from gz_onboard.daemon import Daemon, _lock, fair_share
+from gz_onboard.daemon import Daemon, _lock, fair_share, summary
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame, Reason, State
@@ -118,6 +119,21 @@ def test_frames_in_frames_out(bus: str, tmp_path: Path):
     assert offline.range is not None
     assert told[-1] == pytest.approx(offline.range / 1000, rel=0.01)
     assert [f[1:3] for f in logged if f[3] & TRANSMITTED] == [f[1:3] for f in scene.heard]
+
+
+def test_the_summary_says_what_the_bus_was_told_last():
+    run = ridden(Scooter().steady(20.0))
+    estimate, end = run.estimates[-1], run.sent[-1][0]
+    assert estimate.range is not None
+    *_, numbers, told = summary(run.pipeline)
+    assert numbers.startswith(f"range {estimate.range / 1000:.1f} km (")
+    assert told.startswith(f"state at the end {estimate.state.name.lower()}: ")
+    assert "before" not in told
+    for second in range(1, 61):  # the bus has fallen silent: nothing is told any more
+        run.pipeline.advance((), end + second * S)
+    *_, numbers, told = summary(run.pipeline)
+    assert numbers.startswith(f"range {estimate.range / 1000:.1f} km (")
+    assert re.search(r"^state at the end invalid: .*NO_PACK_VOLTAGE.*; the numbers are of 5\d\.\d s before$", told)
 
 
 def test_a_silent_bus_is_told_that_there_is_nothing(bus: str):

@@ -1,11 +1,15 @@
 from __future__ import annotations
 
+import importlib.util
+import os
+import py_compile
 import re
 from pathlib import Path
 
 import pytest
 
 from gz_onboard.errors import InputError
+from gz_onboard.physics.effect import load_effect
 from gz_onboard.vehicle import OWN, find_vehicle, read_vehicle
 
 REFERENCE = (OWN / "reference.toml").read_text(encoding="utf-8")
@@ -102,6 +106,55 @@ def refusal(file: Path, **options) -> str:
 
 def test_the_effects_of_ones_own_file_run(tmp_path):
     assert "horn" in read_vehicle(with_effect(tmp_path)).key
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        ("import sys; sys.exit('bye')", "SystemExit: bye"),
+        ("1 / 0", "ZeroDivisionError: division by zero"),
+        ("import asyncio; raise asyncio.CancelledError('x')", "CancelledError: x"),
+        ("PARAMETERS = 5", "TypeError: 'int' object is not iterable"),
+        ("PARAMETERS = (1,)", "AttributeError: 'int' object has no attribute 'name'"),
+        ("term = 5", "TypeError: 5 is not a callable object"),
+    ],
+)
+def test_an_effect_whose_code_fails_is_named(tmp_path, line, told):
+    file = with_effect(tmp_path)
+    effect = file.parent / "effects" / "horn.py"
+    effect.write_text(f"{EFFECT}\n{line}\n")
+    for load in (lambda: read_vehicle(file), lambda: load_effect("horn", effect.parent)):
+        with pytest.raises(InputError, match=re.escape(f"{effect}: {told}")):
+            load()
+
+
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        ("raise SystemExit(4)", "SystemExit: 4"),
+        ("return 1 / speed", "ZeroDivisionError: float division by zero"),
+        ("return 'much'", "ValueError: could not convert string to float: 'much'"),
+    ],
+)
+def test_an_effect_whose_term_fails_is_named_before_the_ride(tmp_path, body, told):
+    file = with_effect(tmp_path)
+    effect = file.parent / "effects" / "horn.py"
+    effect.write_text(f"{EFFECT}def term(speed, *, horn_power):\n    {body}\n")
+    with pytest.raises(InputError, match=re.escape(f"{effect}: {told}")):
+        read_vehicle(file)
+
+
+def test_only_the_effects_source_is_run(tmp_path):
+    """Bytecode beside it can be another's: in a folder with the sticky bit, as /tmp, anybody may add some."""
+    file = with_effect(tmp_path)
+    effect = file.parent / "effects" / "horn.py"
+    other = tmp_path / "other.py"
+    other.write_text(EFFECT.replace("5.0, 1.0", "6.0, 1.0"))
+    stamp = effect.stat().st_mtime_ns
+    os.utime(other, ns=(stamp, stamp))
+    py_compile.compile(str(other), cfile=importlib.util.cache_from_source(str(effect)), doraise=True)
+    assert load_effect("horn", effect.parent).parameters[0].prior == 5.0
 
 
 @pytest.mark.parametrize("others", ["effects/horn.py", "effects", "v.toml", "."])

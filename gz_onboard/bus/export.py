@@ -191,7 +191,9 @@ class _CsvTables:
             stream = self._stack.enter_context((self._directory / f"{message}.csv").open("w", newline=""))
             writer = self._writers[message] = csv.writer(stream)
             writer.writerow(["time[s]", *names])
-        writer.writerows([_seconds(t), *(row[name] for name in names)] for t, row in zip(times, rows, strict=True))
+        writer.writerows(
+            [_seconds(t), *(_decimal(row[name]) for name in names)] for t, row in zip(times, rows, strict=True)
+        )
 
 
 class _CsvLong:
@@ -202,7 +204,7 @@ class _CsvLong:
     def write(self, message: str, times: list[int], rows: list[Values]) -> None:
         for time_ns, row in zip(times, rows, strict=True):
             seconds = _seconds(time_ns)
-            self._writer.writerows((seconds, message, name, value) for name, value in row.items())
+            self._writer.writerows((seconds, message, name, _decimal(value)) for name, value in row.items())
 
 
 class _ParquetTables:
@@ -252,6 +254,11 @@ class _ParquetLong:
 
 def _number(value: float | None) -> float | None:
     return None if value is None else float(value)
+
+
+def _decimal(value: float | None) -> float | None:
+    """`value` to the 15 digits that a float has for sure: 28 times 0.1 is 2.8, not 2.8000000000000003."""
+    return float(f"{value:.15g}") if isinstance(value, float) else value
 
 
 def _seconds(time_ns: int) -> str:
@@ -344,14 +351,20 @@ def _write_estimates(log: Path, out: Path, suffix: str, table_format: str, secti
 
 
 def _estimate_columns(log: Path) -> dict[str, str]:
-    """Field -> column of the table, ``name[unit]``: the unit is the first word of the schema's description."""
+    """Field -> column of the table, ``name[unit]``: the unit is the first word of the schema's description.
+
+    The field ``time``, since the first frame, is ``elapsed``: the table's first column is the time of the log.
+    """
     try:
         properties = json.loads(json_channels(log)[ESTIMATE_TOPIC][0])["properties"]
         units = {name: str(about.get("description", "")) for name, about in properties.items()}
     except (ValueError, LookupError, AttributeError, TypeError) as error:
         raise InputError(f"{log}: the schema of {ESTIMATE_TOPIC} is not one of ours: {error!r}") from None
     words = {name: re.split(r"[ ,]", unit)[0] for name, unit in units.items()}
-    return {name: f"{name}[{unit}]" if unit not in ("", "1") else name for name, unit in words.items()}
+    columns = {name: "elapsed" if name == "time" else name for name in words}
+    return {
+        name: f"{columns[name]}[{unit}]" if unit not in ("", "1") else columns[name] for name, unit in words.items()
+    }
 
 
 # --- the command -----------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from __future__ import annotations
 import json
 import logging
 import mmap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -76,12 +76,33 @@ def log_suffix(path: Path) -> str:
         suffixes.pop()
     suffix = suffixes[-1] if suffixes else ""
     if suffix not in _READERS:
+        if path.is_dir():
+            raise InputError(f"{path}: is a folder; give the log in it")
         known = ", ".join(_READERS)
         raise InputError(
             f"{path}: {f'unknown log format {suffix!r}' if suffix else 'a log needs a suffix that tells its format'}"
             f"{nearest(suffix, _READERS) if suffix else ''}; known are {known}, each also with .gz"
         )
     return suffix
+
+
+def logs_among(paths: Iterable[Path]) -> list[Path]:
+    """`paths`, with the logs in it instead of each folder, by name. InputError for a folder without any.
+
+    Of a folder neither .csv, which are mostly tables, nor what ``gz-onboard estimate`` wrote.
+    """
+    logs: list[Path] = []
+    for path in paths:
+        found = [path] if not path.is_dir() else sorted(file for file in path.iterdir() if _is_log(file))
+        if not found:
+            raise InputError(f"{path}: this folder holds no log")
+        logs += found
+    return logs
+
+
+def _is_log(file: Path) -> bool:
+    name = file.name.lower().removesuffix(".gz")
+    return name.endswith(tuple(_READERS)) and not name.endswith((".csv", ".estimate.mcap")) and file.is_file()
 
 
 def read_attachments(path: str | Path) -> dict[str, bytes]:

@@ -28,7 +28,7 @@ from typing import TYPE_CHECKING
 from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.events import ROLES
-from gz_onboard.toml import read_text
+from gz_onboard.toml import is_file, read_text
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
@@ -88,7 +88,7 @@ def find_dbc(name: str, beside: Path | None = None) -> Path:
     if beside:
         places.insert(0, beside)
     for place in places:
-        if (place / name).is_file():
+        if is_file(place / name):
             return place / name
     own = [file.name for place in places if place.is_dir() for file in place.glob("*.dbc")]
     raise InputError(f"{name}: no such DBC file beside {beside or 'the vehicle file'} or in dbc/{nearest(name, own)}")
@@ -110,6 +110,8 @@ def load_database(files: list[Path]) -> Database:
         before = len(database.messages)
         try:
             database.add_dbc_string(text + _END)
+        except LookupError as error:  # of cantools' own code, which has not met such a file
+            raise _invalid(file, text, f"cantools cannot read it ({type(error).__name__}: {error})") from error
         except Exception as error:  # cantools and textparser raise a dozen types on what is not valid
             raise _invalid(file, text, str(error) or type(error).__name__) from error
         if len(database.messages) == before:
@@ -164,6 +166,10 @@ def _problem(message: Message) -> str | None:
 def _invalid(file: Path, text: str, problem: str) -> InputError:
     """The error about a DBC file, with the line that it tells of or on which the message stands that it names."""
     told = re.search(r"line (\d+)", problem)
+    if told and int(told[1]) > text.count("\n") + 1:  # in `_END`, behind the file
+        lines = text.rstrip().split("\n")
+        problem = f"it ends within a statement; its last line is {shown(lines[-1].strip())}. Is the file whole?"
+        return InputError(f"{file}:{len(lines)}: not a valid DBC file: {problem}")
     named = re.search(r"message (\w+)", problem)
     line = told[1] if told else _message_line(text, named[1]) if named else None
     if wide := re.search(r"Standard frame id (0x[0-9a-f]+) is more than 11 bits", problem):

@@ -63,8 +63,8 @@ class Publisher:
     def range(self, estimate: Estimate, counts: Counts, time_ns: int, channel: int = 0) -> list[Frame]:
         """The frames of every second."""
         e = estimate
-        state, remaining, p10, p90 = self._told(e)
-        known = state in _KNOWN
+        state, remaining, p10, p90 = self.told(e)
+        known = state in KNOWN
         frames: dict[str, dict[str, float | None]] = {
             "RANGE_Estimate": {
                 "RANGE_Remaining": remaining,
@@ -89,9 +89,9 @@ class Publisher:
 
     def status(self, estimate: Estimate, time_ns: int, channel: int = 0) -> list[Frame]:
         """The frame of every tenth of a second."""
-        state = self._told(estimate)[0]
+        state = self.told(estimate)[0]
         soc, sigma = _scaled(estimate.soc, 100), _scaled(estimate.soc_sd, 100)
-        if state not in _KNOWN or not (self._can_say(SOC, soc) and self._can_say(SIGMA, sigma)):
+        if state not in KNOWN or not (self._can_say(SOC, soc) and self._can_say(SIGMA, sigma)):
             soc = sigma = None  # neither is of use without the other
         values: dict[str, float | None] = {
             SOC: soc,
@@ -104,9 +104,9 @@ class Publisher:
             values[signal] = reasons & bit != 0
         return [self._frame("RANGE_Status", values, time_ns, channel)]
 
-    def _told(self, e: Estimate) -> tuple[State, float | None, float | None, float | None]:
+    def told(self, e: Estimate) -> tuple[State, float | None, float | None, float | None]:
         """(state, range, P10, P90) [km] as they are sent: never valid unless all three are there and in their order."""
-        if e.state not in _KNOWN:
+        if e.state not in KNOWN:
             return e.state, None, None, None
         remaining, p10, p90 = _scaled(e.range, 1e-3), _scaled(e.range_p10, 1e-3), _scaled(e.range_p90, 1e-3)
         if (
@@ -141,7 +141,8 @@ class Publisher:
 
 
 SOC, SIGMA = "RANGE_StateOfCharge", "RANGE_StateOfChargeSigma"
-_KNOWN = (State.VALID, State.DEGRADED)
+KNOWN = (State.VALID, State.DEGRADED)
+"""The states in which numbers are sent."""
 
 
 def sensor_signal(role: str) -> str:

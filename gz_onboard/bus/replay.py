@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.logs import LogDamage, log_suffix, read_frames
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import INTERRUPTED, InputError, nearest
 from gz_onboard.events import ERR_FLAG, TRANSMITTED, Frame
 
 if TYPE_CHECKING:
@@ -161,7 +161,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--channel",
         default="vcan0",
-        help="where to send (default: %(default)s); several by commas: the log's channels 0, 1, ... in this order",
+        help="where to send (default: %(default)s, so that no recording gets onto a vehicle unasked); several by "
+        "commas: the log's channels 0, 1, ... in this order",
     )
     parser.add_argument("--speed", type=float, default=1.0, help="times as fast; 0: as fast as possible")
     parser.add_argument("--loop", action="store_true", help="begin again at the end, until interrupted")
@@ -195,7 +196,7 @@ def run(args: argparse.Namespace) -> int:
                 break
             time.sleep(_LOOP_GAP_NS * 1e-9)
     except KeyboardInterrupt:
-        code = 130
+        code = INTERRUPTED
     finally:
         for bus in buses:
             bus.shutdown()

@@ -27,8 +27,8 @@ from gz_onboard.bus.channel import Channel
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.codec import raw_range
 from gz_onboard.bus.mapping import find_dbc
-from gz_onboard.bus.publisher import RANGE_DBC, range_messages, reason_signal, sensor_signal
-from gz_onboard.errors import InputError
+from gz_onboard.bus.publisher import KNOWN, RANGE_DBC, range_messages, reason_signal, sensor_signal
+from gz_onboard.errors import FAILED, InputError
 from gz_onboard.events import EFF_FLAG, ROLES, STALE_PERIODS, Activity, Frame, Reason, State
 
 if TYPE_CHECKING:
@@ -139,20 +139,29 @@ class View:
         return "–" if value is None else f"{value:{form}} {unit}"
 
     def state(self, now: float) -> State | None:
-        """How far the numbers can be trusted; None if nothing says so."""
-        for name in ("RANGE_StatusState", "RANGE_EstimateState"):
-            value = self.value(name, now)
-            if value is not None and value in tuple(State):
-                return State(int(value))
-        return None
+        """How far the numbers can be trusted; None if nothing says so.
+
+        The status comes ten times as often as the range, and tells of one that has not come yet: until then the state
+        is that of the last range, or starting.
+        """
+        status, estimate = (self._state(name, now) for name in ("RANGE_StatusState", "RANGE_EstimateState"))
+        if status in KNOWN and self.value("RANGE_Remaining", now) is None:
+            if not self.messages["RANGE_Estimate"].received:
+                return State.STARTING
+            status = estimate
+        return estimate if status is None else status
+
+    def _state(self, signal_: str, now: float) -> State | None:
+        value = self.value(signal_, now)
+        return State(int(value)) if value is not None and value in tuple(State) else None
 
     def reasons(self, now: float) -> list[Reason]:
         """Why the estimate is not what it could be."""
         return [reason for reason in Reason if self.value(reason_signal(reason), now)]
 
     def activity(self, now: float) -> str:
-        """What the vehicle does, in a word; nothing if it is not known."""
-        value = self.value("RANGE_Activity", now)
+        """What the vehicle does, in a word; nothing if it is not known, or before there is an estimate."""
+        value = None if self.state(now) is State.STARTING else self.value("RANGE_Activity", now)
         return Activity(int(value)).name.lower() if value and value in tuple(Activity) else ""
 
     def distrusted(self, now: float) -> list[str]:
@@ -374,7 +383,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard dashboard``."""
     add = parser.add_argument
     add("--interface", default="socketcan", help="python-can's interface (%(default)s)")
-    add("--channel", default="vcan0", metavar="NAME", help="channel (%(default)s)")
+    add("--channel", default="can0", metavar="NAME", help="channel, as the daemon's (%(default)s)")
     add(
         "--dbc",
         default=RANGE_DBC,
@@ -412,13 +421,13 @@ def run(arguments: argparse.Namespace) -> int:
                 _show_lines(view, channel, style, duration, stopped, out)
     except OSError as error:
         if error.errno == errno.EIO:  # the terminal was closed: there is nobody to tell
-            return 1
+            return FAILED
         if isinstance(error, BrokenPipeError):
             raise
         raise InputError(f"standard output: {error.strerror}") from error
     finally:
         channel.close()
-    return 1 if arguments.once and math.isinf(view.age(time.monotonic())) else 0
+    return FAILED if arguments.once and math.isinf(view.age(time.monotonic())) else 0
 
 
 def _is_screen(out: IO[str]) -> bool:

@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard.bus import _can  # noqa: F401 - before cantools, which would import it with asammdf and pandas
-from gz_onboard.bus.logs import LogDamage, read_frames
+from gz_onboard.bus.logs import LogDamage, logs_among, read_frames
 from gz_onboard.bus.publisher import WH, WH_PER_KM, Counts, Publisher
 from gz_onboard.bus.recorder import LogFile
-from gz_onboard.errors import InputError
+from gz_onboard.errors import BAD_INPUT, InputError
 from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log, reason_words
 from gz_onboard.lab.processes import Progress, over_rides, progress_bar
@@ -329,7 +329,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard estimate``."""
     explain_keys(parser, "a ride in the", SUMMARY_VERSION, KEYS)
     add = parser.add_argument
-    add("logs", nargs="+", type=Path, metavar="FILE", help="candump .log, .asc, .blf, .trc, .mf4, .csv, .mcap, or .gz")
+    add("logs", nargs="+", type=Path, metavar="FILE", help="candump .log, .asc, .blf, .trc, .mf4, .csv, .mcap, or .gz; "
+        "or a folder of them (but .csv)")  # fmt: skip
     add(
         "--vehicle", default="reference", metavar="NAME|TOML", help="vehicle file or one of the package's (%(default)s)"
     )
@@ -344,7 +345,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """``gz-onboard estimate``: 0 if every log could be estimated, else 1."""
+    """``gz-onboard estimate``: 0 if every log could be estimated, else `BAD_INPUT`."""
     tasks = _tasks(arguments)
     _vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
     rides: list[dict[str, Any]] = []
@@ -362,14 +363,12 @@ def run(arguments: argparse.Namespace) -> int:
                 say(summary_text(result), sys.stdout)
     if arguments.json:
         write_json(arguments.json, {"version": SUMMARY_VERSION, "rides": rides, "failed": failed})
-    return 1 if failed else 0
+    return BAD_INPUT if failed else 0
 
 
 def _tasks(arguments: argparse.Namespace) -> list[Task]:
-    if arguments.jobs is not None and arguments.jobs < 1:
-        raise InputError(f"--jobs {arguments.jobs}: at least 1")
     check_json(arguments.json)
-    paths = list(dict.fromkeys(arguments.logs))
+    paths = list(dict.fromkeys(logs_among(arguments.logs)))
     names = output_names(paths, [_stem(path) for path in paths], ".estimate.mcap")
     return [
         Task(path, arguments.output / name, arguments.vehicle, arguments.payload, arguments.filter,

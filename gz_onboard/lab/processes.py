@@ -15,6 +15,8 @@ from typing import Any, Protocol, TypeVar
 
 from gz_onboard.errors import InputError
 
+MOST_JOBS = 256
+"""Processes: each takes some 100 MB and does nothing else than a processor's work."""
 Progress = Callable[[float], None]
 """Is told how much work was done since the last time, in any unit."""
 Say = Callable[[str, Any], None]
@@ -43,8 +45,11 @@ def over_rides(
     """Each task with what `function` answers, or with the InputError that it raises, in order.
 
     function: of a task and of what it tells its work, which reaches `progress`; to be found at the top of its module.
-    jobs: so many at a time, as many as there are processors if None. option: of the command line, that sets it.
+    jobs: so many at a time, as many as there are processors if None; InputError beyond 1 to `MOST_JOBS`. option: of
+    the command line, that sets it.
     """
+    if jobs is not None and not 1 <= jobs <= MOST_JOBS:
+        raise InputError(f"{option} {jobs}: must be 1 to {MOST_JOBS} processes")
     jobs = min(jobs or len(os.sched_getaffinity(0)), len(tasks))
     if jobs < 2:
         for task in tasks:

@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.errors import InputError
+from gz_onboard.bus.logs import logs_among
+from gz_onboard.errors import BAD_INPUT, FAILED, InputError
 from gz_onboard.lab.processes import Progress, over_rides, progress_bar
 from gz_onboard.lab.validate_components import Component, components
 from gz_onboard.lab.validate_score import (
@@ -36,7 +37,7 @@ from gz_onboard.physics.model import G
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded, rest_soc
 from gz_onboard.simulation.route import read_route
 from gz_onboard.simulation.run import Command, Run, drive, follow, replay, road_table
-from gz_onboard.simulation.samples import read_facts
+from gz_onboard.simulation.samples import read_facts, rider_mass
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Place, Road, Scooter
 from gz_onboard.simulation.telling import check_json, explain_keys, output_names, write_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -66,6 +67,13 @@ KEYS = {
 }
 """What ``--json`` holds of a ride: {"version", "rides", "pooled": splits of all rides, "failed": [{file, error}]}."""
 
+FORMS = {
+    "open_loop": ("open loop", "the same throttle gives another ride; small errors of force add up to another speed"),
+    "predictive": ("rider model", "the same speed takes another current or torque: road load, losses, or the way of "
+                   "opening the throttle"),
+    "components": ("components", "fed with what was measured, this part alone is off: its parameters or its equation"),
+}  # fmt: skip
+"""By entry of a ride: what people call it, and what it means if it does not pass."""
 AVERAGED = 0.5  # s: over which the measured speed is averaged: its noise is no ride for a rider model to follow
 STANDING = 0.3  # m/s: less is noise of a wheel that stands
 _READ, _RIDE = 0.4, 0.3  # shares of the work
@@ -96,8 +104,7 @@ class Task:
 def validate_ride(task: Task, progress: Progress = lambda _: None) -> dict[str, Any]:
     """The entry of one ride: see `KEYS`; `progress` is told bytes of the log. Raises InputError."""
     facts = read_facts(task.path.parent / "rides.json").get(task.name, {})
-    noted = facts.get("rider_mass_kg")
-    payload = task.payload if task.payload is not None else (float(noted) if isinstance(noted, int | float) else None)
+    payload = task.payload if task.payload is not None else rider_mass(facts)
     vehicle = read_vehicle(task.vehicle, payload)
     told = 0.0
 
@@ -325,7 +332,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard validate``."""
     explain_keys(parser, "a ride in the", SUMMARY_VERSION, KEYS)
     add = parser.add_argument
-    add("logs", nargs="+", type=Path, metavar="RIDE", help="logs of rides: .blf .log .asc .trc .mf4 .csv .mcap, or .gz")
+    add("logs", nargs="+", type=Path, metavar="RIDE", help="logs of rides: .blf .log .asc .trc .mf4 .csv .mcap, "
+        "or .gz; or folders of them (but .csv)")  # fmt: skip
     add(
         "--vehicle", default="reference", metavar="NAME|TOML", help="vehicle file or one of the package's (%(default)s)"
     )
@@ -339,7 +347,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """``gz-onboard validate``: 0 if every ride could be judged (and, with --gate, passed), else 1."""
+    """``gz-onboard validate``: 0; `BAD_INPUT` if a ride cannot be judged; `FAILED` if with --gate one fails."""
     tasks = _tasks(arguments)
     read_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
     rides: list[dict[str, Any]] = []
@@ -363,7 +371,9 @@ def run(arguments: argparse.Namespace) -> int:
         _write_tables(arguments, rides, together)
     if arguments.json:
         write_json(arguments.json, {"version": SUMMARY_VERSION, "rides": rides, "pooled": together, "failed": failed})
-    return 1 if failed or (arguments.gate and not all(ride["passed"] for ride in rides)) else 0
+    if failed:
+        return BAD_INPUT
+    return FAILED if arguments.gate and not all(ride["passed"] for ride in rides) else 0
 
 
 def _write_tables(arguments: argparse.Namespace, rides: list[dict[str, Any]], together: dict[str, Any]) -> None:
@@ -384,10 +394,8 @@ def _write_tables(arguments: argparse.Namespace, rides: list[dict[str, Any]], to
 
 
 def _tasks(arguments: argparse.Namespace) -> list[Task]:
-    if arguments.jobs is not None and arguments.jobs < 1:
-        raise InputError(f"--jobs {arguments.jobs}: at least 1")
     check_json(arguments.json)
-    paths = list(dict.fromkeys(arguments.logs))
+    paths = list(dict.fromkeys(logs_among(arguments.logs)))
     names = [Path(path.name.removesuffix(".gz")).stem for path in paths]
     stems = output_names(paths, names, ".validation.png")
     return [
@@ -406,7 +414,7 @@ def ride_text(ride: dict[str, Any]) -> str:
         f"  {where}, {ride['kind'] or 'kind not noted'}, {ride['distance_km']:.2f} km, {ride['duration_s']:.0f} s, "
         f"{ride['payload_kg']:g} kg{air}",
     ]
-    for form, name in (("open_loop", "open loop"), ("predictive", "rider model"), ("components", "components")):
+    for form, (name, meaning) in FORMS.items():
         entry = ride[form]
         if not entry:
             continue
@@ -415,8 +423,13 @@ def ride_text(ride: dict[str, Any]) -> str:
         for channel, e in entry["channels"].items():
             percent = "–" if e["percent"] is None else f"{e['percent']:5.1f} %"
             spread = "" if e["of_spread"] is None else f", {e['of_spread']:.2f} of its spread"
+            verdict = "ok" if e["passed"] else f"FAIL (limit {e['limit_percent']:g} %)"
             lines.append(
-                f"    {channel.replace('_', ' '):21} {percent} {'ok  ' if e['passed'] else 'FAIL'} "
+                f"    {channel.replace('_', ' '):21} {percent} {verdict:17} "
                 f"rms {e['rms']:7.2f}, max {e['max']:7.2f}, mean {e['mean_error']:+7.2f} {e['unit']}{spread}"
             )
+        if not entry["passed"]:
+            lines.append(f"    FAIL: {meaning}")
+    if not ride["passed"]:
+        lines.append("  what each percentage is of, and where the model is known to fail: docs/validation.md")
     return "\n".join([*lines, *(f"  {text}" for text in ride["missing"])])

@@ -105,7 +105,7 @@ VEHICLE_PARAMETERS = (
     Parameter("cg_height", "m", 0.63, 0.08, 0.1, 2, "centre of gravity over the road"),
     Parameter("wheel_inertia_front", "kg·m²", 0.11, 0.03, 0, 5, "wheel and tyre"),
     Parameter("wheel_inertia_rear", "kg·m²", 0.34, 0.08, 0, 5, "wheel, tyre and hub motor"),
-    Parameter("gear_ratio", "1", 1.0, 0.01, 0.02, 5, "wheel speed over motor speed; 1 for a hub motor"),
+    Parameter("gear_ratio", "1", 1.0, 0.01, 0.02, 5, "wheel speed over motor speed: 0.2 for a reduction of 5"),
     Parameter("torque_constant", "N·m/A", 0.47, 0.02, 0.01, 10, "Lord 2016, table 2.5"),
     Parameter("yaw_inertia", "kg·m²", 28, 6, 1, 300, "m·(0.39 m)²: Cossalter 2006, ch. 7, scooter with rider"),
     Parameter("caster_angle", "rad", 0.46, 0.04, 0.1, 0.8, "26 degrees: Cossalter 2006, sec. 1.3, scooters 24 to 28"),
@@ -169,7 +169,12 @@ def known_effects() -> tuple[str, ...]:
 def load_effect(name: str, folder: Path | None = None) -> Effect:
     """The effect `name`, from `folder` if it has one of that name, else the package's own."""
     if folder and (file := effect_file(name, folder)):
-        return _effect(name, _import_file(name, file))
+        try:
+            return _effect(name, _import_file(name, file))
+        except (InputError, KeyboardInterrupt):
+            raise
+        except BaseException as error:  # SystemExit too: a user's code does not end ours without a word
+            raise failed(file, error) from error
     if name not in known_effects():
         known = [*known_effects(), *effects_in(folder)] if folder else known_effects()
         raise InputError(f"no effect is called {shown(name)}{nearest(name, known)}")
@@ -201,11 +206,14 @@ def _import_file(name: str, file: Path) -> ModuleType:
     assert spec and spec.loader
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise InputError(f"{file}: {type(error).__name__}: {error}") from error
+    # Not `exec_module`, which would take bytecode from a folder beside the file that may be anybody's.
+    exec(compile(file.read_bytes(), file, "exec", dont_inherit=True), module.__dict__)
     return module
+
+
+def failed(file: Path, error: BaseException) -> InputError:
+    """The error to raise about an effect's file whose code raised `error`."""
+    return InputError(f"{file}: {type(error).__name__}: {error}")
 
 
 def _effect(name: str, module: ModuleType) -> Effect:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import product
 from typing import TYPE_CHECKING
 
-from gz_onboard.physics.effect import QUANTITIES
-from gz_onboard.physics.model import air_density
+from gz_onboard.physics.effect import QUANTITIES, failed
+from gz_onboard.physics.model import air_density, bind
 
 if TYPE_CHECKING:
     from gz_onboard.physics.model import Model
@@ -74,12 +75,20 @@ def read_riding(vehicle: Table) -> PriorRiding:
 
 
 def check_riding(vehicle: Table, riding: PriorRiding, model: Model) -> None:
-    """InputError if `riding` costs no energy by `model`, on a level road at 20 degC: then there would be no range."""
+    """InputError if `riding` costs no energy by `model`, on a level road at 20 degC: then there would be no range.
+
+    Also if the code of an effect raises at it.
+    """
     ordinary = dict.fromkeys(QUANTITIES, 0.0) | {
         "grade_cosine": 1.0, "mass": model.mass, "air_density": air_density(20.0), "motor_temperature": 20.0,
         "ambient_temperature": 20.0, "cell_temperature": 20.0, "cell_capacity": model.parameters["cell_capacity"],
         "soc": 0.5, "lateral_acceleration": riding.lateral_acceleration, "vibration": riding.vibration,
     }  # fmt: skip
+    for effect, (_, speed, acceleration) in product(model.effects, riding.points):
+        try:
+            float(bind(effect, model.parameters)(ordinary | {"speed": speed, "acceleration": acceleration}))
+        except (Exception, SystemExit) as error:  # of a user's own: better here than on the road
+            raise failed(effect.file, error) from error
     power = sum(
         share * sum(model.power(ordinary | {"speed": speed, "acceleration": acceleration}).values())
         for share, speed, acceleration in riding.points

@@ -13,6 +13,7 @@ from gz_onboard.simulation.cycles import find_cycle
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded
 from gz_onboard.simulation.route import read_route, speed_profile
 from gz_onboard.simulation.run import Command, along, at_steps, follow, replay, road_table
+from gz_onboard.simulation.samples import read_facts, rider_mass
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Road, straight
 from gz_onboard.vehicle import Vehicle
 
@@ -53,6 +54,14 @@ def find_plan(arguments: argparse.Namespace, vehicle: Vehicle) -> Plan:
     speeds = at_steps(cycle.time, cycle.speed, STEP)
     road = roller or straight(math.sin(math.atan(arguments.grade / 100)), arguments.wind)
     return Plan(cycle.name, "cycle", cycle.duration, road, lambda: follow(speeds, STEP))
+
+
+def noted_payload(what: Path) -> float | None:
+    """The mass [kg] that ``rides.json`` beside it says of the recorded ride `what`; None of anything else."""
+    if _kind(what) != "ride":
+        return None
+    name = Path(what.name.removesuffix(".gz")).stem
+    return rider_mass(read_facts(what.parent / "rides.json").get(name, {}))
 
 
 def _kind(path: Path) -> str:

@@ -59,8 +59,7 @@ class Samples:
     @property
     def rider_mass(self) -> float | None:
         """The mass of rider and luggage as entered [kg], or None."""
-        mass = self.facts.get("rider_mass_kg")
-        return float(mass) if isinstance(mass, int | float) else None
+        return rider_mass(self.facts)
 
 
 def read_samples(log: Path, vehicle: Vehicle, progress: Callable[[int], None] | None = None) -> Samples:
@@ -115,6 +114,12 @@ def read_facts(file: Path) -> dict[str, dict[str, object]]:
         return {row["name"]: {key: value for key, value in row.items() if key != "name"} for row in rows}
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(f"{file}: must be a JSON list of objects with a name: {error!r}") from error
+
+
+def rider_mass(facts: dict[str, object]) -> float | None:
+    """The mass of rider and luggage [kg] that is written down of a ride, or None."""
+    mass = facts.get("rider_mass_kg")
+    return float(mass) if isinstance(mass, int | float) else None
 
 
 def extended(mapping: Mapping) -> Mapping:

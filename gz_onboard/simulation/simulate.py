@@ -19,7 +19,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.simulation.frames import Losses, check_output
 from gz_onboard.simulation.output import FORMATS, write, write_trace
 from gz_onboard.simulation.parts.chassis import MODELS, chassis
-from gz_onboard.simulation.plan import Plan, find_plan
+from gz_onboard.simulation.plan import Plan, find_plan, noted_payload
 from gz_onboard.simulation.recorded import rest_soc
 from gz_onboard.simulation.run import Progress, Run, drive
 from gz_onboard.simulation.scooter import Dynamometer, Scooter
@@ -41,7 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         "--vehicle", default="reference", metavar="NAME|TOML", help="vehicle file or one of the package's (%(default)s)"
     )
-    add("--payload", type=float, metavar="KG", help="mass of rider and luggage")
+    add("--payload", type=float, metavar="KG", help="mass of rider and luggage (of a recorded ride as noted in "
+        "rides.json beside the log, else the vehicle file's)")  # fmt: skip
     add("--soc", type=float, metavar="0..1", help="state of charge at the start (1; of a recorded ride, as there)")
     add("--ambient", type=float, metavar="C", help="temperature of air and vehicle at the start (20)")
     add("--grade", type=float, default=0.0, metavar="%", help="of the road, uphill positive, for cycles (%(default)g)")
@@ -71,7 +72,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard simulate``."""
-    vehicle = read_vehicle(arguments.vehicle, arguments.payload)
+    payload, payload_from = arguments.payload, "--payload"
+    if payload is None:
+        payload = noted_payload(Path(arguments.what))
+        payload_from = "the vehicle file" if payload is None else "rides.json"
+    vehicle = read_vehicle(arguments.vehicle, payload)
     _check(arguments)
     sweeps = [read_sweep(text, vehicle) for text in arguments.sweep]
     if len({sweep.name for sweep in sweeps}) < len(sweeps):
@@ -88,7 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
         result, scooter = ride(vehicle, plan, arguments, progress, trace)
         wall = time.perf_counter() - begin
         variants = [_variant(vehicle, values, plan, arguments, progress) for values in grid(sweeps)] if sweeps else None
-    summary = summarise(vehicle, plan, arguments, result, scooter) | {"wall_s": wall, "sweep": variants}
+    summary = summarise(vehicle, plan, arguments, result, scooter)
+    summary |= {"payload_from": payload_from, "wall_s": wall, "sweep": variants}
     summary["files"] = write(arguments, plan, result, summary, sweeps)
     if trace:
         summary["files"].append(write_trace(arguments, vehicle, trace, scooter))

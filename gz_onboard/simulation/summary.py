@@ -20,6 +20,7 @@ KEYS = {
     "kind": "cycle, route, ride (open loop) or ride (predictive)",
     "vehicle": "name of the vehicle",
     "payload_kg": "mass of rider and luggage",
+    "payload_from": "who said so: --payload, rides.json beside the log, or the vehicle file",
     "step_s": "step of the simulation",
     "duration_s": "ridden",
     "distance_km": "ridden",
@@ -160,7 +161,9 @@ def summary_text(summary: dict[str, Any]) -> str:
         ("computed in", f"{summary['wall_s']:.2f} s, step {1000 * summary['step_s']:g} ms"),
     ]  # fmt: skip
     rows += [("written", ", ".join(summary["files"]))] if summary["files"] else []
-    lines = [f"{summary['what']}, {summary['vehicle']}, payload {summary['payload_kg']:g} kg"]
+    lines = [
+        f"{summary['what']}, {summary['vehicle']}, payload {summary['payload_kg']:g} kg (by {summary['payload_from']})"
+    ]
     lines += [f"  {name:17} {text}" for name, text in rows]
     if summary["sweep"]:
         lines += ["", *_table(summary["sweep"])]

@@ -275,8 +275,11 @@ def test_dbc_files_that_cannot_be_had(tmp_path, names, parts):
         (("[-40|214]", "[-40|1e400]"), [":12:", "Heat has the limits -40 to inf"]),
         (("BO_ 256 100;", "BO_ 256 1e400;"), [":5:", "the cycle time is 1000"]),
         (("BO_ 256 100;", "BO_ 256 -5;"), [":5:", "the cycle time is -5 ms"]),
-        (("BO_ 256 100;\n", "BO_ 256 100"), [":20:", "not a valid DBC file"]),  # cut off
-        (("BO_ 256 100;\n", 'BO_ 256 100;\nCM_ "'), [":21:", "not a valid DBC file"]),
+        (("BO_ 256 100;\n", "BO_ 256 100"), [":19:", "ends within a statement", "BO_ 256 100'. Is the file whole?"]),
+        (
+            ("BO_ 256 100;\n", 'BO_ 256 100;\n\nCM_ "a'),
+            [":21:", "ends within a statement", "'CM_ \"a'. Is the file whole?"],
+        ),
     ],
 )
 def test_a_broken_dbc(tmp_path, change, parts):
@@ -285,6 +288,17 @@ def test_a_broken_dbc(tmp_path, change, parts):
     message = complaint(tmp_path, dbc=DBC.replace(old, new, 1))
     for part in [str(tmp_path / "v.dbc"), *parts]:
         assert part in message
+
+
+def test_a_dbc_that_was_cut_anywhere_says_nothing_of_what_is_not_in_it(tmp_path):
+    file = tmp_path / "v.dbc"
+    for end in range(0, len(DBC), 3):
+        file.write_text(DBC[:end], encoding="utf-8")
+        try:
+            load_database([file])
+        except InputError as error:
+            assert str(error).startswith(f"{file}:")
+            assert "CM_" not in str(error)
 
 
 def test_a_dbc_that_cannot_be_read(tmp_path):

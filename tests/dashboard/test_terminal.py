@@ -124,6 +124,26 @@ def test_without_an_estimate_there_are_dashes(state):
     assert state.name.lower() in text
 
 
+@pytest.mark.parametrize("heard", [False, True])
+def test_before_the_first_range_it_is_starting(heard):
+    """The status is sent ten times as often as the range, which has not come, or still says that there is none."""
+    view, publisher = View(), Publisher()
+    frames = publisher.range(Estimate(time=0.0), COUNTS, 0) if heard else []
+    for frame in [*frames, *publisher.status(replace(ESTIMATE, state=State.VALID), 0)]:
+        view.take(frame, 1.0)
+    line = terminal.summary_line(view, 1.0)
+    assert "; starting;" in line
+    assert "; riding" not in line
+    assert "State             starting" in picture(view, 1.0)
+    assert "Activity" not in picture(view, 1.0)
+    for frame in publisher.range(replace(ESTIMATE, state=State.VALID), COUNTS, 0):
+        view.take(frame, 1.1)
+    assert "; valid; riding;" in terminal.summary_line(view, 1.1)
+    for frame in publisher.status(replace(ESTIMATE, state=State.INVALID), 0):  # bad news is shown at once
+        view.take(frame, 1.2)
+    assert "; invalid; riding;" in terminal.summary_line(view, 1.2)
+
+
 @pytest.mark.parametrize("activity", Activity)
 def test_what_the_vehicle_does(activity):
     view = seen(replace(ESTIMATE, activity=activity))

@@ -158,7 +158,7 @@ def test_a_broken_log_does_not_stop_the_others(tmp_path, frames, capsys, jobs):
     missing = tmp_path / "missing.blf"
     bad = [empty, other, text, missing]
     out = tmp_path / "out"
-    assert run(*bad, *good, "--output", out, "--jobs", jobs, "--json", out / "s.json", "--no-plot") == 1
+    assert run(*bad, *good, "--output", out, "--jobs", jobs, "--json", out / "s.json", "--no-plot") == 2
     said = capsys.readouterr()
     document = json.loads((out / "s.json").read_text())
     assert [ride["file"] for ride in document["rides"]] == list(map(str, good))
@@ -178,6 +178,17 @@ def test_a_cut_log_is_estimated_as_far_as_it_goes(tmp_path, capsys):
     assert run(cut, "--output", tmp_path, "--no-plot") == 0
     assert "cut.blf" in capsys.readouterr().err
     assert 20 < len(estimates(tmp_path / "cut.estimate.mcap")) < 50
+
+
+def test_a_folder_of_logs_is_its_logs(tmp_path, frames, capsys):
+    for name in "b.log", "a.log.gz":
+        candump(tmp_path / name, frames[:2000])
+    for name in "a.route.csv", "rides.json", "c.estimate.mcap":
+        (tmp_path / name).touch()
+    (tmp_path / "d.log").mkdir()
+    assert run(tmp_path, tmp_path / "b.log", "--output", tmp_path, "--no-plot", "--json") == 0
+    rides = json.loads(capsys.readouterr().out)["rides"]
+    assert [Path(ride["file"]).name for ride in rides] == ["a.log.gz", "b.log"]
 
 
 def test_rides_of_the_same_name_in_several_folders(tmp_path, frames):

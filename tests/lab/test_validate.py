@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.cli import main
-from gz_onboard.lab.validate import KEYS, per_second, pool
+from gz_onboard.lab.validate import KEYS, per_second, pool, ride_text
 from gz_onboard.lab.validate_components import components
 from gz_onboard.lab.validate_report import COLUMNS, failures
 from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, conditions, errors, pooled, seconds, split
@@ -241,6 +241,16 @@ def test_pictures_and_page(two):
     assert "class=bad" in page
 
 
+def test_what_fails_is_told_with_its_limit_and_meaning(two):
+    text = ride_text(two[1]["rides"][0]).splitlines()
+    (torque,) = [line for line in text if "FAIL (" in line and "motor torque" in line]
+    assert "FAIL (limit 20 %) rms" in torque
+    (load,) = [line for line in text if "FAIL (" in line and "road load" in line]
+    assert "FAIL (limit 10 %) rms" in load
+    assert [line.split(":")[0] for line in text if "FAIL:" in line] == ["    FAIL"] * 3
+    assert any("docs/validation.md" in line for line in text)
+
+
 def test_tables_as_markdown(two):
     out, summary = two
     text = (out.parent / "v.md").read_text()
@@ -285,7 +295,7 @@ def test_bad_input(tmp_path, capsys):
     other = tmp_path / "other.log"
     other.write_text("(1.000000) can0 7AB#0011223344556677\n(1.010000) can0 7AB#0011223344556677\n")
     none = tmp_path / "none.blf"
-    assert main(["validate", str(other), str(none), "--jobs", "1", "--no-plot", "--output", str(tmp_path)]) == 1
+    assert main(["validate", str(other), str(none), "--jobs", "1", "--no-plot", "--output", str(tmp_path)]) == 2
     said = capsys.readouterr().err
     assert "knows none" in said
     assert "none.blf" in said

@@ -15,6 +15,7 @@ from gz_onboard.simulation.run import COLUMNS
 from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION
 from gz_onboard.simulation.sweep import read_sweep
 from gz_onboard.vehicle import read_vehicle
+from tests.support import LOGS
 
 PNG = b"\x89PNG"
 
@@ -33,6 +34,14 @@ def short(tmp_path):
 
 def summary(capsys):
     return json.loads(capsys.readouterr().out)
+
+
+def test_a_recorded_ride_has_the_rider_that_was_noted(capsys):
+    ride = [LOGS / "coastdown.blf", "--no-plot", "--no-series"]
+    assert simulate(*ride) == 0
+    assert "payload 75 kg (by rides.json)" in capsys.readouterr().out
+    assert simulate(*ride, "--payload", 60) == 0
+    assert "payload 60 kg (by --payload)" in capsys.readouterr().out
 
 
 def test_a_cycle_by_name(tmp_path, capsys):
@@ -56,6 +65,7 @@ def test_the_summary_has_its_keys_and_adds_up(short, tmp_path, capsys):
     found = summary(capsys)
     assert found.pop("version") == SUMMARY_VERSION
     assert set(found) == set(KEYS)
+    assert (found["payload_kg"], found["payload_from"]) == (80, "the vehicle file")
     assert sum(found["ledger_wh"].values()) == pytest.approx(found["energy_cells_wh"], rel=1e-3)
     assert found["consumption_wh_km"] == pytest.approx(found["energy_wh"] / found["distance_km"])
     assert found["kind"] == "cycle"

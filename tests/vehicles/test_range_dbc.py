@@ -34,6 +34,19 @@ def test_a_battery_too_large_for_its_range_frames_is_refused(tmp_path):
         Pipeline(van(tmp_path, ""))
 
 
+def test_a_range_too_long_for_its_range_frames_is_refused(tmp_path):
+    """Of a battery that they can tell: full, such a vehicle would show no range at all."""
+    dbc = (
+        find_dbc("range.dbc")
+        .read_text(encoding="utf-8")
+        .replace("0|16@1+ (0.01,0) [0|655.34]", "0|12@1+ (0.01,0) [0|40]")
+    )
+    with pytest.raises(
+        InputError, match=r"van\.toml: .*range from full is 5\d km, .*RANGE_Remaining .*mine\.dbc .*40 km"
+    ):
+        Pipeline(van(tmp_path, 'range_dbc = "mine.dbc"', dbc, parallel=12))
+
+
 def test_the_large_frames_all_the_way(tmp_path):
     vehicle = van(tmp_path, LARGE)
     run = Run(vehicle)
@@ -63,8 +76,16 @@ def test_a_file_of_ones_own_beside_the_vehicle_file(tmp_path):
     ("line", "dbc", "told"),
     [
         ('range_dbc = "range_larg.dbc"', "", r"van\.toml:1: range_dbc: .*no such DBC file.*mean 'range_large\.dbc'"),
+        ('range_dbc = "."', "", r"van\.toml:1: range_dbc: \.: no such DBC file"),
+        ('range_dbc = ""', "", r"van\.toml:1: range_dbc: '' cannot be the name of a file"),
+        (f'range_dbc = "{"x" * 5000}"', "", r"van\.toml:1: range_dbc: 'xxx.{0,100}' cannot be the name of a file"),
+        (f'range_dbc = "{"ä" * 200}"', "", r"van\.toml:1: range_dbc: '.*ää.*': cannot be read: File name too long"),
         ("range_dbc = 3", "", r"van\.toml:1: range_dbc: must be a string"),
-        ('range_dbc = "vehicle.dbc"', "", r"vehicle\.dbc: has no message RANGE_Estimate, which range\.dbc has"),
+        (
+            'range_dbc = "vehicle.dbc"',
+            "",
+            r"van\.toml: range_dbc: .*vehicle\.dbc: has no message RANGE_Estimate, which",
+        ),
         ('range_dbc = "mine.dbc"', "1552 512", r"van\.toml: .*take the identifiers .*mine\.dbc\): 0x200"),
     ],
 )
