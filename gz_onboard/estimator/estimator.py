@@ -53,7 +53,7 @@ STEADY_AFTER = 10.0  # s over which it must hold still after it has once been se
 STEADY_WAIT = 60.0  # s after which it is begun with whatever there is, knowing nothing
 STEADY_SD = 4.0  # of the movement: how much may be still to come
 SLOW_GAP = 0.5  # s: messages with longer gaps are watched for their real period
-SLOWEST = 5.0  # s: pack current and voltage that come less often are not integrated
+SLOWEST = 5.5  # s: pack current and voltage that come less often are not integrated: 5 s and what a clock is off
 PAUSE = 1.0  # s: without messages of a longer period a longer gap is a pause, in which nobody knows what flowed
 PAUSE_PERIODS = 2.5  # the same in real periods of the pack current
 SLOW_STALE_PERIODS = 3.0  # a slow signal is stale after so many of its real periods
@@ -61,6 +61,7 @@ LONGEST_STALE = 300.0  # s, of temperatures; of everything else so many of the s
 FAST_COUNT = 20  # messages in a row without a long gap: the long ones are over
 SAMPLING_RATE = 0.15  # 1/h: sd of the mean current over capacity between two samples that are seconds apart
 CONTRADICTED = 60.0  # s: a filter whose voltage is off its gate for so long begins anew
+DOUBTED_START = 30.0  # s: a voltage that is doubted so soon has misled the first state of charge
 RESTARTED_FOR = 600.0  # s: for so long it is said
 ERROR_TIME = 600.0  # s: over so long the cell model errs the same way; its error does not average out faster
 EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
@@ -155,9 +156,13 @@ class Estimator:
         self._looked = -inf  # s: the last time
         self._unsteady = False  # a first voltage moved
         self._waited = inf  # s: since when a first voltage has been looked at
+        self._unseen = 0.0  # of SOC: sd that the pauses left
         self._off_gate = 0
         self._contradicted = 0.0  # s
         self._restarted_at = -inf
+        self._started = -inf  # s: when there was a first state of charge,
+        self._started_from: tuple[Saved | None, float | None] = (None, None)  # and what it was made from, how old
+        self._doubted = False  # a voltage
         self._rest = Rest()
         self._rest_variance = inf  # V² of a cell, of what was taken in of this rest
         self._activities = Activities()
@@ -174,6 +179,10 @@ class Estimator:
         self._innovation_square = self._error_square = 0.0
         self._mismatch = 0.0  # A, low-passed
         self._cell_temperature: float | None = None
+        self._odometer: float | None = None  # m, at the last step
+        self._own_soc: float | None = None  # the vehicle's own state of charge, at the last step
+        self._voltage_heard: float | None = None  # s, of the message whose voltage was taken in last
+        self._voltage_taken = -inf  # s: when
         self._pack: tuple[float | None, float | None, str] = (None, None, "none")
         self._said_current: float | None = None  # A of the pack, trusted or not
         self._forecast: Forecast | None = None
@@ -216,6 +225,8 @@ class Estimator:
         self._heard[group] = time
         if gap > SLOW_GAP or self._gaps[group]:
             self._watch(group, gap)
+            for signal in self._slots[group]:  # no mean with what came before the gap
+                signal.total, signal.count = 0.0, 0
         for signal, value in zip(self._slots[group], values):  # noqa: B905 - hot, equal by construction
             if value is not None:
                 signal.value = value
@@ -303,11 +314,16 @@ class Estimator:
         distrusted = voltages.step(dt, compared, current, self._cell_error)
         for role in voltages.ROLES:
             signals[role].trusted = role not in distrusted
+        doubted = bool(voltages.apart or any(voltages.trials[role].guilty for role in voltages.ROLES))
+        if doubted and not self._doubted and now - self._started < DOUBTED_START:
+            self._saved, self._saved_age = self._started_from
+            self._wait_again()
+        self._doubted = doubted
         if voltages.apart and voltage is not None and inverter_voltage is not None:
             voltage = (voltage + inverter_voltage) / 2
         elif not signals.pack_voltage.trusted or voltage is None:
             voltage = inverter_voltage if signals.inverter_voltage.trusted else None
-        self._voltage_sd = sqrt(self._own_voltage_sd**2 + voltages.apart**2)
+        self._voltage_sd = hypot(self._own_voltage_sd, voltages.apart, voltages.spread)
         if current is None and self.road.speed is not None and voltage:
             return voltage, self._model_power(now) / voltage, "model"
         return voltage, current, source
@@ -401,10 +417,31 @@ class Estimator:
 
     # --- battery ----------------------------------------------------------------------------------------------
 
+    def _pause_long(self, gap: float) -> None:
+        """So long a silence [s] is a restart: the voltage and what was known before are weighed anew."""
+        filter_ = self.filter
+        if filter_ is None:
+            return
+        self._saved = Saved(
+            filter_.soc, filter_.v1, filter_.covariance, self._current, self._odometer, self._own_soc,
+            self._forecast.consumption if self._forecast else None,
+        )  # fmt: skip
+        self._saved_age = gap
+        if self._in_cells:
+            self._move_cells(gap, 0.0, filter_.soc, self._cells())
+        self._wait_again()
+
+    def _wait_again(self) -> None:
+        """Wait for a first voltage once more."""
+        self.filter = self._first = self._innovation = None
+        self._rest, self._rest_variance = Rest(), inf
+
     def _battery_step(
         self, now: float, dt: float, voltage: float | None, current: float | None, source: str, temperature: float
     ) -> None:
         battery = self.battery
+        if dt > BRIDGE:
+            self._pause_long(dt)
         filter_ = self.filter
         if voltage is not None and not self._plausible(voltage, current or 0.0, temperature):
             voltage, self._off_gate = None, self._off_gate + 1
@@ -426,8 +463,10 @@ class Estimator:
             if sampled > SLOW_GAP:
                 q += (SAMPLING_RATE / 3600) ** 2 * dt * sampled
             if dt > self._pause:  # nobody knows what flowed
-                mean *= dt <= BRIDGE
-                q += unseen_sd(dt) ** 2
+                # What was taken for it errs the same way each time: the rider goes on as before.
+                before_sd, more = min(self._unseen, sqrt(filter_.covariance[0])), unseen_sd(dt)
+                q += (2 * before_sd + more) * more
+                self._unseen = before_sd + more
                 self._rest.interrupt()
                 self._rest_variance = inf
             filter_.predict(dt, mean / battery.cells_parallel, temperature, (q, 1e-8 * min(dt, RELAXED)))
@@ -441,9 +480,17 @@ class Estimator:
                 self._move_cells(dt, mean / battery.cells_parallel, filter_.soc, temperature)
             filter_.soc = min(max(filter_.soc, SOC_BOUNDS[0]), SOC_BOUNDS[1])
         self._current = current
+        self._odometer, self._own_soc = _last(self.signals.odometer), _last(self.signals.bms_state_of_charge)
         if voltage is None or current is None:
             self._innovation = None
             return
+        # What was held since the last message is taken in once, with all the time it stands for.
+        pack = self.signals.pack_voltage
+        heard = pack.time if pack.fresh(now) else self.signals.inverter_voltage.time
+        if heard == self._voltage_heard:
+            return
+        dt = min(now - self._voltage_taken, self._pause) if self._voltage_taken > -inf else dt
+        self._voltage_heard, self._voltage_taken = heard, now
         if self._latency and self.signals.pack_voltage.fresh(now):
             pair = self._paired(now, voltage, current)
             if pair is None:
@@ -553,11 +600,11 @@ class Estimator:
 
     def _begin_anew(self, now: float) -> None:
         """The voltage has contradicted the state of charge for long: begin again from it."""
-        self.filter = self._first = self._saved = self._innovation = None
+        self._wait_again()
+        self._saved = None
         self._contradicted = self._error_square = self._innovation_square = 0.0
         self._off_gate = 0
         self._restarted_at = now
-        self._rest, self._rest_variance = Rest(), inf
 
     def _await_steady(self, now: float, voltage: float, current: float, temperature: float) -> None:
         """Start from the first voltage that holds still, as soon as what comes once a second is known or overdue.
@@ -611,7 +658,7 @@ class Estimator:
         drop_sd, model_sd = RESISTANCE_SD * r0 * cell_current, self._model_sd if loaded else 0.0
         voltage_sd = hypot(self._rest_sd, self._voltage_sd, drop_sd, model_sd, unsteady)
         saved, age = self._saved, self._saved_age
-        self._saved = None
+        self._saved, self._started, self._started_from = None, now, (saved, age)
         drawn = None
         if saved:
             own = self.signals.bms_state_of_charge.get(now), self.signals.odometer.get(now)

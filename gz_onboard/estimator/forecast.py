@@ -330,8 +330,11 @@ class Forecaster:
         consumption = r.factor * modelled
         power = consumption * speed
 
+        # Downhill next to nothing is drawn in the mean; what is to come is not all downhill.
         prior_time = PRIOR_LENGTH / prior_speed
-        mean = max(prior_power * prior_time + past.measured, LEAST * prior_power * prior_time)
+        mean = max(
+            prior_power * prior_time + max(past.measured, r.factor * past.level), LEAST * prior_power * prior_time
+        )
         form = (PRIOR_FORM * prior_power**2 * prior_time + past.power_squares) * (prior_time + past.duration) / mean**2
         form = min(max(form, 1.0), 6.0)
 

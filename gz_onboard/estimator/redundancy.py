@@ -51,13 +51,14 @@ JUMP, WEATHER = 6.0, 1.0  # m, m/s: how far and how fast an altitude wanders by 
 STANDING_TIME, STANDING_RATE = 20.0, 0.6  # s, m/s: a standing vehicle does not climb
 GAIN = 0.6, 1.5  # of the accelerometer over the wheels' acceleration, over `GAIN_TIME` if there is enough of it
 HARDEST = 10.0  # m/s²
-GAIN_TIME, GAIN_LEAST = 60.0, 10.0  # s, m²/s³
+GAIN_TIME, GAIN_MEAN, GAIN_LEAST = 60.0, 20.0, 10.0  # s, s, m²/s³
 
 # Currents in those that empty the pack in an hour; the voltages are a cell's.
 FAST_TIME, SKEW_TIME, CURRENT_TIME = 0.5, 2.0, 10.0  # s: low passes; the sensors do not sample at the same time
 CURRENT_APART, CURRENT_APART_RELATIVE = 0.10, 0.10  # 1/h and 1: two currents that differ by more contradict each other
 GROSS_CURRENT, GROSS_RELATIVE = 0.5, 0.3  # the same over `FAST_TIME`
 VOLTAGE_TIME, VOLTS_APART, GROSS_VOLTS = 10.0, 0.07, 0.3  # s, V
+VOLTS_USUAL = 0.02  # V: sensors that do not sample at the same time, on the rides
 AGREED_BEFORE = 30.0  # s: two voltages that agreed so long knew the state of charge, and one of them left it
 ERROR_TIME, ERROR_LEAST, GROSS_ERROR = 10.0, 0.04, 0.4  # s, V: what the cell model leaves, low-passed; at once
 ROAD_TIME, OFF_ROAD, OFF_ROAD_RELATIVE = 30.0, 0.15, 0.7  # s, 1/h, 1: by the road load a current is known to half
@@ -66,15 +67,21 @@ STUCK_VOLTAGE = 5.0  # s
 LOWEST_CELL, HIGHEST_CELL = 0.6, 1.12  # of the cut-off, of full at rest
 # Both currents scaled alike: the cells' voltage sags by more (less) than they explain, and a kilometre takes less
 # (more) than the road does. The recorded rides show a sag of 0.6 to 1.3 of the predicted one, an aged pack's up to
-# twice; a frugal rider over the last kilometre 0.7 of the usual. Neither alone says that a sensor lies; both do.
-SAG_FAST, SAG_TIME, SAG_LEAST = 0.5, 120.0, 0.005  # s, s, V²·s of a cell
-SAGS_MORE, TAKES_LESS = 1.45, 0.67
+# twice; a kilometre takes 0.7 of the usual by a frugal rider, and 2.5 of it up a hill against the wind. Neither alone
+# says that a sensor lies; both do.
+SAG_FAST, SAG_TIME, SAG_LEAST = 0.5, 30.0, 0.003  # s, s, V²·s of a cell
+SAGS_MORE, TAKES_LESS, SAGS_LESS, TAKES_MORE = 1.45, 0.67, 0.5, 1.5
+SAG_EXPLAINED, SAG_SHARE = (
+    (0.55, 1.45),
+    0.6,
+)  # a current that explains the sag so well is no lie, whatever the road is said to take
 SAG_AGREES = 1.3  # by no more than this factor: the currents explain the voltage again
 
-# Temperatures [degC] that vehicles have, and how fast [K/s] they change at most.
+# Temperatures [degC] that vehicles have, and how fast [K/s] they rise and fall at most. Cells heat themselves, but cool
+# through their pack.
 TEMPERATURES = {
-    "cell_temperature": (-40.0, 85.0, 0.05), "ambient_temperature": (-50.0, 65.0, 0.5),
-    "motor_temperature": (-50.0, 220.0, 3.0), "inverter_temperature": (-50.0, 180.0, 3.0),
+    "cell_temperature": (-40.0, 85.0, 0.05, 0.01), "ambient_temperature": (-50.0, 65.0, 0.5, 0.5),
+    "motor_temperature": (-50.0, 220.0, 3.0, 3.0), "inverter_temperature": (-50.0, 180.0, 3.0, 3.0),
 }  # fmt: skip
 LEAP = 6.0  # K: beside the rate; sensors of 1 K and what two messages in a row are apart
 COLDER = 45.0  # K: cells were never so much colder than the air
@@ -98,33 +105,36 @@ class Anchor:
     longer takes its place.
     """
 
-    __slots__ = ("_other", "_other_room", "_other_seconds", "_room", "_seconds", "_value")
+    __slots__ = ("_fall", "_other", "_other_fall", "_other_rise", "_other_seconds", "_rise", "_seconds", "_value")
 
     def __init__(self) -> None:
         self._value: float | None = None
         self._other: float | None = None  # the last value that could not follow it
-        self._room = self._other_room = 0.0  # by how much the signal can have changed since
+        self._rise = self._fall = self._other_rise = self._other_fall = 0.0  # how far the signal can have gone since
         self._seconds = self._other_seconds = 0.0  # for how long it has held
 
-    def hear(self, dt: float, value: float | None, change: float, jump: float) -> bool:
-        """Whether `value` can follow, `dt` [s] in which the signal changes by no more than `change`; None: silent.
+    def hear(self, dt: float, value: float | None, rise: float, jump: float, fall: float | None = None) -> bool:
+        """Whether `value` can follow, `dt` [s] in which the signal rises by `rise` or falls by `fall`; None: silent.
 
-        jump: what two values in a row may differ by in addition.
+        jump: what two values in a row may differ by in addition. fall: as `rise` if it is not given.
         """
-        self._room += change
-        self._other_room += change
+        fall = rise if fall is None else fall
+        self._rise, self._fall = self._rise + rise, self._fall + fall
+        self._other_rise, self._other_fall = self._other_rise + rise, self._other_fall + fall
         if value is None:
             return True
-        if self._value is None or abs(value - self._value) <= self._room + jump:
-            self._value, self._room, self._other = value, 0.0, None
+        if self._value is None or -self._fall - jump <= value - self._value <= self._rise + jump:
+            self._value, self._rise, self._fall, self._other = value, 0.0, 0.0, None
             self._seconds += dt
             return True
-        follows = self._other is not None and abs(value - self._other) <= self._other_room + jump
+        other = self._other
+        follows = other is not None and -self._other_fall - jump <= value - other <= self._other_rise + jump
         self._other_seconds = self._other_seconds + dt if follows else 0.0
-        self._other, self._other_room = value, 0.0
+        self._other, self._other_rise, self._other_fall = value, 0.0, 0.0
         if not self._seconds < min(self._other_seconds, SETTLED):
             return False
-        self._value, self._room, self._seconds, self._other = value, 0.0, self._other_seconds, None
+        self._value, self._rise, self._fall, self._other = value, 0.0, 0.0, None
+        self._seconds = self._other_seconds
         return True
 
 
@@ -339,6 +349,7 @@ class Slopes:
         self._said = 0.0
         self._still = 0.0
         self._speed_before: float | None = None  # m/s, at the last step
+        self._means: tuple[float, float] | None = None  # m/s²: accelerometer and acceleration, low-passed
         self._product = self._square = 0.0
         self._deaf = False  # it does not show what the wheels gain
 
@@ -403,8 +414,12 @@ class Slopes:
         self._speed_before = speed
         if max(abs(acceleration), abs(gained) / max(dt, 1e-3)) > HARDEST:  # another sensor took over
             return
-        self._product = keep * self._product + forward * acceleration * dt
-        self._square = keep * self._square + acceleration * gained
+        # Less their means: a slope is in the one and not in the other.
+        slow, wheels = self._means or (forward, 0.0)
+        share = part(dt, GAIN_MEAN)
+        self._means = slow + (forward - slow) * share, wheels + (acceleration - wheels) * share
+        self._product = keep * self._product + (forward - slow) * (acceleration - wheels) * dt
+        self._square = keep * self._square + (acceleration - wheels) * (gained - wheels * dt)
         self._deaf = self._square > GAIN_LEAST and not GAIN[0] < self._product / self._square < GAIN[1]
         if on_road and abs(speed) > MOVING and (self._still > STILL or self._deaf):
             self.trials["accel_x"].hear(dt, True)
@@ -526,6 +541,13 @@ class Electric:
             return None
         return self.inverter + (self.usual_auxiliary if self.auxiliary is None else self.auxiliary)
 
+    def unconnected(self, least: float) -> bool:
+        """Whether the inverter stands still below the pack by `least` [V]: off, or being charged by a precharge."""
+        if self.pack_voltage is None or self.inverter_voltage is None or abs(self.speed or 0.0) > STANDS:
+            return False
+        idle = self.inverter is None or abs(self.inverter) <= self.usual_auxiliary
+        return idle and self.inverter_voltage < self.pack_voltage - least
+
     @property
     def charging(self) -> bool:
         """A charger's current does not pass the inverter."""
@@ -542,7 +564,7 @@ class Sag:
     def __init__(self) -> None:
         self._voltage: float | None = None  # V of a cell, low-passed
         self._drop = 0.0  # V, low-passed
-        self._product = self._square = 0.0  # V²·s
+        self._product = self._square = self._volts = 0.0  # V²·s
 
     def hear(self, dt: float, voltage: float, drop: float) -> None:
         """A cell's voltage and the drop over its R0 by the current [V], after `dt` [s]."""
@@ -555,6 +577,15 @@ class Sag:
         self._drop += fast[1] * share
         self._product = keep * self._product - fast[0] * fast[1] * dt
         self._square = keep * self._square + fast[1] * fast[1] * dt
+        self._volts = keep * self._volts + fast[0] * fast[0] * dt
+
+    @property
+    def explained(self) -> bool:
+        """Whether the current is what moves the voltage, and by about as much as it should."""
+        ratio = self.ratio
+        if ratio is None or not SAG_EXPLAINED[0] < ratio < SAG_EXPLAINED[1]:
+            return False
+        return self._product * ratio > SAG_SHARE * self._volts
 
     @property
     def ratio(self) -> float | None:
@@ -608,7 +639,7 @@ class Currents:
         ratio = self.sag.ratio
         if ratio is not None:
             more = ratio > SAGS_MORE and takes < TAKES_LESS
-            self._scaled |= more or (ratio < 1 / SAGS_MORE and takes > 1 / TAKES_LESS)
+            self._scaled |= more or (ratio < SAGS_LESS and takes > TAKES_MORE)
 
     def _compare(self, dt: float, pack: float, around: float, voltage: float | None, said: Electric,
                  error: Error) -> tuple[frozenset[str], bool | None]:  # fmt: skip
@@ -655,7 +686,9 @@ class Currents:
         first = None if used is None else error(voltage, used)
         if used is None or first is None:
             return False
-        if not (pack or inverter or innovation_rms > ERROR_LEAST or abs(first) > GROSS_ERROR):  # nearly always
+        gross, explained = abs(first) > GROSS_ERROR, self.sag.explained
+        suspicious = gross or pack or inverter or innovation_rms > ERROR_LEAST  # seldom
+        if not suspicious or (explained and not gross):
             self._road.forget()
             self._by_model.forget()
             return False
@@ -663,8 +696,11 @@ class Currents:
         second = None if expected is None else error(voltage, expected)
         if expected is None or second is None:
             return False
-        if abs(first) > GROSS_ERROR and abs(first) > 2 * abs(second):
+        far = abs(used - expected) > OFF_ROAD * self._capacity + 2 * min(abs(used), abs(expected))
+        if gross and abs(first) > 2 * abs(second) and (far or not explained):
             return True
+        if explained:
+            return False
         return self._road.hear(dt, used, expected) & (self._by_model.hear(dt, first, second) == 1)
 
 
@@ -708,7 +744,7 @@ class Voltages:
         self.trials = {role: Trial() for role in self.ROLES}
         self.apart = 0.0  # V of a cell: by how much the two differ while it is not known which is right, else 0
         self._rival = Rival()
-        self._square = 0.0  # V² of a cell, low-passed
+        self._square = self._compared = 0.0  # V² of a cell, low-passed; s of it
         self._agreed = 0.0  # s
         self._said, self._still = 0.0, 0.0
         self._least = self._most = 0.0  # A, since the pack voltage stands still
@@ -717,6 +753,9 @@ class Voltages:
         """Who is not to be believed now, at this `current` [A] of the pack."""
         against = set()
         pack, inverter = said.pack_voltage, said.inverter_voltage
+        if pack is not None and inverter is not None and said.unconnected(VOLTS_APART * self._series):
+            inverter = None
+            self._square = self._compared = 0.0
         for role, voltage in ((self.ROLES[0], pack), (self.ROLES[1], inverter)):
             if voltage is not None and not self._lowest < voltage / self._series < self._highest:
                 against.add(role)
@@ -726,7 +765,8 @@ class Voltages:
         self.apart = 0.0
         if not against and pack is not None and inverter is not None:
             difference = (pack - inverter) / self._series
-            self._square += (difference * difference - self._square) * min(dt / VOLTAGE_TIME, 1.0)
+            self._compared = min(self._compared + dt, VOLTAGE_TIME)
+            self._square += (difference * difference - self._square) * part(dt, self._compared)
             if self._square < VOLTS_APART**2 and abs(difference) < GROSS_VOLTS:
                 self._agreed += dt
                 self._rival.forget()
@@ -745,6 +785,11 @@ class Voltages:
             trial.hear(dt, True if role in against or self.apart else None if voltage is None else agree)
         guilty = {role for role, trial in self.trials.items() if trial.guilty} if not self.apart else set()
         return frozenset(against | guilty)
+
+    @property
+    def spread(self) -> float:
+        """By how much the two differ beyond what is usual [V of a cell]: no better is either of them known."""
+        return max(sqrt(self._square) - VOLTS_USUAL, 0.0)
 
     def _stuck(self, dt: float, voltage: float, current: float) -> bool:
         """It is the same to the last bit while the current says that it must move."""
@@ -767,12 +812,12 @@ class Temperatures:
     def step(self, now: float, dt: float, signals: Signals) -> None:
         """Trust each of them or not."""
         ambient = signals.ambient_temperature.told(now)
-        for role, (low, high, rate) in TEMPERATURES.items():
+        for role, (low, high, rise, fall) in TEMPERATURES.items():
             signal = signals[role]
             value = signal.told(now)
             coldest = ambient - COLDER if role == "cell_temperature" and ambient is not None else low
             can_be = value is not None and max(low, coldest) < value < high
-            follows = self._anchors[role].hear(min(dt, 1.0), value if can_be else None, rate * dt, LEAP)
+            follows = self._anchors[role].hear(min(dt, 1.0), value if can_be else None, rise * dt, LEAP, fall * dt)
             if value is None:
                 continue
             trial, possible = self.trials[role], can_be and follows

@@ -37,9 +37,9 @@ class Signal:
 
     def told(self, now: float) -> float | None:
         """What `mean` gives, trusted or not."""
-        if self.count:
-            return self.total / self.count
-        return self.value if now - self.time <= self.stale_after else None
+        if now - self.time > self.stale_after:
+            return None
+        return self.total / self.count if self.count else self.value
 
 
 class Signals:
