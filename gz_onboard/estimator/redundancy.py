@@ -99,42 +99,46 @@ def part(dt: float, time: float) -> float:
 
 
 class Anchor:
-    """The last value of a slow signal that could be, and whether the next one can follow it.
+    """What a slow signal can be by now: it follows the signal no faster than that can change.
 
     The first value is no better than any other: until the signal has held for `SETTLED` seconds, one that holds for
     longer takes its place.
     """
 
-    __slots__ = ("_fall", "_other", "_other_fall", "_other_rise", "_other_seconds", "_rise", "_seconds", "_value")
+    __slots__ = ("_fall", "_other", "_rise", "_seconds", "_value")
 
     def __init__(self) -> None:
         self._value: float | None = None
-        self._other: float | None = None  # the last value that could not follow it
-        self._rise = self._fall = self._other_rise = self._other_fall = 0.0  # how far the signal can have gone since
-        self._seconds = self._other_seconds = 0.0  # for how long it has held
+        self._rise = self._fall = 0.0  # how far the signal can have gone since
+        self._seconds = 0.0  # for how long it has held
+        self._other: Anchor | None = None  # of the values that could not follow it
 
     def hear(self, dt: float, value: float | None, rise: float, jump: float, fall: float | None = None) -> bool:
-        """Whether `value` can follow, `dt` [s] in which the signal rises by `rise` or falls by `fall`; None: silent.
+        """Whether `value` can be, `dt` [s] in which the signal rises by `rise` or falls by `fall`; None: silent.
 
-        jump: what two values in a row may differ by in addition. fall: as `rise` if it is not given.
+        jump: by how much it may be off what it can be. fall: as `rise` if it is not given.
         """
         fall = rise if fall is None else fall
         self._rise, self._fall = self._rise + rise, self._fall + fall
-        self._other_rise, self._other_fall = self._other_rise + rise, self._other_fall + fall
         if value is None:
             return True
-        if self._value is None or -self._fall - jump <= value - self._value <= self._rise + jump:
-            self._value, self._rise, self._fall, self._other = value, 0.0, 0.0, None
+        if self._value is None:
+            self._value = value
+        near = min(max(value, self._value - self._fall), self._value + self._rise)
+        if abs(value - near) <= jump:
+            self._value, self._rise, self._fall, self._other = near, 0.0, 0.0, None
             self._seconds += dt
             return True
-        other = self._other
-        follows = other is not None and -self._other_fall - jump <= value - other <= self._other_rise + jump
-        self._other_seconds = self._other_seconds + dt if follows else 0.0
-        self._other, self._other_rise, self._other_fall = value, 0.0, 0.0
-        if not self._seconds < min(self._other_seconds, SETTLED):
+        if self._seconds >= SETTLED:
             return False
-        self._value, self._rise, self._fall, self._other = value, 0.0, 0.0, None
-        self._seconds = self._other_seconds
+        if self._other is None or not self._other.hear(dt, value, rise, jump, fall):
+            self._other = Anchor()
+            self._other.hear(0.0, value, rise, jump, fall)
+        other = self._other
+        if other._seconds <= self._seconds:
+            return False
+        self._value, self._rise, self._fall, self._other = other._value, 0.0, 0.0, None
+        self._seconds = other._seconds
         return True
 
 
@@ -388,6 +392,11 @@ class Slopes:
             self._anew()
             self._speed = speed
         signals.accel_x.trusted = not self.trials["accel_x"].guilty
+
+    def pause(self) -> None:
+        """Nothing was heard for a while: what changed meanwhile is no rate."""
+        self._anew()
+        self._before = self._speed_before = self._means = None
 
     def hear_altitude(self, now: float, dt: float, signals: Signals, speed: float | None) -> None:
         """Before the altitude is used: whether a road and a receiver could have come to it since the last one."""
@@ -876,6 +885,8 @@ class Redundancy:
 
         heard: of `dt`, the seconds in which something was heard; what can have changed has all of it.
         """
+        if heard < dt:
+            self.slopes.pause()
         self.speeds.step(now, heard, signals)
         self.slopes.hear_altitude(now, dt, signals, speed)
         self.temperatures.step(now, dt, signals)

@@ -77,6 +77,13 @@ def test_a_climb_is_not_taken_for_consumption():
     assert forecast(climbing).consumption == pytest.approx(forecast(level).consumption, rel=0.25)
 
 
+def test_a_descent_leaves_the_energy_that_can_be_drawn():
+    level, down = forecaster(), forecaster()
+    ride(level, 6)
+    ride(down, 6, grade=lambda x: -0.06)
+    assert forecast(down).energy > 0.97 * forecast(level).energy
+
+
 def test_a_long_descent_that_no_sensor_tells_is_hardly_learned():
     seen, unseen = forecaster(), forecaster()
     for f, told in ((seen, True), (unseen, False)):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from math import exp
+
 import pytest
 
 from gz_onboard.estimator.redundancy import SETTLED, Anchor
 from gz_onboard.estimator.start import Saved, flowed, unseen_sd
 from gz_onboard.events import Activity, Group, Reason, State
-from tests.estimator.life import CELLS, GROUPS, PACK, Scooter, estimator, follow, worst
+from tests.estimator.life import CELLS, GROUPS, INVERTER, PACK, Scooter, estimator, follow, worst
 
 MORE = [*GROUPS, Group("Temperatures", ("motor_temperature",), 1.0), Group("GPS", ("gps_altitude",), 1.0)]
 
@@ -171,3 +173,84 @@ def test_a_saved_number_that_cannot_be_is_refused(damage):
     follow(e, scooter.live(60, 10.0), scooter)
     with pytest.raises(ValueError, match="implausible"):
         estimator().restore({**e.snapshot("key"), **damage}, "key", 10.0)
+
+
+@pytest.mark.parametrize(("seconds", "charge"), [(3600, 15.0), (7200, 8.0), (600, 15.0), (3600, 0.0)])
+@pytest.mark.parametrize("soc", [0.15, 0.3])
+def test_charged_or_parked_while_the_bus_was_silent(soc, seconds, charge):
+    scooter, e = Scooter(soc=soc, seed=4), estimator()
+    follow(e, scooter.live(20), scooter)
+    follow(e, scooter.live(200, 10.0), scooter)
+    follow(e, scooter.live(15), scooter)
+    scooter.away(seconds, charge=charge)
+    rows = follow(e, scooter.live(15), scooter) + follow(e, scooter.live(200, 10.0), scooter)
+    assert worst(rows) < 3
+    assert rows[-1][1].soc_sd < 0.1
+    assert {role for _, row in rows for role in row.distrusted} == set()
+
+
+@pytest.mark.parametrize(("on", "off"), [(3.0, 6.0), (2.5, 20.0), (5.0, 60.0), (30.0, 30.0)])
+def test_a_loose_connector_makes_the_state_of_charge_unsure_and_not_wrong(on, off):
+    scooter, e, rows = Scooter(soc=0.9), estimator(), []
+    follow(e, scooter.live(60), scooter)
+    for _ in range(round(1200 / (on + off))):
+        rows += follow(e, scooter.live(on, 10.0), scooter)
+        scooter.away(off, 10.0)
+    rows += follow(e, scooter.live(30, 10.0), scooter)
+    assert worst(rows) < 3
+    assert {role for _, row in rows for role in row.distrusted} == set()
+
+
+@pytest.mark.parametrize("period", [4.0, 5.0, 8.0])
+def test_a_held_voltage_proves_no_rest(period):
+    """Only the pack's message is slow."""
+    groups = [Group(GROUPS[PACK].message, GROUPS[PACK].roles, None), *GROUPS[1:]]
+    scooter, e, rows, last = Scooter(soc=0.7), estimator(groups), [], 0.0
+    for event in scooter.live(600, 11.0):
+        if event[1] == PACK and event[0] > 60:
+            if event[0] - last < period - 0.01:
+                continue
+            last = event[0]
+        e.handle(event)
+        rows.append((scooter.soc, e.estimate(event[0])))
+    assert worst(rows) < 3
+
+
+@pytest.mark.parametrize("begin", [0.0, 15.0, 40.0])
+@pytest.mark.parametrize("time_constant", [0.5, 3.0])
+def test_a_precharge_accuses_nobody(begin, time_constant):
+    scooter, e, rows = Scooter(soc=0.7), estimator(), []
+
+    def precharged(events):
+        for t, group, values in events:
+            if group == INVERTER:
+                volts = values[0] + (begin - values[0]) * exp(-t / time_constant)
+                yield t, group, (volts, 0.0 if volts < values[0] - 0.5 else values[1])
+            else:
+                yield t, group, values
+
+    rows = follow(e, precharged(scooter.live(15)), scooter) + follow(e, scooter.live(100, 10.0), scooter)
+    assert {role for _, row in rows for role in row.distrusted} == set()
+    assert worst(rows) < 3
+
+
+@pytest.mark.parametrize("volts", [-2.0, 2.0])
+def test_a_start_on_a_voltage_that_lies_is_made_again(volts):
+    scooter, e = Scooter(soc=0.6), estimator()
+    spoilt = ((t, g, (v[0] + volts, *v[1:]) if g == PACK else v) for t, g, v in scooter.live(300, 10.0))
+    rows = follow(e, spoilt, scooter)
+    assert worst(rows[20:]) < 3
+    assert "pack_voltage" in rows[-1][1].distrusted
+
+
+def test_cells_do_not_cool_like_that():
+    scooter, e = Scooter(soc=0.6), estimator(MORE)
+    follow(e, beside(scooter.live(60, 10.0)), scooter)
+    named: dict[str, int] = {}
+    for step in range(300):
+        for event in beside(scooter.live(1.0, 10.0), cells=28.0 - 0.05 * step):
+            e.handle(event)
+        for role in e.estimate(scooter.time).distrusted:
+            named.setdefault(role, step)
+    assert list(named) == ["cell_temperature"]
+    assert named["cell_temperature"] < 240
