@@ -178,7 +178,7 @@ def ridden(frames: Sequence[Frame], vehicle: Vehicle | None = None, portion: int
 
 
 def received(frames: Iterable[tuple[int, Frame]], vehicle: Vehicle | None = None) -> Run:
-    """The frames through a new pipeline as the daemon does it, in rounds of 50 ms; each comes with when it arrives.
+    """The frames through a new pipeline as the daemon does it, in rounds of a tick; each comes with when it arrives.
 
     The time of arrival [ns] is what the daemon's own clock shows, whatever time the frame bears.
     """
@@ -190,7 +190,7 @@ def received(frames: Iterable[tuple[int, Frame]], vehicle: Vehicle | None = None
         while arrival >= due:
             run.pipeline.advance(waiting, due)
             waiting = []
-            due += TICK_NS // 2
+            due += TICK_NS
         waiting.append(frame)
     if due is not None:
         run.pipeline.advance(waiting, due)
