@@ -206,7 +206,7 @@ class Daemon:
             return None
         for copy in state.copies(keeper.file):
             try:
-                found = state.load(copy, time.time(), _uptime(), state.clock_is_kept())
+                found = state.load(copy, time.time(), _uptime(), state.kept_time())
                 if found is None:
                     continue
                 snapshot, age = found
