@@ -336,8 +336,11 @@ def test_the_wait_for_a_first_voltage_counts_as_age(told):
 def test_an_age_that_is_none_is_not_known(age):
     scooter, e = Scooter(soc=0.75), estimator()
     follow(e, scooter.live(60), scooter)
-    e = restarted(e, age)
-    assert worst(follow(e, scooter.live(30), scooter)) < 3
+    e, unknown = restarted(e, age), restarted(e, None)
+    events = list(scooter.live(30))
+    rows = follow(e, events, scooter)
+    assert worst(rows) < 3
+    assert rows == follow(unknown, events, scooter)
 
 
 @pytest.mark.parametrize("temperature", [-20.0, -10.0])
