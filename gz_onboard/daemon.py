@@ -76,7 +76,18 @@ class Daemon:
         self._stopping = True
 
     def run(self) -> None:
-        """Loop until stopped: each tick drain, estimate, send, record, save, feed the watchdog."""
+        """Loop until stopped: each tick drain, estimate, send, record, save, feed the watchdog.
+
+        Whatever is raised, log and state are written to their end first.
+        """
+        try:
+            self._loop()
+            notify.stopping()
+            self.round()  # what waited for its tick
+        finally:
+            self.close()
+
+    def _loop(self) -> None:
         self.restore()
         watchdog = notify.watchdog_interval()
         fed = next_tick = time.monotonic()
@@ -96,9 +107,6 @@ class Daemon:
                 fed = now
                 notify.alive()
             self._say(now)
-        notify.stopping()
-        self.round()  # what waited for its tick
-        self.close()
 
     def close(self) -> None:
         """Save the state, write the log to its end as far as the disks allow it in time, and close the channels."""
@@ -198,7 +206,7 @@ class Daemon:
             return None
         for copy in state.copies(keeper.file):
             try:
-                found = state.load(copy, time.time(), _uptime(), state.clock_is_kept())
+                found = state.load(copy, time.time(), _uptime(), state.kept_time())
                 if found is None:
                     continue
                 snapshot, age = found

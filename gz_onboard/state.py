@@ -12,11 +12,13 @@ import os
 import re
 import zlib
 from collections.abc import Mapping
+from math import inf
 from pathlib import Path
 from typing import Any
 
 FORMAT = 2
 CLOCKS_AGREE = 2.0  # s
+CLOCK_BEHIND = 60.0  # s: by more, no clock that goes on while the power is off is behind the time that was saved
 REFUSED = 3
 """So many refused states are kept."""
 
@@ -36,11 +38,12 @@ def encode(snapshot: Mapping[str, Any], time: float, uptime: float | None = None
 
 
 def decode(
-    text: bytes, time: float, uptime: float | None = None, kept: bool = True
+    text: bytes, time: float, uptime: float | None = None, kept: float = inf
 ) -> tuple[Mapping[str, Any], float | None]:
     """(snapshot, its age [s] at `time` and `uptime` if the clock can be believed).
 
-    kept: the clock goes on while the power is off. ValueError unless it is as it was saved.
+    kept: what a clock says that goes on while the power is off (`kept_time`) [s since the epoch]; inf: `time` is of
+    such a clock. ValueError unless it is as it was saved.
     """
     head = _HEAD.match(text)
     if not head:
@@ -56,16 +59,24 @@ def decode(
     except (ValueError, LookupError, TypeError, RecursionError) as error:  # the checksum is right: not written by us
         raise ValueError(f"is not a saved state: {error!r}") from error
     age = time - saved_at if isinstance(saved_at, int | float) and saved_at > 1e9 and time >= saved_at else None
-    # A board without a clock of its own goes on from the last time it knew, however long it was off. What two clocks
-    # say of the same boot is believed all the same.
-    if age is not None and not kept and not (uptime and began and abs(uptime - began - age) < CLOCKS_AGREE):
-        age = None
+    # A board without a clock of its own goes on from the last time it knew, however long it was off; one whose clock
+    # has no battery as well, but that clock begins anew. What two clocks say of the same boot is believed all the same.
+    if age is not None and kept < saved_at - CLOCK_BEHIND:
+        same_boot = uptime and began and abs(uptime - began - age) < CLOCKS_AGREE
+        age = age if same_boot else None
     return snapshot, age
 
 
-def clock_is_kept() -> bool:
-    """Whether the machine has a clock that goes on while the power is off."""
-    return any(Path("/sys/class/rtc").glob("rtc*"))
+def kept_time(clocks: Path = Path("/sys/class/rtc")) -> float:
+    """What the machine's real-time clocks say, the latest of them [s since the epoch]; -inf if there is none.
+
+    A clock whose battery is missing, as on a Raspberry Pi 5 without one, begins at 1970 when the power comes back.
+    """
+    latest = -inf
+    for clock in clocks.glob("rtc*/since_epoch"):
+        with contextlib.suppress(OSError, ValueError):
+            latest = max(latest, float(clock.read_text()))
+    return latest
 
 
 def save(file: Path, snapshot: Mapping[str, Any], time: float, uptime: float | None = None) -> None:
@@ -96,7 +107,7 @@ def copies(file: Path) -> tuple[Path, Path, Path]:
 
 
 def load(
-    file: Path, time: float, uptime: float | None = None, kept: bool = True
+    file: Path, time: float, uptime: float | None = None, kept: float = inf
 ) -> tuple[Mapping[str, Any], float | None] | None:
     """What `decode` makes of one file; None if there is no such file. ValueError if it cannot be read or is damaged."""
     try:

@@ -178,7 +178,7 @@ def ridden(frames: Sequence[Frame], vehicle: Vehicle | None = None, portion: int
 
 
 def received(frames: Iterable[tuple[int, Frame]], vehicle: Vehicle | None = None) -> Run:
-    """The frames through a new pipeline as the daemon does it, in rounds of 50 ms; each comes with when it arrives.
+    """The frames through a new pipeline as the daemon does it, in rounds of a tick; each comes with when it arrives.
 
     The time of arrival [ns] is what the daemon's own clock shows, whatever time the frame bears.
     """
@@ -190,7 +190,7 @@ def received(frames: Iterable[tuple[int, Frame]], vehicle: Vehicle | None = None
         while arrival >= due:
             run.pipeline.advance(waiting, due)
             waiting = []
-            due += TICK_NS // 2
+            due += TICK_NS
         waiting.append(frame)
     if due is not None:
         run.pipeline.advance(waiting, due)
@@ -214,17 +214,22 @@ NUMBERS = (
 
 def check_sound(run: Run) -> None:
     """What holds whatever was on the bus: finite numbers in their order, frames that every receiver takes."""
-    for e in run.estimates:
-        for name in NUMBERS:
-            value = getattr(e, name)
-            assert value is None or isfinite(value), f"{name} is {value} at {e.time:.1f} s"
-        assert e.soc is None or 0 <= e.soc <= 1
-        assert e.soc_sd is None or e.soc_sd > 0
-        if e.range is not None:
-            assert e.range_p10 is not None
-            assert e.range_p90 is not None
-            assert 0 <= e.range_p10 <= e.range <= e.range_p90
+    for estimate in run.estimates:
+        check_estimate(estimate)
     check_frames(run.sent, run.pipeline.vehicle.range_dbc)
+
+
+def check_estimate(e: Estimate) -> None:
+    """Its numbers are finite, in their bounds and their order."""
+    for name in NUMBERS:
+        value = getattr(e, name)
+        assert value is None or isfinite(value), f"{name} is {value} at {e.time:.1f} s"
+    assert e.soc is None or 0 <= e.soc <= 1
+    assert e.soc_sd is None or e.soc_sd > 0
+    if e.range is not None:
+        assert e.range_p10 is not None
+        assert e.range_p90 is not None
+        assert 0 <= e.range_p10 <= e.range <= e.range_p90
 
 
 def check_frames(frames: Sequence[Frame], file: Path | None = None) -> dict[str, list[dict[str, float]]]:

@@ -28,6 +28,7 @@ from hypothesis import strategies as st
 
 from gz_onboard import state
 from gz_onboard.bus.channel import Channel
+from gz_onboard.bus.completion import is_complete
 from gz_onboard.bus.logs import read_frames, read_samples
 from gz_onboard.bus.recorder import Recorder
 from gz_onboard.cli import main
@@ -664,6 +665,32 @@ def test_at_the_end_a_log_that_hangs_does_not_cost_the_state(
     assert last is not None
     assert found is not None
     assert found[0]["soc"] == last.soc
+
+
+def test_an_unforeseen_error_costs_neither_the_log_nor_the_state(
+    bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    channel = Channel("virtual", bus)
+    channel.open()
+    file, recorder = tmp_path / "scooter.json", Recorder(tmp_path / "log", "v", sync_s=1e6)
+    daemon = Daemon(reference(), [channel], recorder, file)
+    frames = Scooter().steady(3.0)
+    half = len(frames) // 2
+
+    def broken() -> int:
+        daemon.step(frames[: half + 1], frames[half][0])
+        daemon.step(frames[half + 1 :], frames[-1][0])  # so soon after the first it is not saved
+        raise RuntimeError("unforeseen")
+
+    monkeypatch.setattr(daemon, "round", broken)
+    with pytest.raises(RuntimeError, match="unforeseen"):
+        daemon.run()
+    (path,) = recorder.paths
+    assert is_complete(path)
+    assert [f for batch in read_frames(path) for f in batch if not f[3] & TRANSMITTED] == frames
+    found = state.load(file, time.time())
+    assert found is not None
+    assert found[0] == daemon.pipeline.estimator.snapshot(reference().key)
 
 
 HANGING = """

@@ -57,17 +57,32 @@ def test_age(tmp_path: Path, saved_at: float, age: float | None):
 
 
 @pytest.mark.parametrize(
-    ("uptime", "kept", "age"),
+    ("uptime", "clocks", "age"),
     [
-        (1030.0, False, 30.0),  # the same boot: both clocks say so
-        (12.0, False, None),  # off for nobody knows how long: the wall clock went on from where it was
-        (5000.0, False, None),  # set meanwhile, or another boot
-        (12.0, True, 30.0),  # a clock of its own
+        (1030.0, [], 30.0),  # the same boot: both clocks say so
+        (12.0, [], None),  # off for nobody knows how long: the wall clock went on from where it was
+        (5000.0, [], None),  # set meanwhile, or another boot
+        (12.0, [f"{NOW:.0f}\n"], 30.0),  # a clock of its own
+        (12.0, [f"{NOW - 35:.0f}\n"], 30.0),  # one that is a little slow
+        (12.0, ["12\n"], None),  # one without a battery began at 1970 when the power came back
+        (12.0, [f"{NOW - 3600:.0f}\n"], None),  # one whose battery failed meanwhile
+        (1030.0, ["1030\n"], 30.0),
+        (12.0, ["12\n", f"{NOW:.0f}\n"], 30.0),  # a board's own without a battery, and one that was added
+        (12.0, ["rubbish", ""], None),
     ],
 )
-def test_age_on_a_board_without_a_clock_of_its_own(uptime: float, kept: bool, age: float | None):
-    text = state.encode(SNAPSHOT, NOW - 30, 1000.0)
-    assert state.decode(text, NOW, uptime, kept) == (SNAPSHOT, age)
+def test_age_on_a_board_with_or_without_a_clock_of_its_own(
+    tmp_path: Path, uptime: float, clocks: list[str], age: float | None
+):
+    for number, text in enumerate(clocks):
+        (tmp_path / f"rtc{number}").mkdir()
+        (tmp_path / f"rtc{number}" / "since_epoch").write_text(text)
+    saved = state.encode(SNAPSHOT, NOW - 30, 1000.0)
+    assert state.decode(saved, NOW, uptime, state.kept_time(tmp_path)) == (SNAPSHOT, age)
+
+
+def test_a_machine_without_the_directory_of_clocks_has_none(tmp_path: Path):
+    assert state.kept_time(tmp_path / "rtc") < 0
 
 
 def sealed(text: bytes) -> bytes:

@@ -435,7 +435,9 @@ class BackgroundRecorder:
         if self._full and self._thread.load < 0.5:
             self._full = False
         if not self._syncing:
-            self._syncing = self._thread.call(self._sync, weight=0)
+            self._syncing = True  # before the call: it may be done, and have said so, before `call` returns
+            if not self._thread.call(self._sync, weight=0):
+                self._syncing = False
 
     def close(self, seconds: float) -> bool:
         """Write what waits and close the file; False if that takes longer than `seconds`: the rest is lost then."""

@@ -6,7 +6,7 @@ import random
 import resource
 import shutil
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from mcap.reader import make_reader
 
+from gz_onboard.background import Background
 from gz_onboard.bus import framelog, logs, recorder
 from gz_onboard.bus.completion import complete, is_complete
 from gz_onboard.bus.recorder import BackgroundRecorder, LogFile, Recorder, object_schema
@@ -537,6 +538,29 @@ def test_in_the_background_it_writes_the_same(tmp_path: Path) -> None:
     (path,) = (tmp_path / "b").iterdir()
     assert read(path) == read(plain.paths[0])
     assert behind.lost_frames == 0
+
+
+class Prompt(Background):
+    """Has made each call before the caller goes on, as a thread has that gets its turn at once."""
+
+    def call(self, function: Callable[..., object], *arguments: Any, weight: int = 1) -> bool:
+        taken = super().call(function, *arguments, weight=weight)
+        assert self.wait(60)
+        return taken
+
+
+def test_it_goes_on_syncing_though_a_sync_is_done_before_its_caller_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gz_onboard.bus.recorder.Background", Prompt)
+    synced: list[int] = []
+    monkeypatch.setattr(os, "fdatasync", synced.append)
+    behind = BackgroundRecorder(Recorder(tmp_path, "ref", sync_s=0.5), limit=10**9)
+    for batch in ticks(4):
+        behind.frames(batch)
+        behind.sync(batch[-1][0])
+    assert len(synced) == 7  # one in each half second, but the first
+    assert behind.close(60)
 
 
 def test_a_disk_that_does_not_answer_holds_up_nobody_and_what_is_lost_is_counted(

@@ -7,7 +7,7 @@ steps of half a percent.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from math import exp, sqrt
 from typing import Any
@@ -101,7 +101,7 @@ def estimator(groups: list[Group] | None = None) -> Any:  # what is not known is
     return Estimator(groups or GROUPS, BATTERY, VEHICLE.model, VEHICLE.riding)
 
 
-def follow(e: Any, events: Iterator[Event], scooter: Scooter) -> list[tuple[float, Any]]:
+def follow(e: Any, events: Iterable[Event], scooter: Scooter) -> list[tuple[float, Any]]:
     """(true SOC, estimate) once a second."""
     rows: list[tuple[float, Any]] = []
     for event in events:
@@ -109,6 +109,11 @@ def follow(e: Any, events: Iterator[Event], scooter: Scooter) -> list[tuple[floa
         if not rows or event[0] - rows[-1][1].time >= 1.0:
             rows.append((scooter.soc, e.estimate(event[0])))
     return rows
+
+
+def knows(e: Any, scooter: Scooter) -> None:
+    """Tell it the true state of charge: what it says from then on is by what it has counted."""
+    e.filter.soc, e.filter.covariance = scooter.soc, (1e-8, 0.0, 1e-8)
 
 
 def worst(rows: list[tuple[float, Any]]) -> float:

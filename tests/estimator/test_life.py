@@ -7,9 +7,10 @@ from math import exp
 
 import pytest
 
+from gz_onboard.estimator.activity import STOP_TIME
 from gz_onboard.estimator.start import from_voltage
 from gz_onboard.events import Activity, Group, Reason, State
-from tests.estimator.life import BATTERY, GROUPS, MOTOR, PACK, Scooter, estimator, follow, worst
+from tests.estimator.life import BATTERY, GROUPS, MOTOR, OTHERS, PACK, Scooter, estimator, follow, knows, worst
 
 
 def restarted(e, age):
@@ -19,19 +20,31 @@ def restarted(e, age):
     return fresh
 
 
+def heard(events, *, odometer=True, own_soc=True):
+    """The events, on a vehicle that does not tell everything."""
+    for t, group, values in events:
+        if group == PACK and not own_soc:
+            yield t, group, (*values[:2], None)
+        elif group != OTHERS or odometer:
+            yield t, group, values
+
+
 # --- standing and charging ------------------------------------------------------------------------------------------
 
 
 def test_an_hour_of_standing_costs_its_energy_and_no_more():
     scooter, e = Scooter(), estimator()
     follow(e, scooter.live(20), scooter)
-    _, before = follow(e, scooter.live(540, 11.0), scooter)[-1]
+    follow(e, scooter.live(540, 11.0), scooter)
+    follow(e, scooter.live(60), scooter)
+    knows(e, scooter)
+    _, before = follow(e, scooter.live(2), scooter)[-1]
     energy = scooter.energy
     rows = follow(e, scooter.live(3600), scooter)
     _, after = rows[-1]
     standing = (scooter.energy - energy) / before.consumption_expected  # m
     assert rows[60][1].activity is Activity.STANDING
-    assert before.range - after.range == pytest.approx(standing, abs=1000)
+    assert before.range - after.range == pytest.approx(standing, rel=0.25)  # of 1.6 km
     assert after.consumption_expected == pytest.approx(before.consumption_expected, rel=0.03)
     _, later = follow(e, scooter.live(540, 11.0), scooter)[-1]
     assert later.consumption_expected == pytest.approx(before.consumption_expected, rel=0.05)
@@ -65,12 +78,16 @@ def test_a_plug_that_says_yes_for_ever_does_not_stop_the_learning():
 def test_a_stop_at_a_traffic_light_belongs_to_the_ride():
     scooter, e = Scooter(), estimator()
     follow(e, scooter.live(400, 10.0), scooter)
-    duration = e.forecaster.riding.current.duration
+    riding = e.forecaster.riding
+
+    def ridden():
+        return sum(segment.duration for segment in riding.segments) + riding.current.duration
+
+    before = ridden()
     follow(e, scooter.live(60), scooter)
-    assert e.forecaster.riding.current.duration > duration + 40 or len(e.forecaster.riding.segments) > 0
-    duration = e.forecaster.riding.current.duration
+    assert ridden() - before == pytest.approx(60, abs=5)
     follow(e, scooter.live(600), scooter)
-    assert e.forecaster.riding.current.duration < duration + 80
+    assert ridden() - before == pytest.approx(STOP_TIME, abs=15)  # it comes to a stop first
 
 
 # --- the first state of charge --------------------------------------------------------------------------------------
@@ -87,7 +104,7 @@ def test_joined_mid_ride_the_sd_covers_the_polarisation(soc, temperature):
         rows = follow(e, scooter.live(130, 11.0), scooter)
         assert worst(rows) < 3
         first = next(row for _, row in rows if row.soc is not None)
-        assert first.soc_sd > 0.02
+        assert 0.02 < first.soc_sd < (0.24 if temperature < 10 and soc < 0.3 else 0.16)  # as the README says
         scooter.away(17, 11.0)
 
 
@@ -166,35 +183,40 @@ AWAY = [
 @pytest.mark.parametrize(("seconds", "speed", "charge"), AWAY)
 @pytest.mark.parametrize(("told", "clock"), [("all", True), ("all", False), ("neither", True), ("no own", True)])
 def test_a_restart_knows_what_it_does_not_know(seconds, speed, charge, told, clock):
-    drop = {"all": (), "no own": (0,), "neither": (0, 4)}[told]
-
-    def heard(events):
-        for t, group, values in events:
-            if group == 4 and 4 in drop:
-                continue
-            yield (t, group, (*values[:2], None)) if group == PACK and 0 in drop else (t, group, values)
-
+    tells = {"all": {}, "no own": {"own_soc": False}, "neither": {"own_soc": False, "odometer": False}}[told]
     scooter, e = Scooter(soc=0.75), estimator()
-    follow(e, heard(scooter.live(30)), scooter)
-    follow(e, heard(scooter.live(400, 10.0)), scooter)
+    follow(e, heard(scooter.live(30), **tells), scooter)
+    follow(e, heard(scooter.live(400, 10.0), **tells), scooter)
     scooter.away(seconds, speed, charge)
-    e = restarted(e, seconds if clock else None)
-    rows = follow(e, heard(scooter.live(60, 10.0)), scooter)
+    e, fresh = restarted(e, seconds if clock else None), estimator()
+
+    def both(events):
+        for event in events:
+            fresh.handle(event)
+            yield event
+
+    rows = follow(e, both(heard(scooter.live(60, 10.0), **tells)), scooter)
     assert worst(rows) < 3
-    if told == "all" and clock:
-        first = next(row for _, row in rows if row.soc is not None)
-        assert first.soc_sd < 0.1
+    _, end = rows[-1]
+    without = fresh.estimate(scooter.time)
+    assert end.soc_sd < (0.5 if clock and seconds <= 60 else 1.15) * without.soc_sd
+    assert without.reasons & Reason.PRIOR_RIDING
+    assert not end.reasons & Reason.PRIOR_RIDING  # what a kilometre costs is known at once, whatever has flowed
+    assert end.consumption_expected_sd < without.consumption_expected_sd
 
 
 def test_an_odometer_tells_what_was_ridden():
     scooter, e = Scooter(soc=0.75), estimator()
-    follow(e, scooter.live(30), scooter)
-    follow(e, scooter.live(400, 10.0), scooter)
-    scooter.away(590, 10.0)
-    e = restarted(e, 590.0)
-    rows = follow(e, scooter.live(30, 10.0), scooter)
-    true, first = next(row for row in rows if row[1].soc is not None)
-    assert abs(first.soc - true) < 0.025
+    follow(e, heard(scooter.live(30), own_soc=False), scooter)
+    follow(e, heard(scooter.live(400, 10.0), own_soc=False), scooter)
+    scooter.away(120, 10.0)
+    e, without = restarted(e, 120.0), restarted(e, 120.0)
+    events = list(heard(scooter.live(3, 10.0), own_soc=False))
+    follow(e, events, scooter)
+    follow(without, heard(events, odometer=False), scooter)
+    told, untold = e.estimate(scooter.time), without.estimate(scooter.time)
+    assert told.soc_sd < 0.7 * untold.soc_sd
+    assert abs(told.soc - scooter.soc) < 0.01
 
 
 def test_twenty_one_power_cuts_cost_little():
@@ -233,6 +255,11 @@ def test_messages_every_three_seconds_are_integrated_over_three_seconds(declared
     assert worst(rows) < 3
     assert not end.reasons & Reason.SIGNALS_SLOW
     assert end.range is not None
+    knows(e, scooter)
+    knows(other, often)
+    _, end = follow(e, scooter.live(300, 5.0), scooter)[-1]
+    _, usual = follow(other, often.live(300, 5.0), often)[-1]
+    assert end.soc_sd > 1.2 * usual.soc_sd  # what flows between two samples is not known
 
 
 def test_slower_than_the_limit_is_refused_and_said():
@@ -256,33 +283,64 @@ def test_a_message_that_becomes_slow_is_noticed_and_forgiven():
 
 
 def test_messages_that_come_in_bursts_are_integrated_over_their_long_gaps():
-    scooter, e = Scooter(soc=0.8), estimator()
+    scooter, e, whole = Scooter(soc=0.8), estimator(), estimator()
     begin = scooter.distance
-    follow(e, scooter.live(30), scooter)
-    rows = []
-    for _ in range(200):  # two samples 0.1 s apart, then 4 s of silence
-        rows += follow(e, scooter.live(0.2, 10.0), scooter)
-        scooter.away(3.9, 10.0)
+    for event in scooter.live(90):
+        e.handle(event)
+        whole.handle(event)
+    knows(e, scooter)
+    knows(whole, scooter)
+    rows, usual = [], []
+    for number in range(200):  # two samples 0.1 s apart, then 4 s of silence
+        if number == 20:
+            knows(e, scooter)
+            knows(whole, scooter)
+        burst = list(scooter.live(0.2, 10.0))
+        rows += follow(e, burst, scooter)
+        usual += follow(whole, burst, scooter)
+        follow(whole, scooter.live(3.9, 10.0), scooter)
     _, end = rows[-1]
     assert end.distance == pytest.approx(scooter.distance - begin, rel=0.1)
     assert worst(rows) < 3
+    assert rows[1][1].soc_sd > 1.6 * usual[1][1].soc_sd  # the first gap: nobody knows yet that it is none
+    assert end.soc_sd > 1.1 * usual[-1][1].soc_sd  # later: what flows between two samples is not known
 
 
-def test_the_wait_for_a_first_voltage_counts_as_age():
+@pytest.mark.parametrize(("seconds", "speed"), [(20.0, 10.0), (20.0, 24.0)])
+def test_what_flows_while_nothing_is_heard_is_not_known(seconds, speed):
+    scooter, e = Scooter(soc=0.7, seed=1), estimator()
+    follow(e, scooter.live(60), scooter)
+    knows(e, scooter)
+    scooter.away(seconds, speed)
+    assert worst(follow(e, scooter.live(1.0, speed), scooter)) < 3
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_the_wait_for_a_first_voltage_counts_as_age(told):
     scooter, e = Scooter(soc=0.75), estimator()
-    follow(e, scooter.live(400, 10.0), scooter)
-    e = restarted(e, 3.0)
-    scooter.away(1200, 10.0)
-    e.wait(1200.0)
-    assert worst(follow(e, scooter.live(30, 10.0), scooter)) < 3
+    follow(e, heard(scooter.live(400, 10.0), own_soc=told, odometer=told), scooter)
+    waited, aged, young = restarted(e, 3.0), restarted(e, 60.0), restarted(e, 3.0)
+    waited.wait(57.0)
+    scooter.away(60, 10.0)
+    events = list(heard(scooter.live(3, 10.0), own_soc=told, odometer=told))
+    sds = []
+    for each in (waited, aged, young):
+        follow(each, events, scooter)
+        sds.append(each.estimate(scooter.time).soc_sd)
+    assert sds[0] == pytest.approx(sds[1])
+    assert sds[2] != pytest.approx(sds[1], rel=0.2)
+    assert abs(waited.estimate(scooter.time).soc - scooter.soc) < 3 * sds[0]
 
 
 @pytest.mark.parametrize("age", [-5.0, float("nan"), float("inf"), -1e9])
 def test_an_age_that_is_none_is_not_known(age):
     scooter, e = Scooter(soc=0.75), estimator()
     follow(e, scooter.live(60), scooter)
-    e = restarted(e, age)
-    assert worst(follow(e, scooter.live(30), scooter)) < 3
+    e, unknown = restarted(e, age), restarted(e, None)
+    events = list(scooter.live(30))
+    rows = follow(e, events, scooter)
+    assert worst(rows) < 3
+    assert rows == follow(unknown, events, scooter)
 
 
 @pytest.mark.parametrize("temperature", [-20.0, -10.0])

@@ -8,6 +8,7 @@ import pytest
 
 from gz_onboard.bus.codec import TIME
 from gz_onboard.events import Frame, Reason, State
+from gz_onboard.pipeline import TICK_NS
 from tests.faults.support import (
     BEGIN,
     RIDE,
@@ -105,7 +106,7 @@ def test_the_clock_is_set_under_the_daemon(step: float):
         while frame[0] >= due:
             run.pipeline.advance(waiting, due + shift)
             waiting = []
-            due += 50 * MS
+            due += TICK_NS
             if not set_already and due - first >= BEGIN * S:
                 set_already = True
                 shift = round(step * S)
@@ -138,6 +139,10 @@ def test_a_gap(seconds: float, live: bool):
     check_no_jump(run)
     silent = run.between(BEGIN + 2.3, BEGIN + seconds)
     lost = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT | Reason.NO_SPEED | Reason.NO_IMU
+    assert bool(silent) == (seconds > 2.3)
+    if seconds < 1:  # only what comes a hundred times a second is missed so soon, and for no longer
+        assert reasons_in(run.between(BEGIN, BEGIN + 2.3)) & lost == Reason.NO_IMU
+        assert {e.state for e in run.between(BEGIN + seconds + 0.15, BEGIN + 2.3)} == {State.VALID}
     assert all(e.reasons & lost == lost for e in silent)
     assert all(e.state is State.INVALID and e.speed is None and e.pack_current is None for e in silent)
     if seconds == 20.0 and live:

@@ -1,4 +1,4 @@
-"""Every kind with its full count, two processes at a time; rewrites the tables of docs/reliability.md."""
+"""Every kind with its full count, a process each on every processor; rewrites the tables of docs/reliability.md."""
 
 from __future__ import annotations
 

@@ -18,9 +18,10 @@ from operator import itemgetter
 from random import Random
 
 from gz_onboard.bus.codec import Codec, raw_range
+from gz_onboard.daemon import CLOCK_STEP_NS
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.lab.estimate import feed
-from gz_onboard.pipeline import DROPPING
+from gz_onboard.pipeline import DROPPING, TICK_NS
 from gz_onboard.vehicle import Vehicle
 from tests.hardening.report import Report
 from tests.support import EPOCH, MS, Run, S, check_sound, recorded, reference, sealed
@@ -217,7 +218,7 @@ class Watch:
 
 
 def live(watch: Watch, frames: Iterator[tuple[int, Frame]]) -> None:
-    """As the daemon does it: rounds of 50 ms, sorted by stamp, what is a little ahead of its time waits."""
+    """As the daemon does it: a round each tick, sorted by stamp, what is a little ahead of its time waits."""
     waiting: list[Frame] = []
     due: int | None = None
     since = 0
@@ -225,10 +226,10 @@ def live(watch: Watch, frames: Iterator[tuple[int, Frame]]) -> None:
         due = arrival if due is None else due
         while arrival >= due:
             waiting.sort(key=itemgetter(0))
-            end, beyond = bisect_left(waiting, (due,)), bisect_left(waiting, (due + 500 * MS,))
+            end, beyond = bisect_left(waiting, (due,)), bisect_left(waiting, (due + CLOCK_STEP_NS,))
             now, waiting = waiting[:end] + waiting[beyond:], waiting[end:beyond]
             watch.run.pipeline.advance(now, due)
-            due += 50 * MS
+            due += TICK_NS
         waiting.append(frame)
         since += 1
         if since >= PORTION:
