@@ -376,7 +376,7 @@ class Estimator:
         slopes.step(now, dt, self.signals, speeds, power,
                     lambda speed, acceleration: self._power_at(now, speed, acceleration, 0.0))  # fmt: skip
         if slopes.guilty != before:
-            road.forget_slope(slopes.offset)
+            road.forget_slope(slopes.offset, self.signals.gps_altitude.fresh(now))
         distrusted = self.redundancy.distrusted
         if any(role in LEARNED_FROM and role not in self._distrusted for role in distrusted):
             self.forecaster.forget(UNLEARNED)
@@ -841,7 +841,7 @@ class Estimator:
 
     def restore(self, saved: Mapping[str, Any], key: str, age: float | None) -> None:
         """Go on from a snapshot that is `age` [s] old (None: not known). ValueError if it does not fit, whole."""
-        if age is not None and not age >= 0:
+        if age is not None and not 0 <= age < inf:
             age = None
         if not isinstance(saved, Mapping) or saved.get("version") != SNAPSHOT_VERSION:
             raise ValueError(f"is of version {saved.get('version') if isinstance(saved, Mapping) else saved!r}")

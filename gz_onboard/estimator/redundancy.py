@@ -234,7 +234,7 @@ class Speeds:
         if not speeds:
             self.middle = None
             return
-        middle = median(speeds.values())
+        middle = median([v for role, v in speeds.items() if not self.trials[role].guilty] or speeds.values())
         if dt > 0:
             before = middle if self.middle is None else self._slow
             self._slow, self.acceleration = accelerated(before, middle, dt)

@@ -61,9 +61,14 @@ class Road:
         self._turn(now, dt, signals)
         self._slope(now, dt, signals)
 
-    def forget_slope(self, grade_offset: float) -> None:
-        """Begin the grade anew: one that it was made from lied; `grade_offset` is what is known of it all the same."""
+    def forget_slope(self, grade_offset: float, altitude_holds: bool) -> None:
+        """Begin the grade anew: one that it was made from lied; `grade_offset` is what is known of it all the same.
+
+        altitude_holds: the observer goes on from the measured altitude. Where it was led to is no climb to come back.
+        """
         self.grade_offset, self.accelerometer_grade = grade_offset, 0.0
+        if altitude_holds:
+            self.altitude = None
 
     def _speed(self, now: float, dt: float, signals: Signals, radius: float, gear: float) -> None:
         motor = signals.motor_speed.mean(now)

@@ -131,7 +131,6 @@ LIMITS: dict[tuple[tuple[str, ...], str], str] = {  # break a promise, for a kno
     (("gps_altitude",), "climbing 0.1 m/s"): "less than a receiver wanders and an accelerometer is tilted",
     (("gps_altitude",), "drifting"): "0.25 m/s, little more than a receiver wanders",
     (("accel_x",), "+0.5 m/s²"): "a tilt of 3°, which takes kilometres to tell from a hill",
-    (("accel_x",), "too low"): "a piece of way is learned by the slope that it has left behind when it is named",
     (("accel_x",), "spikes"): "one sample in fifty, by which the mean moves by 0.4 m/s²",
 }
 
