@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.cli import main as command
+from gz_onboard.constants import GRAVITY
 from gz_onboard.lab.discover.engine import discover
 from gz_onboard.lab.discover.files import write_model
 from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.parts import Over, before_and_after, binned, edges, gathered
 from gz_onboard.lab.discover.result import METRICS, Report
-from gz_onboard.physics.model import G
 from gz_onboard.simulation.recorded import read_recorded
 from gz_onboard.simulation.samples import read_samples
 from gz_onboard.simulation.style import (
@@ -83,7 +83,7 @@ def residual(report: Report, file: Path) -> None:
                       linewidth=1.5, label="means of bins, ± 2 standard errors")  # fmt: skip
         if i == 0:
             a = np.linspace(float(x.min()), float(x.max()), 200)
-            low, middle, high = (c * mass * a**2 / G for c in (cause.ci95[0], cause.value, cause.ci95[1]))
+            low, middle, high = (c * mass * a**2 / GRAVITY for c in (cause.ci95[0], cause.value, cause.ci95[1]))
             axis.fill_between(a, low, high, color=GREEN, alpha=0.2, linewidth=0)
             axis.plot(a, middle, color=GREEN, linewidth=1.6,
                       label=f"c·m·a²/g, c = {cause.value:.3f} rad, 95 % interval")  # fmt: skip

@@ -15,6 +15,7 @@ from gz_onboard.estimator.ekf import ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Group
+from gz_onboard.lab.discover.channels import rest_at
 from gz_onboard.physics.battery import Battery, drawable
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.recorded import Recorded, rest_soc
@@ -34,6 +35,13 @@ unit = "V"
 sd = 0.004
 """
 temperatures = st.floats(-30, 50)
+
+
+@given(st.lists(st.tuples(st.floats(-0.05, 1.05), temperatures), min_size=1, max_size=20))
+def test_a_whole_ride_rests_where_each_step_does(points):
+    soc, celsius = np.array(points).T
+    for battery in (PLAIN, COLD):
+        assert rest_at(battery, soc, celsius) == pytest.approx([battery.ocv(s, t)[0] for s, t in points], abs=1e-12)
 
 
 def read(folder: Path, table: str) -> Battery:

@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 
 # The parts of the package, lowest first. A part imports itself and those in the lines above its own.
 LAYERS = [
-    ["__init__", "background", "errors", "events", "notify", "state"],
+    ["__init__", "background", "constants", "errors", "events", "notify", "state"],
     ["toml"],
     ["bus", "physics"],
     ["vehicle"],
@@ -109,6 +109,11 @@ def test_the_daemon_loads_nothing_heavy(name):
     loaded = set(run.stdout.split())
     assert "gz_onboard" in loaded
     assert not HEAVY & loaded
+
+
+def test_a_constant_of_nature_stands_once():
+    holders = [str(module) for module in MODULES if "9.80665" in (PACKAGE / module).read_text()]
+    assert holders == ["constants.py"]
 
 
 def test_the_checks_see_what_they_look_for():

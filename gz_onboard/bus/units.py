@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from math import pi
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.events import ROLES
 
 # (unit in a DBC, SI unit) -> factor, offset
@@ -19,7 +20,7 @@ _CONVERSIONS: dict[tuple[str, str], tuple[float, float]] = {
     ("km/h", "m/s"): (1 / 3.6, 0.0),
     ("mph", "m/s"): (0.44704, 0.0),
     ("km", "m"): (1e3, 0.0),
-    ("g", "m/s^2"): (9.80665, 0.0),
+    ("g", "m/s^2"): (GRAVITY, 0.0),
     ("%", "1"): (0.01, 0.0),
 }
 

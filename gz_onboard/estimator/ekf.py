@@ -14,7 +14,6 @@ ExtendedKalmanFilter, the reference. A test holds them equal to 1e-9.
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import exp
 from typing import Protocol
 
 from gz_onboard.physics.battery import Battery
@@ -52,10 +51,9 @@ class ScalarFilter:
     def predict(self, dt: float, current: float, temperature: float, noise: tuple[float, float]) -> None:
         """See `SocFilter`."""
         battery = self.battery
-        r1 = battery.r1.at(self.soc, temperature)[0]
-        a = exp(-dt / (r1 * battery.c1.at(self.soc, temperature)[0]))
+        r1, c1 = battery.r1.at(self.soc, temperature)[0], battery.c1.at(self.soc, temperature)[0]
         self.soc -= current * dt / (3600 * battery.cell_capacity(temperature))
-        self.v1 = a * self.v1 + r1 * (1 - a) * current
+        self.v1, a = battery.relax(dt, self.v1, current, r1, c1)
         p00, p01, p11 = self.covariance
         self.covariance = p00 + noise[0], a * p01, a * a * p11 + noise[1]
 

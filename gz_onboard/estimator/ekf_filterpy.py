@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from math import exp
-
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
@@ -52,10 +50,10 @@ class FilterpyFilter:
     def predict(self, dt: float, current: float, temperature: float, noise: tuple[float, float]) -> None:
         """See `SocFilter`. The model is linear in state and current, so filterpy's own F·x + B·u is exact."""
         battery = self.battery
-        r1 = battery.r1.at(self.soc, temperature)[0]
-        a = exp(-dt / (r1 * battery.c1.at(self.soc, temperature)[0]))
+        r1, c1 = battery.r1.at(self.soc, temperature)[0], battery.c1.at(self.soc, temperature)[0]
+        settled, a = battery.relax(dt, 0.0, 1.0, r1, c1)  # V of an ampere that flows from rest
         self._ekf.F = np.diag([1.0, a])
-        self._ekf.B = np.array([[-dt / (3600 * battery.cell_capacity(temperature))], [r1 * (1 - a)]])
+        self._ekf.B = np.array([[-dt / (3600 * battery.cell_capacity(temperature))], [settled]])
         self._ekf.Q = np.diag(noise)
         self._ekf.predict(np.array([[current]]))
 

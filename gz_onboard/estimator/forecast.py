@@ -31,6 +31,7 @@ from dataclasses import dataclass, field
 from math import exp, isfinite, pi, sqrt
 from typing import Any
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.battery import Battery, drawable
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import Model, air_density, stepping
@@ -46,7 +47,6 @@ SEGMENT_SD = 0.18  # relative: measured against modelled energy of one segment, 
 HEIGHT_WALK = 0.75  # m per sqrt(m): roads climb or fall by 60 m on 6 km; of a way whose grade no sensor told
 PRIOR_FORM = 2.5  # mean square of the power over the square of its mean, of the eight commissioning rides
 PRIOR_SCATTER = 0.25  # relative sd of segments of a riding not yet known
-G = 9.80665  # m/s²
 AHEAD = 1800.0  # s: half of what a range lasts
 HEADINGS = tuple(
     pi / 4 * i for i in range(8)
@@ -208,7 +208,7 @@ class Forecaster:
         else:
             energy = to_come = sum(self.model.power(q).values()) * r.seconds
         segment.modelled += energy
-        stored = G * r.climb + (speed * speed - r.speed_before * r.speed_before) / 2
+        stored = GRAVITY * r.climb + (speed * speed - r.speed_before * r.speed_before) / 2
         segment.level += to_come - self.model.mass * stored
         self._next_second()
         r.speed_before = speed
@@ -304,7 +304,7 @@ class Forecaster:
         r.factor_variance += FACTOR_WALK**2
         if segment.modelled > 0:
             noise = SEGMENT_SD * self._past.level / self._past.distance * segment.distance
-            height = self.model.mass * G * HEIGHT_WALK * sqrt(segment.unseen)
+            height = self.model.mass * GRAVITY * HEIGHT_WALK * sqrt(segment.unseen)
             variance = (noise * noise + height * height) / segment.modelled**2
             gain = r.factor_variance / (r.factor_variance + variance)
             r.factor += gain * (segment.measured / segment.modelled - r.factor)

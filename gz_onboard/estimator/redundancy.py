@@ -18,7 +18,8 @@ from dataclasses import dataclass
 from math import sqrt
 from statistics import median
 
-from gz_onboard.estimator.road import STANDS, G, accelerated
+from gz_onboard.constants import GRAVITY
+from gz_onboard.estimator.road import STANDS, accelerated
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.physics.battery import Battery
 
@@ -340,7 +341,7 @@ class Slopes:
     ROLES = ("accel_x", "gps_altitude")
 
     def __init__(self, mass: float, level: float) -> None:
-        self._weight = mass * G
+        self._weight = mass * GRAVITY
         self._free = -FREE * level / self._weight
         self.trials = {role: Trial() for role in self.ROLES}
         self._inertial, self._energy, self._energy_altitude = Gap(), Gap(), Gap()  # accelerometer less altitude, ...
@@ -384,7 +385,7 @@ class Slopes:
         if forward is None:
             self._climb = None
         elif self._climb is not None:
-            self._climb += (forward - speeds.acceleration) / G * way
+            self._climb += (forward - speeds.acceleration) / GRAVITY * way
             self._hear_accelerometer(dt, forward, speed, speeds)
         self._work = None if self._work is None or power is None else self._work + power * dt
         if self._seconds >= 1.0:

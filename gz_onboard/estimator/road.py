@@ -11,9 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import asin, atan, atan2, cos, pi, sin
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.signals import Signals
 
-G = 9.80665  # m/s²
 SPEED_TIME = 0.3  # s: the speed's low pass, whose lag gives the acceleration
 LEAN_TIME = 2.0  # s: how fast the lean is drawn to that of the steady turn
 GRADE_TIME = 5.0  # s: low pass of the accelerometer's grade; at 2 s its noise adds 4 % to the energy modelled
@@ -111,10 +111,10 @@ class Road:
             self.yaw_rate = (yaw - self.bias_z) / max(cos(lean), 0.5)
             lean += (roll - self.bias_x) * dt
             if abs(speed) > 2:
-                steady = -atan(speed * self.yaw_rate / G)
+                steady = -atan(speed * self.yaw_rate / GRAVITY)
             else:
                 sideways = signals.accel_y.mean(now)
-                steady = asin(min(max(sideways / G, -1.0), 1.0)) if sideways is not None else 0.0
+                steady = asin(min(max(sideways / GRAVITY, -1.0), 1.0)) if sideways is not None else 0.0
             self.lean = lean + (steady - lean) * min(dt / LEAN_TIME, 1.0)
         course, gps_speed = signals.gps_course.get(now), signals.gps_speed.get(now)
         if self.heading is not None and self.yaw_rate is not None:
@@ -140,7 +140,7 @@ class Road:
             self.grade = None
             return
         if forward is not None and self.acceleration is not None:
-            sine = min(max((forward - self.acceleration) / G, -1.0), 1.0)
+            sine = min(max((forward - self.acceleration) / GRAVITY, -1.0), 1.0)
             self.accelerometer_grade += (sine - self.accelerometer_grade) * min(dt / GRADE_TIME, 1.0)
         else:
             self.accelerometer_grade = 0.0

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.bus.logs import logs_among
+from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import BAD_INPUT, FAILED, InputError
 from gz_onboard.lab.processes import Progress, over_rides, progress_bar
 from gz_onboard.lab.validate_components import Component, components
@@ -33,7 +34,6 @@ from gz_onboard.lab.validate_score import (
     seconds,
     split,
 )
-from gz_onboard.physics.model import G
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded, rest_soc
 from gz_onboard.simulation.route import read_route
 from gz_onboard.simulation.run import Command, Run, drive, follow, replay, road_table
@@ -128,7 +128,7 @@ def validate_ride(task: Task, progress: Progress = lambda _: None) -> dict[str, 
         f"{channel.label} not judged: not measured" for name, channel in CHANNELS.items() if name not in measured
     ]
     if place is not None and not _route_file(recorded, task.path).is_file():
-        newtons = 0.005 * G * vehicle.model.mass
+        newtons = 0.005 * GRAVITY * vehicle.model.mass
         missing.append(
             "grade is the on-board filter's, by accelerometer and altitude: wrong by some 0.5 % in the first minutes, "
             f"{newtons:.0f} N of road load; a {recorded.name}.route.csv beside the log would tell it"

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import exp
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ import numpy as np
 from gz_onboard.lab.validate_score import Array, Channel, Mask
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Effect, Port
 from gz_onboard.physics.model import air_density
+from gz_onboard.physics.relaxation import relaxed
 from gz_onboard.simulation.scooter import Dynamometer, Scooter
 from gz_onboard.vehicle import Vehicle
 
@@ -97,12 +97,11 @@ def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float)
     for i, (amperes, celsius, shaken, moving) in enumerate(rows):
         cell = amperes / m
         r0, r1, c1 = (mesh.at(soc, celsius)[0] for mesh in (battery.r0, battery.r1, battery.c1))
-        decay = exp(-0.5 / (r1 * c1))  # to the middle of the second, over which the measured is averaged
-        v1 = decay * v1 + r1 * (1 - decay) * cell
+        v1, decay = battery.relax(0.5, v1, cell, r1, c1)  # to its middle: what is measured is the second's mean
         soc -= 0.5 * amperes / (3600 * battery.pack_capacity(celsius))
         lacking = v1 + sum(states.values())
         result[i] = n * (battery.ocv(soc, celsius)[0] - r0 * cell - lacking) - battery.series_resistance * amperes
-        v1 = decay * v1 + r1 * (1 - decay) * cell
+        v1 = relaxed(v1, r1 * cell, decay)
         soc -= 0.5 * amperes / (3600 * battery.pack_capacity(celsius))
         if states:
             q |= {"cell_current": cell, "soc": soc, "cell_temperature": celsius, "vibration": shaken}

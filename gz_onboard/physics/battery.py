@@ -14,10 +14,11 @@ from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from math import exp, sqrt
+from math import sqrt
 from typing import TYPE_CHECKING
 
 from gz_onboard.physics.parameters import Parameters
+from gz_onboard.physics.relaxation import decay_over, relaxed
 
 if TYPE_CHECKING:
     from gz_onboard.toml import Table
@@ -141,8 +142,8 @@ class Battery:
 
     def relax(self, dt: float, v1: float, current: float, r1: float, c1: float) -> tuple[float, float]:
         """(V1 after `dt` [s] of constant cell current [A], the factor that V1 decayed by): eq. 2.22, exact."""
-        decay = exp(-dt / (r1 * c1))
-        return decay * v1 + r1 * (1 - decay) * current, decay
+        decay = decay_over(dt, r1 * c1)
+        return relaxed(v1, r1 * current, decay), decay
 
     def with_parameters(self, parameters: Mapping[str, float]) -> Battery:
         """The same battery with what a vehicle's `parameters` say of capacity, cut-off and resistances."""

@@ -14,12 +14,12 @@ from gz_onboard.errors import InputError, shown
 from gz_onboard.physics.battery import Battery, Lacks
 from gz_onboard.physics.effect import QUANTITIES, Effect, Port, effect_file, load_effect
 from gz_onboard.physics.parameters import Parameters
+from gz_onboard.physics.relaxation import relaxation, relaxed
 from gz_onboard.physics.trust import changeable, trusted_users
 
 if TYPE_CHECKING:
     from gz_onboard.toml import Table
 
-G = 9.80665  # m/s²
 BASE_EFFECTS = (
     "aerodynamic_drag", "rolling_resistance", "grade_force", "inertia", "motor_copper_loss", "motor_iron_loss",
     "inverter_loss", "auxiliary_load",
@@ -58,8 +58,7 @@ class Bound:
 
     def step(self, state: float, dt: float, quantities: Mapping[str, Any]) -> float:
         """Its value after `dt` [s] from `state`."""
-        decay = self.decay(dt, quantities)
-        return float(decay * state + (1 - decay) * self(quantities))
+        return float(relaxed(state, self(quantities), self.decay(dt, quantities)))
 
     def series(self, dt: Any, quantities: Mapping[str, Any], start: float = 0.0) -> Any:
         """Its values at the ends of steps of `dt` [s], with the quantities in them: scalars, or arrays of shape (n,).
@@ -73,12 +72,7 @@ class Bound:
         )[:2]
         if self.effect.decay is None:
             return target.copy()
-        x = start
-        values = []
-        for d, t in zip(decay.tolist(), target.tolist(), strict=True):  # floats: a step is shorter than numpy's call
-            x = d * x + (1 - d) * t
-            values.append(x)
-        return np.array(values)
+        return np.array(relaxation(target.tolist(), decay.tolist(), start))
 
 
 def bind(effect: Effect, parameters: Mapping[str, float]) -> Bound:

@@ -15,8 +15,9 @@ from dataclasses import dataclass, field
 from math import atan, sqrt
 from typing import Any
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Effect, Port
-from gz_onboard.physics.model import G, air_density, drag_torque
+from gz_onboard.physics.model import air_density, drag_torque
 from gz_onboard.simulation.parts.battery import EffectPack, FirstOrderPack, Pack
 from gz_onboard.simulation.parts.brakes import Brakes
 from gz_onboard.simulation.parts.chassis import STRAIGHT_ON, Chassis, StraightChassis
@@ -172,7 +173,7 @@ class Scooter:
         self._gear_efficiency = p["gear_efficiency"]
         self._bms_resistance = p["bms_resistance"]
         self._mass = self.dynamometer.inertia if self.dynamometer else vehicle.model.mass
-        self._weight = vehicle.model.mass * G
+        self._weight = vehicle.model.mass * GRAVITY
         self._turns = self.chassis.name != "straight" and not self.dynamometer
         self._turn = STRAIGHT_ON
         self._rear_share = 1 - p["cg_to_rear"] / p["wheelbase"]
@@ -213,7 +214,7 @@ class Scooter:
         q["speed"], q["grade"], q["grade_cosine"], q["headwind"] = v, grade, cosine, headwind
         if curvature:
             lateral = v * v * curvature
-            q["yaw_rate"], q["lateral_acceleration"], q["lean"] = v * curvature, lateral, -atan(lateral / G)
+            q["yaw_rate"], q["lateral_acceleration"], q["lean"] = v * curvature, lateral, -atan(lateral / GRAVITY)
         elif q["yaw_rate"]:
             q["yaw_rate"] = q["lateral_acceleration"] = q["lean"] = 0.0
         if self._tracks:

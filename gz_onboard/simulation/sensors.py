@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from math import cos, pi
 from typing import TYPE_CHECKING, Any
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
-from gz_onboard.physics.model import G, bind
+from gz_onboard.physics.model import bind
 from gz_onboard.physics.vibration import FAST
 from gz_onboard.simulation.recorded import BRAKE_FORCE
 from gz_onboard.simulation.run import Command
@@ -98,7 +99,7 @@ class Truth:
         if scooter.chassis.name == "leaning":
             c["lean"] = _smooth(c["chassis_lean"], width)
         else:
-            c["lean"] = _lean_of(-np.arctan(c["way"] ** 2 * curvature / G), self.parameters)
+            c["lean"] = _lean_of(-np.arctan(c["way"] ** 2 * curvature / GRAVITY), self.parameters)
         c["lean_rate"] = np.gradient(c["lean"], dt)
         c["slope"] = np.arcsin(_smooth(c["grade"], width))
         c["pitch_rate"] = -np.gradient(c["slope"], dt)
@@ -208,19 +209,19 @@ def _pressure(share: Callable[[Mapping[str, float]], float]) -> Callable[[Truth]
 def _lateral(t: Truth) -> Array:
     import numpy as np
 
-    return G * np.cos(t["slope"]) * np.sin(t["lean"]) + t["way"] * t["yaw_rate"] * np.cos(t["lean"])
+    return GRAVITY * np.cos(t["slope"]) * np.sin(t["lean"]) + t["way"] * t["yaw_rate"] * np.cos(t["lean"])
 
 
 def _vertical(t: Truth) -> Array:
     import numpy as np
 
-    return G * np.cos(t["slope"]) * np.cos(t["lean"]) - t["way"] * t["yaw_rate"] * np.sin(t["lean"])
+    return GRAVITY * np.cos(t["slope"]) * np.cos(t["lean"]) - t["way"] * t["yaw_rate"] * np.sin(t["lean"])
 
 
 def _forward(t: Truth) -> Array:
     import numpy as np
 
-    return t["acceleration"] + G * np.sin(t["slope"])
+    return t["acceleration"] + GRAVITY * np.sin(t["slope"])
 
 
 def _pitch(t: Truth) -> Array:

@@ -7,8 +7,8 @@ from math import cos, sin
 
 import pytest
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.redundancy import FORGIVEN_AFTER, NOBODY, Currents, Sag, Slopes, Speeds, vote
-from gz_onboard.estimator.road import G
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import ROLES
 
@@ -223,7 +223,7 @@ def hills(seconds: float, lies: Mapping[str, Lie], roles: tuple[str, ...] = SLOP
         way += speed * STEP
         height += grade * speed * STEP
         honest = {
-            "accel_x": acceleration + G * (grade + MOUNTED) + 0.1 * sin(77 * t),
+            "accel_x": acceleration + GRAVITY * (grade + MOUNTED) + 0.1 * sin(77 * t),
             "gps_altitude": height + sin(t / 60),
         }
         for role in roles:
@@ -232,7 +232,7 @@ def hills(seconds: float, lies: Mapping[str, Lie], roles: tuple[str, ...] = SLOP
                 value = lies[role](t - begin, honest[role])
             if value is not None:
                 signals[role].value, signals[role].time = value, t
-        work = speed * (FORCE + WIND + MASS * (G * grade + acceleration)) if power else None
+        work = speed * (FORCE + WIND + MASS * (GRAVITY * grade + acceleration)) if power else None
         slopes.hear_altitude(t, STEP, signals, speed)
         speeds.middle, speeds.acceleration, speeds.on_road = speed, acceleration, on_road
         slopes.step(t, STEP, signals, speeds, work, lambda v, a: v * (FORCE + MASS * a))
@@ -298,7 +298,7 @@ def test_pulling_away_on_a_slope_is_not_deaf():
             acceleration = 1.0 if step > 300 and speed < 12 else 0.0
             speed += acceleration * STEP
             speeds.middle, speeds.acceleration = speed, acceleration
-            signals.accel_x.value, signals.accel_x.time = acceleration + G * grade + 0.1 * sin(77 * t), t
+            signals.accel_x.value, signals.accel_x.time = acceleration + GRAVITY * grade + 0.1 * sin(77 * t), t
             slopes.step(t, STEP, signals, speeds, None, lambda v, a: v * (FORCE + MASS * a))
             assert not slopes._deaf
 

@@ -7,7 +7,8 @@ from math import atan, pi, radians, sin, tan
 import numpy as np
 import pytest
 
-from gz_onboard.estimator.road import G, Road
+from gz_onboard.constants import GRAVITY
+from gz_onboard.estimator.road import Road
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import ROLES
 
@@ -26,8 +27,8 @@ def drive(seconds, motion, *, without=(), seed=0, dt=0.1):
         heading = (heading - yaw * dt) % (2 * pi)
         values = {
             "motor_speed": speed / RADIUS,
-            "accel_x": (speed - before[0]) / dt + G * grade + 0.05 + 0.1 * rng.standard_normal(),
-            "accel_y": G * sin(lean) + 0.05 * rng.standard_normal(),
+            "accel_x": (speed - before[0]) / dt + GRAVITY * grade + 0.05 + 0.1 * rng.standard_normal(),
+            "accel_y": GRAVITY * sin(lean) + 0.05 * rng.standard_normal(),
             "rate_x": (lean - before[2]) / dt + radians(0.2) + 0.005 * rng.standard_normal(),
             "rate_z": yaw * np.cos(lean) - radians(0.15) + 0.005 * rng.standard_normal(),
             "gps_speed": speed, "gps_course": heading, "gps_fix": 3.0,
@@ -50,7 +51,7 @@ def turning(t):
         return 0.0, 0.0, 0.0, 0.0, 100.0
     speed = min(9.0, 1.5 * (t - 30))
     yaw = 0.35 * sin((t - 40) / 4) if t > 40 else 0.0
-    return speed, 0.0, -atan(speed * yaw / G), yaw, 100.0
+    return speed, 0.0, -atan(speed * yaw / GRAVITY), yaw, 100.0
 
 
 def test_a_gyro_with_a_large_offset_is_learned_at_rest():
@@ -120,4 +121,4 @@ def test_speed_by_whatever_there_is():
 def test_distance_and_steady_turn_sign():
     road, _ = drive(100, hill)
     assert road.distance == pytest.approx(800, rel=0.01)
-    assert tan(-atan(9 * 0.35 / G)) < 0
+    assert tan(-atan(9 * 0.35 / GRAVITY)) < 0

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.physics.model import G, air_density
+from gz_onboard.constants import GRAVITY
+from gz_onboard.physics.model import air_density
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.parts.brakes import Brakes
 from gz_onboard.simulation.parts.cooling import InverterCooling, LumpedCooling, MotorCooling
@@ -81,7 +82,7 @@ def test_2_8_torque_constant_makes_the_force():
     inertia = VEHICLE.model.mass + (P["wheel_inertia_front"] + P["wheel_inertia_rear"]) / P["wheel_radius"] ** 2
     before = scooter.speed
     scooter.step(0.5, 0.0)
-    rolling = P["rolling_resistance_constant"] * VEHICLE.model.mass * G
+    rolling = P["rolling_resistance_constant"] * VEHICLE.model.mass * GRAVITY
     drag = 0.5 * air_density(20.0) * P["drag_area"] * before**2
     expected = (torque / P["wheel_radius"] - rolling - drag) / inertia
     assert (scooter.speed - before) / DT == pytest.approx(expected, rel=0.03)
@@ -246,14 +247,14 @@ def test_3_2_grade(riding):
     climb = riding.climb
     _, speed, _ = parted(riding, 0.3)
     assert riding.climb - climb == pytest.approx(0.02 * speed * DT, rel=1e-9)
-    assert riding.potential_energy() == pytest.approx(VEHICLE.model.mass * G * riding.climb)
+    assert riding.potential_energy() == pytest.approx(VEHICLE.model.mass * GRAVITY * riding.climb)
 
 
 def test_3_3_forces_accelerate_the_mass(riding):
     before = riding.speed
     watts, speed, _ = parted(riding, 0.5)
     rolling_front = riding.front_load / (riding.front_load + riding.rear_load) * watts["rolling_resistance"] / speed
-    against = watts["aerodynamic_drag"] / speed + VEHICLE.model.mass * G * 0.02 + rolling_front
+    against = watts["aerodynamic_drag"] / speed + VEHICLE.model.mass * GRAVITY * 0.02 + rolling_front
     mass = VEHICLE.model.mass + P["wheel_inertia_front"] / P["wheel_radius"] ** 2
     assert (riding.speed - before) / DT == pytest.approx((riding.force - against) / mass, rel=2e-3)
 
@@ -267,7 +268,7 @@ def test_3_4_distance(riding):
 def test_3_5_to_3_7_axle_loads(riding):
     force = riding.force
     riding.step(0.3, 0.0)
-    normal = VEHICLE.model.mass * G * math.sqrt(1 - 0.02**2)
+    normal = VEHICLE.model.mass * GRAVITY * math.sqrt(1 - 0.02**2)
     rear = normal * (P["wheelbase"] - P["cg_to_rear"]) / P["wheelbase"] + force * P["cg_height"] / P["wheelbase"]
     assert riding.rear_load == pytest.approx(rear, rel=1e-9)
     assert riding.front_load == pytest.approx(normal - rear, rel=1e-9)
@@ -290,7 +291,9 @@ def test_3_9_rolling_resistance(riding):
     riding.speed = 9.0
     watts, speed, _ = parted(riding, 0.3)
     cosine = math.sqrt(1 - 0.02**2)
-    force = VEHICLE.model.mass * G * cosine * (P["rolling_resistance_constant"] + P["rolling_resistance_speed"] * 9.0)
+    force = (
+        VEHICLE.model.mass * GRAVITY * cosine * (P["rolling_resistance_constant"] + P["rolling_resistance_speed"] * 9.0)
+    )
     assert watts["rolling_resistance"] == pytest.approx(force * speed, rel=0.01)
 
 

@@ -13,9 +13,9 @@ import pytest
 from gz_onboard.bus.codec import NOT_AVAILABLE, Codec
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.cli import main
+from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.events import Reason, State
-from gz_onboard.physics.model import G
 from gz_onboard.simulation.frames import START_NS, Losses, batches, simulate_frames, write_frames
 from gz_onboard.simulation.parts.chassis import chassis
 from gz_onboard.simulation.run import along, drive, road_table
@@ -116,7 +116,7 @@ def test_lean_is_that_of_round_tyres(name):
     drive(scooter, trace.watch(along([speed] * 100)), 6.0)
     truth = trace.truth(scooter)
     v = truth["speed"][400]
-    ideal = -atan(v * v * curvature / G)
+    ideal = -atan(v * v * curvature / GRAVITY)
     assert truth["lean"][400] == pytest.approx(lean_of(ideal, p["tyre_crown_radius"], p["cg_height"]), rel=0.01)
     assert truth["lean"][400] < 1.05 * ideal
 

@@ -11,9 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.cli import main
+from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.physics.effect import load_effect
-from gz_onboard.physics.model import G, Model
+from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import read_parameters
 from gz_onboard.simulation.parts.chassis import HARDEST, MODELS, chassis, steady_turn
 from gz_onboard.simulation.run import drive, follow, road_table
@@ -48,7 +49,7 @@ def test_the_scooter_rides_the_turn_of_the_model(name, speed, lateral):
     state, steer = steady_turn(model, speed, abs(lateral) / speed)
     seen = model.rates(state, steer, None, Road()).seen
     drag, _ = model.machine.resistance(speed, Road())
-    expected = seen["drive"] - drag - model.machine.rolling(speed) * model.machine.mass * G
+    expected = seen["drive"] - drag - model.machine.rolling(speed) * model.machine.mass * GRAVITY
     scooter = Scooter(VEHICLE, lambda _: (0.0, lateral / speed**2, 0.0), soc=0.8, speed=speed,
                       chassis=chassis(name, P))  # fmt: skip
     run = drive(scooter, follow([speed] * 3000, 0.01), 30.0)

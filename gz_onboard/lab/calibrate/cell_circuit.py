@@ -10,11 +10,11 @@ I is the cell's current [A], positive when discharging. With the time constants 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp
 
 import numpy as np
 
 from gz_onboard.lab.calibrate.result import Array
+from gz_onboard.physics.relaxation import relaxation, relaxed
 
 KELVIN = 273.15
 
@@ -68,12 +68,7 @@ def at(nodes: Array, rows: Array, table: Array, x: Array, temperature: Array) ->
 
 def follow(current: Array, dt: Array, tau: float | Array) -> Array:
     """x (m,) that follows `current` (m,) [A], which flows for the `dt` (m,) [s] before each sample, with `tau` [s]."""
-    decay = np.exp(-dt / tau).tolist()
-    x, result = 0.0, []
-    for a, i in zip(decay, current.tolist(), strict=True):
-        x = i + a * (x - i)
-        result.append(x)
-    return np.array(result)
+    return np.array(relaxation(current.tolist(), np.exp(-dt / tau * np.ones(len(current))).tolist()))
 
 
 def follow_slope(current: Array, dt: Array, tau: Array) -> tuple[Array, Array]:
@@ -82,7 +77,7 @@ def follow_slope(current: Array, dt: Array, tau: Array) -> tuple[Array, Array]:
     x, y, xs, ys = 0.0, 0.0, [], []
     for a, d, i in zip(decay.tolist(), (decay * dt / tau).tolist(), current.tolist(), strict=True):
         y = a * y + d * (x - i)
-        x = i + a * (x - i)
+        x = relaxed(x, i, a)
         xs.append(x)
         ys.append(y)
     return np.array(xs), np.array(ys)
@@ -109,12 +104,7 @@ def voltage(
 
 def _pair(resistance: Array, tau: Array, current: Array, dt: Array) -> Array:
     """Voltage (m,) [V] of an RC pair, exact for a current constant over each step (eq. 2.22)."""
-    v, result = 0.0, []
-    for dt_, r, t, i in zip(dt.tolist(), resistance.tolist(), tau.tolist(), current.tolist(), strict=True):
-        a = exp(-dt_ / t)
-        v = a * v + r * (1 - a) * i
-        result.append(v)
-    return np.array(result)
+    return np.array(relaxation((resistance * current).tolist(), np.exp(-dt / tau).tolist()))
 
 
 def ocv_at(nodes: Array, values: Array, soc: Array) -> Array:

@@ -12,13 +12,13 @@ from math import sqrt
 
 import numpy as np
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.coastdown_fit import RoadFit, covariance_with_nuisance, fit_road
 from gz_onboard.lab.calibrate.coastdown_run import FASTEST, SLOWEST, SPAN, Coast, coast, directions
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.result import Array, Fit, Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.road_load import NAMES, RoadLoad, own_wind, roll
-from gz_onboard.physics.model import G
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
@@ -167,7 +167,7 @@ def _panels(force: RoadLoad, road: RoadFit, runs: Sequence[Coast], speeds: Seque
         time = run.time - run.time[0]
         lines += [Trace(run.name, time, run.speed, "."), Trace("", time, model, "-")]
         errors.append(Trace(run.name, time, model - run.speed, "-"))
-        level = run.slowing * (run.mass + force.rotating) - run.direction * slope * run.mass * G
+        level = run.slowing * (run.mass + force.rotating) - run.direction * slope * run.mass * GRAVITY
         loads.append(Trace(run.name, run.middle, level, "."))
     v = np.linspace(SLOWEST, FASTEST, 50)
     still = Coast("", v, v, 1, None, float(np.mean([run.mass for run in runs])),

@@ -27,11 +27,12 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.grid import MOVING, STEP, Array, Mask, Ride
 from gz_onboard.physics.battery import Battery, Mesh
 from gz_onboard.physics.effect import Effect
-from gz_onboard.physics.model import G
+from gz_onboard.physics.relaxation import relaxation, relaxed
 from gz_onboard.physics.riding import VIBRATION
 
 Values = Mapping[str, float]
@@ -49,6 +50,7 @@ class System:
     battery: Battery | None
     payload: float  # kg, of the vehicle file: what a ride without an entry carries
     copper: float = 0.0  # ohm, of the healthy motor
+    vibration: float = VIBRATION  # m/s², of the vehicle file's prior riding: for rides that did not measure it
 
     def at(self, *ports: str) -> list[Effect]:
         """The effects at these ports."""
@@ -56,7 +58,7 @@ class System:
 
     def term(self, effect: Effect, q: Mapping[str, Any], p: Values, dt: float) -> Any:
         """The term of `effect` over time; the state's, if it has memory."""
-        read = [q[name] if name in q else typical(q, name) for name in effect.quantities]
+        read = [q[name] if name in q else typical(q, name, self.vibration) for name in effect.quantities]
         term = effect.term(*read, **{name: p[name] for name in effect.keywords})
         if effect.decay is None:
             return term
@@ -64,26 +66,24 @@ class System:
         if not np.any(term):
             return np.zeros(n)
         keywords = {name: p[name] for name in effect.decay_keywords}
-        read = [q[name] if name in q else typical(q, name) for name in effect.decay_quantities]
+        read = [q[name] if name in q else typical(q, name, self.vibration) for name in effect.decay_quantities]
         factor = effect.decay(dt, *read, **keywords)
         return recursion(np.broadcast_to(factor, n), np.broadcast_to(term, n))
 
 
-def typical(q: Mapping[str, Array], name: str) -> Array:
-    """A quantity that a ride did not measure, shape of its others; InputError for one that nothing stands in for."""
+def typical(q: Mapping[str, Array], name: str, vibration: float) -> Array:
+    """A quantity that a ride did not measure, shape of its others; InputError for one that nothing stands in for.
+
+    vibration: of the vehicle while it moves [m/s²].
+    """
     if name != "vibration":
         raise InputError(f"no ride measures {name}, which an effect reads")
-    return np.where(np.abs(q["speed"]) > MOVING, VIBRATION, 0.0)
+    return np.where(np.abs(q["speed"]) > MOVING, vibration, 0.0)
 
 
 def recursion(decay: Array, target: Array, start: float = 0.0) -> Array:
-    """x[k+1] = decay[k]·x[k] + (1 − decay[k])·target[k], x[0] = start; shape of `decay`."""
-    x = start
-    result = []
-    for d, t in zip(decay.tolist(), target.tolist(), strict=True):
-        result.append(x)
-        x = d * x + (1 - d) * t
-    return np.array(result)
+    """`relaxation` at the beginnings of the steps, x[0] = start; shape of `decay`."""
+    return np.array([start, *relaxation(target.tolist(), decay.tolist(), start)[:-1]])
 
 
 def mesh_at(mesh: Mesh, soc: Array, temperature: Array) -> Array:
@@ -99,6 +99,14 @@ def mesh_at(mesh: Mesh, soc: Array, temperature: Array) -> Array:
     low = rows[j, i] * (1 - u) + rows[j, i + 1] * u
     high = rows[j + 1, i] * (1 - u) + rows[j + 1, i + 1] * u
     return np.asarray(low * (1 - w) + high * w)
+
+
+def rest_at(battery: Battery, soc: Array, temperature: Array) -> Array:
+    """Rest voltage of a cell, shape of `soc`: `Battery.ocv` for a whole ride."""
+    rest = ocv_at(battery, soc)
+    if battery.rest_shift_value:
+        rest = rest + np.interp(temperature, battery.rest_shift_temperature, battery.rest_shift_value)
+    return rest
 
 
 def ocv_at(battery: Battery, soc: Array) -> Array:
@@ -197,7 +205,7 @@ def altitude(ride: Ride, p: Values, system: System) -> Array:
     """[m]"""
     q = moving(ride, p, system)
     acceleration = q["acceleration"]
-    sine = (ride.signals["accel_x"] - p["accel_bias"] - (1 + p["pitch_gain"]) * acceleration) / G
+    sine = (ride.signals["accel_x"] - p["accel_bias"] - (1 + p["pitch_gain"]) * acceleration) / GRAVITY
     height = np.cumsum(sine * q["speed"]) * STEP
     return np.asarray(ride.signals["gps_altitude"] - height - ride.signals["gps_altitude"][0] - p["altitude_start"])
 
@@ -272,17 +280,15 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, A
     decay = np.exp(-DT / (r1 * mesh_at(battery.c1, soc, temperature) * np.exp(p["pair_time"])))
     r1 = r1 * (1 + p["pair_resistance"])
     v1 = recursion(decay, r1 * factor * cell, p["v1_start"])
-    v1 = (v1 + decay * v1 + (1 - decay) * r1 * factor * cell) / 2  # the mean of the step's ends
+    v1 = (v1 + relaxed(v1, r1 * factor * cell, decay)) / 2  # the mean of the step's ends
     extra: Any = p["drift"] * np.arange(len(cell)) * DT / 600
     extra = extra + p["mid_resistance"] * recursion(np.full(len(cell), np.exp(-DT / MID)), cell)
     q = {name: mean_over(value, SLOW) for name, value in ride.quantities.items()}
     q |= {"cell_current": cell, "soc": soc, "cell_temperature": temperature, "cell_capacity": capacity}
     for effect in system.at("CELL_VOLTAGE"):
         extra = extra + system.term(effect, q, p, DT)
-    rest = ocv_at(battery, soc) + p["ocv_offset"] + p["ocv_tilt"] * (soc - 0.7)
+    rest = rest_at(battery, soc, temperature) + p["ocv_offset"] + p["ocv_tilt"] * (soc - 0.7)
     rest = rest + p["ocv_cold"] * (20 - temperature) / 20
-    if battery.rest_shift_value:
-        rest = rest + np.interp(temperature, battery.rest_shift_temperature, battery.rest_shift_value)
     return rest - r0 * cell - v1 - extra, cell * battery.cells_parallel, soc
 
 
@@ -336,7 +342,7 @@ def gps_speed(ride: Ride, p: Values, system: System) -> Array:
     """[m/s]"""
     q = moving(ride, p, system)
     slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / 100
-    lean = 1 - p["lean_radius"] * (q["lateral_acceleration"] / G) ** 2 / 2
+    lean = 1 - p["lean_radius"] * (q["lateral_acceleration"] / GRAVITY) ** 2 / 2
     return np.asarray(ride.signals["gps_speed"] - q["speed"] * slip * lean + p["gps_lag"] * q["acceleration"])
 
 
@@ -353,7 +359,7 @@ def front_speed(ride: Ride, p: Values, system: System) -> Array:
     """[m/s]"""
     q = moving(ride, p, system)
     slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / 100
-    lean = 1 - p["front_lean"] * (q["lateral_acceleration"] / G) ** 2 / 2
+    lean = 1 - p["front_lean"] * (q["lateral_acceleration"] / GRAVITY) ** 2 / 2
     speed = q["motor_speed"] * p["gear_ratio"] * slip * lean
     front = ride.signals["wheel_speed_front"] * (1 - p["front_scale"])
     return np.asarray((front - speed) * ride.radius + p["wheel_lag"] * q["acceleration"])
@@ -418,8 +424,9 @@ def cell_temperature(ride: Ride, p: Values, system: System) -> Array:
     battery = system.battery
     assert battery is not None
     volts, amperes, soc = cell_circuit(ride, p, system)
-    heat = (battery.cells_series * (ocv_at(battery, soc) - volts) * amperes).tolist()
     measured = mean_over(ride.signals["cell_temperature"], SLOW)
+    rest = rest_at(battery, soc, mean_over(ride.quantities["cell_temperature"], SLOW))
+    heat = (battery.cells_series * (rest - volts) * amperes).tolist()
     ambient = mean_over(ride.quantities["ambient_temperature"], SLOW).tolist()
     cells = float(measured[:20].mean()) + p["cells_start"]
     a = DT / p["pack_heat_capacity"]

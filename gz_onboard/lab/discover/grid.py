@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
-from gz_onboard.physics.model import G, air_density
+from gz_onboard.physics.model import air_density
 from gz_onboard.physics.vibration import Vibration
 from gz_onboard.simulation.samples import Samples
 
@@ -192,11 +193,11 @@ def _quantities(ride: Ride, mass: float) -> dict[str, Array]:
         bias = float(np.median(s["rate_z"][still])) if still.sum() > 30 else float(np.median(s["rate_z"]))
         yaw = smooth(s["rate_z"] - bias, 0.5)
     # the body leans: its yaw rate is r·cos φ, and tan φ = v·r/g, so sin φ = v·rate/g
-    sine = np.clip(speed * yaw / G, -0.85, 0.85)
-    lateral = G * sine / np.sqrt(1 - sine**2)
+    sine = np.clip(speed * yaw / GRAVITY, -0.85, 0.85)
+    lateral = GRAVITY * sine / np.sqrt(1 - sine**2)
     grade = np.zeros(n)
     if "accel_x" in s:
-        grade = smooth((s["accel_x"] - acceleration) / G, 2.0)
+        grade = smooth((s["accel_x"] - acceleration) / GRAVITY, 2.0)
     moved = np.cumsum(np.abs(speed) > MOVING) * STEP
     course = s.get("gps_course", np.zeros(n))
     altitude = float(np.median(s["gps_altitude"])) if "gps_altitude" in s else 0.0

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.WHEEL_FORCE
@@ -23,11 +24,10 @@ SHOWN_BY = (
     "Road load that grows with the square of speed times yaw rate and is absent on the straight; bends at one speed, "
     "left and right, split it from drag area and rolling resistance."
 )
-G = 9.80665  # m/s²
 STANDSTILL = 0.1  # m/s
 
 
 def term(speed: Any, mass: Any, lateral_acceleration: Any, *, cornering_compliance: float) -> Any:
     """Force [N] against the motion."""
     direction = speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5
-    return cornering_compliance * mass * lateral_acceleration * lateral_acceleration / G * direction
+    return cornering_compliance * mass * lateral_acceleration * lateral_acceleration / GRAVITY * direction

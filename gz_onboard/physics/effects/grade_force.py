@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.WHEEL_FORCE
@@ -12,4 +13,4 @@ PARAMETERS: tuple[Parameter, ...] = ()
 
 def term(mass: Any, grade: Any) -> Any:
     """Force [N] against the motion."""
-    return mass * 9.80665 * grade
+    return mass * GRAVITY * grade

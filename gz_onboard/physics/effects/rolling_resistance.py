@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.TYRE
@@ -27,4 +28,4 @@ def term(
 ) -> Any:
     """Force [N] against the motion."""
     direction = speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5
-    return mass * 9.80665 * grade_cosine * (rolling_resistance_constant * direction + rolling_resistance_speed * speed)
+    return mass * GRAVITY * grade_cosine * (rolling_resistance_constant * direction + rolling_resistance_speed * speed)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import Parameter, Port
 from gz_onboard.physics.elementary import exp
 
@@ -37,4 +38,4 @@ def term(
     """Force [N] against the motion."""
     direction = speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5
     cold = warm_up_share * exp(-time_moving / warm_up_time)
-    return mass * 9.80665 * grade_cosine * rolling_resistance_constant * cold * direction
+    return mass * GRAVITY * grade_cosine * rolling_resistance_constant * cold * direction

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import MutableMapping, Sequence
 from itertools import pairwise
-from math import exp, sqrt
+from math import sqrt
 from typing import Protocol
 
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.model import Bound
+from gz_onboard.physics.relaxation import decay_over, relaxed
 
 TABLE_PERIOD = 1.0  # s: R0, R1 and C1 follow SOC and temperature this often; both move slowly
 
@@ -56,7 +57,7 @@ class FirstOrderPack:
         self._r0 = battery.r0.at(soc, temperature)[0]
         self._r1 = battery.r1.at(soc, temperature)[0]
         self._c1 = battery.c1.at(soc, temperature)[0]
-        self._decay, self._decay_dt = exp(-dt / (self._r1 * self._c1)), dt
+        self._decay, self._decay_dt = decay_over(dt, self._r1 * self._c1), dt
         self._charge = 3600 * battery.pack_capacity(temperature)
         self._shift = battery.rest_shift(temperature)
         self._age = 0.0
@@ -79,7 +80,7 @@ class FirstOrderPack:
         middle = n * (ocv - slope * step / 2)
         voltage = middle - n * self.v1 - resistance * current
         self.soc -= step
-        self.v1 = self._decay * self.v1 + self._r1 * (1 - self._decay) * current / m
+        self.v1 = relaxed(self.v1, self._r1 * current / m, self._decay)
         return current, voltage, (middle - voltage) * current, voltage * current
 
     def chemical_energy_drawn(self) -> float:
@@ -114,9 +115,8 @@ class SecondOrderPack(FirstOrderPack):
         fast, self.v1 = self.v1, self.v1 + self.v2
         current, voltage, heat, delivered = super().draw(power, dt, temperature)
         cell = current / self.battery.cells_parallel
-        self.v1 = self._decay * fast + self._r1 * (1 - self._decay) * cell
-        decay = exp(-dt / self.tau2)
-        self.v2 = decay * self.v2 + self.r2 * (1 - decay) * cell
+        self.v1 = relaxed(fast, self._r1 * cell, self._decay)
+        self.v2 = relaxed(self.v2, self.r2 * cell, decay_over(dt, self.tau2))
         return current, voltage, heat, delivered
 
 
@@ -141,7 +141,7 @@ class EffectPack(FirstOrderPack):
         self.v1 = fast + sum(states.values())
         current, voltage, heat, delivered = super().draw(power, dt, temperature)
         cell = current / self.battery.cells_parallel
-        self.v1 = self._decay * fast + self._r1 * (1 - self._decay) * cell
+        self.v1 = relaxed(fast, self._r1 * cell, self._decay)
         q["cell_current"], q["soc"], q["cell_temperature"] = cell, self.soc, temperature
         q["cell_capacity"] = self._charge / (3600 * self.battery.cells_parallel)
         for effect in self._effects:

@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from math import atan
 from typing import NamedTuple, Protocol
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.physics.model import G
 from gz_onboard.simulation.turning.leaning import LEAN_TIME, Leaning
 from gz_onboard.simulation.turning.machine import Machine, Road, State
 from gz_onboard.simulation.turning.planar import Planar
@@ -67,7 +67,7 @@ class SteadyTurn:
         self.beyond = 0.0
         self.lateral = 0.0  # m/s², positive left, as the machine has it
         machine = model.machine
-        grip = 0.8 * min(machine.front.friction, machine.rear.friction) * G
+        grip = 0.8 * min(machine.front.friction, machine.rear.friction) * GRAVITY
         self._limits = [min(HARDEST, grip, speed * speed / TIGHTEST) for speed in _SPEEDS]
         self._table = [_steady_turns(model, speed, limit) for speed, limit in zip(_SPEEDS, self._limits, strict=True)]
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from math import atan, cos, sin
 
-from gz_onboard.physics.model import G
+from gz_onboard.constants import GRAVITY
 from gz_onboard.simulation.turning.machine import Rates, Road, State
 from gz_onboard.simulation.turning.planar import Planar, Posture
 from gz_onboard.simulation.turning.tyre import front_camber, ground_steer, handlebar_of, lean_of, rolling_radius
@@ -64,4 +64,4 @@ class Leaning(Planar):
         return (self._balance(state[0], state[2]) - state[8]) / LEAN_TIME
 
     def _balance(self, u: float, r: float) -> float:
-        return lean_of(-atan(u * r / G), self.machine.crown, self.machine.cg_height)
+        return lean_of(-atan(u * r / GRAVITY), self.machine.crown, self.machine.cg_height)

@@ -6,8 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import ceil, sqrt
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effects import aerodynamic_drag, rolling_resistance
-from gz_onboard.physics.model import G, air_density
+from gz_onboard.physics.model import air_density
 from gz_onboard.simulation.turning.tyre import Tyre
 
 State = tuple[float, ...]
@@ -93,14 +94,14 @@ class Machine:
     def resistance(self, speed: float, road: Road) -> tuple[float, float]:
         """(aerodynamic drag, weight along the road) [N], against the motion: eqs. 3.1, 3.2."""
         drag = aerodynamic_drag.term(speed, road.headwind, road.air_density, drag_area=self.drag_area)
-        return float(drag), self.mass * G * road.grade
+        return float(drag), self.mass * GRAVITY * road.grade
 
     def rolling(self, speed: float) -> float:
         """Rolling resistance per load: eq. 3.9 with a constant term."""
         return float(
             rolling_resistance.term(
                 speed,
-                1 / G,
+                1 / GRAVITY,
                 1.0,
                 rolling_resistance_constant=self.rolling_constant,
                 rolling_resistance_speed=self.rolling_speed,
@@ -109,7 +110,7 @@ class Machine:
 
     def weight(self, road: Road) -> float:
         """Load on both axles [N]: eq. 3.5."""
-        return self.mass * G * sqrt(1 - road.grade * road.grade)
+        return self.mass * GRAVITY * sqrt(1 - road.grade * road.grade)
 
 
 def step(rates: Callable[[State], Rates], state: State, dt: float) -> tuple[State, dict[str, float]]:

@@ -18,7 +18,7 @@ from math import atan, cos, degrees, pi, radians, tan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.physics.model import G
+from gz_onboard.constants import GRAVITY
 from gz_onboard.simulation.turning.leaning import Leaning
 from gz_onboard.simulation.turning.machine import Machine, Rates, Road, State, step
 from gz_onboard.simulation.turning.planar import Planar
@@ -83,7 +83,7 @@ class Rider:
     def __init__(self, chassis: Chassis, roll: float, road: Road) -> None:
         self.chassis, self.road = chassis, road
         machine = chassis.machine
-        self.turn = -G * tan(ideal_of(roll, machine.crown, machine.cg_height))  # m/s²
+        self.turn = -GRAVITY * tan(ideal_of(roll, machine.crown, machine.cg_height))  # m/s²
         self.let_go = False
 
     def start(self, speed: float) -> State:

@@ -1,0 +1,32 @@
+"""First-order relaxation, dx/dt = (target - x)/τ: an RC pair, an effect with memory.
+
+Exact for a target that holds over a step. An RC pair has the target R·I (Lord 2016, eq. 2.22). The functions take
+floats, or numpy arrays of one shape.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from math import exp
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+def decay_over(dt: float, time_constant: float) -> float:
+    """The factor by which the distance from the target shrinks in `dt` [s]; `time_constant` in s."""
+    return exp(-dt / time_constant)
+
+
+def relaxed(x: T, target: T, decay: T) -> T:
+    """`x` after a step over which it decays by `decay` towards `target`; x and target in one unit."""
+    return decay * x + (1 - decay) * target  # type: ignore[operator,no-any-return]
+
+
+def relaxation(targets: Iterable[float], decays: Iterable[float], start: float = 0.0) -> list[float]:
+    """The values at the ends of all steps, beginning from `start`. Floats: a step is shorter than a call of numpy."""
+    x, result = start, []
+    for target, decay in zip(targets, decays, strict=True):
+        x = relaxed(x, target, decay)
+        result.append(x)
+    return result
