@@ -59,6 +59,7 @@ FAST_TIME, SKEW_TIME, CURRENT_TIME = 0.5, 2.0, 10.0  # s: low passes; the sensor
 CURRENT_APART, CURRENT_APART_RELATIVE = 0.10, 0.10  # 1/h and 1: two currents that differ by more contradict each other
 GROSS_CURRENT, GROSS_RELATIVE = 0.5, 0.3  # the same over `FAST_TIME`
 VOLTAGE_TIME, VOLTS_APART, GROSS_VOLTS = 10.0, 0.07, 0.3  # s, V
+LINK_TIME = 1.0  # s: an inverter that is being charged or discharges moves by more in it than half of
 VOLTS_USUAL = 0.02  # V: sensors that do not sample at the same time, on the rides
 AGREED_BEFORE = 30.0  # s: two voltages that agreed so long knew the state of charge, and one of them left it
 ERROR_TIME, ERROR_LEAST, GROSS_ERROR = 10.0, 0.04, 0.4  # s, V: what the cell model leaves, low-passed; at once
@@ -552,7 +553,7 @@ class Electric:
         return self.inverter + (self.usual_auxiliary if self.auxiliary is None else self.auxiliary)
 
     def unconnected(self, least: float) -> bool:
-        """Whether the inverter stands still below the pack by `least` [V]: off, or being charged by a precharge."""
+        """Whether an idle inverter is below the pack of a standing vehicle by `least` [V]."""
         if self.pack_voltage is None or self.inverter_voltage is None or abs(self.speed or 0.0) > STANDS:
             return False
         idle = self.inverter is None or abs(self.inverter) <= self.usual_auxiliary
@@ -754,6 +755,7 @@ class Voltages:
         self.trials = {role: Trial() for role in self.ROLES}
         self.apart = 0.0  # V of a cell: by how much the two differ while it is not known which is right, else 0
         self._rival = Rival()
+        self._link: float | None = None  # V, of the inverter, low-passed
         self._square = self._compared = 0.0  # V² of a cell, low-passed; s of it
         self._agreed = 0.0  # s
         self._said, self._still = 0.0, 0.0
@@ -763,9 +765,14 @@ class Voltages:
         """Who is not to be believed now, at this `current` [A] of the pack."""
         against = set()
         pack, inverter = said.pack_voltage, said.inverter_voltage
-        if pack is not None and inverter is not None and said.unconnected(VOLTS_APART * self._series):
-            inverter = None
-            self._square = self._compared = 0.0
+        if inverter is not None:
+            link = inverter if self._link is None else self._link
+            self._link = link + (inverter - link) * part(dt, LINK_TIME)
+            moves = abs(inverter - self._link) > VOLTS_USUAL / 2 * self._series
+            off = inverter < self._lowest * self._series
+            if pack is not None and (moves or off) and said.unconnected(VOLTS_APART * self._series):
+                inverter = None
+                self._square = self._compared = 0.0
         for role, voltage in ((self.ROLES[0], pack), (self.ROLES[1], inverter)):
             if voltage is not None and not self._lowest < voltage / self._series < self._highest:
                 against.add(role)
