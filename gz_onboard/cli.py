@@ -8,6 +8,7 @@ import os
 import re
 import sys
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from typing import NoReturn
 
 from gz_onboard import __version__
@@ -80,6 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return status
     except InputError as error:
         print(f"gz-onboard {called}: {error}", file=sys.stderr)
+        _let_go()
         return BAD_INPUT
     except KeyboardInterrupt:
         return INTERRUPTED
@@ -88,7 +90,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         return FAILED
     except OSError as error:  # what is left is mostly a disk that is full
         print(f"gz-onboard {called}: {error}", file=sys.stderr)
+        _let_go()
         return FAILED
+
+
+def _let_go() -> None:
+    """Drop output that cannot be written: at its end the interpreter would try again, and give status 120 for ours."""
+    if sys.stdout is None:
+        return
+    try:
+        sys.stdout.flush()
+    except OSError:
+        with suppress(OSError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":
