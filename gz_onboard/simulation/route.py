@@ -263,14 +263,6 @@ class SpeedProfile:
         v0, v1 = self.speed[i], self.speed[i + 1]
         return math.sqrt(v0 * v0 + part * (v1 * v1 - v0 * v0))
 
-    def speed_at_time(self, time: float) -> float:
-        """Target speed [m/s] at `time` [s] since the begin; 0 before the begin and past the end."""
-        if not 0.0 <= time <= self.time[-1]:
-            return 0.0
-        i = min(bisect_right(self.time, time), len(self.time) - 1) - 1
-        part = (time - self.time[i]) / (self.time[i + 1] - self.time[i])
-        return self.speed[i] + part * (self.speed[i + 1] - self.speed[i])
-
 
 def speed_profile(
     route: Route,

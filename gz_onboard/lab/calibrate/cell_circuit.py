@@ -83,16 +83,12 @@ def follow_slope(current: Array, dt: Array, tau: Array) -> tuple[Array, Array]:
     return np.array(xs), np.array(ys)
 
 
-def voltage(
-    cell: Circuit, flowed: Array, current: Array, dt: Array, soc: Array, temperature: Array, rested: bool = True
-) -> Array:
+def voltage(cell: Circuit, flowed: Array, current: Array, dt: Array, soc: Array, temperature: Array) -> Array:
     """The cell's voltage (m,) [V] as the on-board model steps it.
 
-    flowed: the mean current over the `dt` before each sample; current: at the sample. `rested`: all RC pairs start at
-    zero, the only start there is a use for.
+    flowed: the mean current over the `dt` before each sample; current: at the sample. The cell has rested: all
+    RC pairs start at zero.
     """
-    if not rested:
-        raise ValueError("a cell that has not rested starts from an unknown polarisation")
     r0, r1, c1 = (at(cell.soc, cell.temperature, t, soc, temperature) for t in (cell.r0, cell.r1, cell.c1))
     rest = ocv_at(cell.ocv_soc, cell.ocv, soc) + cell.ocv_shift(temperature)
     result = rest - r0 * current - _pair(r1, r1 * c1, flowed, dt)

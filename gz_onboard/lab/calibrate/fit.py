@@ -2,7 +2,7 @@
 
 Two fits, `linear` and `nonlinear`, give a `Solution`. Its covariance is that of independent residuals; for samples
 that depend on each other (one run, one ride) give `groups`: then it is the sandwich of Liang & Zeger (1986), which
-takes whole groups as the independent pieces. `unseparated` and `profile` say what a solution does not.
+takes whole groups as the independent pieces. `profile` says what a solution does not.
 """
 
 from __future__ import annotations
@@ -205,27 +205,6 @@ def score(what: str, unit: str, data: Array, model: Array, *, held_out: bool, so
     r2 = 1 - float(error @ error) / spread if spread > 0 else None
     rms = float(np.sqrt(np.mean(error**2)))
     return Fit(what, unit, rms, float(np.max(np.abs(error))), r2, len(error), held_out, source)
-
-
-def unseparated(solution: Solution, scale: Mapping[str, float] | None = None, limit: float = 0.5) -> list[str]:
-    """What the data cannot tell, one sentence for each direction of parameters that they hardly change with.
-
-    The directions are the eigenvectors of the Fisher information in units of `scale` (default: each value; a prior
-    sd is better where there is one). A direction with an sd above `limit` of that is reported.
-    """
-    unit = np.array([(scale or {}).get(n, abs(v) or 1.0) for n, v in zip(solution.names, solution.value, strict=True)])
-    values, vectors = np.linalg.eigh(solution.information * np.outer(unit, unit))
-    said = []
-    for value, vector in zip(values, vectors.T, strict=True):
-        sd = 1 / np.sqrt(value) if value > 0 else np.inf
-        if sd > limit:
-            order = np.argsort(-np.abs(vector))
-            main = [i for i in order if abs(vector[i]) > 0.3 * abs(vector[order[0]])]
-            parts = [f"{solution.names[i]} {'+' if vector[i] * vector[order[0]] > 0 else '-'}" for i in main]
-            percent = f"{100 * sd:.0f} %" if sd < 100 else "any amount"
-            what = "changed alone" if len(parts) == 1 else "changed together"
-            said.append(f"{', '.join(parts)} ({what}, scaled): known to {percent} only")
-    return said
 
 
 @dataclass(frozen=True)

@@ -107,11 +107,6 @@ MOVABLE: Mapping[str, tuple[str, int, str, str]] = {
         "Voltage answers steps of the current late or early; switching the throttle on and off.",
     ),
 }  # fmt: skip
-NAMES = {"cornering_drag": "cornering_compliance", "headwind": "wind_north", "dragging_brake": "brake_drag_force",
-         "tyre_warm_up": "warm_up_share", "drivetrain_drag": "drivetrain_drag_torque",
-         "regen_loss": "regeneration_loss_share", "slow_relaxation": "slow_resistance",
-         "ocv_hysteresis": "hysteresis_voltage"}  # fmt: skip
-"""The package's own effects that are candidates, and the parameter that is their strength."""
 HELD = ("slow_time", "warm_up_time", "hysteresis_rate")
 """Parameters that shape an effect but are not its strength."""
 

@@ -39,7 +39,6 @@ PAIRS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("pack_balance", ("speed", "pack_current", "motor_temperature", "time")),
     ("cell_voltage", ("pack_current", "soc", "time", "current_change", "vibration")),
 )  # fmt: skip
-SHARE = 0.15  # sd before of a coefficient, over the residual's own standard deviation: see `amplitude`
 
 
 ROUND = ("heading",)
