@@ -72,6 +72,7 @@ RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
 GATE = 5.0  # sd: a voltage further off is a glitch, unless it persists
 GATE_COUNT = 20  # so many in a row are no glitch
 CONFLICT = 4.0  # sd between the saved SOC and that of the voltage: beyond, one of the two is wrong
+REST_BETTER = 0.35  # of the sd that is known: a rest is taken in only if its own is no more than this share
 REST_NEWS = 0.8  # a rest is taken in again when its variance fell below this share
 CURRENT_SD = {
     "pack": 0.0,
@@ -588,8 +589,10 @@ class Estimator:
             return False
         emf += rest.coming
         soc = battery.soc_at(emf, temperature)
-        if filter_.covariance[0] < (soc_width(battery, emf, sqrt(variance), temperature) / 2) ** 2:
-            return False  # the curve's own error is the same at every rest: it does not average out
+        # Curve and relaxation err the same way at every rest: that does not average out.
+        better = REST_BETTER if self._rest_variance == inf else 1.0
+        if better**2 * filter_.covariance[0] < (soc_width(battery, emf, sqrt(variance), temperature) / 2) ** 2:
+            return False
         # The same rest again, only better known: what is new is the difference of what both tell.
         new = 1 / (1 / variance - (0.0 if self._rest_variance == inf else 1 / self._rest_variance))
         self._rest_variance = variance

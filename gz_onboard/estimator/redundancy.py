@@ -355,7 +355,7 @@ class Slopes:
         self._said = 0.0
         self._still = 0.0
         self._speed_before: float | None = None  # m/s, at the last step
-        self._means: tuple[float, float] | None = None  # m/s²: accelerometer and acceleration, low-passed
+        self._means: tuple[float, float, float] | None = None  # m/s²: accelerometer, acceleration; s of both
         self._product = self._square = 0.0
         self._deaf = False  # it does not show what the wheels gain
 
@@ -426,9 +426,10 @@ class Slopes:
         if max(abs(acceleration), abs(gained) / max(dt, 1e-3)) > HARDEST:  # another sensor took over
             return
         # Less their means: a slope is in the one and not in the other.
-        slow, wheels = self._means or (forward, 0.0)
-        share = part(dt, GAIN_MEAN)
-        self._means = slow + (forward - slow) * share, wheels + (acceleration - wheels) * share
+        slow, wheels, time = self._means or (forward, acceleration, 0.0)
+        time = min(time + dt, GAIN_MEAN)  # plain means at first: nobody knows what was before
+        share = part(dt, time)
+        self._means = slow + (forward - slow) * share, wheels + (acceleration - wheels) * share, time
         self._product = keep * self._product + (forward - slow) * (acceleration - wheels) * dt
         self._square = keep * self._square + (acceleration - wheels) * (gained - wheels * dt)
         self._deaf = self._square > GAIN_LEAST and not GAIN[0] < self._product / self._square < GAIN[1]
