@@ -321,7 +321,7 @@ def case(number: int, seed: int) -> tuple[str, str, str, float]:
             outcome, said = "refused", str(error)
             if file.name not in said and not (kind.startswith("dbc") and "v.toml" in said):
                 wrong = f"does not name {file.name}: {said[:200]}"
-            elif kind == "values" and not any(key in said for key in (*named, "not valid TOML", "dbc")):
+            elif kind == "values" and not any(key.lower() in said.lower() for key in (*named, "not valid TOML", "dbc")):
                 wrong = f"names none of {sorted(named)}: {said[:200]}"
             elif len(said) > 1000:
                 wrong = f"a message of {len(said)} letters: {said[:200]}"
