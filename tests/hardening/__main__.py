@@ -27,11 +27,21 @@ def run_kind(name: str, share: float, seed: int) -> tuple[str, Report, float]:
 def tables(reports: dict[str, Report], seed: int, share: float) -> str:
     """The tables in Markdown."""
     text = f"\nSeed {seed}, {share:.0%} of the full counts.\n"
-    for name, report in reports.items():
-        text += f"\n### {kinds()[name].TITLE}\n\n| what | measured |\n| --- | --- |\n"
-        text += "".join(f"| {what} | {value} |\n" for what, value in report.rows.items())
-        text += f"| cases that broke a promise | {len(report.failures)} |\n"
-    return text + "\n"
+    return text + "".join(table(name, report) for name, report in reports.items()) + "\n"
+
+
+def table(name: str, report: Report) -> str:
+    """One of them."""
+    text = f"\n### {kinds()[name].TITLE}\n\n| what | measured |\n| --- | --- |\n"
+    text += "".join(f"| {what} | {value} |\n" for what, value in report.rows.items())
+    return text + f"| cases that broke a promise | {len(report.failures)} |\n"
+
+
+def replaced(page: str, name: str, report: Report) -> str:
+    """The page with this kind's table as it is now."""
+    before, title, rest = page.partition(f"\n### {kinds()[name].TITLE}\n")
+    end = min((at for at in (rest.find("\n### "), rest.find("\n" + END)) if at >= 0), default=len(rest))
+    return before + table(name, report) + rest[end:] if title else page
 
 
 def main() -> int:
@@ -40,7 +50,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1000, help="of the cases (%(default)d; the tests use 1)")
     parser.add_argument("--share", type=float, default=1.0, help="of the full counts (%(default)g)")
     parser.add_argument(
-        "--kind", action="append", choices=sorted(kinds()), help="only this one; the page is not written"
+        "--kind", action="append", choices=sorted(kinds()), help="only this one, and its table of the page"
     )
     arguments = parser.parse_args()
     names = arguments.kind or sorted(kinds())
@@ -54,13 +64,15 @@ def main() -> int:
                 print(f"  {what}: {value}")
             for failure in report.failures[:20]:
                 print(f"  FAILED {failure}")
-    if not arguments.kind and PAGE.exists():
+    if PAGE.exists():
         page = PAGE.read_text(encoding="utf-8")
-        before, _, rest = page.partition(BEGIN)
-        PAGE.write_text(
-            before + BEGIN + tables(reports, arguments.seed, arguments.share) + END + rest.partition(END)[2],
-            encoding="utf-8",
-        )
+        if arguments.kind:
+            for name, report in reports.items():
+                page = replaced(page, name, report)
+        else:
+            before, _, rest = page.partition(BEGIN)
+            page = before + BEGIN + tables(reports, arguments.seed, arguments.share) + END + rest.partition(END)[2]
+        PAGE.write_text(page, encoding="utf-8")
         print(f"\nwritten: {PAGE}")
     return any(report.failures for report in reports.values())
 

@@ -22,7 +22,7 @@ from tests.support import S, Scooter, check_estimate, reference
 
 TITLE = "A damaged saved state"
 COUNT = 3000
-FULL_COUNT = 24_000
+FULL_COUNT = 28_000
 
 ODD: tuple[Any, ...] = (None, True, -1, 0, 1e308, 2**70, "", "a", [], [None], {}, {"a": {}}, [[[]]], -0.5, -1e300)
 ODOMETER = 3210.0  # km
