@@ -72,7 +72,7 @@ RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
 GATE = 5.0  # sd: a voltage further off is a glitch, unless it persists
 GATE_COUNT = 20  # so many in a row are no glitch
 CONFLICT = 4.0  # sd between the saved SOC and that of the voltage: beyond, one of the two is wrong
-REST_BETTER = 0.35  # of the sd that is known: a rest is taken in only if its own is no more than this share
+REST_BETTER = 0.35  # of the sd that is known: a rest after a load is taken in only if its own is no more than this
 REST_NEWS = 0.8  # a rest is taken in again when its variance fell below this share
 CURRENT_SD = {
     "pack": 0.0,
@@ -226,8 +226,9 @@ class Estimator:
         self._heard[group] = time
         if gap > SLOW_GAP or self._gaps[group]:
             self._watch(group, gap)
-            for signal in self._slots[group]:  # no mean with what came before the gap
-                signal.total, signal.count = 0.0, 0
+            if gap > SLOW_GAP:
+                for signal in self._slots[group]:  # no mean with what came before the gap
+                    signal.total, signal.count = 0.0, 0
         for signal, value in zip(self._slots[group], values):  # noqa: B905 - hot, equal by construction
             if value is not None:
                 signal.value = value
@@ -590,7 +591,7 @@ class Estimator:
         emf += rest.coming
         soc = battery.soc_at(emf, temperature)
         # Curve and relaxation err the same way at every rest: that does not average out.
-        better = REST_BETTER if self._rest_variance == inf else 1.0
+        better = REST_BETTER if rest.loaded and self._rest_variance == inf else 1.0
         if better**2 * filter_.covariance[0] < (soc_width(battery, emf, sqrt(variance), temperature) / 2) ** 2:
             return False
         # The same rest again, only better known: what is new is the difference of what both tell.

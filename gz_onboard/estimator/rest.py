@@ -29,7 +29,7 @@ class Rest:
         self.coming = 0.0  # V of a cell that relaxation will still add
         self.sd: float | None = None  # V of a cell, of what it adds; None while nothing is proven
         self.fresh = False  # whether `sd` is of this step
-        self._loaded = False  # ever
+        self.loaded = False  # ever
         self._resolution: float | None = None  # V: the smallest change ever seen
         self._last: float | None = None
         self._blocks: deque[tuple[float, float]] = deque(maxlen=LONGEST)  # mean [V], its variance [V²]
@@ -51,7 +51,7 @@ class Rest:
             self._resolution = min(change, self._resolution or change)
         self._last = voltage
         if abs(c_rate) > RATE:
-            self._loaded = True
+            self.loaded = True
             self.interrupt()
             return
         self._time += dt
@@ -68,7 +68,7 @@ class Rest:
             rate, noise = slope(self._blocks)
             self.coming, self.sd = SLOW_TIME * rate, SLOW_TIME * hypot(SLOW_SHARE * rate, noise)
             at_first = hypot(FAST_TIMES * fast_time * hypot(rate, noise), unnamed)
-            if not self._loaded and at_first < self.sd:
+            if not self.loaded and at_first < self.sd:
                 self.coming, self.sd = 0.0, at_first
             elif self.sd > PROVEN * unnamed:  # a fast tail, of which the slow one's time constant says nothing
                 self.sd = None
