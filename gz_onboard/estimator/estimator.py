@@ -72,7 +72,7 @@ RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
 GATE = 5.0  # sd: a voltage further off is a glitch, unless it persists
 GATE_COUNT = 20  # so many in a row are no glitch
 CONFLICT = 4.0  # sd between the saved SOC and that of the voltage: beyond, one of the two is wrong
-REST_BETTER = 0.35  # of the sd that is known: a rest after a load is taken in only if its own is no more than this
+REST_BETTER = 0.15  # of the sd that is known: a rest after a load is taken in only if its own is no more than this
 REST_NEWS = 0.8  # a rest is taken in again when its variance fell below this share
 CURRENT_SD = {
     "pack": 0.0,
