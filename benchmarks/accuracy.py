@@ -99,10 +99,24 @@ def ride(file: Path, payload: float | None) -> tuple[str, list[Sample]]:
             bms = signals["bms_state_of_charge"].value
             assert pipeline.estimator.filter
             samples.append(
-                Sample(e.time, pipeline.estimator.filter.soc, e.soc_sd, state["soc"], e.innovation or 0.0, e.distance,
-                       e.range, e.range_p10 or 0.0, e.range_p90 or 0.0, bms, baseline.range(bms, 0.15),
-                       baseline.range(bms, 0.0), baseline.energy, e.energy_left or 0.0, e.consumption_expected or 0.0)
-            )  # fmt: skip
+                Sample(
+                    e.time,
+                    pipeline.estimator.filter.soc,
+                    e.soc_sd,
+                    state["soc"],
+                    e.innovation or 0.0,
+                    e.distance,
+                    e.range,
+                    e.range_p10 or 0.0,
+                    e.range_p90 or 0.0,
+                    bms,
+                    baseline.range(bms, 0.15),
+                    baseline.range(bms, 0.0),
+                    baseline.energy,
+                    e.energy_left or 0.0,
+                    e.consumption_expected or 0.0,
+                )
+            )
 
     pipeline = Pipeline(vehicle, observer=observe)
     for frames in read_frames(file):
@@ -161,10 +175,12 @@ def range_table(results: list[tuple[str, list[Sample]]]) -> None:
         jumps = [abs((b.range - a.range) + (b.distance - a.distance)) for a, b in zip(s[600:], s[660:], strict=False)]
         half = next(x for x in s if x.reference <= 0.5)
         to_come, ahead = (end - half.used) / 3600, (total - half.distance) * 3.6
-        print(f"- {name}: the distance that was ridden lies within P10 to P90 for {100 * inside:.0f} % of the way; the "
-              f"largest change of the sum of ridden and remaining within a minute is {max(jumps) / 1000:.1f} km; at "
-              f"50 %, {to_come:.0f} Wh were still drawn (ours {half.energy / 3600:.0f}) at "
-              f"{(end - half.used) / ahead:.1f} Wh/km (ours {half.consumption / 3.6:.1f})")  # fmt: skip
+        print(
+            f"- {name}: the distance that was ridden lies within P10 to P90 for {100 * inside:.0f} % of the way; the "
+            f"largest change of the sum of ridden and remaining within a minute is {max(jumps) / 1000:.1f} km; at "
+            f"50 %, {to_come:.0f} Wh were still drawn (ours {half.energy / 3600:.0f}) at "
+            f"{(end - half.used) / ahead:.1f} Wh/km (ours {half.consumption / 3.6:.1f})"
+        )
 
 
 def _error(value: float, true: float) -> str:

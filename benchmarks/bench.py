@@ -148,9 +148,12 @@ def started(which: str, directory: Path) -> Iterator[tuple[subprocess.Popen[str]
         ready.bind(str(notify))
         ready.settimeout(TIMEOUT)
         process = subprocess.Popen(
-            [*prefix, *(ours if which == "ours" else plain)], env=environment, text=True, stdout=subprocess.PIPE,
+            [*prefix, *(ours if which == "ours" else plain)],
+            env=environment,
+            text=True,
+            stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,
-        )  # fmt: skip
+        )
         try:
             assert process.stdout
             line = ready.recv(4096) if which == "ours" else process.stdout.readline().encode()
@@ -164,10 +167,7 @@ def started(which: str, directory: Path) -> Iterator[tuple[subprocess.Popen[str]
 
 def run_live(which: str, frames: Send, live: Live) -> None:
     """Send `frames` in their timing to one of the pipelines and measure it meanwhile; adds to `live`."""
-    with (
-        tempfile.TemporaryDirectory() as name,
-        started(which, Path(name)) as (process, sender, _),
-    ):
+    with tempfile.TemporaryDirectory() as name, started(which, Path(name)) as (process, sender, _):
         time.sleep(0.5)
         used: list[tuple[float, float]] = []
         begin = time.perf_counter()
@@ -224,10 +224,24 @@ def offline_ours(rides: Sequence[Path], *options: str) -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as name:
         before = os.times()
         text = subprocess.run(
-            [sys.executable, "-m", "gz_onboard", "estimate", *map(str, rides), "--no-plot", "--jobs", "1", "--json=-",
-             "--output", name, *options],
-            check=True, stdout=subprocess.PIPE, text=True,
-        ).stdout  # fmt: skip
+            [
+                sys.executable,
+                "-m",
+                "gz_onboard",
+                "estimate",
+                *map(str, rides),
+                "--no-plot",
+                "--jobs",
+                "1",
+                "--json=-",
+                "--output",
+                name,
+                *options,
+            ],
+            check=True,
+            stdout=subprocess.PIPE,
+            text=True,
+        ).stdout
         after = os.times()
     used = after.children_user + after.children_system - before.children_user - before.children_system
     return used, sum(ride["duration_s"] for ride in json.loads(text)["rides"])

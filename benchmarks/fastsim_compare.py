@@ -104,13 +104,20 @@ def in_fastsim(
     car["pwr_aux_base_watts"] = p["auxiliary_power"]
     chassis = car["chassis"]
     chassis |= {
-        "drag_coef": p["drag_area"], "frontal_area_square_meters": 1.0, "num_wheels": 2,
-        "wheel_rr_coef": p["rolling_resistance_constant"], "wheel_radius_meters": p["wheel_radius"],
+        "drag_coef": p["drag_area"],
+        "frontal_area_square_meters": 1.0,
+        "num_wheels": 2,
+        "wheel_rr_coef": p["rolling_resistance_constant"],
+        "wheel_radius_meters": p["wheel_radius"],
         "wheel_inertia_kilogram_square_meters": (p["wheel_inertia_front"] + p["wheel_inertia_rear"]) / 2,
-        "glider_mass_kilograms": None, "cargo_mass_kilograms": None, "drive_type": "RWD",
-        "cg_height_meters": -p["cg_height"], "wheel_base_meters": p["wheelbase"],
-        "drive_axle_weight_frac": 1 - p["cg_to_rear"] / p["wheelbase"], "wheel_fric_coef": 1.0,
-    }  # fmt: skip
+        "glider_mass_kilograms": None,
+        "cargo_mass_kilograms": None,
+        "drive_type": "RWD",
+        "cg_height_meters": -p["cg_height"],
+        "wheel_base_meters": p["wheelbase"],
+        "drive_axle_weight_frac": 1 - p["cg_to_rear"] / p["wheelbase"],
+        "wheel_fric_coef": 1.0,
+    }
     electric = car["pt_type"]["BEV"]
     electric["transmission"]["eff_interp"] = 1.0
     res, em = electric["res"], electric["em"]
@@ -125,10 +132,16 @@ def in_fastsim(
     ride = fastsim.Cycle.from_resource("udds.csv").to_dict()
     n = len(t)
     ride = {
-        "init_elev_meters": 121.92, "time_seconds": list(t), "speed_meters_per_second": list(v),
-        "dist_meters": [], "grade": [0.0] * n, "elev_meters": [], "pwr_max_chrg_watts": [0.0] * n,
-        "temp_amb_air_kelvin": [AMBIENT + 273.15] * n, "pwr_solar_load_watts": [0.0] * n,
-    }  # fmt: skip
+        "init_elev_meters": 121.92,
+        "time_seconds": list(t),
+        "speed_meters_per_second": list(v),
+        "dist_meters": [],
+        "grade": [0.0] * n,
+        "elev_meters": [],
+        "pwr_max_chrg_watts": [0.0] * n,
+        "temp_amb_air_kelvin": [AMBIENT + 273.15] * n,
+        "pwr_solar_load_watts": [0.0] * n,
+    }
     vehicle_ = fastsim.Vehicle.from_dict(car)
     simulation = fastsim.SimDrive(vehicle_, fastsim.Cycle.from_dict(ride))
     begin = time.perf_counter()
@@ -212,8 +225,16 @@ def row(name: str, ours: float, theirs: float) -> str:
 
 
 def main() -> None:
-    effects = ("aerodynamic_drag", "rolling_resistance", "grade_force", "inertia", "motor_copper_loss",
-               "motor_iron_loss", "inverter_loss", "auxiliary_load")  # fmt: skip
+    effects = (
+        "aerodynamic_drag",
+        "rolling_resistance",
+        "grade_force",
+        "inertia",
+        "motor_copper_loss",
+        "motor_iron_loss",
+        "inverter_loss",
+        "auxiliary_load",
+    )
     vehicle = read_vehicle("reference", 80.0)
     chosen = tuple(e for e in vehicle.model.effects if e.name in effects)
     vehicle = replace(vehicle, model=Model(chosen, vehicle.parameters))
@@ -223,16 +244,25 @@ def main() -> None:
         theirs = in_fastsim(vehicle, t, v, EFFICIENCY, PACK_EFFICIENCY, POWER)
         for key in ("drag", "rolling", "motor", "auxiliary", "terminals", "cells"):
             print(row(key, ours[key], theirs[key]))
-        print(f"\nslip {ours['slip'] / WH:.2f} Wh, brakes {ours['brakes'] / WH:.2f} and {theirs['brakes'] / WH:.2f} Wh;"
-              f" distance {ours['distance']:.0f} and {theirs['distance']:.0f} m; met {theirs['met']:.0f};"
-              f" greatest power {ours['peak']:.0f} W; {ours['wall']:.2f} and {theirs['wall']:.3f} s")  # fmt: skip
+        print(
+            f"\nslip {ours['slip'] / WH:.2f} Wh, brakes {ours['brakes'] / WH:.2f} and {theirs['brakes'] / WH:.2f} Wh;"
+            f" distance {ours['distance']:.0f} and {theirs['distance']:.0f} m; met {theirs['met']:.0f};"
+            f" greatest power {ours['peak']:.0f} W; {ours['wall']:.2f} and {theirs['wall']:.3f} s"
+        )
 
         print("\n| own losses, Wh | gz-onboard | FASTSim | difference |\n| --- | --- | --- | --- |")
         electric = electric_braking(vehicle)
         ours = forward(unlimited(Scooter(electric, ambient=AMBIENT, altitude=ALTITUDE, soc=0.9)), t, v)
         fine = at_steps(t, v, 0.1)
-        energy = backward(electric, [0.1 * i for i in range(len(fine))], fine, ambient=AMBIENT, altitude=ALTITUDE,
-                          smoothing=0.0, motor_temperature=30.0)  # fmt: skip
+        energy = backward(
+            electric,
+            [0.1 * i for i in range(len(fine))],
+            fine,
+            ambient=AMBIENT,
+            altitude=ALTITUDE,
+            smoothing=0.0,
+            motor_temperature=30.0,
+        )
         shares, efficiency = mean_efficiency(vehicle)
         pack = 1 - (ours["cells"] - ours["terminals"]) / ours["cells"]
         theirs = in_fastsim(vehicle, t, v, efficiency, pack, POWER, shares)

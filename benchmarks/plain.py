@@ -165,8 +165,10 @@ class Pipeline:
             return messages
         estimate = {"Remaining": way, "RemainingP10": 0.8 * way, "RemainingP90": 1.2 * way, "EstimateState": 1}
         energy = {
-            "EnergyLeft": left / 3600, "ConsumptionRecent": consumption / 3.6, "ConsumptionExpected": consumption / 3.6,
-        }  # fmt: skip
+            "EnergyLeft": left / 3600,
+            "ConsumptionRecent": consumption / 3.6,
+            "ConsumptionExpected": consumption / 3.6,
+        }
         for part, values in ("Estimate", estimate), ("Energy", energy), ("Diagnosis", {}):
             messages.append(self.encode(f"RANGE_{part}", {f"RANGE_{key}": value for key, value in values.items()}))
         return messages
@@ -221,10 +223,17 @@ def offline(ride: Path, log: Path, seconds: float, log_frames: bool) -> None:
                 break
             pipeline.take(message)
     pipeline.close()
-    print(json.dumps({
-        "start": start, "cpu": time.process_time() - start, "seconds": last - first, "frames": pipeline.frames,
-        "bytes": log.stat().st_size,
-    }))  # fmt: skip
+    print(
+        json.dumps(
+            {
+                "start": start,
+                "cpu": time.process_time() - start,
+                "seconds": last - first,
+                "frames": pipeline.frames,
+                "bytes": log.stat().st_size,
+            }
+        )
+    )
 
 
 def main() -> None:

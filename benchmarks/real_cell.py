@@ -18,12 +18,13 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.estimator.ekf import Covariance, ScalarFilter, SocFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Group
 from gz_onboard.lab.calibrate import ocv, pulse
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, voltage
-from gz_onboard.lab.calibrate.result import Array, Result
+from gz_onboard.lab.calibrate.result import Result
 from gz_onboard.lab.calibrate.table import Named, Table, read_table
 from gz_onboard.physics.battery import Battery, Mesh
 from gz_onboard.physics.model import Model
@@ -38,9 +39,12 @@ CONVERGED = 0.025  # of SOC: from here on the error counts
 NOMINAL = 2.9  # A·h, for C-rates
 SENSOR = {"pack_current_offset": (0.0, OFFSET), "pack_current_gain": (1.0, 0.005), "pack_voltage_offset": (0.0, 0.002)}
 COLUMNS = {
-    "time": Named("t_s", "s"), "current": Named("i_A", "A", -1), "voltage": Named("v_V", "V"),
-    "cell_temperature": Named("t_cell_C", "degC"), "charge": Named("q_Ah", "Ah", -1),
-}  # fmt: skip
+    "time": Named("t_s", "s"),
+    "current": Named("i_A", "A", -1),
+    "voltage": Named("v_V", "V"),
+    "cell_temperature": Named("t_cell_C", "degC"),
+    "charge": Named("q_Ah", "Ah", -1),
+}
 
 
 def pulse_test(folder: Path, temperature: int) -> Table:
@@ -103,9 +107,20 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
 
     sd = result.curves["battery.ocv"].sd[(cell.ocv_soc > 0.1) & (cell.ocv_soc < 0.95)]
     battery = Battery(
-        1, 1, capacity_25, temperature, share, 2.5, 0.0, tuple(map(float, cell.ocv_soc)), tuple(map(float, cell.ocv)),
-        float(np.median(sd)), mesh(cell.r0), mesh(cell.r1), mesh(cell.c1),
-    )  # fmt: skip
+        1,
+        1,
+        capacity_25,
+        temperature,
+        share,
+        2.5,
+        0.0,
+        tuple(map(float, cell.ocv_soc)),
+        tuple(map(float, cell.ocv)),
+        float(np.median(sd)),
+        mesh(cell.r0),
+        mesh(cell.r1),
+        mesh(cell.c1),
+    )
     if (shift := result.curves.get("battery.rest_shift")) is None:
         return battery
     return replace(
@@ -211,9 +226,13 @@ def run(setting: Setting, cycle: Cycle, wrong: float, offset: float) -> Score:
     e, start = error[near[0] :], int(near[0])
     outside = float(np.mean(np.abs(error) > 3 * sd))
     return Score(
-        float(np.sqrt(np.mean(e**2))), float(np.mean(np.abs(e))), float(np.abs(e).max()), outside, float(start),
+        float(np.sqrt(np.mean(e**2))),
+        float(np.mean(np.abs(e))),
+        float(np.abs(e).max()),
+        outside,
+        float(start),
         float(np.mean(sd)),
-    )  # fmt: skip
+    )
 
 
 def open_loop(cell: Circuit, cycle: Cycle, capacity: float) -> Array:
@@ -299,8 +318,11 @@ def report(folder: Path) -> list[str]:
 
 def _tables(result: Result) -> list[str]:
     c = result.curves
-    lines = ["", "| °C | capacity, A·h | rest voltage, mV | R0, R1 half full, mΩ | τ1, s | slow R, mΩ | slow τ, s |",
-             "| --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+    lines = [
+        "",
+        "| °C | capacity, A·h | rest voltage, mV | R0, R1 half full, mΩ | τ1, s | slow R, mΩ | slow τ, s |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
     soc = c["battery.r0"].axes["soc"]
     k = int(np.argmin(np.abs(soc - 0.5)))
     written = c["battery.rest_shift"].value if "battery.rest_shift" in c else np.zeros(len(TEMPERATURES))
@@ -315,8 +337,11 @@ def _tables(result: Result) -> list[str]:
     lines += ["", "| fit, in sample | RMS, mV | largest, mV |", "| --- | --- | --- |"]
     lines += [f"| {f.what} | {1e3 * f.rms:.1f} | {1e3 * f.largest:.0f} |" for f in result.fits if f.unit == "V"]
     lines += ["", "| mesh | RMS | R² | held out |", "| --- | --- | --- | --- |"]
-    lines += [f"| {f.what} | {f.rms:.3g} {f.unit} | {f.r2 or 0:.4f} | {'yes' if f.held_out else 'no'} |"
-              for f in result.fits if f.what.startswith("mesh")]  # fmt: skip
+    lines += [
+        f"| {f.what} | {f.rms:.3g} {f.unit} | {f.r2 or 0:.4f} | {'yes' if f.held_out else 'no'} |"
+        for f in result.fits
+        if f.what.startswith("mesh")
+    ]
     return lines
 
 
@@ -324,8 +349,11 @@ Scores = dict[tuple[str, Cycle, float, float], Score]
 
 
 def _detail(setting: Setting, work: list[Cycle], scores: Scores) -> list[str]:
-    lines = ["| °C | cycle | to SOC, % | right: RMS, MAE, max, >3σ | right, offset | 20 % wrong: RMS, MAE, max, >3σ, s "
-             "| 20 % wrong, offset | σ |", "| --- | --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+    lines = [
+        "| °C | cycle | to SOC, % | right: RMS, MAE, max, >3σ | right, offset | 20 % wrong: RMS, MAE, max, >3σ, s "
+        "| 20 % wrong, offset | σ |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
     for c in work:
         cells = []
         for case in ((0.0, 0.0), (0.0, OFFSET), (WRONG, 0.0), (WRONG, OFFSET)):
@@ -366,21 +394,27 @@ def _residuals(result: Result, setting: Setting, work: list[Cycle]) -> list[str]
     one, two = pulse.circuit(result), pulse.circuit(result, slow=True)
     bins = ((-99, -1), (-1, 0.3), (0.3, 1.5), (1.5, 4), (4, 8), (8, 99))
     heads = ["below -1 A", "-1 to 0.3 A", "0.3 to 1.5 A", "1.5 to 4 A", "4 to 8 A", "above 8 A"]
-    lines = ["| °C | one pair: RMS (mean) | two pairs: RMS (mean) | " + " | ".join(heads) + " |",
-             "| --- " * (3 + len(bins)) + "|"]  # fmt: skip
+    lines = [
+        "| °C | one pair: RMS (mean) | two pairs: RMS (mean) | " + " | ".join(heads) + " |",
+        "| --- " * (3 + len(bins)) + "|",
+    ]
     for t in TEMPERATURES:
         mine = [c for c in work if c.temperature == t]
         capacity = setting.battery.cell_capacity(t)
         use = [1 - c.drawn / capacity > 0.15 for c in mine]
-        e1, e2 = (np.concatenate([1e3 * open_loop(x, c, capacity)[u] for c, u in zip(mine, use, strict=True)])
-                  for x in (one, two))  # fmt: skip
+        e1, e2 = (
+            np.concatenate([1e3 * open_loop(x, c, capacity)[u] for c, u in zip(mine, use, strict=True)])
+            for x in (one, two)
+        )
         i = np.concatenate([c.current[u] for c, u in zip(mine, use, strict=True)])
         cells = []
         for low, high in bins:
             part = (i >= low) & (i < high)
             cells.append(f"{e1[part].mean():+.0f}" if np.count_nonzero(part) > 30 else "–")
-        lines.append(f"| {t} | {np.sqrt(np.mean(e1**2)):.0f} ({e1.mean():+.0f}) | {np.sqrt(np.mean(e2**2)):.0f} "
-                     f"({e2.mean():+.0f}) | {' | '.join(cells)} |")  # fmt: skip
+        lines.append(
+            f"| {t} | {np.sqrt(np.mean(e1**2)):.0f} ({e1.mean():+.0f}) | {np.sqrt(np.mean(e2**2)):.0f} "
+            f"({e2.mean():+.0f}) | {' | '.join(cells)} |"
+        )
     return lines
 
 

@@ -87,8 +87,10 @@ def both(log: Path, payload: float, chassis: str, figures: Path | None) -> dict[
 
 def table(rows: list[dict[str, Any]]) -> str:
     """The rides by group, the range of each error."""
-    lines = ["| rides | form | number | energy % | Wh/km % | speed, km/h RMS | pack, V RMS | current % | torque % |",
-             "| --- | --- | --- | --- | --- | --- | --- | --- | --- |"]  # fmt: skip
+    lines = [
+        "| rides | form | number | energy % | Wh/km % | speed, km/h RMS | pack, V RMS | current % | torque % |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
     groups: defaultdict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
         groups[row["group"], row["form"]].append(row)

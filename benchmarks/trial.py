@@ -80,10 +80,17 @@ def judge_scooter(seeds: Sequence[int], keep: Path | None = None) -> list[Row]:
 def judge(base: Any, case: plant.Case) -> Row:
     """What the tool says of one case, beside the truth."""
     truths = [
-        {"name": t.name, "parameter": t.parameter, "unit": t.unit, "change": list(t.change), "relative": t.relative,
-         "share": t.share, "clear": t.clear}
+        {
+            "name": t.name,
+            "parameter": t.parameter,
+            "unit": t.unit,
+            "change": list(t.change),
+            "relative": t.relative,
+            "share": t.share,
+            "clear": t.clear,
+        }
         for t in case.truths
-    ]  # fmt: skip
+    ]
     row: Row = {"seed": case.seed, "kind": case.kind, "truths": truths, "accepted": list(case.accepted)}
     began, wall = time.process_time(), time.monotonic()
     try:
@@ -110,9 +117,18 @@ def _parameters(report: Row, truth: plant.Truth) -> list[Row]:
             healthy = cause["value"] - cause["change"] if name == cause["parameter"] else 0.0
             true = healthy * (1 + change) if truth.relative else healthy + change
             low, high = found["ci95"]
-            rows.append({"effect": truth.name, "parameter": name, "true": true, "value": found["value"],
-                         "change": true - healthy, "ci95": [low, high], "held": bool(low <= true <= high),
-                         "clear": truth.clear})  # fmt: skip
+            rows.append(
+                {
+                    "effect": truth.name,
+                    "parameter": name,
+                    "true": true,
+                    "value": found["value"],
+                    "change": true - healthy,
+                    "ci95": [low, high],
+                    "held": bool(low <= true <= high),
+                    "clear": truth.clear,
+                }
+            )
     return rows
 
 
@@ -125,8 +141,16 @@ def judge_healthy(seeds: Sequence[int]) -> list[Row]:
     for seed, rides in zip(seeds, sets, strict=True):
         for against, vehicle in known.items():
             report = discover(vehicle, rides, seed=seed).to_json()
-            rows.append({"seed": seed, "against": against, "verdict": report["verdict"], "causes": report["causes"],
-                         "ambiguous": report["ambiguous"], "unknown": report["unknown"]})  # fmt: skip
+            rows.append(
+                {
+                    "seed": seed,
+                    "against": against,
+                    "verdict": report["verdict"],
+                    "causes": report["causes"],
+                    "ambiguous": report["ambiguous"],
+                    "unknown": report["unknown"],
+                }
+            )
     return rows
 
 

@@ -15,11 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.cli import main as command
 from gz_onboard.constants import GRAVITY
 from gz_onboard.lab.discover.engine import discover
 from gz_onboard.lab.discover.files import write_model
-from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.parts import Over, before_and_after, binned, edges, gathered
 from gz_onboard.lab.discover.result import METRICS, Report
 from gz_onboard.simulation.recorded import read_recorded
@@ -79,14 +79,23 @@ def residual(report: Report, file: Path) -> None:
         x, y, _ = gathered(lines, "road_force", "lateral_acceleration", over)
         axis.plot(x, y, ".", color=MUTED, markersize=2.5, alpha=0.5, label="means of 4 s")
         rows = binned(x, y, edges(x, 16))
-        axis.errorbar(rows[:, 0], rows[:, 1], 2 * rows[:, 2], fmt="o", color=ORANGE if i == 0 else BLUE, markersize=5,
-                      linewidth=1.5, label="means of bins, ± 2 standard errors")  # fmt: skip
+        axis.errorbar(
+            rows[:, 0],
+            rows[:, 1],
+            2 * rows[:, 2],
+            fmt="o",
+            color=ORANGE if i == 0 else BLUE,
+            markersize=5,
+            linewidth=1.5,
+            label="means of bins, ± 2 standard errors",
+        )
         if i == 0:
             a = np.linspace(float(x.min()), float(x.max()), 200)
             low, middle, high = (c * mass * a**2 / GRAVITY for c in (cause.ci95[0], cause.value, cause.ci95[1]))
             axis.fill_between(a, low, high, color=GREEN, alpha=0.2, linewidth=0)
-            axis.plot(a, middle, color=GREEN, linewidth=1.6,
-                      label=f"c·m·a²/g, c = {cause.value:.3f} rad, 95 % interval")  # fmt: skip
+            axis.plot(
+                a, middle, color=GREEN, linewidth=1.6, label=f"c·m·a²/g, c = {cause.value:.3f} rad, 95 % interval"
+            )
             ordinate(axis, "road force, measured less model [N]")
             axis.set_ylim(-30, 50)
         else:
@@ -108,8 +117,12 @@ def gain(report: Report, file: Path) -> None:
         rule(axis)
         axis.grid(False, axis="y")
         values = [report.gain[name][key] * factor for key in ("after", "control", "before")]
-        axis.barh(["after", "control", "before"] if i == 0 else ["", " ", "  "], values, height=0.65,
-                  color=[BLUE, MUTED, ORANGE])  # fmt: skip
+        axis.barh(
+            ["after", "control", "before"] if i == 0 else ["", " ", "  "],
+            values,
+            height=0.65,
+            color=[BLUE, MUTED, ORANGE],
+        )
         for place, value in enumerate(values):
             axis.text(value, place, f" {value:.3g}", va="center", fontsize=8.5, color=INK)
         axis.set_xlim(0, 1.25 * max(values))
@@ -126,8 +139,22 @@ def simulated(vehicle: str, folder: Path) -> tuple[Array, Array, dict[str, Any]]
     out.mkdir()
     summary = out / "summary.json"
     with contextlib.redirect_stdout(io.StringIO()):
-        command(["simulate", str(OVAL), "--vehicle", vehicle, "--payload", "84", "--predictive", "--no-plot",
-                 "--output", str(out), "--json", str(summary)])  # fmt: skip
+        command(
+            [
+                "simulate",
+                str(OVAL),
+                "--vehicle",
+                vehicle,
+                "--payload",
+                "84",
+                "--predictive",
+                "--no-plot",
+                "--output",
+                str(out),
+                "--json",
+                str(summary),
+            ]
+        )
     table = parquet.read_table(next(out.glob("*.parquet")))
     way, energy = (np.array(table[name]) for name in ("distance[m]", "energy[J]"))
     return way, energy, json.loads(summary.read_text())

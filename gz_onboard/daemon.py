@@ -51,8 +51,15 @@ log = logging.getLogger("gz-onboard")
 class Daemon:
     """Runs until `stop` is called (by SIGTERM or SIGINT)."""
 
-    def __init__(self, vehicle: Vehicle, channels: list[Channel], recorder: Recorder | None, state_file: Path | None,
-                 filter_name: str = "scalar", tick: float = TICK) -> None:  # fmt: skip
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        channels: list[Channel],
+        recorder: Recorder | None,
+        state_file: Path | None,
+        filter_name: str = "scalar",
+        tick: float = TICK,
+    ) -> None:
         self.channels = channels
         self.recorder = recorder
         self.finished = True  # whether log and state were written to their end
@@ -386,10 +393,14 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
     recorder = None
     if arguments.log_dir:
         recorder = Recorder(
-            arguments.log_dir, vehicle.name, metadata={"vehicle_key": vehicle.key}, attachments=dbc_texts(vehicle),
-            max_file_bytes=round(arguments.log_file_mb * 1e6), max_age_s=arguments.log_file_hours * 3600,
+            arguments.log_dir,
+            vehicle.name,
+            metadata={"vehicle_key": vehicle.key},
+            attachments=dbc_texts(vehicle),
+            max_file_bytes=round(arguments.log_file_mb * 1e6),
+            max_age_s=arguments.log_file_hours * 3600,
             max_total_bytes=round(arguments.log_total_mb * 1e6),
-        )  # fmt: skip
+        )
     state_file = None
     if arguments.state_dir:
         state_file = arguments.state_dir / (re.sub(r"[^\w.+-]+", "-", vehicle.name) + ".json")
@@ -467,8 +478,10 @@ def _summary(daemon: Daemon) -> None:
 def summary(pipeline: Pipeline) -> list[str]:
     """What came, the last numbers and the last state, as they were sent: numbers may be older than the state."""
     last, known, counts = pipeline.last, pipeline.last_known, pipeline.counts()
-    lines = [f"received {pipeline.codec.received} frames; dropped {counts.dropped}, lost {counts.lost}, "
-             f"implausible {counts.implausible}, unknown identifiers {counts.unknown}"]  # fmt: skip
+    lines = [
+        f"received {pipeline.codec.received} frames; dropped {counts.dropped}, lost {counts.lost}, "
+        f"implausible {counts.implausible}, unknown identifiers {counts.unknown}"
+    ]
     if last is None:
         return lines
     ago = ""

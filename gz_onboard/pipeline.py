@@ -31,14 +31,33 @@ COUNTS = ("received", "error_frames", "kernel_lost", "overrun", "send_failures",
 DROPPING = (LENGTH, CRC, COUNTER, TIME, UNDECODABLE)  # reasons that drop a frame
 
 ESTIMATE_UNITS = {
-    "time": "s since the first frame", "soc": "1", "soc_sd": "1", "v1": "V of a cell", "innovation": "V of a cell",
-    "innovation_rms": "V of a cell", "pack_voltage": "V", "pack_current": "A, positive discharging",
-    "cell_temperature": "degC", "speed": "m/s", "acceleration": "m/s^2", "grade": "sine, positive uphill",
-    "lean": "rad, positive right", "yaw_rate": "rad/s, positive left", "heading": "rad, clockwise from north",
-    "distance": "m", "range": "m", "range_p10": "m", "range_p90": "m", "energy_left": "J", "energy_left_sd": "J",
-    "consumption_recent": "J/m", "consumption_expected": "J/m", "consumption_expected_sd": "J/m",
-    "consumption_factor": "1, measured over modelled", "consumption_factor_sd": "1",
-}  # fmt: skip
+    "time": "s since the first frame",
+    "soc": "1",
+    "soc_sd": "1",
+    "v1": "V of a cell",
+    "innovation": "V of a cell",
+    "innovation_rms": "V of a cell",
+    "pack_voltage": "V",
+    "pack_current": "A, positive discharging",
+    "cell_temperature": "degC",
+    "speed": "m/s",
+    "acceleration": "m/s^2",
+    "grade": "sine, positive uphill",
+    "lean": "rad, positive right",
+    "yaw_rate": "rad/s, positive left",
+    "heading": "rad, clockwise from north",
+    "distance": "m",
+    "range": "m",
+    "range_p10": "m",
+    "range_p90": "m",
+    "energy_left": "J",
+    "energy_left_sd": "J",
+    "consumption_recent": "J/m",
+    "consumption_expected": "J/m",
+    "consumption_expected_sd": "J/m",
+    "consumption_factor": "1, measured over modelled",
+    "consumption_factor_sd": "1",
+}
 
 
 class Log(Protocol):

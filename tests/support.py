@@ -88,8 +88,16 @@ class Scooter:
         data = definition.encode(complete, strict=False)
         return time_ns, int(definition.frame_id), sealed(data) if protection and protection.crc else data, channel
 
-    def steady(self, seconds: float, begin_ns: int = EPOCH, speed: float = 10.0, current: float = 8.0,
-               voltage: float = 52.0, ambient: float = 20.0, hbm: int = 0) -> list[Frame]:  # fmt: skip
+    def steady(
+        self,
+        seconds: float,
+        begin_ns: int = EPOCH,
+        speed: float = 10.0,
+        current: float = 8.0,
+        voltage: float = 52.0,
+        ambient: float = 20.0,
+        hbm: int = 0,
+    ) -> list[Frame]:
         """A ride at constant speed [m/s], pack current [A] and voltage [V], on a level road to the north.
 
         Every mapped message in its period; those of the measuring system are on channel `hbm`.
@@ -104,8 +112,16 @@ class Scooter:
                 frames.append(self.frame(name, begin_ns + t, channel, **values))
 
         every(10, 0, "INV_Motion", INV_MotorSpeed=turn * 9.5492966, INV_MotorCurrent=20, INV_MotorTorque=9)
-        every(100, 1, "INV_Power", INV_DcVoltage=voltage, INV_DcCurrent=current - auxiliary, INV_Temperature=30,
-              INV_MotorTemperature=40, INV_CurrentLimit=150)  # fmt: skip
+        every(
+            100,
+            1,
+            "INV_Power",
+            INV_DcVoltage=voltage,
+            INV_DcCurrent=current - auxiliary,
+            INV_Temperature=30,
+            INV_MotorTemperature=40,
+            INV_CurrentLimit=150,
+        )
         every(100, 2, "BMS_Pack", BMS_PackVoltage=voltage, BMS_PackCurrent=current, BMS_StateOfCharge=70)
         every(1000, 3, "BMS_Cells", BMS_CellTempMean=25, BMS_CellVoltageMin=3.7, BMS_CellVoltageMax=3.72)
         for phase, accel_z in ((4, 9.83), (14, 9.79), (24, 9.82)):  # one that never changes on the road is stuck
@@ -205,11 +221,32 @@ def spread(estimate: Estimate) -> float:
 
 
 NUMBERS = (
-    "soc", "soc_sd", "v1", "innovation", "innovation_rms", "pack_voltage", "pack_current", "cell_temperature", "speed",
-    "acceleration", "grade", "lean", "yaw_rate", "heading", "distance", "range", "range_p10", "range_p90",
-    "energy_left", "energy_left_sd", "consumption_recent", "consumption_expected", "consumption_expected_sd",
-    "consumption_factor", "consumption_factor_sd",
-)  # fmt: skip
+    "soc",
+    "soc_sd",
+    "v1",
+    "innovation",
+    "innovation_rms",
+    "pack_voltage",
+    "pack_current",
+    "cell_temperature",
+    "speed",
+    "acceleration",
+    "grade",
+    "lean",
+    "yaw_rate",
+    "heading",
+    "distance",
+    "range",
+    "range_p10",
+    "range_p90",
+    "energy_left",
+    "energy_left_sd",
+    "consumption_recent",
+    "consumption_expected",
+    "consumption_expected_sd",
+    "consumption_factor",
+    "consumption_factor_sd",
+)
 
 
 def check_sound(run: Run) -> None:

@@ -328,8 +328,10 @@ def test_where_the_latest_state_is_damaged_the_one_before_is_used(
     assert caplog.text.count("not used, kept as") == 2
     assert "going on from the state saved" in caplog.text
     assert [path.suffixes[-2:] for path in sorted(tmp_path.iterdir())] == [
-        [".previous", ".json"], [".refused-1", ".json"], [".refused-2", ".json"],
-    ]  # fmt: skip
+        [".previous", ".json"],
+        [".refused-1", ".json"],
+        [".refused-2", ".json"],
+    ]
 
 
 def test_a_cut_between_two_names_loses_nothing(tmp_path: Path, learned: Snapshot):

@@ -53,8 +53,10 @@ def read(folder: Path, table: str) -> Battery:
 def test_the_table_is_read(tmp_path):
     battery = read(tmp_path, TABLE)
     assert (battery.rest_shift_temperature, battery.rest_shift_value, battery.rest_shift_sd) == (
-        COLD.rest_shift_temperature, COLD.rest_shift_value, COLD.rest_shift_sd,
-    )  # fmt: skip
+        COLD.rest_shift_temperature,
+        COLD.rest_shift_value,
+        COLD.rest_shift_sd,
+    )
     assert battery.rest_shift(0.0) == pytest.approx(-0.02)
     assert (battery.rest_shift(-40.0), battery.rest_shift(60.0)) == (-0.03, 0.0)
 

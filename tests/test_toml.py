@@ -106,10 +106,7 @@ def test_a_complaint_names_the_line(table, path, key, line):
         (lambda t: t.table("many").numbers("empty"), [":28:", "many.empty", "list of numbers"]),
         (lambda t: t.table("many").integer("half", 0, 9), ["half", "whole number", "0.5"]),
         (lambda t: t.table("many").number("huge"), ["huge", "must be a finite number"]),
-        (
-            lambda t: t.table("many").number("hexadecimal"),
-            ["hexadecimal", "thousands of digits"],
-        ),
+        (lambda t: t.table("many").number("hexadecimal"), ["hexadecimal", "thousands of digits"]),
         (lambda t: t.texts("name", "words"), [":1:", "name", "must be a list of words", "'x'"]),
         (lambda t: t.texts("absent", "words"), ["absent", "is missing"]),
         (lambda t: t.rows("absent", 2, "x and y", 0, 9), ["absent", "is missing"]),

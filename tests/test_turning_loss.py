@@ -63,9 +63,11 @@ def test_its_commands_give_what_it_shows(ran: tuple[Path, list[tuple[str, str]]]
 def test_it_predicts_rides_held_out_better_than_a_refit(ran: tuple[Path, list[tuple[str, str]]]):
     for metric in ("power, rms", "consumption", "range"):
         before, control, after = (
-            float(x) for x in re.findall(rf"^  {metric}\s+([0-9.]+) before,\s+([0-9.]+) refitted,\s+([0-9.]+) extended",
-                                         ran[1][0][1], re.M)[0]
-        )  # fmt: skip
+            float(x)
+            for x in re.findall(
+                rf"^  {metric}\s+([0-9.]+) before,\s+([0-9.]+) refitted,\s+([0-9.]+) extended", ran[1][0][1], re.M
+            )[0]
+        )
         assert after < 0.9 * control < before
 
 

@@ -39,8 +39,15 @@ _ANCILLARY = socket.CMSG_SPACE(16) + socket.CMSG_SPACE(4)
 class Channel:
     """One channel. `index` is put into its frames; `identifiers` are all that the kernel shall let through."""
 
-    def __init__(self, interface: str, channel: str, index: int = 0, identifiers: Sequence[int] | None = None,
-                 wall: Any = time.time_ns, **options: Any) -> None:  # fmt: skip
+    def __init__(
+        self,
+        interface: str,
+        channel: str,
+        index: int = 0,
+        identifiers: Sequence[int] | None = None,
+        wall: Any = time.time_ns,
+        **options: Any,
+    ) -> None:
         self.interface = interface
         self.name = channel
         self.index = index

@@ -417,9 +417,15 @@ def _check(name: str, signal: Signal, limits: tuple[float, float]) -> str:
 
 
 def _generate(
-    message: Message, sources: list[Source], signals: list[Signal], limits: list[tuple[float, float]],
-    protection: Protection, period: float | None, not_available: bool, plain: bool,
-) -> str:  # fmt: skip
+    message: Message,
+    sources: list[Source],
+    signals: list[Signal],
+    limits: list[tuple[float, float]],
+    protection: Protection,
+    period: float | None,
+    not_available: bool,
+    plain: bool,
+) -> str:
     """Python source of ``make(codec, group, through, crc constant, *crc tables)``, which returns the handler.
 
     ``through`` takes what is not plain: the raw values if some are beyond their limits, or (if not `plain`) the data.

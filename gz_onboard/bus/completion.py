@@ -144,10 +144,16 @@ class _Found:
         self._counts.update({number: len(index.records) for number, index in indices.items()})
         self._last_index = list(indices.values())
         chunk = ChunkIndex(
-            chunk_length=end - start + _HEADER, chunk_start_offset=start - _HEADER, compression=compression,
-            compressed_size=packed, message_end_time=last, message_index_length=0, message_index_offsets={},
-            message_start_time=first, uncompressed_size=size,
-        )  # fmt: skip
+            chunk_length=end - start + _HEADER,
+            chunk_start_offset=start - _HEADER,
+            compression=compression,
+            compressed_size=packed,
+            message_end_time=last,
+            message_index_length=0,
+            message_index_offsets={},
+            message_start_time=first,
+            uncompressed_size=size,
+        )
         self._chunks.append(chunk)
         return chunk
 
@@ -200,11 +206,16 @@ class _Found:
         counts = self._counts
         times = [time for c in self._chunks for time in (c.message_start_time, c.message_end_time)]
         statistics = Statistics(
-            attachment_count=len(self._attachments), channel_count=len(self._channels),
-            channel_message_counts=dict(counts), chunk_count=len(self._chunks), message_count=counts.total(),
-            message_end_time=max(times, default=0), message_start_time=min(times, default=0),
-            metadata_count=len(self._metadata), schema_count=len(self._schemas),
-        )  # fmt: skip
+            attachment_count=len(self._attachments),
+            channel_count=len(self._channels),
+            channel_message_counts=dict(counts),
+            chunk_count=len(self._chunks),
+            message_count=counts.total(),
+            message_end_time=max(times, default=0),
+            message_start_time=min(times, default=0),
+            metadata_count=len(self._metadata),
+            schema_count=len(self._schemas),
+        )
         return (
             (Opcode.SCHEMA, list(self._schemas.values())),
             (Opcode.CHANNEL, list(self._channels.values())),

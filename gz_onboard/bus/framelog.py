@@ -140,15 +140,7 @@ def decode_block(block: bytes) -> list[Frame]:
         datas[place] = data
     identifiers = [identifier for identifier, _, _ in table]
     channels = [channel for _, channel, _ in table]
-    return list(
-        zip(
-            times,
-            map(identifiers.__getitem__, order),
-            datas,
-            map(channels.__getitem__, order),
-            strict=True,
-        )
-    )
+    return list(zip(times, map(identifiers.__getitem__, order), datas, map(channels.__getitem__, order), strict=True))
 
 
 def _little(values: array[int]) -> array[int]:

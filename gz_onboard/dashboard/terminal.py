@@ -237,18 +237,31 @@ def screen(view: View, now: float, source: str, width: int) -> list[Line]:
     lines: list[Line] = [
         [(" gz-onboard", _BOLD), (f" · {source}", _DIM)],
         [],
-        [("  Range             ", ""), number("RANGE_Remaining", f"{_BOLD};{colour}"), ("     80 %: ", _DIM),
-         number("RANGE_RemainingP10"), (" to ", _DIM), number("RANGE_RemainingP90")],
+        [
+            ("  Range             ", ""),
+            number("RANGE_Remaining", f"{_BOLD};{colour}"),
+            ("     80 %: ", _DIM),
+            number("RANGE_RemainingP10"),
+            (" to ", _DIM),
+            number("RANGE_RemainingP90"),
+        ],
         *_band(view, now, width, colour),
         [],
         _soc(view, now, width),
         [("  Energy left       ", ""), number("RANGE_EnergyLeft")],
-        [("  Consumption       ", ""), number("RANGE_ConsumptionExpected"), (" expected, ", ""),
-         number("RANGE_ConsumptionRecent"), (" over the last km", "")],
+        [
+            ("  Consumption       ", ""),
+            number("RANGE_ConsumptionExpected"),
+            (" expected, ", ""),
+            number("RANGE_ConsumptionRecent"),
+            (" over the last km", ""),
+        ],
         [],
-        [("  State             ", ""),
-         (_STATE_WORDS[state], f"{_BOLD};{_STATE_COLOURS[state]}") if state is not None else ("not known", _DIM)],
-    ]  # fmt: skip
+        [
+            ("  State             ", ""),
+            (_STATE_WORDS[state], f"{_BOLD};{_STATE_COLOURS[state]}") if state is not None else ("not known", _DIM),
+        ],
+    ]
     if activity := view.activity(now):
         lines.append([("  Activity          ", ""), (activity, "")])
     for i, reason in enumerate(view.reasons(now)):

@@ -173,9 +173,7 @@ class Estimator:
         self._thermal = {i for i, group in enumerate(groups) if any("temperature" in role for role in group.roles)}
         self._periods = [group.period or 0.0 for group in groups]  # s, where slow: declared, then as they really are
         self._stale = [signals[0].stale_after if signals else 0.0 for signals in self._slots]
-        self._integrated = [
-            i for i, group in enumerate(groups) if {"pack_current", "pack_voltage"} & set(group.roles)
-        ]  # fmt: skip
+        self._integrated = [i for i, group in enumerate(groups) if {"pack_current", "pack_voltage"} & set(group.roles)]
         self._innovation: float | None = None
         self._innovation_square = self._error_square = 0.0
         self._mismatch = 0.0  # A, low-passed
@@ -375,8 +373,14 @@ class Estimator:
         power = None if voltage is None or current is None or source == "model" else voltage * current
         before = slopes.guilty
         speeds = self.redundancy.speeds
-        slopes.step(now, dt, self.signals, speeds, power,
-                    lambda speed, acceleration: self._power_at(now, speed, acceleration, 0.0))  # fmt: skip
+        slopes.step(
+            now,
+            dt,
+            self.signals,
+            speeds,
+            power,
+            lambda speed, acceleration: self._power_at(now, speed, acceleration, 0.0),
+        )
         if slopes.guilty != before:
             road.forget_slope(slopes.offset, self.signals.gps_altitude.fresh(now))
         distrusted = self.redundancy.distrusted
@@ -425,9 +429,14 @@ class Estimator:
         if filter_ is None:
             return
         self._saved = Saved(
-            filter_.soc, filter_.v1, filter_.covariance, self._current, self._odometer, self._own_soc,
+            filter_.soc,
+            filter_.v1,
+            filter_.covariance,
+            self._current,
+            self._odometer,
+            self._own_soc,
             self._forecast.consumption if self._forecast else None,
-        )  # fmt: skip
+        )
         self._saved_age = gap
         if self._in_cells:
             self._move_cells(gap, 0.0, filter_.soc, self._cells())
@@ -709,10 +718,16 @@ class Estimator:
             return
         motor = self.signals.motor_temperature.get(now)
         learned = self.forecaster.ride(
-            dt, speed, self.road.grade, voltage * current, self._ambient(now)[0], self.road.altitude or 0.0,
-            40.0 if motor is None else motor, self._turn(now) if self.forecaster.extended else None,
+            dt,
+            speed,
+            self.road.grade,
+            voltage * current,
+            self._ambient(now)[0],
+            self.road.altitude or 0.0,
+            40.0 if motor is None else motor,
+            self._turn(now) if self.forecaster.extended else None,
             max(self._periods[i] for i in self._speeds) if self._speeds else 0.0,
-        )  # fmt: skip
+        )
         if learned and self.signals.cell_temperature.fresh(now):  # R0 is known only with it
             self.redundancy.currents.weigh(self.forecaster.recent_factor)
 
@@ -737,9 +752,14 @@ class Estimator:
         soc_sd = sqrt(filter_.covariance[0])
         temperature_sd = 1.0 if self.signals.cell_temperature.fresh(now) else 8.0
         self._forecast = self.forecaster.forecast(
-            filter_.soc, soc_sd, temperature, temperature_sd, self._ambient(now)[0], self.road.altitude or 0.0,
+            filter_.soc,
+            soc_sd,
+            temperature,
+            temperature_sd,
+            self._ambient(now)[0],
+            self.road.altitude or 0.0,
             sum(sd * sd for reason, sd in LOSS_SD.items() if reason & reasons),
-        )  # fmt: skip
+        )
 
     # --- results ----------------------------------------------------------------------------------------------
 

@@ -51,8 +51,19 @@ AHEAD = 1800.0  # s: half of what a range lasts
 HEADINGS = tuple(
     pi / 4 * i for i in range(8)
 )  # rad: of a wind slower than the scooter their mean is that of all, exactly
-BASE = {"speed", "acceleration", "grade", "grade_cosine", "headwind", "mass", "air_density", "motor_temperature",
-        "motor_speed", "motor_current", "torque"}  # fmt: skip
+BASE = {
+    "speed",
+    "acceleration",
+    "grade",
+    "grade_cosine",
+    "headwind",
+    "mass",
+    "air_density",
+    "motor_temperature",
+    "motor_speed",
+    "motor_current",
+    "torque",
+}
 """Quantities that need nothing beyond speed, grade and air."""
 ACCELERATION = 15.0  # m/s²: no road gives more; a second that shows more is left out
 SPEEDS = -5.0, 70.0  # m/s: the same
@@ -158,8 +169,18 @@ class Forecaster:
 
     # --- learning ---------------------------------------------------------------------------------------------
 
-    def ride(self, dt: float, speed: float, grade: float | None, power: float, ambient: float, altitude: float,
-             motor_temperature: float, turn: Turn | None = None, period: float = 0.0) -> bool:  # fmt: skip
+    def ride(
+        self,
+        dt: float,
+        speed: float,
+        grade: float | None,
+        power: float,
+        ambient: float,
+        altitude: float,
+        motor_temperature: float,
+        turn: Turn | None = None,
+        period: float = 0.0,
+    ) -> bool:
         """Take in `dt` [s] of riding: speed [m/s], grade (sine), power at the pack [W], ambient and motor [degC].
 
         `turn` is needed, and read, if the model is `extended`. `period` [s]: how often the speed comes, if seldom;
@@ -249,10 +270,16 @@ class Forecaster:
     ) -> dict[str, Any]:
         """What the model reads, on a level road without wind; temperatures in degC."""
         return {
-            "speed": speed, "acceleration": acceleration, "grade": 0.0, "grade_cosine": 1.0, "headwind": 0.0,
-            "mass": self.model.mass, "air_density": air_density(ambient, altitude), "motor_temperature": motor,
+            "speed": speed,
+            "acceleration": acceleration,
+            "grade": 0.0,
+            "grade_cosine": 1.0,
+            "headwind": 0.0,
+            "mass": self.model.mass,
+            "air_density": air_density(ambient, altitude),
+            "motor_temperature": motor,
             "lateral_acceleration": 0.0,
-        }  # fmt: skip
+        }
 
     def add(self, q: dict[str, Any], turn: Turn, ambient: float) -> None:
         """Add to `q` what an extended model may read beside; `ambient` in degC."""
@@ -313,8 +340,16 @@ class Forecaster:
 
     # --- forecasting ------------------------------------------------------------------------------------------
 
-    def forecast(self, soc: float, soc_sd: float, cell_temperature: float, temperature_sd: float, ambient: float,
-                 altitude: float, loss_variance: float = 0.0) -> Forecast:  # fmt: skip
+    def forecast(
+        self,
+        soc: float,
+        soc_sd: float,
+        cell_temperature: float,
+        temperature_sd: float,
+        ambient: float,
+        altitude: float,
+        loss_variance: float = 0.0,
+    ) -> Forecast:
         """The range from this state of the battery, with the riding known so far.
 
         Temperatures and their sd in degC, altitude in m; `loss_variance`: relative variance that missing sensors
@@ -424,8 +459,13 @@ class Forecaster:
         """What is to be kept over a restart."""
         r = self.riding
         rows = [[s.distance, s.duration, s.measured, s.squares, s.modelled, s.level] for s in r.segments]
-        return {"segments": rows, "factor": r.factor, "factor_variance": r.factor_variance,
-                "time_moving": r.time_moving, "states": dict(self._states)}  # fmt: skip
+        return {
+            "segments": rows,
+            "factor": r.factor,
+            "factor_variance": r.factor_variance,
+            "time_moving": r.time_moving,
+            "states": dict(self._states),
+        }
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Take what `snapshot` gave; raises KeyError, TypeError or ValueError if it is not that."""

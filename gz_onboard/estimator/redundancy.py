@@ -82,16 +82,21 @@ SAG_AGREES = 1.3  # by no more than this factor: the currents explain the voltag
 # Temperatures [degC] that vehicles have, and how fast [K/s] they rise and fall at most. Cells heat themselves, but cool
 # through their pack.
 TEMPERATURES = {
-    "cell_temperature": (-40.0, 85.0, 0.05, 0.01), "ambient_temperature": (-50.0, 65.0, 0.5, 0.5),
-    "motor_temperature": (-50.0, 220.0, 3.0, 3.0), "inverter_temperature": (-50.0, 180.0, 3.0, 3.0),
-}  # fmt: skip
+    "cell_temperature": (-40.0, 85.0, 0.05, 0.01),
+    "ambient_temperature": (-50.0, 65.0, 0.5, 0.5),
+    "motor_temperature": (-50.0, 220.0, 3.0, 3.0),
+    "inverter_temperature": (-50.0, 180.0, 3.0, 3.0),
+}
 LEAP = 6.0  # K: beside the rate; sensors of 1 K and what two messages in a row are apart
 COLDER = 45.0  # K: cells were never so much colder than the air
 # Means over `AXIS_TIME` [s] that a vehicle can have, leaning, on a side stand or on a hill; m/s² and rad/s.
 AXES = {
-    "accel_y": (-5.0, 5.0), "accel_z": (6.5, 13.0), "rate_x": (-0.15, 0.15), "rate_y": (-0.15, 0.15),
+    "accel_y": (-5.0, 5.0),
+    "accel_z": (6.5, 13.0),
+    "rate_x": (-0.15, 0.15),
+    "rate_y": (-0.15, 0.15),
     "rate_z": (-0.8, 0.8),
-}  # fmt: skip
+}
 AXIS_TIME = 30.0
 
 
@@ -366,8 +371,15 @@ class Slopes:
         self._work: float | None = 0.0  # J, out of the pack
         self._speed: float | None = None  # m/s, at its begin
 
-    def step(self, now: float, dt: float, signals: Signals, speeds: Speeds, power: float | None,
-             level: Callable[[float, float], float]) -> None:  # fmt: skip
+    def step(
+        self,
+        now: float,
+        dt: float,
+        signals: Signals,
+        speeds: Speeds,
+        power: float | None,
+        level: Callable[[float, float], float],
+    ) -> None:
         """Hear the witnesses of `dt` [s].
 
         speeds: where they are not unsettled, their median is the speed; one of them may be late or noisy. power: of
@@ -620,8 +632,9 @@ class Currents:
         self._difference = self._square = self._load = self._without = 0.0  # A, A², A, A²; low-passed
         self._fast = self._extra = 0.0  # A
 
-    def step(self, dt: float, said: Electric, error: Error, model: Callable[[], float | None],
-             innovation_rms: float) -> frozenset[str]:  # fmt: skip
+    def step(
+        self, dt: float, said: Electric, error: Error, model: Callable[[], float | None], innovation_rms: float
+    ) -> frozenset[str]:
         """Who is not to be believed now.
 
         error: see `Error`; model: the pack's current by the road [A]; innovation_rms [V]: of the last ten seconds.
@@ -653,8 +666,9 @@ class Currents:
             more = ratio > SAGS_MORE and takes < TAKES_LESS
             self._scaled |= more or (ratio < SAGS_LESS and takes > TAKES_MORE)
 
-    def _compare(self, dt: float, pack: float, around: float, voltage: float | None, said: Electric,
-                 error: Error) -> tuple[frozenset[str], bool | None]:  # fmt: skip
+    def _compare(
+        self, dt: float, pack: float, around: float, voltage: float | None, said: Electric, error: Error
+    ) -> tuple[frozenset[str], bool | None]:
         """(who lies, whether all agree; None if there is nothing to agree about)."""
         hour = self._capacity
         least = min(abs(pack), abs(around))
@@ -690,8 +704,15 @@ class Currents:
             return frozenset({"pack_current" if known[0] else "inverter_current"}), None
         return frozenset((self.ROLES[:1], self.ROLES[1:2])[liar - 1] if liar else self.ROLES[:2]), None
 
-    def _by_road(self, dt: float, said: Electric, voltage: float, error: Error, model: Callable[[], float | None],
-                 innovation_rms: float) -> bool:  # fmt: skip
+    def _by_road(
+        self,
+        dt: float,
+        said: Electric,
+        voltage: float,
+        error: Error,
+        model: Callable[[], float | None],
+        innovation_rms: float,
+    ) -> bool:
         """Whether the cells' voltage and the road both say that the currents are not what flows."""
         pack, inverter = (self.trials[role].guilty for role in self.ROLES[:2])
         used = said.around if said.pack is None or (pack and not inverter) else said.pack

@@ -96,9 +96,14 @@ def unseen_sd(gap: float) -> float:
 
 
 def flowed(
-    saved: Saved, age: float | None, charge: float, voltage: float, current: float,
-    odometer: float | None, own_soc: float | None,
-) -> tuple[float, float]:  # fmt: skip
+    saved: Saved,
+    age: float | None,
+    charge: float,
+    voltage: float,
+    current: float,
+    odometer: float | None,
+    own_soc: float | None,
+) -> tuple[float, float]:
     """(SOC that was drawn while nobody counted, its sd).
 
     age: of what was saved [s], None if not known; charge: of the pack [A·h]; voltage, current: of the pack now

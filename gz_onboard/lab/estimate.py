@@ -218,9 +218,13 @@ def estimate_log(task: Task, progress: Progress | None = None) -> dict[str, Any]
         log = _open_log(task, vehicle, batch[0][0])
         try:
             pipeline = Pipeline(
-                vehicle, filter_name=task.filter_name, log=log, log_frames=task.frames, log_signals=task.signals,
+                vehicle,
+                filter_name=task.filter_name,
+                log=log,
+                log_frames=task.frames,
+                log_signals=task.signals,
                 observer=tally,
-            )  # fmt: skip
+            )
             if not task.frames:
                 pipeline.publisher = _Mute()
             feed(pipeline, _chained(batch, ours), progress)
@@ -329,8 +333,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard estimate``."""
     explain_keys(parser, "a ride in the", SUMMARY_VERSION, KEYS)
     add = parser.add_argument
-    add("logs", nargs="+", type=Path, metavar="FILE", help="candump .log, .asc, .blf, .trc, .mf4, .csv, .mcap, or .gz; "
-        "or a folder of them (but .csv)")  # fmt: skip
+    add(
+        "logs",
+        nargs="+",
+        type=Path,
+        metavar="FILE",
+        help="candump .log, .asc, .blf, .trc, .mf4, .csv, .mcap, or .gz; or a folder of them (but .csv)",
+    )
     add(
         "--vehicle", default="reference", metavar="NAME|TOML", help="vehicle file or one of the package's (%(default)s)"
     )
@@ -371,10 +380,18 @@ def _tasks(arguments: argparse.Namespace) -> list[Task]:
     paths = list(dict.fromkeys(logs_among(arguments.logs)))
     names = output_names(paths, [_stem(path) for path in paths], ".estimate.mcap")
     return [
-        Task(path, arguments.output / name, arguments.vehicle, arguments.payload, arguments.filter,
-             arguments.frames, arguments.signals, not arguments.no_plot)
+        Task(
+            path,
+            arguments.output / name,
+            arguments.vehicle,
+            arguments.payload,
+            arguments.filter,
+            arguments.frames,
+            arguments.signals,
+            not arguments.no_plot,
+        )
         for path, name in zip(paths, names, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def _stem(path: Path) -> str:
@@ -425,28 +442,48 @@ def summary_text(ride: dict[str, Any]) -> str:
     """A ride's summary for a terminal."""
     soc = [_percent(ride[f"soc_{end}"], ride[f"soc_{end}_sd"]) for end in ("start", "end")]
     rows = [
-        ("ride", f"{clock(ride['duration_s'])}, {ride['distance_km']:.2f} km, "
-                 f"at most {number(ride['speed_max_km_h'], '.0f', 'km/h')}"),
-        ("energy", f"{number(ride['energy_wh'], '.0f', 'Wh')} drawn net, "
-                   f"{number(ride['energy_recovered_wh'], '.0f', 'Wh')} of it recovered before; "
-                   f"{number(ride['consumption_wh_km'], '.1f', 'Wh/km')}"),
+        (
+            "ride",
+            f"{clock(ride['duration_s'])}, {ride['distance_km']:.2f} km, "
+            f"at most {number(ride['speed_max_km_h'], '.0f', 'km/h')}",
+        ),
+        (
+            "energy",
+            f"{number(ride['energy_wh'], '.0f', 'Wh')} drawn net, "
+            f"{number(ride['energy_recovered_wh'], '.0f', 'Wh')} of it recovered before; "
+            f"{number(ride['consumption_wh_km'], '.1f', 'Wh/km')}",
+        ),
         ("state of charge", f"{soc[0]} at the start, {soc[1]} at the end"),
-        ("range at the end", f"{number(ride['range_end_km'], '.1f', 'km')} "
-                             f"({number(ride['range_end_p10_km'], '.1f')} to "
-                             f"{number(ride['range_end_p90_km'], '.1f')}, 80 % interval), "
-                             f"{number(ride['energy_left_wh'], '.0f', 'Wh')} left"),
-        ("innovation", f"{number(ride['innovation_rms_v'], '.1f', 'mV', 1000)} RMS, "
-                       f"{number(ride['innovation_max_v'], '.0f', 'mV', 1000)} at most, of a cell"),
-        ("frames", f"{ride['frames']} received, {ride['dropped']} dropped, {ride['lost']} lost, "
-                   f"{ride['unknown']} unknown identifiers, {ride['error_frames']} error frames"),
-        *(("sensor faults", f"{reason}: " + ", ".join(f"{name} {count}" for name, count in places.items()))
-          for reason, places in ride["faults"].items()),
+        (
+            "range at the end",
+            f"{number(ride['range_end_km'], '.1f', 'km')} "
+            f"({number(ride['range_end_p10_km'], '.1f')} to "
+            f"{number(ride['range_end_p90_km'], '.1f')}, 80 % interval), "
+            f"{number(ride['energy_left_wh'], '.0f', 'Wh')} left",
+        ),
+        (
+            "innovation",
+            f"{number(ride['innovation_rms_v'], '.1f', 'mV', 1000)} RMS, "
+            f"{number(ride['innovation_max_v'], '.0f', 'mV', 1000)} at most, of a cell",
+        ),
+        (
+            "frames",
+            f"{ride['frames']} received, {ride['dropped']} dropped, {ride['lost']} lost, "
+            f"{ride['unknown']} unknown identifiers, {ride['error_frames']} error frames",
+        ),
+        *(
+            ("sensor faults", f"{reason}: " + ", ".join(f"{name} {count}" for name, count in places.items()))
+            for reason, places in ride["faults"].items()
+        ),
         ("state", ", ".join(f"{name.lower()} {duration:.1f} s" for name, duration in ride["states"].items())),
         *(("", f"{reason_words(Reason[name])} {duration:.1f} s") for name, duration in ride["reasons"].items()),
-        ("computed", f"{ride['cpu_s']:.2f} s of processor time, {number(ride['real_time_factor'], '.0f')} times "
-                     "as fast as the ride"),
+        (
+            "computed",
+            f"{ride['cpu_s']:.2f} s of processor time, {number(ride['real_time_factor'], '.0f')} times "
+            "as fast as the ride",
+        ),
         ("written", f"{ride['log']}{' and .png' if ride['plot'] else ''}"),
-    ]  # fmt: skip
+    ]
     return "\n".join([f"{ride['file']}", *(f"  {name:17} {text}" for name, text in rows)])
 
 

@@ -242,8 +242,9 @@ def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Row], reasons: Sequenc
     axis.grid(visible=False)
     for state, colour in _STATES.items():
         spans = _spans(x, [row["state"] == state.name for row in rows])
-        axis.broken_barh(spans, (-0.42, 0.84), facecolors=colour, linewidth=0,
-                         label=state.name.lower() if spans else None)  # fmt: skip
+        axis.broken_barh(
+            spans, (-0.42, 0.84), facecolors=colour, linewidth=0, label=state.name.lower() if spans else None
+        )
     labels = ["state"]
     for place, reason in enumerate(reasons, 1):
         spans = _spans(x, [reason.name in row["reasons"].split() for row in rows])
@@ -258,8 +259,16 @@ def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Row], reasons: Sequenc
             f"{status.get('received', 0)} frames received, {sum(status.get('lost', {}).values())} lost, "
             f"{faults} frames or signals dropped, {len(status.get('unknown', {}))} unknown identifiers"
         )
-        axis.annotate(text, (1, 0), (0, -27), xycoords="axes fraction", textcoords="offset points", ha="right",
-                      fontsize=8, color=MUTED)  # fmt: skip
+        axis.annotate(
+            text,
+            (1, 0),
+            (0, -27),
+            xycoords="axes fraction",
+            textcoords="offset points",
+            ha="right",
+            fontsize=8,
+            color=MUTED,
+        )
 
 
 def reason_words(reason: Reason) -> str:

@@ -18,22 +18,13 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.bus.logs import logs_among
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import BAD_INPUT, FAILED, InputError
 from gz_onboard.lab.processes import Progress, over_rides, progress_bar
 from gz_onboard.lab.validate_components import Component, components
-from gz_onboard.lab.validate_score import (
-    CHANNELS,
-    COMPONENT_GATE,
-    GATE,
-    Array,
-    conditions,
-    errors,
-    pooled,
-    seconds,
-    split,
-)
+from gz_onboard.lab.validate_score import CHANNELS, COMPONENT_GATE, GATE, conditions, errors, pooled, seconds, split
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded, rest_soc
 from gz_onboard.simulation.route import read_route
 from gz_onboard.simulation.run import Command, Run, drive, follow, replay, road_table
@@ -69,10 +60,12 @@ KEYS = {
 
 FORMS = {
     "open_loop": ("open loop", "the same throttle gives another ride; small errors of force add up to another speed"),
-    "predictive": ("rider model", "the same speed takes another current or torque: road load, losses, or the way of "
-                   "opening the throttle"),
+    "predictive": (
+        "rider model",
+        "the same speed takes another current or torque: road load, losses, or the way of opening the throttle",
+    ),
     "components": ("components", "fed with what was measured, this part alone is off: its parameters or its equation"),
-}  # fmt: skip
+}
 """By entry of a ride: what people call it, and what it means if it does not pass."""
 AVERAGED = 0.5  # s: over which the measured speed is averaged: its noise is no ride for a rider model to follow
 STANDING = 0.3  # m/s: less is noise of a wheel that stands
@@ -267,10 +260,14 @@ def _ride(
 
     ambient = recorded.first("ambient_temperature", 20.0)
     scooter = Scooter(
-        vehicle, road if isinstance(road, Dynamometer) else lambda _: here, soc=0.5 if soc is None else soc,
-        ambient=ambient, cell_temperature=recorded.first("cell_temperature", ambient),
-        speed=recorded.first("speed", 0.0), vibration=(lambda _: rough[step]) if rough else None,
-    )  # fmt: skip
+        vehicle,
+        road if isinstance(road, Dynamometer) else lambda _: here,
+        soc=0.5 if soc is None else soc,
+        ambient=ambient,
+        cell_temperature=recorded.first("cell_temperature", ambient),
+        speed=recorded.first("speed", 0.0),
+        vibration=(lambda _: rough[step]) if rough else None,
+    )
     motor, inverter = scooter.motor_cooling, scooter.inverter_cooling
     motor.stator = motor.rotor = recorded.first("motor_temperature", ambient)
     inverter.board = inverter.box = recorded.first("inverter_temperature", ambient)
@@ -332,8 +329,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard validate``."""
     explain_keys(parser, "a ride in the", SUMMARY_VERSION, KEYS)
     add = parser.add_argument
-    add("logs", nargs="+", type=Path, metavar="RIDE", help="logs of rides: .blf .log .asc .trc .mf4 .csv .mcap, "
-        "or .gz; or folders of them (but .csv)")  # fmt: skip
+    add(
+        "logs",
+        nargs="+",
+        type=Path,
+        metavar="RIDE",
+        help="logs of rides: .blf .log .asc .trc .mf4 .csv .mcap, or .gz; or folders of them (but .csv)",
+    )
     add(
         "--vehicle", default="reference", metavar="NAME|TOML", help="vehicle file or one of the package's (%(default)s)"
     )
@@ -399,10 +401,15 @@ def _tasks(arguments: argparse.Namespace) -> list[Task]:
     names = [Path(path.name.removesuffix(".gz")).stem for path in paths]
     stems = output_names(paths, names, ".validation.png")
     return [
-        Task(path, name, arguments.vehicle, arguments.payload,
-             None if arguments.no_plot else arguments.output / f"{stem}.validation.png")
+        Task(
+            path,
+            name,
+            arguments.vehicle,
+            arguments.payload,
+            None if arguments.no_plot else arguments.output / f"{stem}.validation.png",
+        )
         for path, name, stem in zip(paths, names, stems, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def ride_text(ride: dict[str, Any]) -> str:

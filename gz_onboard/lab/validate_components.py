@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.lab.validate_score import Array, Channel, Mask
+from gz_onboard.arrays import Array, Mask
+from gz_onboard.lab.validate_score import Channel
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Effect, Port
 from gz_onboard.physics.model import air_density
 from gz_onboard.physics.relaxation import relaxed
@@ -88,8 +89,12 @@ def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float)
     """Pack voltage [V] per second by the circuit of `physics.battery`, at rest before the first; sensor's offset in."""
     battery = vehicle.pack
     n, m = battery.cells_series, battery.cells_parallel
-    columns = (measured["pack_current"], measured["cell_temperature"], vibration(vehicle, measured),
-               time_moving(measured))  # fmt: skip
+    columns = (
+        measured["pack_current"],
+        measured["cell_temperature"],
+        vibration(vehicle, measured),
+        time_moving(measured),
+    )
     v1, result = 0.0, np.empty(len(columns[0]))
     states = {name: 0.0 for name, _ in vehicle.model.cell_voltage}  # V of a cell, of effects in it
     q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0)
@@ -190,9 +195,11 @@ def _temperatures(
         inverter = parts.inverter_cooling
         inverter.board = inverter.box = float(measured["inverter_temperature"][0])
         found["inverter_temperature"] = Component(
-            Channel("degC", "inverter temperature", True), measured["inverter_temperature"],
-            _cooled(inverter, inverter_heat, air), every,
-        )  # fmt: skip
+            Channel("degC", "inverter temperature", True),
+            measured["inverter_temperature"],
+            _cooled(inverter, inverter_heat, air),
+            every,
+        )
     if measured.keys() >= {"cell_temperature", "pack_current", "pack_voltage"} and soc is not None:
         battery = vehicle.pack
         charge = np.cumsum(measured["pack_current"] / 3600) / battery.pack_capacity(

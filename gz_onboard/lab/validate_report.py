@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.validate_components import Component
-from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, Array
+from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -56,8 +57,9 @@ def draw_ride(
     height = 1.0 + 1.45 * len(rows)
     figure = Figure(figsize=(15, height), facecolor="white")
     FigureCanvasAgg(figure)
-    grid = figure.add_gridspec(len(rows), 2, left=0.055, right=0.99, top=1 - 0.75 / height, bottom=0.45 / height,
-                               hspace=0.35, wspace=0.11)  # fmt: skip
+    grid = figure.add_gridspec(
+        len(rows), 2, left=0.055, right=0.99, top=1 - 0.75 / height, bottom=0.45 / height, hspace=0.35, wspace=0.11
+    )
     minutes = 60.0 if entry["duration_s"] >= 300 else 1.0
     first: Axes | None = None
     for i, (label, unit, truth, lines) in enumerate(rows):
@@ -76,8 +78,13 @@ def draw_ride(
             known = np.isfinite(error)
             weight = np.convolve(known, np.ones(wide), "same")
             mean = np.convolve(np.where(known, error, 0.0), np.ones(wide), "same") / np.maximum(weight, 1)
-            right.plot(time[:n], np.where(weight > wide / 4, mean, np.nan), color=_COLOURS[form], linewidth=1.5,
-                       label=_NAMES[form])  # fmt: skip
+            right.plot(
+                time[:n],
+                np.where(weight > wide / 4, mean, np.nan),
+                color=_COLOURS[form],
+                linewidth=1.5,
+                label=_NAMES[form],
+            )
         left.set_ylabel(f"{label}\n[{unit}]", fontsize=8, color=_INK)
         for axis in (left, right):
             axis.grid(True, color=_GRID, linewidth=0.8)
@@ -96,8 +103,15 @@ def draw_ride(
     assert first
     named = {label: line for axis in figure.axes for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     order = [label for label in ("measured", *_NAMES.values()) if label in named]
-    figure.legend(handles=[named[label] for label in order], labels=order, loc="upper right", ncols=4, frameon=False,
-                  fontsize=9, bbox_to_anchor=(0.99, 1.0))  # fmt: skip
+    figure.legend(
+        handles=[named[label] for label in order],
+        labels=order,
+        loc="upper right",
+        ncols=4,
+        frameon=False,
+        fontsize=9,
+        bbox_to_anchor=(0.99, 1.0),
+    )
     first.set_xlim(0, max(entry["duration_s"] / minutes, 1e-3))
     air = "" if entry["ambient_c"] is None else f", air {entry['ambient_c']:.0f} °C"
     title = f"{entry['name']} · {entry['vehicle']}, {entry['payload_kg']:g} kg{air}, {entry['distance_km']:.1f} km"

@@ -19,10 +19,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from gz_onboard.arrays import Array, Mask
 
 GATE, COMPONENT_GATE = 20.0, 10.0  # percent: Lord 2016, ch. 3
 LEAST_RISE = 10.0  # K
@@ -145,10 +143,29 @@ LABELS = {
 
 
 ORDER = (
-    "straight", "slightly", "turning", "uphill", "level", "downhill", "cold", "mild", "warm", "first 3 min",
-    "3 to 10 min", "later", "standing", "below 4 m/s", "4 to 8 m/s", "8 to 11 m/s", "above 11 m/s", "hard acceleration",
-    "acceleration", "steady", "coasting", "braking",
-)  # fmt: skip
+    "straight",
+    "slightly",
+    "turning",
+    "uphill",
+    "level",
+    "downhill",
+    "cold",
+    "mild",
+    "warm",
+    "first 3 min",
+    "3 to 10 min",
+    "later",
+    "standing",
+    "below 4 m/s",
+    "4 to 8 m/s",
+    "8 to 11 m/s",
+    "above 11 m/s",
+    "hard acceleration",
+    "acceleration",
+    "steady",
+    "coasting",
+    "braking",
+)
 """The conditions as tables list them."""
 
 

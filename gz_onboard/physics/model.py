@@ -21,9 +21,15 @@ if TYPE_CHECKING:
     from gz_onboard.toml import Table
 
 BASE_EFFECTS = (
-    "aerodynamic_drag", "rolling_resistance", "grade_force", "inertia", "motor_copper_loss", "motor_iron_loss",
-    "inverter_loss", "auxiliary_load",
-)  # fmt: skip
+    "aerodynamic_drag",
+    "rolling_resistance",
+    "grade_force",
+    "inertia",
+    "motor_copper_loss",
+    "motor_iron_loss",
+    "inverter_loss",
+    "auxiliary_load",
+)
 """What a vehicle file gets that lists none: what every vehicle has."""
 
 STANDSTILL = 0.1  # rad/s of the motor: below this its drag fades

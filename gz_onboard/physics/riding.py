@@ -29,9 +29,14 @@ class PriorRiding:
     """
 
     points: tuple[tuple[float, float, float], ...] = (
-        (0.18, 0.0, 0.0), (0.10, 4.0, 0.8), (0.08, 9.0, 0.6), (0.08, 4.0, -1.1), (0.06, 9.0, -1.0), (0.20, 7.0, 0.0),
+        (0.18, 0.0, 0.0),
+        (0.10, 4.0, 0.8),
+        (0.08, 9.0, 0.6),
+        (0.08, 4.0, -1.1),
+        (0.06, 9.0, -1.0),
+        (0.20, 7.0, 0.0),
         (0.30, 11.0, 0.0),
-    )  # fmt: skip
+    )
     unevenness: float = 1.1
     factor: float = 1.0
     factor_sd: float = 0.15
@@ -80,10 +85,17 @@ def check_riding(vehicle: Table, riding: PriorRiding, model: Model) -> None:
     Also if the code of an effect raises at it.
     """
     ordinary = dict.fromkeys(QUANTITIES, 0.0) | {
-        "grade_cosine": 1.0, "mass": model.mass, "air_density": air_density(20.0), "motor_temperature": 20.0,
-        "ambient_temperature": 20.0, "cell_temperature": 20.0, "cell_capacity": model.parameters["cell_capacity"],
-        "soc": 0.5, "lateral_acceleration": riding.lateral_acceleration, "vibration": riding.vibration,
-    }  # fmt: skip
+        "grade_cosine": 1.0,
+        "mass": model.mass,
+        "air_density": air_density(20.0),
+        "motor_temperature": 20.0,
+        "ambient_temperature": 20.0,
+        "cell_temperature": 20.0,
+        "cell_capacity": model.parameters["cell_capacity"],
+        "soc": 0.5,
+        "lateral_acceleration": riding.lateral_acceleration,
+        "vibration": riding.vibration,
+    }
     for effect, (_, speed, acceleration) in product(model.effects, riding.points):
         try:
             float(bind(effect, model.parameters)(ordinary | {"speed": speed, "acceleration": acceleration}))

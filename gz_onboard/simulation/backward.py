@@ -15,10 +15,10 @@ from gz_onboard.physics.model import air_density, over
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import ArrayLike, NDArray
+    from numpy.typing import ArrayLike
 
-    Array = NDArray[np.float64]
+    from gz_onboard.arrays import Array
+
 
 SMOOTHING = 0.5  # s: a wheel speed sensor's steps of 0.1 r/min at 100 Hz are 0.25 m/s² of acceleration
 

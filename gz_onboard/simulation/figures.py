@@ -35,11 +35,13 @@ STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
     "battery": ("#6b46c1", ("battery_heat", "bms", "not_delivered")),
     "auxiliary": ("#7b8794", ("auxiliary_load",)),
     "drive": ("#1667b7", ("inverter_loss", "motor_copper_loss", "motor_iron_loss", "motor_map_loss", "gearing")),
-    "road": ("#2f855a", ("tyre_slip", "rolling_resistance", "aerodynamic_drag", "cornering_drag", "turning",
-                         "dynamometer")),
+    "road": (
+        "#2f855a",
+        ("tyre_slip", "rolling_resistance", "aerodynamic_drag", "cornering_drag", "turning", "dynamometer"),
+    ),
     "brakes": ("#c53030", ("brakes",)),
     "stored": ("#d9730d", ("kinetic_energy", "potential_energy")),
-}  # fmt: skip
+}
 """The entries of a ledger in the order in which energy passes them, each stage with its colour."""
 
 
@@ -55,8 +57,14 @@ def overview(run: Run, title: str) -> Figure:
     axes[0].plot(x, s["speed"] * 3.6, color=BLUE, linewidth=1.2, label="ridden")
     for i, short in enumerate(run.shortfalls):
         begin = short.time / _unit(run)[0]
-        axes[0].axvspan(begin, begin + short.duration / _unit(run)[0], color=RED, alpha=0.15, linewidth=0,
-                        label="shortfall" if not i else None)  # fmt: skip
+        axes[0].axvspan(
+            begin,
+            begin + short.duration / _unit(run)[0],
+            color=RED,
+            alpha=0.15,
+            linewidth=0,
+            label="shortfall" if not i else None,
+        )
     ordinate(axes[0], "speed [km/h]")
     axes[1].plot(x, s["throttle"] * 100, color=GREEN, linewidth=0.8, label="throttle")
     axes[1].plot(x, s["brake"] * -100, color=RED, linewidth=0.8, label="brake (down)")
@@ -139,14 +147,30 @@ def sankey(ledger: Mapping[str, float], title: str) -> Figure:
     for name, energy, colour in sources:
         thick = energy / total * height
         axis.add_patch(Rectangle((left - 0.025, y - thick), 0.025, thick, color=colour, linewidth=0))
-        axis.text(left - 0.035, y - thick / 2, f"{_words(name)}\n{energy / WH:.1f} Wh", ha="right", va="center",
-                  fontsize=10, color=INK)  # fmt: skip
+        axis.text(
+            left - 0.035,
+            y - thick / 2,
+            f"{_words(name)}\n{energy / WH:.1f} Wh",
+            ha="right",
+            va="center",
+            fontsize=10,
+            color=INK,
+        )
         y -= thick
     y = trunk
     middle = (left + right) / 2
     for name, energy, colour, low, thick in places:
-        points = [(left, y), (middle, y), (middle, low + thick), (right, low + thick),
-                  (right, low), (middle, low), (middle, y - thick), (left, y - thick), (left, y)]  # fmt: skip
+        points = [
+            (left, y),
+            (middle, y),
+            (middle, low + thick),
+            (right, low + thick),
+            (right, low),
+            (middle, low),
+            (middle, y - thick),
+            (left, y - thick),
+            (left, y),
+        ]
         codes = [Curve.MOVETO, *[Curve.CURVE4] * 3, Curve.LINETO, *[Curve.CURVE4] * 3, Curve.CLOSEPOLY]
         axis.add_patch(PathPatch(Curve(points, codes), facecolor=colour, alpha=0.38, linewidth=0))
         axis.add_patch(Rectangle((right, low), 0.02, thick, color=colour, linewidth=0))
@@ -175,9 +199,11 @@ def sweep_lines(name: str, values: Sequence[float], variants: Sequence[Mapping[s
 
 
 def sweep_map(
-    names: tuple[str, str], values: tuple[Sequence[float], Sequence[float]], variants: Sequence[Mapping[str, Any]],
+    names: tuple[str, str],
+    values: tuple[Sequence[float], Sequence[float]],
+    variants: Sequence[Mapping[str, Any]],
     title: str,
-) -> Figure:  # fmt: skip
+) -> Figure:
     """Range and consumption over two parameters, `variants` with the second changing fastest."""
     import numpy as np
 

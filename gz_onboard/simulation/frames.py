@@ -16,17 +16,7 @@ from gz_onboard.bus.codec import raw_range
 from gz_onboard.bus.export import out_suffix, write_frames_as
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, Frame
-from gz_onboard.simulation.sensors import (
-    GPS_MESSAGES,
-    ROLLER,
-    SENSORS,
-    TURNS,
-    Sensor,
-    Truth,
-    latency,
-    shaken,
-    spread,
-)
+from gz_onboard.simulation.sensors import GPS_MESSAGES, ROLLER, SENSORS, TURNS, Sensor, Truth, latency, shaken, spread
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -131,8 +121,16 @@ def write_frames(out: Path, sent: list[Sent]) -> int:
     return write_frames_as(out, check_output(out), batches(sent))
 
 
-def _send(vehicle: Vehicle, message: Message, sensors: dict[str, Sensor], truth: Truth, seed: int, start_ns: int,
-          losses: Losses, gaps: Floats) -> Sent:  # fmt: skip
+def _send(
+    vehicle: Vehicle,
+    message: Message,
+    sensors: dict[str, Sensor],
+    truth: Truth,
+    seed: int,
+    start_ns: int,
+    losses: Losses,
+    gaps: Floats,
+) -> Sent:
     import numpy as np
 
     period_ns = round(vehicle.mapping.periods[message.name] * 1e9)

@@ -22,10 +22,8 @@ from gz_onboard.simulation.scooter import STEP, Dynamometer, Road
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    from gz_onboard.arrays import Array
 
-    Array = NDArray[np.float64]
 
 BRAKE_FORCE = 20e-5
 """N of both brakes for each Pa, front and rear pressure added: deceleration on 8 road rides, with 19 N of scatter."""

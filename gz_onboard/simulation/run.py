@@ -9,16 +9,15 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import nan
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gz_onboard.physics.battery import drawable
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.scooter import Road, Scooter
 
 if TYPE_CHECKING:
-    import numpy as np
+    from gz_onboard.arrays import Array
 
-    Array = np.ndarray[Any, np.dtype[np.float64]]
 
 COLUMNS = {
     "time": "s",
@@ -184,15 +183,29 @@ def drive(
 def _row(scooter: Scooter, wanted: float, energy: float) -> tuple[float, ...]:
     """The values of `COLUMNS`, in their order."""
     return (
-        scooter.time, scooter.distance, scooter.speed, wanted, scooter.throttle, scooter.brake,
+        scooter.time,
+        scooter.distance,
+        scooter.speed,
+        wanted,
+        scooter.throttle,
+        scooter.brake,
         0.0 if scooter.dynamometer else scooter.road(scooter.distance)[0],
-        scooter.wheel_speed / scooter.vehicle.parameters["gear_ratio"], scooter.motor_current,
-        scooter.motor.torque_constant * scooter.motor_current, scooter.current, scooter.voltage, scooter.pack.soc,
+        scooter.wheel_speed / scooter.vehicle.parameters["gear_ratio"],
+        scooter.motor_current,
+        scooter.motor.torque_constant * scooter.motor_current,
+        scooter.current,
+        scooter.voltage,
+        scooter.pack.soc,
         energy,
-        scooter.pack_cooling.temperature, scooter.motor_cooling.stator, scooter.inverter_cooling.board,
-        scooter.bms_cooling.temperature, scooter.rear_load, scooter.front_load, scooter.force,
+        scooter.pack_cooling.temperature,
+        scooter.motor_cooling.stator,
+        scooter.inverter_cooling.board,
+        scooter.bms_cooling.temperature,
+        scooter.rear_load,
+        scooter.front_load,
+        scooter.force,
         scooter.lean,
-    )  # fmt: skip
+    )
 
 
 # --- commands -----------------------------------------------------------------------------------------------------

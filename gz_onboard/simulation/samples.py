@@ -19,10 +19,8 @@ from gz_onboard.events import Event
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+    from gz_onboard.arrays import Array
 
-    Array = NDArray[np.float64]
 
 # Signals that no estimator needs, of the reference scooter's instruments: role, message, signal, factor to SI.
 INSTRUMENTS = (

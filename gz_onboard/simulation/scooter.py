@@ -81,13 +81,25 @@ class Scooter:
     that over distance [m], or that where the road begins and its curvature turns.
     """
 
-    def __init__(self, vehicle: Vehicle, road: Road | Dynamometer | None = None, *, soc: float = 1.0,
-                 ambient: float = 20.0, cell_temperature: float | None = None, altitude: float = 0.0,
-                 speed: float = 0.0, dt: float = STEP, pack: Pack | None = None, motor: Motor | None = None,
-                 tyre_form: str = "transient", brake_form: str = "friction",
-                 heading: float | Callable[[float], float] = 0.0,
-                 vibration: float | Callable[[float], float] | None = None,
-                 chassis: Chassis | None = None) -> None:  # fmt: skip
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        road: Road | Dynamometer | None = None,
+        *,
+        soc: float = 1.0,
+        ambient: float = 20.0,
+        cell_temperature: float | None = None,
+        altitude: float = 0.0,
+        speed: float = 0.0,
+        dt: float = STEP,
+        pack: Pack | None = None,
+        motor: Motor | None = None,
+        tyre_form: str = "transient",
+        brake_form: str = "friction",
+        heading: float | Callable[[float], float] = 0.0,
+        vibration: float | Callable[[float], float] | None = None,
+        chassis: Chassis | None = None,
+    ) -> None:
         if vehicle.battery is None:
             raise vehicle.error("has no [battery], which a simulation needs")
         p = vehicle.parameters
@@ -136,8 +148,9 @@ class Scooter:
         self.pack: Pack = pack or own
         effects = model.effects
         at = {port: [e for e in effects if e.port is port] for port in Port}
-        self._tracks = bool(model.reads & {"heading", "time_moving", "soc", "cell_temperature", "cell_current",
-                                             "vibration"})  # fmt: skip
+        self._tracks = bool(
+            model.reads & {"heading", "time_moving", "soc", "cell_temperature", "cell_current", "vibration"}
+        )
         # Forces that read the acceleration are the dynamics that this simulation integrates itself.
         forces = [e for e in at[Port.WHEEL_FORCE] if "acceleration" not in e.quantities]
         if self.dynamometer:
@@ -152,20 +165,35 @@ class Scooter:
         losses = at[Port.MOTOR_LOSS]
         self.motor: Motor = motor or EffectMotor(_booked(losses, p, dt), _settled(losses, p), *constants, self._q)
         self.tyre = Tyre(p["tyre_b"], p["tyre_c"], p["tyre_d"], p["tyre_e"], form=tyre_form)
-        self.brakes = Brakes(p["brake_torque_limit"], p["brake_viscous_constant"], p["brake_disc_radius"],
-                             p["front_brake_share"], form=brake_form)  # fmt: skip
+        self.brakes = Brakes(
+            p["brake_torque_limit"],
+            p["brake_viscous_constant"],
+            p["brake_disc_radius"],
+            p["front_brake_share"],
+            form=brake_form,
+        )
         regeneration = p["regeneration_torque_limit"] / p["torque_constant"]
         self.controller = Controller(p["motor_current_limit"], regeneration, vehicle.derating)
         cooled = p["cooling_factor"]
         self.inverter_cooling = InverterCooling(
-            p["inverter_board_capacity"], p["inverter_box_capacity"], p["inverter_board_to_air"],
-            p["inverter_box_to_air"], p["inverter_board_to_box"], cooled * p["inverter_box_to_ambient"], ambient,
+            p["inverter_board_capacity"],
+            p["inverter_box_capacity"],
+            p["inverter_board_to_air"],
+            p["inverter_box_to_air"],
+            p["inverter_board_to_box"],
+            cooled * p["inverter_box_to_ambient"],
             ambient,
-        )  # fmt: skip
+            ambient,
+        )
         self.motor_cooling = MotorCooling(
-            p["motor_stator_capacity"], p["motor_rotor_capacity"], p["motor_gap_conductance"],
-            cooled * p["motor_rotor_to_ambient"], p["motor_stator_share"], ambient, ambient,
-        )  # fmt: skip
+            p["motor_stator_capacity"],
+            p["motor_rotor_capacity"],
+            p["motor_gap_conductance"],
+            cooled * p["motor_rotor_to_ambient"],
+            p["motor_stator_share"],
+            ambient,
+            ambient,
+        )
         self.pack_cooling = LumpedCooling(p["pack_heat_capacity"], cooled * p["pack_conductance"], cells)
         self.bms_cooling = LumpedCooling(p["bms_heat_capacity"], p["bms_conductance"], cells)
         self._radius = p["wheel_radius"]

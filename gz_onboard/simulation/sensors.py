@@ -10,7 +10,7 @@ from array import array
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import cos, pi
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
@@ -21,9 +21,8 @@ from gz_onboard.simulation.run import Command
 from gz_onboard.simulation.scooter import Scooter
 
 if TYPE_CHECKING:
-    import numpy as np
+    from gz_onboard.arrays import Array
 
-    Array = np.ndarray[Any, np.dtype[np.float64]]
 
 BMS_DELAY = 0.10  # s behind the inverter
 GPS_DELAY = 0.4  # s
@@ -35,10 +34,27 @@ LATITUDE, LONGITUDE, ALTITUDE = 45.0, 9.0, 200.0  # deg, deg, m: where a simulat
 _METRES_PER_DEGREE = 111_200.0
 
 _NAMES = (
-    "time", "speed", "wheel_speed", "distance", "climb", "grade", "curvature", "throttle", "brake", "motor_current",
-    "pack_current", "pack_voltage", "soc", "cell", "motor", "inverter", "bms", "tyre_force", "chassis_lean",
+    "time",
+    "speed",
+    "wheel_speed",
+    "distance",
+    "climb",
+    "grade",
+    "curvature",
+    "throttle",
+    "brake",
+    "motor_current",
+    "pack_current",
+    "pack_voltage",
+    "soc",
+    "cell",
+    "motor",
+    "inverter",
+    "bms",
+    "tyre_force",
+    "chassis_lean",
     "vibration",
-)  # fmt: skip
+)
 
 
 class Trace:
@@ -53,11 +69,30 @@ class Trace:
 
         def watched(s: Scooter) -> tuple[float, float, float]:
             grade, curvature, _ = (0.0, 0.0, 0.0) if s.dynamometer else s.road(s.distance)
-            extend((
-                s.time, s.speed, s.wheel_speed, s.distance, s.climb, grade, curvature, s.throttle, s.brake,
-                s.motor_current, s.current, s.voltage, s.pack.soc, s.pack_cooling.temperature, s.motor_cooling.stator,
-                s.inverter_cooling.board, s.bms_cooling.temperature, s.force, s.lean, s.vibration,
-            ))  # fmt: skip
+            extend(
+                (
+                    s.time,
+                    s.speed,
+                    s.wheel_speed,
+                    s.distance,
+                    s.climb,
+                    grade,
+                    curvature,
+                    s.throttle,
+                    s.brake,
+                    s.motor_current,
+                    s.current,
+                    s.voltage,
+                    s.pack.soc,
+                    s.pack_cooling.temperature,
+                    s.motor_cooling.stator,
+                    s.inverter_cooling.board,
+                    s.bms_cooling.temperature,
+                    s.force,
+                    s.lean,
+                    s.vibration,
+                )
+            )
             return command(s)
 
         return watched
@@ -115,12 +150,19 @@ class Truth:
 
         c = self.columns
         q = dict.fromkeys(QUANTITIES, 0.0) | {
-            "speed": c["way"], "acceleration": c["acceleration"], "grade": c["grade"], "soc": c["soc"],
-            "lateral_acceleration": c["way"] * c["yaw_rate"], "heading": c["heading"],
-            "motor_current": c["motor_current"], "motor_temperature": c["motor"], "cell_temperature": c["cell"],
-            "time_moving": np.cumsum(c["way"] > MOVING) * self.dt, "ambient_temperature": self.ambient,
+            "speed": c["way"],
+            "acceleration": c["acceleration"],
+            "grade": c["grade"],
+            "soc": c["soc"],
+            "lateral_acceleration": c["way"] * c["yaw_rate"],
+            "heading": c["heading"],
+            "motor_current": c["motor_current"],
+            "motor_temperature": c["motor"],
+            "cell_temperature": c["cell"],
+            "time_moving": np.cumsum(c["way"] > MOVING) * self.dt,
+            "ambient_temperature": self.ambient,
             "vibration": c["vibration"],
-        }  # fmt: skip
+        }
         power = np.zeros(self.count)
         for effect in scooter.vehicle.model.effects:
             if effect.port is Port.DC_POWER:
@@ -178,8 +220,13 @@ def _column(name: str, factor: float = 1.0) -> Callable[[Truth], Array]:
 
 
 def _temperatures() -> list[Sensor]:
-    places = {"INV_Temperature": "inverter", "INV_MotorTemperature": "motor", "TC_Inverter1": "inverter",
-              "TC_Inverter2": "inverter", "TC_Inverter3": "inverter"}  # fmt: skip
+    places = {
+        "INV_Temperature": "inverter",
+        "INV_MotorTemperature": "motor",
+        "TC_Inverter1": "inverter",
+        "TC_Inverter2": "inverter",
+        "TC_Inverter3": "inverter",
+    }
     places |= {f"BMS_CellTemp{which}": "cell" for which in ("Min", "Max", "Mean")} | {"BMS_BoardTemp": "bms"}
     places |= {f"TC_Pack{i}": "cell" for i in range(1, 7)}
     sensors = [Sensor(signal, _column(place), delay=_delay(signal)) for signal, place in places.items()]
@@ -274,8 +321,11 @@ SENSORS: tuple[Sensor, ...] = (
     Sensor("INV_DcCurrent", _inverter_current, sd=0.35),
     # battery; gain, offset and noise are the vehicle's, see `spread`
     Sensor("BMS_PackVoltage", lambda t: t["pack_voltage"] + t.parameters["pack_voltage_offset"], delay=BMS_DELAY),
-    Sensor("BMS_PackCurrent", lambda t: t["pack_current"] * t.parameters["pack_current_gain"]
-           + t.parameters["pack_current_offset"], delay=BMS_DELAY),
+    Sensor(
+        "BMS_PackCurrent",
+        lambda t: t["pack_current"] * t.parameters["pack_current_gain"] + t.parameters["pack_current_offset"],
+        delay=BMS_DELAY,
+    ),
     Sensor("BMS_StateOfCharge", _column("soc", 100.0), delay=BMS_DELAY),
     Sensor("BMS_State", lambda t: t.constant(2.0)),
     Sensor("BMS_Contactor", lambda t: t.constant(1.0)),
@@ -308,7 +358,7 @@ SENSORS: tuple[Sensor, ...] = (
     Sensor("GPS_Satellites", lambda t: t.constant(9.0)),
     Sensor("GPS_Fix", lambda t: t.constant(3.0)),
     *_temperatures(),
-)  # fmt: skip
+)
 """Cell voltages, limits, steering and suspension are in the DBC files but not here: the simulation has none."""
 
 ROLLER: tuple[Sensor, ...] = (

@@ -36,13 +36,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard simulate``."""
     explain_keys(parser, "the", SUMMARY_VERSION, KEYS)
     add = parser.add_argument
-    add("what", metavar="WHAT", help="a built-in drive cycle by name, a CSV file of a cycle or of a route, or the log "
-        "of a recorded ride, whose throttle and brake are replayed")  # fmt: skip
+    add(
+        "what",
+        metavar="WHAT",
+        help="a built-in drive cycle by name, a CSV file of a cycle or of a route, or the log "
+        "of a recorded ride, whose throttle and brake are replayed",
+    )
     add(
         "--vehicle", default="reference", metavar="NAME|TOML", help="vehicle file or one of the package's (%(default)s)"
     )
-    add("--payload", type=float, metavar="KG", help="mass of rider and luggage (of a recorded ride as noted in "
-        "rides.json beside the log, else the vehicle file's)")  # fmt: skip
+    add(
+        "--payload",
+        type=float,
+        metavar="KG",
+        help="mass of rider and luggage (of a recorded ride as noted in "
+        "rides.json beside the log, else the vehicle file's)",
+    )
     add("--soc", type=float, metavar="0..1", help="state of charge at the start (1; of a recorded ride, as there)")
     add("--ambient", type=float, metavar="C", help="temperature of air and vehicle at the start (20)")
     add("--grade", type=float, default=0.0, metavar="%", help="of the road, uphill positive, for cycles (%(default)g)")
@@ -50,24 +59,46 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     often = parser.add_mutually_exclusive_group()
     often.add_argument("--repeat", type=int, default=1, metavar="N", help="ride it N times (%(default)s)")
     often.add_argument("--until-empty", action="store_true", help="repeat it until the pack is empty")
-    add("--dyno", metavar="KG[,A,B,C]", help="on a chassis dynamometer: inertia of its roller and absorber force "
-        "A + B·V + C·V² in N, V in m/s")  # fmt: skip
-    add("--chassis", choices=tuple(MODELS), default="straight", help="what bends do to it: nothing, or what "
-        "this turning model says (%(default)s)")  # fmt: skip
+    add(
+        "--dyno",
+        metavar="KG[,A,B,C]",
+        help="on a chassis dynamometer: inertia of its roller and absorber force A + B·V + C·V² in N, V in m/s",
+    )
+    add(
+        "--chassis",
+        choices=tuple(MODELS),
+        default="straight",
+        help="what bends do to it: nothing, or what this turning model says (%(default)s)",
+    )
     add("--predictive", action="store_true", help="of a recorded ride: the rider follows its speed, by own throttle")
-    add("--sweep", action="append", default=[], metavar="NAME=LO..HI[:STEPS]",
+    add(
+        "--sweep",
+        action="append",
+        default=[],
+        metavar="NAME=LO..HI[:STEPS]",
         help="ride it with other values of a parameter, or of battery.parallel or battery.series (cells); at "
-        "most twice")  # fmt: skip
+        "most twice",
+    )
     add("--json", nargs="?", const="-", metavar="FILE|-", help="write the summary as JSON, to standard output or FILE")
     add("--output", type=Path, default=Path(), metavar="DIR", help="where to write (the current directory)")
     add("--format", choices=FORMATS, default="parquet", help="of the time series (%(default)s)")
     add("--no-series", action="store_true", help="write no time series")
     add("--no-plot", action="store_true", help="draw nothing")
-    add("--frames", type=Path, metavar="FILE", help="write the ride as the CAN frames of the vehicle's sensors, in the "
-        "format of the suffix: .blf .log .asc .trc .csv .mf4")  # fmt: skip
+    add(
+        "--frames",
+        type=Path,
+        metavar="FILE",
+        help="write the ride as the CAN frames of the vehicle's sensors, in the "
+        "format of the suffix: .blf .log .asc .trc .csv .mf4",
+    )
     add("--seed", type=int, default=0, metavar="N", help="of the noise and losses of --frames (%(default)s)")
-    add("--frame-loss", type=float, default=Losses.frames, metavar="SHARE", help="of the frames that the bus loses "
-        "(%(default)g)")  # fmt: skip
+    add(
+        "--frame-loss",
+        type=float,
+        default=Losses.frames,
+        metavar="SHARE",
+        help="of the frames that the bus loses (%(default)g)",
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -135,10 +166,16 @@ def ride(
     if soc is None:
         soc = (rest_soc(recorded, vehicle) if recorded else None) or 1.0
     scooter = Scooter(
-        vehicle, plan.road, soc=soc, ambient=ambient, cell_temperature=measured("cell_temperature", ambient),
-        speed=measured("speed", 0.0), heading=plan.heading, vibration=plan.vibration,
+        vehicle,
+        plan.road,
+        soc=soc,
+        ambient=ambient,
+        cell_temperature=measured("cell_temperature", ambient),
+        speed=measured("speed", 0.0),
+        heading=plan.heading,
+        vibration=plan.vibration,
         chassis=chassis(arguments.chassis, vehicle.parameters),
-    )  # fmt: skip
+    )
     scooter.motor_cooling.stator = scooter.motor_cooling.rotor = measured("motor_temperature", ambient)
     scooter.inverter_cooling.board = scooter.inverter_cooling.box = measured("inverter_temperature", ambient)
     seconds = _MOST_HOURS * 3600 if arguments.until_empty else plan.seconds * arguments.repeat

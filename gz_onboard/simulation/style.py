@@ -35,8 +35,16 @@ def stack(
 ) -> list[Axes]:
     """Panels one above the other, of one abscissa; `top` and `bottom` are margins [inch]."""
     height = figure.get_figheight()
-    grid = figure.add_gridspec(len(heights), 1, height_ratios=heights, left=left, right=0.93, hspace=hspace,
-                               top=1 - top / height, bottom=bottom / height)  # fmt: skip
+    grid = figure.add_gridspec(
+        len(heights),
+        1,
+        height_ratios=heights,
+        left=left,
+        right=0.93,
+        hspace=hspace,
+        top=1 - top / height,
+        bottom=bottom / height,
+    )
     axes: list[Axes] = []
     for i in range(len(heights)):
         axes.append(figure.add_subplot(grid[i], sharex=axes[0] if axes else None))
@@ -76,9 +84,20 @@ def legend(axis: Axes, *others: Axes) -> None:
     for other in others:
         more, names = other.get_legend_handles_labels()
         handles, labels = handles + more, labels + names
-    axis.legend(handles=handles, labels=labels, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.15,
-                fontsize=7.5, ncols=len(labels), frameon=False, borderpad=0, handlelength=1.6, columnspacing=1.2,
-                labelcolor=MUTED)  # fmt: skip
+    axis.legend(
+        handles=handles,
+        labels=labels,
+        loc="lower right",
+        bbox_to_anchor=(1, 1),
+        borderaxespad=0.15,
+        fontsize=7.5,
+        ncols=len(labels),
+        frameon=False,
+        borderpad=0,
+        handlelength=1.6,
+        columnspacing=1.2,
+        labelcolor=MUTED,
+    )
 
 
 def close(axes: Sequence[Axes], x: Sequence[float], text: str) -> None:

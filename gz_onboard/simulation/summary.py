@@ -143,23 +143,32 @@ def summary_text(summary: dict[str, Any]) -> str:
     ledger = [(name, energy) for name, energy in ledger if abs(energy) >= 0.005]
     gross = sum(energy for _, energy in ledger if energy > 0) or 1.0
     rows = [
-        (summary["kind"], f"{clock(summary['duration_s'])}, {summary['distance_km']:.2f} km, "
-                          f"at most {summary['speed_max_km_h']:.0f} km/h, "
-                          f"{summary['repetitions']:.3g} times"),
-        ("energy", f"{summary['energy_wh']:.1f} Wh net, {summary['energy_recovered_wh']:.1f} Wh recovered before; "
-                   f"{number(summary['consumption_wh_km'], '.2f', 'Wh/km')}"),
+        (
+            summary["kind"],
+            f"{clock(summary['duration_s'])}, {summary['distance_km']:.2f} km, "
+            f"at most {summary['speed_max_km_h']:.0f} km/h, "
+            f"{summary['repetitions']:.3g} times",
+        ),
+        (
+            "energy",
+            f"{summary['energy_wh']:.1f} Wh net, {summary['energy_recovered_wh']:.1f} Wh recovered before; "
+            f"{number(summary['consumption_wh_km'], '.2f', 'Wh/km')}",
+        ),
         ("state of charge", f"{100 * summary['soc_start']:.1f} → {100 * summary['soc_end']:.1f} %"),
-        ("range", f"{number(summary['range_km'], '.1f', 'km')} "
-                  f"({way.get(summary['range_by'], 'not to be told')})"),
+        ("range", f"{number(summary['range_km'], '.1f', 'km')} ({way.get(summary['range_by'], 'not to be told')})"),
         *_shortfall_rows(summary),
-        *(("where it went" if not i else "",
-           f"{name.replace('_', ' '):20} {energy:9.2f} Wh {100 * energy / gross:6.1f} %")
-          for i, (name, energy) in enumerate(ledger)),
+        *(
+            (
+                "where it went" if not i else "",
+                f"{name.replace('_', ' '):20} {energy:9.2f} Wh {100 * energy / gross:6.1f} %",
+            )
+            for i, (name, energy) in enumerate(ledger)
+        ),
         *_measured_rows(summary),
         *_turning_rows(summary),
         ("closes to", f"{100 * summary['closure']:.1g} % of what was turned over"),
         ("computed in", f"{summary['wall_s']:.2f} s, step {1000 * summary['step_s']:g} ms"),
-    ]  # fmt: skip
+    ]
     rows += [("written", ", ".join(summary["files"]))] if summary["files"] else []
     lines = [
         f"{summary['what']}, {summary['vehicle']}, payload {summary['payload_kg']:g} kg (by {summary['payload_from']})"
@@ -194,13 +203,25 @@ def _measured_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
     if not m:
         return []
     return [
-        ("measured", f"{m['distance_km']:.2f} km, {number(m['energy_wh'], '.1f', 'Wh')}, "
-                     f"{number(m['consumption_wh_km'], '.2f', 'Wh/km')}"),
-        ("simulated less", "RMS " + ", ".join(
-            number(m[key], form, unit) for key, form, unit in (
-                ("rms_speed_km_h", ".1f", "km/h"), ("rms_pack_voltage_v", ".2f", "V"),
-                ("rms_pack_current_a", ".1f", "A"), ("rms_motor_torque_nm", ".1f", "N·m")))),
-    ]  # fmt: skip
+        (
+            "measured",
+            f"{m['distance_km']:.2f} km, {number(m['energy_wh'], '.1f', 'Wh')}, "
+            f"{number(m['consumption_wh_km'], '.2f', 'Wh/km')}",
+        ),
+        (
+            "simulated less",
+            "RMS "
+            + ", ".join(
+                number(m[key], form, unit)
+                for key, form, unit in (
+                    ("rms_speed_km_h", ".1f", "km/h"),
+                    ("rms_pack_voltage_v", ".2f", "V"),
+                    ("rms_pack_current_a", ".1f", "A"),
+                    ("rms_motor_torque_nm", ".1f", "N·m"),
+                )
+            ),
+        ),
+    ]
 
 
 def _table(sweep: Sequence[dict[str, Any]]) -> list[str]:
@@ -210,7 +231,10 @@ def _table(sweep: Sequence[dict[str, Any]]) -> list[str]:
     lines = ["  ".join(f"{head:>{w}}" for head, w in zip(heads, width, strict=True))]
     for variant in sweep:
         cells = [f"{value:g}" for value in variant["values"].values()]
-        cells += [number(variant["consumption_wh_km"], ".2f"), number(variant["range_km"], ".1f"),
-                  f"{variant['shortfall_s']:.0f}"]  # fmt: skip
+        cells += [
+            number(variant["consumption_wh_km"], ".2f"),
+            number(variant["range_km"], ".1f"),
+            f"{variant['shortfall_s']:.0f}",
+        ]
         lines.append("  ".join(f"{cell:>{w}}" for cell, w in zip(cells, width, strict=True)))
     return lines

@@ -13,10 +13,18 @@ from gz_onboard.vehicle import Vehicle
 CELLS = ("battery.cells_parallel", "battery.cells_series")
 _SHORT = {"battery.parallel": CELLS[0], "battery.series": CELLS[1]}
 _SPOKEN = {
-    "battery": CELLS[0], "cells": CELLS[0], "parallel": CELLS[0], "cells_parallel": CELLS[0],
-    "series": CELLS[1], "cells_series": CELLS[1], "capacity": "cell_capacity", "mass": "vehicle_mass",
-    "payload": "payload_mass", "cda": "drag_area", "rolling_resistance": "rolling_resistance_constant",
-}  # fmt: skip
+    "battery": CELLS[0],
+    "cells": CELLS[0],
+    "parallel": CELLS[0],
+    "cells_parallel": CELLS[0],
+    "series": CELLS[1],
+    "cells_series": CELLS[1],
+    "capacity": "cell_capacity",
+    "mass": "vehicle_mass",
+    "payload": "payload_mass",
+    "cda": "drag_area",
+    "rolling_resistance": "rolling_resistance_constant",
+}
 """What is said for a parameter, so that the nearest by letters is the one that is meant."""
 _STEPS = 5
 _MOST_STEPS = 50

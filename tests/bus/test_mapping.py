@@ -157,10 +157,7 @@ def test_known_units_are_known(role):
         ('pack_volt = "Voltage"', [":5:", "roles.pack_volt", "unknown key", "did you mean 'pack_voltage'"]),
         ('pack_voltage = "Voltag"', [":5:", "roles.pack_voltage", "'Voltag'", "did you mean 'Voltage'"]),
         ("pack_voltage = 5", [":5:", "roles.pack_voltage", "must be a string", "5"]),
-        (
-            'pack_voltage = "Current"',
-            [":5:", "roles.pack_voltage", "'Current'", "'A'", "pack_voltage [V]", "V, mV"],
-        ),
+        ('pack_voltage = "Current"', [":5:", "roles.pack_voltage", "'Current'", "'A'", "pack_voltage [V]", "V, mV"]),
         ('throttle = "State"', [":5:", "roles.throttle", "several messages (Pack, Motor)", "message ="]),
         (
             'throttle = { message = "Pak", signal = "State" }',

@@ -105,10 +105,15 @@ def check_what_is_sent(file: str, given_values: dict[str, float | None], state: 
     expected = state if state not in KNOWN or whole else State.DEGRADED if told else State.INVALID
     assert got["RANGE_EstimateState"] == got["RANGE_StatusState"] == expected
     there = {
-        "RANGE_Remaining": told, "RANGE_RemainingP10": told, "RANGE_RemainingP90": whole,
-        "RANGE_EnergyLeft": told, "RANGE_ConsumptionExpected": told, "RANGE_ConsumptionRecent": True,
-        SOC: told and sayable(SIGMA, values[SIGMA], file), SIGMA: told and sayable(SOC, values[SOC], file),
-    }  # fmt: skip
+        "RANGE_Remaining": told,
+        "RANGE_RemainingP10": told,
+        "RANGE_RemainingP90": whole,
+        "RANGE_EnergyLeft": told,
+        "RANGE_ConsumptionExpected": told,
+        "RANGE_ConsumptionRecent": True,
+        SOC: told and sayable(SIGMA, values[SIGMA], file),
+        SIGMA: told and sayable(SOC, values[SOC], file),
+    }
     for name, value in values.items():
         if there[name] and sayable(name, value, file):
             assert got[name] == pytest.approx(value, abs=0.5001 * signal_of(name, file).scale), name
@@ -122,8 +127,11 @@ def test_a_number_is_sent_to_the_nearest_or_not_at_all(given_values, state):
         check_what_is_sent(file, given_values, state)
 
 
-@given(st.lists(st.floats(0, 1e7), min_size=3, max_size=3), st.fixed_dictionaries(
-    {f: numbers for f, _ in QUANTITIES.values() if not f.startswith("range")}), st.sampled_from(KNOWN))  # fmt: skip
+@given(
+    st.lists(st.floats(0, 1e7), min_size=3, max_size=3),
+    st.fixed_dictionaries({f: numbers for f, _ in QUANTITIES.values() if not f.startswith("range")}),
+    st.sampled_from(KNOWN),
+)
 def test_a_range_in_its_order_is_sent_to_the_nearest_or_not_at_all(ranges, others, state):
     for file in DATABASES:
         check_what_is_sent(
@@ -131,8 +139,18 @@ def test_a_range_in_its_order_is_sent_to_the_nearest_or_not_at_all(ranges, other
         )
 
 
-CAR = Estimate(0.0, State.VALID, soc=0.8, soc_sd=0.02, range=400e3, range_p10=320e3, range_p90=500e3,
-               energy_left=54_500 * 3600.0, consumption_recent=718 * 3.6, consumption_expected=136 * 3.6)  # fmt: skip
+CAR = Estimate(
+    0.0,
+    State.VALID,
+    soc=0.8,
+    soc_sd=0.02,
+    range=400e3,
+    range_p10=320e3,
+    range_p90=500e3,
+    energy_left=54_500 * 3600.0,
+    consumption_recent=718 * 3.6,
+    consumption_expected=136 * 3.6,
+)
 
 
 def test_a_car_by_the_scooters_file_is_not_available_instead_of_wrong():
@@ -143,10 +161,18 @@ def test_a_car_by_the_scooters_file_is_not_available_instead_of_wrong():
 
 def test_a_car_by_the_large_file():
     got = sent(Publisher(find_dbc("range_large.dbc")), CAR)
-    assert {name: got[name] for name in QUANTITIES} == pytest.approx({
-        "RANGE_Remaining": 400, "RANGE_RemainingP10": 320, "RANGE_RemainingP90": 500, "RANGE_EnergyLeft": 54_500,
-        "RANGE_ConsumptionRecent": 718, "RANGE_ConsumptionExpected": 136, SOC: 80, SIGMA: 2,
-    })  # fmt: skip
+    assert {name: got[name] for name in QUANTITIES} == pytest.approx(
+        {
+            "RANGE_Remaining": 400,
+            "RANGE_RemainingP10": 320,
+            "RANGE_RemainingP90": 500,
+            "RANGE_EnergyLeft": 54_500,
+            "RANGE_ConsumptionRecent": 718,
+            "RANGE_ConsumptionExpected": 136,
+            SOC: 80,
+            SIGMA: 2,
+        }
+    )
     assert got["RANGE_EstimateState"] == State.VALID
 
 
@@ -215,11 +241,20 @@ OWNERS = {
     .replace("[-327.67|327.67]", "[-511|511]")
     .replace("ConsumptionExpected : 32|16", "ConsumptionExpected : 30|16"),
     "an offset": TEXT.replace("(0.1,0) [0|25.4]", "(0.2,-10) [0|40]"),
-    "more in it": TEXT.replace("\nBO_ 1537", '\nBO_ 7 Brake: 2 DASH\n SG_ P : 0|8@1+ (1,0) [0|0] "" RANGE\n\nBO_ 1537')
-    .replace(" SG_ RANGE_EnergyCounter", ' SG_ Mine : 48|4@1- (1,0) [0|0] "" DASH\n SG_ RANGE_EnergyCounter'),
-}  # fmt: skip
-SCOOTER = replace(CAR, soc_sd=0.12, range=40e3, range_p10=32e3, range_p90=50e3, energy_left=1200 * 3600.0,
-                  consumption_recent=31 * 3.6, consumption_expected=30 * 3.6)  # fmt: skip
+    "more in it": TEXT.replace(
+        "\nBO_ 1537", '\nBO_ 7 Brake: 2 DASH\n SG_ P : 0|8@1+ (1,0) [0|0] "" RANGE\n\nBO_ 1537'
+    ).replace(" SG_ RANGE_EnergyCounter", ' SG_ Mine : 48|4@1- (1,0) [0|0] "" DASH\n SG_ RANGE_EnergyCounter'),
+}
+SCOOTER = replace(
+    CAR,
+    soc_sd=0.12,
+    range=40e3,
+    range_p10=32e3,
+    range_p90=50e3,
+    energy_left=1200 * 3600.0,
+    consumption_recent=31 * 3.6,
+    consumption_expected=30 * 3.6,
+)
 
 
 @pytest.mark.parametrize("text", OWNERS.values(), ids=OWNERS)
@@ -259,7 +294,7 @@ def test_an_owners_file(text, tmp_path):
         ("RANGE_EnergyLeft : 0|16", "RANGE_EnergyLeft : 0|20", "mine.dbc.*RANGE_EnergyLeft"),  # overlaps the next
         ("BO_ 1540", "BO_ 1539", "identifier 0x603"),
     ],
-)  # fmt: skip
+)
 def test_a_file_that_cannot_be_sent_is_refused(old, new, told, tmp_path):
     assert old in TEXT
     text = TEXT.replace(old, new)
@@ -272,8 +307,11 @@ def test_a_file_that_cannot_be_sent_is_refused(old, new, told, tmp_path):
 
 
 def test_a_floating_point_signal_is_refused(tmp_path):
-    text = TEXT.replace("EnergyLeft : 0|16@1+ (0.1,0)", "EnergyLeft : 0|32@1- (1,0)").replace(
-        "Recent : 16|16", "Recent : 32|10").replace("Expected : 32|16", "Expected : 42|10")  # fmt: skip
+    text = (
+        TEXT.replace("EnergyLeft : 0|16@1+ (0.1,0)", "EnergyLeft : 0|32@1- (1,0)")
+        .replace("Recent : 16|16", "Recent : 32|10")
+        .replace("Expected : 32|16", "Expected : 42|10")
+    )
     (tmp_path / "mine.dbc").write_text(text + "SIG_VALTYPE_ 1537 RANGE_EnergyLeft : 1;\n")
     with pytest.raises(InputError, match="RANGE_EnergyLeft must be an integer"):
         Publisher(tmp_path / "mine.dbc")
@@ -312,8 +350,9 @@ def test_a_distrusted_sensor_is_sent_by_name():
     for _, identifier, data, _ in frames:
         decoded.update(DATABASE.get_message_by_frame_id(identifier).decode_simple(data, decode_choices=False))
     assert {name for name, value in decoded.items() if name.startswith("RANGE_Bad") and value} == {
-        "RANGE_BadMotorSpeed", "RANGE_BadGpsAltitude",
-    }  # fmt: skip
+        "RANGE_BadMotorSpeed",
+        "RANGE_BadGpsAltitude",
+    }
     assert decoded["RANGE_SensorDistrusted"] == 1
 
 

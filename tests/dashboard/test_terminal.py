@@ -30,10 +30,19 @@ from gz_onboard.events import ROLES, Activity, Estimate, Frame, Reason, State
 
 REASONS = Reason.NO_IMU | Reason.PRIOR_RIDING
 ESTIMATE = Estimate(
-    time=1.0, activity=Activity.RIDING,
-    state=State.DEGRADED, reasons=REASONS, soc=0.624, soc_sd=0.012, range=34_210.0, range_p10=26_540.0,
-    range_p90=44_340.0, energy_left=895 * 3600.0, consumption_recent=24.6 * 3.6, consumption_expected=26.2 * 3.6,
-)  # fmt: skip
+    time=1.0,
+    activity=Activity.RIDING,
+    state=State.DEGRADED,
+    reasons=REASONS,
+    soc=0.624,
+    soc_sd=0.012,
+    range=34_210.0,
+    range_p10=26_540.0,
+    range_p90=44_340.0,
+    energy_left=895 * 3600.0,
+    consumption_recent=24.6 * 3.6,
+    consumption_expected=26.2 * 3.6,
+)
 COUNTS = Counts(dropped=7, implausible=3, lost=24, unknown=2)
 PLAIN = Style(colour=False, unicode=True)
 
@@ -64,9 +73,20 @@ def numbers(text: str) -> list[str]:
 
 def test_it_shows_what_the_daemon_sends():
     text = picture(seen(), 100.0)
-    for shown in ("34.2 km", "26.5 km to 44.3 km", "62.4 ± 1.2 %", "895 Wh", "26.2 Wh/km expected", "24.6 Wh/km over",
-                  "degraded", "no IMU: No lean", "prior riding", "0.0 s old, 14 received, 0 lost, 0 bad",
-                  "Activity          riding", "7 dropped, 3 implausible, 24 lost, 2 unknown"):  # fmt: skip
+    for shown in (
+        "34.2 km",
+        "26.5 km to 44.3 km",
+        "62.4 ± 1.2 %",
+        "895 Wh",
+        "26.2 Wh/km expected",
+        "24.6 Wh/km over",
+        "degraded",
+        "no IMU: No lean",
+        "prior riding",
+        "0.0 s old, 14 received, 0 lost, 0 bad",
+        "Activity          riding",
+        "7 dropped, 3 implausible, 24 lost, 2 unknown",
+    ):
         assert shown in text
     assert "Stale" not in text
     line = terminal.summary_line(seen(), 100.0)
@@ -182,8 +202,15 @@ def test_all_sensors_left_out_take_several_lines():
 # --- range frames of another file ---------------------------------------------------------------------------------
 
 
-VAN = replace(ESTIMATE, range=412e3, range_p10=365e3, range_p90=466e3, energy_left=54_500 * 3600.0,
-              consumption_recent=718 * 3.6, consumption_expected=132 * 3.6)  # fmt: skip
+VAN = replace(
+    ESTIMATE,
+    range=412e3,
+    range_p10=365e3,
+    range_p90=466e3,
+    energy_left=54_500 * 3600.0,
+    consumption_recent=718 * 3.6,
+    consumption_expected=132 * 3.6,
+)
 
 
 def test_large_frames_by_their_own_file():
@@ -285,9 +312,18 @@ def test_the_scale_is_a_round_number_just_beyond(value):
 
 @given(st.floats(0, 1), st.floats(0, 0.3), st.floats(0, 700e3), st.integers(1, 120))
 def test_every_line_fits(soc, sd, metres, width):
-    estimate = Estimate(time=1.0, state=State.VALID, reasons=~Reason(0), distrusted=tuple(ROLES), soc=soc,
-                        soc_sd=sd, range=metres, range_p10=metres * 0.7, range_p90=metres * 1.4,
-                        energy_left=metres * 90)  # fmt: skip
+    estimate = Estimate(
+        time=1.0,
+        state=State.VALID,
+        reasons=~Reason(0),
+        distrusted=tuple(ROLES),
+        soc=soc,
+        soc_sd=sd,
+        range=metres,
+        range_p10=metres * 0.7,
+        range_p90=metres * 1.4,
+        energy_left=metres * 90,
+    )
     for line in picture(seen(estimate), 100.0, width).splitlines():
         assert len(line) <= min(width, 78)
 
@@ -347,10 +383,15 @@ def test_once_without_frames(capsys):
 
 @pytest.mark.parametrize(
     ("arguments", "told"),
-    [(["--duration", "0"], "--duration 0"), (["--interface", "nonesuch"], "--interface nonesuch"),
-     (["--interface", "virtual", "--onse"], "--once"), (["--dbc", "range_larg.dbc"], "did you mean 'range_large.dbc'"),
-     (["--dbc", "vehicle.dbc"], "vehicle.dbc: has no message RANGE_Estimate"), (["--dbc", "."], "no such DBC file")],
-)  # fmt: skip
+    [
+        (["--duration", "0"], "--duration 0"),
+        (["--interface", "nonesuch"], "--interface nonesuch"),
+        (["--interface", "virtual", "--onse"], "--once"),
+        (["--dbc", "range_larg.dbc"], "did you mean 'range_large.dbc'"),
+        (["--dbc", "vehicle.dbc"], "vehicle.dbc: has no message RANGE_Estimate"),
+        (["--dbc", "."], "no such DBC file"),
+    ],
+)
 def test_wrong_use_is_told(arguments, told, capsys):
     try:
         status = cli.main(["dashboard", *arguments])
@@ -388,9 +429,13 @@ def start(*arguments, out, sending=60.0, **environment):
     inherited = {k: v for k, v in os.environ.items() if k not in ("COLUMNS", "LINES")}  # pytest's workers have these
     environment = {**inherited, "TERM": "xterm", "PYTHONPATH": str(Path(__file__).resolve().parents[2]), **environment}
     return subprocess.Popen(
-        [sys.executable, "-c", CHILD, str(sending), *arguments], stdin=out, stdout=out, stderr=subprocess.PIPE,
-        env=environment, start_new_session=True,
-    )  # fmt: skip
+        [sys.executable, "-c", CHILD, str(sending), *arguments],
+        stdin=out,
+        stdout=out,
+        stderr=subprocess.PIPE,
+        env=environment,
+        start_new_session=True,
+    )
 
 
 class Terminal:

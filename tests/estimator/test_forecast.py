@@ -129,9 +129,15 @@ def test_snapshot_goes_on_as_if_nothing_had_been():
 
 @pytest.mark.parametrize(
     "damage",
-    [{"factor": 50.0}, {"factor_variance": -1.0}, {"segments": [[0, 0, 0, 0, 0, 0]]}, {"segments": [["x"] * 6]},
-     {"segments": [[1.0]]}, {"factor": float("nan")}],
-)  # fmt: skip
+    [
+        {"factor": 50.0},
+        {"factor_variance": -1.0},
+        {"segments": [[0, 0, 0, 0, 0, 0]]},
+        {"segments": [["x"] * 6]},
+        {"segments": [[1.0]]},
+        {"factor": float("nan")},
+    ],
+)
 def test_a_damaged_snapshot_is_refused_and_changes_nothing(damage):
     f = forecaster()
     ride(f, 4)
@@ -155,8 +161,14 @@ def test_coverage_of_the_interval():
         ride(f, 6, factor=rider, seed=seed, stop_every=stops, dt=0.5)
         result = f.forecast(0.8, 0.01, 25.0, 1.0, 20.0, 0.0)
         other = forecaster()
-        energy, way = ride(other, 10, factor=rider * rng.normal(1.0, 0.05), seed=1000 + seed,
-                           stop_every=float(np.clip(stops * rng.normal(1, 0.2), 200, 1200)), dt=0.5)  # fmt: skip
+        energy, way = ride(
+            other,
+            10,
+            factor=rider * rng.normal(1.0, 0.05),
+            seed=1000 + seed,
+            stop_every=float(np.clip(stops * rng.normal(1, 0.2), 200, 1200)),
+            dt=0.5,
+        )
         true = result.energy / (energy / way)
         inside.append(result.p10 <= true <= result.p90)
     assert 0.65 <= np.mean(inside) <= 0.98

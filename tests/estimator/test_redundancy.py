@@ -15,9 +15,12 @@ from gz_onboard.events import ROLES
 RADIUS, GEAR = 0.25, 0.5  # m; wheel speed over motor speed
 STEP = 0.1  # s
 HONEST: Mapping[str, float] = {  # what each sensor says at 1 m/s
-    "motor_speed": 1 / (RADIUS * GEAR), "wheel_speed_rear": 1 / RADIUS, "wheel_speed_front": 1 / RADIUS,
-    "vehicle_speed": 1.0, "gps_speed": 1.0,
-}  # fmt: skip
+    "motor_speed": 1 / (RADIUS * GEAR),
+    "wheel_speed_rear": 1 / RADIUS,
+    "wheel_speed_front": 1 / RADIUS,
+    "vehicle_speed": 1.0,
+    "gps_speed": 1.0,
+}
 FOUR = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "gps_speed")
 Lie = Callable[[float, float], float | None]
 
@@ -27,8 +30,14 @@ def town(t: float) -> float:
     return max(0.0, 7.0 + 6.0 * sin(t / 9.0))
 
 
-def said(seconds: float, roles: tuple[str, ...], lies: Mapping[str, Lie], truth: Callable[[float], float] = town,
-         watch: Speeds | None = None, begin: float = 0.0) -> tuple[Speeds, Signals]:  # fmt: skip
+def said(
+    seconds: float,
+    roles: tuple[str, ...],
+    lies: Mapping[str, Lie],
+    truth: Callable[[float], float] = town,
+    watch: Speeds | None = None,
+    begin: float = 0.0,
+) -> tuple[Speeds, Signals]:
     """`seconds` of riding; a lie makes of (time [s], what the sensor should say) what it says, None being nothing."""
     signals = Signals((role, 2.0) for role in ROLES)
     speeds = watch or Speeds(RADIUS, GEAR)
@@ -209,8 +218,14 @@ MASS, FORCE, WIND, MOUNTED = 200.0, 100.0, 25.0, 0.02  # kg; N that the level ta
 SLOPES = ("accel_x", "gps_altitude")
 
 
-def hills(seconds: float, lies: Mapping[str, Lie], roles: tuple[str, ...] = SLOPES, power: bool = True,
-          on_road: bool = True, begin: float = 300.0) -> Slopes:  # fmt: skip
+def hills(
+    seconds: float,
+    lies: Mapping[str, Lie],
+    roles: tuple[str, ...] = SLOPES,
+    power: bool = True,
+    on_road: bool = True,
+    begin: float = 300.0,
+) -> Slopes:
     """Riding over hills of 4 %, stopping now and then; the lies begin at `begin` [s]."""
     signals, slopes, speeds = Signals((role, 2.0) for role in ROLES), Slopes(MASS, FORCE), Speeds(RADIUS, GEAR)
     way, before, height = 0.0, town(0.0), 200.0

@@ -31,9 +31,11 @@ def drive(seconds, motion, *, without=(), seed=0, dt=0.1):
             "accel_y": GRAVITY * sin(lean) + 0.05 * rng.standard_normal(),
             "rate_x": (lean - before[2]) / dt + radians(0.2) + 0.005 * rng.standard_normal(),
             "rate_z": yaw * np.cos(lean) - radians(0.15) + 0.005 * rng.standard_normal(),
-            "gps_speed": speed, "gps_course": heading, "gps_fix": 3.0,
+            "gps_speed": speed,
+            "gps_course": heading,
+            "gps_fix": 3.0,
             "gps_altitude": altitude + 1.5 * rng.standard_normal(),
-        }  # fmt: skip
+        }
         for role, value in values.items():
             if role not in without:
                 signal = signals[role]

@@ -164,10 +164,16 @@ def test_a_gps_without_a_fix_tells_no_speed():
 
 @pytest.mark.parametrize(
     "damage",
-    [{"consumption": 1e300}, {"consumption": -1e300}, {"odometer": 1e308}, {"current": 1e200}, {"own_soc": 1e200},
-     {"gyro_bias": [0.0, 0.5]}],
+    [
+        {"consumption": 1e300},
+        {"consumption": -1e300},
+        {"odometer": 1e308},
+        {"current": 1e200},
+        {"own_soc": 1e200},
+        {"gyro_bias": [0.0, 0.5]},
+    ],
     ids=str,
-)  # fmt: skip
+)
 def test_a_saved_number_that_cannot_be_is_refused(damage):
     scooter, e = Scooter(soc=0.75), estimator()
     follow(e, scooter.live(60, 10.0), scooter)

@@ -55,8 +55,7 @@ def lengthened(frame: Frame) -> Frame:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "reason"),
-    [(bad_crc, CRC), (flipped, CRC), (shortened, LENGTH), (emptied, LENGTH), (lengthened, LENGTH)],
+    ("spoil", "reason"), [(bad_crc, CRC), (flipped, CRC), (shortened, LENGTH), (emptied, LENGTH), (lengthened, LENGTH)]
 )
 @pytest.mark.parametrize("every", [5, 1])
 def test_frames_that_fail_a_check_are_dropped_counted_and_told(spoil: Spoil, reason: str, every: int):

@@ -137,8 +137,7 @@ def spoilers(known: dict[int, Layout]) -> dict[str, Spoiler]:
             stuck[frame[1]] = rng.choice(layout.extremes)
         return ((frame[0], frame[1], layout.put(frame[2], *stuck[frame[1]]), frame[3]),)
 
-    return {f.__name__: f for f in (
-        stranger, random_data, flagged, damaged, resized, lost, repeated, forged, extreme)}  # fmt: skip
+    return {f.__name__: f for f in (stranger, random_data, flagged, damaged, resized, lost, repeated, forged, extreme)}
 
 
 def hostile(rng: Random, known: dict[int, Layout], ride: Sequence[Frame]) -> Iterator[tuple[int, Frame]]:

@@ -97,14 +97,20 @@ def _kinds(size: float, full_scale: float) -> dict[str, Callable[[], Lie]]:
 
 
 SIZES = {  # an offset that matters, full scale
-    "motor_speed": (40.0, 100.0), "wheel_speed_rear": (40.0, 370.0), "wheel_speed_front": (40.0, 370.0),
-    "gps_speed": (8.0, 150.0), "accel_x": (2.0, 60.0), "gps_altitude": (30.0, 6000.0), "pack_current": (20.0, 300.0),
-    "inverter_current": (20.0, 300.0), "pack_voltage": (3.0, 100.0), "inverter_voltage": (3.0, 100.0),
-}  # fmt: skip
+    "motor_speed": (40.0, 100.0),
+    "wheel_speed_rear": (40.0, 370.0),
+    "wheel_speed_front": (40.0, 370.0),
+    "gps_speed": (8.0, 150.0),
+    "accel_x": (2.0, 60.0),
+    "gps_altitude": (30.0, 6000.0),
+    "pack_current": (20.0, 300.0),
+    "inverter_current": (20.0, 300.0),
+    "pack_voltage": (3.0, 100.0),
+    "inverter_voltage": (3.0, 100.0),
+}
 BOTH = "pack_current", "inverter_current"
 BY_HAND: list[Fault] = [
-    *((("gps_altitude",), f"climbing {rate:g} m/s", _climbing(rate)) for rate in
-      (0.1, 0.3, 1.0, 3.0, -1.0)),
+    *((("gps_altitude",), f"climbing {rate:g} m/s", _climbing(rate)) for rate in (0.1, 0.3, 1.0, 3.0, -1.0)),
     *((("accel_x",), f"{size:+g} m/s²", _off(size)) for size in (0.5, -0.5, 1.0, 5.0)),
     (("pack_current",), "-300 A", _plain(lambda t, v: -300.0)),
     (("pack_current",), "5 A too high", _plain(lambda t, v: v + 5.0)),
@@ -125,7 +131,7 @@ BY_HAND: list[Fault] = [
     (("accel_y",), "+20 m/s²", _plain(lambda t, v: v + 20.0)),
     (("rate_x",), "+1 rad/s", _plain(lambda t, v: v + 1.0)),
     (("rate_z",), "stuck", _stuck),
-]  # fmt: skip
+]
 GRACE = 60.0  # s: time of detection, some 500 m of a ride through town
 LIMITS: dict[tuple[tuple[str, ...], str], str] = {  # break a promise, for a known reason: told in the table
     (("gps_altitude",), "climbing 0.1 m/s"): "less than a receiver wanders and an accelerometer is tilted",

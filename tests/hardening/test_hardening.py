@@ -42,10 +42,7 @@ def silent(e):
         (lambda rows: between(rows, 300, 301, doubled), "not named though it spoils the range"),
         (lambda rows: between(rows, 300, 301, lambda e: {"soc": e.soc + 4 * e.soc_sd}), "SOC off by 4.0 sd"),
         (lambda rows: between(rows, 300, 301, lambda e: {"distrusted": ("accel_x",)}), "accel_x accused"),
-        (
-            lambda rows: between(rows, 300, 361, silent),
-            "no range for 61 s and nobody named",
-        ),
+        (lambda rows: between(rows, 300, 361, silent), "no range for 61 s and nobody named"),
     ],
 )
 def test_a_lie_is_judged_at_every_second(unspoilt, made, promise):

@@ -113,8 +113,9 @@ def test_the_same_log_gives_the_same_bytes(tmp_path):
             "--output",
             folder,
         ]
-        subprocess.run(command, check=True, env={**os.environ, "PYTHONHASHSEED": seed, "TZ": f"UTC+{seed}"},
-                       capture_output=True)  # fmt: skip
+        subprocess.run(
+            command, check=True, env={**os.environ, "PYTHONHASHSEED": seed, "TZ": f"UTC+{seed}"}, capture_output=True
+        )
         made.append({file.name: file.read_bytes() for file in sorted(folder.iterdir())})
     assert set(made[0]) == {"coastdown.estimate.mcap", "coastdown.estimate.png"}
     assert made[0] == made[1]
@@ -288,8 +289,19 @@ def test_the_expected_number_of_frames_is_about_right(tmp_path, frames):
 
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_ctrl_c_leaves_nothing_half_written(tmp_path, jobs):
-    command = [*HEARS_CTRL_C, sys.executable, "-m", "gz_onboard", "estimate", RIDE, LOGS / "city_14C.blf",
-               "--jobs", jobs, "--output", tmp_path]  # fmt: skip
+    command = [
+        *HEARS_CTRL_C,
+        sys.executable,
+        "-m",
+        "gz_onboard",
+        "estimate",
+        RIDE,
+        LOGS / "city_14C.blf",
+        "--jobs",
+        jobs,
+        "--output",
+        tmp_path,
+    ]
     child = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True)
     while not list(tmp_path.glob("*.part")) and child.poll() is None:
         time.sleep(0.01)

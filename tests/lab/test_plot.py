@@ -160,8 +160,15 @@ def test_the_naive_range_forgets_what_is_more_than_25_km_ago():
     rows: list[plot.Row] = []
     distance = 0.0
     for t in range(12_000):  # 20 km at 160 J/m, then 100 km at 80 J/m
-        rows.append({"time": float(t), "distance": distance, "pack_voltage": 50.0,
-                     "pack_current": 10 * (160 if distance <= 20_000 else 80) / 50, "energy_left": 8e6})  # fmt: skip
+        rows.append(
+            {
+                "time": float(t),
+                "distance": distance,
+                "pack_voltage": 50.0,
+                "pack_current": 10 * (160 if distance <= 20_000 else 80) / 50,
+                "energy_left": 8e6,
+            }
+        )
         distance += 10
     naive = plot.naive_range(rows)
     assert naive[1900] == pytest.approx(50_000, rel=0.01)

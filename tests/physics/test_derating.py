@@ -49,10 +49,16 @@ def test_what_the_file_says_counts_the_rest_is_default(tmp_path):
     ("old", "new", "words"),
     [
         ("current_by_soc", "curent_by_soc", ["curent_by_soc", "unknown key", "did you mean 'current_by_soc'"]),
-        ("at = [2.75, 2.89, 3.04", "at = [2.75, 3.09, 3.04",
-         ["controller.current_by_cell_voltage.at", "must increase", "3.04 V follows 3.09 V"]),
-        ("at = [0.0, 120.0, 150.0]", "at = [0.0, 120.0, 1500.0]",
-         ["controller.current_by_motor_temperature.at", "1500 degC is outside -60 to 300 degC"]),
+        (
+            "at = [2.75, 2.89, 3.04",
+            "at = [2.75, 3.09, 3.04",
+            ["controller.current_by_cell_voltage.at", "must increase", "3.04 V follows 3.09 V"],
+        ),
+        (
+            "at = [0.0, 120.0, 150.0]",
+            "at = [0.0, 120.0, 1500.0]",
+            ["controller.current_by_motor_temperature.at", "1500 degC is outside -60 to 300 degC"],
+        ),
         ("share = [0.1, 1.0]", "share = [0.1, 1.2]", ["controller.current_by_soc.share", "1.2 is outside 0 to 1"]),
         ("share = [0.1, 1.0]", "share = [0.1]", ["controller.current_by_soc.share", "1 numbers for 2"]),
         ('0.0], unit = "rad/s"', '0.0], unit = "rpm"', ["current_by_motor_speed.unit", "'rpm'", "rad/s"]),
@@ -60,7 +66,7 @@ def test_what_the_file_says_counts_the_rest_is_default(tmp_path):
         ("at = [7.0, 14.5]", 'at = [7.0, "fast"]', ["regeneration_by_motor_speed.at", "'fast'"]),
         ("at = [7.0, 14.5], ", "", ["regeneration_by_motor_speed.at", "is missing"]),
     ],
-)  # fmt: skip
+)
 def test_what_makes_no_sense_is_refused_by_line_and_key(tmp_path, old, new, words):
     place = REFERENCE.index(CONTROLLER) + CONTROLLER.index(old)
     file = tmp_path / "v.toml"

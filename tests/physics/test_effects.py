@@ -18,13 +18,27 @@ from gz_onboard.physics.parameters import declared_parameters
 EFFECTS = [load_effect(name) for name in known_effects()]
 CONSERVATIVE = {"inertia", "grade_force", "headwind"}  # what they take they give back; the wind gives of its own
 LIMITS = {
-    "speed": (-5, 40), "acceleration": (-8, 8), "grade": (-0.3, 0.3), "grade_cosine": (0.9, 1), "mass": (50, 400),
-    "air_density": (0.9, 1.5), "headwind": (-15, 15), "lateral_acceleration": (-8, 8), "motor_speed": (-30, 400),
-    "motor_current": (-300, 300), "vibration": (0, 10),
-    "motor_temperature": (-40, 200), "torque": (-120, 120), "heading": (-10, 10), "time_moving": (0, 1e4),
-    "ambient_temperature": (-30, 50), "cell_current": (-30, 30), "cell_temperature": (-30, 70),
-    "cell_capacity": (0.5, 50), "soc": (-0.05, 1.05),
-}  # fmt: skip
+    "speed": (-5, 40),
+    "acceleration": (-8, 8),
+    "grade": (-0.3, 0.3),
+    "grade_cosine": (0.9, 1),
+    "mass": (50, 400),
+    "air_density": (0.9, 1.5),
+    "headwind": (-15, 15),
+    "lateral_acceleration": (-8, 8),
+    "motor_speed": (-30, 400),
+    "motor_current": (-300, 300),
+    "vibration": (0, 10),
+    "motor_temperature": (-40, 200),
+    "torque": (-120, 120),
+    "heading": (-10, 10),
+    "time_moving": (0, 1e4),
+    "ambient_temperature": (-30, 50),
+    "cell_current": (-30, 30),
+    "cell_temperature": (-30, 70),
+    "cell_capacity": (0.5, 50),
+    "soc": (-0.05, 1.05),
+}
 PRIORS = {name: parameter.prior for name, parameter in declared_parameters().items()}
 
 
@@ -163,8 +177,16 @@ def test_headwind_is_the_difference_of_the_drag_and_goes_round_with_the_heading(
 
 
 def test_candidates_say_what_shows_them():
-    for name in ("cornering_drag", "headwind", "dragging_brake", "tyre_warm_up", "drivetrain_drag", "regen_loss",
-                 "slow_relaxation", "ocv_hysteresis"):  # fmt: skip
+    for name in (
+        "cornering_drag",
+        "headwind",
+        "dragging_brake",
+        "tyre_warm_up",
+        "drivetrain_drag",
+        "regen_loss",
+        "slow_relaxation",
+        "ocv_hysteresis",
+    ):
         assert len(load_effect(name).shown_by) > 40
 
 

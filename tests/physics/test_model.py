@@ -40,20 +40,23 @@ def test_ledger_against_the_equations_written_out(q):
     inertia = m + (P["wheel_inertia_front"] + P["wheel_inertia_rear"]) / r**2
     force = (
         0.5 * q["air_density"] * P["drag_area"] * flow * abs(flow)
-        + m * 9.80665 * math.sqrt(1 - q["grade"] ** 2)
+        + m
+        * 9.80665
+        * math.sqrt(1 - q["grade"] ** 2)
         * (P["rolling_resistance_constant"] * v / math.hypot(v, 0.1) + P["rolling_resistance_speed"] * v)
         + m * 9.80665 * q["grade"]
         + inertia * q["acceleration"]
-    )  # fmt: skip
+    )
     torque = max(force * r, -P["regeneration_torque_limit"])
     speed = v / r
     iron = P["motor_iron_linear"] * speed + P["motor_iron_quadratic"] * speed**2
     current = (torque + iron * speed / (speed**2 + 0.01)) / P["torque_constant"]  # in the air gap
     copper = P["motor_copper_resistance"] * (1 + 0.00393 * (q["motor_temperature"] - 25)) * current**2
     inverter = (
-        P["inverter_loss_constant"] + P["inverter_loss_linear"] * abs(current)
+        P["inverter_loss_constant"]
+        + P["inverter_loss_linear"] * abs(current)
         + P["inverter_loss_quadratic"] * current**2
-    )  # fmt: skip
+    )
     expected = torque * speed + copper + iron + inverter + P["auxiliary_power"]
     assert sum(MODEL.power(complete(q)).values()) == pytest.approx(expected, rel=1e-9, abs=1e-6)
 
@@ -78,11 +81,27 @@ def test_out_and_back_over_a_hill_costs_but_never_gives():
     """Kinetic and potential energy are given back at best: a round trip has a positive sum."""
     total = 0.0
     for grade in (0.05, -0.05):
-        q = complete({"speed": 8.0, "acceleration": 0.0, "grade": grade, "headwind": 0.0, "air_density": 1.2,
-                      "motor_temperature": 40.0})  # fmt: skip
+        q = complete(
+            {
+                "speed": 8.0,
+                "acceleration": 0.0,
+                "grade": grade,
+                "headwind": 0.0,
+                "air_density": 1.2,
+                "motor_temperature": 40.0,
+            }
+        )
         total += sum(MODEL.power(q).values())
-    flat = complete({"speed": 8.0, "acceleration": 0.0, "grade": 0.0, "headwind": 0.0, "air_density": 1.2,
-                     "motor_temperature": 40.0})  # fmt: skip
+    flat = complete(
+        {
+            "speed": 8.0,
+            "acceleration": 0.0,
+            "grade": 0.0,
+            "headwind": 0.0,
+            "air_density": 1.2,
+            "motor_temperature": 40.0,
+        }
+    )
     assert total > 2 * sum(MODEL.power(flat).values())
 
 

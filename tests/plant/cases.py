@@ -137,9 +137,13 @@ class _Draft:
 
 
 RELATIVE = {
-    "aero_drag_area", "tyre_radius", "torque_constant_loss", "capacity_fade", "current_sensor_gain",
+    "aero_drag_area",
+    "tyre_radius",
+    "torque_constant_loss",
+    "capacity_fade",
+    "current_sensor_gain",
     "rolling_resistance",
-}  # fmt: skip
+}
 
 
 def _strength(rng: np.random.Generator, name: str) -> tuple[dict[str, float], tuple[float, ...]]:
@@ -330,9 +334,7 @@ def trial(
         number: [measure(next(ridden), f"commissioning_{i:03d}") for i in range(len(runs))]
         for number, runs in zip(numbers, healthy, strict=True)
     }
-    cases = [
-        _case(draft, [next(ridden) for _ in runs], truths) for draft, runs in zip(drafts, hidden, strict=True)
-    ]  # fmt: skip
+    cases = [_case(draft, [next(ridden) for _ in runs], truths) for draft, runs in zip(drafts, hidden, strict=True)]
     return rides, cases
 
 
@@ -470,10 +472,13 @@ def _first_runs(number: int) -> list[Run]:
     charge = rng.permutation(np.linspace(0.18, 0.99, 8))
     seed = 3_000_000_000 + number * 64
     return [
-        (plan(seed + i, str(kinds[i]), str(rng.choice(list("ABCD"))), float(air[i]), float(charge[i])), scooter(number),
-         Hidden())
+        (
+            plan(seed + i, str(kinds[i]), str(rng.choice(list("ABCD"))), float(air[i]), float(charge[i])),
+            scooter(number),
+            Hidden(),
+        )
         for i in range(8)
-    ]  # fmt: skip
+    ]
 
 
 def healthy(number: int, seeds: Sequence[int]) -> tuple[list[Samples], list[list[Samples]]]:

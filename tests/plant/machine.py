@@ -14,11 +14,29 @@ SERIES, PARALLEL = 14, 12
 
 # Open-circuit voltage of the cell at rest: points of an NMC 18650 of 2.8 A·h, joined by a monotone cubic.
 OCV_POINTS = (
-    (0.0, 2.60), (0.004, 2.72), (0.012, 2.89), (0.022, 3.035), (0.036, 3.16), (0.055, 3.27), (0.08, 3.362),
-    (0.12, 3.446), (0.17, 3.505), (0.23, 3.551), (0.31, 3.596), (0.4, 3.640), (0.47, 3.680), (0.54, 3.733),
-    (0.61, 3.800), (0.68, 3.865), (0.76, 3.938), (0.84, 4.013), (0.92, 4.092), (0.965, 4.140), (0.985, 4.167),
+    (0.0, 2.60),
+    (0.004, 2.72),
+    (0.012, 2.89),
+    (0.022, 3.035),
+    (0.036, 3.16),
+    (0.055, 3.27),
+    (0.08, 3.362),
+    (0.12, 3.446),
+    (0.17, 3.505),
+    (0.23, 3.551),
+    (0.31, 3.596),
+    (0.4, 3.640),
+    (0.47, 3.680),
+    (0.54, 3.733),
+    (0.61, 3.800),
+    (0.68, 3.865),
+    (0.76, 3.938),
+    (0.84, 4.013),
+    (0.92, 4.092),
+    (0.965, 4.140),
+    (0.985, 4.167),
     (1.0, 4.193),
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -111,20 +129,59 @@ class Machine:
 
 # How much scooters of one make differ: relative standard deviations, and absolute ones.
 SPREAD = {
-    "wheel_radius": 0.002, "front_radius": 0.002, "drag_area": 0.03, "rolling": 0.05, "rolling_temperature": 0.15,
-    "tyre_time": 0.15, "camber_rolling": 0.15, "slip_stiffness": 0.1, "bearing_drag": 0.3, "torque_constant": 0.008,
-    "copper": 0.03, "hysteresis_loss": 0.05, "eddy_loss": 0.06, "inverter_switching": 0.04, "auxiliary": 0.03,
-    "capacity": 0.01, "ohmic": 0.05, "transfer": 0.06, "diffusion_a": 0.08, "diffusion_b": 0.08, "diffusion_c": 0.15,
-    "diffusion_d": 0.2, "hysteresis": 0.3, "series_resistance": 0.15, "core_capacity": 0.05, "shell_to_air": 0.2,
-    "stator_capacity": 0.05, "rotor_capacity": 0.05, "rotor_to_air": 0.1, "board_capacity": 0.05, "box_capacity": 0.05,
-    "box_to_air": 0.1, "core_to_shell": 0.1,
-}  # fmt: skip
+    "wheel_radius": 0.002,
+    "front_radius": 0.002,
+    "drag_area": 0.03,
+    "rolling": 0.05,
+    "rolling_temperature": 0.15,
+    "tyre_time": 0.15,
+    "camber_rolling": 0.15,
+    "slip_stiffness": 0.1,
+    "bearing_drag": 0.3,
+    "torque_constant": 0.008,
+    "copper": 0.03,
+    "hysteresis_loss": 0.05,
+    "eddy_loss": 0.06,
+    "inverter_switching": 0.04,
+    "auxiliary": 0.03,
+    "capacity": 0.01,
+    "ohmic": 0.05,
+    "transfer": 0.06,
+    "diffusion_a": 0.08,
+    "diffusion_b": 0.08,
+    "diffusion_c": 0.15,
+    "diffusion_d": 0.2,
+    "hysteresis": 0.3,
+    "series_resistance": 0.15,
+    "core_capacity": 0.05,
+    "shell_to_air": 0.2,
+    "stator_capacity": 0.05,
+    "rotor_capacity": 0.05,
+    "rotor_to_air": 0.1,
+    "board_capacity": 0.05,
+    "box_capacity": 0.05,
+    "box_to_air": 0.1,
+    "core_to_shell": 0.1,
+}
 SPREAD_ABSOLUTE = {
-    "current_gain": 0.004, "current_offset": 0.03, "voltage_offset": 0.015, "inverter_voltage_offset": 0.015,
-    "inverter_current_gain": 0.003, "accel_bias_x": 0.03, "accel_pitch": 0.03, "accel_bias_y": 0.03,
-    "gyro_bias_x": 0.001, "gyro_bias_y": 0.001, "gyro_bias_z": 0.0006, "ambient_bias": 0.3, "gps_latency": 0.03,
-    "ocv_shift": 0.002, "ocv_wave": 0.0015, "ocv_phase": 3.0, "cell_probe_bias": 0.3,
-}  # fmt: skip
+    "current_gain": 0.004,
+    "current_offset": 0.03,
+    "voltage_offset": 0.015,
+    "inverter_voltage_offset": 0.015,
+    "inverter_current_gain": 0.003,
+    "accel_bias_x": 0.03,
+    "accel_pitch": 0.03,
+    "accel_bias_y": 0.03,
+    "gyro_bias_x": 0.001,
+    "gyro_bias_y": 0.001,
+    "gyro_bias_z": 0.0006,
+    "ambient_bias": 0.3,
+    "gps_latency": 0.03,
+    "ocv_shift": 0.002,
+    "ocv_wave": 0.0015,
+    "ocv_phase": 3.0,
+    "cell_probe_bias": 0.3,
+}
 
 
 def scooter(number: int) -> Machine:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
+from gz_onboard.arrays import Array
 from tests.plant.machine import OCV_POINTS, PARALLEL, SERIES, G, Machine
 from tests.plant.roads import (
     BRAKE_HAND,
@@ -30,8 +31,6 @@ from tests.plant.roads import (
     Plan,
 )
 
-Array = NDArray[np.float64]
-
 STEP = 0.02  # s
 DELAY = 10  # steps that a rider takes to react
 REST = 12.0  # s of standing before the start and, at most, after the end
@@ -39,10 +38,35 @@ KELVIN = 273.15
 GAS = 8.314
 SPEED_LIMIT = (50.5, 54.0)  # rad/s: where the controller begins to take the torque away, and where none is left
 COLUMNS = (
-    "speed", "acceleration", "distance", "altitude", "grade", "lean", "lean_rate", "yaw_rate", "heading", "north",
-    "east", "rear", "front", "motor_current", "throttle", "brake", "squeeze", "pack_voltage", "pack_current",
-    "inverter_voltage", "inverter_current", "auxiliary_current", "soc", "shell", "stator", "board", "ambient", "rough",
-)  # fmt: skip
+    "speed",
+    "acceleration",
+    "distance",
+    "altitude",
+    "grade",
+    "lean",
+    "lean_rate",
+    "yaw_rate",
+    "heading",
+    "north",
+    "east",
+    "rear",
+    "front",
+    "motor_current",
+    "throttle",
+    "brake",
+    "squeeze",
+    "pack_voltage",
+    "pack_current",
+    "inverter_voltage",
+    "inverter_current",
+    "auxiliary_current",
+    "soc",
+    "shell",
+    "stator",
+    "board",
+    "ambient",
+    "rough",
+)
 
 
 @dataclass(frozen=True)
@@ -119,8 +143,10 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
     h = SimpleNamespace(**{f.name: np.array([float(getattr(x, f.name)) for x in hiddens]) for f in fields(Hidden)})
     own = ("ambient", "pressure", "wind_north", "wind_east", "soc", "pack_warmer", "motor_warmer", "heading")
     p = SimpleNamespace(**{name: np.array([getattr(x, name) for x in plans]) for name in own})
-    rider = {name: np.array([getattr(x.rider, name) for x in plans]) for name in
-             ("mass", "acceleration", "braking", "lag", "preview")}  # fmt: skip
+    rider = {
+        name: np.array([getattr(x.rider, name) for x in plans])
+        for name in ("mass", "acceleration", "braking", "lag", "preview")
+    }
     r = SimpleNamespace(**rider)
     rows = np.arange(n)
 
@@ -319,10 +345,17 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
         pack_voltage = emf - inside * pack_current
         cell_current = pack_current / PARALLEL
         thermal = np.exp(3400 * cold_factor) * h.resistance_factor
-        settle = np.array([
-            m.diffusion_a * thermal, m.diffusion_b * thermal * (1 + 0.3 * np.exp(-soc / 0.12)),
-            m.diffusion_c * np.exp(2500 * cold_factor), m.diffusion_d * np.exp(1500 * cold_factor),
-        ]) * cell_current  # fmt: skip
+        settle = (
+            np.array(
+                [
+                    m.diffusion_a * thermal,
+                    m.diffusion_b * thermal * (1 + 0.3 * np.exp(-soc / 0.12)),
+                    m.diffusion_c * np.exp(2500 * cold_factor),
+                    m.diffusion_d * np.exp(1500 * cold_factor),
+                ]
+            )
+            * cell_current
+        )
         branch = keep * branch + (1 - keep) * settle
         slow = slow_keep * slow + (1 - slow_keep) * h.slow_resistance * cell_current
         capacity = m.capacity * (1 - m.capacity_temperature * np.maximum(25 - core, 0)) * h.capacity_factor
@@ -338,9 +371,16 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
         heat = heat + SERIES * PARALLEL * cell_current * kelvin * 0.00008 * np.sin(5 * soc)
         flow_heat = m.core_to_shell * (core - shell)
         core = core + STEP * (heat - flow_heat) / m.core_capacity
-        shell = shell + STEP * (
-            flow_heat + m.series_resistance * 0.3 * pack_current**2 - m.shell_to_air * warm * blow * (shell - p.ambient)
-        ) / m.shell_capacity  # fmt: skip
+        shell = (
+            shell
+            + STEP
+            * (
+                flow_heat
+                + m.series_resistance * 0.3 * pack_current**2
+                - m.shell_to_air * warm * blow * (shell - p.ambient)
+            )
+            / m.shell_capacity
+        )
         gap = m.stator_to_rotor * (stator - rotor)
         stator = stator + STEP * (copper + 0.85 * iron - gap) / m.stator_capacity
         rotor = rotor + STEP * (0.15 * iron + gap - m.rotor_to_air * warm * 2 * blow * (rotor - p.ambient)) / (
@@ -376,11 +416,35 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
         # --- kept
         inverter_voltage = pack_voltage - m.cable * inverter_now
         now = (
-            v, acceleration, s, altitude, grade, lean, lean_rate, yaw_rate, heading, north, east, rear, front,
-            motor_current, throttle, braking, squeeze, pack_voltage, pack_current, inverter_voltage,
-            dc / inverter_voltage, auxiliary / pack_voltage, soc, shell, stator, board, p.ambient,
+            v,
+            acceleration,
+            s,
+            altitude,
+            grade,
+            lean,
+            lean_rate,
+            yaw_rate,
+            heading,
+            north,
+            east,
+            rear,
+            front,
+            motor_current,
+            throttle,
+            braking,
+            squeeze,
+            pack_voltage,
+            pack_current,
+            inverter_voltage,
+            dc / inverter_voltage,
+            auxiliary / pack_voltage,
+            soc,
+            shell,
+            stator,
+            board,
+            p.ambient,
             rough,
-        )  # fmt: skip
+        )
         for name, value in zip(COLUMNS, now, strict=True):
             record[name][step] = value
 
@@ -390,10 +454,13 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
         columns = {name: np.ascontiguousarray(record[name][:count, i]) for name in COLUMNS}
         out.append(
             Ridden(
-                plans[i], machines[i], hiddens[i], columns,
+                plans[i],
+                machines[i],
+                hiddens[i],
+                columns,
                 float(roll_work[i] / max(load_way[i], 1.0)),
                 float(drag_work[i] / drag_way[i]) if abs(drag_way[i]) > 1 else float(drag[i]),
                 float(energy[i] / max(energy_way[i], 1.0)),
             )
-        )  # fmt: skip
+        )
     return out

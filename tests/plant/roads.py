@@ -5,10 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-Array = NDArray[np.float64]
+from gz_onboard.arrays import Array
 
 GRID = 2.0  # m
 NOISE_STEP = 0.2  # s
@@ -167,9 +166,15 @@ def _hills(rng: np.random.Generator, count: int, hilly: float) -> Array:
     grade = np.zeros(count)
     for wavelength, height in ((1900.0, 6.0), (800.0, 2.6), (330.0, 1.0)):
         length = wavelength * rng.uniform(0.7, 1.4)
-        grade += hilly * height * rng.uniform(0.5, 1.3) * 2 * np.pi / length * np.cos(
-            2 * np.pi * x / length + rng.uniform(0, 2 * np.pi)
-        )  # fmt: skip
+        grade += (
+            hilly
+            * height
+            * rng.uniform(0.5, 1.3)
+            * 2
+            * np.pi
+            / length
+            * np.cos(2 * np.pi * x / length + rng.uniform(0, 2 * np.pi))
+        )
     return np.clip(grade, -0.09, 0.09)
 
 

@@ -10,11 +10,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from gz_onboard.arrays import Array
 from gz_onboard.simulation.samples import Samples
 from tests.plant.machine import G
 from tests.plant.ride import STEP, Ridden
-
-Array = NDArray[np.float64]
 
 ORIGIN = (40.307, -83.537)  # deg
 DEGREE = 111_200.0  # m

@@ -68,10 +68,22 @@ def test_energy_and_charge_balance(healthy):
 
 def test_what_is_wrong_costs_energy(healthy):
     wrong = [
-        {"cornering": 0.3}, {"rolling_factor": 1.4}, {"drag_factor": 1.3}, {"luggage": 40.0}, {"pad_force": 10.0},
-        {"warm_share": 0.8}, {"wheel_viscous": 0.05}, {"auxiliary": 60.0}, {"copper": 0.03}, {"switching": 1.0},
-        {"recovery_lost": 0.8}, {"band_force": 20.0}, {"surge_loss": 8.0}, {"steer_drag": 500.0}, {"left_drag": 30.0},
-    ]  # fmt: skip
+        {"cornering": 0.3},
+        {"rolling_factor": 1.4},
+        {"drag_factor": 1.3},
+        {"luggage": 40.0},
+        {"pad_force": 10.0},
+        {"warm_share": 0.8},
+        {"wheel_viscous": 0.05},
+        {"auxiliary": 60.0},
+        {"copper": 0.03},
+        {"switching": 1.0},
+        {"recovery_lost": 0.8},
+        {"band_force": 20.0},
+        {"surge_loss": 8.0},
+        {"steer_drag": 500.0},
+        {"left_drag": 30.0},
+    ]
     rides = ride([PLANS[1]] * len(wrong), [scooter(3)] * len(wrong), [Hidden(**w) for w in wrong])
     for fields, ridden in zip(wrong, rides, strict=True):
         assert ridden.energy_per_metre > 1.004 * healthy[1].energy_per_metre, fields

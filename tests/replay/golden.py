@@ -31,14 +31,37 @@ Row = Mapping[str, str]
 # How far a field may be from its golden value: absolute, in the field's unit. Another processor or mathematical
 # library rounds otherwise in the last digits; a change in the estimator moves more than this.
 TOLERANCE = {
-    "time": 1e-6, "soc": 1e-6, "soc_sd": 1e-6, "v1": 1e-6, "innovation": 1e-6, "innovation_rms": 1e-6,
-    "pack_voltage": 1e-4, "pack_current": 1e-4, "cell_temperature": 1e-4, "speed": 1e-5, "acceleration": 1e-5,
-    "grade": 1e-6, "lean": 1e-6, "yaw_rate": 1e-6, "heading": 1e-5, "distance": 0.01, "range": 0.5, "range_p10": 0.5,
-    "range_p90": 0.5, "energy_left": 20.0, "energy_left_sd": 20.0, "consumption_recent": 1e-3,
-    "consumption_expected": 1e-3, "consumption_expected_sd": 1e-3, "consumption_factor": 1e-5,
-    "consumption_factor_sd": 1e-5, "state": 0.0, "reasons": 0.0,
-    "activity": 0.0, "distrusted": 0.0,
-}  # fmt: skip
+    "time": 1e-6,
+    "soc": 1e-6,
+    "soc_sd": 1e-6,
+    "v1": 1e-6,
+    "innovation": 1e-6,
+    "innovation_rms": 1e-6,
+    "pack_voltage": 1e-4,
+    "pack_current": 1e-4,
+    "cell_temperature": 1e-4,
+    "speed": 1e-5,
+    "acceleration": 1e-5,
+    "grade": 1e-6,
+    "lean": 1e-6,
+    "yaw_rate": 1e-6,
+    "heading": 1e-5,
+    "distance": 0.01,
+    "range": 0.5,
+    "range_p10": 0.5,
+    "range_p90": 0.5,
+    "energy_left": 20.0,
+    "energy_left_sd": 20.0,
+    "consumption_recent": 1e-3,
+    "consumption_expected": 1e-3,
+    "consumption_expected_sd": 1e-3,
+    "consumption_factor": 1e-5,
+    "consumption_factor_sd": 1e-5,
+    "state": 0.0,
+    "reasons": 0.0,
+    "activity": 0.0,
+    "distrusted": 0.0,
+}
 
 
 @dataclass(frozen=True)
@@ -117,8 +140,9 @@ def differences(golden: Sequence[Row], now: Sequence[Row], tolerance: Mapping[st
         found.append(Difference("", "number of rows", str(len(golden)), str(len(now))))
     for old, new in zip(golden, now, strict=False):
         for name in dict.fromkeys([*old, *new]):
-            difference = Difference(new.get("time", ""), name, old.get(name, "(no such field)"),
-                                    new.get(name, "(no such field)"))  # fmt: skip
+            difference = Difference(
+                new.get("time", ""), name, old.get(name, "(no such field)"), new.get(name, "(no such field)")
+            )
             if difference.golden != difference.now and not difference.size <= tolerance.get(name, 0.0):
                 found.append(difference)
     return found

@@ -77,8 +77,10 @@ def test_a_difference_is_told_with_its_field_and_size():
     before, now = [row(), row(), row()], [row(), row(range="1001.5"), row(state="DEGRADED", soc="")]
     found = golden.differences(before, now, golden.TOLERANCE)
     assert [(d.field, d.golden, d.now) for d in found] == [
-        ("range", "1000", "1001.5"), ("soc", "0.5", ""), ("state", "VALID", "DEGRADED"),
-    ]  # fmt: skip
+        ("range", "1000", "1001.5"),
+        ("soc", "0.5", ""),
+        ("state", "VALID", "DEGRADED"),
+    ]
     text = golden.told(found, len(now))
     assert "range: 1 of 3 rows differ by more than 0.5" in text
     assert "+1.5" in text

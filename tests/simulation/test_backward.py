@@ -25,10 +25,15 @@ def test_is_the_model_summed_up_step_by_step():
     for i in range(4):
         dt, sine = t[i + 1] - t[i], (grade[i] + grade[i + 1]) / 2
         q = dict.fromkeys(QUANTITIES, 0.0) | {
-            "speed": (v[i] + v[i + 1]) / 2, "acceleration": (v[i + 1] - v[i]) / dt, "grade": sine,
-            "grade_cosine": (1 - sine**2) ** 0.5, "mass": VEHICLE.model.mass, "headwind": 1.5,
-            "air_density": air_density(12.0), "motor_temperature": 40.0,
-        }  # fmt: skip
+            "speed": (v[i] + v[i + 1]) / 2,
+            "acceleration": (v[i + 1] - v[i]) / dt,
+            "grade": sine,
+            "grade_cosine": (1 - sine**2) ** 0.5,
+            "mass": VEHICLE.model.mass,
+            "headwind": 1.5,
+            "air_density": air_density(12.0),
+            "motor_temperature": 40.0,
+        }
         total += sum(VEHICLE.model.power(q).values()) * dt
     assert energy.total == pytest.approx(total, rel=1e-12)
     assert sum(energy.ledger.values()) == pytest.approx(energy.total, rel=1e-9)

@@ -18,8 +18,16 @@ from gz_onboard.simulation.sensors import SENSORS, Trace, latency
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 BASE = read_vehicle("reference")
-CANDIDATES = ("cornering_drag", "headwind", "dragging_brake", "tyre_warm_up", "drivetrain_drag", "regen_loss",
-              "slow_relaxation", "ocv_hysteresis")  # fmt: skip
+CANDIDATES = (
+    "cornering_drag",
+    "headwind",
+    "dragging_brake",
+    "tyre_warm_up",
+    "drivetrain_drag",
+    "regen_loss",
+    "slow_relaxation",
+    "ocv_hysteresis",
+)
 
 
 def extended(*names: str, **values: float) -> Vehicle:
@@ -57,9 +65,18 @@ def test_the_candidates_are_all_effects_beyond_the_base():
 
 
 def test_the_balance_closes_with_all_effects_and_parameters():
-    vehicle = extended(*CANDIDATES, wind_north=4.0, wind_east=-2.0, cell_resistance_factor=1.4, cooling_factor=0.3,
-                       speed_sensor_scale=1.02, pack_voltage_latency=0.2, cell_capacity=2.4, hysteresis_voltage=0.02,
-                       hysteresis_rate=100.0)  # fmt: skip
+    vehicle = extended(
+        *CANDIDATES,
+        wind_north=4.0,
+        wind_east=-2.0,
+        cell_resistance_factor=1.4,
+        cooling_factor=0.3,
+        speed_sensor_scale=1.02,
+        pack_voltage_latency=0.2,
+        cell_capacity=2.4,
+        hysteresis_voltage=0.02,
+        hysteresis_rate=100.0,
+    )
     run, scooter = ride(vehicle, 300.0)
     assert abs(run.closure) < 1e-4
     assert set(CANDIDATES) - {"slow_relaxation", "ocv_hysteresis"} <= set(run.ledger)
@@ -197,8 +214,9 @@ def test_what_the_sensors_show_of_it():
         return {sensor.signal: sensor.read(truth) for sensor in SENSORS}
 
     true = signals(BASE)
-    false = signals(extended(speed_sensor_scale=1.05, pack_current_offset=0.5, pack_current_gain=1.1,
-                             pack_voltage_offset=-0.3))  # fmt: skip
+    false = signals(
+        extended(speed_sensor_scale=1.05, pack_current_offset=0.5, pack_current_gain=1.1, pack_voltage_offset=-0.3)
+    )
     moving = true["HBM_WheelSpeedRear"] > 1
     assert false["INV_MotorSpeed"][moving] == pytest.approx(1.05 * true["INV_MotorSpeed"][moving])
     for other in ("HBM_WheelSpeedRear", "HBM_WheelSpeedFront", "GPS_Speed", "INV_DcVoltage", "VCU_Odometer"):

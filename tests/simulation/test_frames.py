@@ -32,8 +32,9 @@ SECONDS = 180.0
 @cache
 def ride():
     """Three minutes: level, a bend to the left, a hill of 3 %."""
-    road = road_table([0.0, 400.0, 500.0, 700.0, 1000.0], [0.0, 0.0, 0.0, sin(atan(0.03)), 0.0],
-                      [0.0, 1 / 60, 0.0, 0.0, 0.0])  # fmt: skip
+    road = road_table(
+        [0.0, 400.0, 500.0, 700.0, 1000.0], [0.0, 0.0, 0.0, sin(atan(0.03)), 0.0], [0.0, 1 / 60, 0.0, 0.0, 0.0]
+    )
     scooter = Scooter(reference(), road, soc=0.8)
     trace = Trace()
     metres = [10.0] * 5000
@@ -110,8 +111,9 @@ def test_lean_is_that_of_round_tyres(name):
     """In a long bend: more than a thin disc's, of every chassis what the leaning one settles at."""
     p = reference().parameters
     speed, curvature = 8.0, 1 / 25
-    scooter = Scooter(reference(), lambda distance: (0.0, curvature, 0.0), soc=0.8, speed=speed,
-                      chassis=chassis(name, p))  # fmt: skip
+    scooter = Scooter(
+        reference(), lambda distance: (0.0, curvature, 0.0), soc=0.8, speed=speed, chassis=chassis(name, p)
+    )
     trace = Trace()
     drive(scooter, trace.watch(along([speed] * 100)), 6.0)
     truth = trace.truth(scooter)

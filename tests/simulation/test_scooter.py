@@ -38,10 +38,14 @@ def town(t):
 
 @settings(max_examples=25, deadline=None)
 @given(
-    soc=st.floats(0.15, 0.98), ambient=st.floats(-5, 38), grade=st.floats(-0.08, 0.08), wind=st.floats(-6, 6),
-    form=st.sampled_from(["transient", "steady"]), brakes=st.sampled_from(["friction", "viscous"]),
+    soc=st.floats(0.15, 0.98),
+    ambient=st.floats(-5, 38),
+    grade=st.floats(-0.08, 0.08),
+    wind=st.floats(-6, 6),
+    form=st.sampled_from(["transient", "steady"]),
+    brakes=st.sampled_from(["friction", "viscous"]),
     ride=st.lists(st.tuples(st.floats(0, 1), st.floats(0, 1), st.integers(20, 300)), min_size=1, max_size=8),
-)  # fmt: skip
+)
 def test_the_ledger_closes_over_any_ride(soc, ambient, grade, wind, form, brakes, ride):
     scooter = Scooter(VEHICLE, straight(grade, wind), soc=soc, ambient=ambient, tyre_form=form, brake_form=brakes)
     for throttle, brake, steps in ride:

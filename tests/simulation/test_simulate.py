@@ -188,8 +188,10 @@ def test_sweep_of_two(short, tmp_path, capsys):
         (["ece15", "--sweep", "battery.cells_parallel=1.5..4"], ["whole number"]),
         (["ece15", "--sweep", "drag_area=0.4..0.6:999"], ["999 steps"]),
         (["ece15", *(["--sweep", "drag_area=0.4..0.6"] * 2)], ["twice"]),
-        (["ece15", "--sweep", "drag_area=.4...6", "--sweep", "payload_mass=60..70", "--sweep", "cell_mass=.1...2"],
-         ["at most two"]),
+        (
+            ["ece15", "--sweep", "drag_area=.4...6", "--sweep", "payload_mass=60..70", "--sweep", "cell_mass=.1...2"],
+            ["at most two"],
+        ),
         (["ece15", "--soc", "80"], ["--soc 80", "0 to 1"]),
         (["ece15", "--ambient", "200"], ["200 degC"]),
         (["ece15", "--payload", "-5"], ["-5 kg"]),
@@ -199,7 +201,7 @@ def test_sweep_of_two(short, tmp_path, capsys):
         (["ece15", "--vehicle", "referense"], ["reference"]),
         (["nowhere.blf"], ["nowhere.blf"]),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_is_refused_by_name(tmp_path, capsys, arguments, words):
     assert simulate(*arguments, "--output", tmp_path) == 2
     message = capsys.readouterr().err

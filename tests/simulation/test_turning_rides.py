@@ -50,8 +50,7 @@ def test_the_scooter_rides_the_turn_of_the_model(name, speed, lateral):
     seen = model.rates(state, steer, None, Road()).seen
     drag, _ = model.machine.resistance(speed, Road())
     expected = seen["drive"] - drag - model.machine.rolling(speed) * model.machine.mass * GRAVITY
-    scooter = Scooter(VEHICLE, lambda _: (0.0, lateral / speed**2, 0.0), soc=0.8, speed=speed,
-                      chassis=chassis(name, P))  # fmt: skip
+    scooter = Scooter(VEHICLE, lambda _: (0.0, lateral / speed**2, 0.0), soc=0.8, speed=speed, chassis=chassis(name, P))
     run = drive(scooter, follow([speed] * 3000, 0.01), 30.0)
     assert scooter.speed == pytest.approx(speed, abs=0.05)
     before = scooter.ledger.entries["turning"]
@@ -70,9 +69,10 @@ def test_the_scooter_rides_the_turn_of_the_model(name, speed, lateral):
 @pytest.mark.parametrize("name", TURNING)
 @settings(max_examples=8, deadline=None)
 @given(
-    bends=st.lists(st.floats(-0.15, 0.15), min_size=2, max_size=8), speed=st.floats(2.0, 11.0),
+    bends=st.lists(st.floats(-0.15, 0.15), min_size=2, max_size=8),
+    speed=st.floats(2.0, 11.0),
     grade=st.floats(-0.05, 0.05),
-)  # fmt: skip
+)
 def test_the_ledger_closes_through_bends(name, bends, speed, grade):
     road = road_table([15.0 * i for i in range(len(bends))], [grade] * len(bends), bends)
     run = drive(Scooter(VEHICLE, road, soc=0.8, chassis=chassis(name, P)), follow([speed] * 1500, 0.01), 15.0)

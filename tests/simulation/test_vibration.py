@@ -40,8 +40,12 @@ def term(vibration, *, {name}_size):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("rough")
-    for name, port, value in (("rough_road", "WHEEL_FORCE", NEWTONS), ("rough_power", "DC_POWER", 20.0),
-                              ("loose_contact", "CELL_VOLTAGE", 0.01), ("rough_tyre", "TYRE", NEWTONS)):  # fmt: skip
+    for name, port, value in (
+        ("rough_road", "WHEEL_FORCE", NEWTONS),
+        ("rough_power", "DC_POWER", 20.0),
+        ("loose_contact", "CELL_VOLTAGE", 0.01),
+        ("rough_tyre", "TYRE", NEWTONS),
+    ):
         (folder / f"{name}.py").write_text(EFFECT.format(port=port, value=value, name=name))
     return folder
 
@@ -161,9 +165,11 @@ def test_the_battery_alone_has_the_measured_and_the_time_moving(folder: Path, re
     measured = per_second(recorded, vehicle)
     fewer = battery_voltage(BASE, measured, 0.8) - battery_voltage(vehicle, measured, 0.8)
     assert fewer[1:] == pytest.approx(BASE.pack.cells_series * 0.01 * measured["vibration"][:-1], abs=1e-9)
-    (tmp_path / "wearing.py").write_text(EFFECT.format(port="CELL_VOLTAGE", value=0.001, name="wearing")
-                                         .replace("(vibration,", "(time_moving,")
-                                         .replace("* vibration", "* time_moving"))  # fmt: skip
+    (tmp_path / "wearing.py").write_text(
+        EFFECT.format(port="CELL_VOLTAGE", value=0.001, name="wearing")
+        .replace("(vibration,", "(time_moving,")
+        .replace("* vibration", "* time_moving")
+    )
     fewer = battery_voltage(BASE, measured, 0.8) - battery_voltage(extended(tmp_path, "wearing"), measured, 0.8)
     moving = np.cumsum(measured["speed"] > 1.0)
     assert fewer[1:] == pytest.approx(BASE.pack.cells_series * 0.001 * moving[:-1], abs=1e-6)

@@ -111,9 +111,12 @@ class Running:
             server.bind(str(address))
             server.settimeout(30)
             process = subprocess.Popen(
-                [*command, *options], stdout=subprocess.PIPE, stderr=stream, text=True,
+                [*command, *options],
+                stdout=subprocess.PIPE,
+                stderr=stream,
+                text=True,
                 env={**os.environ, "NOTIFY_SOCKET": str(address)},
-            )  # fmt: skip
+            )
             self._processes.append(process)
             assert server.recv(4096).startswith(b"READY=1"), errors.read_text()
         return Daemon(process, folder, folder, errors)

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.fit import score
-from gz_onboard.lab.calibrate.result import Array, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
 from gz_onboard.simulation.samples import Samples
 
 NEEDED = ("auxiliary_current", "pack_voltage")
@@ -54,11 +55,22 @@ def auxiliary_power(rides: Sequence[Samples]) -> Result:
     result.parameters["auxiliary_power"] = Found(value, sd, "W", source)
     if len(mean) > 1:
         others = np.array([np.delete(mean, k).mean() for k in range(len(mean))])
-        result.fits.append(score("auxiliary power, mean of a ride", "W", mean, others, held_out=True,
-                                 source=f"each of {len(mean)} rides by the others"))  # fmt: skip
+        result.fits.append(
+            score(
+                "auxiliary power, mean of a ride",
+                "W",
+                mean,
+                others,
+                held_out=True,
+                source=f"each of {len(mean)} rides by the others",
+            )
+        )
     x = np.arange(len(mean), dtype=float)
-    traces = [Trace("without brake light", x, without, "."), Trace("with brake light", x, lit, "."),
-              Trace("mean", x, np.full(len(x), value))]  # fmt: skip
+    traces = [
+        Trace("without brake light", x, without, "."),
+        Trace("with brake light", x, lit, "."),
+        Trace("mean", x, np.full(len(x), value)),
+    ]
     result.panels.append(Panel("Auxiliary power", "ride", "power [W]", tuple(traces)))
     return result
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gz_onboard.lab.calibrate.result import Array
+from gz_onboard.arrays import Array
 from gz_onboard.physics.relaxation import relaxation, relaxed
 
 KELVIN = 273.15

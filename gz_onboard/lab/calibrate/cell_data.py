@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from gz_onboard.lab.calibrate.result import Array
+from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.table import Table
 
 FEWEST = 50  # samples

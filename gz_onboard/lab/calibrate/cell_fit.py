@@ -18,9 +18,9 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.optimize import nnls
 from scipy.signal import lfilter
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cell_circuit import KELVIN, follow, follow_slope, hats
 from gz_onboard.lab.calibrate.cell_data import CellTest
-from gz_onboard.lab.calibrate.result import Array
 
 # s. A pair between two of them is made of both, and one pair made of these is off by the square of their distance: C1
 # of a pair of 30 s by -10 % for a factor of 4 from each to the next, -1 % for the 1.75 of these.
@@ -97,9 +97,12 @@ def pieces(
     inverse = 1 / (test.temperature + KELVIN) - 1 / (temperature + KELVIN)
     weight = 1 / (np.hypot(VOLTAGE_SD, SOC_SD * ocv[1]) * np.sqrt(CORRELATED))
     columns = np.column_stack(
-        [-test.current * np.exp(activation[0] * inverse), -relaxing * np.exp(activation[1] * inverse)[:, None],
-         np.ones(len(test))]
-    )  # fmt: skip
+        [
+            -test.current * np.exp(activation[0] * inverse),
+            -relaxing * np.exp(activation[1] * inverse)[:, None],
+            np.ones(len(test)),
+        ]
+    )
     columns *= weight[:, None]
     target = (test.voltage - ocv[0]) * weight
     hat = hats(soc, level)
@@ -141,9 +144,16 @@ def fit_branches(of: Pieces, keep: NDArray[np.bool_] | None = None, leave_out: b
     covariance = (bread @ (scores.T @ scores + prior) @ bread).reshape(branches + 1, n, branches + 1, n)
     shift_prior = np.sqrt(np.diag(bread @ prior @ bread)[-n:])
     at_node = np.array([covariance[:-1, k, :-1, k] for k in range(n)])
-    return Branches(of.soc, of.temperature, p[:-n].reshape(branches, n), p[-n:], at_node,
-                    np.reshape(without, (2, -1, branches + 1, n)), shift_prior,
-                    of.samples[used].sum(axis=0) > 3)  # fmt: skip
+    return Branches(
+        of.soc,
+        of.temperature,
+        p[:-n].reshape(branches, n),
+        p[-n:],
+        at_node,
+        np.reshape(without, (2, -1, branches + 1, n)),
+        shift_prior,
+        of.samples[used].sum(axis=0) > 3,
+    )
 
 
 def _positive(normal: Array, right: Array, n: int) -> Array:

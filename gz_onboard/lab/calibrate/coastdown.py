@@ -12,12 +12,13 @@ from math import sqrt
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.coastdown_fit import RoadFit, covariance_with_nuisance, fit_road
 from gz_onboard.lab.calibrate.coastdown_run import FASTEST, SLOWEST, SPAN, Coast, coast, directions
 from gz_onboard.lab.calibrate.fit import score
-from gz_onboard.lab.calibrate.result import Array, Fit, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Fit, Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.road_load import NAMES, RoadLoad, own_wind, roll
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
@@ -170,8 +171,17 @@ def _panels(force: RoadLoad, road: RoadFit, runs: Sequence[Coast], speeds: Seque
         level = run.slowing * (run.mass + force.rotating) - run.direction * slope * run.mass * GRAVITY
         loads.append(Trace(run.name, run.middle, level, "."))
     v = np.linspace(SLOWEST, FASTEST, 50)
-    still = Coast("", v, v, 1, None, float(np.mean([run.mass for run in runs])),
-                  float(np.mean([run.temperature for run in runs])), 0.0, (v, v))  # fmt: skip
+    still = Coast(
+        "",
+        v,
+        v,
+        1,
+        None,
+        float(np.mean([run.mass for run in runs])),
+        float(np.mean([run.temperature for run in runs])),
+        0.0,
+        (v, v),
+    )
     loads.append(Trace("model, still air, motor included", v, force(v, still, 0.0, 0.0), "-"))
     return [
         Panel("Coast-downs", "time [s]", "speed [m/s]", tuple(lines)),

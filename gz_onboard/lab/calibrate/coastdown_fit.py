@@ -16,9 +16,9 @@ import numpy as np
 from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.coastdown_run import SPAN, Coast
 from gz_onboard.lab.calibrate.fit import Solution, linear
-from gz_onboard.lab.calibrate.result import Array
 from gz_onboard.lab.calibrate.road_load import NAMES, RoadLoad
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import air_density
@@ -101,8 +101,11 @@ def _linearised(
     Gusts of `gust` [m/s] add their mean square to that of the flow.
     """
     here = RoadLoad(vehicle, {name: value[name] for name in NAMES})
-    moved = {name: RoadLoad(vehicle, {n: value[n] + (_STEP[n] if n == name else 0.0) for n in NAMES})
-             for name in names if name in NAMES}  # fmt: skip
+    moved = {
+        name: RoadLoad(vehicle, {n: value[n] + (_STEP[n] if n == name else 0.0) for n in NAMES})
+        for name in names
+        if name in NAMES
+    }
     columns: dict[str, list[Array]] = {name: [] for name in names}
     left = []
     for run in runs:
@@ -211,8 +214,9 @@ def covariance_with_nuisance(
     columns, left = _linearised(runs, vehicle, value, solution.names, road.noise.gust)
     base = {name: value[name] for name in NAMES}
     motor = [n for e in vehicle.model.effects if e.port is Port.MOTOR_LOSS for n in e.keywords if p.sd(n) > 0]
-    drag = [n for n in dict.fromkeys(["wheel_inertia_front", "wheel_inertia_rear", "wheel_radius", *motor])
-            if p.sd(n) > 0]  # fmt: skip
+    drag = [
+        n for n in dict.fromkeys(["wheel_inertia_front", "wheel_inertia_rear", "wheel_radius", *motor]) if p.sd(n) > 0
+    ]
     here = RoadLoad(vehicle, base)
     moved: list[tuple[str, Callable[[Coast], Array]]] = []
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.lab.calibrate.result import Array
 from gz_onboard.lab.calibrate.table import Table
 from gz_onboard.simulation.samples import Samples, read_facts
 from gz_onboard.vehicle import Vehicle
@@ -23,9 +23,19 @@ RISE_TIME = 5.0  # s
 CLOSED = 0.02  # of the throttle: below is noise
 
 _ROLES = {"speed": "vehicle_speed"} | dict.fromkeys(
-    ("vehicle_speed", "motor_speed", "wheel_speed_rear", "throttle", "brake_switch", "motor_current",
-     "ambient_temperature", "gps_altitude", "gps_course"), ""
-)  # fmt: skip
+    (
+        "vehicle_speed",
+        "motor_speed",
+        "wheel_speed_rear",
+        "throttle",
+        "brake_switch",
+        "motor_current",
+        "ambient_temperature",
+        "gps_altitude",
+        "gps_course",
+    ),
+    "",
+)
 
 
 @dataclass(frozen=True)
@@ -124,8 +134,17 @@ def coast(run: Samples, vehicle: Vehicle, direction: int) -> Coast:
     payload = run.rider_mass if run.rider_mass is not None else p["payload_mass"]
     mass = float(total) if isinstance(total, int | float) else p["vehicle_mass"] + payload
     altitude = float(np.median(run.columns["gps_altitude"][1])) if "gps_altitude" in run.columns else 0.0
-    return Coast(run.name, ends, at, direction, None if total is not None else payload, mass,
-                 _temperature(run), altitude, (time, speed))  # fmt: skip
+    return Coast(
+        run.name,
+        ends,
+        at,
+        direction,
+        None if total is not None else payload,
+        mass,
+        _temperature(run),
+        altitude,
+        (time, speed),
+    )
 
 
 def run_start(run: Samples) -> float:
@@ -134,8 +153,12 @@ def run_start(run: Samples) -> float:
 
 
 def _speed(run: Samples, p: Mapping[str, float]) -> tuple[Array, Array]:
-    factors = {"motor_speed": p["gear_ratio"] * p["wheel_radius"], "wheel_speed_rear": p["wheel_radius"],
-               "vehicle_speed": 1.0, "gps_speed": 1.0}  # fmt: skip
+    factors = {
+        "motor_speed": p["gear_ratio"] * p["wheel_radius"],
+        "wheel_speed_rear": p["wheel_radius"],
+        "vehicle_speed": 1.0,
+        "gps_speed": 1.0,
+    }
     for role, factor in factors.items():
         if role in run.columns:
             time, speed = run.columns[role]

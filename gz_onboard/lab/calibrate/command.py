@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.lab.calibrate import (
     auxiliary,
@@ -34,7 +35,7 @@ from gz_onboard.lab.calibrate.cell_data import cell_test
 from gz_onboard.lab.calibrate.coastdown_run import samples as coastdown_samples
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.manifest import Option, Slot, Step, check_count
-from gz_onboard.lab.calibrate.result import Array, Curve, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Curve, Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.table import Table, read_table
 from gz_onboard.lab.calibrate.vehicle_file import write_vehicle
 from gz_onboard.simulation.samples import Samples, read_samples
@@ -118,11 +119,19 @@ def _pulse(given: Given) -> Result:
         result.notes.append(f"{table.file.name}: {100 * near:.0f} % of the samples within ±{THESIS_VOLTS:g} V")
         minutes = test.time / 60
         result.panels += [
-            Panel(f"{table.file.name}, held out", "time [min]", "cell voltage [V]",
-                  (Trace("measured", minutes, measured), Trace("model", minutes, model))),
-            Panel(f"{table.file.name}: residual", "time [min]", "model less measured [mV]",
-                  (Trace("", minutes, 1000 * (model - measured)),)),
-        ]  # fmt: skip
+            Panel(
+                f"{table.file.name}, held out",
+                "time [min]",
+                "cell voltage [V]",
+                (Trace("measured", minutes, measured), Trace("model", minutes, model)),
+            ),
+            Panel(
+                f"{table.file.name}: residual",
+                "time [min]",
+                "model less measured [mV]",
+                (Trace("", minutes, 1000 * (model - measured)),),
+            ),
+        ]
     return result
 
 
@@ -133,8 +142,9 @@ def _open_circuit(given: Given) -> tuple[Curve, Found]:
             return result.curves["battery.ocv"], result.parameters["cell_capacity"]
     battery, known = given.vehicle.pack, given.vehicle.parameters.known["cell_capacity"]
     value = np.array(battery.ocv_value)
-    curve = Curve({"soc": np.array(battery.ocv_soc)}, value, np.full(len(value), battery.ocv_sd), "V",
-                  given.vehicle.file.name)  # fmt: skip
+    curve = Curve(
+        {"soc": np.array(battery.ocv_soc)}, value, np.full(len(value), battery.ocv_sd), "V", given.vehicle.file.name
+    )
     return curve, Found(known.value, known.sd, known.unit, known.source)
 
 
@@ -233,9 +243,7 @@ PROCEDURES: dict[str, Procedure] = {
         {"method": "reduced"},
     ),
     "auxiliary": Procedure(
-        "power of lamps, dashboard and control",
-        {"data": Slot("ride", "rides with auxiliary current", 1)},
-        _auxiliary,
+        "power of lamps, dashboard and control", {"data": Slot("ride", "rides with auxiliary current", 1)}, _auxiliary
     ),
     "offsets": Procedure(
         "offset, gain and noise of the pack's sensors",
@@ -252,10 +260,7 @@ PROCEDURES: dict[str, Procedure] = {
     ),
     "cooling": Procedure(
         "the four cooling networks from warming up and cooling down, on a bench (tables) and on the vehicle (rides)",
-        {
-            "data": Slot("any", "runs of 5 min or longer", 1),
-            "held_out": Slot("any", "further runs, to validate", 0),
-        },
+        {"data": Slot("any", "runs of 5 min or longer", 1), "held_out": Slot("any", "further runs, to validate", 0)},
         _cooling,
     ),
     "coastdown": Procedure(
@@ -354,9 +359,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         ["what to calibrate, and from which data:"]
         + [f"  {'all':<12} everything that the manifest {manifest.NAME} of a folder names"]
         + [line for name, procedure in PROCEDURES.items() for line in _help(name, procedure)]
-        + ["", "Tables are CSV (.csv, .csv.gz) or Parquet with the unit in the name of a column: time_s, current_A.",
-           "Rides are logs in any format that `gz-onboard estimate` reads. See docs/calibration.md."]
-    )  # fmt: skip
+        + [
+            "",
+            "Tables are CSV (.csv, .csv.gz) or Parquet with the unit in the name of a column: time_s, current_A.",
+            "Rides are logs in any format that `gz-onboard estimate` reads. See docs/calibration.md.",
+        ]
+    )
     parser.add_argument("what", metavar="WHAT", help="a procedure, or all")
     parser.add_argument(
         "data", metavar="DATA", nargs="+", type=Path, help="files; for `all` a folder with its manifest"
@@ -445,8 +453,10 @@ def _asked(arguments: argparse.Namespace) -> tuple[Path, list[Step]]:
     for text in [*arguments.more, *(f"held_out={file}" for file in arguments.held_out)]:
         slot, equals, file = text.partition("=")
         if not equals or slot not in procedure.slots:
-            raise InputError(f"--with {text}: {name} has no data {slot!r}{nearest(slot, procedure.slots)}; "
-                             f"there are {', '.join(procedure.slots)}")  # fmt: skip
+            raise InputError(
+                f"--with {text}: {name} has no data {slot!r}{nearest(slot, procedure.slots)}; "
+                f"there are {', '.join(procedure.slots)}"
+            )
         files.setdefault(slot, []).append(Path(file))
     for slot, needed in procedure.slots.items():
         check_count(name, slot, needed, len(files.get(slot, ())))

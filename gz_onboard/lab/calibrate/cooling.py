@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import truncnorm
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.cooling_run import Run
 from gz_onboard.lab.calibrate.fit import Solution, nonlinear, score
-from gz_onboard.lab.calibrate.result import Array, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.simulation.parts.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.vehicle import Vehicle
@@ -66,9 +67,15 @@ def inverter_temperatures(p: Values, run: Run) -> dict[str, Array]:
         p, run, "inverter_box_temperature" if "inverter_box_temperature" in run.measured else "inverter_temperature"
     )
     network = InverterCooling(
-        p["inverter_board_capacity"], p["inverter_box_capacity"], p["inverter_board_to_air"], p["inverter_box_to_air"],
-        p["inverter_board_to_box"], 1.0, board, box,
-    )  # fmt: skip
+        p["inverter_board_capacity"],
+        p["inverter_box_capacity"],
+        p["inverter_board_to_air"],
+        p["inverter_box_to_air"],
+        p["inverter_board_to_box"],
+        1.0,
+        board,
+        box,
+    )
     outside = _outside(p, run, "inverter_box_to_ambient")
     result = np.empty((2, len(run.time)))
     rows = zip(run.inverter_heat.tolist(), run.ambient.tolist(), outside.tolist(), strict=True)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.result import Array
 from gz_onboard.lab.calibrate.table import Table
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import Bound
@@ -63,8 +63,19 @@ def bench_run(table: Table, vehicle: Vehicle) -> Run:
     iron = _iron(vehicle, turning)
     nothing = np.zeros_like(grid)
     radius = vehicle.parameters["wheel_radius"] * vehicle.parameters["gear_ratio"]
-    return Run(table.file.name, True, grid, np.interp(grid, time, table["ambient_temperature"]), speed * radius,
-               motor_heat, iron, inverter_heat, nothing, nothing, measured)  # fmt: skip
+    return Run(
+        table.file.name,
+        True,
+        grid,
+        np.interp(grid, time, table["ambient_temperature"]),
+        speed * radius,
+        motor_heat,
+        iron,
+        inverter_heat,
+        nothing,
+        nothing,
+        measured,
+    )
 
 
 def ride_run(ride: Samples, vehicle: Vehicle) -> Run:
@@ -82,9 +93,10 @@ def ride_run(ride: Samples, vehicle: Vehicle) -> Run:
     time, current = ride.columns["motor_current"]
     speed = np.interp(time, *ride.columns["motor_speed"])
     quantities = {
-        "motor_current": current, "motor_speed": speed,
+        "motor_current": current,
+        "motor_speed": speed,
         "motor_temperature": np.interp(time, *ride.columns["motor_temperature"]),
-    }  # fmt: skip
+    }
     heat = {port: np.zeros_like(time) for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS)}
     for effect in vehicle.model.effects:
         if effect.port in heat:
@@ -101,15 +113,28 @@ def ride_run(ride: Samples, vehicle: Vehicle) -> Run:
     pack_heat = np.zeros_like(grid)
     if vehicle.battery and "cell_temperature" in measured and "pack_voltage" in ride.columns:
         pack_heat = _pack_heat(vehicle, mean, square, measured["cell_temperature"], at("pack_voltage")[:5].mean())
-    return Run(ride.name, "roller_speed" in ride.columns, grid, at("ambient_temperature"),
-               np.abs(_means(*ride.columns["motor_speed"], grid)) * radius,
-               _means(time, heat[Port.MOTOR_LOSS], grid), _means(time, _iron(vehicle, speed), grid),
-               _means(time, heat[Port.INVERTER_LOSS], grid), pack_heat, square, measured)  # fmt: skip
+    return Run(
+        ride.name,
+        "roller_speed" in ride.columns,
+        grid,
+        at("ambient_temperature"),
+        np.abs(_means(*ride.columns["motor_speed"], grid)) * radius,
+        _means(time, heat[Port.MOTOR_LOSS], grid),
+        _means(time, _iron(vehicle, speed), grid),
+        _means(time, heat[Port.INVERTER_LOSS], grid),
+        pack_heat,
+        square,
+        measured,
+    )
 
 
 SENSORS = (
-    "motor_temperature", "inverter_temperature", "inverter_box_temperature", "cell_temperature", "bms_temperature",
-)  # fmt: skip
+    "motor_temperature",
+    "inverter_temperature",
+    "inverter_box_temperature",
+    "cell_temperature",
+    "bms_temperature",
+)
 
 
 def _grid(time: Array, name: str) -> Array:

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.result import Array, Fit, Found
+from gz_onboard.lab.calibrate.result import Fit, Found
 
-Mask = NDArray[np.bool_]
 Residual = Callable[[Array], Array]
 
 
@@ -258,8 +258,13 @@ def profile(
             total += ((float(values[i]) - prior[name][0]) / prior[name][1]) ** 2
         excess[i] = (total - least) / solution.variance
     limit = chi2.ppf(0.95, 1)
-    return Profile(name, values, excess, _crossing(values[:around], excess[:around], -1, limit, solution[name]),
-                   _crossing(values[around:], excess[around:], 1, limit, solution[name]))  # fmt: skip
+    return Profile(
+        name,
+        values,
+        excess,
+        _crossing(values[:around], excess[:around], -1, limit, solution[name]),
+        _crossing(values[around:], excess[around:], 1, limit, solution[name]),
+    )
 
 
 def _with_prior(solution: Solution, prior: Mapping[str, tuple[float, float]] | None) -> float:

@@ -9,18 +9,23 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate import motor
 from gz_onboard.lab.calibrate.fit import Solution, linear, score, split
 from gz_onboard.lab.calibrate.motor import RIDING_CURRENT, Bench
-from gz_onboard.lab.calibrate.result import Array, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.table import Table
 from gz_onboard.physics.effects import inverter_loss, motor_iron_loss
 
 TIED = ("torque_constant", "motor_copper_resistance", "motor_iron_linear", "motor_iron_quadratic")
 UNITS = {
-    "motor_copper_resistance": "ohm", "motor_iron_linear": "W·s/rad", "motor_iron_quadratic": "W·s²/rad²",
-    "inverter_loss_constant": "W", "inverter_loss_linear": "W/A", "inverter_loss_quadratic": "W/A²",
-}  # fmt: skip
+    "motor_copper_resistance": "ohm",
+    "motor_iron_linear": "W·s/rad",
+    "motor_iron_quadratic": "W·s²/rad²",
+    "inverter_loss_constant": "W",
+    "inverter_loss_linear": "W/A",
+    "inverter_loss_quadratic": "W/A²",
+}
 
 
 def motor_losses(dyno: Table, largest_current: float = RIDING_CURRENT) -> Result:
@@ -61,9 +66,10 @@ def motor_losses(dyno: Table, largest_current: float = RIDING_CURRENT) -> Result
 def motor_loss(solution: Solution, bench: Bench) -> Array:
     """Motor loss [W] of the model at all points."""
     iron: Array = motor_iron_loss.term(
-        bench.speed, motor_iron_linear=solution["motor_iron_linear"],
+        bench.speed,
+        motor_iron_linear=solution["motor_iron_linear"],
         motor_iron_quadratic=solution["motor_iron_quadratic"],
-    )  # fmt: skip
+    )
     return motor.copper(solution, bench) + iron
 
 
@@ -113,8 +119,9 @@ def inverter_losses(dyno: Table, largest_current: float = RIDING_CURRENT) -> Res
         result.parameters[parameter] = found.found(parameter, UNITS[parameter], source)
     result.covariance.append((found.names, found.covariance))
     speed = np.abs(dyno["motor_speed"])
-    more = linear({"constant": np.ones_like(loss), "linear": np.abs(current), "quadratic": current**2, "speed": speed},
-                  loss)  # fmt: skip
+    more = linear(
+        {"constant": np.ones_like(loss), "linear": np.abs(current), "quadratic": current**2, "speed": speed}, loss
+    )
     sure = abs(more["speed"]) > 3 * more.sd("speed")
     result.notes.append(
         f"inverter loss over speed: {more['speed']:+.3f} ± {more.sd('speed'):.3f} W·s/rad, "
@@ -123,10 +130,16 @@ def inverter_losses(dyno: Table, largest_current: float = RIDING_CURRENT) -> Res
     mechanical = dyno["ac_power"]
     result.panels += [
         *_panels("Inverter loss", current, loss, model),
-        Panel("Inverter efficiency (derived)", "AC power [W]", "efficiency [%]",
-              (Trace("measured", mechanical, _ratio(mechanical, loss), "."),
-               Trace("model", mechanical, _ratio(mechanical, model), "x"))),
-    ]  # fmt: skip
+        Panel(
+            "Inverter efficiency (derived)",
+            "AC power [W]",
+            "efficiency [%]",
+            (
+                Trace("measured", mechanical, _ratio(mechanical, loss), "."),
+                Trace("model", mechanical, _ratio(mechanical, model), "x"),
+            ),
+        ),
+    ]
     return result
 
 
@@ -174,8 +187,5 @@ def _ratio(power: Array, loss: Array) -> Array:
 
 def _efficiency(title: str, speed: Array, torque: Array, loss: Array, model: Array) -> Panel:
     power = torque * speed
-    traces = (
-        Trace("measured", torque, _ratio(power, loss), "."),
-        Trace("model", torque, _ratio(power, model), "x"),
-    )
+    traces = (Trace("measured", torque, _ratio(power, loss), "."), Trace("model", torque, _ratio(power, model), "x"))
     return Panel(title, "torque [N·m]", "efficiency [%]", traces)

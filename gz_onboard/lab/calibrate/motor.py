@@ -14,8 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.fit import Solution, linear, score, split
-from gz_onboard.lab.calibrate.result import Array, Fit, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Fit, Panel, Result, Trace
 from gz_onboard.lab.calibrate.table import Table
 from gz_onboard.physics.effects import motor_copper_loss
 
@@ -57,11 +58,19 @@ def voltage_constant(ramp: Table) -> Result:
         result.notes.append(f"{ramp.file.name}: {found['offset']:+.3g} V at no speed, {found.sd('offset'):.2g} V sd")
     order = np.argsort(speed)
     result.panels += [
-        Panel("Back-EMF", "motor speed [rad/s]", "line voltage, RMS [V]",
-              (Trace("measured", speed, emf, "."), Trace("line", speed[order], model[order]))),
-        Panel("Back-EMF: residual", "motor speed [rad/s]", "measured less model [V]",
-              (Trace("residual", speed, emf - model, "."),)),
-    ]  # fmt: skip
+        Panel(
+            "Back-EMF",
+            "motor speed [rad/s]",
+            "line voltage, RMS [V]",
+            (Trace("measured", speed, emf, "."), Trace("line", speed[order], model[order])),
+        ),
+        Panel(
+            "Back-EMF: residual",
+            "motor speed [rad/s]",
+            "measured less model [V]",
+            (Trace("residual", speed, emf - model, "."),),
+        ),
+    ]
     return result
 
 
@@ -155,8 +164,15 @@ def torque_constant(dyno: Table, warming: Table | None = None, largest_current: 
     result.fits += [inside, *scores("shaft torque", "N·m", bench.torque, torque(held, bench), use, ~keep, bench)]
     line = linear({"slope": i}, bench.torque)
     result.fits.append(
-        score("shaft torque, thesis' line through zero", "N·m", bench.torque, line["slope"] * i, held_out=False,
-              source=f"{name}, all currents"))  # fmt: skip
+        score(
+            "shaft torque, thesis' line through zero",
+            "N·m",
+            bench.torque,
+            line["slope"] * i,
+            held_out=False,
+            source=f"{name}, all currents",
+        )
+    )
     at_gap = bench.torque + found["torque_constant"] * i - torque(found, bench)
     saturation = linear({"small": i, "fall": i**3}, at_gap)
     small, fall = saturation["small"], saturation["fall"]
@@ -171,21 +187,35 @@ def torque_constant(dyno: Table, warming: Table | None = None, largest_current: 
         )
     low, high = bench.temperature[use].min(), bench.temperature[use].max()
     result.parameters["torque_constant"] = found.found(
-        "torque_constant", "N·m/A",
+        "torque_constant",
+        "N·m/A",
         f"{name}: {int(use.sum())} points up to {largest_current:.0f} A at {low:.0f} to {high:.0f} degC, air-gap "
-        f"torque; rms {inside.rms:.2g} N·m; sd holds its fall with current", systematic,
-    )  # fmt: skip
+        f"torque; rms {inside.rms:.2g} N·m; sd holds its fall with current",
+        systematic,
+    )
     if warming is not None:
         result.notes.append(_temperature_note(warming))
     speeds = np.argsort(i)
     result.panels += [
-        Panel("Shaft torque", "motor current, RMS [A]", "torque [N·m]",
-              (Trace("measured", i, bench.torque, "."), Trace("torque constant", i[speeds],
-                                                              found["torque_constant"] * i[speeds]))),
-        Panel("Shaft torque: residual", "motor current, RMS [A]", "measured less model [N·m]",
-              (Trace("used", i[use], (bench.torque - torque(found, bench))[use], "."),
-               Trace("beyond the range", i[~use], (bench.torque - torque(found, bench))[~use], "x"))),
-    ]  # fmt: skip
+        Panel(
+            "Shaft torque",
+            "motor current, RMS [A]",
+            "torque [N·m]",
+            (
+                Trace("measured", i, bench.torque, "."),
+                Trace("torque constant", i[speeds], found["torque_constant"] * i[speeds]),
+            ),
+        ),
+        Panel(
+            "Shaft torque: residual",
+            "motor current, RMS [A]",
+            "measured less model [N·m]",
+            (
+                Trace("used", i[use], (bench.torque - torque(found, bench))[use], "."),
+                Trace("beyond the range", i[~use], (bench.torque - torque(found, bench))[~use], "x"),
+            ),
+        ),
+    ]
     return result
 
 
@@ -234,7 +264,9 @@ def _temperature_note(warming: Table) -> str:
 def copper(solution: Solution, bench: Bench) -> Array:
     """Copper loss [W] at all points."""
     result: Array = motor_copper_loss.term(
-        bench.current, bench.temperature, motor_copper_resistance=solution["motor_copper_resistance"],
+        bench.current,
+        bench.temperature,
+        motor_copper_resistance=solution["motor_copper_resistance"],
         motor_copper_temperature_coefficient=COPPER,
-    )  # fmt: skip
+    )
     return result

@@ -10,14 +10,44 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
-from gz_onboard.lab.calibrate.result import Array, Curve, Fit, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.table import Table
 
-SOC = np.array([
-    0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.125, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4, 0.45, 0.5, 0.55, 0.6, 0.65,
-    0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 0.98, 0.99, 1,
-])  # fmt: skip
+SOC = np.array(
+    [
+        0,
+        0.005,
+        0.01,
+        0.02,
+        0.03,
+        0.05,
+        0.075,
+        0.1,
+        0.125,
+        0.15,
+        0.2,
+        0.25,
+        0.3,
+        0.35,
+        0.4,
+        0.45,
+        0.5,
+        0.55,
+        0.6,
+        0.65,
+        0.7,
+        0.75,
+        0.8,
+        0.85,
+        0.9,
+        0.95,
+        0.98,
+        0.99,
+        1,
+    ]
+)
 SLOWEST_HOURS = 8.0  # a discharge faster than that is not slow
 TESTER = 0.005  # relative: what a tester's current may be off
 UNSURE = 0.2  # relative: the resistance of steady current, out of that of its steps
@@ -103,10 +133,17 @@ def calibrate(table: Table, soc: Array = SOC) -> Result:
     middle = down & (level > soc[0]) & (level < 1)
     back = np.interp(level[middle], soc, value - np.where(np.isfinite(half), half, 0.0)) - test.voltage[middle]
     result.fits.append(
-        Fit("discharge voltage less half the gap", "V", float(np.sqrt(np.mean(back**2))), float(np.abs(back).max()),
+        Fit(
+            "discharge voltage less half the gap",
+            "V",
+            float(np.sqrt(np.mean(back**2))),
+            float(np.abs(back).max()),
             1 - float(np.sum(back**2) / np.sum((test.voltage[middle] - test.voltage[middle].mean()) ** 2)),
-            int(np.count_nonzero(middle)), False, table.file.name)
-    )  # fmt: skip
+            int(np.count_nonzero(middle)),
+            False,
+            table.file.name,
+        )
+    )
     traces = [Trace("discharge", level[down], test.voltage[down], ".")]
     if np.any(up):
         traces.append(Trace("charge", level[up], test.voltage[up], "."))
@@ -114,9 +151,13 @@ def calibrate(table: Table, soc: Array = SOC) -> Result:
         Panel("Open-circuit voltage", "state of charge", "voltage [V]", (*traces, Trace("OCV", soc, value)))
     )
     result.panels.append(
-        Panel("Half the gap of the branches", "state of charge", "mV", (Trace("half gap", soc, 1e3 * half, "."),
-              Trace("standard deviation", soc, 1e3 * sd)))
-    )  # fmt: skip
+        Panel(
+            "Half the gap of the branches",
+            "state of charge",
+            "mV",
+            (Trace("half gap", soc, 1e3 * half, "."), Trace("standard deviation", soc, 1e3 * sd)),
+        )
+    )
     return result
 
 

@@ -13,10 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD
 from gz_onboard.lab.calibrate.fit import linear, score, split
-from gz_onboard.lab.calibrate.result import Array, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
@@ -66,8 +67,17 @@ def read_pair(ride: Samples, vehicle: Vehicle) -> Pair:
     lag = float(min(LAGS, key=lambda x: float(np.std(pack - auxiliary - at("inverter_current", x)))))
     speed, current = np.abs(at("motor_speed")), np.abs(at("motor_current"))
     rest = (speed < MOVING) & (current < DRIVING) & (np.abs(at("inverter_current", lag)) < 2.0)
-    return Pair(ride.name, time, pack, at("inverter_current", lag), auxiliary, at("pack_voltage"),
-                at("inverter_voltage", lag), rest, lag)  # fmt: skip
+    return Pair(
+        ride.name,
+        time,
+        pack,
+        at("inverter_current", lag),
+        auxiliary,
+        at("pack_voltage"),
+        at("inverter_voltage", lag),
+        rest,
+        lag,
+    )
 
 
 def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
@@ -89,21 +99,26 @@ def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     spread = float(np.std(apart - own, ddof=1)) if len(apart) > 1 else 0.05
     offset = float(np.mean(apart - own))
     result.parameters["pack_current_offset"] = Found(
-        offset, float(np.hypot(max(spread, DRIFT_SD), own_sd) + CURRENT_SD * 0.85), "A",
+        offset,
+        float(np.hypot(max(spread, DRIFT_SD), own_sd) + CURRENT_SD * 0.85),
+        "A",
         f"{len(resting)} rides at rest: pack less inverter less auxiliary is {apart.mean():+.3f} ± {spread:.3f} "
         f"A, {own.mean():.3f} A of it the inverter's own {p['inverter_loss_constant']:.1f} W",
-    )  # fmt: skip
+    )
     _gain(result, pairs)
     noises = np.array([(_noise(pair.pack, pair.rest), _noise(pair.pack_voltage, pair.rest)) for pair in resting])
     for (name, unit), column in zip((("pack_current_noise", "A"), ("pack_voltage_noise", "V")), noises.T, strict=True):
         sd = float(column.std(ddof=1)) if len(column) > 1 else 0.2 * float(column.mean())
-        result.parameters[name] = Found(float(np.median(column)), max(sd, 1e-4), unit,
-                                        f"first differences at rest, {len(resting)} rides, white")  # fmt: skip
+        result.parameters[name] = Found(
+            float(np.median(column)), max(sd, 1e-4), unit, f"first differences at rest, {len(resting)} rides, white"
+        )
     volts = np.array([(pair.pack_voltage - pair.inverter_voltage)[pair.rest].mean() for pair in resting])
     result.parameters["pack_voltage_offset"] = Found(
-        0.0, float(max(abs(volts.mean()), 0.01)), "V",
+        0.0,
+        float(max(abs(volts.mean()), 0.01)),
+        "V",
         f"reads {volts.mean():+.3f} V over the inverter's at rest, {len(resting)} rides; which one errs is unknown",
-    )  # fmt: skip
+    )
     result.refusals.append(
         f"pack_voltage_offset: {volts.mean():+.3f} V between two sensors is all that the data tell, not which one "
         "errs; left at zero with that sd"
@@ -148,8 +163,14 @@ def _gain(result: Result, pairs: Sequence[Pair]) -> None:
         score("pack current", "A", y[~fitted], model[~fitted], held_out=True, source="every second ride"),
     ]
     residual = y - found["pack_current_gain"] * x - found["offset"]
-    result.panels.append(Panel("Pack current against inverter and auxiliary", "inverter and auxiliary current [A]",
-                               "pack current less line [A]", (Trace("means of 2 s", x, residual, "."),)))  # fmt: skip
+    result.panels.append(
+        Panel(
+            "Pack current against inverter and auxiliary",
+            "inverter and auxiliary current [A]",
+            "pack current less line [A]",
+            (Trace("means of 2 s", x, residual, "."),),
+        )
+    )
 
 
 def _noise(values: Array, rest: NDArray[np.bool_]) -> float:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.stats import chi2
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.lab.calibrate.cell_circuit import KELVIN, Circuit, ocv_at, riding_current, voltage
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
@@ -32,7 +33,7 @@ from gz_onboard.lab.calibrate.cell_fit import (
 )
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.ocv import TESTER
-from gz_onboard.lab.calibrate.result import Array, Curve, Fit, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.table import Table
 
 SOC = np.array([0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
@@ -106,10 +107,30 @@ def calibrate(
     rests = _rests_over_soc(fitted, tested, names)
     result.curves["rest_shift"] = rests
     rest_shift = _shift_of_rests(rests, tested, names, result)
-    cell = Circuit(nodes, volts + shift, soc, np.array([t.temperature for t in tested]),
-                   np.array([t.capacity for t in tested]), r0, r1, tau / r1, rest_shift=rest_shift)  # fmt: skip
-    slow = Circuit(nodes, volts + shift, soc, cell.temperature, cell.capacity, tables_two[0], tables_two[1],
-                   tables_two[3] / tables_two[1], tables_two[2], tables_two[4], rest_shift)  # fmt: skip
+    cell = Circuit(
+        nodes,
+        volts + shift,
+        soc,
+        np.array([t.temperature for t in tested]),
+        np.array([t.capacity for t in tested]),
+        r0,
+        r1,
+        tau / r1,
+        rest_shift=rest_shift,
+    )
+    slow = Circuit(
+        nodes,
+        volts + shift,
+        soc,
+        cell.temperature,
+        cell.capacity,
+        tables_two[0],
+        tables_two[1],
+        tables_two[3] / tables_two[1],
+        tables_two[2],
+        tables_two[4],
+        rest_shift,
+    )
     axes = {"soc": soc, "temperature": cell.temperature}
     how = f"{names}: {len(TIMES)} RC pairs, reduced over {'synthetic rides' if loads is None else 'the loads given'}"
     if method == "direct":
@@ -120,9 +141,12 @@ def calibrate(
 
     result.curves["battery.ocv"] = Curve({"soc": nodes}, cell.ocv, ocv_sd, "V", f"{ocv.source}; moved to the rests")
     result.curves["battery.capacity"] = Curve(
-        {"temperature": cell.temperature}, cell.capacity, np.array([t.capacity_sd for t in tested]), "A·h",
+        {"temperature": cell.temperature},
+        cell.capacity,
+        np.array([t.capacity_sd for t in tested]),
+        "A·h",
         f"{names}: charge that lays the rest voltages on the OCV",
-    )  # fmt: skip
+    )
     result.curves["battery.r0"] = curve(r0, r0 * sd_one[0], "ohm", "R0")
     result.curves["battery.r1"] = curve(r1, r1 * sd_one[1], "ohm", "R1")
     result.curves["battery.c1"] = curve(cell.c1, cell.c1 * sd_one[3], "F", "τ1/R1")
@@ -150,8 +174,15 @@ def circuit(result: Result, slow: bool = False) -> Circuit:
     base = (ocv.axes["soc"], ocv.value, axes["soc"], axes["temperature"], c["battery.capacity"].value)
     cold = c["battery.rest_shift"].value if "battery.rest_shift" in c else None
     if slow:
-        return Circuit(*base, c["slow_r0"].value, c["slow_r1"].value, c["slow_c1"].value, c["slow_resistance"].value,
-                       c["slow_time"].value, cold)  # fmt: skip
+        return Circuit(
+            *base,
+            c["slow_r0"].value,
+            c["slow_r1"].value,
+            c["slow_c1"].value,
+            c["slow_resistance"].value,
+            c["slow_time"].value,
+            cold,
+        )
     return Circuit(*base, c["battery.r0"].value, c["battery.r1"].value, c["battery.c1"].value, rest_shift=cold)
 
 
@@ -205,11 +236,26 @@ def _tested(table: Table, nodes: Array, volts: Array, capacity: Found, result: R
     found = share * capacity.value
     temperature = float(np.round(np.median(test.temperature[rests]))) + 0.0  # no -0
     result.fits.append(
-        Fit(f"rest voltage at {temperature:g} degC, SOC above 0.12", "V", float(np.sqrt(np.mean(error**2))),
-            float(np.abs(error).max()), None, len(error), False, test.name)
-    )  # fmt: skip
-    return Tested(test, temperature, found, float(np.hypot(sd * capacity.value, 0.005 * found)),
-                  start - test.drawn / found, rests, offset)  # fmt: skip
+        Fit(
+            f"rest voltage at {temperature:g} degC, SOC above 0.12",
+            "V",
+            float(np.sqrt(np.mean(error**2))),
+            float(np.abs(error).max()),
+            None,
+            len(error),
+            False,
+            test.name,
+        )
+    )
+    return Tested(
+        test,
+        temperature,
+        found,
+        float(np.hypot(sd * capacity.value, 0.005 * found)),
+        start - test.drawn / found,
+        rests,
+        offset,
+    )
 
 
 def _began(test: CellTest, end: int) -> int:
@@ -246,9 +292,13 @@ def _pieces(
 
 
 def _direct(
-    tested: list[Tested], fitted: list[Branches], activation: list[tuple[float, float]], nodes: Array, volts: Array,
+    tested: list[Tested],
+    fitted: list[Branches],
+    activation: list[tuple[float, float]],
+    nodes: Array,
+    volts: Array,
     start: list[Array],
-) -> tuple[list[Array], list[Array]]:  # fmt: skip
+) -> tuple[list[Array], list[Array]]:
     """As `_meshes` for one pair, from the pulses themselves."""
     found = [
         fit_direct(t.test, t.level, _ocv(nodes, volts, t.level), f, (start[0][k], start[1][k], start[2][k]), a)
@@ -338,8 +388,13 @@ def _rests_over_soc(fitted: list[Branches], tested: list[Tested], names: str) ->
     sd = np.array([np.hypot(jackknife(f.shift, f.without[:, :, -1]), f.shift_prior) for f in fitted])
     axes = {"soc": fitted[0].soc, "temperature": np.array([t.temperature for t in tested])}
     covered = np.array([f.covered for f in fitted])
-    return Curve(axes, shifts - shifts[_nearest(tested)], np.where(covered, sd, np.nan), "V",
-                 f"{names}: rest voltage against that near 25 degC")  # fmt: skip
+    return Curve(
+        axes,
+        shifts - shifts[_nearest(tested)],
+        np.where(covered, sd, np.nan),
+        "V",
+        f"{names}: rest voltage against that near 25 degC",
+    )
 
 
 def _shift_of_rests(rests: Curve, tested: list[Tested], names: str, result: Result) -> Array | None:
@@ -360,8 +415,11 @@ def _shift_of_rests(rests: Curve, tested: list[Tested], names: str, result: Resu
     sd = np.array([np.hypot(row.std(), s.mean()) for row, s in zip(known, within, strict=True)])
     others = np.arange(len(tested)) != reference
     chance = float(chi2.sf(np.sum((mean[others] / np.maximum(sd[others], 1e-3)) ** 2), len(tested) - 1))
-    told = ", ".join(f"{1e3 * m:+.1f} ± {1e3 * s:.1f} mV at {t.temperature:g} degC"
-                     for t, m, s, other in zip(tested, mean, sd, others, strict=True) if other)  # fmt: skip
+    told = ", ".join(
+        f"{1e3 * m:+.1f} ± {1e3 * s:.1f} mV at {t.temperature:g} degC"
+        for t, m, s, other in zip(tested, mean, sd, others, strict=True)
+        if other
+    )
     if chance > 1 - SURE:
         result.notes.append(
             f"rests do not move with temperature beyond how they scatter over the state of charge: {told}; "
@@ -370,9 +428,12 @@ def _shift_of_rests(rests: Curve, tested: list[Tested], names: str, result: Resu
         return None
     result.notes.append(f"the cell rests {told} against {tested[reference].temperature:g} degC")
     result.curves["battery.rest_shift"] = Curve(
-        {"temperature": rests.axes["temperature"]}, mean, sd, "V",
+        {"temperature": rests.axes["temperature"]},
+        mean,
+        sd,
+        "V",
         f"{names}: mean over 15 to 95 % SOC of the rests against those near 25 degC",
-    )  # fmt: skip
+    )
     return mean
 
 
@@ -423,27 +484,48 @@ def _voltages(result: Result, tested: list[Tested], cell: Circuit, slow: Circuit
                 if np.count_nonzero(part) > 20:
                     spread = float(np.sum((test.voltage[part] - test.voltage[part].mean()) ** 2))
                     result.fits.append(
-                        Fit(f"voltage, {what}, {t.temperature:g} degC, SOC {name} 0.1", "V",
-                            float(np.sqrt(np.mean(error[part] ** 2))), float(np.abs(error[part]).max()),
-                            1 - float(np.sum(error[part] ** 2)) / spread, int(np.count_nonzero(part)), False, test.name)
-                    )  # fmt: skip
+                        Fit(
+                            f"voltage, {what}, {t.temperature:g} degC, SOC {name} 0.1",
+                            "V",
+                            float(np.sqrt(np.mean(error[part] ** 2))),
+                            float(np.abs(error[part]).max()),
+                            1 - float(np.sum(error[part] ** 2)) / spread,
+                            int(np.count_nonzero(part)),
+                            False,
+                            test.name,
+                        )
+                    )
                     if what == "one pair":
                         (residuals if name == "above" else empties).append(float(np.mean(error[part] ** 2)))
         model = voltage(cell, test.flowed, test.current, test.dt, t.level, test.temperature)
         hours = test.time / 3600
         result.panels += [
-            Panel(f"Pulse test at {t.temperature:g} °C", "time [h]", "voltage [V]",
-                  (Trace("measured", hours, test.voltage, "."), Trace("model", hours, model))),
-            Panel(f"Pulse test at {t.temperature:g} °C: residual", "time [h]", "model less measured [mV]",
-                  (Trace("", hours, 1000 * (model - test.voltage)),)),
-        ]  # fmt: skip
+            Panel(
+                f"Pulse test at {t.temperature:g} °C",
+                "time [h]",
+                "voltage [V]",
+                (Trace("measured", hours, test.voltage, "."), Trace("model", hours, model)),
+            ),
+            Panel(
+                f"Pulse test at {t.temperature:g} °C: residual",
+                "time [h]",
+                "model less measured [mV]",
+                (Trace("", hours, 1000 * (model - test.voltage)),),
+            ),
+        ]
     for key, unit, factor in (("r0", "mΩ", 1e3), ("r1", "mΩ", 1e3), ("c1", "F", 1.0)):
         mesh = result.curves[f"battery.{key}"]
         result.panels.append(
-            Panel(key.upper(), "state of charge", unit,
-                  tuple(Trace(f"{degrees:g} °C", mesh.axes["soc"], factor * row)
-                        for degrees, row in zip(mesh.axes["temperature"], mesh.value, strict=True)))
-        )  # fmt: skip
+            Panel(
+                key.upper(),
+                "state of charge",
+                unit,
+                tuple(
+                    Trace(f"{degrees:g} °C", mesh.axes["soc"], factor * row)
+                    for degrees, row in zip(mesh.axes["temperature"], mesh.value, strict=True)
+                ),
+            )
+        )
     names = ", ".join(t.test.name for t in tested)
     result.parameters["cell_voltage_error"] = Found(
         0.0, float(np.sqrt(np.mean(residuals))), "V", f"{names}: rms of one RC pair above 10 % SOC"

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate import thesis
-from gz_onboard.lab.calibrate.result import Array, Curve, Fit, Panel, Result
+from gz_onboard.lab.calibrate.result import Curve, Fit, Panel, Result
 from gz_onboard.lab.calibrate.vehicle_file import correlation
 
 if TYPE_CHECKING:
@@ -227,9 +228,15 @@ def _draw(axis: Axes, panel: Panel) -> None:
         x, y = thinned(trace.x), thinned(trace.y)
         points = trace.style in (".", ",", "o", "x", "+")
         axis.plot(
-            x, y, trace.style, color=_COLOURS[i % len(_COLOURS)], label=trace.label or None,
-            markersize=3 if points else 5, linewidth=1.3, rasterized=points and len(x) > 200,
-        )  # fmt: skip
+            x,
+            y,
+            trace.style,
+            color=_COLOURS[i % len(_COLOURS)],
+            label=trace.label or None,
+            markersize=3 if points else 5,
+            linewidth=1.3,
+            rasterized=points and len(x) > 200,
+        )
         labels += bool(trace.label)
     if labels:
         axis.legend(fontsize=7.5, frameon=False, ncols=2 if labels > 5 else 1)

@@ -10,10 +10,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.fit import linear, score, split
 from gz_onboard.lab.calibrate.offsets import read_pair
-from gz_onboard.lab.calibrate.result import Array, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.table import Table
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
@@ -61,15 +62,23 @@ def cable_resistance(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     outside = half["cable_resistance"] * i + half["offset"]
     result.fits += [
         score("voltage between pack and inverter", "V", v, model, held_out=False, source=source),
-        score("voltage between pack and inverter", "V", v[~fitted], outside[~fitted], held_out=True,
-              source="every second ride"),
-    ]  # fmt: skip
+        score(
+            "voltage between pack and inverter",
+            "V",
+            v[~fitted],
+            outside[~fitted],
+            held_out=True,
+            source="every second ride",
+        ),
+    ]
     sag = abs(linear(columns, np.concatenate(packs), groups=label if len(rides) > 2 else None)["cable_resistance"])
     gains = 2**0.5 * VOLTAGE_GAIN_SD * sag
     result.parameters["cable_resistance"] = Found(
-        max(found["cable_resistance"], 0.0), float(np.hypot(found.sd("cable_resistance"), gains)), "ohm",
+        max(found["cable_resistance"], 0.0),
+        float(np.hypot(found.sd("cable_resistance"), gains)),
+        "ohm",
         f"{source}; {found['offset']:+.3f} V at no current",
-    )  # fmt: skip
+    )
     result.panels += _panels("Voltage between pack and inverter", i, v, model, "pack less inverter voltage [V]")
     return result
 

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.coastdown_run import Coast
-from gz_onboard.lab.calibrate.result import Array
 from gz_onboard.physics.effect import QUANTITIES, Effect, Port
 from gz_onboard.physics.model import air_density
 from gz_onboard.vehicle import Vehicle
@@ -31,8 +31,11 @@ class RoadLoad:
         p = dict(vehicle.parameters) | dict(values or {})
         self.p = p
         bound = [(e, {name: p[name] for name in e.keywords}) for e in vehicle.model.effects]
-        self._road = [(e, values) for e, values in bound
-                      if e.port in (Port.WHEEL_FORCE, Port.TYRE) and "acceleration" not in e.quantities]  # fmt: skip
+        self._road = [
+            (e, values)
+            for e, values in bound
+            if e.port in (Port.WHEEL_FORCE, Port.TYRE) and "acceleration" not in e.quantities
+        ]
         self._motor = [(e, values) for e, values in bound if e.port is Port.MOTOR_LOSS]
         self._vibration = vehicle.riding.vibration  # a coast-down shows no road that is rougher than others
         self.rotating = (p["wheel_inertia_front"] + p["wheel_inertia_rear"]) / p["wheel_radius"] ** 2
@@ -86,6 +89,8 @@ def own_wind(force: RoadLoad, run: Coast, slope: float) -> float:
     """The constant headwind [m/s] with which `run` is followed best."""
     best = minimize_scalar(
         lambda wind: float(np.sum((roll(force, run, slope, wind, run.time) - run.speed) ** 2)),
-        bounds=(-8.0, 8.0), method="bounded", options={"xatol": 0.01},
-    )  # fmt: skip
+        bounds=(-8.0, 8.0),
+        method="bounded",
+        options={"xatol": 0.01},
+    )
     return float(best.x)

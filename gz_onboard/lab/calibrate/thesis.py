@@ -88,9 +88,14 @@ def _row(row: Row, fits: Sequence[Fit]) -> tuple[str, ...]:
         return row.what, row.thesis, f"R² {r2:.4f}", "", on, _word(r2 >= row.limit)
     worst = max(fits, key=lambda fit: fit.largest)
     rms = max(fit.rms for fit in fits)
-    return row.what, row.thesis, f"±{worst.largest:.2g} {row.unit}", f"{rms:.2g} {row.unit}", on, _word(
-        worst.largest <= row.limit
-    )  # fmt: skip
+    return (
+        row.what,
+        row.thesis,
+        f"±{worst.largest:.2g} {row.unit}",
+        f"{rms:.2g} {row.unit}",
+        on,
+        _word(worst.largest <= row.limit),
+    )
 
 
 def _word(better: bool) -> str:

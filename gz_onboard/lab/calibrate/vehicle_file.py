@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.result import Array, Curve, Found, Result
+from gz_onboard.lab.calibrate.result import Curve, Found, Result
 from gz_onboard.physics.effect import PACKAGE_EFFECTS, Effect
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import read_vehicle
@@ -304,11 +305,7 @@ def _starts(path: KeyPath, begin: KeyPath) -> bool:
 
 
 def _spliced(
-    entries: list[_Entry],
-    new: Mapping[KeyPath, str],
-    tables: Mapping[KeyPath, str],
-    dropped: set[KeyPath],
-    file: Path,
+    entries: list[_Entry], new: Mapping[KeyPath, str], tables: Mapping[KeyPath, str], dropped: set[KeyPath], file: Path
 ) -> str:
     """The text of `entries` with the keys `new` and the tables `tables` in place of theirs, and without `dropped`."""
     gone = dropped | set(tables)

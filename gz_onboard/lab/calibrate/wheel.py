@@ -10,8 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.result import Array, Fit, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Fit, Found, Panel, Result, Trace
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
@@ -65,9 +66,13 @@ def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         result.fits.append(Fit("wheel radius", "m", rms, largest, None, len(radii), True, data))
     ends = np.array([SLOWEST, max(float(t.x.max()) * radius for t in traces)]) / radius
     result.panels.append(
-        Panel("Speed over ground by wheel speed", "speed of the driven wheel [rad/s]", "m",
-              (*traces, Trace("radius", ends, np.full(2, radius))))
-    )  # fmt: skip
+        Panel(
+            "Speed over ground by wheel speed",
+            "speed of the driven wheel [rad/s]",
+            "m",
+            (*traces, Trace("radius", ends, np.full(2, radius))),
+        )
+    )
     return result
 
 

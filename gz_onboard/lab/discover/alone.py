@@ -11,7 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from gz_onboard.lab.discover.grid import Array, Ride
+from gz_onboard.arrays import Array
+from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.linear import Linear, Noise, fit_mixed, learn_noise, normal
 from gz_onboard.lab.discover.state import State
 from gz_onboard.physics.effect import Port
@@ -21,18 +22,24 @@ ROUNDS = 2
 SCATTER_FROM = 3  # rides
 CIRCUIT_TIME = 300.0  # s: what one RC pair lacks relaxes over minutes
 ABSENT = 1e-3  # sd in scales of an effect that the model lacks
-LOSSES = ("motor_copper_resistance", "motor_iron_linear", "motor_iron_quadratic", "inverter_loss_constant",
-          "inverter_loss_linear", "inverter_loss_quadratic")  # fmt: skip
+LOSSES = (
+    "motor_copper_resistance",
+    "motor_iron_linear",
+    "motor_iron_quadratic",
+    "inverter_loss_constant",
+    "inverter_loss_linear",
+    "inverter_loss_quadratic",
+)
 UNTOLD = ("cell_resistance_factor", "cooling_factor")
 """Factors on what a bench told of one cell and one motor: as sure as they are declared, until a ride has told."""
 MAKE = 0.05  # by which losses differ between motors and inverters of one make, sd as a share
-NOTE = ("no healthy rides are known of this vehicle (--baseline): it is held against its file, whose model is taken at "
-        "its word, and the rate of false alarms is not calibrated")  # fmt: skip
+NOTE = (
+    "no healthy rides are known of this vehicle (--baseline): it is held against its file, whose model is taken at "
+    "its word, and the rate of false alarms is not calibrated"
+)
 
 
-def alone(
-    state: State, rides: Sequence[Ride], linearise: Callable[[Sequence[Ride], State], list[Linear]]
-) -> State:  # fmt: skip
+def alone(state: State, rides: Sequence[Ride], linearise: Callable[[Sequence[Ride], State], list[Linear]]) -> State:
     """`state` of a vehicle file, to judge `rides` with. linearise: rides at a state."""
     lines = linearise(rides, state)
     noise = state.noise

@@ -55,15 +55,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     parser.add_argument("rides", nargs="*", type=Path, metavar="RIDE", help="logs, or folders of logs")
     parser.add_argument("--vehicle", default="reference", metavar="V.toml", help="vehicle file or name (%(default)s)")
-    parser.add_argument("--baseline", type=Path, metavar="OUT.toml",
-                        help="the rides are healthy: write the vehicle as they show it, and what healthy rides look "
-                        "like beside it; give that file as --vehicle from then on")  # fmt: skip
+    parser.add_argument(
+        "--baseline",
+        type=Path,
+        metavar="OUT.toml",
+        help="the rides are healthy: write the vehicle as they show it, and what healthy rides look "
+        "like beside it; give that file as --vehicle from then on",
+    )
     parser.add_argument("--payload", type=float, metavar="KG", help="rider and luggage, of rides without a rides.json")
     parser.add_argument("--report", type=Path, metavar="OUT.html", help="write a report to read")
     parser.add_argument("--json", metavar="OUT", help="write the result as JSON; - for standard output")
     parser.add_argument("--write-model", type=Path, metavar="NEW.toml", help="write the extended vehicle file")
-    parser.add_argument("--holdout", metavar="RIDE,...", help="rides by name that the gain is measured on; each in "
-                        "turn if none is named")  # fmt: skip
+    parser.add_argument(
+        "--holdout",
+        metavar="RIDE,...",
+        help="rides by name that the gain is measured on; each in turn if none is named",
+    )
     parser.add_argument("--effects", type=Path, metavar="DIR", help="folder with effects of your own as candidates")
     parser.add_argument("--list", action="store_true", help="print the candidates and what would show them")
     parser.add_argument("--seed", type=int, default=0, help="of the resampling of rides (%(default)s)")
@@ -118,8 +125,10 @@ def run_baseline(arguments: argparse.Namespace, vehicle: Vehicle, rides: list[Sa
     with _Bar(arguments.quiet) as bar:
         found = baseline(vehicle, healthy, arguments.effects, bar.say, arguments.workers)
     write_baseline(found, find_vehicle(arguments.vehicle), arguments.baseline)
-    print(f"{arguments.baseline}: {vehicle.name} as {len(healthy)} healthy rides show it; what healthy rides look like "
-          f"is in {arguments.baseline.with_suffix('.healthy.npz').name} beside it")  # fmt: skip
+    print(
+        f"{arguments.baseline}: {vehicle.name} as {len(healthy)} healthy rides show it; what healthy rides look like "
+        f"is in {arguments.baseline.with_suffix('.healthy.npz').name} beside it"
+    )
     if left:
         print(f"left out, as no rides on a road: {', '.join(left)}")
     for text in refused:
@@ -264,8 +273,9 @@ def write_extended(report: Report, vehicle: Vehicle, arguments: argparse.Namespa
         raise InputError(f"--write-model {arguments.write_model}: cannot be written: {error.strerror}") from error
     told = [str(arguments.write_model), *added] if report.extended_model else ["not written", *added]
     if report.ambiguous:
-        told.append("of causes that cannot be told apart it has the likeliest: right for these rides, perhaps not for "
-                    "others")  # fmt: skip
+        told.append(
+            "of causes that cannot be told apart it has the likeliest: right for these rides, perhaps not for others"
+        )
     return told
 
 
@@ -326,16 +336,20 @@ def summary(report: Report, vehicle: Vehicle, told: Sequence[str] = ()) -> str:
         lines.append(f"  not told apart:      {', '.join(group)}")
     if report.unknown:
         u = report.unknown
-        lines.append(f"  no name:             {words(u['channel'])} over {words(u['quantity'])}, "
-                     f"{u['share']:+.1%} of the energy, score {u['score']:.0f}")  # fmt: skip
+        lines.append(
+            f"  no name:             {words(u['channel'])} over {words(u['quantity'])}, "
+            f"{u['share']:+.1%} of the energy, score {u['score']:.0f}"
+        )
         if u["denies"]:
             lines.append(f"  denied:              {', '.join(u['denies'])}, which would not act alike everywhere")
     best = ", ".join(f"{name} {score:.0f}" for name, score in report.ranking[:5])
     lines.append(f"scores       {best}; healthy rides stay below {report.threshold:.0f}")
     left = sizes(before_and_after(report)[0])
     largest = sorted(left.items(), key=lambda row: -abs(row[1]["energy_share"]))[:_ROWS]
-    text = "; ".join(f"{words(name)} {r['mean']:+.3g} ± {r['rms']:.3g} {BY_NAME[name].unit} ({r['energy_share']:+.1%} "
-                     "of the energy)" for name, r in largest)  # fmt: skip
+    text = "; ".join(
+        f"{words(name)} {r['mean']:+.3g} ± {r['rms']:.3g} {BY_NAME[name].unit} ({r['energy_share']:+.1%} of the energy)"
+        for name, r in largest
+    )
     lines.append(f"residuals    {text}")
     lines += _gain(report)
     seen = [limit for limit in limits(report) if 0 < limit.share < float("inf")]
@@ -363,6 +377,8 @@ def _gain(report: Report) -> list[str]:
             )
     if not lines:
         return [f"held out     {report.gain.get('note', 'nothing')}"]
-    head = ("errors on rides held out of the fit; refitted: with the parameters that the model has already; "
-            "gain over that, 95 % over rides")  # fmt: skip
+    head = (
+        "errors on rides held out of the fit; refitted: with the parameters that the model has already; "
+        "gain over that, 95 % over rides"
+    )
     return [f"held out     {head}", *(f"  {line}" for line in lines)]

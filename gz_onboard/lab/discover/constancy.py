@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.channels import over_blocks
-from gz_onboard.lab.discover.grid import Array, Ride
+from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.linear import Linear, Normal, Table, whitened
 from gz_onboard.lab.discover.search import _evidence
 from gz_onboard.lab.discover.state import State
@@ -71,9 +72,13 @@ class Split:
 
 
 def splits(
-    state: State, lines: Sequence[Linear], normals: Sequence[Normal], place: Mapping[str, Sequence[int]],
-    chosen: Sequence[str], change: Array,
-) -> list[Split]:  # fmt: skip
+    state: State,
+    lines: Sequence[Linear],
+    normals: Sequence[Normal],
+    place: Mapping[str, Sequence[int]],
+    chosen: Sequence[str],
+    change: Array,
+) -> list[Split]:
     """Of each of `chosen`, whose parameters stand at `place` and were found to change by `change` (p,), in scales."""
     fixed = [i for name in chosen for i in place[name]]
     found = []
@@ -83,15 +88,19 @@ def splits(
         if len(lines) > 2 and name not in OF_RIDES:
             tests |= {f"{RIDE}{line.ride.name}": _of_ride(line.ride) for line in lines}
         for quantity, sign in tests.items():
-            rides = [_extended(line, normal, state, index, change[index], sign)
-                     for line, normal in zip(lines, normals, strict=True)]  # fmt: skip
+            rides = [
+                _extended(line, normal, state, index, change[index], sign)
+                for line, normal in zip(lines, normals, strict=True)
+            ]
             p = len(state.mean)
             prior = np.zeros((p + 1, p + 1))
             prior[:p, :p] = state.prior
             prior[p, p] = RATIO_SD**2
             e = _evidence(np.append(state.mean, 0.0), prior, np.append(state.scatter, RIDE_SD**2), rides)
-            cross = np.linalg.solve(e.information[np.ix_(fixed, fixed)] + 1e-6 * np.eye(len(fixed)), np.column_stack(
-                [e.information[fixed, p], e.score[fixed]]))  # fmt: skip
+            cross = np.linalg.solve(
+                e.information[np.ix_(fixed, fixed)] + 1e-6 * np.eye(len(fixed)),
+                np.column_stack([e.information[fixed, p], e.score[fixed]]),
+            )
             inner = e.information[p, p] - e.information[p, fixed] @ cross[:, 0]
             score = e.score[p] - e.information[p, fixed] @ cross[:, 1]
             if inner > 1e-6:
@@ -99,10 +108,7 @@ def splits(
     return found
 
 
-def _extended(
-    line: Linear, normal: Normal, state: State, index: Sequence[int], change: Array,
-    sign: Sign,
-) -> Normal:  # fmt: skip
+def _extended(line: Linear, normal: Normal, state: State, index: Sequence[int], change: Array, sign: Sign) -> Normal:
     """`normal` with one more column: what the cause does, times the sign."""
     p = len(normal.b)
     n, b = np.zeros((p + 1, p + 1)), np.zeros(p + 1)
@@ -112,8 +118,11 @@ def _extended(
         if not np.any(effect):
             continue
         touched = np.flatnonzero(np.any(table.a != 0, axis=0))
-        both = whitened(table, state.noise[name], np.column_stack(
-            [effect * sign(line.ride, table, effect), table.a[:, touched], table.y]))  # fmt: skip
+        both = whitened(
+            table,
+            state.noise[name],
+            np.column_stack([effect * sign(line.ride, table, effect), table.a[:, touched], table.y]),
+        )
         split, a, y = both[:, 0], both[:, 1:-1], both[:, -1]
         n[p, p] += split @ split
         n[p, touched] += split @ a

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, Normal, normal
 from gz_onboard.lab.discover.search import Search, evidence
 from gz_onboard.lab.discover.state import State

@@ -10,12 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.alone import NOTE, alone
 from gz_onboard.lab.discover.channels import BY_NAME, usable, voltage_timing
 from gz_onboard.lab.discover.converge import about
 from gz_onboard.lab.discover.gain import measure_gain
-from gz_onboard.lab.discover.grid import Array, Ride
+from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.linear import (
     Linear,
     Noise,
@@ -47,9 +48,12 @@ LATENCY = "pack_voltage_latency"
 
 
 def baseline(
-    vehicle: Vehicle, healthy: Sequence[Samples], folder: Path | None = None, progress: Progress | None = None,
+    vehicle: Vehicle,
+    healthy: Sequence[Samples],
+    folder: Path | None = None,
+    progress: Progress | None = None,
     workers: int = 1,
-) -> Vehicle:  # fmt: skip
+) -> Vehicle:
     """`vehicle` as `healthy` rides show it: parameters refitted within their calibration, and the null statistics.
 
     Needs three rides. Raises InputError for rides that cannot be used.
@@ -121,8 +125,15 @@ def learn(state: State, rides: Sequence[Ride], progress: Progress, workers: int 
     normals = [normal(line, noise) for line in lines]
     weight = np.array([WEATHER_WEIGHT if name in WEATHER else WEIGHT for name in state.names])
     post = fit_mixed(normals, first - shift, state.prior, state.scatter, weight, state.free, 120)
-    after = replace(state, values=values, mean=post.mean, prior=post.covariance, scatter=post.scatter, noise=noise,
-                    healthy=len(rides))  # fmt: skip
+    after = replace(
+        state,
+        values=values,
+        mean=post.mean,
+        prior=post.covariance,
+        scatter=post.scatter,
+        noise=noise,
+        healthy=len(rides),
+    )
     before = replace(after, mean=first - shift, prior=state.prior)
     folds = left_out(before, normals)
     return replace(after, inflation=inflation(folds, normals), shapes=with_inflation(after, folds, lines, normals))
@@ -190,9 +201,14 @@ def usable_causes(state: State) -> list:  # type: ignore[type-arg]
 
 
 def discover(
-    vehicle: Vehicle, rides: Sequence[Samples], seed: int = 0, folder: Path | None = None,
-    progress: Progress | None = None, workers: int = 1, holdout: Sequence[str] | None = None,
-) -> Report:  # fmt: skip
+    vehicle: Vehicle,
+    rides: Sequence[Samples],
+    seed: int = 0,
+    folder: Path | None = None,
+    progress: Progress | None = None,
+    workers: int = 1,
+    holdout: Sequence[str] | None = None,
+) -> Report:
     """What `rides` show that `vehicle` does not: shown, named, measured. See `Report`.
 
     seed: of the bootstrap over rides held out. holdout: names of rides that only the gain is measured on, in no choice

@@ -13,10 +13,10 @@ from zipfile import BadZipFile
 import numpy as np
 from scipy.stats import t as student
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.result import Found, Result
 from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged, number, string, with_keys
-from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.limits import amount
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.state import Shape, State
@@ -63,17 +63,29 @@ def _write(out: Path, text: str) -> None:
 
 def save(state: State, file: Path) -> None:
     """Write what healthy rides taught to an npz file."""
-    shapes = {f"shape_{i}_{key}": getattr(shape, key) for i, shape in enumerate(state.shapes.values())
-              for key in ("mean", "covariance", "inflation")}  # fmt: skip
+    shapes = {
+        f"shape_{i}_{key}": getattr(shape, key)
+        for i, shape in enumerate(state.shapes.values())
+        for key in ("mean", "covariance", "inflation")
+    }
     with file.open("wb") as stream:
         np.savez_compressed(
-            stream, names=np.array(state.names), scale=state.scale, mean=state.mean, prior=state.prior,
-            scatter=state.scatter, healthy=state.healthy,
-            value_names=np.array(list(state.values)), values=np.array(list(state.values.values())),
-            noise_names=np.array(list(state.noise)), noise=np.array(list(state.noise.values())),
-            inflation_names=np.array(list(state.inflation)), inflation=np.array(list(state.inflation.values())),
-            shape_names=np.array(list(state.shapes)), **shapes,
-        )  # fmt: skip
+            stream,
+            names=np.array(state.names),
+            scale=state.scale,
+            mean=state.mean,
+            prior=state.prior,
+            scatter=state.scatter,
+            healthy=state.healthy,
+            value_names=np.array(list(state.values)),
+            values=np.array(list(state.values.values())),
+            noise_names=np.array(list(state.noise)),
+            noise=np.array(list(state.noise.values())),
+            inflation_names=np.array(list(state.inflation)),
+            inflation=np.array(list(state.inflation.values())),
+            shape_names=np.array(list(state.shapes)),
+            **shapes,
+        )
 
 
 def load(state: State, file: Path) -> State:
@@ -98,14 +110,26 @@ def load(state: State, file: Path) -> State:
             prior[np.ix_(at, at)] = data["prior"][np.ix_(take, take)]
             pairs = [str(name) for name in data["shape_names"]]
             return replace(
-                state, mean=mean, prior=prior, scatter=scatter, scale=scale, healthy=int(data["healthy"]),
+                state,
+                mean=mean,
+                prior=prior,
+                scatter=scatter,
+                scale=scale,
+                healthy=int(data["healthy"]),
                 values=state.values | _mapping(data["value_names"], data["values"]),
-                noise=state.noise | {str(n): (float(a), float(b), float(c))
-                                     for n, (a, b, c) in zip(data["noise_names"], data["noise"], strict=True)},
+                noise=state.noise
+                | {
+                    str(n): (float(a), float(b), float(c))
+                    for n, (a, b, c) in zip(data["noise_names"], data["noise"], strict=True)
+                },
                 inflation=_mapping(data["inflation_names"], data["inflation"]),
-                shapes={pair: Shape(data[f"shape_{i}_mean"], data[f"shape_{i}_covariance"],
-                                    float(data[f"shape_{i}_inflation"])) for i, pair in enumerate(pairs)},
-            )  # fmt: skip
+                shapes={
+                    pair: Shape(
+                        data[f"shape_{i}_mean"], data[f"shape_{i}_covariance"], float(data[f"shape_{i}_inflation"])
+                    )
+                    for i, pair in enumerate(pairs)
+                },
+            )
     except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
         raise InputError(f"{file}: cannot be read as what healthy rides taught: {error}") from error
 
@@ -134,8 +158,9 @@ def write_model(report: Report, vehicle: Vehicle, base: Path, out: Path) -> list
     if report.unknown is not None:
         curve = curve_text(report)
         if curve is None:
-            words.append(f"nothing for the curve: no effect can read {report.unknown['quantity']} at "
-                         f"{report.unknown['channel']}")  # fmt: skip
+            words.append(
+                f"nothing for the curve: no effect can read {report.unknown['quantity']} at {report.unknown['channel']}"
+            )
         else:
             words.append(f"an empirical effect, {folder.name}/{curve[0]}.py")
             names.append(curve[0])

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.lab.discover.grid import Array
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed, normal
 from gz_onboard.lab.discover.shapes import Form, columns, extended
 from gz_onboard.lab.discover.state import State

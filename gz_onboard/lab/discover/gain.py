@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.folds import extended_mean, started, with_curve, with_start, without
-from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, fit_mixed, normal
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.shapes import Form
@@ -61,9 +61,11 @@ def measure_gain(report: Report, seed: int, apart: Sequence[Linear] = ()) -> dic
         draws = rng.integers(0, len(table), (400, len(table)))
         saved = (table[:, 1] - table[:, 2])[draws].mean(axis=1)
         result[metric] = {
-            "before": float(before), "control": float(control_), "after": float(after_),
+            "before": float(before),
+            "control": float(control_),
+            "after": float(after_),
             "ci95": [float(np.quantile(saved, 0.025)), float(np.quantile(saved, 0.975))],
-        }  # fmt: skip
+        }
     return result
 
 

@@ -10,16 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.physics.model import air_density
 from gz_onboard.physics.vibration import Vibration
 from gz_onboard.simulation.samples import Samples
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 STEP = 0.1  # s
 LAGS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}
@@ -137,9 +134,24 @@ def read_ride(samples: Samples, radius: float, mass: float) -> Ride:
         ride.quantities["suspension_speed"] = suspension_speed(wheels, grid)
     if "accel_z" in samples.columns and np.median(np.diff(samples.columns["accel_z"][0])) < SHAKING:
         ride.quantities["vibration"] = vibration(*samples.columns["accel_z"], grid)
-    wanted = ("accel_x", "rate_z", "gps_speed", "gps_altitude", "gps_course", "pack_voltage", "pack_current",
-              "inverter_voltage", "inverter_current", "auxiliary_current", "cell_temperature", "ambient_temperature",
-              "motor_temperature", "inverter_temperature", "wheel_speed_front", "wheel_speed_rear")  # fmt: skip
+    wanted = (
+        "accel_x",
+        "rate_z",
+        "gps_speed",
+        "gps_altitude",
+        "gps_course",
+        "pack_voltage",
+        "pack_current",
+        "inverter_voltage",
+        "inverter_current",
+        "auxiliary_current",
+        "cell_temperature",
+        "ambient_temperature",
+        "motor_temperature",
+        "inverter_temperature",
+        "wheel_speed_front",
+        "wheel_speed_rear",
+    )
     ride.missing = tuple(role for role in wanted if role not in signals)
     return ride
 

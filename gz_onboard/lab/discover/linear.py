@@ -14,8 +14,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.channels import CHANNELS, Channel, System, blocks, depends, roughness, support, usable
-from gz_onboard.lab.discover.grid import Array, Mask, Ride
+from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.terms import stepped
 
 LEAST = 0.02  # of the variance before, down to which the scatter between rides is learned
@@ -217,9 +218,14 @@ class Posterior:
 
 
 def fit_mixed(
-    rides: Sequence[Normal], mean: Array, prior: Array, scatter: Array, weight: Array | float, free: Mask,
+    rides: Sequence[Normal],
+    mean: Array,
+    prior: Array,
+    scatter: Array,
+    weight: Array | float,
+    free: Mask,
     rounds: int = 60,
-) -> Posterior:  # fmt: skip
+) -> Posterior:
     """Common part, and the scatter between rides by expectation and maximisation (Dempster, Laird & Rubin 1977).
 
     mean, prior: (p,), (p, p) of the common part before. scatter: (p,) variances before, worth `weight` (p,) rides;
@@ -258,8 +264,11 @@ def learn_noise(rides: Sequence[Linear], shifts: Array, start: Noise) -> Noise:
     result = dict(start)
     every = [residuals(ride, shift) for ride, shift in zip(rides, shifts, strict=True)]
     for channel in CHANNELS:
-        rows = [(ride.tables[channel.name], rest[channel.name]) for ride, rest in zip(rides, every, strict=True)
-                if channel.name in rest]  # fmt: skip
+        rows = [
+            (ride.tables[channel.name], rest[channel.name])
+            for ride, rest in zip(rides, every, strict=True)
+            if channel.name in rest
+        ]
         if not rows:
             continue
         pooled = np.concatenate([rest for _, rest in rows])
@@ -268,9 +277,12 @@ def learn_noise(rides: Sequence[Linear], shifts: Array, start: Noise) -> Noise:
         if not channel.correlated:
             result[channel.name] = (float(np.sqrt(np.mean(np.concatenate([r for _, r in rows]) ** 2))), 0.0, 10.0)
             continue
-        grid = [(q, t) for t in (3 * channel.block, 10 * channel.block, 60.0, 200.0, 600.0)
-                for q in (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0)
-                if not channel.slow or (t >= channel.slow and q >= 0.5)]  # fmt: skip
+        grid = [
+            (q, t)
+            for t in (3 * channel.block, 10 * channel.block, 60.0, 200.0, 600.0)
+            for q in (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0)
+            if not channel.slow or (t >= channel.slow and q >= 0.5)
+        ]
         ratio, time = (np.array(column) for column in zip(*grid, strict=True))
         parts = [likelihoods(table.time, rest, ratio, time) for table, rest in rows]
         count = sum(len(rest) for _, rest in rows)

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.channels import BY_NAME, SLOW, cell_circuit, over_blocks, usable
-from gz_onboard.lab.discover.grid import STEP, Array, Ride, since
+from gz_onboard.lab.discover.grid import STEP, Ride, since
 from gz_onboard.lab.discover.limits import words
 from gz_onboard.lab.discover.linear import Linear, Posterior, Table, fit_mixed
 from gz_onboard.lab.discover.result import Report
@@ -109,9 +110,15 @@ class Over:
         return None if values is None else over_blocks(table.channel, values)[table.used]
 
 
-NEEDS = {"lateral_acceleration": "rate_z", "grade": "accel_x", "heading": "gps_course",
-         "ambient_temperature": "ambient_temperature", "motor_temperature": "motor_temperature",
-         "cell_temperature": "cell_temperature", "pack_current": "pack_current"}  # fmt: skip
+NEEDS = {
+    "lateral_acceleration": "rate_z",
+    "grade": "accel_x",
+    "heading": "gps_course",
+    "ambient_temperature": "ambient_temperature",
+    "motor_temperature": "motor_temperature",
+    "cell_temperature": "cell_temperature",
+    "pack_current": "pack_current",
+}
 """The role without which a quantity is made up."""
 
 

@@ -125,10 +125,17 @@ def _causes(report: Report) -> str:
     text = ""
     rows = []
     for c in report.causes:
-        rows.append([
-            words(c.name), c.parameter, amount(c.value, c.unit), f"{c.ci95[0]:.4g} to {c.ci95[1]:.4g}",
-            f"{c.change:+.4g}", f"{c.energy_share:+.1%}", f"{c.evidence:.0f}",
-        ])  # fmt: skip
+        rows.append(
+            [
+                words(c.name),
+                c.parameter,
+                amount(c.value, c.unit),
+                f"{c.ci95[0]:.4g} to {c.ci95[1]:.4g}",
+                f"{c.change:+.4g}",
+                f"{c.energy_share:+.1%}",
+                f"{c.evidence:.0f}",
+            ]
+        )
         rows += [["", name, f"{value:.4g}", f"{ci[0]:.4g} to {ci[1]:.4g}", "", "", ""] for name, value, ci in c.others]
     if rows:
         heads = ["cause", "parameter", "value", "95 % interval", "change", "of the energy", "score"]
@@ -171,13 +178,33 @@ def _residuals(report: Report, before: Sequence[Linear], after: Sequence[Linear]
         r, b, a = raw[name], first.get(name, raw[name]), last.get(name, raw[name])
         energy = any(abs(x["energy_share"]) > 0 for x in (b, a))
         shares = [f"{x:+.1%}" if energy else "–" for x in (b["energy_share"], b["range_share"], a["energy_share"])]
-        rows.append([
-            words(name), BY_NAME[name].unit, f"{r['mean']:+.2g}", f"{r['rms']:.2g}",
-            f"{b['rms']:.2g}", f"{b['autocorrelation']:.2f}", *shares[:2],
-            f"{a['rms']:.2g}", f"{a['autocorrelation']:.2f}", shares[2],
-        ])  # fmt: skip
-    heads = ["measured less model", "unit", "mean", "rms", "before: rms", "auto­correlation", "of the energy",
-             "of the range", "after: rms", "auto­correlation", "of the energy"]  # fmt: skip
+        rows.append(
+            [
+                words(name),
+                BY_NAME[name].unit,
+                f"{r['mean']:+.2g}",
+                f"{r['rms']:.2g}",
+                f"{b['rms']:.2g}",
+                f"{b['autocorrelation']:.2f}",
+                *shares[:2],
+                f"{a['rms']:.2g}",
+                f"{a['autocorrelation']:.2f}",
+                shares[2],
+            ]
+        )
+    heads = [
+        "measured less model",
+        "unit",
+        "mean",
+        "rms",
+        "before: rms",
+        "auto­correlation",
+        "of the energy",
+        "of the range",
+        "after: rms",
+        "auto­correlation",
+        "of the energy",
+    ]
     blocks = ", ".join(f"{words(n)} {BY_NAME[n].block:g} s" for n in ("road_force", "inverter_power", "cell_voltage"))
     return table(heads, rows) + (
         '<p class="muted">Mean and rms as measured, with the bias of each ride\'s sensors and its wind; before and '
@@ -213,8 +240,13 @@ def _gain(report: Report) -> str:
         g = report.gain.get(metric)
         if isinstance(g, dict):
             low, high = (x * factor for x in g["ci95"])
-            rows.append([f"{label} [{unit}]", *(f"{g[key] * factor:.3g}" for key in ("before", "control", "after")),
-                         f"{low:+.3g} to {high:+.3g}"])  # fmt: skip
+            rows.append(
+                [
+                    f"{label} [{unit}]",
+                    *(f"{g[key] * factor:.3g}" for key in ("before", "control", "after")),
+                    f"{low:+.3g} to {high:+.3g}",
+                ]
+            )
     if not rows:
         return f"<p>{html.escape(str(report.gain.get('note', 'nothing was held out')))}</p>"
     heads = ["error", "before", "control", "after", "gain over control, 95 % over rides"]
@@ -300,8 +332,15 @@ def overview(
             for c in range(len(quantities)):
                 value = grid[r, c]
                 if value >= 1:
-                    axis.text(c, r, f"{value:.0f}", ha="center", va="center", fontsize=7.5,
-                              color="white" if value > 40 else INK)  # fmt: skip
+                    axis.text(
+                        c,
+                        r,
+                        f"{value:.0f}",
+                        ha="center",
+                        va="center",
+                        fontsize=7.5,
+                        color="white" if value > 40 else INK,
+                    )
         axis.set_xticks(
             range(len(quantities)), [words(name) for name in quantities], rotation=38, ha="left", fontsize=8
         )
@@ -316,9 +355,13 @@ def overview(
 
 
 def panels(
-    before: Sequence[Linear], after: Sequence[Linear], channel: str, over: Over, named: bool,
+    before: Sequence[Linear],
+    after: Sequence[Linear],
+    channel: str,
+    over: Over,
+    named: bool,
     names: Sequence[str] = tuple(QUANTITIES),
-) -> Figure:  # fmt: skip
+) -> Figure:
     """The residual's mean over each quantity, in bins of as many blocks, one standard error as a band."""
     drawn = []
     for name in names:
@@ -332,8 +375,9 @@ def panels(
     figure = new_figure(12.5, height)
     if not drawn:
         return figure
-    grid = figure.add_gridspec(rows, columns, left=0.06, right=0.985, wspace=0.13, hspace=0.42,
-                               top=1 - 0.3 / height, bottom=0.48 / height)  # fmt: skip
+    grid = figure.add_gridspec(
+        rows, columns, left=0.06, right=0.985, wspace=0.13, hspace=0.42, top=1 - 0.3 / height, bottom=0.48 / height
+    )
     axes: list[Any] = []
     for i, (name, first, last) in enumerate(drawn):
         axis = figure.add_subplot(grid[i // columns, i % columns], sharey=axes[0] if axes else None)
@@ -352,8 +396,9 @@ def panels(
         if i % columns:
             axis.tick_params(labelleft=False)
     legend(axes[min(columns, len(axes)) - 1])
-    figure.text(0.012, 0.5, f"measured less model [{BY_NAME[channel].unit}]", rotation=90, va="center", fontsize=8.5,
-                color=INK)  # fmt: skip
+    figure.text(
+        0.012, 0.5, f"measured less model [{BY_NAME[channel].unit}]", rotation=90, va="center", fontsize=8.5, color=INK
+    )
     return figure
 
 
@@ -369,8 +414,16 @@ def ranking(report: Report) -> Figure:
     colours = [BLUE if name in chosen else "#8fb8de" if name in near else "#cbd2d9" for name, _ in rows]
     axis.barh([words(name) for name, _ in rows], [max(score, 0.0) for _, score in rows], color=colours, height=0.7)
     axis.axvline(report.threshold, color=INK, linewidth=1, linestyle=(0, (4, 2)))
-    axis.annotate("threshold", (report.threshold, 0), (4, 3), xycoords=("data", "axes fraction"),
-                  textcoords="offset points", fontsize=8, color=MUTED, va="bottom")  # fmt: skip
+    axis.annotate(
+        "threshold",
+        (report.threshold, 0),
+        (4, 3),
+        xycoords=("data", "axes fraction"),
+        textcoords="offset points",
+        fontsize=8,
+        color=MUTED,
+        va="bottom",
+    )
     axis.set_xscale("symlog", linthresh=10)
     axis.set_xlim(0, max(2 * report.threshold, 1.3 * max((score for _, score in rows), default=1)))
     axis.set_xlabel("score beside the causes named (blue), linear up to 10", fontsize=8.5, color=INK)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.constancy import Split
-from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, Normal
 from gz_onboard.lab.discover.state import State
 
@@ -44,12 +44,18 @@ class Cause:
     def to_json(self) -> dict[str, Any]:
         """As a JSON object."""
         return {
-            "name": self.name, "parameter": self.parameter, "value": self.value, "unit": self.unit,
-            "ci95": list(self.ci95), "change": self.change, "energy_share": self.energy_share,
-            "evidence": self.evidence, "varies": self.varies,
+            "name": self.name,
+            "parameter": self.parameter,
+            "value": self.value,
+            "unit": self.unit,
+            "ci95": list(self.ci95),
+            "change": self.change,
+            "energy_share": self.energy_share,
+            "evidence": self.evidence,
+            "varies": self.varies,
             "parameters": {self.parameter: {"value": self.value, "ci95": list(self.ci95)}}
             | {name: {"value": value, "ci95": list(ci)} for name, value, ci in self.others},
-        }  # fmt: skip
+        }
 
 
 @dataclass

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.stats import f as fisher
 from scipy.stats import t as student
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Normal, marginal
 from gz_onboard.lab.discover.state import State
 
@@ -73,9 +73,12 @@ class Search:
     """The hypotheses over one `Evidence`."""
 
     def __init__(
-        self, state: State, evidence: Evidence, causes: Sequence[Candidate],
+        self,
+        state: State,
+        evidence: Evidence,
+        causes: Sequence[Candidate],
         shares: Mapping[str, Mapping[str, float]] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.state, self.evidence, self.shares = state, evidence, shares or {}
         self.causes = {c.name: c for c in causes}
         self.place = {c.name: state.index(c.names) for c in causes}
@@ -166,8 +169,10 @@ class Search:
             near = {n: self.gain([*rest, n]) for n in self.causes if n not in chosen}
             inflation = self.state.inflation
             allowed = {n: margin * max(1.0, inflation.get(n, 1.0), inflation.get(name, 1.0)) for n in near}
-            others = sorted((n for n, g in near.items() if g > own - allowed[n] and self.step(rest, n) > least),
-                            key=lambda n: -near[n])  # fmt: skip
+            others = sorted(
+                (n for n, g in near.items() if g > own - allowed[n] and self.step(rest, n) > least),
+                key=lambda n: -near[n],
+            )
             if others:
                 sets.append((name, *others))
         return sets

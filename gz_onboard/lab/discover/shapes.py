@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.channels import BY_NAME, over_blocks
-from gz_onboard.lab.discover.grid import STEP, Array, Ride, smooth
+from gz_onboard.lab.discover.grid import STEP, Ride, smooth
 from gz_onboard.lab.discover.linear import Linear, Noise, Normal, Table, fit_mixed, marginal, whitened
 from gz_onboard.lab.discover.search import _evidence
 from gz_onboard.lab.discover.state import Shape, State
@@ -32,13 +33,29 @@ QUANTITIES: dict[str, tuple[tuple[float, ...], str]] = {
     "since_braking": ((0.0, 4.0, 8.0, 15.0, 30.0, 60.0), "s"),
 }
 PAIRS: tuple[tuple[str, tuple[str, ...]], ...] = (
-    ("road_force", ("speed", "acceleration", "lateral_acceleration", "grade", "heading", "motor_temperature", "time",
-                    "motor_current", "current_change", "steering", "vibration", "suspension_speed", "since_braking")),
+    (
+        "road_force",
+        (
+            "speed",
+            "acceleration",
+            "lateral_acceleration",
+            "grade",
+            "heading",
+            "motor_temperature",
+            "time",
+            "motor_current",
+            "current_change",
+            "steering",
+            "vibration",
+            "suspension_speed",
+            "since_braking",
+        ),
+    ),
     ("inverter_power", ("speed", "motor_current", "motor_temperature", "time", "current_change")),
     ("auxiliary", ("speed", "motor_temperature", "time", "pack_current", "vibration")),
     ("pack_balance", ("speed", "pack_current", "motor_temperature", "time")),
     ("cell_voltage", ("pack_current", "soc", "time", "current_change", "vibration")),
-)  # fmt: skip
+)
 
 
 ROUND = ("heading",)
@@ -209,9 +226,13 @@ def supported(form: Form, linears: Sequence[Linear]) -> Array:
 
 
 def shape_evidence(
-    state: State, linears: Sequence[Linear], normals: Sequence[Normal], form: Form, fixed: Sequence[int],
+    state: State,
+    linears: Sequence[Linear],
+    normals: Sequence[Normal],
+    form: Form,
+    fixed: Sequence[int],
     own: bool = False,
-) -> Curve | None:  # fmt: skip
+) -> Curve | None:
     """What `form` is beside changes at `fixed`; None where no ride has it, or not enough of it.
 
     own: with the scatter of its coefficients that these rides show, where it is more than `Form.scatter`.
@@ -242,8 +263,10 @@ def shape_evidence(
     score = e.score[mine]
     if fixed:
         f = list(fixed)
-        cross = np.linalg.solve(e.information[np.ix_(f, f)] + 1e-6 * np.eye(len(f)), np.column_stack(
-            [e.information[np.ix_(f, mine)], e.score[f]]))  # fmt: skip
+        cross = np.linalg.solve(
+            e.information[np.ix_(f, f)] + 1e-6 * np.eye(len(f)),
+            np.column_stack([e.information[np.ix_(f, mine)], e.score[f]]),
+        )
         inner = inner - e.information[np.ix_(mine, f)] @ cross[:, :-1]
         score = score - e.information[np.ix_(mine, f)] @ cross[:, -1]
     inner = free.T @ (inner + 1e-3 * np.eye(k)) @ free
@@ -255,8 +278,13 @@ def shape_evidence(
         if form.channel in line.tables:
             knots = columns(line.ride, form.quantity, line.tables[form.channel])
             weights += 0.0 if knots is None else (knots**2).sum(axis=0)
-    return Curve(float(score @ estimate), free.shape[1], at @ estimate, at @ np.linalg.inv(inner) @ at.T,
-                 weights / np.sum(weights))  # fmt: skip
+    return Curve(
+        float(score @ estimate),
+        free.shape[1],
+        at @ estimate,
+        at @ np.linalg.inv(inner) @ at.T,
+        weights / np.sum(weights),
+    )
 
 
 def learn_shapes(state: State, linears: Sequence[Linear], normals: Sequence[Normal]) -> dict[str, Shape]:

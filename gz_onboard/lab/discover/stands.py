@@ -12,11 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.constancy import RIDE, splits
 from gz_onboard.lab.discover.converge import Converged, Known, Linearised, converged
 from gz_onboard.lab.discover.folds import Fold, better, folds
-from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed
 from gz_onboard.lab.discover.search import Search, evidence
 from gz_onboard.lab.discover.state import State

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.candidates import Candidate, candidates
 from gz_onboard.lab.discover.channels import CHANNELS, System, counted_soc, depends
-from gz_onboard.lab.discover.grid import Array, Mask, Ride, read_ride
+from gz_onboard.lab.discover.grid import Ride, read_ride
 from gz_onboard.lab.discover.linear import Noise
 from gz_onboard.lab.discover.terms import BASE, FIXED, LOG, NUISANCES, RIDE_SD, RIDE_SD_SHARE, stepped
 from gz_onboard.physics.effect import Effect
@@ -19,14 +20,32 @@ from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
 MEAN_SD = {
-    "cornering_compliance": 0.1, "wind_north": 0.4, "wind_east": 0.4, "brake_drag_force": 1.5,
-    "drivetrain_drag_torque": 0.01, "warm_up_share": 0.2, "regeneration_loss_share": 0.03, "slow_resistance": 0.01,
-    "hysteresis_voltage": 0.005, "cell_resistance_factor": 0.005, "cooling_factor": 0.01, "speed_sensor_scale": 0.001,
-    "pack_voltage_latency": 0.02, "payload_mass": 2.0,
-}  # fmt: skip
+    "cornering_compliance": 0.1,
+    "wind_north": 0.4,
+    "wind_east": 0.4,
+    "brake_drag_force": 1.5,
+    "drivetrain_drag_torque": 0.01,
+    "warm_up_share": 0.2,
+    "regeneration_loss_share": 0.03,
+    "slow_resistance": 0.01,
+    "hysteresis_voltage": 0.005,
+    "cell_resistance_factor": 0.005,
+    "cooling_factor": 0.01,
+    "speed_sensor_scale": 0.001,
+    "pack_voltage_latency": 0.02,
+    "payload_mass": 2.0,
+}
 """Of what a healthy vehicle may show of a candidate that its model lacks: standard deviation about none."""
-TRANSFER = ("motor_copper_resistance", "motor_iron_linear", "motor_iron_quadratic", "inverter_loss_constant",
-            "inverter_loss_linear", "inverter_loss_quadratic", "torque_constant", "cable_resistance")  # fmt: skip
+TRANSFER = (
+    "motor_copper_resistance",
+    "motor_iron_linear",
+    "motor_iron_quadratic",
+    "inverter_loss_constant",
+    "inverter_loss_linear",
+    "inverter_loss_quadratic",
+    "torque_constant",
+    "cable_resistance",
+)
 TRANSFERRED = 3.0
 """Found on a bench at steady points: on the road they hold within so many times their standard deviation."""
 
@@ -143,8 +162,20 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> State:
             prior[place[a], place[b]] = prior[place[b], place[a]] = r * bench[place[a]] * bench[place[b]]
     noise = {channel.name: channel.noise for channel in CHANNELS}
     free = np.array([name not in FIXED for name in names])
-    return State(vehicle, system, causes, tuple(names), np.array(scale), values, np.zeros(len(names)), prior,
-                 np.array(ride_sd) ** 2, noise, 0, free)  # fmt: skip
+    return State(
+        vehicle,
+        system,
+        causes,
+        tuple(names),
+        np.array(scale),
+        values,
+        np.zeros(len(names)),
+        prior,
+        np.array(ride_sd) ** 2,
+        noise,
+        0,
+        free,
+    )
 
 
 def vehicle_file_names(vehicle: Vehicle) -> set[str]:

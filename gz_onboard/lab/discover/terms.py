@@ -75,13 +75,22 @@ NUISANCES = (
     Nuisance("inverter_airflow", "1/(10 m/s)", 0.0, 1.0, 0.1, "box cools better in moving air"),
     Nuisance("cells_start", "K", 0.0, 0.3, 0.5, "first cell temperature: quantised"),
     Nuisance("pack_airflow", "1/(10 m/s)", 0.0, 1.0, 0.1, "pack cools better in moving air"),
-)  # fmt: skip
+)
 
-LOG = frozenset((
-    "motor_stator_capacity", "motor_rotor_capacity", "motor_gap_conductance", "motor_rotor_to_ambient",
-    "inverter_board_capacity", "inverter_box_capacity", "inverter_board_to_box", "inverter_box_to_ambient",
-    "pack_heat_capacity", "pack_conductance",
-))  # fmt: skip
+LOG = frozenset(
+    (
+        "motor_stator_capacity",
+        "motor_rotor_capacity",
+        "motor_gap_conductance",
+        "motor_rotor_to_ambient",
+        "inverter_board_capacity",
+        "inverter_box_capacity",
+        "inverter_board_to_box",
+        "inverter_box_to_ambient",
+        "pack_heat_capacity",
+        "pack_conductance",
+    )
+)
 """Those that are positive and known to a factor only: a step is one of their logarithm."""
 
 
@@ -90,8 +99,17 @@ def stepped(name: str, value: float, step: float) -> float:
     return value * exp(step) if name in LOG else value + step
 
 
-FIXED = ("soc_start", "v1_start", "altitude_start", "payload_error", "motor_start", "rotor_start", "inverter_start",
-         "box_start", "cells_start")  # fmt: skip
+FIXED = (
+    "soc_start",
+    "v1_start",
+    "altitude_start",
+    "payload_error",
+    "motor_start",
+    "rotor_start",
+    "inverter_start",
+    "box_start",
+    "cells_start",
+)
 """Those whose scatter is of the ride's start or of what was entered: nothing that healthy rides would tell better."""
 
 WEATHER = ("wind_north", "wind_east")
@@ -101,23 +119,60 @@ STARTS = (*(name for name in FIXED if name != "payload_error"), "accel_bias", "p
 """Those that are the sensors' or the start's, not the vehicle's: each ride tells its own, whatever the model."""
 
 BASE = (
-    "wheel_radius", "payload_mass", "torque_constant", "cell_capacity", "cable_resistance",
-    "pack_current_offset", "pack_current_gain", "pack_voltage_offset", "pack_heat_capacity", "pack_conductance",
-    "motor_stator_capacity", "motor_rotor_capacity", "motor_gap_conductance", "motor_rotor_to_ambient",
-    "inverter_board_capacity", "inverter_box_capacity", "inverter_board_to_box", "inverter_box_to_ambient",
-)  # fmt: skip
+    "wheel_radius",
+    "payload_mass",
+    "torque_constant",
+    "cell_capacity",
+    "cable_resistance",
+    "pack_current_offset",
+    "pack_current_gain",
+    "pack_voltage_offset",
+    "pack_heat_capacity",
+    "pack_conductance",
+    "motor_stator_capacity",
+    "motor_rotor_capacity",
+    "motor_gap_conductance",
+    "motor_rotor_to_ambient",
+    "inverter_board_capacity",
+    "inverter_box_capacity",
+    "inverter_board_to_box",
+    "inverter_box_to_ambient",
+)
 """Of the vehicle's own parameters those that a channel depends on; those of the model's effects come on top."""
 
 RIDE_SD = {
-    "wheel_radius": 4e-4, "payload_mass": 0.0, "torque_constant": 0.002, "cell_capacity": 0.01,
-    "pack_series_resistance": 3e-4, "cable_resistance": 2e-4, "pack_current_offset": 0.03, "pack_current_gain": 0.002,
-    "pack_voltage_offset": 0.01, "drag_area": 0.01, "rolling_resistance_constant": 7e-4,
-    "rolling_resistance_speed": 2e-5, "motor_copper_resistance": 3e-4, "motor_iron_linear": 0.03,
-    "motor_iron_quadratic": 0.001, "inverter_loss_constant": 0.5, "inverter_loss_linear": 0.02,
-    "inverter_loss_quadratic": 1e-4, "auxiliary_power": 0.7, "cornering_compliance": 0.015,
-    "wind_north": 1.2, "wind_east": 1.2, "brake_drag_force": 1.0, "drivetrain_drag_torque": 0.005,
-    "warm_up_share": 0.05, "regeneration_loss_share": 0.02, "slow_resistance": 0.001, "hysteresis_voltage": 0.001,
-    "cell_resistance_factor": 0.01, "cooling_factor": 0.08, "speed_sensor_scale": 3e-4, "pack_voltage_latency": 0.004,
-}  # fmt: skip
+    "wheel_radius": 4e-4,
+    "payload_mass": 0.0,
+    "torque_constant": 0.002,
+    "cell_capacity": 0.01,
+    "pack_series_resistance": 3e-4,
+    "cable_resistance": 2e-4,
+    "pack_current_offset": 0.03,
+    "pack_current_gain": 0.002,
+    "pack_voltage_offset": 0.01,
+    "drag_area": 0.01,
+    "rolling_resistance_constant": 7e-4,
+    "rolling_resistance_speed": 2e-5,
+    "motor_copper_resistance": 3e-4,
+    "motor_iron_linear": 0.03,
+    "motor_iron_quadratic": 0.001,
+    "inverter_loss_constant": 0.5,
+    "inverter_loss_linear": 0.02,
+    "inverter_loss_quadratic": 1e-4,
+    "auxiliary_power": 0.7,
+    "cornering_compliance": 0.015,
+    "wind_north": 1.2,
+    "wind_east": 1.2,
+    "brake_drag_force": 1.0,
+    "drivetrain_drag_torque": 0.005,
+    "warm_up_share": 0.05,
+    "regeneration_loss_share": 0.02,
+    "slow_resistance": 0.001,
+    "hysteresis_voltage": 0.001,
+    "cell_resistance_factor": 0.01,
+    "cooling_factor": 0.08,
+    "speed_sensor_scale": 3e-4,
+    "pack_voltage_latency": 0.004,
+}
 RIDE_SD_SHARE = 0.1
 """What a parameter without a row scatters by, as a share of its prior's standard deviation."""

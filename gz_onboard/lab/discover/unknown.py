@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.constancy import RIDE, Split
 from gz_onboard.lab.discover.folds import Fold, better, folds
-from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear
 from gz_onboard.lab.discover.search import Search, one_degree
 from gz_onboard.lab.discover.shapes import QUANTITIES, Curve, Form, forms, shape_evidence
@@ -28,9 +28,15 @@ BETTER = 15.0  # of chi-squared, each further knot taken off with 2, by which a 
 
 
 def unexplained(
-    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str],
-    change: Array, constancy: Sequence[Split], limit: float,
-) -> dict[str, Any] | None:  # fmt: skip
+    state: State,
+    search: Search,
+    lines: Sequence[Linear],
+    normals: Sequence[Any],
+    chosen: Sequence[str],
+    change: Array,
+    constancy: Sequence[Split],
+    limit: float,
+) -> dict[str, Any] | None:
     """The curve that explains most beside the causes chosen, and which of them it `denies`, as they are none; None if
     no curve is significant.
 
@@ -81,9 +87,14 @@ def unexplained(
 
 
 def stands(
-    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], form: Form, rest: Sequence[str],
+    state: State,
+    search: Search,
+    lines: Sequence[Linear],
+    normals: Sequence[Any],
+    form: Form,
+    rest: Sequence[str],
     limit: float,
-) -> bool:  # fmt: skip
+) -> bool:
     """Whether the curve `form` beside the causes `rest` is more than what differs between these rides, and mends its
     channel on rides held out of the fit.
     """
@@ -131,8 +142,17 @@ def of_rides(
     mine = [s for s in constancy if s.cause == worst.cause and s.quantity.startswith(RIDE)]
     rows = [[float(i), s.ratio, abs(s.ratio) / max(s.chi2, 1e-9) ** 0.5] for i, s in enumerate(mine)]
     share = energy_share(state, lines, change)
-    return {"channel": channel, "quantity": RIDES, "straight": False, "unit": "", "score": worst.chi2,
-            "chi2": worst.chi2, "curve": rows, "denies": [worst.cause], "share": share}  # fmt: skip
+    return {
+        "channel": channel,
+        "quantity": RIDES,
+        "straight": False,
+        "unit": "",
+        "score": worst.chi2,
+        "chi2": worst.chi2,
+        "curve": rows,
+        "denies": [worst.cause],
+        "share": share,
+    }
 
 
 def inflated(state: State, form: Form) -> float:
@@ -145,8 +165,15 @@ def described(form: Form, curve: Curve, score: float) -> dict[str, Any]:
     """The curve for the report."""
     knots, unit = QUANTITIES[form.quantity]
     rows = zip(knots, curve.values.tolist(), curve.sd.tolist(), strict=True)
-    return {"channel": form.channel, "quantity": form.quantity, "straight": form.straight, "unit": unit,
-            "score": score, "chi2": curve.chi2, "curve": [list(row) for row in rows]}  # fmt: skip
+    return {
+        "channel": form.channel,
+        "quantity": form.quantity,
+        "straight": form.straight,
+        "unit": unit,
+        "score": score,
+        "chi2": curve.chi2,
+        "curve": [list(row) for row in rows],
+    }
 
 
 def unlike_causes(curve: Curve, inflation: float, size: float, share: float) -> bool:

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from scipy.stats import t as student
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.constancy import splits
 from gz_onboard.lab.discover.converge import Known, Linearised, about, converged
-from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear, normal
 from gz_onboard.lab.discover.result import Cause, Report
 from gz_onboard.lab.discover.search import Evidence, Search, evidence
@@ -27,8 +27,13 @@ from gz_onboard.lab.discover.worth import energy_share, sizes
 
 FALSE_ALARMS = 0.05  # of sets of healthy rides, all candidates and curves together
 DISCREPANCY = 0.05  # of a change, sd: the form of an effect is not exactly the real one's
-LUMPED = {"cell_voltage": 1, "voltage_timing": 1, "motor_temperature": 3, "inverter_temperature": 3,
-          "cell_temperature": 3}  # fmt: skip
+LUMPED = {
+    "cell_voltage": 1,
+    "voltage_timing": 1,
+    "motor_temperature": 3,
+    "inverter_temperature": 3,
+    "cell_temperature": 3,
+}
 """Channels whose model is a circuit or a network of lumps: by how much more than that they err, in shares of it."""
 LEAST = 0.4  # of the threshold, by which a stand-in must explain something itself
 MARGIN = 6.0  # of chi-squared within which another cause explains as well: a likelihood ratio of 20
@@ -98,10 +103,23 @@ def reach(state: State, notes: list[str], say: Callable[[str], None], linearised
         verdict = "cause"
     ranking = sorted(((name, round(score, 2)) for name, score in scores.items()), key=lambda pair: -pair[1])
     return Report(
-        verdict, found, sets, unknown, ranking, sizes(lines), {}, advice(search, sets, unknown), notes,
-        isolability(every), limit, constancy=constancy, state=state, at=now.offset, lines=list(lines),
+        verdict,
+        found,
+        sets,
+        unknown,
+        ranking,
+        sizes(lines),
+        {},
+        advice(search, sets, unknown),
+        notes,
+        isolability(every),
+        limit,
+        constancy=constancy,
+        state=state,
+        at=now.offset,
+        lines=list(lines),
         normals=normals,
-    )  # fmt: skip
+    )
 
 
 def channel_shares(state: State, lines: Sequence[Linear], causes: Sequence[Candidate]) -> dict[str, dict[str, float]]:
@@ -169,11 +187,19 @@ def causes_of(state: State, search: Search, chosen: Sequence[str], lines: Sequen
             rows.append((parameter.name, float(ends[0]), (float(ends[1]), float(ends[2])), float(ends[0] - healthy)))
             at += 1
         first = rows[0]
-        result.append(Cause(
-            name, first[0], first[1], cause.parameters[0].unit, first[2], first[3],
-            energy_share(state, lines, change), round(evidence_, 2),
-            tuple((n, v, ci) for n, v, ci, _ in rows[1:]),
-        ))  # fmt: skip
+        result.append(
+            Cause(
+                name,
+                first[0],
+                first[1],
+                cause.parameters[0].unit,
+                first[2],
+                first[3],
+                energy_share(state, lines, change),
+                round(evidence_, 2),
+                tuple((n, v, ci) for n, v, ci, _ in rows[1:]),
+            )
+        )
     return result
 
 
@@ -193,8 +219,12 @@ def likely(search: Search, chosen: Sequence[str], group: Sequence[str]) -> list[
 
 def own_value(state: State, name: str) -> float:
     """The healthy vehicle's value of a parameter: that of its file, 0 for an effect that its model lacks."""
-    absent = {n for c in state.causes if c.effect and c.effect.name not in
-              {x.name for x in state.vehicle.model.effects} for n in c.names}  # fmt: skip
+    absent = {
+        n
+        for c in state.causes
+        if c.effect and c.effect.name not in {x.name for x in state.vehicle.model.effects}
+        for n in c.names
+    }
     return 0.0 if name in absent else float(state.vehicle.parameters[name])
 
 
@@ -203,8 +233,9 @@ def isolability(search: Search) -> dict[str, Any]:
     2008). same_signature: those that only the form of what they do separates, no matter how much is measured.
     look_alikes: pairs that these rides can hardly separate, by the cosine of what they do once nuisances are out.
     """
-    signatures = {name: sorted(c for c, share in search.shares.get(name, {}).items() if share > 0)
-                  for name in search.place}  # fmt: skip
+    signatures = {
+        name: sorted(c for c, share in search.shares.get(name, {}).items() if share > 0) for name in search.place
+    }
     groups: dict[tuple[str, ...], list[str]] = {}
     for name, channels in signatures.items():
         groups.setdefault(tuple(channels), []).append(name)
@@ -217,8 +248,11 @@ def isolability(search: Search) -> dict[str, Any]:
             scale = np.sqrt(abs(information[i, i] * information[j, j]))
             if scale > 0 and abs(cosine := information[i, j] / scale) > 0.8:
                 pairs.append([a, b, round(float(cosine), 3)])
-    return {"signatures": signatures, "same_signature": [group for group in groups.values() if len(group) > 1],
-            "look_alikes": sorted(pairs, key=lambda p: -abs(p[2]))}  # fmt: skip
+    return {
+        "signatures": signatures,
+        "same_signature": [group for group in groups.values() if len(group) > 1],
+        "look_alikes": sorted(pairs, key=lambda p: -abs(p[2])),
+    }
 
 
 def advice(search: Search, sets: Sequence[Sequence[str]], unknown: dict[str, Any] | None) -> list[str]:

@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.converge import Converged, Known, about, converged
-from gz_onboard.lab.discover.grid import MOVING, Array, Ride
+from gz_onboard.lab.discover.grid import MOVING, Ride
 from gz_onboard.lab.discover.search import one_degree
 
 NAME = "headwind"

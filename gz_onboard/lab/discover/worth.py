@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.channels import over_blocks
-from gz_onboard.lab.discover.grid import Array
 from gz_onboard.lab.discover.linear import Linear
 from gz_onboard.lab.discover.shapes import columns
 from gz_onboard.lab.discover.state import State
@@ -88,11 +88,18 @@ def sizes(lines: Sequence[Linear]) -> dict[str, dict[str, float]]:
         late, early = (np.concatenate(side) for side in zip(*pairs, strict=True))
         correlation = float(np.corrcoef(late, early)[0, 1]) if np.std(late) > 0 and np.std(early) > 0 else 0.0
         powers = [power_of(name, line, table.y) for line, table in tables]
-        more = sum(float(np.mean(w)) * share_of_time(line, name)
-                   for w, (line, _) in zip(powers, tables, strict=True) if w is not None and len(w))  # fmt: skip
+        more = sum(
+            float(np.mean(w)) * share_of_time(line, name)
+            for w, (line, _) in zip(powers, tables, strict=True)
+            if w is not None and len(w)
+        )
         share = more / drawn if drawn else 0.0
         result[name] = {
-            "mean": float(y.mean()), "rms": float(np.sqrt(np.mean(y**2))), "autocorrelation": correlation,
-            "blocks": len(y), "energy_share": share, "range_share": -share / (1 + share) if share > -1 else 0.0,
-        }  # fmt: skip
+            "mean": float(y.mean()),
+            "rms": float(np.sqrt(np.mean(y**2))),
+            "autocorrelation": correlation,
+            "blocks": len(y),
+            "energy_share": share,
+            "range_share": -share / (1 + share) if share > -1 else 0.0,
+        }
     return result

@@ -15,11 +15,7 @@ PARAMETERS = (
 
 
 def term(
-    motor_current: Any,
-    *,
-    inverter_loss_constant: float,
-    inverter_loss_linear: float,
-    inverter_loss_quadratic: float,
+    motor_current: Any, *, inverter_loss_constant: float, inverter_loss_linear: float, inverter_loss_quadratic: float
 ) -> Any:
     """Heat [W]."""
     return (

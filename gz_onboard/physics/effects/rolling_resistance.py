@@ -19,12 +19,7 @@ STANDSTILL = 0.1  # m/s
 
 
 def term(
-    speed: Any,
-    mass: Any,
-    grade_cosine: Any,
-    *,
-    rolling_resistance_constant: float,
-    rolling_resistance_speed: float,
+    speed: Any, mass: Any, grade_cosine: Any, *, rolling_resistance_constant: float, rolling_resistance_speed: float
 ) -> Any:
     """Force [N] against the motion."""
     direction = speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5

@@ -62,8 +62,14 @@ class EffectMotor:
 class MapMotor:
     """A motor with a measured loss map [W] over speed [rad/s] (rows) and current [A] (columns), bilinear, clamped."""
 
-    def __init__(self, speed: Sequence[float], current: Sequence[float], loss: Sequence[Sequence[float]],
-                 torque_constant: float, voltage_constant: float) -> None:  # fmt: skip
+    def __init__(
+        self,
+        speed: Sequence[float],
+        current: Sequence[float],
+        loss: Sequence[Sequence[float]],
+        torque_constant: float,
+        voltage_constant: float,
+    ) -> None:
         self.torque_constant = torque_constant
         self.voltage_constant = voltage_constant
         self._speed, self._current = list(speed), list(current)

@@ -46,13 +46,24 @@ class Straight:
                 "drive": -drive * speed,
             },
             {
-                "speed": speed, "acceleration": acceleration, "drive": drive,
-                "lateral_acceleration": 0.0, "yaw_rate": 0.0, "lean": 0.0, "steer": 0.0,
-                "load_front": front, "load_rear": weight - front,
-                "plane_load_front": front, "plane_load_rear": weight - front, "rolling_radius": m.wheel_radius,
-                "slip_front": 0.0, "slip_rear": 0.0, "side_front": 0.0, "side_rear": 0.0,
+                "speed": speed,
+                "acceleration": acceleration,
+                "drive": drive,
+                "lateral_acceleration": 0.0,
+                "yaw_rate": 0.0,
+                "lean": 0.0,
+                "steer": 0.0,
+                "load_front": front,
+                "load_rear": weight - front,
+                "plane_load_front": front,
+                "plane_load_rear": weight - front,
+                "rolling_radius": m.wheel_radius,
+                "slip_front": 0.0,
+                "slip_rear": 0.0,
+                "side_front": 0.0,
+                "side_rear": 0.0,
             },
-        )  # fmt: skip
+        )
 
     def handlebar(self, steer: float, lean: float) -> float:
         """Handlebar angle [rad] for a steer angle at the ground: there is no steering."""

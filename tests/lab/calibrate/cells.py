@@ -63,8 +63,12 @@ class Plant:
         time, current, volts = (np.array(c) for c in zip(*rows, strict=True))
         size = len(time)
         volts = volts + rng.normal(0, self.noise, size)
-        columns = {"time": time, "current": current * (1 + self.gain), "voltage": volts,
-                   "cell_temperature": np.full(size, float(temperature)) + rng.normal(0, 0.05, size)}  # fmt: skip
+        columns = {
+            "time": time,
+            "current": current * (1 + self.gain),
+            "voltage": volts,
+            "cell_temperature": np.full(size, float(temperature)) + rng.normal(0, 0.05, size),
+        }
         return Table(Path(name), columns)
 
 

@@ -37,12 +37,22 @@ def plant(seed, trials=1, runs=6, **fixed):
     """
     rng = np.random.default_rng(seed)
     p, shape = VEHICLE.parameters, (trials, 1)
-    draw = {name: p[name] + p.sd(name) * rng.standard_normal(shape) for name in (
-        "vehicle_mass", "wheel_inertia_front", "wheel_inertia_rear", "motor_iron_linear", "motor_iron_quadratic",
-        "wheel_radius")}  # fmt: skip
+    draw = {
+        name: p[name] + p.sd(name) * rng.standard_normal(shape)
+        for name in (
+            "vehicle_mass",
+            "wheel_inertia_front",
+            "wheel_inertia_rear",
+            "motor_iron_linear",
+            "motor_iron_quadratic",
+            "wheel_radius",
+        )
+    }
     low, high = (0.008, 0.0, 0.4), (0.016, 6e-4, 0.7)
-    truth = {name: np.full(shape, fixed.get(name, rng.uniform(a, b, shape)))
-             for name, a, b in zip(NAMES, low, high, strict=True)}  # fmt: skip
+    truth = {
+        name: np.full(shape, fixed.get(name, rng.uniform(a, b, shape)))
+        for name, a, b in zip(NAMES, low, high, strict=True)
+    }
     c0, c1, area = (truth[name] for name in NAMES)
     mass = draw["vehicle_mass"] + 75 + rng.standard_normal(shape)
     radius = draw["wheel_radius"]
@@ -211,8 +221,11 @@ def test_a_table_of_time_and_speed(tmp_path):
     assert time.tolist() == [0, 1, 2.5]
     assert speed == pytest.approx([10, 9.75, 9.5])
     assert (run.name, run.facts) == ("down", {"direction": "down", "total_mass_kg": 180, "ambient_C": 20})
-    warm = in_table(tmp_path, "time_s,motor_speed_rpm,ambient_temperature_degC\n0,300,21\n1,295,21\n",
-                    '[{"name": "down", "direction": "down", "rider_mass_kg": 70}]')  # fmt: skip
+    warm = in_table(
+        tmp_path,
+        "time_s,motor_speed_rpm,ambient_temperature_degC\n0,300,21\n1,295,21\n",
+        '[{"name": "down", "direction": "down", "rider_mass_kg": 70}]',
+    )
     assert warm.columns["motor_speed"][1][0] == pytest.approx(31.416, abs=1e-3)
     assert warm.columns["ambient_temperature"][1].tolist() == [21, 21]
     assert warm.rider_mass == 70
@@ -249,8 +262,14 @@ def test_tables_give_what_the_same_runs_give_as_rides(tmp_path, healthy):
         rows = zip(time[inside], speed[inside] * VEHICLE.parameters["wheel_radius"] * 3.6, strict=True)
         lines = ["time_s,speed_kmh", *(f"{t:.2f},{v:.4f}" for t, v in rows)]
         (tmp_path / f"{run.name}.csv").write_text("\n".join(lines) + "\n")
-        notes.append({"name": run.name, "direction": run.facts["direction"], "ambient_C": rolling.temperature,
-                      "rider_mass_kg": rolling.payload})  # fmt: skip
+        notes.append(
+            {
+                "name": run.name,
+                "direction": run.facts["direction"],
+                "ambient_C": rolling.temperature,
+                "rider_mass_kg": rolling.payload,
+            }
+        )
     (tmp_path / "rides.json").write_text(json.dumps(notes))
     answer = tmp_path / "answer.json"
     files = [str(tmp_path / f"{run.name}.csv") for run in runs]
@@ -265,11 +284,17 @@ def test_tables_give_what_the_same_runs_give_as_rides(tmp_path, healthy):
 
 def small_car():
     """A vehicle without a driven wheel that turns along, of 76 kg in all: wheels of a Shell Eco-marathon car."""
-    small = {"drag_area": 0.064, "rolling_resistance_constant": 0.004, "wheel_inertia_front": 0.02,
-             "wheel_inertia_rear": 0.01}  # fmt: skip
+    small = {
+        "drag_area": 0.064,
+        "rolling_resistance_constant": 0.004,
+        "wheel_inertia_front": 0.02,
+        "wheel_inertia_rear": 0.01,
+    }
     p = VEHICLE.parameters
-    known = {n: replace(v, value=small.get(n, v.value), sd=0.2 * small[n] if n in small else v.sd)
-             for n, v in p.known.items()}  # fmt: skip
+    known = {
+        n: replace(v, value=small.get(n, v.value), sd=0.2 * small[n] if n in small else v.sd)
+        for n, v in p.known.items()
+    }
     parameters = type(p)(known)
     effects = tuple(load_effect(n) for n in ("aerodynamic_drag", "rolling_resistance", "grade_force", "inertia"))
     return replace(VEHICLE, parameters=parameters, model=Model(effects, parameters))

@@ -53,9 +53,18 @@ def planted(name, seed, still, seconds=900, noise=0.2, truth=TRUTH):
     else:
         load = np.repeat(rng.uniform(0.2, 1.2, seconds // 60), 60)
     run = Run(
-        name, still, time, np.full(seconds, 20.0), 10.0 * load, 280 * load, 60 * load, 70 * load, 150 * load,
-        900 * load, {f"{sensor}_temperature": np.full(seconds, 20.0) for sensor in (*NETWORKS, "inverter_box")},
-    )  # fmt: skip
+        name,
+        still,
+        time,
+        np.full(seconds, 20.0),
+        10.0 * load,
+        280 * load,
+        60 * load,
+        70 * load,
+        150 * load,
+        900 * load,
+        {f"{sensor}_temperature": np.full(seconds, 20.0) for sensor in (*NETWORKS, "inverter_box")},
+    )
     measured = dict(run.measured)
     for network, model in NETWORKS.items():
         values = {**truth, "room": ROOM[network]} if network in ROOM else truth
@@ -166,9 +175,16 @@ def bench(seconds=400):
     time = np.arange(float(seconds))
     on = np.ones(seconds)
     return table(
-        time=time, motor_temperature=30 + 0.05 * time, inverter_temperature=30 + 0.05 * time, motor_current=100 * on,
-        motor_speed=30 * on, ac_power=1600 * on, dc_power=1680 * on, shaft_torque=45 * on, ambient_temperature=25 * on,
-    )  # fmt: skip
+        time=time,
+        motor_temperature=30 + 0.05 * time,
+        inverter_temperature=30 + 0.05 * time,
+        motor_current=100 * on,
+        motor_speed=30 * on,
+        ac_power=1600 * on,
+        dc_power=1680 * on,
+        shaft_torque=45 * on,
+        ambient_temperature=25 * on,
+    )
 
 
 def test_bench_run_takes_the_measured_heat():

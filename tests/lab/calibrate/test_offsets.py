@@ -27,8 +27,11 @@ def test_intervals_hold_what_instruments_of_their_class_do():
     own_sd = known.sd("inverter_loss_constant") / known["inverter_loss_constant"]
     away = []
     for seed in range(0, 300, 3):
-        errs = {"inverter_gain": 1 + GAIN_SD * rng.normal(), "own_loss": 1 + own_sd * rng.normal(),
-                "auxiliary_sign": 1 + CURRENT_SD * rng.normal()}  # fmt: skip
+        errs = {
+            "inverter_gain": 1 + GAIN_SD * rng.normal(),
+            "own_loss": 1 + own_sd * rng.normal(),
+            "auxiliary_sign": 1 + CURRENT_SD * rng.normal(),
+        }
         *drifts, next_one = DRIFT_SD * rng.normal(size=4)  # the offset's sd is of a ride to come
         rides = [ride(seed + k, seconds=200, drift=drift, **errs) for k, drift in enumerate(drifts)]
         found = offsets(rides, VEHICLE).parameters

@@ -79,10 +79,7 @@ def test_names_of_other_people(tmp_path):
 def test_the_mapping_of_a_manifest(tmp_path):
     text = '[columns]\ntime = "t_s"\ncurrent = { column = "i", unit = "mA", scale = -1 }\n'
     file = write(tmp_path, text, "m.toml")
-    assert read_columns(Toml.read(file).table("columns")) == {
-        "time": Named("t_s"),
-        "current": Named("i", "mA", -1.0),
-    }
+    assert read_columns(Toml.read(file).table("columns")) == {"time": Named("t_s"), "current": Named("i", "mA", -1.0)}
     wrong = write(tmp_path, text.replace("mA", "mAA"), "n.toml")
     with pytest.raises(InputError, match=r"n.toml:3: .*unknown unit 'mAA' \(did you mean 'mA'\?\)"):
         read_columns(Toml.read(wrong).table("columns"))

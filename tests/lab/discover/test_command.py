@@ -84,8 +84,10 @@ def test_the_list_says_of_each_what_it_is_and_what_shows_it(capsys):
 def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One healthy ride, against the vehicle file alone."""
     folder = tmp_path_factory.mktemp("discover")
-    files = [f"--{option}={folder / name}" for option, name in
-             (("json", "out.json"), ("report", "out.html"), ("write-model", "new.toml"))]  # fmt: skip
+    files = [
+        f"--{option}={folder / name}"
+        for option, name in (("json", "out.json"), ("report", "out.html"), ("write-model", "new.toml"))
+    ]
     assert main(["discover", str(RIDE), "--workers", "1", "--quiet", *files]) == 0
     return folder
 

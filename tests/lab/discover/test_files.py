@@ -74,8 +74,11 @@ def test_causes_become_effects_and_parameters(state, lines, tmp_path: Path):
     assert value.status == "measured"
     assert "cornering_drag" in value.source and "coastdown" in value.source
     assert any("cornering_compliance = 0.25" in word for word in words)
-    untouched = {n for n in before.parameters.known if n not in
-                 {"cornering_compliance", "rolling_resistance_constant", "wind_north", "wind_east"}}  # fmt: skip
+    untouched = {
+        n
+        for n in before.parameters.known
+        if n not in {"cornering_compliance", "rolling_resistance_constant", "wind_north", "wind_east"}
+    }
     assert all(after.parameters.known[name] == before.parameters.known[name] for name in untouched)
 
 
@@ -203,9 +206,14 @@ def learned(state: State) -> State:
     rng = np.random.default_rng(4)
     shape = Shape(rng.normal(size=8), np.eye(8), 1.3)
     return replace(
-        state, mean=rng.normal(size=n) * 0.1, prior=np.diag(rng.uniform(0.5, 1, n)), scatter=rng.uniform(0.5, 1, n),
-        healthy=7, inflation={"headwind": 1.4}, shapes={"road_force over speed": shape},
-    )  # fmt: skip
+        state,
+        mean=rng.normal(size=n) * 0.1,
+        prior=np.diag(rng.uniform(0.5, 1, n)),
+        scatter=rng.uniform(0.5, 1, n),
+        healthy=7,
+        inflation={"headwind": 1.4},
+        shapes={"road_force over speed": shape},
+    )
 
 
 def test_a_baseline_is_read_as_it_was_written(learned: State, tmp_path: Path):

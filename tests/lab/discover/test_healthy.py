@@ -80,9 +80,19 @@ def test_a_knot_that_hardly_a_block_is_at_bends_no_curve(line: Linear):
     free = supported(form, [line, line])
     assert speed.max() < knots[-1] and free[-1] == pytest.approx(free[-2])  # 15 m/s goes with 13
     assert free.sum(axis=1) == pytest.approx(1.0)  # a constant stays one
-    short = replace(line, tables={**line.tables, "road_force": replace(
-        line.tables["road_force"], used=np.zeros_like(line.tables["road_force"].used),
-        y=np.zeros(0), a=np.zeros((0, line.tables["road_force"].a.shape[1])), time=np.zeros(0))})  # fmt: skip
+    short = replace(
+        line,
+        tables={
+            **line.tables,
+            "road_force": replace(
+                line.tables["road_force"],
+                used=np.zeros_like(line.tables["road_force"].used),
+                y=np.zeros(0),
+                a=np.zeros((0, line.tables["road_force"].a.shape[1])),
+                time=np.zeros(0),
+            ),
+        },
+    )
     assert supported(form, [line, short]).shape[1] == 0  # one ride alone shows nothing that is the scooter's
 
 
@@ -136,8 +146,14 @@ def test_no_error_of_the_range_where_nobody_knows_what_the_pack_gave(state: Stat
 
 
 def row(against: str, causes: list[str], unknown: Row | None = None) -> Row:
-    return {"seed": 1, "against": against, "verdict": "cause", "causes": [{"name": name} for name in causes],
-            "ambiguous": [], "unknown": unknown}  # fmt: skip
+    return {
+        "seed": 1,
+        "against": against,
+        "verdict": "cause",
+        "causes": [{"name": name} for name in causes],
+        "ambiguous": [],
+        "unknown": unknown,
+    }
 
 
 def test_alarms_are_counted_as_they_are():

@@ -90,8 +90,16 @@ def test_the_counting_itself():
 
     def row(kind: str, hidden: str, verdict: str, causes: list[str], sets: list[list[str]]) -> Row:
         truth = {"name": hidden, "clear": True, "change": [1.0], "share": 0.1}
-        return {"seed": 1, "kind": kind, "truths": [truth] if hidden else [], "verdict": verdict, "ranking": [],
-                "causes": [{"name": name} for name in causes], "ambiguous": sets, "accepted": []}  # fmt: skip
+        return {
+            "seed": 1,
+            "kind": kind,
+            "truths": [truth] if hidden else [],
+            "verdict": verdict,
+            "ranking": [],
+            "causes": [{"name": name} for name in causes],
+            "ambiguous": sets,
+            "accepted": [],
+        }
 
     made = [
         row("healthy", "", "none", [], []),

@@ -83,15 +83,33 @@ def reported(state: State, samples: Samples) -> Report:
     lines = linearise_all([state.ride(samples)], state)
     cause = Cause("rolling_resistance", "rolling_resistance_constant", 0.015, "1", (0.014, 0.016), 0.003, 0.1, 50.0)
     knots = [[float(v), float(v - 5), 0.5] for v in range(0, 16, 3)]
-    unknown = {"channel": "road_force", "quantity": "speed", "unit": "m/s", "share": 0.03, "score": 40.0,
-               "curve": knots, "denies": []}  # fmt: skip
+    unknown = {
+        "channel": "road_force",
+        "quantity": "speed",
+        "unit": "m/s",
+        "share": 0.03,
+        "score": 40.0,
+        "curve": knots,
+        "denies": [],
+    }
     ranking = [(c.name, 1.0) for c in state.causes]
     gain = {"holdout": ["a<b", "c"], "power": {"before": 9.0, "control": 8.0, "after": 7.0, "ci95": [0.5, 1.5]}}
     return Report(
-        "unknown", [cause], [["rolling_resistance", "dragging_brake"]], unknown, ranking, {}, gain, ["Ride <more>."],
-        ["a note"], {"look_alikes": [["aero_drag_area", "drivetrain_drag", 0.91]]}, 15.0, state=state, lines=lines,
+        "unknown",
+        [cause],
+        [["rolling_resistance", "dragging_brake"]],
+        unknown,
+        ranking,
+        {},
+        gain,
+        ["Ride <more>."],
+        ["a note"],
+        {"look_alikes": [["aero_drag_area", "drivetrain_drag", 0.91]]},
+        15.0,
+        state=state,
+        lines=lines,
         normals=[normal(line, state.noise) for line in lines],
-    )  # fmt: skip
+    )
 
 
 def test_after_is_before_less_what_the_cause_does(report: Report):
@@ -125,12 +143,29 @@ def test_a_quantity_that_was_not_measured_is_not_made_up(report: Report):
 
 
 def test_the_page_says_it_all(report: Report):
-    text = page(replace(report, residuals={"road_force": dict.fromkeys(
-        ("mean", "rms", "autocorrelation", "blocks", "energy_share", "range_share"), 0.1)}))  # fmt: skip
+    text = page(
+        replace(
+            report,
+            residuals={
+                "road_force": dict.fromkeys(
+                    ("mean", "rms", "autocorrelation", "blocks", "energy_share", "range_share"), 0.1
+                )
+            },
+        )
+    )
     said = (
-        "none of the candidates", "rolling_resistance_constant", "0.014 to 0.016", "+10.0%", "+0.91",
-        "Ride &lt;more&gt;.", "a note", "a&lt;b", "What has no name", "+0.5 to +1.5", "dragging brake",
-    )  # fmt: skip
+        "none of the candidates",
+        "rolling_resistance_constant",
+        "0.014 to 0.016",
+        "+10.0%",
+        "+0.91",
+        "Ride &lt;more&gt;.",
+        "a note",
+        "a&lt;b",
+        "What has no name",
+        "+0.5 to +1.5",
+        "dragging brake",
+    )
     for words in said:
         assert words in text, words
     assert "<script" not in text

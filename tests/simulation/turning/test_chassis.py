@@ -35,9 +35,12 @@ def ride(chassis, state, steer, drive, road, seconds, dt=0.005):
 @pytest.mark.parametrize("kind", CHASSIS)
 @settings(max_examples=15, deadline=None)
 @given(
-    speed=st.floats(3, 14), bend=st.floats(-0.3, 0.3), drive=st.floats(-200, 200),
-    grade=st.floats(-0.1, 0.1), wind=st.floats(-5, 5),
-)  # fmt: skip
+    speed=st.floats(3, 14),
+    bend=st.floats(-0.3, 0.3),
+    drive=st.floats(-200, 200),
+    grade=st.floats(-0.1, 0.1),
+    wind=st.floats(-5, 5),
+)
 def test_energy_closes(machine, kind, speed, bend, drive, grade, wind):
     chassis = kind(machine)
     road = Road(grade, wind)

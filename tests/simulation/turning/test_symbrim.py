@@ -63,9 +63,14 @@ def steady(bicycle, speed: float, lean: float, crown: float, spin_inertia: float
     d1, d3 = c * (TRAIL + WHEELBASE - RADIUS * t), -c * (TRAIL - RADIUS * t)
     up = CG_HEIGHT - RADIUS
     values = dict.fromkeys(names, 0.0) | {
-        "g": G, "rf_body_mass": MASS, "rf_d1": d1, "ff_d3": d3, "ff_d2": (d1 + d3) * s / c,
-        "rf_l1": CG_TO_REAR * c + up * s, "rf_l2": CG_TO_REAR * s - up * c,
-    }  # fmt: skip
+        "g": G,
+        "rf_body_mass": MASS,
+        "rf_d1": d1,
+        "ff_d3": d3,
+        "ff_d2": (d1 + d3) * s / c,
+        "rf_l1": CG_TO_REAR * c + up * s,
+        "rf_l2": CG_TO_REAR * s - up * c,
+    }
     for wheel in ("fw", "rw"):
         values |= {f"{wheel}_r": RADIUS - crown, f"{wheel}_tr": crown, f"{wheel}_mass": 1e-6}
         values |= {f"{wheel}_iyy": spin_inertia, f"{wheel}_ixx": spin_inertia / 2}
