@@ -13,6 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from math import atan, sqrt
+from typing import Any
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
@@ -56,6 +57,10 @@ class Dynamometer:
     a: float = 0.0  # N
     b: float = 0.0  # N·s/m
     c: float = 0.0  # N·s²/m²
+
+    def absorbed(self, speed: Any) -> Any:
+        """The force [N] at a surface speed [m/s]."""
+        return self.a * direction(speed) + self.b * speed + self.c * speed * abs(speed)
 
 
 @dataclass
@@ -268,7 +273,7 @@ class Scooter:
         against += front_rolling + turning
         absorbed = 0.0
         if d := dynamometer:
-            absorbed = (d.a * direction(v) if d.a else 0.0) + d.b * v + d.c * v * abs(v)
+            absorbed = d.absorbed(v)
             against += absorbed
 
         # --- wheel, tyre and vehicle together, implicit in the slip (eqs. 2.11, 3.3, 3.8, 3.10-3.12)
