@@ -26,7 +26,7 @@ from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCool
 from gz_onboard.physics.effect import MOVING, QUANTITIES, ROAD_LOAD, Port
 from gz_onboard.physics.model import air_density, drag_torque, over, total
 from gz_onboard.physics.relaxation import relaxed
-from gz_onboard.simulation.scooter import Dynamometer
+from gz_onboard.simulation.parts.road import Dynamometer
 from gz_onboard.vehicle import Vehicle
 
 
