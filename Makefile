@@ -8,7 +8,7 @@ FIRST ?= 100240
 PYTHON_IN_VENV := .venv/bin/python
 DEMO = replay_logs/demo.py "$(RIDE)" --speed $(SPEED) --seconds $(SECONDS)
 
-.PHONY: help setup run test lint format bench trial hardening clean
+.PHONY: help setup run test lint format docs bench trial hardening clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -38,6 +38,12 @@ lint: setup  ## ruff and mypy
 format: setup  ## let ruff format the code
 	$(PYTHON_IN_VENV) -m ruff check --fix .
 	$(PYTHON_IN_VENV) -m ruff format .
+
+docs: setup .venv/.docs-ready  ## the documentation as a site in build/docs; a dead link or any other warning is an error
+	$(PYTHON_IN_VENV) -m sphinx --builder html --fresh-env --fail-on-warning --keep-going --quiet docs build/docs
+
+.venv/.docs-ready: .venv/.ready .ci/requirements-docs.txt
+	@.ci/setup docs
 
 bench: setup  ## cost per frame, start-up, memory, beside the obvious pipeline of the same libraries
 	$(PYTHON_IN_VENV) benchmarks/bench.py
