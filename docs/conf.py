@@ -113,10 +113,12 @@ def as_rst(lines: list[str]) -> list[str]:
 
 
 def inline(line: str) -> str:
-    """Code stays code, all else is text: no character of an equation is markup."""
-    parts = re.split(r"(``[^`]+``|`[^`]+`)", line)
+    """Code stays code, all else is text: no character of an equation is markup, no first word a list or a directive."""
+    parts = re.split(r"(``[^`]+``|`[^`]+`)", re.sub(r"::$", ":", line.rstrip()))
     code = [f"``{part.strip('`')}``" for part in parts[1::2]]
     text = [re.sub(r"([*_|\\])", r"\\\1", part) for part in parts[::2]]
+    if re.match(r"\w+[.)] |[^\w\s\\-]|-(?! )", text[0]):
+        text[0] = "\\" + text[0]
     return "".join(a + b for a, b in zip(text, [*(f"{c}\\ " for c in code), ""], strict=True))
 
 
