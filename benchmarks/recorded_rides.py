@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.offline.style import save
 from gz_onboard.simulation.figures import comparison
 from gz_onboard.simulation.plan import find_plan
 from gz_onboard.simulation.run import follow
 from gz_onboard.simulation.simulate import add_arguments, ride
-from gz_onboard.simulation.style import save
 from gz_onboard.simulation.summary import compare, measured_columns
 from gz_onboard.vehicle import read_vehicle
 

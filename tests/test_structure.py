@@ -20,6 +20,7 @@ LAYERS = [
     ["vehicle"],
     ["estimator"],
     ["pipeline"],
+    ["offline"],
     ["simulation"],
     ["lab", "dashboard"],
     ["daemon"],
@@ -33,9 +34,10 @@ FORBIDDEN = {
     ("estimator", "bus"): "events are all that the estimator sees of a bus",
     ("daemon", "lab"): "the daemon carries no offline tools",
     ("daemon", "simulation"): "the daemon carries no offline tools",
+    ("daemon", "offline"): "the daemon carries no offline tools",
 }
 
-OFFLINE = ("simulation", "lab")
+OFFLINE = ("offline", "simulation", "lab")
 HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow"}
 # Imported only when asked for: the reference filter behind --filter filterpy.
 ON_REQUEST = {"estimator/ekf_filterpy.py"}

@@ -26,9 +26,9 @@ from gz_onboard.bus.recorder import LogFile
 from gz_onboard.errors import BAD_INPUT, InputError
 from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log, reason_words
-from gz_onboard.lab.processes import Progress, over_rides, progress_bar
+from gz_onboard.offline.processes import Progress, over_rides, progress_bar
+from gz_onboard.offline.results import check_json, clock, explain_keys, number, output_names, times, write_json
 from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, range_publisher, reason_names
-from gz_onboard.simulation.telling import check_json, clock, explain_keys, number, output_names, times, write_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 SUMMARY_VERSION = 1

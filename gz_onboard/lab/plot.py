@@ -14,8 +14,7 @@ from gz_onboard.bus.logs import read_metadata, read_samples
 from gz_onboard.bus.publisher import WH_PER_KM
 from gz_onboard.errors import InputError
 from gz_onboard.events import Reason, State
-from gz_onboard.pipeline import ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
-from gz_onboard.simulation.style import (
+from gz_onboard.offline.style import (
     BLUE,
     GREEN,
     MUTED,
@@ -30,6 +29,7 @@ from gz_onboard.simulation.style import (
     second,
     stack,
 )
+from gz_onboard.pipeline import ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -22,15 +22,15 @@ from gz_onboard.arrays import Array
 from gz_onboard.bus.logs import logs_among
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import BAD_INPUT, FAILED, InputError
-from gz_onboard.lab.processes import Progress, over_rides, progress_bar
 from gz_onboard.lab.validate_components import Component, components
 from gz_onboard.lab.validate_score import CHANNELS, COMPONENT_GATE, GATE, conditions, errors, pooled, seconds, split
+from gz_onboard.offline.processes import Progress, over_rides, progress_bar
+from gz_onboard.offline.results import check_json, explain_keys, output_names, write_json
+from gz_onboard.offline.samples import read_facts, rider_mass
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded, rest_soc
 from gz_onboard.simulation.route import read_route
 from gz_onboard.simulation.run import Command, Run, drive, follow, replay, road_table
-from gz_onboard.simulation.samples import read_facts, rider_mass
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Place, Road, Scooter
-from gz_onboard.simulation.telling import check_json, explain_keys, output_names, write_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 SUMMARY_VERSION = 1

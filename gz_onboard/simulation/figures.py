@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.publisher import WH
-from gz_onboard.simulation.run import Run
-from gz_onboard.simulation.style import (
+from gz_onboard.offline.style import (
     BLUE,
     GREEN,
     INK,
@@ -26,6 +25,7 @@ from gz_onboard.simulation.style import (
     second,
     stack,
 )
+from gz_onboard.simulation.run import Run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

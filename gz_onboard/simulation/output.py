@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard.errors import InputError
+from gz_onboard.offline.style import save
 from gz_onboard.simulation.frames import Losses, simulate_frames, write_frames
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.run import COLUMNS, Run
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.sensors import Trace
-from gz_onboard.simulation.style import save
 from gz_onboard.simulation.summary import measured_columns, summary_text
 from gz_onboard.simulation.sweep import Sweep
 from gz_onboard.vehicle import Vehicle

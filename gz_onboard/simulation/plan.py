@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gz_onboard.errors import InputError, nearest
+from gz_onboard.offline.samples import read_facts, rider_mass
 from gz_onboard.simulation.cycles import find_cycle
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded
 from gz_onboard.simulation.route import read_route, speed_profile
 from gz_onboard.simulation.run import Command, along, at_steps, follow, replay, road_table
-from gz_onboard.simulation.samples import read_facts, rider_mass
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Road, straight
 from gz_onboard.vehicle import Vehicle
 

@@ -16,8 +16,8 @@ from gz_onboard.bus.codec import Codec
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Event
+from gz_onboard.offline.samples import INSTRUMENTS, extended, read_roles
 from gz_onboard.simulation.run import road_table
-from gz_onboard.simulation.samples import INSTRUMENTS, extended, read_roles
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Road
 from gz_onboard.vehicle import Vehicle
 

@@ -16,6 +16,7 @@ from typing import Any
 
 from gz_onboard.bus.publisher import WH_PER_KM
 from gz_onboard.errors import InputError
+from gz_onboard.offline.results import explain_keys, times, write_json
 from gz_onboard.simulation.frames import Losses, check_output
 from gz_onboard.simulation.output import FORMATS, write, write_trace
 from gz_onboard.simulation.parts.chassis import MODELS, chassis
@@ -26,7 +27,6 @@ from gz_onboard.simulation.scooter import Dynamometer, Scooter
 from gz_onboard.simulation.sensors import Trace
 from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION, cycle_range, summarise, summary_text
 from gz_onboard.simulation.sweep import Sweep, grid, read_sweep, redesigned
-from gz_onboard.simulation.telling import explain_keys, times, write_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 _MOST_HOURS = 48.0  # of riding until empty

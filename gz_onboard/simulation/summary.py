@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from gz_onboard.bus.publisher import WH, WH_PER_KM
+from gz_onboard.offline.results import clock, number, times
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.recorded import Recorded
 from gz_onboard.simulation.run import COLUMNS, Run, range_by_energy
 from gz_onboard.simulation.scooter import Scooter
-from gz_onboard.simulation.telling import clock, number, times
 from gz_onboard.vehicle import Vehicle
 
 SUMMARY_VERSION = 1

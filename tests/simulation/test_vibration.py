@@ -15,11 +15,11 @@ from gz_onboard.cli import main
 from gz_onboard.lab.discover.grid import vibration as of_samples
 from gz_onboard.lab.validate import per_second
 from gz_onboard.lab.validate_components import battery_voltage, road_load
+from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.simulation.backward import backward
 from gz_onboard.simulation.recorded import Recorded, read_recorded
 from gz_onboard.simulation.run import drive
-from gz_onboard.simulation.samples import read_samples
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Scooter, straight
 from gz_onboard.simulation.sensors import SENSORS, Trace
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle

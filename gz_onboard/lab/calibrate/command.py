@@ -38,7 +38,7 @@ from gz_onboard.lab.calibrate.manifest import Option, Slot, Step, check_count
 from gz_onboard.lab.calibrate.result import Curve, Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.table import Table, read_table
 from gz_onboard.lab.calibrate.vehicle_file import write_vehicle
-from gz_onboard.simulation.samples import Samples, read_samples
+from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 # --- what a procedure is given ------------------------------------------------------------------------------------

@@ -20,9 +20,9 @@ from gz_onboard.lab.discover.limits import amount, limits, size, strange, unform
 from gz_onboard.lab.discover.parts import before_and_after, outstanding
 from gz_onboard.lab.discover.result import METRICS, SCHEMA, VERDICTS, Report
 from gz_onboard.lab.discover.worth import sizes
-from gz_onboard.lab.processes import Progress, over_rides
-from gz_onboard.simulation.samples import Samples, read_samples
-from gz_onboard.simulation.telling import clock, explain_keys, write_json
+from gz_onboard.offline.processes import Progress, over_rides
+from gz_onboard.offline.results import clock, explain_keys, write_json
+from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 KEYS = {
