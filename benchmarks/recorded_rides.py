@@ -69,8 +69,8 @@ def both(log: Path, payload: float, chassis: str, figures: Path | None) -> dict[
         found[form] = {
             "energy_pct": 100 * (run.energy / energy - 1),
             "consumption_pct": 100 * (per_metre - 1),
-            "speed_km_h": errors["rms_speed_km_h"],
-            "voltage_v": errors["rms_pack_voltage_v"],
+            "speed_km_h": errors.rms_speed_km_h,
+            "voltage_v": errors.rms_pack_voltage_v,
             "current_pct": share("pack_current"),
             "torque_pct": share("motor_torque"),
             "motor_k": float((run.series["motor_temperature"] - measured["motor_temperature"])[-1]),

@@ -14,7 +14,8 @@ PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 
 # The parts of the package, lowest first. A part imports itself and those in the lines above its own.
 LAYERS = [
-    ["__init__", "background", "constants", "errors", "events", "notify", "state"],
+    ["__init__", "background", "constants", "errors", "events", "notify", "progress", "state"],
+    ["options"],
     ["toml"],
     ["bus", "physics"],
     ["vehicle"],

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.lab.validate_score import Channel
+from gz_onboard.lab.validate_score import Quantity
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Effect, Port
 from gz_onboard.physics.model import air_density
 from gz_onboard.physics.relaxation import relaxed
@@ -31,7 +31,7 @@ from gz_onboard.vehicle import Vehicle
 class Component:
     """Measured and modelled, per second, shape (n,); `valid` where they can be compared."""
 
-    channel: Channel
+    quantity: Quantity
     measured: Array
     modelled: Array
     valid: Mask
@@ -48,7 +48,7 @@ def components(
     every = np.ones(len(measured["speed"]), dtype=bool)
     if has >= {"pack_current", "pack_voltage", "cell_temperature"} and soc is not None:
         voltage = battery_voltage(vehicle, measured, soc)
-        found["battery_voltage"] = Component(Channel("V", "battery voltage"), measured["pack_voltage"], voltage, every)
+        found["battery_voltage"] = Component(Quantity("V", "battery voltage"), measured["pack_voltage"], voltage, every)
     if has >= {"motor_current", "motor_speed"}:
         current, speed = measured["motor_current"], measured["motor_speed"]
         motor_temperature = measured.get("motor_temperature", np.full(len(speed), ambient))
@@ -57,10 +57,10 @@ def components(
         if has >= {"inverter_voltage", "inverter_current"}:
             power = measured["inverter_voltage"] * measured["inverter_current"]
             modelled = constant * current * speed + copper + inverter
-            found["inverter_power"] = Component(Channel("W", "inverter DC power"), power, modelled, every)
+            found["inverter_power"] = Component(Quantity("W", "inverter DC power"), power, modelled, every)
         if "motor_torque" in has:
             found["motor_torque"] = Component(
-                Channel("N·m", "motor torque"), measured["motor_torque"], constant * current, every
+                Quantity("N·m", "motor torque"), measured["motor_torque"], constant * current, every
             )
         moving = (measured["speed"] > 2.0) & (measured.get("braking", np.zeros(len(speed))) <= 0)
         if "acceleration" in has and ("grade" in has or roller):
@@ -69,7 +69,7 @@ def components(
                 drag = np.where(moving, idle / np.where(moving, speed, 1.0), 0.0)
             force = (constant * current - drag) / radius
             needed = road_load(vehicle, measured, ambient, roller)
-            found["road_load"] = Component(Channel("N", "road load"), force, needed, moving)
+            found["road_load"] = Component(Quantity("N", "road load"), force, needed, moving)
         found |= _temperatures(vehicle, measured, soc, ambient, copper + idle, inverter, every)
     return found
 
@@ -186,7 +186,7 @@ def _temperatures(
         motor = parts.motor_cooling
         motor.stator = motor.rotor = float(measured["motor_temperature"][0])
         found["motor_temperature"] = Component(
-            Channel("degC", "motor temperature", True),
+            Quantity("degC", "motor temperature", True),
             measured["motor_temperature"],
             _cooled(motor, motor_heat, air),
             every,
@@ -195,7 +195,7 @@ def _temperatures(
         inverter = parts.inverter_cooling
         inverter.board = inverter.box = float(measured["inverter_temperature"][0])
         found["inverter_temperature"] = Component(
-            Channel("degC", "inverter temperature", True),
+            Quantity("degC", "inverter temperature", True),
             measured["inverter_temperature"],
             _cooled(inverter, inverter_heat, air),
             every,
@@ -211,7 +211,7 @@ def _temperatures(
         pack = parts.pack_cooling
         pack.temperature = float(measured["cell_temperature"][0])
         found["cell_temperature"] = Component(
-            Channel("degC", "cell temperature", True), measured["cell_temperature"], _cooled(pack, heat, air), every
+            Quantity("degC", "cell temperature", True), measured["cell_temperature"], _cooled(pack, heat, air), every
         )
     return found
 

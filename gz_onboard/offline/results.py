@@ -1,26 +1,66 @@
-"""What the commands have in common in telling what came out: as JSON, and as text."""
+"""Results of a command: as JSON by one writer, with keys that explain themselves, and as text."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
+from typing import Annotated, Any, get_type_hints
 
-from gz_onboard.bus.logs import log_suffix
 from gz_onboard.errors import InputError
+
+# --- JSON ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A log that could not be used."""
+
+    file: Annotated[str, "the log"]
+    error: Annotated[str, "why"]
+
+
+def keys_of(result: type) -> dict[str, str]:
+    """The keys that a dataclass has as JSON, and what they mean: its fields with the text of their Annotated types."""
+    hints = get_type_hints(result, include_extras=True)
+    return {field.name: " ".join(getattr(hints[field.name], "__metadata__", ())) for field in fields(result)}
 
 
 def explain_keys(parser: argparse.ArgumentParser, of: str, version: int, keys: Mapping[str, str]) -> None:
-    """The keys of a JSON summary and their meaning, below the options in the help."""
+    """The keys of a JSON result and their meaning, below the options in the help."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     rows = "\n".join(f"  {key:20} {meaning}" for key, meaning in keys.items())
-    parser.epilog = f"keys of {of} JSON summary, version {version}:\n{rows}"
+    parser.epilog = f"JSON keys of {of}, version {version}:\n{rows}"
 
 
-def write_json(file: str, document: object) -> None:
-    """What ``--json FILE`` asks for; ``-`` is standard output. Raises InputError if it cannot be written."""
-    text = json.dumps(document, indent=1, ensure_ascii=False)
+def plain(value: object) -> Any:
+    """`value` as JSON has it: dataclasses as objects, arrays as lists, numbers that are not finite as null."""
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        return float(value) if math.isfinite(value) else None
+    if is_dataclass(value) and not isinstance(value, type):
+        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, Sequence):
+        return [plain(item) for item in value]
+    if hasattr(value, "tolist"):  # of numpy
+        return plain(value.tolist())
+    return str(value)
+
+
+def write_json(file: str | None, version: int, result: object) -> None:
+    """What ``--json FILE`` asks for: `result`, a dataclass or mapping, after the `version` of its keys.
+
+    ``-`` is standard output, and None nothing. Raises InputError if it cannot be written.
+    """
+    if file is None:
+        return
+    text = json.dumps({"version": version, **plain(result)}, indent=1, ensure_ascii=False)
     if file == "-":
         print(text)
         return
@@ -30,14 +70,7 @@ def write_json(file: str, document: object) -> None:
         raise InputError(f"--json {file}: cannot be written: {error.strerror}") from error
 
 
-def check_json(file: str | None) -> None:
-    """InputError if what ``--json`` is to write is named like a log, as in ``validate --json ride.blf``."""
-    try:
-        log = file is not None and not file.endswith(".csv") and bool(log_suffix(Path(file)))
-    except InputError:
-        return
-    if log:
-        raise InputError(f"--json {file}: that is the name of a log; write --json=- or put --json last")
+# --- names of files -----------------------------------------------------------------------------------------------
 
 
 def output_names(logs: Sequence[Path], names: Sequence[str], suffix: str) -> list[str]:
@@ -53,6 +86,14 @@ def output_names(logs: Sequence[Path], names: Sequence[str], suffix: str) -> lis
         both = " and ".join(str(log) for log, name in zip(logs, full, strict=True) if name == twice[0])
         raise InputError(f"{both} would both be written as {twice[0]}{suffix}; give them one at a time")
     return full
+
+
+# --- text ---------------------------------------------------------------------------------------------------------
+
+
+def text_rows(head: str, rows: Sequence[tuple[str, str]]) -> str:
+    """A line and below it named values, one in each line."""
+    return "\n".join([head, *(f"  {name:17} {text}" for name, text in rows)])
 
 
 def clock(seconds: float) -> str:

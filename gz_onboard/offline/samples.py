@@ -67,8 +67,7 @@ def read_samples(log: Path, vehicle: Vehicle, progress: Callable[[int], None] | 
     vehicle.
     """
     columns = read_roles(log, vehicle, Codec(extended(vehicle.mapping)), progress)
-    name = Path(log.name.removesuffix(".gz")).stem
-    return Samples(name, columns, read_facts(log.parent / "rides.json").get(name, {}))
+    return Samples(ride_name(log), columns, facts_of(log))
 
 
 def read_roles(
@@ -112,6 +111,16 @@ def read_facts(file: Path) -> dict[str, dict[str, object]]:
         return {row["name"]: {key: value for key, value in row.items() if key != "name"} for row in rows}
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(f"{file}: must be a JSON list of objects with a name: {error!r}") from error
+
+
+def ride_name(log: Path) -> str:
+    """The name of the ride in a log: the file's, without its suffixes."""
+    return Path(log.name.removesuffix(".gz")).stem
+
+
+def facts_of(log: Path) -> dict[str, object]:
+    """What ``rides.json`` beside a log says about its ride."""
+    return read_facts(log.parent / "rides.json").get(ride_name(log), {})
 
 
 def rider_mass(facts: dict[str, object]) -> float | None:

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.offline.samples import read_facts, rider_mass
+from gz_onboard.offline.samples import facts_of, rider_mass
+from gz_onboard.options import LOG_SUFFIXES
 from gz_onboard.simulation.cycles import find_cycle
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded
 from gz_onboard.simulation.route import read_route, speed_profile
@@ -17,7 +18,7 @@ from gz_onboard.simulation.run import Command, along, at_steps, follow, replay, 
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Road, straight
 from gz_onboard.vehicle import Vehicle
 
-_LOGS = (".mcap", ".blf", ".log", ".asc", ".trc", ".mf4", ".gz")
+_LOGS = {*LOG_SUFFIXES, ".gz"} - {".csv"}
 TOP_SPEED = 50 / 3.6
 """m/s: what a rider wants to ride on a route without limits."""
 
@@ -60,8 +61,7 @@ def noted_payload(what: Path) -> float | None:
     """The mass [kg] that ``rides.json`` beside it says of the recorded ride `what`; None of anything else."""
     if _kind(what) != "ride":
         return None
-    name = Path(what.name.removesuffix(".gz")).stem
-    return rider_mass(read_facts(what.parent / "rides.json").get(name, {}))
+    return rider_mass(facts_of(what))
 
 
 def _kind(path: Path) -> str:

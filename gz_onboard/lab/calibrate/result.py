@@ -81,3 +81,13 @@ class Result:
     refusals: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     panels: list[Panel] = field(default_factory=list)
+
+    def add(self, other: Result) -> None:
+        """Put what `other` found into this."""
+        self.parameters |= other.parameters
+        self.curves |= other.curves
+        self.covariance += other.covariance
+        self.fits += other.fits
+        self.refusals += other.refusals
+        self.notes += other.notes
+        self.panels += other.panels

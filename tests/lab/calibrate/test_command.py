@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from gz_onboard.cli import main
-from gz_onboard.lab.calibrate.command import PROCEDURES, for_file
+from gz_onboard.lab.calibrate.command import for_file
+from gz_onboard.lab.calibrate.procedures import PROCEDURES
 from gz_onboard.lab.calibrate.result import Curve, Found, Result
 from gz_onboard.vehicle import read_vehicle
 
