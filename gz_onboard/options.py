@@ -49,28 +49,32 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
     "logs": {
         "nargs": "+",
         "type": Path,
-        "metavar": "FILE",
-        "help": f"logs of rides: {_LOGS}; or folders of them (CSV files in a folder are not read)",
+        "metavar": "LOG",
+        "help": f"logs of rides: {_LOGS}; or folders of them, of which CSV files are not read",
     },
     "--vehicle": {
         "default": "reference",
         "metavar": "NAME|TOML",
-        "help": "name of a built-in vehicle, or a vehicle file (%(default)s)",
+        "help": "name of a built-in vehicle, or a vehicle file (default: %(default)s)",
     },
     "--payload": {
         "type": number("--payload", 0.0, MOST_PAYLOAD, "kg"),
         "metavar": "KG",
-        "help": "mass of rider and luggage (from rides.json beside the log, else from the vehicle file)",
+        "help": "mass of rider and luggage (default: from rides.json beside the log, or the vehicle file)",
     },
     "--effects": {"type": Path, "metavar": "DIR", "help": "folder with effects of your own: Python code you trust"},
     "--filter": {
         "default": "scalar",
         "choices": ("scalar", "filterpy"),
-        "help": "implementation of the SOC filter (%(default)s)",
+        "help": "implementation of the SOC filter (default: %(default)s)",
     },
     "--from": {"dest": "start", "type": float, "default": 0.0, "metavar": "S", "help": "start, seconds into the log"},
     "--to": {"dest": "end", "type": float, "metavar": "S", "help": "end, seconds into the log"},
-    "--jobs": {"type": _jobs("--jobs"), "metavar": "N", "help": "number of parallel processes (one per processor)"},
+    "--jobs": {
+        "type": _jobs("--jobs"),
+        "metavar": "N",
+        "help": "number of parallel processes (default: one per processor)",
+    },
     "--json": {
         "nargs": "?",
         "const": "-",
@@ -79,14 +83,19 @@ _SHARED: Mapping[str, Mapping[str, Any]] = {
         "help": "write the result as JSON to FILE, or instead of text to standard output",
     },
     "--no-plot": {"action": "store_true", "help": "draw nothing"},
-    "--output": {"type": Path, "default": Path(), "metavar": "DIR", "help": "folder to write to (the current one)"},
+    "--output": {
+        "type": Path,
+        "default": Path(),
+        "metavar": "DIR",
+        "help": "folder to write to (default: the current one)",
+    },
     "--quiet": {"action": "store_true", "help": "show no progress"},
     "--report": {"type": Path, "metavar": "HTML", "help": "write a report as an HTML page"},
     "--seed": {
         "type": number("--seed", 0, MOST_SEED, kind=int),
         "default": 0,
         "metavar": "N",
-        "help": "seed of the random numbers (%(default)s)",
+        "help": "seed of the random numbers (default: %(default)s)",
     },
 }
 

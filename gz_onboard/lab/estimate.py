@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard estimate``."""
     explain_keys(parser, "a ride", SUMMARY_VERSION, KEYS)
     add_shared(parser, "logs", "--vehicle")
-    add_shared(parser, "--payload", help="mass of rider and luggage (unknown)")
+    add_shared(parser, "--payload", help="mass of rider and luggage (default: unknown)")
     add_shared(parser, "--filter", "--output", "--json", "--no-plot")
     parser.add_argument("--signals", action="store_true", help="also log the signals of each message, once a second")
     parser.add_argument("--frames", action="store_true", help="also log the raw frames and the range frames")

@@ -75,6 +75,7 @@ def log_size(log: Path) -> int:
 def validate_ride(task: Task, progress: Progress = lambda _: None) -> Ride:
     """Compare one ride with its simulation; `progress` counts bytes of the log. Raises InputError."""
     facts = facts_of(task.path)
+    kind = facts.get("kind")
     vehicle = read_vehicle(task.vehicle, task.payload if task.payload is not None else rider_mass(facts))
     size = log_size(task.path)
     ride = _measured(task.path, vehicle, size, progress)
@@ -106,7 +107,7 @@ def validate_ride(task: Task, progress: Progress = lambda _: None) -> Ride:
     result = Ride(
         file=str(task.path),
         name=ride_name(task.path),
-        kind=facts.get("kind"),
+        kind=None if kind is None else str(kind),
         vehicle=vehicle.name,
         payload_kg=vehicle.parameters["payload_mass"],
         on_dynamometer=recorded.on_dynamometer,

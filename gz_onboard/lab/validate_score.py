@@ -130,7 +130,7 @@ class Ride:
 
     file: Annotated[str, "the log"]
     name: Annotated[str, "of the ride"]
-    kind: Annotated[object, "as noted in rides.json beside the log, or null"]
+    kind: Annotated[str | None, "as noted in rides.json beside the log, or null"]
     vehicle: Annotated[str, "name of the vehicle"]
     payload_kg: Annotated[
         float, "mass of rider and luggage: --payload, or as noted in rides.json, or of the vehicle file"

@@ -5,12 +5,15 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
 from gz_onboard.errors import InputError
+
+_WIDTH = 110  # of a line in a terminal
 
 # --- JSON ---------------------------------------------------------------------------------------------------------
 
@@ -32,8 +35,10 @@ def keys_of(result: type) -> dict[str, str]:
 def explain_keys(parser: argparse.ArgumentParser, of: str, version: int, keys: Mapping[str, str]) -> None:
     """The keys of a JSON result and their meaning, below the options in the help."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    rows = "\n".join(f"  {key:20} {meaning}" for key, meaning in keys.items())
-    parser.epilog = f"JSON keys of {of}, version {version}:\n{rows}"
+    wrap = textwrap.TextWrapper(_WIDTH, subsequent_indent=" " * 23)
+    rows = "\n".join(wrap.fill(f"  {key:20} {meaning}") for key, meaning in keys.items())
+    before = f"{parser.epilog}\n\n" if parser.epilog else ""
+    parser.epilog = f"{before}JSON keys of {of}, version {version}:\n{rows}"
 
 
 def plain(value: object) -> Any:

@@ -40,30 +40,49 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = "name of a built-in drive cycle, CSV file of a cycle or a route, or log of a recorded ride to be replayed"
     add("what", metavar="WHAT", help=what)
     add_shared(parser, "--vehicle", "--payload")
-    _number(parser, "--soc", 0.0, 1.0, help="state of charge at the start (1; of a recorded ride, as recorded)")
-    _number(parser, "--ambient", -40.0, 60.0, "degC", metavar="C", help="temperature of air and vehicle (20)")
-    _number(parser, "--grade", -30.0, 30.0, "%", default=0.0, help="of the road, uphill positive (%(default)g)")
-    _number(parser, "--wind", -40.0, 40.0, "m/s", default=0.0, help="headwind (%(default)g)")
+    _number(
+        parser, "--soc", 0.0, 1.0, help="state of charge at the start (default: 1; of a recorded ride, as recorded)"
+    )
+    _number(
+        parser,
+        "--ambient",
+        -40.0,
+        60.0,
+        "degC",
+        metavar="C",
+        help="temperature of air and vehicle at the start (default: 20)",
+    )
+    _number(
+        parser,
+        "--grade",
+        -30.0,
+        30.0,
+        "%",
+        default=0.0,
+        metavar="PERCENT",
+        help="of the road, uphill positive (default: %(default)g)",
+    )
+    _number(parser, "--wind", -40.0, 40.0, "m/s", default=0.0, help="headwind (default: %(default)g)")
     often = parser.add_mutually_exclusive_group()
     repeat = number("--repeat", 1, 1000, kind=int)
-    often.add_argument("--repeat", type=repeat, default=1, metavar="N", help="ride it N times (%(default)s)")
+    often.add_argument("--repeat", type=repeat, default=1, metavar="N", help="ride it N times (default: %(default)s)")
     often.add_argument("--until-empty", action="store_true", help="repeat it until the pack is empty")
     dyno = "on a chassis dynamometer: inertia of the roller [kg], force A + B·V + C·V² [N] at a speed V [m/s]"
     add("--dyno", metavar="KG[,A,B,C]", help=dyno)
-    bends = "chassis model, which says what bends cost; straight: nothing (%(default)s)"
+    bends = "chassis model, which says what bends cost; straight: nothing (default: %(default)s)"
     add("--chassis", choices=tuple(MODELS), default="straight", help=bends)
     predictive = "of a recorded ride: a rider model follows its speed, instead of replaying throttle and brake"
     add("--predictive", action="store_true", help=predictive)
     sweep = "ride it with other values of a parameter, battery.parallel or battery.series; at most twice"
     add("--sweep", action="append", default=[], metavar="NAME=LO..HI[:STEPS]", help=sweep)
     add_shared(parser, "--output", "--json")
-    add("--format", choices=FORMATS, default="parquet", help="of the time series (%(default)s)")
+    add("--format", choices=FORMATS, default="parquet", help="of the time series (default: %(default)s)")
     add("--no-series", action="store_true", help="write no time series")
     add_shared(parser, "--no-plot")
     frames = "write the ride as CAN frames of the vehicle's sensors: .blf .log .asc .trc .csv .mf4"
     add("--frames", type=Path, metavar="FILE", help=frames)
-    add_shared(parser, "--seed", help="seed of the noise and losses of --frames (%(default)s)")
-    lost = "share of frames that the bus loses (%(default)g)"
+    add_shared(parser, "--seed", help="seed of the noise and losses of --frames (default: %(default)s)")
+    lost = "share of frames that the bus loses (default: %(default)g)"
     _number(parser, "--frame-loss", 0.0, 1.0, default=Losses.frames, metavar="SHARE", help=lost)
     add_shared(parser, "--quiet")
 
@@ -71,7 +90,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _number(
     parser: argparse.ArgumentParser, option: str, low: float, high: float, unit: str = "", **about: Any
 ) -> None:
-    about = {"metavar": unit.upper().replace("%", "%%") or f"{low:g}..{high:g}", **about}
+    about = {"metavar": unit.upper() or f"{low:g}..{high:g}", **about}
     parser.add_argument(option, type=number(option, low, high, unit), **about)
 
 

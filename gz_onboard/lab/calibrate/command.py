@@ -19,7 +19,7 @@ from gz_onboard.lab.calibrate.procedures import PROCEDURES, Given, Procedure
 from gz_onboard.lab.calibrate.result import Result
 from gz_onboard.lab.calibrate.table import read_table
 from gz_onboard.lab.calibrate.vehicle_file import write_vehicle
-from gz_onboard.offline.results import write_json
+from gz_onboard.offline.results import explain_keys, write_json
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.options import add_shared, keep_old_name
 from gz_onboard.progress import progress_bar
@@ -95,7 +95,6 @@ def _known_by_now(base: Path, results: Sequence[Result], file: Path) -> Vehicle:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The arguments of ``gz-onboard calibrate``."""
-    parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.epilog = "\n".join(
         ["what to calibrate, and from which data:"]
         + [f"  {'all':<12} everything that the manifest {manifest.NAME} of a folder names"]
@@ -106,11 +105,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "Rides are logs in any format that `gz-onboard estimate` reads. See docs/calibration.md.",
         ]
     )
+    explain_keys(parser, "a calibration", report.VERSION, report.KEYS)
     add = parser.add_argument
     add("what", metavar="WHAT", help="a procedure, or all")
     data = "files, or for rides folders of logs; for `all` a folder with its manifest"
     add("data", metavar="DATA", nargs="+", type=Path, help=data)
-    base = "name of a built-in vehicle, or a vehicle file, to start from (reference, or the manifest's)"
+    base = "name of a built-in vehicle, or a vehicle file, to start from (default: reference, or the manifest's)"
     add_shared(parser, "--vehicle", default=None, help=base)
     add("--with", dest="more", metavar="NAME=FILE", action="append", default=[], help="further data of a procedure")
     add("--held-out", metavar="FILE", action="append", default=[], help="the same as --with held_out=FILE")

@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from gz_onboard.lab.calibrate import thesis
 from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, Result
 from gz_onboard.lab.calibrate.vehicle_file import correlation
 from gz_onboard.offline.page import html_table, svg, write_page
+from gz_onboard.offline.results import keys_of
 from gz_onboard.offline.style import INK, MUTED, new_figure, rule
 
 if TYPE_CHECKING:
@@ -39,23 +40,26 @@ class Correlation:
 class ProcedureEntry:
     """What one procedure found, without its pictures."""
 
-    procedure: str
-    parameters: dict[str, Found]
-    curves: dict[str, Curve]
-    correlation: list[Correlation]
-    fits: list[Fit]
-    refusals: list[str]
-    notes: list[str]
+    procedure: Annotated[str, "its name"]
+    parameters: Annotated[dict[str, Found], "by name: value, sd, unit, source"]
+    curves: Annotated[dict[str, Curve], "tables of the vehicle file by name: axes, value, sd, unit, source"]
+    correlation: Annotated[list[Correlation], "of parameters found together: parameters, value (a matrix)"]
+    fits: Annotated[list[Fit], "what, unit, rms, largest, r2, points, held_out, data"]
+    refusals: Annotated[list[str], "what the data do not show, and why"]
+    notes: Annotated[list[str], "what else was noticed"]
 
 
 @dataclass(frozen=True)
 class Document:
     """What ``--json`` writes."""
 
-    vehicle: str  # file that the calibration started from
-    out: str | None  # file that was written
-    procedures: list[ProcedureEntry]
-    thesis: list[dict[str, str]]  # what the thesis found beside what was found here
+    vehicle: Annotated[str, "vehicle file that the calibration started from"]
+    out: Annotated[str | None, "vehicle file written, or null"]
+    procedures: Annotated[list[ProcedureEntry], "one for each procedure:"]
+    thesis: Annotated[list[dict[str, str]], "what the thesis gives beside what was found here"]
+
+
+KEYS = keys_of(Document) | {f"  {key}": text for key, text in keys_of(ProcedureEntry).items()}
 
 
 def document(results: Sequence[Result], vehicle: str, out: str | None) -> Document:

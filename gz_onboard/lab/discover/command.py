@@ -76,10 +76,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--list", action="store_true", help="print the candidates and what would show them")
     jobs = min(2, os.cpu_count() or 1)
     add_shared(parser, "--seed")
-    add_shared(parser, "--jobs", default=jobs, help="number of parallel processes (%(default)s)")
+    add_shared(parser, "--jobs", default=jobs, help="number of parallel processes (default: %(default)s)")
     keep_old_name(parser, "--workers", "--jobs")
     add_shared(parser, "--quiet")
-    explain_keys(parser, "the", SCHEMA, KEYS)
+    explain_keys(parser, "the report", SCHEMA, KEYS)
 
 
 def run(arguments: argparse.Namespace) -> int:
