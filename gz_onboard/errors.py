@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 EXIT_STATUSES = {
@@ -45,3 +46,12 @@ def shown(value: object) -> str:
         return _SHORT.repr(value)
     except ValueError:  # Python does not write out an integer of thousands of digits
         return "a number of thousands of digits"
+
+
+@contextmanager
+def writing(place: object) -> Iterator[None]:
+    """InputError for what the operating system refuses within, naming the file, or else `place`."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{error.filename or place}: cannot be written: {error.strerror or error}") from error

@@ -44,66 +44,49 @@ def _jobs(option: str) -> Callable[[str], float]:
     return number(option, 1, MOST_JOBS, kind=int, counted="processes")
 
 
-_SHARED: Mapping[str, Mapping[str, Any]] = {
-    "log": {"type": Path, "metavar": "LOG", "help": f"log: {_LOGS}"},
-    "logs": {
-        "nargs": "+",
-        "type": Path,
-        "metavar": "LOG",
-        "help": f"logs of rides: {_LOGS}; or folders of them, of which CSV files are not read",
-    },
-    "--vehicle": {
-        "default": "reference",
-        "metavar": "NAME|TOML",
-        "help": "name of a built-in vehicle, or a vehicle file (default: %(default)s)",
-    },
-    "--payload": {
-        "type": number("--payload", 0.0, MOST_PAYLOAD, "kg"),
-        "metavar": "KG",
-        "help": "mass of rider and luggage (default: from rides.json beside the log, or the vehicle file)",
-    },
-    "--effects": {"type": Path, "metavar": "DIR", "help": "folder with effects of your own: Python code you trust"},
-    "--filter": {
-        "default": "scalar",
-        "choices": ("scalar", "filterpy"),
-        "help": "implementation of the SOC filter (default: %(default)s)",
-    },
-    "--from": {"dest": "start", "type": float, "default": 0.0, "metavar": "S", "help": "start, seconds into the log"},
-    "--to": {"dest": "end", "type": float, "metavar": "S", "help": "end, seconds into the log"},
-    "--jobs": {
-        "type": _jobs("--jobs"),
-        "metavar": "N",
-        "help": "number of parallel processes (default: one per processor)",
-    },
-    "--json": {
-        "nargs": "?",
-        "const": "-",
-        "type": _json_file,
-        "metavar": "FILE|-",
-        "help": "write the result as JSON to FILE, or instead of text to standard output",
-    },
-    "--no-plot": {"action": "store_true", "help": "draw nothing"},
-    "--output": {
-        "type": Path,
-        "default": Path(),
-        "metavar": "DIR",
-        "help": "folder to write to (default: the current one)",
-    },
-    "--quiet": {"action": "store_true", "help": "show no progress"},
-    "--report": {"type": Path, "metavar": "HTML", "help": "write a report as an HTML page"},
-    "--seed": {
-        "type": number("--seed", 0, MOST_SEED, kind=int),
-        "default": 0,
-        "metavar": "N",
-        "help": "seed of the random numbers (default: %(default)s)",
-    },
+_SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "log": (f"log: {_LOGS}", {"type": Path, "metavar": "LOG"}),
+    "logs": (
+        f"logs of rides: {_LOGS}; or folders of them, of which CSV files are not read",
+        {"nargs": "+", "type": Path, "metavar": "LOG"},
+    ),
+    "--vehicle": (
+        "name of a built-in vehicle, or a vehicle file (default: %(default)s)",
+        {"default": "reference", "metavar": "NAME|TOML"},
+    ),
+    "--payload": (
+        "mass of rider and luggage (default: from rides.json beside the log, or the vehicle file)",
+        {"type": number("--payload", 0.0, MOST_PAYLOAD, "kg"), "metavar": "KG"},
+    ),
+    "--effects": ("folder with effects of your own: Python code you trust", {"type": Path, "metavar": "DIR"}),
+    "--filter": (
+        "implementation of the SOC filter (default: %(default)s)",
+        {"default": "scalar", "choices": ("scalar", "filterpy")},
+    ),
+    "--from": ("start, seconds into the log", {"dest": "start", "type": float, "default": 0.0, "metavar": "S"}),
+    "--to": ("end, seconds into the log", {"dest": "end", "type": float, "metavar": "S"}),
+    "--jobs": ("number of parallel processes (default: one per processor)", {"type": _jobs("--jobs"), "metavar": "N"}),
+    "--json": (
+        "write the result as JSON to FILE, or instead of text to standard output",
+        {"nargs": "?", "const": "-", "type": _json_file, "metavar": "FILE|-"},
+    ),
+    "--no-plot": ("draw nothing", {"action": "store_true"}),
+    "--output": ("folder to write to (default: the current one)", {"type": Path, "default": Path(), "metavar": "DIR"}),
+    "--quiet": ("show no progress", {"action": "store_true"}),
+    "--report": ("write a report as an HTML page", {"type": Path, "metavar": "HTML"}),
+    "--seed": (
+        "seed of the random numbers (default: %(default)s)",
+        {"type": number("--seed", 0, MOST_SEED, kind=int), "default": 0, "metavar": "N"},
+    ),
 }
+"""By name: help, and what else argparse is told."""
 
 
 def add_shared(parser: argparse.ArgumentParser, *names: str, **changes: Any) -> None:
     """Give `parser` these shared options; `changes` are to what argparse is told of each."""
     for name in names:
-        parser.add_argument(name, **{**_SHARED[name], **changes})
+        text, about = _SHARED[name]
+        parser.add_argument(name, **{"help": text, **about, **changes})
 
 
 def keep_old_name(parser: argparse.ArgumentParser, old: str, name: str) -> None:

@@ -15,7 +15,7 @@ from gz_onboard.bus import _can  # noqa: F401 - before cantools, which would imp
 from gz_onboard.bus.logs import LogDamage, read_frames
 from gz_onboard.bus.publisher import WH, WH_PER_KM, Counts, Publisher
 from gz_onboard.bus.recorder import LogFile
-from gz_onboard.errors import InputError
+from gz_onboard.errors import InputError, writing
 from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log
 from gz_onboard.offline.processes import Task
@@ -207,7 +207,7 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> Summar
     if batch is None:
         raise InputError(f"{task.path}: holds no frames of a vehicle" + (f" ({damages[0]})" if damages else ""))
     tally = Tally()
-    try:
+    with writing(task.log):
         log = _open_log(task, vehicle, batch[0][0])
         try:
             pipeline = Pipeline(
@@ -231,8 +231,6 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> Summar
         took = time.process_time() - cpu, time.perf_counter() - wall
         if task.picture:
             plot_log(task.log, task.picture)
-    except OSError as error:
-        raise InputError(f"{error.filename or task.log}: cannot be written: {error.strerror or error}") from error
     return _summary(task, pipeline, tally, batch[0][0], damages, took)
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.logs import read_metadata, read_samples
 from gz_onboard.bus.publisher import WH_PER_KM
-from gz_onboard.errors import OK, InputError
+from gz_onboard.errors import OK, InputError, writing
 from gz_onboard.events import Reason, State
 from gz_onboard.offline.style import (
     BLUE,
@@ -310,9 +310,7 @@ def run(arguments: argparse.Namespace) -> int:
     picture = arguments.picture or arguments.log.with_suffix(".png")
     if picture.suffix.lower() != ".png":
         raise InputError(f"{picture}: the picture's name has to end in .png")
-    try:
+    with writing(picture):
         plot_log(arguments.log, picture, arguments.over)
-    except OSError as error:
-        raise InputError(f"{picture}: cannot be written: {error.strerror or error}") from error
     print(picture)
     return OK

@@ -11,12 +11,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Protocol
 
 from gz_onboard.bus.logs import logs_among
-from gz_onboard.errors import BAD_INPUT, FAILED, OK, InputError
+from gz_onboard.errors import BAD_INPUT, FAILED, OK, writing
 from gz_onboard.lab.validate_ride import log_size, validate_ride
-from gz_onboard.lab.validate_score import Means, PooledMeans, Ride, SimulationVerdict, Splits, pooled
+from gz_onboard.lab.validate_score import Means, PooledMeans, Ride, SimulationVerdict, pooled
 from gz_onboard.offline.processes import Task, collect, over_rides
 from gz_onboard.offline.results import explain_keys, keys_of, output_names, write_json
 from gz_onboard.offline.samples import ride_name
@@ -42,19 +41,7 @@ Pooled = dict[str, dict[str, dict[str, dict[str, dict[str, PooledMeans]]]]]
 """On the road or the dynamometer: by form, channel, sorting and condition."""
 
 
-class Split(Protocol):
-    """What of a ride is pooled."""
-
-    @property
-    def on_dynamometer(self) -> bool:
-        """Whether a roller was under the wheel."""
-
-    @property
-    def splits(self) -> dict[str, dict[str, Splits]]:
-        """By form and channel."""
-
-
-def pool(rides: Sequence[Split]) -> Pooled:
+def pool(rides: Sequence[Ride]) -> Pooled:
     """The splits of all rides as one, apart for road and dynamometer."""
     result: Pooled = {}
     for where in ("road", "dynamometer"):
@@ -87,10 +74,8 @@ def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard validate``: `OK`; `BAD_INPUT` if a ride cannot be judged; `FAILED` if with --gate one fails."""
     tasks = _tasks(arguments)
     read_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
-    try:
+    with writing(arguments.output):
         arguments.output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"--output {arguments.output}: cannot be written: {error.strerror}") from error
     with progress_bar(lambda: sum(log_size(task.path) for task in tasks), quiet=arguments.quiet) as display:
         results = over_rides(validate_ride, tasks, arguments.jobs, display.update)
         rides, failed = collect("validate", results, display, None if arguments.json == "-" else ride_text)
@@ -107,15 +92,13 @@ def _write_tables(arguments: argparse.Namespace, rides: list[Ride], together: Po
     from gz_onboard.lab.validate_report import markdown, write_report
 
     written = []
-    try:
+    with writing(arguments.output):
         if not arguments.no_plot:
             written.append(arguments.output / "validation.html")
             write_report(written[-1], rides, together)
         if arguments.markdown:
             written.append(arguments.markdown)
             arguments.markdown.write_text(markdown(rides, together), encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"{written[-1]}: cannot be written: {error.strerror}") from error
     if arguments.json != "-" and written:
         print(f"written: {', '.join(map(str, written))}")
 

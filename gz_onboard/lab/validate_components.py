@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.lab.validate_score import Quantity
+from gz_onboard.lab.validate_score import CHANNELS, Quantity
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Effect, Port
 from gz_onboard.physics.model import air_density
 from gz_onboard.physics.relaxation import relaxed
@@ -48,7 +48,7 @@ def components(
     every = np.ones(len(measured["speed"]), dtype=bool)
     if has >= {"pack_current", "pack_voltage", "cell_temperature"} and soc is not None:
         voltage = battery_voltage(vehicle, measured, soc)
-        found["battery_voltage"] = Component(Quantity("V", "battery voltage"), measured["pack_voltage"], voltage, every)
+        found["battery_voltage"] = Component(CHANNELS["pack_voltage"], measured["pack_voltage"], voltage, every)
     if has >= {"motor_current", "motor_speed"}:
         current, speed = measured["motor_current"], measured["motor_speed"]
         motor_temperature = measured.get("motor_temperature", np.full(len(speed), ambient))
@@ -60,7 +60,7 @@ def components(
             found["inverter_power"] = Component(Quantity("W", "inverter DC power"), power, modelled, every)
         if "motor_torque" in has:
             found["motor_torque"] = Component(
-                Quantity("N·m", "motor torque"), measured["motor_torque"], constant * current, every
+                CHANNELS["motor_torque"], measured["motor_torque"], constant * current, every
             )
         moving = (measured["speed"] > 2.0) & (measured.get("braking", np.zeros(len(speed))) <= 0)
         if "acceleration" in has and ("grade" in has or roller):
@@ -181,38 +181,26 @@ def _temperatures(
     """The cooling networks with the heat of the measured currents and the measured ambient temperature."""
     air = measured.get("ambient_temperature", np.full(len(every), ambient))
     parts = Scooter(vehicle, soc=0.5 if soc is None else soc, ambient=ambient)
+    motor, inverter, pack = parts.motor_cooling, parts.inverter_cooling, parts.pack_cooling
     found = {}
+
+    def compare(name: str, part: Any, heat: Array, *masses: str) -> None:
+        """A network whose `masses` begin at the temperature measured first."""
+        for mass in masses:
+            setattr(part, mass, float(measured[name][0]))
+        found[name] = Component(CHANNELS[name], measured[name], _cooled(part, heat, air), every)
+
     if "motor_temperature" in measured:
-        motor = parts.motor_cooling
-        motor.stator = motor.rotor = float(measured["motor_temperature"][0])
-        found["motor_temperature"] = Component(
-            Quantity("degC", "motor temperature", True),
-            measured["motor_temperature"],
-            _cooled(motor, motor_heat, air),
-            every,
-        )
+        compare("motor_temperature", motor, motor_heat, "stator", "rotor")
     if "inverter_temperature" in measured:
-        inverter = parts.inverter_cooling
-        inverter.board = inverter.box = float(measured["inverter_temperature"][0])
-        found["inverter_temperature"] = Component(
-            Quantity("degC", "inverter temperature", True),
-            measured["inverter_temperature"],
-            _cooled(inverter, inverter_heat, air),
-            every,
-        )
+        compare("inverter_temperature", inverter, inverter_heat, "board", "box")
     if measured.keys() >= {"cell_temperature", "pack_current", "pack_voltage"} and soc is not None:
-        battery = vehicle.pack
-        charge = np.cumsum(measured["pack_current"] / 3600) / battery.pack_capacity(
-            float(measured["cell_temperature"][0])
-        )
-        levels = zip((soc - charge).tolist(), measured["cell_temperature"].tolist(), strict=True)
-        source = np.array([battery.ocv(s, celsius)[0] for s, celsius in levels]) * battery.cells_series
+        battery, celsius = vehicle.pack, measured["cell_temperature"]
+        charge = np.cumsum(measured["pack_current"] / 3600) / battery.pack_capacity(float(celsius[0]))
+        levels = zip((soc - charge).tolist(), celsius.tolist(), strict=True)
+        source = np.array([battery.ocv(s, at)[0] for s, at in levels]) * battery.cells_series
         heat = (source - measured["pack_voltage"]) * measured["pack_current"]
-        pack = parts.pack_cooling
-        pack.temperature = float(measured["cell_temperature"][0])
-        found["cell_temperature"] = Component(
-            Quantity("degC", "cell temperature", True), measured["cell_temperature"], _cooled(pack, heat, air), every
-        )
+        compare("cell_temperature", pack, heat, "temperature")
     return found
 
 

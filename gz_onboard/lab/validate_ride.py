@@ -14,7 +14,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
-from gz_onboard.errors import InputError
+from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.validate_components import Component, components
 from gz_onboard.lab.validate_score import (
     CHANNELS,
@@ -124,23 +124,11 @@ def validate_ride(task: Task, progress: Progress = lambda _: None) -> Ride:
         plot=str(picture) if picture else None,
     )
     if picture:
-        _draw(picture, result, measured, simulated, alone)
+        from gz_onboard.lab.validate_plot import draw_ride
+
+        with writing(picture):
+            draw_ride(picture, result, measured, simulated, alone)
     return result
-
-
-def _draw(
-    picture: Path,
-    ride: Ride,
-    measured: Mapping[str, Array],
-    simulated: Mapping[str, Mapping[str, Array]],
-    alone: Mapping[str, Component],
-) -> None:
-    from gz_onboard.lab.validate_plot import draw_ride
-
-    try:
-        draw_ride(picture, ride, measured, simulated, alone)
-    except OSError as error:
-        raise InputError(f"{picture}: cannot be written: {error.strerror or error}") from error
 
 
 # --- what was measured --------------------------------------------------------------------------------------------

@@ -213,8 +213,9 @@ def conditions(measured: Mapping[str, Array]) -> tuple[dict[str, dict[str, Mask]
         "later": straight & (begun > 600),
     }
     edges = (0.0, 0.5, 4.0, 8.0, 11.0, 40.0)
-    names = ("standing", "below 4 m/s", "4 to 8 m/s", "8 to 11 m/s", "above 11 m/s")
-    found["speed"] = {name: (speed >= a) & (speed < b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True)}
+    found["speed"] = {
+        name: (speed >= a) & (speed < b) for name, a, b in zip(_SPEEDS, edges[:-1], edges[1:], strict=True)
+    }
     a = measured["acceleration"]
     braking = measured.get("braking", np.zeros(len(speed))) > 0
     found["pace"] = {
@@ -227,39 +228,19 @@ def conditions(measured: Mapping[str, Array]) -> tuple[dict[str, dict[str, Mask]
     return found, missing
 
 
-LABELS = {
-    "turning": "lateral acceleration below 0.5, 0.5 to 1.5, above 1.5 m/s²",
-    "grade": "above 1 %, within, below −1 %",
-    "temperature": "air below 12, 12 to 20, above 20 °C, straight on",
-    "since start": "time ridden since the start, straight on",
-    "speed": "speed",
-    "pace": "acceleration above 1, 0.3 to 1, within 0.3, below −0.3 m/s² without brake; with brake",
+_SPEEDS = ("standing", "below 4 m/s", "4 to 8 m/s", "8 to 11 m/s", "above 11 m/s")
+_PACES = ("hard acceleration", "acceleration", "steady", "coasting", "braking")
+_SORTINGS = {
+    "turning": ("lateral acceleration below 0.5, 0.5 to 1.5, above 1.5 m/s²", ("straight", "slightly", "turning")),
+    "grade": ("above 1 %, within, below −1 %", ("uphill", "level", "downhill")),
+    "temperature": ("air below 12, 12 to 20, above 20 °C, straight on", ("cold", "mild", "warm")),
+    "since start": ("time ridden since the start, straight on", ("first 3 min", "3 to 10 min", "later")),
+    "speed": ("speed", _SPEEDS),
+    "pace": ("acceleration above 1, 0.3 to 1, within 0.3, below −0.3 m/s² without brake; with brake", _PACES),
 }
-
-ORDER = (
-    "straight",
-    "slightly",
-    "turning",
-    "uphill",
-    "level",
-    "downhill",
-    "cold",
-    "mild",
-    "warm",
-    "first 3 min",
-    "3 to 10 min",
-    "later",
-    "standing",
-    "below 4 m/s",
-    "4 to 8 m/s",
-    "8 to 11 m/s",
-    "above 11 m/s",
-    "hard acceleration",
-    "acceleration",
-    "steady",
-    "coasting",
-    "braking",
-)
+LABELS = {by: label for by, (label, _) in _SORTINGS.items()}
+"""What the seconds are sorted by."""
+ORDER = tuple(kind for _, kinds in _SORTINGS.values() for kind in kinds)
 """The conditions as tables list them."""
 
 

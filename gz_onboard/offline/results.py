@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, get_type_hints
 
-from gz_onboard.errors import InputError
+from gz_onboard.errors import InputError, writing
 
 _WIDTH = 110  # of a line in a terminal
 
@@ -58,21 +58,20 @@ def plain(value: object) -> Any:
     return str(value)
 
 
-def write_json(file: str | None, version: int, result: object) -> None:
+def write_json(file: str | None, version: int | None, result: object) -> None:
     """What ``--json FILE`` asks for: `result`, a dataclass or mapping, after the `version` of its keys.
 
-    ``-`` is standard output, and None nothing. Raises InputError if it cannot be written.
+    version: None if the result has it. file: ``-`` is standard output, None nothing. Raises InputError.
     """
     if file is None:
         return
-    text = json.dumps({"version": version, **plain(result)}, indent=1, ensure_ascii=False)
+    head = {} if version is None else {"version": version}
+    text = json.dumps(head | plain(result), indent=1, ensure_ascii=False)
     if file == "-":
         print(text)
         return
-    try:
+    with writing(file):
         Path(file).write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise InputError(f"--json {file}: cannot be written: {error.strerror}") from error
 
 
 # --- names of files -----------------------------------------------------------------------------------------------

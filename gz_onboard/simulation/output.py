@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from gz_onboard.errors import InputError
+from gz_onboard.errors import writing
 from gz_onboard.offline.page import svg, write_page
 from gz_onboard.offline.style import save
 from gz_onboard.simulation.frames import Losses, simulate_frames, write_frames
@@ -37,28 +37,22 @@ def write(
         files.append(arguments.output / f"{name}{ending}")
         return files[-1]
 
-    try:
+    with writing(arguments.output):
         arguments.output.mkdir(parents=True, exist_ok=True)
         if not arguments.no_series:
             metadata = {"vehicle": summary.vehicle, "source": summary.what}
             write_series(result, file(f".{arguments.format}"), metadata)
         if not arguments.no_plot:
             _draw(file, plan, result, summary, sweeps)
-    except OSError as error:
-        raise InputError(
-            f"{error.filename or arguments.output}: cannot be written: {error.strerror or error}"
-        ) from error
     return [str(file) for file in files]
 
 
 def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, scooter: Scooter) -> str:
     """Write the ride's frames; gives the file's name. InputError if it cannot be written."""
     sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, losses=Losses(frames=arguments.frame_loss))
-    try:
+    with writing(arguments.frames):
         arguments.frames.parent.mkdir(parents=True, exist_ok=True)
         write_frames(arguments.frames, sent)
-    except OSError as error:
-        raise InputError(f"{arguments.frames}: cannot be written: {error.strerror or error}") from error
     return str(arguments.frames)
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.bus.logs import logs_among
-from gz_onboard.errors import OK, InputError, nearest
+from gz_onboard.errors import OK, InputError, nearest, writing
 from gz_onboard.lab.calibrate import manifest, report
 from gz_onboard.lab.calibrate.manifest import Option, Step, check_count
 from gz_onboard.lab.calibrate.procedures import PROCEDURES, Given, Procedure
@@ -147,14 +147,12 @@ def run(arguments: argparse.Namespace) -> int:
     if text:
         for result in results:
             print(f"{report.text(result)}\n  ({seconds[result.procedure]:.1f} s)")
-    try:
+    with writing(base):
         if arguments.output:
             write_vehicle(base, for_file(results, read_vehicle(base)), arguments.output)
             read_vehicle(arguments.output)
         if arguments.report:
             report.write_report(arguments.report, f"Calibration of {read_vehicle(base).name}", results)
-    except OSError as error:
-        raise InputError(f"{error.filename}: {error.strerror}") from error
     out = str(arguments.output) if arguments.output else None
     write_json(arguments.json, report.VERSION, report.document(results, str(base), out))
     if text:

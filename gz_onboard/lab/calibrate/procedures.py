@@ -62,10 +62,6 @@ class Procedure:
     options: Mapping[str, Option] = field(default_factory=dict)
 
 
-def _wheel(given: Given) -> Result:
-    return wheel.calibrate(given.rides["data"], given.vehicle)
-
-
 def _motor(given: Given) -> Result:
     result = Result("motor")
     if ramp := given.one("emf"):
@@ -84,10 +80,6 @@ def _losses(given: Given) -> Result:
     if any(refusal.startswith(copper) for refusal in result.refusals):
         del result.parameters[copper]  # not measured: what the base file says stays
     return result
-
-
-def _ocv(given: Given) -> Result:
-    return ocv.calibrate(given.tables["data"][0])
 
 
 THESIS_VOLTS = 0.02  # V: what Lord 2016 gives for a cell on a road profile
@@ -145,14 +137,6 @@ def _load(ride: Samples) -> Array:
     return np.asarray(np.interp(seconds + 0.5, at, current))
 
 
-def _auxiliary(given: Given) -> Result:
-    return auxiliary.auxiliary_power(given.rides["data"])
-
-
-def _offsets(given: Given) -> Result:
-    return offsets.offsets(given.rides["data"], given.vehicle)
-
-
 def _resistance(given: Given) -> Result:
     result = resistance.cable_resistance(given.rides["data"], given.vehicle)
     result.procedure = "resistance"
@@ -197,7 +181,7 @@ PROCEDURES: dict[str, Procedure] = {
     "wheel": Procedure(
         "rolling radius of the driven wheel from GPS speed over motor speed",
         {"data": Slot("ride", "rides with GPS", 1)},
-        _wheel,
+        lambda given: wheel.calibrate(given.rides["data"], given.vehicle),
     ),
     "motor": Procedure(
         "constants of the motor from a dynamometer: back-EMF over speed, torque over current",
@@ -218,7 +202,7 @@ PROCEDURES: dict[str, Procedure] = {
     "ocv": Procedure(
         "open-circuit voltage and capacity of a cell from a slow discharge and charge",
         {"data": Slot("table", "a discharge (and charge) of C/8 or slower", 1, 1)},
-        _ocv,
+        lambda given: ocv.calibrate(given.tables["data"][0]),
     ),
     "pulse": Procedure(
         "R0, R1, C1 over state of charge and temperature from pulse tests of a cell",
@@ -231,12 +215,14 @@ PROCEDURES: dict[str, Procedure] = {
         {"method": "reduced"},
     ),
     "auxiliary": Procedure(
-        "power of lamps, dashboard and control", {"data": Slot("ride", "rides with auxiliary current", 1)}, _auxiliary
+        "power of lamps, dashboard and control",
+        {"data": Slot("ride", "rides with auxiliary current", 1)},
+        lambda given: auxiliary.auxiliary_power(given.rides["data"]),
     ),
     "offsets": Procedure(
         "offset, gain and noise of the pack's sensors",
         {"data": Slot("ride", "rides that begin or end at rest", 1)},
-        _offsets,
+        lambda given: offsets.offsets(given.rides["data"], given.vehicle),
     ),
     "resistance": Procedure(
         "resistance of pack and cable beside the cells",

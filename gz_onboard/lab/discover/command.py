@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
     report.notes += [*unsettled(report), *outstanding(report), *strange(report), *unformed(report)]
     told = write_extended(report, vehicle, arguments) if arguments.write_model else []
     if arguments.json:
-        write_json(arguments.json, SCHEMA, document(report))
+        write_json(arguments.json, None, document(report))
     if arguments.report:
         from gz_onboard.lab.discover.report import write_report
 
