@@ -76,7 +76,7 @@ def command_line(called: Collection[str]) -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv`; gives the exit status: 0, or one of those in `errors`."""
-    # Our matrices are small, and what is large runs in processes of its own: threads would stand in each other's way.
+    # Our matrices are small, and large work runs in processes of its own: threads would only get in each other's way.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     argv = list(sys.argv[1:] if argv is None else argv)
     called = next((word for word in argv if not word.startswith("-")), "")

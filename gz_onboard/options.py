@@ -12,7 +12,7 @@ from gz_onboard.errors import InputError
 LOG_SUFFIXES = (".mcap", ".blf", ".log", ".asc", ".csv", ".trc", ".mf4")
 _LOGS = f"{' '.join(LOG_SUFFIXES)}, each also with .gz"
 MOST_JOBS = 256
-"""Processes: each takes some 100 MB and does nothing else than a processor's work."""
+"""Processes: each takes some 100 MB and keeps a processor busy."""
 MOST_PAYLOAD = 300.0  # kg
 MOST_SEED = 2**32 - 1
 
@@ -79,11 +79,11 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
         {"type": number("--seed", 0, MOST_SEED, kind=int), "default": 0, "metavar": "N"},
     ),
 }
-"""By name: help, and what else argparse is told."""
+"""By name: help, and the other arguments for argparse."""
 
 
 def add_shared(parser: argparse.ArgumentParser, *names: str, **changes: Any) -> None:
-    """Give `parser` these shared options; `changes` are to what argparse is told of each."""
+    """Give `parser` these shared options; `changes` replace arguments for argparse."""
     for name in names:
         text, about = _SHARED[name]
         parser.add_argument(name, **{"help": text, **about, **changes})

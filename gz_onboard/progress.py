@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import Any, TextIO
 
 Progress = Callable[[float], None]
-"""Is told how much work was done since the last time, in any unit."""
+"""Called with the work done since the last call, in any unit."""
 
 
 class Display:

@@ -71,7 +71,7 @@ def replay(
     summary: Summary | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Summary:
-    """Send the frames at the times at which they stand in the log, `speed` times as fast; 0: without waiting.
+    """Send the frames at the times they have in the log, `speed` times as fast; 0: without waiting.
 
     progress is called about twice a second with the seconds of log sent. A `summary` that is given is added to,
     and is up to date when KeyboardInterrupt ends the replay.
@@ -168,7 +168,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--speed", type=float, default=1.0, help="speed as a factor (default: %(default)g); 0: as fast as possible"
     )
-    parser.add_argument("--loop", action="store_true", help="begin again at the end, until interrupted")
+    parser.add_argument("--loop", action="store_true", help="start again at the end, until interrupted")
     add_shared(parser, "--from", "--to")
     everything = "of our own logs also send the frames that were sent, not received, back then"
     parser.add_argument("--all", action="store_true", help=everything)

@@ -1,9 +1,9 @@
 """``gz-onboard validate``: measured rides against their simulation, by the thesis' gate (Lord 2016, ch. 3).
 
 Each ride is simulated twice from its measured start: open loop, with the measured throttle and brake, and with the
-rider model following the measured speed. Each component is also fed alone with its measured inputs. Battery current and
-voltage, motor torque and speed must be within 20 % (temperatures too), components within 10 %; `validate_score` says of
-what.
+rider model following the measured speed. Each component is also simulated by itself, with its measured inputs. Battery
+current and voltage, motor torque and speed must be within 20 % (temperatures too), components within 10 %;
+`validate_score` says of what.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ FORMS = {
     "open_loop": ("open loop", "the same throttle gives another ride; small errors of force add up to another speed"),
     "predictive": (
         "rider model",
-        "the same speed takes another current or torque: road load, losses, or the way of opening the throttle",
+        "the same speed takes another current or torque: road load, losses, or how the throttle is opened",
     ),
-    "components": ("components", "fed with what was measured, this part alone is off: its parameters or its equation"),
+    "components": ("components", "with measured inputs this part is still off: its parameters or its equation"),
 }
 """By entry of a ride: what people call it, and what it means if it does not pass."""
 

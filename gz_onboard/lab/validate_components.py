@@ -1,4 +1,4 @@
-"""Each component alone, fed with what was measured at its inputs: where a wrong whole comes from.
+"""Each component by itself, with what was measured at its inputs: it shows which part makes the whole wrong.
 
     battery voltage     from measured current and cell temperature
     inverter DC power   from measured motor current (torque), motor speed and motor temperature
@@ -75,7 +75,7 @@ def components(
 
 
 def vibration(vehicle: Vehicle, measured: Mapping[str, Array]) -> Array:
-    """[m/s²] per second; where the ride does not tell it, while moving what the vehicle's file expects."""
+    """[m/s²] per second; where it was not measured, the vehicle file's value while moving."""
     typical = np.where(measured["speed"] > MOVING, vehicle.riding.vibration, 0.0)
     return measured.get("vibration", typical)
 

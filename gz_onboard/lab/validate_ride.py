@@ -1,4 +1,4 @@
-"""One ride against its simulation: open loop, with the rider model, and each component alone.
+"""One ride against its simulation: open loop, with the rider model, and each component by itself.
 
 The grade is that of the place where the scooter really was at that time, so that a speed that drifts does not also move
 the hills; so is the vibration.

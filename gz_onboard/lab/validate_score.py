@@ -7,7 +7,7 @@ Definitions, the same for every channel. Both signals are first averaged over wh
     percent        mean absolute error over mean absolute measured. A mean of relative errors would be without meaning
                    where a current or a torque passes through zero, and a share of the greatest value would flatter
     of_spread      rms error over the standard deviation of the measured: for a voltage, whose percent is small by
-                   nature, this is the figure that tells. 1 is no better than its mean
+                   nature, this is the figure to look at. 1 is no better than its mean
     of a temperature percent is the mean absolute error over the rise, max less min measured, at least 10 K
     energy         the integral of the error over the integral of the measured
 """
@@ -24,7 +24,7 @@ from gz_onboard.arrays import Array, Mask
 
 GATE, COMPONENT_GATE = 20.0, 10.0  # percent: Lord 2016, ch. 3
 LEAST_RISE = 10.0  # K
-LEAST_SECONDS = 20  # of a condition; fewer tell nothing
+LEAST_SECONDS = 20  # of a condition; fewer mean nothing
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class Ride:
         "simulated with the measured throttle and brake, or null: channels, energy_percent, passed",
     ]
     predictive: Annotated[SimulationVerdict, "simulated with the rider model following the measured speed: the same"]
-    components: Annotated[Verdict | None, "each alone with measured inputs: channels, passed; or null"]
+    components: Annotated[Verdict | None, "each by itself, with measured inputs: channels, passed; or null"]
     splits: Annotated[
         dict[str, dict[str, Splits]],
         "by form, channel, sorting and condition: seconds, mean_measured, mean_error, mean_abs_error, "

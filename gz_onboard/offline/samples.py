@@ -63,7 +63,7 @@ class Samples:
 def read_samples(log: Path, vehicle: Vehicle, progress: Callable[[int], None] | None = None) -> Samples:
     """The samples in the log of a ride of `vehicle`, with its facts from a ``rides.json`` beside it, if there is one.
 
-    progress: is told how many frames were read. Raises InputError for a log that cannot be read or is not of the
+    progress: called with the number of frames read. Raises InputError for a log that cannot be read or is not of the
     vehicle.
     """
     columns = read_roles(log, vehicle, Codec(extended(vehicle.mapping)), progress)
@@ -77,9 +77,9 @@ def read_roles(
     progress: Callable[[int], None] | None = None,
     observe: Callable[[Event], None] | None = None,
 ) -> dict[str, tuple[Array, Array]]:
-    """(times [s], values) by role of all that `codec` decodes in `log` more than once; `observe` is told every event.
+    """(times [s], values) by role of all that `codec` decodes in `log` more than once; `observe` gets every event.
 
-    progress: is told how many frames were read. Raises InputError for a log that cannot be read or is not of the
+    progress: called with the number of frames read. Raises InputError for a log that cannot be read or is not of the
     vehicle.
     """
     import numpy as np

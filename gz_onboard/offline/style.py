@@ -101,7 +101,7 @@ def legend(axis: Axes, *others: Axes) -> None:
 
 
 def close(axes: Sequence[Axes], x: Sequence[float], text: str) -> None:
-    """The abscissa `x` of a stack: named below the last panel, with numbers there alone, from end to end."""
+    """The abscissa `x` of a stack: named and numbered below the last panel only, from end to end."""
     for axis in axes[:-1]:
         axis.tick_params(labelbottom=False)
     axes[-1].set_xlabel(text, color=INK, fontsize=9, loc="left")

@@ -120,7 +120,7 @@ Flow = tuple[str, float, str]
 def sankey(ledger: Mapping[str, float], title: str) -> Figure:
     """Where the energy went: sources on the left, on the right what took it, as thick as it is much.
 
-    ledger: J by name; what is negative gave energy and stands on the left with the cells.
+    ledger: J by name; what is negative gave energy and is on the left with the cells.
     """
     from matplotlib.patches import Rectangle
 

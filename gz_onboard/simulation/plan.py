@@ -20,7 +20,7 @@ from gz_onboard.vehicle import Vehicle
 
 _LOGS = {*LOG_SUFFIXES, ".gz"} - {".csv"}
 TOP_SPEED = 50 / 3.6
-"""m/s: what a rider wants to ride on a route without limits."""
+"""m/s: what a rider aims for on a route without limits."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def _kind(path: Path) -> str:
 
 def _route_plan(path: Path, arguments: argparse.Namespace, roller: Dynamometer | None) -> Plan:
     if arguments.repeat > 1 or arguments.until_empty:
-        raise InputError(f"{path}: a route is ridden once: its end is not its begin; --repeat is for cycles")
+        raise InputError(f"{path}: a route is ridden once, as it does not end where it starts; --repeat is for cycles")
     route = read_route(path)
     profile = speed_profile(route, top_speed=TOP_SPEED)
     metres = [profile.speed_at(float(i)) for i in range(int(route.length) + 1)]

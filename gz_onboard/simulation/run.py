@@ -1,6 +1,6 @@
 """Rides of the simulated scooter: along a cycle, along a route, or with throttle and brake given.
 
-`drive` is the loop; what it is told each step is a `Command`. Nothing here reads files or prints.
+`drive` is the loop; a `Command` says what the rider does in each step. Nothing here reads files or prints.
 """
 
 from __future__ import annotations

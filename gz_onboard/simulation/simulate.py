@@ -1,7 +1,7 @@
-"""``gz-onboard simulate``: the scooter along a drive cycle, a route or a recorded ride, without the scooter.
+"""``gz-onboard simulate``: the simulated scooter along a drive cycle, a route or a recorded ride.
 
-It prints what the ride takes, how far a charge goes at that, where the energy went and where the ride asked more than
-the vehicle has; and writes time series and pictures.
+It prints the energy used, the range at that consumption, where the energy went and where the profile was beyond the
+vehicle; and writes time series and pictures.
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ class Summary:
     kind: Annotated[str, "cycle, route, ride (open loop) or ride (predictive)"]
     vehicle: Annotated[str, "name of the vehicle"]
     payload_kg: Annotated[float, "mass of rider and luggage"]
-    payload_from: Annotated[str, "who said so: --payload, rides.json beside the log, or the vehicle file"] = (
+    payload_from: Annotated[str, "source of it: --payload, rides.json beside the log, or the vehicle file"] = (
         "the vehicle file"
     )
     step_s: Annotated[float, "step of the simulation"]
@@ -95,8 +95,8 @@ class Summary:
         ", missing_km_h at most, wanted_km_h there, beyond_vehicle (the throttle was open)",
     ]
     shortfall_s: Annotated[float, "their time in all"]
-    ledger_wh: Annotated[dict[str, float], "where the energy of the cells went, by name; negative: gave"]
-    closure: Annotated[float, "energy_cells_wh less the sum of the ledger, over all that was turned over"]
+    ledger_wh: Annotated[dict[str, float], "where the energy of the cells went, by name; negative: a source"]
+    closure: Annotated[float, "energy_cells_wh less the sum of the ledger, over the sum of all magnitudes"]
     chassis: Annotated[str, "straight, planar or leaning"]
     turning_beyond_s: Annotated[
         float, "time in which the road turned harder than the chassis' model goes; its edge was taken"

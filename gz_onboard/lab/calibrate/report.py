@@ -99,7 +99,7 @@ def text(result: Result) -> str:
         held = ", held out" if f.held_out else ""
         r2 = f"R² {f.r2:.4f}, " if f.r2 is not None else ""
         lines.append(f"  fit of {f.what}: {r2}{f.rms:.3g} {f.unit} rms, {f.largest:.3g} at most ({f.data}{held})")
-    lines += [f"  not told: {refusal}" for refusal in result.refusals]
+    lines += [f"  not identified: {refusal}" for refusal in result.refusals]
     lines += [f"  note: {note}" for note in result.notes]
     return "\n".join(lines)
 
@@ -144,7 +144,7 @@ def _section(result: Result) -> str:
         rows = [[a, *(f"{tied.value[i, j]:+.2f}" for j in range(i + 1))] for i, a in enumerate(names)]
         if len(names) <= _MOST_TIED:
             parts.append(html_table(["correlation", *names], rows, range(1, len(names) + 1)))
-    parts += [f'<p class="no">Not told by these data: {html.escape(refusal)}</p>' for refusal in result.refusals]
+    parts += [f'<p class="no">Not identified by these data: {html.escape(refusal)}</p>' for refusal in result.refusals]
     parts += [f"<p>{html.escape(note)}</p>" for note in result.notes]
     if result.panels:
         parts.append(f"<figure>{picture(result.panels)}</figure>")

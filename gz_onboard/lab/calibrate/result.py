@@ -1,4 +1,4 @@
-"""What a calibration procedure gives: values with their uncertainty, what could not be told, and how well it fits."""
+"""What a procedure gives: values with their uncertainty, what could not be identified, and how well it fits."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Result:
     """What one procedure found.
 
     covariance: groups of parameters that are tied, each with its matrix in the parameters' units.
-    refusals: what the data could not tell, one sentence each, with the number that says so.
+    refusals: what the data could not identify, one sentence each, with the number that shows it.
     """
 
     procedure: str

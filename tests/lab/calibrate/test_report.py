@@ -80,7 +80,7 @@ def test_text():
     lines = text(a_result()).splitlines()
     assert lines[0] == "coast"
     assert "  drag_area = 0.500 ± 0.030 m²" in lines
-    assert "  not told: the slope: ± 3 %" in lines
+    assert "  not identified: the slope: ± 3 %" in lines
 
 
 @pytest.mark.parametrize(
