@@ -11,7 +11,7 @@ OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 EXIT_STATUSES = {
     OK: "done",
     FAILED: "the answer is no (validate --gate, dashboard --once), or the system failed: a full disk, a closed pipe",
-    BAD_INPUT: "the command line, a file or a parameter cannot be used (one of several logs is enough)",
+    BAD_INPUT: "the command line, a file or a parameter cannot be used, or one of several logs cannot",
     INTERRUPTED: "interrupted by Ctrl-C",
 }
 """What the exit status of a command means."""

@@ -28,6 +28,7 @@ from gz_onboard.offline.style import (
     save,
     second,
     stack,
+    time_unit,
 )
 from gz_onboard.options import add_shared
 from gz_onboard.pipeline import ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
@@ -165,7 +166,7 @@ def _abscissa(rows: Sequence[Logged], times: Sequence[int], over: str) -> tuple[
         return [row["distance"] / 1000 for row in rows], "distance [km]"
     # The time within the estimates goes on evenly when the clock is set; that of the log does not.
     start, end = rows[0]["time"], rows[-1]["time"]
-    seconds, unit = (1, "s") if end - start < 300 else (60, "min")
+    seconds, unit = time_unit(end - start)
     return [(row["time"] - start) / seconds for row in rows], f"time [{unit}]"
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.validate_components import Component
 from gz_onboard.lab.validate_score import CHANNELS, Ride
-from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, new_figure, rule
+from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, new_figure, rule, time_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,7 +28,6 @@ _ALONE = {
     "cell_temperature": "cell_temperature",
 }
 """Components that are drawn beside the channel that they give."""
-_LONG = 300.0  # s: from here on the abscissa is in minutes
 _MEAN = 30  # s: what is left of an error when gears and gusts are averaged out
 _DPI = 90  # of a wide picture
 
@@ -55,7 +54,7 @@ def draw_ride(
     grid = figure.add_gridspec(
         len(panels), 2, left=0.055, right=0.99, top=1 - 0.75 / height, bottom=0.45 / height, hspace=0.35, wspace=0.11
     )
-    unit, name = (60.0, "min") if ride.duration_s >= _LONG else (1.0, "s")
+    unit, name = time_unit(ride.duration_s)
     first: Axes | None = None
     for i, panel in enumerate(panels):
         left = figure.add_subplot(grid[i, 0], sharex=first)

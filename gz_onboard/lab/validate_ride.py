@@ -33,7 +33,7 @@ from gz_onboard.lab.validate_score import (
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.progress import Progress
-from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded, rest_soc
+from gz_onboard.simulation.recorded import AMBIENT, Recorded, fit_dynamometer, read_recorded, rest_soc, scooter_at_start
 from gz_onboard.simulation.route import read_route
 from gz_onboard.simulation.run import Command, Run, drive, follow, replay, road_table
 from gz_onboard.simulation.scooter import STEP, Dynamometer, Place, Road, Scooter
@@ -57,11 +57,6 @@ class Measured:
     series: dict[str, Array]  # per second, see `per_second`; and the grade on a road
     road: Road | Dynamometer
     soc: float | None
-
-    @property
-    def ambient(self) -> float:
-        """Of the air at the start [degC]."""
-        return self.recorded.first("ambient_temperature", 20.0)
 
 
 def log_size(log: Path) -> int:
@@ -90,9 +85,9 @@ def validate_ride(task: Task, progress: Progress = lambda _: None) -> Ride:
         for form, command in commands.items()
     }
     verdicts = {form: _judge_ride(measured, series) for form, series in simulated.items()}
-    alone = components(
-        vehicle, measured, ride.soc, ride.ambient, ride.road if isinstance(ride.road, Dynamometer) else None
-    )
+    ambient = recorded.first("ambient_temperature", AMBIENT)
+    roller = ride.road if isinstance(ride.road, Dynamometer) else None
+    alone = components(vehicle, measured, ride.soc, ambient, roller)
     judged = _judge_components(alone)
     splits: dict[str, dict[str, Splits]] = {
         form: {
@@ -238,7 +233,7 @@ def _not_judged(ride: Measured, log: Path, commands: Mapping[str, Command]) -> l
 
 def _ride(ride: Measured, command: Command, progress: Progress) -> Run:
     """The simulated ride; `progress` counts shares of it."""
-    recorded, road, ambient = ride.recorded, ride.road, ride.ambient
+    recorded, road = ride.recorded, ride.road
     here: Place = (0.0, 0.0, 0.0)
     distance = recorded.signals["distance"].tolist()
     rough = recorded.signals["vibration"].tolist() if "vibration" in recorded.signals else None
@@ -254,18 +249,13 @@ def _ride(ride: Measured, command: Command, progress: Progress) -> Run:
             counted = step
         return command(scooter)
 
-    scooter = Scooter(
+    scooter = scooter_at_start(
+        recorded,
         ride.vehicle,
         road if isinstance(road, Dynamometer) else lambda _: here,
         soc=0.5 if ride.soc is None else ride.soc,
-        ambient=ambient,
-        cell_temperature=recorded.first("cell_temperature", ambient),
-        speed=recorded.first("speed", 0.0),
         vibration=(lambda _: rough[step]) if rough else None,
     )
-    motor, inverter = scooter.motor_cooling, scooter.inverter_cooling
-    motor.stator = motor.rotor = recorded.first("motor_temperature", ambient)
-    inverter.board = inverter.box = recorded.first("inverter_temperature", ambient)
     run = drive(scooter, where, recorded.duration)
     progress((len(distance) - counted) / len(distance))
     return run

@@ -21,6 +21,7 @@ from gz_onboard.offline.style import (
     ordinate,
     second,
     stack,
+    time_unit,
 )
 from gz_onboard.simulation.run import Run
 from gz_onboard.simulation.summary import Variant
@@ -50,20 +51,15 @@ def overview(run: Run, title: str) -> Figure:
 
     s = run.series
     figure, axes = _panels(title, (1.7, 1.0, 1.3, 1.0, 1.0, 1.2))
-    x, label = _time(run)
+    x, time = _time(run)
     if not np.isnan(s["wanted_speed"]).all():
         axes[0].plot(x, s["wanted_speed"] * 3.6, color=ORANGE, linewidth=1.0, label="wanted")
     axes[0].plot(x, s["speed"] * 3.6, color=BLUE, linewidth=1.2, label="ridden")
+    unit, _ = time_unit(run.duration)
     for i, short in enumerate(run.shortfalls):
-        begin = short.time / _unit(run)[0]
-        axes[0].axvspan(
-            begin,
-            begin + short.duration / _unit(run)[0],
-            color=RED,
-            alpha=0.15,
-            linewidth=0,
-            label="shortfall" if not i else None,
-        )
+        begin, length = short.time / unit, short.duration / unit
+        label = "shortfall" if not i else None
+        axes[0].axvspan(begin, begin + length, color=RED, alpha=0.15, linewidth=0, label=label)
     ordinate(axes[0], "speed [km/h]")
     axes[1].plot(x, s["throttle"] * 100, color=GREEN, linewidth=0.8, label="throttle")
     axes[1].plot(x, s["brake"] * -100, color=RED, linewidth=0.8, label="brake (down)")
@@ -83,7 +79,7 @@ def overview(run: Run, title: str) -> Figure:
         others[5].plot(x, s["grade"] * 100, color=MUTED, linewidth=0.8, label="grade")
     axes[5].plot(x, s["energy"] / WH, color=BLUE, linewidth=1.4, label="energy from the pack")
     ordinate(axes[5], "energy [Wh]", BLUE)
-    _finish(axes, x, label, others)
+    _finish(axes, x, time, others)
     return figure
 
 
@@ -235,12 +231,8 @@ def _panels(title: str, heights: Sequence[float]) -> tuple[Figure, list[Axes]]:
     return figure, stack(figure, heights, left=0.08, hspace=0.3, top=0.85, bottom=0.55)
 
 
-def _unit(run: Run) -> tuple[float, str]:
-    return (1.0, "s") if run.duration < 300 else (60.0, "min")
-
-
 def _time(run: Run) -> tuple[Any, str]:
-    seconds, unit = _unit(run)
+    seconds, unit = time_unit(run.duration)
     return run.series["time"] / seconds, f"time [{unit}]"
 
 

@@ -22,7 +22,7 @@ from gz_onboard.simulation.frames import Losses, check_output
 from gz_onboard.simulation.output import FORMATS, write, write_trace
 from gz_onboard.simulation.parts.chassis import MODELS, chassis
 from gz_onboard.simulation.plan import Plan, find_plan, noted_payload
-from gz_onboard.simulation.recorded import rest_soc
+from gz_onboard.simulation.recorded import rest_soc, scooter_at_start
 from gz_onboard.simulation.run import Run, drive
 from gz_onboard.simulation.scooter import Dynamometer, Scooter
 from gz_onboard.simulation.sensors import Trace
@@ -137,25 +137,19 @@ def ride(
     vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, progress: Progress | None, trace: Trace | None = None
 ) -> tuple[Run, Scooter]:
     """Ride `plan` with the options of the command line; what these do not say of the start is as it was recorded."""
-    recorded = plan.recorded
-    measured = recorded.first if recorded else lambda _, default: default
-    ambient = measured("ambient_temperature", 20.0) if arguments.ambient is None else arguments.ambient
-    soc = arguments.soc
+    recorded, soc = plan.recorded, arguments.soc
     if soc is None:
         soc = (rest_soc(recorded, vehicle) if recorded else None) or 1.0
-    scooter = Scooter(
+    scooter = scooter_at_start(
+        recorded,
         vehicle,
         plan.road,
+        arguments.ambient,
         soc=soc,
-        ambient=ambient,
-        cell_temperature=measured("cell_temperature", ambient),
-        speed=measured("speed", 0.0),
         heading=plan.heading,
         vibration=plan.vibration,
         chassis=chassis(arguments.chassis, vehicle.parameters),
     )
-    scooter.motor_cooling.stator = scooter.motor_cooling.rotor = measured("motor_temperature", ambient)
-    scooter.inverter_cooling.board = scooter.inverter_cooling.box = measured("inverter_temperature", ambient)
     seconds = _MOST_HOURS * 3600 if arguments.until_empty else plan.seconds * arguments.repeat
     if plan.length is not None:
         seconds = 3 * plan.seconds + 600  # a weak vehicle takes longer
