@@ -44,10 +44,10 @@ class _Parser(argparse.ArgumentParser):
         super().error(message)
 
     def known_options(self) -> list[str]:
-        """The options of this command and of its subcommands."""
+        """The options of this command and of its subcommands, without their old names."""
         options: list[str] = []
         for action in self._actions:
-            options += action.option_strings
+            options += action.option_strings if action.help != argparse.SUPPRESS else []
             if isinstance(action, argparse._SubParsersAction):
                 for parser in action.choices.values():
                     options += parser.known_options()

@@ -26,7 +26,9 @@ def number(
         value = kind(text)
         if not low <= value <= high:
             after = f" {unit}".rstrip()
-            raise InputError(f"{option} {value:g}{after}: must be {low:g} to {high:g}{f' {counted}'.rstrip() or after}")
+            raise InputError(
+                f"{option} {value:.10g}{after}: must be {low:g} to {high:.10g}{f' {counted}'.rstrip() or after}"
+            )
         return value
 
     parse.__name__ = kind.__name__  # what argparse calls it for a text that is no number
@@ -35,7 +37,7 @@ def number(
 
 def _json_file(text: str) -> str:
     """InputError for the name of a log, as in ``validate --json ride.blf``."""
-    if text.removesuffix(".gz").endswith(tuple(suffix for suffix in LOG_SUFFIXES if suffix != ".csv")):
+    if text.lower().removesuffix(".gz").endswith(tuple(suffix for suffix in LOG_SUFFIXES if suffix != ".csv")):
         raise InputError(f"--json {text}: that is the name of a log; write --json=- or put --json last")
     return text
 
