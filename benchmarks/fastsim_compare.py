@@ -21,7 +21,7 @@ import numpy as np
 
 from gz_onboard.physics.derating import Curve
 from gz_onboard.physics.model import Model
-from gz_onboard.simulation.backward import backward
+from gz_onboard.simulation.backward import Conditions, backward
 from gz_onboard.simulation.cycles import cycle
 from gz_onboard.simulation.run import at_steps, drive, follow
 from gz_onboard.simulation.scooter import Scooter
@@ -258,10 +258,8 @@ def main() -> None:
             electric,
             [0.1 * i for i in range(len(fine))],
             fine,
-            ambient=AMBIENT,
-            altitude=ALTITUDE,
+            Conditions(ambient=AMBIENT, altitude=ALTITUDE, motor_temperature=30.0),
             smoothing=0.0,
-            motor_temperature=30.0,
         )
         shares, efficiency = mean_efficiency(vehicle)
         pack = 1 - (ours["cells"] - ours["terminals"]) / ours["cells"]

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from gz_onboard.offline.style import save
 from gz_onboard.simulation.figures import comparison
 from gz_onboard.simulation.plan import find_plan
 from gz_onboard.simulation.run import follow
 from gz_onboard.simulation.simulate import add_arguments, ride
-from gz_onboard.simulation.style import save
 from gz_onboard.simulation.summary import compare, measured_columns
 from gz_onboard.vehicle import read_vehicle
 
@@ -69,8 +69,8 @@ def both(log: Path, payload: float, chassis: str, figures: Path | None) -> dict[
         found[form] = {
             "energy_pct": 100 * (run.energy / energy - 1),
             "consumption_pct": 100 * (per_metre - 1),
-            "speed_km_h": errors["rms_speed_km_h"],
-            "voltage_v": errors["rms_pack_voltage_v"],
+            "speed_km_h": errors.rms_speed_km_h,
+            "voltage_v": errors.rms_pack_voltage_v,
             "current_pct": share("pack_current"),
             "torque_pct": share("motor_torque"),
             "motor_k": float((run.series["motor_temperature"] - measured["motor_temperature"])[-1]),

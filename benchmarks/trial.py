@@ -33,7 +33,7 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.lab.discover.engine import baseline, discover
-from gz_onboard.simulation.samples import Samples
+from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import read_vehicle
 from tests import plant
 from tests.plant.cases import CASES_OF_A_SCOOTER, CHANNEL_CLEAR, EFFECTS, ENERGY_CLEAR

@@ -22,21 +22,9 @@ from gz_onboard.lab.discover.engine import discover
 from gz_onboard.lab.discover.files import write_model
 from gz_onboard.lab.discover.parts import Over, before_and_after, binned, edges, gathered
 from gz_onboard.lab.discover.result import METRICS, Report
+from gz_onboard.offline.samples import read_samples
+from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, legend, new_figure, ordinate, rule, save
 from gz_onboard.simulation.recorded import read_recorded
-from gz_onboard.simulation.samples import read_samples
-from gz_onboard.simulation.style import (
-    BLUE,
-    GREEN,
-    INK,
-    MUTED,
-    ORANGE,
-    headline,
-    legend,
-    new_figure,
-    ordinate,
-    rule,
-    save,
-)
 from gz_onboard.vehicle import find_vehicle, read_vehicle
 
 RIDES = Path(__file__).parents[1] / "replay_logs"

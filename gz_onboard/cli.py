@@ -12,22 +12,22 @@ from contextlib import suppress
 from typing import NoReturn
 
 from gz_onboard import __version__
-from gz_onboard.errors import BAD_INPUT, FAILED, INTERRUPTED, InputError, nearest
+from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, InputError, nearest
 
 COMMANDS = {
     "run": ("gz_onboard.daemon", "estimate the range from a live bus and publish it (the daemon)"),
-    "dashboard": ("gz_onboard.dashboard.terminal", "show the range from the frames that the daemon sends"),
-    "replay": ("gz_onboard.bus.replay", "put a recorded log onto a bus, in its own timing"),
-    "estimate": ("gz_onboard.lab.estimate", "estimate recorded rides without a bus, as fast as it goes"),
-    "simulate": ("gz_onboard.simulation.simulate", "ride a drive cycle, a route or a recorded ride by simulation"),
-    "validate": ("gz_onboard.lab.validate", "hold recorded rides against their simulation, by a gate of 20 %"),
-    "calibrate": ("gz_onboard.lab.calibrate.command", "find a vehicle's parameters from measurements"),
+    "dashboard": ("gz_onboard.dashboard.terminal", "show the range that the daemon sends, in a terminal"),
+    "replay": ("gz_onboard.bus.replay", "send a recorded log onto a bus, in its own timing"),
+    "estimate": ("gz_onboard.lab.estimate", "estimate the range on recorded rides, without a bus, as fast as possible"),
+    "simulate": ("gz_onboard.simulation.simulate", "simulate a drive cycle, a route or a recorded ride"),
+    "validate": ("gz_onboard.lab.validate", "compare recorded rides with their simulation; the gate is 20 %"),
+    "calibrate": ("gz_onboard.lab.calibrate.command", "determine a vehicle's parameters from measurements"),
     "discover": (
         "gz_onboard.lab.discover.command",
-        "find what the model gets wrong on rides, name the cause, extend it",
+        "find what the model gets wrong on rides, name the cause, extend the model",
     ),
-    "export": ("gz_onboard.bus.export", "turn a log into candump, BLF, ASC, Parquet, CSV, ..."),
-    "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride"),
+    "export": ("gz_onboard.bus.export", "convert a log to candump, BLF, ASC, Parquet, CSV, ..."),
+    "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride as PNG"),
 }
 
 
@@ -44,10 +44,10 @@ class _Parser(argparse.ArgumentParser):
         super().error(message)
 
     def known_options(self) -> list[str]:
-        """The options of this command and of its subcommands."""
+        """The options of this command and of its subcommands, without their old names."""
         options: list[str] = []
         for action in self._actions:
-            options += action.option_strings
+            options += action.option_strings if action.help != argparse.SUPPRESS else []
             if isinstance(action, argparse._SubParsersAction):
                 for parser in action.choices.values():
                     options += parser.known_options()
@@ -56,7 +56,13 @@ class _Parser(argparse.ArgumentParser):
 
 def command_line(called: Collection[str]) -> argparse.ArgumentParser:
     """The command line with the arguments of the commands `called`; the others' would only cost their import."""
-    parser = _Parser(prog="gz-onboard", description="The range a scooter's rider can trust.")
+    statuses = "\n".join(f"  {status:<4} {text}" for status, text in EXIT_STATUSES.items())
+    parser = _Parser(
+        prog="gz-onboard",
+        description="Range of an electric scooter, estimated from its CAN bus.",
+        epilog=f"exit status:\n{statuses}",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
     parser.add_argument("--version", action="version", version=f"gz-onboard {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
     for name, (module, text) in COMMANDS.items():
@@ -70,7 +76,7 @@ def command_line(called: Collection[str]) -> argparse.ArgumentParser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv`; gives the exit status: 0, or one of those in `errors`."""
-    # Our matrices are small, and what is large runs in processes of its own: threads would stand in each other's way.
+    # Our matrices are small, and large work runs in processes of its own: threads would only get in each other's way.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     argv = list(sys.argv[1:] if argv is None else argv)
     called = next((word for word in argv if not word.startswith("-")), "")

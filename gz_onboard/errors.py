@@ -1,17 +1,20 @@
-"""The one error that a user's input can cause, and the help that goes with it."""
+"""The one error that a user's input can cause, the help that goes with it, and the exit statuses."""
 
 from __future__ import annotations
 
 import difflib
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
-FAILED = 1
-"""Exit status: the command was right and the answer is no (``validate --gate``, ``dashboard --once``), or the system
-failed it: a full disk, a reader that went away."""
-BAD_INPUT = 2
-"""Exit status: the command line, a file or a parameter cannot be used; of several logs, one is enough."""
-INTERRUPTED = 130
+OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+EXIT_STATUSES = {
+    OK: "done",
+    FAILED: "the answer is no (validate --gate, dashboard --once), or the system failed: a full disk, a closed pipe",
+    BAD_INPUT: "the command line, a file or a parameter cannot be used, or one of several logs cannot",
+    INTERRUPTED: "interrupted by Ctrl-C",
+}
+"""What the exit status of a command means."""
 LONGEST_NAME = 100  # beyond it no near name is looked for, which takes the square of the length
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict = 3, 8, 4
@@ -43,3 +46,12 @@ def shown(value: object) -> str:
         return _SHORT.repr(value)
     except ValueError:  # Python does not write out an integer of thousands of digits
         return "a number of thousands of digits"
+
+
+@contextmanager
+def writing(place: object) -> Iterator[None]:
+    """InputError for what the operating system refuses within, naming the file, or else `place`."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(f"{error.filename or place}: cannot be written: {error.strerror or error}") from error

@@ -14,12 +14,14 @@ PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 
 # The parts of the package, lowest first. A part imports itself and those in the lines above its own.
 LAYERS = [
-    ["__init__", "background", "constants", "errors", "events", "notify", "state"],
+    ["__init__", "background", "constants", "errors", "events", "notify", "progress", "state"],
+    ["options"],
     ["toml"],
     ["bus", "physics"],
     ["vehicle"],
     ["estimator"],
     ["pipeline"],
+    ["offline"],
     ["simulation"],
     ["lab", "dashboard"],
     ["daemon"],
@@ -33,9 +35,10 @@ FORBIDDEN = {
     ("estimator", "bus"): "events are all that the estimator sees of a bus",
     ("daemon", "lab"): "the daemon carries no offline tools",
     ("daemon", "simulation"): "the daemon carries no offline tools",
+    ("daemon", "offline"): "the daemon carries no offline tools",
 }
 
-OFFLINE = ("simulation", "lab")
+OFFLINE = ("offline", "simulation", "lab")
 HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow"}
 # Imported only when asked for: the reference filter behind --filter filterpy.
 ON_REQUEST = {"estimator/ekf_filterpy.py"}

@@ -41,6 +41,7 @@ from gz_onboard.bus.replay import log_section
 from gz_onboard.bus.writers import write_blf, write_candump
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import EFF_FLAG, Frame
+from gz_onboard.options import add_shared
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
@@ -372,23 +373,19 @@ def _estimate_columns(log: Path) -> dict[str, str]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``gz-onboard export``."""
-    parser.add_argument("log", type=Path, help="log: .mcap .blf .log .asc .trc .csv .mf4, each also with .gz")
-    parser.add_argument(
-        "out",
-        type=Path,
-        help="frames: .log .blf .asc .trc .csv .mf4; signals: .parquet (one long table), .mcap (for Foxglove), or the"
-        " name of a directory (one table for each message)",
+    add_shared(parser, "log")
+    out = (
+        "frames: .log .blf .asc .trc .csv .mf4; signals: .parquet (one long table), .mcap (for Foxglove), or a name "
+        "without suffix (a folder with one table per message)"
     )
-    parser.add_argument("--estimates", action="store_true", help="write what was estimated, a row for each time")
-    parser.add_argument("--signals", action="store_true", help="write signals into .csv, where it could be frames")
-    parser.add_argument(
-        "--table-format", choices=["parquet", "csv"], default="parquet", help="of the tables in a directory"
-    )
-    parser.add_argument(
-        "--dbc", type=Path, nargs="+", metavar="FILE", help="to decode by; default: what is attached to the log"
-    )
-    parser.add_argument("--from", dest="start", type=float, default=0.0, metavar="S", help="seconds into the log")
-    parser.add_argument("--to", dest="end", type=float, metavar="S", help="seconds into the log")
+    parser.add_argument("out", type=Path, metavar="OUT", help=out)
+    parser.add_argument("--estimates", action="store_true", help="write the estimates, one row each")
+    parser.add_argument("--signals", action="store_true", help="write signals, not frames, to .csv")
+    tables = "format of the tables in a folder (default: %(default)s)"
+    parser.add_argument("--table-format", choices=["parquet", "csv"], default="parquet", help=tables)
+    dbc = "DBC files to decode the signals (default: those attached to the log)"
+    parser.add_argument("--dbc", type=Path, nargs="+", metavar="FILE", help=dbc)
+    add_shared(parser, "--from", "--to")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -18,8 +18,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.logs import LogDamage, log_suffix, read_frames
-from gz_onboard.errors import INTERRUPTED, InputError, nearest
+from gz_onboard.errors import INTERRUPTED, OK, InputError, nearest
 from gz_onboard.events import ERR_FLAG, TRANSMITTED, Frame
+from gz_onboard.options import add_shared
+from gz_onboard.progress import progress_bar
 
 if TYPE_CHECKING:
     import can
@@ -69,7 +71,7 @@ def replay(
     summary: Summary | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Summary:
-    """Send the frames at the times at which they stand in the log, `speed` times as fast; 0: without waiting.
+    """Send the frames at the times they have in the log, `speed` times as fast; 0: without waiting.
 
     progress is called about twice a second with the seconds of log sent. A `summary` that is given is added to,
     and is up to date when KeyboardInterrupt ends the replay.
@@ -156,56 +158,59 @@ def bus_sender(bus: can.BusABC) -> Send:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``gz-onboard replay``."""
-    parser.add_argument("file", type=Path, help="log: .mcap .blf .log .asc .trc .csv .mf4, each also with .gz")
-    parser.add_argument("--interface", default="socketcan", help="python-can's interface (default: %(default)s)")
-    parser.add_argument(
-        "--channel",
-        default="vcan0",
-        help="where to send (default: %(default)s, so that no recording gets onto a vehicle unasked); several by "
-        "commas: the log's channels 0, 1, ... in this order",
+    add_shared(parser, "log")
+    parser.add_argument("--interface", default="socketcan", help="interface of python-can (default: %(default)s)")
+    channel = (
+        "where to send (default: %(default)s, so that no recording reaches a vehicle unasked); several by commas: the "
+        "log's channels 0, 1, ... in this order"
     )
-    parser.add_argument("--speed", type=float, default=1.0, help="times as fast; 0: as fast as possible")
-    parser.add_argument("--loop", action="store_true", help="begin again at the end, until interrupted")
-    parser.add_argument("--from", dest="start", type=float, default=0.0, metavar="S", help="seconds into the log")
-    parser.add_argument("--to", dest="end", type=float, metavar="S", help="seconds into the log")
+    parser.add_argument("--channel", default="vcan0", help=channel)
     parser.add_argument(
-        "--all", action="store_true", help="of our own logs also the frames that were sent, not received, back then"
+        "--speed", type=float, default=1.0, help="speed as a factor (default: %(default)g); 0: as fast as possible"
     )
+    parser.add_argument("--loop", action="store_true", help="start again at the end, until interrupted")
+    add_shared(parser, "--from", "--to")
+    everything = "of our own logs also send the frames that were sent, not received, back then"
+    parser.add_argument("--all", action="store_true", help=everything)
+    add_shared(parser, "--quiet")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run ``gz-onboard replay``: 0, or 130 when interrupted. Raises InputError for what cannot be used."""
     if args.speed and not SLOWEST <= args.speed < float("inf"):
         raise InputError(f"--speed {args.speed:g}: must be 0 (as fast as possible) or a factor of {SLOWEST:g} or more")
-    start_ns, end_ns = log_section(args.file, args.start, args.end)
-    received_only = log_suffix(args.file) == ".mcap" and not args.all
+    start_ns, end_ns = log_section(args.log, args.start, args.end)
+    received_only = log_suffix(args.log) == ".mcap" and not args.all
     names = [name for name in args.channel.split(",") if name]
     buses = _open_buses(args.interface, names)
     summary = Summary()
     damages: list[LogDamage] = []
-    code = 0
+    status = OK
     try:
         senders = [_sender(bus) for bus in buses]
         send = senders[0] if len(senders) == 1 else _by_channel(senders)
-        while True:
-            batches = read_frames(args.file, start_ns, end_ns, damages.append)
-            replay(_sendable(batches, received_only, len(senders), summary), send, args.speed, summary, _progress())
-            if not summary.sent and not summary.failed:
-                raise InputError(f"{args.file}: no frames to send in the chosen part")
-            if not args.loop:
-                break
-            time.sleep(_LOOP_GAP_NS * 1e-9)
+        with progress_bar(lambda: None, quiet=args.quiet) as display:
+
+            def show(seconds: float) -> None:
+                display.step(f"{int(seconds) // 60}:{seconds % 60:04.1f} of the log sent")
+
+            while True:
+                batches = read_frames(args.log, start_ns, end_ns, damages.append)
+                replay(_sendable(batches, received_only, len(senders), summary), send, args.speed, summary, show)
+                if not summary.sent and not summary.failed:
+                    raise InputError(f"{args.log}: no frames to send in the chosen part")
+                if not args.loop:
+                    break
+                time.sleep(_LOOP_GAP_NS * 1e-9)
     except KeyboardInterrupt:
-        code = INTERRUPTED
+        status = INTERRUPTED
     finally:
         for bus in buses:
             bus.shutdown()
-    if sys.stderr.isatty():
-        print("\r\x1b[K", end="", file=sys.stderr)
     for damage in damages[:1]:
         print(damage, file=sys.stderr)
-    print(f"replayed {args.file}: {summary}")
-    return code
+    print(f"replayed {args.log}: {summary}")
+    return status
 
 
 def log_section(path: Path, start_s: float, end_s: float | None) -> tuple[int | None, int | None]:
@@ -276,13 +281,3 @@ def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
     if not buses:
         raise InputError("--channel: no channel is named")
     return buses
-
-
-def _progress() -> Callable[[float], None] | None:
-    if not sys.stderr.isatty():
-        return None
-
-    def show(seconds: float) -> None:
-        print(f"\r\x1b[K{int(seconds) // 60}:{seconds % 60:04.1f} of the log sent", end="", file=sys.stderr, flush=True)
-
-    return show

@@ -6,16 +6,15 @@ import argparse
 from collections import deque
 from collections.abc import Sequence
 from datetime import UTC, datetime
-from math import isfinite
+from math import degrees, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.logs import read_metadata, read_samples
 from gz_onboard.bus.publisher import WH_PER_KM
-from gz_onboard.errors import InputError
+from gz_onboard.errors import OK, InputError, writing
 from gz_onboard.events import Reason, State
-from gz_onboard.pipeline import ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
-from gz_onboard.simulation.style import (
+from gz_onboard.offline.style import (
     BLUE,
     GREEN,
     MUTED,
@@ -29,13 +28,17 @@ from gz_onboard.simulation.style import (
     save,
     second,
     stack,
+    time_unit,
 )
+from gz_onboard.options import add_shared
+from gz_onboard.pipeline import ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Row = dict[str, Any]
+Logged = dict[str, Any]
+"""The values of one sample in a log, as its JSON has them."""
 
 NAIVE_LENGTH = 25_000.0  # m: what usual displays average the consumption over
 NAIVE_FROM = 1_000.0  # m
@@ -43,14 +46,14 @@ _STATES = {State.STARTING: "#9fb3c8", State.VALID: "#3f9d6b", State.DEGRADED: "#
 _NAN = float("nan")
 
 
-def read_ride(log: Path) -> tuple[list[Row], list[int], Row]:
+def read_ride(log: Path) -> tuple[list[Logged], list[int], Logged]:
     """(estimates, their times [ns], the last status) of one of our logs, whole or cut off.
 
     Raises InputError if the log holds no estimates.
     """
-    rows: list[Row] = []
+    rows: list[Logged] = []
     times: list[int] = []
-    status: Row = {}
+    status: Logged = {}
     for topic, time_ns, values in read_samples(log):
         if topic == ESTIMATE_TOPIC:
             if _is_estimate(values):
@@ -65,7 +68,7 @@ def read_ride(log: Path) -> tuple[list[Row], list[int], Row]:
     return rows, times, status
 
 
-def _is_estimate(values: Row) -> bool:
+def _is_estimate(values: Logged) -> bool:
     """Whether it is a row as we write them: others may write to a topic of this name, too."""
     if values.get("state") not in State.__members__ or not isinstance(values.get("reasons"), str):
         return False
@@ -78,7 +81,7 @@ def _is_estimate(values: Row) -> bool:
     return _is_number(numbers["time"]) and _is_number(numbers["distance"])
 
 
-def _is_status(values: Row) -> bool:
+def _is_status(values: Logged) -> bool:
     faults, lost, unknown = (values.get(name, {}) for name in ("faults", "lost", "unknown"))
     if not all(isinstance(counts, dict) for counts in (faults, lost, unknown)):
         return False
@@ -92,7 +95,7 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and isfinite(value) and abs(value) < 1e15
 
 
-def naive_range(rows: Sequence[Row]) -> list[float | None]:
+def naive_range(rows: Sequence[Logged]) -> list[float | None]:
     """What a usual display would show [m]: energy left over the consumption of the last 25 km, from the first on.
 
     Source of the rule: OVMS' vehicle modules; the energy left is taken from the estimate.
@@ -110,9 +113,9 @@ def naive_range(rows: Sequence[Row]) -> list[float | None]:
             ridden.append((distance, drawn))
         while len(ridden) > 1 and distance - ridden[1][0] >= NAIVE_LENGTH:
             ridden.popleft()
-        way, energy = distance - ridden[0][0], drawn - ridden[0][1]
+        length, energy = distance - ridden[0][0], drawn - ridden[0][1]
         left = row.get("energy_left")
-        result.append(left * way / energy if left is not None and way >= NAIVE_FROM and energy > 0 else None)
+        result.append(left * length / energy if left is not None and length >= NAIVE_FROM and energy > 0 else None)
     return result
 
 
@@ -123,7 +126,9 @@ def plot_log(log: Path, picture: Path, over: str = "time") -> None:
     save(figure, picture)
 
 
-def draw(rows: Sequence[Row], times: Sequence[int], status: Row, title: tuple[str, str], over: str = "time") -> Figure:
+def draw(
+    rows: Sequence[Logged], times: Sequence[int], status: Logged, title: tuple[str, str], over: str = "time"
+) -> Figure:
     """The overview of a ride as a figure, over ``time`` or ``distance``."""
     reasons = [reason for reason in Reason if any(str(reason.name) in row["reasons"].split() for row in rows)]
     strip = 0.34 + 0.17 * len(reasons)
@@ -141,7 +146,7 @@ def draw(rows: Sequence[Row], times: Sequence[int], status: Row, title: tuple[st
     return figure
 
 
-def _title(log: Path, rows: Sequence[Row], times: Sequence[int]) -> tuple[str, str]:
+def _title(log: Path, rows: Sequence[Logged], times: Sequence[int]) -> tuple[str, str]:
     metadata = read_metadata(log)
     last = rows[-1]
     start = datetime.fromtimestamp(times[0] / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
@@ -156,16 +161,16 @@ def _title(log: Path, rows: Sequence[Row], times: Sequence[int]) -> tuple[str, s
     return " · ".join(filter(None, (metadata.get("source", log.name), metadata.get("vehicle")))), "  ·  ".join(parts)
 
 
-def _abscissa(rows: Sequence[Row], times: Sequence[int], over: str) -> tuple[list[float], str]:
+def _abscissa(rows: Sequence[Logged], times: Sequence[int], over: str) -> tuple[list[float], str]:
     if over == "distance":
         return [row["distance"] / 1000 for row in rows], "distance [km]"
     # The time within the estimates goes on evenly when the clock is set; that of the log does not.
     start, end = rows[0]["time"], rows[-1]["time"]
-    seconds, unit = (1, "s") if end - start < 300 else (60, "min")
+    seconds, unit = time_unit(end - start)
     return [(row["time"] - start) / seconds for row in rows], f"time [{unit}]"
 
 
-def _column(rows: Sequence[Row], name: str, factor: float = 1.0) -> list[float]:
+def _column(rows: Sequence[Logged], name: str, factor: float = 1.0) -> list[float]:
     """A field of the estimates; what is not known leaves a gap in the line."""
     return [_NAN if (value := row.get(name)) is None else value * factor for row in rows]
 
@@ -180,7 +185,7 @@ def _finite(*columns: Sequence[float]) -> list[float]:
     return [value for column in columns for value in column if isfinite(value)]
 
 
-def _range(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
+def _range(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
     p10, p90 = _column(rows, "range_p10", 1e-3), _column(rows, "range_p90", 1e-3)
     naive = [_NAN if value is None else value / 1000 for value in naive_range(rows)]
     axis.fill_between(x, p10, p90, color=BLUE, alpha=0.18, linewidth=0, label="P10 to P90")
@@ -192,7 +197,7 @@ def _range(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
     legend(axis)
 
 
-def _soc(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
+def _soc(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
     soc = _column(rows, "soc", 100)
     _band(axis, x, soc, _column(rows, "soc_sd", 100), GREEN, "± σ")
     axis.plot(x, soc, color=GREEN, linewidth=1.6, label="state of charge")
@@ -200,7 +205,7 @@ def _soc(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
     legend(axis)
 
 
-def _electric(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
+def _electric(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
     other = second(axis, "current [A]", ORANGE)
     other.plot(x, _column(rows, "pack_current"), color=ORANGE, linewidth=0.7, alpha=0.8, label="pack current")
     axis.plot(x, _column(rows, "pack_voltage"), color=PURPLE, linewidth=1.0, label="pack voltage")
@@ -208,7 +213,7 @@ def _electric(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
     legend(axis, other)
 
 
-def _innovation(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
+def _innovation(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
     rms = _column(rows, "innovation_rms", 1000)
     axis.fill_between(x, [-v for v in rms], rms, color=PURPLE, alpha=0.2, linewidth=0, label="± RMS of 10 s")
     axis.plot(x, _column(rows, "innovation", 1000), color=PURPLE, linewidth=0.8, label="innovation")
@@ -217,9 +222,9 @@ def _innovation(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
     legend(axis)
 
 
-def _motion(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
+def _motion(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
     other = second(axis, "grade [%], lean [°]", MUTED)
-    other.plot(x, _column(rows, "lean", 57.29578), color=ORANGE, linewidth=0.6, alpha=0.75, label="lean")
+    other.plot(x, _column(rows, "lean", degrees(1.0)), color=ORANGE, linewidth=0.6, alpha=0.75, label="lean")
     other.plot(x, _column(rows, "grade", 100), color=GREEN, linewidth=1.0, label="grade")
     other.axhline(0, color=MUTED, linewidth=0.6, zorder=1)
     axis.plot(x, _column(rows, "speed", 3.6), color=BLUE, linewidth=1.1, label="speed")
@@ -227,7 +232,7 @@ def _motion(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
     legend(axis, other)
 
 
-def _consumption(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
+def _consumption(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
     expected = _column(rows, "consumption_expected", 1 / WH_PER_KM)
     _band(axis, x, expected, _column(rows, "consumption_expected_sd", 1 / WH_PER_KM), BLUE, "± σ")
     axis.plot(x, expected, color=BLUE, linewidth=1.6, label="expected")
@@ -237,7 +242,7 @@ def _consumption(axis: Axes, x: Sequence[float], rows: Sequence[Row]) -> None:
     legend(axis)
 
 
-def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Row], reasons: Sequence[Reason], status: Row) -> None:
+def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Logged], reasons: Sequence[Reason], status: Logged) -> None:
     """State and reasons over the ride, one line each."""
     axis.grid(visible=False)
     for state, colour in _STATES.items():
@@ -294,9 +299,11 @@ def _spans(x: Sequence[float], true: Sequence[bool]) -> list[tuple[float, float]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard plot``."""
-    parser.add_argument("log", type=Path, metavar="LOG.mcap", help="log of the daemon or of gz-onboard estimate")
-    parser.add_argument("picture", type=Path, nargs="?", metavar="OUT.png", help="the picture (LOG.png)")
-    parser.add_argument("--over", choices=("time", "distance"), default="time", help="abscissa (%(default)s)")
+    add_shared(parser, "log", help="MCAP log of gz-onboard run or gz-onboard estimate")
+    parser.add_argument(
+        "picture", type=Path, nargs="?", metavar="PNG", help="file to write (default: the name of the log, with .png)"
+    )
+    parser.add_argument("--over", choices=("time", "distance"), default="time", help="abscissa (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -304,9 +311,7 @@ def run(arguments: argparse.Namespace) -> int:
     picture = arguments.picture or arguments.log.with_suffix(".png")
     if picture.suffix.lower() != ".png":
         raise InputError(f"{picture}: the picture's name has to end in .png")
-    try:
+    with writing(picture):
         plot_log(arguments.log, picture, arguments.over)
-    except OSError as error:
-        raise InputError(f"{picture}: cannot be written: {error.strerror or error}") from error
     print(picture)
-    return 0
+    return OK

@@ -1,4 +1,4 @@
-"""Each component alone, fed with what was measured at its inputs: where a wrong whole comes from.
+"""Each component by itself, with what was measured at its inputs: it shows which part makes the whole wrong.
 
     battery voltage     from measured current and cell temperature
     inverter DC power   from measured motor current (torque), motor speed and motor temperature
@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.lab.validate_score import Channel
+from gz_onboard.lab.validate_score import CHANNELS, Quantity
 from gz_onboard.physics.battery import discharged, heat, terminal_voltage
 from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.physics.effect import MOVING, QUANTITIES, ROAD_LOAD, Port
@@ -34,7 +34,7 @@ from gz_onboard.vehicle import Vehicle
 class Component:
     """Measured and modelled, per second, shape (n,); `valid` where they can be compared."""
 
-    channel: Channel
+    quantity: Quantity
     measured: Array
     modelled: Array
     valid: Mask
@@ -51,7 +51,7 @@ def components(
     every = np.ones(len(measured["speed"]), dtype=bool)
     if has >= {"pack_current", "pack_voltage", "cell_temperature"} and soc is not None:
         voltage = battery_voltage(vehicle, measured, soc)
-        found["battery_voltage"] = Component(Channel("V", "battery voltage"), measured["pack_voltage"], voltage, every)
+        found["battery_voltage"] = Component(CHANNELS["pack_voltage"], measured["pack_voltage"], voltage, every)
     if has >= {"motor_current", "motor_speed"}:
         current, speed = measured["motor_current"], measured["motor_speed"]
         motor_temperature = measured.get("motor_temperature", np.full(len(speed), ambient))
@@ -60,23 +60,23 @@ def components(
         if has >= {"inverter_voltage", "inverter_current"}:
             power = measured["inverter_voltage"] * measured["inverter_current"]
             modelled = constant * current * speed + copper + inverter
-            found["inverter_power"] = Component(Channel("W", "inverter DC power"), power, modelled, every)
+            found["inverter_power"] = Component(Quantity("W", "inverter DC power"), power, modelled, every)
         if "motor_torque" in has:
             found["motor_torque"] = Component(
-                Channel("N·m", "motor torque"), measured["motor_torque"], constant * current, every
+                CHANNELS["motor_torque"], measured["motor_torque"], constant * current, every
             )
         moving = (measured["speed"] > 2.0) & (measured.get("braking", np.zeros(len(speed))) <= 0)
         if "acceleration" in has and ("grade" in has or roller):
             radius = vehicle.parameters["wheel_radius"] * vehicle.parameters["gear_ratio"]
             force = (constant * current - drag_torque(idle, speed)) / radius
             needed = road_load(vehicle, measured, ambient, roller)
-            found["road_load"] = Component(Channel("N", "road load"), force, needed, moving)
+            found["road_load"] = Component(Quantity("N", "road load"), force, needed, moving)
         found |= _temperatures(vehicle, measured, soc, ambient, copper + idle, inverter, every)
     return found
 
 
 def vibration(vehicle: Vehicle, measured: Mapping[str, Array]) -> Array:
-    """[m/s²] per second; where the ride does not tell it, while moving what the vehicle's file expects."""
+    """[m/s²] per second; where it was not measured, the vehicle file's value while moving."""
     typical = np.where(measured["speed"] > MOVING, vehicle.riding.vibration, 0.0)
     return measured.get("vibration", typical)
 
@@ -173,24 +173,24 @@ def _temperatures(
     p, battery = vehicle.parameters, vehicle.battery
     found: dict[str, Component] = {}
 
-    def add(sensor: str, name: str, network: Network, heat: Array) -> None:
+    def add(sensor: str, network: Network, heat: Array) -> None:
         flow = repeat(p["cooling_factor"], len(heat))
         modelled = np.array(temperatures(network, 1.0, heat.tolist(), air.tolist(), flow))
-        found[sensor] = Component(Channel("degC", name, True), measured[sensor], modelled, every)
+        found[sensor] = Component(CHANNELS[sensor], measured[sensor], modelled, every)
 
     def start(sensor: str) -> float:
         return float(measured[sensor][0])
 
     if "motor_temperature" in measured:
-        add("motor_temperature", "motor temperature", MotorCooling.of(p, start("motor_temperature")), motor_heat)
+        add("motor_temperature", MotorCooling.of(p, start("motor_temperature")), motor_heat)
     if "inverter_temperature" in measured:
         network = InverterCooling.of(p, start("inverter_temperature"))
-        add("inverter_temperature", "inverter temperature", network, inverter_heat)
+        add("inverter_temperature", network, inverter_heat)
     if battery and measured.keys() >= {"cell_temperature", "pack_current", "pack_voltage"} and soc is not None:
         cells, current = measured["cell_temperature"], measured["pack_current"]
         levels = soc - np.cumsum(discharged(current, 1.0, battery.pack_capacity(start("cell_temperature"))))
         rest = battery.ocv_over(levels, cells) * battery.cells_series
         generated = heat(rest, measured["pack_voltage"], current)
         pack = LumpedCooling.of(p, "pack", start("cell_temperature"))
-        add("cell_temperature", "cell temperature", pack, generated)
+        add("cell_temperature", pack, generated)
     return found

@@ -7,16 +7,16 @@ Definitions, the same for every channel. Both signals are first averaged over wh
     percent        mean absolute error over mean absolute measured. A mean of relative errors would be without meaning
                    where a current or a torque passes through zero, and a share of the greatest value would flatter
     of_spread      rms error over the standard deviation of the measured: for a voltage, whose percent is small by
-                   nature, this is the figure that tells. 1 is no better than its mean
+                   nature, this is the figure to look at. 1 is no better than its mean
     of a temperature percent is the mean absolute error over the rise, max less min measured, at least 10 K
     energy         the integral of the error over the integral of the measured
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated
 
 import numpy as np
 
@@ -24,12 +24,12 @@ from gz_onboard.arrays import Array, Mask
 
 GATE, COMPONENT_GATE = 20.0, 10.0  # percent: Lord 2016, ch. 3
 LEAST_RISE = 10.0  # K
-LEAST_SECONDS = 20  # of a condition; fewer tell nothing
+LEAST_SECONDS = 20  # of a condition; fewer mean nothing
 
 
 @dataclass(frozen=True)
-class Channel:
-    """A measured signal: its unit, what people call it."""
+class Quantity:
+    """What is compared: its unit and name."""
 
     unit: str
     label: str
@@ -37,34 +37,129 @@ class Channel:
 
 
 CHANNELS = {
-    "pack_current": Channel("A", "battery current"),
-    "pack_voltage": Channel("V", "battery voltage"),
-    "motor_torque": Channel("N·m", "motor torque"),
-    "motor_speed": Channel("rad/s", "motor speed"),
-    "motor_temperature": Channel("degC", "motor temperature", True),
-    "inverter_temperature": Channel("degC", "inverter temperature", True),
-    "cell_temperature": Channel("degC", "cell temperature", True),
+    "pack_current": Quantity("A", "battery current"),
+    "pack_voltage": Quantity("V", "battery voltage"),
+    "motor_torque": Quantity("N·m", "motor torque"),
+    "motor_speed": Quantity("rad/s", "motor speed"),
+    "motor_temperature": Quantity("degC", "motor temperature", True),
+    "inverter_temperature": Quantity("degC", "inverter temperature", True),
+    "cell_temperature": Quantity("degC", "cell temperature", True),
 }
 """The thesis' gate is on the first four; temperatures are judged by the same percentage."""
 
 
-def errors(measured: Array, simulated: Array, channel: Channel, limit: float) -> dict[str, Any]:
-    """The entry of a channel in the JSON: see the module's text. Arrays of shape (n,), n > 0."""
+@dataclass(frozen=True)
+class Errors:
+    """How far a simulated quantity is from the measured one: see the module's text."""
+
+    unit: str
+    rms: float
+    max: float
+    mean_error: float
+    percent: float | None
+    of_spread: float | None
+    limit_percent: float
+    passed: bool
+
+
+def errors(measured: Array, simulated: Array, quantity: Quantity, limit: float) -> Errors:
+    """Compare two arrays of shape (n,), n > 0; limit: in percent."""
     error = simulated - measured
-    mae = float(np.abs(error).mean())
-    base = float(max(np.ptp(measured), LEAST_RISE)) if channel.temperature else float(np.abs(measured).mean())
+    mae, rms = float(np.abs(error).mean()), float(np.sqrt(np.mean(error**2)))
+    base = float(max(np.ptp(measured), LEAST_RISE)) if quantity.temperature else float(np.abs(measured).mean())
     percent = 100 * mae / base if base > 0 else None
     spread = float(measured.std())
-    return {
-        "unit": "K" if channel.temperature else channel.unit,
-        "rms": float(np.sqrt(np.mean(error**2))),
-        "max": float(np.abs(error).max()),
-        "mean_error": float(error.mean()),
-        "percent": percent,
-        "of_spread": float(np.sqrt(np.mean(error**2))) / spread if spread > 0 else None,
-        "limit_percent": limit,
-        "passed": percent is not None and percent <= limit,
-    }
+    return Errors(
+        unit="K" if quantity.temperature else quantity.unit,
+        rms=rms,
+        max=float(np.abs(error).max()),
+        mean_error=float(error.mean()),
+        percent=percent,
+        of_spread=rms / spread if spread > 0 else None,
+        limit_percent=limit,
+        passed=percent is not None and percent <= limit,
+    )
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Whether a simulation, or the components, are within the limits."""
+
+    channels: Annotated[
+        dict[str, Errors], "by name: unit, rms, max, mean_error, percent, of_spread, limit_percent, passed"
+    ]
+    passed: bool
+
+
+@dataclass(frozen=True)
+class SimulationVerdict(Verdict):
+    """The same of a whole ride."""
+
+    energy_percent: Annotated[
+        float | None, "energy at the pack's terminals, simulated less measured, in percent of measured"
+    ]
+
+
+@dataclass(frozen=True)
+class Means:
+    """A quantity over the seconds of one condition; errors are simulated less measured."""
+
+    seconds: int
+    mean_measured: float
+    mean_error: float
+    mean_abs_error: float
+    mean_abs_measured: float
+
+
+@dataclass(frozen=True)
+class PooledMeans(Means):
+    """The same over several rides. percent: mean magnitude of the error, bias_percent: its mean, of the measured."""
+
+    rides: int
+    percent: float
+    bias_percent: float
+
+
+Splits = dict[str, dict[str, Means]]
+"""By what the seconds are sorted by, and by condition."""
+
+
+@dataclass(frozen=True)
+class Ride:
+    """What was found of a ride."""
+
+    file: Annotated[str, "the log"]
+    name: Annotated[str, "of the ride"]
+    kind: Annotated[str | None, "as noted in rides.json beside the log, or null"]
+    vehicle: Annotated[str, "name of the vehicle"]
+    payload_kg: Annotated[
+        float, "mass of rider and luggage: --payload, or as noted in rides.json, or of the vehicle file"
+    ]
+    on_dynamometer: Annotated[bool, "whether a roller was under the wheel"]
+    duration_s: Annotated[float, "of the ride"]
+    distance_km: Annotated[float, "of the ride"]
+    ambient_c: Annotated[float | None, "air, mean"]
+    energy_wh: Annotated[float | None, "measured at the pack's terminals, sensor's known gain and offset taken off"]
+    open_loop: Annotated[
+        SimulationVerdict | None,
+        "simulated with the measured throttle and brake, or null: channels, energy_percent, passed",
+    ]
+    predictive: Annotated[SimulationVerdict, "simulated with the rider model following the measured speed: the same"]
+    components: Annotated[Verdict | None, "each by itself, with measured inputs: channels, passed; or null"]
+    splits: Annotated[
+        dict[str, dict[str, Splits]],
+        "by form, channel, sorting and condition: seconds, mean_measured, mean_error, mean_abs_error, "
+        "mean_abs_measured",
+    ]
+    missing: Annotated[list[str], "what could not be judged, or not as well, and why"]
+    passed: Annotated[bool, "whether open loop, predictive and components passed"]
+    plot: Annotated[str | None, "file, or null"]
+
+    @property
+    def verdicts(self) -> dict[str, Verdict]:
+        """Those that there are, by form."""
+        every = {"open_loop": self.open_loop, "predictive": self.predictive, "components": self.components}
+        return {form: verdict for form, verdict in every.items() if verdict}
 
 
 def seconds(values: Array, per_second: int) -> Array:
@@ -118,8 +213,9 @@ def conditions(measured: Mapping[str, Array]) -> tuple[dict[str, dict[str, Mask]
         "later": straight & (begun > 600),
     }
     edges = (0.0, 0.5, 4.0, 8.0, 11.0, 40.0)
-    names = ("standing", "below 4 m/s", "4 to 8 m/s", "8 to 11 m/s", "above 11 m/s")
-    found["speed"] = {name: (speed >= a) & (speed < b) for name, a, b in zip(names, edges[:-1], edges[1:], strict=True)}
+    found["speed"] = {
+        name: (speed >= a) & (speed < b) for name, a, b in zip(_SPEEDS, edges[:-1], edges[1:], strict=True)
+    }
     a = measured["acceleration"]
     braking = measured.get("braking", np.zeros(len(speed))) > 0
     found["pace"] = {
@@ -132,49 +228,28 @@ def conditions(measured: Mapping[str, Array]) -> tuple[dict[str, dict[str, Mask]
     return found, missing
 
 
-LABELS = {
-    "turning": "lateral acceleration below 0.5, 0.5 to 1.5, above 1.5 m/s²",
-    "grade": "above 1 %, within, below −1 %",
-    "temperature": "air below 12, 12 to 20, above 20 °C, straight on",
-    "since start": "time ridden since the start, straight on",
-    "speed": "speed",
-    "pace": "acceleration above 1, 0.3 to 1, within 0.3, below −0.3 m/s² without brake; with brake",
+_SPEEDS = ("standing", "below 4 m/s", "4 to 8 m/s", "8 to 11 m/s", "above 11 m/s")
+_PACES = ("hard acceleration", "acceleration", "steady", "coasting", "braking")
+_SORTINGS = {
+    "turning": ("lateral acceleration below 0.5, 0.5 to 1.5, above 1.5 m/s²", ("straight", "slightly", "turning")),
+    "grade": ("above 1 %, within, below −1 %", ("uphill", "level", "downhill")),
+    "temperature": ("air below 12, 12 to 20, above 20 °C, straight on", ("cold", "mild", "warm")),
+    "since start": ("time ridden since the start, straight on", ("first 3 min", "3 to 10 min", "later")),
+    "speed": ("speed", _SPEEDS),
+    "pace": ("acceleration above 1, 0.3 to 1, within 0.3, below −0.3 m/s² without brake; with brake", _PACES),
 }
-
-
-ORDER = (
-    "straight",
-    "slightly",
-    "turning",
-    "uphill",
-    "level",
-    "downhill",
-    "cold",
-    "mild",
-    "warm",
-    "first 3 min",
-    "3 to 10 min",
-    "later",
-    "standing",
-    "below 4 m/s",
-    "4 to 8 m/s",
-    "8 to 11 m/s",
-    "above 11 m/s",
-    "hard acceleration",
-    "acceleration",
-    "steady",
-    "coasting",
-    "braking",
-)
+LABELS = {by: label for by, (label, _) in _SORTINGS.items()}
+"""What the seconds are sorted by."""
+ORDER = tuple(kind for _, kinds in _SORTINGS.values() for kind in kinds)
 """The conditions as tables list them."""
 
 
 def split(
     measured: Array, simulated: Array, found: Mapping[str, Mapping[str, Mask]], valid: Mask | None = None
-) -> dict[str, dict[str, dict[str, float]]]:
-    """Per condition of at least `LEAST_SECONDS`: seconds and the means that `KEYS` of `validate` lists."""
+) -> Splits:
+    """The means of each condition of at least `LEAST_SECONDS`."""
     n = min(len(measured), len(simulated))
-    result: dict[str, dict[str, dict[str, float]]] = {}
+    result: Splits = {}
     for by, masks in found.items():
         for name, mask in masks.items():
             inside = mask[:n] if valid is None else mask[:n] & valid[:n]
@@ -182,25 +257,27 @@ def split(
             if count < LEAST_SECONDS:
                 continue
             m, e = measured[:n][inside], (simulated[:n] - measured[:n])[inside]
-            result.setdefault(by, {})[name] = {
-                "seconds": count,
-                "mean_measured": float(m.mean()),
-                "mean_error": float(e.mean()),
-                "mean_abs_error": float(np.abs(e).mean()),
-                "mean_abs_measured": float(np.abs(m).mean()),
-            }
+            result.setdefault(by, {})[name] = Means(
+                count, float(m.mean()), float(e.mean()), float(np.abs(e).mean()), float(np.abs(m).mean())
+            )
     return result
 
 
-def pooled(rows: list[dict[str, float]]) -> dict[str, float]:
-    """Entries of `split` of several rides as one, every second alike; with ``percent``, ``bias_percent``."""
-    total = sum(row["seconds"] for row in rows)
-    result = {key: sum(row[key] * row["seconds"] for row in rows) / total for key in rows[0] if key != "seconds"}
-    base = result["mean_abs_measured"]
-    return {
-        "seconds": total,
-        "rides": len(rows),
-        **result,
-        "percent": 100 * result["mean_abs_error"] / base if base else 0.0,
-        "bias_percent": 100 * result["mean_error"] / base if base else 0.0,
-    }
+def pooled(parts: Sequence[Means]) -> PooledMeans:
+    """The means of several rides as those of one, every second alike."""
+    total = sum(part.seconds for part in parts)
+
+    def mean(name: str) -> float:
+        return float(sum(getattr(part, name) * part.seconds for part in parts) / total)
+
+    error, size, base = mean("mean_error"), mean("mean_abs_error"), mean("mean_abs_measured")
+    return PooledMeans(
+        seconds=total,
+        mean_measured=mean("mean_measured"),
+        mean_error=error,
+        mean_abs_error=size,
+        mean_abs_measured=base,
+        rides=len(parts),
+        percent=100 * size / base if base else 0.0,
+        bias_percent=100 * error / base if base else 0.0,
+    )

@@ -40,26 +40,30 @@ class Energy:
         return self.total / self.distance if self.distance >= 100 else None
 
 
+@dataclass(frozen=True)
+class Conditions:
+    """Where and in what a speed is ridden; quantities of the ride are scalars or of shape (n,)."""
+
+    grade: ArrayLike = 0.0  # sine of the road's angle
+    curvature: ArrayLike = 0.0  # 1/m, positive to the left
+    heading: ArrayLike | None = None  # rad clockwise from north; None: as the curvature turns it from north
+    headwind: ArrayLike = 0.0  # m/s
+    ambient: float = 20.0  # degC
+    altitude: float = 0.0  # m
+    motor_temperature: ArrayLike | None = None  # degC; None: ambient
+    vibration: ArrayLike | None = None  # m/s²; None: while moving what the vehicle's file expects
+
+
 def backward(
     vehicle: Vehicle,
     time: ArrayLike,
     speed: ArrayLike,
+    conditions: Conditions = Conditions(),
     *,
-    grade: ArrayLike = 0.0,
-    curvature: ArrayLike = 0.0,
-    heading: ArrayLike | None = None,
-    headwind: ArrayLike = 0.0,
-    ambient: float = 20.0,
-    altitude: float = 0.0,
-    motor_temperature: ArrayLike | None = None,
-    vibration: ArrayLike | None = None,
     smoothing: float = SMOOTHING,
 ) -> Energy:
     """The energy of riding `speed` [m/s] over `time` [s], both of shape (n,); n of 2 or more.
 
-    grade (sine of the road's angle), curvature [1/m], headwind [m/s], heading [rad clockwise from north; if not given,
-    as the curvature turns it from north], motor_temperature [degC, ambient if not given], vibration [m/s², while moving
-    what the vehicle's file expects if not given]: scalars or shape (n,).
     smoothing: the acceleration is the mean one over so many seconds; 0 for a drive cycle.
     Raises ValueError for shapes that do not fit and time that does not increase.
     """
@@ -74,28 +78,7 @@ def backward(
     acceleration = _acceleration(t, v, smoothing)
     # Power over an interval counts at its middle: there speed times acceleration is the change of kinetic energy.
     middle = (v[1:] + v[:-1]) / 2
-    sine = _middle(grade)
-    q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0)
-    q |= {
-        "speed": middle,
-        "acceleration": acceleration,
-        "grade": sine,
-        "grade_cosine": np.sqrt(1 - sine * sine) if np.any(sine) else 1.0,
-        "mass": vehicle.model.mass,
-        "air_density": air_density(ambient, altitude),
-        "headwind": _middle(headwind),
-        "lateral_acceleration": middle * middle * _middle(curvature) if np.any(curvature) else 0.0,
-        "ambient_temperature": ambient,
-        "motor_temperature": ambient if motor_temperature is None else _middle(motor_temperature),
-    }
-    if "heading" in vehicle.model.reads:
-        turn = -np.cumsum(middle * _middle(curvature) * dt)
-        q["heading"] = turn if heading is None else _middle(heading)
-    if "vibration" in vehicle.model.reads:
-        rough = vehicle.riding.vibration
-        q["vibration"] = np.where(middle > MOVING, rough, 0.0) if vibration is None else _middle(vibration)
-    if "time_moving" in vehicle.model.reads:
-        q["time_moving"] = np.cumsum(np.where(middle > MOVING, dt, 0.0))
+    q = _quantities(vehicle, middle, acceleration, dt, conditions)
     power, ledger = np.zeros_like(middle), defaultdict[str, float](float)
     block = len(dt) if any(effect.decay for effect in vehicle.model.effects) else BLOCK
     for first in range(0, len(dt), block):
@@ -106,6 +89,38 @@ def backward(
             ledger[name] += float(np.sum(term * dt[part]))
     # sums, not products of vectors: threads of the linear algebra would take longer to start than to add
     return Energy(np.append(power, power[-1]), dict(ledger), float(np.sum(power * dt)), float(np.sum(middle * dt)))
+
+
+def _quantities(
+    vehicle: Vehicle, middle: Array, acceleration: Array, dt: Array, conditions: Conditions
+) -> dict[str, Any]:
+    """What effects read, at the middle of each interval of `dt` [s]."""
+    import numpy as np
+
+    c = conditions
+    sine = _middle(c.grade)
+    q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0)
+    q |= {
+        "speed": middle,
+        "acceleration": acceleration,
+        "grade": sine,
+        "grade_cosine": np.sqrt(1 - sine * sine) if np.any(sine) else 1.0,
+        "mass": vehicle.model.mass,
+        "air_density": air_density(c.ambient, c.altitude),
+        "headwind": _middle(c.headwind),
+        "lateral_acceleration": middle * middle * _middle(c.curvature) if np.any(c.curvature) else 0.0,
+        "ambient_temperature": c.ambient,
+        "motor_temperature": c.ambient if c.motor_temperature is None else _middle(c.motor_temperature),
+    }
+    if "heading" in vehicle.model.reads:
+        turn = -np.cumsum(middle * _middle(c.curvature) * dt)
+        q["heading"] = turn if c.heading is None else _middle(c.heading)
+    if "vibration" in vehicle.model.reads:
+        rough = vehicle.riding.vibration
+        q["vibration"] = np.where(middle > MOVING, rough, 0.0) if c.vibration is None else _middle(c.vibration)
+    if "time_moving" in vehicle.model.reads:
+        q["time_moving"] = np.cumsum(np.where(middle > MOVING, dt, 0.0))
+    return q
 
 
 def _middle(values: ArrayLike) -> Any:

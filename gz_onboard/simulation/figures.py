@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import html
-import io
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.publisher import WH
-from gz_onboard.simulation.run import Run
-from gz_onboard.simulation.style import (
+from gz_onboard.offline.style import (
     BLUE,
     GREEN,
     INK,
@@ -25,7 +21,10 @@ from gz_onboard.simulation.style import (
     ordinate,
     second,
     stack,
+    time_unit,
 )
+from gz_onboard.simulation.run import Run
+from gz_onboard.simulation.summary import Variant
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -43,6 +42,7 @@ STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
     "stored": ("#d9730d", ("kinetic_energy", "potential_energy")),
 }
 """The entries of a ledger in the order in which energy passes them, each stage with its colour."""
+_LEAST_SHARE = 5e-5  # of all energy: less cannot be seen
 
 
 def overview(run: Run, title: str) -> Figure:
@@ -51,20 +51,15 @@ def overview(run: Run, title: str) -> Figure:
 
     s = run.series
     figure, axes = _panels(title, (1.7, 1.0, 1.3, 1.0, 1.0, 1.2))
-    x, label = _time(run)
+    x, time = _time(run)
     if not np.isnan(s["wanted_speed"]).all():
         axes[0].plot(x, s["wanted_speed"] * 3.6, color=ORANGE, linewidth=1.0, label="wanted")
     axes[0].plot(x, s["speed"] * 3.6, color=BLUE, linewidth=1.2, label="ridden")
+    unit, _ = time_unit(run.duration)
     for i, short in enumerate(run.shortfalls):
-        begin = short.time / _unit(run)[0]
-        axes[0].axvspan(
-            begin,
-            begin + short.duration / _unit(run)[0],
-            color=RED,
-            alpha=0.15,
-            linewidth=0,
-            label="shortfall" if not i else None,
-        )
+        begin, length = short.time / unit, short.duration / unit
+        label = "shortfall" if not i else None
+        axes[0].axvspan(begin, begin + length, color=RED, alpha=0.15, linewidth=0, label=label)
     ordinate(axes[0], "speed [km/h]")
     axes[1].plot(x, s["throttle"] * 100, color=GREEN, linewidth=0.8, label="throttle")
     axes[1].plot(x, s["brake"] * -100, color=RED, linewidth=0.8, label="brake (down)")
@@ -84,7 +79,7 @@ def overview(run: Run, title: str) -> Figure:
         others[5].plot(x, s["grade"] * 100, color=MUTED, linewidth=0.8, label="grade")
     axes[5].plot(x, s["energy"] / WH, color=BLUE, linewidth=1.4, label="energy from the pack")
     ordinate(axes[5], "energy [Wh]", BLUE)
-    _finish(axes, x, label, others)
+    _finish(axes, x, time, others)
     return figure
 
 
@@ -114,82 +109,83 @@ def comparison(run: Run, measured: Mapping[str, Any], title: str) -> Figure:
     return figure
 
 
+Flow = tuple[str, float, str]
+"""Name, energy [J] and colour."""
+
+
 def sankey(ledger: Mapping[str, float], title: str) -> Figure:
     """Where the energy went: sources on the left, on the right what took it, as thick as it is much.
 
-    ledger: J by name; what is negative gave energy and stands on the left with the cells.
+    ledger: J by name; what is negative gave energy and is on the left with the cells.
     """
-    from matplotlib.patches import PathPatch, Rectangle
-    from matplotlib.path import Path as Curve
+    from matplotlib.patches import Rectangle
 
     figure = new_figure(11, 7.2)
     axis = figure.add_axes((0.02, 0.02, 0.96, 0.86))
     axis.set_axis_off()
-    order = [(name, colour) for colour, names in STAGES.values() for name in names]
-    order += [(name, MUTED) for name in ledger if name not in {n for n, _ in order}]
-    takes = [(name, ledger[name], colour) for name, colour in order if ledger.get(name, 0.0) > 0]
-    gives = [(name, -ledger[name], colour) for name, colour in order if ledger.get(name, 0.0) < 0]
-    total = sum(energy for _, energy, _ in takes) or 1.0
-    takes = [take for take in takes if take[1] >= 5e-5 * total]
-    cells = total - sum(energy for _, energy, _ in gives)
-    sources = [("cells", cells, INK), *(give for give in gives if give[1] >= 5e-5 * total)]
+    sources, sinks, total = _flows(ledger)
     gap = 0.028
     left, right = 0.17, 0.62
-    height = 1.0 - gap * max(len(takes) - 1, 1)
-    places = []
-    y = 1.0
-    for name, energy, colour in takes:
-        thick = energy / total * height
-        places.append((name, energy, colour, y - thick, thick))
-        y -= thick + gap
+    height = 1.0 - gap * max(len(sinks) - 1, 1)
     trunk = 0.5 + height / 2
     y = trunk
     for name, energy, colour in sources:
         thick = energy / total * height
         axis.add_patch(Rectangle((left - 0.025, y - thick), 0.025, thick, color=colour, linewidth=0))
-        axis.text(
-            left - 0.035,
-            y - thick / 2,
-            f"{_words(name)}\n{energy / WH:.1f} Wh",
-            ha="right",
-            va="center",
-            fontsize=10,
-            color=INK,
-        )
+        text = f"{_words(name)}\n{energy / WH:.1f} Wh"
+        axis.text(left - 0.035, y - thick / 2, text, ha="right", va="center", fontsize=10, color=INK)
         y -= thick
-    y = trunk
-    middle = (left + right) / 2
-    for name, energy, colour, low, thick in places:
-        points = [
-            (left, y),
-            (middle, y),
-            (middle, low + thick),
-            (right, low + thick),
-            (right, low),
-            (middle, low),
-            (middle, y - thick),
-            (left, y - thick),
-            (left, y),
-        ]
-        codes = [Curve.MOVETO, *[Curve.CURVE4] * 3, Curve.LINETO, *[Curve.CURVE4] * 3, Curve.CLOSEPOLY]
-        axis.add_patch(PathPatch(Curve(points, codes), facecolor=colour, alpha=0.38, linewidth=0))
+    y, low = trunk, 1.0
+    for name, energy, colour in sinks:
+        thick = energy / total * height
+        low -= thick
+        _band(axis, (left, y), (right, low + thick), thick, colour)
         axis.add_patch(Rectangle((right, low), 0.02, thick, color=colour, linewidth=0))
         text = f"{_words(name)}   {energy / WH:.2f} Wh   {100 * energy / total:.1f} %"
         axis.text(right + 0.03, low + thick / 2, text, va="center", fontsize=10, color=INK)
         y -= thick
+        low -= gap
     axis.set_xlim(0, 1)
     axis.set_ylim(-0.02, 1.02)
     headline(figure, 0.03, 0.94, title)
     return figure
 
 
-def sweep_lines(name: str, values: Sequence[float], variants: Sequence[Mapping[str, Any]], title: str) -> Figure:
+def _flows(ledger: Mapping[str, float]) -> tuple[list[Flow], list[Flow], float]:
+    """(what gave energy, what took it, the sum of the latter [J]), without what is too little to be seen."""
+    order = [(name, colour) for colour, names in STAGES.values() for name in names]
+    order += [(name, MUTED) for name in ledger if name not in {n for n, _ in order}]
+    sinks = [(name, ledger[name], colour) for name, colour in order if ledger.get(name, 0.0) > 0]
+    gives = [(name, -ledger[name], colour) for name, colour in order if ledger.get(name, 0.0) < 0]
+    total = sum(energy for _, energy, _ in sinks) or 1.0
+    cells = total - sum(energy for _, energy, _ in gives)
+    least = _LEAST_SHARE * total
+    sources = [("cells", cells, INK), *(give for give in gives if give[1] >= least)]
+    return sources, [sink for sink in sinks if sink[1] >= least], total
+
+
+def _band(axis: Axes, start: tuple[float, float], end: tuple[float, float], thick: float, colour: str) -> None:
+    """A band of a thickness whose upper edge goes from `start` to `end`, both (x, y)."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    (left, y), (right, top) = start, end
+    middle = (left + right) / 2
+    points = [
+        *((left, y), (middle, y), (middle, top), (right, top)),
+        *((right, top - thick), (middle, top - thick), (middle, y - thick), (left, y - thick), (left, y)),
+    ]
+    codes = [Path.MOVETO, *[Path.CURVE4] * 3, Path.LINETO, *[Path.CURVE4] * 3, Path.CLOSEPOLY]
+    axis.add_patch(PathPatch(Path(points, codes), facecolor=colour, alpha=0.38, linewidth=0))
+
+
+def sweep_lines(name: str, values: Sequence[float], variants: Sequence[Variant], title: str) -> Figure:
     """Range and consumption against one parameter."""
     figure, axes = _panels(title, (1.3, 1.3))
     for axis, key, text, colour in zip(
         axes, ("range_km", "consumption_wh_km"), ("range [km]", "consumption [Wh/km]"), (BLUE, ORANGE), strict=True
     ):
-        column = [float("nan") if v[key] is None else v[key] for v in variants]
+        column = [float("nan") if value is None else value for value in (getattr(v, key) for v in variants)]
         axis.plot(values, column, color=colour, linewidth=1.6, marker="o", markersize=4)
         ordinate(axis, text, colour)
     axes[0].tick_params(labelbottom=False)
@@ -199,10 +195,7 @@ def sweep_lines(name: str, values: Sequence[float], variants: Sequence[Mapping[s
 
 
 def sweep_map(
-    names: tuple[str, str],
-    values: tuple[Sequence[float], Sequence[float]],
-    variants: Sequence[Mapping[str, Any]],
-    title: str,
+    names: tuple[str, str], values: tuple[Sequence[float], Sequence[float]], variants: Sequence[Variant], title: str
 ) -> Figure:
     """Range and consumption over two parameters, `variants` with the second changing fastest."""
     import numpy as np
@@ -212,7 +205,7 @@ def sweep_map(
         (("range_km", "range [km]", "Blues"), ("consumption_wh_km", "consumption [Wh/km]", "Oranges"))
     ):
         axis = figure.add_axes((0.07 + 0.49 * i, 0.13, 0.36, 0.68))
-        flat = [np.nan if v[key] is None else v[key] for v in variants]
+        flat = [np.nan if value is None else value for value in (getattr(v, key) for v in variants)]
         table = np.array(flat, dtype=float).reshape(len(values[0]), len(values[1]))
         mesh = axis.pcolormesh(values[1], values[0], table, cmap=colours, shading="nearest", alpha=0.85)
         if min(table.shape) > 1 and np.nanmax(table) > np.nanmin(table):
@@ -228,31 +221,6 @@ def sweep_map(
     return figure
 
 
-def page(file: Path, title: str, summary: str, figures: Sequence[Figure]) -> None:
-    """Write an HTML page that stands alone: the summary and the figures, as SVG. Raises OSError."""
-    import matplotlib as mpl
-
-    drawn = []
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "gz-onboard", "font.family": "sans-serif"}):
-        for figure in figures:
-            text = io.StringIO()
-            figure.savefig(text, format="svg", metadata={"Date": None})
-            drawn.append(text.getvalue().partition("<svg")[2])
-    body = "\n".join(f"<figure><svg{svg}</figure>" for svg in drawn)
-    file.write_text(
-        f"""<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>{html.escape(title)}</title><style>
-body {{ font-family: system-ui, sans-serif; color: {INK}; max-width: 70rem; margin: 2rem auto; padding: 0 1rem; }}
-pre {{ background: #f5f7fa; padding: 1rem; overflow-x: auto; }} figure {{ margin: 1.5rem 0; }}
-svg {{ width: 100%; height: auto; }}
-</style></head><body><h1>{html.escape(title)}</h1><pre>{html.escape(summary)}</pre>
-{body}
-</body></html>
-""",
-        encoding="utf-8",
-    )
-
-
 # --- panels -------------------------------------------------------------------------------------------------------
 
 
@@ -263,12 +231,8 @@ def _panels(title: str, heights: Sequence[float]) -> tuple[Figure, list[Axes]]:
     return figure, stack(figure, heights, left=0.08, hspace=0.3, top=0.85, bottom=0.55)
 
 
-def _unit(run: Run) -> tuple[float, str]:
-    return (1.0, "s") if run.duration < 300 else (60.0, "min")
-
-
 def _time(run: Run) -> tuple[Any, str]:
-    seconds, unit = _unit(run)
+    seconds, unit = time_unit(run.duration)
     return run.series["time"] / seconds, f"time [{unit}]"
 
 

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import argparse
 import csv
+import html
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-from gz_onboard.errors import InputError
+from gz_onboard.errors import writing
+from gz_onboard.offline.page import svg, write_page
+from gz_onboard.offline.style import save
 from gz_onboard.simulation.frames import Losses, simulate_frames, write_frames
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.run import COLUMNS, Run
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.sensors import Trace
-from gz_onboard.simulation.style import save
-from gz_onboard.simulation.summary import measured_columns, summary_text
+from gz_onboard.simulation.summary import Summary, measured_columns, summary_text
 from gz_onboard.simulation.sweep import Sweep
 from gz_onboard.vehicle import Vehicle
 
@@ -25,7 +26,7 @@ _TOPIC = "simulation"
 
 
 def write(
-    arguments: argparse.Namespace, plan: Plan, result: Run, summary: dict[str, Any], sweeps: Sequence[Sweep]
+    arguments: argparse.Namespace, plan: Plan, result: Run, summary: Summary, sweeps: Sequence[Sweep]
 ) -> list[str]:
     """The time series and the pictures; gives their names. Raises InputError if they cannot be written."""
     mode = ".predictive" if arguments.predictive else ""
@@ -36,42 +37,34 @@ def write(
         files.append(arguments.output / f"{name}{ending}")
         return files[-1]
 
-    try:
+    with writing(arguments.output):
         arguments.output.mkdir(parents=True, exist_ok=True)
         if not arguments.no_series:
-            metadata = {"vehicle": str(summary["vehicle"]), "source": str(summary["what"])}
+            metadata = {"vehicle": summary.vehicle, "source": summary.what}
             write_series(result, file(f".{arguments.format}"), metadata)
         if not arguments.no_plot:
             _draw(file, plan, result, summary, sweeps)
-    except OSError as error:
-        raise InputError(
-            f"{error.filename or arguments.output}: cannot be written: {error.strerror or error}"
-        ) from error
     return [str(file) for file in files]
 
 
 def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, scooter: Scooter) -> str:
     """Write the ride's frames; gives the file's name. InputError if it cannot be written."""
     sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, losses=Losses(frames=arguments.frame_loss))
-    try:
+    with writing(arguments.frames):
         arguments.frames.parent.mkdir(parents=True, exist_ok=True)
         write_frames(arguments.frames, sent)
-    except OSError as error:
-        raise InputError(f"{arguments.frames}: cannot be written: {error.strerror or error}") from error
     return str(arguments.frames)
 
 
-def _draw(
-    file: Callable[[str], Path], plan: Plan, result: Run, summary: dict[str, Any], sweeps: Sequence[Sweep]
-) -> None:
+def _draw(file: Callable[[str], Path], plan: Plan, result: Run, summary: Summary, sweeps: Sequence[Sweep]) -> None:
     from gz_onboard.simulation import figures
 
-    title = f"{plan.name}, {summary['kind']} · {summary['vehicle']}, payload {summary['payload_kg']:g} kg"
+    title = f"{plan.name}, {summary.kind} · {summary.vehicle}, payload {summary.payload_kg:g} kg"
     drawn = [("", figures.overview(result, title)), (".ledger", figures.sankey(result.ledger, f"{title}: energy"))]
     if plan.recorded:
         columns = measured_columns(plan.recorded, result)
         drawn.append((".measured", figures.comparison(result, columns, title)))
-    variants = summary["sweep"]
+    variants = summary.sweep or []
     if len(sweeps) == 1:
         drawn.append((".sweep", figures.sweep_lines(sweeps[0].label, sweeps[0].values, variants, title)))
     elif sweeps:
@@ -80,7 +73,8 @@ def _draw(
         drawn.append((".sweep", figures.sweep_map(names, values, variants, title)))
     for ending, figure in drawn:
         save(figure, file(f"{ending}.png"))
-    figures.page(file(".html"), title, summary_text(summary | {"files": []}), [figure for _, figure in drawn])
+    text = f"<pre>{html.escape(summary_text(summary))}</pre>"
+    write_page(file(".html"), title, [text, *(f"<figure>{svg(figure)}</figure>" for _, figure in drawn)])
 
 
 def write_series(result: Run, file: Path, metadata: dict[str, str]) -> None:

@@ -9,18 +9,19 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gz_onboard.errors import InputError, nearest
+from gz_onboard.offline.samples import facts_of, rider_mass
+from gz_onboard.options import LOG_SUFFIXES
 from gz_onboard.simulation.cycles import find_cycle
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile, straight
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded
 from gz_onboard.simulation.route import read_route, speed_profile
 from gz_onboard.simulation.run import Command, along, at_steps, follow, replay, road_table
-from gz_onboard.simulation.samples import read_facts, rider_mass
 from gz_onboard.simulation.scooter import STEP
 from gz_onboard.vehicle import Vehicle
 
-_LOGS = (".mcap", ".blf", ".log", ".asc", ".trc", ".mf4", ".gz")
+_LOGS = {*LOG_SUFFIXES, ".gz"} - {".csv"}
 TOP_SPEED = 50 / 3.6
-"""m/s: what a rider wants to ride on a route without limits."""
+"""m/s: what a rider aims for on a route without limits."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,7 @@ def noted_payload(what: Path) -> float | None:
     """The mass [kg] that ``rides.json`` beside it says of the recorded ride `what`; None of anything else."""
     if _kind(what) != "ride":
         return None
-    name = Path(what.name.removesuffix(".gz")).stem
-    return rider_mass(read_facts(what.parent / "rides.json").get(name, {}))
+    return rider_mass(facts_of(what))
 
 
 def _kind(path: Path) -> str:
@@ -89,7 +89,7 @@ def _kind(path: Path) -> str:
 
 def _route_plan(path: Path, arguments: argparse.Namespace, roller: Dynamometer | None) -> Plan:
     if arguments.repeat > 1 or arguments.until_empty:
-        raise InputError(f"{path}: a route is ridden once: its end is not its begin; --repeat is for cycles")
+        raise InputError(f"{path}: a route is ridden once, as it does not end where it starts; --repeat is for cycles")
     route = read_route(path)
     profile = speed_profile(route, top_speed=TOP_SPEED)
     metres = [profile.speed_at(float(i)) for i in range(int(route.length) + 1)]

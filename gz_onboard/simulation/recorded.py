@@ -16,10 +16,10 @@ from gz_onboard.bus.codec import Codec
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Event
+from gz_onboard.offline.samples import INSTRUMENTS, extended, read_roles
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
 from gz_onboard.simulation.run import road_table
-from gz_onboard.simulation.samples import INSTRUMENTS, extended, read_roles
-from gz_onboard.simulation.scooter import STEP
+from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ BRAKE_FORCE = 20e-5
 BRAKE_PRESSED = 0.5e5  # Pa: below this the sensors show noise
 BRAKE_MEAN = 90.0  # N: the mean of the same rides while the switch is on, where there are no pressures
 ROAD_PIECE = 5.0  # m
+AMBIENT = 20.0  # degC: of the air, where it was not measured
 _MOVING = 2.0  # m/s: slower than this, yaw rate over speed is no curvature
 
 
@@ -202,6 +203,26 @@ def _headings(rows: list[tuple[float, float]]) -> Array | None:
     distance, keep = np.unique([row[0] for row in rows], return_index=True)
     heading = np.unwrap(np.array([row[1] for row in rows])[keep])
     return np.interp(np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE), distance, heading)
+
+
+def scooter_at_start(
+    recorded: Recorded | None,
+    vehicle: Vehicle,
+    road: RoadProfile | Dynamometer,
+    ambient: float | None = None,
+    **options: Any,
+) -> Scooter:
+    """The scooter as it was when a recorded ride began; what was not measured, and all without a ride, is at `ambient`.
+
+    ambient: air [degC]; None: as measured, or 20 degC. options: of `Scooter`.
+    """
+    measured = recorded.first if recorded else lambda _, default: default
+    air = measured("ambient_temperature", AMBIENT) if ambient is None else ambient
+    cell, speed = measured("cell_temperature", air), measured("speed", 0.0)
+    scooter = Scooter(vehicle, road, ambient=air, cell_temperature=cell, speed=speed, **options)
+    scooter.motor_cooling.stator = scooter.motor_cooling.rotor = measured("motor_temperature", air)
+    scooter.inverter_cooling.board = scooter.inverter_cooling.box = measured("inverter_temperature", air)
+    return scooter
 
 
 def rest_soc(recorded: Recorded, vehicle: Vehicle) -> float | None:

@@ -1,6 +1,6 @@
 """Rides of the simulated scooter: along a cycle, along a route, or with throttle and brake given.
 
-`drive` is the loop; what it is told each step is a `Command`. Nothing here reads files or prints.
+`drive` is the loop; a `Command` says what the rider does in each step. Nothing here reads files or prints.
 """
 
 from __future__ import annotations
@@ -9,9 +9,10 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import nan
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from gz_onboard.physics.drawable import drawable
+from gz_onboard.progress import Progress
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.parts.road import RoadProfile
 from gz_onboard.simulation.scooter import Scooter
@@ -53,8 +54,6 @@ TOLERANCE_TIME = 1.0  # s
 
 Command = Callable[[Scooter], tuple[float, float, float]]
 """(throttle 0..1, brake 0..1, wanted speed [m/s] or not a number) for the next step."""
-Progress = Callable[[float], None]
-"""Is told how many seconds have been ridden since it was told last."""
 
 
 @dataclass(frozen=True)
@@ -118,15 +117,13 @@ def drive(
 
     until_empty: end where the cells reach the cut-off voltage or SOC 0. finish: end at this distance [m].
     """
-    import numpy as np
-
     dt = scooter.dt
     every = max(round(sample / dt), 1)
     battery = scooter.vehicle.battery
     assert battery  # a Scooter has one
     cutoff = battery.cutoff_voltage * battery.cells_series if until_empty else -1.0
     end = finish if finish is not None else float("inf")
-    kinetic, soc_start = scooter.kinetic_energy(), scooter.pack.soc
+    before = scooter.kinetic_energy(), scooter.pack.soc
     energy = recovered = charge = squares = 0.0
     wanted = nan
     rows = [_row(scooter, nan, 0.0)]
@@ -155,11 +152,30 @@ def drive(
             break
     if done % every:
         rows.append(_row(scooter, wanted, energy))
+    form = max(squares * done / (charge * charge), 1.0) if charge else 1.0
+    return _finished(scooter, rows, before, _Totals(energy, recovered, form, done * dt, empty))
+
+
+class _Totals(NamedTuple):
+    """Of a ride, as in `Run`."""
+
+    energy: float
+    recovered: float
+    form: float
+    duration: float
+    empty: bool
+
+
+def _finished(scooter: Scooter, rows: Sequence[tuple[float, ...]], before: tuple[float, float], totals: _Totals) -> Run:
+    """The run of a scooter that has ended it. before: kinetic energy [J] and SOC at its start."""
+    import numpy as np
+
+    kinetic, soc_start = before
     series = dict(zip(COLUMNS, np.array(rows, dtype=float).T, strict=True))
     if len(rows) > 1 and not np.isnan(series["wanted_speed"][1]):
         series["wanted_speed"][0] = series["speed"][0]  # before the first step nothing else can be wanted
-    duration = done * dt
-    run = Run(
+    energy, duration = totals.energy, totals.duration
+    return Run(
         series=series,
         ledger={
             **scooter.ledger.entries,
@@ -168,17 +184,16 @@ def drive(
         },
         chemical=scooter.pack.chemical_energy_drawn(),
         energy=energy,
-        recovered=recovered,
+        recovered=totals.recovered,
         distance=scooter.distance,
         duration=duration,
         soc_start=soc_start,
         soc_end=scooter.pack.soc,
         mean_power=energy / duration if duration else 0.0,
-        form=max(squares * done / (charge * charge), 1.0) if charge else 1.0,
-        empty=empty,
+        form=totals.form,
+        empty=totals.empty,
+        shortfalls=shortfalls(series),
     )
-    run.shortfalls = shortfalls(series)
-    return run
 
 
 def _row(scooter: Scooter, wanted: float, energy: float) -> tuple[float, ...]:

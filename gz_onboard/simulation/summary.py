@@ -1,56 +1,122 @@
-"""What a simulated ride came to: the summary of ``gz-onboard simulate``, as JSON keys and as text."""
+"""What a simulated ride came to: the summary of ``gz-onboard simulate``, as JSON and as text."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated
 
 from gz_onboard.bus.publisher import WH, WH_PER_KM
+from gz_onboard.offline.results import clock, keys_of, number, text_rows, times
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.recorded import Recorded
 from gz_onboard.simulation.run import COLUMNS, Run, range_by_energy
 from gz_onboard.simulation.scooter import Scooter
-from gz_onboard.simulation.telling import clock, number, times
 from gz_onboard.vehicle import Vehicle
 
+if TYPE_CHECKING:
+    from gz_onboard.arrays import Array
+
 SUMMARY_VERSION = 1
-KEYS = {
-    "what": "the cycle, route or ride, as given",
-    "kind": "cycle, route, ride (open loop) or ride (predictive)",
-    "vehicle": "name of the vehicle",
-    "payload_kg": "mass of rider and luggage",
-    "payload_from": "who said so: --payload, rides.json beside the log, or the vehicle file",
-    "step_s": "step of the simulation",
-    "duration_s": "ridden",
-    "distance_km": "ridden",
-    "speed_max_km_h": "greatest speed",
-    "repetitions": "times that the cycle was ridden; the last may be unfinished",
-    "energy_wh": "delivered by the pack, less what was recovered",
-    "energy_recovered_wh": "charged into the pack",
-    "energy_cells_wh": "that left the cells' chemistry: energy_wh and the heat of the battery",
-    "consumption_wh_km": "energy_wh over distance; null below 0.1 km",
-    "soc_start": "state of charge, 0 to 1",
-    "soc_end": "at the end",
-    "range_km": "on this riding from soc_start, or null",
-    "range_by": "repetition: ridden until empty; energy: energy left at the start over the consumption",
-    "shortfalls": "where the profile asked more than was ridden, worst first: time_s, distance_km, duration_s, "
-    "missing_km_h at most, wanted_km_h there, beyond_vehicle (the throttle was open)",
-    "shortfall_s": "their time in all",
-    "ledger_wh": "where the energy of the cells went, by name; negative: gave",
-    "closure": "energy_cells_wh less the sum of the ledger, over all that was turned over",
-    "chassis": "straight, planar or leaning",
-    "turning_beyond_s": "time in which the road turned harder than the chassis' model goes; its edge was taken",
-    "measured": "of a recorded ride: distance_km, energy_wh, consumption_wh_km, and RMS of simulated less measured: "
-    "rms_speed_km_h, rms_pack_voltage_v, rms_pack_current_a, rms_motor_torque_nm; else null",
-    "files": "written",
-    "wall_s": "time taken by the simulation",
-    "sweep": "a list of {values, consumption_wh_km, range_km, shortfall_s}, or null",
+_RANGE_BY = {
+    "repetition": "ridden until empty",
+    "energy": "energy left at the start over the consumption",
+    None: "not known",
 }
-"""What ``--json`` writes."""
+_SHOWN = 5  # shortfalls
+_LEAST = 0.005  # Wh: less of the ledger is not shown
 
 
-def cycle_range(result: Run, scooter: Scooter, arguments: argparse.Namespace) -> tuple[float | None, str | None]:
+@dataclass(frozen=True)
+class ShortfallEntry:
+    """A stretch in which the ride was slower than wanted."""
+
+    time_s: float
+    distance_km: float
+    duration_s: float
+    missing_km_h: float
+    wanted_km_h: float
+    beyond_vehicle: bool
+
+
+@dataclass(frozen=True)
+class MeasuredEntry:
+    """What was measured on a recorded ride, and the RMS of simulated less measured."""
+
+    distance_km: float
+    energy_wh: float | None
+    consumption_wh_km: float | None
+    rms_speed_km_h: float | None
+    rms_pack_voltage_v: float | None
+    rms_pack_current_a: float | None
+    rms_motor_torque_nm: float | None
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The ride with other values of the parameters that are swept."""
+
+    values: dict[str, float]
+    consumption_wh_km: float | None
+    range_km: float | None
+    shortfall_s: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Summary:
+    """What ``--json`` writes."""
+
+    what: Annotated[str, "the cycle, route or ride, as given"]
+    kind: Annotated[str, "cycle, route, ride (open loop) or ride (predictive)"]
+    vehicle: Annotated[str, "name of the vehicle"]
+    payload_kg: Annotated[float, "mass of rider and luggage"]
+    payload_from: Annotated[str, "source of it: --payload, rides.json beside the log, or the vehicle file"] = (
+        "the vehicle file"
+    )
+    step_s: Annotated[float, "step of the simulation"]
+    duration_s: Annotated[float, "ridden"]
+    distance_km: Annotated[float, "ridden"]
+    speed_max_km_h: Annotated[float, "greatest speed"]
+    repetitions: Annotated[float, "times that the cycle was ridden; the last may be unfinished"]
+    energy_wh: Annotated[float, "delivered by the pack, less what was recovered"]
+    energy_recovered_wh: Annotated[float, "charged into the pack"]
+    energy_cells_wh: Annotated[float, "that left the cells' chemistry: energy_wh and the heat of the battery"]
+    consumption_wh_km: Annotated[float | None, "energy_wh over distance; null below 0.1 km"]
+    soc_start: Annotated[float, "state of charge, 0 to 1"]
+    soc_end: Annotated[float, "at the end"]
+    range_km: Annotated[float | None, "on this riding from soc_start, or null"]
+    range_by: Annotated[
+        str | None, "repetition: ridden until empty; energy: energy left at the start over the consumption"
+    ]
+    shortfalls: Annotated[
+        list[ShortfallEntry],
+        "where the profile asked more than was ridden, worst first: time_s, distance_km, duration_s"
+        ", missing_km_h at most, wanted_km_h there, beyond_vehicle (the throttle was open)",
+    ]
+    shortfall_s: Annotated[float, "their time in all"]
+    ledger_wh: Annotated[dict[str, float], "where the energy of the cells went, by name; negative: a source"]
+    closure: Annotated[float, "energy_cells_wh less the sum of the ledger, over the sum of all magnitudes"]
+    chassis: Annotated[str, "straight, planar or leaning"]
+    turning_beyond_s: Annotated[
+        float, "time in which the road turned harder than the chassis' model goes; its edge was taken"
+    ]
+    measured: Annotated[
+        MeasuredEntry | None,
+        "of a recorded ride: distance_km, energy_wh, consumption_wh_km, and RMS of simulated less m"
+        "easured: rms_speed_km_h, rms_pack_voltage_v, rms_pack_current_a, rms_motor_torque_nm; else null",
+    ]
+    files: Annotated[list[str], "written"] = field(default_factory=list)
+    wall_s: Annotated[float, "time taken by the simulation"] = 0.0
+    sweep: Annotated[list[Variant] | None, "a list of {values, consumption_wh_km, range_km, shortfall_s}, or null"] = (
+        None
+    )
+
+
+KEYS = keys_of(Summary)
+
+
+def cycle_range(result: Run, scooter: Scooter) -> tuple[float | None, str | None]:
     """(range [m], how it was found)."""
     if result.empty:
         return result.distance, "repetition"
@@ -59,50 +125,41 @@ def cycle_range(result: Run, scooter: Scooter, arguments: argparse.Namespace) ->
     return metres, None if metres is None else "energy"
 
 
-def summarise(
-    vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, result: Run, scooter: Scooter
-) -> dict[str, Any]:
-    """The summary without what is written and swept: see `KEYS`."""
-    metres, by = cycle_range(result, scooter, arguments)
-    return {
-        "what": str(arguments.what),
-        "kind": plan.kind,
-        "vehicle": vehicle.name,
-        "payload_kg": vehicle.parameters["payload_mass"],
-        "step_s": scooter.dt,
-        "duration_s": result.duration,
-        "distance_km": result.distance * 1e-3,
-        "speed_max_km_h": float(result.series["speed"].max()) * 3.6,
-        "repetitions": result.duration / plan.seconds if plan.kind == "cycle" else 1.0,
-        "energy_wh": result.energy / WH,
-        "energy_recovered_wh": result.recovered / WH,
-        "energy_cells_wh": result.chemical / WH,
-        "consumption_wh_km": times(result.consumption, 1 / WH_PER_KM),
-        "soc_start": result.soc_start,
-        "soc_end": result.soc_end,
-        "range_km": times(metres, 1e-3),
-        "range_by": by,
-        "shortfalls": [
-            {
-                "time_s": s.time,
-                "distance_km": s.distance * 1e-3,
-                "duration_s": s.duration,
-                "missing_km_h": s.missing * 3.6,
-                "wanted_km_h": s.wanted * 3.6,
-                "beyond_vehicle": s.beyond_vehicle,
-            }
+def summarise(vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, result: Run, scooter: Scooter) -> Summary:
+    """The summary, without what only the command knows: its time, sweep and files."""
+    metres, by = cycle_range(result, scooter)
+    return Summary(
+        what=str(arguments.what),
+        kind=plan.kind,
+        vehicle=vehicle.name,
+        payload_kg=vehicle.parameters["payload_mass"],
+        step_s=scooter.dt,
+        duration_s=result.duration,
+        distance_km=result.distance * 1e-3,
+        speed_max_km_h=float(result.series["speed"].max()) * 3.6,
+        repetitions=result.duration / plan.seconds if plan.kind == "cycle" else 1.0,
+        energy_wh=result.energy / WH,
+        energy_recovered_wh=result.recovered / WH,
+        energy_cells_wh=result.chemical / WH,
+        consumption_wh_km=times(result.consumption, 1 / WH_PER_KM),
+        soc_start=result.soc_start,
+        soc_end=result.soc_end,
+        range_km=times(metres, 1e-3),
+        range_by=by,
+        shortfalls=[
+            ShortfallEntry(s.time, s.distance * 1e-3, s.duration, s.missing * 3.6, s.wanted * 3.6, s.beyond_vehicle)
             for s in result.shortfalls
         ],
-        "shortfall_s": sum(s.duration for s in result.shortfalls),
-        "ledger_wh": {name: energy / WH for name, energy in result.ledger.items()},
-        "closure": result.closure,
-        "chassis": scooter.chassis.name,
-        "turning_beyond_s": scooter.chassis.beyond,
-        "measured": compare(plan.recorded, result) if plan.recorded else None,
-    }
+        shortfall_s=sum(s.duration for s in result.shortfalls),
+        ledger_wh={name: energy / WH for name, energy in result.ledger.items()},
+        closure=result.closure,
+        chassis=scooter.chassis.name,
+        turning_beyond_s=scooter.chassis.beyond,
+        measured=compare(plan.recorded, result) if plan.recorded else None,
+    )
 
 
-def measured_columns(recorded: Recorded, result: Run) -> dict[str, Any]:
+def measured_columns(recorded: Recorded, result: Run) -> dict[str, Array]:
     """What was recorded of the columns of a run, at the times of its series."""
     import numpy as np
 
@@ -113,7 +170,7 @@ def measured_columns(recorded: Recorded, result: Run) -> dict[str, Any]:
     return columns
 
 
-def compare(recorded: Recorded, result: Run) -> dict[str, Any]:
+def compare(recorded: Recorded, result: Run) -> MeasuredEntry:
     """The entry ``measured`` of the summary."""
     import numpy as np
 
@@ -125,37 +182,36 @@ def compare(recorded: Recorded, result: Run) -> dict[str, Any]:
             return None
         return float(np.sqrt(np.mean((result.series[name] - columns[name]) ** 2))) * factor
 
-    return {
-        "distance_km": recorded.distance * 1e-3,
-        "energy_wh": times(energy, 1 / WH),
-        "consumption_wh_km": None if energy is None else energy / recorded.distance / WH_PER_KM,
-        "rms_speed_km_h": rms("speed", 3.6),
-        "rms_pack_voltage_v": rms("pack_voltage", 1.0),
-        "rms_pack_current_a": rms("pack_current", 1.0),
-        "rms_motor_torque_nm": rms("motor_torque", 1.0),
-    }
+    return MeasuredEntry(
+        distance_km=recorded.distance * 1e-3,
+        energy_wh=times(energy, 1 / WH),
+        consumption_wh_km=None if energy is None else energy / recorded.distance / WH_PER_KM,
+        rms_speed_km_h=rms("speed", 3.6),
+        rms_pack_voltage_v=rms("pack_voltage", 1.0),
+        rms_pack_current_a=rms("pack_current", 1.0),
+        rms_motor_torque_nm=rms("motor_torque", 1.0),
+    )
 
 
-def summary_text(summary: dict[str, Any]) -> str:
+def summary_text(summary: Summary) -> str:
     """A summary for a terminal."""
-    way = {"repetition": "ridden until empty", "energy": "energy left at the start over the consumption"}
-    ledger = sorted(summary["ledger_wh"].items(), key=lambda item: -item[1])
-    ledger = [(name, energy) for name, energy in ledger if abs(energy) >= 0.005]
+    ledger = sorted(summary.ledger_wh.items(), key=lambda item: -item[1])
+    ledger = [(name, energy) for name, energy in ledger if abs(energy) >= _LEAST]
     gross = sum(energy for _, energy in ledger if energy > 0) or 1.0
     rows = [
         (
-            summary["kind"],
-            f"{clock(summary['duration_s'])}, {summary['distance_km']:.2f} km, "
-            f"at most {summary['speed_max_km_h']:.0f} km/h, "
-            f"{summary['repetitions']:.3g} times",
+            summary.kind,
+            f"{clock(summary.duration_s)}, {summary.distance_km:.2f} km, "
+            f"at most {summary.speed_max_km_h:.0f} km/h, "
+            f"{summary.repetitions:.3g} times",
         ),
         (
             "energy",
-            f"{summary['energy_wh']:.1f} Wh net, {summary['energy_recovered_wh']:.1f} Wh recovered before; "
-            f"{number(summary['consumption_wh_km'], '.2f', 'Wh/km')}",
+            f"{summary.energy_wh:.1f} Wh net, {summary.energy_recovered_wh:.1f} Wh recovered before; "
+            f"{number(summary.consumption_wh_km, '.2f', 'Wh/km')}",
         ),
-        ("state of charge", f"{100 * summary['soc_start']:.1f} → {100 * summary['soc_end']:.1f} %"),
-        ("range", f"{number(summary['range_km'], '.1f', 'km')} ({way.get(summary['range_by'], 'not to be told')})"),
+        ("state of charge", f"{100 * summary.soc_start:.1f} → {100 * summary.soc_end:.1f} %"),
+        ("range", f"{number(summary.range_km, '.1f', 'km')} ({_RANGE_BY[summary.range_by]})"),
         *_shortfall_rows(summary),
         *(
             (
@@ -166,75 +222,69 @@ def summary_text(summary: dict[str, Any]) -> str:
         ),
         *_measured_rows(summary),
         *_turning_rows(summary),
-        ("closes to", f"{100 * summary['closure']:.1g} % of what was turned over"),
-        ("computed in", f"{summary['wall_s']:.2f} s, step {1000 * summary['step_s']:g} ms"),
+        ("closes to", f"{100 * summary.closure:.1g} % of what was turned over"),
+        ("computed in", f"{summary.wall_s:.2f} s, step {1000 * summary.step_s:g} ms"),
     ]
-    rows += [("written", ", ".join(summary["files"]))] if summary["files"] else []
-    lines = [
-        f"{summary['what']}, {summary['vehicle']}, payload {summary['payload_kg']:g} kg (by {summary['payload_from']})"
-    ]
-    lines += [f"  {name:17} {text}" for name, text in rows]
-    if summary["sweep"]:
-        lines += ["", *_table(summary["sweep"])]
-    return "\n".join(lines)
+    rows += [("written", ", ".join(summary.files))] if summary.files else []
+    head = f"{summary.what}, {summary.vehicle}, payload {summary.payload_kg:g} kg (by {summary.payload_from})"
+    return "\n".join([text_rows(head, rows), *(["", *_table(summary.sweep)] if summary.sweep else [])])
 
 
-def _shortfall_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    found = summary["shortfalls"]
+def _shortfall_rows(summary: Summary) -> list[tuple[str, str]]:
+    found = summary.shortfalls
     if not found:
         return []
-    rows = [("shortfall", f"{summary['shortfall_s']:.0f} s slower than wanted, in {len(found)} stretches; the worst:")]
-    for s in found[:5]:
-        why = "beyond the vehicle" if s["beyond_vehicle"] else "the rider's lag"
-        place = f"at {s['time_s']:.0f} s, {s['distance_km']:.2f} km, for {s['duration_s']:.0f} s"
-        rows.append(("", f"{place}: {s['missing_km_h']:.1f} km/h below {s['wanted_km_h']:.0f} km/h: {why}"))
+    rows = [("shortfall", f"{summary.shortfall_s:.0f} s slower than wanted, in {len(found)} stretches; the worst:")]
+    for s in found[:_SHOWN]:
+        why = "beyond the vehicle" if s.beyond_vehicle else "the rider's lag"
+        place = f"at {s.time_s:.0f} s, {s.distance_km:.2f} km, for {s.duration_s:.0f} s"
+        rows.append(("", f"{place}: {s.missing_km_h:.1f} km/h below {s.wanted_km_h:.0f} km/h: {why}"))
     return rows
 
 
-def _turning_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    seconds = summary["turning_beyond_s"]
+def _turning_rows(summary: Summary) -> list[tuple[str, str]]:
+    seconds = summary.turning_beyond_s
     if not seconds:
         return []
-    return [("turning", f"{seconds:.1f} s in bends harder than the {summary['chassis']} model goes: taken at its edge")]
+    return [("turning", f"{seconds:.1f} s in bends harder than the {summary.chassis} model goes: taken at its edge")]
 
 
-def _measured_rows(summary: dict[str, Any]) -> list[tuple[str, str]]:
-    m = summary["measured"]
+def _measured_rows(summary: Summary) -> list[tuple[str, str]]:
+    m = summary.measured
     if not m:
         return []
     return [
         (
             "measured",
-            f"{m['distance_km']:.2f} km, {number(m['energy_wh'], '.1f', 'Wh')}, "
-            f"{number(m['consumption_wh_km'], '.2f', 'Wh/km')}",
+            f"{m.distance_km:.2f} km, {number(m.energy_wh, '.1f', 'Wh')}, "
+            f"{number(m.consumption_wh_km, '.2f', 'Wh/km')}",
         ),
         (
             "simulated less",
             "RMS "
             + ", ".join(
-                number(m[key], form, unit)
-                for key, form, unit in (
-                    ("rms_speed_km_h", ".1f", "km/h"),
-                    ("rms_pack_voltage_v", ".2f", "V"),
-                    ("rms_pack_current_a", ".1f", "A"),
-                    ("rms_motor_torque_nm", ".1f", "N·m"),
+                (
+                    number(m.rms_speed_km_h, ".1f", "km/h"),
+                    number(m.rms_pack_voltage_v, ".2f", "V"),
+                    number(m.rms_pack_current_a, ".1f", "A"),
+                    number(m.rms_motor_torque_nm, ".1f", "N·m"),
                 )
             ),
         ),
     ]
 
 
-def _table(sweep: Sequence[dict[str, Any]]) -> list[str]:
-    names = list(sweep[0]["values"])
+def _table(sweep: Sequence[Variant]) -> list[str]:
+    names = list(sweep[0].values)
     heads = [*names, "Wh/km", "range km", "shortfall s"]
     width = [max(len(head), 10) for head in heads]
     lines = ["  ".join(f"{head:>{w}}" for head, w in zip(heads, width, strict=True))]
     for variant in sweep:
-        cells = [f"{value:g}" for value in variant["values"].values()]
+        cells = [f"{value:g}" for value in variant.values.values()]
         cells += [
-            number(variant["consumption_wh_km"], ".2f"),
-            number(variant["range_km"], ".1f"),
-            f"{variant['shortfall_s']:.0f}",
+            number(variant.consumption_wh_km, ".2f"),
+            number(variant.range_km, ".1f"),
+            f"{variant.shortfall_s:.0f}",
         ]
         lines.append("  ".join(f"{cell:>{w}}" for cell, w in zip(cells, width, strict=True)))
     return lines

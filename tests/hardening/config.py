@@ -18,8 +18,8 @@ from typing import Any
 
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, Frame
-from gz_onboard.lab.calibrate.command import PROCEDURES
 from gz_onboard.lab.calibrate.manifest import read_manifest
+from gz_onboard.lab.calibrate.procedures import PROCEDURES
 from gz_onboard.physics.battery import Battery
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle

@@ -20,7 +20,7 @@ from random import Random
 from gz_onboard.bus.codec import Codec, raw_range
 from gz_onboard.daemon import CLOCK_STEP_NS
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
-from gz_onboard.lab.estimate import feed
+from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.pipeline import DROPPING, TICK_NS
 from gz_onboard.vehicle import Vehicle
 from tests.hardening.report import Report

@@ -21,6 +21,7 @@ from gz_onboard.bus.logs import read_attachments, read_frames, read_metadata, re
 from gz_onboard.bus.mapping import find_dbc, load_database
 from gz_onboard.events import EFF_FLAG, Estimate
 from gz_onboard.lab import estimate
+from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, Summary, Tally, feed
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
 from tests.support import HEARS_CTRL_C
@@ -61,7 +62,7 @@ def estimates(log):
 def test_the_summary_of_a_ride_agrees_with_its_frames(tmp_path, capsys):
     assert run(RIDE, "--output", tmp_path, "--json", "--no-plot") == 0
     document = json.loads(capsys.readouterr().out)
-    assert (document["version"], document["failed"]) == (estimate.SUMMARY_VERSION, [])
+    assert (document["version"], document["failed"]) == (SUMMARY_VERSION, [])
     (ride,) = document["rides"]
     assert set(ride) == set(estimate.KEYS)
 
@@ -221,9 +222,9 @@ def test_what_cannot_be_done_is_told(tmp_path, monkeypatch, capsys, frames, argu
 
 def test_a_slow_bus_is_estimated_ten_times_a_second(vehicle, frames):
     slow = frames[::12]  # 45 frames/s: a reader's batch takes 20 s
-    tally = estimate.Tally()
+    tally = Tally()
     pipeline = Pipeline(vehicle, observer=tally)
-    estimate.feed(pipeline, [slow[:1000], slow[1000:]])
+    feed(pipeline, [slow[:1000], slow[1000:]])
     assert sum(tally.ticks.values()) == pytest.approx((slow[-1][0] - slow[0][0]) / 1e8, abs=2)
 
 
@@ -232,7 +233,7 @@ def test_a_gap_is_ridden_through_and_a_pause_is_not(vehicle, frames):
         made: list[Estimate] = []
         pipeline = Pipeline(vehicle, observer=made.append)
         later = [(t + round(gap_s * 1e9), i, d, c) for t, i, d, c in frames[6000:9000]]
-        estimate.feed(pipeline, [frames[:6000], later])
+        feed(pipeline, [frames[:6000], later])
         return made
 
     without, gap, pause = states(0), states(25), states(3600)
@@ -257,7 +258,7 @@ def test_no_jump_of_the_clock_stops_it(jumps, size):
     made: list[Estimate] = []
     counted: list[float] = []
     pipeline = Pipeline(REFERENCE, observer=made.append)
-    estimate.feed(pipeline, [moved[i : i + size] for i in range(0, len(moved), size)], counted.append)
+    feed(pipeline, [moved[i : i + size] for i in range(0, len(moved), size)], counted.append)
     assert sum(counted) == len(moved) == pipeline.codec.received
     assert len(made) < 3000
     for e in made:
@@ -271,11 +272,11 @@ REFERENCE = read_vehicle("reference")
 
 def test_progress_is_told_from_all_processes(tmp_path, frames, monkeypatch):
     logs = [candump(tmp_path / f"{n}.log", frames[:3000]) for n in range(3)]
-    tasks = [estimate.Task(log, tmp_path / log.stem, "reference", plot=False) for log in logs]
+    tasks = [EstimateTask(log, tmp_path / log.stem, "reference", plot=False) for log in logs]
     for jobs in 1, 2:
         told: list[float] = []
         results = list(estimate._results(tasks, jobs, told.append))
-        assert all(isinstance(result, dict) for _, result in results)
+        assert all(isinstance(result, Summary) for _, result in results)
         assert sum(told) <= 9000
         assert sum(told) >= 3000
 

@@ -157,7 +157,7 @@ def test_the_naive_range_of_steady_riding_is_energy_over_consumption(speed, cons
 
 
 def test_the_naive_range_forgets_what_is_more_than_25_km_ago():
-    rows: list[plot.Row] = []
+    rows: list[plot.Logged] = []
     distance = 0.0
     for t in range(12_000):  # 20 km at 160 J/m, then 100 km at 80 J/m
         rows.append(

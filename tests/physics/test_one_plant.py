@@ -20,12 +20,12 @@ from gz_onboard.lab.discover import residuals
 from gz_onboard.lab.discover.grid import Ride, read_ride
 from gz_onboard.lab.discover.state import initial
 from gz_onboard.lab.validate_components import battery_voltage, components, losses, road_load
+from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Port
 from gz_onboard.physics.model import air_density
 from gz_onboard.physics.tables import Mesh, bilinear_over, extended, extended_over, linear
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.parts.rider import Rider
-from gz_onboard.simulation.samples import read_samples
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import read_vehicle
 

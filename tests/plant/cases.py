@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from gz_onboard.simulation.samples import Samples
+from gz_onboard.offline.samples import Samples
 from tests.plant.machine import Machine, scooter
 from tests.plant.ride import STEP, Hidden, Ridden, ride
 from tests.plant.roads import KINDS as ROADS

@@ -13,7 +13,7 @@ from cantools.database.can import Message
 from cantools.database.can.signal import Signal
 from numpy.typing import NDArray
 
-from gz_onboard.simulation.samples import Samples
+from gz_onboard.offline.samples import Samples
 
 DBC = Path(__file__).parents[2] / "dbc"
 DEGREE, REVOLUTION, BAR = np.pi / 180, 2 * np.pi, 1e5

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array
-from gz_onboard.simulation.samples import Samples
+from gz_onboard.offline.samples import Samples
 from tests.plant.machine import G
 from tests.plant.ride import STEP, Ridden
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.events import ROLES
-from gz_onboard.simulation.samples import read_samples
+from gz_onboard.offline.samples import read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.plant.cases import EFFECTS, RIDES, UNKNOWN, _draft
 from tests.plant.logs import write_logs
@@ -39,7 +39,7 @@ def test_it_knows_of_the_package_nothing_but_the_form_of_a_ride():
                     names.add(node.module)
                 elif isinstance(node, ast.Import):
                     names |= {alias.name for alias in node.names}
-    assert {name for name in names if name.startswith("gz_onboard")} == {"gz_onboard.simulation.samples"}
+    assert {name for name in names if name.startswith("gz_onboard")} == {"gz_onboard.offline.samples"}
 
 
 def test_a_ride_does_not_depend_on_its_company(healthy):

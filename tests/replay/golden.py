@@ -17,7 +17,7 @@ from pathlib import Path
 
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import Estimate, Frame
-from gz_onboard.lab.estimate import feed
+from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.pipeline import Pipeline, estimate_row
 from gz_onboard.vehicle import read_vehicle
 

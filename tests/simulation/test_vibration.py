@@ -13,14 +13,14 @@ import pytest
 
 from gz_onboard.cli import main
 from gz_onboard.lab.discover.grid import vibration as of_samples
-from gz_onboard.lab.validate import per_second
 from gz_onboard.lab.validate_components import battery_voltage, road_load
+from gz_onboard.lab.validate_ride import per_second
+from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import MOVING, load_effect
-from gz_onboard.simulation.backward import backward
+from gz_onboard.simulation.backward import Conditions, backward
 from gz_onboard.simulation.parts.road import Dynamometer, straight
 from gz_onboard.simulation.recorded import Recorded, read_recorded
 from gz_onboard.simulation.run import drive
-from gz_onboard.simulation.samples import read_samples
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.simulation.sensors import SENSORS, Trace
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
@@ -91,7 +91,7 @@ def test_backward_agrees_with_forward(folder: Path):
         run, _ = ride(vehicle, vibration=given)
         series = run.series
         told = None if given is None else np.where(series["speed"] > 0.5, given, 0.0)
-        energy = backward(vehicle, series["time"], series["speed"], vibration=told, smoothing=0.0)
+        energy = backward(vehicle, series["time"], series["speed"], Conditions(vibration=told), smoothing=0.0)
         for name in ("rough_road", "rough_power"):
             assert energy.ledger[name] == pytest.approx(run.ledger[name], rel=0.02)
 

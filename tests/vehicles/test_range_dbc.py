@@ -9,7 +9,7 @@ import pytest
 from gz_onboard.bus.mapping import find_dbc, load_database
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, State
-from gz_onboard.lab.estimate import feed
+from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.pipeline import Pipeline, dbc_texts
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 from tests.support import Run, Scooter, check_sound

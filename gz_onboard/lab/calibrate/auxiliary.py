@@ -10,7 +10,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
-from gz_onboard.simulation.samples import Samples
+from gz_onboard.offline.samples import Samples
 
 NEEDED = ("auxiliary_current", "pack_voltage")
 CURRENT_SD = 0.01  # of the current, relative: a shunt's calibration

@@ -20,7 +20,7 @@ from gz_onboard.lab.calibrate.coastdown_run import FASTEST, SLOWEST, SPAN, Coast
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.result import Fit, Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.road_load import NAMES, RoadLoad, own_wind, roll
-from gz_onboard.simulation.samples import Samples
+from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
 WIND_SD = 1.0  # m/s: a constant wind along the track on a day that was chosen for coast-downs

@@ -11,7 +11,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.lab.calibrate.table import Table
-from gz_onboard.simulation.samples import Samples, read_facts
+from gz_onboard.offline.samples import Samples, read_facts
 from gz_onboard.vehicle import Vehicle
 
 SPAN = 2.0  # s

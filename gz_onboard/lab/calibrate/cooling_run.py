@@ -12,11 +12,11 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.cooling import PERIOD
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import total
-from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
 SHORTEST = 300.0  # s: less tells nothing of time constants of minutes

@@ -18,7 +18,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD
 from gz_onboard.lab.calibrate.fit import linear, score, split
 from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
-from gz_onboard.simulation.samples import Samples
+from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
 LAGS = np.arange(-0.3, 0.31, 0.05)  # s: what one set of sensors may lag the other

@@ -16,7 +16,7 @@ from gz_onboard.lab.calibrate.fit import linear, score, split
 from gz_onboard.lab.calibrate.offsets import read_pair
 from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.table import Table
-from gz_onboard.simulation.samples import Samples
+from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
 STEP_TIME = 0.2  # s

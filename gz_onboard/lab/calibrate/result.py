@@ -1,4 +1,4 @@
-"""What a calibration procedure gives: values with their uncertainty, what could not be told, and how well it fits."""
+"""What a procedure gives: values with their uncertainty, what could not be identified, and how well it fits."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Result:
     """What one procedure found.
 
     covariance: groups of parameters that are tied, each with its matrix in the parameters' units.
-    refusals: what the data could not tell, one sentence each, with the number that says so.
+    refusals: what the data could not identify, one sentence each, with the number that shows it.
     """
 
     procedure: str
@@ -81,3 +81,13 @@ class Result:
     refusals: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     panels: list[Panel] = field(default_factory=list)
+
+    def add(self, other: Result) -> None:
+        """Put what `other` found into this."""
+        self.parameters |= other.parameters
+        self.curves |= other.curves
+        self.covariance += other.covariance
+        self.fits += other.fits
+        self.refusals += other.refusals
+        self.notes += other.notes
+        self.panels += other.panels

@@ -13,7 +13,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.result import Fit, Found, Panel, Result, Trace
-from gz_onboard.simulation.samples import Samples
+from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
 SLOWEST = 5.0  # m/s: below, a receiver's speed is poor

@@ -20,9 +20,11 @@ from gz_onboard.lab.discover.limits import amount, limits, size, strange, unform
 from gz_onboard.lab.discover.parts import before_and_after, outstanding
 from gz_onboard.lab.discover.result import METRICS, SCHEMA, VERDICTS, Report
 from gz_onboard.lab.discover.worth import sizes
-from gz_onboard.lab.processes import Progress, over_rides
-from gz_onboard.simulation.samples import Samples, read_samples
-from gz_onboard.simulation.telling import clock, explain_keys, write_json
+from gz_onboard.offline.processes import Task, over_rides
+from gz_onboard.offline.results import clock, explain_keys, write_json
+from gz_onboard.offline.samples import Samples, read_samples
+from gz_onboard.options import add_shared, keep_old_name
+from gz_onboard.progress import Progress
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 KEYS = {
@@ -54,7 +56,7 @@ _ROWS = 3  # residuals and limits told in the terminal
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the command line."""
     parser.add_argument("rides", nargs="*", type=Path, metavar="RIDE", help="logs, or folders of logs")
-    parser.add_argument("--vehicle", default="reference", metavar="V.toml", help="vehicle file or name (%(default)s)")
+    add_shared(parser, "--vehicle")
     parser.add_argument(
         "--baseline",
         type=Path,
@@ -62,21 +64,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the rides are healthy: write the vehicle as they show it, and what healthy rides look "
         "like beside it; give that file as --vehicle from then on",
     )
-    parser.add_argument("--payload", type=float, metavar="KG", help="rider and luggage, of rides without a rides.json")
-    parser.add_argument("--report", type=Path, metavar="OUT.html", help="write a report to read")
-    parser.add_argument("--json", metavar="OUT", help="write the result as JSON; - for standard output")
+    add_shared(parser, "--payload", help="mass of rider and luggage, of rides that rides.json does not name")
+    add_shared(parser, "--report", "--json")
     parser.add_argument("--write-model", type=Path, metavar="NEW.toml", help="write the extended vehicle file")
     parser.add_argument(
         "--holdout",
         metavar="RIDE,...",
         help="rides by name that the gain is measured on; each in turn if none is named",
     )
-    parser.add_argument("--effects", type=Path, metavar="DIR", help="folder with effects of your own as candidates")
+    add_shared(parser, "--effects", help="folder with effects of your own as candidates")
     parser.add_argument("--list", action="store_true", help="print the candidates and what would show them")
-    parser.add_argument("--seed", type=int, default=0, help="of the resampling of rides (%(default)s)")
-    parser.add_argument("--workers", type=int, default=min(2, os.cpu_count() or 1), help="processes (%(default)s)")
-    parser.add_argument("--quiet", action="store_true", help="no progress")
-    explain_keys(parser, "the", SCHEMA, KEYS)
+    jobs = min(2, os.cpu_count() or 1)
+    add_shared(parser, "--seed")
+    add_shared(parser, "--jobs", default=jobs, help="number of parallel processes (default: %(default)s)")
+    keep_old_name(parser, "--workers", "--jobs")
+    add_shared(parser, "--quiet")
+    explain_keys(parser, "the report", SCHEMA, KEYS)
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -98,12 +101,12 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("; ".join(refused))
     holdout = [name.strip() for name in arguments.holdout.split(",")] if arguments.holdout else None
     with _Bar(arguments.quiet) as bar:
-        report = discover(vehicle, rides, arguments.seed, arguments.effects, bar.say, arguments.workers, holdout)
+        report = discover(vehicle, rides, arguments.seed, arguments.effects, bar.say, arguments.jobs, holdout)
     report.notes[:0] = refused
     report.notes += [*unsettled(report), *outstanding(report), *strange(report), *unformed(report)]
     told = write_extended(report, vehicle, arguments) if arguments.write_model else []
     if arguments.json:
-        write_json(arguments.json, document(report))
+        write_json(arguments.json, None, document(report))
     if arguments.report:
         from gz_onboard.lab.discover.report import write_report
 
@@ -123,7 +126,7 @@ def run_baseline(arguments: argparse.Namespace, vehicle: Vehicle, rides: list[Sa
     healthy = [ride for ride in rides if on_road(ride)]
     left = [ride.name for ride in rides if not on_road(ride)]
     with _Bar(arguments.quiet) as bar:
-        found = baseline(vehicle, healthy, arguments.effects, bar.say, arguments.workers)
+        found = baseline(vehicle, healthy, arguments.effects, bar.say, arguments.jobs)
     write_baseline(found, find_vehicle(arguments.vehicle), arguments.baseline)
     print(
         f"{arguments.baseline}: {vehicle.name} as {len(healthy)} healthy rides show it; what healthy rides look like "
@@ -160,8 +163,6 @@ def _check(arguments: argparse.Namespace, logs: Sequence[Path]) -> None:
             raise InputError(f"--holdout: no ride is called {name!r}{nearest(name, names)}")
     if arguments.holdout and len(logs) < 2:
         raise InputError("--holdout: one ride alone cannot be held out of the fit")
-    if arguments.payload is not None and not 0 <= arguments.payload <= 300:
-        raise InputError(f"--payload {arguments.payload:g}: must be 0 to 300 kg")
 
 
 # --- rides --------------------------------------------------------------------------------------------------------
@@ -199,13 +200,10 @@ def stem(log: Path) -> str:
 
 
 @dataclass(frozen=True)
-class _Reading:
-    """A log to be read."""
+class _Reading(Task):
+    """A log to be read; its payload is for one whose facts have none."""
 
-    path: Path
-    vehicle: str
-    payload: float | None  # kg, where none is noted
-    effects: Path | None  # folder of the user's own
+    effects: Path | None = None  # folder of the user's own
 
 
 def _read(task: _Reading, _: Progress) -> Samples:
@@ -219,11 +217,11 @@ def read_rides(logs: Sequence[Path], arguments: argparse.Namespace) -> tuple[lis
     """The rides, and why a log is none. InputError if no log is one."""
     from tqdm import tqdm
 
-    tasks = [_Reading(log, arguments.vehicle, arguments.payload, arguments.effects) for log in logs]
+    tasks = [_Reading(log, log, arguments.vehicle, arguments.payload, effects=arguments.effects) for log in logs]
     rides: list[Samples] = []
     refused: list[str] = []
     with tqdm(total=len(tasks), desc="reading", unit=" rides", leave=False, disable=arguments.quiet or None) as bar:
-        for _, result in over_rides(_read, tasks, max(arguments.workers, 1), option="--workers"):
+        for _, result in over_rides(_read, tasks, arguments.jobs):
             if isinstance(result, InputError):
                 refused.append(str(result))
             else:

@@ -36,8 +36,8 @@ from gz_onboard.lab.discover.shapes import with_inflation
 from gz_onboard.lab.discover.state import State, initial, restore
 from gz_onboard.lab.discover.terms import FIXED, LOG, WEATHER
 from gz_onboard.lab.discover.verdict import reach
+from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.parameters import Parameters, Value, declared_parameters
-from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
 WEIGHT = 1.0  # rides that the scatter before any healthy ride is worth

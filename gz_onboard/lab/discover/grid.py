@@ -14,9 +14,9 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
+from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.model import air_density
 from gz_onboard.physics.vibration import Vibration
-from gz_onboard.simulation.samples import Samples
 
 STEP = 0.1  # s
 LAGS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}

@@ -18,8 +18,8 @@ from gz_onboard.lab.discover.parts import QUANTITIES, Over, before_and_after, bi
 from gz_onboard.lab.discover.result import METRICS, VERDICTS, Report
 from gz_onboard.lab.discover.unknown import RIDES
 from gz_onboard.lab.discover.worth import sizes
-from gz_onboard.simulation.style import BLUE, GRID, INK, MUTED, ORANGE, headline, legend, new_figure, rule
-from gz_onboard.simulation.telling import clock
+from gz_onboard.offline.results import clock
+from gz_onboard.offline.style import BLUE, GRID, INK, MUTED, ORANGE, headline, legend, new_figure, rule
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -15,9 +15,9 @@ from gz_onboard.lab.discover.grid import Ride, read_ride
 from gz_onboard.lab.discover.linear import Noise
 from gz_onboard.lab.discover.residuals import System, counted_soc
 from gz_onboard.lab.discover.terms import BASE, FIXED, LOG, NUISANCES, RIDE_SD, RIDE_SD_SHARE, stepped
+from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import Effect
 from gz_onboard.physics.parameters import declared_parameters
-from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
 MEAN_SD = {

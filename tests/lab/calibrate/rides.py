@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gz_onboard.simulation.samples import Samples
+from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")

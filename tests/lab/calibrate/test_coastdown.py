@@ -17,9 +17,9 @@ from gz_onboard.lab.calibrate.coastdown import calibrate
 from gz_onboard.lab.calibrate.coastdown_run import coast, directions, samples
 from gz_onboard.lab.calibrate.road_load import NAMES
 from gz_onboard.lab.calibrate.table import Table, read_table
+from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
-from gz_onboard.simulation.samples import Samples, read_samples
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")

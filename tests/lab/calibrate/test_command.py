@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from gz_onboard.cli import main
-from gz_onboard.lab.calibrate.command import PROCEDURES, for_file
+from gz_onboard.lab.calibrate.command import for_file
+from gz_onboard.lab.calibrate.procedures import PROCEDURES
 from gz_onboard.lab.calibrate.result import Curve, Found, Result
 from gz_onboard.vehicle import read_vehicle
 
@@ -82,6 +83,16 @@ def test_columns_of_other_people(tmp_path, capsys):
     assert found["value"] == pytest.approx(0.5309, abs=0.002)
 
 
+def test_a_folder_of_rides_is_its_logs(tmp_path, capsys):
+    for name in ("coastdown_01.blf", "coastdown_02.blf", "rides.json", "motor_emf_ramp.csv.gz"):
+        shutil.copy(DATA / name, tmp_path)
+    answers = []
+    for data in ([tmp_path], [tmp_path / "coastdown_01.blf", tmp_path / "coastdown_02.blf"]):
+        assert main(["calibrate", "coastdown", *map(str, data), "--json"]) == 0
+        answers.append(json.loads(capsys.readouterr().out))
+    assert answers[0] == answers[1]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -102,6 +113,7 @@ def test_columns_of_other_people(tmp_path, capsys):
         (["motor", "motor_dyno.csv.gz", "--out", "none/x.toml"], "there is no folder none"),
         (["motor", "motor_dyno.csv.gz", "--vehicle", "refrence"], r"no such vehicle file; .*did you mean 'reference'"),
         (["all", "..", ".."], "all takes one folder"),
+        (["wheel", "../../dbc"], "dbc: this folder holds no log"),
         (["all", "..", "--held-out", "x"], "from the manifest"),
         (["all", ".."], "takes a folder with a manifest calibration.toml"),
     ],

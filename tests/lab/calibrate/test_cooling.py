@@ -10,8 +10,8 @@ from gz_onboard.lab.calibrate import cooling
 from gz_onboard.lab.calibrate.cooling import bms_cooling, inverter_cooling, motor_cooling, pack_cooling
 from gz_onboard.lab.calibrate.cooling_run import Run, bench_run, ride_run
 from gz_onboard.lab.calibrate.table import read_table
+from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.parameters import declared_parameters
-from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import read_vehicle
 
 from .bench import bench_file, changed, needs_data, table, without

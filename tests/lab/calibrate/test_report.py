@@ -8,8 +8,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from gz_onboard.lab.calibrate.report import document, picture, text, thinned, told, write_report
+from gz_onboard.lab.calibrate.report import VERSION, document, picture, plus_minus, text, thinned, write_report
 from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, Result, Trace
+from gz_onboard.offline.results import write_json
 
 NAN = float("nan")
 
@@ -61,8 +62,10 @@ def test_the_page_needs_nothing_else_and_says_all(tmp_path):
     assert again.read_bytes() == file.read_bytes()
 
 
-def test_json_holds_no_nan():
-    written = json.dumps(document([a_result()], "v.toml", None), allow_nan=False)
+def test_json_holds_no_nan(capsys):
+    write_json("-", VERSION, document([a_result()], "v.toml", None))
+    written = capsys.readouterr().out
+    assert "NaN" not in written
     read = json.loads(written)
     (procedure,) = read["procedures"]
     assert read["version"] == 1
@@ -77,7 +80,7 @@ def test_text():
     lines = text(a_result()).splitlines()
     assert lines[0] == "coast"
     assert "  drag_area = 0.500 ± 0.030 m²" in lines
-    assert "  not told: the slope: ± 3 %" in lines
+    assert "  not identified: the slope: ± 3 %" in lines
 
 
 @pytest.mark.parametrize(
@@ -91,7 +94,7 @@ def test_text():
     ],
 )
 def test_as_many_digits_as_are_known(value, sd, expected):
-    assert told(value, sd) == expected
+    assert plus_minus(value, sd) == expected
 
 
 def test_thinning_keeps_the_start():

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.wheel import RECEIVER, calibrate
-from gz_onboard.simulation.samples import Samples
+from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")

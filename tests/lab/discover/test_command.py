@@ -12,7 +12,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.candidates import candidates
 from gz_onboard.lab.discover.command import KEYS
 from gz_onboard.lab.discover.engine import discover
-from gz_onboard.simulation.samples import read_samples
+from gz_onboard.offline.samples import read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS, ROOT
 from tests.test_vehicle import with_effect

@@ -18,9 +18,9 @@ from gz_onboard.lab.discover.linear import Linear
 from gz_onboard.lab.discover.result import Cause, Report
 from gz_onboard.lab.discover.shapes import hats
 from gz_onboard.lab.discover.state import Shape, State, initial, restore
+from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Bound
-from gz_onboard.simulation.samples import read_samples
 from gz_onboard.vehicle import find_vehicle, read_vehicle
 from tests.support import LOGS
 

@@ -20,7 +20,7 @@ from gz_onboard.lab.discover.search import one_degree
 from gz_onboard.lab.discover.shapes import QUANTITIES, Form, supported
 from gz_onboard.lab.discover.stands import possible, widened
 from gz_onboard.lab.discover.state import State, initial
-from gz_onboard.simulation.samples import Samples, read_samples
+from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests import plant
 from tests.support import LOGS

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks.trial import Row, interval, judge, reported, right, summary
 from gz_onboard.lab.discover.engine import baseline, discover
-from gz_onboard.simulation.samples import Samples
+from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.plant import cases as plant
 

@@ -29,7 +29,7 @@ from gz_onboard.lab.discover.parts import (
 from gz_onboard.lab.discover.report import page
 from gz_onboard.lab.discover.result import Cause, Report
 from gz_onboard.lab.discover.state import State, initial
-from gz_onboard.simulation.samples import Samples, read_samples
+from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS
 

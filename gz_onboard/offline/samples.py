@@ -63,12 +63,11 @@ class Samples:
 def read_samples(log: Path, vehicle: Vehicle, progress: Callable[[int], None] | None = None) -> Samples:
     """The samples in the log of a ride of `vehicle`, with its facts from a ``rides.json`` beside it, if there is one.
 
-    progress: is told how many frames were read. Raises InputError for a log that cannot be read or is not of the
+    progress: called with the number of frames read. Raises InputError for a log that cannot be read or is not of the
     vehicle.
     """
     columns = read_roles(log, vehicle, Codec(extended(vehicle.mapping)), progress)
-    name = Path(log.name.removesuffix(".gz")).stem
-    return Samples(name, columns, read_facts(log.parent / "rides.json").get(name, {}))
+    return Samples(ride_name(log), columns, facts_of(log))
 
 
 def read_roles(
@@ -78,9 +77,9 @@ def read_roles(
     progress: Callable[[int], None] | None = None,
     observe: Callable[[Event], None] | None = None,
 ) -> dict[str, tuple[Array, Array]]:
-    """(times [s], values) by role of all that `codec` decodes in `log` more than once; `observe` is told every event.
+    """(times [s], values) by role of all that `codec` decodes in `log` more than once; `observe` gets every event.
 
-    progress: is told how many frames were read. Raises InputError for a log that cannot be read or is not of the
+    progress: called with the number of frames read. Raises InputError for a log that cannot be read or is not of the
     vehicle.
     """
     import numpy as np
@@ -112,6 +111,16 @@ def read_facts(file: Path) -> dict[str, dict[str, object]]:
         return {row["name"]: {key: value for key, value in row.items() if key != "name"} for row in rows}
     except (ValueError, TypeError, KeyError) as error:
         raise InputError(f"{file}: must be a JSON list of objects with a name: {error!r}") from error
+
+
+def ride_name(log: Path) -> str:
+    """The name of the ride in a log: the file's, without its suffixes."""
+    return Path(log.name.removesuffix(".gz")).stem
+
+
+def facts_of(log: Path) -> dict[str, object]:
+    """What ``rides.json`` beside a log says about its ride."""
+    return read_facts(log.parent / "rides.json").get(ride_name(log), {})
 
 
 def rider_mass(facts: dict[str, object]) -> float | None:

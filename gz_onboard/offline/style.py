@@ -12,6 +12,7 @@ if TYPE_CHECKING:
 
 INK, MUTED, GRID = "#1f2933", "#7b8794", "#e4e7eb"
 BLUE, ORANGE, GREEN, RED, PURPLE = "#1667b7", "#d9730d", "#2f855a", "#c53030", "#6b46c1"
+_LONG = 300.0  # s: from here on an abscissa is in minutes
 _SIDES = ("top", "right", "left", "bottom")
 
 
@@ -101,11 +102,16 @@ def legend(axis: Axes, *others: Axes) -> None:
 
 
 def close(axes: Sequence[Axes], x: Sequence[float], text: str) -> None:
-    """The abscissa `x` of a stack: named below the last panel, with numbers there alone, from end to end."""
+    """The abscissa `x` of a stack: named and numbered below the last panel only, from end to end."""
     for axis in axes[:-1]:
         axis.tick_params(labelbottom=False)
     axes[-1].set_xlabel(text, color=INK, fontsize=9, loc="left")
     axes[0].set_xlim(float(x[0]), max(float(x[-1]), float(x[0]) + 1e-3))
+
+
+def time_unit(duration: float) -> tuple[float, str]:
+    """The unit of an abscissa over a ride of `duration` [s]: its length [s] and name."""
+    return (60.0, "min") if duration >= _LONG else (1.0, "s")
 
 
 def headline(figure: Figure, x: float, y: float, text: str, size: float = 13) -> None:

@@ -1,0 +1,324 @@
+"""One recorded ride through the pipeline of the daemon, as fast as it goes; and the summary of its estimates."""
+
+from __future__ import annotations
+
+import functools
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from math import sqrt
+from pathlib import Path
+from typing import Annotated, cast
+
+from gz_onboard.bus import _can  # noqa: F401 - before cantools, which would import it with asammdf and pandas
+from gz_onboard.bus.logs import LogDamage, read_frames
+from gz_onboard.bus.publisher import WH, WH_PER_KM, Counts, Publisher
+from gz_onboard.bus.recorder import LogFile
+from gz_onboard.errors import InputError, writing
+from gz_onboard.events import Estimate, Frame, Reason, State
+from gz_onboard.lab.plot import plot_log
+from gz_onboard.offline.processes import Task
+from gz_onboard.offline.results import times
+from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, range_publisher, reason_names
+from gz_onboard.progress import Progress
+from gz_onboard.vehicle import Vehicle, read_vehicle
+
+SUMMARY_VERSION = 1
+TICK_S = TICK_NS * 1e-9
+_GAP_NS = 2_000_000_000  # a longer pause between two frames is ridden through in steps
+_PAUSE_NS = 30_000_000_000  # beyond this the recording was stopped, and nothing is estimated meanwhile
+_CONFIRM = 3  # fewer frames than this do not set the time
+
+
+@dataclass(frozen=True)
+class EstimateTask(Task):
+    """A log to be estimated."""
+
+    filter_name: str = "scalar"
+    frames: bool = False
+    signals: bool = False
+
+    @property
+    def log(self) -> Path:
+        """The MCAP."""
+        return self.output(".estimate.mcap")
+
+    @property
+    def picture(self) -> Path | None:
+        """The PNG, if one is to be drawn."""
+        return self.output(".estimate.png") if self.plot else None
+
+    @property
+    def part(self) -> Path:
+        """The MCAP while it is not complete."""
+        return self.output(".estimate.mcap.part")
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A ride in the JSON: {"version", "rides": [summaries], "failed": [{file, error}]}."""
+
+    file: Annotated[str, "the log"]
+    log: Annotated[str, "the MCAP written"]
+    plot: Annotated[str | None, "the PNG written, or null"]
+    vehicle: Annotated[str, "name of the vehicle"]
+    filter: Annotated[str, "backend of the filter"]
+    start_ns: Annotated[int, "time of the first frame [ns since the epoch, as in the log]"]
+    duration_s: Annotated[float, "from the first to the last estimate"]
+    distance_km: Annotated[float, "ridden"]
+    speed_max_km_h: Annotated[float | None, "greatest speed, or null"]
+    energy_wh: Annotated[
+        float | None, "drawn from the pack, less what was recovered; null if voltage or current was never known"
+    ]
+    energy_recovered_wh: Annotated[float | None, "charged into the pack while riding, or null"]
+    consumption_wh_km: Annotated[float | None, "energy over distance; null below 0.1 km"]
+    soc_start: Annotated[float | None, "state of charge, 0 to 1, at the first estimate that has one"]
+    soc_start_sd: Annotated[float | None, "its standard deviation"]
+    soc_end: Annotated[float | None, "at the last estimate that has one"]
+    soc_end_sd: Annotated[float | None, "its standard deviation"]
+    range_start_km: Annotated[float | None, "first range published"]
+    range_end_km: Annotated[float | None, "last range published"]
+    range_end_p10_km: Annotated[float | None, "exceeded with 90 % probability"]
+    range_end_p90_km: Annotated[float | None, "exceeded with 10 % probability"]
+    energy_left_wh: Annotated[float | None, "to be drawn before the cut-off, at the end"]
+    innovation_rms_v: Annotated[float | None, "root mean square of measured less predicted voltage of a cell [V]"]
+    innovation_max_v: Annotated[float | None, "greatest magnitude of the same"]
+    states: Annotated[dict[str, float], "seconds in each state"]
+    reasons: Annotated[dict[str, float], "seconds with each reason to distrust the estimate"]
+    frames: Annotated[int, "received"]
+    dropped: Annotated[int, "frames that failed a check"]
+    implausible: Annotated[int, "signals out of their physical range"]
+    lost: Annotated[int, "frames missing by their counters"]
+    unknown: Annotated[int, "different identifiers that the database does not know"]
+    error_frames: Annotated[int, "error frames of the bus"]
+    faults: Annotated[dict[str, dict[str, int]], "what was dropped, by reason and by message or signal"]
+    damage: Annotated[str | None, "what of the log could not be read, or null"]
+    cpu_s: Annotated[float, "processor time taken, without drawing"]
+    real_time_factor: Annotated[float | None, "duration of the ride over the time taken, without drawing"]
+
+
+@dataclass
+class Tally:
+    """Sums over a ride's estimates; pass it to the pipeline as its observer."""
+
+    first: Estimate | None = None
+    last: Estimate | None = None
+    soc_start: tuple[float, float] | None = None
+    soc_end: tuple[float, float] | None = None
+    range_start: float | None = None  # m
+    drawn: float | None = None  # J, net
+    recovered: float = 0.0  # J
+    speed_max: float | None = None  # m/s
+    innovation_max: float = 0.0  # V
+    ticks: Counter[tuple[State, int]] = field(default_factory=Counter)
+    _squares: float = 0.0
+    _innovations: int = 0
+    _before: float = 0.0
+
+    def __call__(self, e: Estimate) -> None:
+        """Take in the next estimate."""
+        if self.first is None:
+            self.first, self._before = e, e.time
+        dt, self._before = e.time - self._before, e.time
+        self.last = e
+        self.ticks[e.state, int(e.reasons)] += 1
+        if e.pack_voltage is not None and e.pack_current is not None and 0 <= dt <= 1:
+            energy = e.pack_voltage * e.pack_current * dt
+            self.drawn = (self.drawn or 0.0) + energy
+            self.recovered -= min(energy, 0.0)
+        if e.innovation is not None:
+            self._squares += e.innovation * e.innovation
+            self._innovations += 1
+            self.innovation_max = max(self.innovation_max, abs(e.innovation))
+        if e.speed is not None and (self.speed_max is None or e.speed > self.speed_max):
+            self.speed_max = e.speed
+        if e.soc is not None and e.soc_sd is not None:
+            self.soc_end = e.soc, e.soc_sd
+            if self.soc_start is None:
+                self.soc_start = self.soc_end
+        if self.range_start is None:
+            self.range_start = e.range
+
+    @property
+    def innovation_rms(self) -> float | None:
+        """[V] of a cell, or None if there was no innovation."""
+        return sqrt(self._squares / self._innovations) if self._innovations else None
+
+
+class _Mute(Publisher):
+    """No bus, no range frames: encoding them would take a third of the time."""
+
+    def range(self, estimate: Estimate, counts: Counts, time_ns: int, channel: int = 0) -> list[Frame]:
+        return []
+
+    def status(self, estimate: Estimate, time_ns: int, channel: int = 0) -> list[Frame]:
+        return []
+
+
+def feed(pipeline: Pipeline, batches: Iterable[Sequence[Frame]], progress: Progress | None = None) -> None:
+    """All frames of a log through `pipeline`, in any portions; `progress` is called with their numbers.
+
+    Gaps are ridden through as a live bus would have it, up to a minute; a longer one is a pause of the recording.
+    """
+    now: int | None = None
+    for batch in batches:
+        for portion in _without_jumps(batch):
+            first, last = portion[0][0], portion[-1][0]
+            if now is None:
+                now = first
+            if len(portion) < _CONFIRM and not -TICK_NS <= last - now <= _PAUSE_NS:  # an odd stamp: the codec judges it
+                pipeline.advance(portion, now)
+                continue
+            if _GAP_NS < first - now <= _PAUSE_NS:
+                for step in range(now + _GAP_NS, first, _GAP_NS):
+                    pipeline.advance((), step)
+            pipeline.advance(portion, last)
+            now = last
+        if progress:
+            progress(len(batch))
+
+
+def _without_jumps(batch: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
+    """Parts of `batch` in which time neither goes back nor leaps by more than a gap, and none longer than that."""
+    if not batch:
+        return
+    if 0 <= batch[-1][0] - batch[0][0] <= _GAP_NS:  # nearly all; single odd stamps within are the codec's business
+        yield batch
+        return
+    begin = 0
+    for i in range(1, len(batch)):
+        leap = not -TICK_NS <= batch[i][0] - batch[i - 1][0] <= _GAP_NS
+        if leap or batch[i][0] - batch[begin][0] > _GAP_NS:  # on a slow bus a batch takes many seconds
+            yield batch[begin:i]
+            begin = i
+    yield batch[begin:]
+
+
+def estimate_log(task: EstimateTask, progress: Progress | None = None) -> Summary:
+    """Estimate one log and write its MCAP and picture; gives its summary. Raises InputError."""
+    vehicle = known_vehicle(task.vehicle, task.payload)
+    damages: list[LogDamage] = []
+    cpu, wall = time.process_time(), time.perf_counter()
+    batches = read_frames(task.path, on_damage=damages.append)
+    own = range_publisher(vehicle).identifiers
+    ours = ([frame for frame in batch if frame[1] not in own] for batch in batches)  # an earlier run's estimates
+    batch = next((batch for batch in ours if batch), None)
+    if batch is None:
+        raise InputError(f"{task.path}: holds no frames of a vehicle" + (f" ({damages[0]})" if damages else ""))
+    tally = Tally()
+    with writing(task.log):
+        log = _open_log(task, vehicle, batch[0][0])
+        try:
+            pipeline = Pipeline(
+                vehicle,
+                filter_name=task.filter_name,
+                log=log,
+                log_frames=task.frames,
+                log_signals=task.signals,
+                observer=tally,
+            )
+            if not task.frames:
+                pipeline.publisher = _Mute()
+            feed(pipeline, _chained(batch, ours), progress)
+            if not pipeline.codec.latest:
+                raise _unknown(task, vehicle, pipeline)
+            log.close()
+            task.part.replace(task.log)
+        finally:
+            log.abandon()
+            task.part.unlink(missing_ok=True)
+        took = time.process_time() - cpu, time.perf_counter() - wall
+        if task.picture:
+            plot_log(task.log, task.picture)
+    return _summary(task, pipeline, tally, batch[0][0], damages, took)
+
+
+@functools.lru_cache(maxsize=1)
+def known_vehicle(name: str, payload: float | None) -> Vehicle:
+    """The vehicle, read once for all logs of a process."""
+    return read_vehicle(name, payload)
+
+
+def _chained(first: list[Frame], rest: Iterable[list[Frame]]) -> Iterator[list[Frame]]:
+    yield first
+    yield from rest
+
+
+def _open_log(task: EstimateTask, vehicle: Vehicle, start_ns: int) -> LogFile:
+    task.part.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {
+        "vehicle": vehicle.name,
+        "vehicle_key": vehicle.key,
+        "source": task.path.name,
+        "filter": task.filter_name,
+        **({} if task.payload is None else {"payload_kg": f"{task.payload:g}"}),
+    }
+    return LogFile(task.part.open("wb"), start_ns, metadata, dbc_texts(vehicle))
+
+
+def _unknown(task: EstimateTask, vehicle: Vehicle, pipeline: Pipeline) -> InputError:
+    unknown = sorted(pipeline.codec.unknown)[:5]
+    names = ", ".join(f"{identifier & 0x1FFFFFFF:X}" for identifier in unknown)
+    return InputError(
+        f"{task.path}: vehicle {vehicle.name!r} knows none of its {pipeline.codec.received} frames"
+        f"{f' (identifiers {names}, ...)' if names else ''}; name its vehicle with --vehicle"
+    )
+
+
+def _summary(
+    task: EstimateTask,
+    pipeline: Pipeline,
+    tally: Tally,
+    start_ns: int,
+    damages: Sequence[LogDamage],
+    took: tuple[float, float],
+) -> Summary:
+    """The summary of a ride that went through `pipeline`; took: processor and wall time [s]."""
+    cpu, wall = took
+    last = tally.last or Estimate(0.0)
+    soc_start, soc_end = tally.soc_start or (None, None), tally.soc_end or (None, None)
+    counts, status = pipeline.counts(), pipeline.status()
+    states: Counter[str] = Counter()
+    reasons: Counter[str] = Counter()
+    for (state, bits), ticks in tally.ticks.items():
+        states[state.name] += ticks
+        for name in reason_names(Reason(bits)):
+            reasons[name] += ticks
+    return Summary(
+        file=str(task.path),
+        log=str(task.log),
+        plot=str(task.picture) if task.picture else None,
+        vehicle=pipeline.vehicle.name,
+        filter=task.filter_name,
+        start_ns=start_ns,
+        duration_s=last.time,
+        distance_km=last.distance * 1e-3,
+        speed_max_km_h=times(tally.speed_max, 3.6),
+        energy_wh=times(tally.drawn, 1 / WH),
+        energy_recovered_wh=None if tally.drawn is None else tally.recovered / WH,
+        consumption_wh_km=times(tally.drawn, 1 / last.distance / WH_PER_KM) if last.distance >= 100 else None,
+        soc_start=soc_start[0],
+        soc_start_sd=soc_start[1],
+        soc_end=soc_end[0],
+        soc_end_sd=soc_end[1],
+        range_start_km=times(tally.range_start, 1e-3),
+        range_end_km=times(last.range, 1e-3),
+        range_end_p10_km=times(last.range_p10, 1e-3),
+        range_end_p90_km=times(last.range_p90, 1e-3),
+        energy_left_wh=times(last.energy_left, 1 / WH),
+        innovation_rms_v=tally.innovation_rms,
+        innovation_max_v=tally.innovation_max if tally.innovation_rms is not None else None,
+        states={state.name: round(states[state.name] * TICK_S, 1) for state in State if states[state.name]},
+        reasons={name: round(ticks * TICK_S, 1) for name, ticks in sorted(reasons.items())},
+        frames=pipeline.codec.received,
+        dropped=counts.dropped,
+        implausible=counts.implausible,
+        lost=counts.lost,
+        unknown=counts.unknown,
+        error_frames=pipeline.codec.error_frames,
+        faults=cast("dict[str, dict[str, int]]", status["faults"]),
+        damage=str(damages[0]) if damages else None,
+        cpu_s=cpu,
+        real_time_factor=tally.last.time / wall if tally.last else None,
+    )

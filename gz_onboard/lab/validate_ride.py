@@ -1,0 +1,306 @@
+"""One ride against its simulation: open loop, with the rider model, and each component by itself.
+
+The grade is that of the place where the scooter really was at that time, so that a speed that drifts does not also move
+the hills; so is the vibration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.constants import GRAVITY
+from gz_onboard.errors import InputError, writing
+from gz_onboard.lab.validate_components import Component, components
+from gz_onboard.lab.validate_score import (
+    CHANNELS,
+    COMPONENT_GATE,
+    GATE,
+    LEAST_SECONDS,
+    Ride,
+    SimulationVerdict,
+    Splits,
+    Verdict,
+    conditions,
+    errors,
+    seconds,
+    split,
+)
+from gz_onboard.offline.processes import Task
+from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
+from gz_onboard.progress import Progress
+from gz_onboard.simulation.parts.road import Dynamometer, Place, RoadProfile
+from gz_onboard.simulation.recorded import AMBIENT, Recorded, fit_dynamometer, read_recorded, rest_soc, scooter_at_start
+from gz_onboard.simulation.route import read_route
+from gz_onboard.simulation.run import Command, Run, drive, follow, replay, road_table
+from gz_onboard.simulation.scooter import STEP, Scooter
+from gz_onboard.vehicle import Vehicle, read_vehicle
+
+AVERAGED = 0.5  # s: over which the measured speed is averaged: its noise is no ride for a rider model to follow
+STANDING = 0.3  # m/s: less is noise of a wheel that stands
+SHORTEST = 30  # s
+GRADE_ERROR = 0.005  # sine: of the on-board filter in the first minutes
+FRAME_BYTES = 13.0  # of a compressed log
+MOST_AT_ONCE = 1000  # steps between two reports of progress
+_READ, _RIDE = 0.4, 0.3  # shares of the work
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A recorded ride as it is compared. soc: at rest before it, None if that is not known."""
+
+    recorded: Recorded
+    vehicle: Vehicle
+    series: dict[str, Array]  # per second, see `per_second`; and the grade on a road
+    road: RoadProfile | Dynamometer
+    soc: float | None
+
+
+def log_size(log: Path) -> int:
+    """Of a log [bytes], as a measure of the work."""
+    try:
+        return log.stat().st_size
+    except OSError:
+        return 1
+
+
+def validate_ride(task: Task, progress: Progress = lambda _: None) -> Ride:
+    """Compare one ride with its simulation; `progress` counts bytes of the log. Raises InputError."""
+    facts = facts_of(task.path)
+    kind = facts.get("kind")
+    vehicle = read_vehicle(task.vehicle, task.payload if task.payload is not None else rider_mass(facts))
+    size = log_size(task.path)
+    ride = _measured(task.path, vehicle, size, progress)
+    recorded, measured = ride.recorded, ride.series
+    found, missing = conditions(measured)
+    commands = _commands(recorded)
+    missing += _not_judged(ride, task.path, commands)
+    if "open_loop" not in commands:
+        progress(_RIDE * size)
+    simulated = {
+        form: _series(_ride(ride, command, lambda share: progress(share * _RIDE * size)))
+        for form, command in commands.items()
+    }
+    verdicts = {form: _judge_ride(measured, series) for form, series in simulated.items()}
+    ambient = recorded.first("ambient_temperature", AMBIENT)
+    roller = ride.road if isinstance(ride.road, Dynamometer) else None
+    alone = components(vehicle, measured, ride.soc, ambient, roller)
+    judged = _judge_components(alone)
+    splits: dict[str, dict[str, Splits]] = {
+        form: {
+            name: split(measured[name], series[name], found)
+            for name in (*CHANNELS, "pack_power")
+            if name in measured and name in series
+        }
+        for form, series in simulated.items()
+    }
+    splits["components"] = {name: split(c.measured, c.modelled, found, c.valid) for name, c in alone.items()}
+    picture = task.output(".validation.png") if task.plot else None
+    result = Ride(
+        file=str(task.path),
+        name=ride_name(task.path),
+        kind=None if kind is None else str(kind),
+        vehicle=vehicle.name,
+        payload_kg=vehicle.parameters["payload_mass"],
+        on_dynamometer=recorded.on_dynamometer,
+        duration_s=recorded.duration,
+        distance_km=recorded.distance * 1e-3,
+        ambient_c=float(measured["ambient_temperature"].mean()) if "ambient_temperature" in measured else None,
+        energy_wh=_energy(measured),
+        open_loop=verdicts.get("open_loop"),
+        predictive=verdicts["predictive"],
+        components=judged,
+        splits=splits,
+        missing=missing,
+        passed=all(verdict.passed for verdict in (*verdicts.values(), judged) if verdict),
+        plot=str(picture) if picture else None,
+    )
+    if picture:
+        from gz_onboard.lab.validate_plot import draw_ride
+
+        with writing(picture):
+            draw_ride(picture, result, measured, simulated, alone)
+    return result
+
+
+# --- what was measured --------------------------------------------------------------------------------------------
+
+
+def _measured(log: Path, vehicle: Vehicle, size: int, progress: Progress) -> Measured:
+    counted = 0.0
+
+    def frames(count: int) -> None:
+        nonlocal counted
+        part = min(FRAME_BYTES * count, _READ * size - counted)
+        counted += part
+        progress(part)
+
+    recorded = read_recorded(log, vehicle, frames)
+    progress(_READ * size - counted)
+    measured = per_second(recorded, vehicle)
+    if len(measured["speed"]) < SHORTEST:
+        raise InputError(f"{log}: {len(measured['speed'])} s are too short a ride to judge; at least {SHORTEST} s")
+    road, grade = _road(recorded, log)
+    if grade is not None:
+        measured["grade"] = grade
+    return Measured(recorded, vehicle, measured, road, rest_soc(recorded, vehicle))
+
+
+def per_second(recorded: Recorded, vehicle: Vehicle) -> dict[str, Array]:
+    """What was measured, as means over seconds, by role; and acceleration, yaw_rate, braking, pack_power.
+
+    The pack's current is that which flows: the sensor's known gain and offset are taken off.
+    """
+    rate = round(1 / recorded.dt)
+    measured = {role: seconds(values, rate) for role, values in recorded.signals.items()}
+    smooth = _averaged_speed(recorded)
+    n = len(measured["speed"])
+    ends = np.minimum(np.arange(n + 1) * rate, len(smooth) - 1)
+    measured["acceleration"] = np.diff(smooth[ends])  # over one second
+    if "rate_z" in measured and not recorded.on_dynamometer:
+        measured["yaw_rate"] = measured["rate_z"]
+    if "brake" in measured:
+        measured["braking"] = (measured["brake"] > 0).astype(float)
+    if "pack_current" in measured:
+        p = vehicle.parameters
+        measured["pack_current"] = (measured["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"]
+        if "pack_voltage" in measured:
+            measured["pack_power"] = measured["pack_voltage"] * measured["pack_current"]
+    return measured
+
+
+def _averaged_speed(recorded: Recorded) -> Array:
+    """The measured speed [m/s], each sample the mean over `AVERAGED` about it."""
+    reach = round(AVERAGED / recorded.dt / 2)
+    width = 2 * reach + 1
+    return np.convolve(np.pad(recorded.signals["speed"], reach, mode="edge"), np.ones(width) / width, "valid")
+
+
+def _road(recorded: Recorded, log: Path) -> tuple[RoadProfile | Dynamometer, Array | None]:
+    """(the road by place, or the roller; the grade of each second, None on a roller)."""
+    if recorded.on_dynamometer:
+        return fit_dynamometer(recorded), None
+    beside = _route_file(recorded, log)
+    if beside.is_file():
+        route = read_route(beside)
+        road = road_table(route.distance, route.grade, route.curvature)
+    else:
+        road = recorded.road()
+    distance = recorded.signals["distance"]
+    at = seconds(distance, round(1 / recorded.dt))
+    return road, np.array([road(place)[0] for place in at.tolist()])
+
+
+def _route_file(recorded: Recorded, log: Path) -> Path:
+    return log.with_name(f"{recorded.name}.route.csv")
+
+
+def _commands(recorded: Recorded) -> dict[str, Command]:
+    """How the ride is simulated, by form; not open loop without throttle and brake."""
+    commands: dict[str, Command] = {}
+    if {"throttle", "brake"} <= recorded.signals.keys():
+        throttle, brake = (recorded.signals[name].tolist() for name in ("throttle", "brake"))
+        commands["open_loop"] = replay(throttle, brake, STEP)
+    profile = _averaged_speed(recorded)
+    profile[profile < STANDING] = 0.0  # or the rider would hold a hill by throttle, not by brake
+    commands["predictive"] = follow(profile.tolist(), STEP)
+    return commands
+
+
+def _not_judged(ride: Measured, log: Path, commands: Mapping[str, Command]) -> list[str]:
+    """What the ride does not have, and what follows."""
+    recorded = ride.recorded
+    missing = [
+        f"{channel.label} not judged: not measured" for name, channel in CHANNELS.items() if name not in ride.series
+    ]
+    if not recorded.on_dynamometer and not _route_file(recorded, log).is_file():
+        newtons = GRADE_ERROR * GRAVITY * ride.vehicle.model.mass
+        missing.append(
+            f"grade is the on-board filter's, by accelerometer and altitude: wrong by some {100 * GRADE_ERROR:g} % in "
+            f"the first minutes, {newtons:.0f} N of road load; a {recorded.name}.route.csv beside the log would give it"
+        )
+    if "open_loop" not in commands:
+        gone = [name for name in ("throttle", "brake") if name not in recorded.signals]
+        missing.append(f"not simulated open loop: the ride has no {' and no '.join(gone)}")
+    return missing
+
+
+# --- its simulation -----------------------------------------------------------------------------------------------
+
+
+def _ride(ride: Measured, command: Command, progress: Progress) -> Run:
+    """The simulated ride; `progress` counts shares of it."""
+    recorded, road = ride.recorded, ride.road
+    here: Place = (0.0, 0.0, 0.0)
+    distance = recorded.signals["distance"].tolist()
+    rough = recorded.signals["vibration"].tolist() if "vibration" in recorded.signals else None
+    counted = step = 0
+
+    def where(scooter: Scooter) -> tuple[float, float, float]:
+        nonlocal here, counted, step
+        step = min(round(scooter.time / STEP), len(distance) - 1)
+        if not isinstance(road, Dynamometer):
+            here = road(distance[step])
+        if step - counted >= MOST_AT_ONCE:
+            progress((step - counted) / len(distance))
+            counted = step
+        return command(scooter)
+
+    scooter = scooter_at_start(
+        recorded,
+        ride.vehicle,
+        road if isinstance(road, Dynamometer) else lambda _: here,
+        soc=0.5 if ride.soc is None else ride.soc,
+        vibration=(lambda _: rough[step]) if rough else None,
+    )
+    run = drive(scooter, where, recorded.duration)
+    progress((len(distance) - counted) / len(distance))
+    return run
+
+
+def _series(run: Run) -> dict[str, Array]:
+    """A run as means over seconds."""
+    rate = round(1 / float(run.series["time"][1] - run.series["time"][0]))
+    series = {name: seconds(values, rate) for name, values in run.series.items()}
+    series["pack_power"] = seconds(run.series["pack_voltage"] * run.series["pack_current"], rate)
+    return series
+
+
+# --- how far they are apart ---------------------------------------------------------------------------------------
+
+
+def _judge_ride(measured: Mapping[str, Array], series: Mapping[str, Array]) -> SimulationVerdict:
+    channels = {
+        name: errors(*_even(measured[name], series[name]), channel, GATE)
+        for name, channel in CHANNELS.items()
+        if name in measured
+    }
+    energy = _energy(measured)
+    return SimulationVerdict(
+        channels,
+        all(channel.passed for channel in channels.values()),
+        None if not energy else 100 * (_energy(series) or 0.0) / energy - 100,
+    )
+
+
+def _judge_components(alone: Mapping[str, Component]) -> Verdict | None:
+    channels = {
+        name: errors(c.measured[c.valid], c.modelled[c.valid], c.quantity, COMPONENT_GATE)
+        for name, c in alone.items()
+        if c.valid.sum() >= LEAST_SECONDS
+    }
+    return Verdict(channels, all(c.passed for c in channels.values())) if channels else None
+
+
+def _even(a: Array, b: Array) -> tuple[Array, Array]:
+    n = min(len(a), len(b))
+    return a[:n], b[:n]
+
+
+def _energy(series: Mapping[str, Array]) -> float | None:
+    """[Wh] at the pack's terminals."""
+    return float(series["pack_power"].sum()) / 3600 if "pack_power" in series else None

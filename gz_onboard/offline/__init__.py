@@ -1,0 +1,1 @@
+"""What the offline commands share: measured rides, parallel work and its progress, results as JSON, text and pages."""

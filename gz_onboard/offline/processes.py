@@ -1,0 +1,120 @@
+"""A function over rides, in processes of their own: results in order, progress of all, and no ride stops another."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from multiprocessing import Value
+from pathlib import Path
+from typing import Any, TypeVar
+
+from gz_onboard.errors import InputError
+from gz_onboard.offline.results import Failure
+from gz_onboard.progress import Display, Progress
+
+
+@dataclass(frozen=True)
+class Task:
+    """One ride and what to do with it."""
+
+    path: Path  # its log
+    stem: Path  # of the files to be written, without their suffixes
+    vehicle: str
+    payload: float | None = None  # kg
+    plot: bool = True
+
+    def output(self, suffix: str) -> Path:
+        """The file to be written that ends in `suffix`."""
+        return self.stem.with_name(self.stem.name + suffix)
+
+
+TaskT = TypeVar("TaskT", bound=Task)
+Answer = TypeVar("Answer")
+
+
+def over_rides(
+    function: Callable[[TaskT, Progress], Answer],
+    tasks: Sequence[TaskT],
+    jobs: int | None,
+    progress: Progress = lambda _: None,
+) -> Iterator[tuple[TaskT, Answer | InputError]]:
+    """Each task with what `function` answers, or with the InputError that it raises, in order.
+
+    function: of a task and of what counts its work, which reaches `progress`; to be found at the top of its module.
+    jobs: so many at a time, as many as there are processors if None.
+    """
+    jobs = min(jobs or len(os.sched_getaffinity(0)), len(tasks))
+    if jobs < 2:
+        for task in tasks:
+            yield task, _attempt(function, task, progress)
+        return
+    done = Value("d")
+    with ProcessPoolExecutor(jobs, initializer=_begin, initargs=(done,)) as pool:
+        futures = [pool.submit(_attempt, function, task) for task in tasks]
+        counted = 0.0
+        for task, future in zip(tasks, futures, strict=True):
+            while not future.done():
+                wait([future], 0.2)
+                now = float(done.value)
+                progress(now - counted)
+                counted = now
+            try:
+                answer = future.result()
+            except BrokenProcessPool:
+                answer = InputError(f"{task.path}: the process was killed; is there enough memory? Try --jobs 1")
+            yield task, answer
+
+
+def collect(
+    command: str,
+    results: Iterable[tuple[TaskT, Answer | InputError]],
+    display: Display,
+    text: Callable[[Answer], str] | None,
+    warning: Callable[[Answer], str | None] = lambda _: None,
+) -> tuple[list[Answer], list[Failure]]:
+    """The answers and the failures of `over_rides`; each failure, and `text` and `warning` of each answer, is printed
+    at once.
+    """
+    answers: list[Answer] = []
+    failures: list[Failure] = []
+    for task, result in results:
+        if isinstance(result, InputError):
+            failures.append(Failure(str(task.path), str(result)))
+            display.print(f"gz-onboard {command}: {result}", sys.stderr)
+            continue
+        answers.append(result)
+        if warned := warning(result):
+            display.print(f"gz-onboard {command}: {warned}", sys.stderr)
+        if text:
+            display.print(text(result), sys.stdout)
+    return answers, failures
+
+
+_done: Any = None  # work done by all processes of the pool
+
+
+def _begin(done: Any) -> None:
+    """In each process of the pool: Ctrl-C ends it without a word; the parent process reports it."""
+    global _done  # noqa: PLW0603 - the only way into a process of the pool
+    _done = done
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as a shell has it that started us in the background
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def _count(work: float) -> None:
+    with _done.get_lock():
+        _done.value += work
+
+
+def _attempt(
+    function: Callable[[TaskT, Progress], Answer], task: TaskT, progress: Progress = _count
+) -> Answer | InputError:
+    try:
+        return function(task, progress)
+    except InputError as error:
+        return error

@@ -1,0 +1,106 @@
+"""The options that several commands have: one name, help, type, default and range for each."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from gz_onboard.errors import InputError
+
+LOG_SUFFIXES = (".mcap", ".blf", ".log", ".asc", ".csv", ".trc", ".mf4")
+_LOGS = f"{' '.join(LOG_SUFFIXES)}, each also with .gz"
+MOST_JOBS = 256
+"""Processes: each takes some 100 MB and keeps a processor busy."""
+MOST_PAYLOAD = 300.0  # kg
+MOST_SEED = 2**32 - 1
+
+
+def number(
+    option: str, low: float, high: float, unit: str = "", *, kind: type[float] = float, counted: str = ""
+) -> Callable[[str], float]:
+    """A type for argparse: a number from `low` to `high`, else InputError. counted: what the range is a number of."""
+
+    def parse(text: str) -> float:
+        value = kind(text)
+        if not low <= value <= high:
+            after = f" {unit}".rstrip()
+            raise InputError(
+                f"{option} {value:.10g}{after}: must be {low:g} to {high:.10g}{f' {counted}'.rstrip() or after}"
+            )
+        return value
+
+    parse.__name__ = kind.__name__  # what argparse calls it for a text that is no number
+    return parse
+
+
+def _json_file(text: str) -> str:
+    """InputError for the name of a log, as in ``validate --json ride.blf``."""
+    if text.lower().removesuffix(".gz").endswith(tuple(suffix for suffix in LOG_SUFFIXES if suffix != ".csv")):
+        raise InputError(f"--json {text}: that is the name of a log; write --json=- or put --json last")
+    return text
+
+
+def _jobs(option: str) -> Callable[[str], float]:
+    return number(option, 1, MOST_JOBS, kind=int, counted="processes")
+
+
+_SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
+    "log": (f"log: {_LOGS}", {"type": Path, "metavar": "LOG"}),
+    "logs": (
+        f"logs of rides: {_LOGS}; or folders of them, of which CSV files are not read",
+        {"nargs": "+", "type": Path, "metavar": "LOG"},
+    ),
+    "--vehicle": (
+        "name of a built-in vehicle, or a vehicle file (default: %(default)s)",
+        {"default": "reference", "metavar": "NAME|TOML"},
+    ),
+    "--payload": (
+        "mass of rider and luggage (default: from rides.json beside the log, or the vehicle file)",
+        {"type": number("--payload", 0.0, MOST_PAYLOAD, "kg"), "metavar": "KG"},
+    ),
+    "--effects": ("folder with effects of your own: Python code you trust", {"type": Path, "metavar": "DIR"}),
+    "--filter": (
+        "implementation of the SOC filter (default: %(default)s)",
+        {"default": "scalar", "choices": ("scalar", "filterpy")},
+    ),
+    "--from": ("start, seconds into the log", {"dest": "start", "type": float, "default": 0.0, "metavar": "S"}),
+    "--to": ("end, seconds into the log", {"dest": "end", "type": float, "metavar": "S"}),
+    "--jobs": ("number of parallel processes (default: one per processor)", {"type": _jobs("--jobs"), "metavar": "N"}),
+    "--json": (
+        "write the result as JSON to FILE, or instead of text to standard output",
+        {"nargs": "?", "const": "-", "type": _json_file, "metavar": "FILE|-"},
+    ),
+    "--no-plot": ("draw nothing", {"action": "store_true"}),
+    "--output": ("folder to write to (default: the current one)", {"type": Path, "default": Path(), "metavar": "DIR"}),
+    "--quiet": ("show no progress", {"action": "store_true"}),
+    "--report": ("write a report as an HTML page", {"type": Path, "metavar": "HTML"}),
+    "--seed": (
+        "seed of the random numbers (default: %(default)s)",
+        {"type": number("--seed", 0, MOST_SEED, kind=int), "default": 0, "metavar": "N"},
+    ),
+}
+"""By name: help, and the other arguments for argparse."""
+
+
+def add_shared(parser: argparse.ArgumentParser, *names: str, **changes: Any) -> None:
+    """Give `parser` these shared options; `changes` replace arguments for argparse."""
+    for name in names:
+        text, about = _SHARED[name]
+        parser.add_argument(name, **{"help": text, **about, **changes})
+
+
+def keep_old_name(parser: argparse.ArgumentParser, old: str, name: str) -> None:
+    """Let `parser` take `old`, as its option `name` was called before, without listing it."""
+    action = next(action for action in parser._actions if name in action.option_strings)
+    kind = _jobs(old) if name == "--jobs" else action.type
+    parser.add_argument(
+        old,
+        dest=action.dest,
+        nargs=action.nargs,
+        const=action.const,
+        type=kind or str,
+        default=argparse.SUPPRESS,
+        help=argparse.SUPPRESS,
+    )

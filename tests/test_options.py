@@ -1,0 +1,91 @@
+"""Shared options: ranges, old names, and what is a log."""
+
+from __future__ import annotations
+
+import argparse
+
+import pytest
+
+from gz_onboard.bus import logs
+from gz_onboard.cli import COMMANDS, command_line
+from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, OK, InputError
+from gz_onboard.options import LOG_SUFFIXES, MOST_JOBS, add_shared, keep_old_name, number
+from tests.support import ROOT
+
+
+@pytest.fixture
+def parser():
+    parser = argparse.ArgumentParser(exit_on_error=False)
+    add_shared(parser, "--jobs", "--json", "--output", "--payload")
+    return parser
+
+
+@pytest.mark.parametrize(("text", "value"), [("0", 0.0), ("300", 300.0), ("75.5", 75.5)])
+def test_a_number_in_its_range(parser, text, value):
+    assert parser.parse_args(["--payload", text]).payload == value
+
+
+@pytest.mark.parametrize("text", ["-0.1", "300.1", "nan", "inf", "-inf"])
+def test_a_number_beyond_its_range_is_refused_with_its_unit(text):
+    with pytest.raises(InputError, match=r"^--payload \S+ kg: must be 0 to 300 kg$"):
+        number("--payload", 0.0, 300.0, "kg")(text)
+
+
+def test_what_is_no_number_is_left_to_argparse():
+    with pytest.raises(ValueError, match="heavy"):
+        number("--payload", 0.0, 300.0, "kg")("heavy")
+    assert number("--jobs", 1, 2, kind=int).__name__ == "int"
+
+
+@pytest.mark.parametrize("name", ["ride.blf", "a/ride.mcap.gz", "x.log"])
+def test_json_takes_no_name_of_a_log(parser, name):
+    with pytest.raises(InputError, match="name of a log"):
+        parser.parse_args(["--json", name])
+
+
+def test_json_without_a_name_is_standard_output(parser):
+    assert parser.parse_args([]).json is None
+    assert parser.parse_args(["--json"]).json == "-"
+    assert parser.parse_args(["--json", "table.csv"]).json == "table.csv"
+
+
+def test_an_old_name_is_the_same_option(parser):
+    keep_old_name(parser, "--workers", "--jobs")
+    keep_old_name(parser, "--out", "--output")
+    assert parser.parse_args(["--workers", "3"]).jobs == 3
+    assert parser.parse_args(["--jobs", "2"]).jobs == 2
+    assert parser.parse_args([]).jobs is None
+    assert str(parser.parse_args(["--out", "x.toml"]).output) == "x.toml"
+    assert "--workers" not in parser.format_help()
+    with pytest.raises(InputError, match=f"--workers 0: must be 1 to {MOST_JOBS} processes"):
+        parser.parse_args(["--workers", "0"])
+
+
+def test_the_formats_of_logs_are_those_that_can_be_read():
+    assert set(LOG_SUFFIXES) == set(logs._READERS)
+
+
+def test_an_option_has_one_meaning():
+    """The same name, the same type and number of values, in all commands but for what is written."""
+    kinds: dict[str, set[tuple[object, ...]]] = {}
+    (commands,) = (a for a in command_line(COMMANDS)._actions if isinstance(a, argparse._SubParsersAction))
+    for parser in commands.choices.values():
+        for action in parser._actions:
+            for name in set(action.option_strings) & {
+                "--jobs",
+                "--json",
+                "--quiet",
+                "--vehicle",
+                "--report",
+                "--no-plot",
+            }:
+                kinds.setdefault(name, set()).add((action.type, action.nargs, action.const, action.metavar))
+    assert {name: len(found) for name, found in kinds.items()} == dict.fromkeys(kinds, 1)
+
+
+def test_the_exit_statuses_stand_in_one_table():
+    assert list(EXIT_STATUSES) == [OK, FAILED, BAD_INPUT, INTERRUPTED]
+    table = (ROOT / "docs" / "commands.md").read_text(encoding="utf-8")
+    for status in EXIT_STATUSES:
+        assert f"| {status} | {EXIT_STATUSES[status]} |" in table
+    assert all(text in command_line([]).format_help() for text in EXIT_STATUSES.values())
