@@ -26,7 +26,7 @@ from typing import Any
 
 from gz_onboard import notify, state
 from gz_onboard.background import Background
-from gz_onboard.bus.channel import Channel
+from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.recorder import BackgroundRecorder, Recorder
 from gz_onboard.errors import FAILED, InputError
 from gz_onboard.events import Frame, Reason, State
@@ -54,7 +54,7 @@ class Daemon:
     def __init__(
         self,
         vehicle: Vehicle,
-        channels: list[Channel],
+        channels: list[CanChannel],
         recorder: Recorder | None,
         state_file: Path | None,
         filter_name: str = "scalar",
@@ -407,7 +407,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
     from gz_onboard.bus.codec import known_identifiers
 
     wanted = None if arguments.all_frames else known_identifiers(vehicle.mapping)
-    channels = [Channel(arguments.interface, name, index, wanted) for index, name in enumerate(names)]
+    channels = [CanChannel(arguments.interface, name, index, wanted) for index, name in enumerate(names)]
     for channel in channels:
         channel.open()
     daemon = Daemon(vehicle, channels, recorder, state_file, arguments.filter, arguments.tick)

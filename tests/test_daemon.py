@@ -27,7 +27,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard import state
-from gz_onboard.bus.channel import Channel
+from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.completion import is_complete
 from gz_onboard.bus.logs import read_frames, read_samples
 from gz_onboard.bus.recorder import Recorder
@@ -52,7 +52,7 @@ class Scene:
     """A daemon in a thread, a ride onto its bus in real time, and all that is heard there."""
 
     def __init__(self, bus: str, **options: object) -> None:
-        channel = Channel("virtual", bus)
+        channel = CanChannel("virtual", bus)
         channel.open()
         self.daemon = Daemon(reference(), [channel], **{"recorder": None, "state_file": None, **options})  # type: ignore[arg-type]
         self.heard: list[Frame] = []
@@ -147,7 +147,7 @@ def test_a_silent_bus_is_told_that_there_is_nothing(bus: str):
 
 
 def test_identifiers_of_others_are_not_taken_in(bus: str):
-    channel = Channel("virtual", bus, identifiers=[0x200, EFF_FLAG | 0x201])
+    channel = CanChannel("virtual", bus, identifiers=[0x200, EFF_FLAG | 0x201])
     channel.open()
     with can.Bus(interface="virtual", channel=bus) as other:
         for can_id, extended in ((0x200, False), (0x201, False), (0x200, True), (0x201, True), (0x7FF, False)):
@@ -363,7 +363,7 @@ def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, ca
 @pytest.mark.parametrize("delta", [3600.0, -7200.0, 40.0])
 def test_the_clock_is_set_in_the_middle_of_a_round(bus: str, monkeypatch: pytest.MonkeyPatch, delta: float):
     """Between the reading of the clock and that of the frames: no time is left out, none comes twice."""
-    channel = Channel("virtual", bus)
+    channel = CanChannel("virtual", bus)
     channel.open()
     daemon = Daemon(reference(), [channel], recorder=None, state_file=None)
     ticks: list[tuple[float, float]] = []  # s: of the estimate, of a clock that nobody sets
@@ -484,7 +484,7 @@ def test_what_cannot_be_decoded_in_time_is_left_out_fairly_counted_and_flagged(
 @pytest.mark.parametrize("lag_s", [1.5, 10.0])
 def test_an_estimate_of_old_frames_does_not_count_as_good(bus: str, lag_s: float):
     """As they come from a buffer that is read too slowly."""
-    channel = Channel("virtual", bus)
+    channel = CanChannel("virtual", bus)
     channel.open()
     daemon = Daemon(reference(), [channel], None, None)
     frames = Scooter().steady(10.0)
@@ -559,7 +559,7 @@ def test_the_state_is_saved_when_the_charge_has_moved(
 ):
     """Ridden hard, what a cut costs is a tenth of a point; else it is saved once in ten seconds."""
     file = tmp_path / "scooter.json"
-    channel = Channel("virtual", bus)
+    channel = CanChannel("virtual", bus)
     channel.open()
     daemon = Daemon(reference(), [channel], None, file)
     keeper = daemon._keeper
@@ -655,7 +655,7 @@ def test_at_the_end_a_log_that_hangs_does_not_cost_the_state(
 
     monkeypatch.setattr(os, "fdatasync", hang)
     monkeypatch.setattr("gz_onboard.daemon.STOP_S", 0.2)
-    channel = Channel("virtual", bus)
+    channel = CanChannel("virtual", bus)
     channel.open()
     file = tmp_path / "scooter.json"
     daemon = Daemon(reference(), [channel], Recorder(tmp_path / "log", "v", sync_s=0.1), file)
@@ -681,7 +681,7 @@ def test_at_the_end_a_log_that_hangs_does_not_cost_the_state(
 def test_an_unforeseen_error_costs_neither_the_log_nor_the_state(
     bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    channel = Channel("virtual", bus)
+    channel = CanChannel("virtual", bus)
     channel.open()
     file, recorder = tmp_path / "scooter.json", Recorder(tmp_path / "log", "v", sync_s=1e6)
     daemon = Daemon(reference(), [channel], recorder, file)

@@ -36,7 +36,7 @@ _COUNT = struct.Struct("=I")
 _ANCILLARY = socket.CMSG_SPACE(16) + socket.CMSG_SPACE(4)
 
 
-class Channel:
+class CanChannel:
     """One channel. `index` is put into its frames; `identifiers` are all that the kernel shall let through."""
 
     def __init__(

@@ -23,7 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import IO, TYPE_CHECKING, TextIO
 
-from gz_onboard.bus.channel import Channel
+from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.codec import raw_range
 from gz_onboard.bus.mapping import find_dbc
@@ -415,7 +415,7 @@ def run(arguments: argparse.Namespace) -> int:
     if out is None:  # closed by who called us
         raise InputError("there is no standard output to show anything on")
     view = View(find_dbc(arguments.dbc, Path.cwd()))
-    channel = Channel(arguments.interface, arguments.channel, identifiers=view.identifiers)
+    channel = CanChannel(arguments.interface, arguments.channel, identifiers=view.identifiers)
     channel.open()
     source = f"{arguments.channel} ({arguments.interface})"
     duration = arguments.duration or (ONCE_WITHIN if arguments.once else math.inf)
@@ -465,7 +465,7 @@ def _until_signalled() -> Iterator[Callable[[], bool]]:
             signal.signal(number, handler)
 
 
-def _polled(view: View, channel: Channel, duration: float, stopped: Callable[[], bool]) -> Iterator[float]:
+def _polled(view: View, channel: CanChannel, duration: float, stopped: Callable[[], bool]) -> Iterator[float]:
     """Drain the channel into the view until it is time to stop; yields the time [s] after each drain."""
     end = time.monotonic() + duration
     while True:
@@ -480,7 +480,13 @@ def _polled(view: View, channel: Channel, duration: float, stopped: Callable[[],
 
 
 def _show_screen(
-    view: View, channel: Channel, source: str, style: Style, duration: float, stopped: Callable[[], bool], out: IO[str]
+    view: View,
+    channel: CanChannel,
+    source: str,
+    style: Style,
+    duration: float,
+    stopped: Callable[[], bool],
+    out: IO[str],
 ) -> None:
     out.write("\x1b[?1049h\x1b[?25l")  # the other screen, without the cursor: what stood here comes back
     try:
@@ -503,7 +509,7 @@ def _show_screen(
 
 
 def _show_lines(
-    view: View, channel: Channel, style: Style, duration: float, stopped: Callable[[], bool], out: IO[str]
+    view: View, channel: CanChannel, style: Style, duration: float, stopped: Callable[[], bool], out: IO[str]
 ) -> None:
     printed = time.monotonic()
     for now in _polled(view, channel, duration, stopped):

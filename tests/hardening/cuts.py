@@ -23,7 +23,7 @@ from unittest import mock
 
 from mcap.reader import make_reader
 
-from gz_onboard.bus.channel import Channel
+from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.readers.mcap import MAGIC
 from gz_onboard.bus.recorder import Recorder
@@ -133,7 +133,7 @@ def cuts(count: int, source: Random, folder: Path, case: str) -> list[Cut]:
     """A hard ride of a daemon, its power cut `count` times: the disk is copied, and it rides on."""
     disk = Disk(folder, source)
     file = folder / "state" / "scooter.json"
-    channel = Channel("virtual", case)
+    channel = CanChannel("virtual", case)
     channel.open()
     recorder = Recorder(folder / "log", "v", max_file_bytes=200_000)
     daemon = Daemon(reference(), [channel], recorder, file)
