@@ -9,7 +9,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.fit import score
-from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Found, Panel, PlotLine, Result
 from gz_onboard.simulation.samples import Samples
 
 NEEDED = ("auxiliary_current", "pack_voltage")
@@ -67,9 +67,9 @@ def auxiliary_power(rides: Sequence[Samples]) -> Result:
         )
     x = np.arange(len(mean), dtype=float)
     traces = [
-        Trace("without brake light", x, without, "."),
-        Trace("with brake light", x, lit, "."),
-        Trace("mean", x, np.full(len(x), value)),
+        PlotLine("without brake light", x, without, "."),
+        PlotLine("with brake light", x, lit, "."),
+        PlotLine("mean", x, np.full(len(x), value)),
     ]
     result.panels.append(Panel("Auxiliary power", "ride", "power [W]", tuple(traces)))
     return result

@@ -18,7 +18,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.coastdown_fit import RoadFit, covariance_with_nuisance, fit_road
 from gz_onboard.lab.calibrate.coastdown_run import FASTEST, SLOWEST, SPAN, Coast, coast, directions
 from gz_onboard.lab.calibrate.fit import score
-from gz_onboard.lab.calibrate.result import Fit, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Fit, Found, Panel, PlotLine, Result
 from gz_onboard.lab.calibrate.road_load import NAMES, RoadLoad, own_wind, roll
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
@@ -166,10 +166,10 @@ def _panels(force: RoadLoad, road: RoadFit, runs: Sequence[Coast], speeds: Seque
     lines, errors, loads = [], [], []
     for run, model in zip(runs, speeds, strict=True):
         time = run.time - run.time[0]
-        lines += [Trace(run.name, time, run.speed, "."), Trace("", time, model, "-")]
-        errors.append(Trace(run.name, time, model - run.speed, "-"))
+        lines += [PlotLine(run.name, time, run.speed, "."), PlotLine("", time, model, "-")]
+        errors.append(PlotLine(run.name, time, model - run.speed, "-"))
         level = run.slowing * (run.mass + force.rotating) - run.direction * slope * run.mass * GRAVITY
-        loads.append(Trace(run.name, run.middle, level, "."))
+        loads.append(PlotLine(run.name, run.middle, level, "."))
     v = np.linspace(SLOWEST, FASTEST, 50)
     still = Coast(
         "",
@@ -182,7 +182,7 @@ def _panels(force: RoadLoad, road: RoadFit, runs: Sequence[Coast], speeds: Seque
         0.0,
         (v, v),
     )
-    loads.append(Trace("model, still air, motor included", v, force(v, still, 0.0, 0.0), "-"))
+    loads.append(PlotLine("model, still air, motor included", v, force(v, still, 0.0, 0.0), "-"))
     return [
         Panel("Coast-downs", "time [s]", "speed [m/s]", tuple(lines)),
         Panel("Speed, modelled less measured", "time [s]", "error [m/s]", tuple(errors)),

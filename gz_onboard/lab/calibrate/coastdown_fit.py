@@ -31,7 +31,7 @@ _STEP = {"rolling_resistance_constant": 1e-4, "rolling_resistance_speed": 1e-5, 
 
 
 @dataclass(frozen=True)
-class Noise:
+class CoastdownNoise:
     """What no parameter explains: speed noise at the ends of a span [m/s]; gusts [m/s], lasting [s]."""
 
     speed: float
@@ -44,7 +44,7 @@ class RoadFit:
     """A fit of all runs: its solution over `NAMES` (but for those held), ``slope`` and each run's ``wind NAME``."""
 
     solution: Solution
-    noise: Noise
+    noise: CoastdownNoise
     held: dict[str, float]
 
     def value(self, name: str) -> float:
@@ -66,7 +66,7 @@ def fit_road(
     held: Mapping[str, float],
     wind_sd: float,
     slope_sd: float,
-    noise: Noise | None = None,
+    noise: CoastdownNoise | None = None,
     start: RoadFit | None = None,
 ) -> RoadFit:
     """All runs at once: Gauss-Newton in the parameters and, unless given, maximum likelihood of the noise.
@@ -82,7 +82,7 @@ def fit_road(
     value |= dict.fromkeys(("slope", *winds), 0.0) | (start.values() if start else {}) | dict(held)
     known, solution = noise, None
     for step in range(1 if start else 4):
-        now = known or Noise(0.02, 0.5, 5.0)
+        now = known or CoastdownNoise(0.02, 0.5, 5.0)
         columns, left = _linearised(runs, vehicle, value, names, now.gust)
         if noise is None and step == 1:
             known = now = _likely(runs, vehicle, value, columns, left, names, prior, now)
@@ -90,7 +90,7 @@ def fit_road(
         solution = linear(whitened, target, 1.0, prior=prior)
         value |= {name: solution[name] for name in names}
     assert solution
-    return RoadFit(solution, known or Noise(0.02, 0.5, 5.0), dict(held))
+    return RoadFit(solution, known or CoastdownNoise(0.02, 0.5, 5.0), dict(held))
 
 
 def _linearised(
@@ -126,7 +126,7 @@ def _linearised(
     return columns, left
 
 
-def _covariance(run: Coast, drag_area: float, noise: Noise) -> Array:
+def _covariance(run: Coast, drag_area: float, noise: CoastdownNoise) -> Array:
     """Of the deceleration of the spans: gusts that last, and speed noise that neighbouring spans share."""
     n, dt = len(run.middle), SPAN
     at = (run.time[1:] + run.time[:-1]) / 2
@@ -140,7 +140,7 @@ def _covariance(run: Coast, drag_area: float, noise: Noise) -> Array:
 def _whiten(
     runs: Sequence[Coast],
     value: Mapping[str, float],
-    noise: Noise,
+    noise: CoastdownNoise,
     columns: Mapping[str, list[Array]],
     left: Sequence[Array],
     names: Sequence[str],
@@ -165,8 +165,8 @@ def _likely(
     left: Sequence[Array],
     names: Sequence[str],
     prior: Mapping[str, tuple[float, float]],
-    start: Noise,
-) -> Noise:
+    start: CoastdownNoise,
+) -> CoastdownNoise:
     """The noise of greatest restricted likelihood (REML: Patterson & Thompson 1971), the parameters marginal."""
     drag = max(value["drag_area"], 0.02)
     blocks = [np.column_stack([*(columns[name][i] for name in names), left[i]]) for i in range(len(runs))]
@@ -178,7 +178,7 @@ def _likely(
         pull[names.index(name)] = mean
 
     def minus_log(x: Array) -> float:
-        noise = Noise(*np.exp(x).tolist())
+        noise = CoastdownNoise(*np.exp(x).tolist())
         logs, normal, right, square = 0.0, np.diag(precision).copy(), precision * (pull - centre), 0.0
         for run, block in zip(runs, blocks, strict=True):
             root = cholesky(_covariance(run, drag, noise), lower=True, check_finite=False)
@@ -197,7 +197,7 @@ def _likely(
 
     x0 = np.log([start.speed, start.gust, start.lasting])
     best = minimize(minus_log, x0, method="Nelder-Mead", options={"xatol": 0.1, "fatol": 0.1, "maxiter": 120})
-    return Noise(*np.exp(best.x).tolist())
+    return CoastdownNoise(*np.exp(best.x).tolist())
 
 
 def covariance_with_nuisance(

@@ -10,7 +10,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.simulation.samples import Samples, read_facts
 from gz_onboard.vehicle import Vehicle
 
@@ -67,7 +67,7 @@ class Coast:
         return result
 
 
-def samples(table: Table, facts: Mapping[str, object] | None = None) -> Samples:
+def samples(table: Measurements, facts: Mapping[str, object] | None = None) -> Samples:
     """The coast-down in `table`, of ``time`` and ``speed`` [m/s] (or ``motor_speed``) and, if it has them, more roles.
 
     facts: what was written down of it; None: in a ``rides.json`` beside the table. It needs ``direction`` (``up`` or

@@ -16,9 +16,9 @@ from scipy.stats import truncnorm
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.cooling_run import Run
+from gz_onboard.lab.calibrate.cooling_run import CoolingRun
 from gz_onboard.lab.calibrate.fit import Solution, nonlinear, score
-from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Found, Panel, PlotLine, Result
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.simulation.parts.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.vehicle import Vehicle
@@ -33,11 +33,11 @@ BENCH_SD, RIDE_SD = 0.2, 0.5  # K: resolution and noise of the sensors
 # --- the networks: parameters by their names in the vehicle file, ``room`` for the conductance of a closed room
 
 Values = Mapping[str, float]
-Model = Callable[[Values, Run], dict[str, Array]]
+Model = Callable[[Values, CoolingRun], dict[str, Array]]
 """The temperatures [degC] of a network over a run, by sensor, each of shape (n,)."""
 
 
-def motor_temperatures(p: Values, run: Run) -> dict[str, Array]:
+def motor_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     """Of the stator. The rotor has no sensor and starts as warm as the stator.
 
     ``iron_share``: of the iron loss in the stator, if it has one of its own.
@@ -60,7 +60,7 @@ def motor_temperatures(p: Values, run: Run) -> dict[str, Array]:
     return {"motor_temperature": result}
 
 
-def inverter_temperatures(p: Values, run: Run) -> dict[str, Array]:
+def inverter_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     """Of board and box; without a sensor on it the box starts as warm as the board."""
     board = _first(p, run, "inverter_temperature")
     box = _first(
@@ -85,7 +85,7 @@ def inverter_temperatures(p: Values, run: Run) -> dict[str, Array]:
     return {"inverter_temperature": result[0], "inverter_box_temperature": result[1]}
 
 
-def pack_temperatures(p: Values, run: Run) -> dict[str, Array]:
+def pack_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     """Of the cells."""
     start = _first(p, run, "cell_temperature")
     return {
@@ -93,14 +93,14 @@ def pack_temperatures(p: Values, run: Run) -> dict[str, Array]:
     }
 
 
-def bms_temperatures(p: Values, run: Run) -> dict[str, Array]:
+def bms_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     """Of the BMS, over the pack's temperature as measured."""
     start = _first(p, run, "bms_temperature")
     heat, cells = p["bms_resistance"] * run.pack_square, run.measured["cell_temperature"]
     return {"bms_temperature": _lumped(p["bms_heat_capacity"], p["bms_conductance"], start, heat, cells)}
 
 
-def _first(p: Values, run: Run, sensor: str) -> float:
+def _first(p: Values, run: CoolingRun, sensor: str) -> float:
     """Where the node of `sensor` starts [degC]: on a line through the sensor's first ten seconds, as a board warms
     fast. ``start:RUN:SENSOR`` is what is added to that."""
     first = run.measured[sensor][:10]
@@ -117,7 +117,7 @@ def _lumped(capacity: float, conductance: float, start: float, heat: Array, ambi
     return result
 
 
-def _outside(p: Values, run: Run, name: str) -> Array:
+def _outside(p: Values, run: CoolingRun, name: str) -> Array:
     """The conductance to the ambient [W/K], shape (n,)."""
     if run.still and "room" in p:
         return np.full_like(run.time, p["room"])
@@ -141,16 +141,16 @@ class Job:
     prior: dict[str, tuple[float, float]]
     outside: str = ""
 
-    def error(self, values: Values, run: Run) -> Array:
+    def error(self, values: Values, run: CoolingRun) -> Array:
         """Model less measured [K], all sensors of the run after one another."""
         modelled = self.model(values, run)
         return np.concatenate([modelled[name] - run.measured[name] for name in modelled if name in run.measured])
 
-    def rms(self, values: Values, runs: Sequence[Run]) -> float:
+    def rms(self, values: Values, runs: Sequence[CoolingRun]) -> float:
         """[K], of all runs and sensors."""
         return float(np.sqrt(np.mean(np.concatenate([self.error(values, run) for run in runs]) ** 2)))
 
-    def fit(self, runs: Sequence[Run], **more: float) -> tuple[Solution, dict[str, float]]:
+    def fit(self, runs: Sequence[CoolingRun], **more: float) -> tuple[Solution, dict[str, float]]:
         """(The solution, all values with it); `more`: further free parameters, with their starts."""
         start = {**self.start, **more}
         if self.outside in start:
@@ -180,7 +180,7 @@ class Job:
         found = nonlinear(residual, start, bounds=bounds, prior=prior, known_sd=True, groups=self._pieces(runs))
         return found, {**self.held, **dict(zip(names, found.value.tolist(), strict=True))}
 
-    def _pieces(self, runs: Sequence[Run]) -> Array:
+    def _pieces(self, runs: Sequence[CoolingRun]) -> Array:
         """For each residual the piece it belongs to: its run if there are `MANY`, else its `BLOCK`."""
         labels, first = [], 0.0
         for run in runs:
@@ -204,7 +204,7 @@ class _Fitted:
         return next((s for s in (self.riding, self.still) if s and name in s.names), None)
 
 
-def _fit(job: Job, runs: Sequence[Run]) -> _Fitted:
+def _fit(job: Job, runs: Sequence[CoolingRun]) -> _Fitted:
     """The closed room first, then the conductance to the ambient out of the rides; either alone gives all."""
     still, rides = [run for run in runs if run.still], [run for run in runs if not run.still]
     if not job.outside or not (still and rides):
@@ -216,7 +216,7 @@ def _fit(job: Job, runs: Sequence[Run]) -> _Fitted:
     return _Fitted(first, _with_doubt(job, first, second, values, rides), values)
 
 
-def _with_doubt(job: Job, first: Solution, second: Solution, values: Values, rides: Sequence[Run]) -> Solution:
+def _with_doubt(job: Job, first: Solution, second: Solution, values: Values, rides: Sequence[CoolingRun]) -> Solution:
     """`second`, its variance more by what the doubt of `first` about the inside of the network adds to it."""
     inner = [name for name in first.names if name in job.start]
     more = 0.0
@@ -229,7 +229,7 @@ def _with_doubt(job: Job, first: Solution, second: Solution, values: Values, rid
 
 
 def _with_doubt_of_held(
-    job: Job, fitted: _Fitted, runs: Sequence[Run], doubted: Mapping[str, tuple[float, float]]
+    job: Job, fitted: _Fitted, runs: Sequence[CoolingRun], doubted: Mapping[str, tuple[float, float]]
 ) -> _Fitted:
     """`fitted`, its covariances more by what holding a parameter at its (lower, upper) likely value would change."""
     still, riding = fitted.still, fitted.riding
@@ -257,7 +257,7 @@ def _likely(vehicle: Vehicle, name: str) -> tuple[float, float]:
     return float(within.mean() - within.std()), float(within.mean() + within.std())
 
 
-def _usable(runs: Sequence[Run], sensor: str, result: Result) -> list[Run]:
+def _usable(runs: Sequence[CoolingRun], sensor: str, result: Result) -> list[CoolingRun]:
     """The runs with that sensor in which it changes enough to tell anything."""
     good, least = [], 1.0 if sensor == "cell_temperature" else LEAST_RISE
     for run in runs:
@@ -272,7 +272,7 @@ def _usable(runs: Sequence[Run], sensor: str, result: Result) -> list[Run]:
     return good
 
 
-def _score(job: Job, values: Values, runs: Sequence[Run], held_out: bool, result: Result) -> None:
+def _score(job: Job, values: Values, runs: Sequence[CoolingRun], held_out: bool, result: Result) -> None:
     """A fit for each sensor over the still runs, and one over the rides."""
     for kind in ("closed room", "riding"):
         some = [run for run in runs if run.still == (kind == "closed room")]
@@ -287,7 +287,7 @@ def _score(job: Job, values: Values, runs: Sequence[Run], held_out: bool, result
                 result.fits.append(score(what, "degC", data, model, held_out=held_out, source=names))
 
 
-def _panels(job: Job, values: Values, runs: Sequence[Run], held: Sequence[Run]) -> list[Panel]:
+def _panels(job: Job, values: Values, runs: Sequence[CoolingRun], held: Sequence[CoolingRun]) -> list[Panel]:
     panels = []
     for run in [*runs, *held]:
         x, traces, left, modelled = run.time - run.time[0], [], [], job.model(values, run)
@@ -295,10 +295,10 @@ def _panels(job: Job, values: Values, runs: Sequence[Run], held: Sequence[Run]) 
             if sensor in run.measured:
                 label = sensor.removesuffix("_temperature").replace("_", " ")
                 traces += [
-                    Trace(f"{label}, measured", x, run.measured[sensor], "."),
-                    Trace(f"{label}, model", x, model),
+                    PlotLine(f"{label}, measured", x, run.measured[sensor], "."),
+                    PlotLine(f"{label}, model", x, model),
                 ]
-                left.append(Trace(label, x, model - run.measured[sensor]))
+                left.append(PlotLine(label, x, model - run.measured[sensor]))
         title = f"{run.name}{' (held out)' if run in held else ''}"
         panels += [
             Panel(title, "time [s]", "temperature [degC]", tuple(traces)),
@@ -307,7 +307,7 @@ def _panels(job: Job, values: Values, runs: Sequence[Run], held: Sequence[Run]) 
     return panels
 
 
-def _halves(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:
+def _halves(runs: Sequence[CoolingRun]) -> tuple[list[CoolingRun], list[CoolingRun]]:
     """(to fit, held out): every second ride is held out, if there are two or more."""
     held = {run.name for run in [run for run in runs if not run.still][1::2]}
     return [run for run in runs if run.name not in held], [run for run in runs if run.name in held]
@@ -316,8 +316,8 @@ def _halves(runs: Sequence[Run]) -> tuple[list[Run], list[Run]]:
 def _solve(
     result: Result,
     job: Job,
-    runs: Sequence[Run],
-    validation: Sequence[Run],
+    runs: Sequence[CoolingRun],
+    validation: Sequence[CoolingRun],
     names: Sequence[str],
     more: Mapping[str, float],
     doubted: Mapping[str, tuple[float, float]] | None = None,
@@ -352,13 +352,13 @@ def _solve(
 _UNITS = {"capacity": "J/K", "conductance": "W/K", "ambient": "W/K", "box": "W/K", "air": "W/K", "resistance": "ohm"}
 
 
-def _source(runs: Sequence[Run]) -> str:
+def _source(runs: Sequence[CoolingRun]) -> str:
     names = [run.name for run in runs]
     listed = ", ".join(names if len(names) < 4 else [names[0], "...", names[-1]])
     return f"{listed}: {sum(len(run.time) for run in runs)} s"
 
 
-def _outside_notes(result: Result, job: Job, fitted: _Fitted, runs: Sequence[Run], hold_out: bool) -> None:
+def _outside_notes(result: Result, job: Job, fitted: _Fitted, runs: Sequence[CoolingRun], hold_out: bool) -> None:
     """How the airflow of riding differs from a closed room, and whether it grows with speed."""
     name, still, riding = job.outside, fitted.still, fitted.riding
     if still is None or riding is None:
@@ -398,7 +398,7 @@ def _outside_notes(result: Result, job: Job, fitted: _Fitted, runs: Sequence[Run
 
 
 def motor_cooling(
-    runs: Sequence[Run], vehicle: Vehicle, validation: Sequence[Run] = (), hold_out: bool = True
+    runs: Sequence[CoolingRun], vehicle: Vehicle, validation: Sequence[CoolingRun] = (), hold_out: bool = True
 ) -> Result:
     """Capacities of stator and rotor, the gap's conductance and the rotor's to the ambient.
 
@@ -425,7 +425,7 @@ def _priors(vehicle: Vehicle, names: Sequence[str]) -> dict[str, tuple[float, fl
     return {name: (known[name].value, 3 * max(known[name].sd, 0.3 * known[name].value)) for name in names}
 
 
-def _share_refusal(result: Result, job: Job, runs: Sequence[Run]) -> None:
+def _share_refusal(result: Result, job: Job, runs: Sequence[CoolingRun]) -> None:
     """Whether the data tell the stator's share of the heat: the rest fitted anew at two other shares."""
     some = [run for run in runs if run.still] or list(runs)
     rms = {}
@@ -442,7 +442,9 @@ def _share_refusal(result: Result, job: Job, runs: Sequence[Run]) -> None:
         result.notes.append(f"motor_stator_share held at {job.held['motor_stator_share']:g}; rms {text}")
 
 
-def _iron_note(result: Result, job: Job, fitted: _Fitted, runs: Sequence[Run], validation: Sequence[Run]) -> None:
+def _iron_note(
+    result: Result, job: Job, fitted: _Fitted, runs: Sequence[CoolingRun], validation: Sequence[CoolingRun]
+) -> None:
     """What a share of its own for the iron loss would do, which the network does not know."""
     part, held = _halves(runs)
     if not held or not any(run.iron.sum() > 0.1 * run.motor_heat.sum() for run in runs):
@@ -462,7 +464,7 @@ def _iron_note(result: Result, job: Job, fitted: _Fitted, runs: Sequence[Run], v
 
 
 def inverter_cooling(
-    runs: Sequence[Run], vehicle: Vehicle, validation: Sequence[Run] = (), hold_out: bool = True
+    runs: Sequence[CoolingRun], vehicle: Vehicle, validation: Sequence[CoolingRun] = (), hold_out: bool = True
 ) -> Result:
     """Capacities of board and box, the conductance between them and the box's to the ambient.
 
@@ -491,7 +493,7 @@ def inverter_cooling(
     return result
 
 
-def pack_cooling(runs: Sequence[Run], vehicle: Vehicle, validation: Sequence[Run] = ()) -> Result:
+def pack_cooling(runs: Sequence[CoolingRun], vehicle: Vehicle, validation: Sequence[CoolingRun] = ()) -> Result:
     """pack_heat_capacity and pack_conductance out of rides and dynamometer runs; InputError without pack heat."""
     names = ("pack_heat_capacity", "pack_conductance")
     result = Result("pack_cooling")
@@ -507,7 +509,7 @@ def pack_cooling(runs: Sequence[Run], vehicle: Vehicle, validation: Sequence[Run
     return result
 
 
-def bms_cooling(runs: Sequence[Run], vehicle: Vehicle, validation: Sequence[Run] = ()) -> Result:
+def bms_cooling(runs: Sequence[CoolingRun], vehicle: Vehicle, validation: Sequence[CoolingRun] = ()) -> Result:
     """bms_resistance, bms_heat_capacity, bms_conductance: the board over the cells it sits on.
 
     Temperatures tell their ratios only (heat scales with all three), so that the scale is that of the priors.

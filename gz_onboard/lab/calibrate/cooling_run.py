@@ -11,7 +11,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import Bound
 from gz_onboard.simulation.parts.cooling import PERIOD
@@ -22,7 +22,7 @@ SHORTEST = 300.0  # s: less tells nothing of time constants of minutes
 
 
 @dataclass(frozen=True)
-class Run:
+class CoolingRun:
     """One run at `PERIOD` spacing, every array of shape (n,); powers in W, temperatures in degC.
 
     still: on a bench or a roller, without the airflow of riding. iron: the part of the motor's heat that grows with
@@ -43,7 +43,7 @@ class Run:
     measured: dict[str, Array]
 
 
-def bench_run(table: Table, vehicle: Vehicle) -> Run:
+def bench_run(table: Measurements, vehicle: Vehicle) -> CoolingRun:
     """A run of motor and inverter in a closed room with their losses measured. InputError naming what is missing."""
     time = table["time"]
     grid = _grid(time, table.file.name)
@@ -63,7 +63,7 @@ def bench_run(table: Table, vehicle: Vehicle) -> Run:
     iron = _iron(vehicle, turning)
     nothing = np.zeros_like(grid)
     radius = vehicle.parameters["wheel_radius"] * vehicle.parameters["gear_ratio"]
-    return Run(
+    return CoolingRun(
         table.file.name,
         True,
         grid,
@@ -78,7 +78,7 @@ def bench_run(table: Table, vehicle: Vehicle) -> Run:
     )
 
 
-def ride_run(ride: Samples, vehicle: Vehicle) -> Run:
+def ride_run(ride: Samples, vehicle: Vehicle) -> CoolingRun:
     """A ride or dynamometer run with the heat that the vehicle's own losses give. InputError for signals it lacks."""
     for role in ("motor_speed", "motor_current", "motor_temperature", "ambient_temperature", "pack_current"):
         if role not in ride.columns:
@@ -113,7 +113,7 @@ def ride_run(ride: Samples, vehicle: Vehicle) -> Run:
     pack_heat = np.zeros_like(grid)
     if vehicle.battery and "cell_temperature" in measured and "pack_voltage" in ride.columns:
         pack_heat = _pack_heat(vehicle, mean, square, measured["cell_temperature"], at("pack_voltage")[:5].mean())
-    return Run(
+    return CoolingRun(
         ride.name,
         "roller_speed" in ride.columns,
         grid,

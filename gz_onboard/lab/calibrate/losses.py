@@ -13,8 +13,8 @@ from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate import motor
 from gz_onboard.lab.calibrate.fit import Solution, linear, score, split
 from gz_onboard.lab.calibrate.motor import RIDING_CURRENT, Bench
-from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.result import Found, Panel, PlotLine, Result
+from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.physics.effects import inverter_loss, motor_iron_loss
 
 TIED = ("torque_constant", "motor_copper_resistance", "motor_iron_linear", "motor_iron_quadratic")
@@ -28,7 +28,7 @@ UNITS = {
 }
 
 
-def motor_losses(dyno: Table, largest_current: float = RIDING_CURRENT) -> Result:
+def motor_losses(dyno: Measurements, largest_current: float = RIDING_CURRENT) -> Result:
     """motor_copper_resistance [ohm], motor_iron_linear [W·s/rad], motor_iron_quadratic [W·s²/rad²] of steady points.
 
     They are tied to the torque_constant of `motor.torque_constant`, which comes out of the same fit.
@@ -87,7 +87,7 @@ def _copper_with_speed(result: Result, found: Solution, bench: Bench) -> None:
         )
 
 
-def inverter_losses(dyno: Table, largest_current: float = RIDING_CURRENT) -> Result:
+def inverter_losses(dyno: Measurements, largest_current: float = RIDING_CURRENT) -> Result:
     """inverter_loss_constant [W], _linear [W/A], _quadratic [W/A²] of steady points: DC less AC power."""
     current, loss = dyno["motor_current"], dyno["dc_power"] - dyno["ac_power"]
     name = dyno.file.name
@@ -135,8 +135,8 @@ def inverter_losses(dyno: Table, largest_current: float = RIDING_CURRENT) -> Res
             "AC power [W]",
             "efficiency [%]",
             (
-                Trace("measured", mechanical, _ratio(mechanical, loss), "."),
-                Trace("model", mechanical, _ratio(mechanical, model), "x"),
+                PlotLine("measured", mechanical, _ratio(mechanical, loss), "."),
+                PlotLine("model", mechanical, _ratio(mechanical, model), "x"),
             ),
         ),
     ]
@@ -172,8 +172,8 @@ def _inverter_model(found: Solution, current: Array) -> Array:
 def _panels(title: str, current: Array, loss: Array, model: Array) -> list[Panel]:
     x = "motor current, RMS [A]"
     return [
-        Panel(title, x, "loss [W]", (Trace("measured", current, loss, "."), Trace("model", current, model, "x"))),
-        Panel(f"{title}: residual", x, "measured less model [W]", (Trace("residual", current, loss - model, "."),)),
+        Panel(title, x, "loss [W]", (PlotLine("measured", current, loss, "."), PlotLine("model", current, model, "x"))),
+        Panel(f"{title}: residual", x, "measured less model [W]", (PlotLine("residual", current, loss - model, "."),)),
     ]
 
 
@@ -187,5 +187,8 @@ def _ratio(power: Array, loss: Array) -> Array:
 
 def _efficiency(title: str, speed: Array, torque: Array, loss: Array, model: Array) -> Panel:
     power = torque * speed
-    traces = (Trace("measured", torque, _ratio(power, loss), "."), Trace("model", torque, _ratio(power, model), "x"))
+    traces = (
+        PlotLine("measured", torque, _ratio(power, loss), "."),
+        PlotLine("model", torque, _ratio(power, model), "x"),
+    )
     return Panel(title, "torque [N·m]", "efficiency [%]", traces)

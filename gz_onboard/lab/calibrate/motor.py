@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.fit import Solution, linear, score, split
-from gz_onboard.lab.calibrate.result import Fit, Panel, Result, Trace
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.result import Fit, Panel, PlotLine, Result
+from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.physics.effects import motor_copper_loss
 
 RIDING_CURRENT = 120.0  # A: larger ones are short, and the constant falls with them
@@ -25,7 +25,7 @@ COPPER = 0.00393  # 1/K (IEC 60034-1)
 ROUGH = 0.02  # a point's torque sd is not known better than to this share of the greatest torque
 
 
-def voltage_constant(ramp: Table) -> Result:
+def voltage_constant(ramp: Measurements) -> Result:
     """voltage_constant [V·s/rad, line to line, RMS] out of `motor_speed` and `emf_line` at no torque.
 
     The slope of a line with a free offset. Raises InputError for fewer than 5 points, speeds that hardly differ, or
@@ -62,13 +62,13 @@ def voltage_constant(ramp: Table) -> Result:
             "Back-EMF",
             "motor speed [rad/s]",
             "line voltage, RMS [V]",
-            (Trace("measured", speed, emf, "."), Trace("line", speed[order], model[order])),
+            (PlotLine("measured", speed, emf, "."), PlotLine("line", speed[order], model[order])),
         ),
         Panel(
             "Back-EMF: residual",
             "motor speed [rad/s]",
             "measured less model [V]",
-            (Trace("residual", speed, emf - model, "."),),
+            (PlotLine("residual", speed, emf - model, "."),),
         ),
     ]
     return result
@@ -78,7 +78,7 @@ def voltage_constant(ramp: Table) -> Result:
 class Bench:
     """Steady points of a motor dynamometer, each array of shape (n,), SI units."""
 
-    table: Table
+    table: Measurements
     speed: Array
     current: Array
     torque: Array  # of the shaft: mean of torque sensor and power analyser, where there are both
@@ -86,7 +86,7 @@ class Bench:
     loss: Array  # electrical less mechanical power
 
 
-def read_bench(dyno: Table) -> Bench:
+def read_bench(dyno: Measurements) -> Bench:
     """The points of a dynamometer run with their motor loss; InputError where signs or units cannot be right."""
     speed, current, torque = dyno["motor_speed"], dyno["motor_current"], dyno["shaft_torque"]
     ac, temperature = dyno["ac_power"], dyno["motor_temperature"]
@@ -148,7 +148,9 @@ def torque(solution: Solution, bench: Bench) -> Array:
     return result
 
 
-def torque_constant(dyno: Table, warming: Table | None = None, largest_current: float = RIDING_CURRENT) -> Result:
+def torque_constant(
+    dyno: Measurements, warming: Measurements | None = None, largest_current: float = RIDING_CURRENT
+) -> Result:
     """torque_constant [N·m/A, at the air gap] of steady points up to `largest_current` [A].
 
     warming: a run at constant current in which the motor heats up: says how the torque falls with its temperature.
@@ -202,8 +204,8 @@ def torque_constant(dyno: Table, warming: Table | None = None, largest_current: 
             "motor current, RMS [A]",
             "torque [N·m]",
             (
-                Trace("measured", i, bench.torque, "."),
-                Trace("torque constant", i[speeds], found["torque_constant"] * i[speeds]),
+                PlotLine("measured", i, bench.torque, "."),
+                PlotLine("torque constant", i[speeds], found["torque_constant"] * i[speeds]),
             ),
         ),
         Panel(
@@ -211,8 +213,8 @@ def torque_constant(dyno: Table, warming: Table | None = None, largest_current: 
             "motor current, RMS [A]",
             "measured less model [N·m]",
             (
-                Trace("used", i[use], (bench.torque - torque(found, bench))[use], "."),
-                Trace("beyond the range", i[~use], (bench.torque - torque(found, bench))[~use], "x"),
+                PlotLine("used", i[use], (bench.torque - torque(found, bench))[use], "."),
+                PlotLine("beyond the range", i[~use], (bench.torque - torque(found, bench))[~use], "x"),
             ),
         ),
     ]
@@ -249,7 +251,7 @@ def scores(
     return fits
 
 
-def _temperature_note(warming: Table) -> str:
+def _temperature_note(warming: Measurements) -> str:
     current, hot = warming["motor_current"], warming["motor_temperature"]
     on = np.abs(current - np.median(current[np.abs(current) > 1.0])) < 0.05 * np.max(np.abs(current))
     ratio = warming["shaft_torque"][on] / current[on]

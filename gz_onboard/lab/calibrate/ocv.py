@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
-from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, Result, Trace
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, PlotLine, Result
+from gz_onboard.lab.calibrate.table import Measurements
 
 SOC = np.array(
     [
@@ -54,7 +54,7 @@ UNSURE = 0.2  # relative: the resistance of steady current, out of that of its s
 LEAST_SLOPE = 1e-3  # V over all of SOC: what a flat or falling part is given
 
 
-def calibrate(table: Table, soc: Array = SOC) -> Result:
+def calibrate(table: Measurements, soc: Array = SOC) -> Result:
     """``battery.ocv`` over the nodes `soc` and ``cell_capacity``.
 
     SOC 1 is the state before the discharge, 0 its end. Where a branch is missing, the other is moved by half the gap
@@ -144,18 +144,18 @@ def calibrate(table: Table, soc: Array = SOC) -> Result:
             table.file.name,
         )
     )
-    traces = [Trace("discharge", level[down], test.voltage[down], ".")]
+    traces = [PlotLine("discharge", level[down], test.voltage[down], ".")]
     if np.any(up):
-        traces.append(Trace("charge", level[up], test.voltage[up], "."))
+        traces.append(PlotLine("charge", level[up], test.voltage[up], "."))
     result.panels.append(
-        Panel("Open-circuit voltage", "state of charge", "voltage [V]", (*traces, Trace("OCV", soc, value)))
+        Panel("Open-circuit voltage", "state of charge", "voltage [V]", (*traces, PlotLine("OCV", soc, value)))
     )
     result.panels.append(
         Panel(
             "Half the gap of the branches",
             "state of charge",
             "mV",
-            (Trace("half gap", soc, 1e3 * half, "."), Trace("standard deviation", soc, 1e3 * sd)),
+            (PlotLine("half gap", soc, 1e3 * half, "."), PlotLine("standard deviation", soc, 1e3 * sd)),
         )
     )
     return result

@@ -17,7 +17,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD
 from gz_onboard.lab.calibrate.fit import linear, score, split
-from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Found, Panel, PlotLine, Result
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
@@ -168,7 +168,7 @@ def _gain(result: Result, pairs: Sequence[Pair]) -> None:
             "Pack current against inverter and auxiliary",
             "inverter and auxiliary current [A]",
             "pack current less line [A]",
-            (Trace("means of 2 s", x, residual, "."),),
+            (PlotLine("means of 2 s", x, residual, "."),),
         )
     )
 

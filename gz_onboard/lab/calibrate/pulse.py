@@ -33,8 +33,8 @@ from gz_onboard.lab.calibrate.cell_fit import (
 )
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.ocv import TESTER
-from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, Result, Trace
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, PlotLine, Result
+from gz_onboard.lab.calibrate.table import Measurements
 
 SOC = np.array([0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
 FEWEST_PULSES = 6
@@ -61,7 +61,7 @@ class Tested:
 
 
 def calibrate(
-    tables: Sequence[Table],
+    tables: Sequence[Measurements],
     ocv: Curve,
     capacity: Found,
     *,
@@ -196,7 +196,7 @@ def follow_profile(cell: Circuit, test: CellTest) -> tuple[Array, Array]:
     return voltage(cell, test.flowed, test.current, test.dt, level, test.temperature), test.voltage
 
 
-def _tested(table: Table, nodes: Array, volts: Array, capacity: Found, result: Result) -> Tested:
+def _tested(table: Measurements, nodes: Array, volts: Array, capacity: Found, result: Result) -> Tested:
     """`table` with its capacity: the one with which its rest voltages lie best on the OCV above 10 % SOC."""
     test = cell_test(table)
     pulses = int(test.block[-1])
@@ -504,13 +504,13 @@ def _voltages(result: Result, tested: list[Tested], cell: Circuit, slow: Circuit
                 f"Pulse test at {t.temperature:g} °C",
                 "time [h]",
                 "voltage [V]",
-                (Trace("measured", hours, test.voltage, "."), Trace("model", hours, model)),
+                (PlotLine("measured", hours, test.voltage, "."), PlotLine("model", hours, model)),
             ),
             Panel(
                 f"Pulse test at {t.temperature:g} °C: residual",
                 "time [h]",
                 "model less measured [mV]",
-                (Trace("", hours, 1000 * (model - test.voltage)),),
+                (PlotLine("", hours, 1000 * (model - test.voltage)),),
             ),
         ]
     for key, unit, factor in (("r0", "mΩ", 1e3), ("r1", "mΩ", 1e3), ("c1", "F", 1.0)):
@@ -521,7 +521,7 @@ def _voltages(result: Result, tested: list[Tested], cell: Circuit, slow: Circuit
                 "state of charge",
                 unit,
                 tuple(
-                    Trace(f"{degrees:g} °C", mesh.axes["soc"], factor * row)
+                    PlotLine(f"{degrees:g} °C", mesh.axes["soc"], factor * row)
                     for degrees, row in zip(mesh.axes["temperature"], mesh.value, strict=True)
                 ),
             )

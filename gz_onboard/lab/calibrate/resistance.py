@@ -14,8 +14,8 @@ from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.fit import linear, score, split
 from gz_onboard.lab.calibrate.offsets import read_pair
-from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.result import Found, Panel, PlotLine, Result
+from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
@@ -83,7 +83,7 @@ def cable_resistance(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     return result
 
 
-def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: Sequence[Table] = ()) -> Result:
+def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: Sequence[Measurements] = ()) -> Result:
     """pack_series_resistance [ohm]: 0.2 s steps of warm rides less what the cells alone give in that time.
 
     pulses: pulse tests of a cell at two temperatures or more, with `time`, `current`, `voltage` and `cell_temperature`:
@@ -154,7 +154,7 @@ def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: S
     return result
 
 
-def cell_steps(pulses: Sequence[Table]) -> tuple[Array, Array]:
+def cell_steps(pulses: Sequence[Measurements]) -> tuple[Array, Array]:
     """(temperatures [degC], logarithms of the resistance [ohm] that a cell shows `STEP_TIME` after a step of current),
     by temperature; the median over states of charge above 0.1 of the charge passed. InputError for tests without steps.
     """
@@ -196,8 +196,8 @@ def _soc(ride: Samples, vehicle: Vehicle) -> float:
 
 def _panels(title: str, x: Array, data: Array, model: Array, y_label: str) -> list[Panel]:
     order = np.argsort(x)
-    traces = Trace("measured", x, data, "."), Trace("model", x[order], model[order])
+    traces = PlotLine("measured", x, data, "."), PlotLine("model", x[order], model[order])
     return [
         Panel(title, "current [A]", y_label, traces),
-        Panel(f"{title}: residual", "current [A]", "measured less model [V]", (Trace("", x, data - model, "."),)),
+        Panel(f"{title}: residual", "current [A]", "measured less model [V]", (PlotLine("", x, data - model, "."),)),
     ]

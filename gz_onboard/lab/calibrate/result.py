@@ -46,7 +46,7 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Trace:
+class PlotLine:
     """A curve of a plot, in the units of its panel."""
 
     label: str
@@ -62,7 +62,7 @@ class Panel:
     title: str
     x_label: str  # with unit
     y_label: str
-    traces: tuple[Trace, ...]
+    traces: tuple[PlotLine, ...]
 
 
 @dataclass

@@ -26,7 +26,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError, nearest
 
 if TYPE_CHECKING:
-    from gz_onboard.toml import Table as TomlTable
+    from gz_onboard.toml import Table
 
 # Unit as written -> (unit it is turned into, factor, offset)
 _PER_MINUTE = 2 * math.pi / 60
@@ -143,7 +143,7 @@ class Named(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Table:
+class Measurements:
     """Columns of measurements.
 
     columns: by quantity (``current``, ``cell_temperature``, ...), all of one length, in SI units and degC; ``time``
@@ -183,7 +183,7 @@ class Table:
         return InputError(f"{self.file}{'' if row is None else f':{self.line(row)}'}: {message}")
 
 
-def read_table(file: Path, columns: Mapping[str, Named] | None = None, needed: Sequence[str] = ()) -> Table:
+def read_table(file: Path, columns: Mapping[str, Named] | None = None, needed: Sequence[str] = ()) -> Measurements:
     """The table in `file`.
 
     columns: for a file with names of its own, the column of each quantity; all others are left out. needed: quantities
@@ -201,7 +201,7 @@ def read_table(file: Path, columns: Mapping[str, Named] | None = None, needed: S
             trouble[quantity] = message
         else:
             found[quantity] = array
-    table = Table(file, found, lines, trouble)
+    table = Measurements(file, found, lines, trouble)
     for quantity in needed:
         table[quantity]
     if columns and trouble:  # what somebody has named must be of use
@@ -217,7 +217,7 @@ def read_table(file: Path, columns: Mapping[str, Named] | None = None, needed: S
     return table
 
 
-def read_columns(table: TomlTable) -> dict[str, Named]:
+def read_columns(table: Table) -> dict[str, Named]:
     """The table ``columns`` of a manifest: quantity = "column", or { column, unit, scale }."""
     found = {}
     for quantity, entry in table.values.items():
