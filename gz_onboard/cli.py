@@ -15,7 +15,7 @@ from gz_onboard import __version__
 from gz_onboard.errors import BAD_INPUT, FAILED, INTERRUPTED, InputError, nearest
 
 COMMANDS = {
-    "run": ("gz_onboard.daemon", "estimate the range from a live bus and publish it (the daemon)"),
+    "run": ("gz_onboard.daemon.command", "estimate the range from a live bus and publish it (the daemon)"),
     "dashboard": ("gz_onboard.dashboard.terminal", "show the range from the frames that the daemon sends"),
     "replay": ("gz_onboard.bus.replay", "put a recorded log onto a bus, in its own timing"),
     "estimate": ("gz_onboard.lab.estimate", "estimate recorded rides without a bus, as fast as it goes"),

@@ -9,6 +9,8 @@ from __future__ import annotations
 import importlib
 import sys
 
+from gz_onboard.errors import InputError, nearest
+
 
 def _import_without_asammdf() -> None:
     """Import python-can with asammdf hidden from it, unless either is there already."""
@@ -25,4 +27,11 @@ _import_without_asammdf()
 
 import can  # noqa: E402
 
-__all__ = ["can"]
+__all__ = ["can", "check_interface"]
+
+
+def check_interface(name: str) -> None:
+    """InputError if python-can has no such interface."""
+    if name not in can.VALID_INTERFACES:
+        known = sorted(can.VALID_INTERFACES)
+        raise InputError(f"--interface {name}: unknown{nearest(name, known)}; known are {', '.join(known)}")

@@ -14,14 +14,13 @@ import struct
 import time
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus._can import can
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.bus._can import can, check_interface
+from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Frame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-SOL_CAN_RAW = 101
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
 SO_RCVBUFFORCE = 33
@@ -66,11 +65,7 @@ class CanChannel:
 
     def open(self) -> None:
         """Open for the first time; InputError if there is no such interface or channel at all."""
-        if self.interface not in can.VALID_INTERFACES:
-            known = sorted(can.VALID_INTERFACES)
-            raise InputError(
-                f"--interface {self.interface}: unknown{nearest(self.interface, known)}; known are {', '.join(known)}"
-            )
+        check_interface(self.interface)
         try:
             self._open()
         except (can.CanInterfaceNotImplementedError, ValueError, ImportError) as error:

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
-from gz_onboard.bus.codec import first_bit, raw_range
+from gz_onboard.bus.layout import first_bit, identifier_of, raw_range
 from gz_onboard.bus.mapping import find_dbc, load_database
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.events import EFF_FLAG, ROLES, TRANSMITTED, Estimate, Frame, Reason, State
+from gz_onboard.events import ROLES, TRANSMITTED, Estimate, Frame, Reason, State
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -63,7 +63,7 @@ class Publisher:
     def range(self, estimate: Estimate, counts: Counts, time_ns: int, channel: int = 0) -> list[Frame]:
         """The frames of every second."""
         e = estimate
-        state, remaining, p10, p90 = self.told(e)
+        state, remaining, p10, p90 = self.reported(e)
         known = state in KNOWN
         frames: dict[str, dict[str, float | None]] = {
             "RANGE_Estimate": {
@@ -89,7 +89,7 @@ class Publisher:
 
     def status(self, estimate: Estimate, time_ns: int, channel: int = 0) -> list[Frame]:
         """The frame of every tenth of a second."""
-        state = self.told(estimate)[0]
+        state = self.reported(estimate)[0]
         soc, sigma = _scaled(estimate.soc, 100), _scaled(estimate.soc_sd, 100)
         if state not in KNOWN or not (self._can_say(SOC, soc) and self._can_say(SIGMA, sigma)):
             soc = sigma = None  # neither is of use without the other
@@ -104,7 +104,7 @@ class Publisher:
             values[signal] = reasons & bit != 0
         return [self._frame("RANGE_Status", values, time_ns, channel)]
 
-    def told(self, e: Estimate) -> tuple[State, float | None, float | None, float | None]:
+    def reported(self, e: Estimate) -> tuple[State, float | None, float | None, float | None]:
         """(state, range, P10, P90) [km] as they are sent: never valid unless all three are there and in their order."""
         if e.state not in KNOWN:
             return e.state, None, None, None
@@ -289,5 +289,4 @@ def _layout(message: Message) -> _Layout:
             continue
         fields.append(_field(signal, first_bit(signal) if little else 56 - first_bit(signal) - signal.length))
         unused &= ~(fields[-1].mask << fields[-1].shift)
-    identifier = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
-    return _Layout(identifier, "little" if little else "big", unused, fields, counter, counts)
+    return _Layout(identifier_of(message), "little" if little else "big", unused, fields, counter, counts)

@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard.bus import _can  # noqa: F401 - before cantools, which would import it with asammdf and pandas
+from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import LogDamage, logs_among, read_frames
 from gz_onboard.bus.publisher import WH, WH_PER_KM, Counts, Publisher
-from gz_onboard.bus.recorder import LogFile
 from gz_onboard.errors import BAD_INPUT, InputError
 from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log, reason_words

@@ -39,7 +39,7 @@ EPOCH = 1_700_000_000 * S
 def any_value() -> Iterator[None]:
     """Signals play roles of other kinds here: what is plausible for those says nothing (test_plausible.py has it)."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gz_onboard.bus.codec.PLAUSIBLE", dict.fromkeys(PLAUSIBLE, (-math.inf, math.inf)))
+        patch.setattr("gz_onboard.bus.layout.PLAUSIBLE", dict.fromkeys(PLAUSIBLE, (-math.inf, math.inf)))
         yield
 
 
