@@ -54,23 +54,17 @@ _OFFSETS = {"K": -273.15, "degF": -160 / 9}
 UNITS: dict[str, tuple[str, float, float]] = {
     unit: (si, factor, _OFFSETS.get(unit, 0)) for si, units in _FACTORS.items() for unit, factor in units.items()
 }
-_SPELLINGS = {"": "1", "-": "1"} | dict(
-    pair.split("=")
-    for pair in (
-        "rad/s=radps r/min=rpm 1/min=rpm rev/s=revps deg/s=degps m/s=mps km/h=kmph kmh=kmph kph=kmph m/s2=mps2 "
-        "m/s^2=mps2 m/s²=mps2 N·m=Nm N.m=Nm °C=degC Ω=ohm A·h=Ah %=pct °=deg sec=s Amps=A Volts=V celsius=degC hr=h "
-        "µs=us mΩ=mohm"
-    ).split()
+_ALIASES = (
+    "rad/s=radps r/min=rpm 1/min=rpm rev/s=revps deg/s=degps m/s=mps km/h=kmph kmh=kmph kph=kmph m/s2=mps2 m/s^2=mps2 "
+    "m/s²=mps2 N·m=Nm N.m=Nm °C=degC Ω=ohm A·h=Ah %=pct °=deg sec=s Amps=A Volts=V celsius=degC hr=h µs=us mΩ=mohm"
 )
-# The last word of a quantity says in what it must be.
-_KINDS = {
-    word: tuple(units)
-    for word, *units in map(
-        str.split,
-        "time s, current A, voltage V, line V, temperature degC, speed rad/s m/s, torque N·m, power W, force N, mass kg, "
-        "charge A·h, energy J, acceleration m/s^2, distance m, altitude m".split(", "),
-    )
-}
+_SPELLINGS = {"": "1", "-": "1"} | dict(alias.split("=") for alias in _ALIASES.split())
+# The last word of a quantity, and in what such a quantity must be.
+_QUANTITIES = (
+    "time s, current A, voltage V, line V, temperature degC, speed rad/s m/s, torque N·m, power W, force N, mass kg, "
+    "charge A·h, energy J, acceleration m/s^2, distance m, altitude m"
+)
+_KINDS = {word: tuple(units) for word, *units in map(str.split, _QUANTITIES.split(", "))}
 _SPEED_OF = {"motor_speed": "rad/s", "wheel_speed": "rad/s", "vehicle_speed": "m/s", "speed": "m/s"}
 
 _BRACKETS = re.compile(r"^\s*(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]\s*$")
