@@ -5,6 +5,7 @@ On a bench the heat is measured; of a ride it is what the vehicle's own losses g
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,11 +98,6 @@ def ride_run(ride: Samples, vehicle: Vehicle) -> CoolingRun:
         "motor_speed": speed,
         "motor_temperature": np.interp(time, *ride.columns["motor_temperature"]),
     }
-    heat = {port: np.zeros_like(time) for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS)}
-    for effect in vehicle.model.effects:
-        if effect.port in heat:
-            values = {name: vehicle.parameters[name] for name in effect.keywords}
-            heat[effect.port] = heat[effect.port] + Bound(effect, values)(quantities)
     pack_time, pack_current = ride.columns["pack_current"]
     amperes = (pack_current - vehicle.parameters["pack_current_offset"]) / vehicle.parameters["pack_current_gain"]
     measured = {name: at(name) for name in SENSORS if name in ride.columns}
@@ -119,22 +115,16 @@ def ride_run(ride: Samples, vehicle: Vehicle) -> CoolingRun:
         grid,
         at("ambient_temperature"),
         np.abs(_means(*ride.columns["motor_speed"], grid)) * radius,
-        _means(time, heat[Port.MOTOR_LOSS], grid),
+        _means(time, _loss(vehicle, Port.MOTOR_LOSS, quantities), grid),
         _means(time, _iron(vehicle, speed), grid),
-        _means(time, heat[Port.INVERTER_LOSS], grid),
+        _means(time, _loss(vehicle, Port.INVERTER_LOSS, quantities), grid),
         pack_heat,
         square,
         measured,
     )
 
 
-SENSORS = (
-    "motor_temperature",
-    "inverter_temperature",
-    "inverter_box_temperature",
-    "cell_temperature",
-    "bms_temperature",
-)
+SENSORS = tuple(f"{part}_temperature" for part in ("motor", "inverter", "inverter_box", "cell", "bms"))
 
 
 def _grid(time: Array, name: str) -> Array:
@@ -155,18 +145,19 @@ def _means(time: Array, value: Array, grid: Array) -> Array:
     return result
 
 
+def _loss(vehicle: Vehicle, port: Port, quantities: Mapping[str, Array]) -> Array:
+    """What the effects of the vehicle's model give at `port` [W]."""
+    total: Array = np.zeros_like(quantities["motor_speed"])
+    for effect in vehicle.model.effects:
+        if effect.port is port:
+            total = total + Bound(effect, {name: vehicle.parameters[name] for name in effect.keywords})(quantities)
+    return total
+
+
 def _iron(vehicle: Vehicle, speed: Array) -> Array:
     """The motor's loss without current [W]."""
-    total: Array = np.zeros_like(speed)
-    nothing = {
-        "motor_current": np.zeros_like(speed),
-        "motor_speed": speed,
-        "motor_temperature": np.full_like(speed, 25.0),
-    }
-    for effect in vehicle.model.effects:
-        if effect.port is Port.MOTOR_LOSS:
-            total = total + Bound(effect, {name: vehicle.parameters[name] for name in effect.keywords})(nothing)
-    return total
+    still = {"motor_current": np.zeros_like(speed), "motor_temperature": np.full_like(speed, 25.0)}
+    return _loss(vehicle, Port.MOTOR_LOSS, {"motor_speed": speed, **still})
 
 
 def _pack_heat(vehicle: Vehicle, mean: Array, square: Array, temperature: Array, rest: float) -> Array:

@@ -49,11 +49,7 @@ class Solution:
 
     def correlation(self) -> Array:
         """(n, n); zero for a parameter without spread."""
-        sd = np.sqrt(np.diag(self.covariance))
-        scale = np.where(sd > 0, sd, np.inf)
-        result: Array = self.covariance / np.outer(scale, scale)
-        np.fill_diagonal(result, 1.0)
-        return result
+        return correlation(self.covariance)
 
     def part(self, names: Sequence[str]) -> Array:
         """The covariance of `names`, in that order."""
@@ -63,6 +59,17 @@ class Solution:
     def found(self, name: str, unit: str, source: str, sd_more: float = 0.0) -> Found:
         """`name` as a result. sd_more: a further standard deviation that no sample shows, such as of the sensor."""
         return Found(self[name], float(np.hypot(self.sd(name), sd_more)), unit, source)
+
+
+def correlation(covariance: Array) -> Array:
+    """The correlation of a covariance, exactly symmetric; nothing is correlated with what has no spread."""
+    sd = np.sqrt(np.diag(covariance))
+    scale = np.where(sd > 0, sd, np.inf)
+    matrix = np.clip(covariance / np.outer(scale, scale), -1.0, 1.0)
+    matrix = (matrix + matrix.T) / 2
+    np.fill_diagonal(matrix, 1.0)
+    result: Array = matrix
+    return result
 
 
 def linear(

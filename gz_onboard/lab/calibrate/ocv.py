@@ -62,7 +62,8 @@ class _Sweep:
     @cached_property
     def level(self) -> Array:
         """The state of charge of each sample, 1 before the discharge."""
-        return 1 - (self.test.drawn - self.test.drawn[self.before]) / self.capacity
+        level: Array = 1 - (self.test.drawn - self.test.drawn[self.before]) / self.capacity
+        return level
 
     @cached_property
     def hours(self) -> float:

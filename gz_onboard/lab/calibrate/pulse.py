@@ -117,16 +117,13 @@ def circuit(result: Result, slow: bool = False) -> Circuit:
     """The cell that `calibrate` found; with `slow`, of two RC pairs."""
     c = result.curves
     ocv, axes = c["battery.ocv"], c["battery.r0"].axes
-    slow_names = ("slow_r0", "slow_r1", "slow_c1", "slow_resistance", "slow_time")
-    return Circuit(
-        ocv.axes["soc"],
-        ocv.value,
-        axes["soc"],
-        axes["temperature"],
-        c["battery.capacity"].value,
-        *(c[name].value for name in (slow_names if slow else ("battery.r0", "battery.r1", "battery.c1"))),
-        rest_shift=c["battery.rest_shift"].value if "battery.rest_shift" in c else None,
-    )
+    prefix = "slow_" if slow else "battery."
+    tables = {name: c[prefix + name].value for name in ("r0", "r1", "c1")}
+    tables |= {name: c[name].value for name in ("slow_resistance", "slow_time") if slow}
+    if "battery.rest_shift" in c:
+        tables["rest_shift"] = c["battery.rest_shift"].value
+    capacity = c["battery.capacity"].value
+    return Circuit(ocv.axes["soc"], ocv.value, axes["soc"], axes["temperature"], capacity, **tables)
 
 
 def follow_profile(cell: Circuit, test: CellTest) -> tuple[Array, Array]:
@@ -166,9 +163,9 @@ def _voltages(result: Result, tests: Sequence[Tested], names: str) -> None:
     for key, unit, factor in (("r0", "mΩ", 1e3), ("r1", "mΩ", 1e3), ("c1", "F", 1.0)):
         mesh = result.curves[f"battery.{key}"]
         rows = zip(mesh.axes["temperature"], mesh.value, strict=True)
-        lines = tuple(PlotLine(f"{degrees:g} °C", mesh.axes["soc"], factor * row) for degrees, row in rows)
-        result.panels.append(Panel(key.upper(), "state of charge", unit, lines))
-    for parameter, part in (("cell_voltage_error", "above"), ("cell_voltage_error_empty", "below")):
-        if rms[part] or part == "above":
-            sd, source = float(np.sqrt(np.mean(np.square(rms[part])))), f"rms of one RC pair {part} 10 % SOC"
+        over_soc = tuple(PlotLine(f"{degrees:g} °C", mesh.axes["soc"], factor * row) for degrees, row in rows)
+        result.panels.append(Panel(key.upper(), "state of charge", unit, over_soc))
+    for parameter, where in (("cell_voltage_error", "above"), ("cell_voltage_error_empty", "below")):
+        if rms[where] or where == "above":
+            sd, source = float(np.sqrt(np.mean(np.square(rms[where])))), f"rms of one RC pair {where} 10 % SOC"
             result.parameters[parameter] = Found(0.0, sd, "V", f"{names}: {source}")

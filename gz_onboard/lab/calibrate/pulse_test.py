@@ -30,7 +30,7 @@ class Tested:
     capacity: float  # A·h between full and empty
     capacity_sd: float
     level: Array
-    rests: Array  # rows at the ends of rests
+    rests: NDArray[np.int_]  # rows at the ends of rests
     offset: float  # V: how far the rests lie above the OCV, in the mean
 
 
@@ -71,7 +71,7 @@ def _long_rests(test: CellTest, capacity: Found) -> NDArray[np.int_]:
         raise table.error(f"has {pulses} pulses; at least {FEWEST_PULSES} are needed")
     ends = np.flatnonzero(test.rest & ~np.concatenate([test.rest[1:], [False]]))
     began = np.array([_began(test, int(k)) for k in ends])
-    rests = ends[test.time[ends] - test.time[began] >= REST]
+    rests: NDArray[np.int_] = ends[test.time[ends] - test.time[began] >= REST]
     used = float(test.drawn.max() - test.drawn.min())
     levels = np.unique(np.round(test.drawn[rests] / max(used, 1e-9) * 50))
     if len(levels) < FEWEST_LEVELS:

@@ -13,8 +13,8 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate import thesis
+from gz_onboard.lab.calibrate.fit import correlation
 from gz_onboard.lab.calibrate.result import Curve, Fit, Panel, Result
-from gz_onboard.lab.calibrate.vehicle_file import correlation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

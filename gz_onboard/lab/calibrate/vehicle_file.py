@@ -15,6 +15,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate import toml_text
+from gz_onboard.lab.calibrate.fit import correlation
 from gz_onboard.lab.calibrate.result import Curve, Found, Result
 from gz_onboard.lab.calibrate.toml_text import KeyPath, number, spliced, string, with_keys
 from gz_onboard.physics.effect import PACKAGE_EFFECTS, Effect
@@ -174,17 +175,6 @@ def _correlations(
             matrix = correlation(np.asarray(covariance)[np.ix_(kept, kept)])
             groups[key] = ([names[k] for k in kept], matrix, f"of {result.procedure}")
     return {name: _group(name, *group) for name, group in groups.items()}
-
-
-def correlation(covariance: Array) -> Array:
-    """The correlation of a covariance, exactly symmetric; nothing is correlated with what has no spread."""
-    sd = np.sqrt(np.diag(covariance))
-    scale = np.where(sd > 0, sd, np.inf)
-    matrix = np.clip(covariance / np.outer(scale, scale), -1.0, 1.0)
-    matrix = (matrix + matrix.T) / 2
-    np.fill_diagonal(matrix, 1.0)
-    result: Array = matrix
-    return result
 
 
 def _group(name: str, parameters: list[str], matrix: Array, source: str) -> str:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate import cooling
+from gz_onboard.lab.calibrate import cooling_network
 from gz_onboard.lab.calibrate.cooling import bms_cooling, inverter_cooling, motor_cooling, pack_cooling
 from gz_onboard.lab.calibrate.cooling_run import CoolingRun, bench_run, ride_run
 from gz_onboard.lab.calibrate.table import read_table
@@ -37,10 +37,10 @@ TRUTH = {
 }
 ROOM = {"motor": 1.8, "inverter": 1.1}
 NETWORKS = {
-    "motor": cooling.motor_temperatures,
-    "inverter": cooling.inverter_temperatures,
-    "cell": cooling.pack_temperatures,
-    "bms": cooling.bms_temperatures,
+    "motor": cooling_network.motor_temperatures,
+    "inverter": cooling_network.inverter_temperatures,
+    "cell": cooling_network.pack_temperatures,
+    "bms": cooling_network.bms_temperatures,
 }
 
 
