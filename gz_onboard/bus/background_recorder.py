@@ -13,7 +13,7 @@ _STUCK = 10.0  # s: no disk takes as long
 
 
 class BackgroundRecorder:
-    """A `Recorder` on a thread of its own, for one that may not wait for a disk. The recorder is its alone.
+    """A `Recorder` on a thread of its own, for one that may not wait for a disk. Nothing else may use the recorder.
 
     limit: how many frames may wait for the disk (a value of a sample counts as one); what does not fit is left out,
     whole portions of it, and counted in `lost_frames`.

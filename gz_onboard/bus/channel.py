@@ -14,7 +14,7 @@ import struct
 import time
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus._can import can, check_interface
+from gz_onboard.bus._can import can, check_interface, flagged
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Frame
 
@@ -171,10 +171,7 @@ class CanChannel:
         for _ in range(MOST):
             if time.monotonic() > until or (message := self._bus.recv(0)) is None:
                 return
-            identifier = message.arbitration_id
-            identifier |= EFF_FLAG if message.is_extended_id else 0
-            identifier |= RTR_FLAG if message.is_remote_frame else 0
-            identifier |= ERR_FLAG if message.is_error_frame else 0
+            identifier = flagged(message)
             # Filtered here: with filters of its own python-can's recv(0) says "nothing" at each frame it rejects.
             if self._wanted is not None and identifier & ~RTR_FLAG not in self._wanted:
                 continue

@@ -25,17 +25,8 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus import tables
+from gz_onboard.bus import logs, tables
 from gz_onboard.bus.logfile import LogFile, object_schema
-from gz_onboard.bus.logs import (
-    LogDamage,
-    json_channels,
-    log_suffix,
-    read_attachments,
-    read_frames,
-    read_metadata,
-    read_samples,
-)
 from gz_onboard.bus.replay import log_section
 from gz_onboard.bus.signals import Decoder
 from gz_onboard.bus.writers import write_blf, write_candump
@@ -86,10 +77,10 @@ def _write_mcap(log: Path, out: Path, decoder: Decoder, batches: Iterator[list[F
     first = next(batches, None)
     if first is None:
         raise InputError(f"{log}: no frames in the chosen part")
-    metadata = {**read_metadata(log), "expanded_from": log.name}
+    metadata = {**logs.read_metadata(log), "expanded_from": log.name}
     with out.open("wb") as stream:
-        file = LogFile(stream, first[0][0], metadata, read_attachments(log))
-        recorded, topics = json_channels(log), {m.name: f"/can/{m.name}" for m in decoder.messages.values()}
+        file = LogFile(stream, first[0][0], metadata, logs.read_attachments(log))
+        recorded, topics = logs.json_channels(log), {m.name: f"/can/{m.name}" for m in decoder.messages.values()}
         for topic, (schema, of_channel) in recorded.items():
             file.channel(topic, json.loads(schema), of_channel)
         for message in decoder.messages.values():
@@ -103,7 +94,7 @@ def _write_mcap(log: Path, out: Path, decoder: Decoder, batches: Iterator[list[F
                 file.frames(batch)
                 yield batch
 
-        samples = ((time_ns, topic, values) for topic, time_ns, values in read_samples(log, *section))
+        samples = ((time_ns, topic, values) for topic, time_ns, values in logs.read_samples(log, *section))
         signals = ((time_ns, topics[name], values) for time_ns, name, values in decoder.decode(logged()))
         count = 0
         for time_ns, topic, values in heapq.merge(signals, samples, key=lambda item: item[0]):
@@ -126,7 +117,7 @@ def _write_estimates(log: Path, out: Path, suffix: str, table_format: str, secti
     """The rows of the topic of estimates, a column for each field, with its unit; gives how many."""
     if suffix not in (".csv", ".parquet", ""):
         raise InputError(f"{out}: estimates can be written into .csv, .parquet or a directory")
-    found = [(time_ns, values) for topic, time_ns, values in read_samples(log) if topic == ESTIMATE_TOPIC]
+    found = [(time_ns, values) for topic, time_ns, values in logs.read_samples(log) if topic == ESTIMATE_TOPIC]
     if not found:
         raise InputError(f"{log}: holds no estimates ({ESTIMATE_TOPIC})")
     start_s, end_s = section
@@ -150,7 +141,7 @@ def _estimate_columns(log: Path) -> dict[str, str]:
     The field ``time``, since the first frame, is ``elapsed``: the table's first column is the time of the log.
     """
     try:
-        properties = json.loads(json_channels(log)[ESTIMATE_TOPIC][0])["properties"]
+        properties = json.loads(logs.json_channels(log)[ESTIMATE_TOPIC][0])["properties"]
         units = {name: str(about.get("description", "")) for name, about in properties.items()}
     except (ValueError, LookupError, AttributeError, TypeError) as error:
         raise InputError(f"{log}: the schema of {ESTIMATE_TOPIC} is not one of ours: {error!r}") from None
@@ -196,8 +187,8 @@ def run(args: argparse.Namespace) -> int:
         print(f"wrote {out}: {count} estimates")
         return 0
     section = log_section(log, args.start, args.end)
-    damages: list[LogDamage] = []
-    rest = read_frames(log, *section, damages.append)
+    damages: list[logs.LogDamage] = []
+    rest = logs.read_frames(log, *section, damages.append)
     first = next(rest, None)
     if first is None:
         where = "this log" if section == (None, None) else "the chosen part"
@@ -227,9 +218,9 @@ def _written(out: Path, write: Callable[[], int]) -> int:
 
 def _holds_only_estimates(log: Path) -> bool:
     """Whether it is a log of ours that holds estimates and not a single frame."""
-    if log_suffix(log) != ".mcap" or ESTIMATE_TOPIC not in json_channels(log):
+    if logs.log_suffix(log) != ".mcap" or ESTIMATE_TOPIC not in logs.json_channels(log):
         return False
-    return next(read_frames(log, on_damage=lambda _: None), None) is None
+    return next(logs.read_frames(log, on_damage=lambda _: None), None) is None
 
 
 def _export_signals(
@@ -274,7 +265,7 @@ def _database(log: Path, files: list[Path] | None) -> Database:
         return load_database(files)
     import cantools.database
 
-    attached = {name: data for name, data in read_attachments(log).items() if name.lower().endswith(".dbc")}
+    attached = {name: data for name, data in logs.read_attachments(log).items() if name.lower().endswith(".dbc")}
     if not attached:
         raise InputError(f"{log}: no DBC file is attached to this log; say which to decode by, with --dbc FILE")
     database = cantools.database.can.Database()

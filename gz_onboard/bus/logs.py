@@ -2,10 +2,10 @@
 
 BLF, candump and our own files have a reader of their own, five to ten times as fast as one that builds a message
 object for each frame; the rest is read by python-can. A damaged log is read as far as it can be: what is lost is
-counted and told once (`LogDamage`), never silently and never by giving up.
+counted and reported once (`LogDamage`), never silently and never by giving up.
 
 A frame has the kernel's identifier flags. The data of a remote frame are as many zero bytes as it asked for. A
-CAN FD frame of up to 8 bytes is not told from a classic one.
+CAN FD frame of up to 8 bytes cannot be distinguished from a classic one.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def read_samples(
 ) -> Iterator[tuple[str, int, dict[str, Any]]]:
     """Topic, time [ns] and values of the samples in one of our own logs, as they stand in it; others have none.
 
-    Damage is passed over: `read_frames` tells of it.
+    Damage is passed over: `read_frames` reports it.
     """
     if not (own := _own(path)):
         return

@@ -78,10 +78,8 @@ class Publisher:
                 "RANGE_ConsumptionExpected": _scaled(e.consumption_expected, 1 / WH_PER_KM) if known else None,
             },
             "RANGE_Diagnosis": {
-                "RANGE_CountDropped": self._count("RANGE_CountDropped", counts.dropped),
-                "RANGE_CountImplausible": self._count("RANGE_CountImplausible", counts.implausible),
-                "RANGE_CountLost": self._count("RANGE_CountLost", counts.lost),
-                "RANGE_CountUnknown": self._count("RANGE_CountUnknown", counts.unknown),
+                signal: min(count, self.greatest(signal))
+                for signal, count in ((f"RANGE_Count{name.capitalize()}", n) for name, n in vars(counts).items())
             },
             "RANGE_Sensors": {signal: role in e.distrusted for role, signal in self._sensor_signals},
         }
@@ -124,9 +122,6 @@ class Publisher:
 
     def _can_say(self, signal: str, value: float | None) -> bool:
         return self._fields[signal].raw(value) is not None
-
-    def _count(self, signal: str, count: int) -> float:
-        return min(count, self.greatest(signal))
 
     def _frame(self, name: str, values: dict[str, float | None], time_ns: int, channel: int) -> Frame:
         layout = self._layouts[name]

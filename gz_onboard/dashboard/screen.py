@@ -53,53 +53,43 @@ def screen(view: View, now: float, source: str, width: int) -> list[Line]:
     colour = _STATE_COLOURS[state] if state is not None else _DIM
     if view.messages["RANGE_Estimate"].late(now):
         colour = _DIM
+    interval = number("RANGE_RemainingP10"), (" to ", _DIM), number("RANGE_RemainingP90")
+    recent = number("RANGE_ConsumptionRecent"), (" over the last km", "")
+    trust = (_STATE_WORDS[state], f"{_BOLD};{_STATE_COLOURS[state]}") if state is not None else ("not known", _DIM)
     lines: list[Line] = [
         [(" gz-onboard", _BOLD), (f" · {source}", _DIM)],
         [],
-        [
-            ("  Range             ", ""),
-            number("RANGE_Remaining", f"{_BOLD};{colour}"),
-            ("     80 %: ", _DIM),
-            number("RANGE_RemainingP10"),
-            (" to ", _DIM),
-            number("RANGE_RemainingP90"),
-        ],
+        _row("Range", number("RANGE_Remaining", f"{_BOLD};{colour}"), ("     80 %: ", _DIM), *interval),
         *_band(view, now, width, colour),
         [],
         _soc(view, now, width),
-        [("  Energy left       ", ""), number("RANGE_EnergyLeft")],
-        [
-            ("  Consumption       ", ""),
-            number("RANGE_ConsumptionExpected"),
-            (" expected, ", ""),
-            number("RANGE_ConsumptionRecent"),
-            (" over the last km", ""),
-        ],
+        _row("Energy left", number("RANGE_EnergyLeft")),
+        _row("Consumption", number("RANGE_ConsumptionExpected"), (" expected, ", ""), *recent),
         [],
-        [
-            ("  State             ", ""),
-            (_STATE_WORDS[state], f"{_BOLD};{_STATE_COLOURS[state]}") if state is not None else ("not known", _DIM),
-        ],
+        _row("State", trust),
     ]
     if activity := view.activity(now):
-        lines.append([("  Activity          ", ""), (activity, "")])
+        lines.append(_row("Activity", (activity, "")))
     for i, reason in enumerate(view.reasons(now)):
         name, comment = words(str(reason.name)), view.comments[reason_signal(reason)]
-        lines.append([("  Because           " if i == 0 else " " * 20, ""), (name, "33")])
+        lines.append(_row("" if i else "Because", (name, "33")))
         if len(name) + len(comment) + 24 <= width:
             lines[-1].append((f": {comment.rstrip('.')}", _DIM))
     left_out = ", ".join(words(role) for role in view.distrusted(now))
     for i, text in enumerate(textwrap.wrap(left_out, max(width - 20, 20))):
-        lines.append([("  Sensors left out  " if i == 0 else " " * 20, ""), (text, "33")])
+        lines.append(_row("" if i else "Sensors left out", (text, "33")))
     if math.isinf(view.age(now)):
-        lines.append([("  No frame of       ", ""), (view.file.name, "31")])
-        lines.append([(f"                    {_NONE_YET}", _DIM)])
+        lines += [_row("No frame of", (view.file.name, "31")), [(f"{'':20}{_NONE_YET}", _DIM)]]
     else:
         for i, (name, age) in enumerate(view.stale(now).items()):
             how = "never came" if math.isinf(age) else f"last came {_duration(age)} ago"
-            lines.append([("  Stale             " if i == 0 else " " * 20, ""), (f"{name}: {how}", "31")])
+            lines.append(_row("" if i else "Stale", (f"{name}: {how}", "31")))
     lines += [[], *_counts(view, now)]
     return [_cropped(line, min(room, width)) for line in lines]
+
+
+def _row(label: str, *spans: Span, codes: str = "") -> Line:
+    return [(f"  {label:18}", codes), *spans]
 
 
 def _band(view: View, now: float, width: int, colour: str) -> list[Line]:
@@ -138,7 +128,7 @@ def _soc(view: View, now: float, width: int) -> Line:
     late = view.messages["RANGE_Status"].late(now)
     soc, sigma = view.value("RANGE_StateOfCharge", now), view.value("RANGE_StateOfChargeSigma", now)
     text = "–" if soc is None else f"{soc:.1f} %" if sigma is None else f"{soc:.1f} ± {sigma:.1f} %"
-    line: Line = [("  State of charge   ", ""), (f"{text:16}", _DIM if late else _BOLD)]
+    line = _row("State of charge", (f"{text:16}", _DIM if late else _BOLD))
     cells = min(width - 38, 36)
     if soc is not None and cells >= 10:
         full = min(max(round(soc / 100 * cells), 0), cells)
@@ -151,13 +141,13 @@ def _counts(view: View, now: float) -> list[Line]:
     age = view.age(now)
     last = "none yet" if math.isinf(age) else f"{age:.1f} s old" if age < 100 else f"{_duration(age)} old"
     own = f"{last}, {sum(e.received for e in entries)} received, {sum(e.lost for e in entries)} lost"
-    bad = sum(e.bad for e in entries)
+    bad = view.bad()
     names = {"Dropped": "dropped", "Implausible": "implausible", "Lost": "lost", "Unknown": "unknown identifiers"}
     counts = {word: view.value(f"RANGE_Count{name}", now) for name, word in names.items()}
     known = [f"{value:.0f} {word}" for word, value in counts.items() if value is not None]
     return [
-        [("  Range frames      ", _DIM), (own, _DIM), (f", {bad} bad", "31" if bad else _DIM)],
-        [("  Vehicle's frames  ", _DIM), (", ".join(known) or "–", _DIM)],
+        _row("Range frames", (own, _DIM), (f", {bad} bad", "31" if bad else _DIM), codes=_DIM),
+        _row("Vehicle's frames", (", ".join(known) or "–", _DIM), codes=_DIM),
     ]
 
 
@@ -184,7 +174,7 @@ def rendered(line: Line, style: Style) -> str:
 def summary_line(view: View, now: float) -> str:
     """Everything that matters on one line, for where there is no terminal."""
     if math.isinf(view.age(now)):
-        bad = sum(entry.bad for entry in view.messages.values())
+        bad = view.bad()
         return f"no frame of {view.file.name}{f' but {bad} bad ones' if bad else ''}. {_NONE_YET}"
     text = partial(view.text, now=now)
     state = view.state(now)
@@ -195,14 +185,14 @@ def summary_line(view: View, now: float) -> str:
         f"{text('RANGE_ConsumptionRecent')} recent, {text('RANGE_ConsumptionExpected')} expected",
         state.name.lower() if state is not None else "state not known",
     ]
-    activity = view.activity(now)
-    reasons = ", ".join(words(str(reason.name)) for reason in view.reasons(now))
-    left_out = ", ".join(words(role) for role in view.distrusted(now))
-    stale = ", ".join(view.stale(now))
-    bad = sum(entry.bad for entry in view.messages.values())
-    parts += [activity] if activity else []
-    parts += [f"because: {reasons}"] if reasons else []
-    parts += [f"left out: {left_out}"] if left_out else []
-    parts += [f"stale: {stale}"] if stale else []
-    parts += [f"{bad} bad range frames"] if bad else []
+    if activity := view.activity(now):
+        parts.append(activity)
+    for what, names in (
+        ("because", [words(str(reason.name)) for reason in view.reasons(now)]),
+        ("left out", [words(role) for role in view.distrusted(now)]),
+        ("stale", list(view.stale(now))),
+    ):
+        parts += [f"{what}: {', '.join(names)}"] if names else []
+    if bad := view.bad():
+        parts.append(f"{bad} bad range frames")
     return "; ".join(parts)

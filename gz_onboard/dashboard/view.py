@@ -153,6 +153,10 @@ class View:
         """[s] since the last good frame; infinite if none ever came."""
         return now - max(entry.time for entry in self.messages.values())
 
+    def bad(self) -> int:
+        """How many frames failed a check."""
+        return sum(entry.bad for entry in self.messages.values())
+
     def complete(self) -> bool:
         """Whether every message has come."""
         return all(entry.received for entry in self.messages.values())

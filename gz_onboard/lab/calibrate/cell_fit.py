@@ -130,7 +130,7 @@ def fit_branches(of: Pieces, keep: NDArray[np.bool_] | None = None, leave_out: b
     n, branches = len(of.soc), 1 + len(TIMES)
     gram, right = of.gram[used].sum(axis=0), of.right[used].sum(axis=0)
     scale = np.full(branches, 0.02)  # ohm
-    for _ in range(2):  # how far a table may bend is relative to its size, which the first turn tells
+    for _ in range(2):  # how far a table may bend is relative to its size, which the first turn gives
         prior = _smoothness(of.soc, scale, n, branches)
         p = _positive(gram + prior, right, n)
         scale = np.maximum(np.median(p[:-n].reshape(branches, n), axis=1), 2e-3)
@@ -178,7 +178,7 @@ def left_out(a: Array, residual: Array, labels: NDArray[Any], normal: Array) -> 
     """The covariance of a least-squares fit from what leaving out each piece of the data changes (the jackknife).
 
     a: (m, n), residual: (m,), weighted; labels: the piece of each row; normal: (n, n), with priors. A piece pulls the
-    fit towards itself, so that the scatter of what is left over tells too little where pieces are few; the jackknife
+    fit towards itself, so that the scatter of what is left over shows too little where pieces are few; the jackknife
     does not suffer from that (CR3 of Bell & McCaffrey 2002).
     """
     total = np.zeros_like(normal)

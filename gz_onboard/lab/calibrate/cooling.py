@@ -35,7 +35,7 @@ def _likely(vehicle: Vehicle, name: str) -> tuple[float, float]:
 
 
 def _usable(runs: Sequence[CoolingRun], sensor: str, result: Result) -> list[CoolingRun]:
-    """The runs with that sensor in which it changes enough to tell anything."""
+    """The runs with that sensor in which it changes enough to be of use."""
     good, least = [], 1.0 if sensor == "cell_temperature" else LEAST_RISE
     for run in runs:
         if sensor not in run.measured:
@@ -190,7 +190,7 @@ def _priors(vehicle: Vehicle, names: Sequence[str]) -> dict[str, tuple[float, fl
 
 
 def _share_refusal(result: Result, job: Job, runs: Sequence[CoolingRun]) -> None:
-    """Whether the data tell the stator's share of the heat: the rest fitted anew at two other shares."""
+    """Whether the data determine the stator's share of the heat: the rest fitted anew at two other shares."""
     some = [run for run in runs if run.still] or list(runs)
     rms = {}
     for share in (0.75, job.held["motor_stator_share"], 1.0):
@@ -231,7 +231,7 @@ def inverter_cooling(
     """Capacities of board and box, the conductance between them and the box's to the ambient.
 
     Between board and box act board_to_box and, beside it, the two to the air in series: the air has no sensor and no
-    capacity, so that only the sum can be told; the two to the air stay as they are.
+    capacity, so that only the sum is determined; the two to the air stay as they are.
     """
     p = vehicle.parameters
     names = ("inverter_board_capacity", "inverter_box_capacity", "inverter_board_to_box", "inverter_box_to_ambient")
@@ -275,7 +275,7 @@ def pack_cooling(runs: Sequence[CoolingRun], vehicle: Vehicle, validation: Seque
 def bms_cooling(runs: Sequence[CoolingRun], vehicle: Vehicle, validation: Sequence[CoolingRun] = ()) -> Result:
     """bms_resistance, bms_heat_capacity, bms_conductance: the board over the cells it sits on.
 
-    Temperatures tell their ratios only (heat scales with all three), so that the scale is that of the priors.
+    Temperatures determine their ratios only (heat scales with all three), so that the scale is that of the priors.
     """
     p = vehicle.parameters
     names = ("bms_resistance", "bms_heat_capacity", "bms_conductance")

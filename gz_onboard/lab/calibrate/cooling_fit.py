@@ -103,7 +103,7 @@ class Fitted:
 
 
 def fit_networks(job: Job, runs: Sequence[CoolingRun]) -> Fitted:
-    """The closed room first, then the conductance to the ambient out of the rides; either alone gives all."""
+    """The closed room first, then the conductance to the ambient out of the rides; either by itself gives all."""
     still, rides = [run for run in runs if run.still], [run for run in runs if not run.still]
     if not job.outside or not (still and rides):
         found, values = job.fit(runs)

@@ -19,7 +19,7 @@ from gz_onboard.simulation.parts.cooling import PERIOD
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
-SHORTEST = 300.0  # s: less tells nothing of time constants of minutes
+SHORTEST = 300.0  # s: less says nothing of time constants of minutes
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def ride_run(ride: Samples, vehicle: Vehicle) -> CoolingRun:
     amperes = (pack_current - vehicle.parameters["pack_current_offset"]) / vehicle.parameters["pack_current_gain"]
     measured = {name: at(name) for name in SENSORS if name in ride.columns}
     inside = [at(role) for role in ride.columns if role.startswith("pack_temperature_")]
-    if inside:  # the mean of thermocouples tells more than the BMS's whole degrees
+    if inside:  # the mean of thermocouples is finer than the BMS's whole degrees
         measured["cell_temperature"] = np.mean(inside, axis=0)
     mean, square = _means(pack_time, amperes, grid), _means(pack_time, amperes**2, grid)
     radius = vehicle.parameters["wheel_radius"] * vehicle.parameters["gear_ratio"]

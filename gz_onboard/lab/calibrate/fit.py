@@ -82,7 +82,7 @@ def linear(
 ) -> Solution:
     """The parameters p (one for each of `columns`, shape (m,)) for which sum(p·column) is nearest to y, shape (m,).
 
-    sd: of y, of one sample or of each; without it the residuals tell. prior: (value, sd) of parameters that more is
+    sd: of y, of one sample or of each; without it the residuals give it. prior: (value, sd) of parameters that more is
     known of. groups: label of each sample, (m,), where samples of one label depend on each other.
     Raises InputError for fewer samples than parameters, or columns that depend on each other without a prior.
     """
@@ -96,6 +96,21 @@ def linear(
     _check(names, full, len(y), size)
     value = np.linalg.lstsq(full / size, target, rcond=None)[0] / size
     return _solution(names, value, jacobian, jacobian @ value - y * weight, rows, sd is not None, groups)
+
+
+def line(
+    name: str, x: Array, y: Array, keep: Mask, groups: NDArray[Any] | None = None
+) -> tuple[Solution, Array, Array]:
+    """(slope `name` and ``offset`` of the line through y over x; its y; that of the line through the points `keep`)."""
+    columns = {name: x, "offset": np.ones_like(x)}
+    found = linear(columns, y, groups=groups)
+    part = linear({key: column[keep] for key, column in columns.items()}, y[keep])
+    return found, found[name] * x + found["offset"], part[name] * x + part["offset"]
+
+
+def grouped(labels: NDArray[Any]) -> NDArray[Any] | None:
+    """`labels` as groups for `linear`; None for two or fewer, whose scatter says nothing."""
+    return labels if len(np.unique(labels)) > 2 else None
 
 
 def nonlinear(
@@ -203,6 +218,11 @@ def split(count: int, share: float = 1 / 3, seed: int = 0) -> Mask:
     keep = np.ones(count, dtype=bool)
     keep[np.random.default_rng(seed).permutation(count)[: round(share * count)]] = False
     return keep
+
+
+def every_second(labels: NDArray[Any]) -> Mask:
+    """True for the points to fit: those with an even label, or as of `split` where all have one label."""
+    return np.asarray(labels % 2 == 0) if len(np.unique(labels)) > 1 else split(len(labels))
 
 
 def score(what: str, unit: str, data: Array, model: Array, *, held_out: bool, source: str) -> Fit:

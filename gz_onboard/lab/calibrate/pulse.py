@@ -1,6 +1,6 @@
 """R0, R1 and C1 over state of charge and temperature from pulse tests of one cell (Lord 2016, sec. 2.2).
 
-One table per temperature. Each test begins at full and rests before its pulses; what it rests at tells how much charge
+One table per temperature. Each test begins at full and rests before its pulses; what it rests at shows how much charge
 there is between full and empty at its temperature. Many RC pairs of fixed time constants are fitted, linear in every
 table; then the one pair (and beside it the two) that is nearest to them under a load like riding (see `cell_fit`).
 """
@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, riding_current, voltage
 from gz_onboard.lab.calibrate.cell_data import CellTest
@@ -74,18 +74,8 @@ def calibrate(
     source = f"{names}: charge that lays the rest voltages on the OCV"
     result.curves["battery.capacity"] = Curve({"temperature": temperature}, amount, amount_sd, "A·h", source)
     covered = np.array([f.covered for f in fitted])
-    for name, value, sd, unit, what in (
-        ("battery.r0", one[0], sd_one[0], "ohm", "R0"),
-        ("battery.r1", one[1], sd_one[1], "ohm", "R1"),
-        ("battery.c1", one[2] / one[1], sd_one[3], "F", "τ1/R1"),
-        ("slow_r0", two[0], sd_two[0], "ohm", "R0 beside two pairs"),
-        ("slow_r1", two[1], sd_two[1], "ohm", "R1 beside a slow pair"),
-        ("slow_c1", two[3] / two[1], sd_two[5], "F", "C1 beside a slow pair"),
-        ("slow_resistance", two[2], sd_two[2], "ohm", "slow pair"),
-        ("slow_time", two[4], sd_two[4], "s", "slow pair"),
-    ):
-        sds = np.where(covered, value * np.hypot(sd, TESTER), np.nan)
-        result.curves[name] = Curve({"soc": soc, "temperature": temperature}, value, sds, unit, f"{how}; {what}")
+    axes = {"soc": soc, "temperature": temperature}
+    _tables(result, axes, covered, how, (one, sd_one), (two, sd_two))
     for t, there in zip(tests, covered, strict=True):
         if not np.all(there):
             result.refusals.append(
@@ -96,6 +86,31 @@ def calibrate(
     if method == "reduced":  # the halves are
         mesh_quality(result, tests, fitted, split, reduction, one)
     return result
+
+
+def _tables(
+    result: Result,
+    axes: dict[str, Array],
+    covered: Mask,
+    how: str,
+    one: tuple[list[Array], list[Array]],
+    two: tuple[list[Array], list[Array]],
+) -> None:
+    """The tables of one pair and of two, each (values, relative sd) as of `meshes`, without an sd where not covered."""
+    (r0, r1, time), sd = one
+    (slow_r0, fast, slow, fast_time, slow_time), slow_sd = two
+    for name, value, share, unit, what in (
+        ("battery.r0", r0, sd[0], "ohm", "R0"),
+        ("battery.r1", r1, sd[1], "ohm", "R1"),
+        ("battery.c1", time / r1, sd[3], "F", "τ1/R1"),
+        ("slow_r0", slow_r0, slow_sd[0], "ohm", "R0 beside two pairs"),
+        ("slow_r1", fast, slow_sd[1], "ohm", "R1 beside a slow pair"),
+        ("slow_c1", fast_time / fast, slow_sd[5], "F", "C1 beside a slow pair"),
+        ("slow_resistance", slow, slow_sd[2], "ohm", "slow pair"),
+        ("slow_time", slow_time, slow_sd[4], "s", "slow pair"),
+    ):
+        sds = np.where(covered, value * np.hypot(share, TESTER), np.nan)
+        result.curves[name] = Curve(axes, value, sds, unit, f"{how}; {what}")
 
 
 def _tests(tables: Sequence[Measurements], ocv: Curve, capacity: Found, result: Result) -> list[Tested]:

@@ -84,7 +84,7 @@ class Measurements:
 
     columns: by quantity (``current``, ``cell_temperature``, ...), all of one length, in SI units and degC; ``time``
     never decreases; two rows at one time are the two sides of a step. lines: where each row stands in the file, from 1
-    (for Parquet: its row). trouble: why a column of the file cannot be used, by quantity; told when it is asked for.
+    (for Parquet: its row). trouble: why a column of the file cannot be used, by quantity; raised when it is asked for.
     """
 
     file: Path

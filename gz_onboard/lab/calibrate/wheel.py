@@ -24,7 +24,7 @@ RECEIVER = 0.002  # relative: Doppler speed of a receiver in the open
 
 
 def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
-    """wheel_radius [m] of the rides that have GPS and steady riding; each ride held out once tells how it differs.
+    """wheel_radius [m] of the rides that have GPS and steady riding; each ride held out once shows how it differs.
 
     Raises InputError if none of them has.
     """
