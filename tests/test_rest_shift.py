@@ -16,7 +16,8 @@ from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Group
 from gz_onboard.lab.discover.channels import rest_at
-from gz_onboard.physics.battery import Battery, drawable
+from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.drawable import drawable
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.recorded import Recorded, rest_soc
 from gz_onboard.simulation.scooter import Scooter

@@ -11,6 +11,8 @@ An effect file has
 - if it has memory, ``decay(dt, quantity, ..., *, parameter, ...)``: the factor, 0 to 1, that its state keeps over
   ``dt`` [s]. The effect's value then is not the term but the state x, 0 at the start, which goes to what the term
   says: x' = decay·x + (1 - decay)·term, exact for quantities that are constant over the step;
+- what others need to know of it, if so: ``STORES_ENERGY = True`` (it gives back what it took, and the accelerometer
+  measures it), ``TURNING_LOSS = True`` (a chassis that turns has the same loss);
 - ``SHOWN_BY``, if it is a candidate of the discovery: the data that would show it, and the ride that would split it
   from its look-alikes.
 
@@ -137,6 +139,8 @@ class Effect:
     decay_quantities: tuple[str, ...] = ()
     decay_keywords: tuple[str, ...] = ()
     shown_by: str = ""
+    stores_energy: bool = False
+    turning_loss: bool = False
 
     @property
     def reads(self) -> frozenset[str]:
@@ -252,6 +256,8 @@ def _effect(name: str, module: ModuleType) -> Effect:
         decay_quantities=decay_quantities,
         decay_keywords=decay_parameters,
         shown_by=getattr(module, "SHOWN_BY", ""),
+        stores_energy=getattr(module, "STORES_ENERGY", False),
+        turning_loss=getattr(module, "TURNING_LOSS", False),
     )
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
-from gz_onboard.physics.model import bind
+from gz_onboard.physics.model import Bound
 from gz_onboard.physics.vibration import FAST
 from gz_onboard.simulation.recorded import BRAKE_FORCE
 from gz_onboard.simulation.run import Command
@@ -166,7 +166,7 @@ class Truth:
         power = np.zeros(self.count)
         for effect in scooter.vehicle.model.effects:
             if effect.port is Port.DC_POWER:
-                power = power + bind(effect, self.parameters).series(self.dt, q)
+                power = power + Bound(effect, self.parameters).series(self.dt, q)
         return power
 
     def __getitem__(self, name: str) -> Array:

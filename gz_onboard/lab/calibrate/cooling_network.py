@@ -1,4 +1,4 @@
-"""The temperatures of the simulation's own cooling networks over a run, stepped at its period.
+"""The temperatures of the model's own cooling networks over a run, stepped at its period.
 
 Parameters go by their names in the vehicle file, and ``room`` for the conductance of a closed room.
 """
@@ -11,7 +11,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cooling_run import CoolingRun
-from gz_onboard.simulation.parts.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
+from gz_onboard.physics.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling, temperatures
 
 Values = Mapping[str, float]
 Model = Callable[[Values, CoolingRun], dict[str, Array]]
@@ -25,9 +25,7 @@ def motor_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     """
     stator = _first(p, run, "motor_temperature")
     share, iron_share = p["motor_stator_share"], p.get("iron_share")
-    network = MotorCooling(
-        p["motor_stator_capacity"], p["motor_rotor_capacity"], p["motor_gap_conductance"], 1.0, share, stator, stator
-    )
+    network = MotorCooling.of({**p, "motor_rotor_to_ambient": 1.0}, stator)
     shares = np.full_like(run.time, share)
     if iron_share is not None:
         fraction = run.iron / np.where(np.abs(run.motor_heat) > 1.0, run.motor_heat, np.inf)
@@ -35,9 +33,9 @@ def motor_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     outside = _outside(p, run, "motor_rotor_to_ambient")
     result = np.empty_like(run.time)
     rows = zip(run.motor_heat.tolist(), run.ambient.tolist(), shares.tolist(), outside.tolist(), strict=True)
-    for k, (heat, ambient, network.stator_share, network.rotor_to_ambient) in enumerate(rows):
+    for k, (heat, ambient, network.stator_share, conductance) in enumerate(rows):
         result[k] = network.stator
-        network.step(PERIOD, heat, ambient)
+        network.step(PERIOD, heat, ambient, conductance)
     return {"motor_temperature": result}
 
 
@@ -47,38 +45,27 @@ def inverter_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     box = _first(
         p, run, "inverter_box_temperature" if "inverter_box_temperature" in run.measured else "inverter_temperature"
     )
-    network = InverterCooling(
-        p["inverter_board_capacity"],
-        p["inverter_box_capacity"],
-        p["inverter_board_to_air"],
-        p["inverter_box_to_air"],
-        p["inverter_board_to_box"],
-        1.0,
-        board,
-        box,
-    )
+    network = InverterCooling.of({**p, "inverter_box_to_ambient": 1.0}, board, box)
     outside = _outside(p, run, "inverter_box_to_ambient")
     result = np.empty((2, len(run.time)))
     rows = zip(run.inverter_heat.tolist(), run.ambient.tolist(), outside.tolist(), strict=True)
-    for k, (heat, ambient, network.box_to_ambient) in enumerate(rows):
+    for k, (heat, ambient, conductance) in enumerate(rows):
         result[:, k] = network.board, network.box
-        network.step(PERIOD, heat, ambient)
+        network.step(PERIOD, heat, ambient, conductance)
     return {"inverter_temperature": result[0], "inverter_box_temperature": result[1]}
 
 
 def pack_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     """Of the cells."""
     start = _first(p, run, "cell_temperature")
-    return {
-        "cell_temperature": _lumped(p["pack_heat_capacity"], p["pack_conductance"], start, run.pack_heat, run.ambient)
-    }
+    return {"cell_temperature": _lumped(LumpedCooling.of(p, "pack", start), run.pack_heat, run.ambient)}
 
 
 def bms_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     """Of the BMS, over the pack's temperature as measured."""
     start = _first(p, run, "bms_temperature")
     heat, cells = p["bms_resistance"] * run.pack_square, run.measured["cell_temperature"]
-    return {"bms_temperature": _lumped(p["bms_heat_capacity"], p["bms_conductance"], start, heat, cells)}
+    return {"bms_temperature": _lumped(LumpedCooling.of(p, "bms", start), heat, cells)}
 
 
 def _first(p: Values, run: CoolingRun, sensor: str) -> float:
@@ -89,13 +76,8 @@ def _first(p: Values, run: CoolingRun, sensor: str) -> float:
     return float(line[1]) + p.get(f"start:{run.name}:{sensor}", 0.0)
 
 
-def _lumped(capacity: float, conductance: float, start: float, heat: Array, ambient: Array) -> Array:
-    network = LumpedCooling(capacity, conductance, start)
-    result = np.empty_like(heat)
-    for k, (q, a) in enumerate(zip(heat.tolist(), ambient.tolist(), strict=True)):
-        result[k] = network.temperature
-        network.step(PERIOD, q, a)
-    return result
+def _lumped(network: LumpedCooling, heat: Array, ambient: Array) -> Array:
+    return np.array(temperatures(network, PERIOD, heat.tolist(), ambient.tolist()))
 
 
 def _outside(p: Values, run: CoolingRun, name: str) -> Array:

@@ -13,9 +13,9 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.table import Measurements
+from gz_onboard.physics.cooling import PERIOD
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import Bound
-from gz_onboard.simulation.parts.cooling import PERIOD
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 

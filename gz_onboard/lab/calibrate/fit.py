@@ -108,7 +108,7 @@ def line(
     return found, found[name] * x + found["offset"], part[name] * x + part["offset"]
 
 
-def grouped(labels: NDArray[Any]) -> NDArray[Any] | None:
+def as_groups(labels: NDArray[Any]) -> NDArray[Any] | None:
     """`labels` as groups for `linear`; None for two or fewer, whose scatter says nothing."""
     return labels if len(np.unique(labels)) > 2 else None
 

@@ -15,7 +15,7 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD
-from gz_onboard.lab.calibrate.fit import every_second, grouped, line, score
+from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, score
 from gz_onboard.lab.calibrate.result import Found, Panel, PlotLine, Result
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
@@ -132,7 +132,7 @@ def _gain(result: Result, pairs: Sequence[Pair]) -> None:
         result.refusals.append(f"pack_current_gain: currents of {x.min():.1f} to {x.max():.1f} A only tell no gain")
         return
     fitted = every_second(labels)
-    found, model, outside = line("pack_current_gain", x, y, fitted, grouped(labels))
+    found, model, outside = line("pack_current_gain", x, y, fitted, as_groups(labels))
     source = f"{len(pairs)} rides, {len(x)} means of {WINDOW:g} s, against inverter and auxiliary current"
     result.parameters["pack_current_gain"] = found.found("pack_current_gain", "1", source, GAIN_SD)
     result.refusals.append(

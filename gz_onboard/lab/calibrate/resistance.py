@@ -12,7 +12,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.fit import every_second, grouped, line, linear, score
+from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, linear, score
 from gz_onboard.lab.calibrate.offsets import read_pair, window_means
 from gz_onboard.lab.calibrate.result import Found, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
@@ -47,7 +47,7 @@ def cable_resistance(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
             f"{LEAST_SPAN:g} A are needed"
         )
     fitted = every_second(label)
-    found, model, outside = line("cable_resistance", i, v, fitted, grouped(label))
+    found, model, outside = line("cable_resistance", i, v, fitted, as_groups(label))
     if found["cable_resistance"] < -3 * found.sd("cable_resistance"):
         raise InputError(f"{rides[0].name}: inverter_voltage rises over pack_voltage with current: a sign is wrong")
     what, source = "voltage between pack and inverter", f"{len(rides)} rides, {len(i)} means of 1 s, "
@@ -90,7 +90,7 @@ def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: S
         )
     di, dv, cell = (np.concatenate(column) for column in zip(*steps, strict=True))
     label = np.repeat(np.arange(len(steps)), [len(columns[0]) for columns in steps])
-    found = linear({"series": di}, dv - cell * di, groups=grouped(label))
+    found = linear({"series": di}, dv - cell * di, groups=as_groups(label))
     doubt = CELL_SHARE_SD * float(cell.mean())
     sd = float(np.hypot(found.sd("series"), doubt))
     whole = linear({"whole": di}, dv)["whole"]

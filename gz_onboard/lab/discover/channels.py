@@ -31,10 +31,11 @@ from gz_onboard.arrays import Array, Mask
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.grid import MOVING, STEP, Ride
-from gz_onboard.physics.battery import Battery, Mesh
+from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import Effect
 from gz_onboard.physics.relaxation import relaxation, relaxed
 from gz_onboard.physics.riding import VIBRATION
+from gz_onboard.physics.tables import Mesh
 
 Values = Mapping[str, float]
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s

@@ -9,18 +9,22 @@ from typing import Any
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.elementary import direction
 
 PORT = Port.TYRE
 PARAMETERS = (
     Parameter("rolling_resistance_constant", "1", 0.015, 0.005, 0.0, 0.06, "scooter tyres: Cossalter 2006, sec. 2.3"),
     Parameter("rolling_resistance_speed", "s/m", 2e-4, 2e-4, 0.0, 3e-3, "SAE J2452: rises by a few percent per m/s"),
 )
-STANDSTILL = 0.1  # m/s
 
 
 def term(
     speed: Any, mass: Any, grade_cosine: Any, *, rolling_resistance_constant: float, rolling_resistance_speed: float
 ) -> Any:
     """Force [N] against the motion."""
-    direction = speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5
-    return mass * GRAVITY * grade_cosine * (rolling_resistance_constant * direction + rolling_resistance_speed * speed)
+    return (
+        mass
+        * GRAVITY
+        * grade_cosine
+        * (rolling_resistance_constant * direction(speed) + rolling_resistance_speed * speed)
+    )

@@ -101,25 +101,6 @@ class FirstOrderPack:
         return sign * total * self.battery.cells_series * self._charge
 
 
-class SecondOrderPack(FirstOrderPack):
-    """The same with a second, slow RC pair: what the first-order model lacks (Lord 2016, sec. 3.3)."""
-
-    def __init__(self, battery: Battery, soc: float = 1.0, r2: float = 0.008, tau2: float = 1200.0) -> None:
-        super().__init__(battery, soc)
-        self.r2 = r2  # ohm of a cell
-        self.tau2 = tau2  # s
-        self.v2 = 0.0  # V of a cell
-
-    def draw(self, power: float, dt: float, temperature: float) -> tuple[float, float, float, float]:
-        """See `Pack`."""
-        fast, self.v1 = self.v1, self.v1 + self.v2
-        current, voltage, heat, delivered = super().draw(power, dt, temperature)
-        cell = current / self.battery.cells_parallel
-        self.v1 = relaxed(fast, self._r1 * cell, self._decay)
-        self.v2 = relaxed(self.v2, self.r2 * cell, decay_over(dt, self.tau2))
-        return current, voltage, heat, delivered
-
-
 class EffectPack(FirstOrderPack):
     """The first-order pack with effects of the vehicle's model in its cells: slow relaxation, hysteresis, one's own.
 
