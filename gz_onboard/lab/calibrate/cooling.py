@@ -176,10 +176,10 @@ def motor_cooling(
     held = {"motor_stator_share": p["motor_stator_share"]}
     start, doubted = {name: p[name] for name in names}, {name: _likely(vehicle, name) for name in held}
     job = Job(network.motor_temperatures, start, held, _priors(vehicle, names[:3]), names[3], doubted)
-    fitted = _solve(result, job, runs, validation, hold_out)
+    _solve(result, job, runs, validation, hold_out)
     if hold_out:
         _share_refusal(result, job, runs)
-        _iron_note(result, job, fitted, runs, validation)
+        _iron_note(result, job, runs, validation)
     return result
 
 
@@ -206,9 +206,7 @@ def _share_refusal(result: Result, job: Job, runs: Sequence[CoolingRun]) -> None
         result.notes.append(f"motor_stator_share held at {job.held['motor_stator_share']:g}; rms {text}")
 
 
-def _iron_note(
-    result: Result, job: Job, fitted: Fitted, runs: Sequence[CoolingRun], validation: Sequence[CoolingRun]
-) -> None:
+def _iron_note(result: Result, job: Job, runs: Sequence[CoolingRun], validation: Sequence[CoolingRun]) -> None:
     """What a share of its own for the iron loss would do, which the network does not know."""
     part, held = halves(runs)
     if not held or not any(run.iron.sum() > 0.1 * run.motor_heat.sum() for run in runs):
