@@ -53,7 +53,6 @@ class CanChannel:
         self.up = False
         self.overflow = 0  # frames that the kernel had to drop, as it counts them
         self.send_failures = 0
-        self.openings = 0
         self._identifiers = identifiers
         self._wanted = None if identifiers is None else {*identifiers, *(ERR_FLAG | bit for bit in (0, EFF_FLAG))}
         self._options = options
@@ -99,7 +98,6 @@ class CanChannel:
             self._socket = raw
             self._kernel_count = 0
         self.up = True
-        self.openings += 1
 
     def _close(self) -> None:
         self.up = False
@@ -118,10 +116,6 @@ class CanChannel:
             except (OSError, can.CanError, ValueError):
                 self._close()
         return self.up
-
-    def fileno(self) -> int | None:
-        """The socket to wait for, if it has one."""
-        return self._socket.fileno() if self._socket else None
 
     def drain(self) -> list[Frame]:
         """The frames that have come since the last call, without waiting, as far as `READ_S` and `MOST` allow."""

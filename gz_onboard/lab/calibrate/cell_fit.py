@@ -216,7 +216,6 @@ class Pairs:
     r0: float
     resistance: tuple[float, ...]
     time: tuple[float, ...]
-    rms: float  # V per A RMS of the load: what they leave of the many
 
 
 class Reduction:
@@ -229,7 +228,6 @@ class Reduction:
 
         load = np.concatenate(list(loads))
         self._many = np.column_stack([load, *(filtered_by(tau) for tau in TIMES)])
-        self._square = float(np.mean(load**2))
         fast = np.geomspace(3, 300, 50) if count == 1 else np.geomspace(1.5, 120, 26)
         slow = np.geomspace(150, 3000, 16)
         filtered = {float(tau): filtered_by(float(tau)) for tau in (*fast, *(slow if count == 2 else ()))}
@@ -265,8 +263,7 @@ class Reduction:
             j = k + (1 if move > 0 else -1)
             solution = best[k] + abs(move) * (best[j] - best[k])
             times = np.exp(np.log(times) + abs(move) * (np.log(self._times[j]) - np.log(times)))
-        rms = float(np.sqrt(max(cost[k], 0.0) / len(self._many) / self._square)) if np.isfinite(cost[k]) else np.nan
-        return Pairs(float(solution[0]), tuple(map(float, solution[1:])), tuple(map(float, times)), rms)
+        return Pairs(float(solution[0]), tuple(map(float, solution[1:])), tuple(map(float, times)))
 
     def spread(self, resistance: Array, covariance: Array) -> Array:
         """Covariance of a row of `logs`, from that of `resistance`: moved by one sd along the axes of its ellipsoid."""

@@ -179,7 +179,7 @@ def _panels(force: RoadLoad, road: RoadFit, runs: Sequence[Coast], speeds: Seque
     mass, temperature = (
         float(np.mean(column)) for column in zip(*((r.mass, r.temperature) for r in runs), strict=True)
     )
-    still = Coast("", v, v, 1, None, mass, temperature, 0.0, (v, v))
+    still = Coast("", v, v, 1, None, mass, temperature, 0.0)
     loads.append(PlotLine("model, still air, motor included", v, force(v, still, 0.0, 0.0), "-"))
     return [
         Panel("Coast-downs", "time [s]", "speed [m/s]", tuple(lines)),

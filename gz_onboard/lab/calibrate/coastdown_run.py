@@ -44,7 +44,6 @@ class Coast:
     mass: float  # kg, all
     temperature: float  # degC
     altitude: float  # m
-    samples: tuple[Array, Array]  # time, speed as measured
 
     @property
     def middle(self) -> Array:
@@ -126,7 +125,7 @@ def coast(run: Samples, vehicle: Vehicle, direction: int) -> Coast:
     mass = float(total) if isinstance(total, int | float) else p["vehicle_mass"] + payload
     altitude = float(np.median(run.columns["gps_altitude"][1])) if "gps_altitude" in run.columns else 0.0
     known = None if total is not None else payload
-    return Coast(run.name, ends, at, direction, known, mass, _temperature(run), altitude, (time, speed))
+    return Coast(run.name, ends, at, direction, known, mass, _temperature(run), altitude)
 
 
 def run_start(run: Samples) -> float:

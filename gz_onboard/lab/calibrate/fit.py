@@ -27,15 +27,14 @@ Residual = Callable[[Array], Array]
 class Solution:
     """Parameters that fit best.
 
-    value: shape (n,) in the order of `names`. covariance: (n, n). information: (n, n), the Fisher information of the
-    data alone, without priors. residual: (m,), weighted (in units of its sd if one was given), model less data.
-    variance: of a weighted residual, by which the covariance was scaled: 1 if the sd given is right.
+    value: shape (n,) in the order of `names`. covariance: (n, n). residual: (m,), weighted (in units of its sd if one
+    was given), model less data. variance: of a weighted residual, by which the covariance was scaled: 1 if the sd given
+    is right.
     """
 
     names: tuple[str, ...]
     value: Array
     covariance: Array
-    information: Array
     residual: Array
     variance: float
 
@@ -192,7 +191,6 @@ def _solution(
     freedom = len(residual) + len(rows) - len(names)
     mean_square = float(residual @ residual) / freedom if freedom > 0 else float("nan")
     variance = max(1.0, mean_square) if known_sd else mean_square
-    information = jacobian.T @ jacobian / (variance or 1.0)
     # Prior rows are in units of a weighted residual's sd: of 1 where that is known.
     prior = rows.T @ rows * (variance if known_sd else 1.0)
     bread = jacobian.T @ jacobian + prior
@@ -210,7 +208,7 @@ def _solution(
         independent = inverse * variance
         short = np.sqrt(np.maximum(np.diag(independent) / np.maximum(np.diag(covariance), 1e-300), 1.0))
         covariance = covariance * np.outer(short, short)
-    return Solution(names, value, covariance, information, residual, variance)
+    return Solution(names, value, covariance, residual, variance)
 
 
 def split(count: int, share: float = 1 / 3, seed: int = 0) -> Mask:

@@ -31,7 +31,6 @@ class Tested:
     capacity_sd: float
     level: Array
     rests: NDArray[np.int_]  # rows at the ends of rests
-    offset: float  # V: how far the rests lie above the OCV, in the mean
 
 
 def tested(table: Measurements, nodes: Array, volts: Array, capacity: Found, result: Result) -> Tested:
@@ -44,24 +43,26 @@ def tested(table: Measurements, nodes: Array, volts: Array, capacity: Found, res
         result.notes.append(f"{test.name}: begins at {test.voltage[0]:.3f} V, SOC {start:.3f}, not full")
     drawn, at_rest = test.drawn[rests], test.voltage[rests]
 
-    def misses(share: float) -> tuple[Array, float]:
+    def misses(share: float) -> Array:
+        """What the rests lie off the OCV [V], those above 0.12 of SOC and less their common offset."""
         level = start - drawn / (share * capacity.value)
         error = at_rest - ocv_at(nodes, volts, level)
         weight = np.where(level > 0.12, 1.0, 0.0)
         offset = float(np.sum(weight * error) / (np.sum(weight) + 1.0))  # prior: 5 mV, as one rest counts
-        return np.sqrt(weight) * (error - offset), offset
+        result: Array = np.sqrt(weight) * (error - offset)
+        return result
 
-    best = minimize_scalar(lambda x: float(np.sum(misses(x)[0] ** 2)), bounds=(0.6, 1.15), method="bounded")
+    best = minimize_scalar(lambda x: float(np.sum(misses(x) ** 2)), bounds=(0.6, 1.15), method="bounded")
     share = float(best.x)
-    error, offset = misses(share)
-    curvature = (np.sum((misses(share + 1e-3)[0] - error) ** 2)) / 1e-6
+    error = misses(share)
+    curvature = (np.sum((misses(share + 1e-3) - error) ** 2)) / 1e-6
     sd = float(np.sqrt(max(np.sum(error**2) / max(len(error) - 2, 1), 1e-6) / max(curvature, 1e-12)))
     found = share * capacity.value
     temperature = float(np.round(np.median(test.temperature[rests]))) + 0.0  # no -0
     what, rms = f"rest voltage at {temperature:g} degC, SOC above 0.12", float(np.sqrt(np.mean(error**2)))
     result.fits.append(Fit(what, "V", rms, float(np.abs(error).max()), None, len(error), False, test.name))
     found_sd = float(np.hypot(sd * capacity.value, 0.005 * found))
-    return Tested(test, temperature, found, found_sd, start - test.drawn / found, rests, offset)
+    return Tested(test, temperature, found, found_sd, start - test.drawn / found, rests)
 
 
 def _long_rests(test: CellTest, capacity: Found) -> NDArray[np.int_]:
