@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import logging
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -79,6 +79,7 @@ class Mapping:
     periods: dict[str, float]  # s, by message; only where known
     not_available: bool = True
     j1939: bool = False
+    roles: tuple[str, ...] = field(default=())
 
 
 def find_dbc(name: str, beside: Path | None = None) -> Path:
@@ -233,6 +234,7 @@ def read_mapping(vehicle: Table) -> Mapping:
         periods=periods,
         not_available=bus.text("not_available", "all-ones", ["all-ones", "none"]) == "all-ones",
         j1939=j1939,
+        roles=tuple(source.role for source in sources),
     )
 
 
