@@ -8,7 +8,7 @@ FIRST ?= 100240
 PYTHON_IN_VENV := .venv/bin/python
 DEMO = replay_logs/demo.py "$(RIDE)" --speed $(SPEED) --seconds $(SECONDS)
 
-.PHONY: help setup run test lint format bench trial hardening clean
+.PHONY: help setup run test lint format docs bench trial hardening clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -39,6 +39,12 @@ format: setup  ## let ruff format the code
 	$(PYTHON_IN_VENV) -m ruff check --fix .
 	$(PYTHON_IN_VENV) -m ruff format .
 
+docs: setup .venv/.docs-ready  ## the documentation as a site in build/docs; a dead link or any other warning is an error
+	$(PYTHON_IN_VENV) -m sphinx --builder html --fresh-env --fail-on-warning --keep-going --quiet docs build/docs
+
+.venv/.docs-ready: .venv/.ready .ci/requirements-docs.txt
+	@.ci/setup docs
+
 bench: setup  ## cost per frame, start-up, memory, beside the obvious pipeline of the same libraries
 	$(PYTHON_IN_VENV) benchmarks/bench.py
 
@@ -49,5 +55,5 @@ hardening: setup  ## hostile frames, sensors that lie, power cuts, damaged state
 	$(PYTHON_IN_VENV) -m tests.hardening
 
 clean:  ## remove what the other targets made, except runs/
-	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
+	rm -rf .venv build dist docs/api .pytest_cache .mypy_cache .ruff_cache .hypothesis *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import tomllib
 from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-LOCK = (ROOT / ".ci" / "requirements.txt").read_text(encoding="utf-8")
+LOCK, DOCS_LOCK = (
+    (ROOT / ".ci" / f"{name}.txt").read_text(encoding="utf-8") for name in ("requirements", "requirements-docs")
+)
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
 PINNED = re.compile(r"^([A-Za-z0-9._-]+)==([^\s;]+)", re.M)
 
@@ -21,9 +25,10 @@ def versions(text: str) -> dict[str, str]:
     return {canonicalize_name(name): version for name, version in found}
 
 
-def test_every_file_has_its_hash():
-    requirements = re.split(r"\n(?=\S)", LOCK.rstrip())[1:]  # the first line is a comment
-    assert len(requirements) == len(versions(LOCK)) > 30
+@pytest.mark.parametrize("text", [LOCK, DOCS_LOCK], ids=["all", "docs"])
+def test_every_file_has_its_hash(text):
+    requirements = re.split(r"\n(?=\S)", text.rstrip())[1:]  # the first line is a comment
+    assert len(requirements) == len(versions(text)) > 30
     for requirement in requirements:
         lines = requirement.replace(" \\\n", "\n").splitlines()
         assert PINNED.match(lines[0])
@@ -32,7 +37,7 @@ def test_every_file_has_its_hash():
 
 
 def test_no_place_is_named():
-    assert not re.search(r"://|index|find-links", LOCK)
+    assert not re.search(r"://|index|find-links", LOCK + DOCS_LOCK)
 
 
 def test_it_is_what_the_constraints_say():
@@ -40,11 +45,22 @@ def test_it_is_what_the_constraints_say():
     assert {name: lock.get(name) for name in constraints} == constraints
 
 
+def test_the_documentation_takes_no_other_version():
+    lock, docs = versions(LOCK), versions(DOCS_LOCK)
+    constraints = versions((ROOT / ".ci" / "constraints-docs.txt").read_text(encoding="utf-8"))
+    assert {name: docs.get(name) for name in constraints} == constraints
+    assert not {name for name in lock.keys() & docs.keys() if lock[name] != docs[name]}
+
+
 def test_it_has_all_that_the_project_needs():
     project, lock = PROJECT["project"], versions(LOCK)
     needed = [*project["dependencies"], *PROJECT["build-system"]["requires"], "editables"]
-    for extra in project["optional-dependencies"].values():
-        needed += extra
+    extras = dict(project["optional-dependencies"])
+    check(extras.pop("docs"), versions(DOCS_LOCK))
+    check([*needed, *itertools.chain(*extras.values())], lock)
+
+
+def check(needed: list[str], lock: dict[str, str]) -> None:
     for text in needed:
         requirement = Requirement(text)
         assert requirement.specifier.contains(lock[canonicalize_name(requirement.name)]), text

@@ -25,11 +25,12 @@ from gz_onboard.errors import BAD_INPUT, FAILED, InputError
 from gz_onboard.lab.processes import Progress, over_rides, progress_bar
 from gz_onboard.lab.validate_components import Component, components
 from gz_onboard.lab.validate_score import CHANNELS, COMPONENT_GATE, GATE, conditions, errors, pooled, seconds, split
+from gz_onboard.simulation.parts.road import Dynamometer, Place, RoadProfile
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded, rest_soc
 from gz_onboard.simulation.route import read_route
 from gz_onboard.simulation.run import Command, Run, drive, follow, replay, road_table
 from gz_onboard.simulation.samples import read_facts, rider_mass
-from gz_onboard.simulation.scooter import STEP, Dynamometer, Place, Road, Scooter
+from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.simulation.telling import check_json, explain_keys, output_names, write_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -215,7 +216,7 @@ def _averaged_speed(recorded: Recorded) -> Array:
     return np.convolve(np.pad(recorded.signals["speed"], reach, mode="edge"), np.ones(width) / width, "valid")
 
 
-def _road(recorded: Recorded, log: Path) -> tuple[Road | Dynamometer, Array | None]:
+def _road(recorded: Recorded, log: Path) -> tuple[RoadProfile | Dynamometer, Array | None]:
     """(the road by place, or the roller; the grade of each second, None on a roller)."""
     if recorded.on_dynamometer:
         return fit_dynamometer(recorded), None
@@ -237,7 +238,7 @@ def _route_file(recorded: Recorded, log: Path) -> Path:
 def _ride(
     recorded: Recorded,
     vehicle: Vehicle,
-    road: Road | Dynamometer,
+    road: RoadProfile | Dynamometer,
     command: Command,
     soc: float | None,
     progress: Progress,

@@ -72,11 +72,11 @@ class Battery:
         """Capacity of a cell [A·h] at `temperature` [degC]: the charge between SOC 0 and 1."""
         return self.capacity * linear(self.capacity_temperature, self.capacity_share, temperature)
 
-    def cell_capacity_over(self, temperature: Array) -> Array:
-        """`cell_capacity` at `temperature` (m,)."""
+    def capacity_share_over(self, temperature: Array) -> Array:
+        """The share of the capacity at 25 degC that there is at `temperature` (m,) [degC]."""
         import numpy as np
 
-        return np.asarray(self.capacity * np.interp(temperature, self.capacity_temperature, self.capacity_share))
+        return np.asarray(np.interp(temperature, self.capacity_temperature, self.capacity_share))
 
     def pack_capacity(self, temperature: float) -> float:
         """Capacity of the pack [A·h] at `temperature` [degC]."""
@@ -110,9 +110,13 @@ class Battery:
             ocv -= linear(self.rest_shift_temperature, self.rest_shift_value, temperature)
         return extended(self.ocv_value, self.ocv_soc, ocv)[0]
 
-    def cell_voltage(self, pack_voltage: float, pack_current: float) -> float:
+    def cell_voltage(self, pack_voltage: Any, pack_current: Any) -> Any:
         """Voltage of the mean cell [V] out of pack voltage [V] and current [A]."""
         return (pack_voltage + self.series_resistance * pack_current) / self.cells_series
+
+    def pack_voltage(self, cell_voltage: Any, pack_current: Any) -> Any:
+        """Voltage at the pack's terminals [V] out of that of the mean cell [V] and pack current [A] (eq. 2.18)."""
+        return self.cells_series * cell_voltage - self.series_resistance * pack_current
 
     def relax(self, dt: float, v1: float, current: float, r1: float, c1: float) -> tuple[float, float]:
         """(V1 after `dt` [s] of constant cell current [A], the factor that V1 decayed by): eq. 2.22, exact."""

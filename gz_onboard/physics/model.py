@@ -5,7 +5,7 @@ Backward in the sense of simulation (speed in, power out), light enough for on b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, MutableMapping
+from collections.abc import Callable, Collection, Iterable, Mapping, MutableMapping
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
@@ -17,7 +17,7 @@ from gz_onboard.physics.battery import Battery, Overpotential
 from gz_onboard.physics.effect import QUANTITIES, Effect, Port, effect_file, load_effect
 from gz_onboard.physics.elementary import STANDSTILL
 from gz_onboard.physics.parameters import Parameters
-from gz_onboard.physics.relaxation import relaxation, relaxed
+from gz_onboard.physics.relaxation import relaxation_over, relaxed
 from gz_onboard.physics.trust import changeable, trusted_users
 
 if TYPE_CHECKING:
@@ -75,19 +75,19 @@ class Bound:
         """Its value after `dt` [s] from `state`."""
         return float(relaxed(state, self(quantities), self.decay(dt, quantities)))
 
-    def series(self, dt: Any, quantities: Mapping[str, Any], start: float = 0.0) -> Any:
+    def series(self, dt: Any, quantities: Mapping[str, Any], before: bool = False) -> Any:
         """Its values at the ends of steps of `dt` [s], with the quantities in them: scalars, or arrays of shape (n,).
 
-        Shape (n,); n = 1 if all are scalars.
+        Shape (n,); n = 1 if all are scalars. From nothing remembered. before: at the beginnings instead.
         """
         import numpy as np
 
         target, decay = np.broadcast_arrays(
             np.asarray(self(quantities), dtype=float), np.asarray(self.decay(dt, quantities), dtype=float), np.ones(1)
         )[:2]
-        if self.effect.decay is None:
+        if self.effect.decay is None or not target.any():
             return target.copy()
-        return np.array(relaxation(target.tolist(), decay.tolist(), start))
+        return relaxation_over(target, decay, before=before)
 
 
 def _with(
@@ -120,9 +120,9 @@ Recall = Callable[[Bound, Mapping[str, Any]], Any]
 """The value of an effect with memory at these quantities."""
 
 
-def over(dt: Any) -> Recall:
+def over(dt: Any, before: bool = False) -> Recall:
     """For arrays over steps of `dt` [s], in their order, from nothing remembered: see `Bound.series`."""
-    return lambda effect, quantities: effect.series(dt, quantities)
+    return lambda effect, quantities: effect.series(dt, quantities, before)
 
 
 def stepping(states: MutableMapping[str, float], dt: float) -> Recall:
@@ -150,6 +150,19 @@ def remembering(effect: Bound, dt: float) -> Callable[[Mapping[str, Any]], float
     return value
 
 
+def value_of(effect: Bound, quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:
+    """The value of `effect`; recall: gives that of one with memory, which without it is what it settles at."""
+    return recall(effect, quantities) if recall and effect.effect.decay else effect(quantities)
+
+
+def total(effects: Iterable[Bound], quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:
+    """The sum of the values of `effects`: see `value_of`."""
+    result: Any = 0.0
+    for effect in effects:
+        result = result + value_of(effect, quantities, recall)
+    return result
+
+
 def drag_torque(power: Any, motor_speed: Any) -> Any:
     """Torque [N·m] against the motion by which `power` [W] of loss at no current slows the motor; 0 at standstill."""
     return power * motor_speed / (motor_speed * motor_speed + STANDSTILL * STANDSTILL)
@@ -172,6 +185,14 @@ class Model:
         self.mass = parameters["vehicle_mass"] + parameters["payload_mass"]
         self._motor_per_speed = 1 / (parameters["wheel_radius"] * parameters["gear_ratio"])
 
+    def at(self, *ports: Port) -> list[Bound]:
+        """The effects at these ports."""
+        return [effect for port in ports for _, effect in self._at[port]]
+
+    def idle_loss(self, quantities: Mapping[str, Any]) -> Any:
+        """What the motor loses [W] turning without current: drag on the shaft, which its current makes up for."""
+        return total(self.at(Port.MOTOR_LOSS), {**quantities, "torque": 0.0, "motor_current": 0.0})
+
     def power(self, quantities: Mapping[str, Any], recall: Recall | None = None) -> dict[str, Any]:
         """The ledger [W] of moving as `quantities` say: what each effect takes out of the pack, by name.
 
@@ -187,7 +208,7 @@ class Model:
         ledger: dict[str, Any] = {}
         force = 0.0
         for name, effect in (*self._at[Port.WHEEL_FORCE], *self._at[Port.TYRE]):
-            term = recall(effect, q) if recall and effect.effect.decay else effect(q)
+            term = value_of(effect, q, recall)
             force = force + term
             ledger[name] = term * speed
         motor_speed = speed * self._motor_per_speed
@@ -196,15 +217,11 @@ class Model:
         torque = (wanted + limit + abs(wanted - limit)) / 2  # the greater of both, for arrays too
         ledger["brakes"] = (torque - wanted) * motor_speed
         q["motor_speed"] = motor_speed
-        q["torque"] = q["motor_current"] = 0.0
-        drag = 0.0  # power that the motor takes to turn without current: its current makes up for it
-        for _, effect in self._at[Port.MOTOR_LOSS]:
-            drag = drag + effect(q)
-        q["torque"] = torque + drag_torque(drag, motor_speed)
+        q["torque"] = torque + drag_torque(self.idle_loss(q), motor_speed)
         q["motor_current"] = q["torque"] / self.parameters["torque_constant"]
         for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS, Port.DC_POWER):
             for name, effect in self._at[port]:
-                ledger[name] = recall(effect, q) if recall and effect.effect.decay else effect(q)
+                ledger[name] = value_of(effect, q, recall)
         return ledger
 
     def overpotential(self, battery: Battery, beside: Mapping[str, float] | None = None) -> Overpotential | None:
@@ -223,7 +240,7 @@ class Model:
                 "cell_temperature": temperature,
                 "cell_capacity": battery.cell_capacity(temperature),
             }
-            return float(sum(effect(q) for _, effect in self.cell_voltage))
+            return float(total(self.at(Port.CELL_VOLTAGE), q))
 
         return settled
 

@@ -10,11 +10,12 @@ from pathlib import Path
 
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.simulation.cycles import find_cycle
+from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile, straight
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded
 from gz_onboard.simulation.route import read_route, speed_profile
 from gz_onboard.simulation.run import Command, along, at_steps, follow, replay, road_table
 from gz_onboard.simulation.samples import read_facts, rider_mass
-from gz_onboard.simulation.scooter import STEP, Dynamometer, Road, straight
+from gz_onboard.simulation.scooter import STEP
 from gz_onboard.vehicle import Vehicle
 
 _LOGS = (".mcap", ".blf", ".log", ".asc", ".trc", ".mf4", ".gz")
@@ -29,7 +30,7 @@ class Plan:
     name: str
     kind: str
     seconds: float  # of one repetition, as planned
-    road: Road | Dynamometer
+    road: RoadProfile | Dynamometer
     command: Callable[[], Command]
     length: float | None = None  # m, of one repetition; None if it ends by time
     recorded: Recorded | None = None
@@ -106,7 +107,7 @@ def _ride_plan(path: Path, arguments: argparse.Namespace, vehicle: Vehicle) -> P
     beside = path.with_name(f"{recorded.name}.route.csv")
     heading: float | Callable[[float], float] = recorded.heading_at
     if arguments.dyno:
-        road: Road | Dynamometer = dynamometer(arguments.dyno)
+        road: RoadProfile | Dynamometer = dynamometer(arguments.dyno)
     elif recorded.on_dynamometer:
         road = fit_dynamometer(recorded)
     elif beside.is_file():

@@ -16,9 +16,10 @@ from gz_onboard.bus.codec import Codec
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Event
+from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
 from gz_onboard.simulation.run import road_table
 from gz_onboard.simulation.samples import INSTRUMENTS, extended, read_roles
-from gz_onboard.simulation.scooter import STEP, Dynamometer, Road
+from gz_onboard.simulation.scooter import STEP
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ class Recorded:
         assert self.vibration is not None
         return float(self.vibration[min(max(int(distance / ROAD_PIECE), 0), len(self.vibration) - 1)])
 
-    def road(self, headwind: float = 0.0) -> Road:
+    def road(self, headwind: float = 0.0) -> RoadProfile:
         """The road that was ridden."""
         starts = [ROAD_PIECE * i for i in range(len(self.grade))]
         return road_table(starts, self.grade.tolist(), self.curvature.tolist(), headwind)

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING
 
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.simulation.parts.rider import Rider
-from gz_onboard.simulation.scooter import Road, Scooter
+from gz_onboard.simulation.parts.road import RoadProfile
+from gz_onboard.simulation.scooter import Scooter
 
 if TYPE_CHECKING:
     from gz_onboard.arrays import Array
@@ -256,7 +257,7 @@ def at_steps(time: Sequence[float], speed: Sequence[float], dt: float) -> list[f
 
 def road_table(
     distance: Sequence[float], grade: Sequence[float], curvature: Sequence[float] | None = None, headwind: float = 0.0
-) -> Road:
+) -> RoadProfile:
     """A road of pieces: at each `distance` [m] begins a piece of constant sine of grade and curvature [1/m]."""
     bends = curvature or [0.0] * len(grade)
     places = [(g, c, headwind) for g, c in zip(grade, bends, strict=True)]

@@ -19,10 +19,11 @@ from gz_onboard.errors import InputError
 from gz_onboard.simulation.frames import Losses, check_output
 from gz_onboard.simulation.output import FORMATS, write, write_trace
 from gz_onboard.simulation.parts.chassis import MODELS, chassis
+from gz_onboard.simulation.parts.road import Dynamometer
 from gz_onboard.simulation.plan import Plan, find_plan, noted_payload
 from gz_onboard.simulation.recorded import rest_soc
 from gz_onboard.simulation.run import Progress, Run, drive
-from gz_onboard.simulation.scooter import Dynamometer, Scooter
+from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.sensors import Trace
 from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION, cycle_range, summarise, summary_text
 from gz_onboard.simulation.sweep import Sweep, grid, read_sweep, redesigned

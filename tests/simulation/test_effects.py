@@ -12,8 +12,9 @@ from gz_onboard.physics.effect import known_effects, load_effect
 from gz_onboard.simulation.backward import backward
 from gz_onboard.simulation.cycles import cycle, names
 from gz_onboard.simulation.parts.battery import EffectPack
+from gz_onboard.simulation.parts.road import Dynamometer, straight
 from gz_onboard.simulation.run import Run, at_steps, drive, follow
-from gz_onboard.simulation.scooter import STEP, Dynamometer, Scooter, straight
+from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.simulation.sensors import SENSORS, Trace, latency
 from gz_onboard.vehicle import Vehicle, read_vehicle
 

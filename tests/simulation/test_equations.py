@@ -14,8 +14,9 @@ from gz_onboard.physics.model import air_density
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.parts.brakes import Brakes
 from gz_onboard.simulation.parts.rider import Rider
+from gz_onboard.simulation.parts.road import straight
 from gz_onboard.simulation.parts.tyre import Tyre
-from gz_onboard.simulation.scooter import Scooter, straight
+from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference", 75.0)

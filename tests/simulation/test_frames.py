@@ -18,8 +18,9 @@ from gz_onboard.errors import InputError
 from gz_onboard.events import Reason, State
 from gz_onboard.simulation.frames import START_NS, Losses, batches, simulate_frames, write_frames
 from gz_onboard.simulation.parts.chassis import chassis
+from gz_onboard.simulation.parts.road import Dynamometer
 from gz_onboard.simulation.run import along, drive, road_table
-from gz_onboard.simulation.scooter import Dynamometer, Scooter
+from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.sensors import ALTITUDE, ROLLER, SENSORS, Trace
 from gz_onboard.simulation.turning.tyre import lean_of
 from gz_onboard.vehicle import read_vehicle

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from gz_onboard.simulation.parts.motor import MapMotor
 from gz_onboard.simulation.parts.rider import Rider
-from gz_onboard.simulation.scooter import Dynamometer, Scooter, straight
+from gz_onboard.simulation.parts.road import Dynamometer, straight
+from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import read_vehicle
 from tests.simulation.packs import SecondOrderPack
 

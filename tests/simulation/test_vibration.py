@@ -15,12 +15,13 @@ from gz_onboard.cli import main
 from gz_onboard.lab.discover.grid import vibration as of_samples
 from gz_onboard.lab.validate import per_second
 from gz_onboard.lab.validate_components import battery_voltage, road_load
-from gz_onboard.physics.effect import load_effect
+from gz_onboard.physics.effect import MOVING, load_effect
 from gz_onboard.simulation.backward import backward
+from gz_onboard.simulation.parts.road import Dynamometer, straight
 from gz_onboard.simulation.recorded import Recorded, read_recorded
 from gz_onboard.simulation.run import drive
 from gz_onboard.simulation.samples import read_samples
-from gz_onboard.simulation.scooter import STEP, Dynamometer, Scooter, straight
+from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.simulation.sensors import SENSORS, Trace
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 from tests.support import LOGS
@@ -171,7 +172,7 @@ def test_the_battery_alone_has_the_measured_and_the_time_moving(folder: Path, re
         .replace("* vibration", "* time_moving")
     )
     fewer = battery_voltage(BASE, measured, 0.8) - battery_voltage(extended(tmp_path, "wearing"), measured, 0.8)
-    moving = np.cumsum(measured["speed"] > 1.0)
+    moving = np.cumsum(measured["speed"] > MOVING)
     assert fewer[1:] == pytest.approx(BASE.pack.cells_series * 0.001 * moving[:-1], abs=1e-6)
 
 

@@ -67,7 +67,7 @@ def test_it_names_every_role():
         "physics/model",
         "physics/riding",
         "physics/parameters",
-        "physics/battery",
+        "physics/battery_file",
         "physics/derating",
     ],
 )

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.calibrate.cell_circuit import KELVIN, ocv_at
+from gz_onboard.lab.calibrate.cell_circuit import KELVIN
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
 from gz_onboard.lab.calibrate.cell_fit import Pieces, filtered, fit_branches, pieces
 from gz_onboard.lab.calibrate.result import Fit, Found, Result
 from gz_onboard.lab.calibrate.table import Measurements
+from gz_onboard.physics.tables import extended_over
 
 FEWEST_PULSES = 6
 FEWEST_LEVELS = 3
@@ -46,7 +47,7 @@ def tested(table: Measurements, nodes: Array, volts: Array, capacity: Found, res
     def misses(share: float) -> Array:
         """What the rests lie off the OCV [V], those above 0.12 of SOC and less their common offset."""
         level = start - drawn / (share * capacity.value)
-        error = at_rest - ocv_at(nodes, volts, level)
+        error = at_rest - extended_over(nodes, volts, level)
         weight = np.where(level > 0.12, 1.0, 0.0)
         offset = float(np.sum(weight * error) / (np.sum(weight) + 1.0))  # prior: 5 mV, as one rest counts
         result: Array = np.sqrt(weight) * (error - offset)
@@ -121,5 +122,5 @@ def moved_pieces(
 
 def ocv_and_slope(nodes: Array, volts: Array, level: Array) -> tuple[Array, Array]:
     """The open-circuit voltage [V] and its slope [V] over SOC, at `level`, each (m,)."""
-    up, down = ocv_at(nodes, volts, level + 0.005), ocv_at(nodes, volts, level - 0.005)
-    return ocv_at(nodes, volts, level), (up - down) / 0.01
+    up, down = extended_over(nodes, volts, level + 0.005), extended_over(nodes, volts, level - 0.005)
+    return extended_over(nodes, volts, level), (up - down) / 0.01

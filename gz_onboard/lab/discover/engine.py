@@ -13,7 +13,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.alone import NOTE, alone
-from gz_onboard.lab.discover.channels import BY_NAME, usable, voltage_timing
+from gz_onboard.lab.discover.channels import BY_NAME, usable
 from gz_onboard.lab.discover.converge import about
 from gz_onboard.lab.discover.gain import measure_gain
 from gz_onboard.lab.discover.grid import Ride
@@ -29,6 +29,7 @@ from gz_onboard.lab.discover.linear import (
     spread_out,
     trimmed,
 )
+from gz_onboard.lab.discover.residuals import voltage_timing
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.search import Search, evidence
 from gz_onboard.lab.discover.shapes import with_inflation

@@ -15,8 +15,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.lab.discover.channels import CHANNELS, Channel, System, blocks, depends, roughness, support, usable
+from gz_onboard.lab.discover.channels import CHANNELS, Channel, blocks, depends, roughness, support, usable
 from gz_onboard.lab.discover.grid import Ride
+from gz_onboard.lab.discover.residuals import System
 from gz_onboard.lab.discover.terms import stepped
 
 LEAST = 0.02  # of the variance before, down to which the scatter between rides is learned

@@ -10,9 +10,10 @@ import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.candidates import Candidate, candidates
-from gz_onboard.lab.discover.channels import CHANNELS, System, counted_soc, depends
+from gz_onboard.lab.discover.channels import CHANNELS, depends
 from gz_onboard.lab.discover.grid import Ride, read_ride
 from gz_onboard.lab.discover.linear import Noise
+from gz_onboard.lab.discover.residuals import System, counted_soc
 from gz_onboard.lab.discover.terms import BASE, FIXED, LOG, NUISANCES, RIDE_SD, RIDE_SD_SHARE, stepped
 from gz_onboard.physics.effect import Effect
 from gz_onboard.physics.parameters import declared_parameters
@@ -115,8 +116,7 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> State:
     lacking = [c.effect for c in causes if c.effect and c.name not in {e.name for e in vehicle.model.effects}]
     effects: tuple[Effect, ...] = (*vehicle.model.effects, *lacking)
     p = vehicle.parameters
-    copper = p.get("motor_copper_resistance", 0.0)
-    system = System(effects, vehicle.battery, p["payload_mass"], copper, vehicle.riding.vibration)
+    system = System(effects, vehicle.battery, p["payload_mass"], dict(p), vehicle.riding.vibration)
     declared = declared_parameters(effects)
     known = vehicle.parameters
     values = {name: p.prior for name, p in declared.items()} | {name: known[name] for name in known}

@@ -28,3 +28,8 @@ def term(
         * grade_cosine
         * (rolling_resistance_constant * direction(speed) + rolling_resistance_speed * speed)
     )
+
+
+def variation(ambient_temperature: Any, *, rolling_cold: float) -> Any:
+    """Cold rubber rolls worse; rolling_cold: by how much more at 0 than at 20 degC."""
+    return 1 + rolling_cold * (20 - ambient_temperature) / 20
