@@ -280,7 +280,7 @@ def log_of_ride(directory: Path) -> tuple[int, int, dict[str, float]]:
     """
     from gz_onboard.bus.logs import read_frames
     from gz_onboard.bus.recorder import Recorder
-    from gz_onboard.daemon import TICK
+    from gz_onboard.daemon.loop import TICK
     from gz_onboard.pipeline import Pipeline, dbc_texts
     from gz_onboard.vehicle import read_vehicle
 

@@ -25,7 +25,7 @@ from gz_onboard.events import Group
 from gz_onboard.lab.calibrate import ocv, pulse
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, voltage
 from gz_onboard.lab.calibrate.result import Result
-from gz_onboard.lab.calibrate.table import Named, Table, read_table
+from gz_onboard.lab.calibrate.table import Measurements, Named, read_table
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters
@@ -48,7 +48,7 @@ COLUMNS = {
 }
 
 
-def pulse_test(folder: Path, temperature: int) -> Table:
+def pulse_test(folder: Path, temperature: int) -> Measurements:
     """The pulses, with the discharge and the rest between them, which stand in a file of their own.
 
     That one has a clock of its own: its first rest ends where the pulses go on.
@@ -72,7 +72,7 @@ def pulse_test(folder: Path, temperature: int) -> Table:
         columns[name] = np.concatenate([main[name], extra])[order]
     # The counter of one file never leads that of the other by more than its resolution.
     columns["charge"] = np.maximum.accumulate(columns["charge"])
-    return Table(main.file, columns)
+    return Measurements(main.file, columns)
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +243,7 @@ def open_loop(cell: Circuit, cycle: Cycle, capacity: float) -> Array:
     return voltage(cell, cycle.current, cycle.current, dt, level, cycle.cell) - cycle.voltage
 
 
-def pulse_resistance(table: Table, capacity: float) -> dict[float, float]:
+def pulse_resistance(table: Measurements, capacity: float) -> dict[float, float]:
     """By C-rate the voltage drop of the 10 s pulses nearest to half full over their current [ohm]."""
     time, current, volts = table["time"], table["current"], table["voltage"]
     on = current > 0.1 * NOMINAL
@@ -419,7 +419,7 @@ def _residuals(result: Result, setting: Setting, work: list[Cycle]) -> list[str]
     return lines
 
 
-def _rates(tables: dict[int, Table], setting: Setting) -> list[str]:
+def _rates(tables: dict[int, Measurements], setting: Setting) -> list[str]:
     lines = ["| °C | C/2 | 1 C | 2 C | 4 C | 6 C |", "| --- " * 6 + "|"]
     for t, table in tables.items():
         found = pulse_resistance(table, setting.battery.cell_capacity(t))

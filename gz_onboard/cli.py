@@ -15,7 +15,7 @@ from gz_onboard import __version__
 from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, InputError, nearest
 
 COMMANDS = {
-    "run": ("gz_onboard.daemon", "estimate the range from a live bus and publish it (the daemon)"),
+    "run": ("gz_onboard.daemon.command", "estimate the range from a live bus and publish it (the daemon)"),
     "dashboard": ("gz_onboard.dashboard.terminal", "show the range that the daemon sends, in a terminal"),
     "replay": ("gz_onboard.bus.replay", "send a recorded log onto a bus, in its own timing"),
     "estimate": ("gz_onboard.lab.estimate", "estimate the range on recorded rides, without a bus, as fast as possible"),

@@ -1,4 +1,4 @@
-"""What the daemon tells systemd: ready, alive, what it is doing, stopping (sd_notify(3), sd_watchdog_enabled(3)).
+"""What the daemon reports to systemd: ready, alive, what it is doing, stopping (sd_notify(3), sd_watchdog_enabled(3)).
 
 Nothing happens where systemd does not listen: every function works the same in a terminal and in a test.
 """

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE, Codec
+from gz_onboard.bus.logfile import object_schema
 from gz_onboard.bus.mapping import pgn
 from gz_onboard.bus.publisher import KNOWN, WH, Counts, Publisher
 from gz_onboard.errors import InputError
@@ -61,7 +62,7 @@ ESTIMATE_UNITS = {
 
 
 class Log(Protocol):
-    """What the pipeline writes to; `gz_onboard.bus.recorder` has them."""
+    """What the pipeline writes to; `gz_onboard.bus.logfile` and `recorder` have them."""
 
     def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
         """Declare a topic of JSON objects."""
@@ -74,7 +75,7 @@ class Log(Protocol):
 
 
 class Pipeline:
-    """One vehicle's way from frames to estimates.
+    """From the frames of one vehicle to its estimates.
 
     log: where to write, if anywhere; log_frames, log_signals: also the raw frames, and each message's latest
     signals once a second. observer: called with each estimate made, ten times a second of the frames' time.
@@ -118,7 +119,7 @@ class Pipeline:
     def advance(self, frames: Sequence[Frame], until_ns: int) -> list[Frame]:
         """Take in `frames`, in the order of their times, up to `until_ns`; gives the frames to be sent."""
         if self._next_ns is None or (frames and not self.codec.started):
-            # A silent bus is told that we are there and have nothing; the grid begins with the first frame.
+            # On a silent bus we say that we are there and have nothing; the grid begins with the first frame.
             self._next_ns = (frames[0][0] if frames else until_ns) + TICK_NS
         out: list[Frame] = []
         if not -10 * TICK_NS <= until_ns - self._next_ns <= 50 * TICK_NS:  # a pause, or the clock was set
@@ -243,21 +244,23 @@ def range_publisher(vehicle: Vehicle) -> Publisher:
         raise vehicle.error(f"its DBC files take the identifiers of our own range frames ({publisher.file}): {names}")
     if vehicle.battery:
         full = drawable(vehicle.battery, 1.0, 25.0, 1.0).energy / WH
-        way = Forecaster(vehicle.model, vehicle.battery, vehicle.riding).forecast(1.0, 0.0, 25.0, 0.0, 25.0, 0.0).range
-        for told, value, signal, unit in (
+        reach = (
+            Forecaster(vehicle.model, vehicle.battery, vehicle.riding).forecast(1.0, 0.0, 25.0, 0.0, 25.0, 0.0).range
+        )
+        for what, value, signal, unit in (
             ("the battery holds", full, "RANGE_EnergyLeft", "Wh"),
-            ("the expected range from full is", way * 1e-3, "RANGE_Remaining", "km"),
+            ("the expected range from full is", reach * 1e-3, "RANGE_Remaining", "km"),
         ):
             if value > (most := publisher.greatest(signal)):
                 raise vehicle.error(
-                    f"{told} {value:.0f} {unit}, but {signal} of {publisher.file} says at most {most:g} {unit}: "
+                    f"{what} {value:.0f} {unit}, but {signal} of {publisher.file} says at most {most:g} {unit}: "
                     'give range frames of a larger scale, such as range_dbc = "range_large.dbc"'
                 )
     return publisher
 
 
 def _frame_key(vehicle: Vehicle, identifier: int, extended: bool) -> tuple[bool, int]:
-    """What the vehicle's codec tells a frame by."""
+    """What the vehicle's codec knows a frame by."""
     return extended, pgn(identifier) if extended and vehicle.mapping.j1939 else identifier
 
 
@@ -281,17 +284,17 @@ def estimate_row(estimate: Estimate) -> dict[str, object]:
 
 
 def _declare(log: Log, codec: Codec, signals: bool) -> None:
-    number = ["number", "null"]
-    properties: dict[str, Any] = {name: {"type": number, "description": unit} for name, unit in ESTIMATE_UNITS.items()}
-    properties |= {name: {"type": "string"} for name in ("state", "reasons", "activity", "distrusted")}
-    log.channel(ESTIMATE_TOPIC, {"title": "gz_onboard.Estimate", "type": "object", "properties": properties})
+    estimate = object_schema("gz_onboard.Estimate", ESTIMATE_UNITS)
+    estimate["properties"] |= {name: {"type": "string"} for name in ("state", "reasons", "activity", "distrusted")}
+    log.channel(ESTIMATE_TOPIC, estimate)
     counts = {name: {"type": "integer"} for name in COUNTS}
     maps = {name: {"type": "object"} for name in ("faults", "lost", "unknown")}
     reasons = {"reasons": {"type": "array", "items": {"type": "string"}}}
     log.channel(STATUS_TOPIC, {"title": "gz_onboard.Status", "type": "object", "properties": counts | maps | reasons})
     for message in codec.mapping.database.messages if signals else ():
-        properties = {s.name: {"type": number, "description": s.unit or ""} for s in message.signals}
-        log.channel(f"/can/{message.name}", {"title": message.name, "type": "object", "properties": properties})
+        log.channel(
+            f"/can/{message.name}", object_schema(message.name, {s.name: s.unit or "" for s in message.signals})
+        )
 
 
 def dbc_texts(vehicle: Vehicle) -> dict[str, bytes]:

@@ -107,12 +107,10 @@ class Table:
 
     def texts(self, key: str, what: str) -> list[str]:
         """The list of strings `key`, at least one, at most `LONGEST_LIST`; `what` they are, for the complaint."""
-        value: Any = self.values.get(key)
-        if value is None:
-            raise self.error("is missing", key)
-        texts = [text for text in value if isinstance(text, str)] if isinstance(value, list) else []
-        if not 0 < len(texts) <= LONGEST_LIST or len(texts) < len(value):
-            raise self.error(f"must be a list of {what}, is {shown(value)}", key)
+        complaint = f"must be a list of {what}, is {shown(self.values.get(key))}"
+        texts = self._list(key, complaint)
+        if not all(isinstance(text, str) for text in texts):
+            raise self.error(complaint, key)
         return texts
 
     def check_path(self, key: str, text: str) -> str:
@@ -137,20 +135,23 @@ class Table:
 
     def numbers(self, key: str, low: float = -1e300, high: float = 1e300) -> tuple[float, ...]:
         """The list of numbers `key`, each within [low, high]; at least one, at most `LONGEST_LIST`."""
-        value = self.values.get(key)
-        if not isinstance(value, list) or not 0 < len(value) <= LONGEST_LIST:
-            raise self.error("is missing" if value is None else f"must be a list of numbers, 1 to {LONGEST_LIST}", key)
-        return tuple(self._number_of(number, key, low, high) for number in value)
+        numbers = self._list(key, f"must be a list of numbers, 1 to {LONGEST_LIST}")
+        return tuple(self._number_of(number, key, low, high) for number in numbers)
 
     def rows(self, key: str, columns: int, of: str, low: float, high: float) -> tuple[tuple[float, ...], ...]:
         """The list of rows of `columns` numbers `key`, each within [low, high]; `of` says what they are."""
-        value = self.values.get(key)
-        if not isinstance(value, list) or not 0 < len(value) <= LONGEST_LIST:
-            raise self.error("is missing" if value is None else "must be a list of rows of numbers", key)
-        for row in value:
+        rows = self._list(key, "must be a list of rows of numbers")
+        for row in rows:
             if not isinstance(row, list) or len(row) != columns:
                 raise self.error(f"each row must be {columns} numbers ({of}), not {shown(row)}", key)
-        return tuple(tuple(self._number_of(number, key, low, high) for number in row) for row in value)
+        return tuple(tuple(self._number_of(number, key, low, high) for number in row) for row in rows)
+
+    def _list(self, key: str, complaint: str) -> list[Any]:
+        """The list `key`, at least one value, at most `LONGEST_LIST`."""
+        value = self.values.get(key)
+        if not isinstance(value, list) or not 0 < len(value) <= LONGEST_LIST:
+            raise self.error("is missing" if value is None else complaint, key)
+        return value
 
     def _number_of(self, value: object, key: str, low: float, high: float) -> float:
         if isinstance(value, bool) or not isinstance(value, int | float):

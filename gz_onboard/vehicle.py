@@ -20,6 +20,7 @@ from gz_onboard.physics.riding import PriorRiding, check_riding, read_riding
 from gz_onboard.toml import Table, is_file
 
 OWN = Path(__file__).resolve().parent / "vehicles"
+KEYS = "schema name dbc range_dbc bus roles model parameters correlation battery forecast controller healthy"
 
 
 @dataclass(frozen=True)
@@ -95,23 +96,7 @@ def read_vehicle(
     run that nobody but `users` can change (see `read_model`).
     """
     table = Table.read(find_vehicle(name))
-    table.only(
-        [
-            "schema",
-            "name",
-            "dbc",
-            "range_dbc",
-            "bus",
-            "roles",
-            "model",
-            "parameters",
-            "correlation",
-            "battery",
-            "forecast",
-            "controller",
-            "healthy",
-        ]
-    )
+    table.only(KEYS.split())
     if table.number("schema") != 1:
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
     effects = read_model(table, effects_folder, users)

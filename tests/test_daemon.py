@@ -27,12 +27,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard import state
-from gz_onboard.bus.channel import Channel
+from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.completion import is_complete
 from gz_onboard.bus.logs import read_frames, read_samples
-from gz_onboard.bus.recorder import Recorder
+from gz_onboard.bus.recorder import Limits, Recorder
 from gz_onboard.cli import main
-from gz_onboard.daemon import Daemon, _lock, fair_share, summary
+from gz_onboard.daemon.command import _lock, summary
+from gz_onboard.daemon.loop import Daemon, fair_share
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame, Reason, State
@@ -52,7 +53,7 @@ class Scene:
     """A daemon in a thread, a ride onto its bus in real time, and all that is heard there."""
 
     def __init__(self, bus: str, **options: object) -> None:
-        channel = Channel("virtual", bus)
+        channel = CanChannel("virtual", bus)
         channel.open()
         self.daemon = Daemon(reference(), [channel], **{"recorder": None, "state_file": None, **options})  # type: ignore[arg-type]
         self.heard: list[Frame] = []
@@ -147,7 +148,7 @@ def test_a_silent_bus_is_told_that_there_is_nothing(bus: str):
 
 
 def test_identifiers_of_others_are_not_taken_in(bus: str):
-    channel = Channel("virtual", bus, identifiers=[0x200, EFF_FLAG | 0x201])
+    channel = CanChannel("virtual", bus, identifiers=[0x200, EFF_FLAG | 0x201])
     channel.open()
     with can.Bus(interface="virtual", channel=bus) as other:
         for can_id, extended in ((0x200, False), (0x201, False), (0x200, True), (0x201, True), (0x7FF, False)):
@@ -168,7 +169,7 @@ def largest_file(size: int) -> Iterator[None]:
 
 
 def test_a_log_that_cannot_be_written_is_told_and_begun_again(bus: str, tmp_path: Path):
-    recorder = Recorder(tmp_path, "v", sync_s=0.2, retry_s=0.5)
+    recorder = Recorder(tmp_path, "v", limits=Limits(sync_s=0.2, retry_s=0.5))
     with Scene(bus, recorder=recorder) as scene:
         with largest_file(8_000):
             failed: list[bool] = []  # that it was, once: half a second later it is tried again
@@ -363,7 +364,7 @@ def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, ca
 @pytest.mark.parametrize("delta", [3600.0, -7200.0, 40.0])
 def test_the_clock_is_set_in_the_middle_of_a_round(bus: str, monkeypatch: pytest.MonkeyPatch, delta: float):
     """Between the reading of the clock and that of the frames: no time is left out, none comes twice."""
-    channel = Channel("virtual", bus)
+    channel = CanChannel("virtual", bus)
     channel.open()
     daemon = Daemon(reference(), [channel], recorder=None, state_file=None)
     ticks: list[tuple[float, float]] = []  # s: of the estimate, of a clock that nobody sets
@@ -456,7 +457,7 @@ def test_what_cannot_be_decoded_in_time_is_left_out_fairly_counted_and_flagged(
     """One identifier floods the bus; the others' frames are all taken, and the estimate stays good."""
     with Scene(bus) as scene:
         daemon = scene.daemon
-        monkeypatch.setattr("gz_onboard.daemon.WORK_S", 0.0)  # as on a slow board: 400 frames a tick
+        monkeypatch.setattr("gz_onboard.daemon.loop.WORK_S", 0.0)  # as on a slow board: 400 frames a tick
         stop = threading.Event()
 
         def flood() -> None:
@@ -484,7 +485,7 @@ def test_what_cannot_be_decoded_in_time_is_left_out_fairly_counted_and_flagged(
 @pytest.mark.parametrize("lag_s", [1.5, 10.0])
 def test_an_estimate_of_old_frames_does_not_count_as_good(bus: str, lag_s: float):
     """As they come from a buffer that is read too slowly."""
-    channel = Channel("virtual", bus)
+    channel = CanChannel("virtual", bus)
     channel.open()
     daemon = Daemon(reference(), [channel], None, None)
     frames = Scooter().steady(10.0)
@@ -527,7 +528,7 @@ def test_disks_that_do_not_answer_do_not_silence_it(bus: str, tmp_path: Path, mo
         real[number](descriptor)
 
     file = tmp_path / "scooter.json"
-    recorder = Recorder(tmp_path / "log", "v", sync_s=0.3)
+    recorder = Recorder(tmp_path / "log", "v", limits=Limits(sync_s=0.3))
     with Scene(bus, recorder=recorder, state_file=file) as scene:
         log = scene.daemon._log
         assert log is not None
@@ -559,7 +560,7 @@ def test_the_state_is_saved_when_the_charge_has_moved(
 ):
     """Ridden hard, what a cut costs is a tenth of a point; else it is saved once in ten seconds."""
     file = tmp_path / "scooter.json"
-    channel = Channel("virtual", bus)
+    channel = CanChannel("virtual", bus)
     channel.open()
     daemon = Daemon(reference(), [channel], None, file)
     keeper = daemon._keeper
@@ -587,9 +588,9 @@ HOLDING = """
 import sys, time
 from contextlib import ExitStack
 from pathlib import Path
-from gz_onboard import daemon
+from gz_onboard.daemon import command
 with ExitStack() as locks:
-    daemon._lock(locks, sys.argv[1], [sys.argv[2]], Path(sys.argv[3]))
+    command._lock(locks, sys.argv[1], [sys.argv[2]], Path(sys.argv[3]))
     print("held", flush=True)
     time.sleep(float(sys.argv[4]))
     if len(sys.argv) > 5:
@@ -617,7 +618,7 @@ def take(interface: str, name: str, folder: Path) -> None:
 def test_of_two_daemons_on_one_bus_or_state_directory_the_second_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr("gz_onboard.daemon.LOCK_S", 0.3)
+    monkeypatch.setattr("gz_onboard.daemon.command.LOCK_S", 0.3)
     name = f"can{os.getpid()}"  # the names are those of the whole machine
     with holder("socketcan", name, tmp_path / "a", 60):
         with pytest.raises(InputError, match=f"--channel {name}: another gz-onboard run has it"):
@@ -631,7 +632,7 @@ def test_of_two_daemons_on_one_bus_or_state_directory_the_second_is_refused(
 
 @pytest.mark.parametrize("crash", [(), ("crash",)])
 def test_one_that_is_ending_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, crash: tuple[str, ...]):
-    monkeypatch.setattr("gz_onboard.daemon.LOCK_S", 60.0)
+    monkeypatch.setattr("gz_onboard.daemon.command.LOCK_S", 60.0)
     name = f"can{os.getpid()}"
     with holder("socketcan", name, tmp_path, 1.0, *crash):
         take("socketcan", name, tmp_path)
@@ -654,11 +655,11 @@ def test_at_the_end_a_log_that_hangs_does_not_cost_the_state(
         answer.wait(60)
 
     monkeypatch.setattr(os, "fdatasync", hang)
-    monkeypatch.setattr("gz_onboard.daemon.STOP_S", 0.2)
-    channel = Channel("virtual", bus)
+    monkeypatch.setattr("gz_onboard.daemon.loop.STOP_S", 0.2)
+    channel = CanChannel("virtual", bus)
     channel.open()
     file = tmp_path / "scooter.json"
-    daemon = Daemon(reference(), [channel], Recorder(tmp_path / "log", "v", sync_s=0.1), file)
+    daemon = Daemon(reference(), [channel], Recorder(tmp_path / "log", "v", limits=Limits(sync_s=0.1)), file)
     frames = Scooter().steady(2.0)
     daemon.step(frames[: len(frames) // 2], frames[len(frames) // 2][0])
     daemon.step(frames[len(frames) // 2 :], frames[-1][0] + S)
@@ -681,9 +682,9 @@ def test_at_the_end_a_log_that_hangs_does_not_cost_the_state(
 def test_an_unforeseen_error_costs_neither_the_log_nor_the_state(
     bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    channel = Channel("virtual", bus)
+    channel = CanChannel("virtual", bus)
     channel.open()
-    file, recorder = tmp_path / "scooter.json", Recorder(tmp_path / "log", "v", sync_s=1e6)
+    file, recorder = tmp_path / "scooter.json", Recorder(tmp_path / "log", "v", limits=Limits(sync_s=1e6))
     daemon = Daemon(reference(), [channel], recorder, file)
     frames = Scooter().steady(3.0)
     half = len(frames) // 2
@@ -709,10 +710,10 @@ import os, sys, threading
 def hang(descriptor):
     print("hangs", flush=True)
     threading.Event().wait()
-from gz_onboard import daemon
+from gz_onboard.daemon import loop
 from gz_onboard.cli import main
 os.fdatasync = hang
-daemon.STOP_S = 0.5
+loop.STOP_S = 0.5
 sys.exit(main(["run", "--interface", "virtual", "--channel", "x", "--log-dir", sys.argv[1]]))
 """
 

@@ -1,1 +1,1 @@
-"""The way in and out: CAN channels, the codec between frames and events, logs. Knows no physics."""
+"""Input and output: CAN channels, the codec between frames and events, logs. Knows no physics."""

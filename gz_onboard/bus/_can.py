@@ -9,6 +9,9 @@ from __future__ import annotations
 import importlib
 import sys
 
+from gz_onboard.errors import InputError, nearest
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG
+
 
 def _import_without_asammdf() -> None:
     """Import python-can with asammdf hidden from it, unless either is there already."""
@@ -25,4 +28,17 @@ _import_without_asammdf()
 
 import can  # noqa: E402
 
-__all__ = ["can"]
+__all__ = ["can", "check_interface", "flagged"]
+
+
+def check_interface(name: str) -> None:
+    """InputError if python-can has no such interface."""
+    if name not in can.VALID_INTERFACES:
+        known = sorted(can.VALID_INTERFACES)
+        raise InputError(f"--interface {name}: unknown{nearest(name, known)}; known are {', '.join(known)}")
+
+
+def flagged(message: can.Message) -> int:
+    """The identifier of a message with the kernel's flags."""
+    identifier = message.arbitration_id | (EFF_FLAG if message.is_extended_id else 0)
+    return identifier | (RTR_FLAG if message.is_remote_frame else 0) | (ERR_FLAG if message.is_error_frame else 0)

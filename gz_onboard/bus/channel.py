@@ -14,14 +14,13 @@ import struct
 import time
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus._can import can
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.bus._can import can, check_interface, flagged
+from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Frame
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-SOL_CAN_RAW = 101
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40
 SO_RCVBUFFORCE = 33
@@ -36,7 +35,7 @@ _COUNT = struct.Struct("=I")
 _ANCILLARY = socket.CMSG_SPACE(16) + socket.CMSG_SPACE(4)
 
 
-class Channel:
+class CanChannel:
     """One channel. `index` is put into its frames; `identifiers` are all that the kernel shall let through."""
 
     def __init__(
@@ -54,7 +53,6 @@ class Channel:
         self.up = False
         self.overflow = 0  # frames that the kernel had to drop, as it counts them
         self.send_failures = 0
-        self.openings = 0
         self._identifiers = identifiers
         self._wanted = None if identifiers is None else {*identifiers, *(ERR_FLAG | bit for bit in (0, EFF_FLAG))}
         self._options = options
@@ -66,11 +64,7 @@ class Channel:
 
     def open(self) -> None:
         """Open for the first time; InputError if there is no such interface or channel at all."""
-        if self.interface not in can.VALID_INTERFACES:
-            known = sorted(can.VALID_INTERFACES)
-            raise InputError(
-                f"--interface {self.interface}: unknown{nearest(self.interface, known)}; known are {', '.join(known)}"
-            )
+        check_interface(self.interface)
         try:
             self._open()
         except (can.CanInterfaceNotImplementedError, ValueError, ImportError) as error:
@@ -104,7 +98,6 @@ class Channel:
             self._socket = raw
             self._kernel_count = 0
         self.up = True
-        self.openings += 1
 
     def _close(self) -> None:
         self.up = False
@@ -123,10 +116,6 @@ class Channel:
             except (OSError, can.CanError, ValueError):
                 self._close()
         return self.up
-
-    def fileno(self) -> int | None:
-        """The socket to wait for, if it has one."""
-        return self._socket.fileno() if self._socket else None
 
     def drain(self) -> list[Frame]:
         """The frames that have come since the last call, without waiting, as far as `READ_S` and `MOST` allow."""
@@ -176,10 +165,7 @@ class Channel:
         for _ in range(MOST):
             if time.monotonic() > until or (message := self._bus.recv(0)) is None:
                 return
-            identifier = message.arbitration_id
-            identifier |= EFF_FLAG if message.is_extended_id else 0
-            identifier |= RTR_FLAG if message.is_remote_frame else 0
-            identifier |= ERR_FLAG if message.is_error_frame else 0
+            identifier = flagged(message)
             # Filtered here: with filters of its own python-can's recv(0) says "nothing" at each frame it rejects.
             if self._wanted is not None and identifier & ~RTR_FLAG not in self._wanted:
                 continue

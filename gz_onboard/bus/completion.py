@@ -38,8 +38,6 @@ from mcap.records import (
 from gz_onboard.bus.readers import mcap
 from gz_onboard.bus.readers.common import Contents, Damage
 
-_HEADER = 9  # bytes of a record's opcode and length
-_CHUNK = struct.Struct("<QQQLL")
 _MESSAGE = struct.Struct("<HLQ")
 
 
@@ -100,7 +98,7 @@ class _Found:
         self._last_index: list[MessageIndex] = []  # of the last chunk, to be written if it is not there
         chunk: ChunkIndex | None = None
         for opcode, start, end in mcap.records(path, data, Damage()):
-            begin = start - _HEADER
+            begin = start - mcap.RECORD.size
             try:
                 if opcode == Opcode.CHUNK:
                     chunk = None
@@ -131,21 +129,21 @@ class _Found:
             if opcode == Opcode.MESSAGE:
                 number, _, time_ns = _MESSAGE.unpack_from(content, at)
                 index = indices.setdefault(number, MessageIndex(number, []))
-                index.records.append((time_ns, at - _HEADER))
+                index.records.append((time_ns, at - mcap.RECORD.size))
             elif opcode == Opcode.SCHEMA:
                 schemas.append(Schema.read(_stream(content[at:until])))
             elif opcode == Opcode.CHANNEL:
                 channels.append(Channel.read(_stream(content[at:until])))
-        first, last, size, _, name = _CHUNK.unpack_from(data, start)
-        compression = data[start + _CHUNK.size : start + _CHUNK.size + name].decode("ascii", "replace")
-        packed = end - start - _CHUNK.size - name - 8
+        first, last, size, _, name = mcap.CHUNK.unpack_from(data, start)
+        compression = data[start + mcap.CHUNK.size : start + mcap.CHUNK.size + name].decode("ascii", "replace")
+        packed = end - start - mcap.CHUNK.size - name - 8
         self._schemas |= {schema.id: schema for schema in schemas}
         self._channels |= {channel.id: channel for channel in channels}
         self._counts.update({number: len(index.records) for number, index in indices.items()})
         self._last_index = list(indices.values())
         chunk = ChunkIndex(
-            chunk_length=end - start + _HEADER,
-            chunk_start_offset=start - _HEADER,
+            chunk_length=end - start + mcap.RECORD.size,
+            chunk_start_offset=start - mcap.RECORD.size,
             compression=compression,
             compressed_size=packed,
             message_end_time=last,

@@ -97,50 +97,55 @@ def decode_block(block: bytes) -> list[Frame]:
         raise ValueError(f"a block of {len(block)} bytes is too short") from None
     if version != _VERSION or width not in _WIDTHS or not kinds or not count:
         raise ValueError(f"not a block of frames of version {_VERSION}")
-    position = _HEAD.size
     order_type, order_width = ("B", 1) if kinds <= 256 else ("H", 2)
-    steps_at = position + kinds * _KIND.size + count * order_width
+    order_at = _HEAD.size + kinds * _KIND.size
+    steps_at = order_at + count * order_width
     data_at = steps_at + (count - 1) * width
     if len(block) < data_at:
         raise ValueError(f"a block of {count} frames is cut off")
-    table = list(_KIND.iter_unpack(block[position : steps_at - count * order_width]))
-    order = _little(array(order_type, block[steps_at - count * order_width : steps_at]))
+    table = list(_KIND.iter_unpack(block[_HEAD.size : order_at]))
+    order = _little(array(order_type, block[order_at:steps_at]))
     if max(order) >= kinds:
         raise ValueError("a frame of a kind that the block does not have")
+    steps = _little(array(_WIDTHS[width], bytes(_rows(block, steps_at, count - 1, width))))
+    times = accumulate((step * unit for step in steps), initial=first)
+    datas = _datas(block, data_at, order, [length for _, _, length in table])
+    identifiers = [identifier for identifier, _, _ in table]
+    channels = [channel for _, channel, _ in table]
+    return list(zip(times, map(identifiers.__getitem__, order), datas, map(channels.__getitem__, order), strict=True))
 
-    planes = bytearray((count - 1) * width)
+
+def _rows(block: bytes, at: int, count: int, width: int) -> bytearray:
+    """`count` rows of `width` bytes that stand at `at` as byte planes."""
+    rows = bytearray(count * width)
     for i in range(width):
-        planes[i::width] = block[steps_at + i * (count - 1) : steps_at + (i + 1) * (count - 1)]
-    steps = _little(array(_WIDTHS[width], bytes(planes)))
-    times = list(accumulate((step * unit for step in steps), initial=first))
+        rows[i::width] = block[at + i * count : at + (i + 1) * count]
+    return rows
 
+
+def _datas(block: bytes, position: int, order: array[int], lengths: Sequence[int]) -> list[bytes]:
+    """The data of the frames in their order. `order`: the kind of each; `lengths`: of the data, by kind."""
     of_kind: list[list[bytes]] = []
-    position = data_at
     numbers = Counter(order)
-    for kind, (_, _, length) in enumerate(table):
+    for kind, length in enumerate(lengths):
         number = numbers[kind]
         end = position + number * length
         if end > len(block):
-            raise ValueError(f"a block of {count} frames is cut off")
+            raise ValueError(f"a block of {len(order)} frames is cut off")
         if length:
-            rows = bytearray(end - position)
-            for i in range(length):
-                rows[i::length] = block[position + i * number : position + (i + 1) * number]
-            of_kind.append([data for (data,) in struct.iter_unpack(f"{length}s", rows)])
+            of_kind.append(
+                [data for (data,) in struct.iter_unpack(f"{length}s", _rows(block, position, number, length))]
+            )
         else:
             of_kind.append([b""] * number)
         position = end
     if position != len(block):
-        raise ValueError(f"{len(block) - position} bytes too many after a block of {count} frames")
-
+        raise ValueError(f"{len(block) - position} bytes too many after a block of {len(order)} frames")
     # Stable sorting of the frames' places by kind gives, for each frame in order of kind, where it belongs.
-    places = sorted(range(count), key=order.__getitem__)
-    datas = [b""] * count
-    for place, data in zip(places, chain.from_iterable(of_kind), strict=True):
+    datas = [b""] * len(order)
+    for place, data in zip(sorted(range(len(order)), key=order.__getitem__), chain.from_iterable(of_kind), strict=True):
         datas[place] = data
-    identifiers = [identifier for identifier, _, _ in table]
-    channels = [channel for _, channel, _ in table]
-    return list(zip(times, map(identifiers.__getitem__, order), datas, map(channels.__getitem__, order), strict=True))
+    return datas
 
 
 def _little(values: array[int]) -> array[int]:

@@ -2,10 +2,10 @@
 
 BLF, candump and our own files have a reader of their own, five to ten times as fast as one that builds a message
 object for each frame; the rest is read by python-can. A damaged log is read as far as it can be: what is lost is
-counted and told once (`LogDamage`), never silently and never by giving up.
+counted and reported once (`LogDamage`), never silently and never by giving up.
 
 A frame has the kernel's identifier flags. The data of a remote frame are as many zero bytes as it asked for. A
-CAN FD frame of up to 8 bytes is not told from a classic one.
+CAN FD frame of up to 8 bytes cannot be distinguished from a classic one.
 """
 
 from __future__ import annotations
@@ -29,9 +29,7 @@ _READERS: dict[str, Reader] = {
     ".mcap": mcap.read,
     ".blf": blf.read,
     ".log": candump.read,
-    ".asc": pycan.text_reader(".asc"),
-    ".csv": pycan.text_reader(".csv"),
-    ".trc": pycan.text_reader(".trc"),
+    **{suffix: pycan.text_reader(suffix) for suffix in (".asc", ".csv", ".trc")},
     ".mf4": pycan.read_mf4,
 }
 
@@ -107,26 +105,20 @@ def _is_log(file: Path) -> bool:
 
 def read_attachments(path: str | Path) -> dict[str, bytes]:
     """The files attached to one of our own logs by name, such as the DBC files; of other formats none."""
-    path = Path(path)
-    if log_suffix(path) != ".mcap":
-        return {}
-    return mcap.attachments(path, unpacked(path, _load(path), Damage()))
+    own = _own(path)
+    return mcap.attachments(*own) if own else {}
 
 
 def read_metadata(path: str | Path) -> dict[str, str]:
     """The metadata of one of our own logs (vehicle, version, ...); of other formats none."""
-    path = Path(path)
-    if log_suffix(path) != ".mcap":
-        return {}
-    return mcap.metadata(path, unpacked(path, _load(path), Damage()))
+    own = _own(path)
+    return mcap.metadata(*own) if own else {}
 
 
 def json_channels(path: str | Path) -> dict[str, tuple[bytes, dict[str, str]]]:
     """Schema (a JSON text) and metadata of each topic of samples in one of our own logs; of other formats none."""
-    path = Path(path)
-    if log_suffix(path) != ".mcap":
-        return {}
-    return mcap.json_channels(path, unpacked(path, _load(path), Damage()))
+    own = _own(path)
+    return mcap.json_channels(*own) if own else {}
 
 
 def read_samples(
@@ -134,19 +126,23 @@ def read_samples(
 ) -> Iterator[tuple[str, int, dict[str, Any]]]:
     """Topic, time [ns] and values of the samples in one of our own logs, as they stand in it; others have none.
 
-    Damage is passed over: `read_frames` tells of it.
+    Damage is passed over: `read_frames` reports it.
     """
-    path = Path(path)
-    if log_suffix(path) != ".mcap":
+    if not (own := _own(path)):
         return
-    data = unpacked(path, _load(path), Damage())
-    for topic, time_ns, text in mcap.samples(path, data, Damage(), start_ns, end_ns):
+    for topic, time_ns, text in mcap.samples(*own, Damage(), start_ns, end_ns):
         try:
             values = json.loads(text)
         except (ValueError, RecursionError):
             continue
         if isinstance(values, dict):
             yield topic, time_ns, values
+
+
+def _own(path: str | Path) -> tuple[Path, Contents] | None:
+    """(path, contents) of a log in our own format; None for other formats."""
+    path = Path(path)
+    return (path, unpacked(path, _load(path), Damage())) if log_suffix(path) == ".mcap" else None
 
 
 def _warn(damage: LogDamage) -> None:

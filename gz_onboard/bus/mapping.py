@@ -164,14 +164,14 @@ def _problem(message: Message) -> str | None:
 
 
 def _invalid(file: Path, text: str, problem: str) -> InputError:
-    """The error about a DBC file, with the line that it tells of or on which the message stands that it names."""
-    told = re.search(r"line (\d+)", problem)
-    if told and int(told[1]) > text.count("\n") + 1:  # in `_END`, behind the file
+    """The error about a DBC file, with the line that `problem` names, or that of the message it names."""
+    numbered = re.search(r"line (\d+)", problem)
+    if numbered and int(numbered[1]) > text.count("\n") + 1:  # in `_END`, behind the file
         lines = text.rstrip().split("\n")
         problem = f"it ends within a statement; its last line is {shown(lines[-1].strip())}. Is the file whole?"
         return InputError(f"{file}:{len(lines)}: not a valid DBC file: {problem}")
     named = re.search(r"message (\w+)", problem)
-    line = told[1] if told else _message_line(text, named[1]) if named else None
+    line = numbered[1] if numbered else _message_line(text, named[1]) if named else None
     if wide := re.search(r"Standard frame id (0x[0-9a-f]+) is more than 11 bits", problem):
         problem += f" A DBC writes a 29-bit identifier with bit 31 set: {int(wide[1], 16) | 1 << 31}."
     if len(problem) > LONGEST_PROBLEM:

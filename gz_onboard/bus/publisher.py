@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
-from gz_onboard.bus.codec import first_bit, raw_range
+from gz_onboard.bus.layout import first_bit, identifier_of, raw_range
 from gz_onboard.bus.mapping import find_dbc, load_database
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.events import EFF_FLAG, ROLES, TRANSMITTED, Estimate, Frame, Reason, State
+from gz_onboard.events import ROLES, TRANSMITTED, Estimate, Frame, Reason, State
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -63,7 +63,7 @@ class Publisher:
     def range(self, estimate: Estimate, counts: Counts, time_ns: int, channel: int = 0) -> list[Frame]:
         """The frames of every second."""
         e = estimate
-        state, remaining, p10, p90 = self.told(e)
+        state, remaining, p10, p90 = self.reported(e)
         known = state in KNOWN
         frames: dict[str, dict[str, float | None]] = {
             "RANGE_Estimate": {
@@ -78,10 +78,8 @@ class Publisher:
                 "RANGE_ConsumptionExpected": _scaled(e.consumption_expected, 1 / WH_PER_KM) if known else None,
             },
             "RANGE_Diagnosis": {
-                "RANGE_CountDropped": self._count("RANGE_CountDropped", counts.dropped),
-                "RANGE_CountImplausible": self._count("RANGE_CountImplausible", counts.implausible),
-                "RANGE_CountLost": self._count("RANGE_CountLost", counts.lost),
-                "RANGE_CountUnknown": self._count("RANGE_CountUnknown", counts.unknown),
+                signal: min(count, self.greatest(signal))
+                for signal, count in ((f"RANGE_Count{name.capitalize()}", n) for name, n in vars(counts).items())
             },
             "RANGE_Sensors": {signal: role in e.distrusted for role, signal in self._sensor_signals},
         }
@@ -89,7 +87,7 @@ class Publisher:
 
     def status(self, estimate: Estimate, time_ns: int, channel: int = 0) -> list[Frame]:
         """The frame of every tenth of a second."""
-        state = self.told(estimate)[0]
+        state = self.reported(estimate)[0]
         soc, sigma = _scaled(estimate.soc, 100), _scaled(estimate.soc_sd, 100)
         if state not in KNOWN or not (self._can_say(SOC, soc) and self._can_say(SIGMA, sigma)):
             soc = sigma = None  # neither is of use without the other
@@ -104,7 +102,7 @@ class Publisher:
             values[signal] = reasons & bit != 0
         return [self._frame("RANGE_Status", values, time_ns, channel)]
 
-    def told(self, e: Estimate) -> tuple[State, float | None, float | None, float | None]:
+    def reported(self, e: Estimate) -> tuple[State, float | None, float | None, float | None]:
         """(state, range, P10, P90) [km] as they are sent: never valid unless all three are there and in their order."""
         if e.state not in KNOWN:
             return e.state, None, None, None
@@ -124,9 +122,6 @@ class Publisher:
 
     def _can_say(self, signal: str, value: float | None) -> bool:
         return self._fields[signal].raw(value) is not None
-
-    def _count(self, signal: str, count: int) -> float:
-        return min(count, self.greatest(signal))
 
     def _frame(self, name: str, values: dict[str, float | None], time_ns: int, channel: int) -> Frame:
         layout = self._layouts[name]
@@ -289,5 +284,4 @@ def _layout(message: Message) -> _Layout:
             continue
         fields.append(_field(signal, first_bit(signal) if little else 56 - first_bit(signal) - signal.length))
         unused &= ~(fields[-1].mask << fields[-1].shift)
-    identifier = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
-    return _Layout(identifier, "little" if little else "big", unused, fields, counter, counts)
+    return _Layout(identifier_of(message), "little" if little else "big", unused, fields, counter, counts)

@@ -1,151 +1,63 @@
-"""Writing logs: MCAP files with the raw frames in blocks and JSON channels for everything else.
+"""A directory of logs: begins, rotates, completes and deletes them; a full disk or a broken one raises nothing.
 
-`LogFile` writes one file and lets errors through; `Recorder` keeps a directory of them, rotates, completes and deletes
-them, and never raises for a full disk or a broken one; `BackgroundRecorder` does so on a thread of its own. None of
-them has a clock: times come with the frames and samples. What stands in a file: docs/log-format.md.
+There is no clock: times come with the frames and samples.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import json
-import math
 import os
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any
 
-from mcap.writer import CompressionType, Writer
-
-from gz_onboard import __version__
-from gz_onboard.background import Background
-from gz_onboard.bus import framelog
 from gz_onboard.bus.completion import complete, is_complete, lock
+from gz_onboard.bus.logfile import LogFile
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
 from gz_onboard.state import sync_directory
 
-BLOCK_FRAMES = 512
-BLOCK_NS = 1_000_000_000
-"""A block holds at most this many frames and this much time: a reader that looks for a time relies on it."""
-
-_CHUNK_BYTES = 256 * 1024
 _NAME = re.compile(r"(\d{8}T\d{6}Z)_(.+?)(?:~(\d{1,9}))?\.mcap")
 _LEFT_FREE = 64 << 20  # bytes
 _LEAST_ROOM = 64 << 10  # bytes: the beginning of a file has some 20 kB, with the DBC files
-_STUCK = 10.0  # s: no disk takes as long
 
 
-class LogFile:
-    """One MCAP file of frames and samples. An I/O error is raised as OSError.
+@dataclass(frozen=True)
+class Limits:
+    """How often a `Recorder` syncs, when it closes a file, how much it keeps, how long it waits after an error.
 
-    stream: opened for binary writing; closed by `close`. start_ns: the time of the first entry.
-    metadata: text by key, kept in the file's metadata record ``gz_onboard``; attachments: files by name, such as
-    the DBC files that the frames can be decoded by.
+    InputError for limits that cannot be kept.
     """
 
-    def __init__(
-        self,
-        stream: IO[bytes],
-        start_ns: int,
-        metadata: Mapping[str, str] | None = None,
-        attachments: Mapping[str, bytes] | None = None,
-    ) -> None:
-        self.start_ns = start_ns
-        self.unsynced_frames = 0
-        self.flushed = False
-        self._stream = stream
-        self._pending: list[Frame] = []
-        self._channels: dict[str, int] = {}
-        self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self._writer.start(profile="", library=f"gz-onboard {__version__}")
-        self._writer.add_metadata("gz_onboard", {"version": __version__, **(metadata or {})})
-        for name, data in (attachments or {}).items():
-            self._writer.add_attachment(start_ns, start_ns, name, "text/plain", data)
-        schema = self._writer.register_schema(framelog.SCHEMA_NAME, framelog.ENCODING, framelog.SCHEMA_TEXT.encode())
-        self._frames_channel = self._writer.register_channel(framelog.TOPIC, framelog.ENCODING, schema)
-        stream.flush()  # a file cut off before the first chunk is a valid beginning
+    sync_s: float = 1.5
+    max_file_bytes: int = 64 << 20
+    max_age_s: float = 3600.0
+    max_total_bytes: int = 1 << 30
+    retry_s: float = 10.0
 
-    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
-        """Declare a topic of JSON objects; its schema is named by the JSON schema's ``title``, or the topic."""
-        schema = self._writer.register_schema(
-            str(json_schema.get("title", topic)), "jsonschema", json.dumps(json_schema, separators=(",", ":")).encode()
-        )
-        self._channels[topic] = self._writer.register_channel(topic, "json", schema, dict(metadata or {}))
+    def __post_init__(self) -> None:
+        if not 0 < self.max_file_bytes <= self.max_total_bytes:
+            raise InputError(
+                f"log: a file of up to {self.max_file_bytes} bytes does not fit into {self.max_total_bytes} bytes in "
+                "all; make the total larger or the files smaller"
+            )
 
-    def frames(self, batch: Sequence[Frame]) -> None:
-        """Log raw frames; they are written once there is a block of them, or at the next `flush`."""
-        pending = self._pending
-        pending += batch
-        self.unsynced_frames += len(batch)
-        while pending and (len(pending) >= BLOCK_FRAMES or abs(pending[-1][0] - pending[0][0]) >= BLOCK_NS):
-            self._write_block(_block_length(pending))
 
-    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
-        """Log one JSON object on a declared topic; not-a-number and infinities become null."""
-        try:
-            text = json.dumps(values, allow_nan=False, separators=(",", ":"))
-        except ValueError:
-            text = json.dumps(_without_nan(values), separators=(",", ":"))
-        self._writer.add_message(self._channels[topic], time_ns, text.encode(), time_ns)
-
-    def flush(self, *, to_disk: bool = False) -> None:
-        """Write all that there is, so that it can be read though the file is cut off; to_disk: fsync as well."""
-        while self._pending:
-            self._write_block(_block_length(self._pending))
-        self._writer.flush()  # type: ignore[no-untyped-call]
-        if to_disk:
-            os.fdatasync(self._stream.fileno())
-        self.unsynced_frames = 0
-        self.flushed = True
-
-    def size(self) -> int:
-        """Bytes written so far, without what still waits for a chunk to be full."""
-        return self._stream.tell()
-
-    def vanished(self, path: Path) -> bool:
-        """Whether the file is no longer at `path`: deleted or moved, itself or its directory."""
-        try:
-            there = path.stat()
-        except (FileNotFoundError, NotADirectoryError):
-            return True
-        return not os.path.samestat(there, os.fstat(self._stream.fileno()))
-
-    def close(self) -> None:
-        """Write the rest and the summary that lets readers jump to a time."""
-        try:
-            self.flush()
-            self._writer.finish()  # type: ignore[no-untyped-call]
-            self._stream.flush()
-            os.fsync(self._stream.fileno())
-        finally:
-            self._stream.close()
-
-    def abandon(self) -> None:
-        """Close without writing anything more, after an error."""
-        with contextlib.suppress(OSError):
-            self._stream.close()
-
-    def _write_block(self, count: int) -> None:
-        block = self._pending[:count]
-        self._writer.add_message(
-            self._frames_channel, block[0][0], framelog.encode_block(block), publish_time=block[-1][0]
-        )
-        del self._pending[:count]
+LIMITS = Limits()
 
 
 class Recorder:
     """Logs into a directory of MCAP files named by their start in UTC, the vehicle and a running number.
 
     Nothing is raised for an error in writing: it closes the file and is counted in `errors` (its text in `last_error`);
-    recording goes on with a new file `retry_s` later, and `lost_frames` counts the frames not known to be in a file. A
-    file is closed at `max_file_bytes` or `max_age_s`. Before a new one is begun, the oldest of the files named as ours
-    (by their running numbers: clocks are set) are deleted until all together, with the new one, stay below
-    `max_total_bytes`, and leave free on the file system what `left_free` says; other files are not touched, nor are
-    files that are being written. Raises InputError for limits that cannot be kept.
+    recording goes on with a new file `retry_s` later, and `lost_frames` counts the frames not known to be in a file.
+    Before a new file is begun, the oldest of those named as ours (by their running numbers: clocks are set) are deleted
+    until all together, with the new one, stay below `max_total_bytes`, and leave free on the file system what
+    `free_space` says; other files are not touched, nor are files that are being written.
     """
 
     def __init__(
@@ -154,18 +66,8 @@ class Recorder:
         vehicle: str,
         metadata: Mapping[str, str] | None = None,
         attachments: Mapping[str, bytes] | None = None,
-        *,
-        sync_s: float = 1.5,
-        max_file_bytes: int = 64 << 20,
-        max_age_s: float = 3600.0,
-        max_total_bytes: int = 1 << 30,
-        retry_s: float = 10.0,
+        limits: Limits = LIMITS,
     ) -> None:
-        if not 0 < max_file_bytes <= max_total_bytes:
-            raise InputError(
-                f"log: a file of up to {max_file_bytes} bytes does not fit into {max_total_bytes} bytes in all;"
-                " make the total larger or the files smaller"
-            )
         self.path: Path | None = None
         self.paths: list[Path] = []
         self.errors = 0
@@ -176,11 +78,11 @@ class Recorder:
         self._metadata = {"vehicle": vehicle, **(metadata or {})}
         self._attachments = dict(attachments or {})
         self._channels: dict[str, tuple[Mapping[str, Any], Mapping[str, str]]] = {}
-        self._sync_ns = round(sync_s * 1e9)
-        self._retry_ns = round(retry_s * 1e9)
-        self._max_age_ns = round(max_age_s * 1e9)
-        self._max_file_bytes = self._file_bytes = max_file_bytes
-        self._max_total_bytes = max_total_bytes
+        self._limits = limits
+        self._sync_ns = round(limits.sync_s * 1e9)
+        self._retry_ns = round(limits.retry_s * 1e9)
+        self._max_age_ns = round(limits.max_age_s * 1e9)
+        self._file_bytes = limits.max_file_bytes
         self._file: LogFile | None = None
         self._synced_ns: int | None = None
         self._failed_ns: int | None = None
@@ -337,8 +239,10 @@ class Recorder:
         room = free - keep + total  # that all of ours may take together
         if room < _LEAST_ROOM:
             raise OSError(errno.ENOSPC, f"no room for a log: {max(free, 0) >> 10} kB are free", str(self._directory))
-        self._file_bytes = min(self._max_file_bytes, room // 4)  # on a small disk small ones: the oldest goes whole
-        allowed = min(self._max_total_bytes, room) - self._file_bytes
+        self._file_bytes = min(
+            self._limits.max_file_bytes, room // 4
+        )  # on a small disk small ones: the oldest goes whole
+        allowed = min(self._limits.max_total_bytes, room) - self._file_bytes
         for path, size in sizes.items():
             if total <= allowed:
                 return
@@ -382,73 +286,6 @@ class Recorder:
         self.path = self.paths[-1] if self.paths else None
 
 
-class BackgroundRecorder:
-    """A `Recorder` on a thread of its own, for one that may not wait for a disk. The recorder is its alone.
-
-    limit: how many frames may wait for the disk (a value of a sample counts as one); what does not fit is left out,
-    whole portions of it, and counted in `lost_frames`.
-    """
-
-    def __init__(self, recorder: Recorder, limit: int = 40_000) -> None:
-        self._recorder = recorder
-        self._thread = Background("log", limit, recorder.complete_one)
-        self._left_out = 0
-        self._full = False
-        self._now_ns = 0
-        self._syncing = False
-
-    @property
-    def failing(self) -> bool:
-        """Whether frames are lost: errors, or a disk that is too slow or does not answer."""
-        return self._recorder.failing or self._full or self._thread.stuck > _STUCK
-
-    @property
-    def last_error(self) -> str:
-        """Why it is failing."""
-        if self._recorder.failing:
-            return self._recorder.last_error
-        return "the disk is too slow" if self._full else "the disk does not answer"
-
-    @property
-    def lost_frames(self) -> int:
-        """Frames not known to be in a file."""
-        return self._recorder.lost_frames + self._left_out
-
-    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
-        """As that of `Recorder`; to be called before anything is logged."""
-        self._recorder.channel(topic, json_schema, metadata)
-
-    def frames(self, batch: Sequence[Frame]) -> None:
-        """As that of `Recorder`; `batch` may not be changed afterwards."""
-        if batch and not self._thread.call(self._recorder.frames, batch, weight=len(batch)):
-            self._left_out += len(batch)
-            self._full = True
-
-    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
-        """As that of `Recorder`; `values` may not be changed afterwards."""
-        if not self._thread.call(self._recorder.sample, topic, time_ns, values, weight=len(values)):
-            self._full = True
-
-    def sync(self, now_ns: int) -> None:
-        """As that of `Recorder`."""
-        self._now_ns = now_ns
-        if self._full and self._thread.load < 0.5:
-            self._full = False
-        if not self._syncing:
-            self._syncing = True  # before the call: it may be done, and have said so, before `call` returns
-            if not self._thread.call(self._sync, weight=0):
-                self._syncing = False
-
-    def close(self, seconds: float) -> bool:
-        """Write what waits and close the file; False if that takes longer than `seconds`: the rest is lost then."""
-        self._thread.call(self._recorder.close, weight=0)
-        return self._thread.close(seconds)
-
-    def _sync(self) -> None:
-        self._syncing = False
-        self._recorder.sync(self._now_ns)
-
-
 def free_space(directory: Path) -> tuple[int, int]:
     """Bytes free on the file system of a directory, and how many of them our logs leave to others.
 
@@ -471,28 +308,3 @@ def _delete(path: Path) -> bool:
     except OSError:  # not ours to delete, or gone
         return False
     return True
-
-
-def object_schema(title: str, units: Mapping[str, str]) -> dict[str, Any]:
-    """A JSON schema for an object of numbers, each with its unit; null stands for not available."""
-    properties = {name: {"type": ["number", "null"], "description": unit} for name, unit in units.items()}
-    return {"title": title, "type": "object", "properties": properties}
-
-
-def _block_length(pending: Sequence[Frame]) -> int:
-    """How many of the pending frames go into the next block: within a second of the first, in either direction."""
-    candidates = pending[:BLOCK_FRAMES]
-    first = candidates[0][0]
-    if abs(candidates[-1][0] - first) < BLOCK_NS:
-        return len(candidates)
-    return next(i for i, frame in enumerate(candidates) if abs(frame[0] - first) >= BLOCK_NS)
-
-
-def _without_nan(value: object) -> object:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_without_nan(item) for item in value]
-    return value

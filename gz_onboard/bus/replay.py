@@ -262,11 +262,9 @@ def _sender(bus: can.BusABC) -> Send:
 
 
 def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
-    from gz_onboard.bus._can import can
+    from gz_onboard.bus._can import can, check_interface
 
-    if interface not in can.VALID_INTERFACES:
-        known = sorted(can.VALID_INTERFACES)
-        raise InputError(f"--interface {interface}: unknown{nearest(interface, known)}; known are {', '.join(known)}")
+    check_interface(interface)
     buses: list[can.BusABC] = []
     for name in names:
         try:

@@ -25,36 +25,12 @@ _CONVERSIONS: dict[tuple[str, str], tuple[float, float]] = {
 }
 
 # Spellings seen in DBC files -> ours
-_SPELLINGS = {
-    "r/min": "rpm",
-    "1/min": "rpm",
-    "RPM": "rpm",
-    "r/s": "rev/s",
-    "rps": "rev/s",
-    "°/s": "deg/s",
-    "dps": "deg/s",
-    "°": "deg",
-    "degree": "deg",
-    "degrees": "deg",
-    "°C": "degC",
-    "C": "degC",
-    "ºC": "degC",
-    "deg C": "degC",
-    "Celsius": "degC",
-    "Nm": "N·m",
-    "N.m": "N·m",
-    "N*m": "N·m",
-    "kph": "km/h",
-    "kmh": "km/h",
-    "m/s2": "m/s^2",
-    "m/s²": "m/s^2",
-    "meters": "m",
-    "Volt": "V",
-    "Amp": "A",
-    "Percent": "%",
-    "": "1",
-    "-": "1",
-}
+_ALIASES = (
+    "r/min=rpm 1/min=rpm RPM=rpm r/s=rev/s rps=rev/s °/s=deg/s dps=deg/s °=deg degree=deg degrees=deg °C=degC "
+    "C=degC ºC=degC Celsius=degC Nm=N·m N.m=N·m N*m=N·m kph=km/h kmh=km/h m/s2=m/s^2 m/s²=m/s^2 meters=m "
+    "Volt=V Amp=A Percent=%"
+)
+_SPELLINGS = {"": "1", "-": "1", "deg C": "degC"} | dict(alias.split("=") for alias in _ALIASES.split())
 
 
 def known_units(role: str) -> list[str]:

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.checksum import sae_j1850_tables
-from gz_onboard.bus.codec import raw_range
 from gz_onboard.bus.export import out_suffix, write_frames_as
+from gz_onboard.bus.layout import raw_range
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, Frame
 from gz_onboard.simulation.sensors import GPS_MESSAGES, ROLLER, SENSORS, TURNS, Sensor, Truth, latency, shaken, spread

@@ -24,6 +24,7 @@ from gz_onboard.bus.codec import (
     Codec,
     known_identifiers,
 )
+from gz_onboard.bus.layout import identifier_of, is_not_available, raw_values
 from gz_onboard.bus.mapping import Mapping, Source, find_dbc, load_database, read_mapping
 from gz_onboard.bus.units import to_si
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, PLAUSIBLE, ROLES, RTR_FLAG, Event
@@ -39,7 +40,7 @@ EPOCH = 1_700_000_000 * S
 def any_value() -> Iterator[None]:
     """Signals play roles of other kinds here: what is plausible for those says nothing (test_plausible.py has it)."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("gz_onboard.bus.codec.PLAUSIBLE", dict.fromkeys(PLAUSIBLE, (-math.inf, math.inf)))
+        patch.setattr("gz_onboard.bus.layout.PLAUSIBLE", dict.fromkeys(PLAUSIBLE, (-math.inf, math.inf)))
         yield
 
 
@@ -653,3 +654,13 @@ def test_whatever_comes_to_cantools(odd_mapping, frames):
         assert len(events) + accounted(codec) - before == 1 or quiet
         for _, _, values in events:
             assert all(v is None or math.isfinite(v) for v in values)
+
+
+def test_raw_values_are_those_of_whole_frames():
+    message = reference().database.get_message_by_name("IMU_Acceleration")
+    assert identifier_of(message) == message.frame_id
+    raw = raw_values(message, b"\xff" * message.length)
+    assert raw is not None
+    for signal in message.signals:  # all ones are -1 of a signed signal
+        assert is_not_available(signal, raw[signal.name]) == (signal.length >= 8 and not signal.is_signed)
+    assert raw_values(message, b"\xff" * (message.length - 1)) is None

@@ -13,8 +13,8 @@ import pytest
 from mcap.reader import make_reader
 
 from gz_onboard.bus import export as command
+from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.logs import read_frames, read_samples
-from gz_onboard.bus.recorder import LogFile, object_schema
 from gz_onboard.bus.writers import write_candump
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame

@@ -16,9 +16,11 @@ import pytest
 from mcap.reader import make_reader
 
 from gz_onboard.background import Background
-from gz_onboard.bus import framelog, logs, recorder
+from gz_onboard.bus import framelog, logfile, logs, recorder
+from gz_onboard.bus.background_recorder import BackgroundRecorder
 from gz_onboard.bus.completion import complete, is_complete
-from gz_onboard.bus.recorder import BackgroundRecorder, LogFile, Recorder, object_schema
+from gz_onboard.bus.logfile import LogFile, object_schema
+from gz_onboard.bus.recorder import Limits, Recorder
 from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
 
@@ -110,7 +112,7 @@ def test_no_block_holds_more_than_its_frames_or_a_second(tmp_path: Path) -> None
             sizes.append(framelog.decode_block(message.data))
             assert message.log_time == sizes[-1][0][0]
     assert flat(sizes) == sparse + dense + back + sparse
-    assert max(map(len, sizes)) <= recorder.BLOCK_FRAMES
+    assert max(map(len, sizes)) <= logfile.BLOCK_FRAMES
     assert all(abs(block[-1][0] - block[0][0]) < SECOND for block in sizes)
 
 
@@ -144,7 +146,7 @@ def test_syncing_brings_the_file_to_the_disk_at_most_once_in_its_interval(
         real(descriptor)
 
     monkeypatch.setattr(os, "fdatasync", counted)
-    log = Recorder(tmp_path, "reference", sync_s=1.0)
+    log = Recorder(tmp_path, "reference", limits=Limits(sync_s=1.0))
     drive(log, ticks(10))
     assert 8 <= len(synced) <= 10
     log.close()
@@ -155,7 +157,7 @@ def test_files_are_rotated_by_size_and_the_oldest_of_ours_deleted(tmp_path: Path
     foreign[0].write_text("mine")
     foreign[1].write_bytes(bytes(5000))
     foreign[2].mkdir()
-    log = Recorder(tmp_path, "ref", sync_s=0.5, max_file_bytes=20_000, max_total_bytes=60_000)
+    log = Recorder(tmp_path, "ref", limits=Limits(sync_s=0.5, max_file_bytes=20_000, max_total_bytes=60_000))
     noise = random.Random(1)
     batches = [[(t, i, noise.randbytes(8), c) for t, i, _, c in batch] for batch in ticks(60)]
     for batch in batches:
@@ -174,7 +176,7 @@ def test_files_are_rotated_by_size_and_the_oldest_of_ours_deleted(tmp_path: Path
 
 
 def test_files_are_rotated_by_age_and_each_stands_for_itself(tmp_path: Path) -> None:
-    log = Recorder(tmp_path, "ref", attachments={"a.dbc": b"text"}, max_age_s=10)
+    log = Recorder(tmp_path, "ref", attachments={"a.dbc": b"text"}, limits=Limits(max_age_s=10))
     log.channel("/estimate", SCHEMA)
     batches = ticks(25)
     for batch in batches:
@@ -211,7 +213,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
 
 
 def test_a_write_error_is_counted_and_recording_resumes_with_a_new_file(tmp_path: Path) -> None:
-    log = Recorder(tmp_path, "ref", retry_s=5, sync_s=1)
+    log = Recorder(tmp_path, "ref", limits=Limits(retry_s=5, sync_s=1))
     log.channel("/estimate", SCHEMA)
     batches = ticks(40)
 
@@ -250,7 +252,7 @@ def test_a_log_file_itself_lets_the_error_through() -> None:
 
 def test_a_directory_that_cannot_be_made_is_counted_not_raised(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
-    log = Recorder(tmp_path / "file" / "logs", "ref", retry_s=5)
+    log = Recorder(tmp_path / "file" / "logs", "ref", limits=Limits(retry_s=5))
     drive(log, ticks(11))
     log.close()
     assert log.errors == 3  # at once, after 5 s and after 10 s
@@ -273,7 +275,7 @@ def test_an_undeclared_topic_is_a_mistake(tmp_path: Path) -> None:
 
 def test_limits_that_cannot_be_kept_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not fit"):
-        Recorder(tmp_path, "ref", max_file_bytes=2000, max_total_bytes=1000)
+        Recorder(tmp_path, "ref", limits=Limits(max_file_bytes=2000, max_total_bytes=1000))
 
 
 def test_the_same_input_gives_the_same_bytes(tmp_path: Path) -> None:
@@ -293,7 +295,7 @@ YEAR = 365 * 86400 * SECOND
 
 
 def test_with_the_clock_set_back_the_oldest_go_first_and_never_the_one_being_written(tmp_path: Path) -> None:
-    log = Recorder(tmp_path, "ref", sync_s=0.5, max_file_bytes=20_000, max_total_bytes=60_000)
+    log = Recorder(tmp_path, "ref", limits=Limits(sync_s=0.5, max_file_bytes=20_000, max_total_bytes=60_000))
     noise = random.Random(1)
     batches = [[(t, i, noise.randbytes(8), c) for t, i, _, c in batch] for batch in ticks(90)]
     for number, batch in enumerate(batches):
@@ -322,7 +324,7 @@ def test_a_log_that_another_writes_is_neither_deleted_nor_completed(tmp_path: Pa
     other = Recorder(tmp_path, "other")
     drive(other, ticks(3))
     assert other.path is not None
-    log = Recorder(tmp_path, "ref", max_file_bytes=5000, max_total_bytes=5000)
+    log = Recorder(tmp_path, "ref", limits=Limits(max_file_bytes=5000, max_total_bytes=5000))
     assert not recorder._delete(other.path)
     while log.complete_one():
         pass
@@ -336,7 +338,7 @@ def test_a_log_that_another_writes_is_neither_deleted_nor_completed(tmp_path: Pa
 @pytest.mark.parametrize("moved", [False, True])
 def test_a_directory_that_is_taken_away_is_noticed_and_made_again(tmp_path: Path, moved: bool) -> None:
     folder, elsewhere = tmp_path / "logs", tmp_path / "elsewhere"
-    log = Recorder(folder, "ref", sync_s=1)
+    log = Recorder(folder, "ref", limits=Limits(sync_s=1))
     drive(log, ticks(3))
     if moved:
         folder.rename(elsewhere)
@@ -376,7 +378,7 @@ def test_on_a_disk_smaller_than_their_limit_logs_leave_room_for_others(
 ) -> None:
     disk = Disk(400_000, tmp_path)
     monkeypatch.setattr(os, "statvfs", disk.statvfs)
-    log = Recorder(tmp_path, "ref", sync_s=0.5, retry_s=1)
+    log = Recorder(tmp_path, "ref", limits=Limits(sync_s=0.5, retry_s=1))
     noise = random.Random(1)
     least = disk.size
     failing = []
@@ -402,7 +404,7 @@ def test_on_a_disk_smaller_than_their_limit_logs_leave_room_for_others(
 
 def cut_off(tmp_path: Path, seconds: float = 8) -> tuple[bytes, int]:
     """A log with frames, samples and attachments, and how much of it is on the disk before it is closed."""
-    log = Recorder(tmp_path / "whole", "ref", {"k": "v"}, {"a.dbc": b"text"}, sync_s=1)
+    log = Recorder(tmp_path / "whole", "ref", {"k": "v"}, {"a.dbc": b"text"}, limits=Limits(sync_s=1))
     log.channel("/estimate", SCHEMA, {"rate": "1 Hz"})
     for number, batch in enumerate(ticks(seconds)):
         log.frames(batch)
@@ -510,7 +512,7 @@ def test_a_recorder_completes_what_was_left_of_before_and_nothing_else(tmp_path:
 
 
 def test_a_file_that_an_error_has_cut_off_is_completed_at_once(tmp_path: Path) -> None:
-    log = Recorder(tmp_path, "ref", sync_s=1, retry_s=1000)
+    log = Recorder(tmp_path, "ref", limits=Limits(sync_s=1, retry_s=1000))
     assert not log.complete_one()
     with files_of_at_most(5_000):
         drive(log, ticks(30))
@@ -552,10 +554,10 @@ class Prompt(Background):
 def test_it_goes_on_syncing_though_a_sync_is_done_before_its_caller_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("gz_onboard.bus.recorder.Background", Prompt)
+    monkeypatch.setattr("gz_onboard.bus.background_recorder.Background", Prompt)
     synced: list[int] = []
     monkeypatch.setattr(os, "fdatasync", synced.append)
-    behind = BackgroundRecorder(Recorder(tmp_path, "ref", sync_s=0.5), limit=10**9)
+    behind = BackgroundRecorder(Recorder(tmp_path, "ref", limits=Limits(sync_s=0.5)), limit=10**9)
     for batch in ticks(4):
         behind.frames(batch)
         behind.sync(batch[-1][0])
@@ -575,7 +577,7 @@ def test_a_disk_that_does_not_answer_holds_up_nobody_and_what_is_lost_is_counted
         real(descriptor)
 
     monkeypatch.setattr(os, "fdatasync", late)
-    log = Recorder(tmp_path, "ref", sync_s=0.5)
+    log = Recorder(tmp_path, "ref", limits=Limits(sync_s=0.5))
     behind = BackgroundRecorder(log, limit=2000)
     batches = ticks(20)  # 10000 frames; were it to wait with the disk, it would be for a minute at each sync
     for batch in batches:

@@ -13,8 +13,8 @@ import can
 import pytest
 
 from gz_onboard.bus import replay as command
+from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.readers.pycan import frame_of
-from gz_onboard.bus.recorder import LogFile
 from gz_onboard.bus.replay import Summary, bus_sender, replay
 from gz_onboard.bus.writers import write_candump
 from gz_onboard.errors import InputError

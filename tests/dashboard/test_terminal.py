@@ -24,8 +24,9 @@ from gz_onboard import cli
 from gz_onboard.bus._can import can
 from gz_onboard.bus.mapping import find_dbc
 from gz_onboard.bus.publisher import Counts, Publisher
-from gz_onboard.dashboard import terminal
-from gz_onboard.dashboard.terminal import Style, View
+from gz_onboard.dashboard import screen
+from gz_onboard.dashboard.screen import Style
+from gz_onboard.dashboard.view import View, words
 from gz_onboard.events import ROLES, Activity, Estimate, Frame, Reason, State
 
 REASONS = Reason.NO_IMU | Reason.PRIOR_RIDING
@@ -63,7 +64,7 @@ def seen(estimate: Estimate = ESTIMATE, now: float = 100.0) -> View:
 
 
 def picture(view: View, now: float, width: int = 80) -> str:
-    return "\n".join(terminal.rendered(line, PLAIN) for line in terminal.screen(view, now, "vcan0", width))
+    return "\n".join(screen.rendered(line, PLAIN) for line in screen.screen(view, now, "vcan0", width))
 
 
 def numbers(text: str) -> list[str]:
@@ -89,7 +90,7 @@ def test_it_shows_what_the_daemon_sends():
     ):
         assert shown in text
     assert "Stale" not in text
-    line = terminal.summary_line(seen(), 100.0)
+    line = screen.summary_line(seen(), 100.0)
     assert line == (
         "range 34.2 km (26.5 km to 44.3 km); SOC 62.4 % ± 1.2 %; 895 Wh left; 24.6 Wh/km recent, "
         "26.2 Wh/km expected; degraded; riding; because: no IMU, prior riding"
@@ -115,15 +116,15 @@ def test_an_old_number_is_never_shown_as_if_fresh():
         assert not numbers(text)
         assert "not known" in text
         assert all(f"{name}: last came" in text for name in view.messages)
-        assert set(re.findall(r"[\d.]+ km", terminal.summary_line(view, late))) == set()
+        assert set(re.findall(r"[\d.]+ km", screen.summary_line(view, late))) == set()
 
 
 def test_a_late_number_is_grey():
     grey, fresh = "\x1b[2m34.2 km", "\x1b[1;33m34.2 km"
     drawn = {}
     for now in 100.5, 104.0:
-        lines = terminal.screen(seen(), now, "vcan0", 80)
-        drawn[now] = "\n".join(terminal.rendered(line, Style(colour=True, unicode=True)) for line in lines)
+        lines = screen.screen(seen(), now, "vcan0", 80)
+        drawn[now] = "\n".join(screen.rendered(line, Style(colour=True, unicode=True)) for line in lines)
     assert fresh in drawn[100.5]
     assert grey in drawn[104.0]
 
@@ -133,7 +134,7 @@ def test_nothing_yet():
     assert "none yet" in text
     assert "No frame of       range.dbc" in text
     assert "Is --dbc its range_dbc?" in text
-    assert terminal.summary_line(View(), 5.0).startswith("no frame of range.dbc. Is the daemon on this bus?")
+    assert screen.summary_line(View(), 5.0).startswith("no frame of range.dbc. Is the daemon on this bus?")
     assert not numbers(text)
 
 
@@ -151,23 +152,23 @@ def test_before_the_first_range_it_is_starting(heard):
     frames = publisher.range(Estimate(time=0.0), COUNTS, 0) if heard else []
     for frame in [*frames, *publisher.status(replace(ESTIMATE, state=State.VALID), 0)]:
         view.take(frame, 1.0)
-    line = terminal.summary_line(view, 1.0)
+    line = screen.summary_line(view, 1.0)
     assert "; starting;" in line
     assert "; riding" not in line
     assert "State             starting" in picture(view, 1.0)
     assert "Activity" not in picture(view, 1.0)
     for frame in publisher.range(replace(ESTIMATE, state=State.VALID), COUNTS, 0):
         view.take(frame, 1.1)
-    assert "; valid; riding;" in terminal.summary_line(view, 1.1)
+    assert "; valid; riding;" in screen.summary_line(view, 1.1)
     for frame in publisher.status(replace(ESTIMATE, state=State.INVALID), 0):  # bad news is shown at once
         view.take(frame, 1.2)
-    assert "; invalid; riding;" in terminal.summary_line(view, 1.2)
+    assert "; invalid; riding;" in screen.summary_line(view, 1.2)
 
 
 @pytest.mark.parametrize("activity", Activity)
 def test_what_the_vehicle_does(activity):
     view = seen(replace(ESTIMATE, activity=activity))
-    text, line = picture(view, 100.0), terminal.summary_line(view, 100.0)
+    text, line = picture(view, 100.0), screen.summary_line(view, 100.0)
     if activity is Activity.UNKNOWN:
         assert "Activity" not in text
     else:
@@ -183,7 +184,7 @@ def test_sensors_left_out_are_named():
     assert "Sensors left out  acceleration x, GPS altitude, BMS state of charge\n" in text
     for shown in "sensor distrusted", "signals slow", "SOC restarted":
         assert shown in text
-    assert terminal.summary_line(view, 100.0).endswith(
+    assert screen.summary_line(view, 100.0).endswith(
         "; because: sensor distrusted, signals slow, SOC restarted; "
         "left out: acceleration x, GPS altitude, BMS state of charge"
     )
@@ -196,7 +197,7 @@ def test_all_sensors_left_out_take_several_lines():
     assert len(view.distrusted(100.0)) == len(sendable) > 20
     text = picture(view, 100.0)
     assert "…" not in text
-    assert all(terminal.words(role) in re.sub(r"\s+", " ", text) for role in view.distrusted(100.0))
+    assert all(words(role) in re.sub(r"\s+", " ", text) for role in view.distrusted(100.0))
 
 
 # --- range frames of another file ---------------------------------------------------------------------------------
@@ -258,7 +259,7 @@ def test_a_broken_frame_is_counted_and_not_shown():
     view.take(frame, 1.0)
     assert view.value("RANGE_Remaining", 1.0) == pytest.approx(34.21)
     assert "5 bad" in picture(view, 1.0)
-    assert "5 bad range frames" in terminal.summary_line(view, 1.0)
+    assert "5 bad range frames" in screen.summary_line(view, 1.0)
 
 
 def test_counters():
@@ -301,12 +302,12 @@ def test_nothing_on_the_bus_breaks_it(frames, checksum):
         for width in 10, 80, 300:
             for line in picture(view, now, width).splitlines():
                 assert len(line) <= width
-        terminal.summary_line(view, now)
+        screen.summary_line(view, now)
 
 
 @given(st.floats(0, 660))
 def test_the_scale_is_a_round_number_just_beyond(value):
-    end = terminal._scale_end(value)
+    end = screen._scale_end(value)
     assert value <= end <= max(2 * value, 1)
 
 
@@ -329,8 +330,8 @@ def test_every_line_fits(soc, sd, metres, width):
 
 
 def test_without_colour_and_unicode():
-    lines = terminal.screen(seen(), 100.0, "vcan0", 80)
-    text = "\n".join(terminal.rendered(line, Style(colour=False, unicode=False)) for line in lines)
+    lines = screen.screen(seen(), 100.0, "vcan0", 80)
+    text = "\n".join(screen.rendered(line, Style(colour=False, unicode=False)) for line in lines)
     assert text.isascii()
     assert "\x1b" not in text
     assert "62.4 +- 1.2 %" in text
@@ -584,6 +585,6 @@ def test_in_a_thread_it_leaves_terminal_and_signals_alone(monkeypatch):
 
 
 def test_ages_read_well():
-    assert terminal._duration(3.2) == "3 s"
-    assert terminal._duration(600) == "10 min"
+    assert screen._duration(3.2) == "3 s"
+    assert screen._duration(600) == "10 min"
     assert View().age(1.0) == math.inf

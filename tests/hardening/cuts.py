@@ -23,11 +23,11 @@ from unittest import mock
 
 from mcap.reader import make_reader
 
-from gz_onboard.bus.channel import Channel
+from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.readers.mcap import MAGIC
-from gz_onboard.bus.recorder import Recorder
-from gz_onboard.daemon import Daemon
+from gz_onboard.bus.recorder import Limits, Recorder
+from gz_onboard.daemon.loop import Daemon
 from gz_onboard.events import TRANSMITTED
 from gz_onboard.pipeline import TICK_NS
 from tests.hardening import _ext4
@@ -133,9 +133,9 @@ def cuts(count: int, source: Random, folder: Path, case: str) -> list[Cut]:
     """A hard ride of a daemon, its power cut `count` times: the disk is copied, and it rides on."""
     disk = Disk(folder, source)
     file = folder / "state" / "scooter.json"
-    channel = Channel("virtual", case)
+    channel = CanChannel("virtual", case)
     channel.open()
-    recorder = Recorder(folder / "log", "v", max_file_bytes=200_000)
+    recorder = Recorder(folder / "log", "v", limits=Limits(max_file_bytes=200_000))
     daemon = Daemon(reference(), [channel], recorder, file)
     log, keeper = daemon._log, daemon._keeper
     assert log is not None

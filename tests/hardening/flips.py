@@ -14,7 +14,7 @@ from typing import Any
 
 from gz_onboard import state
 from gz_onboard.bus.codec import Codec
-from gz_onboard.daemon import Daemon
+from gz_onboard.daemon.loop import Daemon
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Event, Group
 from tests.hardening.report import Report

@@ -16,10 +16,10 @@ _FILE = struct.Struct("<4sL8B2Q2L8H8H")
 _OBJECT = struct.Struct("<4sHHLL")  # signature, header size, header version, object size, object type
 _TIME_1 = struct.Struct("<LHHQ")  # flags, client, object version, time
 _TIME_2 = struct.Struct("<LBxHQ8x")
-_CAN = struct.Struct("<HBBL8s")  # channel, flags, length, identifier, data
-_FD = struct.Struct("<HBBLLBBB5x64s")
+CAN = struct.Struct("<HBBL8s")  # channel, flags, length, identifier, data
+FD = struct.Struct("<HBBLLBBB5x64s")
 _FD_64 = struct.Struct("<BBBBLLLLLLLHBBL")
-_ERROR = struct.Struct("<HHLBBBxLLH2x8s")
+ERROR = struct.Struct("<HHLBBBxLLH2x8s")
 _CONTAINER, _CAN_1, _ERROR_EXT, _CAN_2, _FD_1, _FD_2 = 10, 1, 73, 86, 100, 101
 _TEN_MICROSECONDS = 1
 _LARGEST_CONTAINER = 64 << 20  # bytes, unpacked; usual are 128 kB
@@ -179,14 +179,14 @@ def _frame(
     time_ns = start_ns + time * (10_000 if flags == _TEN_MICROSECONDS else 1)
     body = position + _OBJECT.size + time_header.size
     if kind in (_CAN_1, _CAN_2):
-        channel, flags, length, identifier, payload = _CAN.unpack_from(data, body)
+        channel, flags, length, identifier, payload = CAN.unpack_from(data, body)
         return _can(time_ns, channel, flags, length, identifier, payload)
     if kind == _ERROR_EXT:
-        channel, _, _, _, _, length, _, identifier, _, payload = _ERROR.unpack_from(data, body)
+        channel, _, _, _, _, length, _, identifier, _, payload = ERROR.unpack_from(data, body)
         identifier = identifier & _ID_MASK | ERR_FLAG
         return time_ns, identifier, payload[:length], (channel - 1) & 0x7F
     if kind == _FD_1:
-        channel, flags, length, identifier, _, _, _, valid, payload = _FD.unpack_from(data, body)
+        channel, flags, length, identifier, _, _, _, valid, payload = FD.unpack_from(data, body)
         transmitted, remote = flags & 0x01, flags & 0x80
         payload = payload[:valid]
     else:

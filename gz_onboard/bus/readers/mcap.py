@@ -19,8 +19,8 @@ from gz_onboard.errors import InputError
 from gz_onboard.events import Frame
 
 MAGIC = b"\x89MCAP0\r\n"
-_RECORD = struct.Struct("<BQ")
-_CHUNK = struct.Struct("<QQQLL")  # start, end, size and CRC of the unpacked records, length of the compression's name
+RECORD = struct.Struct("<BQ")
+CHUNK = struct.Struct("<QQQLL")  # start, end, size and CRC of the unpacked records, length of the compression's name
 _MESSAGE = struct.Struct("<HLQQ")  # channel, sequence, log time, publish time
 _U16 = struct.Struct("<H")
 _U32 = struct.Struct("<L")
@@ -43,7 +43,7 @@ def read(path: Path, data: Contents, damage: Damage, start: int | None, end: int
             if opcode == _CHANNEL:
                 _channel(data, position, channels, topics)
             elif opcode == _CHUNK_OP:
-                first, last, _, _, _ = _CHUNK.unpack_from(data, position)
+                first, last, _, _, _ = CHUNK.unpack_from(data, position)
                 # The first chunk declares the channels, so it is always unpacked.
                 wanted = (start is None or last + _MARGIN_NS >= start) and (end is None or first - _MARGIN_NS < end)
                 if not wanted and channels:
@@ -157,9 +157,9 @@ def records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, i
     if data[: len(MAGIC)] != MAGIC:
         raise InputError(f"{path}: not an MCAP file: it does not begin with the format's magic bytes")
     position = len(MAGIC)
-    while position + _RECORD.size <= len(data):
-        opcode, length = _RECORD.unpack_from(data, position)
-        content = position + _RECORD.size
+    while position + RECORD.size <= len(data):
+        opcode, length = RECORD.unpack_from(data, position)
+        content = position + RECORD.size
         if opcode in (_DATA_END, _FOOTER):
             return
         if 0 < opcode <= _DATA_END and content + length <= len(data):
@@ -177,11 +177,11 @@ def records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, i
 
 def _next_chunk(data: Contents, position: int) -> int:
     """Where the next chunk record that fits into the file begins, or -1: found by the name of its compression."""
-    offset = _RECORD.size + _CHUNK.size - 4
+    offset = RECORD.size + CHUNK.size - 4
     found = data.find(_ZSTD_CHUNK, position + offset)
     while found >= 0:
-        opcode, length = _RECORD.unpack_from(data, found - offset)
-        if opcode == _CHUNK_OP and found - offset + _RECORD.size + length <= len(data):
+        opcode, length = RECORD.unpack_from(data, found - offset)
+        if opcode == _CHUNK_OP and found - offset + RECORD.size + length <= len(data):
             return found - offset
         found = data.find(_ZSTD_CHUNK, found + 1)
     return -1
@@ -219,10 +219,10 @@ def unpack_chunk(data: Contents, position: int, limit: int) -> bytes:
     """The records in the chunk whose content is from `position` to `limit`. Raises ValueError if it is broken."""
     import zstandard
 
-    if position + _CHUNK.size > limit:
+    if position + CHUNK.size > limit:
         raise ValueError("it is too short")
-    _, _, size, crc, name_length = _CHUNK.unpack_from(data, position)
-    position += _CHUNK.size
+    _, _, size, crc, name_length = CHUNK.unpack_from(data, position)
+    position += CHUNK.size
     if size > _LARGEST_CHUNK:
         raise ValueError(f"it says that it unpacks to {size} bytes")
     if position + name_length + 8 > limit:
@@ -251,10 +251,10 @@ def records_in(content: bytes) -> Iterator[tuple[int, int, int]]:
     """Opcode, start and end of the records of an unpacked chunk. Raises ValueError where one is cut off."""
     position = 0
     while position < len(content):
-        if position + _RECORD.size > len(content):
+        if position + RECORD.size > len(content):
             raise ValueError("it ends within a record")
-        opcode, length = _RECORD.unpack_from(content, position)
-        position += _RECORD.size
+        opcode, length = RECORD.unpack_from(content, position)
+        position += RECORD.size
         if length > len(content) - position:
             raise ValueError("it ends within a record")
         yield opcode, position, position + length

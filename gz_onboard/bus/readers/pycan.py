@@ -141,16 +141,9 @@ def frame_of(message: can.Message, channels: dict[str, int] | None = None) -> Fr
 
     The time is rounded to a microsecond: the message's is a float of seconds, which has no more since 1970.
     """
-    identifier = message.arbitration_id
-    if message.is_extended_id:
-        identifier |= EFF_FLAG
-    if message.is_error_frame:
-        identifier |= ERR_FLAG
-    if message.is_remote_frame:
-        identifier |= RTR_FLAG
-        data = bytes(min(message.dlc, 8))
-    else:
-        data = bytes(message.data)
+    from gz_onboard.bus._can import flagged
+
+    data = bytes(min(message.dlc, 8)) if message.is_remote_frame else bytes(message.data)
     channel: Any = message.channel
     if channel is None:
         channel = 0
@@ -158,7 +151,7 @@ def frame_of(message: can.Message, channels: dict[str, int] | None = None) -> Fr
         channel = (channels if channels is not None else {})[channel]
     return (
         round(message.timestamp * 1e6) * 1000,
-        identifier,
+        flagged(message),
         data,
         channel & 0x7F if message.is_rx else channel & 0x7F | TRANSMITTED,
     )

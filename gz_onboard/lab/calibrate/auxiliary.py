@@ -9,7 +9,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.fit import score
-from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Found, Panel, PlotLine, Result
 from gz_onboard.offline.samples import Samples
 
 NEEDED = ("auxiliary_current", "pack_voltage")
@@ -42,10 +42,9 @@ def auxiliary_power(rides: Sequence[Samples]) -> Result:
         raise InputError(f"{names[0]}: auxiliary power is {value:.3g} W: the current must be positive when consuming")
     spread = float(mean.std(ddof=1)) if len(mean) > 1 else 0.05 * value
     sd = float(np.hypot(spread, CURRENT_SD * value))
-    off, on = float(np.nanmean(without)) if np.isfinite(without).any() else np.nan, np.nan
     source = f"{len(mean)} rides, {int(points.sum())} samples"
     if np.isfinite(lit).any():
-        on = float(np.nanmean(lit))
+        off, on = float(np.nanmean(without)) if np.isfinite(without).any() else np.nan, float(np.nanmean(lit))
         result.notes.append(
             f"{off:.1f} W without, {on:.1f} W with brake light, which shone {100 * share.mean():.0f} % of the time"
         )
@@ -55,23 +54,12 @@ def auxiliary_power(rides: Sequence[Samples]) -> Result:
     result.parameters["auxiliary_power"] = Found(value, sd, "W", source)
     if len(mean) > 1:
         others = np.array([np.delete(mean, k).mean() for k in range(len(mean))])
-        result.fits.append(
-            score(
-                "auxiliary power, mean of a ride",
-                "W",
-                mean,
-                others,
-                held_out=True,
-                source=f"each of {len(mean)} rides by the others",
-            )
-        )
+        by = f"each of {len(mean)} rides by the others"
+        result.fits.append(score("auxiliary power, mean of a ride", "W", mean, others, held_out=True, source=by))
     x = np.arange(len(mean), dtype=float)
-    traces = [
-        Trace("without brake light", x, without, "."),
-        Trace("with brake light", x, lit, "."),
-        Trace("mean", x, np.full(len(x), value)),
-    ]
-    result.panels.append(Panel("Auxiliary power", "ride", "power [W]", tuple(traces)))
+    points_ = PlotLine("without brake light", x, without, "."), PlotLine("with brake light", x, lit, ".")
+    mean_line = PlotLine("mean", x, np.full(len(x), value))
+    result.panels.append(Panel("Auxiliary power", "ride", "power [W]", (*points_, mean_line)))
     return result
 
 

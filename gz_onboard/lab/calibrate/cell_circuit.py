@@ -2,7 +2,7 @@
 
     V = V_oc(SOC) + shift(T) - R0·I - Σ R_k·x_k,    dx_k/dt = (I - x_k)/τ_k
 
-V_k = R_k·x_k (Lord 2016, eqs. 2.22 and 2.23); shift is nothing unless the rests tell one.
+V_k = R_k·x_k (Lord 2016, eqs. 2.22 and 2.23); shift is zero unless the rests show one.
 
 I is the cell's current [A], positive when discharging. With the time constants given, V is linear in every table.
 """

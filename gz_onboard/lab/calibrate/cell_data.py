@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.table import Measurements
 
 FEWEST = 50  # samples
 LONGEST_GAP = 150.0  # s between samples while a current flows
@@ -24,7 +24,7 @@ class CellTest:
     it, 0 before the first; rest: True where no current flows.
     """
 
-    table: Table
+    table: Measurements
     time: Array
     dt: Array
     flowed: Array
@@ -44,7 +44,7 @@ class CellTest:
         return self.table.file.name
 
 
-def cell_test(table: Table) -> CellTest:
+def cell_test(table: Measurements) -> CellTest:
     """The test in `table`: columns time, current, voltage, cell_temperature and, where it has one, charge.
 
     ``charge`` [A·h] is the tester's own counter, of either sign; with it a gap in the samples does no harm. Raises
@@ -86,7 +86,7 @@ def cell_test(table: Table) -> CellTest:
     return CellTest(table, time, dt, flowed, current, volts, temperature, drawn, np.cumsum(starts), ~on)
 
 
-def _check_sign(table: Table, current: Array, volts: Array, dt: Array, drawn: Array, largest: float) -> None:
+def _check_sign(table: Measurements, current: Array, volts: Array, dt: Array, drawn: Array, largest: float) -> None:
     """Discharging must lower the voltage: at once at the steps of the current, or by and by if those are lost in noise.
 
     drawn: the charge [Ah] at each sample, positive when discharging.
@@ -111,7 +111,7 @@ def _check_sign(table: Table, current: Array, volts: Array, dt: Array, drawn: Ar
         )
 
 
-def _check_clipped(table: Table, current: Array, volts: Array, on: NDArray[np.bool_]) -> None:
+def _check_clipped(table: Measurements, current: Array, volts: Array, on: NDArray[np.bool_]) -> None:
     """A voltage that stays at its own largest or least value while the current does not is the instrument's limit.
 
     Holding a voltage with a falling current is not: then the current moves slowly, and changes from sample to sample.

@@ -130,7 +130,7 @@ def fit_branches(of: Pieces, keep: NDArray[np.bool_] | None = None, leave_out: b
     n, branches = len(of.soc), 1 + len(TIMES)
     gram, right = of.gram[used].sum(axis=0), of.right[used].sum(axis=0)
     scale = np.full(branches, 0.02)  # ohm
-    for _ in range(2):  # how far a table may bend is relative to its size, which the first turn tells
+    for _ in range(2):  # how far a table may bend is relative to its size, which the first turn gives
         prior = _smoothness(of.soc, scale, n, branches)
         p = _positive(gram + prior, right, n)
         scale = np.maximum(np.median(p[:-n].reshape(branches, n), axis=1), 2e-3)
@@ -178,7 +178,7 @@ def left_out(a: Array, residual: Array, labels: NDArray[Any], normal: Array) -> 
     """The covariance of a least-squares fit from what leaving out each piece of the data changes (the jackknife).
 
     a: (m, n), residual: (m,), weighted; labels: the piece of each row; normal: (n, n), with priors. A piece pulls the
-    fit towards itself, so that the scatter of what is left over tells too little where pieces are few; the jackknife
+    fit towards itself, so that the scatter of what is left over shows too little where pieces are few; the jackknife
     does not suffer from that (CR3 of Bell & McCaffrey 2002).
     """
     total = np.zeros_like(normal)
@@ -216,7 +216,6 @@ class Pairs:
     r0: float
     resistance: tuple[float, ...]
     time: tuple[float, ...]
-    rms: float  # V per A RMS of the load: what they leave of the many
 
 
 class Reduction:
@@ -229,7 +228,6 @@ class Reduction:
 
         load = np.concatenate(list(loads))
         self._many = np.column_stack([load, *(filtered_by(tau) for tau in TIMES)])
-        self._square = float(np.mean(load**2))
         fast = np.geomspace(3, 300, 50) if count == 1 else np.geomspace(1.5, 120, 26)
         slow = np.geomspace(150, 3000, 16)
         filtered = {float(tau): filtered_by(float(tau)) for tau in (*fast, *(slow if count == 2 else ()))}
@@ -265,8 +263,7 @@ class Reduction:
             j = k + (1 if move > 0 else -1)
             solution = best[k] + abs(move) * (best[j] - best[k])
             times = np.exp(np.log(times) + abs(move) * (np.log(self._times[j]) - np.log(times)))
-        rms = float(np.sqrt(max(cost[k], 0.0) / len(self._many) / self._square)) if np.isfinite(cost[k]) else np.nan
-        return Pairs(float(solution[0]), tuple(map(float, solution[1:])), tuple(map(float, times)), rms)
+        return Pairs(float(solution[0]), tuple(map(float, solution[1:])), tuple(map(float, times)))
 
     def spread(self, resistance: Array, covariance: Array) -> Array:
         """Covariance of a row of `logs`, from that of `resistance`: moved by one sd along the axes of its ellipsoid."""

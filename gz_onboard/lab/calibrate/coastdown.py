@@ -8,6 +8,7 @@ is in `road_load`, the fit in `coastdown_fit`, what makes a run usable in `coast
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from math import sqrt
 
 import numpy as np
@@ -17,8 +18,8 @@ from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.coastdown_fit import RoadFit, covariance_with_nuisance, fit_road
 from gz_onboard.lab.calibrate.coastdown_run import FASTEST, SLOWEST, SPAN, Coast, coast, directions
-from gz_onboard.lab.calibrate.fit import score
-from gz_onboard.lab.calibrate.result import Fit, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.fit import correlation, score
+from gz_onboard.lab.calibrate.result import Fit, Found, Panel, PlotLine, Result
 from gz_onboard.lab.calibrate.road_load import NAMES, RoadLoad, own_wind, roll
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle
@@ -49,54 +50,59 @@ def calibrate(
     twice = {run.name for run in runs if [r.name for r in runs].count(run.name) > 1}
     if twice:
         raise InputError(f"coast-down {sorted(twice)[0]} is given twice")
-    ways = directions(runs)
-    coasts = [coast(run, vehicle, way) for run, way in zip(runs, ways, strict=True)]
+    signs = directions(runs)
+    coasts = [coast(run, vehicle, sign) for run, sign in zip(runs, signs, strict=True)]
     result = Result("coastdown")
-    both = len(set(ways)) == 2
-    free = fit_road(coasts, vehicle, {}, wind_sd, slope_sd)
-    names = list(NAMES)
-    best = free
-    covariance, shares = covariance_with_nuisance(free, free, coasts, vehicle, names)
-    if free.value(NAMES[1]) < 2 * sqrt(covariance[1, 1]) or free.value(NAMES[2]) <= 0:
-        best = fit_road(coasts, vehicle, {NAMES[1]: 0.0}, wind_sd, slope_sd, free.noise)
-        wide = fit_road(coasts, vehicle, {}, wind_sd, slope_sd, free.noise, best)
-        covariance, shares = covariance_with_nuisance(wide, best, coasts, vehicle, names)
-        speed_term, speed_sd = wide.value(NAMES[1]), sqrt(covariance[1, 1])
-        tie = covariance[:, 1] / covariance[1, 1]
-        # About the value that is held, not about the most likely one: its distance counts as an error too.
-        covariance = covariance + np.outer(tie, tie) * speed_term**2
-        told = f"({1e5 * speed_term:.1f} ± {1e5 * speed_sd:.1f})·10⁻⁵ s/m"
-        why = (
-            f"{told} cannot be told from zero (less than 2 sd)"
-            if free.value(NAMES[2]) > 0
-            else f"{told} cannot be told from drag, whose area would be {free.value(NAMES[2]):.2f} m² beside it"
-        )
-        result.refusals.append(
-            f"rolling_resistance_speed: {why}; held at 0 ± {1e5 * sqrt(covariance[1, 1]):.1f}·10⁻⁵, which the other "
-            "two carry"
-        )
+    both = len(set(signs)) == 2
+    best, covariance, shares = _fitted(coasts, vehicle, wind_sd, slope_sd, result)
     if not both:
-        c0_sd = sqrt(covariance[0, 0])
-        together = best.value(NAMES[0]) + ways[0] * best.solution["slope"]
-        way = runs[0].facts.get("direction", "by GPS course")
+        together = best.value(NAMES[0]) + signs[0] * best.solution["slope"]
         result.refusals.append(
-            f"rolling_resistance_constant: all runs go one way ({way}), so that the track's slope and rolling "
-            f"resistance are not separable: together {together:.4f}, apart known to ± {c0_sd:.4f} only (the "
-            f"slope's prior, ± {slope_sd:g}); coast down the other way too"
+            f"rolling_resistance_constant: all runs go one way ({runs[0].facts.get('direction', 'by GPS course')}), so "
+            f"that the track's slope and rolling resistance are not separable: together {together:.4f}, apart known to "
+            f"± {sqrt(covariance[0, 0]):.4f} only (the slope's prior, ± {slope_sd:g}); coast down the other way too"
         )
-    _tell(result, best, coasts, vehicle, names if both else names[1:], covariance, wind_sd)
+    _report(result, best, coasts, vehicle, NAMES if both else NAMES[1:], covariance, wind_sd)
+    largest = sorted(shares.items(), key=lambda item: -abs(item[1]))[:4]
     result.notes.append(
-        "part of the sd of drag_area from what was taken as given: "
-        + ", ".join(f"{name} {abs(s):.4f}" for name, s in sorted(shares.items(), key=lambda item: -abs(item[1]))[:4])
-        + " m²"
+        f"part of the sd of drag_area from what was taken as given: "
+        f"{', '.join(f'{name} {abs(share):.4f}' for name, share in largest)} m²"
     )
-    _correlation_note(result, names, covariance)
+    _correlation_note(result, covariance)
     if "motor_current" in runs[0].columns:
         offset = np.mean([_coasting_current(run, c) for run, c in zip(runs, coasts, strict=True)])
         result.notes.append(f"motor current while coasting reads {offset:.2f} A in mean, taken as its sensor's offset")
     if hold_out and len(coasts) > 2:
         result.fits += _held_out(coasts, vehicle, best.held, wind_sd, slope_sd)
     return result
+
+
+def _fitted(
+    coasts: Sequence[Coast], vehicle: Vehicle, wind_sd: float, slope_sd: float, result: Result
+) -> tuple[RoadFit, Array, dict[str, float]]:
+    """(the fit, covariance of `NAMES`, shares of what was taken as given in the sd of drag area).
+
+    Rolling resistance is held independent of speed, with a refusal, where that cannot be separated from drag.
+    """
+    free = fit_road(coasts, vehicle, {}, wind_sd, slope_sd)
+    covariance, shares = covariance_with_nuisance(free, free, coasts, vehicle, NAMES)
+    if free.value(NAMES[1]) >= 2 * sqrt(covariance[1, 1]) and free.value(NAMES[2]) > 0:
+        return free, covariance, shares
+    best = fit_road(coasts, vehicle, {NAMES[1]: 0.0}, wind_sd, slope_sd, free.noise)
+    wide = fit_road(coasts, vehicle, {}, wind_sd, slope_sd, free.noise, best)
+    covariance, shares = covariance_with_nuisance(wide, best, coasts, vehicle, NAMES)
+    speed_term, speed_sd = wide.value(NAMES[1]), sqrt(covariance[1, 1])
+    tie = covariance[:, 1] / covariance[1, 1]
+    # About the value that is held, not about the most likely one: its distance counts as an error too.
+    covariance = covariance + np.outer(tie, tie) * speed_term**2
+    why = "zero (less than 2 sd)"
+    if free.value(NAMES[2]) <= 0:
+        why = f"drag, whose area would be {free.value(NAMES[2]):.2f} m² beside it"
+    result.refusals.append(
+        f"rolling_resistance_speed: ({1e5 * speed_term:.1f} ± {1e5 * speed_sd:.1f})·10⁻⁵ s/m cannot be told from "
+        f"{why}; held at 0 ± {1e5 * sqrt(covariance[1, 1]):.1f}·10⁻⁵, which the other two carry"
+    )
+    return best, covariance, shares
 
 
 def _coasting_current(run: Samples, c: Coast) -> float:
@@ -107,14 +113,13 @@ def _coasting_current(run: Samples, c: Coast) -> float:
     return float(current[inside].mean()) if inside.any() else 0.0
 
 
-def _correlation_note(result: Result, names: Sequence[str], covariance: Array) -> None:
-    sd = np.sqrt(np.diag(covariance))
-    r = covariance / np.outer(sd, sd)
-    pairs = [f"{a} and {b} {r[i, j]:+.2f}" for i, a in enumerate(names) for j, b in enumerate(names) if i < j]
+def _correlation_note(result: Result, covariance: Array) -> None:
+    r = correlation(covariance)
+    pairs = [f"{NAMES[i]} and {NAMES[j]} {r[i, j]:+.2f}" for i, j in combinations(range(len(NAMES)), 2)]
     result.notes.append(f"correlations: {', '.join(pairs)}")
 
 
-def _tell(
+def _report(
     result: Result,
     road: RoadFit,
     runs: Sequence[Coast],
@@ -166,23 +171,16 @@ def _panels(force: RoadLoad, road: RoadFit, runs: Sequence[Coast], speeds: Seque
     lines, errors, loads = [], [], []
     for run, model in zip(runs, speeds, strict=True):
         time = run.time - run.time[0]
-        lines += [Trace(run.name, time, run.speed, "."), Trace("", time, model, "-")]
-        errors.append(Trace(run.name, time, model - run.speed, "-"))
+        lines += [PlotLine(run.name, time, run.speed, "."), PlotLine("", time, model, "-")]
+        errors.append(PlotLine(run.name, time, model - run.speed, "-"))
         level = run.slowing * (run.mass + force.rotating) - run.direction * slope * run.mass * GRAVITY
-        loads.append(Trace(run.name, run.middle, level, "."))
+        loads.append(PlotLine(run.name, run.middle, level, "."))
     v = np.linspace(SLOWEST, FASTEST, 50)
-    still = Coast(
-        "",
-        v,
-        v,
-        1,
-        None,
-        float(np.mean([run.mass for run in runs])),
-        float(np.mean([run.temperature for run in runs])),
-        0.0,
-        (v, v),
+    mass, temperature = (
+        float(np.mean(column)) for column in zip(*((r.mass, r.temperature) for r in runs), strict=True)
     )
-    loads.append(Trace("model, still air, motor included", v, force(v, still, 0.0, 0.0), "-"))
+    still = Coast("", v, v, 1, None, mass, temperature, 0.0)
+    loads.append(PlotLine("model, still air, motor included", v, force(v, still, 0.0, 0.0), "-"))
     return [
         Panel("Coast-downs", "time [s]", "speed [m/s]", tuple(lines)),
         Panel("Speed, modelled less measured", "time [s]", "error [m/s]", tuple(errors)),
@@ -194,25 +192,25 @@ def _held_out(
     runs: Sequence[Coast], vehicle: Vehicle, held: Mapping[str, float], wind_sd: float, slope_sd: float
 ) -> list[Fit]:
     """Each pair of runs, one each way, followed by a fit of the others: with its own wind free, and at no wind."""
-    ways = [[i for i, run in enumerate(runs) if run.direction == way] for way in (1, -1)]
-    pairs = [list(pair) for pair in zip(*ways, strict=False)] if all(ways) else [[i] for i in range(len(runs))]
+    by_direction = [[run for run in runs if run.direction == sign] for sign in (1, -1)]
+    both = all(by_direction)
+    pairs = list(zip(*by_direction, strict=False)) if both else [(run,) for run in runs]
     data: list[Array] = []
     free: list[Array] = []
     still: list[Array] = []
     for pair in pairs:
-        rest = [run for i, run in enumerate(runs) if i not in pair]
-        if not rest or (all(ways) and len({run.direction for run in rest}) < 2):
+        rest = [run for run in runs if run.name not in [other.name for other in pair]]
+        if not rest or (both and len({run.direction for run in rest}) < 2):
             continue
         road = fit_road(rest, vehicle, held, wind_sd, slope_sd)
         force, slope = road.force(vehicle), road.solution["slope"]
-        for i in pair:
-            run = runs[i]
+        for run in pair:
             data.append(run.speed)
             still.append(roll(force, run, slope, 0.0, run.time))
             free.append(roll(force, run, slope, own_wind(force, run, slope), run.time))
     if not data:
         return []
-    source = f"one {'pair' if all(ways) else 'run'} at a time left out of {_names(runs)}"
+    source = f"one {'pair' if both else 'run'} at a time left out of {_names(runs)}"
     measured = np.concatenate(data)
     return [
         score("speed, own wind free", "m/s", measured, np.concatenate(free), held_out=True, source=source),

@@ -7,8 +7,8 @@ would count as independent and the standard deviations would be too small (Kariy
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from math import sqrt
 
@@ -31,7 +31,7 @@ _STEP = {"rolling_resistance_constant": 1e-4, "rolling_resistance_speed": 1e-5, 
 
 
 @dataclass(frozen=True)
-class Noise:
+class CoastdownNoise:
     """What no parameter explains: speed noise at the ends of a span [m/s]; gusts [m/s], lasting [s]."""
 
     speed: float
@@ -39,12 +39,15 @@ class Noise:
     lasting: float
 
 
+START_NOISE = CoastdownNoise(0.02, 0.5, 5.0)
+
+
 @dataclass(frozen=True)
 class RoadFit:
     """A fit of all runs: its solution over `NAMES` (but for those held), ``slope`` and each run's ``wind NAME``."""
 
     solution: Solution
-    noise: Noise
+    noise: CoastdownNoise
     held: dict[str, float]
 
     def value(self, name: str) -> float:
@@ -66,7 +69,7 @@ def fit_road(
     held: Mapping[str, float],
     wind_sd: float,
     slope_sd: float,
-    noise: Noise | None = None,
+    noise: CoastdownNoise | None = None,
     start: RoadFit | None = None,
 ) -> RoadFit:
     """All runs at once: Gauss-Newton in the parameters and, unless given, maximum likelihood of the noise.
@@ -80,39 +83,60 @@ def fit_road(
         prior["rolling_resistance_speed"] = (0.0, SPEED_PRIOR)
     value = {"rolling_resistance_constant": 0.012, "rolling_resistance_speed": 0.0, "drag_area": 0.5}
     value |= dict.fromkeys(("slope", *winds), 0.0) | (start.values() if start else {}) | dict(held)
-    known, solution = noise, None
+    now, solution = noise or START_NOISE, None
     for step in range(1 if start else 4):
-        now = known or Noise(0.02, 0.5, 5.0)
-        columns, left = _linearised(runs, vehicle, value, names, now.gust)
+        here = _linearised(runs, vehicle, value, names, now.gust)
         if noise is None and step == 1:
-            known = now = _likely(runs, vehicle, value, columns, left, names, prior, now)
-        whitened, target = _whiten(runs, value, now, columns, left, names, value)
-        solution = linear(whitened, target, 1.0, prior=prior)
+            now = _likely(here, prior, now)
+        whole = np.vstack([white for _, white in here.whitened(now)])
+        target = whole[:, -1] + whole[:, :-1] @ here.centre  # such that the solution is the whole value
+        solution = linear({name: whole[:, i] for i, name in enumerate(names)}, target, 1.0, prior=prior)
         value |= {name: solution[name] for name in names}
     assert solution
-    return RoadFit(solution, known or Noise(0.02, 0.5, 5.0), dict(held))
+    return RoadFit(solution, now, dict(held))
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """The deceleration of the runs, linear about `value`.
+
+    blocks: of each run its derivatives by `names`, and last what is measured over what is modelled.
+    """
+
+    runs: Sequence[Coast]
+    names: Sequence[str]
+    value: Mapping[str, float]
+    blocks: list[Array]
+
+    @property
+    def centre(self) -> Array:
+        """The values that it is linear about, in the order of `names`."""
+        return np.array([self.value[name] for name in self.names])
+
+    def whitened(self, noise: CoastdownNoise) -> Iterator[tuple[float, Array]]:
+        """Of each run the ln of the determinant of its covariance, and its block in units of independent noise of 1."""
+        drag_area = max(self.value["drag_area"], 0.02)
+        for run, block in zip(self.runs, self.blocks, strict=True):
+            root = cholesky(_covariance(run, drag_area, noise), lower=True, check_finite=False)
+            yield 2 * float(np.log(np.diag(root)).sum()), solve_triangular(root, block, lower=True, check_finite=False)
 
 
 def _linearised(
     runs: Sequence[Coast], vehicle: Vehicle, value: Mapping[str, float], names: Sequence[str], gust: float
-) -> tuple[dict[str, list[Array]], list[Array]]:
-    """Derivative of each run's deceleration by each of `names`, and what is measured over what is modelled.
-
-    Gusts of `gust` [m/s] add their mean square to that of the flow.
-    """
+) -> _Linear:
+    """The runs' deceleration about `value`. Gusts of `gust` [m/s] add their mean square to that of the flow."""
     here = RoadLoad(vehicle, {name: value[name] for name in NAMES})
     moved = {
         name: RoadLoad(vehicle, {n: value[n] + (_STEP[n] if n == name else 0.0) for n in NAMES})
         for name in names
         if name in NAMES
     }
-    columns: dict[str, list[Array]] = {name: [] for name in names}
-    left = []
+    blocks = []
     for run in runs:
         v, slope, wind = run.middle, value["slope"], value[f"wind {run.name}"]
         base = here.slowing(v, run, slope, wind)
         gusty = 0.5 * air_density(run.temperature, run.altitude) * value["drag_area"] * gust**2 / run.mass
-        left.append(run.slowing - base - gusty)
+        columns = []
         for name in names:
             if name in NAMES:
                 column = (moved[name].slowing(v, run, slope, wind) - base) / _STEP[name]
@@ -122,11 +146,12 @@ def _linearised(
                 column = (here.slowing(v, run, slope, wind + 1e-3) - here.slowing(v, run, slope, wind - 1e-3)) / 2e-3
             else:
                 column = np.zeros(len(v))
-            columns[name].append(np.broadcast_to(column, v.shape))
-    return columns, left
+            columns.append(np.broadcast_to(column, v.shape))
+        blocks.append(np.column_stack([*columns, run.slowing - base - gusty]))
+    return _Linear(runs, names, value, blocks)
 
 
-def _covariance(run: Coast, drag_area: float, noise: Noise) -> Array:
+def _covariance(run: Coast, drag_area: float, noise: CoastdownNoise) -> Array:
     """Of the deceleration of the spans: gusts that last, and speed noise that neighbouring spans share."""
     n, dt = len(run.middle), SPAN
     at = (run.time[1:] + run.time[:-1]) / 2
@@ -137,54 +162,19 @@ def _covariance(run: Coast, drag_area: float, noise: Noise) -> Array:
     return result
 
 
-def _whiten(
-    runs: Sequence[Coast],
-    value: Mapping[str, float],
-    noise: Noise,
-    columns: Mapping[str, list[Array]],
-    left: Sequence[Array],
-    names: Sequence[str],
-    about: Mapping[str, float],
-) -> tuple[dict[str, Array], Array]:
-    """Columns and target in units of independent noise of 1, the target such that the solution is the whole value."""
-    tall: list[Array] = []
-    for i, run in enumerate(runs):
-        root = cholesky(_covariance(run, max(value["drag_area"], 0.02), noise), lower=True)
-        block = np.column_stack([*(columns[name][i] for name in names), left[i]])
-        tall.append(solve_triangular(root, block, lower=True))
-    whole = np.vstack(tall)
-    centre = np.array([about[name] for name in names])
-    return {name: whole[:, i] for i, name in enumerate(names)}, whole[:, -1] + whole[:, :-1] @ centre
-
-
-def _likely(
-    runs: Sequence[Coast],
-    vehicle: Vehicle,
-    value: Mapping[str, float],
-    columns: Mapping[str, list[Array]],
-    left: Sequence[Array],
-    names: Sequence[str],
-    prior: Mapping[str, tuple[float, float]],
-    start: Noise,
-) -> Noise:
+def _likely(here: _Linear, prior: Mapping[str, tuple[float, float]], start: CoastdownNoise) -> CoastdownNoise:
     """The noise of greatest restricted likelihood (REML: Patterson & Thompson 1971), the parameters marginal."""
-    drag = max(value["drag_area"], 0.02)
-    blocks = [np.column_stack([*(columns[name][i] for name in names), left[i]]) for i in range(len(runs))]
-    centre = np.array([value[name] for name in names])
-    precision = np.zeros(len(names))
-    pull = np.zeros(len(names))
+    centre = here.centre
+    precision, pull = np.zeros((2, len(centre)))
     for name, (mean, sd) in prior.items():
-        precision[names.index(name)] = sd**-2
-        pull[names.index(name)] = mean
+        precision[here.names.index(name)] = sd**-2
+        pull[here.names.index(name)] = mean
 
     def minus_log(x: Array) -> float:
-        noise = Noise(*np.exp(x).tolist())
         logs, normal, right, square = 0.0, np.diag(precision).copy(), precision * (pull - centre), 0.0
-        for run, block in zip(runs, blocks, strict=True):
-            root = cholesky(_covariance(run, drag, noise), lower=True, check_finite=False)
-            white = solve_triangular(root, block, lower=True, check_finite=False)
+        for log_determinant, white in here.whitened(CoastdownNoise(*np.exp(x).tolist())):
             a, y = white[:, :-1], white[:, -1]
-            logs += 2 * float(np.log(np.diag(root)).sum())
+            logs += log_determinant
             normal += a.T @ a
             right = right + a.T @ y
             square += float(y @ y)
@@ -197,7 +187,7 @@ def _likely(
 
     x0 = np.log([start.speed, start.gust, start.lasting])
     best = minimize(minus_log, x0, method="Nelder-Mead", options={"xatol": 0.1, "fatol": 0.1, "maxiter": 120})
-    return Noise(*np.exp(best.x).tolist())
+    return CoastdownNoise(*np.exp(best.x).tolist())
 
 
 def covariance_with_nuisance(
@@ -211,7 +201,6 @@ def covariance_with_nuisance(
     p = vehicle.parameters
     solution = road.solution
     value = about.values()
-    columns, left = _linearised(runs, vehicle, value, solution.names, road.noise.gust)
     base = {name: value[name] for name in NAMES}
     motor = [n for e in vehicle.model.effects if e.port is Port.MOTOR_LOSS for n in e.keywords if p.sd(n) > 0]
     drag = [
@@ -235,11 +224,11 @@ def covariance_with_nuisance(
     heavy = RoadLoad(vehicle, base | {"_mass": mass_sd})
     moved.append(("mass", lambda run: at(heavy, run) - at(here, run)))
     moved.append(("air density", lambda run: at(here, run, 1 + _DENSITY_SD) - at(here, run)))
-    wide = {**columns, **{name: [shift(run) for run in runs] for name, shift in moved}}
-    every = [*solution.names, *(name for name, _ in moved)]
-    white, _ = _whiten(runs, value, road.noise, wide, left, every, dict.fromkeys(every, 0.0))
-    x = np.column_stack([white[name] for name in solution.names])
-    d = np.column_stack([white[name] for name, _ in moved])
+    linear_ = _linearised(runs, vehicle, value, solution.names, road.noise.gust)
+    moves = [np.column_stack([move(run) for _, move in moved]) for run in runs]
+    wide = replace(linear_, blocks=[np.hstack(pair) for pair in zip(linear_.blocks, moves, strict=True)])
+    white = np.vstack([white for _, white in wide.whitened(road.noise)])
+    x, d = white[:, : len(solution.names)], white[:, -len(moved) :]
     shift = -solution.covariance / solution.variance @ x.T @ d  # by one sd of each
     correlation = np.eye(len(moved))
     known = p.covariance(drag)

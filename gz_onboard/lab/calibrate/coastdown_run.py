@@ -10,32 +10,23 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples, read_facts
 from gz_onboard.vehicle import Vehicle
 
 SPAN = 2.0  # s
 FASTEST, SLOWEST = 12.5, 1.0  # m/s: within these the run is fitted
-SHORTEST, LEAST_FALL = 10.0, 3.0  # s, m/s: less than this tells nothing
+SHORTEST, LEAST_FALL = 10.0, 3.0  # s, m/s: less than this is of no use
 DRIVING = 2.0  # A of the motor beside its offset, mean of a span of coasting
 RISING = 0.2  # m/s from one `RISE_TIME` to the next
 RISE_TIME = 5.0  # s
 CLOSED = 0.02  # of the throttle: below is noise
 
-_ROLES = {"speed": "vehicle_speed"} | dict.fromkeys(
-    (
-        "vehicle_speed",
-        "motor_speed",
-        "wheel_speed_rear",
-        "throttle",
-        "brake_switch",
-        "motor_current",
-        "ambient_temperature",
-        "gps_altitude",
-        "gps_course",
-    ),
-    "",
+_MEASURED = (
+    "vehicle_speed motor_speed wheel_speed_rear throttle brake_switch motor_current ambient_temperature gps_altitude "
+    "gps_course"
 )
+_ROLES = {"speed": "vehicle_speed"} | dict.fromkeys(_MEASURED.split(), "")  # column -> role, where that is another
 
 
 @dataclass(frozen=True)
@@ -53,7 +44,6 @@ class Coast:
     mass: float  # kg, all
     temperature: float  # degC
     altitude: float  # m
-    samples: tuple[Array, Array]  # time, speed as measured
 
     @property
     def middle(self) -> Array:
@@ -67,12 +57,12 @@ class Coast:
         return result
 
 
-def samples(table: Table, facts: Mapping[str, object] | None = None) -> Samples:
+def samples(table: Measurements, facts: Mapping[str, object] | None = None) -> Samples:
     """The coast-down in `table`, of ``time`` and ``speed`` [m/s] (or ``motor_speed``) and, if it has them, more roles.
 
     facts: what was written down of it; None: in a ``rides.json`` beside the table. It needs ``direction`` (``up`` or
-    ``down``, or any two words for the two ways), ``rider_mass_kg`` or ``total_mass_kg``, and ``ambient_C`` if there is
-    no column ambient_temperature. Raises InputError naming file, line and column.
+    ``down``, or any two words), ``rider_mass_kg`` or ``total_mass_kg``, and ``ambient_C`` if there is no column
+    ambient_temperature. Raises InputError naming file, line and column.
     """
     time = table["time"]
     again = np.flatnonzero(np.diff(time) <= 0)
@@ -107,12 +97,12 @@ def coast(run: Samples, vehicle: Vehicle, direction: int) -> Coast:
         rolling &= np.interp(time, *run.columns["throttle"]) < CLOSED
     if "brake_switch" in run.columns:
         rolling &= np.interp(time, *run.columns["brake_switch"]) < 0.5
-    told = "throttle" in run.columns or "brake_switch" in run.columns
+    switched = "throttle" in run.columns or "brake_switch" in run.columns
     first, last = _longest(rolling, time)
-    settle = 0.5 if told else 0.0  # s, until the current has died away
+    settle = 0.5 if switched else 0.0  # s, until the current has died away
     keep = slice(int(np.searchsorted(time, time[first] + settle)), last)
     time, speed = time[keep], speed[keep]
-    if not told and len(speed):  # nothing but speed: from its greatest on
+    if not switched and len(speed):  # nothing but speed: from its greatest on
         time, speed = time[int(np.argmax(speed)) :], speed[int(np.argmax(speed)) :]
     from_top = int(np.argmax(speed <= FASTEST)) if len(speed) and speed[0] > FASTEST else 0
     slow = np.flatnonzero(speed < SLOWEST)
@@ -134,17 +124,8 @@ def coast(run: Samples, vehicle: Vehicle, direction: int) -> Coast:
     payload = run.rider_mass if run.rider_mass is not None else p["payload_mass"]
     mass = float(total) if isinstance(total, int | float) else p["vehicle_mass"] + payload
     altitude = float(np.median(run.columns["gps_altitude"][1])) if "gps_altitude" in run.columns else 0.0
-    return Coast(
-        run.name,
-        ends,
-        at,
-        direction,
-        None if total is not None else payload,
-        mass,
-        _temperature(run),
-        altitude,
-        (time, speed),
-    )
+    known = None if total is not None else payload
+    return Coast(run.name, ends, at, direction, known, mass, _temperature(run), altitude)
 
 
 def run_start(run: Samples) -> float:
@@ -247,7 +228,7 @@ def _smooth(time: Array, speed: Array, ends: Array) -> Array:
 def directions(runs: Sequence[Samples]) -> list[int]:
     """+1 or -1 for each run: as noted (``direction``; the first alphabetically but ``up`` is +1), else by GPS course.
 
-    Raises InputError if neither tells.
+    Raises InputError if there is neither.
     """
     noted = [run.facts.get("direction") for run in runs]
     if all(isinstance(word, str) for word in noted):

@@ -11,7 +11,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.cooling import PERIOD
@@ -19,11 +19,11 @@ from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import total
 from gz_onboard.vehicle import Vehicle
 
-SHORTEST = 300.0  # s: less tells nothing of time constants of minutes
+SHORTEST = 300.0  # s: less says nothing of time constants of minutes
 
 
 @dataclass(frozen=True)
-class Run:
+class CoolingRun:
     """One run at `PERIOD` spacing, every array of shape (n,); powers in W, temperatures in degC.
 
     still: on a bench or a roller, without the airflow of riding. iron: the part of the motor's heat that grows with
@@ -44,7 +44,7 @@ class Run:
     measured: dict[str, Array]
 
 
-def bench_run(table: Table, vehicle: Vehicle) -> Run:
+def bench_run(table: Measurements, vehicle: Vehicle) -> CoolingRun:
     """A run of motor and inverter in a closed room with their losses measured. InputError naming what is missing."""
     time = table["time"]
     grid = _grid(time, table.file.name)
@@ -64,7 +64,7 @@ def bench_run(table: Table, vehicle: Vehicle) -> Run:
     nothing = np.zeros_like(grid)
     iron = nothing + vehicle.model.idle_loss({"motor_speed": turning, "motor_temperature": 25.0})
     radius = vehicle.parameters["wheel_radius"] * vehicle.parameters["gear_ratio"]
-    return Run(
+    return CoolingRun(
         table.file.name,
         True,
         grid,
@@ -79,7 +79,7 @@ def bench_run(table: Table, vehicle: Vehicle) -> Run:
     )
 
 
-def ride_run(ride: Samples, vehicle: Vehicle) -> Run:
+def ride_run(ride: Samples, vehicle: Vehicle) -> CoolingRun:
     """A ride or dynamometer run with the heat that the vehicle's own losses give. InputError for signals it lacks."""
     for role in ("motor_speed", "motor_current", "motor_temperature", "ambient_temperature", "pack_current"):
         if role not in ride.columns:
@@ -106,14 +106,14 @@ def ride_run(ride: Samples, vehicle: Vehicle) -> Run:
     amperes = (pack_current - vehicle.parameters["pack_current_offset"]) / vehicle.parameters["pack_current_gain"]
     measured = {name: at(name) for name in SENSORS if name in ride.columns}
     inside = [at(role) for role in ride.columns if role.startswith("pack_temperature_")]
-    if inside:  # the mean of thermocouples tells more than the BMS's whole degrees
+    if inside:  # the mean of thermocouples is finer than the BMS's whole degrees
         measured["cell_temperature"] = np.mean(inside, axis=0)
     mean, square = _means(pack_time, amperes, grid), _means(pack_time, amperes**2, grid)
     radius = vehicle.parameters["wheel_radius"] * vehicle.parameters["gear_ratio"]
     pack_heat = np.zeros_like(grid)
     if vehicle.battery and "cell_temperature" in measured and "pack_voltage" in ride.columns:
         pack_heat = _pack_heat(vehicle, mean, square, measured["cell_temperature"], at("pack_voltage")[:5].mean())
-    return Run(
+    return CoolingRun(
         ride.name,
         "roller_speed" in ride.columns,
         grid,
@@ -128,13 +128,7 @@ def ride_run(ride: Samples, vehicle: Vehicle) -> Run:
     )
 
 
-SENSORS = (
-    "motor_temperature",
-    "inverter_temperature",
-    "inverter_box_temperature",
-    "cell_temperature",
-    "bms_temperature",
-)
+SENSORS = tuple(f"{part}_temperature" for part in ("motor", "inverter", "inverter_box", "cell", "bms"))
 
 
 def _grid(time: Array, name: str) -> Array:

@@ -27,15 +27,14 @@ Residual = Callable[[Array], Array]
 class Solution:
     """Parameters that fit best.
 
-    value: shape (n,) in the order of `names`. covariance: (n, n). information: (n, n), the Fisher information of the
-    data alone, without priors. residual: (m,), weighted (in units of its sd if one was given), model less data.
-    variance: of a weighted residual, by which the covariance was scaled: 1 if the sd given is right.
+    value: shape (n,) in the order of `names`. covariance: (n, n). residual: (m,), weighted (in units of its sd if one
+    was given), model less data. variance: of a weighted residual, by which the covariance was scaled: 1 if the sd given
+    is right.
     """
 
     names: tuple[str, ...]
     value: Array
     covariance: Array
-    information: Array
     residual: Array
     variance: float
 
@@ -49,11 +48,7 @@ class Solution:
 
     def correlation(self) -> Array:
         """(n, n); zero for a parameter without spread."""
-        sd = np.sqrt(np.diag(self.covariance))
-        scale = np.where(sd > 0, sd, np.inf)
-        result: Array = self.covariance / np.outer(scale, scale)
-        np.fill_diagonal(result, 1.0)
-        return result
+        return correlation(self.covariance)
 
     def part(self, names: Sequence[str]) -> Array:
         """The covariance of `names`, in that order."""
@@ -63,6 +58,17 @@ class Solution:
     def found(self, name: str, unit: str, source: str, sd_more: float = 0.0) -> Found:
         """`name` as a result. sd_more: a further standard deviation that no sample shows, such as of the sensor."""
         return Found(self[name], float(np.hypot(self.sd(name), sd_more)), unit, source)
+
+
+def correlation(covariance: Array) -> Array:
+    """The correlation of a covariance, exactly symmetric; nothing is correlated with what has no spread."""
+    sd = np.sqrt(np.diag(covariance))
+    scale = np.where(sd > 0, sd, np.inf)
+    matrix = np.clip(covariance / np.outer(scale, scale), -1.0, 1.0)
+    matrix = (matrix + matrix.T) / 2
+    np.fill_diagonal(matrix, 1.0)
+    result: Array = matrix
+    return result
 
 
 def linear(
@@ -75,7 +81,7 @@ def linear(
 ) -> Solution:
     """The parameters p (one for each of `columns`, shape (m,)) for which sum(p·column) is nearest to y, shape (m,).
 
-    sd: of y, of one sample or of each; without it the residuals tell. prior: (value, sd) of parameters that more is
+    sd: of y, of one sample or of each; without it the residuals give it. prior: (value, sd) of parameters that more is
     known of. groups: label of each sample, (m,), where samples of one label depend on each other.
     Raises InputError for fewer samples than parameters, or columns that depend on each other without a prior.
     """
@@ -89,6 +95,21 @@ def linear(
     _check(names, full, len(y), size)
     value = np.linalg.lstsq(full / size, target, rcond=None)[0] / size
     return _solution(names, value, jacobian, jacobian @ value - y * weight, rows, sd is not None, groups)
+
+
+def line(
+    name: str, x: Array, y: Array, keep: Mask, groups: NDArray[Any] | None = None
+) -> tuple[Solution, Array, Array]:
+    """(slope `name` and ``offset`` of the line through y over x; its y; that of the line through the points `keep`)."""
+    columns = {name: x, "offset": np.ones_like(x)}
+    found = linear(columns, y, groups=groups)
+    part = linear({key: column[keep] for key, column in columns.items()}, y[keep])
+    return found, found[name] * x + found["offset"], part[name] * x + part["offset"]
+
+
+def as_groups(labels: NDArray[Any]) -> NDArray[Any] | None:
+    """`labels` as groups for `linear`; None for two or fewer, whose scatter says nothing."""
+    return labels if len(np.unique(labels)) > 2 else None
 
 
 def nonlinear(
@@ -170,7 +191,6 @@ def _solution(
     freedom = len(residual) + len(rows) - len(names)
     mean_square = float(residual @ residual) / freedom if freedom > 0 else float("nan")
     variance = max(1.0, mean_square) if known_sd else mean_square
-    information = jacobian.T @ jacobian / (variance or 1.0)
     # Prior rows are in units of a weighted residual's sd: of 1 where that is known.
     prior = rows.T @ rows * (variance if known_sd else 1.0)
     bread = jacobian.T @ jacobian + prior
@@ -188,7 +208,7 @@ def _solution(
         independent = inverse * variance
         short = np.sqrt(np.maximum(np.diag(independent) / np.maximum(np.diag(covariance), 1e-300), 1.0))
         covariance = covariance * np.outer(short, short)
-    return Solution(names, value, covariance, information, residual, variance)
+    return Solution(names, value, covariance, residual, variance)
 
 
 def split(count: int, share: float = 1 / 3, seed: int = 0) -> Mask:
@@ -196,6 +216,11 @@ def split(count: int, share: float = 1 / 3, seed: int = 0) -> Mask:
     keep = np.ones(count, dtype=bool)
     keep[np.random.default_rng(seed).permutation(count)[: round(share * count)]] = False
     return keep
+
+
+def every_second(labels: NDArray[Any]) -> Mask:
+    """True for the points to fit: those with an even label, or as of `split` where all have one label."""
+    return np.asarray(labels % 2 == 0) if len(np.unique(labels)) > 1 else split(len(labels))
 
 
 def score(what: str, unit: str, data: Array, model: Array, *, held_out: bool, source: str) -> Fit:

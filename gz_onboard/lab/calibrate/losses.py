@@ -7,16 +7,16 @@ The maps are the package's effects motor_copper_loss, motor_iron_loss and invert
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.calibrate import motor
 from gz_onboard.lab.calibrate.fit import Solution, linear, score, split
 from gz_onboard.lab.calibrate.motor import RIDING_CURRENT, Bench
-from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.result import Found, Panel, PlotLine, Result, compared
+from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.physics.effects import inverter_loss, motor_iron_loss
 
+CURRENT = "motor current, RMS [A]"
 TIED = ("torque_constant", "motor_copper_resistance", "motor_iron_linear", "motor_iron_quadratic")
 UNITS = {
     "motor_copper_resistance": "ohm",
@@ -28,7 +28,7 @@ UNITS = {
 }
 
 
-def motor_losses(dyno: Table, largest_current: float = RIDING_CURRENT) -> Result:
+def motor_losses(dyno: Measurements, largest_current: float = RIDING_CURRENT) -> Result:
     """motor_copper_resistance [ohm], motor_iron_linear [W·s/rad], motor_iron_quadratic [W·s²/rad²] of steady points.
 
     They are tied to the torque_constant of `motor.torque_constant`, which comes out of the same fit.
@@ -57,7 +57,7 @@ def motor_losses(dyno: Table, largest_current: float = RIDING_CURRENT) -> Result
             f"motor_copper_temperature_coefficient: {name} spans {spread:.0f} K only, copper's own is taken"
         )
     result.panels += [
-        *_panels("Motor loss", bench.current, bench.loss, model),
+        *compared("Motor loss", CURRENT, "loss [W]", bench.current, bench.loss, model, "x"),
         _efficiency("Motor efficiency (derived)", bench.speed, bench.torque, bench.loss, model),
     ]
     return result
@@ -87,7 +87,7 @@ def _copper_with_speed(result: Result, found: Solution, bench: Bench) -> None:
         )
 
 
-def inverter_losses(dyno: Table, largest_current: float = RIDING_CURRENT) -> Result:
+def inverter_losses(dyno: Measurements, largest_current: float = RIDING_CURRENT) -> Result:
     """inverter_loss_constant [W], _linear [W/A], _quadratic [W/A²] of steady points: DC less AC power."""
     current, loss = dyno["motor_current"], dyno["dc_power"] - dyno["ac_power"]
     name = dyno.file.name
@@ -101,10 +101,7 @@ def inverter_losses(dyno: Table, largest_current: float = RIDING_CURRENT) -> Res
             "for a loss over current of three parameters"
         )
     keep = split(len(use))
-    found, held = (
-        _inverter(current, loss, dyno["dc_power"], use),
-        _inverter(current, loss, dyno["dc_power"], use & keep),
-    )
+    found, held = (_inverter(current, loss, dyno["dc_power"], points) for points in (use, use & keep))
     model = _inverter_model(found, current)
     result = Result("inverter_losses")
     inside = score("inverter loss", "W", loss[use], model[use], held_out=False, source=name)
@@ -127,23 +124,17 @@ def inverter_losses(dyno: Table, largest_current: float = RIDING_CURRENT) -> Res
         f"inverter loss over speed: {more['speed']:+.3f} ± {more.sd('speed'):.3f} W·s/rad, "
         + ("which the effect does not know" if sure else "no term is asked for")
     )
-    mechanical = dyno["ac_power"]
+    power = dyno["ac_power"]
+    measured = PlotLine("measured", power, _ratio(power, loss), ".")
+    lines = measured, PlotLine("model", power, _ratio(power, model), "x")
     result.panels += [
-        *_panels("Inverter loss", current, loss, model),
-        Panel(
-            "Inverter efficiency (derived)",
-            "AC power [W]",
-            "efficiency [%]",
-            (
-                Trace("measured", mechanical, _ratio(mechanical, loss), "."),
-                Trace("model", mechanical, _ratio(mechanical, model), "x"),
-            ),
-        ),
+        *compared("Inverter loss", CURRENT, "loss [W]", current, loss, model, "x"),
+        Panel("Inverter efficiency (derived)", "AC power [W]", "efficiency [%]", lines),
     ]
     return result
 
 
-def _inverter(current: Array, loss: Array, power: Array, use: NDArray[np.bool_]) -> Solution:
+def _inverter(current: Array, loss: Array, power: Array, use: Mask) -> Solution:
     """The three parameters of the points `use`. A point's sd grows with its power, as an analyser's does."""
     i, y = current[use], loss[use]
     columns = {
@@ -169,14 +160,6 @@ def _inverter_model(found: Solution, current: Array) -> Array:
     return result
 
 
-def _panels(title: str, current: Array, loss: Array, model: Array) -> list[Panel]:
-    x = "motor current, RMS [A]"
-    return [
-        Panel(title, x, "loss [W]", (Trace("measured", current, loss, "."), Trace("model", current, model, "x"))),
-        Panel(f"{title}: residual", x, "measured less model [W]", (Trace("residual", current, loss - model, "."),)),
-    ]
-
-
 def _ratio(power: Array, loss: Array) -> Array:
     """Efficiency [%] of giving `power` [W] forward, or of taking it back where it is negative; nan near no power."""
     forward = power / np.where(power + loss > 0, power + loss, np.nan)
@@ -187,5 +170,8 @@ def _ratio(power: Array, loss: Array) -> Array:
 
 def _efficiency(title: str, speed: Array, torque: Array, loss: Array, model: Array) -> Panel:
     power = torque * speed
-    traces = (Trace("measured", torque, _ratio(power, loss), "."), Trace("model", torque, _ratio(power, model), "x"))
+    traces = (
+        PlotLine("measured", torque, _ratio(power, loss), "."),
+        PlotLine("model", torque, _ratio(power, model), "x"),
+    )
     return Panel(title, "torque [N·m]", "efficiency [%]", traces)

@@ -12,12 +12,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gz_onboard.arrays import Array
-from gz_onboard.lab.calibrate.fit import Solution, linear, score, split
-from gz_onboard.lab.calibrate.result import Fit, Panel, Result, Trace
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.arrays import Array, Mask
+from gz_onboard.lab.calibrate.fit import Solution, line, linear, score, split
+from gz_onboard.lab.calibrate.result import Fit, Panel, PlotLine, Result, compared
+from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.physics.effects import motor_copper_loss
 
 RIDING_CURRENT = 120.0  # A: larger ones are short, and the constant falls with them
@@ -25,7 +24,7 @@ COPPER = 0.00393  # 1/K (IEC 60034-1)
 ROUGH = 0.02  # a point's torque sd is not known better than to this share of the greatest torque
 
 
-def voltage_constant(ramp: Table) -> Result:
+def voltage_constant(ramp: Measurements) -> Result:
     """voltage_constant [V·s/rad, line to line, RMS] out of `motor_speed` and `emf_line` at no torque.
 
     The slope of a line with a free offset. Raises InputError for fewer than 5 points, speeds that hardly differ, or
@@ -36,41 +35,21 @@ def voltage_constant(ramp: Table) -> Result:
         raise ramp.error(f"{len(speed)} points are too few for a line; 5 are needed")
     if np.ptp(speed) < 0.3 * np.max(np.abs(speed)):
         raise ramp.error(f"motor_speed {speed.min():.4g} to {speed.max():.4g} rad/s is too narrow a range for a slope")
-    columns = {"voltage_constant": speed, "offset": np.ones_like(speed)}
-    found = linear(columns, emf)
+    keep = split(len(speed))
+    found, model, outside = line("voltage_constant", speed, emf, keep)
     if found["voltage_constant"] <= 0:
         raise ramp.error("emf_line falls where motor_speed rises: a sign is wrong")
-    keep = split(len(speed))
-    half = linear({name: column[keep] for name, column in columns.items()}, emf[keep])
     result = Result("motor_constants")
     source = f"{ramp.file.name}: {len(speed)} points, {speed.min():.3g} to {speed.max():.3g} rad/s"
-    model = found["voltage_constant"] * speed + found["offset"]
     inside = score("back-EMF", "V", emf, model, held_out=False, source=source)
     result.parameters["voltage_constant"] = found.found(
         "voltage_constant", "V·s/rad", f"{source}; rms {inside.rms:.3g} V"
     )
-    outside = half["voltage_constant"] * speed[~keep] + half["offset"]
-    result.fits += [
-        inside,
-        score("back-EMF", "V", emf[~keep], outside, held_out=True, source=f"a third of {ramp.file.name}"),
-    ]
+    third = f"a third of {ramp.file.name}"
+    result.fits += [inside, score("back-EMF", "V", emf[~keep], outside[~keep], held_out=True, source=third)]
     if abs(found["offset"]) > 3 * found.sd("offset"):
         result.notes.append(f"{ramp.file.name}: {found['offset']:+.3g} V at no speed, {found.sd('offset'):.2g} V sd")
-    order = np.argsort(speed)
-    result.panels += [
-        Panel(
-            "Back-EMF",
-            "motor speed [rad/s]",
-            "line voltage, RMS [V]",
-            (Trace("measured", speed, emf, "."), Trace("line", speed[order], model[order])),
-        ),
-        Panel(
-            "Back-EMF: residual",
-            "motor speed [rad/s]",
-            "measured less model [V]",
-            (Trace("residual", speed, emf - model, "."),),
-        ),
-    ]
+    result.panels += compared("Back-EMF", "motor speed [rad/s]", "line voltage, RMS [V]", speed, emf, model)
     return result
 
 
@@ -78,7 +57,7 @@ def voltage_constant(ramp: Table) -> Result:
 class Bench:
     """Steady points of a motor dynamometer, each array of shape (n,), SI units."""
 
-    table: Table
+    table: Measurements
     speed: Array
     current: Array
     torque: Array  # of the shaft: mean of torque sensor and power analyser, where there are both
@@ -86,7 +65,7 @@ class Bench:
     loss: Array  # electrical less mechanical power
 
 
-def read_bench(dyno: Table) -> Bench:
+def read_bench(dyno: Measurements) -> Bench:
     """The points of a dynamometer run with their motor loss; InputError where signs or units cannot be right."""
     speed, current, torque = dyno["motor_speed"], dyno["motor_current"], dyno["shaft_torque"]
     ac, temperature = dyno["ac_power"], dyno["motor_temperature"]
@@ -114,7 +93,7 @@ def read_bench(dyno: Table) -> Bench:
     return Bench(dyno, speed, current, torque, temperature, loss)
 
 
-def solve(bench: Bench, use: NDArray[np.bool_]) -> Solution:
+def solve(bench: Bench, use: Mask) -> Solution:
     """torque_constant, motor_copper_resistance and both iron terms from loss and torque of the points `use`, together.
 
     Both equations are linear in the four. Errors of torque grow into the loss by the speed, so a point's loss counts
@@ -148,7 +127,9 @@ def torque(solution: Solution, bench: Bench) -> Array:
     return result
 
 
-def torque_constant(dyno: Table, warming: Table | None = None, largest_current: float = RIDING_CURRENT) -> Result:
+def torque_constant(
+    dyno: Measurements, warming: Measurements | None = None, largest_current: float = RIDING_CURRENT
+) -> Result:
     """torque_constant [N·m/A, at the air gap] of steady points up to `largest_current` [A].
 
     warming: a run at constant current in which the motor heats up: says how the torque falls with its temperature.
@@ -162,29 +143,10 @@ def torque_constant(dyno: Table, warming: Table | None = None, largest_current: 
     result = Result("motor_constants")
     inside = score("shaft torque", "N·m", bench.torque[use], torque(found, bench)[use], held_out=False, source=name)
     result.fits += [inside, *scores("shaft torque", "N·m", bench.torque, torque(held, bench), use, ~keep, bench)]
-    line = linear({"slope": i}, bench.torque)
-    result.fits.append(
-        score(
-            "shaft torque, thesis' line through zero",
-            "N·m",
-            bench.torque,
-            line["slope"] * i,
-            held_out=False,
-            source=f"{name}, all currents",
-        )
-    )
-    at_gap = bench.torque + found["torque_constant"] * i - torque(found, bench)
-    saturation = linear({"small": i, "fall": i**3}, at_gap)
-    small, fall = saturation["small"], saturation["fall"]
-    largest = float(np.max(np.abs(i)))
-    systematic = 0.0
-    if abs(fall) > 3 * saturation.sd("fall"):
-        local = small + fall * i[use] ** 2  # torque over current
-        systematic = float(np.std(local))
-        result.notes.append(
-            f"torque over current falls with current: {small:.4f} N·m/A at small, {small + fall * largest**2:.4f} at "
-            f"{largest:.0f} A; {found['torque_constant']:.4f} stands for up to {largest_current:.0f} A"
-        )
+    through_zero = linear({"slope": i}, bench.torque)["slope"] * i
+    what, source = "shaft torque, thesis' line through zero", f"{name}, all currents"
+    result.fits.append(score(what, "N·m", bench.torque, through_zero, held_out=False, source=source))
+    systematic = _fall_with_current(bench, found, use, largest_current, result)
     low, high = bench.temperature[use].min(), bench.temperature[use].max()
     result.parameters["torque_constant"] = found.found(
         "torque_constant",
@@ -195,61 +157,56 @@ def torque_constant(dyno: Table, warming: Table | None = None, largest_current: 
     )
     if warming is not None:
         result.notes.append(_temperature_note(warming))
-    speeds = np.argsort(i)
-    result.panels += [
-        Panel(
-            "Shaft torque",
-            "motor current, RMS [A]",
-            "torque [N·m]",
-            (
-                Trace("measured", i, bench.torque, "."),
-                Trace("torque constant", i[speeds], found["torque_constant"] * i[speeds]),
-            ),
-        ),
-        Panel(
-            "Shaft torque: residual",
-            "motor current, RMS [A]",
-            "measured less model [N·m]",
-            (
-                Trace("used", i[use], (bench.torque - torque(found, bench))[use], "."),
-                Trace("beyond the range", i[~use], (bench.torque - torque(found, bench))[~use], "x"),
-            ),
-        ),
-    ]
+    result.panels += _torque_panels(bench, found, use)
     return result
 
 
-def within(bench: Bench, largest_current: float) -> NDArray[np.bool_]:
+def _fall_with_current(bench: Bench, found: Solution, use: Mask, largest_current: float, result: Result) -> float:
+    """The sd [N·m/A] of torque over current among the currents used, with a note if it falls with current."""
+    i = bench.current
+    saturation = linear({"small": i, "fall": i**3}, bench.torque + found["torque_constant"] * i - torque(found, bench))
+    small, fall, largest = saturation["small"], saturation["fall"], float(np.max(np.abs(i)))
+    if abs(fall) <= 3 * saturation.sd("fall"):
+        return 0.0
+    result.notes.append(
+        f"torque over current falls with current: {small:.4f} N·m/A at small, {small + fall * largest**2:.4f} at "
+        f"{largest:.0f} A; {found['torque_constant']:.4f} stands for up to {largest_current:.0f} A"
+    )
+    return float(np.std(small + fall * i[use] ** 2))
+
+
+def _torque_panels(bench: Bench, found: Solution, use: Mask) -> list[Panel]:
+    i, x, left = bench.current, "motor current, RMS [A]", bench.torque - torque(found, bench)
+    order = np.argsort(i)
+    constant = PlotLine("torque constant", i[order], found["torque_constant"] * i[order])
+    beyond = PlotLine("beyond the range", i[~use], left[~use], "x")
+    return [
+        Panel("Shaft torque", x, "torque [N·m]", (PlotLine("measured", i, bench.torque, "."), constant)),
+        Panel(
+            "Shaft torque: residual", x, "measured less model [N·m]", (PlotLine("used", i[use], left[use], "."), beyond)
+        ),
+    ]
+
+
+def within(bench: Bench, largest_current: float) -> Mask:
     """Which points have a current up to `largest_current` [A]; InputError for too few."""
-    use: NDArray[np.bool_] = np.abs(bench.current) <= largest_current
+    use: Mask = np.abs(bench.current) <= largest_current
     if use.sum() < 12:
         raise bench.table.error(f"{int(use.sum())} points up to {largest_current:g} A are too few; 12 are needed")
     return use
 
 
-def scores(
-    what: str, unit: str, data: Array, model: Array, use: NDArray[np.bool_], held: NDArray[np.bool_], bench: Bench
-) -> list[Fit]:
+def scores(what: str, unit: str, data: Array, model: Array, use: Mask, held: Mask, bench: Bench) -> list[Fit]:
     """The fit on the points `held` out: those of the range used, and all."""
     limit, name = float(np.max(np.abs(bench.current[use]))), bench.table.file.name
-    fits = [
-        score(
-            what,
-            unit,
-            data[use & held],
-            model[use & held],
-            held_out=True,
-            source=f"a third of {name}, up to {limit:.0f} A",
-        )
+    parts = [(use & held, f"up to {limit:.0f} A"), *([] if use.all() else [(held, "all currents")])]
+    return [
+        score(what, unit, data[part], model[part], held_out=True, source=f"a third of {name}, {which}")
+        for part, which in parts
     ]
-    if not use.all():
-        fits.append(
-            score(what, unit, data[held], model[held], held_out=True, source=f"a third of {name}, all currents")
-        )
-    return fits
 
 
-def _temperature_note(warming: Table) -> str:
+def _temperature_note(warming: Measurements) -> str:
     current, hot = warming["motor_current"], warming["motor_temperature"]
     on = np.abs(current - np.median(current[np.abs(current) > 1.0])) < 0.05 * np.max(np.abs(current))
     ratio = warming["shaft_torque"][on] / current[on]

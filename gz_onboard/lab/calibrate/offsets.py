@@ -1,7 +1,7 @@
 """Sensors of the pack: offset, gain and noise of current and voltage, at rest and against the inverter's.
 
 Pack current less auxiliary current is the inverter's DC current; the inverter's own small consumption at rest does not
-show in its reading, but is in the pack's. Two sensors tell where they differ, not which one errs: without a third the
+show in its reading, but is in the pack's. Two sensors show where they differ, not which one errs: without a third the
 gain found is that of the pack against the inverter's, and its sd is that of a sensor's class.
 """
 
@@ -11,20 +11,20 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD
-from gz_onboard.lab.calibrate.fit import linear, score, split
-from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, score
+from gz_onboard.lab.calibrate.result import Found, Panel, PlotLine, Result
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
+NEEDED = "pack_current pack_voltage inverter_current inverter_voltage motor_speed motor_current"
 LAGS = np.arange(-0.3, 0.31, 0.05)  # s: what one set of sensors may lag the other
 MOVING, DRIVING = 0.3, 3.0  # rad/s and A of the motor: below is rest
 LEAST_REST = 20  # samples
-WINDOW = 2.0  # s: means over that tell gains apart from timing
+WINDOW = 2.0  # s: means over that separate gains from timing
 DRIFT_SD = 0.02  # A: of a current sensor's zero from day to day, the least that is believed
 GAIN_SD = 0.007  # of a current sensor of 1 % class
 
@@ -39,20 +39,13 @@ class Pair(NamedTuple):
     auxiliary: Array
     pack_voltage: Array
     inverter_voltage: Array
-    rest: NDArray[np.bool_]
+    rest: Mask
     lag: float  # s: of the pack's sensors behind the inverter's
 
 
 def read_pair(ride: Samples, vehicle: Vehicle) -> Pair:
     """The readings of pack and inverter at the same times, their lag taken off. InputError for what is missing."""
-    for role in (
-        "pack_current",
-        "pack_voltage",
-        "inverter_current",
-        "inverter_voltage",
-        "motor_speed",
-        "motor_current",
-    ):
+    for role in NEEDED.split():
         if role not in ride.columns:
             raise InputError(f"{ride.name}: no {role}, which sensor offsets and resistances need")
     time, pack = ride.columns["pack_current"]
@@ -67,17 +60,8 @@ def read_pair(ride: Samples, vehicle: Vehicle) -> Pair:
     lag = float(min(LAGS, key=lambda x: float(np.std(pack - auxiliary - at("inverter_current", x)))))
     speed, current = np.abs(at("motor_speed")), np.abs(at("motor_current"))
     rest = (speed < MOVING) & (current < DRIVING) & (np.abs(at("inverter_current", lag)) < 2.0)
-    return Pair(
-        ride.name,
-        time,
-        pack,
-        at("inverter_current", lag),
-        auxiliary,
-        at("pack_voltage"),
-        at("inverter_voltage", lag),
-        rest,
-        lag,
-    )
+    inverter, inverter_voltage = at("inverter_current", lag), at("inverter_voltage", lag)
+    return Pair(ride.name, time, pack, inverter, auxiliary, at("pack_voltage"), inverter_voltage, rest, lag)
 
 
 def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
@@ -130,9 +114,9 @@ def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     return result
 
 
-def _windows(pair: Pair, values: Array) -> Array:
-    """Means of `values` over `WINDOW`."""
-    count = max(round(WINDOW / max(float(np.median(np.diff(pair.time))), 1e-3)), 1)
+def window_means(pair: Pair, values: Array, seconds: float) -> Array:
+    """Means of `values` over windows of that length: timing counts less."""
+    count = max(round(seconds / max(float(np.median(np.diff(pair.time))), 1e-3)), 1)
     whole = len(values) // count * count
     means: Array = values[:whole].reshape(-1, count).mean(axis=1)
     return means
@@ -140,40 +124,31 @@ def _windows(pair: Pair, values: Array) -> Array:
 
 def _gain(result: Result, pairs: Sequence[Pair]) -> None:
     """The pack's current over inverter's and auxiliary together, by ride."""
-    total = [_windows(pair, pair.inverter + pair.auxiliary) for pair in pairs]
-    pack = [_windows(pair, pair.pack) for pair in pairs]
+    total = [window_means(pair, pair.inverter + pair.auxiliary, WINDOW) for pair in pairs]
+    pack = [window_means(pair, pair.pack, WINDOW) for pair in pairs]
     x, y = np.concatenate(total), np.concatenate(pack)
     labels = np.concatenate([np.full(len(column), k) for k, column in enumerate(total)])
     if np.ptp(x) < 5.0:
         result.refusals.append(f"pack_current_gain: currents of {x.min():.1f} to {x.max():.1f} A only tell no gain")
         return
-    columns = {"pack_current_gain": x, "offset": np.ones_like(x)}
-    found = linear(columns, y, groups=labels if len(pairs) > 2 else None)
+    fitted = every_second(labels)
+    found, model, outside = line("pack_current_gain", x, y, fitted, as_groups(labels))
     source = f"{len(pairs)} rides, {len(x)} means of {WINDOW:g} s, against inverter and auxiliary current"
     result.parameters["pack_current_gain"] = found.found("pack_current_gain", "1", source, GAIN_SD)
     result.refusals.append(
         f"pack_current_gain: {found['pack_current_gain']:.4f} ± {found.sd('pack_current_gain'):.4f} is the ratio of "
         f"two sensors; which one errs is unknown, so that its sd holds a sensor's class of {100 * GAIN_SD:.1f} %"
     )
-    fitted = labels % 2 == 0 if len(pairs) > 1 else split(len(x))
-    half = linear({name: column[fitted] for name, column in columns.items()}, y[fitted])
-    model = half["pack_current_gain"] * x + half["offset"]
     result.fits += [
-        score("pack current", "A", y, found["pack_current_gain"] * x + found["offset"], held_out=False, source=source),
-        score("pack current", "A", y[~fitted], model[~fitted], held_out=True, source="every second ride"),
+        score("pack current", "A", y, model, held_out=False, source=source),
+        score("pack current", "A", y[~fitted], outside[~fitted], held_out=True, source="every second ride"),
     ]
-    residual = y - found["pack_current_gain"] * x - found["offset"]
-    result.panels.append(
-        Panel(
-            "Pack current against inverter and auxiliary",
-            "inverter and auxiliary current [A]",
-            "pack current less line [A]",
-            (Trace("means of 2 s", x, residual, "."),),
-        )
-    )
+    left, title = PlotLine("means of 2 s", x, y - model, "."), "Pack current against inverter and auxiliary"
+    panel = Panel(title, "inverter and auxiliary current [A]", "pack current less line [A]", (left,))
+    result.panels.append(panel)
 
 
-def _noise(values: Array, rest: NDArray[np.bool_]) -> float:
+def _noise(values: Array, rest: Mask) -> float:
     """The sd of a sample, out of differences of neighbours that both are at rest."""
     both = rest[1:] & rest[:-1]
     return float(np.std(np.diff(values)[both]) / np.sqrt(2)) if both.sum() > 5 else float("nan")

@@ -26,8 +26,8 @@ from gz_onboard.lab.calibrate.cell_data import cell_test
 from gz_onboard.lab.calibrate.coastdown_run import samples as coastdown_samples
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.manifest import Option, Slot
-from gz_onboard.lab.calibrate.result import Curve, Found, Panel, Result, Trace
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.result import Curve, Found, Panel, PlotLine, Result
+from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
@@ -38,7 +38,7 @@ class Given:
 
     vehicle: Vehicle  # with the results of earlier steps
     earlier: list[Result]
-    tables: dict[str, list[Table]] = field(default_factory=dict)  # by slot
+    tables: dict[str, list[Measurements]] = field(default_factory=dict)  # by slot
     rides: dict[str, list[Samples]] = field(default_factory=dict)
     options: dict[str, Option] = field(default_factory=dict)
 
@@ -46,7 +46,7 @@ class Given:
         """The option `name`, a number."""
         return float(self.options[name])
 
-    def one(self, slot: str) -> Table | None:
+    def one(self, slot: str) -> Measurements | None:
         """The one table of a slot that may be left out."""
         tables = self.tables.get(slot)
         return tables[0] if tables else None
@@ -103,13 +103,13 @@ def _pulse(given: Given) -> Result:
                 f"{table.file.name}, held out",
                 "time [min]",
                 "cell voltage [V]",
-                (Trace("measured", minutes, measured), Trace("model", minutes, model)),
+                (PlotLine("measured", minutes, measured), PlotLine("model", minutes, model)),
             ),
             Panel(
                 f"{table.file.name}: residual",
                 "time [min]",
                 "model less measured [mV]",
-                (Trace("", minutes, 1000 * (model - measured)),),
+                (PlotLine("", minutes, 1000 * (model - measured)),),
             ),
         ]
     return result
@@ -164,7 +164,7 @@ def _cooling(given: Given) -> Result:
     return result
 
 
-def _cooling_runs(given: Given, slot: str) -> list[cooling_run.Run]:
+def _cooling_runs(given: Given, slot: str) -> list[cooling_run.CoolingRun]:
     bench = [cooling_run.bench_run(table, given.vehicle) for table in given.tables.get(slot, [])]
     return bench + [cooling_run.ride_run(ride, given.vehicle) for ride in given.rides.get(slot, [])]
 

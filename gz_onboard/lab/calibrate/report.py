@@ -13,8 +13,8 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate import thesis
+from gz_onboard.lab.calibrate.fit import correlation
 from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, Result
-from gz_onboard.lab.calibrate.vehicle_file import correlation
 from gz_onboard.offline.page import html_table, svg, write_page
 from gz_onboard.offline.results import keys_of
 from gz_onboard.offline.style import INK, MUTED, new_figure, rule

@@ -12,10 +12,10 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.fit import linear, score, split
-from gz_onboard.lab.calibrate.offsets import read_pair
-from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, linear, score
+from gz_onboard.lab.calibrate.offsets import read_pair, window_means
+from gz_onboard.lab.calibrate.result import Found, Result, compared
+from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
@@ -23,6 +23,7 @@ STEP_TIME = 0.2  # s
 LEAST_STEP = 15.0  # A
 LEAST_STEPS = 20
 LEAST_SPAN = 10.0  # A: of current, for a line
+MEAN_OF = 1.0  # s: timing counts less then
 WARM = 20.0  # degC: below the cells' resistance is many times that of bars and fuse
 VOLTAGE_GAIN_SD = 1e-3  # of each voltage sensor: a volt of either's gain over the sag of the pack looks like resistance
 CELL_SHARE_SD = 0.05  # of the cells' resistance, from cell to cell and from table to step
@@ -31,47 +32,31 @@ CELL_SHARE_SD = 0.05  # of the cells' resistance, from cell to cell and from tab
 def cable_resistance(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     """cable_resistance [ohm] between the two voltage sensors. InputError for rides without current."""
     result = Result("cable_resistance")
-    currents: list[Array] = []
-    volts: list[Array] = []
-    packs: list[Array] = []
-    labels: list[Array] = []
+    rows, labels = [], []
     for k, ride in enumerate(rides):
         pair = read_pair(ride, vehicle)
-        count = max(round(1.0 / float(np.median(np.diff(pair.time)))), 1)  # means of a second: timing counts less
-        whole = len(pair.time) // count * count
-        apart = pair.pack_voltage - pair.inverter_voltage
-        for column, values in ((currents, pair.inverter), (volts, apart), (packs, pair.pack_voltage)):
-            column.append(values[:whole].reshape(-1, count).mean(axis=1))
-        labels.append(np.full(whole // count, k))
-    if not currents:
+        columns = (pair.inverter, pair.pack_voltage - pair.inverter_voltage, pair.pack_voltage)
+        rows.append([window_means(pair, column, MEAN_OF) for column in columns])
+        labels.append(np.full(len(rows[-1][0]), k))
+    if not rows:
         raise InputError("no ride, which cable_resistance comes from")
-    i, v, label = np.concatenate(currents), np.concatenate(volts), np.concatenate(labels)
+    (i, v, pack), label = (np.concatenate(column) for column in zip(*rows, strict=True)), np.concatenate(labels)
     if np.ptp(i) < LEAST_SPAN:
         raise InputError(
             f"{rides[0].name}: inverter_current of {i.min():.1f} to {i.max():.1f} A spans too little for a resistance; "
             f"{LEAST_SPAN:g} A are needed"
         )
-    columns = {"cable_resistance": i, "offset": np.ones_like(i)}
-    found = linear(columns, v, groups=label if len(rides) > 2 else None)
+    fitted = every_second(label)
+    found, model, outside = line("cable_resistance", i, v, fitted, as_groups(label))
     if found["cable_resistance"] < -3 * found.sd("cable_resistance"):
         raise InputError(f"{rides[0].name}: inverter_voltage rises over pack_voltage with current: a sign is wrong")
-    model = found["cable_resistance"] * i + found["offset"]
-    source = f"{len(rides)} rides, {len(i)} means of 1 s, pack less inverter voltage over inverter current"
-    fitted = label % 2 == 0 if len(rides) > 1 else split(len(i))
-    half = linear({name: column[fitted] for name, column in columns.items()}, v[fitted])
-    outside = half["cable_resistance"] * i + half["offset"]
+    what, source = "voltage between pack and inverter", f"{len(rides)} rides, {len(i)} means of 1 s, "
+    source += "pack less inverter voltage over inverter current"
     result.fits += [
-        score("voltage between pack and inverter", "V", v, model, held_out=False, source=source),
-        score(
-            "voltage between pack and inverter",
-            "V",
-            v[~fitted],
-            outside[~fitted],
-            held_out=True,
-            source="every second ride",
-        ),
+        score(what, "V", v, model, held_out=False, source=source),
+        score(what, "V", v[~fitted], outside[~fitted], held_out=True, source="every second ride"),
     ]
-    sag = abs(linear(columns, np.concatenate(packs), groups=label if len(rides) > 2 else None)["cable_resistance"])
+    sag = abs(line("sag", i, pack, fitted)[0]["sag"])
     gains = 2**0.5 * VOLTAGE_GAIN_SD * sag
     result.parameters["cable_resistance"] = Found(
         max(found["cable_resistance"], 0.0),
@@ -79,11 +64,12 @@ def cable_resistance(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         "ohm",
         f"{source}; {found['offset']:+.3f} V at no current",
     )
-    result.panels += _panels("Voltage between pack and inverter", i, v, model, "pack less inverter voltage [V]")
+    y_label = "pack less inverter voltage [V]"
+    result.panels += compared("Voltage between pack and inverter", "current [A]", y_label, i, v, model)
     return result
 
 
-def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: Sequence[Table] = ()) -> Result:
+def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: Sequence[Measurements] = ()) -> Result:
     """pack_series_resistance [ohm]: 0.2 s steps of warm rides less what the cells alone give in that time.
 
     pulses: pulse tests of a cell at two temperatures or more, with `time`, `current`, `voltage` and `cell_temperature`:
@@ -92,58 +78,30 @@ def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: S
     Raises InputError if there are too few steps of more than `LEAST_STEP`. Gives a refusal instead of a number where
     the cells' own doubt is greater than what is left.
     """
-    battery, p = vehicle.pack, vehicle.parameters
-    n, m = battery.cells_series, battery.cells_parallel
-    result, steps, drops, cells, labels = Result("pack_series_resistance"), [], [], [], []
-    by_temperature = cell_steps(pulses) if pulses else (np.empty(0), np.empty(0))
-    origin = "the pulse tests' steps" if pulses else "the cell tables"
-    for k, ride in enumerate(rides):
-        temperature = _mean_of(ride, "cell_temperature")
-        if temperature < WARM:
-            result.notes.append(f"{ride.name}: cells at {temperature:.0f} degC, left out: {WARM:g} degC are needed")
-            continue
-        time, current = ride.columns["pack_current"]
-        voltage = np.interp(time, *ride.columns["pack_voltage"])
-        current = (current - p["pack_current_offset"]) / p["pack_current_gain"]
-        stride = max(round(STEP_TIME / float(np.median(np.diff(time)))), 1)
-        step, drop = current[stride:] - current[:-stride], -(voltage[stride:] - voltage[:-stride])
-        big = np.abs(step) > LEAST_STEP
-        if not big.any():
-            continue
-        if pulses and not by_temperature[0][0] <= temperature <= by_temperature[0][-1]:
-            low, high = by_temperature[0][[0, -1]]
-            result.notes.append(
-                f"{ride.name}: cells at {temperature:.0f} degC, outside the tests' {low:.0f} to {high:.0f}, left out"
-            )
-            continue
-        if pulses:
-            cell_ohm = float(np.exp(np.interp(temperature, *by_temperature)))
-        else:
-            soc = _soc(ride, vehicle)
-            r0, r1, c1 = (mesh.at(soc, temperature)[0] for mesh in (battery.r0, battery.r1, battery.c1))
-            cell_ohm = r0 + r1 * (1 - float(np.exp(-STEP_TIME / 2 / (r1 * c1))))
-        steps.append(step[big])
-        drops.append(drop[big])
-        cells.append(np.full(int(big.sum()), n / m * cell_ohm))
-        labels.append(np.full(int(big.sum()), k))
-    if sum(map(len, steps)) < LEAST_STEPS:
-        count = sum(map(len, steps))
+    result = Result("pack_series_resistance")
+    by_temperature = cell_steps(pulses) if pulses else None
+    of_rides = [_ride_steps(ride, vehicle, by_temperature, result) for ride in rides]
+    steps = [columns for columns in of_rides if columns is not None]
+    count = sum(len(di) for di, _, _ in steps)
+    if count < LEAST_STEPS:
         raise InputError(
             f"{count} steps of more than {LEAST_STEP:g} A within {STEP_TIME:g} s above {WARM:g} degC are "
             f"too few for pack_series_resistance; {LEAST_STEPS} are needed"
         )
-    di, dv, cell, label = (np.concatenate(column) for column in (steps, drops, cells, labels))
-    found = linear({"series": di}, dv - cell * di, groups=label if len(np.unique(label)) > 2 else None)
+    di, dv, cell = (np.concatenate(column) for column in zip(*steps, strict=True))
+    label = np.repeat(np.arange(len(steps)), [len(columns[0]) for columns in steps])
+    found = linear({"series": di}, dv - cell * di, groups=as_groups(label))
     doubt = CELL_SHARE_SD * float(cell.mean())
     sd = float(np.hypot(found.sd("series"), doubt))
     whole = linear({"whole": di}, dv)["whole"]
+    origin = "the pulse tests' steps" if pulses else "the cell tables"
     source = (
-        f"{len(di)} steps above {LEAST_STEP:g} A within {STEP_TIME:g} s of {len(np.unique(label))} rides above "
-        f"{WARM:g} degC: {1e3 * whole:.1f} mohm, less {1e3 * cell.mean():.1f} mohm of {origin}"
+        f"{len(di)} steps above {LEAST_STEP:g} A within {STEP_TIME:g} s of {len(steps)} rides above {WARM:g} degC: "
+        f"{1e3 * whole:.1f} mohm, less {1e3 * cell.mean():.1f} mohm of {origin}"
     )
     model = (cell + found["series"]) * di
     result.fits.append(score("voltage step", "V", dv, model, held_out=False, source=source))
-    result.panels += _panels("Steps of pack voltage", di, dv, model, "fall of voltage [V]")
+    result.panels += compared("Steps of pack voltage", "current [A]", "fall of voltage [V]", di, dv, model)
     if found["series"] < 2 * sd:
         result.refusals.append(
             f"pack_series_resistance: {1e3 * found['series']:+.1f} ± {1e3 * sd:.1f} mohm is left of {1e3 * whole:.1f} "
@@ -154,7 +112,43 @@ def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: S
     return result
 
 
-def cell_steps(pulses: Sequence[Table]) -> tuple[Array, Array]:
+def _ride_steps(
+    ride: Samples, vehicle: Vehicle, by_temperature: tuple[Array, Array] | None, result: Result
+) -> tuple[Array, Array, Array] | None:
+    """(steps of current [A], falls of voltage [V], the cells' part of the resistance [ohm]) of a ride, each (m,).
+
+    None for a ride without large steps, or at a temperature at which the cells' part is too large or not known.
+    """
+    battery, p = vehicle.pack, vehicle.parameters
+    temperature = _mean_of(ride, "cell_temperature")
+    if temperature < WARM:
+        result.notes.append(f"{ride.name}: cells at {temperature:.0f} degC, left out: {WARM:g} degC are needed")
+        return None
+    time, current = ride.columns["pack_current"]
+    voltage = np.interp(time, *ride.columns["pack_voltage"])
+    current = (current - p["pack_current_offset"]) / p["pack_current_gain"]
+    stride = max(round(STEP_TIME / float(np.median(np.diff(time)))), 1)
+    step, drop = current[stride:] - current[:-stride], -(voltage[stride:] - voltage[:-stride])
+    big = np.abs(step) > LEAST_STEP
+    if not big.any():
+        return None
+    if by_temperature is None:
+        soc = _soc(ride, vehicle)
+        r0, r1, c1 = (mesh.at(soc, temperature)[0] for mesh in (battery.r0, battery.r1, battery.c1))
+        cell_ohm = r0 + r1 * (1 - float(np.exp(-STEP_TIME / 2 / (r1 * c1))))
+    else:
+        low, high = by_temperature[0][[0, -1]]
+        if not low <= temperature <= high:
+            result.notes.append(
+                f"{ride.name}: cells at {temperature:.0f} degC, outside the tests' {low:.0f} to {high:.0f}, left out"
+            )
+            return None
+        cell_ohm = float(np.exp(np.interp(temperature, *by_temperature)))
+    cells = battery.cells_series / battery.cells_parallel * cell_ohm
+    return step[big], drop[big], np.full(int(big.sum()), cells)
+
+
+def cell_steps(pulses: Sequence[Measurements]) -> tuple[Array, Array]:
     """(temperatures [degC], logarithms of the resistance [ohm] that a cell shows `STEP_TIME` after a step of current),
     by temperature; the median over states of charge above 0.1 of the charge passed. InputError for tests without steps.
     """
@@ -192,12 +186,3 @@ def _soc(ride: Samples, vehicle: Vehicle) -> float:
     time, current = ride.columns["pack_current"]
     charge = float(np.trapezoid(current, time)) / 3600
     return start - 0.5 * charge / battery.pack_capacity(25.0)
-
-
-def _panels(title: str, x: Array, data: Array, model: Array, y_label: str) -> list[Panel]:
-    order = np.argsort(x)
-    traces = Trace("measured", x, data, "."), Trace("model", x[order], model[order])
-    return [
-        Panel(title, "current [A]", y_label, traces),
-        Panel(f"{title}: residual", "current [A]", "measured less model [V]", (Trace("", x, data - model, "."),)),
-    ]

@@ -1,8 +1,10 @@
-"""What a procedure gives: values with their uncertainty, what could not be identified, and how well it fits."""
+"""What a calibration procedure gives: values with their uncertainty, what the data do not show, how well it fits."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+
+import numpy as np
 
 from gz_onboard.arrays import Array
 
@@ -46,7 +48,7 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Trace:
+class PlotLine:
     """A curve of a plot, in the units of its panel."""
 
     label: str
@@ -62,7 +64,20 @@ class Panel:
     title: str
     x_label: str  # with unit
     y_label: str
-    traces: tuple[Trace, ...]
+    traces: tuple[PlotLine, ...]
+
+
+def compared(
+    title: str, x_label: str, y_label: str, x: Array, data: Array, model: Array, style: str = "-"
+) -> list[Panel]:
+    """Data and model over `x`, in the unit at the end of `y_label`, and what the model leaves over."""
+    unit = y_label.rpartition("[")[2]
+    order = np.argsort(x) if style == "-" else slice(None)
+    lines = PlotLine("measured", x, data, "."), PlotLine("model", x[order], model[order], style)
+    return [
+        Panel(title, x_label, y_label, lines),
+        Panel(f"{title}: residual", x_label, f"measured less model [{unit}", (PlotLine("", x, data - model, "."),)),
+    ]
 
 
 @dataclass
@@ -70,7 +85,7 @@ class Result:
     """What one procedure found.
 
     covariance: groups of parameters that are tied, each with its matrix in the parameters' units.
-    refusals: what the data could not identify, one sentence each, with the number that shows it.
+    refusals: what the data could not show, one sentence each, with the number that says so.
     """
 
     procedure: str

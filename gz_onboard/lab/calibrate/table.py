@@ -26,109 +26,45 @@ from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError, nearest
 
 if TYPE_CHECKING:
-    from gz_onboard.toml import Table as TomlTable
+    from gz_onboard.toml import Table
 
+_TURN = 2 * math.pi  # rad
+_FACTORS: dict[str, dict[str, float]] = {  # by SI unit (or degC), the units as written
+    "s": {"s": 1, "ms": 1e-3, "us": 1e-6, "min": 60, "h": 3600},
+    "A": {"A": 1, "mA": 1e-3, "Arms": 1},
+    "V": {"V": 1, "mV": 1e-3, "kV": 1e3, "Vrms": 1},
+    "degC": {"degC": 1, "C": 1, "K": 1, "degF": 5 / 9},
+    "rad/s": {"radps": 1, "rpm": _TURN / 60, "revps": _TURN, "degps": math.pi / 180},
+    "m/s": {"mps": 1, "kmph": 1 / 3.6, "mph": 0.44704},
+    "m/s^2": {"mps2": 1},
+    "N·m": {"Nm": 1, "mNm": 1e-3},
+    "W": {"W": 1, "kW": 1e3, "mW": 1e-3},
+    "N": {"N": 1, "kN": 1e3},
+    "ohm": {"ohm": 1, "mohm": 1e-3},
+    "A·h": {"Ah": 1, "mAh": 1e-3},
+    "J": {"Wh": 3600, "J": 1},
+    "m": {"m": 1, "km": 1e3, "mm": 1e-3},
+    "kg": {"kg": 1},
+    "Pa": {"Pa": 1, "bar": 1e5},
+    "rad": {"rad": 1, "deg": math.pi / 180},
+    "1": {"pct": 0.01, "1": 1},
+}
+_OFFSETS = {"K": -273.15, "degF": -160 / 9}
 # Unit as written -> (unit it is turned into, factor, offset)
-_PER_MINUTE = 2 * math.pi / 60
 UNITS: dict[str, tuple[str, float, float]] = {
-    "s": ("s", 1, 0),
-    "ms": ("s", 1e-3, 0),
-    "us": ("s", 1e-6, 0),
-    "min": ("s", 60, 0),
-    "h": ("s", 3600, 0),
-    "A": ("A", 1, 0),
-    "mA": ("A", 1e-3, 0),
-    "Arms": ("A", 1, 0),
-    "V": ("V", 1, 0),
-    "mV": ("V", 1e-3, 0),
-    "kV": ("V", 1e3, 0),
-    "Vrms": ("V", 1, 0),
-    "degC": ("degC", 1, 0),
-    "C": ("degC", 1, 0),
-    "K": ("degC", 1, -273.15),
-    "degF": ("degC", 5 / 9, -160 / 9),
-    "radps": ("rad/s", 1, 0),
-    "rpm": ("rad/s", _PER_MINUTE, 0),
-    "revps": ("rad/s", 2 * math.pi, 0),
-    "degps": ("rad/s", math.pi / 180, 0),
-    "mps": ("m/s", 1, 0),
-    "kmph": ("m/s", 1 / 3.6, 0),
-    "mph": ("m/s", 0.44704, 0),
-    "mps2": ("m/s^2", 1, 0),
-    "Nm": ("N·m", 1, 0),
-    "mNm": ("N·m", 1e-3, 0),
-    "W": ("W", 1, 0),
-    "kW": ("W", 1e3, 0),
-    "mW": ("W", 1e-3, 0),
-    "N": ("N", 1, 0),
-    "kN": ("N", 1e3, 0),
-    "ohm": ("ohm", 1, 0),
-    "mohm": ("ohm", 1e-3, 0),
-    "Ah": ("A·h", 1, 0),
-    "mAh": ("A·h", 1e-3, 0),
-    "Wh": ("J", 3600, 0),
-    "J": ("J", 1, 0),
-    "m": ("m", 1, 0),
-    "km": ("m", 1e3, 0),
-    "mm": ("m", 1e-3, 0),
-    "kg": ("kg", 1, 0),
-    "Pa": ("Pa", 1, 0),
-    "bar": ("Pa", 1e5, 0),
-    "rad": ("rad", 1, 0),
-    "deg": ("rad", math.pi / 180, 0),
-    "pct": ("1", 0.01, 0),
-    "1": ("1", 1, 0),
+    unit: (si, factor, _OFFSETS.get(unit, 0)) for si, units in _FACTORS.items() for unit, factor in units.items()
 }
-
-_SPELLINGS = {
-    "rad/s": "radps",
-    "r/min": "rpm",
-    "1/min": "rpm",
-    "rev/s": "revps",
-    "deg/s": "degps",
-    "m/s": "mps",
-    "km/h": "kmph",
-    "kmh": "kmph",
-    "kph": "kmph",
-    "m/s2": "mps2",
-    "m/s^2": "mps2",
-    "m/s²": "mps2",
-    "N·m": "Nm",
-    "N.m": "Nm",
-    "°C": "degC",
-    "Ω": "ohm",
-    "A·h": "Ah",
-    "%": "pct",
-    "°": "deg",
-    "sec": "s",
-    "Amps": "A",
-    "Volts": "V",
-    "celsius": "degC",
-    "hr": "h",
-    "µs": "us",
-    "mΩ": "mohm",
-    "": "1",
-    "-": "1",
-}
-
-# The last word of a quantity says in what it must be; None: several.
-_KINDS = {
-    "time": ("s",),
-    "current": ("A",),
-    "voltage": ("V",),
-    "line": ("V",),
-    "temperature": ("degC",),
-    "speed": ("rad/s", "m/s"),
-    "torque": ("N·m",),
-    "power": ("W",),
-    "force": ("N",),
-    "mass": ("kg",),
-    "charge": ("A·h",),
-    "energy": ("J",),
-    "acceleration": ("m/s^2",),
-    "distance": ("m",),
-    "altitude": ("m",),
-}
+_ALIASES = (
+    "rad/s=radps r/min=rpm 1/min=rpm rev/s=revps deg/s=degps m/s=mps km/h=kmph kmh=kmph kph=kmph m/s2=mps2 m/s^2=mps2 "
+    "m/s²=mps2 N·m=Nm N.m=Nm °C=degC Ω=ohm A·h=Ah %=pct °=deg sec=s Amps=A Volts=V celsius=degC hr=h µs=us mΩ=mohm"
+)
+_SPELLINGS = {"": "1", "-": "1"} | dict(alias.split("=") for alias in _ALIASES.split())
+# The last word of a quantity, and in what such a quantity must be.
+_QUANTITIES = (
+    "time s, current A, voltage V, line V, temperature degC, speed rad/s m/s, torque N·m, power W, force N, mass kg, "
+    "charge A·h, energy J, acceleration m/s^2, distance m, altitude m"
+)
+_KINDS = {word: tuple(units) for word, *units in map(str.split, _QUANTITIES.split(", "))}
 _SPEED_OF = {"motor_speed": "rad/s", "wheel_speed": "rad/s", "vehicle_speed": "m/s", "speed": "m/s"}
 
 _BRACKETS = re.compile(r"^\s*(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]\s*$")
@@ -143,12 +79,12 @@ class Named(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Table:
+class Measurements:
     """Columns of measurements.
 
     columns: by quantity (``current``, ``cell_temperature``, ...), all of one length, in SI units and degC; ``time``
     never decreases; two rows at one time are the two sides of a step. lines: where each row stands in the file, from 1
-    (for Parquet: its row). trouble: why a column of the file cannot be used, by quantity; told when it is asked for.
+    (for Parquet: its row). trouble: why a column of the file cannot be used, by quantity; raised when it is asked for.
     """
 
     file: Path
@@ -183,7 +119,7 @@ class Table:
         return InputError(f"{self.file}{'' if row is None else f':{self.line(row)}'}: {message}")
 
 
-def read_table(file: Path, columns: Mapping[str, Named] | None = None, needed: Sequence[str] = ()) -> Table:
+def read_table(file: Path, columns: Mapping[str, Named] | None = None, needed: Sequence[str] = ()) -> Measurements:
     """The table in `file`.
 
     columns: for a file with names of its own, the column of each quantity; all others are left out. needed: quantities
@@ -201,7 +137,7 @@ def read_table(file: Path, columns: Mapping[str, Named] | None = None, needed: S
             trouble[quantity] = message
         else:
             found[quantity] = array
-    table = Table(file, found, lines, trouble)
+    table = Measurements(file, found, lines, trouble)
     for quantity in needed:
         table[quantity]
     if columns and trouble:  # what somebody has named must be of use
@@ -217,7 +153,7 @@ def read_table(file: Path, columns: Mapping[str, Named] | None = None, needed: S
     return table
 
 
-def read_columns(table: TomlTable) -> dict[str, Named]:
+def read_columns(table: Table) -> dict[str, Named]:
     """The table ``columns`` of a manifest: quantity = "column", or { column, unit, scale }."""
     found = {}
     for quantity, entry in table.values.items():

@@ -12,7 +12,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.result import Fit, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Fit, Found, Panel, PlotLine, Result
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
@@ -24,7 +24,7 @@ RECEIVER = 0.002  # relative: Doppler speed of a receiver in the open
 
 
 def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
-    """wheel_radius [m] of the rides that have GPS and steady riding; each ride held out once tells how it differs.
+    """wheel_radius [m] of the rides that have GPS and steady riding; each ride held out once shows how it differs.
 
     Raises InputError if none of them has.
     """
@@ -32,7 +32,7 @@ def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     gear = vehicle.parameters["gear_ratio"]
     radii: list[float] = []
     names: list[str] = []
-    traces: list[Trace] = []
+    traces: list[PlotLine] = []
     count = 0
     for ride in rides:
         if "gps_speed" not in ride.columns or "motor_speed" not in ride.columns:
@@ -48,7 +48,7 @@ def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         radii.append(float(np.median(ratio)))
         names.append(ride.name)
         count += len(wheel)
-        traces.append(Trace(ride.name, wheel, ratio, "."))
+        traces.append(PlotLine(ride.name, wheel, ratio, "."))
     if not radii:
         raise InputError(f"no ride tells the wheel's radius: {'; '.join(result.refusals) or 'none given'}")
     radius = float(np.mean(radii))
@@ -70,7 +70,7 @@ def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
             "Speed over ground by wheel speed",
             "speed of the driven wheel [rad/s]",
             "m",
-            (*traces, Trace("radius", ends, np.full(2, radius))),
+            (*traces, PlotLine("radius", ends, np.full(2, radius))),
         )
     )
     return result

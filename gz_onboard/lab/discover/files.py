@@ -16,7 +16,8 @@ from scipy.stats import t as student
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.result import Found, Result
-from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged, number, string, with_keys
+from gz_onboard.lab.calibrate.toml_text import number, string, with_keys
+from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged
 from gz_onboard.lab.discover.limits import amount
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.state import Shape, State

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.table import Measurements
 
 DATA = os.environ.get("GZ_ONBOARD_DATA")
 needs_data = pytest.mark.skipif(not DATA, reason="the recordings are not in the repository: set GZ_ONBOARD_DATA")
@@ -18,16 +18,18 @@ def bench_file(name: str) -> Path:
     return Path(DATA or "") / "bench" / name
 
 
-def table(**columns) -> Table:
-    return Table(Path("planted.csv"), {name: np.asarray(column, dtype=float) for name, column in columns.items()})
+def table(**columns) -> Measurements:
+    return Measurements(
+        Path("planted.csv"), {name: np.asarray(column, dtype=float) for name, column in columns.items()}
+    )
 
 
-def changed(of: Table, **columns) -> Table:
-    return Table(of.file, {**of.columns, **columns})
+def changed(of: Measurements, **columns) -> Measurements:
+    return Measurements(of.file, {**of.columns, **columns})
 
 
-def without(of: Table, *names: str) -> Table:
-    return Table(of.file, {name: column for name, column in of.columns.items() if name not in names})
+def without(of: Measurements, *names: str) -> Measurements:
+    return Measurements(of.file, {name: column for name, column in of.columns.items() if name not in names})
 
 
 MOTOR = {
@@ -39,7 +41,7 @@ MOTOR = {
 INVERTER = {"inverter_loss_constant": 6.0, "inverter_loss_linear": 0.38, "inverter_loss_quadratic": 0.0024}
 
 
-def dyno(seed: int, noise: float = 1.0, saturation: float = 0.0) -> Table:
+def dyno(seed: int, noise: float = 1.0, saturation: float = 0.0) -> Measurements:
     """A grid of speed and current on a motor dynamometer; noise: 1 is 0.3 N·m, 0.2 % and 1 W."""
     rng = np.random.default_rng(seed)
     speed, current = (a.ravel() for a in np.meshgrid(np.linspace(3, 57, 13), np.linspace(-110, 200, 14)))

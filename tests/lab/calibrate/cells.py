@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.lab.calibrate.table import Measurements
 
 
 @dataclass
@@ -69,7 +69,7 @@ class Plant:
             "voltage": volts,
             "cell_temperature": np.full(size, float(temperature)) + rng.normal(0, 0.05, size),
         }
-        return Table(Path(name), columns)
+        return Measurements(Path(name), columns)
 
 
 def slow_test(charge=1.0, hours=20, **plant):

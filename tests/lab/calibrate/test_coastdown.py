@@ -16,7 +16,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.coastdown import calibrate
 from gz_onboard.lab.calibrate.coastdown_run import coast, directions, samples
 from gz_onboard.lab.calibrate.road_load import NAMES
-from gz_onboard.lab.calibrate.table import Table, read_table
+from gz_onboard.lab.calibrate.table import Measurements, read_table
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
@@ -309,7 +309,7 @@ def test_speeds_alone_give_wide_intervals():
     runs = []
     for name in ("A", "A1", "B", "B1"):
         speed = np.loadtxt(folder / f"Michelin60{name}.csv") / 3.6
-        table = Table(Path(f"{name}.csv"), {"time": np.arange(float(len(speed))), "speed": speed})
+        table = Measurements(Path(f"{name}.csv"), {"time": np.arange(float(len(speed))), "speed": speed})
         runs.append(samples(table, {"direction": name[0], "total_mass_kg": 76.0, "ambient_C": 30.0}))
     found = calibrate(runs, small_car(), hold_out=True)
     c0, area = (found.parameters[name] for name in ("rolling_resistance_constant", "drag_area"))

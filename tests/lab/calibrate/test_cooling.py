@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate import cooling
+from gz_onboard.lab.calibrate import cooling_network
 from gz_onboard.lab.calibrate.cooling import bms_cooling, inverter_cooling, motor_cooling, pack_cooling
-from gz_onboard.lab.calibrate.cooling_run import Run, bench_run, ride_run
+from gz_onboard.lab.calibrate.cooling_run import CoolingRun, bench_run, ride_run
 from gz_onboard.lab.calibrate.table import read_table
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.parameters import declared_parameters
@@ -37,10 +37,10 @@ TRUTH = {
 }
 ROOM = {"motor": 1.8, "inverter": 1.1}
 NETWORKS = {
-    "motor": cooling.motor_temperatures,
-    "inverter": cooling.inverter_temperatures,
-    "cell": cooling.pack_temperatures,
-    "bms": cooling.bms_temperatures,
+    "motor": cooling_network.motor_temperatures,
+    "inverter": cooling_network.inverter_temperatures,
+    "cell": cooling_network.pack_temperatures,
+    "bms": cooling_network.bms_temperatures,
 }
 
 
@@ -52,7 +52,7 @@ def planted(name, seed, still, seconds=900, noise=0.2, truth=TRUTH):
         load = (time < 0.4 * seconds).astype(float)
     else:
         load = np.repeat(rng.uniform(0.2, 1.2, seconds // 60), 60)
-    run = Run(
+    run = CoolingRun(
         name,
         still,
         time,

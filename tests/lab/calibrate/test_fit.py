@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.fit import linear, nonlinear, profile, score, split
+from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, linear, nonlinear, profile, score, split
+from gz_onboard.lab.calibrate.result import compared
 
 SEEDS = 400
 
@@ -112,3 +113,30 @@ def test_profile_is_open_where_the_data_tell_nothing():
     found = nonlinear(residual, start, known_sd=True, bounds=bounds)
     p = profile(residual, found, "conductance", np.linspace(0.01, 60, 13), bounds=bounds)
     assert p.low == -np.inf  # as well none at all
+
+
+def test_a_line_of_all_points_and_of_some():
+    x = np.arange(8.0)
+    y = np.where(x < 4, 2 * x + 1, 3 * x)
+    found, whole, part = line("slope", x, y, x < 4)
+    assert found["slope"] == pytest.approx(np.polyfit(x, y, 1)[0])
+    assert whole == pytest.approx(found["slope"] * x + found["offset"])
+    assert part == pytest.approx(2 * x + 1)
+
+
+def test_groups_count_from_three_on_and_every_second_is_fitted():
+    labels = np.array([0, 0, 1, 1, 2])
+    assert as_groups(labels) is labels
+    assert as_groups(labels[:4]) is None
+    assert every_second(labels).tolist() == [True, True, False, False, True]
+    assert every_second(np.zeros(9, dtype=int)).tolist() == split(9).tolist()
+
+
+def test_data_and_model_are_drawn_with_what_is_left_over():
+    x, data, model = np.array([2.0, 1.0]), np.array([5.0, 3.0]), np.array([4.5, 3.5])
+    both, left = compared("Sag", "current [A]", "voltage, mean [V]", x, data, model)
+    assert both.traces[1].x.tolist() == [1.0, 2.0]
+    assert both.traces[1].y.tolist() == [3.5, 4.5]
+    assert (left.title, left.y_label) == ("Sag: residual", "measured less model [V]")
+    assert left.traces[0].y.tolist() == [0.5, -0.5]
+    assert compared("Loss", "x", "y [W]", x, data, model, "x")[0].traces[1].x.tolist() == [2.0, 1.0]

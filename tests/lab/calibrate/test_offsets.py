@@ -5,7 +5,7 @@ import pytest
 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD
-from gz_onboard.lab.calibrate.offsets import DRIFT_SD, GAIN_SD, offsets
+from gz_onboard.lab.calibrate.offsets import DRIFT_SD, GAIN_SD, offsets, read_pair, window_means
 
 from .rides import CURRENT_NOISE, GAIN, OFFSET, VEHICLE, VOLTAGE_NOISE, VOLTS_APART, ride
 
@@ -71,3 +71,12 @@ def test_bad_rides_are_refused():
         offsets([moving], VEHICLE)
     with pytest.raises(InputError, match="no ride"):
         offsets([], VEHICLE)
+
+
+def test_means_are_over_whole_windows():
+    pair = read_pair(ride(0), VEHICLE)
+    step = float(np.median(np.diff(pair.time)))
+    count = round(2.0 / step)
+    means = window_means(pair, np.arange(len(pair.time), dtype=float), 2.0)
+    assert len(means) == len(pair.time) // count
+    assert means[:2] == pytest.approx([(count - 1) / 2, (3 * count - 1) / 2])

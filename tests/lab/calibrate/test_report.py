@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.lab.calibrate.report import VERSION, document, picture, plus_minus, text, thinned, write_report
-from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, Result, Trace
+from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, PlotLine, Result
 from gz_onboard.offline.results import write_json
 
 NAN = float("nan")
@@ -25,7 +25,7 @@ def a_result() -> Result:
         [Fit("speed", "m/s", 0.1, 0.3, 0.99, 12, True, "two runs"), Fit("x", "V", 0.1, 0.3, None, 3, False, "y")],
         ["the slope: ± 3 %"],
         ["a note"],
-        [Panel("Speed", "t [s]", "v [m/s]", (Trace("measured", x, np.sin(x), "."), Trace("model", x, x)))] * 3,
+        [Panel("Speed", "t [s]", "v [m/s]", (PlotLine("measured", x, np.sin(x), "."), PlotLine("model", x, x)))] * 3,
     )
 
 

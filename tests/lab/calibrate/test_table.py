@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.table import UNITS, Named, Table, read_columns, read_table
+from gz_onboard.lab.calibrate.table import UNITS, Measurements, Named, read_columns, read_table
 from gz_onboard.toml import Table as Toml
 
 
@@ -120,7 +120,7 @@ def test_a_file_that_cannot_be_read(tmp_path, name):
 
 
 def test_a_missing_column_of_a_table_made_by_hand():
-    table = Table(Path("made"), {"voltage": np.array([1.0])})
+    table = Measurements(Path("made"), {"voltage": np.array([1.0])})
     assert "voltage" in table
     with pytest.raises(InputError, match=r"made: no column for 'voltag' \(did you mean 'voltage'\?\)"):
         table["voltag"]

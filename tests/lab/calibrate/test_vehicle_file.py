@@ -12,8 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
+from gz_onboard.lab.calibrate.fit import correlation
 from gz_onboard.lab.calibrate.result import Curve, Found, Result
-from gz_onboard.lab.calibrate.vehicle_file import correlation, merged, number, string, write_vehicle
+from gz_onboard.lab.calibrate.toml_text import number, string
+from gz_onboard.lab.calibrate.vehicle_file import merged, write_vehicle
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import OWN, read_vehicle
 from tests.test_vehicle import with_effect

@@ -1,0 +1,146 @@
+"""One log: an MCAP file with the raw frames in blocks and JSON channels for everything else (docs/log-format.md)."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import IO, Any
+
+from mcap.writer import CompressionType, Writer
+
+from gz_onboard import __version__
+from gz_onboard.bus import framelog
+from gz_onboard.events import Frame
+
+BLOCK_FRAMES = 512
+BLOCK_NS = 1_000_000_000
+"""A block holds at most this many frames and this much time: a reader that looks for a time relies on it."""
+
+_CHUNK_BYTES = 256 * 1024
+
+
+class LogFile:
+    """One MCAP file of frames and samples. An I/O error is raised as OSError.
+
+    stream: opened for binary writing; closed by `close`. start_ns: the time of the first entry.
+    metadata: text by key, kept in the file's metadata record ``gz_onboard``; attachments: files by name, such as
+    the DBC files that the frames can be decoded by.
+    """
+
+    def __init__(
+        self,
+        stream: IO[bytes],
+        start_ns: int,
+        metadata: Mapping[str, str] | None = None,
+        attachments: Mapping[str, bytes] | None = None,
+    ) -> None:
+        self.start_ns = start_ns
+        self.unsynced_frames = 0
+        self.flushed = False
+        self._stream = stream
+        self._pending: list[Frame] = []
+        self._channels: dict[str, int] = {}
+        self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._writer.start(profile="", library=f"gz-onboard {__version__}")
+        self._writer.add_metadata("gz_onboard", {"version": __version__, **(metadata or {})})
+        for name, data in (attachments or {}).items():
+            self._writer.add_attachment(start_ns, start_ns, name, "text/plain", data)
+        schema = self._writer.register_schema(framelog.SCHEMA_NAME, framelog.ENCODING, framelog.SCHEMA_TEXT.encode())
+        self._frames_channel = self._writer.register_channel(framelog.TOPIC, framelog.ENCODING, schema)
+        stream.flush()  # a file cut off before the first chunk is a valid beginning
+
+    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
+        """Declare a topic of JSON objects; its schema is named by the JSON schema's ``title``, or the topic."""
+        schema = self._writer.register_schema(
+            str(json_schema.get("title", topic)), "jsonschema", json.dumps(json_schema, separators=(",", ":")).encode()
+        )
+        self._channels[topic] = self._writer.register_channel(topic, "json", schema, dict(metadata or {}))
+
+    def frames(self, batch: Sequence[Frame]) -> None:
+        """Log raw frames; they are written once there is a block of them, or at the next `flush`."""
+        pending = self._pending
+        pending += batch
+        self.unsynced_frames += len(batch)
+        while pending and (len(pending) >= BLOCK_FRAMES or abs(pending[-1][0] - pending[0][0]) >= BLOCK_NS):
+            self._write_block(_block_length(pending))
+
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
+        """Log one JSON object on a declared topic; not-a-number and infinities become null."""
+        try:
+            text = json.dumps(values, allow_nan=False, separators=(",", ":"))
+        except ValueError:
+            text = json.dumps(_without_nan(values), separators=(",", ":"))
+        self._writer.add_message(self._channels[topic], time_ns, text.encode(), time_ns)
+
+    def flush(self, *, to_disk: bool = False) -> None:
+        """Write all that there is, so that it can be read though the file is cut off; to_disk: fsync as well."""
+        while self._pending:
+            self._write_block(_block_length(self._pending))
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        if to_disk:
+            os.fdatasync(self._stream.fileno())
+        self.unsynced_frames = 0
+        self.flushed = True
+
+    def size(self) -> int:
+        """Bytes written so far, without what still waits for a chunk to be full."""
+        return self._stream.tell()
+
+    def vanished(self, path: Path) -> bool:
+        """Whether the file is no longer at `path`: deleted or moved, itself or its directory."""
+        try:
+            there = path.stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return True
+        return not os.path.samestat(there, os.fstat(self._stream.fileno()))
+
+    def close(self) -> None:
+        """Write the rest and the summary that lets readers jump to a time."""
+        try:
+            self.flush()
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._stream.flush()
+            os.fsync(self._stream.fileno())
+        finally:
+            self._stream.close()
+
+    def abandon(self) -> None:
+        """Close without writing anything more, after an error."""
+        with contextlib.suppress(OSError):
+            self._stream.close()
+
+    def _write_block(self, count: int) -> None:
+        block = self._pending[:count]
+        self._writer.add_message(
+            self._frames_channel, block[0][0], framelog.encode_block(block), publish_time=block[-1][0]
+        )
+        del self._pending[:count]
+
+
+def object_schema(title: str, units: Mapping[str, str]) -> dict[str, Any]:
+    """A JSON schema for an object of numbers, each with its unit; null stands for not available."""
+    properties = {name: {"type": ["number", "null"], "description": unit} for name, unit in units.items()}
+    return {"title": title, "type": "object", "properties": properties}
+
+
+def _block_length(pending: Sequence[Frame]) -> int:
+    """How many of the pending frames go into the next block: within a second of the first, in either direction."""
+    candidates = pending[:BLOCK_FRAMES]
+    first = candidates[0][0]
+    if abs(candidates[-1][0] - first) < BLOCK_NS:
+        return len(candidates)
+    return next(i for i, frame in enumerate(candidates) if abs(frame[0] - first) >= BLOCK_NS)
+
+
+def _without_nan(value: object) -> object:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _without_nan(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(item) for item in value]
+    return value

@@ -1,0 +1,1 @@
+"""The daemon: what systemd runs on board."""

@@ -1,0 +1,186 @@
+"""``gz-onboard run``: the daemon's options, its locks, and what it prints when it ends."""
+
+from __future__ import annotations
+
+import argparse
+import errno
+import fcntl
+import logging
+import os
+import re
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+
+from gz_onboard.bus.channel import CanChannel
+from gz_onboard.bus.codec import known_identifiers
+from gz_onboard.bus.recorder import Limits, Recorder
+from gz_onboard.daemon.loop import TICK, Daemon, state_text
+from gz_onboard.errors import FAILED, InputError
+from gz_onboard.physics.trust import ROOT
+from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts
+from gz_onboard.vehicle import Vehicle, read_vehicle
+
+LOCK_S = 3.0  # to wait for one that is ending
+
+log = logging.getLogger("gz-onboard")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``gz-onboard run``."""
+    add = parser.add_argument
+    add(
+        "--vehicle",
+        default="reference",
+        metavar="NAME|TOML",
+        help="vehicle file, or one of the package's (%(default)s)",
+    )
+    add("--interface", default="socketcan", help="python-can's interface (%(default)s)")
+    add("--channel", action="append", metavar="NAME", help="channel (can0, the vehicle's bus); twice, for a second bus")
+    add("--payload", type=float, metavar="KG", help="mass of rider and luggage, where it is known")
+    add("--effects", type=Path, metavar="DIR", help="folder with effects of your own, Python that you trust")
+    add("--filter", default="scalar", choices=("scalar", "filterpy"), help="backend of the SOC filter (%(default)s)")
+    add("--log-dir", type=Path, default=_directory("LOGS_DIRECTORY"), metavar="DIR", help="write MCAP logs here")
+    add("--log-file-mb", type=float, default=64, metavar="MB", help="begin a new log at this size (%(default)g)")
+    add("--log-file-hours", type=float, default=6, metavar="H", help="or at this age (%(default)g)")
+    add("--log-total-mb", type=float, default=2048, metavar="MB", help="delete the oldest beyond this (%(default)g)")
+    add("--state-dir", type=Path, default=_directory("STATE_DIRECTORY"), metavar="DIR", help="keep the state here")
+    add("--all-frames", action="store_true", help="take in, count and log identifiers that the DBC files do not know")
+    add("--tick", type=float, default=TICK, metavar="S", help="drain the bus this often (%(default)g)")
+
+
+def _directory(variable: str) -> Path | None:
+    value = os.environ.get(variable, "").split(":")[0]  # systemd gives several, colon-separated
+    return Path(value) if value else None
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """``gz-onboard run``."""
+    logging.basicConfig(
+        level=logging.INFO, format="%(message)s" if "JOURNAL_STREAM" in os.environ else "%(asctime)s %(message)s"
+    )
+    logging.getLogger("can").setLevel(logging.WARNING)
+    if not 0.005 <= arguments.tick <= TICK_NS * 1e-9:
+        raise InputError(f"--tick {arguments.tick:g}: must be 0.005 to {TICK_NS * 1e-9:g} s")
+    if arguments.payload is not None and not 0 <= arguments.payload <= 300:
+        raise InputError(f"--payload {arguments.payload:g}: must be 0 to 300 kg")
+    for option in ("log_file_mb", "log_file_hours", "log_total_mb"):
+        if not 1e-3 <= (value := getattr(arguments, option)) <= 1e9:
+            raise InputError(f"--{option.replace('_', '-')} {value:g}: must be 0.001 to 1e9")
+    names = arguments.channel or ["can0"]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"--channel {name}: given twice; each of its frames would come twice")
+    # Nobody watches a daemon: the vehicle file's own code runs only if it is root's.
+    vehicle = read_vehicle(arguments.vehicle, arguments.payload, arguments.effects, users={ROOT})
+    with ExitStack() as locks:
+        _lock(locks, arguments.interface, names, arguments.state_dir)
+        return _run(arguments, vehicle, names)
+
+
+def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> int:
+    recorder = None
+    if arguments.log_dir:
+        recorder = Recorder(
+            arguments.log_dir,
+            vehicle.name,
+            metadata={"vehicle_key": vehicle.key},
+            attachments=dbc_texts(vehicle),
+            limits=Limits(
+                max_file_bytes=round(arguments.log_file_mb * 1e6),
+                max_age_s=arguments.log_file_hours * 3600,
+                max_total_bytes=round(arguments.log_total_mb * 1e6),
+            ),
+        )
+    state_file = None
+    if arguments.state_dir:
+        state_file = arguments.state_dir / (re.sub(r"[^\w.+-]+", "-", vehicle.name) + ".json")
+    wanted = None if arguments.all_frames else known_identifiers(vehicle.mapping)
+    channels = [CanChannel(arguments.interface, name, index, wanted) for index, name in enumerate(names)]
+    for channel in channels:
+        channel.open()
+    daemon = Daemon(vehicle, channels, recorder, state_file, arguments.filter, arguments.tick)
+    signal.signal(signal.SIGTERM, daemon.stop)
+    signal.signal(signal.SIGINT, daemon.stop)
+    daemon.run()
+    _summary(daemon)
+    if not daemon.finished:  # a thread still waits for its disk: the interpreter would abort over its files
+        sys.stdout.flush()
+        logging.shutdown()
+        os._exit(FAILED)
+    return 0
+
+
+def _lock(locks: ExitStack, interface: str, names: list[str], state_dir: Path | None) -> None:
+    """Hold the channels and the state directory until `locks` is left, or the process ends, however it does.
+
+    InputError if another daemon has one of them and does not give it back soon, as one that is being restarted does.
+    """
+    until = time.monotonic() + LOCK_S
+    # The names of abstract sockets are those of the network namespace, as the interfaces are; a virtual bus is the
+    # process' own.
+    for name in names if interface != "virtual" else ():
+        holder = locks.enter_context(socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM))
+        address = f"\0gz-onboard:{interface}:{name}"[:107]
+        if not _retried(lambda holder=holder, address=address: holder.bind(address), until):  # type: ignore[misc]
+            raise InputError(f"--channel {name}: another gz-onboard run has it; two would send the same identifiers")
+    if state_dir is None:
+        return
+    try:
+        state_dir.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(state_dir, os.O_RDONLY | os.O_DIRECTORY)
+    except OSError:  # then nothing can be saved there either, and the daemon says so
+        return
+    locks.callback(os.close, descriptor)
+    if not _retried(lambda: fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB), until):
+        raise InputError(f"--state-dir {state_dir}: another gz-onboard run uses it; give each its own")
+
+
+def _retried(take: Callable[[], None], until: float) -> bool:
+    """Take a lock, again and again `until` a monotonic time [s]; False if another holds it. True without locks."""
+    while True:
+        try:
+            take()
+        except OSError as error:
+            if error.errno not in (errno.EADDRINUSE, errno.EWOULDBLOCK):
+                log.warning("without a lock: %s", error)
+                return True
+        else:
+            return True
+        if time.monotonic() > until:
+            return False
+        time.sleep(0.1)
+
+
+def _summary(daemon: Daemon) -> None:
+    """What a person wants to read when the daemon ends."""
+    print("\n".join(summary(daemon.pipeline)))
+    for path in [path for path in daemon.recorder.paths if path.exists()] if daemon.recorder else []:
+        print(f"log {path}")
+
+
+def summary(pipeline: Pipeline) -> list[str]:
+    """What came, the last numbers and the last state, as they were sent: numbers may be older than the state."""
+    last, known, counts = pipeline.last, pipeline.last_known, pipeline.counts()
+    lines = [
+        f"received {pipeline.codec.received} frames; dropped {counts.dropped}, lost {counts.lost}, "
+        f"implausible {counts.implausible}, unknown identifiers {counts.unknown}"
+    ]
+    if last is None:
+        return lines
+    ago = ""
+    if known and known.soc is not None and known.soc_sd is not None:
+        _, *numbers = pipeline.publisher.reported(known)
+        remaining, p10, p90 = ("–" if value is None else f"{value:.1f}" for value in numbers)
+        lines += [
+            f"state of charge {100 * known.soc:.1f} % ± {100 * known.soc_sd:.1f} %, "
+            f"ridden {last.distance / 1000:.2f} km",
+            f"range {remaining} km ({p10} to {p90})",
+        ]
+        ago = f"; the numbers are of {last.time - known.time:.1f} s before" if known is not last else ""
+    state = pipeline.publisher.reported(last)[0]
+    return [*lines, f"state at the end {state_text(state, last.reasons)}{ago}"]

@@ -1,0 +1,235 @@
+"""The daemon: channels, clock, recorder and pipeline together.
+
+The loop never waits for a disk: the log and the state are written by a thread each. Nor for the bus: what one tick
+reads and decodes is bounded, so that the status goes out ten times a second whatever comes.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Callable
+from operator import itemgetter
+from pathlib import Path
+from typing import Any
+
+from gz_onboard import notify
+from gz_onboard.bus.background_recorder import BackgroundRecorder
+from gz_onboard.bus.channel import CanChannel
+from gz_onboard.bus.recorder import Recorder
+from gz_onboard.daemon.keeper import StateKeeper
+from gz_onboard.events import Frame, Reason, State
+from gz_onboard.pipeline import Pipeline, reason_names
+from gz_onboard.vehicle import Vehicle
+
+TICK = 0.1  # s: as often as a status is sent; each wake-up costs as much as ten frames
+BUSY = 200  # frames in a tick from which the next is half as long: what waits in the kernel must fit its buffer
+WORK_S = 0.06  # s of CPU that the frames of one tick may cost
+FRAME_S = 20e-6  # s of CPU for a frame, until it is measured
+STOP_S = 6.0  # to write what waits when stopped; systemd kills after 10 s
+CLOCK_STEP_NS = 500_000_000
+
+log = logging.getLogger("gz-onboard")
+
+
+class Daemon:
+    """Runs until `stop` is called (by SIGTERM or SIGINT)."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        channels: list[CanChannel],
+        recorder: Recorder | None,
+        state_file: Path | None,
+        filter_name: str = "scalar",
+        tick: float = TICK,
+    ) -> None:
+        self.channels = channels
+        self.recorder = recorder
+        self.finished = True  # whether log and state were written to their end
+        self._log = BackgroundRecorder(recorder) if recorder else None
+        self._make_pipeline: Callable[[], Pipeline] = lambda: Pipeline(vehicle, filter_name=filter_name, log=self._log)
+        self.pipeline = self._make_pipeline()
+        self._keeper = StateKeeper(state_file, vehicle.key) if state_file else None
+        self._tick = tick
+        self._stopping = False
+        self._later: list[Frame] = []
+        self._overrun = 0
+        self._frame_s = FRAME_S
+        self._offset = _wall_offset()
+        self._boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        self._said_at = 0.0
+        self._said = ""
+        self._log_error = ""
+
+    def stop(self, *_: object) -> None:
+        """End after the current round."""
+        self._stopping = True
+
+    def run(self) -> None:
+        """Loop until stopped: each tick drain, estimate, send, record, save, feed the watchdog.
+
+        Whatever is raised, log and state are written to their end first.
+        """
+        try:
+            self._loop()
+            notify.stopping()
+            self.round()  # what waited for its tick
+        finally:
+            self.close()
+
+    def _loop(self) -> None:
+        self.restore()
+        watchdog = notify.watchdog_interval()
+        fed = next_tick = time.monotonic()
+        busy = False
+        notify.ready("waiting for frames")
+        log.info("ready after %.2f s of CPU", time.process_time())
+        while not self._stopping:
+            next_tick += self._tick / 2 if busy else self._tick
+            pause = next_tick - time.monotonic()
+            if pause > 0:
+                time.sleep(pause)
+            else:  # overloaded or suspended: do not try to catch up
+                next_tick -= pause
+            busy = self.round() > BUSY
+            now = time.monotonic()
+            if watchdog and now - fed >= watchdog:
+                fed = now
+                notify.alive()
+            self._report(now)
+
+    def close(self) -> None:
+        """Save the state, write the log to its end as far as the disks allow it in time, and close the channels."""
+        until = time.monotonic() + STOP_S
+        if self._keeper:
+            self._keeper.save(self.pipeline, time.time_ns())
+        if self._log and not self._log.close(until - time.monotonic()):
+            log.warning("the disk does not take the log in time: its end is lost")
+            self.finished = False
+        if self._keeper and not self._keeper.close(max(until - time.monotonic(), 1.0)):
+            log.warning("the disk does not take the state in time")
+            self.finished = False
+        for channel in self.channels:
+            channel.close()
+
+    def restore(self) -> dict[str, Any] | None:
+        """Go on from the latest saved state that can be used; gives it."""
+        if self._keeper is None:
+            return None
+        self.pipeline, snapshot = self._keeper.restore(self.pipeline, self._make_pipeline)
+        return snapshot
+
+    def round(self) -> int:
+        """One tick; gives the number of frames that came."""
+        boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        frames, self._later = self._later, []
+        for channel in self.channels:
+            frames += channel.drain()
+        offset = _wall_offset()
+        now_ns = boot_ns + offset  # by the same clock as `offset`, whenever that was set
+        self.pipeline.estimator.wait((boot_ns - self._boot_ns) * 1e-9)
+        self._boot_ns = boot_ns
+        # What came while we read, or were held up, waits for its own tick: of a channel read before, some is missing.
+        frames.sort(key=itemgetter(0))
+        ahead = time.clock_gettime_ns(time.CLOCK_BOOTTIME) + offset + CLOCK_STEP_NS  # for the codec to drop
+        end, beyond = bisect_left(frames, (now_ns,)), bisect_left(frames, (ahead,))
+        frames, self._later = frames[:end] + frames[beyond:], frames[end:beyond]
+        step = offset - self._offset
+        self._offset = offset
+        if abs(step) > CLOCK_STEP_NS:  # by the network's or the GPS' time; what came meanwhile has either time
+            log.warning("the clock was set by %.1f s", step * 1e-9)
+            self.pipeline.clock_set(step)
+            frames, self._later = [], []
+        count = len(frames)
+        kept = fair_share(frames, max(int(WORK_S / self._frame_s), 2 * BUSY))
+        self._overrun += count - len(kept)
+        began = time.thread_time()
+        self.step(kept, now_ns)
+        if len(kept) > BUSY:
+            self._frame_s += 0.2 * ((time.thread_time() - began) / len(kept) - self._frame_s)
+        else:  # so few say nothing of a frame: it is the estimates that cost
+            self._frame_s = max(0.98 * self._frame_s, FRAME_S)
+        return count
+
+    def step(self, frames: list[Frame], now_ns: int) -> None:
+        """Take in frames, in the order of their times, up to `now_ns`; send, record and save what comes of them."""
+        pipeline = self.pipeline
+        pipeline.kernel_lost = sum(channel.overflow for channel in self.channels)
+        pipeline.send_failures = sum(channel.send_failures for channel in self.channels)
+        pipeline.overrun = self._overrun
+        reasons = Reason(0)
+        if not all(channel.up for channel in self.channels):
+            reasons |= Reason.BUS_DOWN
+        if self._log:
+            pipeline.log_lost = self._log.lost_frames
+            if self._log.failing:
+                reasons |= Reason.LOG_FAILED
+        pipeline.extra_reasons = reasons
+        for frame in pipeline.advance(frames, now_ns):
+            self.channels[0].send(frame)
+        if self._log:
+            self._log.sync(now_ns)
+        if self._keeper:
+            self._keeper.save_if_due(pipeline, now_ns)
+
+    def _report(self, now: float) -> None:
+        """Give systemd the status and the journal what changed, at most once a second."""
+        if now - self._said_at < 1.0:
+            return
+        self._said_at = now
+        error = self._log.last_error if self._log and self._log.failing else ""
+        if error and error != self._log_error:
+            log.warning("cannot write the log: %s", error)
+        self._log_error = error
+        if self._keeper:
+            self._keeper.report()
+        last = self.pipeline.last
+        if last is None:
+            return
+        counts = self.pipeline.counts()
+        state, remaining, _, _ = self.pipeline.publisher.reported(last)
+        text = state_text(state, last.reasons)
+        if text != self._said:
+            log.info("%s; dropped %d, lost %d, unknown %d", text, counts.dropped, counts.lost, counts.unknown)
+            self._said = text
+        if remaining is not None and last.soc is not None:
+            text = f"{remaining:.1f} km, {100 * last.soc:.0f} %, {text}"
+        notify.status(text)
+
+
+def fair_share(frames: list[Frame], most: int) -> list[Frame]:
+    """About `most` of the frames, the latest of each identifier: one that floods the bus takes no other's place."""
+    if len(frames) <= most:
+        return frames
+    counts = Counter(itemgetter(1, 3)(frame) for frame in frames)
+    left = most
+    for done, count in enumerate(sorted(counts.values())):
+        share = max(left // (len(counts) - done), 1)
+        if count > share:
+            break
+        left -= count
+    taken: Counter[tuple[int, int]] = Counter()
+    kept = []
+    for frame in reversed(frames):
+        kind = frame[1], frame[3]
+        taken[kind] += 1
+        if taken[kind] <= share:
+            kept.append(frame)
+    return kept[::-1]
+
+
+def _wall_offset() -> int:
+    """The wall clock less the time since boot, suspended or not [ns]: changes only when the clock is set."""
+    for _ in range(10):
+        before, wall = time.clock_gettime_ns(time.CLOCK_BOOTTIME), time.time_ns()
+        if time.clock_gettime_ns(time.CLOCK_BOOTTIME) - before < 1_000_000:  # else we were held up between the two
+            break
+    return wall - before
+
+
+def state_text(state: State, reasons: Reason) -> str:
+    """A state with its reasons, on one line."""
+    return f"{state.name.lower()}: {' '.join(reason_names(reasons)) or 'all inputs there'}"

@@ -1,0 +1,170 @@
+"""What the range frames on the bus say now: decoded, checked and aged."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from gz_onboard.bus.checksum import crc8_sae_j1850
+from gz_onboard.bus.layout import identifier_of, raw_range
+from gz_onboard.bus.mapping import find_dbc
+from gz_onboard.bus.publisher import KNOWN, RANGE_DBC, range_messages, reason_signal, sensor_signal
+from gz_onboard.events import ROLES, STALE_PERIODS, Activity, Frame, Reason, State
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message
+
+LATE_PERIODS = 3  # after so many the numbers are shown in grey, after STALE_PERIODS not at all
+PERIODS = {"RANGE_Status": 100}  # ms, where the DBC does not say; of the others 1000
+_NUMBERS = {  # how each is written: format, unit
+    "RANGE_Remaining": (".1f", "km"),
+    "RANGE_RemainingP10": (".1f", "km"),
+    "RANGE_RemainingP90": (".1f", "km"),
+    "RANGE_EnergyLeft": (".0f", "Wh"),
+    "RANGE_ConsumptionRecent": (".1f", "Wh/km"),
+    "RANGE_ConsumptionExpected": (".1f", "Wh/km"),
+    "RANGE_StateOfCharge": (".1f", "%"),
+    "RANGE_StateOfChargeSigma": (".1f", "%"),
+}
+
+
+@dataclass
+class Received:
+    """What is known of one message."""
+
+    definition: Message
+    period: float  # s
+    limits: dict[str, tuple[float, float]]  # raw
+    values: dict[str, float | None] = field(default_factory=dict)
+    time: float = -math.inf  # s, when it last came whole
+    counter: int | None = None
+    received: int = 0
+    lost: int = 0  # by its counter
+    bad: int = 0  # length, checksum, or a counter that stands still
+
+    def late(self, now: float) -> bool:
+        """Whether a newer one should have come by `now` [s]."""
+        return now - self.time > LATE_PERIODS * self.period
+
+    def stale(self, now: float) -> bool:
+        """Whether its values are too old to be shown at `now` [s]."""
+        return now - self.time > STALE_PERIODS * self.period
+
+
+class View:
+    """What the range frames of a DBC file say, of the package's ``range.dbc`` if none is given.
+
+    No clock: times [s, monotonic] come with the frames. InputError if the file has not what ``range.dbc`` has.
+    """
+
+    def __init__(self, file: Path | None = None) -> None:
+        self.file = file or find_dbc(RANGE_DBC)
+        messages = range_messages(self.file)
+        self.messages: dict[str, Received] = {}
+        self.comments = {s.name: s.comment or "" for m in messages.values() for s in m.signals}
+        for name, message in messages.items():
+            limits = {s.name: raw_range(s, not_available=True) for s in message.signals}
+            self.messages[name] = Received(message, (message.cycle_time or PERIODS.get(name, 1000)) / 1000, limits)
+        self._by_identifier = {identifier_of(entry.definition): entry for entry in self.messages.values()}
+
+    @property
+    def identifiers(self) -> list[int]:
+        """Of the frames that it reads: all that the kernel need let through."""
+        return list(self._by_identifier)
+
+    def take(self, frame: Frame, now: float) -> None:
+        """Take in a frame that came at `now`; one that fails a check is counted and not used."""
+        _, identifier, data, _ = frame
+        entry = self._by_identifier.get(identifier)
+        if entry is None:
+            return
+        message = entry.definition
+        if len(data) != message.length or crc8_sae_j1850(data[:-1]) != data[-1]:
+            entry.bad += 1
+            return
+        raw = message.decode_simple(data, decode_choices=False, scaling=False)
+        counter = int(str(raw[f"{message.name}Counter"]))
+        if entry.counter is not None and not entry.stale(now):
+            step = (counter - entry.counter) % (int(entry.limits[f"{message.name}Counter"][1]) + 1)
+            if step == 0:  # the same frame again: who sends it may hang
+                entry.bad += 1
+                return
+            entry.lost += step - 1
+        entry.counter = counter
+        entry.time = now
+        entry.received += 1
+        for signal_ in message.signals:
+            value = float(str(raw[signal_.name]))
+            low, high = entry.limits[signal_.name]
+            scale, offset = float(signal_.conversion.scale), float(signal_.conversion.offset)
+            entry.values[signal_.name] = value * scale + offset if low <= value <= high else None
+
+    def value(self, signal_: str, now: float) -> float | None:
+        """A signal's value in the units of the DBC; None if it is stale, not available or never came."""
+        for entry in self.messages.values():
+            if signal_ in entry.limits:
+                return None if entry.stale(now) else entry.values.get(signal_)
+        raise KeyError(signal_)
+
+    def text(self, signal_: str, now: float) -> str:
+        """The value with its unit; a dash if there is none."""
+        value = self.value(signal_, now)
+        form, unit = _NUMBERS[signal_]
+        return "–" if value is None else f"{value:{form}} {unit}"
+
+    def state(self, now: float) -> State | None:
+        """How far the numbers can be trusted; None if nothing says so.
+
+        The status comes ten times as often as the range, and may say what no range has yet: until then the state
+        is that of the last range, or starting.
+        """
+        status, estimate = (self._state(name, now) for name in ("RANGE_StatusState", "RANGE_EstimateState"))
+        if status in KNOWN and self.value("RANGE_Remaining", now) is None:
+            if not self.messages["RANGE_Estimate"].received:
+                return State.STARTING
+            status = estimate
+        return estimate if status is None else status
+
+    def _state(self, signal_: str, now: float) -> State | None:
+        value = self.value(signal_, now)
+        return State(int(value)) if value is not None and value in tuple(State) else None
+
+    def reasons(self, now: float) -> list[Reason]:
+        """Why the estimate is not what it could be."""
+        return [reason for reason in Reason if self.value(reason_signal(reason), now)]
+
+    def activity(self, now: float) -> str:
+        """What the vehicle does, in a word; nothing if it is not known, or before there is an estimate."""
+        value = None if self.state(now) is State.STARTING else self.value("RANGE_Activity", now)
+        return Activity(int(value)).name.lower() if value and value in tuple(Activity) else ""
+
+    def distrusted(self, now: float) -> list[str]:
+        """The roles whose sensors contradict the others and are left out."""
+        signals = self.messages["RANGE_Sensors"].limits
+        return [role for role in ROLES if sensor_signal(role) in signals and self.value(sensor_signal(role), now)]
+
+    def stale(self, now: float) -> dict[str, float]:
+        """Age [s] of each message that is stale, infinite if it never came."""
+        return {name: now - entry.time for name, entry in self.messages.items() if entry.stale(now)}
+
+    def age(self, now: float) -> float:
+        """[s] since the last good frame; infinite if none ever came."""
+        return now - max(entry.time for entry in self.messages.values())
+
+    def bad(self) -> int:
+        """How many frames failed a check."""
+        return sum(entry.bad for entry in self.messages.values())
+
+    def complete(self) -> bool:
+        """Whether every message has come."""
+        return all(entry.received for entry in self.messages.values())
+
+
+def words(name: str) -> str:
+    """The name of a reason or a role in words, such as ``no IMU``, ``GPS altitude``, ``acceleration x``."""
+    return " ".join(_WORDS.get(word, word) for word in name.lower().split("_"))
+
+
+_WORDS = {"imu": "IMU", "gps": "GPS", "soc": "SOC", "bms": "BMS", "accel": "acceleration", "rate": "rate of rotation"}

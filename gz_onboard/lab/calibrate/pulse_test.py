@@ -1,0 +1,126 @@
+"""Pulse tests with their state of charge, each the pieces that `cell_fit` takes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
+
+from gz_onboard.arrays import Array
+from gz_onboard.lab.calibrate.cell_circuit import KELVIN
+from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
+from gz_onboard.lab.calibrate.cell_fit import Pieces, filtered, fit_branches, pieces
+from gz_onboard.lab.calibrate.result import Fit, Found, Result
+from gz_onboard.lab.calibrate.table import Measurements
+from gz_onboard.physics.tables import extended_over
+
+FEWEST_PULSES = 6
+FEWEST_LEVELS = 3
+REST = 1200.0  # s without current, after which a voltage is that of rest
+FULL_WITHIN = 0.03  # V: a first voltage so near to the full cell's is that of a full cell
+
+
+@dataclass(frozen=True)
+class Tested:
+    """A pulse test with its state of charge."""
+
+    test: CellTest
+    temperature: float  # degC, nominal
+    capacity: float  # A·h between full and empty
+    capacity_sd: float
+    level: Array
+    rests: NDArray[np.int_]  # rows at the ends of rests
+
+
+def tested(table: Measurements, nodes: Array, volts: Array, capacity: Found, result: Result) -> Tested:
+    """`table` with its capacity: the one with which its rest voltages lie best on the OCV above 10 % SOC."""
+    test = cell_test(table)
+    rests = _long_rests(test, capacity)
+    start = 1.0
+    if test.voltage[0] < volts[-1] - FULL_WITHIN:
+        start = float(np.interp(test.voltage[0], volts, nodes))
+        result.notes.append(f"{test.name}: begins at {test.voltage[0]:.3f} V, SOC {start:.3f}, not full")
+    drawn, at_rest = test.drawn[rests], test.voltage[rests]
+
+    def misses(share: float) -> Array:
+        """What the rests lie off the OCV [V], those above 0.12 of SOC and less their common offset."""
+        level = start - drawn / (share * capacity.value)
+        error = at_rest - extended_over(nodes, volts, level)
+        weight = np.where(level > 0.12, 1.0, 0.0)
+        offset = float(np.sum(weight * error) / (np.sum(weight) + 1.0))  # prior: 5 mV, as one rest counts
+        result: Array = np.sqrt(weight) * (error - offset)
+        return result
+
+    best = minimize_scalar(lambda x: float(np.sum(misses(x) ** 2)), bounds=(0.6, 1.15), method="bounded")
+    share = float(best.x)
+    error = misses(share)
+    curvature = (np.sum((misses(share + 1e-3) - error) ** 2)) / 1e-6
+    sd = float(np.sqrt(max(np.sum(error**2) / max(len(error) - 2, 1), 1e-6) / max(curvature, 1e-12)))
+    found = share * capacity.value
+    temperature = float(np.round(np.median(test.temperature[rests]))) + 0.0  # no -0
+    what, rms = f"rest voltage at {temperature:g} degC, SOC above 0.12", float(np.sqrt(np.mean(error**2)))
+    result.fits.append(Fit(what, "V", rms, float(np.abs(error).max()), None, len(error), False, test.name))
+    found_sd = float(np.hypot(sd * capacity.value, 0.005 * found))
+    return Tested(test, temperature, found, found_sd, start - test.drawn / found, rests)
+
+
+def _long_rests(test: CellTest, capacity: Found) -> NDArray[np.int_]:
+    """The rows at the ends of rests of `REST` or longer; InputError for too few pulses, or too narrow a range."""
+    table, pulses = test.table, int(test.block[-1])
+    if pulses < FEWEST_PULSES:
+        raise table.error(f"has {pulses} pulses; at least {FEWEST_PULSES} are needed")
+    ends = np.flatnonzero(test.rest & ~np.concatenate([test.rest[1:], [False]]))
+    began = np.array([_began(test, int(k)) for k in ends])
+    rests: NDArray[np.int_] = ends[test.time[ends] - test.time[began] >= REST]
+    used = float(test.drawn.max() - test.drawn.min())
+    levels = np.unique(np.round(test.drawn[rests] / max(used, 1e-9) * 50))
+    if len(levels) < FEWEST_LEVELS:
+        raise table.error(
+            f"rests of {REST / 60:.0f} min at {len(levels)} states of charge; at least {FEWEST_LEVELS} are needed"
+        )
+    if used < 0.5 * capacity.value:
+        raise table.error(
+            f"draws {used:.3f} of {capacity.value:.3f} A·h: pulses over at least half of the range of SOC are needed"
+        )
+    return rests
+
+
+def _began(test: CellTest, end: int) -> int:
+    """The first row of the rest that ends at row `end`."""
+    moving = np.flatnonzero(~test.rest[:end])
+    return int(moving[-1]) + 1 if len(moving) else 0
+
+
+def moved_pieces(
+    tests: list[Tested], nodes: Array, volts: Array, soc: Array
+) -> tuple[list[Pieces], list[tuple[float, float]]]:
+    """Every test's pieces, moved to its nominal temperature by the activation seen between the tests, and that."""
+    relaxing = [filtered(t.test) for t in tests]
+
+    def split(activation: list[tuple[float, float]]) -> list[Pieces]:
+        return [
+            pieces(t.test, t.level, ocv_and_slope(nodes, volts, t.level), soc, t.temperature, x, a)
+            for t, x, a in zip(tests, relaxing, activation, strict=True)
+        ]
+
+    activation = [(0.0, 0.0)] * len(tests)
+    if len(tests) == 1:
+        return split(activation), activation
+    fitted = [fit_branches(x) for x in split(activation)]
+    middle = (soc > 0.15) & (soc < 0.95)
+    inverse = np.array([1 / (t.temperature + KELVIN) for t in tests])
+    logs = [
+        np.log([np.median(np.sum(f.resistance[part][:, middle], axis=0)) for f in fitted])
+        for part in (slice(0, 1), slice(1, None))
+    ]
+    slopes = [np.clip(np.gradient(x, inverse), 0, 8000) for x in logs]
+    activation = [(float(a), float(b)) for a, b in zip(*slopes, strict=True)]
+    return split(activation), activation
+
+
+def ocv_and_slope(nodes: Array, volts: Array, level: Array) -> tuple[Array, Array]:
+    """The open-circuit voltage [V] and its slope [V] over SOC, at `level`, each (m,)."""
+    up, down = extended_over(nodes, volts, level + 0.005), extended_over(nodes, volts, level - 0.005)
+    return extended_over(nodes, volts, level), (up - down) / 0.01
