@@ -145,6 +145,20 @@ class Battery:
         decay = decay_over(dt, r1 * c1)
         return relaxed(v1, r1 * current, decay), decay
 
+    def advanced(
+        self, dt: float, soc: float, v1: float, current: float, temperature: float
+    ) -> tuple[float, float, float]:
+        """(SOC, V1 [V], the factor that V1 decayed by) of a cell after `dt` [s] at a constant `current` [A]."""
+        r1, c1 = self.r1.at(soc, temperature)[0], self.c1.at(soc, temperature)[0]
+        v1, decay = self.relax(dt, v1, current, r1, c1)
+        return soc - current * dt / (3600 * self.cell_capacity(temperature)), v1, decay
+
+    def terminal_voltage(self, soc: float, v1: float, current: float, temperature: float) -> tuple[float, float]:
+        """(voltage of a cell [V] at `current` [A] and `temperature` [degC], its derivative over SOC): eq. 2.23."""
+        ocv, slope = self.ocv(soc, temperature)
+        r0, r0_slope = self.r0.at(soc, temperature)
+        return ocv - r0 * current - v1, slope - current * r0_slope
+
     def with_parameters(self, parameters: Mapping[str, float]) -> Battery:
         """The same battery with what a vehicle's `parameters` say of capacity, cut-off and resistances."""
         factor = parameters["cell_resistance_factor"]
