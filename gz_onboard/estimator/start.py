@@ -14,6 +14,7 @@ from gz_onboard.estimator.rest import SLOW_TIME
 from gz_onboard.physics.battery import Battery
 
 SOC_UNKNOWN_SD = 0.5  # whatever has flowed
+SOC_BOUNDS = -0.05, 1.05  # what a linear update, over a curve that is not, may make of it
 BEYOND = 0.5  # of the span of the rest voltage: no cell at work is further beyond full or empty than this
 BRIDGE = 60.0  # s: over so short a gap the current before and after tells what flowed
 RIDING_RATE = 0.5  # 1/h: sd of the mean current over capacity in a gap that may have been ridden or charged
@@ -39,6 +40,11 @@ class Saved:
     odometer: float | None = None  # m
     own_soc: float | None = None  # the vehicle's own state of charge, 0..1
     consumption: float | None = None  # J/m that was expected
+
+
+def bounded(soc: float) -> float:
+    """`soc`, within `SOC_BOUNDS`."""
+    return min(max(soc, SOC_BOUNDS[0]), SOC_BOUNDS[1])
 
 
 def plausible(battery: Battery, emf: float) -> bool:

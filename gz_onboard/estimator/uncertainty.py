@@ -1,0 +1,97 @@
+"""How uncertain what enters the SOC filter is: counted charge, the cell model, the voltage."""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import NamedTuple
+
+from gz_onboard.estimator.sources import Source
+from gz_onboard.estimator.start import unseen_sd
+from gz_onboard.estimator.timing import SLOW_GAP
+from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.parameters import Parameters
+
+HOUR = 3600.0  # s
+SAMPLING_RATE = 0.15  # 1/h: sd of the mean current over capacity between two samples that are seconds apart
+UNCHECKED_CURRENT_SD = 0.2  # A, beside the offset's, while no second sensor confirms the first
+EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
+RESISTANCE_SD = 0.12  # relative: R0 of this pack at this place and temperature
+RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
+INVERTER_VOLTAGE_SD = 0.15  # V: the cable between pack and inverter
+
+
+class CurrentError(NamedTuple):
+    """Of a pack current, beside the sensor's own offset."""
+
+    sd: float  # A
+    time: float  # s that such an error stays the same
+
+
+CURRENT_ERRORS = {
+    Source.PACK: CurrentError(0.0, HOUR),
+    Source.INVERTER: CurrentError(0.5, HOUR),
+    Source.DISPUTED: CurrentError(6.0, HOUR),
+    Source.MODEL: CurrentError(3.0, 600.0),
+    Source.NONE: CurrentError(15.0, 60.0),
+}
+
+
+class ChargeUncertainty:
+    """The variance of SOC that counting charge adds. Remembers what the pauses left."""
+
+    def __init__(self, battery: Battery, parameters: Parameters) -> None:
+        p = parameters
+        self._offset_sd = p.sd("pack_current_offset")
+        self._charge_sd = sqrt((p.sd("cell_capacity") / p["cell_capacity"]) ** 2 + p.sd("pack_current_gain") ** 2)
+        self._unseen = 0.0  # of SOC: sd that the pauses left
+
+    def counted(self, dt: float, flowed: float, charge: float, error: CurrentError, checked: bool) -> float:
+        """Variance after `dt` [s] in which a share `flowed` of the capacity `charge` [A·s] was counted.
+
+        checked: a second sensor confirms the first.
+        """
+        unchecked = 0.0 if checked else UNCHECKED_CURRENT_SD
+        sd = sqrt(self._offset_sd**2 + error.sd**2 + unchecked**2)
+        return (sd / charge) ** 2 * 2 * error.time * dt + self._charge_sd**2 * abs(flowed)
+
+    @staticmethod
+    def between_samples(dt: float, period: float) -> float:
+        """Variance after `dt` [s] of samples that are a long `period` [s] apart."""
+        return (SAMPLING_RATE / HOUR) ** 2 * dt * period if period > SLOW_GAP else 0.0
+
+    def of_pause(self, dt: float, soc_sd: float) -> float:
+        """Variance after a pause of `dt` [s]: nobody knows what flowed.
+
+        What was taken for it errs the same way each time: the rider goes on as before. soc_sd: what is known at most.
+        """
+        before, more = min(self._unseen, soc_sd), unseen_sd(dt)
+        self._unseen = before + more
+        return (2 * before + more) * more
+
+
+class VoltageUncertainty:
+    """Standard deviations [V of a cell] of what a voltage says about the state of charge."""
+
+    def __init__(self, battery: Battery, parameters: Parameters) -> None:
+        p = parameters
+        self._battery = battery
+        self.model = p.sd("cell_voltage_error")
+        self.rest = sqrt(p.sd("rest_voltage_error") ** 2 + battery.ocv_sd**2 + battery.rest_shift_sd**2)
+        self._empty = p.sd("cell_voltage_error_empty")
+        self._capacity_scatter = p.sd("cell_capacity") / p["cell_capacity"]
+
+    def variance(
+        self, soc: float, r0: float, current: float, source: Source, temperature_known: bool, voltage_sd: float
+    ) -> float:
+        """Variance [V²] of the voltage predicted at a cell `current` [A], and measured with `voltage_sd` [V].
+
+        r0: [ohm] of a cell.
+        """
+        resistance_sd = RESISTANCE_SD if temperature_known else RESISTANCE_SD_COLD
+        current_sd = CURRENT_ERRORS[source].sd / self._battery.cells_parallel
+        empty = min(max((EMPTY_BELOW - soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
+        model_sd = self.model + empty * (self._empty - self.model)
+        # The pack's cells are not the bench's: where SOC lies on their curve is known to their capacity's scatter.
+        axis_sd = self._capacity_scatter * (1 - soc) * self._battery.ocv(soc)[1]
+        resistance = (resistance_sd * r0 * current) ** 2 + (r0 * current_sd) ** 2
+        return model_sd**2 + voltage_sd**2 + axis_sd**2 + resistance
