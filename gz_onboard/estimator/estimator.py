@@ -18,16 +18,16 @@ from gz_onboard.estimator import snapshot
 from gz_onboard.estimator.activity import Activities
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
 from gz_onboard.estimator.forecast import Forecast, Forecaster
+from gz_onboard.estimator.present import Present
 from gz_onboard.estimator.reasons import DEGRADING, NO_PACK, loss_variance, missing
-from gz_onboard.estimator.redundancy.checks import Step
+from gz_onboard.estimator.redundancy.checks import StepInputs
 from gz_onboard.estimator.redundancy.currents import CellEvidence
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.road import RoadState
-from gz_onboard.estimator.road_load import HALF_FULL, WARM_MOTOR, Conditions, EffectInputs
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
-from gz_onboard.estimator.soc import Pack, StateOfCharge, last
-from gz_onboard.estimator.sources import PackReading, PackSources, Source
+from gz_onboard.estimator.soc import PackState, StateOfCharge
+from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources
 from gz_onboard.estimator.start import BRIDGE
 from gz_onboard.estimator.temperatures import Temperatures
 from gz_onboard.estimator.timing import SLOW_GAP, SLOWEST, MessageTiming
@@ -74,10 +74,9 @@ class Estimator:
         self._pace = next(iter(_carrying(PACE, groups)), -1)
         self._speeds = _carrying(SpeedCheck.ROLES, groups)[:1]
         # Every sample of accel_z is looked at, but only for a model that reads the vibration.
-        self._reads_vibration = "vibration" in model.reads
-        self._shaken = next(iter(_carrying(("accel_z",), groups)), -1) if self._reads_vibration else -1
+        self._vibration = VibrationMonitor() if "vibration" in model.reads else None
+        self._shaken = next(iter(_carrying(("accel_z",), groups)), -1) if self._vibration else -1
         self._accel_z = groups[self._shaken].roles.index("accel_z") if self._shaken >= 0 else 0
-        self._vibration = VibrationMonitor()
         self._time: float | None = None  # s, of the last step
         self._deadline = float("-inf")
         self._activities = Activities()
@@ -92,12 +91,17 @@ class Estimator:
         self._sources = PackSources(self.signals, self.redundancy, battery, p)
         self._temperatures = Temperatures(self.signals)
         sag = self.redundancy.currents.sag
-        self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, sag, self._riding_power)
+        self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, sag)
+        self._present = Present(self.forecaster, self.road, self._temperatures, self.soc, self._vibration)
 
     @property
     def filter(self) -> SocFilter | None:
         """The filter of the state of charge; None before the start."""
         return self.soc.filter
+
+    def vibration(self, now: float) -> float:
+        """What effects read as ``vibration`` [m/s²] at `now` [s]: the typical value while it is not known."""
+        return self._present.vibration(now)
 
     # --- events -----------------------------------------------------------------------------------------------
 
@@ -114,7 +118,7 @@ class Estimator:
                 signal.time = time
                 signal.total += value
                 signal.count += 1
-        if group == self._shaken and (accel_z := values[self._accel_z]) is not None:
+        if group == self._shaken and self._vibration and (accel_z := values[self._accel_z]) is not None:
             self._vibration.update(time, accel_z)
         if group == self._pace or time >= self._deadline:
             if self._time is None and group != self._pace and self._deadline < 0:
@@ -130,14 +134,14 @@ class Estimator:
         self._deadline = now + STEP_AT_LEAST
         signals, road = self.signals, self.road
         elapsed = min(dt, self._timing.pause)
-        self.redundancy.step(Step(now, dt, elapsed, signals, road.speed))
+        self.redundancy.step(StepInputs(now, dt, elapsed, signals, road.speed))
         road.step(now, elapsed, signals, self._radius, self._gear)
         self._reading = self._read_pack(now, elapsed)
         self._compare_grades(now, elapsed)
         temperature = self._temperatures.step(now, dt)
         if dt > BRIDGE:
             self.soc.interrupt(dt, self._temperatures.cells_or_bench, self._expected_consumption)
-        self.soc.step(now, dt, Pack(self._reading, temperature, road.speed), lambda: self._cell_inputs(now))
+        self.soc.step(now, dt, PackState(self._reading, temperature, road.speed), self._present)
         self._follow_activity(now, dt)
         self._ride(now, dt)
         signals.next_step()
@@ -150,7 +154,7 @@ class Estimator:
 
         def road_power() -> float | None:
             known = self.road.speed is not None and self._timing.sampled <= SLOW_GAP
-            return self._model_power(now) if known else None
+            return self._present.power(now) if known else None
 
         def error(voltage: float, current: float) -> float | None:
             return self.soc.cell_error(voltage, current, cells)
@@ -159,17 +163,19 @@ class Estimator:
         reading = self._sources.read(now, dt, self.road.speed, evidence)
         self.soc.doubt(now, reading.voltage_doubted)
         if reading.current is None and self.road.speed is not None and reading.voltage:
-            return replace(reading, current=self._model_power(now) / reading.voltage, source=Source.MODEL)
+            return replace(reading, current=self._present.power(now) / reading.voltage, source=CurrentSource.MODEL)
         return reading
 
     def _compare_grades(self, now: float, dt: float) -> None:
         """Compare what shows the grade; forget what was learned from a sensor that is newly distrusted."""
         grades, reading = self.redundancy.grades, self._reading
         voltage, current = reading.voltage, reading.current
-        unknown = voltage is None or current is None or reading.source is Source.MODEL
+        unknown = voltage is None or current is None or reading.source is CurrentSource.MODEL
         power = None if voltage is None or current is None or unknown else voltage * current
         before = grades.faulty
-        grades.compare(now, dt, self.signals, self.redundancy.speeds, power, lambda v, a: self._power_at(now, v, a))
+        grades.compare(
+            now, dt, self.signals, self.redundancy.speeds, power, lambda v, a: self._present.power_at(now, v, a)
+        )
         if grades.faulty != before:
             self.road.forget_grade(grades.offset, self.signals.gps_altitude.fresh(now))
         distrusted = self.redundancy.distrusted
@@ -179,52 +185,9 @@ class Estimator:
 
     # --- riding and range -------------------------------------------------------------------------------------
 
-    def _conditions(self, now: float, motor_temperature: float = WARM_MOTOR) -> Conditions:
-        return Conditions(self._temperatures.ambient(now), self.road.altitude or 0.0, motor_temperature)
-
-    def _model_power(self, now: float) -> float:
-        road = self.road
-        return self._power_at(now, road.speed or 0.0, road.acceleration or 0.0, road.grade or 0.0)
-
-    def _power_at(self, now: float, speed: float, acceleration: float, grade: float = 0.0) -> float:
-        """What the pack gives by the model [W]."""
-        load, conditions = self.forecaster.load, self._conditions(now)
-        quantities = load.quantities(speed, acceleration, conditions)
-        quantities["grade"] = grade
-        if load.extended:
-            load.extend(quantities, self._effect_inputs(now), conditions.ambient, self.forecaster.riding.time_moving)
-        return load.power(quantities)
-
-    def _riding_power(self, now: float) -> float:
-        conditions = self._conditions(now)
-        return self.forecaster.load.prior_ride(conditions.ambient, conditions.altitude)[0]
-
-    def _effect_inputs(self, now: float) -> EffectInputs:
-        """What effects beyond the base's may read while riding."""
-        road, filter_ = self.road, self.filter
-        lateral = None if road.yaw_rate is None or road.speed is None else road.speed * road.yaw_rate
-        return EffectInputs(
-            lateral,
-            road.heading,
-            filter_.soc if filter_ else HALF_FULL,
-            self._temperatures.cells_or_bench,
-            self.soc.current or 0.0,
-            self._vibration.value(now) if self._reads_vibration else None,
-        )
-
-    def _cell_inputs(self, now: float) -> dict[str, float]:
-        """What effects in the cells may read of the riding."""
-        inputs = {"time_moving": self.forecaster.riding.time_moving}
-        return inputs | {"vibration": self.vibration(now)} if self._reads_vibration else inputs
-
-    def vibration(self, now: float) -> float:
-        """What effects read as ``vibration`` [m/s²]: the typical value while it is not known."""
-        value = self._vibration.value(now)
-        return self.forecaster.load.typical_vibration(self.road.speed or 0.0) if value is None else value
-
     def _follow_activity(self, now: float, dt: float) -> None:
         signals, current = self.signals, self._reading.current
-        known = current if self._reading.source in (Source.PACK, Source.INVERTER) else None
+        known = current if self._reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else None
         rate = None if known is None else known / self.battery.pack_capacity(self._temperatures.cells_or_bench)
         inverter = (signals.inverter_current, signals.inverter_voltage, signals.motor_speed)
         mapped = [signal for signal in inverter if signal.stale_after]
@@ -234,19 +197,18 @@ class Estimator:
     def _ride(self, now: float, dt: float) -> None:
         """Learn from the riding, where all that it takes is known."""
         speed, reading = self.road.speed, self._reading
-        unsure = reading.source in (Source.MODEL, Source.DISPUTED) or self.redundancy.speeds.unsettled
+        unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.redundancy.speeds.unsettled
         known = 0 < dt <= self._timing.pause and not unsure and self._activities.teaches
         if speed is None or reading.voltage is None or reading.current is None or not known:
             self.forecaster.pause()
             return
-        motor = self.signals.motor_temperature.get(now)
         learned = self.forecaster.ride(
             dt,
             speed,
             self.road.grade,
             reading.voltage * reading.current,
-            self._conditions(now, WARM_MOTOR if motor is None else motor),
-            self._effect_inputs(now) if self.forecaster.load.extended else None,
+            self._present.conditions(now, self.signals.motor_temperature.get(now)),
+            self._present.effect_inputs(now),
             max((self._timing.periods[i] for i in self._speeds), default=0.0),
         )
         if learned and self.signals.cell_temperature.fresh(now):  # R0 is known only with it
@@ -257,7 +219,7 @@ class Estimator:
         if filter_ is None:
             return
         self._forecast_time = now
-        conditions = self._conditions(now)
+        conditions = self._present.conditions(now)
         self._forecast = self.forecaster.forecast(
             filter_.soc,
             sqrt(filter_.covariance[0]),
@@ -334,26 +296,18 @@ class Estimator:
         """What is to be kept over a restart, for the vehicle `key`; None while there is nothing to keep."""
         if self.filter is None:
             return None
-        return {
+        return self.soc.snapshot(self.filter) | {
             "version": snapshot.VERSION,
             "key": key,
-            "soc": self.filter.soc,
-            "v1": self.filter.v1,
-            "covariance": list(self.filter.covariance),
-            "current": self.soc.current,
-            "odometer": last(self.signals.odometer),
-            "own_soc": last(self.signals.bms_state_of_charge),
             "consumption": self._expected_consumption,
             "cell_temperature": self._temperatures.cells,
-            "cell_effects": dict(self.soc.effects.states),
             "gyro_bias": [self.road.bias_x, self.road.bias_z],
             "riding": self.forecaster.snapshot(),
         }
 
     def wait(self, seconds: float) -> None:
         """So much time has passed [s] in which no voltage came to go on with: what was restored is older by that."""
-        if self.soc.saved and self.soc.saved_age is not None:
-            self.soc.saved_age += seconds
+        self.soc.wait(seconds)
 
     def restore(self, saved: Mapping[str, Any], key: str, age: float | None) -> None:
         """Go on from a snapshot that is `age` [s] old (None: not known). ValueError if it does not fit, whole."""
@@ -361,8 +315,7 @@ class Estimator:
         self.road.bias_x, self.road.bias_z = restored.gyro_bias
         if restored.cell_temperature is not None:
             self._temperatures.cells = restored.cell_temperature
-        self.soc.saved, self.soc.saved_age = restored.battery, restored.age
-        self.soc.effects.restore(restored.cell_effects, restored.age, restored.battery.soc)
+        self.soc.restore(restored.battery, restored.age, restored.cell_effects)
 
 
 def _carrying(roles: Sequence[str], groups: Sequence[Group]) -> list[int]:

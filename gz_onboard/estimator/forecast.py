@@ -22,8 +22,8 @@ from math import exp, sqrt
 from typing import Any
 
 from gz_onboard.constants import GRAVITY
+from gz_onboard.estimator.load_model import AHEAD, Conditions, EffectInputs, LoadModel
 from gz_onboard.estimator.ridden import FACTOR, MEMORY, Past, Riding, Second, Segment, restored, restored_states
-from gz_onboard.estimator.road_load import AHEAD, Conditions, EffectInputs, RoadLoad
 from gz_onboard.physics.battery import Battery, Drawable, drawable
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.riding import PriorRiding
@@ -79,7 +79,7 @@ class Forecaster:
     """Learns from the riding and forecasts the range."""
 
     def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
-        self.load = RoadLoad(model, battery, prior)
+        self.load = LoadModel(model, battery, prior)
         self.battery = battery
         self.riding = Riding(factor=prior.factor, factor_variance=prior.factor_sd**2)
         self._past = Past()

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from math import exp, isfinite
 from typing import Any
 
-from gz_onboard.estimator.road_load import EffectInputs
+from gz_onboard.estimator.load_model import EffectInputs
 from gz_onboard.physics.effect import MOVING
 
 MEMORY = 12000.0  # m: what is further back counts for less than 1/e

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import inf, sqrt
+from typing import Protocol
 
 from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.ekf import FilterMaker, SocFilter
@@ -13,7 +13,7 @@ from gz_onboard.estimator.initial import RELAXED, Situation, SteadyVoltage, firs
 from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.rest_update import RestUpdate
 from gz_onboard.estimator.signals import Signal, Signals
-from gz_onboard.estimator.sources import PackReading, Source
+from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.estimator.start import SOC_UNKNOWN_SD, Saved, bounded, plausible
 from gz_onboard.estimator.synchronise import Synchroniser
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
@@ -30,12 +30,22 @@ SHORTEST = 0.02  # s: a step, to divide by
 
 
 @dataclass(frozen=True, slots=True)
-class Pack:
+class PackState:
     """What is known of the pack at one step, beside the signals."""
 
     reading: PackReading
     temperature: float  # degC, of the cells
     speed: float | None  # m/s
+
+
+class RidingModel(Protocol):
+    """What of the vehicle beside its pack the state of charge depends on; times in s."""
+
+    def power_of_prior(self, now: float) -> float:
+        """Of the prior riding [W]."""
+
+    def cell_inputs(self, now: float) -> dict[str, float]:
+        """What effects in the cells read beside the cells' own."""
 
 
 class StateOfCharge:
@@ -49,9 +59,7 @@ class StateOfCharge:
         signals: Signals,
         timing: MessageTiming,
         sag: VoltageSag,
-        riding_power: Callable[[float], float],
     ) -> None:
-        """`riding_power`: of the prior riding [W] at a time [s]."""
         self.filter: SocFilter | None = None
         self.gate = InnovationGate()
         self.effects = CellEffects(model, battery)
@@ -61,7 +69,7 @@ class StateOfCharge:
         self.saved_age: float | None = None  # s
         self.current: float | None = None  # A of the pack, at the last step
         self._battery, self._make, self._signals, self._timing = battery, make, signals, timing
-        self._sag, self._riding_power = sag, riding_power
+        self._sag = sag
         self._charge = ChargeUncertainty(battery, model.parameters)
         self._steady = SteadyVoltage(battery)
         self._rest = RestUpdate(battery, self.uncertainty)
@@ -113,10 +121,32 @@ class StateOfCharge:
         self._steady.forget()
         self._rest = RestUpdate(self._battery, self.uncertainty)
 
+    def wait(self, seconds: float) -> None:
+        """So much time has passed [s] in which no voltage came: what was restored is older by that."""
+        if self.saved and self.saved_age is not None:
+            self.saved_age += seconds
+
+    def snapshot(self, filter_: SocFilter) -> dict[str, object]:
+        """What is to be kept over a restart."""
+        return {
+            "soc": filter_.soc,
+            "v1": filter_.v1,
+            "covariance": list(filter_.covariance),
+            "current": self.current,
+            "odometer": last(self._signals.odometer),
+            "own_soc": last(self._signals.bms_state_of_charge),
+            "cell_effects": dict(self.effects.states),
+        }
+
+    def restore(self, saved: Saved, age: float | None, effects: dict[str, float]) -> None:
+        """Go on from what is `age` [s] old; effects: their states [V of a cell]."""
+        self.saved, self.saved_age = saved, age
+        self.effects.restore(effects, age, saved.soc)
+
     # --- step by step -----------------------------------------------------------------------------------------
 
-    def step(self, now: float, dt: float, pack: Pack, effect_inputs: Callable[[], Mapping[str, float]]) -> None:
-        """Go `dt` [s] ahead to `now` [s]. effect_inputs: what effects in the cells read beside the cells' own."""
+    def step(self, now: float, dt: float, pack: PackState, riding: RidingModel) -> None:
+        """Go `dt` [s] ahead to `now` [s]."""
         reading, filter_ = pack.reading, self.filter
         voltage, current = reading.voltage, reading.current
         if voltage is not None and not self._plausible(voltage, current or 0.0, pack.temperature):
@@ -124,11 +154,11 @@ class StateOfCharge:
             self.gate.off += 1
         if filter_ is None:
             if voltage is not None:
-                self._await_steady(now, voltage, current or 0.0, pack)
+                self._await_steady(now, voltage, current or 0.0, pack, riding)
             self.current = current
             return
         if dt > 0:
-            self._predict(filter_, now, dt, pack, effect_inputs)
+            self._predict(filter_, now, dt, pack, riding)
         self.current = current
         self._odometer, self._own_soc = last(self._signals.odometer), last(self._signals.bms_state_of_charge)
         if voltage is None or current is None:
@@ -149,16 +179,16 @@ class StateOfCharge:
             voltage, current = pair
         self._update(filter_, now, dt, (voltage, current), pack)
 
-    def _predict(
-        self, filter_: SocFilter, now: float, dt: float, pack: Pack, effect_inputs: Callable[[], Mapping[str, float]]
-    ) -> None:
+    def _predict(self, filter_: SocFilter, now: float, dt: float, pack: PackState, riding: RidingModel) -> None:
         """Count the charge of `dt` [s] up to `now` [s]."""
         battery, temperature, current = self._battery, pack.temperature, pack.reading.current
         before = self.current if self.current is not None else current
         mean = ((before or 0.0) + (current or 0.0)) / 2
         charge = 3600 * battery.pack_capacity(temperature)
         sampled, pause = self._timing.sampled, self._timing.pause
-        counted = pack.reading.source if sampled <= SLOWEST else Source.NONE  # beyond, most that flows is not seen
+        counted = (
+            pack.reading.source if sampled <= SLOWEST else CurrentSource.NONE
+        )  # beyond, most that flows is not seen
         checked = self._signals.inverter_current.fresh(now)
         q = self._charge.counted(min(dt, pause), mean * dt / charge, charge, CURRENT_ERRORS[counted], checked)
         q += self._charge.between_samples(dt, sampled)
@@ -170,10 +200,12 @@ class StateOfCharge:
         if p00 > SOC_UNKNOWN_SD**2:
             filter_.covariance = SOC_UNKNOWN_SD**2, p01 * SOC_UNKNOWN_SD / sqrt(p00), p11
         if self.effects:
-            self.effects.step(dt, mean / battery.cells_parallel, filter_.soc, temperature, effect_inputs())
+            self.effects.step(dt, mean / battery.cells_parallel, filter_.soc, temperature, riding.cell_inputs(now))
         filter_.soc = bounded(filter_.soc)
 
-    def _update(self, filter_: SocFilter, now: float, dt: float, measured: tuple[float, float], pack: Pack) -> None:
+    def _update(
+        self, filter_: SocFilter, now: float, dt: float, measured: tuple[float, float], pack: PackState
+    ) -> None:
         """Take in the voltage [V] at a current [A], both of the pack, that stands for `dt` [s]."""
         battery, reading, temperature = self._battery, pack.reading, pack.temperature
         voltage, current = measured
@@ -181,7 +213,9 @@ class StateOfCharge:
         cell_voltage = battery.cell_voltage(voltage, current) + self.effects.overpotential
         cell_current = current / battery.cells_parallel
         r0 = battery.r0.at(filter_.soc, temperature)[0]
-        explaining = current if reading.source in (Source.PACK, Source.INVERTER) else reading.reported_current
+        explaining = (
+            current if reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else reading.reported_current
+        )
         if explaining is not None:
             self._sag.update(dt, cell_voltage, r0 * explaining / battery.cells_parallel)
         if dt <= self._timing.pause and self._rest.step(
@@ -214,7 +248,7 @@ class StateOfCharge:
         self.saved = None
         self._restarted_at = now
 
-    def _await_steady(self, now: float, voltage: float, current: float, pack: Pack) -> None:
+    def _await_steady(self, now: float, voltage: float, current: float, pack: PackState, riding: RidingModel) -> None:
         """Start from the first voltage [V] that holds still, at a current [A]."""
         awaited = [self._signals.cell_temperature]
         if self.saved:
@@ -228,7 +262,7 @@ class StateOfCharge:
             now,
             pack.temperature,
             self.effects.overpotential,  # of before a restart
-            self._riding_power(now),
+            riding.power_of_prior(now),
             pack.reading.voltage_sd,
             unsteady_sd,
         )

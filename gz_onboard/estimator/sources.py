@@ -19,7 +19,7 @@ MISMATCH_SHARE = 0.01  # of a step: the low pass of that
 HALF_FULL = 0.5  # SOC at which the pack has its usual voltage
 
 
-class Source(Enum):
+class CurrentSource(Enum):
     """Where the pack current comes from."""
 
     PACK = auto()
@@ -35,7 +35,7 @@ class PackReading:
 
     voltage: float | None = None
     current: float | None = None
-    source: Source = Source.NONE
+    source: CurrentSource = CurrentSource.NONE
     reported_current: float | None = None  # A, trusted or not
     voltage_sd: float = 0.0  # V of a cell
     voltage_doubted: bool = False  # the two voltages differ, or one of them is faulty
@@ -97,7 +97,7 @@ class PackSources:
             bool(voltages.apart or any(counter.faulty for counter in voltages.counters.values())),
         )
 
-    def _current(self, dt: float, readings: Readings, evidence: CellEvidence) -> tuple[float | None, Source]:
+    def _current(self, dt: float, readings: Readings, evidence: CellEvidence) -> tuple[float | None, CurrentSource]:
         """(pack current [A], where it comes from): None if no sensor is to be believed."""
         signals, currents = self._signals, self._currents
         together = _together(signals.pack_current, signals.inverter_current)
@@ -112,12 +112,12 @@ class PackSources:
             if together and not readings.charging:
                 self._difference += MISMATCH_SHARE * (pack - inverter - self._difference)
             if currents.disputed:
-                return (pack + inverter) / 2, Source.DISPUTED
+                return (pack + inverter) / 2, CurrentSource.DISPUTED
         if pack is not None and signals.pack_current.trusted:
-            return pack, Source.PACK
+            return pack, CurrentSource.PACK
         if inverter is not None and signals.inverter_current.trusted:
-            return inverter, Source.INVERTER
-        return None, Source.NONE
+            return inverter, CurrentSource.INVERTER
+        return None, CurrentSource.NONE
 
 
 def _together(first: Signal, second: Signal) -> bool:

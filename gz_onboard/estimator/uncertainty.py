@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import sqrt
 from typing import NamedTuple
 
-from gz_onboard.estimator.sources import Source
+from gz_onboard.estimator.sources import CurrentSource
 from gz_onboard.estimator.start import unseen_sd
 from gz_onboard.estimator.timing import SLOW_GAP
 from gz_onboard.physics.battery import Battery
@@ -28,11 +28,11 @@ class CurrentError(NamedTuple):
 
 
 CURRENT_ERRORS = {
-    Source.PACK: CurrentError(0.0, HOUR),
-    Source.INVERTER: CurrentError(0.5, HOUR),
-    Source.DISPUTED: CurrentError(6.0, HOUR),
-    Source.MODEL: CurrentError(3.0, 600.0),
-    Source.NONE: CurrentError(15.0, 60.0),
+    CurrentSource.PACK: CurrentError(0.0, HOUR),
+    CurrentSource.INVERTER: CurrentError(0.5, HOUR),
+    CurrentSource.DISPUTED: CurrentError(6.0, HOUR),
+    CurrentSource.MODEL: CurrentError(3.0, 600.0),
+    CurrentSource.NONE: CurrentError(15.0, 60.0),
 }
 
 
@@ -81,7 +81,7 @@ class VoltageUncertainty:
         self._capacity_scatter = p.sd("cell_capacity") / p["cell_capacity"]
 
     def variance(
-        self, soc: float, r0: float, current: float, source: Source, temperature_known: bool, voltage_sd: float
+        self, soc: float, r0: float, current: float, source: CurrentSource, temperature_known: bool, voltage_sd: float
     ) -> float:
         """Variance [V²] of the voltage predicted at a cell `current` [A], and measured with `voltage_sd` [V].
 

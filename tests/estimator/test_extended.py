@@ -10,7 +10,7 @@ import pytest
 
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.road_load import Conditions, EffectInputs
+from gz_onboard.estimator.load_model import Conditions, EffectInputs
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import CELLS, GROUPS, MOTOR, PACK, Plant

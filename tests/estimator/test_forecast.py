@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.estimator.forecast import PRIOR_LENGTH, Forecaster
-from gz_onboard.estimator.road_load import Conditions
+from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference", 75.0)

@@ -8,7 +8,7 @@ from math import cos, sin
 import pytest
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.estimator.redundancy.checks import NO_SENSOR, RECOVERED_AFTER, Step, faulty
+from gz_onboard.estimator.redundancy.checks import NO_SENSOR, RECOVERED_AFTER, StepInputs, faulty
 from gz_onboard.estimator.redundancy.currents import CurrentCheck
 from gz_onboard.estimator.redundancy.grades import GradeCheck
 from gz_onboard.estimator.redundancy.sag import VoltageSag
@@ -53,7 +53,7 @@ def said(
             if value is not None:
                 signal = signals[role]
                 signal.value, signal.time, signal.total, signal.count = value, t, value, 1
-        speeds.step(Step(t, STEP, STEP, signals, None))
+        speeds.step(StepInputs(t, STEP, STEP, signals, None))
         signals.next_step()
     return speeds, signals
 
@@ -152,7 +152,7 @@ def test_a_gps_without_a_fix_is_no_witness():
         t = step * STEP
         for role, value in {"motor_speed": 10 * HONEST["motor_speed"], "gps_speed": 0.0, "gps_fix": 0.0}.items():
             signals[role].value, signals[role].time = value, t
-        speeds.step(Step(t, STEP, STEP, signals, None))
+        speeds.step(StepInputs(t, STEP, STEP, signals, None))
     assert faulty(speeds.counters) == set()
 
 
@@ -248,7 +248,7 @@ def hills(
             if value is not None:
                 signals[role].value, signals[role].time = value, t
         work = speed * (FORCE + WIND + MASS * (GRAVITY * grade + acceleration)) if power else None
-        grades.step(Step(t, STEP, STEP, signals, speed))
+        grades.step(StepInputs(t, STEP, STEP, signals, speed))
         speeds.middle, speeds.acceleration, speeds.on_road = speed, acceleration, on_road
         grades.compare(t, STEP, signals, speeds, work, lambda v, a: v * (FORCE + MASS * a))
     return grades
@@ -325,6 +325,6 @@ def test_a_standing_vehicle_does_not_climb():
         for step in range(600):
             t = step * STEP
             signals.gps_altitude.value, signals.gps_altitude.time = 200 + rate * t, t
-            grades.step(Step(t, STEP, STEP, signals, 0.0))
+            grades.step(StepInputs(t, STEP, STEP, signals, 0.0))
             grades.compare(t, STEP, signals, speeds, 50.0, lambda v, a: 50.0)
         assert grades.counters["gps_altitude"].faulty == wrong

@@ -21,7 +21,7 @@ NO_SENSOR: frozenset[str] = frozenset()
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class StepInputs:
     """One step of the estimator, before any of its signals is used."""
 
     now: float  # s, its end
@@ -59,7 +59,7 @@ class SensorCheck(Protocol):
 
     counters: dict[str, FaultCounter]
 
-    def step(self, step: Step) -> None:
+    def step(self, step: StepInputs) -> None:
         """Compare the values of this step."""
 
 

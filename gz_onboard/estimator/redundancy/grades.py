@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.redundancy.accelerometer import AccelerometerGain
-from gz_onboard.estimator.redundancy.checks import AGREES, LONGEST_EVIDENCE, MOVING, NO_SENSOR, RateLimit, Step
+from gz_onboard.estimator.redundancy.checks import AGREES, LONGEST_EVIDENCE, MOVING, NO_SENSOR, RateLimit, StepInputs
 from gz_onboard.estimator.redundancy.checks import counters as new_counters
 from gz_onboard.estimator.redundancy.checks import faulty as faulty_roles
 from gz_onboard.estimator.redundancy.grade_difference import NEAR, DistanceMean, GradeDifference, Limits
@@ -71,7 +71,7 @@ class GradeCheck:
         self._work: float | None = 0.0  # J, out of the pack
         self._speed = speed  # m/s, at its begin
 
-    def step(self, step: Step) -> None:
+    def step(self, step: StepInputs) -> None:
         """Before the altitude is used: whether a road and a receiver could have come to it since the last one."""
         if step.observed < step.dt:  # what changed in a gap is no rate
             self._begin_interval(None)

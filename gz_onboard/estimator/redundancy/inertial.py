@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gz_onboard.estimator.redundancy.checks import MOVING, STUCK_AFTER, Step, counters, share_of_new
+from gz_onboard.estimator.redundancy.checks import MOVING, STUCK_AFTER, StepInputs, counters, share_of_new
 
 # Means over `AXIS_TIME` [s] that a vehicle can have, leaning, on a side stand or on a hill; m/s² and rad/s.
 AXES = {
@@ -26,7 +26,7 @@ class InertialCheck:
         self._still = dict.fromkeys(AXES, 0.0)  # s without a change
         self._time = 0.0  # s
 
-    def step(self, step: Step) -> None:
+    def step(self, step: StepInputs) -> None:
         """See `SensorCheck`."""
         dt, moving = step.observed, step.speed is not None and abs(step.speed) > MOVING
         self._time += dt

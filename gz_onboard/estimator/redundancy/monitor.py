@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gz_onboard.estimator.redundancy.checks import SensorCheck, Step
+from gz_onboard.estimator.redundancy.checks import SensorCheck, StepInputs
 from gz_onboard.estimator.redundancy.currents import CurrentCheck
 from gz_onboard.estimator.redundancy.grades import GradeCheck
 from gz_onboard.estimator.redundancy.inertial import InertialCheck
@@ -29,7 +29,7 @@ class Redundancy:
         counters = [self.voltages.counters, self.currents.counters, *(check.counters for check in self._checks)]
         self._counters = {role: counter for part in counters for role, counter in part.items()}
 
-    def step(self, step: Step) -> None:
+    def step(self, step: StepInputs) -> None:
         """Check the values of this step before any of them is used."""
         for check in self._checks:
             check.step(step)

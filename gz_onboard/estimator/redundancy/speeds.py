@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from statistics import median
 
-from gz_onboard.estimator.redundancy.checks import MOVING, NO_SENSOR, STUCK_AFTER, Step, counters
+from gz_onboard.estimator.redundancy.checks import MOVING, NO_SENSOR, STUCK_AFTER, StepInputs, counters
 from gz_onboard.estimator.road import accelerated
 from gz_onboard.estimator.signals import FIX_2D
 
@@ -63,7 +63,7 @@ class SpeedCheck:
         self.on_road = False  # the ground goes by as fast as the driven wheel turns: another sensor has seen it
         self.unsettled = False  # two contradict each other, and it is not known which of them is right
 
-    def step(self, step: Step) -> None:
+    def step(self, step: StepInputs) -> None:
         """See `SensorCheck`."""
         dt, signals = step.observed, step.signals
         speeds, apart = self._speeds(step)
@@ -101,7 +101,7 @@ class SpeedCheck:
             counter.update(dt, against if against or (moving and self._still[role] < STUCK_AFTER) else None)
             signals[role].trusted = not (counter.faulty or role in outvoted)
 
-    def _speeds(self, step: Step) -> tuple[dict[str, float], dict[str, float]]:
+    def _speeds(self, step: StepInputs) -> tuple[dict[str, float], dict[str, float]]:
         """(speeds [m/s], how far each may be from another [m/s]) by role, of those that report."""
         speeds: dict[str, float] = {}
         apart: dict[str, float] = {}

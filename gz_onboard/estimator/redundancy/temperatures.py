@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gz_onboard.estimator.redundancy.checks import LONGEST_EVIDENCE, RateLimit, Step, counters
+from gz_onboard.estimator.redundancy.checks import LONGEST_EVIDENCE, RateLimit, StepInputs, counters
 
 # Temperatures [degC] that vehicles have, and how fast [K/s] they rise and fall at most. Cells heat themselves, but cool
 # through their pack.
@@ -23,7 +23,7 @@ class TemperatureCheck:
         self.counters = counters(tuple(TEMPERATURES))
         self._limits = {role: RateLimit() for role in TEMPERATURES}
 
-    def step(self, step: Step) -> None:
+    def step(self, step: StepInputs) -> None:
         """See `SensorCheck`."""
         signals, dt = step.signals, step.dt
         evidence = min(dt, LONGEST_EVIDENCE)

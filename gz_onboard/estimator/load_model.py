@@ -67,7 +67,7 @@ class EffectInputs:
     vibration: float | None = None  # m/s²
 
 
-class RoadLoad:
+class LoadModel:
     """The model of one vehicle with what is usual for it. `extended`: it reads `EffectInputs`."""
 
     def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
