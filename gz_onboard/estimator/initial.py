@@ -11,7 +11,7 @@ from gz_onboard.estimator.rest import RATE as REST_RATE
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.start import Saved, bounded, flowed, from_voltage, parked, take_in
 from gz_onboard.estimator.uncertainty import RESISTANCE_SD, VoltageUncertainty
-from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.effect import MOVING
 
 START_WAIT = 1.5  # s to wait for what comes once a second before the first estimate
@@ -25,7 +25,6 @@ PULLING_RATE = 0.5  # 1/h: current over capacity from which a vehicle that does 
 STOPPED_SHARE = 0.5  # of a ride's polarisation: sd of what a vehicle that stands still has, long parked or just stopped
 RELAXED = 600.0  # s: V1 is no less known than after so long
 CONFLICT = 4.0  # sd between the saved SOC and that of the voltage: beyond, one of the two is wrong
-HALF_FULL = 0.5  # SOC, where it is not known
 ROUGH_SD = 0.01  # V: any, for a state of charge of which only the mean is used
 SHORTEST_AGE = 0.1  # s, to divide by
 

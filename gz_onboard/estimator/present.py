@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.load_model import HALF_FULL, WARM_MOTOR, Conditions, EffectInputs
+from gz_onboard.estimator.load_model import WARM_MOTOR, Conditions, EffectInputs
 from gz_onboard.estimator.road import RoadState
 from gz_onboard.estimator.soc import StateOfCharge
 from gz_onboard.estimator.temperatures import Temperatures
 from gz_onboard.estimator.vibration import VibrationMonitor
+from gz_onboard.physics.battery import HALF_FULL
 
 
 class Present:

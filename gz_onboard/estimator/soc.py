@@ -18,14 +18,13 @@ from gz_onboard.estimator.start import SOC_UNKNOWN_SD, Saved, bounded, plausible
 from gz_onboard.estimator.synchronise import Synchroniser
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
-from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.model import Model
 
 DOUBTED_START = 30.0  # s: a voltage that is doubted so soon has misled the first state of charge
 RESTARTED_FOR = 600.0  # s: for so long it is reported
 V1_WALK = 1e-8  # V²/s: variance that V1 gains, as the RC pair is a mixture of several
 STEADY_NOISE = 1e-9, 1e-7  # variance of SOC and V1 [V²] from the first voltage to the end of the wait
-HALF_FULL = 0.5  # SOC, where it is not known
 SHORTEST = 0.02  # s: a step, to divide by
 
 

@@ -11,12 +11,11 @@ from gz_onboard.estimator.redundancy.electric import Readings
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.signals import Signal, Signals
 from gz_onboard.estimator.timing import SLOW_GAP
-from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.parameters import Parameters
 
 MISMATCH = 3.0  # A between the two current sensors, over ten seconds or so
 MISMATCH_SHARE = 0.01  # of a step: the low pass of that
-HALF_FULL = 0.5  # SOC at which the pack has its usual voltage
 
 
 class CurrentSource(Enum):

@@ -30,6 +30,7 @@ TEMPERATURE = (-60.0, 100.0)  # degC, of a cell
 RESISTANCE = (1e-6, 10.0)  # ohm, of a cell: from the largest to a frozen one of a watch
 CAPACITANCE = (1e-3, 1e8)  # F, of a cell's RC pair
 BENCH_TEMPERATURE = 25.0  # degC, at which capacities are given
+HALF_FULL = 0.5  # SOC that is taken where it is not known
 SMALLEST_STEP = 1e-6  # of SOC, V or degC, from point to point: a slope must stay a number
 LARGEST_SHIFT = 0.2  # V: real cells rest tens of mV apart from -20 to 25 degC; more is a mistyped unit
 
