@@ -7,7 +7,7 @@ from math import exp, hypot, inf, sqrt
 
 from gz_onboard.estimator.ekf import FilterMaker, SocFilter
 from gz_onboard.estimator.gate import ERROR_TIME
-from gz_onboard.estimator.rest import RATE as REST_RATE
+from gz_onboard.estimator.rest import REST_RATE
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.start import Saved, bounded, flowed, from_voltage, parked, take_in
 from gz_onboard.estimator.uncertainty import RESISTANCE_SD, VoltageUncertainty

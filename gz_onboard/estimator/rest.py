@@ -1,4 +1,4 @@
-"""Whether the cells have rested: only then does their voltage say their state of charge.
+"""Whether the cells have rested: only then does their voltage show the state of charge.
 
 After a load the voltage of a cell goes on rising for minutes to an hour: first fast (the RC pair of the cell model),
 then slowly (diffusion, which the cell model does not have). What is still to come is bounded by how fast the voltage
@@ -13,16 +13,18 @@ from collections import deque
 from collections.abc import Sequence
 from math import hypot, sqrt
 
-RATE = 0.05  # 1/h: current over capacity below which a cell counts as unloaded; standing with the key on is less
+REST_RATE = 0.05  # 1/h: current over capacity below which a cell counts as unloaded; standing with the key on is less
 BLOCK = 2.0  # s over which the voltage is averaged
 LONGEST = 900  # blocks: half an hour
 SLOW_TIME = 1000.0  # s: time constant of slow diffusion in lithium-ion cells, a quarter of an hour or so
 SLOW_SHARE = 0.7  # relative sd of that: it is from ten minutes to an hour
 PROVEN = 1.5  # times what the cell model does not have: beyond, a slope proves no rest
+ROUNDING = 12.0  # the square of a step over the variance of a value rounded to it
+FIT_ALL = 6  # blocks: of fewer all are fitted, of more the later half
 FAST_TIMES = 3.0  # time constants of the RC pair: the fast part is a mixture of some, too
 
 
-class Rest:
+class RestMonitor:
     """Follows the voltage of a cell, less what its resistance takes, while there is no load."""
 
     def __init__(self) -> None:
@@ -39,18 +41,18 @@ class Rest:
         self._time = self._sum = self._squares = 0.0
         self._count = 0
 
-    def step(self, dt: float, voltage: float, emf: float, c_rate: float, fast_time: float, unnamed: float) -> None:
+    def step(self, dt: float, voltage: float, emf: float, c_rate: float, fast_time: float, unmodelled: float) -> None:
         """Go `dt` [s] on.
 
         voltage: of a cell as measured [V]; emf: the same without the drop over R0 [V]; c_rate: current over capacity
-        [1/h]; fast_time: time constant of the RC pair [s]; unnamed: sd of what the cell model does not have [V].
+        [1/h]; fast_time: time constant of the RC pair [s]; unmodelled: sd of what the cell model does not have [V].
         """
         self.fresh = False
         if self._last is not None and voltage != self._last:
             change = abs(voltage - self._last)
             self._resolution = min(change, self._resolution or change)
         self._last = voltage
-        if abs(c_rate) > RATE:
+        if abs(c_rate) > REST_RATE:
             self.loaded = True
             self.interrupt()
             return
@@ -62,15 +64,15 @@ class Rest:
             return
         mean = self._sum / self._count
         variance = max(self._squares / self._count - mean * mean, 0.0) / (self._count - 1)
-        self._blocks.append((mean, variance + self._resolution**2 / 12))
+        self._blocks.append((mean, variance + self._resolution**2 / ROUNDING))
         self._begin()
         if len(self._blocks) >= 2:
             rate, noise = slope(self._blocks)
             self.coming, self.sd = SLOW_TIME * rate, SLOW_TIME * hypot(SLOW_SHARE * rate, noise)
-            at_first = hypot(FAST_TIMES * fast_time * hypot(rate, noise), unnamed)
+            at_first = hypot(FAST_TIMES * fast_time * hypot(rate, noise), unmodelled)
             if not self.loaded and at_first < self.sd:
                 self.coming, self.sd = 0.0, at_first
-            elif self.sd > PROVEN * unnamed:  # a fast tail, of which the slow one's time constant says nothing
+            elif self.sd > PROVEN * unmodelled:  # a fast tail, of which the slow one's time constant says nothing
                 self.sd = None
             self.fresh = self.sd is not None
 
@@ -84,7 +86,7 @@ class Rest:
 
 def slope(blocks: Sequence[tuple[float, float]]) -> tuple[float, float]:
     """How fast the voltage moves, and its sd [V/s]: from (mean [V], variance [V²]) of the later half of the blocks."""
-    later = list(blocks)[len(blocks) // 2 if len(blocks) >= 6 else 0 :]
+    later = list(blocks)[len(blocks) // 2 if len(blocks) >= FIT_ALL else 0 :]
     n = len(later)
     middle = (n - 1) / 2
     spread = n * (n * n - 1) / 12  # Σ (i - middle)²

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf, sqrt
 
 from gz_onboard.estimator.ekf import SocFilter
-from gz_onboard.estimator.rest import Rest
+from gz_onboard.estimator.rest import RestMonitor
 from gz_onboard.estimator.start import bounded, soc_width, take_in
 from gz_onboard.estimator.uncertainty import VoltageUncertainty
 from gz_onboard.physics.battery import Battery
@@ -19,7 +19,7 @@ class RestUpdate:
 
     def __init__(self, battery: Battery, uncertainty: VoltageUncertainty) -> None:
         self._battery, self._uncertainty = battery, uncertainty
-        self._rest = Rest()
+        self._rest = RestMonitor()
         self._taken = inf  # V² of a cell: variance of what was taken in of this rest
 
     def interrupt(self) -> None:

@@ -14,7 +14,7 @@ from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.rest_update import RestUpdate
 from gz_onboard.estimator.signals import Signal, Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading
-from gz_onboard.estimator.start import SOC_UNKNOWN_SD, Saved, bounded, plausible
+from gz_onboard.estimator.start import HOUR, SOC_UNKNOWN_SD, Saved, bounded, plausible
 from gz_onboard.estimator.synchronise import Synchroniser
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
@@ -183,7 +183,7 @@ class StateOfCharge:
         battery, temperature, current = self._battery, pack.temperature, pack.reading.current
         before = self.current if self.current is not None else current
         mean = ((before or 0.0) + (current or 0.0)) / 2
-        charge = 3600 * battery.pack_capacity(temperature)
+        charge = HOUR * battery.pack_capacity(temperature)
         sampled, pause = self._timing.sampled, self._timing.pause
         counted = (
             pack.reading.source if sampled <= SLOWEST else CurrentSource.NONE

@@ -11,7 +11,7 @@ from math import exp, hypot, sqrt
 
 from gz_onboard.estimator.ekf import Covariance, SocFilter
 from gz_onboard.estimator.rest import SLOW_TIME
-from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery import HALF_FULL, Battery
 
 SOC_UNKNOWN_SD = 0.5  # whatever has flowed
 SOC_BOUNDS = -0.05, 1.05  # what a linear update, over a curve that is not, may make of it
@@ -20,13 +20,17 @@ BRIDGE = 60.0  # s: over so short a gap the current before and after tells what 
 RIDING_RATE = 0.5  # 1/h: sd of the mean current over capacity in a gap that may have been ridden or charged
 BURST_RATE = 1.0  # 1/h: the same in addition, over `BRIDGE`: nobody rides at full power for longer
 CHARGING_FROM = 120.0  # s: in a shorter gap nobody plugs in, charges and leaves
-CONSUMPTION_SD = 0.3  # relative: of a way that was not seen
+CONSUMPTION_SD = 0.3  # relative: of a distance that was not seen
 ODOMETER_STEP = 100.0  # m: odometers on the bus count in steps of up to this
 FASTEST = 70.0  # m/s
 UNKNOWN_AGE = 86_400.0  # s
 STUCK_SHARE = 0.3  # of what may have flowed: remains though the vehicle's own state of charge says that nothing did
 OWN_SOC_SD = 0.015  # of a change of the vehicle's own state of charge: its steps
 OWN_SOC_GAIN_SD = 0.2  # relative, of the same: its window and its errors
+CONTRADICTS = 3.0  # sd: two that are further apart are not both right
+CURVE = -0.02, 1.02  # SOC to which a first voltage is read off the rest voltage
+ROUNDS = 5  # of the search for a SOC: R0 depends on it
+HOUR = 3600.0  # s
 
 
 @dataclass(frozen=True)
@@ -62,10 +66,10 @@ def from_voltage(
     v1, v1_sd: polarisation that is expected, and its sd [V]; voltage_sd: of everything else [V]. The sd of SOC is the
     chord of the rest voltage over its uncertainty: near empty a tangent would promise far too much.
     """
-    soc = 0.5
-    for _ in range(5):  # R0 depends on SOC
+    soc = HALF_FULL
+    for _ in range(ROUNDS):
         emf = voltage + battery.r0.at(soc, temperature)[0] * current + v1
-        soc = min(max(battery.soc_at(emf, temperature), -0.02), 1.02)
+        soc = min(max(battery.soc_at(emf, temperature), CURVE[0]), CURVE[1])
     sd = hypot(v1_sd, voltage_sd)
     soc_sd = min(soc_width(battery, emf, sd, temperature) / 2, SOC_UNKNOWN_SD)
     return soc, (soc_sd**2, v1_sd**2 * soc_sd / sd, v1_sd**2)
@@ -98,7 +102,7 @@ def parked(saved: Saved, age: float | None, odometer: float | None, own_soc: flo
 
 def unseen_sd(gap: float) -> float:
     """Sd of the SOC that flowed in `gap` [s] in which nobody counted, ridden or charged."""
-    return min((RIDING_RATE * gap + BURST_RATE * min(gap, BRIDGE)) / 3600, SOC_UNKNOWN_SD)
+    return min((RIDING_RATE * gap + BURST_RATE * min(gap, BRIDGE)) / HOUR, SOC_UNKNOWN_SD)
 
 
 def flowed(
@@ -116,24 +120,24 @@ def flowed(
     [V], [A]; odometer [m] and own_soc: as the vehicle shows them now, None if it does not.
     """
     gap = UNKNOWN_AGE if age is None else age
-    way = None if odometer is None or saved.odometer is None else odometer - saved.odometer
-    if way is not None and way > FASTEST * gap + ODOMETER_STEP:  # so much longer than the clock says, or it was reset
-        gap = UNKNOWN_AGE
+    distance = None if odometer is None or saved.odometer is None else odometer - saved.odometer
+    if distance is not None and distance > FASTEST * gap + ODOMETER_STEP:
+        gap = UNKNOWN_AGE  # it is so much longer than the clock says, or the odometer was reset
     mean, sd = 0.0, unseen_sd(gap)
-    if way is not None and saved.consumption is not None:
-        if -ODOMETER_STEP <= way <= FASTEST * gap + ODOMETER_STEP:
-            price = saved.consumption / (3600 * charge * voltage)  # SOC per metre
-            mean = max(way, 0.0) * price
-            charged = RIDING_RATE * max(gap - CHARGING_FROM, 0.0) / 3600
+    if distance is not None and saved.consumption is not None:
+        if -ODOMETER_STEP <= distance <= FASTEST * gap + ODOMETER_STEP:
+            price = saved.consumption / (HOUR * charge * voltage)  # SOC per metre
+            mean = max(distance, 0.0) * price
+            charged = RIDING_RATE * max(gap - CHARGING_FROM, 0.0) / HOUR
             step = min(ODOMETER_STEP, FASTEST * gap) * price
             sd = min(hypot(CONSUMPTION_SD * mean, hypot(charged, step)), sd)
     elif gap <= BRIDGE and saved.current is not None:
-        mean = (saved.current + current) / 2 * gap / (3600 * charge)
+        mean = (saved.current + current) / 2 * gap / (HOUR * charge)
     if own_soc is not None and saved.own_soc is not None:
         own = saved.own_soc - own_soc
         own_sd = OWN_SOC_SD + OWN_SOC_GAIN_SD * abs(own)
         apart = abs(own - mean)
-        if apart > 3 * hypot(sd, own_sd):  # one of the two is wrong
+        if apart > CONTRADICTS * hypot(sd, own_sd):  # one of the two is wrong
             sd = hypot(sd, apart)
         elif apart <= own_sd:  # confirmed, to no better than its steps; but it may be stuck
             sd = min(sd, hypot(own_sd, STUCK_SHARE * sd))

@@ -6,12 +6,11 @@ from math import sqrt
 from typing import NamedTuple
 
 from gz_onboard.estimator.sources import CurrentSource
-from gz_onboard.estimator.start import unseen_sd
+from gz_onboard.estimator.start import HOUR, unseen_sd
 from gz_onboard.estimator.timing import SLOW_GAP
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.parameters import Parameters
 
-HOUR = 3600.0  # s
 SAMPLING_RATE = 0.15  # 1/h: sd of the mean current over capacity between two samples that are seconds apart
 UNCHECKED_CURRENT_SD = 0.2  # A, beside the offset's, while no second sensor confirms the first
 EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
