@@ -222,7 +222,7 @@ class StateOfCharge:
         ):
             return
         by_inverter = not self._signals.pack_voltage.fresh(now)
-        voltage_sd = INVERTER_VOLTAGE_SD / battery.cells_series if by_inverter else reading.voltage_sd
+        voltage_sd = INVERTER_VOLTAGE_SD if by_inverter else reading.voltage_sd
         known = self._signals.cell_temperature.fresh(now)
         slow = self.uncertainty.variance(filter_.soc, r0, cell_current, reading.source, known, voltage_sd)
         error, own = filter_.innovation(cell_voltage, cell_current, temperature)

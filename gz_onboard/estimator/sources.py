@@ -11,10 +11,10 @@ from gz_onboard.estimator.redundancy.electric import Readings
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.signals import Signal, Signals
 from gz_onboard.estimator.timing import SLOW_GAP
-from gz_onboard.physics.battery import HALF_FULL, Battery
+from gz_onboard.physics.battery import BENCH_TEMPERATURE, HALF_FULL, Battery
 from gz_onboard.physics.parameters import Parameters
 
-MISMATCH = 3.0  # A between the two current sensors, over ten seconds or so
+MISMATCH = 0.09145416  # 1/h between the two current sensors, over ten seconds or so: 3 A of 32.8 A·h
 MISMATCH_SHARE = 0.01  # of a step: the low pass of that
 
 
@@ -51,12 +51,13 @@ class PackSources:
         self._voltage_sd = p.sd("pack_voltage_offset") / battery.cells_series
         self._auxiliary_power = p["auxiliary_power"]
         self._usual_voltage = battery.ocv(HALF_FULL)[0] * battery.cells_series
+        self._mismatch = MISMATCH * battery.pack_capacity(BENCH_TEMPERATURE)  # A
         self._difference = 0.0  # A, low-passed
 
     @property
     def currents_differ(self) -> bool:
         """Whether the two current sensors do, in the mean."""
-        return abs(self._difference) > MISMATCH
+        return abs(self._difference) > self._mismatch
 
     def read(self, now: float, dt: float, speed: float | None, evidence: CellEvidence) -> PackReading:
         """The best of this step of `dt` [s]; `speed` in m/s."""

@@ -8,30 +8,32 @@ from typing import NamedTuple
 from gz_onboard.estimator.sources import CurrentSource
 from gz_onboard.estimator.start import HOUR, unseen_sd
 from gz_onboard.estimator.timing import SLOW_GAP
-from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery import BENCH_TEMPERATURE, Battery
 from gz_onboard.physics.parameters import Parameters
 
 SAMPLING_RATE = 0.15  # 1/h: sd of the mean current over capacity between two samples that are seconds apart
-UNCHECKED_CURRENT_SD = 0.2  # A, beside the offset's, while no second sensor confirms the first
+# Errors of currents are C-rates (1/h: A over the pack's A·h at the bench's temperature), as sensors and loads are sized
+# by the pack; those of voltages are a cell's.
+UNCHECKED_SD = 0.006096944  # 1/h, beside the offset's, while no second sensor confirms the first: 0.2 A of 32.8 A·h
 EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
 RESISTANCE_SD = 0.12  # relative: R0 of this pack at this place and temperature
 RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
-INVERTER_VOLTAGE_SD = 0.15  # V: the cable between pack and inverter
+INVERTER_VOLTAGE_SD = 0.01071429  # V of a cell: the cable between pack and inverter, 0.15 V of 14 cells
 
 
 class CurrentError(NamedTuple):
     """Of a pack current, beside the sensor's own offset."""
 
-    sd: float  # A
+    sd: float  # 1/h
     time: float  # s that such an error stays the same
 
 
 CURRENT_ERRORS = {
     CurrentSource.PACK: CurrentError(0.0, HOUR),
-    CurrentSource.INVERTER: CurrentError(0.5, HOUR),
-    CurrentSource.DISPUTED: CurrentError(6.0, HOUR),
-    CurrentSource.MODEL: CurrentError(3.0, 600.0),
-    CurrentSource.NONE: CurrentError(15.0, 60.0),
+    CurrentSource.INVERTER: CurrentError(0.01524236, HOUR),  # 0.5 A of 32.8 A·h: the auxiliary load
+    CurrentSource.DISPUTED: CurrentError(0.1829083, HOUR),  # 6 A: the one that is right may be either
+    CurrentSource.MODEL: CurrentError(0.09145416, 600.0),  # 3 A: wind and load, of which some stay for minutes
+    CurrentSource.NONE: CurrentError(0.4572708, 60.0),  # 15 A: any riding
 }
 
 
@@ -40,6 +42,7 @@ class ChargeUncertainty:
 
     def __init__(self, battery: Battery, parameters: Parameters) -> None:
         p = parameters
+        self._rated = battery.pack_capacity(BENCH_TEMPERATURE)  # A·h
         self._offset_sd = p.sd("pack_current_offset")
         self._charge_sd = sqrt((p.sd("cell_capacity") / p["cell_capacity"]) ** 2 + p.sd("pack_current_gain") ** 2)
         self._unseen = 0.0  # of SOC: sd that the pauses left
@@ -49,8 +52,8 @@ class ChargeUncertainty:
 
         checked: a second sensor confirms the first.
         """
-        unchecked = 0.0 if checked else UNCHECKED_CURRENT_SD
-        sd = sqrt(self._offset_sd**2 + error.sd**2 + unchecked**2)
+        unchecked = 0.0 if checked else UNCHECKED_SD
+        sd = sqrt(self._offset_sd**2 + (error.sd**2 + unchecked**2) * self._rated**2)
         return (sd / charge) ** 2 * 2 * error.time * dt + self._charge_sd**2 * abs(flowed)
 
     @staticmethod
@@ -87,7 +90,7 @@ class VoltageUncertainty:
         r0: [ohm] of a cell.
         """
         resistance_sd = RESISTANCE_SD if temperature_known else RESISTANCE_SD_COLD
-        current_sd = CURRENT_ERRORS[source].sd / self._battery.cells_parallel
+        current_sd = CURRENT_ERRORS[source].sd * self._battery.cell_capacity(BENCH_TEMPERATURE)
         empty = min(max((EMPTY_BELOW - soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
         model_sd = self.model + empty * (self._empty - self.model)
         # The pack's cells are not the bench's: where SOC lies on their curve is known to their capacity's scatter.
