@@ -11,7 +11,7 @@ from math import inf
 from gz_onboard.events import Activity
 from gz_onboard.physics.effect import MOVING
 
-STOP_TIME = 120.0  # s: a stop of up to this belongs to the ride, as at a traffic light; beyond, the vehicle stands
+STOP_TIME = 120.0  # s: a stop of up to this belongs to the ride, as at a traffic light; beyond, it is parked
 STANDING_AFTER = 2.0  # s without motion
 MOVING_AFTER = 1.0  # s of motion: a single sample of a noisy sensor is none
 CHARGING_RATE = 0.02  # 1/h: a charging current of a fiftieth of the capacity; current sensors' offsets are smaller
@@ -54,5 +54,5 @@ class Activities:
 
     @property
     def teaches(self) -> bool:
-        """Whether what flows now is part of a ride: motion, or a stop on the way."""
+        """Whether what flows now is part of a ride: motion, or a short stop."""
         return self.now is not Activity.CHARGING and self._charging == 0 and self._still <= STOP_TIME

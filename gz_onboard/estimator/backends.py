@@ -1,4 +1,4 @@
-"""Which backend of the SOC filter a name stands for."""
+"""The backends of the SOC filter by name."""
 
 from __future__ import annotations
 

@@ -9,8 +9,8 @@ from gz_onboard.physics.effect import QUANTITIES
 from gz_onboard.physics.model import Model
 
 LARGEST = 1.0  # V of a cell, of a saved state
-FOREVER = 1e9  # s: a rest of which nobody knows how long it was
-MILD = 20.0  # degC: of cells that nobody watched
+FOREVER = 1e9  # s: a rest of unknown length
+MILD = 20.0  # degC: of cells after a restart
 
 
 class CellEffects:

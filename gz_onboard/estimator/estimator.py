@@ -195,7 +195,7 @@ class Estimator:
         self._activities.step(dt, self.road.speed, rate, signals.charge_plug.get(now), silent)
 
     def _ride(self, now: float, dt: float) -> None:
-        """Learn from the riding, where all that it takes is known."""
+        """Learn from the riding, where its consumption is known."""
         speed, reading = self.road.speed, self._reading
         unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.redundancy.speeds.unsettled
         known = 0 < dt <= self._timing.pause and not unsure and self._activities.teaches

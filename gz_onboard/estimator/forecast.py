@@ -1,7 +1,7 @@
 """How far the energy that is left will go.
 
 What is known of the riding is kept in segments of `SEGMENT` metres: what the pack delivered, and what the forward
-model says the same riding takes, as it was and less what height and speed have stored. From them:
+model gives for the same riding, as it was and less what height and speed have stored. From them:
 
 - the consumption factor, measured over modelled, learned slowly: one number that carries what the parameters have
   wrong for this vehicle, rider and season;
@@ -43,7 +43,7 @@ ACCELERATION = 15.0  # m/s²: no road gives more; a second that shows more is le
 SPEEDS = -5.0, 70.0  # m/s: the same
 STEEPEST = 0.3  # sine: the same
 LEAST_DISTANCE = 0.1  # m: over less a climb shows no grade
-LEAST = 0.2  # of the prior's consumption: no riding of any length takes less
+LEAST = 0.2  # of the prior's consumption: no riding of any length consumes less
 MOST_SD = 3.0  # of the logarithm of the range: beyond, it is not known at all
 SHOWN_FROM = 500.0  # m: over less the recent consumption is that of one traffic light
 DECILE = 1.2815515655446004  # sd of a normal distribution: 10 % are beyond
@@ -51,7 +51,7 @@ DECILE = 1.2815515655446004  # sd of a normal distribution: 10 % are beyond
 
 @dataclass(frozen=True)
 class Forecast:
-    """Range and what it stands on; SI units."""
+    """Range and what it is based on; SI units."""
 
     range: float
     p10: float
@@ -130,7 +130,7 @@ class Forecaster:
     def _modelled(
         self, speed: float, acceleration: float, conditions: Conditions, inputs: EffectInputs | None
     ) -> tuple[float, float]:
-        """What the second takes by the model, and what riding it again will take [J]."""
+        """(energy of the second by the model, energy of riding it again) [J]."""
         r, second, load = self.riding, self.riding.second, self.load
         q = load.quantities(speed, acceleration, conditions)
         if abs(second.distance) > LEAST_DISTANCE:
@@ -167,8 +167,8 @@ class Forecaster:
         self.riding.second, self.riding.speed_before = Second(), None
 
     def _close(self, segment: Segment) -> None:
-        """Learn the factor: a Kalman filter. Its error is one of energy (a hill or a gust not seen), so a segment that
-        takes little says little.
+        """Learn the factor: a Kalman filter. Its error is one of energy (a hill or a gust not seen), so a segment of
+        little energy has a large variance.
         """
         r = self.riding
         segment.learned = r.factor, r.factor_variance

@@ -39,10 +39,10 @@ class InnovationGate:
     def update(self, dt: float, error: float, own: float, slow: float) -> float | None:
         """The variance [V²] with which a voltage is to be taken in, of which `error` [V] is off; None: not at all.
 
-        dt: [s] that it stands for; own: variance of the prediction by the state, slow: by everything else [V²].
+        dt: [s] that it represents; own: variance of the prediction by the state, slow: by everything else [V²].
         """
         self.innovation, square = error, error * error
-        # A model that errs more than its file says is believed less (Mehra 1970: covariance matching).
+        # A model with larger errors than in the vehicle file gets a larger variance (Mehra 1970: covariance matching).
         believed = max(slow, self._error_square)
         self._error_square += (square - self._error_square) * min(dt / ERROR_TIME, 1.0)
         self._square += (square - self._square) * min(dt / INNOVATION_TIME, 1.0)

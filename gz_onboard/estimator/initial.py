@@ -9,7 +9,7 @@ from gz_onboard.estimator.ekf import FilterMaker, SocFilter
 from gz_onboard.estimator.gate import ERROR_TIME
 from gz_onboard.estimator.rest import REST_RATE
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.estimator.start import Saved, bounded, flowed, from_voltage, parked, take_in
+from gz_onboard.estimator.start import Saved, bounded, from_voltage, parked, uncounted, update_soc
 from gz_onboard.estimator.uncertainty import RESISTANCE_SD, VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.effect import MOVING
@@ -22,7 +22,7 @@ STEADY_AFTER = 10.0  # s over which it must hold still after it has once been se
 STEADY_WAIT = 60.0  # s after which it is begun with whatever there is, knowing nothing
 STEADY_SD = 4.0  # of the movement: how much may be still to come
 PULLING_RATE = 0.5  # 1/h: current over capacity from which a vehicle that does not move yet has been under load already
-STOPPED_SHARE = 0.5  # of a ride's polarisation: sd of what a vehicle that stands still has, long parked or just stopped
+STOPPED_SHARE = 0.5  # of a ride's polarisation: sd at standstill, long parked or just stopped
 RELAXED = 600.0  # s: V1 is no less known than after so long
 CONFLICT = 4.0  # sd between the saved SOC and that of the voltage: beyond, one of the two is wrong
 ROUGH_SD = 0.01  # V: any, for a state of charge of which only the mean is used
@@ -130,7 +130,7 @@ def first_filter(
     capacity = battery.pack_capacity(temperature)
     rate = REST_RATE if first.moving is None else PULLING_RATE
     loaded = abs(first.current) > rate * capacity or bool(first.moving)
-    # The polarisation of a ride that was not seen: at once if the vehicle rides, perhaps if it stands.
+    # The polarisation of a ride that was not seen: certain if the vehicle rides, possible at standstill.
     r0, r1 = battery.r0.at(soc, temperature)[0], battery.r1.at(soc, temperature)[0]
     ridden = r1 * at.riding_power / first.voltage / battery.cells_parallel
     v1, v1_sd = (ridden, ridden) if loaded else (0.0, STOPPED_SHARE * ridden)
@@ -139,14 +139,14 @@ def first_filter(
     drawn = None
     if saved:
         own_soc, odometer = signals.bms_state_of_charge.get(at.now), signals.odometer.get(at.now)
-        drawn = flowed(saved, age, capacity, first.voltage, first.current, odometer, own_soc)
+        drawn = uncounted(saved, age, capacity, first.voltage, first.current, odometer, own_soc)
         if not loaded:
             v1_sd *= 1 - parked(saved, age, odometer, own_soc)
         if age is not None and age < RELAXED:
             decay = exp(-age / (r1 * battery.c1.at(soc, temperature)[0]))
             v1 += (saved.v1 - v1) * decay
             v1_sd = sqrt(saved.covariance[2] * decay**2 + v1_sd**2 * (1 - decay**2))
-        # The cell model errs the same way for ERROR_TIME: after a shorter gap the voltage says nothing new.
+        # The cell model errs the same way for ERROR_TIME: after a shorter gap the voltage adds no information.
         if age is not None:
             voltage_sd *= sqrt(max(2 * ERROR_TIME / max(age, SHORTEST_AGE), 1.0))
     soc, covariance = from_voltage(battery, cell_voltage, cell_current, temperature, v1, v1_sd, voltage_sd)
@@ -154,9 +154,9 @@ def first_filter(
     if saved and drawn:
         before, variance = saved.soc - drawn[0], saved.covariance[0] + drawn[1] ** 2
         apart = (before - soc) ** 2
-        if apart > CONFLICT**2 * (variance + covariance[0]):  # nobody knows which of the two is wrong
+        if apart > CONFLICT**2 * (variance + covariance[0]):  # either may be wrong
             variance += apart
             filter_.covariance = covariance[0] + apart, covariance[1], covariance[2]
-        take_in(filter_, before, variance)
+        update_soc(filter_, before, variance)
     filter_.soc = bounded(filter_.soc)
     return filter_

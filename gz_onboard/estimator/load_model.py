@@ -1,4 +1,4 @@
-"""What the forward model says that riding takes, on board: its inputs, from what is known, and their typical values.
+"""The forward model on board: its inputs, from what is known, and their typical values.
 
 Effects of an extended model read more than speed, acceleration and grade, which is all that is known of the road to
 come. What is modelled of the ride so far has the heading, the lateral acceleration and the vibration (the root mean
@@ -47,7 +47,7 @@ BASE = {
 
 @dataclass(frozen=True, slots=True)
 class Conditions:
-    """What riding takes depends on, beside the motion."""
+    """What the consumption depends on beside the motion."""
 
     ambient: float  # degC
     altitude: float  # m

@@ -1,4 +1,4 @@
-"""What the model says of the vehicle as it moves now."""
+"""What the model gives for the present motion."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from gz_onboard.physics.battery import HALF_FULL
 
 
 class Present:
-    """The present inputs of the model, out of those who know them. All methods take the time [s]."""
+    """The present inputs of the model, collected from the parts that hold them. All methods take the time [s]."""
 
     def __init__(
         self,

@@ -6,7 +6,7 @@ from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.signals import FIX_2D, Signals
 from gz_onboard.events import Reason
 
-# What is missing makes the consumption to come less certain; relative sd, judged by what each is worth on the rides.
+# What is missing makes the consumption to come less certain; relative sd, from the errors on the rides without each.
 LOSS_SD = {
     Reason.NO_SPEED: 0.10,
     Reason.NO_IMU: 0.03,

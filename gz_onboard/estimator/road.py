@@ -23,13 +23,13 @@ STANDSTILL = 0.05  # m/s
 TURNING = 2.0  # m/s: below, the lean is no steady turn's, and the course of the GPS is noise
 COURSE_TIME = 1.0  # s: how fast the heading is drawn to the GPS course
 LEAST_COSINE = 0.5  # of the lean: no tyre holds 60 degrees
-QUIET, QUIET_TIME = 0.05, 1.0  # rad/s, s: a standing vehicle that nobody turns or leans: the rates hold still
+QUIET, QUIET_TIME = 0.05, 1.0  # rad/s, s: of a vehicle at standstill, upright: the rates are constant
 MOST_BIAS = 0.3  # rad/s: cheap MEMS sensors are specified to a third of it
 BIAS_TIME = 5.0  # s of standing to know the offset of a rate sensor
 LOST = 15.0  # m: the observer is never so far from an altitude that it follows
 ALTITUDES = -500.0, 9000.0  # m: where there are roads
 STEEPEST = 0.3  # sine: of roads
-LARGEST_SHARE = 0.5  # of the way to the altitude in one step, however far it went
+LARGEST_SHARE = 0.5  # of the error corrected in one step, however long
 
 
 def accelerated(slow: float, speed: float, dt: float) -> tuple[float, float]:

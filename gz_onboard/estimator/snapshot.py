@@ -11,7 +11,9 @@ from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.road import MOST_BIAS
 from gz_onboard.estimator.start import Saved
 
-VERSION = 3  # 2: the states of effects with memory; 3: what shows what flowed while nobody counted
+VERSION = (
+    3  # 2: the states of effects with memory; 3: odometer, own SOC and consumption, for the charge that flows uncounted
+)
 MOST = {"current": 1e4, "odometer": 1e10, "own_soc": 1.1, "consumption": 1e5}  # A, m, 1, J/m
 SOC = -0.1, 1.1
 V1 = 1.0  # V of a cell
@@ -21,7 +23,7 @@ CELLS_KEEP = 3600.0  # s: for so long the cells' temperature is known
 
 @dataclass(frozen=True)
 class Restored:
-    """What a snapshot says, checked."""
+    """The contents of a snapshot, checked."""
 
     battery: Saved
     age: float | None  # s; None: not known

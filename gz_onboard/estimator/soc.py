@@ -11,11 +11,10 @@ from gz_onboard.estimator.ekf import FilterMaker, SocFilter
 from gz_onboard.estimator.gate import ERROR_TIME, InnovationGate
 from gz_onboard.estimator.initial import RELAXED, Situation, SteadyVoltage, first_filter
 from gz_onboard.estimator.redundancy.sag import VoltageSag
-from gz_onboard.estimator.rest_update import RestUpdate
+from gz_onboard.estimator.rest import RestUpdate
 from gz_onboard.estimator.signals import Signal, Signals
-from gz_onboard.estimator.sources import CurrentSource, PackReading
+from gz_onboard.estimator.sources import CurrentSource, PackReading, Synchroniser
 from gz_onboard.estimator.start import HOUR, SOC_UNKNOWN_SD, Saved, bounded, plausible
-from gz_onboard.estimator.synchronise import Synchroniser
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
@@ -163,7 +162,7 @@ class StateOfCharge:
         if voltage is None or current is None:
             self.gate.innovation = None
             return
-        # What was held since the last message is taken in once, with all the time it stands for.
+        # What was held since the last message is used once, for all the time since.
         shown = self._signals.pack_voltage
         received = shown.time if shown.fresh(now) else self._signals.inverter_voltage.time
         if received == self._voltage_time:
@@ -205,7 +204,7 @@ class StateOfCharge:
     def _update(
         self, filter_: SocFilter, now: float, dt: float, measured: tuple[float, float], pack: PackState
     ) -> None:
-        """Take in the voltage [V] at a current [A], both of the pack, that stands for `dt` [s]."""
+        """Update with the voltage [V] at a current [A], both of the pack, that represents `dt` [s]."""
         battery, reading, temperature = self._battery, pack.reading, pack.temperature
         voltage, current = measured
         # What effects in the cells take is known: the filter sees the voltage that there would be without them.
@@ -230,7 +229,7 @@ class StateOfCharge:
         if self.gate.refuted:
             self._begin_anew(now)
         elif variance is not None:
-            # What errs the same way for ERROR_TIME is worth one sample in that time, not one each step.
+            # What errs the same way for ERROR_TIME counts as one sample in that time, not one each step.
             variance *= max(2 * ERROR_TIME / max(dt, SHORTEST), 1.0)
             filter_.update(cell_voltage, cell_current, temperature, variance)
             filter_.soc = bounded(filter_.soc)

@@ -1,7 +1,8 @@
-"""Which sensor stands in for which: pack voltage and current by the best sensors that work."""
+"""Which sensor replaces which: pack voltage and current, from the best sensors that work, at one time."""
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
 from enum import Enum, auto
 from math import hypot, isinf
@@ -118,6 +119,30 @@ class PackSources:
         if inverter is not None and signals.inverter_current.trusted:
             return inverter, CurrentSource.INVERTER
         return None, CurrentSource.NONE
+
+
+class Synchroniser:
+    """Keeps the one that comes first, and interpolates it. `latency` [s]: of the voltage; negative: of the current."""
+
+    def __init__(self, latency: float) -> None:
+        self.latency = latency
+        self._recent: deque[tuple[float, float, float]] = deque()  # s, V, A of the pack
+
+    def pair(self, now: float, voltage: float, current: float, pause: float) -> tuple[float, float] | None:
+        """(voltage [V], current [A]) of one time; None if not yet, or over a gap longer than `pause` [s]."""
+        recent, then = self._recent, now - abs(self.latency)
+        recent.append((now, voltage, current))
+        if recent[0][0] > then:
+            return None
+        while recent[1][0] <= then:
+            recent.popleft()
+        (t0, v0, i0), (t1, v1, i1) = recent[0], recent[1]
+        if t1 - t0 > pause:
+            return None
+        share = (then - t0) / (t1 - t0)
+        if self.latency > 0:
+            return voltage, i0 + share * (i1 - i0)
+        return v0 + share * (v1 - v0), current
 
 
 def _together(first: Signal, second: Signal) -> bool:

@@ -1,4 +1,4 @@
-"""Temperatures of cells and ambient, and what stands in where a sensor is missing."""
+"""Temperatures of cells and ambient, and what replaces a missing sensor."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from gz_onboard.physics.battery import BENCH_TEMPERATURE
 COOLING_TIME = 7200.0  # s: how fast the cells' temperature drifts to the ambient's
 WARMER = 3.0  # K: cells over the ambient
 UNKNOWN = 20.0  # degC: the ambient that no sensor shows
-CELL_SD, CELL_SD_UNKNOWN = 1.0, 8.0  # K: of a sensor, of what stands in
+CELL_SD, CELL_SD_UNKNOWN = 1.0, 8.0  # K: of a sensor, of its replacement
 
 
 class Temperatures:

@@ -10,7 +10,7 @@ from gz_onboard.events import Group
 
 SLOW_GAP = 0.5  # s: messages with longer gaps are watched for their real period
 SLOWEST = 5.5  # s: pack current and voltage that come less often are not integrated: 5 s and what a clock is off
-PAUSE = 1.0  # s: without messages of a longer period a longer gap is a pause, in which nobody knows what flowed
+PAUSE = 1.0  # s: without messages of a longer period a longer gap is a pause, in which charge is not counted
 PAUSE_PERIODS = 2.5  # the same in real periods of the pack current
 SLOW_STALE_PERIODS = 3.0  # a slow signal is stale after so many of its real periods
 LONGEST_STALE = 300.0  # s, of temperatures; of everything else so many of the slowest period
@@ -20,7 +20,7 @@ INTEGRATED = {"pack_current", "pack_voltage"}
 
 
 class MessageTiming:
-    """Learns the real periods of messages. `last` and `gaps` are public for the estimator's hot path alone."""
+    """Learns the real periods of messages. `last` and `gaps` are public for the estimator's hot path only."""
 
     def __init__(self, groups: Sequence[Group], slots: Sequence[Sequence[Signal]]) -> None:
         self.last = [-inf] * len(groups)  # s, of each group's last message
@@ -59,6 +59,6 @@ class MessageTiming:
 
     @property
     def pause(self) -> float:
-        """A gap that is longer [s] is a pause, in which nobody knows what flowed."""
+        """A gap that is longer [s] is a pause, in which charge is not counted."""
         period = self.sampled
         return max(PAUSE, PAUSE_PERIODS * period) if period <= SLOWEST else PAUSE

@@ -6,7 +6,7 @@ from math import sqrt
 from typing import NamedTuple
 
 from gz_onboard.estimator.sources import CurrentSource
-from gz_onboard.estimator.start import HOUR, unseen_sd
+from gz_onboard.estimator.start import HOUR, uncounted_sd
 from gz_onboard.estimator.timing import SLOW_GAP
 from gz_onboard.physics.battery import BENCH_TEMPERATURE, Battery
 from gz_onboard.physics.parameters import Parameters
@@ -62,17 +62,17 @@ class ChargeUncertainty:
         return (SAMPLING_RATE / HOUR) ** 2 * dt * period if period > SLOW_GAP else 0.0
 
     def of_pause(self, dt: float, soc_sd: float) -> float:
-        """Variance after a pause of `dt` [s]: nobody knows what flowed.
+        """Variance after a pause of `dt` [s], in which charge is not counted.
 
         What was taken for it errs the same way each time: the rider goes on as before. soc_sd: what is known at most.
         """
-        before, more = min(self._unseen, soc_sd), unseen_sd(dt)
+        before, more = min(self._unseen, soc_sd), uncounted_sd(dt)
         self._unseen = before + more
         return (2 * before + more) * more
 
 
 class VoltageUncertainty:
-    """Standard deviations [V of a cell] of what a voltage says about the state of charge."""
+    """Standard deviations [V of a cell] of a voltage as a measurement of the state of charge."""
 
     def __init__(self, battery: Battery, parameters: Parameters) -> None:
         p = parameters

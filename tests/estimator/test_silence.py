@@ -7,7 +7,7 @@ from math import exp
 import pytest
 
 from gz_onboard.estimator.redundancy.checks import SETTLED, RateLimit
-from gz_onboard.estimator.start import Saved, flowed, unseen_sd
+from gz_onboard.estimator.start import Saved, uncounted, uncounted_sd
 from gz_onboard.events import Activity, Group, Reason, State
 from tests.estimator.life import CELLS, GROUPS, INVERTER, PACK, Scooter, estimator, follow, worst
 
@@ -111,7 +111,7 @@ def test_an_anchor_that_was_a_moment_ago_does_not():
 
 @pytest.mark.parametrize("gap", [5.0, 20.0, 60.0, 600.0])
 def test_a_pause_is_as_uncertain_as_a_restart(gap):
-    assert unseen_sd(gap) == flowed(Saved(0.5, 0.0, (1e-4, 0.0, 1e-6)), gap, 32.8, 52.0, 0.0, None, None)[1]
+    assert uncounted_sd(gap) == uncounted(Saved(0.5, 0.0, (1e-4, 0.0, 1e-6)), gap, 32.8, 52.0, 0.0, None, None)[1]
 
 
 @pytest.mark.parametrize("speed", [16.0, 20.0, 24.0])

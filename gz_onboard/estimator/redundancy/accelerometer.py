@@ -43,7 +43,7 @@ class AccelerometerGain:
             return False
         # Less their means: a slope is in the one and not in the other.
         slow, wheels, time = self._means or (forward, acceleration, 0.0)
-        time = min(time + dt, GAIN_MEAN)  # plain means at first: nobody knows what was before
+        time = min(time + dt, GAIN_MEAN)  # plain means at first: the past is not known
         share = share_of_new(dt, time)
         self._means = slow + (forward - slow) * share, wheels + (acceleration - wheels) * share, time
         self._product = keep * self._product + (forward - slow) * (acceleration - wheels) * dt

@@ -10,7 +10,7 @@ from gz_onboard.estimator.signals import Signals
 
 FAULTY_AFTER = 3.0  # s of contradiction: wheels spin and lock for a second or two
 RECOVERED_AFTER = 60.0  # s of agreement
-AGREEMENT_WEIGHT = 0.5  # s of contradiction that a second of agreement takes back
+AGREEMENT_WEIGHT = 0.5  # s of contradiction that a second of agreement cancels
 ROUNDING = 1e-9  # s, of a sum of steps
 SETTLED = 30.0  # s: a signal that has held so long is not replaced by what contradicts it
 AGREES = 0.5  # of a limit: what differs by no more agrees; between it and the limit nothing is proven

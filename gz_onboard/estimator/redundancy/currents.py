@@ -64,7 +64,7 @@ class CurrentCheck:
         return (against if not self.disputed else NO_SENSOR) | faulty(self.counters)
 
     def compare_consumption(self, relative: float) -> None:
-        """`relative`: what the last kilometre took by the currents, over what the road takes by the model."""
+        """`relative`: the consumption of the last kilometre by the currents, over that of the model."""
         self._scaled |= self.sag.scaled(relative)
 
     def _compare(

@@ -1,4 +1,4 @@
-"""The grade by accelerometer, by GPS altitude, and by the energy that riding takes more than on the level.
+"""The grade by accelerometer, by GPS altitude, and by the energy consumed beyond that on the level.
 
 Grades are sines of the road's angle. The commissioning rides' greatest differences of accelerometer and altitude are
 0.026 over 300 m and 0.010 over 1000 m; those of the energy 0.05, most of it wind that stays for the ride.
@@ -7,7 +7,6 @@ Grades are sines of the road's angle. The commissioning rides' greatest differen
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.redundancy.accelerometer import AccelerometerGain
@@ -22,7 +21,7 @@ APART = Limits(0.05, 0.022, 0.08)
 APART_FROM_ENERGY = Limits(0.09, 0.06, 0.10)  # of a single witness against the energy
 DECIDES = 0.4  # of what two are apart: by so much one must be nearer to the energy than the other
 DOWNHILL = -0.02
-FREE = 0.4  # of what the usual riding takes: neither wind nor a light rider saves so much over a kilometre
+FREE = 0.4  # of the usual consumption: neither wind nor a light rider saves so much over a kilometre
 STEEPEST = 0.3
 JUMP, WEATHER = 6.0, 1.0  # m, m/s: how far and how fast an altitude wanders by the receiver alone
 STANDSTILL = 0.1  # m/s, mean of a second
@@ -34,16 +33,8 @@ LevelPower = Callable[[float, float], float]
 """Power of the pack [W] by the model for a speed [m/s] and an acceleration [m/s²] on a level road."""
 
 
-class Witnesses(NamedTuple):
-    """What rose over an interval [m], by each witness; None if it is silent."""
-
-    inertial: float | None
-    altitude: float | None
-    energy: float | None
-
-
 class GradeCheck:
-    """``step`` checks the altitude alone before it is used (`SensorCheck`); ``compare`` the witnesses, after.
+    """``step`` checks the altitude before it is used (`SensorCheck`); ``compare`` the witnesses, after.
 
     mass [kg]; level: the force [N] that the pack gives in the mean of the usual riding.
     """
@@ -131,19 +122,19 @@ class GradeCheck:
             gained = (speed - self._speed) / seconds
             energy = (self._work - level_power(distance / seconds, gained) * seconds) / self._weight
             self._by_energy.add(distance, energy)
-        seen = Witnesses(self._climb, rise, energy)
+        climb = self._climb
         pairs = [
             (difference, first - second)
             for difference, first, second in (
-                (self._inertial, seen.inertial, seen.altitude),
-                (self._energy, seen.energy, seen.inertial),
-                (self._energy_altitude, seen.energy, seen.altitude),
+                (self._inertial, climb, rise),
+                (self._energy, energy, climb),
+                (self._energy_altitude, energy, rise),
             )
             if first is not None and second is not None
         ]
-        for difference, climb in pairs:
-            difference.add(distance, climb)
-        against = self._contradicting(seen)
+        for difference, apart in pairs:
+            difference.add(distance, apart)
+        against = self._contradicting(climb is not None, rise is not None, energy is not None)
         if against is None:
             return
         for role in self.ROLES:
@@ -152,16 +143,16 @@ class GradeCheck:
             for difference, _ in pairs:
                 difference.doubt()
         elif not self.faulty:
-            for difference, climb in pairs:
-                difference.learn(distance, climb)
+            for difference, apart in pairs:
+                difference.learn(distance, apart)
 
-    def _contradicting(self, seen: Witnesses) -> frozenset[str] | None:
-        """Which sensors are contradicted; None if that cannot be decided now."""
-        if seen.inertial is not None and seen.altitude is not None:
-            return self._of_two(seen.energy is not None)
-        if seen.energy is None or (seen.inertial is None and seen.altitude is None):
+    def _contradicting(self, inertial: bool, altitude: bool, energy: bool) -> frozenset[str] | None:
+        """Which sensors are contradicted, of the witnesses that report; None if that cannot be decided now."""
+        if inertial and altitude:
+            return self._of_two(energy)
+        if not energy or not (inertial or altitude):
             return None
-        role, difference = (ALTITUDE, self._energy_altitude) if seen.inertial is None else (ACCELEROMETER, self._energy)
+        role, difference = (ACCELEROMETER, self._energy) if inertial else (ALTITUDE, self._energy_altitude)
         apart = difference.beyond(APART_FROM_ENERGY)
         if apart > 0 and self._by_energy.value < DOWNHILL:  # brakes take what a descent gives: energy does not see it
             return None
@@ -169,7 +160,7 @@ class GradeCheck:
 
     def _of_two(self, energy: bool) -> frozenset[str] | None:
         apart = self._inertial.beyond(APART)
-        if not apart and self._energy_altitude.far.value < self._free:  # riding takes less than it ever can
+        if not apart and self._energy_altitude.far.value < self._free:  # less consumption than possible
             return ALTITUDE
         if not apart:
             return None if self._inertial.beyond(APART, AGREES) else NO_SENSOR

@@ -1,8 +1,8 @@
 """The sag of the cells' voltage over what the current explains of it.
 
-Both currents scaled alike: the cells' voltage sags by more (less) than they explain, and a kilometre takes less
-(more) than the road does. The recorded rides show a sag of 0.6 to 1.3 of the predicted one, an aged pack's up to
-twice; a kilometre takes 0.7 of the usual by a frugal rider, and 2.5 of it up a hill against the wind. Neither of the
+Both currents scaled alike: the cells' voltage sags by more (less) than they explain, and a kilometre consumes less
+(more) than by the road load. The recorded rides show a sag of 0.6 to 1.3 of the predicted one, an aged pack's up to
+twice; a frugal rider consumes 0.7 of the usual per kilometre, and 2.5 of it up a hill against the wind. Neither of the
 two proves that a sensor is wrong; both together do.
 """
 
@@ -12,7 +12,7 @@ from gz_onboard.estimator.redundancy.checks import share_of_new
 
 FAST, TIME, LEAST = 0.5, 30.0, 0.003  # s, s, V²·s of a cell
 SAGS_MORE, TAKES_LESS, SAGS_LESS, TAKES_MORE = 1.45, 0.67, 0.5, 1.5
-EXPLAINED = 0.55, 1.45  # a current that explains the sag so well is right, whatever the road is said to take,
+EXPLAINED = 0.55, 1.45  # a current that explains the sag so well is right, whatever the road load is,
 EXPLAINED_SHARE = 0.6  # and so much of all that the voltage moves
 AGREES_WITHIN = 1.3  # by no more than this factor: the currents explain the voltage again
 
@@ -52,7 +52,7 @@ class VoltageSag:
         return self._product / self._square if self._square > LEAST else None
 
     def scaled(self, consumption: float) -> bool:
-        """Whether the currents are scaled; `consumption`: by them, over what the road takes by the model."""
+        """Whether the currents are scaled; `consumption`: by them, over that of the model."""
         ratio = self.ratio
         if ratio is None:
             return False

@@ -14,7 +14,9 @@ SPEED_APART, SPEED_APART_RELATIVE = 1.0, 0.12  # m/s and 1: two speeds that diff
 BRAKING = 5.0  # m/s²: how fast a speed can have changed since its sensor last reported
 DRIFT_TIME = 20.0  # s, low pass
 DRIFT_APART, DRIFT_APART_RELATIVE = 0.2, 0.08  # the same for the low-passed: tyres and scales err by a few percent
-AXLE = frozenset({"motor_speed", "wheel_speed_rear"})  # what turns on a roller bench or spins while the ground stands
+AXLE = frozenset(
+    {"motor_speed", "wheel_speed_rear"}
+)  # what turns on a roller bench or spins while the vehicle does not move
 GROUND = "wheel_speed_front", "gps_speed"
 ODOMETRY = frozenset({"motor_speed", "wheel_speed_rear", "wheel_speed_front"})  # what a vehicle speed is made from
 

@@ -1,4 +1,4 @@
-"""Temperatures against what can be, and against what they were: heat takes time."""
+"""Temperatures against what can be, and against what they were: heat flows slowly."""
 
 from __future__ import annotations
 
