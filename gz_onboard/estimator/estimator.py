@@ -19,7 +19,7 @@ from gz_onboard.estimator.activity import Activities
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.present import Present
-from gz_onboard.estimator.reasons import DEGRADING, NO_PACK, loss_variance, missing
+from gz_onboard.estimator.reasons import DEGRADING, NO_PACK, MissingSignals, loss_variance
 from gz_onboard.estimator.redundancy.checks import StepInputs
 from gz_onboard.estimator.redundancy.currents import CellEvidence
 from gz_onboard.estimator.redundancy.monitor import Redundancy
@@ -68,6 +68,7 @@ class Estimator:
             for group in groups
             for role in group.roles
         )
+        self._missing = MissingSignals(self.signals)
         self._slots = [[self.signals[role] for role in group.roles] for group in groups]
         self._timing = MessageTiming(groups, self._slots)
         self._last_seen, self._gaps = self._timing.last, self._timing.gaps
@@ -276,7 +277,7 @@ class Estimator:
             estimate.reasons |= Reason.PRIOR_RIDING
 
     def _reasons(self, now: float) -> Reason:
-        s, reasons = self.signals, missing(now, self.signals)
+        s, reasons = self.signals, self._missing.reasons(now)
         if self._sources.currents_differ:
             reasons |= Reason.CURRENT_MISMATCH
         differ = self.redundancy.voltages.apart or not (s.pack_voltage.trusted and s.inverter_voltage.trusted)

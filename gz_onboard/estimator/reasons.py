@@ -30,18 +30,26 @@ NEEDED = {
 """The roles of which none may be missing."""
 
 
-def missing(now: float, signals: Signals) -> Reason:
-    """The reasons for signals that are stale or not trusted at `now` [s]."""
-    reasons = Reason(0)
-    for reason, roles in NEEDED.items():
-        if not all(signals[role].fresh(now) for role in roles):
-            reasons |= reason
-    if not any(signals[role].fresh(now) for role in SpeedCheck.ROLES):
-        reasons |= Reason.NO_SPEED
-    position = signals.gps_speed.fresh(now) or signals.latitude.fresh(now)
-    if signals.fix_below(now, FIX_2D) or not position:
-        reasons |= Reason.NO_GPS
-    return reasons
+class MissingSignals:
+    """Which of the signals are stale or not trusted."""
+
+    def __init__(self, signals: Signals) -> None:
+        self._signals = signals
+        self._needed = [(reason, signals[role]) for reason, roles in NEEDED.items() for role in roles]
+        self._speeds = [signals[role] for role in SpeedCheck.ROLES]
+
+    def reasons(self, now: float) -> Reason:
+        """The reasons for those that are missing at `now` [s]."""
+        signals, reasons = self._signals, Reason(0)
+        for reason, signal in self._needed:
+            if not signal.fresh(now):
+                reasons |= reason
+        if not any(signal.fresh(now) for signal in self._speeds):
+            reasons |= Reason.NO_SPEED
+        position = signals.gps_speed.fresh(now) or signals.latitude.fresh(now)
+        if signals.fix_below(now, FIX_2D) or not position:
+            reasons |= Reason.NO_GPS
+        return reasons
 
 
 def loss_variance(reasons: Reason) -> float:

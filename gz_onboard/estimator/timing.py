@@ -20,7 +20,11 @@ INTEGRATED = {"pack_current", "pack_voltage"}
 
 
 class MessageTiming:
-    """Learns the real periods of messages. `last` and `gaps` are public for the estimator's hot path only."""
+    """Learns the real periods of messages. `last` and `gaps` are public for the estimator's hot path only.
+
+    sampled: the longest real period of pack current and voltage [s], 0 where they are not slow. pause: a gap that is
+    longer [s] is a pause, in which charge is not counted.
+    """
 
     def __init__(self, groups: Sequence[Group], slots: Sequence[Sequence[Signal]]) -> None:
         self.last = [-inf] * len(groups)  # s, of each group's last message
@@ -31,6 +35,7 @@ class MessageTiming:
         self._thermal = {i for i, group in enumerate(groups) if any("temperature" in role for role in group.roles)}
         self._stale = [signals[0].stale_after if signals else 0.0 for signals in slots]
         self._integrated = [i for i, group in enumerate(groups) if INTEGRATED & set(group.roles)]
+        self._summarise()
 
     def watch(self, group: int, gap: float) -> None:
         """Learn the real period of a message that comes with long gaps [s]: two alike are no coincidence."""
@@ -49,16 +54,11 @@ class MessageTiming:
             self.periods[group] = max(gap, before)
             longest = LONGEST_STALE if group in self._thermal else SLOW_STALE_PERIODS * SLOWEST
             stale = max(self._stale[group], min(SLOW_STALE_PERIODS * self.periods[group], longest))
+        self._summarise()
         for signal in self._slots[group]:
             signal.stale_after = stale
 
-    @property
-    def sampled(self) -> float:
-        """The longest real period of pack current and voltage [s]; 0 where they are not slow."""
-        return max((self.periods[i] for i in self._integrated), default=0.0)
-
-    @property
-    def pause(self) -> float:
-        """A gap that is longer [s] is a pause, in which charge is not counted."""
-        period = self.sampled
-        return max(PAUSE, PAUSE_PERIODS * period) if period <= SLOWEST else PAUSE
+    def _summarise(self) -> None:
+        """What follows from the periods; kept, as it is read at every step and changes hardly ever."""
+        self.sampled = max((self.periods[i] for i in self._integrated), default=0.0)
+        self.pause = max(PAUSE, PAUSE_PERIODS * self.sampled) if self.sampled <= SLOWEST else PAUSE

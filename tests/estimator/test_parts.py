@@ -9,7 +9,7 @@ import pytest
 
 from gz_onboard.estimator.gate import CONTRADICTED, GATE_COUNT, InnovationGate
 from gz_onboard.estimator.initial import STEADY_AFTER, STEADY_TIME, STEADY_WAIT, SteadyVoltage
-from gz_onboard.estimator.reasons import LOSS_SD, loss_variance, missing
+from gz_onboard.estimator.reasons import LOSS_SD, MissingSignals, loss_variance
 from gz_onboard.estimator.ridden import MEMORY, Past, Segment
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.estimator.sources import CurrentSource, Synchroniser
@@ -85,14 +85,15 @@ def test_errors_of_currents_go_with_the_size_of_the_pack():
 
 def test_reasons_and_what_they_cost():
     signals = everything()
-    assert missing(1.0, signals) == Reason(0)
+    missing = MissingSignals(signals).reasons
+    assert missing(1.0) == Reason(0)
     assert loss_variance(Reason(0)) == 0.0
     signals.accel_x.trusted = False
     signals.gps_fix.value = 1.0
     signals.motor_speed.time = -10.0
-    assert missing(1.0, signals) == Reason.NO_IMU | Reason.NO_GPS
+    assert missing(1.0) == Reason.NO_IMU | Reason.NO_GPS
     assert loss_variance(Reason.NO_IMU | Reason.NO_GPS) == LOSS_SD[Reason.NO_IMU] ** 2 + LOSS_SD[Reason.NO_GPS] ** 2
-    assert missing(10.0, signals) & Reason.NO_SPEED
+    assert missing(10.0) & Reason.NO_SPEED
 
 
 def test_a_fix_is_below_only_while_it_is_reported():
