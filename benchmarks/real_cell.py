@@ -146,9 +146,11 @@ class Extended(ScalarFilter):
             self.v2 = decay * self.v2 + (1 - decay) * r2 * current
         super().predict(dt, current, temperature, noise)
 
-    def _observe(self, current: float, temperature: float) -> tuple[float, float]:
-        predicted, slope = super()._observe(current, temperature)
-        return predicted - self.v2, slope
+    def innovation(self, voltage: float, current: float, temperature: float) -> tuple[float, float]:
+        return super().innovation(voltage + self.v2, current, temperature)
+
+    def update(self, voltage: float, current: float, temperature: float, variance: float) -> None:
+        super().update(voltage + self.v2, current, temperature, variance)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from gz_onboard.bus.logfile import object_schema
 from gz_onboard.bus.mapping import pgn
 from gz_onboard.bus.publisher import KNOWN, WH, Counts, Publisher
 from gz_onboard.errors import InputError
-from gz_onboard.estimator.ekf import filter_maker
+from gz_onboard.estimator.backends import filter_maker
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State

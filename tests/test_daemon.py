@@ -260,7 +260,7 @@ def learned() -> Snapshot:
 
 def is_fresh(daemon: Daemon) -> bool:
     ours, new = daemon.pipeline.estimator, Daemon(reference(), [], None, None).pipeline.estimator
-    return ours.snapshot("") == new.snapshot("") is None and ours.road == new.road and ours._saved is None
+    return ours.snapshot("") == new.snapshot("") is None and ours.road == new.road and ours.soc.saved is None
 
 
 @pytest.mark.parametrize(

@@ -120,7 +120,7 @@ def test_the_estimator_starts_from_the_cold_rest_voltage_and_doubts_it():
         assert estimator.filter
         expected = 0.6 if battery is COLD else PLAIN.soc_at(COLD.ocv(0.6, 0.0)[0])
         assert estimator.filter.soc == pytest.approx(expected, abs=1e-3)
-        sd[battery is COLD] = estimator._rest_sd
+        sd[battery is COLD] = estimator.soc.uncertainty.rest
     assert sd[True] > 1.01 * sd[False]
 
 

@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 
 # The parts of the package, lowest first. A part imports itself and those in the lines above its own.
 LAYERS = [
-    ["__init__", "background", "constants", "errors", "events", "notify", "progress", "state"],
+    ["__init__", "arrays", "background", "constants", "errors", "events", "notify", "progress", "state"],
     ["options"],
     ["toml"],
     ["bus", "physics"],
@@ -40,8 +40,8 @@ FORBIDDEN = {
 
 OFFLINE = ("offline", "simulation", "lab")
 HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow"}
-# Imported only when asked for: the reference filter behind --filter filterpy.
-ON_REQUEST = {"estimator/ekf_filterpy.py"}
+# Imported only when asked for, or for types: the reference filter behind --filter filterpy, the types of arrays.
+ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py"}
 
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
 

@@ -1,7 +1,7 @@
 """What the vehicle does: riding, standing or charging. Only riding teaches what a kilometre costs.
 
-A charge plug that is in says charging, unless the vehicle moves. Without a plug signal, or with one that says no, a
-charging current that lasts says it too, where it cannot be a brake's: at standstill, or while the inverter is silent.
+A charge plug that is in means charging, unless the vehicle moves. Without a plug signal, or with one that is out, a
+charging current that lasts means it too, where it cannot be a brake's: at standstill, or while the inverter is silent.
 """
 
 from __future__ import annotations
@@ -11,12 +11,13 @@ from math import inf
 from gz_onboard.events import Activity
 from gz_onboard.physics.effect import MOVING
 
-STOP_TIME = 120.0  # s: a stop of up to this belongs to the ride, as at a traffic light; beyond, the vehicle stands
+STOP_TIME = 120.0  # s: a stop of up to this belongs to the ride, as at a traffic light; beyond, it is parked
 STANDING_AFTER = 2.0  # s without motion
 MOVING_AFTER = 1.0  # s of motion: a single sample of a noisy sensor is none
 CHARGING_RATE = 0.02  # 1/h: a charging current of a fiftieth of the capacity; current sensors' offsets are smaller
 CHARGING_AFTER = 3.0  # s of it at standstill: the last of a regenerative brake is over
 SILENT_CHARGING_AFTER = 30.0  # s of it with no speed known and a silent inverter
+PLUGGED_IN = 0.5  # of a signal that is 0 or 1
 
 
 class Activities:
@@ -42,7 +43,7 @@ class Activities:
         charged = c_rate is not None and c_rate < -CHARGING_RATE and not moving
         self._charging = self._charging + dt if charged else 0.0
         enough = CHARGING_AFTER if speed is not None else SILENT_CHARGING_AFTER if inverter_silent else inf
-        if not moving and ((plug is not None and plug > 0.5) or self._charging >= enough):
+        if not moving and ((plug is not None and plug > PLUGGED_IN) or self._charging >= enough):
             self.now = Activity.CHARGING
         elif speed is None:
             self.now = Activity.UNKNOWN
@@ -53,5 +54,5 @@ class Activities:
 
     @property
     def teaches(self) -> bool:
-        """Whether what flows now is part of a ride: motion, or a stop on the way."""
+        """Whether what flows now is part of a ride: motion, or a short stop."""
         return self.now is not Activity.CHARGING and self._charging == 0 and self._still <= STOP_TIME

@@ -7,8 +7,9 @@ Prediction (Lord 2016, eqs. 2.21 and 2.22, exact for a current that is constant 
 Measurement (eq. 2.23): V = V_oc(SOC, T) - R0·I - V1, so H = [dV_oc/dSOC - I·dR0/dSOC, -1].
 
 The covariance is updated in Joseph's form (Bucy & Joseph 1968), which is symmetric and positive by construction.
-Two backends do the same: `ScalarFilter`, plain floats, for on board; and `FilterpyFilter` around filterpy's
-ExtendedKalmanFilter, the reference. A test holds them equal to 1e-9.
+The prediction is `Battery.advanced`, the measurement and its derivative `Battery.terminal_voltage`, for both backends:
+`ScalarFilter`, plain floats, for on board; and `FilterpyFilter` around filterpy's ExtendedKalmanFilter, the
+reference. A test holds them equal to 1e-9.
 """
 
 from __future__ import annotations
@@ -50,28 +51,19 @@ class ScalarFilter:
 
     def predict(self, dt: float, current: float, temperature: float, noise: tuple[float, float]) -> None:
         """See `SocFilter`."""
-        battery = self.battery
-        r1, c1 = battery.r1.at(self.soc, temperature)[0], battery.c1.at(self.soc, temperature)[0]
-        self.soc -= current * dt / (3600 * battery.cell_capacity(temperature))
-        self.v1, a = battery.relax(dt, self.v1, current, r1, c1)
+        self.soc, self.v1, a = self.battery.advanced(dt, self.soc, self.v1, current, temperature)
         p00, p01, p11 = self.covariance
         self.covariance = p00 + noise[0], a * p01, a * a * p11 + noise[1]
 
-    def _observe(self, current: float, temperature: float) -> tuple[float, float]:
-        """(predicted voltage, its derivative over SOC)."""
-        ocv, slope = self.battery.ocv(self.soc, temperature)
-        r0, r0_slope = self.battery.r0.at(self.soc, temperature)
-        return ocv - r0 * current - self.v1, slope - current * r0_slope
-
     def innovation(self, voltage: float, current: float, temperature: float) -> tuple[float, float]:
         """See `SocFilter`."""
-        predicted, h = self._observe(current, temperature)
+        predicted, h = self.battery.terminal_voltage(self.soc, self.v1, current, temperature)
         p00, p01, p11 = self.covariance
         return voltage - predicted, h * h * p00 - 2 * h * p01 + p11
 
     def update(self, voltage: float, current: float, temperature: float, variance: float) -> None:
         """See `SocFilter`."""
-        predicted, h = self._observe(current, temperature)
+        predicted, h = self.battery.terminal_voltage(self.soc, self.v1, current, temperature)
         p00, p01, p11 = self.covariance
         ph0 = h * p00 - p01  # P·Hᵀ
         ph1 = h * p01 - p11
@@ -92,12 +84,4 @@ class ScalarFilter:
 
 
 FilterMaker = Callable[[Battery, float, float, Covariance], SocFilter]
-
-
-def filter_maker(name: str) -> FilterMaker:
-    """The backend called `name`: ``scalar`` or ``filterpy``; the second imports numpy and scipy."""
-    if name == "filterpy":
-        from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
-
-        return FilterpyFilter
-    return ScalarFilter
+"""Makes a filter of a battery, SOC, V1 [V] and covariance."""

@@ -10,12 +10,21 @@ from gz_onboard.estimator.ekf import Covariance
 from gz_onboard.physics.battery import Battery
 
 
+class _Ekf(ExtendedKalmanFilter):  # type: ignore[misc]
+    """filterpy's, with a state that the battery's own equations predict instead of F·x + B·u."""
+
+    advanced: NDArray[np.float64]  # (2, 1): the next state
+
+    def predict_x(self, u: float = 0) -> None:
+        self.x = self.advanced
+
+
 class FilterpyFilter:
     """`SocFilter` by filterpy."""
 
     def __init__(self, battery: Battery, soc: float, v1: float, covariance: Covariance) -> None:
         self.battery = battery
-        self._ekf = ExtendedKalmanFilter(dim_x=2, dim_z=1, dim_u=1)
+        self._ekf = _Ekf(dim_x=2, dim_z=1)
         self._ekf.x = np.array([[soc], [v1]])
         self.covariance = covariance
 
@@ -48,32 +57,29 @@ class FilterpyFilter:
         self._ekf.P = np.array([[value[0], value[1]], [value[1], value[2]]])
 
     def predict(self, dt: float, current: float, temperature: float, noise: tuple[float, float]) -> None:
-        """See `SocFilter`. The model is linear in state and current, so filterpy's own F·x + B·u is exact."""
-        battery = self.battery
-        r1, c1 = battery.r1.at(self.soc, temperature)[0], battery.c1.at(self.soc, temperature)[0]
-        settled, a = battery.relax(dt, 0.0, 1.0, r1, c1)  # V of an ampere that flows from rest
-        self._ekf.F = np.diag([1.0, a])
-        self._ekf.B = np.array([[-dt / (3600 * battery.cell_capacity(temperature))], [settled]])
-        self._ekf.Q = np.diag(noise)
-        self._ekf.predict(np.array([[current]]))
+        """See `SocFilter`."""
+        x = self._ekf.x
+        soc, v1, decay = self.battery.advanced(dt, float(x[0, 0]), float(x[1, 0]), current, temperature)
+        self._ekf.F, self._ekf.Q = np.diag([1.0, decay]), np.diag(noise)
+        self._ekf.advanced = np.array([[soc], [v1]])
+        self._ekf.predict()
 
-    def _hx(self, x: NDArray[np.float64], current: float, temperature: float) -> NDArray[np.float64]:
-        soc, v1 = float(x[0, 0]), float(x[1, 0])
-        predicted = self.battery.ocv(soc, temperature)[0] - self.battery.r0.at(soc, temperature)[0] * current - v1
-        return np.array([[predicted]])  # (1, 1): a scalar would turn x into 2×2
+    def _predicted(self, x: NDArray[np.float64], current: float, temperature: float) -> NDArray[np.float64]:
+        voltage, _ = self.battery.terminal_voltage(float(x[0, 0]), float(x[1, 0]), current, temperature)
+        return np.array([[voltage]])  # (1, 1): a scalar would turn x into 2×2
 
     def _jacobian(self, x: NDArray[np.float64], current: float, temperature: float) -> NDArray[np.float64]:
-        soc = float(x[0, 0])
-        return np.array([[self.battery.ocv(soc)[1] - current * self.battery.r0.at(soc, temperature)[1], -1.0]])
+        _, slope = self.battery.terminal_voltage(float(x[0, 0]), float(x[1, 0]), current, temperature)
+        return np.array([[slope, -1.0]])
 
     def innovation(self, voltage: float, current: float, temperature: float) -> tuple[float, float]:
         """See `SocFilter`."""
         h = self._jacobian(self._ekf.x, current, temperature)
-        predicted = float(self._hx(self._ekf.x, current, temperature)[0, 0])
+        predicted = float(self._predicted(self._ekf.x, current, temperature)[0, 0])
         return voltage - predicted, float((h @ self._ekf.P @ h.T)[0, 0])
 
     def update(self, voltage: float, current: float, temperature: float, variance: float) -> None:
         """See `SocFilter`."""
         arguments = (current, temperature)
         z, r = np.array([[voltage]]), np.array([[variance]])
-        self._ekf.update(z, self._jacobian, self._hx, R=r, args=arguments, hx_args=arguments)
+        self._ekf.update(z, self._jacobian, self._predicted, R=r, args=arguments, hx_args=arguments)

@@ -12,19 +12,24 @@ from dataclasses import dataclass
 from math import asin, atan, atan2, cos, pi, sin
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.estimator.signals import Signals
+from gz_onboard.estimator.signals import FIX_3D, Signals
 
 SPEED_TIME = 0.3  # s: the speed's low pass, whose lag gives the acceleration
 LEAN_TIME = 2.0  # s: how fast the lean is drawn to that of the steady turn
 GRADE_TIME = 5.0  # s: low pass of the accelerometer's grade; at 2 s its noise adds 4 % to the energy modelled
 ALTITUDE_LENGTH = 150.0  # m: how fast the observer follows the altitude where it seeks an offset only
 ALTITUDE_LENGTH_ALONE = 60.0  # m: the same where the altitude is all there is
-STANDS = 0.05  # m/s
-QUIET, QUIET_TIME = 0.05, 1.0  # rad/s, s: a standing vehicle that nobody turns or leans: the rates hold still
+STANDSTILL = 0.05  # m/s
+TURNING = 2.0  # m/s: below, the lean is no steady turn's, and the course of the GPS is noise
+COURSE_TIME = 1.0  # s: how fast the heading is drawn to the GPS course
+LEAST_COSINE = 0.5  # of the lean: no tyre holds 60 degrees
+QUIET, QUIET_TIME = 0.05, 1.0  # rad/s, s: of a vehicle at standstill, upright: the rates are constant
 MOST_BIAS = 0.3  # rad/s: cheap MEMS sensors are specified to a third of it
 BIAS_TIME = 5.0  # s of standing to know the offset of a rate sensor
 LOST = 15.0  # m: the observer is never so far from an altitude that it follows
 ALTITUDES = -500.0, 9000.0  # m: where there are roads
+STEEPEST = 0.3  # sine: of roads
+LARGEST_SHARE = 0.5  # of the error corrected in one step, however long
 
 
 def accelerated(slow: float, speed: float, dt: float) -> tuple[float, float]:
@@ -36,7 +41,7 @@ def accelerated(slow: float, speed: float, dt: float) -> tuple[float, float]:
 
 
 @dataclass(slots=True)
-class Road:
+class RoadState:
     """State and result of the road filter."""
 
     speed: float | None = None  # m/s
@@ -57,20 +62,20 @@ class Road:
 
     def step(self, now: float, dt: float, signals: Signals, wheel_radius: float, gear_ratio: float) -> None:
         """Go `dt` [s] ahead to `now` [s]."""
-        self._speed(now, dt, signals, wheel_radius, gear_ratio)
-        self._turn(now, dt, signals)
-        self._slope(now, dt, signals)
+        self._update_speed(now, dt, signals, wheel_radius, gear_ratio)
+        self._update_turn(now, dt, signals)
+        self._update_grade(now, dt, signals)
 
-    def forget_slope(self, grade_offset: float, altitude_holds: bool) -> None:
-        """Begin the grade anew: one that it was made from lied; `grade_offset` is what is known of it all the same.
+    def forget_grade(self, grade_offset: float, altitude_holds: bool) -> None:
+        """Begin the grade anew: a sensor that it was made from is faulty; `grade_offset` is still known.
 
-        altitude_holds: the observer goes on from the measured altitude. Where it was led to is no climb to come back.
+        altitude_holds: the observer goes on from the measured altitude. Where the fault led it to is no climb.
         """
         self.grade_offset, self.accelerometer_grade = grade_offset, 0.0
         if altitude_holds:
             self.altitude = None
 
-    def _speed(self, now: float, dt: float, signals: Signals, radius: float, gear: float) -> None:
+    def _update_speed(self, now: float, dt: float, signals: Signals, radius: float, gear: float) -> None:
         motor = signals.motor_speed.mean(now)
         rear, front = signals.wheel_speed_rear.mean(now), signals.wheel_speed_front.mean(now)
         speed: float | None = None
@@ -93,7 +98,7 @@ class Road:
         self.slow_speed, self.acceleration = accelerated(self.slow_speed, speed, dt)
         self.distance += abs(speed) * dt
 
-    def _turn(self, now: float, dt: float, signals: Signals) -> None:
+    def _update_turn(self, now: float, dt: float, signals: Signals) -> None:
         roll, yaw = signals.rate_x.mean(now), signals.rate_z.mean(now)
         speed = self.speed
         if roll is None or yaw is None or speed is None:
@@ -103,14 +108,14 @@ class Road:
             share = min(dt / QUIET_TIME, 1.0)
             self.slow_roll += (roll - self.slow_roll) * share
             self.slow_yaw += (yaw - self.slow_yaw) * share
-            if abs(speed) < STANDS and quiet and max(abs(self.slow_roll), abs(self.slow_yaw)) < MOST_BIAS:
+            if abs(speed) < STANDSTILL and quiet and max(abs(self.slow_roll), abs(self.slow_yaw)) < MOST_BIAS:
                 share = min(dt / BIAS_TIME, 1.0)
                 self.bias_x += (roll - self.bias_x) * share
                 self.bias_z += (yaw - self.bias_z) * share
             lean = self.lean or 0.0
-            self.yaw_rate = (yaw - self.bias_z) / max(cos(lean), 0.5)
+            self.yaw_rate = (yaw - self.bias_z) / max(cos(lean), LEAST_COSINE)
             lean += (roll - self.bias_x) * dt
-            if abs(speed) > 2:
+            if abs(speed) > TURNING:
                 steady = -atan(speed * self.yaw_rate / GRAVITY)
             else:
                 sideways = signals.accel_y.mean(now)
@@ -119,21 +124,19 @@ class Road:
         course, gps_speed = signals.gps_course.get(now), signals.gps_speed.get(now)
         if self.heading is not None and self.yaw_rate is not None:
             self.heading -= self.yaw_rate * dt
-        if course is not None and gps_speed is not None and gps_speed > 2:
+        if course is not None and gps_speed is not None and gps_speed > TURNING:
             if self.heading is None:
                 self.heading = course
             turn = course - self.heading
-            self.heading += atan2(sin(turn), cos(turn)) * min(dt / 1.0, 1.0)
+            self.heading += atan2(sin(turn), cos(turn)) * min(dt / COURSE_TIME, 1.0)
         elif self.yaw_rate is None:
             self.heading = None
         if self.heading is not None:
             self.heading %= 2 * pi
 
-    def _slope(self, now: float, dt: float, signals: Signals) -> None:
+    def _update_grade(self, now: float, dt: float, signals: Signals) -> None:
         forward = signals.accel_x.mean(now)
-        altitude = signals.gps_altitude.get(now)
-        if signals.gps_fix.fresh(now) and signals.gps_fix.value < 3:
-            altitude = None
+        altitude = None if signals.fix_below(now, FIX_3D) else signals.gps_altitude.get(now)
         distrusted = not (signals.accel_x.trusted and signals.gps_altitude.trusted)
         nothing = forward is None and altitude is None and (distrusted or self.altitude is None)
         if self.speed is None or nothing:
@@ -144,9 +147,9 @@ class Road:
             self.accelerometer_grade += (sine - self.accelerometer_grade) * min(dt / GRADE_TIME, 1.0)
         else:
             self.accelerometer_grade = 0.0
-        way = abs(self.speed) * dt
+        distance = abs(self.speed) * dt
         if self.altitude is not None:
-            self.altitude += (self.accelerometer_grade + self.grade_offset) * way
+            self.altitude += (self.accelerometer_grade + self.grade_offset) * distance
         if altitude is not None:
             if self.altitude is None:
                 self.altitude = altitude
@@ -154,9 +157,9 @@ class Road:
             if abs(error) > LOST:  # it was away for long, or left out: no grade is to be learned from where it is now
                 self.altitude, error = altitude, 0.0
             length = ALTITUDE_LENGTH_ALONE if forward is None else ALTITUDE_LENGTH
-            share = min(way / length, 0.5)  # critically damped over distance
+            share = min(distance / length, LARGEST_SHARE)  # critically damped over distance
             self.altitude += 2 * share * error
             self.grade_offset += share * error / length
         if self.altitude is not None:
             self.altitude = min(max(self.altitude, ALTITUDES[0]), ALTITUDES[1])
-        self.grade = min(max(self.accelerometer_grade + self.grade_offset, -0.3), 0.3)
+        self.grade = min(max(self.accelerometer_grade + self.grade_offset, -STEEPEST), STEEPEST)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from gz_onboard.events import ROLES
 
 DEFAULT_STALE = 2.0  # s, for messages of unknown period
+FIX_2D, FIX_3D = 2, 3  # of `gps_fix`: a position, an altitude
 
 
 class Signal:
@@ -33,9 +34,9 @@ class Signal:
 
     def mean(self, now: float) -> float | None:
         """Its mean since the last step; if nothing came, its last value; None if that is stale or not trusted."""
-        return self.told(now) if self.trusted else None
+        return self.reported(now) if self.trusted else None
 
-    def told(self, now: float) -> float | None:
+    def reported(self, now: float) -> float | None:
         """What `mean` gives, trusted or not."""
         if now - self.time > self.stale_after:
             return None
@@ -58,6 +59,10 @@ class Signals:
 
     def __getitem__(self, role: str) -> Signal:
         return self._all[role]
+
+    def fix_below(self, now: float, least: int) -> bool:
+        """Whether the GPS reports a fix worse than `least` (`FIX_2D`, `FIX_3D`)."""
+        return self.gps_fix.fresh(now) and self.gps_fix.value < least
 
     def next_step(self) -> None:
         """Start new means."""

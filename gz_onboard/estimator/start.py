@@ -1,7 +1,7 @@
-"""The first state of charge: from a voltage of which nobody knows whether it rests, and from what was saved before.
+"""The first state of charge: from a voltage that may not be at rest, and from what was saved before.
 
-Nothing here is believed for more than it is worth: a loaded voltage carries the polarisation of a past that was not
-seen, and a saved state of charge carries whatever flowed while nobody counted.
+Each has its variance: a loaded voltage carries the polarisation of an unknown past, and a saved state of charge
+lacks the charge that flowed uncounted.
 """
 
 from __future__ import annotations
@@ -10,22 +10,27 @@ from dataclasses import dataclass
 from math import exp, hypot, sqrt
 
 from gz_onboard.estimator.ekf import Covariance, SocFilter
-from gz_onboard.estimator.rest import SLOW_TIME
-from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery import HALF_FULL, Battery
 
 SOC_UNKNOWN_SD = 0.5  # whatever has flowed
+SOC_BOUNDS = -0.05, 1.05  # what a linear update, over a curve that is not, may make of it
 BEYOND = 0.5  # of the span of the rest voltage: no cell at work is further beyond full or empty than this
-BRIDGE = 60.0  # s: over so short a gap the current before and after tells what flowed
+BRIDGE = 60.0  # s: over so short a gap the currents before and after give the charge
 RIDING_RATE = 0.5  # 1/h: sd of the mean current over capacity in a gap that may have been ridden or charged
-BURST_RATE = 1.0  # 1/h: the same in addition, over `BRIDGE`: nobody rides at full power for longer
-CHARGING_FROM = 120.0  # s: in a shorter gap nobody plugs in, charges and leaves
-CONSUMPTION_SD = 0.3  # relative: of a way that was not seen
+BURST_RATE = 1.0  # 1/h: the same in addition, over `BRIDGE`: full power does not last longer
+CHARGING_FROM = 120.0  # s: a shorter gap is too short to plug in, charge and leave
+CONSUMPTION_SD = 0.3  # relative: of a distance that was not seen
 ODOMETER_STEP = 100.0  # m: odometers on the bus count in steps of up to this
 FASTEST = 70.0  # m/s
 UNKNOWN_AGE = 86_400.0  # s
-STUCK_SHARE = 0.3  # of what may have flowed: remains though the vehicle's own state of charge says that nothing did
+STUCK_SHARE = 0.3  # of what may have flowed: remains though the vehicle's own state of charge shows no change
 OWN_SOC_SD = 0.015  # of a change of the vehicle's own state of charge: its steps
 OWN_SOC_GAIN_SD = 0.2  # relative, of the same: its window and its errors
+CONTRADICTS = 3.0  # sd: two that are further apart are not both right
+CURVE = -0.02, 1.02  # SOC to which a first voltage is read off the rest voltage
+ROUNDS = 5  # of the search for a SOC: R0 depends on it
+HOUR = 3600.0  # s
+SLOW_TIME = 1000.0  # s: time constant of slow diffusion in lithium-ion cells, a quarter of an hour or so
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,11 @@ class Saved:
     odometer: float | None = None  # m
     own_soc: float | None = None  # the vehicle's own state of charge, 0..1
     consumption: float | None = None  # J/m that was expected
+
+
+def bounded(soc: float) -> float:
+    """`soc`, within `SOC_BOUNDS`."""
+    return min(max(soc, SOC_BOUNDS[0]), SOC_BOUNDS[1])
 
 
 def plausible(battery: Battery, emf: float) -> bool:
@@ -56,10 +66,10 @@ def from_voltage(
     v1, v1_sd: polarisation that is expected, and its sd [V]; voltage_sd: of everything else [V]. The sd of SOC is the
     chord of the rest voltage over its uncertainty: near empty a tangent would promise far too much.
     """
-    soc = 0.5
-    for _ in range(5):  # R0 depends on SOC
+    soc = HALF_FULL
+    for _ in range(ROUNDS):
         emf = voltage + battery.r0.at(soc, temperature)[0] * current + v1
-        soc = min(max(battery.soc_at(emf, temperature), -0.02), 1.02)
+        soc = min(max(battery.soc_at(emf, temperature), CURVE[0]), CURVE[1])
     sd = hypot(v1_sd, voltage_sd)
     soc_sd = min(soc_width(battery, emf, sd, temperature) / 2, SOC_UNKNOWN_SD)
     return soc, (soc_sd**2, v1_sd**2 * soc_sd / sd, v1_sd**2)
@@ -70,7 +80,7 @@ def soc_width(battery: Battery, emf: float, sd: float, temperature: float) -> fl
     return battery.soc_at(emf + sd, temperature) - battery.soc_at(emf - sd, temperature)
 
 
-def take_in(filter_: SocFilter, soc: float, variance: float) -> None:
+def update_soc(filter_: SocFilter, soc: float, variance: float) -> None:
     """A state of charge that is known from elsewhere, as a measurement of the first state."""
     p00, p01, p11 = filter_.covariance
     total = p00 + variance
@@ -90,12 +100,12 @@ def parked(saved: Saved, age: float | None, odometer: float | None, own_soc: flo
     return 1 - exp(-age / SLOW_TIME)
 
 
-def unseen_sd(gap: float) -> float:
-    """Sd of the SOC that flowed in `gap` [s] in which nobody counted, ridden or charged."""
-    return min((RIDING_RATE * gap + BURST_RATE * min(gap, BRIDGE)) / 3600, SOC_UNKNOWN_SD)
+def uncounted_sd(gap: float) -> float:
+    """Sd of the SOC that flowed uncounted in `gap` [s], ridden or charged."""
+    return min((RIDING_RATE * gap + BURST_RATE * min(gap, BRIDGE)) / HOUR, SOC_UNKNOWN_SD)
 
 
-def flowed(
+def uncounted(
     saved: Saved,
     age: float | None,
     charge: float,
@@ -104,30 +114,30 @@ def flowed(
     odometer: float | None,
     own_soc: float | None,
 ) -> tuple[float, float]:
-    """(SOC that was drawn while nobody counted, its sd).
+    """(SOC that was drawn uncounted, its sd).
 
     age: of what was saved [s], None if not known; charge: of the pack [A·h]; voltage, current: of the pack now
     [V], [A]; odometer [m] and own_soc: as the vehicle shows them now, None if it does not.
     """
     gap = UNKNOWN_AGE if age is None else age
-    way = None if odometer is None or saved.odometer is None else odometer - saved.odometer
-    if way is not None and way > FASTEST * gap + ODOMETER_STEP:  # so much longer than the clock says, or it was reset
-        gap = UNKNOWN_AGE
-    mean, sd = 0.0, unseen_sd(gap)
-    if way is not None and saved.consumption is not None:
-        if -ODOMETER_STEP <= way <= FASTEST * gap + ODOMETER_STEP:
-            price = saved.consumption / (3600 * charge * voltage)  # SOC per metre
-            mean = max(way, 0.0) * price
-            charged = RIDING_RATE * max(gap - CHARGING_FROM, 0.0) / 3600
+    distance = None if odometer is None or saved.odometer is None else odometer - saved.odometer
+    if distance is not None and distance > FASTEST * gap + ODOMETER_STEP:
+        gap = UNKNOWN_AGE  # it is so much longer than the clock says, or the odometer was reset
+    mean, sd = 0.0, uncounted_sd(gap)
+    if distance is not None and saved.consumption is not None:
+        if -ODOMETER_STEP <= distance <= FASTEST * gap + ODOMETER_STEP:
+            price = saved.consumption / (HOUR * charge * voltage)  # SOC per metre
+            mean = max(distance, 0.0) * price
+            charged = RIDING_RATE * max(gap - CHARGING_FROM, 0.0) / HOUR
             step = min(ODOMETER_STEP, FASTEST * gap) * price
             sd = min(hypot(CONSUMPTION_SD * mean, hypot(charged, step)), sd)
     elif gap <= BRIDGE and saved.current is not None:
-        mean = (saved.current + current) / 2 * gap / (3600 * charge)
+        mean = (saved.current + current) / 2 * gap / (HOUR * charge)
     if own_soc is not None and saved.own_soc is not None:
         own = saved.own_soc - own_soc
         own_sd = OWN_SOC_SD + OWN_SOC_GAIN_SD * abs(own)
         apart = abs(own - mean)
-        if apart > 3 * hypot(sd, own_sd):  # one of the two is wrong
+        if apart > CONTRADICTS * hypot(sd, own_sd):  # one of the two is wrong
             sd = hypot(sd, apart)
         elif apart <= own_sd:  # confirmed, to no better than its steps; but it may be stuck
             sd = min(sd, hypot(own_sd, STUCK_SHARE * sd))

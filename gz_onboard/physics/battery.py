@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import sqrt
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from gz_onboard.physics.relaxation import decay_over, relaxed
 from gz_onboard.physics.tables import Mesh, Row, extended, extended_over, linear
@@ -23,9 +23,12 @@ from gz_onboard.physics.tables import Mesh, Row, extended, extended_over, linear
 if TYPE_CHECKING:
     from gz_onboard.arrays import Array
 
+T = TypeVar("T")
 Overpotential = Callable[[float, float, float], float]
 """What a cell's voltage lacks [V] beside R0 and the RC pair, at a cell's current [A], SOC and temperature [degC]."""
 HOUR = 3600.0  # s
+BENCH_TEMPERATURE = 25.0  # degC, at which capacities are given
+HALF_FULL = 0.5  # SOC that is taken where it is not known
 
 
 def terminal_voltage(rest: Any, r0: Any, current: Any, overpotential: Any) -> Any:
@@ -110,9 +113,9 @@ class Battery:
             ocv -= linear(self.rest_shift_temperature, self.rest_shift_value, temperature)
         return extended(self.ocv_value, self.ocv_soc, ocv)[0]
 
-    def cell_voltage(self, pack_voltage: Any, pack_current: Any) -> Any:
+    def cell_voltage(self, pack_voltage: T, pack_current: T) -> T:
         """Voltage of the mean cell [V] out of pack voltage [V] and current [A]."""
-        return (pack_voltage + self.series_resistance * pack_current) / self.cells_series
+        return (pack_voltage + self.series_resistance * pack_current) / self.cells_series  # type: ignore[operator,return-value]
 
     def pack_voltage(self, cell_voltage: Any, pack_current: Any) -> Any:
         """Voltage at the pack's terminals [V] out of that of the mean cell [V] and pack current [A] (eq. 2.18)."""
@@ -122,6 +125,20 @@ class Battery:
         """(V1 after `dt` [s] of constant cell current [A], the factor that V1 decayed by): eq. 2.22, exact."""
         decay = decay_over(dt, r1 * c1)
         return relaxed(v1, r1 * current, decay), decay
+
+    def advanced(
+        self, dt: float, soc: float, v1: float, current: float, temperature: float
+    ) -> tuple[float, float, float]:
+        """(SOC, V1 [V], the factor that V1 decayed by) of a cell after `dt` [s] at a constant `current` [A]."""
+        r1, c1 = self.r1.at(soc, temperature)[0], self.c1.at(soc, temperature)[0]
+        v1, decay = self.relax(dt, v1, current, r1, c1)
+        return soc - discharged(current, dt, self.cell_capacity(temperature)), v1, decay
+
+    def terminal_voltage(self, soc: float, v1: float, current: float, temperature: float) -> tuple[float, float]:
+        """(voltage of a cell [V] at `current` [A] and `temperature` [degC], its derivative over SOC): eq. 2.23."""
+        ocv, slope = self.ocv(soc, temperature)
+        r0, r0_slope = self.r0.at(soc, temperature)
+        return terminal_voltage(ocv, r0, current, v1), slope - current * r0_slope
 
     def with_parameters(self, parameters: Mapping[str, float]) -> Battery:
         """The same battery with what a vehicle's `parameters` say of capacity, cut-off and resistances."""

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.estimator.forecast import Forecaster, Turn
+from gz_onboard.estimator.forecast import Forecaster
+from gz_onboard.estimator.load_model import Conditions, EffectInputs
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import CELLS, GROUPS, MOTOR, PACK, Plant
 
 BASE = read_vehicle("reference", 75.0)
+AIR = Conditions(20.0, 0.0)
 
 
 def extended(*names: str, **values: float) -> Vehicle:
@@ -80,7 +82,7 @@ def test_a_second_rc_pair_is_taken_out_of_the_innovation_and_of_the_soc():
         assert found.soc is not None
         results[name] = abs(found.innovation), abs(found.soc - soc)
         if name == "slow":
-            assert e._lacking == pytest.approx(slow, rel=0.02)
+            assert e.soc.effects.overpotential == pytest.approx(slow, rel=0.02)
     assert results["slow"][0] < 0.003
     assert results["base"][0] > 10 * results["slow"][0]
     assert results["slow"][1] < 0.002
@@ -90,15 +92,17 @@ def test_the_states_outlive_a_restart_and_relax_meanwhile():
     vehicle = extended("slow_relaxation", "ocv_hysteresis", slow_time=600.0, hysteresis_rate=300.0)
     first, _ = run(vehicle, 300)
     saved = json.loads(json.dumps(first.snapshot(vehicle.key)))
-    before = dict(first._cell_states)
+    before = dict(first.soc.effects.states)
     assert before["slow_relaxation"] > 1e-3
     assert before["ocv_hysteresis"] > 1e-3
     for age, share in ((0.0, 1.0), (600.0, math.exp(-1)), (None, 0.0)):
         second = estimator(vehicle)
         second.restore(saved, vehicle.key, age)
-        assert second._cell_states["slow_relaxation"] == pytest.approx(share * before["slow_relaxation"], abs=1e-9)
-        assert second._cell_states["ocv_hysteresis"] == pytest.approx(before["ocv_hysteresis"])
-        assert second._lacking == pytest.approx(sum(second._cell_states.values()))
+        assert second.soc.effects.states["slow_relaxation"] == pytest.approx(
+            share * before["slow_relaxation"], abs=1e-9
+        )
+        assert second.soc.effects.states["ocv_hysteresis"] == pytest.approx(before["ocv_hysteresis"])
+        assert second.soc.effects.overpotential == pytest.approx(sum(second.soc.effects.states.values()))
 
 
 @pytest.mark.parametrize(
@@ -194,10 +198,10 @@ def ride(f, truth, kilometres, *, heading=0.0, radius=0.0):
         a = min(max(0.5 * (target - v), -1.2), 0.9)
         lateral = (1 if x % 200 < 100 else -1) * v * v / radius if radius else 0.0
         moving += 0.1 if v > 0.5 else 0.0
-        turn = Turn(lateral, heading, 0.6, 20.0, 5.0)
-        q = f.quantities(v, a, 20.0, 0.0, 40.0) | {"lateral_acceleration": lateral, "heading": heading}
+        inputs = EffectInputs(lateral, heading, 0.6, 20.0, 5.0)
+        q = f.load.quantities(v, a, AIR) | {"lateral_acceleration": lateral, "heading": heading}
         power = sum(truth.power(q | {"time_moving": moving}).values())
-        f.ride(0.1, v, 0.0, power, 20.0, 0.0, 40.0, turn if f.extended else None)
+        f.ride(0.1, v, 0.0, power, AIR, inputs if f.load.extended else None)
         x += v * 0.1
         v += a * 0.1
     return f
@@ -212,10 +216,10 @@ def expected(f):
 
 
 def test_the_base_model_asks_for_nothing_more():
-    assert not forecaster(BASE).extended
-    assert not forecaster(extended("dragging_brake", "drivetrain_drag", "regen_loss")).extended
+    assert not forecaster(BASE).load.extended
+    assert not forecaster(extended("dragging_brake", "drivetrain_drag", "regen_loss")).load.extended
     for name in ("cornering_drag", "headwind", "tyre_warm_up"):
-        assert forecaster(extended(name)).extended
+        assert forecaster(extended(name)).load.extended
 
 
 def test_of_bends_those_ridden_count():
@@ -280,13 +284,13 @@ def test_memory_between_road_and_pack_steps_each_second(tmp_path):
     effect = load_effect("slow_drag", tmp_path)
     vehicle = BASE.changed(BASE.parameters.joined([effect]), (*BASE.model.effects, effect))
     fresh, settled = forecaster(vehicle), forecaster(vehicle)
-    settled._states["slow_drag"] = 20.0
+    settled.load.states["slow_drag"] = 20.0
     pairs = zip(*(ride(f, BASE.model, 2).riding.segments for f in (fresh, settled)), strict=True)
     shares = [one.modelled / other.modelled for one, other in pairs]
     assert shares[0] < 0.9
     assert shares[-1] == pytest.approx(1.0, abs=0.02)
-    assert 1 < fresh._states["slow_drag"] < 20
-    assert fresh._states["slow_drag"] == pytest.approx(settled._states["slow_drag"], rel=0.1)
+    assert 1 < fresh.load.states["slow_drag"] < 20
+    assert fresh.load.states["slow_drag"] == pytest.approx(settled.load.states["slow_drag"], rel=0.1)
     again = forecaster(vehicle)
     again.restore(json.loads(json.dumps(fresh.snapshot())))
-    assert again._states == fresh._states
+    assert again.load.states == fresh.load.states

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from gz_onboard.estimator.forecast import PRIOR_LENGTH, Forecaster
+from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference", 75.0)
+AIR = Conditions(20.0, 0.0)
 
 
 def forecaster():
@@ -28,11 +30,11 @@ def ride(f, kilometres, *, factor=1.0, seed=0, grade=lambda x: 0.0, stop_every=6
         elif v < 0.5:
             target = rng.uniform(6, 13)
         a = float(np.clip(0.5 * (target - v), -1.2, 0.9))
-        q = f.quantities(v, a, 20.0, 0.0, 40.0)
+        q = f.load.quantities(v, a, AIR)
         q["grade"] = grade(x)
-        power = factor * sum(f.model.power(q).values())
+        power = factor * sum(f.load.model.power(q).values())
         energy += power * dt
-        f.ride(dt, v, grade(x), power, 20.0, 0.0, 40.0)
+        f.ride(dt, v, grade(x), power, AIR)
         x += v * dt
         v += a * dt
     return energy, x
@@ -89,9 +91,9 @@ def test_a_long_descent_that_no_sensor_tells_is_hardly_learned():
     for f, told in ((seen, True), (unseen, False)):
         v, x = 10.0, 0.0
         while x < 6000:
-            q = f.quantities(v, 0.0, 20.0, 0.0, 40.0)
+            q = f.load.quantities(v, 0.0, AIR)
             q["grade"] = -0.05
-            f.ride(0.1, v, -0.05 if told else None, sum(f.model.power(q).values()), 20.0, 0.0, 40.0)
+            f.ride(0.1, v, -0.05 if told else None, sum(f.load.model.power(q).values()), AIR)
             x += v * 0.1
     assert forecast(seen).consumption == pytest.approx(forecast(forecaster()).consumption, rel=0.25)
     assert unseen.riding.factor > 0.8

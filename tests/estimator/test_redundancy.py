@@ -8,7 +8,11 @@ from math import cos, sin
 import pytest
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.estimator.redundancy import FORGIVEN_AFTER, NOBODY, Currents, Sag, Slopes, Speeds, vote
+from gz_onboard.estimator.redundancy.checks import NO_SENSOR, RECOVERED_AFTER, StepInputs, faulty
+from gz_onboard.estimator.redundancy.currents import CurrentCheck
+from gz_onboard.estimator.redundancy.grades import GradeCheck
+from gz_onboard.estimator.redundancy.sag import VoltageSag
+from gz_onboard.estimator.redundancy.speeds import SpeedCheck, vote
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import ROLES
 
@@ -35,12 +39,12 @@ def said(
     roles: tuple[str, ...],
     lies: Mapping[str, Lie],
     truth: Callable[[float], float] = town,
-    watch: Speeds | None = None,
+    watch: SpeedCheck | None = None,
     begin: float = 0.0,
-) -> tuple[Speeds, Signals]:
+) -> tuple[SpeedCheck, Signals]:
     """`seconds` of riding; a lie makes of (time [s], what the sensor should say) what it says, None being nothing."""
     signals = Signals((role, 2.0) for role in ROLES)
-    speeds = watch or Speeds(RADIUS, GEAR)
+    speeds = watch or SpeedCheck(RADIUS, GEAR)
     for step in range(round(seconds / STEP)):
         t = begin + step * STEP
         for role in roles:
@@ -49,13 +53,9 @@ def said(
             if value is not None:
                 signal = signals[role]
                 signal.value, signal.time, signal.total, signal.count = value, t, value, 1
-        speeds.step(t, STEP, signals)
+        speeds.step(StepInputs(t, STEP, STEP, signals, None))
         signals.next_step()
     return speeds, signals
-
-
-def guilty(speeds: Speeds) -> set[str]:
-    return {role for role, trial in speeds.trials.items() if trial.guilty}
 
 
 LIES: dict[str, Lie] = {
@@ -74,7 +74,7 @@ LIES: dict[str, Lie] = {
 @pytest.mark.parametrize("liar", FOUR)
 def test_one_of_four_that_lies_is_named_and_left_out(liar: str, name: str):
     speeds, signals = said(60.0, FOUR, {liar: LIES[name]})
-    assert guilty(speeds) == {liar}
+    assert faulty(speeds.counters) == {liar}
     assert not signals[liar].trusted
     assert all(signals[role].trusted for role in FOUR if role != liar)
     assert not speeds.unsettled
@@ -84,7 +84,7 @@ def test_one_of_four_that_lies_is_named_and_left_out(liar: str, name: str):
 def test_nobody_is_accused_who_errs_by_a_few_percent_or_is_late(roles: tuple[str, ...]):
     late: Lie = lambda t, v: town(t - 0.6) * 1.03 + 0.1 * sin(3 * t)  # noqa: E731
     speeds, _ = said(600.0, roles, {"motor_speed": lambda t, v: 1.05 * v, "gps_speed": late})
-    assert guilty(speeds) == set()
+    assert faulty(speeds.counters) == set()
 
 
 def test_contradicted_it_is_not_believed_from_the_first_step():
@@ -97,7 +97,7 @@ def test_slip_and_a_locked_wheel_for_two_seconds_are_no_faults(role: str):
     lies: tuple[Lie, Lie] = (lambda t, v: 0.0 if t % 30 < 2 else v), (lambda t, v: 2 * v if t % 30 < 2 else v)
     for lie in lies:
         speeds, signals = said(120.0, FOUR, {role: lie})
-        assert guilty(speeds) == set()
+        assert faulty(speeds.counters) == set()
         assert signals[role].trusted
 
 
@@ -106,7 +106,7 @@ def test_a_roller_bench_and_a_spinning_wheel_are_no_faults():
     still: Lie = lambda t, v: 0.0  # noqa: E731
     for roles in (FOUR, FOUR[:3], (*FOUR, "vehicle_speed")):
         speeds, signals = said(300.0, roles, {"wheel_speed_front": still, "gps_speed": still})
-        assert guilty(speeds) == set()
+        assert faulty(speeds.counters) == set()
         assert signals.motor_speed.trusted
 
 
@@ -114,46 +114,46 @@ def test_a_vehicle_speed_made_from_the_motors_does_not_outvote_the_gps():
     roles = ("motor_speed", "vehicle_speed", "gps_speed")
     double: Lie = lambda t, v: 2 * v  # noqa: E731
     speeds, _ = said(60.0, roles, {"motor_speed": double, "vehicle_speed": double})
-    assert guilty(speeds) == set(roles)
-    assert guilty(said(60.0, roles, {"motor_speed": double})[0]) == {"motor_speed"}
+    assert faulty(speeds.counters) == set(roles)
+    assert faulty(said(60.0, roles, {"motor_speed": double})[0].counters) == {"motor_speed"}
 
 
 def test_of_two_that_disagree_the_stuck_one_lies():
     for liar in ("motor_speed", "gps_speed"):
         speeds, _ = said(60.0, ("motor_speed", "gps_speed"), {liar: lambda t, v: 40.0})
-        assert guilty(speeds) == {liar}
+        assert faulty(speeds.counters) == {liar}
 
 
 def test_of_two_that_disagree_and_move_neither_is_believed():
     roles = ("motor_speed", "gps_speed")
     speeds, signals = said(60.0, roles, {"motor_speed": lambda t, v: 1.6 * v})
-    assert guilty(speeds) == set(roles)
+    assert faulty(speeds.counters) == set(roles)
     assert speeds.unsettled
     assert signals.motor_speed.mean(59.9) is None
-    assert signals.motor_speed.told(59.9) is not None
+    assert signals.motor_speed.reported(59.9) is not None
 
 
 def test_forgiven_only_after_a_minute_of_agreement_about_something():
     speeds, _ = said(60.0, FOUR, {"motor_speed": LIES["doubled"]})
     stands = lambda t: 0.0  # noqa: E731
-    said(3 * FORGIVEN_AFTER, FOUR, {}, stands, speeds, 60.0)
-    assert guilty(speeds) == {"motor_speed"}, "standing, all agree that they stand"
+    said(3 * RECOVERED_AFTER, FOUR, {}, stands, speeds, 60.0)
+    assert faulty(speeds.counters) == {"motor_speed"}, "standing, all agree that they stand"
     steady = lambda t: 9.0  # noqa: E731
-    said(0.9 * FORGIVEN_AFTER, FOUR, {}, steady, speeds, 300.0)
-    assert guilty(speeds) == {"motor_speed"}
-    said(0.2 * FORGIVEN_AFTER, FOUR, {}, steady, speeds, 400.0)
-    assert guilty(speeds) == set()
+    said(0.9 * RECOVERED_AFTER, FOUR, {}, steady, speeds, 300.0)
+    assert faulty(speeds.counters) == {"motor_speed"}
+    said(0.2 * RECOVERED_AFTER, FOUR, {}, steady, speeds, 400.0)
+    assert faulty(speeds.counters) == set()
 
 
 def test_a_gps_without_a_fix_is_no_witness():
     signals = Signals((role, 2.0) for role in ROLES)
-    speeds = Speeds(RADIUS, GEAR)
+    speeds = SpeedCheck(RADIUS, GEAR)
     for step in range(300):
         t = step * STEP
         for role, value in {"motor_speed": 10 * HONEST["motor_speed"], "gps_speed": 0.0, "gps_fix": 0.0}.items():
             signals[role].value, signals[role].time = value, t
-        speeds.step(t, STEP, signals)
-    assert guilty(speeds) == set()
+        speeds.step(StepInputs(t, STEP, STEP, signals, None))
+    assert faulty(speeds.counters) == set()
 
 
 def test_a_wheel_that_was_locked_is_believed_again_when_it_is_all_there_is():
@@ -165,9 +165,9 @@ def test_a_wheel_that_was_locked_is_believed_again_when_it_is_all_there_is():
 def test_votes():
     apart = dict.fromkeys(HONEST, 1.0)
     assert vote({"motor_speed": 5.0, "wheel_speed_rear": 9.0, "gps_speed": 9.5}, apart)[0] == {"motor_speed"}
-    assert vote({"motor_speed": 5.0, "gps_speed": 9.5}, apart) == (NOBODY, frozenset({"motor_speed", "gps_speed"}))
+    assert vote({"motor_speed": 5.0, "gps_speed": 9.5}, apart) == (NO_SENSOR, frozenset({"motor_speed", "gps_speed"}))
     two_and_two = {"motor_speed": 5.0, "gps_speed": 5.2, "wheel_speed_rear": 0.0, "wheel_speed_front": 0.0}
-    assert vote(two_and_two, apart) == (NOBODY, frozenset(two_and_two))
+    assert vote(two_and_two, apart) == (NO_SENSOR, frozenset(two_and_two))
 
 
 # --- currents -----------------------------------------------------------------------------------------------------
@@ -175,19 +175,19 @@ def test_votes():
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
 def test_the_sag_tells_what_a_current_leaves_unexplained(scale: float):
-    sag = Sag()
+    sag = VoltageSag()
     for step in range(3000):
         current = 40.0 * (1 + sin(step * STEP))
-        sag.hear(STEP, 3.7 - 0.002 * current - 1e-5 * step, 0.002 * scale * current)
+        sag.update(STEP, 3.7 - 0.002 * current - 1e-5 * step, 0.002 * scale * current)
     assert sag.ratio == pytest.approx(1 / scale, rel=0.05)
 
 
 def test_a_current_that_moves_the_voltage_explains_it():
-    right, stuck = Sag(), Sag()
+    right, stuck = VoltageSag(), VoltageSag()
     for step in range(3000):
         current = 40.0 * (1 + sin(step * STEP))
-        right.hear(STEP, 3.7 - 0.0014 * current, 0.002 * current)  # a cold cell, of which the file says too much
-        stuck.hear(STEP, 3.7 - 0.002 * current, 0.002 * current if step < 2000 else 0.08)
+        right.update(STEP, 3.7 - 0.0014 * current, 0.002 * current)  # a cold cell, of which the file says too much
+        stuck.update(STEP, 3.7 - 0.002 * current, 0.002 * current if step < 2000 else 0.08)
         if step == 1999:
             assert right.explained
             assert stuck.explained
@@ -196,19 +196,19 @@ def test_a_current_that_moves_the_voltage_explains_it():
 
 
 def test_a_steady_current_tells_no_sag():
-    sag = Sag()
+    sag = VoltageSag()
     for step in range(3000):
-        sag.hear(STEP, 3.7 - 1e-5 * step, 0.04)
+        sag.update(STEP, 3.7 - 1e-5 * step, 0.04)
     assert sag.ratio is None
 
 
 def test_neither_a_frugal_rider_nor_an_aged_pack_is_a_lie():
     for sags, takes, scaled in ((1.0, 0.4, False), (2.0, 1.0, False), (2.0, 0.5, True), (0.45, 2.0, True)):
-        currents = Currents(30.0)
+        currents = CurrentCheck(30.0)
         for step in range(3000):
             drop = 0.08 * (1 + sin(step * STEP))
-            currents.sag.hear(STEP, 3.7 - sags * drop, drop)
-        currents.weigh(takes)
+            currents.sag.update(STEP, 3.7 - sags * drop, drop)
+        currents.compare_consumption(takes)
         assert currents._scaled == scaled
 
 
@@ -225,9 +225,9 @@ def hills(
     power: bool = True,
     on_road: bool = True,
     begin: float = 300.0,
-) -> Slopes:
+) -> GradeCheck:
     """Riding over hills of 4 %, stopping now and then; the lies begin at `begin` [s]."""
-    signals, slopes, speeds = Signals((role, 2.0) for role in ROLES), Slopes(MASS, FORCE), Speeds(RADIUS, GEAR)
+    signals, grades, speeds = Signals((role, 2.0) for role in ROLES), GradeCheck(MASS, FORCE), SpeedCheck(RADIUS, GEAR)
     way, before, height = 0.0, town(0.0), 200.0
     for step in range(round(seconds / STEP)):
         t = step * STEP
@@ -248,16 +248,16 @@ def hills(
             if value is not None:
                 signals[role].value, signals[role].time = value, t
         work = speed * (FORCE + WIND + MASS * (GRAVITY * grade + acceleration)) if power else None
-        slopes.hear_altitude(t, STEP, signals, speed)
+        grades.step(StepInputs(t, STEP, STEP, signals, speed))
         speeds.middle, speeds.acceleration, speeds.on_road = speed, acceleration, on_road
-        slopes.step(t, STEP, signals, speeds, work, lambda v, a: v * (FORCE + MASS * a))
-    return slopes
+        grades.compare(t, STEP, signals, speeds, work, lambda v, a: v * (FORCE + MASS * a))
+    return grades
 
 
 def test_hills_wind_and_a_tilted_accelerometer_accuse_nobody():
     for roles in (SLOPES, SLOPES[:1], SLOPES[1:]):
-        assert hills(1500.0, {}, roles).guilty == NOBODY
-        assert hills(1500.0, {}, roles, power=False).guilty == NOBODY
+        assert hills(1500.0, {}, roles).faulty == NO_SENSOR
+        assert hills(1500.0, {}, roles, power=False).faulty == NO_SENSOR
 
 
 SLOPE_LIES: dict[str, tuple[str, Lie]] = {
@@ -278,33 +278,33 @@ SLOPE_LIES: dict[str, tuple[str, Lie]] = {
 @pytest.mark.parametrize("name", SLOPE_LIES)
 def test_whoever_lies_about_the_grade_is_named_by_what_riding_takes(name: str):
     role, lie = SLOPE_LIES[name]
-    assert hills(800.0, {role: lie}).guilty == {role}
+    assert hills(800.0, {role: lie}).faulty == {role}
 
 
 def test_without_the_energy_neither_is_believed():
     for role, lie in (SLOPE_LIES["climbs for ever"], SLOPE_LIES["+2 m/s²"]):
-        assert hills(800.0, {role: lie}, power=False).guilty == set(SLOPES)
+        assert hills(800.0, {role: lie}, power=False).faulty == set(SLOPES)
 
 
 def test_a_single_witness_of_the_grade_is_held_against_the_energy():
     for name in ("climbs for ever", "sinks for ever", "+2 m/s²"):
         role, lie = SLOPE_LIES[name]
-        assert hills(800.0, {role: lie}, (role,)).guilty == {role}
+        assert hills(800.0, {role: lie}, (role,)).faulty == {role}
 
 
 def test_on_a_roller_bench_an_accelerometer_that_shows_nothing_is_right():
     still: Lie = lambda t, v: 0.1 * sin(77 * t)  # noqa: E731
-    assert hills(800.0, {"accel_x": still}, ("accel_x",), on_road=False).guilty == NOBODY
+    assert hills(800.0, {"accel_x": still}, ("accel_x",), on_road=False).faulty == NO_SENSOR
 
 
 def test_the_mounting_is_kept_from_before_the_lie():
-    slopes = hills(800.0, {"gps_altitude": lambda t, v: v + t})
-    assert slopes.offset == pytest.approx(-MOUNTED, abs=0.006)
+    grades = hills(800.0, {"gps_altitude": lambda t, v: v + t})
+    assert grades.offset == pytest.approx(-MOUNTED, abs=0.006)
 
 
 def test_pulling_away_on_a_slope_is_not_deaf():
     """What the slope shows is no part of what the wheels gain."""
-    signals, slopes, speeds = Signals((role, 2.0) for role in ROLES), Slopes(MASS, FORCE), Speeds(RADIUS, GEAR)
+    signals, grades, speeds = Signals((role, 2.0) for role in ROLES), GradeCheck(MASS, FORCE), SpeedCheck(RADIUS, GEAR)
     speeds.on_road = True
     for grade in (-0.06, 0.06):
         speed = 0.0
@@ -314,17 +314,17 @@ def test_pulling_away_on_a_slope_is_not_deaf():
             speed += acceleration * STEP
             speeds.middle, speeds.acceleration = speed, acceleration
             signals.accel_x.value, signals.accel_x.time = acceleration + GRAVITY * grade + 0.1 * sin(77 * t), t
-            slopes.step(t, STEP, signals, speeds, None, lambda v, a: v * (FORCE + MASS * a))
-            assert not slopes._deaf
+            grades.compare(t, STEP, signals, speeds, None, lambda v, a: v * (FORCE + MASS * a))
+            assert not grades.gain.wrong
 
 
 def test_a_standing_vehicle_does_not_climb():
-    signals, slopes, speeds = Signals((role, 2.0) for role in ROLES), Slopes(MASS, FORCE), Speeds(RADIUS, GEAR)
+    signals, grades, speeds = Signals((role, 2.0) for role in ROLES), GradeCheck(MASS, FORCE), SpeedCheck(RADIUS, GEAR)
     speeds.middle = 0.0
-    for rate, guilty in ((0.1, False), (1.0, True)):
+    for rate, wrong in ((0.1, False), (1.0, True)):
         for step in range(600):
             t = step * STEP
             signals.gps_altitude.value, signals.gps_altitude.time = 200 + rate * t, t
-            slopes.hear_altitude(t, STEP, signals, 0.0)
-            slopes.step(t, STEP, signals, speeds, 50.0, lambda v, a: 50.0)
-        assert slopes.trials["gps_altitude"].guilty == guilty
+            grades.step(StepInputs(t, STEP, STEP, signals, 0.0))
+            grades.compare(t, STEP, signals, speeds, 50.0, lambda v, a: 50.0)
+        assert grades.counters["gps_altitude"].faulty == wrong

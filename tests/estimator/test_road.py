@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.estimator.road import Road
+from gz_onboard.estimator.road import RoadState
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import ROLES
 
@@ -19,7 +19,7 @@ def drive(seconds, motion, *, without=(), seed=0, dt=0.1):
     """Run the filter over `motion`(t) -> true speed, grade, lean, yaw rate (left), altitude; with noisy sensors."""
     rng = np.random.default_rng(seed)
     signals = Signals((role, 2.0) for role in ROLES if role not in without)
-    road = Road()
+    road = RoadState()
     heading, rows, before = 0.0, [], motion(0.0)
     for step in range(1, round(seconds / dt) + 1):
         t = step * dt
@@ -57,7 +57,7 @@ def turning(t):
 
 
 def test_a_gyro_with_a_large_offset_is_learned_at_rest():
-    road = Road()
+    road = RoadState()
     signals = Signals((role, 2.0) for role in ROLES)
     for step in range(1, 300):
         for role, value in (("motor_speed", 0.0), ("rate_x", 0.1), ("rate_z", -0.12), ("accel_y", 0.0)):

@@ -6,8 +6,8 @@ from math import exp
 
 import pytest
 
-from gz_onboard.estimator.redundancy import SETTLED, Anchor
-from gz_onboard.estimator.start import Saved, flowed, unseen_sd
+from gz_onboard.estimator.redundancy.checks import SETTLED, RateLimit
+from gz_onboard.estimator.start import Saved, uncounted, uncounted_sd
 from gz_onboard.events import Activity, Group, Reason, State
 from tests.estimator.life import CELLS, GROUPS, INVERTER, PACK, Scooter, estimator, follow, worst
 
@@ -96,22 +96,22 @@ def test_a_first_value_that_is_none_accuses_nobody():
 
 
 def test_an_anchor_that_has_held_stays():
-    anchor = Anchor()
-    assert all(anchor.hear(1.0, 20.0, 0.1, 2.0) for _ in range(round(SETTLED) + 1))
-    assert not any(anchor.hear(1.0, 60.0, 0.1, 2.0) for _ in range(200))
-    assert anchor.hear(1.0, 21.0, 0.1, 2.0)
+    limit = RateLimit()
+    assert all(limit.update(1.0, 20.0, 0.1, 2.0) for _ in range(round(SETTLED) + 1))
+    assert not any(limit.update(1.0, 60.0, 0.1, 2.0) for _ in range(200))
+    assert limit.update(1.0, 21.0, 0.1, 2.0)
 
 
 def test_an_anchor_that_was_a_moment_ago_does_not():
-    anchor = Anchor()
-    heard = [anchor.hear(1.0, value, 0.1, 2.0) for value in (0.0, 30.0, 30.0, 30.0, 30.0)]
-    assert heard == [True, False, False, True, True]
-    assert not anchor.hear(1.0, 0.0, 0.1, 2.0)
+    limit = RateLimit()
+    possible = [limit.update(1.0, value, 0.1, 2.0) for value in (0.0, 30.0, 30.0, 30.0, 30.0)]
+    assert possible == [True, False, False, True, True]
+    assert not limit.update(1.0, 0.0, 0.1, 2.0)
 
 
 @pytest.mark.parametrize("gap", [5.0, 20.0, 60.0, 600.0])
 def test_a_pause_is_as_uncertain_as_a_restart(gap):
-    assert unseen_sd(gap) == flowed(Saved(0.5, 0.0, (1e-4, 0.0, 1e-6)), gap, 32.8, 52.0, 0.0, None, None)[1]
+    assert uncounted_sd(gap) == uncounted(Saved(0.5, 0.0, (1e-4, 0.0, 1e-6)), gap, 32.8, 52.0, 0.0, None, None)[1]
 
 
 @pytest.mark.parametrize("speed", [16.0, 20.0, 24.0])
@@ -130,7 +130,7 @@ def test_what_flowed_in_a_pause_is_covered(gap, speed):
 def test_a_late_voltage_is_used_however_seldom_it_comes(period, latency):
     groups = [Group(group.message, group.roles, period) for group in GROUPS]
     scooter, e = Scooter(soc=0.8, period=period), estimator(groups)
-    e._latency = latency
+    e.soc.synchroniser.latency = latency
     follow(e, scooter.live(60), scooter)
     e.filter.soc, e.filter.covariance = scooter.soc + 0.1, (0.01, 0.0, 1e-6)
     rows = follow(e, scooter.live(600, 11.0), scooter)

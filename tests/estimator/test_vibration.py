@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.shaking import SETTLED, STUCK, Shaking
+from gz_onboard.estimator.vibration import SETTLED, STUCK, VibrationMonitor
 from gz_onboard.events import Group
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.vibration import Vibration
@@ -62,11 +62,11 @@ def shaken(seconds, rms, *, step=0.01, begin=0.0, seed=1):
     return [(begin + step * i, 9.81 + z) for i, z in enumerate(noise.tolist())]
 
 
-def fed(samples, shaking=None):
-    shaking = shaking or Shaking()
+def fed(samples, monitor=None):
+    monitor = monitor or VibrationMonitor()
     for time, z in samples:
-        shaking.sample(time, z)
-    return shaking
+        monitor.update(time, z)
+    return monitor
 
 
 def test_it_is_what_the_lab_makes_of_the_same_samples():
@@ -100,27 +100,27 @@ def test_slow_motion_is_no_vibration():
 )
 def test_known_or_not(samples, known):
     now = samples[-1][0] if samples else 0.0
-    shaking = fed(samples)
-    assert (shaking.value(now) is not None) == known
-    assert shaking.value(now + 0.2) is None
+    monitor = fed(samples)
+    assert (monitor.value(now) is not None) == known
+    assert monitor.value(now + 0.2) is None
 
 
 def test_after_a_stuck_sensor_it_begins_anew():
     stuck = shaken(20, 3.0) + [(20 + 0.01 * i, 11.0) for i in range(round(100 * (STUCK + 1)))]
-    shaking = fed(stuck)
-    assert shaking.value(stuck[-1][0]) is None
+    monitor = fed(stuck)
+    assert monitor.value(stuck[-1][0]) is None
     again = shaken(60, 1.0, begin=stuck[-1][0] + 0.01)
-    assert fed(again[:300], shaking).value(again[299][0]) is None
-    assert fed(again[300:], shaking).value(again[-1][0]) == pytest.approx(1.0, rel=0.2)
+    assert fed(again[:300], monitor).value(again[299][0]) is None
+    assert fed(again[300:], monitor).value(again[-1][0]) == pytest.approx(1.0, rel=0.2)
 
 
 @given(st.lists(st.tuples(st.floats(-0.1, 0.3), st.floats(-60, 60)), max_size=60), st.floats(0, 0.2))
 def test_whatever_comes_it_is_none_or_a_possible_number(steps, after):
-    now, shaking = 0.0, fed(shaken(SETTLED + 1, 1.0, begin=-8.0))
+    now, monitor = 0.0, fed(shaken(SETTLED + 1, 1.0, begin=-8.0))
     for dt, z in steps:
         now += dt
-        shaking.sample(now, z)
-    value = shaking.value(now + after)
+        monitor.update(now, z)
+    value = monitor.value(now + after)
     assert value is None or 0 <= value <= 120
 
 
@@ -194,7 +194,7 @@ def test_a_model_that_does_not_read_it_does_not_look(quiet):
     with_samples, without = (
         estimated(BASE, rows) for rows in (events(60, 2.0), [row for row in events(60, 2.0) if row[1] != AT])
     )
-    assert with_samples._shaking.value(60.0) is None
+    assert with_samples._vibration.value(60.0) is None
     assert with_samples.estimate(60.0) == without.estimate(60.0)
 
 
@@ -229,7 +229,7 @@ def test_a_contact_that_loses_voltage_on_rough_roads(tmp_path):
     loose = vehicle_with(tmp_path, "CELL_VOLTAGE", 0.01)
     for vibration in (1e-6, 2.5):
         e = estimated(loose, events(60, vibration))
-        assert e._lacking == pytest.approx(0.01 * vibration, rel=0.2, abs=1e-4)
+        assert e.soc.effects.overpotential == pytest.approx(0.01 * vibration, rel=0.2, abs=1e-4)
     settled = e.forecaster._overpotential
     assert settled is not None
     assert settled(1.0, 0.5, 20.0) == pytest.approx(0.01 * TYPICAL)

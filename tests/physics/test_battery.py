@@ -50,6 +50,25 @@ def test_two_half_steps_make_one_step(dt, v1, current, r1, c1):
     assert again == pytest.approx(whole, rel=1e-9, abs=1e-12)
 
 
+@given(st.floats(0.05, 0.95), st.floats(-0.1, 0.1), st.floats(-4, 9), st.floats(-10, 45), st.floats(0.02, 100))
+def test_a_cell_advances_by_charge_and_rc_pair(soc, v1, current, temperature, dt):
+    later, after, decay = BATTERY.advanced(dt, soc, v1, current, temperature)
+    r1, c1 = BATTERY.r1.at(soc, temperature)[0], BATTERY.c1.at(soc, temperature)[0]
+    assert later == pytest.approx(soc - current * dt / 3600 / BATTERY.cell_capacity(temperature))
+    assert after == pytest.approx(r1 * current + (v1 - r1 * current) * math.exp(-dt / (r1 * c1)))
+    assert decay == pytest.approx(math.exp(-dt / (r1 * c1)))
+
+
+@given(st.floats(0.05, 0.95), st.floats(-4, 9), st.floats(-10, 45))
+def test_terminal_voltage_and_its_slope(soc, current, temperature):
+    voltage, slope = BATTERY.terminal_voltage(soc, 0.02, current, temperature)
+    assert voltage == BATTERY.ocv(soc, temperature)[0] - BATTERY.r0.at(soc, temperature)[0] * current - 0.02
+    if any(abs(soc - knot) < 1e-6 for knot in (*BATTERY.ocv_soc, *BATTERY.r0.soc)):
+        return
+    high, low = (BATTERY.terminal_voltage(soc + h, 0.02, current, temperature)[0] for h in (1e-7, -1e-7))
+    assert slope == pytest.approx((high - low) / 2e-7, rel=1e-3, abs=1e-5)
+
+
 def test_a_mesh_of_one_temperature():
     mesh = Mesh((0.0, 1.0), (25.0,), ((1.0, 3.0),))
     assert mesh.at(0.25, -40) == (1.5, 2.0)

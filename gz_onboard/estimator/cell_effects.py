@@ -1,0 +1,53 @@
+"""Effects in the cells beside R0 and the RC pair, followed with their memory."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.effect import QUANTITIES
+from gz_onboard.physics.model import Model
+
+LARGEST = 1.0  # V of a cell, of a saved state
+FOREVER = 1e9  # s: a rest of unknown length
+MILD = 20.0  # degC: of cells after a restart
+
+
+class CellEffects:
+    """The states of the effects. False if the model has none."""
+
+    def __init__(self, model: Model, battery: Battery) -> None:
+        self._battery = battery
+        self._effects = [effect for _, effect in model.cell_voltage]
+        self._quantities = dict.fromkeys(QUANTITIES, 0.0)
+        self.states = {effect.effect.name: 0.0 for effect in self._effects}  # V of a cell
+        self.overpotential = 0.0  # V of a cell: their sum
+
+    def __bool__(self) -> bool:
+        return bool(self._effects)
+
+    def step(
+        self, dt: float, current: float, soc: float, temperature: float, others: Mapping[str, float] | None = None
+    ) -> None:
+        """`dt` [s] on at a mean cell `current` [A], `temperature` in degC; others: what else has changed, by name."""
+        q = self._quantities
+        q.update(others or {})
+        q["cell_current"], q["soc"], q["cell_temperature"] = current, soc, temperature
+        q["cell_capacity"] = self._battery.cell_capacity(temperature)
+        for effect in self._effects:
+            name = effect.effect.name
+            self.states[name] = effect.step(self.states[name], dt, q)
+        self.overpotential = sum(self.states.values())
+
+    def read(self, saved: Mapping[str, float]) -> dict[str, float]:
+        """Saved states; KeyError, TypeError or ValueError if they are not of these effects."""
+        states = {name: float(saved[name]) for name in self.states}
+        if not all(abs(x) < LARGEST for x in states.values()):
+            raise ValueError("holds implausible voltages of effects in the cells")
+        return states
+
+    def restore(self, states: dict[str, float], age: float | None, soc: float) -> None:
+        """At rest meanwhile; for how long [s] if that is not known: for long."""
+        if states:
+            self.states = states
+            self.step(FOREVER if age is None else age, 0.0, soc, MILD)

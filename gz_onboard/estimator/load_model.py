@@ -1,0 +1,158 @@
+"""The forward model on board: its inputs, from what is known, and their typical values.
+
+Effects of an extended model read more than speed, acceleration and grade, which is all that is known of the road to
+come. What is modelled of the ride so far has the heading, the lateral acceleration and the vibration (the root mean
+square over each second) and the time moving as they were. What is expected of the rest of it has
+- of the heading nothing: the mean over all of them, so that a steady wind costs what it costs on a round trip;
+- the lateral acceleration and the vibration that the same segment had; before anything is ridden, or without IMU,
+  the prior's;
+- the time moving of half an hour on, as a range lasts an hour or so: tyres are warm then;
+- of memory nothing: effects are settled. Those in the cells take their voltage at the mean current.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import pi
+
+from gz_onboard.physics.battery import HALF_FULL, Battery
+from gz_onboard.physics.effect import MOVING
+from gz_onboard.physics.model import Model, air_density, stepping
+from gz_onboard.physics.riding import PriorRiding
+
+Quantities = dict[str, float]
+"""By name what effects read: see `physics.effect.QUANTITIES`."""
+AHEAD = 1800.0  # s: half of what a range lasts
+WARM_MOTOR = 40.0  # degC: a motor at work, where its temperature is not known
+HEADINGS = tuple(
+    pi / 4 * i for i in range(8)
+)  # rad: of a wind slower than the scooter their mean is that of all, exactly
+USUAL_AIR = 20.0, 0.0  # degC, m: of the usual force
+AMBIENT_DIGITS, ALTITUDE_DIGITS = 0, -2  # the prior riding is modelled anew for each degC and each 100 m
+BASE = {
+    "speed",
+    "acceleration",
+    "grade",
+    "grade_cosine",
+    "headwind",
+    "mass",
+    "air_density",
+    "motor_temperature",
+    "motor_speed",
+    "motor_current",
+    "torque",
+}
+"""Quantities that need nothing beyond speed, grade and air."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conditions:
+    """What the consumption depends on beside the motion."""
+
+    ambient: float  # degC
+    altitude: float  # m
+    motor_temperature: float = WARM_MOTOR  # degC
+
+
+@dataclass(frozen=True, slots=True)
+class EffectInputs:
+    """What effects beyond the base's may read at one time; None where it is not known."""
+
+    lateral_acceleration: float | None  # m/s²
+    heading: float | None  # rad, clockwise from north
+    soc: float
+    cell_temperature: float  # degC
+    current: float  # A of the pack
+    vibration: float | None = None  # m/s²
+
+
+class LoadModel:
+    """The model of one vehicle with what is usual for it. `extended`: it reads `EffectInputs`."""
+
+    def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
+        self.model = model
+        self.prior = prior
+        self.states: dict[str, float] = {}  # of effects with memory between road and pack
+        self.extended = not model.reads <= BASE or any(e.decay for e in model.effects)
+        self._battery = battery
+        self._by_heading = "heading" in model.reads
+        self._prior_at: tuple[tuple[float, float], float] = (float("nan"), 0.0), 0.0
+
+    def quantities(self, speed: float, acceleration: float, conditions: Conditions) -> Quantities:
+        """What the base model reads, on a level road without wind; speed [m/s], acceleration [m/s²]."""
+        return {
+            "speed": speed,
+            "acceleration": acceleration,
+            "grade": 0.0,
+            "grade_cosine": 1.0,
+            "headwind": 0.0,
+            "mass": self.model.mass,
+            "air_density": air_density(conditions.ambient, conditions.altitude),
+            "motor_temperature": conditions.motor_temperature,
+            "lateral_acceleration": 0.0,
+        }
+
+    def extend(self, q: Quantities, inputs: EffectInputs, ambient: float, time_moving: float) -> None:
+        """Add to `q` what an extended model may read beside; `ambient` in degC, `time_moving` in s."""
+        lateral = inputs.lateral_acceleration
+        q["lateral_acceleration"] = self._typical_lateral(q["speed"]) if lateral is None else lateral
+        q["vibration"] = self.typical_vibration(q["speed"]) if inputs.vibration is None else inputs.vibration
+        q["heading"] = inputs.heading or 0.0
+        q["time_moving"] = time_moving
+        self._add_cells(q, inputs.soc, inputs.cell_temperature, inputs.current, ambient)
+
+    def typical_vibration(self, speed: float) -> float:
+        """The prior riding's [m/s²] at `speed` [m/s]: what is taken where it is not known."""
+        return self.prior.vibration if speed > MOVING else 0.0
+
+    def _typical_lateral(self, speed: float) -> float:
+        return self.prior.lateral_acceleration if speed > MOVING else 0.0
+
+    def _add_cells(self, q: Quantities, soc: float, temperature: float, current: float, ambient: float) -> None:
+        q |= {
+            "ambient_temperature": ambient,
+            "soc": soc,
+            "cell_temperature": temperature,
+            "cell_current": current / self._battery.cells_parallel,
+            "cell_capacity": self._battery.cell_capacity(temperature),
+        }
+
+    def power(self, q: Quantities) -> float:
+        """The power at the pack [W] with all effects settled."""
+        return float(sum(self.model.power(q).values()))
+
+    def power_with_memory(self, q: Quantities, heading_known: bool, dt: float) -> tuple[float, float]:
+        """The power [W] as it was, over the last `dt` [s], and as it is to be expected of riding the same again."""
+        to_come = self._over_headings(q | {"time_moving": q["time_moving"] + AHEAD})
+        if self._by_heading and not heading_known:
+            return self._over_headings(q), to_come
+        return float(sum(self.model.power(q, stepping(self.states, dt)).values())), to_come
+
+    def _over_headings(self, q: Quantities) -> float:
+        """The power [W] with all settled, in the mean over the headings if the model reads them."""
+        if not self._by_heading:
+            return self.power(q)
+        powers = (sum(self.model.power(q | {"heading": heading}).values()) for heading in HEADINGS)
+        return float(sum(powers)) / len(HEADINGS)
+
+    def prior_ride(self, ambient: float, altitude: float) -> tuple[float, float]:
+        """(power [W], speed [m/s]) of the prior riding at `ambient` [degC] and `altitude` [m]."""
+        return self._prior(round(ambient, AMBIENT_DIGITS), round(altitude, ALTITUDE_DIGITS)), self.prior.speed
+
+    def usual_force(self) -> float:
+        """Mean force [N] of the prior riding: its energy at the pack over its distance."""
+        return self.prior.factor * self._prior(*USUAL_AIR) / self.prior.speed
+
+    def _prior(self, ambient: float, altitude: float) -> float:
+        if self._prior_at[0] != (ambient, altitude):
+            power = 0.0
+            for share, speed, acceleration in self.prior.points:
+                q = self.quantities(speed, acceleration, Conditions(ambient, altitude))
+                if self.extended:
+                    settled = EffectInputs(None, None, HALF_FULL, ambient, 0.0)
+                    self.extend(q, settled, ambient, AHEAD)
+                    power += share * self._over_headings(q)
+                else:
+                    power += share * self.power(q)
+            self._prior_at = (ambient, altitude), power * self.prior.unevenness
+        return self._prior_at[1]

@@ -1,0 +1,76 @@
+"""What the model gives for the present motion."""
+
+from __future__ import annotations
+
+from gz_onboard.estimator.forecast import Forecaster
+from gz_onboard.estimator.load_model import WARM_MOTOR, Conditions, EffectInputs
+from gz_onboard.estimator.road import RoadState
+from gz_onboard.estimator.soc import StateOfCharge
+from gz_onboard.estimator.temperatures import Temperatures
+from gz_onboard.estimator.vibration import VibrationMonitor
+from gz_onboard.physics.battery import HALF_FULL
+
+
+class Present:
+    """The present inputs of the model, collected from the parts that hold them. All methods take the time [s]."""
+
+    def __init__(
+        self,
+        forecaster: Forecaster,
+        road: RoadState,
+        temperatures: Temperatures,
+        soc: StateOfCharge,
+        monitor: VibrationMonitor | None,
+    ) -> None:
+        """`monitor`: for a model that reads the vibration."""
+        self._forecaster, self._load = forecaster, forecaster.load
+        self._road, self._temperatures, self._soc, self._monitor = road, temperatures, soc, monitor
+
+    def conditions(self, now: float, motor_temperature: float | None = None) -> Conditions:
+        """`motor_temperature` in degC, if it is known."""
+        motor = WARM_MOTOR if motor_temperature is None else motor_temperature
+        return Conditions(self._temperatures.ambient(now), self._road.altitude or 0.0, motor)
+
+    def power(self, now: float) -> float:
+        """What the pack gives [W]."""
+        road = self._road
+        return self.power_at(now, road.speed or 0.0, road.acceleration or 0.0, road.grade or 0.0)
+
+    def power_at(self, now: float, speed: float, acceleration: float, grade: float = 0.0) -> float:
+        """What the pack would give [W] at this speed [m/s], acceleration [m/s²] and grade (sine)."""
+        conditions = self.conditions(now)
+        quantities = self._load.quantities(speed, acceleration, conditions)
+        quantities["grade"] = grade
+        if inputs := self.effect_inputs(now):
+            self._load.extend(quantities, inputs, conditions.ambient, self._forecaster.riding.time_moving)
+        return self._load.power(quantities)
+
+    def power_of_prior(self, now: float) -> float:
+        """Of the prior riding [W]."""
+        conditions = self.conditions(now)
+        return self._load.prior_ride(conditions.ambient, conditions.altitude)[0]
+
+    def effect_inputs(self, now: float) -> EffectInputs | None:
+        """What effects beyond the base's may read; None if the model has none."""
+        if not self._load.extended:
+            return None
+        road, filter_ = self._road, self._soc.filter
+        lateral = None if road.yaw_rate is None or road.speed is None else road.speed * road.yaw_rate
+        return EffectInputs(
+            lateral,
+            road.heading,
+            filter_.soc if filter_ else HALF_FULL,
+            self._temperatures.cells_or_bench,
+            self._soc.current or 0.0,
+            self._monitor.value(now) if self._monitor else None,
+        )
+
+    def cell_inputs(self, now: float) -> dict[str, float]:
+        """What effects in the cells may read beside the cells' own."""
+        inputs = {"time_moving": self._forecaster.riding.time_moving}
+        return inputs | {"vibration": self.vibration(now)} if self._monitor else inputs
+
+    def vibration(self, now: float) -> float:
+        """What effects read as ``vibration`` [m/s²]: the typical value while it is not known."""
+        value = self._monitor.value(now) if self._monitor else None
+        return self._load.typical_vibration(self._road.speed or 0.0) if value is None else value

@@ -1,0 +1,57 @@
+"""Which signals are missing, and what that costs: the reasons of an estimate."""
+
+from __future__ import annotations
+
+from gz_onboard.estimator.redundancy.speeds import SpeedCheck
+from gz_onboard.estimator.signals import FIX_2D, Signals
+from gz_onboard.events import Reason
+
+# What is missing makes the consumption to come less certain; relative sd, from the errors on the rides without each.
+LOSS_SD = {
+    Reason.NO_SPEED: 0.10,
+    Reason.NO_IMU: 0.03,
+    Reason.NO_GPS: 0.03,
+    Reason.NO_AMBIENT_TEMPERATURE: 0.04,
+    Reason.NO_CELL_TEMPERATURE: 0.02,
+    Reason.NO_PACK_CURRENT: 0.03,
+    Reason.NO_PACK_VOLTAGE: 0.02,
+    Reason.SENSOR_DISTRUSTED: 0.05,  # what was learned from it before it was found out
+}
+DEGRADING = ~(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)  # reasons that degrade an estimate
+NO_PACK = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT
+NEEDED = {
+    Reason.NO_PACK_VOLTAGE: ("pack_voltage",),
+    Reason.NO_PACK_CURRENT: ("pack_current",),
+    Reason.NO_INVERTER_CURRENT: ("inverter_current",),
+    Reason.NO_CELL_TEMPERATURE: ("cell_temperature",),
+    Reason.NO_AMBIENT_TEMPERATURE: ("ambient_temperature",),
+    Reason.NO_IMU: ("rate_x", "rate_z", "accel_x"),
+}
+"""The roles of which none may be missing."""
+
+
+class MissingSignals:
+    """Which of the signals are stale or not trusted."""
+
+    def __init__(self, signals: Signals) -> None:
+        self._signals = signals
+        self._needed = [(reason, signals[role]) for reason, roles in NEEDED.items() for role in roles]
+        self._speeds = [signals[role] for role in SpeedCheck.ROLES]
+
+    def reasons(self, now: float) -> Reason:
+        """The reasons for those that are missing at `now` [s]."""
+        signals, reasons = self._signals, Reason(0)
+        for reason, signal in self._needed:
+            if not signal.fresh(now):
+                reasons |= reason
+        if not any(signal.fresh(now) for signal in self._speeds):
+            reasons |= Reason.NO_SPEED
+        position = signals.gps_speed.fresh(now) or signals.latitude.fresh(now)
+        if signals.fix_below(now, FIX_2D) or not position:
+            reasons |= Reason.NO_GPS
+        return reasons
+
+
+def loss_variance(reasons: Reason) -> float:
+    """The relative variance that these reasons add to the consumption."""
+    return sum(sd * sd for reason, sd in LOSS_SD.items() if reason & reasons)

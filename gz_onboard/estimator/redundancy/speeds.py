@@ -1,0 +1,130 @@
+"""The speeds of motor, wheels, vehicle and GPS, by majority."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from statistics import median
+
+from gz_onboard.estimator.redundancy.checks import MOVING, NO_SENSOR, STUCK_AFTER, StepInputs, counters
+from gz_onboard.estimator.road import accelerated
+from gz_onboard.estimator.signals import FIX_2D
+
+REVERSE = 4.0  # m/s: no road vehicle goes back faster; slower, wheels and GPS do not show the direction
+SPEED_APART, SPEED_APART_RELATIVE = 1.0, 0.12  # m/s and 1: two speeds that differ by more contradict each other
+BRAKING = 5.0  # m/s²: how fast a speed can have changed since its sensor last reported
+DRIFT_TIME = 20.0  # s, low pass
+DRIFT_APART, DRIFT_APART_RELATIVE = 0.2, 0.08  # the same for the low-passed: tyres and scales err by a few percent
+AXLE = frozenset(
+    {"motor_speed", "wheel_speed_rear"}
+)  # what turns on a roller bench or spins while the vehicle does not move
+GROUND = "wheel_speed_front", "gps_speed"
+ODOMETRY = frozenset({"motor_speed", "wheel_speed_rear", "wheel_speed_front"})  # what a vehicle speed is made from
+
+
+def weight(group: frozenset[str]) -> int:
+    """How many independent witnesses of the speed these are: a vehicle speed repeats the wheel it is made from."""
+    return len(group - {"vehicle_speed"} if group & ODOMETRY else group)
+
+
+def vote(speeds: Mapping[str, float], apart: Mapping[str, float]) -> tuple[frozenset[str], frozenset[str]]:
+    """(roles that are outvoted, roles that contradict each other with nothing to decide by).
+
+    speeds [m/s] by role; apart: how far [m/s] the speed of each role may be from another.
+    """
+    groups = {
+        frozenset(b for b, w in speeds.items() if abs(v - w) <= max(apart[a], apart[b])) for a, v in speeds.items()
+    }
+    everyone = frozenset(speeds)
+    if everyone in groups:
+        return NO_SENSOR, NO_SENSOR
+    best = max(groups, key=lambda group: (weight(group), sorted(group)))
+    others = everyone - best
+    # Two sensors of the driven axle agree and the ground does not: wheelspin or a roller bench, and no fault.
+    if any(everyone & AXLE == side == AXLE for side in (best - {"vehicle_speed"}, others - {"vehicle_speed"})):
+        return NO_SENSOR, NO_SENSOR
+    if any(weight(group) >= weight(best) for group in groups if not group & best):
+        return NO_SENSOR, everyone
+    return others, NO_SENSOR
+
+
+class SpeedCheck:
+    """See `SensorCheck`."""
+
+    ROLES = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed", "gps_speed")
+
+    def __init__(self, radius: float, gear: float) -> None:
+        self._scale = {"motor_speed": radius * gear, "wheel_speed_rear": radius, "wheel_speed_front": radius}
+        self.counters = counters(self.ROLES)
+        self._last = dict.fromkeys(self.ROLES, 0.0)  # m/s
+        self._still = dict.fromkeys(self.ROLES, 0.0)  # s without a change
+        self._apart = dict.fromkeys(self.ROLES, 0.0)  # m/s, low-passed, from the median
+        self._median = 0.0  # m/s, low-passed
+        self.middle: float | None = None  # m/s, median
+        self.acceleration = 0.0  # m/s², of the median
+        self._slow = 0.0  # m/s
+        self.on_road = False  # the ground goes by as fast as the driven wheel turns: another sensor has seen it
+        self.unsettled = False  # two contradict each other, and it is not known which of them is right
+
+    def step(self, step: StepInputs) -> None:
+        """See `SensorCheck`."""
+        dt, signals = step.observed, step.signals
+        speeds, apart = self._speeds(step)
+        self.unsettled = self.on_road = False
+        if not speeds:
+            self.middle = None
+            return
+        middle = median([v for role, v in speeds.items() if not self.counters[role].faulty] or speeds.values())
+        if dt > 0:
+            before = middle if self.middle is None else self._slow
+            self._slow, self.acceleration = accelerated(before, middle, dt)
+        self.middle = middle
+        if len(speeds) < 2:
+            for role in speeds:
+                signals[role].trusted = not self.counters[role].faulty
+            return
+        outvoted, tied = NO_SENSOR, NO_SENSOR
+        if max(speeds.values()) - min(speeds.values()) > min(apart.values()):
+            outvoted, tied = vote(speeds, apart)
+        elif len(speeds) > 2:
+            outvoted = self._drifted(dt, speeds, middle)
+        if tied:
+            stuck = frozenset(role for role in tied if self._still[role] >= STUCK_AFTER)
+            if stuck and stuck != tied:
+                outvoted, tied = stuck, NO_SENSOR
+        self.unsettled = bool(tied)
+        doubted = tied | {role for role in outvoted if not self.counters[role].faulty}
+        self.on_road = not doubted and any(
+            role in speeds and role not in outvoted and abs(speeds[role] - middle) <= apart[role] for role in GROUND
+        )
+        moving = middle > MOVING
+        for role in speeds:
+            counter = self.counters[role]
+            against = role in outvoted or role in tied
+            counter.update(dt, against if against or (moving and self._still[role] < STUCK_AFTER) else None)
+            signals[role].trusted = not (counter.faulty or role in outvoted)
+
+    def _speeds(self, step: StepInputs) -> tuple[dict[str, float], dict[str, float]]:
+        """(speeds [m/s], how far each may be from another [m/s]) by role, of those that report."""
+        speeds: dict[str, float] = {}
+        apart: dict[str, float] = {}
+        for role in self.ROLES:
+            signal = step.signals[role]
+            reported = signal.reported(step.now)
+            if role == "gps_speed":
+                signal.trusted = step.signals.gps_course.trusted = not step.signals.fix_below(step.now, FIX_2D)
+            if reported is None or (role == "gps_speed" and not signal.trusted):
+                continue
+            speed = reported * self._scale.get(role, 1.0)
+            speeds[role] = speed if speed < -REVERSE else abs(speed)
+            apart[role] = SPEED_APART + SPEED_APART_RELATIVE * abs(speed) + BRAKING * max(step.now - signal.time, 0.0)
+            self._still[role] = 0.0 if speed != self._last[role] else self._still[role] + step.observed
+            self._last[role] = speed
+        return speeds, apart
+
+    def _drifted(self, dt: float, speeds: Mapping[str, float], middle: float) -> frozenset[str]:
+        share = min(dt / DRIFT_TIME, 1.0)
+        self._median += share * (middle - self._median)
+        for role, speed in speeds.items():
+            self._apart[role] += share * (speed - middle - self._apart[role])
+        most = DRIFT_APART + DRIFT_APART_RELATIVE * self._median
+        return frozenset(role for role in speeds if abs(self._apart[role]) > most)

@@ -1,0 +1,276 @@
+"""The state of charge: first wait for a voltage, then count charge and take in voltages; begin anew if refuted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import inf, sqrt
+from typing import Protocol
+
+from gz_onboard.estimator.cell_effects import CellEffects
+from gz_onboard.estimator.ekf import FilterMaker, SocFilter
+from gz_onboard.estimator.gate import ERROR_TIME, InnovationGate
+from gz_onboard.estimator.initial import RELAXED, Situation, SteadyVoltage, first_filter
+from gz_onboard.estimator.redundancy.sag import VoltageSag
+from gz_onboard.estimator.rest import RestUpdate
+from gz_onboard.estimator.signals import Signal, Signals
+from gz_onboard.estimator.sources import CurrentSource, PackReading, Synchroniser
+from gz_onboard.estimator.start import HOUR, SOC_UNKNOWN_SD, Saved, bounded, plausible
+from gz_onboard.estimator.timing import SLOWEST, MessageTiming
+from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
+from gz_onboard.physics.battery import HALF_FULL, Battery
+from gz_onboard.physics.model import Model
+
+DOUBTED_START = 30.0  # s: a voltage that is doubted so soon has misled the first state of charge
+RESTARTED_FOR = 600.0  # s: for so long it is reported
+V1_WALK = 1e-8  # V²/s: variance that V1 gains, as the RC pair is a mixture of several
+STEADY_NOISE = 1e-9, 1e-7  # variance of SOC and V1 [V²] from the first voltage to the end of the wait
+SHORTEST = 0.02  # s: a step, to divide by
+
+
+@dataclass(frozen=True, slots=True)
+class PackState:
+    """What is known of the pack at one step, beside the signals."""
+
+    reading: PackReading
+    temperature: float  # degC, of the cells
+    speed: float | None  # m/s
+
+
+class RidingModel(Protocol):
+    """What of the vehicle beside its pack the state of charge depends on; times in s."""
+
+    def power_of_prior(self, now: float) -> float:
+        """Of the prior riding [W]."""
+
+    def cell_inputs(self, now: float) -> dict[str, float]:
+        """What effects in the cells read beside the cells' own."""
+
+
+class StateOfCharge:
+    """The filter of one pack, and what it is begun from."""
+
+    def __init__(
+        self,
+        battery: Battery,
+        model: Model,
+        make: FilterMaker,
+        signals: Signals,
+        timing: MessageTiming,
+        sag: VoltageSag,
+    ) -> None:
+        self.filter: SocFilter | None = None
+        self.gate = InnovationGate()
+        self.effects = CellEffects(model, battery)
+        self.uncertainty = VoltageUncertainty(battery, model.parameters)
+        self.synchroniser = Synchroniser(model.parameters["pack_voltage_latency"])
+        self.saved: Saved | None = None
+        self.saved_age: float | None = None  # s
+        self.current: float | None = None  # A of the pack, at the last step
+        self._battery, self._make, self._signals, self._timing = battery, make, signals, timing
+        self._sag = sag
+        self._charge = ChargeUncertainty(battery, model.parameters)
+        self._steady = SteadyVoltage(battery)
+        self._rest = RestUpdate(battery, self.uncertainty)
+        self._odometer: float | None = None  # m, at the last step
+        self._own_soc: float | None = None  # the vehicle's own state of charge, at the last step
+        self._started = -inf  # s: when there was a first state of charge,
+        self._started_from: tuple[Saved | None, float | None] = (None, None)  # and what it was made from, how old
+        self._doubted = False  # a voltage
+        self._restarted_at = -inf  # s
+        self._voltage_time: float | None = None  # s, of the message whose voltage was taken in last
+        self._voltage_taken = -inf  # s: when
+
+    # --- what others ask --------------------------------------------------------------------------------------
+
+    def cell_error(self, voltage: float, current: float, temperature: float) -> float | None:
+        """Measured less predicted voltage of a cell [V] for those of the pack; None before there is a filter."""
+        if self.filter is None:
+            return None
+        cell = self._battery.cell_voltage(voltage, current) + self.effects.overpotential
+        return self.filter.innovation(cell, current / self._battery.cells_parallel, temperature)[0]
+
+    def restarted(self, now: float) -> bool:
+        """Whether it was begun anew a short while ago."""
+        return now - self._restarted_at < RESTARTED_FOR
+
+    def doubt(self, now: float, doubted: bool) -> None:
+        """A voltage that is doubted for the first time, and soon after the start, has misled it: begin again."""
+        if doubted and not self._doubted and now - self._started < DOUBTED_START:
+            self.saved, self.saved_age = self._started_from
+            self._wait_again()
+        self._doubted = doubted
+
+    def interrupt(self, gap: float, temperature: float, consumption: float | None) -> None:
+        """A silence [s] as long as a restart: the voltage and what was known before are weighed anew.
+
+        temperature: of the cells [degC]; consumption: that is expected [J/m].
+        """
+        filter_ = self.filter
+        if filter_ is None:
+            return
+        known = self.current, self._odometer, self._own_soc, consumption
+        self.saved, self.saved_age = Saved(filter_.soc, filter_.v1, filter_.covariance, *known), gap
+        if self.effects:
+            self.effects.step(gap, 0.0, filter_.soc, temperature)
+        self._wait_again()
+
+    def _wait_again(self) -> None:
+        self.filter = self.gate.innovation = None
+        self._steady.forget()
+        self._rest = RestUpdate(self._battery, self.uncertainty)
+
+    def wait(self, seconds: float) -> None:
+        """So much time has passed [s] in which no voltage came: what was restored is older by that."""
+        if self.saved and self.saved_age is not None:
+            self.saved_age += seconds
+
+    def snapshot(self, filter_: SocFilter) -> dict[str, object]:
+        """What is to be kept over a restart."""
+        return {
+            "soc": filter_.soc,
+            "v1": filter_.v1,
+            "covariance": list(filter_.covariance),
+            "current": self.current,
+            "odometer": last(self._signals.odometer),
+            "own_soc": last(self._signals.bms_state_of_charge),
+            "cell_effects": dict(self.effects.states),
+        }
+
+    def restore(self, saved: Saved, age: float | None, effects: dict[str, float]) -> None:
+        """Go on from what is `age` [s] old; effects: their states [V of a cell]."""
+        self.saved, self.saved_age = saved, age
+        self.effects.restore(effects, age, saved.soc)
+
+    # --- step by step -----------------------------------------------------------------------------------------
+
+    def step(self, now: float, dt: float, pack: PackState, riding: RidingModel) -> None:
+        """Go `dt` [s] ahead to `now` [s]."""
+        reading, filter_ = pack.reading, self.filter
+        voltage, current = reading.voltage, reading.current
+        if voltage is not None and not self._plausible(voltage, current or 0.0, pack.temperature):
+            voltage = None
+            self.gate.off += 1
+        if filter_ is None:
+            if voltage is not None:
+                self._await_steady(now, voltage, current or 0.0, pack, riding)
+            self.current = current
+            return
+        if dt > 0:
+            self._predict(filter_, now, dt, pack, riding)
+        self.current = current
+        self._odometer, self._own_soc = last(self._signals.odometer), last(self._signals.bms_state_of_charge)
+        if voltage is None or current is None:
+            self.gate.innovation = None
+            return
+        # What was held since the last message is used once, for all the time since.
+        shown = self._signals.pack_voltage
+        received = shown.time if shown.fresh(now) else self._signals.inverter_voltage.time
+        if received == self._voltage_time:
+            return
+        pause = self._timing.pause
+        dt = min(now - self._voltage_taken, pause) if self._voltage_taken > -inf else dt
+        self._voltage_time, self._voltage_taken = received, now
+        if self.synchroniser.latency and shown.fresh(now):
+            pair = self.synchroniser.pair(now, voltage, current, pause)
+            if pair is None:
+                return
+            voltage, current = pair
+        self._update(filter_, now, dt, (voltage, current), pack)
+
+    def _predict(self, filter_: SocFilter, now: float, dt: float, pack: PackState, riding: RidingModel) -> None:
+        """Count the charge of `dt` [s] up to `now` [s]."""
+        battery, temperature, current = self._battery, pack.temperature, pack.reading.current
+        before = self.current if self.current is not None else current
+        mean = ((before or 0.0) + (current or 0.0)) / 2
+        charge = HOUR * battery.pack_capacity(temperature)
+        sampled, pause = self._timing.sampled, self._timing.pause
+        counted = (
+            pack.reading.source if sampled <= SLOWEST else CurrentSource.NONE
+        )  # beyond, most that flows is not seen
+        checked = self._signals.inverter_current.fresh(now)
+        q = self._charge.counted(min(dt, pause), mean * dt / charge, charge, CURRENT_ERRORS[counted], checked)
+        q += self._charge.between_samples(dt, sampled)
+        if dt > pause:
+            q += self._charge.of_pause(dt, sqrt(filter_.covariance[0]))
+            self._rest.interrupt()
+        filter_.predict(dt, mean / battery.cells_parallel, temperature, (q, V1_WALK * min(dt, RELAXED)))
+        p00, p01, p11 = filter_.covariance
+        if p00 > SOC_UNKNOWN_SD**2:
+            filter_.covariance = SOC_UNKNOWN_SD**2, p01 * SOC_UNKNOWN_SD / sqrt(p00), p11
+        if self.effects:
+            self.effects.step(dt, mean / battery.cells_parallel, filter_.soc, temperature, riding.cell_inputs(now))
+        filter_.soc = bounded(filter_.soc)
+
+    def _update(
+        self, filter_: SocFilter, now: float, dt: float, measured: tuple[float, float], pack: PackState
+    ) -> None:
+        """Update with the voltage [V] at a current [A], both of the pack, that represents `dt` [s]."""
+        battery, reading, temperature = self._battery, pack.reading, pack.temperature
+        voltage, current = measured
+        # What effects in the cells take is known: the filter sees the voltage that there would be without them.
+        cell_voltage = battery.cell_voltage(voltage, current) + self.effects.overpotential
+        cell_current = current / battery.cells_parallel
+        r0 = battery.r0.at(filter_.soc, temperature)[0]
+        explaining = (
+            current if reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else reading.reported_current
+        )
+        if explaining is not None:
+            self._sag.update(dt, cell_voltage, r0 * explaining / battery.cells_parallel)
+        if dt <= self._timing.pause and self._rest.step(
+            filter_, dt, cell_voltage, cell_current, temperature, reading.voltage_sd
+        ):
+            return
+        by_inverter = not self._signals.pack_voltage.fresh(now)
+        voltage_sd = INVERTER_VOLTAGE_SD if by_inverter else reading.voltage_sd
+        known = self._signals.cell_temperature.fresh(now)
+        slow = self.uncertainty.variance(filter_.soc, r0, cell_current, reading.source, known, voltage_sd)
+        error, own = filter_.innovation(cell_voltage, cell_current, temperature)
+        variance = self.gate.update(dt, error, own, slow)
+        if self.gate.refuted:
+            self._begin_anew(now)
+        elif variance is not None:
+            # What errs the same way for ERROR_TIME counts as one sample in that time, not one each step.
+            variance *= max(2 * ERROR_TIME / max(dt, SHORTEST), 1.0)
+            filter_.update(cell_voltage, cell_current, temperature, variance)
+            filter_.soc = bounded(filter_.soc)
+
+    def _plausible(self, voltage: float, current: float, temperature: float) -> bool:
+        battery = self._battery
+        r0 = battery.r0.at(self.filter.soc if self.filter else HALF_FULL, temperature)[0]
+        return plausible(battery, battery.cell_voltage(voltage, current) + r0 * current / battery.cells_parallel)
+
+    def _begin_anew(self, now: float) -> None:
+        """The voltage has contradicted the state of charge for long: begin again from it."""
+        self._wait_again()
+        self.gate = InnovationGate()
+        self.saved = None
+        self._restarted_at = now
+
+    def _await_steady(self, now: float, voltage: float, current: float, pack: PackState, riding: RidingModel) -> None:
+        """Start from the first voltage [V] that holds still, at a current [A]."""
+        awaited = [self._signals.cell_temperature]
+        if self.saved:
+            awaited += [self._signals.odometer, self._signals.bms_state_of_charge]
+        missing = any(signal.stale_after and not signal.fresh(now) for signal in awaited)
+        found = self._steady.step(now, voltage, current, pack.temperature, pack.speed, self._timing.pause, missing)
+        if found is None:
+            return
+        first, unsteady_sd = found
+        at = Situation(
+            now,
+            pack.temperature,
+            self.effects.overpotential,  # of before a restart
+            riding.power_of_prior(now),
+            pack.reading.voltage_sd,
+            unsteady_sd,
+        )
+        restored = self.saved, self.saved_age
+        self.saved, self._started, self._started_from = None, now, restored
+        self.filter = first_filter(self._battery, self._make, self.uncertainty, first, at, self._signals, restored)
+        mean = (first.current + current) / 2 / self._battery.cells_parallel
+        self.filter.predict(now - first.time, mean, pack.temperature, STEADY_NOISE)
+
+
+def last(signal: Signal) -> float | None:
+    """The last value that ever came."""
+    return signal.value if signal.time > -inf else None

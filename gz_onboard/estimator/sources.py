@@ -1,0 +1,150 @@
+"""Which sensor replaces which: pack voltage and current, from the best sensors that work, at one time."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from enum import Enum, auto
+from math import hypot, isinf
+
+from gz_onboard.estimator.redundancy.currents import CellEvidence
+from gz_onboard.estimator.redundancy.electric import Readings
+from gz_onboard.estimator.redundancy.monitor import Redundancy
+from gz_onboard.estimator.signals import Signal, Signals
+from gz_onboard.estimator.timing import SLOW_GAP
+from gz_onboard.physics.battery import BENCH_TEMPERATURE, HALF_FULL, Battery
+from gz_onboard.physics.parameters import Parameters
+
+MISMATCH = 0.09145416  # 1/h between the two current sensors, over ten seconds or so: 3 A of 32.8 A·h
+MISMATCH_SHARE = 0.01  # of a step: the low pass of that
+
+
+class CurrentSource(Enum):
+    """Where the pack current comes from."""
+
+    PACK = auto()
+    INVERTER = auto()
+    DISPUTED = auto()  # the mean of two that contradict each other
+    MODEL = auto()
+    NONE = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class PackReading:
+    """Voltage [V] and current [A] of the pack; None where no sensor is to be believed."""
+
+    voltage: float | None = None
+    current: float | None = None
+    source: CurrentSource = CurrentSource.NONE
+    reported_current: float | None = None  # A, trusted or not
+    voltage_sd: float = 0.0  # V of a cell
+    voltage_doubted: bool = False  # the two voltages differ, or one of them is faulty
+
+
+class PackSources:
+    """Corrects, compares and chooses the electric sensors."""
+
+    def __init__(self, signals: Signals, redundancy: Redundancy, battery: Battery, parameters: Parameters) -> None:
+        p = parameters
+        self._signals, self._currents, self._voltages = signals, redundancy.currents, redundancy.voltages
+        self._offset, self._gain = p["pack_current_offset"], p["pack_current_gain"]
+        self._voltage_offset, self._cable = p["pack_voltage_offset"], p["cable_resistance"]
+        self._voltage_sd = p.sd("pack_voltage_offset") / battery.cells_series
+        self._auxiliary_power = p["auxiliary_power"]
+        self._usual_voltage = battery.ocv(HALF_FULL)[0] * battery.cells_series
+        self._mismatch = MISMATCH * battery.pack_capacity(BENCH_TEMPERATURE)  # A
+        self._difference = 0.0  # A, low-passed
+
+    @property
+    def currents_differ(self) -> bool:
+        """Whether the two current sensors do, in the mean."""
+        return abs(self._difference) > self._mismatch
+
+    def read(self, now: float, dt: float, speed: float | None, evidence: CellEvidence) -> PackReading:
+        """The best of this step of `dt` [s]; `speed` in m/s."""
+        signals, voltages = self._signals, self._voltages
+        voltage, inverter_voltage = signals.pack_voltage.reported(now), signals.inverter_voltage.reported(now)
+        pack = signals.pack_current.reported(now)
+        any_voltage = voltage if voltage is not None else inverter_voltage
+        readings = Readings(
+            None if pack is None else (pack - self._offset) / self._gain,
+            signals.inverter_current.reported(now),
+            signals.auxiliary_current.reported(now),
+            self._auxiliary_power / (any_voltage or self._usual_voltage),
+            voltage,
+            inverter_voltage,
+            speed,
+        )
+        current, source = self._current(dt, readings, evidence)
+        if voltage is not None:
+            voltage -= self._voltage_offset
+        if inverter_voltage is not None:
+            inverter_voltage += self._cable * (current or 0.0)
+        together = _together(signals.pack_voltage, signals.inverter_voltage)
+        compared = replace(readings, pack_voltage=voltage, inverter_voltage=inverter_voltage if together else None)
+        distrusted = voltages.update(dt, compared, current, evidence.error)
+        for role in voltages.ROLES:
+            signals[role].trusted = role not in distrusted
+        if voltages.apart and voltage is not None and inverter_voltage is not None:
+            voltage = (voltage + inverter_voltage) / 2
+        elif not signals.pack_voltage.trusted or voltage is None:
+            voltage = inverter_voltage if signals.inverter_voltage.trusted else None
+        return PackReading(
+            voltage,
+            current,
+            source,
+            readings.through_inverter if readings.pack is None else readings.pack,
+            hypot(self._voltage_sd, voltages.apart, voltages.spread),
+            bool(voltages.apart or any(counter.faulty for counter in voltages.counters.values())),
+        )
+
+    def _current(self, dt: float, readings: Readings, evidence: CellEvidence) -> tuple[float | None, CurrentSource]:
+        """(pack current [A], where it comes from): None if no sensor is to be believed."""
+        signals, currents = self._signals, self._currents
+        together = _together(signals.pack_current, signals.inverter_current)
+        compared = readings if together else replace(readings, inverter=None)
+        distrusted = currents.update(dt, compared, evidence)
+        for role in currents.ROLES:
+            signals[role].trusted = role not in distrusted
+        if not signals.auxiliary_current.trusted:
+            readings = replace(readings, auxiliary=None)
+        pack, inverter = readings.pack, readings.through_inverter
+        if pack is not None and inverter is not None:
+            if together and not readings.charging:
+                self._difference += MISMATCH_SHARE * (pack - inverter - self._difference)
+            if currents.disputed:
+                return (pack + inverter) / 2, CurrentSource.DISPUTED
+        if pack is not None and signals.pack_current.trusted:
+            return pack, CurrentSource.PACK
+        if inverter is not None and signals.inverter_current.trusted:
+            return inverter, CurrentSource.INVERTER
+        return None, CurrentSource.NONE
+
+
+class Synchroniser:
+    """Keeps the one that comes first, and interpolates it. `latency` [s]: of the voltage; negative: of the current."""
+
+    def __init__(self, latency: float) -> None:
+        self.latency = latency
+        self._recent: deque[tuple[float, float, float]] = deque()  # s, V, A of the pack
+
+    def pair(self, now: float, voltage: float, current: float, pause: float) -> tuple[float, float] | None:
+        """(voltage [V], current [A]) of one time; None if not yet, or over a gap longer than `pause` [s]."""
+        recent, then = self._recent, now - abs(self.latency)
+        recent.append((now, voltage, current))
+        if recent[0][0] > then:
+            return None
+        while recent[1][0] <= then:
+            recent.popleft()
+        (t0, v0, i0), (t1, v1, i1) = recent[0], recent[1]
+        if t1 - t0 > pause:
+            return None
+        share = (then - t0) / (t1 - t0)
+        if self.latency > 0:
+            return voltage, i0 + share * (i1 - i0)
+        return v0 + share * (v1 - v0), current
+
+
+def _together(first: Signal, second: Signal) -> bool:
+    """Whether two that both report do so at the same time; or one of them is silent."""
+    return isinf(first.time + second.time) or abs(first.time - second.time) <= SLOW_GAP

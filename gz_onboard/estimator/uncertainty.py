@@ -1,0 +1,99 @@
+"""How uncertain what enters the SOC filter is: counted charge, the cell model, the voltage."""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import NamedTuple
+
+from gz_onboard.estimator.sources import CurrentSource
+from gz_onboard.estimator.start import HOUR, uncounted_sd
+from gz_onboard.estimator.timing import SLOW_GAP
+from gz_onboard.physics.battery import BENCH_TEMPERATURE, Battery
+from gz_onboard.physics.parameters import Parameters
+
+SAMPLING_RATE = 0.15  # 1/h: sd of the mean current over capacity between two samples that are seconds apart
+# Errors of currents are C-rates (1/h: A over the pack's A·h at the bench's temperature), as sensors and loads are sized
+# by the pack; those of voltages are a cell's.
+UNCHECKED_SD = 0.006096944  # 1/h, beside the offset's, while no second sensor confirms the first: 0.2 A of 32.8 A·h
+EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
+RESISTANCE_SD = 0.12  # relative: R0 of this pack at this place and temperature
+RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
+INVERTER_VOLTAGE_SD = 0.01071429  # V of a cell: the cable between pack and inverter, 0.15 V of 14 cells
+
+
+class CurrentError(NamedTuple):
+    """Of a pack current, beside the sensor's own offset."""
+
+    sd: float  # 1/h
+    time: float  # s that such an error stays the same
+
+
+CURRENT_ERRORS = {
+    CurrentSource.PACK: CurrentError(0.0, HOUR),
+    CurrentSource.INVERTER: CurrentError(0.01524236, HOUR),  # 0.5 A of 32.8 A·h: the auxiliary load
+    CurrentSource.DISPUTED: CurrentError(0.1829083, HOUR),  # 6 A: the one that is right may be either
+    CurrentSource.MODEL: CurrentError(0.09145416, 600.0),  # 3 A: wind and load, of which some stay for minutes
+    CurrentSource.NONE: CurrentError(0.4572708, 60.0),  # 15 A: any riding
+}
+
+
+class ChargeUncertainty:
+    """The variance of SOC that counting charge adds. Remembers what the pauses left."""
+
+    def __init__(self, battery: Battery, parameters: Parameters) -> None:
+        p = parameters
+        self._rated = battery.pack_capacity(BENCH_TEMPERATURE)  # A·h
+        self._offset_sd = p.sd("pack_current_offset")
+        self._charge_sd = sqrt((p.sd("cell_capacity") / p["cell_capacity"]) ** 2 + p.sd("pack_current_gain") ** 2)
+        self._unseen = 0.0  # of SOC: sd that the pauses left
+
+    def counted(self, dt: float, flowed: float, charge: float, error: CurrentError, checked: bool) -> float:
+        """Variance after `dt` [s] in which a share `flowed` of the capacity `charge` [A·s] was counted.
+
+        checked: a second sensor confirms the first.
+        """
+        unchecked = 0.0 if checked else UNCHECKED_SD
+        sd = sqrt(self._offset_sd**2 + (error.sd**2 + unchecked**2) * self._rated**2)
+        return (sd / charge) ** 2 * 2 * error.time * dt + self._charge_sd**2 * abs(flowed)
+
+    @staticmethod
+    def between_samples(dt: float, period: float) -> float:
+        """Variance after `dt` [s] of samples that are a long `period` [s] apart."""
+        return (SAMPLING_RATE / HOUR) ** 2 * dt * period if period > SLOW_GAP else 0.0
+
+    def of_pause(self, dt: float, soc_sd: float) -> float:
+        """Variance after a pause of `dt` [s], in which charge is not counted.
+
+        What was taken for it errs the same way each time: the rider goes on as before. soc_sd: what is known at most.
+        """
+        before, more = min(self._unseen, soc_sd), uncounted_sd(dt)
+        self._unseen = before + more
+        return (2 * before + more) * more
+
+
+class VoltageUncertainty:
+    """Standard deviations [V of a cell] of a voltage as a measurement of the state of charge."""
+
+    def __init__(self, battery: Battery, parameters: Parameters) -> None:
+        p = parameters
+        self._battery = battery
+        self.model = p.sd("cell_voltage_error")
+        self.rest = sqrt(p.sd("rest_voltage_error") ** 2 + battery.ocv_sd**2 + battery.rest_shift_sd**2)
+        self._empty = p.sd("cell_voltage_error_empty")
+        self._capacity_scatter = p.sd("cell_capacity") / p["cell_capacity"]
+
+    def variance(
+        self, soc: float, r0: float, current: float, source: CurrentSource, temperature_known: bool, voltage_sd: float
+    ) -> float:
+        """Variance [V²] of the voltage predicted at a cell `current` [A], and measured with `voltage_sd` [V].
+
+        r0: [ohm] of a cell.
+        """
+        resistance_sd = RESISTANCE_SD if temperature_known else RESISTANCE_SD_COLD
+        current_sd = CURRENT_ERRORS[source].sd * self._battery.cell_capacity(BENCH_TEMPERATURE)
+        empty = min(max((EMPTY_BELOW - soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
+        model_sd = self.model + empty * (self._empty - self.model)
+        # The pack's cells are not the bench's: where SOC lies on their curve is known to their capacity's scatter.
+        axis_sd = self._capacity_scatter * (1 - soc) * self._battery.ocv(soc)[1]
+        resistance = (resistance_sd * r0 * current) ** 2 + (r0 * current_sd) ** 2
+        return model_sd**2 + voltage_sd**2 + axis_sd**2 + resistance

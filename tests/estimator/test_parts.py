@@ -1,0 +1,124 @@
+"""The estimator's parts by themselves: what each decides on its own numbers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from math import exp
+
+import pytest
+
+from gz_onboard.estimator.gate import CONTRADICTED, GATE_COUNT, InnovationGate
+from gz_onboard.estimator.initial import STEADY_AFTER, STEADY_TIME, STEADY_WAIT, SteadyVoltage
+from gz_onboard.estimator.reasons import LOSS_SD, MissingSignals, loss_variance
+from gz_onboard.estimator.ridden import MEMORY, Past, Segment
+from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
+from gz_onboard.estimator.sources import CurrentSource, Synchroniser
+from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, ChargeUncertainty
+from gz_onboard.events import ROLES, Reason
+from gz_onboard.vehicle import read_vehicle
+
+VEHICLE = read_vehicle("reference")
+BATTERY = VEHICLE.pack
+SLOW = 1e-4  # V²
+
+
+def everything(now: float = 0.0) -> Signals:
+    signals = Signals((role, 2.0) for role in ROLES)
+    for role in ROLES:
+        signals[role].time, signals[role].value = now, 3.0
+    return signals
+
+
+def test_past_segments_count_less_the_further_back_they_are():
+    near, far = Segment(250.0, 25.0, 900.0, 1.0, 800.0, 700.0), Segment(250.0, 50.0, 500.0, 1.0, 400.0, 300.0)
+    past = Past.of([near, far])
+    share = exp(-250.0 / MEMORY)
+    assert past.whole == 500.0
+    assert past.level == pytest.approx(700.0 + share * 300.0)
+    assert past.duration == pytest.approx(25.0 + share * 50.0)
+    assert past.recent_factor == 1.0, "not yet a kilometre"
+    assert Past.of([near] * 4).recent_factor == pytest.approx(900.0 / 800.0)
+
+
+def test_a_glitch_is_not_used_and_what_persists_is():
+    gate = InnovationGate()
+    assert gate.update(0.1, 0.01, 0.0, SLOW) == SLOW
+    used = [gate.update(0.1, 0.3, 0.0, SLOW) is not None for _ in range(GATE_COUNT)]
+    assert used == [False] * (GATE_COUNT - 1) + [True]
+    assert gate.mismatch
+    assert not gate.refuted
+
+
+def test_a_voltage_that_is_off_for_long_refutes_the_state():
+    gate = InnovationGate()
+    for _ in range(round(CONTRADICTED) - 1):
+        gate.update(1.0, 0.3, 0.0, SLOW)
+    assert not gate.refuted
+    assert gate.update(1.0, 0.3, 0.0, SLOW) is None
+    assert gate.refuted
+
+
+@pytest.mark.parametrize("latency", [0.2, -0.2])
+def test_voltage_and_current_are_of_one_time(latency):
+    late, early = (lambda t: 50.0 + t), (lambda t: 10.0 * t)
+    voltage, current = (late, early) if latency > 0 else (early, late)
+    synchroniser = Synchroniser(latency)
+    pairs = [synchroniser.pair(0.1 * i, voltage(0.1 * i), current(0.1 * i), 1.0) for i in range(30)]
+    assert pairs[:2] == [None, None]
+    known = pairs[-1]
+    assert known is not None
+    assert known == pytest.approx((voltage(2.9), current(2.7)) if latency > 0 else (voltage(2.7), current(2.9)))
+    assert synchroniser.pair(9.0, 60.0, 1.0, 1.0) is None, "nothing is interpolated over a pause"
+
+
+def test_errors_of_currents_go_with_the_size_of_the_pack():
+    """No sensor at all: two packs of one cell, one ten times the other, lose their state of charge alike."""
+    variances = []
+    for parallel in (BATTERY.cells_parallel, 10 * BATTERY.cells_parallel):
+        battery = replace(BATTERY, cells_parallel=parallel)
+        charge = 3600 * battery.pack_capacity(25.0)
+        uncertainty = ChargeUncertainty(battery, VEHICLE.parameters)
+        variances.append(uncertainty.counted(60.0, 0.0, charge, CURRENT_ERRORS[CurrentSource.NONE], True))
+    assert variances[1] == pytest.approx(variances[0], rel=1e-4)
+    assert variances[0] ** 0.5 == pytest.approx(15.0 / 32.8 / 60 * 2**0.5, rel=1e-3)
+
+
+def test_reasons_and_what_they_cost():
+    signals = everything()
+    missing = MissingSignals(signals).reasons
+    assert missing(1.0) == Reason(0)
+    assert loss_variance(Reason(0)) == 0.0
+    signals.accel_x.trusted = False
+    signals.gps_fix.value = 1.0
+    signals.motor_speed.time = -10.0
+    assert missing(1.0) == Reason.NO_IMU | Reason.NO_GPS
+    assert loss_variance(Reason.NO_IMU | Reason.NO_GPS) == LOSS_SD[Reason.NO_IMU] ** 2 + LOSS_SD[Reason.NO_GPS] ** 2
+    assert missing(10.0) & Reason.NO_SPEED
+
+
+def test_a_fix_is_below_only_while_it_is_reported():
+    signals = everything()
+    signals.gps_fix.value = 2.0
+    assert signals.fix_below(1.0, FIX_3D)
+    assert not signals.fix_below(1.0, FIX_2D)
+    assert not signals.fix_below(10.0, FIX_3D)
+
+
+def wait(steady: SteadyVoltage, voltage, seconds: float):
+    """(time [s] at which the wait is over, what it gives)."""
+    for step in range(round(seconds * 10) + 1):
+        if found := steady.step(step / 10, voltage(step / 10), 0.0, 25.0, 0.0, 1.0, False):
+            return step / 10, found
+    return None
+
+
+def test_the_first_voltage_is_waited_for():
+    now, (first, sd) = wait(SteadyVoltage(BATTERY), lambda t: 52.0, 5.0)
+    assert (now, first.voltage, sd) == (STEADY_TIME, 52.0, 0.0)
+    assert first.moving is False
+    now, (first, _) = wait(SteadyVoltage(BATTERY), lambda t: min(20.0 + 40 * t, 52.0), 60.0)
+    assert first.voltage == 52.0
+    assert now == pytest.approx(first.time + STEADY_AFTER, abs=0.11)
+    now, (_, sd) = wait(SteadyVoltage(BATTERY), lambda t: 50.0 + 2 * (t * 10 % 2), 100.0)
+    assert now == STEADY_WAIT
+    assert sd == pytest.approx(BATTERY.ocv(1.0)[0] - BATTERY.ocv(0.0)[0])
