@@ -18,7 +18,7 @@ UNCHECKED_SD = 0.006096944  # 1/h, beside the offset's, while no second sensor c
 EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
 RESISTANCE_SD = 0.12  # relative: R0 of this pack at this place and temperature
 RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
-INVERTER_VOLTAGE_SD = 0.01071429  # V of a cell: the cable between pack and inverter, 0.15 V of 14 cells
+INVERTER_VOLTAGE_SD = 0.010714286  # V of a cell: the cable between pack and inverter, 0.15 V of 14 cells
 
 
 class CurrentError(NamedTuple):

@@ -1,4 +1,4 @@
-"""Sensors held against each other: whoever lies is found, and nobody else."""
+"""Sensors checked against each other: the faulty one is found, and no other."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HONEST: Mapping[str, float] = {  # what each sensor says at 1 m/s
     "gps_speed": 1.0,
 }
 FOUR = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "gps_speed")
-Lie = Callable[[float, float], float | None]
+Fault = Callable[[float, float], float | None]
 
 
 def town(t: float) -> float:
@@ -34,22 +34,22 @@ def town(t: float) -> float:
     return max(0.0, 7.0 + 6.0 * sin(t / 9.0))
 
 
-def said(
+def ridden(
     seconds: float,
     roles: tuple[str, ...],
-    lies: Mapping[str, Lie],
+    faults: Mapping[str, Fault],
     truth: Callable[[float], float] = town,
     watch: SpeedCheck | None = None,
     begin: float = 0.0,
 ) -> tuple[SpeedCheck, Signals]:
-    """`seconds` of riding; a lie makes of (time [s], what the sensor should say) what it says, None being nothing."""
+    """`seconds` of riding; a fault makes of (time [s], true value) what is reported, None being nothing."""
     signals = Signals((role, 2.0) for role in ROLES)
     speeds = watch or SpeedCheck(RADIUS, GEAR)
     for step in range(round(seconds / STEP)):
         t = begin + step * STEP
         for role in roles:
             value: float | None = truth(t) * HONEST[role] * (1 + 1e-4 * sin(7.3 * t))
-            value = lies[role](t, value) if role in lies and value is not None else value
+            value = faults[role](t, value) if role in faults and value is not None else value
             if value is not None:
                 signal = signals[role]
                 signal.value, signal.time, signal.total, signal.count = value, t, value, 1
@@ -58,7 +58,7 @@ def said(
     return speeds, signals
 
 
-LIES: dict[str, Lie] = {
+FAULTS: dict[str, Fault] = {
     "stuck": lambda t, v: HONEST["motor_speed"] * 8,
     "zero": lambda t, v: 0.0,
     "doubled": lambda t, v: 2 * v,
@@ -70,63 +70,63 @@ LIES: dict[str, Lie] = {
 }
 
 
-@pytest.mark.parametrize("name", LIES)
-@pytest.mark.parametrize("liar", FOUR)
-def test_one_of_four_that_lies_is_named_and_left_out(liar: str, name: str):
-    speeds, signals = said(60.0, FOUR, {liar: LIES[name]})
-    assert faulty(speeds.counters) == {liar}
-    assert not signals[liar].trusted
-    assert all(signals[role].trusted for role in FOUR if role != liar)
+@pytest.mark.parametrize("name", FAULTS)
+@pytest.mark.parametrize("wrong_role", FOUR)
+def test_one_of_four_that_is_wrong_is_named_and_left_out(wrong_role: str, name: str):
+    speeds, signals = ridden(60.0, FOUR, {wrong_role: FAULTS[name]})
+    assert faulty(speeds.counters) == {wrong_role}
+    assert not signals[wrong_role].trusted
+    assert all(signals[role].trusted for role in FOUR if role != wrong_role)
     assert not speeds.unsettled
 
 
 @pytest.mark.parametrize("roles", [FOUR, FOUR[:3], ("motor_speed", "gps_speed"), ("motor_speed", "vehicle_speed")])
-def test_nobody_is_accused_who_errs_by_a_few_percent_or_is_late(roles: tuple[str, ...]):
-    late: Lie = lambda t, v: town(t - 0.6) * 1.03 + 0.1 * sin(3 * t)  # noqa: E731
-    speeds, _ = said(600.0, roles, {"motor_speed": lambda t, v: 1.05 * v, "gps_speed": late})
+def test_no_sensor_is_faulty_that_errs_by_a_few_percent_or_is_late(roles: tuple[str, ...]):
+    late: Fault = lambda t, v: town(t - 0.6) * 1.03 + 0.1 * sin(3 * t)  # noqa: E731
+    speeds, _ = ridden(600.0, roles, {"motor_speed": lambda t, v: 1.05 * v, "gps_speed": late})
     assert faulty(speeds.counters) == set()
 
 
 def test_contradicted_it_is_not_believed_from_the_first_step():
-    _, signals = said(20.0, FOUR, {"motor_speed": lambda t, v: v if t < 19.85 else 2 * v})
+    _, signals = ridden(20.0, FOUR, {"motor_speed": lambda t, v: v if t < 19.85 else 2 * v})
     assert not signals.motor_speed.trusted
 
 
 @pytest.mark.parametrize("role", ["motor_speed", "wheel_speed_rear", "wheel_speed_front"])
 def test_slip_and_a_locked_wheel_for_two_seconds_are_no_faults(role: str):
-    lies: tuple[Lie, Lie] = (lambda t, v: 0.0 if t % 30 < 2 else v), (lambda t, v: 2 * v if t % 30 < 2 else v)
-    for lie in lies:
-        speeds, signals = said(120.0, FOUR, {role: lie})
+    faults: tuple[Fault, Fault] = (lambda t, v: 0.0 if t % 30 < 2 else v), (lambda t, v: 2 * v if t % 30 < 2 else v)
+    for fault in faults:
+        speeds, signals = ridden(120.0, FOUR, {role: fault})
         assert faulty(speeds.counters) == set()
         assert signals[role].trusted
 
 
 def test_a_roller_bench_and_a_spinning_wheel_are_no_faults():
-    """Motor and rear wheel agree, front wheel and GPS stand: no sensor of them can be told to lie."""
-    still: Lie = lambda t, v: 0.0  # noqa: E731
+    """Motor and rear wheel agree, front wheel and GPS stand: none of them can be shown to be faulty."""
+    still: Fault = lambda t, v: 0.0  # noqa: E731
     for roles in (FOUR, FOUR[:3], (*FOUR, "vehicle_speed")):
-        speeds, signals = said(300.0, roles, {"wheel_speed_front": still, "gps_speed": still})
+        speeds, signals = ridden(300.0, roles, {"wheel_speed_front": still, "gps_speed": still})
         assert faulty(speeds.counters) == set()
         assert signals.motor_speed.trusted
 
 
 def test_a_vehicle_speed_made_from_the_motors_does_not_outvote_the_gps():
     roles = ("motor_speed", "vehicle_speed", "gps_speed")
-    double: Lie = lambda t, v: 2 * v  # noqa: E731
-    speeds, _ = said(60.0, roles, {"motor_speed": double, "vehicle_speed": double})
+    double: Fault = lambda t, v: 2 * v  # noqa: E731
+    speeds, _ = ridden(60.0, roles, {"motor_speed": double, "vehicle_speed": double})
     assert faulty(speeds.counters) == set(roles)
-    assert faulty(said(60.0, roles, {"motor_speed": double})[0].counters) == {"motor_speed"}
+    assert faulty(ridden(60.0, roles, {"motor_speed": double})[0].counters) == {"motor_speed"}
 
 
-def test_of_two_that_disagree_the_stuck_one_lies():
-    for liar in ("motor_speed", "gps_speed"):
-        speeds, _ = said(60.0, ("motor_speed", "gps_speed"), {liar: lambda t, v: 40.0})
-        assert faulty(speeds.counters) == {liar}
+def test_of_two_that_disagree_the_stuck_one_is_faulty():
+    for wrong_role in ("motor_speed", "gps_speed"):
+        speeds, _ = ridden(60.0, ("motor_speed", "gps_speed"), {wrong_role: lambda t, v: 40.0})
+        assert faulty(speeds.counters) == {wrong_role}
 
 
 def test_of_two_that_disagree_and_move_neither_is_believed():
     roles = ("motor_speed", "gps_speed")
-    speeds, signals = said(60.0, roles, {"motor_speed": lambda t, v: 1.6 * v})
+    speeds, signals = ridden(60.0, roles, {"motor_speed": lambda t, v: 1.6 * v})
     assert faulty(speeds.counters) == set(roles)
     assert speeds.unsettled
     assert signals.motor_speed.mean(59.9) is None
@@ -134,18 +134,18 @@ def test_of_two_that_disagree_and_move_neither_is_believed():
 
 
 def test_forgiven_only_after_a_minute_of_agreement_about_something():
-    speeds, _ = said(60.0, FOUR, {"motor_speed": LIES["doubled"]})
+    speeds, _ = ridden(60.0, FOUR, {"motor_speed": FAULTS["doubled"]})
     stands = lambda t: 0.0  # noqa: E731
-    said(3 * RECOVERED_AFTER, FOUR, {}, stands, speeds, 60.0)
+    ridden(3 * RECOVERED_AFTER, FOUR, {}, stands, speeds, 60.0)
     assert faulty(speeds.counters) == {"motor_speed"}, "standing, all agree that they stand"
     steady = lambda t: 9.0  # noqa: E731
-    said(0.9 * RECOVERED_AFTER, FOUR, {}, steady, speeds, 300.0)
+    ridden(0.9 * RECOVERED_AFTER, FOUR, {}, steady, speeds, 300.0)
     assert faulty(speeds.counters) == {"motor_speed"}
-    said(0.2 * RECOVERED_AFTER, FOUR, {}, steady, speeds, 400.0)
+    ridden(0.2 * RECOVERED_AFTER, FOUR, {}, steady, speeds, 400.0)
     assert faulty(speeds.counters) == set()
 
 
-def test_a_gps_without_a_fix_is_no_witness():
+def test_a_gps_without_a_fix_does_not_count():
     signals = Signals((role, 2.0) for role in ROLES)
     speeds = SpeedCheck(RADIUS, GEAR)
     for step in range(300):
@@ -157,8 +157,8 @@ def test_a_gps_without_a_fix_is_no_witness():
 
 
 def test_a_wheel_that_was_locked_is_believed_again_when_it_is_all_there_is():
-    speeds, _ = said(20.0, FOUR, {"wheel_speed_front": lambda t, v: 0.0 if t > 19 else v})
-    _, signals = said(20.0, ("wheel_speed_front",), {}, watch=speeds, begin=20.0)
+    speeds, _ = ridden(20.0, FOUR, {"wheel_speed_front": lambda t, v: 0.0 if t > 19 else v})
+    _, signals = ridden(20.0, ("wheel_speed_front",), {}, watch=speeds, begin=20.0)
     assert signals.wheel_speed_front.trusted
 
 
@@ -174,7 +174,7 @@ def test_votes():
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
-def test_the_sag_tells_what_a_current_leaves_unexplained(scale: float):
+def test_the_sag_shows_what_a_current_leaves_unexplained(scale: float):
     sag = VoltageSag()
     for step in range(3000):
         current = 40.0 * (1 + sin(step * STEP))
@@ -195,14 +195,14 @@ def test_a_current_that_moves_the_voltage_explains_it():
     assert not stuck.explained
 
 
-def test_a_steady_current_tells_no_sag():
+def test_a_steady_current_shows_no_sag():
     sag = VoltageSag()
     for step in range(3000):
         sag.update(STEP, 3.7 - 1e-5 * step, 0.04)
     assert sag.ratio is None
 
 
-def test_neither_a_frugal_rider_nor_an_aged_pack_is_a_lie():
+def test_neither_a_frugal_rider_nor_an_aged_pack_is_a_fault():
     for sags, takes, scaled in ((1.0, 0.4, False), (2.0, 1.0, False), (2.0, 0.5, True), (0.45, 2.0, True)):
         currents = CurrentCheck(30.0)
         for step in range(3000):
@@ -215,27 +215,27 @@ def test_neither_a_frugal_rider_nor_an_aged_pack_is_a_lie():
 # --- grade --------------------------------------------------------------------------------------------------------
 
 MASS, FORCE, WIND, MOUNTED = 200.0, 100.0, 25.0, 0.02  # kg; N that the level takes; N that nobody knows of; rad
-SLOPES = ("accel_x", "gps_altitude")
+GRADES = ("accel_x", "gps_altitude")
 
 
 def hills(
     seconds: float,
-    lies: Mapping[str, Lie],
-    roles: tuple[str, ...] = SLOPES,
+    faults: Mapping[str, Fault],
+    roles: tuple[str, ...] = GRADES,
     power: bool = True,
     on_road: bool = True,
     begin: float = 300.0,
 ) -> GradeCheck:
-    """Riding over hills of 4 %, stopping now and then; the lies begin at `begin` [s]."""
+    """Riding over hills of 4 %, stopping now and then; the faults begin at `begin` [s]."""
     signals, grades, speeds = Signals((role, 2.0) for role in ROLES), GradeCheck(MASS, FORCE), SpeedCheck(RADIUS, GEAR)
-    way, before, height = 0.0, town(0.0), 200.0
+    distance, before, height = 0.0, town(0.0), 200.0
     for step in range(round(seconds / STEP)):
         t = step * STEP
         speed = town(t)
-        grade = 0.04 * cos(way / 120.0)
+        grade = 0.04 * cos(distance / 120.0)
         acceleration = (speed - before) / STEP
         before = speed
-        way += speed * STEP
+        distance += speed * STEP
         height += grade * speed * STEP
         honest = {
             "accel_x": acceleration + GRAVITY * (grade + MOUNTED) + 0.1 * sin(77 * t),
@@ -243,8 +243,8 @@ def hills(
         }
         for role in roles:
             value: float | None = honest[role]
-            if role in lies and t >= begin:
-                value = lies[role](t - begin, honest[role])
+            if role in faults and t >= begin:
+                value = faults[role](t - begin, honest[role])
             if value is not None:
                 signals[role].value, signals[role].time = value, t
         work = speed * (FORCE + WIND + MASS * (GRAVITY * grade + acceleration)) if power else None
@@ -254,13 +254,13 @@ def hills(
     return grades
 
 
-def test_hills_wind_and_a_tilted_accelerometer_accuse_nobody():
-    for roles in (SLOPES, SLOPES[:1], SLOPES[1:]):
+def test_hills_wind_and_a_tilted_accelerometer_are_no_faults():
+    for roles in (GRADES, GRADES[:1], GRADES[1:]):
         assert hills(1500.0, {}, roles).faulty == NO_SENSOR
         assert hills(1500.0, {}, roles, power=False).faulty == NO_SENSOR
 
 
-SLOPE_LIES: dict[str, tuple[str, Lie]] = {
+GRADE_FAULTS: dict[str, tuple[str, Fault]] = {
     "climbs for ever": ("gps_altitude", lambda t, v: v + 1.0 * t),
     "climbs slowly": ("gps_altitude", lambda t, v: v + 0.3 * t),
     "sinks for ever": ("gps_altitude", lambda t, v: v - 1.0 * t),
@@ -275,34 +275,34 @@ SLOPE_LIES: dict[str, tuple[str, Lie]] = {
 }
 
 
-@pytest.mark.parametrize("name", SLOPE_LIES)
-def test_whoever_lies_about_the_grade_is_named_by_what_riding_takes(name: str):
-    role, lie = SLOPE_LIES[name]
-    assert hills(800.0, {role: lie}).faulty == {role}
+@pytest.mark.parametrize("name", GRADE_FAULTS)
+def test_a_wrong_sensor_of_the_grade_is_named_by_the_energy(name: str):
+    role, fault = GRADE_FAULTS[name]
+    assert hills(800.0, {role: fault}).faulty == {role}
 
 
 def test_without_the_energy_neither_is_believed():
-    for role, lie in (SLOPE_LIES["climbs for ever"], SLOPE_LIES["+2 m/s²"]):
-        assert hills(800.0, {role: lie}, power=False).faulty == set(SLOPES)
+    for role, fault in (GRADE_FAULTS["climbs for ever"], GRADE_FAULTS["+2 m/s²"]):
+        assert hills(800.0, {role: fault}, power=False).faulty == set(GRADES)
 
 
 def test_a_single_witness_of_the_grade_is_held_against_the_energy():
     for name in ("climbs for ever", "sinks for ever", "+2 m/s²"):
-        role, lie = SLOPE_LIES[name]
-        assert hills(800.0, {role: lie}, (role,)).faulty == {role}
+        role, fault = GRADE_FAULTS[name]
+        assert hills(800.0, {role: fault}, (role,)).faulty == {role}
 
 
 def test_on_a_roller_bench_an_accelerometer_that_shows_nothing_is_right():
-    still: Lie = lambda t, v: 0.1 * sin(77 * t)  # noqa: E731
+    still: Fault = lambda t, v: 0.1 * sin(77 * t)  # noqa: E731
     assert hills(800.0, {"accel_x": still}, ("accel_x",), on_road=False).faulty == NO_SENSOR
 
 
-def test_the_mounting_is_kept_from_before_the_lie():
+def test_the_mounting_is_kept_from_before_the_fault():
     grades = hills(800.0, {"gps_altitude": lambda t, v: v + t})
     assert grades.offset == pytest.approx(-MOUNTED, abs=0.006)
 
 
-def test_pulling_away_on_a_slope_is_not_deaf():
+def test_pulling_away_on_a_slope_is_no_fault():
     """What the slope shows is no part of what the wheels gain."""
     signals, grades, speeds = Signals((role, 2.0) for role in ROLES), GradeCheck(MASS, FORCE), SpeedCheck(RADIUS, GEAR)
     speeds.on_road = True
