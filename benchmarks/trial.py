@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.lab.discover.engine import baseline, discover
+from gz_onboard.lab.discover.discovery import baseline, discover
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import read_vehicle
 from tests import plant

@@ -18,9 +18,9 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.cli import main as command
 from gz_onboard.constants import GRAVITY
-from gz_onboard.lab.discover.engine import discover
-from gz_onboard.lab.discover.files import write_model
-from gz_onboard.lab.discover.parts import Over, before_and_after, binned, edges, gathered
+from gz_onboard.lab.discover.breakdown import QuantityReader, before_and_after, binned, edges, pooled
+from gz_onboard.lab.discover.discovery import discover
+from gz_onboard.lab.discover.extension import write_model
 from gz_onboard.lab.discover.result import METRICS, Report
 from gz_onboard.simulation.recorded import read_recorded
 from gz_onboard.simulation.samples import read_samples
@@ -64,11 +64,11 @@ def main() -> None:
 
 def residual(report: Report, file: Path) -> None:
     """Road force over lateral acceleration, before and after, with what the effect says."""
-    state = report.state
-    assert state is not None
+    mixed = report.mixed
+    assert mixed is not None
     cause = next(c for c in report.causes if c.name == "cornering_drag")
     before, after = before_and_after(report)
-    over = Over(state)
+    over = QuantityReader(mixed)
     figure = new_figure(11, 4.3)
     mass = float(np.mean([line.ride.quantities["mass"][0] for line in report.lines]))
     axes: list[Any] = []
@@ -76,7 +76,7 @@ def residual(report: Report, file: Path) -> None:
         axis = figure.add_axes((0.07 + 0.47 * i, 0.12, 0.44, 0.74), sharey=axes[0] if axes else None)
         axes.append(axis)
         rule(axis)
-        x, y, _ = gathered(lines, "road_force", "lateral_acceleration", over)
+        x, y, _ = pooled(lines, "road_force", "lateral_acceleration", over)
         axis.plot(x, y, ".", color=MUTED, markersize=2.5, alpha=0.5, label="means of 4 s")
         rows = binned(x, y, edges(x, 16))
         axis.errorbar(

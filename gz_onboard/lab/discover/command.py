@@ -12,14 +12,22 @@ from pathlib import Path
 
 from gz_onboard.bus.logs import log_suffix
 from gz_onboard.errors import InputError, nearest
+from gz_onboard.lab.discover.breakdown import before_and_after, outlying_rides
 from gz_onboard.lab.discover.candidates import Candidate, candidates
 from gz_onboard.lab.discover.channels import BY_NAME
-from gz_onboard.lab.discover.engine import baseline, discover
-from gz_onboard.lab.discover.files import write_baseline, write_model
-from gz_onboard.lab.discover.limits import amount, limits, size, strange, unformed, unsettled, words
-from gz_onboard.lab.discover.parts import before_and_after, outstanding
+from gz_onboard.lab.discover.detectability import (
+    amount,
+    implausible_rides,
+    limits,
+    missing_residuals,
+    remaining_range_error,
+    size,
+    words,
+)
+from gz_onboard.lab.discover.discovery import baseline, discover
+from gz_onboard.lab.discover.energy import residual_sizes
+from gz_onboard.lab.discover.extension import write_baseline, write_model
 from gz_onboard.lab.discover.result import METRICS, SCHEMA, VERDICTS, Report
-from gz_onboard.lab.discover.worth import sizes
 from gz_onboard.lab.processes import Progress, over_rides
 from gz_onboard.simulation.samples import Samples, read_samples
 from gz_onboard.simulation.telling import clock, explain_keys, write_json
@@ -100,12 +108,17 @@ def run(arguments: argparse.Namespace) -> int:
     with _Bar(arguments.quiet) as bar:
         report = discover(vehicle, rides, arguments.seed, arguments.effects, bar.say, arguments.workers, holdout)
     report.notes[:0] = refused
-    report.notes += [*unsettled(report), *outstanding(report), *strange(report), *unformed(report)]
+    report.notes += [
+        *remaining_range_error(report),
+        *outlying_rides(report),
+        *implausible_rides(report),
+        *missing_residuals(report),
+    ]
     told = write_extended(report, vehicle, arguments) if arguments.write_model else []
     if arguments.json:
         write_json(arguments.json, document(report))
     if arguments.report:
-        from gz_onboard.lab.discover.report import write_report
+        from gz_onboard.lab.discover.page import write_report
 
         try:
             write_report(report, arguments.report)
@@ -315,8 +328,8 @@ def listing(every: Sequence[Candidate]) -> str:
 def summary(report: Report, vehicle: Vehicle, told: Sequence[str] = ()) -> str:
     """The result in the terminal. told: of the extended model."""
     way, time, drawn = size(report)
-    state = report.state
-    known = f"{state.healthy} healthy rides" if state and state.healthy else "the vehicle file alone"
+    mixed = report.mixed
+    known = f"{mixed.healthy} healthy rides" if mixed and mixed.healthy else "the vehicle file alone"
     energy = f", {drawn / 3.6e6:.2f} kWh drawn" if drawn > 0 else ""
     rides = f"{len(report.lines)} ride{'s' if len(report.lines) > 1 else ''}, {way / 1e3:.1f} km in {clock(time)}"
     lines = [
@@ -344,7 +357,7 @@ def summary(report: Report, vehicle: Vehicle, told: Sequence[str] = ()) -> str:
             lines.append(f"  denied:              {', '.join(u['denies'])}, which would not act alike everywhere")
     best = ", ".join(f"{name} {score:.0f}" for name, score in report.ranking[:5])
     lines.append(f"scores       {best}; healthy rides stay below {report.threshold:.0f}")
-    left = sizes(before_and_after(report)[0])
+    left = residual_sizes(before_and_after(report)[0])
     largest = sorted(left.items(), key=lambda row: -abs(row[1]["energy_share"]))[:_ROWS]
     text = "; ".join(
         f"{words(name)} {r['mean']:+.3g} ± {r['rms']:.3g} {BY_NAME[name].unit} ({r['energy_share']:+.1%} of the energy)"

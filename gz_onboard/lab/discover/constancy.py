@@ -16,19 +16,19 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.channels import over_blocks
 from gz_onboard.lab.discover.grid import Ride
-from gz_onboard.lab.discover.linear import Linear, Normal, Table, whitened
-from gz_onboard.lab.discover.search import _evidence
-from gz_onboard.lab.discover.state import State
+from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Normal, whitened
+from gz_onboard.lab.discover.mixed_model import MixedModel
+from gz_onboard.lab.discover.search import evidence_of
 
 RATIO_SD, RIDE_SD = 0.15, 0.25  # of a real cause: on all rides, and from ride to ride
 RATIO = 0.5  # beyond which half of the cause is missing in one of the halves
 CHI2 = 9.0  # three standard deviations
 
 
-Sign = Callable[[Ride, Table, Array], Array]
+Sign = Callable[[Ride, LinearChannel, Array], Array]
 
 
-def _side(ride: Ride, table: Table, effect: Array) -> Array:
+def _side(ride: Ride, table: LinearChannel, effect: Array) -> Array:
     """+1 in left bends, -1 in right ones, 0 on the straight."""
     return np.asarray(np.tanh(over_blocks(table.channel, ride.quantities["lateral_acceleration"])[table.used] / 0.3))
 
@@ -36,7 +36,7 @@ def _side(ride: Ride, table: Table, effect: Array) -> Array:
 def _halves(name: str) -> Sign:
     """-1 below a value of the quantity, +1 above it, half of the cause's own squared effect on either side."""
 
-    def sign(ride: Ride, table: Table, effect: Array) -> Array:
+    def sign(ride: Ride, table: LinearChannel, effect: Array) -> Array:
         values = ride.time if name == "time" else ride.quantities[name]
         at = over_blocks(table.channel, values)[table.used]
         order = np.argsort(at)
@@ -72,8 +72,8 @@ class Split:
 
 
 def splits(
-    state: State,
-    lines: Sequence[Linear],
+    mixed: MixedModel,
+    lines: Sequence[LinearRide],
     normals: Sequence[Normal],
     place: Mapping[str, Sequence[int]],
     chosen: Sequence[str],
@@ -89,14 +89,14 @@ def splits(
             tests |= {f"{RIDE}{line.ride.name}": _of_ride(line.ride) for line in lines}
         for quantity, sign in tests.items():
             rides = [
-                _extended(line, normal, state, index, change[index], sign)
+                _extended(line, normal, mixed, index, change[index], sign)
                 for line, normal in zip(lines, normals, strict=True)
             ]
-            p = len(state.mean)
+            p = len(mixed.mean)
             prior = np.zeros((p + 1, p + 1))
-            prior[:p, :p] = state.prior
+            prior[:p, :p] = mixed.prior
             prior[p, p] = RATIO_SD**2
-            e = _evidence(np.append(state.mean, 0.0), prior, np.append(state.scatter, RIDE_SD**2), rides)
+            e = evidence_of(np.append(mixed.mean, 0.0), prior, np.append(mixed.scatter, RIDE_SD**2), rides)
             cross = np.linalg.solve(
                 e.information[np.ix_(fixed, fixed)] + 1e-6 * np.eye(len(fixed)),
                 np.column_stack([e.information[fixed, p], e.score[fixed]]),
@@ -108,7 +108,9 @@ def splits(
     return found
 
 
-def _extended(line: Linear, normal: Normal, state: State, index: Sequence[int], change: Array, sign: Sign) -> Normal:
+def _extended(
+    line: LinearRide, normal: Normal, mixed: MixedModel, index: Sequence[int], change: Array, sign: Sign
+) -> Normal:
     """`normal` with one more column: what the cause does, times the sign."""
     p = len(normal.b)
     n, b = np.zeros((p + 1, p + 1)), np.zeros(p + 1)
@@ -120,7 +122,7 @@ def _extended(line: Linear, normal: Normal, state: State, index: Sequence[int], 
         touched = np.flatnonzero(np.any(table.a != 0, axis=0))
         both = whitened(
             table,
-            state.noise[name],
+            mixed.noise[name],
             np.column_stack([effect * sign(line.ride, table, effect), table.a[:, touched], table.y]),
         )
         split, a, y = both[:, 0], both[:, 1:-1], both[:, -1]

@@ -7,8 +7,8 @@ from typing import Any
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.constancy import Split
-from gz_onboard.lab.discover.linear import Linear, Normal
-from gz_onboard.lab.discover.state import State
+from gz_onboard.lab.discover.linear import LinearRide, Normal
+from gz_onboard.lab.discover.mixed_model import MixedModel
 
 SCHEMA = 1
 VERDICTS = {
@@ -75,9 +75,9 @@ class Report:
     threshold: float
     constancy: list[Split] = field(default_factory=list)
     extended_model: str | None = None
-    state: State | None = field(default=None, repr=False)
+    mixed: MixedModel | None = field(default=None, repr=False)
     at: Array | None = field(default=None, repr=False)  # where the rides are linearised, in scales, (p,)
-    lines: list[Linear] = field(default_factory=list, repr=False)
+    lines: list[LinearRide] = field(default_factory=list, repr=False)
     normals: list[Normal] = field(default_factory=list, repr=False)
 
     def to_json(self) -> dict[str, Any]:

@@ -10,20 +10,20 @@ import numpy as np
 from scipy.stats import t as student
 
 from gz_onboard.arrays import Array
+from gz_onboard.lab.discover.acceptance import accept, within_bounds
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.constancy import splits
-from gz_onboard.lab.discover.converge import Known, Linearised, about, converged
-from gz_onboard.lab.discover.linear import Linear, normal
+from gz_onboard.lab.discover.curves import curve_forms
+from gz_onboard.lab.discover.energy import energy_share, residual_sizes
+from gz_onboard.lab.discover.linear import LinearRide, normal
+from gz_onboard.lab.discover.mixed_model import MixedModel
+from gz_onboard.lab.discover.prior import LOG
 from gz_onboard.lab.discover.result import Cause, Report
 from gz_onboard.lab.discover.search import Evidence, Search, evidence
-from gz_onboard.lab.discover.shapes import forms
-from gz_onboard.lab.discover.stands import possible, standing
-from gz_onboard.lab.discover.state import State
-from gz_onboard.lab.discover.terms import LOG
-from gz_onboard.lab.discover.unknown import RIDES, unexplained
+from gz_onboard.lab.discover.selection import Linearised, SearchProblem, linearised_about, select_causes
+from gz_onboard.lab.discover.unexplained import RIDES, unexplained
 from gz_onboard.lab.discover.winds import NAME as WIND
 from gz_onboard.lab.discover.winds import about_winds, own_winds
-from gz_onboard.lab.discover.worth import energy_share, sizes
 
 FALSE_ALARMS = 0.05  # of sets of healthy rides, all candidates and curves together
 DISCREPANCY = 0.05  # of a change, sd: the form of an effect is not exactly the real one's
@@ -47,51 +47,55 @@ def tries(e: Evidence, index: Sequence[int]) -> float:
     return float(np.sum((values >= 1) + (values - np.floor(values))))
 
 
-def threshold(state: State, tried: float) -> float:
+def threshold(mixed: MixedModel, tried: float) -> float:
     """The chi-squared of one cause that healthy rides exceed with `FALSE_ALARMS`, among `tried`.
 
     Student's t, for the scatter between rides is known from the healthy rides alone; Šidák over the candidates.
     """
     one = 1 - (1 - FALSE_ALARMS) ** (1 / tried)
-    return float(student.ppf(1 - one / 2, state.freedom) ** 2)
+    return float(student.ppf(1 - one / 2, mixed.freedom) ** 2)
 
 
-def reach(state: State, notes: list[str], say: Callable[[str], None], linearised: Linearised, start: Array) -> Report:
-    """The verdict. linearised: each ride at its state. start (p,): where to linearise first, in scales."""
-    lines = about(state, start, linearised)
-    normals = [normal(line, state.noise) for line in lines]
-    e = evidence(state, normals)
-    causes = seen(state, e, notes)
+def reach(
+    mixed: MixedModel, notes: list[str], say: Callable[[str], None], linearised: Linearised, start: Array
+) -> Report:
+    """The verdict. linearised: each ride at its model. start (p,): where to linearise first, in scales."""
+    lines = linearised_about(mixed, start, linearised)
+    normals = [normal(line, mixed.noise) for line in lines]
+    e = evidence(mixed, normals)
+    causes = seen(mixed, e, notes)
     channels = {name for line in lines for name in line.tables}
-    proportions = sum(form.straight and form.channel in channels for form in forms())
-    limit = threshold(state, tries(e, [i for c in causes for i in state.index(c.names)]) + proportions)
-    shares = channel_shares(state, lines, causes)
+    proportions = sum(form.straight and form.channel in channels for form in curve_forms())
+    limit = threshold(mixed, tries(e, [i for c in causes for i in mixed.index(c.names)]) + proportions)
+    shares = channel_shares(mixed, lines, causes)
     say(f"{len(causes)} candidates")
-    known = Known(state, causes, shares, limit, linearised)
+    known = SearchProblem(mixed, causes, shares, limit, linearised)
     still = np.zeros_like(start)
-    now, known, told = standing(known, converged(known, lines, start, still), lines, start, still)
+    now, known, told = accept(known, select_causes(known, lines, start, still), lines, start, still)
     winds = own_winds(now) if WIND in now.search.place and WIND not in now.chosen else None
     if winds is not None and winds.score > limit:
         now = about_winds(known, winds, start, [line.ride for line in lines])
-        known = replace(known, state=now.state, causes=list(now.search.causes.values()))
-        now, known, more = standing(known, now, now.lines, start, winds.blown)
+        known = replace(known, mixed=now.mixed, causes=list(now.search.causes.values()))
+        now, known, more = accept(known, now, now.lines, start, winds.blown)
         told += more
     notes += told
-    state, lines, normals, search, chosen = now.state, now.lines, now.normals, now.search, now.chosen
+    mixed, lines, normals, search, chosen = now.mixed, now.lines, now.normals, now.search, now.chosen
     say("curves over quantities")
     change = now.change
-    constancy = splits(state, lines, normals, search.place, chosen, change) if chosen else []
-    unknown = unexplained(state, search, lines, normals, chosen, change, constancy, limit)
+    constancy = splits(mixed, lines, normals, search.place, chosen, change) if chosen else []
+    unknown = unexplained(mixed, search, lines, normals, chosen, change, constancy, limit)
     if unknown is not None:
         chosen = tuple(name for name in chosen if name not in unknown["denies"])
-    every = Search(state, search.evidence, causes, shares)
-    found = causes_of(state, search, chosen, lines)
-    sets = [able for s in search.stand_ins(chosen, MARGIN, LEAST * limit) if len(able := likely(search, chosen, s)) > 1]
+    every = Search(mixed, search.evidence, causes, shares)
+    found = causes_of(mixed, search, chosen, lines)
+    sets = [
+        able for s in search.alternatives(chosen, MARGIN, LEAST * limit) if len(able := likely(search, chosen, s)) > 1
+    ]
     scores = {name: every.step([n for n in chosen if n != name], name) for name in every.causes}
     if winds is not None:
         scores[WIND] = max(scores.get(WIND, 0.0), winds.score)
         if winds.score > limit:
-            (wind,) = causes_of(state, every, [*chosen, WIND], lines)[-1:]
+            (wind,) = causes_of(mixed, every, [*chosen, WIND], lines)[-1:]
             found = [*found, replace(wind, evidence=round(winds.score, 2), varies=True)]
             notes.append("the wind differed from ride to ride: " + winds.words)
     verdict = "none"
@@ -108,43 +112,45 @@ def reach(state: State, notes: list[str], say: Callable[[str], None], linearised
         sets,
         unknown,
         ranking,
-        sizes(lines),
+        residual_sizes(lines),
         {},
         advice(search, sets, unknown),
         notes,
         isolability(every),
         limit,
         constancy=constancy,
-        state=state,
+        mixed=mixed,
         at=now.offset,
         lines=list(lines),
         normals=normals,
     )
 
 
-def channel_shares(state: State, lines: Sequence[Linear], causes: Sequence[Candidate]) -> dict[str, dict[str, float]]:
+def channel_shares(
+    mixed: MixedModel, lines: Sequence[LinearRide], causes: Sequence[Candidate]
+) -> dict[str, dict[str, float]]:
     """Of each cause, by channel, its share of what could be seen of it."""
     found = {}
     for cause in causes:
-        index = state.index(cause.names)
+        index = mixed.index(cause.names)
         seen_in: dict[str, float] = {}
         for line in lines:
             for name, table in line.tables.items():
-                noise = float(np.hypot(*state.noise[name][:2]))
+                noise = float(np.hypot(*mixed.noise[name][:2]))
                 seen_in[name] = seen_in.get(name, 0.0) + float(np.sum((table.a[:, index] / noise) ** 2))
         whole = sum(seen_in.values()) or 1.0
         found[cause.name] = {name: value / whole for name, value in seen_in.items()}
     return found
 
 
-def seen(state: State, e: Evidence, notes: list[str]) -> list[Candidate]:
+def seen(mixed: MixedModel, e: Evidence, notes: list[str]) -> list[Candidate]:
     """The candidates that these rides can say anything of; the others go into `notes`."""
     found, blind = [], []
-    for cause in state.causes:
-        if not set(cause.names) <= set(state.names):
+    for cause in mixed.causes:
+        if not set(cause.names) <= set(mixed.names):
             blind.append(cause.name)
             continue
-        index = state.index(cause.names)
+        index = mixed.index(cause.names)
         if np.any(np.diag(e.information)[index] < 1e-4):
             blind.append(cause.name)
         else:
@@ -154,31 +160,31 @@ def seen(state: State, e: Evidence, notes: list[str]) -> list[Candidate]:
     return found
 
 
-def causes_of(state: State, search: Search, chosen: Sequence[str], lines: Sequence[Linear]) -> list[Cause]:
+def causes_of(mixed: MixedModel, search: Search, chosen: Sequence[str], lines: Sequence[LinearRide]) -> list[Cause]:
     """The chosen causes with values and intervals."""
     if not chosen:
         return []
     index = search.index(chosen)
     estimate = search.evidence.estimate(index)
     covariance = search.evidence.covariance(index)
-    quantile = float(student.ppf(0.975, max(state.healthy + 3, 4)))
+    quantile = float(student.ppf(0.975, max(mixed.healthy + 3, 4)))
     result, at = [], 0
     for name in chosen:
         cause = search.causes[name]
         rows = []
         evidence_ = search.step([n for n in chosen if n != name], name)
-        inflation = state.inflation.get(name, 1.0)
-        change = np.zeros(len(state.mean))
+        inflation = mixed.inflation.get(name, 1.0)
+        change = np.zeros(len(mixed.mean))
         for parameter in cause.parameters:
             i = index[at]
-            healthy = own_value(state, parameter.name)
+            healthy = own_value(mixed, parameter.name)
             x = float(estimate[at])
             shape = DISCREPANCY * (
                 1 + sum(more * search.shares.get(name, {}).get(channel, 0.0) for channel, more in LUMPED.items())
             )
             sd = float(np.hypot(np.sqrt(covariance[at, at] * inflation), shape * x))
             change[i] = x
-            step = float(state.scale[i])
+            step = float(mixed.scale[i])
             if parameter.name in LOG:
                 ends = [healthy * np.exp(step * (x + s * quantile * sd)) for s in (0, -1, 1)]
             else:
@@ -195,7 +201,7 @@ def causes_of(state: State, search: Search, chosen: Sequence[str], lines: Sequen
                 cause.parameters[0].unit,
                 first[2],
                 first[3],
-                energy_share(state, lines, change),
+                energy_share(mixed, lines, change),
                 round(evidence_, 2),
                 tuple((n, v, ci) for n, v, ci, _ in rows[1:]),
             )
@@ -212,20 +218,20 @@ def likely(search: Search, chosen: Sequence[str], group: Sequence[str]) -> list[
         k = len(search.place[name])
         change = search.evidence.estimate(index)[-k:]
         sd = np.sqrt(np.diag(search.evidence.covariance(index)))[-k:]
-        if possible(search.state, search.causes[name], change.tolist(), sd.tolist()):
+        if within_bounds(search.mixed, search.causes[name], change.tolist(), sd.tolist()):
             found.append(name)
     return found
 
 
-def own_value(state: State, name: str) -> float:
+def own_value(mixed: MixedModel, name: str) -> float:
     """The healthy vehicle's value of a parameter: that of its file, 0 for an effect that its model lacks."""
     absent = {
         n
-        for c in state.causes
-        if c.effect and c.effect.name not in {x.name for x in state.vehicle.model.effects}
+        for c in mixed.causes
+        if c.effect and c.effect.name not in {x.name for x in mixed.vehicle.model.effects}
         for n in c.names
     }
-    return 0.0 if name in absent else float(state.vehicle.parameters[name])
+    return 0.0 if name in absent else float(mixed.vehicle.parameters[name])
 
 
 def isolability(search: Search) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from gz_onboard.cli import main
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.candidates import candidates
 from gz_onboard.lab.discover.command import KEYS
-from gz_onboard.lab.discover.engine import discover
+from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.simulation.samples import read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS, ROOT
@@ -81,7 +81,7 @@ def test_the_list_says_of_each_what_it_is_and_what_shows_it(capsys):
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def without_baseline(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One healthy ride, against the vehicle file alone."""
     folder = tmp_path_factory.mktemp("discover")
     files = [

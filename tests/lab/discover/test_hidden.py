@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 
 from benchmarks.trial import Row, interval, judge, reported, right, summary
-from gz_onboard.lab.discover.engine import baseline, discover
+from gz_onboard.lab.discover.discovery import baseline, discover
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.plant import cases as plant

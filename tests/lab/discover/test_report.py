@@ -10,25 +10,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.lab.discover.alone import as_the_file_says
-from gz_onboard.lab.discover.channels import BY_NAME
-from gz_onboard.lab.discover.engine import linearise_all
-from gz_onboard.lab.discover.limits import limits, strange, unformed, unsettled
-from gz_onboard.lab.discover.linear import normal
-from gz_onboard.lab.discover.parts import (
+from gz_onboard.lab.discover.breakdown import (
     QUANTITIES,
-    Over,
+    QuantityReader,
     before_and_after,
     binned,
     edges,
-    gathered,
-    outstanding,
+    outlying_rides,
+    pooled,
     share_over,
     since_change,
 )
-from gz_onboard.lab.discover.report import page
+from gz_onboard.lab.discover.channels import BY_NAME
+from gz_onboard.lab.discover.detectability import implausible_rides, limits, missing_residuals, remaining_range_error
+from gz_onboard.lab.discover.discovery import linearise_all
+from gz_onboard.lab.discover.linear import normal
+from gz_onboard.lab.discover.mixed_model import MixedModel, initial
+from gz_onboard.lab.discover.page import page
 from gz_onboard.lab.discover.result import Cause, Report
-from gz_onboard.lab.discover.state import State, initial
+from gz_onboard.lab.discover.uncalibrated import prior_of_file
 from gz_onboard.simulation.samples import Samples, read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS
@@ -78,9 +78,9 @@ def report(samples: Samples) -> Report:
     return reported(initial(read_vehicle("reference")), samples)
 
 
-def reported(state: State, samples: Samples) -> Report:
-    state = replace(state, prior=as_the_file_says(state))
-    lines = linearise_all([state.ride(samples)], state)
+def reported(mixed: MixedModel, samples: Samples) -> Report:
+    mixed = replace(mixed, prior=prior_of_file(mixed))
+    lines = linearise_all([mixed.ride(samples)], mixed)
     cause = Cause("rolling_resistance", "rolling_resistance_constant", 0.015, "1", (0.014, 0.016), 0.003, 0.1, 50.0)
     knots = [[float(v), float(v - 5), 0.5] for v in range(0, 16, 3)]
     unknown = {
@@ -92,7 +92,7 @@ def reported(state: State, samples: Samples) -> Report:
         "curve": knots,
         "denies": [],
     }
-    ranking = [(c.name, 1.0) for c in state.causes]
+    ranking = [(c.name, 1.0) for c in mixed.causes]
     gain = {"holdout": ["a<b", "c"], "power": {"before": 9.0, "control": 8.0, "after": 7.0, "ci95": [0.5, 1.5]}}
     return Report(
         "unknown",
@@ -106,17 +106,17 @@ def reported(state: State, samples: Samples) -> Report:
         ["a note"],
         {"look_alikes": [["aero_drag_area", "drivetrain_drag", 0.91]]},
         15.0,
-        state=state,
+        mixed=mixed,
         lines=lines,
-        normals=[normal(line, state.noise) for line in lines],
+        normals=[normal(line, mixed.noise) for line in lines],
     )
 
 
 def test_after_is_before_less_what_the_cause_does(report: Report):
-    state = report.state
-    assert state is not None
+    mixed = report.mixed
+    assert mixed is not None
     (before,), (after,) = before_and_after(report)
-    place = state.names.index("rolling_resistance_constant")
+    place = mixed.names.index("rolling_resistance_constant")
     for name, table in before.tables.items():
         column = table.a[:, place]
         difference = table.y - after.tables[name].y
@@ -129,15 +129,15 @@ def test_after_is_before_less_what_the_cause_does(report: Report):
 
 
 def test_a_quantity_that_was_not_measured_is_not_made_up(report: Report):
-    state = report.state
-    assert state is not None
+    mixed = report.mixed
+    assert mixed is not None
     (line,) = report.lines
     ride = line.ride
     bare = replace(ride, signals={k: v for k, v in ride.signals.items() if k not in ("rate_z", "gps_course")})
-    over = Over(state)
+    over = QuantityReader(mixed)
     less = replace(line, ride=bare)
     for name in QUANTITIES:
-        x, y, _ = gathered([less], "road_force", name, over)
+        x, y, _ = pooled([less], "road_force", name, over)
         assert len(x) == len(y)
         assert (len(x) == 0) == (name in ("lateral_acceleration", "heading")), name
 
@@ -182,29 +182,29 @@ def test_limits_shrink_with_the_rides(report: Report):
 
 
 def test_a_ride_of_another_vehicle_is_suspected(report: Report):
-    assert strange(report) == []
+    assert implausible_rides(report) == []
     (line,) = report.lines
     signals = {**line.ride.signals, "gps_speed": 1.35 * line.ride.signals["gps_speed"]}
-    (said,) = strange(replace(report, lines=[replace(line, ride=replace(line.ride, signals=signals))]))
+    (said,) = implausible_rides(replace(report, lines=[replace(line, ride=replace(line.ride, signals=signals))]))
     assert "coastdown: GPS speed is 1.3" in said
 
 
 def test_a_range_that_is_still_missed_is_said(report: Report):
     errors = {"before": 0.2, "control": 0.1, "after": 0.09, "ci95": [0.0, 0.02]}
-    (said,) = unsettled(replace(report, gain={"range": errors}))
+    (said,) = remaining_range_error(replace(report, gain={"range": errors}))
     assert "9% of the range is missed" in said
-    assert unsettled(replace(report, gain={"range": {**errors, "after": 0.02}})) == []
-    assert unsettled(replace(report, gain={"note": "one ride: nothing to hold out"})) == []
+    assert remaining_range_error(replace(report, gain={"range": {**errors, "after": 0.02}})) == []
+    assert remaining_range_error(replace(report, gain={"note": "one ride: nothing to hold out"})) == []
 
 
 def test_what_one_ride_alone_shows_is_said(report: Report):
-    state = report.state
-    assert state is not None
-    assert outstanding(report) == []
-    far = np.zeros(len(state.names))
-    far[state.names.index("soc_start")] = 12.0
+    mixed = report.mixed
+    assert mixed is not None
+    assert outlying_rides(report) == []
+    far = np.zeros(len(mixed.names))
+    far[mixed.names.index("soc_start")] = 12.0
     lines = [line.seen_from(far) for line in report.lines]
-    (said,) = outstanding(replace(report, lines=lines, normals=[normal(line, state.noise) for line in lines]))
+    (said,) = outlying_rides(replace(report, lines=lines, normals=[normal(line, mixed.noise) for line in lines]))
     assert "coastdown alone differs" in said
     assert "soc start +1" in said
 
@@ -213,7 +213,7 @@ def test_what_the_rides_lack_is_said(samples: Samples):
     lacking = ("accel_x", "rate_z", "gps_speed", "gps_course", "gps_altitude")
     less = replace(samples, columns={k: v for k, v in samples.columns.items() if k not in lacking})
     bare = reported(initial(read_vehicle("reference")), less)
-    said = " ".join(unformed(bare))
+    said = " ".join(missing_residuals(bare))
     assert "no ride has accel_x: no road force there" in said
     assert "no residual over lateral acceleration" in said
     assert {limit.name for limit in limits(bare) if limit.change == float("inf")} >= {

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed, normal
-from gz_onboard.lab.discover.shapes import Form, columns, extended
-from gz_onboard.lab.discover.state import State
-from gz_onboard.lab.discover.terms import STARTS
+from gz_onboard.lab.discover.curves import CurveForm, columns, extended
+from gz_onboard.lab.discover.linear import LinearRide, Normal, fit_mixed, normal
+from gz_onboard.lab.discover.mixed_model import MixedModel
+from gz_onboard.lab.discover.prior import STARTS
 
-WIDE = 100.0  # variance of a curve's coefficients, in units of `Form.size`
+WIDE = 100.0  # variance of a curve's coefficients, in units of `CurveForm.size`
 
 
 @dataclass(frozen=True)
@@ -22,15 +22,15 @@ class Fold:
     """What is free on the rides that a model is fitted to: causes, and the curve of what has no name."""
 
     causes: Sequence[Any] = ()
-    form: Form | None = None
+    form: CurveForm | None = None
 
-    def fit(self, state: State, lines: Sequence[Linear], normals: Sequence[Normal]) -> tuple[Array, Array]:
+    def fit(self, mixed: MixedModel, lines: Sequence[LinearRide], normals: Sequence[Normal]) -> tuple[Array, Array]:
         """(the common part (p,), the curve's coefficients (k,)) from these rides."""
         if self.form is not None:
-            return with_curve(state, list(zip(lines, normals, strict=True)), self.causes, self.form)
-        return extended_mean(state, normals, self.causes), np.zeros(0)
+            return with_curve(mixed, list(zip(lines, normals, strict=True)), self.causes, self.form)
+        return extended_mean(mixed, normals, self.causes), np.zeros(0)
 
-    def shown(self, line: Linear, curve: Array) -> Linear:
+    def shown(self, line: LinearRide, curve: Array) -> LinearRide:
         """`line` less the curve."""
         return line if self.form is None else without(line, self.form, curve)
 
@@ -39,7 +39,7 @@ Squares = dict[str, tuple[float, float, float]]  # by channel: mean square befor
 
 
 def folds(
-    state: State, lines: Sequence[Linear], normals: Sequence[Normal], after: Fold, control: Fold
+    mixed: MixedModel, lines: Sequence[LinearRide], normals: Sequence[Normal], after: Fold, control: Fold
 ) -> Iterator[Squares]:
     """Of each ride in turn, held out of the fit, the mean squares of its residuals: before (the causes of `control`
     alone moved), with `control` refitted, with `after`; each with its own start.
@@ -47,13 +47,13 @@ def folds(
     for i, line in enumerate(lines):
         rest = [j for j in range(len(lines)) if j != i]
         some, theirs = [lines[j] for j in rest], [normals[j] for j in rest]
-        plain, _ = control.fit(state, some, theirs)
-        before = state.mean.copy()
-        index = [k for cause in control.causes for k in state.index(cause.names)]
+        plain, _ = control.fit(mixed, some, theirs)
+        before = mixed.mean.copy()
+        index = [k for cause in control.causes for k in mixed.index(cause.names)]
         before[index] = plain[index]
-        full, curve = after.fit(state, some, theirs)
+        full, curve = after.fit(mixed, some, theirs)
         models = ((line, before), (line, plain), (after.shown(line, curve), full))
-        begun = [(shown, with_start(state, started(state, shown), theta)) for shown, theta in models]
+        begun = [(shown, with_own_start(mixed, start_equations(mixed, shown), theta)) for shown, theta in models]
         squares = [
             {name: float(np.mean((table.y - table.a @ theta) ** 2)) for name, table in shown.tables.items()}
             for shown, theta in begun
@@ -61,7 +61,7 @@ def folds(
         yield {name: (squares[0][name], squares[1][name], squares[2][name]) for name in squares[0]}
 
 
-def better(held: Iterator[Squares], shares: Mapping[str, float]) -> bool:
+def improves(held: Iterator[Squares], shares: Mapping[str, float]) -> bool:
     """Whether rides held out are known better after than before and than with the control, in the channels that have
     a part of the evidence (`shares`), each by its share.
     """
@@ -75,55 +75,55 @@ def better(held: Iterator[Squares], shares: Mapping[str, float]) -> bool:
     return total < 0
 
 
-def started(state: State, line: Linear) -> Normal:
+def start_equations(mixed: MixedModel, line: LinearRide) -> Normal:
     """What tells how a ride began: not the road force, whose mean would be taken for the accelerometer's bias."""
-    return normal(line, state.noise, [name for name in line.tables if name != "road_force"])
+    return normal(line, mixed.noise, [name for name in line.tables if name != "road_force"])
 
 
 def with_curve(
-    state: State, fitted: Sequence[tuple[Linear, Normal]], causes: Sequence[Any], form: Form
+    mixed: MixedModel, fitted: Sequence[tuple[LinearRide, Normal]], causes: Sequence[Any], form: CurveForm
 ) -> tuple[Array, Array]:
     """(the common part (p,), the coefficients of `form` (k,)) from the rides `fitted`, the `causes` free."""
-    p, k = len(state.mean), form.basis.shape[1]
-    shape = state.shapes.get(form.name)
-    mean = np.concatenate([state.mean, shape.mean if shape else np.zeros(k)])
+    p, k = len(mixed.mean), form.basis.shape[1]
+    shape = mixed.shapes.get(form.name)
+    mean = np.concatenate([mixed.mean, shape.mean if shape else np.zeros(k)])
     prior = np.diag(np.full(p + k, WIDE))
-    prior[:p, :p] = state.prior
-    for i in (i for cause in causes for i in state.index(cause.names)):
+    prior[:p, :p] = mixed.prior
+    for i in (i for cause in causes for i in mixed.index(cause.names)):
         prior[i, i] += 1e6
-    scatter = np.concatenate([state.scatter, np.full(k, form.scatter**2)])
+    scatter = np.concatenate([mixed.scatter, np.full(k, form.scatter**2)])
     rides = []
     for line, plain in fitted:
-        more = extended(line, plain, form, state.noise)
+        more = extended(line, plain, form, mixed.noise)
         rides.append(more or Normal(np.pad(plain.n, (0, k)), np.pad(plain.b, (0, k))))
     both = fit_mixed(rides, mean, prior, scatter, 1.0, np.zeros(p + k, dtype=bool), 0).mean
     return both[:p], both[p:]
 
 
-def without(line: Linear, form: Form, coefficients: Array) -> Linear:
+def without(line: LinearRide, form: CurveForm, coefficients: Array) -> LinearRide:
     """`line` less the curve."""
     table = line.tables.get(form.channel)
     knots = columns(line.ride, form.quantity, table) if table else None
     if table is None or knots is None:
         return line
     less = knots @ form.basis @ coefficients * form.size / table.unit
-    return Linear(line.ride, {**line.tables, form.channel: replace(table, y=table.y - less)})
+    return LinearRide(line.ride, {**line.tables, form.channel: replace(table, y=table.y - less)})
 
 
-def with_start(state: State, ride: Normal, theta: Array) -> Array:
-    """`theta` (p,) with what is the ride's own of `terms.STARTS`, which is no merit or fault of a model."""
-    m = [i for i, name in enumerate(state.names) if name in STARTS]
-    variance = state.scatter[m] + np.diag(state.prior)[m]
+def with_own_start(mixed: MixedModel, ride: Normal, theta: Array) -> Array:
+    """`theta` (p,) with what is the ride's own of `prior.STARTS`, which is no merit or fault of a model."""
+    m = [i for i, name in enumerate(mixed.names) if name in STARTS]
+    variance = mixed.scatter[m] + np.diag(mixed.prior)[m]
     rest = ride.b[m] - ride.n[m] @ theta
     moved = theta.copy()
     moved[m] += np.linalg.solve(np.diag(1 / variance) + ride.n[np.ix_(m, m)], rest)
     return moved
 
 
-def extended_mean(state: State, rest: Sequence[Normal], causes: Sequence[Any]) -> Array:
+def extended_mean(mixed: MixedModel, rest: Sequence[Normal], causes: Sequence[Any]) -> Array:
     """The common part from `rest` with the parameters of `causes` free."""
-    wide = state.prior.copy()
-    index = [i for cause in causes for i in state.index(cause.names)]
+    wide = mixed.prior.copy()
+    index = [i for cause in causes for i in mixed.index(cause.names)]
     for i in index:
         wide[i, i] += 1e6
-    return fit_mixed(rest, state.mean, wide, state.scatter, 1.0, state.free, 0).mean
+    return fit_mixed(rest, mixed.mean, wide, mixed.scatter, 1.0, mixed.free, 0).mean

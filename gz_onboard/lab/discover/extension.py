@@ -17,10 +17,10 @@ from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.result import Found, Result
 from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged, number, string, with_keys
-from gz_onboard.lab.discover.limits import amount
+from gz_onboard.lab.discover.detectability import amount
+from gz_onboard.lab.discover.energy import energy, pack_power, share_of_time
+from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel
 from gz_onboard.lab.discover.result import Report
-from gz_onboard.lab.discover.state import Shape, State
-from gz_onboard.lab.discover.worth import energy, power_of, share_of_time
 from gz_onboard.physics.effect import QUANTITIES, Effect
 from gz_onboard.vehicle import Vehicle
 
@@ -36,9 +36,9 @@ MODELLED = ("road_force", "inverter_power", "auxiliary")
 
 
 def write_baseline(vehicle: Vehicle, base: Path, out: Path) -> None:
-    """Write `vehicle`, which `engine.baseline` gave, to `out`, after the file `base`, and its statistics beside it."""
-    state = vehicle.healthy
-    assert isinstance(state, State)
+    """Write `vehicle`, as `discovery.baseline` gave it, to `out` after the file `base`, its statistics beside it."""
+    mixed = vehicle.healthy
+    assert isinstance(mixed, MixedModel)
     found = {
         name: Found(value.value, value.sd, value.unit, value.source)
         for name, value in vehicle.parameters.known.items()
@@ -46,10 +46,10 @@ def write_baseline(vehicle: Vehicle, base: Path, out: Path) -> None:
     }
     text = merged(base.read_text(encoding="utf-8"), [Result("baseline", parameters=found)], base, out)
     beside = out.with_suffix(".healthy.npz")
-    save(state, beside)
+    save(mixed, beside)
     keys = copied_effects(vehicle.model.effects, out) | {
         ("healthy", "file"): string(beside.name),
-        ("healthy", "rides"): str(state.healthy),
+        ("healthy", "rides"): str(mixed.healthy),
     }
     _write(out, with_keys(text, keys, out))
 
@@ -61,48 +61,48 @@ def _write(out: Path, text: str) -> None:
     temporary.replace(out)
 
 
-def save(state: State, file: Path) -> None:
+def save(mixed: MixedModel, file: Path) -> None:
     """Write what healthy rides taught to an npz file."""
     shapes = {
         f"shape_{i}_{key}": getattr(shape, key)
-        for i, shape in enumerate(state.shapes.values())
+        for i, shape in enumerate(mixed.shapes.values())
         for key in ("mean", "covariance", "inflation")
     }
     with file.open("wb") as stream:
         np.savez_compressed(
             stream,
-            names=np.array(state.names),
-            scale=state.scale,
-            mean=state.mean,
-            prior=state.prior,
-            scatter=state.scatter,
-            healthy=state.healthy,
-            value_names=np.array(list(state.values)),
-            values=np.array(list(state.values.values())),
-            noise_names=np.array(list(state.noise)),
-            noise=np.array(list(state.noise.values())),
-            inflation_names=np.array(list(state.inflation)),
-            inflation=np.array(list(state.inflation.values())),
-            shape_names=np.array(list(state.shapes)),
+            names=np.array(mixed.names),
+            scale=mixed.scale,
+            mean=mixed.mean,
+            prior=mixed.prior,
+            scatter=mixed.scatter,
+            healthy=mixed.healthy,
+            value_names=np.array(list(mixed.values)),
+            values=np.array(list(mixed.values.values())),
+            noise_names=np.array(list(mixed.noise)),
+            noise=np.array(list(mixed.noise.values())),
+            inflation_names=np.array(list(mixed.inflation)),
+            inflation=np.array(list(mixed.inflation.values())),
+            shape_names=np.array(list(mixed.shapes)),
             **shapes,
         )
 
 
-def load(state: State, file: Path) -> State:
-    """`state` of a vehicle with what the npz `file` holds; InputError for one of another model."""
+def load(mixed: MixedModel, file: Path) -> MixedModel:
+    """`mixed` of a vehicle with what the npz `file` holds; InputError for one of another model."""
     try:
         with np.load(file) as data:
             names = [str(name) for name in data["names"]]
-            mine = [n for n in names if n in state.names]
+            mine = [n for n in names if n in mixed.names]
             if sorted(mine) != sorted(names):
                 raise InputError(f"{file}: was learned for another model list; run discover --baseline again")
             # candidates that came after it, such as a user's own, keep what is known before any ride
-            at, take = state.index(names), list(range(len(names)))
+            at, take = mixed.index(names), list(range(len(names)))
             mean, prior, scatter, scale = (
-                state.mean.copy(),
-                state.prior.copy(),
-                state.scatter.copy(),
-                state.scale.copy(),
+                mixed.mean.copy(),
+                mixed.prior.copy(),
+                mixed.scatter.copy(),
+                mixed.scale.copy(),
             )
             mean[at], scatter[at], scale[at] = data["mean"], data["scatter"], data["scale"]
             prior[at, :] = 0.0
@@ -110,21 +110,21 @@ def load(state: State, file: Path) -> State:
             prior[np.ix_(at, at)] = data["prior"][np.ix_(take, take)]
             pairs = [str(name) for name in data["shape_names"]]
             return replace(
-                state,
+                mixed,
                 mean=mean,
                 prior=prior,
                 scatter=scatter,
                 scale=scale,
                 healthy=int(data["healthy"]),
-                values=state.values | _mapping(data["value_names"], data["values"]),
-                noise=state.noise
+                values=mixed.values | _mapping(data["value_names"], data["values"]),
+                noise=mixed.noise
                 | {
                     str(n): (float(a), float(b), float(c))
                     for n, (a, b, c) in zip(data["noise_names"], data["noise"], strict=True)
                 },
                 inflation=_mapping(data["inflation_names"], data["inflation"]),
                 shapes={
-                    pair: Shape(
+                    pair: HealthyCurve(
                         data[f"shape_{i}_mean"], data[f"shape_{i}_covariance"], float(data[f"shape_{i}_inflation"])
                     )
                     for i, pair in enumerate(pairs)
@@ -148,8 +148,8 @@ def write_model(report: Report, vehicle: Vehicle, base: Path, out: Path) -> list
     What the vehicle file alone lacks is part of its ``[forecast] factor``, measured over modelled energy, and leaves
     it (`lowered`); what came on top of healthy rides is not.
     """
-    state = report.state
-    assert state is not None
+    mixed = report.mixed
+    assert mixed is not None
     found, added = extension(report, vehicle)
     words = [f"{name} = {f.value:.4g} ± {amount(f.sd, f.unit, '.2g')}" for name, f in found.items()]
     folder = out.with_name(f"{out.stem}_effects")
@@ -172,7 +172,7 @@ def write_model(report: Report, vehicle: Vehicle, base: Path, out: Path) -> list
         folder.mkdir(exist_ok=True)
         (folder / f"{curve[0]}.py").write_text(curve[1], encoding="utf-8")
         keys["model", "effects_folder"] = string(folder.name)
-    if not state.healthy and (factor := lowered(report, vehicle, curve is not None)):
+    if not mixed.healthy and (factor := lowered(report, vehicle, curve is not None)):
         value, reason = factor
         before = tomllib.loads(base.read_text(encoding="utf-8")).get("forecast", {}).get("source")
         source = f"{reason}; before: {before}" if before else reason
@@ -186,15 +186,15 @@ def write_model(report: Report, vehicle: Vehicle, base: Path, out: Path) -> list
 
 def extension(report: Report, vehicle: Vehicle) -> tuple[dict[str, Found], list[Effect]]:
     """The parameters of the causes that `report` named, and the effects that the model lacks for them."""
-    state = report.state
-    assert state is not None
-    quantile = float(student.ppf(0.975, max(state.healthy + 3, 4)))  # as the intervals of `verdict.causes_of`
+    mixed = report.mixed
+    assert mixed is not None
+    quantile = float(student.ppf(0.975, max(mixed.healthy + 3, 4)))  # as the intervals of `verdict.causes_of`
     names = ", ".join(line.ride.name for line in report.lines)
     rides = f"{len(report.lines)} rides ({names})" if len(names) < 150 else f"{len(report.lines)} rides"
     has = {effect.name for effect in vehicle.model.effects}
     found, added = {}, []
     for cause in (c for c in report.causes if not c.varies):
-        candidate = next(c for c in state.causes if c.name == cause.name)
+        candidate = next(c for c in mixed.causes if c.name == cause.name)
         rows = [(cause.parameter, cause.value, cause.ci95), *cause.others]
         for (name, value, ci), parameter in zip(rows, candidate.parameters, strict=True):
             source = f"discovered on {rides} as {cause.name}, score {cause.evidence:.0f}"
@@ -226,15 +226,15 @@ def lowered(report: Report, vehicle: Vehicle, curve: bool) -> tuple[float, str] 
 
 def changes(report: Report) -> list[Array]:
     """What each cause changes in the parameters of the discovery's linear model, in scales, (p,) each."""
-    state = report.state
-    assert state is not None
+    mixed = report.mixed
+    assert mixed is not None
     result = []
     for cause in (c for c in report.causes if not c.varies):
-        change = np.zeros(len(state.names))
+        change = np.zeros(len(mixed.names))
         for name, value in ((cause.parameter, cause.value), *((n, v) for n, v, _ in cause.others)):
-            place = state.names.index(name)
+            place = mixed.names.index(name)
             healthy = cause.value - cause.change if name == cause.parameter else 0.0
-            change[place] = (value - healthy) / float(state.scale[place])
+            change[place] = (value - healthy) / float(mixed.scale[place])
         result.append(change)
     return result
 
@@ -246,7 +246,7 @@ def modelled_share(report: Report, change: Array) -> float:
         drawn += energy(line)
         for name in MODELLED:
             if name in line.tables:
-                power = power_of(name, line, line.tables[name].a @ change)
+                power = pack_power(name, line, line.tables[name].a @ change)
                 more += float(np.mean(power)) * share_of_time(line, name) if power is not None and len(power) else 0.0
     return more / drawn if drawn > 0 else 0.0
 
@@ -270,7 +270,7 @@ def curve_text(report: Report) -> tuple[str, str] | None:
     if unknown["channel"] not in PORTS or reads not in QUANTITIES:
         return None
     port, unit, sign = PORTS[unknown["channel"]]
-    cells = report.state.system.battery.cells_parallel if report.state and report.state.system.battery else 1
+    cells = report.mixed.system.battery.cells_parallel if report.mixed and report.mixed.system.battery else 1
     stretch = 1 / cells if reads == "cell_current" else 1.0
     rows = [(float(at) * stretch, float(value) * sign) for at, value, _ in unknown["curve"]]
     if reads == "heading":

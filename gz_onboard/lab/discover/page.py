@@ -11,13 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from gz_onboard.lab.discover.breakdown import (
+    QUANTITIES,
+    QuantityReader,
+    before_and_after,
+    binned,
+    edges,
+    pooled,
+    share_over,
+)
 from gz_onboard.lab.discover.channels import BY_NAME
-from gz_onboard.lab.discover.limits import amount, limits, size, words
-from gz_onboard.lab.discover.linear import Linear
-from gz_onboard.lab.discover.parts import QUANTITIES, Over, before_and_after, binned, edges, gathered, share_over
+from gz_onboard.lab.discover.detectability import amount, limits, size, words
+from gz_onboard.lab.discover.energy import residual_sizes
+from gz_onboard.lab.discover.linear import LinearRide
 from gz_onboard.lab.discover.result import METRICS, VERDICTS, Report
-from gz_onboard.lab.discover.unknown import RIDES
-from gz_onboard.lab.discover.worth import sizes
+from gz_onboard.lab.discover.unexplained import RIDES
 from gz_onboard.simulation.style import BLUE, GRID, INK, MUTED, ORANGE, headline, legend, new_figure, rule
 from gz_onboard.simulation.telling import clock
 
@@ -54,7 +62,7 @@ def write_report(report: Report, out: Path) -> None:
 def page(report: Report) -> str:
     """The report as HTML."""
     before, after = before_and_after(report)
-    over = Over(report.state) if report.state else None
+    over = QuantityReader(report.mixed) if report.mixed else None
     assert over is not None
     channels = [name for name in BY_NAME if any(name in line.tables for line in report.lines)]
     parts = [
@@ -94,10 +102,10 @@ def _named(report: Report) -> str:
 
 
 def _head(report: Report) -> str:
-    state = report.state
-    assert state is not None
+    mixed = report.mixed
+    assert mixed is not None
     way, time, drawn = size(report)
-    known = f"{state.healthy} healthy rides" if state.healthy else "the vehicle file alone"
+    known = f"{mixed.healthy} healthy rides" if mixed.healthy else "the vehicle file alone"
     cards = [
         (f"{len(report.lines)}", "ride" if len(report.lines) == 1 else "rides"),
         (f"{way / 1e3:.1f} km", clock(time)),
@@ -115,7 +123,7 @@ def _head(report: Report) -> str:
     boxes = "".join(f'<div class="card"><b>{value}</b>{text}</div>' for value, text in cards)
     rides = ", ".join(html.escape(line.ride.name) for line in report.lines)
     return (
-        f"<h1>{html.escape(state.vehicle.name)}: {report.verdict}</h1>"
+        f"<h1>{html.escape(mixed.vehicle.name)}: {report.verdict}</h1>"
         f'<p class="verdict">{VERDICTS[report.verdict].capitalize()}.</p>'
         f'<p class="muted">{rides}; against the vehicle as known from {known}.</p><div class="cards">{boxes}</div>'
     )
@@ -169,8 +177,8 @@ def _next(report: Report) -> str:
     return "<h2>What to ride next</h2>" + "".join(f"<p>{html.escape(line)}</p>" for line in report.advice)
 
 
-def _residuals(report: Report, before: Sequence[Linear], after: Sequence[Linear]) -> str:
-    raw, first, last = report.residuals, sizes(before), sizes(after)
+def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[LinearRide]) -> str:
+    raw, first, last = report.residuals, residual_sizes(before), residual_sizes(after)
     rows = []
     for name in BY_NAME:
         if name not in raw:
@@ -213,15 +221,15 @@ def _residuals(report: Report, before: Sequence[Linear], after: Sequence[Linear]
     )
 
 
-def _most(report: Report, before: Sequence[Linear], channels: Sequence[str]) -> list[str]:
+def _most(report: Report, before: Sequence[LinearRide], channels: Sequence[str]) -> list[str]:
     """The channels whose pictures are open: those that the causes change most, else the road's and the cells'."""
-    state = report.state
-    if state is None or not report.causes:
+    mixed = report.mixed
+    if mixed is None or not report.causes:
         wanted = [report.unknown["channel"]] if report.unknown else []
         return [c for c in (*wanted, "road_force", "cell_voltage") if c in channels][:2]
     found = []
     for cause in report.causes:
-        index = state.index(next(c for c in state.causes if c.name == cause.name).names)
+        index = mixed.index(next(c for c in mixed.causes if c.name == cause.name).names)
         weight = {}
         for name in channels:
             tables = [line.tables[name] for line in before if name in line.tables]
@@ -313,7 +321,11 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def overview(
-    before: Sequence[Linear], after: Sequence[Linear], channels: Sequence[str], over: Over, named: bool
+    before: Sequence[LinearRide],
+    after: Sequence[LinearRide],
+    channels: Sequence[str],
+    over: QuantityReader,
+    named: bool,
 ) -> Figure:
     """Channels by quantities: the share of variance that goes with each, before and after."""
     quantities = list(QUANTITIES)
@@ -321,7 +333,7 @@ def overview(
     for lines in (before, after) if named else (before,):
         rows = []
         for channel in channels:
-            rows.append([100 * share_over(*gathered(lines, channel, name, over)[:2]) for name in quantities])
+            rows.append([100 * share_over(*pooled(lines, channel, name, over)[:2]) for name in quantities])
         grids.append(np.array(rows))
     width, height = 12.5, 1.5 + 0.3 * len(channels)
     figure = new_figure(width, height)
@@ -355,20 +367,20 @@ def overview(
 
 
 def panels(
-    before: Sequence[Linear],
-    after: Sequence[Linear],
+    before: Sequence[LinearRide],
+    after: Sequence[LinearRide],
     channel: str,
-    over: Over,
+    over: QuantityReader,
     named: bool,
     names: Sequence[str] = tuple(QUANTITIES),
 ) -> Figure:
     """The residual's mean over each quantity, in bins of as many blocks, one standard error as a band."""
     drawn = []
     for name in names:
-        x, y, _ = gathered(before, channel, name, over)
+        x, y, _ = pooled(before, channel, name, over)
         if len(x) > 20 and np.ptp(x) > 0:
             at = edges(x)
-            drawn.append((name, binned(x, y, at), binned(*gathered(after, channel, name, over)[:2], at)))
+            drawn.append((name, binned(x, y, at), binned(*pooled(after, channel, name, over)[:2], at)))
     columns = min(4, max(len(drawn), 1))
     rows = max(1, -(-len(drawn) // columns))
     height = 0.55 + 2.15 * rows

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from gz_onboard.lab.discover.channels import CHANNELS
+from gz_onboard.lab.discover.energy import energy, energy_share
 from gz_onboard.lab.discover.linear import normal
+from gz_onboard.lab.discover.prior import LOG
 from gz_onboard.lab.discover.result import Report
 from gz_onboard.lab.discover.search import evidence
-from gz_onboard.lab.discover.terms import LOG
 from gz_onboard.lab.discover.verdict import own_value
-from gz_onboard.lab.discover.worth import energy, energy_share
 
 RIDING = 5.0  # m/s
 MISSED = 0.05  # of the range
@@ -36,36 +36,36 @@ class Limit:
 
 def limits(report: Report) -> list[Limit]:
     """Of every candidate, in the order of the ranking, those that the rides say nothing of last."""
-    state = report.state
-    if state is None:
+    mixed = report.mixed
+    if mixed is None:
         return []
-    found = evidence(state, report.normals or [normal(line, state.noise) for line in report.lines])
+    found = evidence(mixed, report.normals or [normal(line, mixed.noise) for line in report.lines])
     order = {name: i for i, (name, _) in enumerate(report.ranking)}
     result = []
-    for cause in sorted(state.causes, key=lambda c: order.get(c.name, len(order))):
+    for cause in sorted(mixed.causes, key=lambda c: order.get(c.name, len(order))):
         parameter = cause.parameters[0]
-        place = state.names.index(parameter.name) if parameter.name in state.names else None
+        place = mixed.names.index(parameter.name) if parameter.name in mixed.names else None
         information = float(found.information[place, place]) if place is not None else 0.0
         if place is None or cause.name not in order or information <= 0:
             result.append(Limit(cause.name, parameter.name, float("inf"), parameter.unit, float("inf")))
             continue
-        steps = float(np.sqrt(report.threshold * state.inflation.get(cause.name, 1.0) / information))
-        change = np.zeros(len(state.mean))
+        steps = float(np.sqrt(report.threshold * mixed.inflation.get(cause.name, 1.0) / information))
+        change = np.zeros(len(mixed.mean))
         change[place] = steps
-        step = float(state.scale[place]) * (own_value(state, parameter.name) if parameter.name in LOG else 1.0)
-        share = abs(energy_share(state, report.lines, change))
+        step = float(mixed.scale[place]) * (own_value(mixed, parameter.name) if parameter.name in LOG else 1.0)
+        share = abs(energy_share(mixed, report.lines, change))
         result.append(Limit(cause.name, parameter.name, steps * step, parameter.unit, share))
     return result
 
 
-def unformed(report: Report) -> list[str]:
+def missing_residuals(report: Report) -> list[str]:
     """What measurements the rides lack, and which residuals and candidates that costs, one sentence for each set."""
-    state = report.state
-    if state is None:
+    mixed = report.mixed
+    if mixed is None:
         return []
     lost: dict[tuple[str, ...], list[str]] = {}
     for channel in CHANNELS:
-        if channel.battery and state.system.battery is None:
+        if channel.battery and mixed.system.battery is None:
             continue
         for line in report.lines:
             lacking = tuple(role for role in channel.roles if role not in line.ride.have)
@@ -82,7 +82,7 @@ def unformed(report: Report) -> list[str]:
     return sentences
 
 
-def strange(report: Report) -> list[str]:
+def implausible_rides(report: Report) -> list[str]:
     """Rides whose GPS speed does not go with the motor's at all: perhaps they are another vehicle's."""
     found = []
     for line in report.lines:
@@ -98,7 +98,7 @@ def strange(report: Report) -> list[str]:
     return found
 
 
-def unsettled(report: Report) -> list[str]:
+def remaining_range_error(report: Report) -> list[str]:
     """That the model, whatever was named, still misses much of the range of rides held out of the fit."""
     error = report.gain.get("range")
     if not isinstance(error, dict) or not error["after"] > MISSED:
@@ -126,4 +126,13 @@ def words(name: str) -> str:
     return name.replace("_", " ").replace("gps", "GPS")
 
 
-__all__ = ["Limit", "amount", "limits", "size", "strange", "unformed", "unsettled", "words"]
+__all__ = [
+    "Limit",
+    "amount",
+    "implausible_rides",
+    "limits",
+    "missing_residuals",
+    "remaining_range_error",
+    "size",
+    "words",
+]

@@ -9,31 +9,31 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.linear import Linear, Normal, normal
+from gz_onboard.lab.discover.linear import LinearRide, Normal, normal
+from gz_onboard.lab.discover.mixed_model import MixedModel
+from gz_onboard.lab.discover.prior import LOG
 from gz_onboard.lab.discover.search import Search, evidence
-from gz_onboard.lab.discover.state import State
-from gz_onboard.lab.discover.terms import LOG
 
-AGAIN = 5  # times at most
-Linearised = Callable[[State | Sequence[State]], list[Linear]]
+MAX_ROUNDS = 5  # times at most
+Linearised = Callable[[MixedModel | Sequence[MixedModel]], list[LinearRide]]
 
 
-def about(state: State, offset: Array, linearised: Linearised) -> list[Linear]:
+def linearised_about(mixed: MixedModel, offset: Array, linearised: Linearised) -> list[LinearRide]:
     """The rides linearised at `offset` in scales, (p,) or one for each, (rides, p); their residuals as seen from the
-    values of `state`.
+    values of `mixed`.
     """
     if offset.ndim == 1:
-        moved = replace(state, values=state.unit_value(offset)) if np.any(offset) else state
+        moved = replace(mixed, values=mixed.unit_value(offset)) if np.any(offset) else mixed
         return [line.seen_from(offset) for line in linearised(moved)]
-    lines = linearised([replace(state, values=state.unit_value(own)) for own in offset])
+    lines = linearised([replace(mixed, values=mixed.unit_value(own)) for own in offset])
     return [line.seen_from(own) for line, own in zip(lines, offset, strict=True)]
 
 
 @dataclass(frozen=True)
-class Known:
+class SearchProblem:
     """What the search for causes goes by."""
 
-    state: State
+    mixed: MixedModel
     causes: Sequence[Candidate]
     shares: dict[str, dict[str, float]]
     limit: float
@@ -41,11 +41,11 @@ class Known:
 
 
 @dataclass(frozen=True)
-class Converged:
+class Selection:
     """The causes chosen, linearised about what they change: `offset` (p,), in scales."""
 
-    state: State
-    lines: list[Linear]
+    mixed: MixedModel
+    lines: list[LinearRide]
     normals: list[Normal]
     search: Search
     chosen: tuple[str, ...]
@@ -54,46 +54,46 @@ class Converged:
     @property
     def change(self) -> Array:
         """Of the parameters by the causes, (p,)."""
-        change = np.zeros(len(self.state.mean))
+        change = np.zeros(len(self.mixed.mean))
         index = self.search.index(self.chosen)
         change[index] = self.search.evidence.estimate(index)
         return change
 
 
-def converged(known: Known, lines: list[Linear], start: Array, own: Array) -> Converged:
+def select_causes(known: SearchProblem, lines: list[LinearRide], start: Array, own: Array) -> Selection:
     """The causes that explain `lines`, found about `start`, then about what they change, until it stays.
 
     own: what is each ride's own and stays, (p,) or (rides, p) in scales.
     """
-    state, offset = known.state, start
+    mixed, offset = known.mixed, start
 
-    def searched(lines: list[Linear], offset: Array) -> Converged:
-        normals = [normal(line, state.noise) for line in lines]
-        search = Search(state, evidence(state, normals), known.causes, known.shares)
-        return Converged(state, lines, normals, search, search.select(known.limit).names, offset)
+    def searched(lines: list[LinearRide], offset: Array) -> Selection:
+        normals = [normal(line, mixed.noise) for line in lines]
+        search = Search(mixed, evidence(mixed, normals), known.causes, known.shares)
+        return Selection(mixed, lines, normals, search, search.select(known.limit).names, offset)
 
     now = searched(lines, offset)
-    for _ in range(AGAIN):
+    for _ in range(MAX_ROUNDS):
         if not now.chosen:
             break
         before, offset = offset, now.change
         for name in now.chosen:
             for i in now.search.place[name]:
-                offset[i] = kept(state, i, offset[i])
-        now = searched(about(state, offset + own, known.linearised), offset)
+                offset[i] = limited_step(mixed, i, offset[i])
+        now = searched(linearised_about(mixed, offset + own, known.linearised), offset)
         if np.all(np.abs(offset - before) < 0.03 * np.abs(offset) + 1e-9):
             break
     return now
 
 
-def kept(state: State, i: int, x: float) -> float:
+def limited_step(mixed: MixedModel, i: int, x: float) -> float:
     """A change `x` of the parameter at `i`, in scales, that stays within the bounds of what it is, and does not take
     more than two thirds of it at once.
     """
-    name, value = state.names[i], state.values[state.names[i]]
-    bounds = next((p for c in state.causes for p in c.parameters if p.name == name), None)
+    name, value = mixed.names[i], mixed.values[mixed.names[i]]
+    bounds = next((p for c in mixed.causes for p in c.parameters if p.name == name), None)
     if name in LOG or bounds is None:
         return x
     low = max(bounds.low, value / 3) if bounds.low > 0 else bounds.low
-    moved = float(np.clip(value + x * float(state.scale[i]), low, bounds.high))
-    return (moved - value) / float(state.scale[i])
+    moved = float(np.clip(value + x * float(mixed.scale[i]), low, bounds.high))
+    return (moved - value) / float(mixed.scale[i])

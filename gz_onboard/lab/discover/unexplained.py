@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.arrays import Array
+from gz_onboard.lab.discover.acceptance import with_observed_scatter
 from gz_onboard.lab.discover.constancy import RIDE, Split
-from gz_onboard.lab.discover.folds import Fold, better, folds
-from gz_onboard.lab.discover.linear import Linear
+from gz_onboard.lab.discover.cross_validation import Fold, folds, improves
+from gz_onboard.lab.discover.curves import QUANTITIES, CurveFit, CurveForm, curve_forms, fit_curve
+from gz_onboard.lab.discover.energy import curve_energy_share, energy_share
+from gz_onboard.lab.discover.linear import LinearRide
+from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.search import Search, one_degree
-from gz_onboard.lab.discover.shapes import QUANTITIES, Curve, Form, forms, shape_evidence
-from gz_onboard.lab.discover.stands import widened
-from gz_onboard.lab.discover.state import State
-from gz_onboard.lab.discover.worth import energy_share, shape_share
 
 RIDES = "ride"  # the quantity of what differs from ride to ride
 LEFT = 0.1  # of what causes explain: a curve beside them that takes less is the bend of a large effect
@@ -28,9 +28,9 @@ BETTER = 15.0  # of chi-squared, each further knot taken off with 2, by which a 
 
 
 def unexplained(
-    state: State,
+    mixed: MixedModel,
     search: Search,
-    lines: Sequence[Linear],
+    lines: Sequence[LinearRide],
     normals: Sequence[Any],
     chosen: Sequence[str],
     change: Array,
@@ -48,31 +48,31 @@ def unexplained(
     index = search.index(chosen)
     total = search.evidence.gain(index)
     best: dict[str, Any] | None = None
-    for form in forms():
-        curve = shape_evidence(state, lines, normals, form, index)
+    for form in curve_forms():
+        curve = fit_curve(mixed, lines, normals, form, index)
         if curve is None:
             continue
-        inflation = inflated(state, form)
-        score = one_degree(curve.chi2 / inflation, curve.k, state.freedom)
+        inflation = curve_inflation(mixed, form)
+        score = one_degree(curve.chi2 / inflation, curve.k, mixed.freedom)
         if score < limit * (1.0 if form.straight else CURVE):
             continue
         mine = [name for name in chosen if search.shares.get(name, {}).get(form.channel, 0.0) > 0.3]
         theirs = sum(search.step([other for other in chosen if other != name], name) for name in mine)
-        unlike = unlike_causes(curve, inflation, *weight(state, lines, form.channel, change))
+        unlike = contradicts_causes(curve, inflation, *weight(mixed, lines, form.channel, change))
         unlike = unlike or bool(mine and curve.chi2 / inflation > RIVAL * theirs)
         if chosen and curve.chi2 < (UNLIKE_LEFT if unlike else LEFT) * total:
             continue
         if best is not None and (unlike, score) <= (bool(best["denies"]), best["score"]):
             continue
         rest = [name for name in chosen if not (unlike and name in mine)]
-        if stands(state, search, lines, normals, form, rest, limit):
+        if curve_is_accepted(mixed, search, lines, normals, form, rest, limit):
             best = described(form, curve, score) | {"denies": mine if unlike else []}
     if best is None or not best["denies"]:
-        best = instead(state, search, lines, normals, chosen, limit) or best
+        best = rival_curve(mixed, search, lines, normals, chosen, limit) or best
     unequal = [s for s in constancy if s.unequal]
     if unequal and (best is None or not best["denies"]):
         worst = max(unequal, key=lambda s: s.chi2)
-        best = halves(state, lines, normals, worst) or of_rides(state, lines, change, worst, constancy)
+        best = curve_over_split(mixed, lines, normals, worst) or ride_to_ride(mixed, lines, change, worst, constancy)
     if best is None:
         return None
     if best["denies"]:
@@ -82,34 +82,41 @@ def unexplained(
         denied |= dict.fromkeys(n for n in left if search.step([m for m in left if m != n], n) < least)
         best["denies"] = list(denied)
     if "share" not in best:
-        best["share"] = shape_share(lines, best)
+        best["share"] = curve_energy_share(lines, best)
     return best
 
 
-def stands(
-    state: State,
+def curve_is_accepted(
+    mixed: MixedModel,
     search: Search,
-    lines: Sequence[Linear],
+    lines: Sequence[LinearRide],
     normals: Sequence[Any],
-    form: Form,
+    form: CurveForm,
     rest: Sequence[str],
     limit: float,
 ) -> bool:
     """Whether the curve `form` beside the causes `rest` is more than what differs between these rides, and mends its
     channel on rides held out of the fit.
     """
-    curve = shape_evidence(widened(state, normals), lines, normals, form, search.index(rest), own=True)
+    curve = fit_curve(with_observed_scatter(mixed, normals), lines, normals, form, search.index(rest), own=True)
     if curve is None:
         return False
-    score = one_degree(curve.chi2 / inflated(state, form), curve.k, state.freedom)
+    score = one_degree(curve.chi2 / curve_inflation(mixed, form), curve.k, mixed.freedom)
     if score < limit * (1.0 if form.straight else CURVE):
         return False
     causes = [search.causes[name] for name in rest]
-    return len(lines) < 2 or better(folds(state, lines, normals, Fold(causes, form), Fold(causes)), {form.channel: 1.0})
+    return len(lines) < 2 or improves(
+        folds(mixed, lines, normals, Fold(causes, form), Fold(causes)), {form.channel: 1.0}
+    )
 
 
-def instead(
-    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Any], chosen: Sequence[str], limit: float
+def rival_curve(
+    mixed: MixedModel,
+    search: Search,
+    lines: Sequence[LinearRide],
+    normals: Sequence[Any],
+    chosen: Sequence[str],
+    limit: float,
 ) -> dict[str, Any] | None:
     """The curve that explains much better than one of the causes chosen what that one explains, in its own channel."""
     best: dict[str, Any] | None = None
@@ -117,31 +124,33 @@ def instead(
     for name in chosen:
         rest = [other for other in chosen if other != name]
         own = search.step(rest, name)
-        for form in forms():
+        for form in curve_forms():
             if search.shares.get(name, {}).get(form.channel, 0.0) < 0.3:
                 continue
-            curve = shape_evidence(state, lines, normals, form, search.index(rest))
+            curve = fit_curve(mixed, lines, normals, form, search.index(rest))
             if curve is None:
                 continue
-            inflation = inflated(state, form)
-            ahead = curve.chi2 / inflation - 2 * (curve.k - 1) - own * max(state.inflation.get(name, 1.0), 1.0)
-            if ahead > max(most, UNLIKE_LEFT * own) and stands(state, search, lines, normals, form, rest, limit):
+            inflation = curve_inflation(mixed, form)
+            ahead = curve.chi2 / inflation - 2 * (curve.k - 1) - own * max(mixed.inflation.get(name, 1.0), 1.0)
+            if ahead > max(most, UNLIKE_LEFT * own) and curve_is_accepted(
+                mixed, search, lines, normals, form, rest, limit
+            ):
                 most = ahead
-                best = described(form, curve, one_degree(curve.chi2 / inflation, curve.k, state.freedom)) | {
+                best = described(form, curve, one_degree(curve.chi2 / inflation, curve.k, mixed.freedom)) | {
                     "denies": [name]
                 }
     return best
 
 
-def of_rides(
-    state: State, lines: Sequence[Linear], change: Array, worst: Split, constancy: Sequence[Split]
+def ride_to_ride(
+    mixed: MixedModel, lines: Sequence[LinearRide], change: Array, worst: Split, constancy: Sequence[Split]
 ) -> dict[str, Any]:
     """What no cause is that acts in some rides and not in others: by how much more or less in each."""
     channels = {name for line in lines for name in line.tables}
-    channel = max(channels, key=lambda name: weight(state, lines, name, change)[1])
+    channel = max(channels, key=lambda name: weight(mixed, lines, name, change)[1])
     mine = [s for s in constancy if s.cause == worst.cause and s.quantity.startswith(RIDE)]
     rows = [[float(i), s.ratio, abs(s.ratio) / max(s.chi2, 1e-9) ** 0.5] for i, s in enumerate(mine)]
-    share = energy_share(state, lines, change)
+    share = energy_share(mixed, lines, change)
     return {
         "channel": channel,
         "quantity": RIDES,
@@ -155,13 +164,13 @@ def of_rides(
     }
 
 
-def inflated(state: State, form: Form) -> float:
+def curve_inflation(mixed: MixedModel, form: CurveForm) -> float:
     """By how much the chi-squared of `form` is too high on healthy rides that were left out."""
-    shape = state.shapes.get(form.name)
+    shape = mixed.shapes.get(form.name)
     return shape.inflation if shape else 1.0
 
 
-def described(form: Form, curve: Curve, score: float) -> dict[str, Any]:
+def described(form: CurveForm, curve: CurveFit, score: float) -> dict[str, Any]:
     """The curve for the report."""
     knots, unit = QUANTITIES[form.quantity]
     rows = zip(knots, curve.values.tolist(), curve.sd.tolist(), strict=True)
@@ -176,7 +185,7 @@ def described(form: Form, curve: Curve, score: float) -> dict[str, Any]:
     }
 
 
-def unlike_causes(curve: Curve, inflation: float, size: float, share: float) -> bool:
+def contradicts_causes(curve: CurveFit, inflation: float, size: float, share: float) -> bool:
     """Whether what is left beside the causes, of `size` in this channel and `share` of the evidence for them, is no
     mere bend of what they do.
     """
@@ -185,7 +194,7 @@ def unlike_causes(curve: Curve, inflation: float, size: float, share: float) -> 
     return bool(share > 0.3 and size > 0 and np.any(np.abs(value)[certain] > UNLIKE * size))
 
 
-def weight(state: State, lines: Sequence[Linear], channel: str, change: Array) -> tuple[float, float]:
+def weight(mixed: MixedModel, lines: Sequence[LinearRide], channel: str, change: Array) -> tuple[float, float]:
     """(what `change` (p,) of the parameters makes in `channel`, rms where it acts [unit]; the channel's share of the
     evidence for it).
     """
@@ -193,7 +202,7 @@ def weight(state: State, lines: Sequence[Linear], channel: str, change: Array) -
     for line in lines:
         for name, table in line.tables.items():
             effect = table.a @ change
-            strength = float(np.sum((effect / np.hypot(*state.noise[name][:2])) ** 2))
+            strength = float(np.sum((effect / np.hypot(*mixed.noise[name][:2])) ** 2))
             everywhere += strength
             if name == channel:
                 here += strength
@@ -205,16 +214,18 @@ def weight(state: State, lines: Sequence[Linear], channel: str, change: Array) -
     return float(np.sqrt(np.mean(acting**2))), here / everywhere
 
 
-def halves(state: State, lines: Sequence[Linear], normals: Sequence[Any], split: Split) -> dict[str, Any] | None:
+def curve_over_split(
+    mixed: MixedModel, lines: Sequence[LinearRide], normals: Sequence[Any], split: Split
+) -> dict[str, Any] | None:
     """The curve over the quantity of `split`, with no cause named, in the channel where it has most to say."""
     best: dict[str, Any] | None = None
-    for form in forms():
+    for form in curve_forms():
         if form.quantity != split.quantity or form.straight:
             continue
-        curve = shape_evidence(state, lines, normals, form, [])
+        curve = fit_curve(mixed, lines, normals, form, [])
         if curve is None:
             continue
-        score = one_degree(curve.chi2 / inflated(state, form), curve.k, state.freedom)
+        score = one_degree(curve.chi2 / curve_inflation(mixed, form), curve.k, mixed.freedom)
         if best is None or score > best["score"]:
             best = described(form, curve, score) | {"denies": [split.cause]}
     return best

@@ -9,12 +9,12 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.channels import over_blocks
-from gz_onboard.lab.discover.linear import Linear
-from gz_onboard.lab.discover.shapes import columns
-from gz_onboard.lab.discover.state import State
+from gz_onboard.lab.discover.curves import columns
+from gz_onboard.lab.discover.linear import LinearRide
+from gz_onboard.lab.discover.mixed_model import MixedModel
 
 
-def power_of(table_name: str, line: Linear, values: Array) -> Array | None:
+def pack_power(table_name: str, line: LinearRide, values: Array) -> Array | None:
     """What a residual of a channel is worth at the pack's terminals [W], over its blocks."""
     table = line.tables[table_name]
     real = values * table.unit
@@ -27,19 +27,19 @@ def power_of(table_name: str, line: Linear, values: Array) -> Array | None:
     return None
 
 
-def energy_share(state: State, lines: Sequence[Linear], change: Array) -> float:
+def energy_share(mixed: MixedModel, lines: Sequence[LinearRide], change: Array) -> float:
     """The part of the energy drawn that `change` (p,) of the parameters makes, over these rides."""
     more = drawn = 0.0
     for line in lines:
         drawn += energy(line)
         for name in line.tables:
-            power = power_of(name, line, -(line.tables[name].a @ change) * -1.0)
+            power = pack_power(name, line, -(line.tables[name].a @ change) * -1.0)
             if power is not None and len(power):
                 more += float(np.mean(power)) * share_of_time(line, name)
     return more / drawn if drawn else 0.0
 
 
-def energy(line: Linear) -> float:
+def energy(line: LinearRide) -> float:
     """What the pack gave over the ride [J]."""
     s = line.ride.signals
     volts, amperes = (
@@ -50,7 +50,7 @@ def energy(line: Linear) -> float:
     return float(np.sum(s[volts] * s[amperes])) * 0.1
 
 
-def share_of_time(line: Linear, channel: str) -> float:
+def share_of_time(line: LinearRide, channel: str) -> float:
     """The time [s] for which a channel's mean holds: the ride, or that part of it in which it moves."""
     whole = len(line.ride.time) * 0.1
     if channel == "road_force":
@@ -58,7 +58,7 @@ def share_of_time(line: Linear, channel: str) -> float:
     return whole
 
 
-def shape_share(lines: Sequence[Linear], shape: dict[str, Any]) -> float:
+def curve_energy_share(lines: Sequence[LinearRide], shape: dict[str, Any]) -> float:
     """The part of the energy drawn that the curve takes."""
 
     more = drawn = 0.0
@@ -71,13 +71,13 @@ def shape_share(lines: Sequence[Linear], shape: dict[str, Any]) -> float:
         c = columns(line.ride, shape["quantity"], table)
         if c is None:
             continue
-        power = power_of(shape["channel"], line, c @ values / table.unit)
+        power = pack_power(shape["channel"], line, c @ values / table.unit)
         if power is not None and len(power):
             more += float(np.mean(power)) * share_of_time(line, shape["channel"])
     return more / drawn if drawn else 0.0
 
 
-def sizes(lines: Sequence[Linear]) -> dict[str, dict[str, float]]:
+def residual_sizes(lines: Sequence[LinearRide]) -> dict[str, dict[str, float]]:
     """Of each channel's residual: mean, rms, correlation of neighbours, share of the energy."""
     result: dict[str, dict[str, float]] = {}
     drawn = sum(energy(line) for line in lines)
@@ -87,7 +87,7 @@ def sizes(lines: Sequence[Linear]) -> dict[str, dict[str, float]]:
         pairs = [(table.y[1:], table.y[:-1]) for _, table in tables]
         late, early = (np.concatenate(side) for side in zip(*pairs, strict=True))
         correlation = float(np.corrcoef(late, early)[0, 1]) if np.std(late) > 0 and np.std(early) > 0 else 0.0
-        powers = [power_of(name, line, table.y) for line, table in tables]
+        powers = [pack_power(name, line, table.y) for line, table in tables]
         more = sum(
             float(np.mean(w)) * share_of_time(line, name)
             for w, (line, _) in zip(powers, tables, strict=True)

@@ -10,9 +10,9 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.channels import BY_NAME, over_blocks
 from gz_onboard.lab.discover.grid import STEP, Ride, smooth
-from gz_onboard.lab.discover.linear import Linear, Noise, Normal, Table, fit_mixed, marginal, whitened
-from gz_onboard.lab.discover.search import _evidence
-from gz_onboard.lab.discover.state import Shape, State
+from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Noise, Normal, fit_mixed, marginal, whitened
+from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel
+from gz_onboard.lab.discover.search import evidence_of
 
 # knots of the hat functions, the middle one left out (it is the level); unit
 QUANTITIES: dict[str, tuple[tuple[float, ...], str]] = {
@@ -64,7 +64,7 @@ IN_PROPORTION = ("time", "current_change", "steering", "vibration", "suspension_
 
 
 @dataclass(frozen=True)
-class Form:
+class CurveForm:
     """What a channel may leave over a quantity: a curve, or what is in proportion, which needs less to be seen."""
 
     channel: str
@@ -79,7 +79,7 @@ class Form:
     @property
     def size(self) -> float:
         """Unit of its coefficients, in the channel's."""
-        return SIZES[self.channel]
+        return COEFFICIENT_UNITS[self.channel]
 
     @property
     def scatter(self) -> float:
@@ -95,13 +95,13 @@ class Form:
         return np.asarray(knots[:, None] / np.abs(knots).max())
 
 
-def forms() -> list[Form]:
+def curve_forms() -> list[CurveForm]:
     """A curve for every pair of channel and quantity, and what is in proportion to some."""
-    every = [Form(channel, quantity) for channel, quantities in PAIRS for quantity in quantities]
+    every = [CurveForm(channel, quantity) for channel, quantities in PAIRS for quantity in quantities]
     return [*every, *(replace(form, straight=True) for form in every if form.quantity in IN_PROPORTION)]
 
 
-def quantity(ride: Ride, name: str, table: Table) -> Array | None:
+def quantity(ride: Ride, name: str, table: LinearChannel) -> Array | None:
     """The quantity over the blocks of `table`, (m,); None if the ride has it not."""
     channel = table.channel
     q = ride.quantities
@@ -131,7 +131,7 @@ def quantity(ride: Ride, name: str, table: Table) -> Array | None:
     return over_blocks(channel, values)[table.used]
 
 
-def hats(x: Array, knots: Sequence[float], periodic: bool = False) -> Array:
+def hat_functions(x: Array, knots: Sequence[float], periodic: bool = False) -> Array:
     """Linear hat functions over `knots` but the one that most is at, (m, k)."""
     at = np.array(knots)
     if periodic:
@@ -144,15 +144,15 @@ def hats(x: Array, knots: Sequence[float], periodic: bool = False) -> Array:
     return np.asarray(full)
 
 
-def columns(ride: Ride, name: str, table: Table) -> Array | None:
+def columns(ride: Ride, name: str, table: LinearChannel) -> Array | None:
     """The curve's columns over the blocks of `table`, (m, k), in the channel's unit."""
     x = quantity(ride, name, table)
     if x is None:
         return None
-    return hats(x, QUANTITIES[name][0], name in ROUND)
+    return hat_functions(x, QUANTITIES[name][0], name in ROUND)
 
 
-def extended(linear: Linear, normal: Normal, form: Form, noise: Noise) -> Normal | None:
+def extended(linear: LinearRide, normal: Normal, form: CurveForm, noise: Noise) -> Normal | None:
     """`normal` with the columns of `form`."""
     table = linear.tables.get(form.channel)
     if table is None:
@@ -172,16 +172,22 @@ def extended(linear: Linear, normal: Normal, form: Form, noise: Noise) -> Normal
     return Normal(n, np.concatenate([normal.b, b.T @ y]))
 
 
-SIZES = {"road_force": 5.0, "inverter_power": 10.0, "auxiliary": 2.0, "pack_balance": 0.1, "cell_voltage": 0.005}
+COEFFICIENT_UNITS = {
+    "road_force": 5.0,
+    "inverter_power": 10.0,
+    "auxiliary": 2.0,
+    "pack_balance": 0.1,
+    "cell_voltage": 0.005,
+}
 """Unit of a curve's coefficients, in the channel's; `SCATTER` of it is taken to differ between rides."""
 SCATTER = 0.3
 ENOUGH = 1.0  # sum of squared weights of a ride's blocks at a knot, from which on it counts as visited
-OWN_FREE = 100.0  # variance in `Form.size` of the common curve while its scatter between rides is sought
+OWN_FREE = 100.0  # variance in `CurveForm.size` of the common curve while its scatter between rides is sought
 SCATTERS = {"cell_voltage": 1.0}  # whose model lacks more
 
 
 @dataclass(frozen=True)
-class Curve:
+class CurveFit:
     """What rides show over a quantity. chi2: twice the rise of the log likelihood, of `k` degrees of freedom.
 
     values (knots,): of the curve at each knot [the channel's unit]; covariance (knots, knots); weights (knots,): how
@@ -205,7 +211,7 @@ class Curve:
         return d @ self.values, np.sqrt(np.abs(np.diag(d @ self.covariance @ d.T)))
 
 
-def supported(form: Form, linears: Sequence[Linear]) -> Array:
+def supported_knots(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
     """The coefficients of `form` that these rides can tell, (k, free): a knot that less than `ENOUGH` of two rides is
     at goes with the nearest that has it, so that no curve bends where hardly anything was measured.
     """
@@ -225,40 +231,40 @@ def supported(form: Form, linears: Sequence[Linear]) -> Array:
     return np.asarray(np.eye(len(good))[nearest])
 
 
-def shape_evidence(
-    state: State,
-    linears: Sequence[Linear],
+def fit_curve(
+    mixed: MixedModel,
+    linears: Sequence[LinearRide],
     normals: Sequence[Normal],
-    form: Form,
+    form: CurveForm,
     fixed: Sequence[int],
     own: bool = False,
-) -> Curve | None:
+) -> CurveFit | None:
     """What `form` is beside changes at `fixed`; None where no ride has it, or not enough of it.
 
-    own: with the scatter of its coefficients that these rides show, where it is more than `Form.scatter`.
+    own: with the scatter of its coefficients that these rides show, where it is more than `CurveForm.scatter`.
     """
-    free = supported(form, linears)
+    free = supported_knots(form, linears)
     if not free.shape[1]:
         return None
-    found = [extended(line, normal, form, state.noise) for line, normal in zip(linears, normals, strict=True)]
+    found = [extended(line, normal, form, mixed.noise) for line, normal in zip(linears, normals, strict=True)]
     rides = [ride for ride in found if ride is not None]
     if not rides:
         return None
-    p = len(state.mean)
+    p = len(mixed.mean)
     k = len(rides[0].b) - p
-    shape = state.shapes.get(form.name)
-    mean = np.concatenate([state.mean, shape.mean if shape else np.zeros(k)])
+    shape = mixed.shapes.get(form.name)
+    mean = np.concatenate([mixed.mean, shape.mean if shape else np.zeros(k)])
     prior = np.zeros((p + k, p + k))
-    prior[:p, :p] = state.prior
+    prior[:p, :p] = mixed.prior
     prior[p:, p:] = shape.covariance if shape else np.eye(k) * form.scatter**2
-    scatter = np.concatenate([state.scatter, np.full(k, form.scatter**2)])
+    scatter = np.concatenate([mixed.scatter, np.full(k, form.scatter**2)])
     mine = list(range(p, p + k))
     if own and len(rides) > 1:
         wide = prior.copy()
         wide[p:, p:] += np.eye(k) * OWN_FREE
         learns = np.arange(p + k) >= p
         scatter = np.maximum(scatter, fit_mixed(rides, mean, wide, scatter, 1.0, learns, 10).scatter)
-    e = _evidence(mean, prior, scatter, rides)
+    e = evidence_of(mean, prior, scatter, rides)
     inner = e.information[np.ix_(mine, mine)] + 1e-3 * np.eye(k)
     score = e.score[mine]
     if fixed:
@@ -278,7 +284,7 @@ def shape_evidence(
         if form.channel in line.tables:
             knots = columns(line.ride, form.quantity, line.tables[form.channel])
             weights += 0.0 if knots is None else (knots**2).sum(axis=0)
-    return Curve(
+    return CurveFit(
         float(score @ estimate),
         free.shape[1],
         at @ estimate,
@@ -287,48 +293,53 @@ def shape_evidence(
     )
 
 
-def learn_shapes(state: State, linears: Sequence[Linear], normals: Sequence[Normal]) -> dict[str, Shape]:
-    """What the healthy rides leave over each quantity, beside what the parameters of `state` explain."""
+def learn_healthy_curves(
+    mixed: MixedModel, linears: Sequence[LinearRide], normals: Sequence[Normal]
+) -> dict[str, HealthyCurve]:
+    """What the healthy rides leave over each quantity, beside what the parameters of `mixed` explain."""
     found = {}
-    for form in forms():
-        rides = [extended(line, normal, form, state.noise) for line, normal in zip(linears, normals, strict=True)]
+    for form in curve_forms():
+        rides = [extended(line, normal, form, mixed.noise) for line, normal in zip(linears, normals, strict=True)]
         rides = [ride for ride in rides if ride is not None]
         if not rides:
             continue
-        p = len(state.mean)
+        p = len(mixed.mean)
         k = len(rides[0].b) - p  # type: ignore[union-attr]
         # the parameters stay as they were learned: their values at the mean, the curve what is left
         m, c = np.zeros((k, k)), np.zeros(k)
         for ride in rides:
-            v = np.linalg.inv(np.diag(1 / state.scatter) + ride.n[:p, :p])  # type: ignore[union-attr]
-            u = state.mean + v @ (ride.b[:p] - ride.n[:p, :p] @ state.mean)  # type: ignore[union-attr]
+            v = np.linalg.inv(np.diag(1 / mixed.scatter) + ride.n[:p, :p])  # type: ignore[union-attr]
+            u = mixed.mean + v @ (ride.b[:p] - ride.n[:p, :p] @ mixed.mean)  # type: ignore[union-attr]
             inner = ride.n[p:, p:] - ride.n[p:, :p] @ v @ ride.n[:p, p:]  # type: ignore[union-attr]
             score = ride.b[p:] - ride.n[p:, :p] @ u  # type: ignore[union-attr]
             part = marginal(Normal((inner + inner.T) / 2, score), np.full(k, form.scatter**2))
             m, c = m + part.n, c + part.b
         covariance = np.linalg.inv(m + np.eye(k))
-        found[form.name] = Shape(np.asarray(covariance @ c), np.asarray(covariance), 1.0)
+        found[form.name] = HealthyCurve(np.asarray(covariance @ c), np.asarray(covariance), 1.0)
     return found
 
 
 def with_inflation(
-    state: State, folds: Sequence[tuple[State, Sequence[int]]], linears: Sequence[Linear], normals: Sequence[Normal]
-) -> dict[str, Shape]:
-    """The shapes of `state`, each with how much too high its score is on healthy rides left out of `folds`."""
+    mixed: MixedModel,
+    folds: Sequence[tuple[MixedModel, Sequence[int]]],
+    linears: Sequence[LinearRide],
+    normals: Sequence[Normal],
+) -> dict[str, HealthyCurve]:
+    """The shapes of `mixed`, each with how much too high its score is on healthy rides left out of `folds`."""
     total: dict[str, list[float]] = {}
     for learned, held in folds:
         rest = [i for i in range(len(linears)) if i not in held]
-        shapes = learn_shapes(learned, [linears[i] for i in rest], [normals[i] for i in rest])
+        shapes = learn_healthy_curves(learned, [linears[i] for i in rest], [normals[i] for i in rest])
         blind = replace(learned, shapes=shapes)
-        for form in forms():
-            found = shape_evidence(blind, [linears[i] for i in held], [normals[i] for i in held], form, [])
+        for form in curve_forms():
+            found = fit_curve(blind, [linears[i] for i in held], [normals[i] for i in held], form, [])
             if found:
                 total.setdefault(form.name, []).append(found.chi2 / found.k)
-    whole = learn_shapes(state, linears, normals)
+    whole = learn_healthy_curves(mixed, linears, normals)
     return {
         name: replace(shape, inflation=max(1.0, (2 + sum(total.get(name, []))) / (2 + len(total.get(name, [])))))
         for name, shape in whole.items()
     }
 
 
-__all__ = ["BY_NAME", "QUANTITIES", "Form", "forms", "hats", "learn_shapes", "shape_evidence"]
+__all__ = ["BY_NAME", "QUANTITIES", "CurveForm", "curve_forms", "fit_curve", "hat_functions", "learn_healthy_curves"]

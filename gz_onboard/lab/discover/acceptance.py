@@ -15,44 +15,49 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.constancy import RIDE, splits
-from gz_onboard.lab.discover.converge import Converged, Known, Linearised, converged
-from gz_onboard.lab.discover.folds import Fold, better, folds
-from gz_onboard.lab.discover.linear import Linear, Normal, fit_mixed
+from gz_onboard.lab.discover.cross_validation import Fold, folds, improves
+from gz_onboard.lab.discover.linear import LinearRide, Normal, fit_mixed
+from gz_onboard.lab.discover.mixed_model import MixedModel
+from gz_onboard.lab.discover.prior import LOG
 from gz_onboard.lab.discover.search import Search, evidence
-from gz_onboard.lab.discover.state import State
-from gz_onboard.lab.discover.terms import LOG
+from gz_onboard.lab.discover.selection import Linearised, SearchProblem, Selection, select_causes
 
 FREE = 25.0  # variance in scales of the common part while the scatter of these rides is sought
 ROUNDS = 25
 SURE = 2.0  # standard deviations: an estimate further beyond a bound is none of its cause
-REFUSALS = 6  # names at most that are tried and refused
+MAX_REJECTIONS = 6  # names at most that are tried and refused
 
 
-def widened(state: State, normals: Sequence[Normal]) -> State:
-    """`state` with the scatter between rides that these show, where it is more than healthy ones did."""
+def with_observed_scatter(mixed: MixedModel, normals: Sequence[Normal]) -> MixedModel:
+    """`mixed` with the scatter between rides that these show, where it is more than healthy ones did."""
     if len(normals) < 2:
-        return state
-    free = state.prior + FREE * np.eye(len(state.names))
-    weight = float(state.healthy + 1)
-    found = fit_mixed(normals, state.mean, free, state.scatter, weight, state.free, ROUNDS).scatter
-    return replace(state, scatter=np.maximum(found, state.scatter))
+        return mixed
+    free = mixed.prior + FREE * np.eye(len(mixed.names))
+    weight = float(mixed.healthy + 1)
+    found = fit_mixed(normals, mixed.mean, free, mixed.scatter, weight, mixed.free, ROUNDS).scatter
+    return replace(mixed, scatter=np.maximum(found, mixed.scatter))
 
 
-def possible(state: State, cause: Candidate, change: Sequence[float], sd: Sequence[float]) -> bool:
+def within_bounds(mixed: MixedModel, cause: Candidate, change: Sequence[float], sd: Sequence[float]) -> bool:
     """Whether the parameters of `cause` can have changed by `change` [scales], known within `sd`."""
     for parameter, x, s in zip(cause.parameters, change, sd, strict=True):
-        (i,) = state.index([parameter.name])
+        (i,) = mixed.index([parameter.name])
         if parameter.name in LOG:
             continue
-        step = float(state.scale[i])
-        value, spread = state.values[parameter.name] + x * step, SURE * s * step
+        step = float(mixed.scale[i])
+        value, spread = mixed.values[parameter.name] + x * step, SURE * s * step
         if not parameter.low - spread <= value <= parameter.high + spread:
             return False
     return True
 
 
-def foretold(
-    state: State, search: Search, lines: Sequence[Linear], normals: Sequence[Normal], chosen: Sequence[str], name: str
+def predicts_held_out(
+    mixed: MixedModel,
+    search: Search,
+    lines: Sequence[LinearRide],
+    normals: Sequence[Normal],
+    chosen: Sequence[str],
+    name: str,
 ) -> bool:
     """Whether `name` beside the other causes `chosen` mends its own channels on rides held out of the fit."""
     if len(lines) < 2:
@@ -60,18 +65,18 @@ def foretold(
     every = [search.causes[n] for n in chosen]
     others = [c for c in every if c.name != name]
     shares = search.shares.get(name, {})
-    return better(folds(state, lines, normals, Fold(every), Fold(others)), shares)
+    return improves(folds(mixed, lines, normals, Fold(every), Fold(others)), shares)
 
 
-def refused(now: Converged, limit: float) -> tuple[str, str] | None:
+def refused(now: Selection, limit: float) -> tuple[str, str] | None:
     """(the cause among those chosen that stands least, why); None if all stand."""
-    state, search = now.state, now.search
-    wide = widened(state, now.normals)
+    mixed, search = now.mixed, now.search
+    wide = with_observed_scatter(mixed, now.normals)
     strict = Search(wide, evidence(wide, now.normals), list(search.causes.values()), search.shares)
     index = search.index(now.chosen)
     estimate, sd = search.evidence.estimate(index), np.sqrt(np.diag(search.evidence.covariance(index)))
     # against a file what differs between rides cannot be told from what its model lacks; healthy rides have told
-    parts = [] if state.healthy else splits(state, now.lines, now.normals, search.place, now.chosen, now.change)
+    parts = [] if mixed.healthy else splits(mixed, now.lines, now.normals, search.place, now.chosen, now.change)
     uneven = {split.cause for split in parts if split.unequal and split.quantity.startswith(RIDE)}
     found: list[tuple[float, str, str]] = []
     at = 0
@@ -80,31 +85,31 @@ def refused(now: Converged, limit: float) -> tuple[str, str] | None:
         own = slice(at, at + len(cause.parameters))
         at = own.stop
         score = strict.step([n for n in now.chosen if n != name], name)
-        if not possible(state, cause, estimate[own].tolist(), sd[own].tolist()):
+        if not within_bounds(mixed, cause, estimate[own].tolist(), sd[own].tolist()):
             found.append((score, name, "would be beyond what it can be"))
         elif score < limit:
             found.append((score, name, "differs from ride to ride as much as it is"))
         elif name in uneven:
             found.append((score, name, "acts in some rides and not in others"))
-        elif not foretold(state, search, now.lines, now.normals, now.chosen, name):
+        elif not predicts_held_out(mixed, search, now.lines, now.normals, now.chosen, name):
             found.append((score, name, "does not foretell rides held out"))
     return min(found)[1:] if found else None
 
 
-def standing(
-    known: Known, now: Converged, lines: list[Linear], start: Array, own: Array
-) -> tuple[Converged, Known, list[str]]:
+def accept(
+    known: SearchProblem, now: Selection, lines: list[LinearRide], start: Array, own: Array
+) -> tuple[Selection, SearchProblem, list[str]]:
     """`now` searched again without each cause that does not stand, what is known less these, and what was refused."""
     told: list[str] = []
-    while now.chosen and len(told) < REFUSALS:
+    while now.chosen and len(told) < MAX_REJECTIONS:
         bad = refused(now, known.limit)
         if bad is None:
             break
         name, why = bad
         told.append(f"{name} {why}: not named")
         known = replace(known, causes=[c for c in known.causes if c.name != name])
-        now = converged(known, lines, start, own)
+        now = select_causes(known, lines, start, own)
     return now, known, told
 
 
-__all__ = ["Linearised", "foretold", "possible", "refused", "standing", "widened"]
+__all__ = ["Linearised", "accept", "predicts_held_out", "refused", "with_observed_scatter", "within_bounds"]

@@ -13,7 +13,7 @@ from gz_onboard.lab.discover.candidates import Candidate, candidates
 from gz_onboard.lab.discover.channels import CHANNELS, System, counted_soc, depends
 from gz_onboard.lab.discover.grid import Ride, read_ride
 from gz_onboard.lab.discover.linear import Noise
-from gz_onboard.lab.discover.terms import BASE, FIXED, LOG, NUISANCES, RIDE_SD, RIDE_SD_SHARE, stepped
+from gz_onboard.lab.discover.prior import BASE, FIXED, LOG, NUISANCES, RIDE_SD, RIDE_SD_SHARE, stepped
 from gz_onboard.physics.effect import Effect
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.simulation.samples import Samples
@@ -51,7 +51,7 @@ TRANSFERRED = 3.0
 
 
 @dataclass(frozen=True)
-class Shape:
+class HealthyCurve:
     """What healthy rides leave over a quantity in a channel: coefficients (k,), covariance (k, k), inflation."""
 
     mean: Array
@@ -60,7 +60,7 @@ class Shape:
 
 
 @dataclass
-class State:
+class MixedModel:
     """The linear model's frame: names (p,), scale (p,), values where it is linearised, and what is known before.
 
     mean, prior: of the common part less `values`, in scales, (p,), (p, p). scatter: variances between rides, (p,).
@@ -81,7 +81,7 @@ class State:
     inflation: dict[str, float] = field(
         default_factory=dict
     )  # of a cause's score on healthy rides left out, 1 if right
-    shapes: dict[str, Shape] = field(default_factory=dict)  # what healthy rides show over quantities, by name
+    shapes: dict[str, HealthyCurve] = field(default_factory=dict)  # what healthy rides show over quantities, by name
 
     @property
     def freedom(self) -> float:
@@ -109,7 +109,7 @@ class State:
         return ride
 
 
-def initial(vehicle: Vehicle, folder: Path | None = None) -> State:
+def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
     """What is known of `vehicle` from its file alone."""
     causes = candidates(folder)
     lacking = [c.effect for c in causes if c.effect and c.name not in {e.name for e in vehicle.model.effects}]
@@ -162,7 +162,7 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> State:
             prior[place[a], place[b]] = prior[place[b], place[a]] = r * bench[place[a]] * bench[place[b]]
     noise = {channel.name: channel.noise for channel in CHANNELS}
     free = np.array([name not in FIXED for name in names])
-    return State(
+    return MixedModel(
         vehicle,
         system,
         causes,
@@ -183,13 +183,13 @@ def vehicle_file_names(vehicle: Vehicle) -> set[str]:
     return {name for name, value in vehicle.parameters.known.items() if not value.source.startswith("prior:")}
 
 
-def restore(vehicle: Vehicle, folder: Path | None = None) -> State:
+def restore(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
     """What healthy rides taught of `vehicle`, or its file alone."""
-    if isinstance(vehicle.healthy, State):
+    if isinstance(vehicle.healthy, MixedModel):
         return vehicle.healthy
-    state = initial(vehicle, folder)
+    mixed = initial(vehicle, folder)
     if isinstance(vehicle.healthy, Path):
-        from gz_onboard.lab.discover.files import load
+        from gz_onboard.lab.discover.extension import load
 
-        return load(state, vehicle.healthy)
-    return state
+        return load(mixed, vehicle.healthy)
+    return mixed
