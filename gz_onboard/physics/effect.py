@@ -12,7 +12,8 @@ An effect file has
   ``dt`` [s]. The effect's value then is not the term but the state x, 0 at the start, which goes to what the term
   says: x' = decay·x + (1 - decay)·term, exact for quantities that are constant over the step;
 - ``SHOWN_BY``, if it is a candidate of the discovery: the data that would show it, and the ride that would split it
-  from its look-alikes.
+  from its look-alikes; ``STRENGTHS``, the parameters that then change, the first if it is not given; ``VARIES = True``
+  if it differs from ride to ride by itself.
 
 Sign conventions
     speed, motor torque, motor current   positive forward, driving
@@ -137,6 +138,8 @@ class Effect:
     decay_quantities: tuple[str, ...] = ()
     decay_keywords: tuple[str, ...] = ()
     shown_by: str = ""
+    strengths: tuple[str, ...] = ()  # parameters that change where it is found, the one that is reported first
+    varies: bool = False  # from ride to ride by itself
 
     @property
     def reads(self) -> frozenset[str]:
@@ -252,6 +255,8 @@ def _effect(name: str, module: ModuleType) -> Effect:
         decay_quantities=decay_quantities,
         decay_keywords=decay_parameters,
         shown_by=getattr(module, "SHOWN_BY", ""),
+        strengths=getattr(module, "STRENGTHS", tuple(declared[:1])),
+        varies=getattr(module, "VARIES", False),
     )
 
 

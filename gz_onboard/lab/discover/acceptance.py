@@ -1,8 +1,8 @@
-"""What a cause must stand before it is named: its bounds, the spread of these very rides, and rides held out.
+"""Which causes are accepted: within their bounds, beyond the scatter of these rides, and right of rides held out.
 
 The spread that healthy rides showed is not that of the healthy world: where they hardly went, and what they happened
 not to vary, the next rides show for the first time. So what differs between the rides at hand by more than healthy ones
-did widens the scatter, beside a common part that is free; and what was found on some rides must foretell the others.
+did widens the scatter, beside a common part that is free; and what was found on some rides must predict the others.
 """
 
 from __future__ import annotations
@@ -12,15 +12,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.constancy import RIDE, splits
+from gz_onboard.lab.discover.constancy import RIDE, splits, unequal
 from gz_onboard.lab.discover.cross_validation import Fold, folds, improves
-from gz_onboard.lab.discover.linear import LinearRide, Normal, fit_mixed
+from gz_onboard.lab.discover.linear import Normal, fit_mixed
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.prior import LOG
 from gz_onboard.lab.discover.search import Search, evidence
-from gz_onboard.lab.discover.selection import Linearised, SearchProblem, Selection, select_causes
+from gz_onboard.lab.discover.selection import SearchProblem, Selection, select_causes
 
 FREE = 25.0  # variance in scales of the common part while the scatter of these rides is sought
 ROUNDS = 25
@@ -51,33 +50,26 @@ def within_bounds(mixed: MixedModel, cause: Candidate, change: Sequence[float], 
     return True
 
 
-def predicts_held_out(
-    mixed: MixedModel,
-    search: Search,
-    lines: Sequence[LinearRide],
-    normals: Sequence[Normal],
-    chosen: Sequence[str],
-    name: str,
-) -> bool:
-    """Whether `name` beside the other causes `chosen` mends its own channels on rides held out of the fit."""
-    if len(lines) < 2:
+def predicts_held_out(now: Selection, name: str) -> bool:
+    """Whether `name` beside the other causes chosen mends its own channels on rides held out of the fit."""
+    if len(now.lines) < 2:
         return True
-    every = [search.causes[n] for n in chosen]
+    every = [now.search.causes[n] for n in now.chosen]
     others = [c for c in every if c.name != name]
-    shares = search.shares.get(name, {})
-    return improves(folds(mixed, lines, normals, Fold(every), Fold(others)), shares)
+    held = folds(now.mixed, now.lines, now.normals, Fold(every), Fold(others))
+    return improves(held, now.search.shares.get(name, {}))
 
 
-def refused(now: Selection, limit: float) -> tuple[str, str] | None:
-    """(the cause among those chosen that stands least, why); None if all stand."""
+def rejection(now: Selection, limit: float) -> tuple[str, str] | None:
+    """(the least certain of the causes chosen that cannot be accepted, why); None if all can."""
     mixed, search = now.mixed, now.search
     wide = with_observed_scatter(mixed, now.normals)
     strict = Search(wide, evidence(wide, now.normals), list(search.causes.values()), search.shares)
     index = search.index(now.chosen)
     estimate, sd = search.evidence.estimate(index), np.sqrt(np.diag(search.evidence.covariance(index)))
-    # against a file what differs between rides cannot be told from what its model lacks; healthy rides have told
-    parts = [] if mixed.healthy else splits(mixed, now.lines, now.normals, search.place, now.chosen, now.change)
-    uneven = {split.cause for split in parts if split.unequal and split.quantity.startswith(RIDE)}
+    # against a file what differs between rides cannot be told from what its model lacks; healthy rides have shown it
+    parts = [] if mixed.healthy else splits(now)
+    uneven = {split.cause for split in parts if unequal(split) and split.quantity.startswith(RIDE)}
     found: list[tuple[float, str, str]] = []
     at = 0
     for name in now.chosen:
@@ -91,25 +83,20 @@ def refused(now: Selection, limit: float) -> tuple[str, str] | None:
             found.append((score, name, "differs from ride to ride as much as it is"))
         elif name in uneven:
             found.append((score, name, "acts in some rides and not in others"))
-        elif not predicts_held_out(mixed, search, now.lines, now.normals, now.chosen, name):
+        elif not predicts_held_out(now, name):
             found.append((score, name, "does not foretell rides held out"))
     return min(found)[1:] if found else None
 
 
-def accept(
-    known: SearchProblem, now: Selection, lines: list[LinearRide], start: Array, own: Array
-) -> tuple[Selection, SearchProblem, list[str]]:
-    """`now` searched again without each cause that does not stand, what is known less these, and what was refused."""
-    told: list[str] = []
-    while now.chosen and len(told) < MAX_REJECTIONS:
-        bad = refused(now, known.limit)
+def accept(problem: SearchProblem, now: Selection) -> tuple[Selection, SearchProblem, list[str]]:
+    """`now` searched again without each cause that is rejected, the problem less these, and what was rejected."""
+    rejected: list[str] = []
+    while now.chosen and len(rejected) < MAX_REJECTIONS:
+        bad = rejection(now, problem.limit)
         if bad is None:
             break
         name, why = bad
-        told.append(f"{name} {why}: not named")
-        known = replace(known, causes=[c for c in known.causes if c.name != name])
-        now = select_causes(known, lines, start, own)
-    return now, known, told
-
-
-__all__ = ["Linearised", "accept", "predicts_held_out", "refused", "with_observed_scatter", "within_bounds"]
+        rejected.append(f"{name} {why}: not named")
+        problem = replace(problem, causes=[c for c in problem.causes if c.name != name])
+        now = select_causes(problem)
+    return now, problem, rejected

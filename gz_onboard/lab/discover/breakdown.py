@@ -13,11 +13,11 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.channels import BY_NAME, SLOW, cell_circuit, over_blocks, usable
-from gz_onboard.lab.discover.detectability import words
 from gz_onboard.lab.discover.grid import STEP, Ride, since
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Posterior, fit_mixed
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.result import Report
+from gz_onboard.lab.discover.verdict import Discovery
+from gz_onboard.lab.discover.wording import readable
 
 FREE = 1e6  # variance in scales of a cause that is free
 JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
@@ -44,54 +44,45 @@ QUANTITIES: dict[str, tuple[str, str]] = {
 """What residuals are looked at over: words and unit."""
 
 
-def before_and_after(report: Report) -> tuple[list[LinearRide], list[LinearRide]]:
-    """The rides of `report` with residuals before and after its causes."""
-    mixed = report.mixed
-    assert mixed is not None
-    index, post = fitted(report)
+def before_and_after(found: Discovery) -> tuple[list[LinearRide], list[LinearRide]]:
+    """The rides of `found` with residuals before and after its causes."""
+    index, post = fitted(found)
     before, after = [], []
-    for line, own in zip(report.lines, post.own, strict=True):
+    for line, own in zip(found.lines, post.own, strict=True):
         theta = post.mean + own
         rest = theta.copy()
-        rest[index] = mixed.mean[index] + own[index]
+        rest[index] = found.mixed.mean[index] + own[index]
         before.append(line.seen_from(-rest))
         after.append(line.seen_from(-theta))
     return before, after
 
 
-def fitted(report: Report) -> tuple[list[int], Posterior]:
+def fitted(found: Discovery) -> tuple[list[int], Posterior]:
     """Where the parameters of the causes are, and all parameters as the rides show them with these free."""
-    mixed = report.mixed
-    assert mixed is not None
-    index = [i for cause in report.causes for i in _places(mixed, cause.name)]
+    mixed = found.mixed
+    index = [i for cause in found.report.causes for i in mixed.index(list(cause.parameters))]
     prior = mixed.prior.copy()
     for i in index:
         prior[i, i] += FREE
-    return index, fit_mixed(report.normals, mixed.mean, prior, mixed.scatter, 1.0, mixed.free, 0)
+    return index, fit_mixed(found.normals, mixed.mean, prior, mixed.scatter, 1.0, mixed.free, 0)
 
 
-def outlying_rides(report: Report) -> list[str]:
+def outlying_rides(found: Discovery) -> list[str]:
     """What differs in single rides by more than `OUTSTANDING` of what healthy rides scatter by, a sentence for each.
 
     No cause is common to them; it may be the day, such as wind, or the ride.
     """
-    mixed = report.mixed
-    if mixed is None or not report.normals:
-        return []
-    index, post = fitted(report)
+    mixed = found.mixed
+    index, post = fitted(found)
     sentences = []
-    for line, own in zip(report.lines, post.own, strict=True):
+    for line, own in zip(found.lines, post.own, strict=True):
         beyond = own / np.sqrt(mixed.scatter)
         beyond[index] = 0.0
         rows = [(abs(z), name, z) for name, z in zip(mixed.names, beyond, strict=True) if abs(z) > OUTSTANDING]
         if rows:
-            told = ", ".join(f"{words(name)} {z:+.1f}" for _, name, z in sorted(rows, reverse=True)[:3])
-            sentences.append(f"{line.ride.name} alone differs by more than rides do: {told} standard deviations")
+            most = ", ".join(f"{readable(name)} {z:+.1f}" for _, name, z in sorted(rows, reverse=True)[:3])
+            sentences.append(f"{line.ride.name} alone differs by more than rides do: {most} standard deviations")
     return sentences
-
-
-def _places(mixed: MixedModel, name: str) -> list[int]:
-    return mixed.index(next(c for c in mixed.causes if c.name == name).names)
 
 
 class QuantityReader:
@@ -146,17 +137,16 @@ def since_change(current: Array) -> Array:
     return since(np.abs(current - np.concatenate([np.full(n, current[0]), current[:-n]])) > JUMP)
 
 
-def pooled(lines: Sequence[LinearRide], channel: str, name: str, over: QuantityReader) -> tuple[Array, Array, Array]:
-    """(quantity, residual in the channel's unit, number of the ride) of all blocks, each (m,)."""
-    xs, ys, rides = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
-    for i, line in enumerate(lines):
+def pooled(lines: Sequence[LinearRide], channel: str, name: str, over: QuantityReader) -> tuple[Array, Array]:
+    """(quantity, residual in the channel's unit) of all blocks, each (m,)."""
+    xs, ys = [np.zeros(0)], [np.zeros(0)]
+    for line in lines:
         table = line.tables.get(channel)
         x = over(line, name, table) if table is not None else None
         if table is not None and x is not None:
             xs.append(x)
             ys.append(table.y * table.unit)
-            rides.append(np.full(len(x), float(i)))
-    return np.concatenate(xs), np.concatenate(ys), np.concatenate(rides)
+    return np.concatenate(xs), np.concatenate(ys)
 
 
 def edges(x: Array, count: int = 12) -> Array:

@@ -32,6 +32,11 @@ class Candidate:
         """The names of its parameters."""
         return tuple(parameter.name for parameter in self.parameters)
 
+    @property
+    def varies(self) -> bool:
+        """Whether it differs from ride to ride by itself."""
+        return self.effect is not None and self.effect.varies
+
 
 # name: (parameter, sign of the change that its cause can make, equation, what shows it and splits it)
 MOVABLE: Mapping[str, tuple[str, int, str, str]] = {
@@ -139,8 +144,6 @@ MOVABLE: Mapping[str, tuple[str, int, str, str]] = {
         "Voltage answers steps of the current late or early; switching the throttle on and off.",
     ),
 }
-HELD = ("slow_time", "warm_up_time", "hysteresis_rate")
-"""Parameters that shape an effect but are not its strength."""
 
 
 def candidates(folder: Path | None = None) -> tuple[Candidate, ...]:
@@ -152,15 +155,15 @@ def candidates(folder: Path | None = None) -> tuple[Candidate, ...]:
     found = []
     for name, (parameter, sign, equation, shown_by) in MOVABLE.items():
         found.append(Candidate(name, (declared[parameter],), equation, shown_by, None, sign))
-    own = [name for name in known_effects() if name not in BASE_EFFECTS]
-    theirs = [name for name in effects_in(folder) if name not in own] if folder else []
-    for name in (*own, *theirs):
+    packaged = [name for name in known_effects() if name not in BASE_EFFECTS]
+    theirs = [name for name in effects_in(folder) if name not in packaged] if folder else []
+    for name in (*packaged, *theirs):
         effect = load_effect(name, folder)
-        strengths = tuple(p for p in effect.parameters if p.name not in HELD)
-        if not strengths:
+        own = {parameter.name: parameter for parameter in effect.parameters}
+        if not effect.strengths:
             continue
-        first = strengths if name == "headwind" else strengths[:1]
+        strengths = tuple(own[strength] for strength in effect.strengths)
         equation = effect.doc.splitlines()[0] if effect.doc else name
-        sign = 1 if first[0].low >= 0 else 0
-        found.append(Candidate(name, first, equation, effect.shown_by, effect, sign))
+        sign = 1 if strengths[0].low >= 0 else 0
+        found.append(Candidate(name, strengths, equation, effect.shown_by, effect, sign))
     return tuple(found)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from gz_onboard.arrays import Array
+from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.curves import CurveForm, columns, extended
 from gz_onboard.lab.discover.linear import LinearRide, Normal, fit_mixed, normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
@@ -21,7 +21,7 @@ WIDE = 100.0  # variance of a curve's coefficients, in units of `CurveForm.size`
 class Fold:
     """What is free on the rides that a model is fitted to: causes, and the curve of what has no name."""
 
-    causes: Sequence[Any] = ()
+    causes: Sequence[Candidate] = ()
     form: CurveForm | None = None
 
     def fit(self, mixed: MixedModel, lines: Sequence[LinearRide], normals: Sequence[Normal]) -> tuple[Array, Array]:
@@ -81,7 +81,7 @@ def start_equations(mixed: MixedModel, line: LinearRide) -> Normal:
 
 
 def with_curve(
-    mixed: MixedModel, fitted: Sequence[tuple[LinearRide, Normal]], causes: Sequence[Any], form: CurveForm
+    mixed: MixedModel, fitted: Sequence[tuple[LinearRide, Normal]], causes: Sequence[Candidate], form: CurveForm
 ) -> tuple[Array, Array]:
     """(the common part (p,), the coefficients of `form` (k,)) from the rides `fitted`, the `causes` free."""
     p, k = len(mixed.mean), form.basis.shape[1]
@@ -120,7 +120,7 @@ def with_own_start(mixed: MixedModel, ride: Normal, theta: Array) -> Array:
     return moved
 
 
-def extended_mean(mixed: MixedModel, rest: Sequence[Normal], causes: Sequence[Any]) -> Array:
+def extended_mean(mixed: MixedModel, rest: Sequence[Normal], causes: Sequence[Candidate]) -> Array:
     """The common part from `rest` with the parameters of `causes` free."""
     wide = mixed.prior.copy()
     index = [i for cause in causes for i in mixed.index(cause.names)]

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.channels import BY_NAME, over_blocks
+from gz_onboard.lab.discover.channels import over_blocks
 from gz_onboard.lab.discover.grid import STEP, Ride, smooth
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Noise, Normal, fit_mixed, marginal, whitened
 from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel
@@ -182,6 +182,7 @@ COEFFICIENT_UNITS = {
 """Unit of a curve's coefficients, in the channel's; `SCATTER` of it is taken to differ between rides."""
 SCATTER = 0.3
 ENOUGH = 1.0  # sum of squared weights of a ride's blocks at a knot, from which on it counts as visited
+CURVE_RIDGE = 1e-3  # information, in `CurveForm.size`, that keeps knots without data from running away
 OWN_FREE = 100.0  # variance in `CurveForm.size` of the common curve while its scatter between rides is sought
 SCATTERS = {"cell_voltage": 1.0}  # whose model lacks more
 
@@ -246,51 +247,50 @@ def fit_curve(
     free = supported_knots(form, linears)
     if not free.shape[1]:
         return None
-    found = [extended(line, normal, form, mixed.noise) for line, normal in zip(linears, normals, strict=True)]
-    rides = [ride for ride in found if ride is not None]
+    rides = _with_columns(mixed, linears, normals, form)
     if not rides:
         return None
     p = len(mixed.mean)
     k = len(rides[0].b) - p
-    shape = mixed.shapes.get(form.name)
-    mean = np.concatenate([mixed.mean, shape.mean if shape else np.zeros(k)])
+    healthy = mixed.shapes.get(form.name)
+    mean = np.concatenate([mixed.mean, healthy.mean if healthy else np.zeros(k)])
     prior = np.zeros((p + k, p + k))
     prior[:p, :p] = mixed.prior
-    prior[p:, p:] = shape.covariance if shape else np.eye(k) * form.scatter**2
+    prior[p:, p:] = healthy.covariance if healthy else np.eye(k) * form.scatter**2
     scatter = np.concatenate([mixed.scatter, np.full(k, form.scatter**2)])
-    mine = list(range(p, p + k))
     if own and len(rides) > 1:
         wide = prior.copy()
         wide[p:, p:] += np.eye(k) * OWN_FREE
         learns = np.arange(p + k) >= p
         scatter = np.maximum(scatter, fit_mixed(rides, mean, wide, scatter, 1.0, learns, 10).scatter)
     e = evidence_of(mean, prior, scatter, rides)
-    inner = e.information[np.ix_(mine, mine)] + 1e-3 * np.eye(k)
-    score = e.score[mine]
-    if fixed:
-        f = list(fixed)
-        cross = np.linalg.solve(
-            e.information[np.ix_(f, f)] + 1e-6 * np.eye(len(f)),
-            np.column_stack([e.information[np.ix_(f, mine)], e.score[f]]),
-        )
-        inner = inner - e.information[np.ix_(mine, f)] @ cross[:, :-1]
-        score = score - e.information[np.ix_(mine, f)] @ cross[:, -1]
-    inner = free.T @ (inner + 1e-3 * np.eye(k)) @ free
+    inner, score = e.given(range(p, p + k), fixed, CURVE_RIDGE)
+    inner = free.T @ (inner + CURVE_RIDGE * np.eye(k)) @ free
     score = free.T @ score
     estimate = np.linalg.solve(inner, score)
     at = form.basis @ free * form.size
-    weights = np.zeros(len(at))
+    visits = _visits(form, linears)
+    return CurveFit(
+        float(score @ estimate), free.shape[1], at @ estimate, at @ np.linalg.inv(inner) @ at.T, visits / np.sum(visits)
+    )
+
+
+def _with_columns(
+    mixed: MixedModel, linears: Sequence[LinearRide], normals: Sequence[Normal], form: CurveForm
+) -> list[Normal]:
+    """The normal equations of the rides that have `form`, with its columns."""
+    every = (extended(line, normal, form, mixed.noise) for line, normal in zip(linears, normals, strict=True))
+    return [ride for ride in every if ride is not None]
+
+
+def _visits(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
+    """The sum of squared weights of all blocks at each knot, (knots,)."""
+    visits = np.zeros(len(form.basis))
     for line in linears:
         if form.channel in line.tables:
             knots = columns(line.ride, form.quantity, line.tables[form.channel])
-            weights += 0.0 if knots is None else (knots**2).sum(axis=0)
-    return CurveFit(
-        float(score @ estimate),
-        free.shape[1],
-        at @ estimate,
-        at @ np.linalg.inv(inner) @ at.T,
-        weights / np.sum(weights),
-    )
+            visits += 0.0 if knots is None else (knots**2).sum(axis=0)
+    return visits
 
 
 def learn_healthy_curves(
@@ -299,19 +299,18 @@ def learn_healthy_curves(
     """What the healthy rides leave over each quantity, beside what the parameters of `mixed` explain."""
     found = {}
     for form in curve_forms():
-        rides = [extended(line, normal, form, mixed.noise) for line, normal in zip(linears, normals, strict=True)]
-        rides = [ride for ride in rides if ride is not None]
+        rides = _with_columns(mixed, linears, normals, form)
         if not rides:
             continue
         p = len(mixed.mean)
-        k = len(rides[0].b) - p  # type: ignore[union-attr]
+        k = len(rides[0].b) - p
         # the parameters stay as they were learned: their values at the mean, the curve what is left
         m, c = np.zeros((k, k)), np.zeros(k)
         for ride in rides:
-            v = np.linalg.inv(np.diag(1 / mixed.scatter) + ride.n[:p, :p])  # type: ignore[union-attr]
-            u = mixed.mean + v @ (ride.b[:p] - ride.n[:p, :p] @ mixed.mean)  # type: ignore[union-attr]
-            inner = ride.n[p:, p:] - ride.n[p:, :p] @ v @ ride.n[:p, p:]  # type: ignore[union-attr]
-            score = ride.b[p:] - ride.n[p:, :p] @ u  # type: ignore[union-attr]
+            v = np.linalg.inv(np.diag(1 / mixed.scatter) + ride.n[:p, :p])
+            u = mixed.mean + v @ (ride.b[:p] - ride.n[:p, :p] @ mixed.mean)
+            inner = ride.n[p:, p:] - ride.n[p:, :p] @ v @ ride.n[:p, p:]
+            score = ride.b[p:] - ride.n[p:, :p] @ u
             part = marginal(Normal((inner + inner.T) / 2, score), np.full(k, form.scatter**2))
             m, c = m + part.n, c + part.b
         covariance = np.linalg.inv(m + np.eye(k))
@@ -340,6 +339,3 @@ def with_inflation(
         name: replace(shape, inflation=max(1.0, (2 + sum(total.get(name, []))) / (2 + len(total.get(name, [])))))
         for name, shape in whole.items()
     }
-
-
-__all__ = ["BY_NAME", "QUANTITIES", "CurveForm", "curve_forms", "fit_curve", "hat_functions", "learn_healthy_curves"]

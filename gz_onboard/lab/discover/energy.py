@@ -1,21 +1,23 @@
-"""What residuals and changes are worth: as power at the pack's terminals, as a share of the energy drawn."""
+"""Residuals and changes as power at the pack's terminals, and as a share of the energy drawn."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.channels import over_blocks
 from gz_onboard.lab.discover.curves import columns
+from gz_onboard.lab.discover.grid import STEP
 from gz_onboard.lab.discover.linear import LinearRide
-from gz_onboard.lab.discover.mixed_model import MixedModel
+from gz_onboard.lab.discover.result import ResidualSize, Unknown
+
+ROLLING = 2.0  # m/s: where `channels.road_force` holds
 
 
 def pack_power(table_name: str, line: LinearRide, values: Array) -> Array | None:
-    """What a residual of a channel is worth at the pack's terminals [W], over its blocks."""
+    """A residual of a channel as power at the pack's terminals [W], over its blocks; None if it is none."""
     table = line.tables[table_name]
     real = values * table.unit
     if table_name == "road_force":
@@ -27,79 +29,68 @@ def pack_power(table_name: str, line: LinearRide, values: Array) -> Array | None
     return None
 
 
-def energy_share(mixed: MixedModel, lines: Sequence[LinearRide], change: Array) -> float:
-    """The part of the energy drawn that `change` (p,) of the parameters makes, over these rides."""
-    more = drawn = 0.0
+def channel_energy(name: str, line: LinearRide, values: Array) -> float:
+    """A residual of a channel as energy at the pack's terminals [J] over the ride; 0 if it is none."""
+    power = pack_power(name, line, values)
+    return 0.0 if power is None or not len(power) else float(np.mean(power)) * channel_time(line, name)
+
+
+def energy_share(lines: Sequence[LinearRide], change: Array, channels: Collection[str] | None = None) -> float:
+    """The part of the energy drawn that `change` (p,) of the parameters makes over these rides, in some channels."""
+    drawn = sum(energy_drawn(line) for line in lines)
+    more = 0.0
     for line in lines:
-        drawn += energy(line)
-        for name in line.tables:
-            power = pack_power(name, line, -(line.tables[name].a @ change) * -1.0)
-            if power is not None and len(power):
-                more += float(np.mean(power)) * share_of_time(line, name)
+        for name, table in line.tables.items():
+            if channels is None or name in channels:
+                more += channel_energy(name, line, table.a @ change)
     return more / drawn if drawn else 0.0
 
 
-def energy(line: LinearRide) -> float:
-    """What the pack gave over the ride [J]."""
+def energy_drawn(line: LinearRide) -> float:
+    """What the pack gave over the ride [J]; the motor's work where its current or voltage is not known."""
     s = line.ride.signals
     volts, amperes = (
         ("pack_voltage", "pack_current") if "pack_current" in s else ("inverter_voltage", "inverter_current")
     )
     if amperes not in s or volts not in s:
-        return float(np.sum(np.abs(s["motor_current"] * line.ride.quantities["motor_speed"]))) * 0.045
-    return float(np.sum(s[volts] * s[amperes])) * 0.1
+        q = line.ride.quantities
+        return float(np.sum(np.abs(q["torque"] * q["motor_speed"]))) * STEP
+    return float(np.sum(s[volts] * s[amperes])) * STEP
 
 
-def share_of_time(line: LinearRide, channel: str) -> float:
-    """The time [s] for which a channel's mean holds: the ride, or that part of it in which it moves."""
-    whole = len(line.ride.time) * 0.1
+def channel_time(line: LinearRide, channel: str) -> float:
+    """The time [s] for which a channel's mean holds: the ride, or that part of it in which it rolls."""
+    whole = len(line.ride.time) * STEP
     if channel == "road_force":
-        return float(np.mean(np.abs(line.ride.quantities["speed"]) > 2.0)) * whole
+        return float(np.mean(np.abs(line.ride.quantities["speed"]) > ROLLING)) * whole
     return whole
 
 
-def curve_energy_share(lines: Sequence[LinearRide], shape: dict[str, Any]) -> float:
+def curve_energy_share(lines: Sequence[LinearRide], unknown: Unknown) -> float:
     """The part of the energy drawn that the curve takes."""
-
-    more = drawn = 0.0
-    values = np.array([row[1] for row in shape["curve"]])
+    drawn = sum(energy_drawn(line) for line in lines)
+    more = 0.0
+    values = np.array([row[1] for row in unknown.curve])
     for line in lines:
-        drawn += energy(line)
-        table = line.tables.get(shape["channel"])
-        if table is None:
-            continue
-        c = columns(line.ride, shape["quantity"], table)
-        if c is None:
-            continue
-        power = pack_power(shape["channel"], line, c @ values / table.unit)
-        if power is not None and len(power):
-            more += float(np.mean(power)) * share_of_time(line, shape["channel"])
+        table = line.tables.get(unknown.channel)
+        knots = columns(line.ride, unknown.quantity, table) if table is not None else None
+        if table is not None and knots is not None:
+            more += channel_energy(unknown.channel, line, knots @ values / table.unit)
     return more / drawn if drawn else 0.0
 
 
-def residual_sizes(lines: Sequence[LinearRide]) -> dict[str, dict[str, float]]:
-    """Of each channel's residual: mean, rms, correlation of neighbours, share of the energy."""
-    result: dict[str, dict[str, float]] = {}
-    drawn = sum(energy(line) for line in lines)
+def residual_sizes(lines: Sequence[LinearRide]) -> dict[str, ResidualSize]:
+    """Of each channel's residual."""
+    result = {}
+    drawn = sum(energy_drawn(line) for line in lines)
     for name in sorted({name for line in lines for name in line.tables}):
         tables = [(line, line.tables[name]) for line in lines if name in line.tables]
         y = np.concatenate([table.y for _, table in tables])
         pairs = [(table.y[1:], table.y[:-1]) for _, table in tables]
         late, early = (np.concatenate(side) for side in zip(*pairs, strict=True))
         correlation = float(np.corrcoef(late, early)[0, 1]) if np.std(late) > 0 and np.std(early) > 0 else 0.0
-        powers = [pack_power(name, line, table.y) for line, table in tables]
-        more = sum(
-            float(np.mean(w)) * share_of_time(line, name)
-            for w, (line, _) in zip(powers, tables, strict=True)
-            if w is not None and len(w)
-        )
-        share = more / drawn if drawn else 0.0
-        result[name] = {
-            "mean": float(y.mean()),
-            "rms": float(np.sqrt(np.mean(y**2))),
-            "autocorrelation": correlation,
-            "blocks": len(y),
-            "energy_share": share,
-            "range_share": -share / (1 + share) if share > -1 else 0.0,
-        }
+        share = sum(channel_energy(name, line, table.y) for line, table in tables) / drawn if drawn else 0.0
+        size = float(np.sqrt(np.mean(y**2)))
+        of_range = -share / (1 + share) if share > -1 else 0.0
+        result[name] = ResidualSize(float(y.mean()), size, correlation, len(y), share, of_range)
     return result

@@ -45,7 +45,6 @@ class Ride:
     radius: float
     payload: float | None
     quantities: dict[str, Array] = field(default_factory=dict)
-    missing: tuple[str, ...] = ()
 
     @property
     def have(self) -> set[str]:
@@ -61,7 +60,7 @@ class Ride:
 
     @property
     def distance(self) -> float:
-        """The way ridden [m]."""
+        """The distance ridden [m]."""
         return float(np.sum(np.abs(self.quantities["speed"])) * STEP)
 
     @property
@@ -104,8 +103,9 @@ def measured(times: Array, grid: Array) -> Mask:
     return np.asarray((gap < limit) & (grid > times[0] - limit) & (grid < times[-1] + limit))
 
 
-def read_ride(samples: Samples, radius: float, mass: float) -> Ride:
-    """`samples` on the grid. radius: of the driven wheel over the gear ratio [m], mass: of vehicle and payload [kg].
+def read_ride(samples: Samples, radius: float, mass: float, torque_constant: float) -> Ride:
+    """`samples` on the grid. radius: of the driven wheel over the gear ratio [m], mass: of vehicle and payload [kg],
+    torque_constant: of the motor [N·m/A].
 
     Raises InputError for a ride without motor speed or current, or shorter than a minute.
     """
@@ -127,32 +127,13 @@ def read_ride(samples: Samples, radius: float, mass: float) -> Ride:
         signals[role] = averaged(times, turned, at)
         valid[role] = measured(times, at)
     ride = Ride(samples.name, grid - start, signals, valid, radius, samples.rider_mass)
-    ride.quantities = _quantities(ride, mass)
+    ride.quantities = _quantities(ride, mass, torque_constant)
     ride.quantities["since_braking"] = since(ride.braking)
     wheels = [samples.columns[role] for role in SUSPENSION if role in samples.columns]
     if wheels and all(np.median(np.diff(times)) < SHAKING for times, _ in wheels):
         ride.quantities["suspension_speed"] = suspension_speed(wheels, grid)
     if "accel_z" in samples.columns and np.median(np.diff(samples.columns["accel_z"][0])) < SHAKING:
         ride.quantities["vibration"] = vibration(*samples.columns["accel_z"], grid)
-    wanted = (
-        "accel_x",
-        "rate_z",
-        "gps_speed",
-        "gps_altitude",
-        "gps_course",
-        "pack_voltage",
-        "pack_current",
-        "inverter_voltage",
-        "inverter_current",
-        "auxiliary_current",
-        "cell_temperature",
-        "ambient_temperature",
-        "motor_temperature",
-        "inverter_temperature",
-        "wheel_speed_front",
-        "wheel_speed_rear",
-    )
-    ride.missing = tuple(role for role in wanted if role not in signals)
     return ride
 
 
@@ -191,7 +172,7 @@ def smooth(values: Array, seconds: float) -> Array:
     return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
 
 
-def _quantities(ride: Ride, mass: float) -> dict[str, Array]:
+def _quantities(ride: Ride, mass: float, torque_constant: float) -> dict[str, Array]:
     s = ride.signals
     n = len(ride.time)
     motor_speed = s["motor_speed"]
@@ -230,5 +211,5 @@ def _quantities(ride: Ride, mass: float) -> dict[str, Array]:
         "cell_temperature": temperature,
         "heading": np.asarray(np.mod(course, 2 * np.pi), dtype=np.float64),
         "time_moving": np.asarray(moved, dtype=np.float64),
-        "torque": s["motor_current"],
+        "torque": torque_constant * s["motor_current"],
     }

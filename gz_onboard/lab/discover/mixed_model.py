@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.stats import t as student
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.candidates import Candidate, candidates
 from gz_onboard.lab.discover.channels import CHANNELS, System, counted_soc, depends
 from gz_onboard.lab.discover.grid import Ride, read_ride
-from gz_onboard.lab.discover.linear import Noise
+from gz_onboard.lab.discover.linear import LinearRide, Noise, linearise, spread_out, trimmed
 from gz_onboard.lab.discover.prior import BASE, FIXED, LOG, NUISANCES, RIDE_SD, RIDE_SD_SHARE, stepped
 from gz_onboard.physics.effect import Effect
 from gz_onboard.physics.parameters import declared_parameters
@@ -48,6 +50,8 @@ TRANSFER = (
 )
 TRANSFERRED = 3.0
 """Found on a bench at steady points: on the road they hold within so many times their standard deviation."""
+PRIOR_RIDES, LEAST_FREEDOM = 3, 4
+"""What is known without healthy rides, worth so many of them; and no scatter is known worse than with so many."""
 
 
 @dataclass(frozen=True)
@@ -85,8 +89,24 @@ class MixedModel:
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom that the scatter between rides is known with; four are for what is known without any."""
-        return float(max(2 * (self.healthy + 3), 8))
+        """Degrees of freedom that the scatter between rides is known with: of a search, two for each ride."""
+        return float(max(2 * (self.healthy + PRIOR_RIDES), 2 * LEAST_FREEDOM))
+
+    @property
+    def quantile(self) -> float:
+        """Of Student's t: half of a 95 % interval, in standard deviations."""
+        return float(student.ppf(0.975, max(self.healthy + PRIOR_RIDES, LEAST_FREEDOM)))
+
+    @property
+    def usable_causes(self) -> list[Candidate]:
+        """The candidates whose parameters some channel depends on."""
+        return [cause for cause in self.causes if set(cause.names) <= set(self.names)]
+
+    def healthy_value(self, name: str) -> float:
+        """The healthy vehicle's value of a parameter: that of its file, 0 for an effect that its model lacks."""
+        has = {effect.name for effect in self.vehicle.model.effects}
+        lacking = {n for c in self.causes if c.effect and c.effect.name not in has for n in c.names}
+        return 0.0 if name in lacking else float(self.vehicle.parameters[name])
 
     def index(self, names: Sequence[str]) -> list[int]:
         """Where `names` stand."""
@@ -103,7 +123,9 @@ class MixedModel:
         """`samples` on the grid of this vehicle."""
         p = self.vehicle.parameters
         payload = samples.rider_mass if samples.rider_mass is not None else p["payload_mass"]
-        ride = read_ride(samples, p["wheel_radius"] * p["gear_ratio"], p["vehicle_mass"] + payload)
+        ride = read_ride(
+            samples, p["wheel_radius"] * p["gear_ratio"], p["vehicle_mass"] + payload, p["torque_constant"]
+        )
         if self.system.battery is not None and {"pack_voltage", "pack_current"} <= ride.have:
             ride.quantities["soc"] = counted_soc(ride, self.system)
         return ride
@@ -183,13 +205,24 @@ def vehicle_file_names(vehicle: Vehicle) -> set[str]:
     return {name for name, value in vehicle.parameters.known.items() if not value.source.startswith("prior:")}
 
 
-def restore(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
-    """What healthy rides taught of `vehicle`, or its file alone."""
-    if isinstance(vehicle.healthy, MixedModel):
-        return vehicle.healthy
-    mixed = initial(vehicle, folder)
-    if isinstance(vehicle.healthy, Path):
-        from gz_onboard.lab.discover.extension import load
+def _linearised(job: tuple[Ride, MixedModel]) -> LinearRide:
+    ride, mixed = job
+    line = linearise(ride, mixed.values, mixed.names, mixed.scale, mixed.system)
+    wide = np.sqrt(np.diag(mixed.prior)) + 3 * np.sqrt(mixed.scatter)
+    for parameter in [parameter for cause in mixed.usable_causes for parameter in cause.parameters]:
+        (i,) = mixed.index([parameter.name])
+        wide[i] += max(10 * float(np.sqrt(mixed.scatter[i])), 3 * parameter.prior_sd / float(mixed.scale[i]))
+    line = trimmed(line, mixed.noise, mixed.mean, wide)
+    return spread_out(line, mixed.noise, mixed.mean, wide) if mixed.healthy else line
 
-        return load(mixed, vehicle.healthy)
-    return mixed
+
+def linearise_all(
+    rides: Sequence[Ride], mixed: MixedModel | Sequence[MixedModel], workers: int = 1
+) -> list[LinearRide]:
+    """All rides at a model, or each at its own, in `workers` processes."""
+    states = [mixed] * len(rides) if isinstance(mixed, MixedModel) else mixed
+    jobs = list(zip(rides, states, strict=True))
+    if workers < 2 or len(rides) < 2:
+        return [_linearised(job) for job in jobs]
+    with ProcessPoolExecutor(workers) as pool:
+        return list(pool.map(_linearised, jobs))

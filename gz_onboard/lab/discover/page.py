@@ -7,32 +7,24 @@ import html
 import io
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gz_onboard.lab.discover.breakdown import (
-    QUANTITIES,
-    QuantityReader,
-    before_and_after,
-    binned,
-    edges,
-    pooled,
-    share_over,
-)
+from gz_onboard.lab.discover.breakdown import QuantityReader, before_and_after
 from gz_onboard.lab.discover.channels import BY_NAME
-from gz_onboard.lab.discover.detectability import amount, limits, size, words
+from gz_onboard.lab.discover.detectability import extent
 from gz_onboard.lab.discover.energy import residual_sizes
 from gz_onboard.lab.discover.linear import LinearRide
+from gz_onboard.lab.discover.plots import curve, overview, panels, ranking
 from gz_onboard.lab.discover.result import METRICS, VERDICTS, Report
-from gz_onboard.lab.discover.unexplained import RIDES
-from gz_onboard.simulation.style import BLUE, GRID, INK, MUTED, ORANGE, headline, legend, new_figure, rule
+from gz_onboard.lab.discover.verdict import Discovery
+from gz_onboard.lab.discover.wording import readable, with_unit
 from gz_onboard.simulation.telling import clock
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-BEFORE, AFTER = ORANGE, BLUE
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #1f2933; max-width: 1150px; margin: 2rem auto; padding: 0 1.5rem }
 h1 { font-size: 1.7rem; margin-bottom: .2rem } h2 { margin-top: 2.4rem; border-bottom: 1px solid #e4e7eb }
@@ -54,19 +46,19 @@ _GRADE = (
 )
 
 
-def write_report(report: Report, out: Path) -> None:
-    """Write `report` to the HTML file `out`. Raises OSError."""
-    out.write_text(page(report), encoding="utf-8")
+def write_report(found: Discovery, out: Path) -> None:
+    """Write the report of `found` to the HTML file `out`. Raises OSError."""
+    out.write_text(page(found), encoding="utf-8")
 
 
-def page(report: Report) -> str:
+def page(found: Discovery) -> str:
     """The report as HTML."""
-    before, after = before_and_after(report)
-    over = QuantityReader(report.mixed) if report.mixed else None
-    assert over is not None
-    channels = [name for name in BY_NAME if any(name in line.tables for line in report.lines)]
+    report = found.report
+    before, after = before_and_after(found)
+    over = QuantityReader(found.mixed)
+    channels = [name for name in BY_NAME if any(name in line.tables for line in found.lines)]
     parts = [
-        _head(report),
+        _head(found),
         _causes(report),
         _next(report),
         "<h2>What the residuals are</h2>" + _residuals(report, before, after),
@@ -74,9 +66,9 @@ def page(report: Report) -> str:
         f"<p>Share of each residual's variance that goes with a quantity, in percent: before{_named(report)}.</p>",
         _picture(overview(before, after, channels, over, bool(report.causes))),
     ]
-    shown = _most(report, before, channels)
+    shown = _most(found, before, channels)
     for name in [*shown, *(c for c in channels if c not in shown)]:
-        title = f"{words(name)} [{BY_NAME[name].unit}]"
+        title = f"{readable(name)} [{BY_NAME[name].unit}]"
         picture = _picture(panels(before, after, name, over, bool(report.causes)))
         note = _GRADE if name == "road_force" else ""
         parts.append(f"<details{' open' if name in shown else ''}><summary>{title}</summary>{picture}{note}</details>")
@@ -97,31 +89,29 @@ def page(report: Report) -> str:
 def _named(report: Report) -> str:
     if not report.causes:
         return "hand, each ride's own biases and wind taken off"
-    names = ", ".join(words(cause.name) for cause in report.causes)
+    names = ", ".join(readable(cause.name) for cause in report.causes)
     return f" and after {html.escape(names)}; each ride's own biases and wind taken off"
 
 
-def _head(report: Report) -> str:
-    mixed = report.mixed
-    assert mixed is not None
-    way, time, drawn = size(report)
+def _head(found: Discovery) -> str:
+    report, mixed = found.report, found.mixed
+    ridden = extent(found.lines)
     known = f"{mixed.healthy} healthy rides" if mixed.healthy else "the vehicle file alone"
     cards = [
-        (f"{len(report.lines)}", "ride" if len(report.lines) == 1 else "rides"),
-        (f"{way / 1e3:.1f} km", clock(time)),
+        (f"{len(found.lines)}", "ride" if len(found.lines) == 1 else "rides"),
+        (f"{ridden.distance / 1e3:.1f} km", clock(ridden.time)),
     ]
-    if drawn > 0:
-        cards.append((f"{drawn / 3.6e6:.2f} kWh", "drawn"))
+    if ridden.energy > 0:
+        cards.append((f"{ridden.energy / 3.6e6:.2f} kWh", "drawn"))
     share = sum(cause.energy_share for cause in report.causes)
     if report.causes:
         cards.append((f"{share:+.1%}", "of the energy named"))
     elif report.unknown:
-        cards.append((f"{report.unknown['share']:+.1%}", "of the energy, without a name"))
-    error = report.gain.get("range")
-    if isinstance(error, dict):
-        cards.append((f"{error['before']:.1%} → {error['after']:.1%}", "error of the range, held out"))
+        cards.append((f"{report.unknown.share:+.1%}", "of the energy, without a name"))
+    if (error := report.gain.range) is not None:
+        cards.append((f"{error.before:.1%} → {error.after:.1%}", "error of the range, held out"))
     boxes = "".join(f'<div class="card"><b>{value}</b>{text}</div>' for value, text in cards)
-    rides = ", ".join(html.escape(line.ride.name) for line in report.lines)
+    rides = ", ".join(html.escape(line.ride.name) for line in found.lines)
     return (
         f"<h1>{html.escape(mixed.vehicle.name)}: {report.verdict}</h1>"
         f'<p class="verdict">{VERDICTS[report.verdict].capitalize()}.</p>'
@@ -135,16 +125,18 @@ def _causes(report: Report) -> str:
     for c in report.causes:
         rows.append(
             [
-                words(c.name),
+                readable(c.name),
                 c.parameter,
-                amount(c.value, c.unit),
+                with_unit(c.value, c.unit),
                 f"{c.ci95[0]:.4g} to {c.ci95[1]:.4g}",
                 f"{c.change:+.4g}",
                 f"{c.energy_share:+.1%}",
                 f"{c.evidence:.0f}",
             ]
         )
-        rows += [["", name, f"{value:.4g}", f"{ci[0]:.4g} to {ci[1]:.4g}", "", "", ""] for name, value, ci in c.others]
+        for name, other in c.others.items():
+            low, high = other.ci95
+            rows.append(["", name, f"{other.value:.4g}", f"{low:.4g} to {high:.4g}", "", "", ""])
     if rows:
         heads = ["cause", "parameter", "value", "95 % interval", "change", "of the energy", "score"]
         text += "<h2>Causes</h2>" + table(heads, rows)
@@ -154,19 +146,18 @@ def _causes(report: Report) -> str:
         )
     for c in report.causes:
         if c.varies:
-            text += (
-                f"<p>The {words(c.name)} differs from ride to ride: it is named, but no model is extended with it.</p>"
-            )
+            name = readable(c.name)
+            text += f"<p>The {name} differs from ride to ride: it is named, but no model is extended with it.</p>"
     for group in report.ambiguous:
-        text += f"<p><b>Not told apart by these rides:</b> {', '.join(words(name) for name in group)}.</p>"
+        text += f"<p><b>Not told apart by these rides:</b> {', '.join(readable(name) for name in group)}.</p>"
     if report.unknown:
         u = report.unknown
         text += (
-            f"<p><b>No candidate explains</b> what {words(u['channel'])} leaves over {words(u['quantity'])}: "
-            f"{u['share']:+.1%} of the energy, score {u['score']:.0f}.</p>"
+            f"<p><b>No candidate explains</b> what {readable(u.channel)} leaves over {readable(u.quantity)}: "
+            f"{u.share:+.1%} of the energy, score {u.score:.0f}.</p>"
         )
-        if u["denies"]:
-            names = ", ".join(words(name) for name in u["denies"])
+        if u.denies:
+            names = ", ".join(readable(name) for name in u.denies)
             text += f"<p><b>Denied:</b> {names}, which would not act alike everywhere.</p>"
     return text
 
@@ -184,19 +175,19 @@ def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[Lin
         if name not in raw:
             continue
         r, b, a = raw[name], first.get(name, raw[name]), last.get(name, raw[name])
-        energy = any(abs(x["energy_share"]) > 0 for x in (b, a))
-        shares = [f"{x:+.1%}" if energy else "–" for x in (b["energy_share"], b["range_share"], a["energy_share"])]
+        energy = any(abs(x.energy_share) > 0 for x in (b, a))
+        shares = [f"{x:+.1%}" if energy else "–" for x in (b.energy_share, b.range_share, a.energy_share)]
         rows.append(
             [
-                words(name),
+                readable(name),
                 BY_NAME[name].unit,
-                f"{r['mean']:+.2g}",
-                f"{r['rms']:.2g}",
-                f"{b['rms']:.2g}",
-                f"{b['autocorrelation']:.2f}",
+                f"{r.mean:+.2g}",
+                f"{r.rms:.2g}",
+                f"{b.rms:.2g}",
+                f"{b.autocorrelation:.2f}",
                 *shares[:2],
-                f"{a['rms']:.2g}",
-                f"{a['autocorrelation']:.2f}",
+                f"{a.rms:.2g}",
+                f"{a.autocorrelation:.2f}",
                 shares[2],
             ]
         )
@@ -213,7 +204,9 @@ def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[Lin
         "auto­correlation",
         "of the energy",
     ]
-    blocks = ", ".join(f"{words(n)} {BY_NAME[n].block:g} s" for n in ("road_force", "inverter_power", "cell_voltage"))
+    blocks = ", ".join(
+        f"{readable(n)} {BY_NAME[n].block:g} s" for n in ("road_force", "inverter_power", "cell_voltage")
+    )
     return table(heads, rows) + (
         '<p class="muted">Mean and rms as measured, with the bias of each ride\'s sensors and its wind; before and '
         "after with these taken off, without and with the causes named. Autocorrelation: of neighbouring blocks "
@@ -221,15 +214,15 @@ def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[Lin
     )
 
 
-def _most(report: Report, before: Sequence[LinearRide], channels: Sequence[str]) -> list[str]:
+def _most(found: Discovery, before: Sequence[LinearRide], channels: Sequence[str]) -> list[str]:
     """The channels whose pictures are open: those that the causes change most, else the road's and the cells'."""
-    mixed = report.mixed
-    if mixed is None or not report.causes:
-        wanted = [report.unknown["channel"]] if report.unknown else []
+    report, mixed = found.report, found.mixed
+    if not report.causes:
+        wanted = [report.unknown.channel] if report.unknown else []
         return [c for c in (*wanted, "road_force", "cell_voltage") if c in channels][:2]
-    found = []
+    most: list[str] = []
     for cause in report.causes:
-        index = mixed.index(next(c for c in mixed.causes if c.name == cause.name).names)
+        index = mixed.index(list(cause.parameters))
         weight = {}
         for name in channels:
             tables = [line.tables[name] for line in before if name in line.tables]
@@ -237,29 +230,23 @@ def _most(report: Report, before: Sequence[LinearRide], channels: Sequence[str])
             noise = sum(float(np.sum(t.y**2)) for t in tables)
             weight[name] = size_ / noise if noise > 0 else 0.0
         best = max(weight, key=lambda n: weight[n])
-        if best not in found:
-            found.append(best)
-    return found
+        if best not in most:
+            most.append(best)
+    return most
 
 
 def _gain(report: Report) -> str:
     rows = []
-    for metric, (label, factor, unit) in METRICS.items():
-        g = report.gain.get(metric)
-        if isinstance(g, dict):
-            low, high = (x * factor for x in g["ci95"])
-            rows.append(
-                [
-                    f"{label} [{unit}]",
-                    *(f"{g[key] * factor:.3g}" for key in ("before", "control", "after")),
-                    f"{low:+.3g} to {high:+.3g}",
-                ]
-            )
+    for metric, errors in report.gain.errors.items():
+        label, factor, unit = METRICS[metric]
+        low, high = (x * factor for x in errors.ci95)
+        values = [f"{x * factor:.3g}" for x in (errors.before, errors.control, errors.after)]
+        rows.append([f"{label} [{unit}]", *values, f"{low:+.3g} to {high:+.3g}"])
     if not rows:
-        return f"<p>{html.escape(str(report.gain.get('note', 'nothing was held out')))}</p>"
+        return f"<p>{html.escape(report.gain.note or 'nothing was held out')}</p>"
     heads = ["error", "before", "control", "after", "gain over control, 95 % over rides"]
-    held = ", ".join(map(html.escape, report.gain.get("holdout", [])))
-    text = "In no choice and no fit" if report.gain.get("apart") else "Each in turn was held out of the fit"
+    held = ", ".join(map(html.escape, report.gain.holdout))
+    text = "In no choice and no fit" if report.gain.apart else "Each in turn was held out of the fit"
     return table(heads, rows) + (
         f'<p class="muted">{text}: {held}. Control: the parameters that the model has already, refitted on the other '
         "rides. After: the causes as well.</p>"
@@ -270,7 +257,7 @@ def _constancy(report: Report) -> str:
     splits = report.constancy
     if not splits:
         return ""
-    rows = [[words(s.cause), words(s.quantity), f"{s.ratio:+.2f}", f"{s.chi2:.1f}"] for s in splits]
+    rows = [[readable(s.cause), readable(s.quantity), f"{s.ratio:+.2f}", f"{s.chi2:.1f}"] for s in splits]
     return (
         "<h2>Whether a cause acts alike everywhere</h2><p>Half the difference of left and right bends, or of the upper "
         "and lower half of a quantity, over the mean: 0 for the cause itself, ±1 for what acts in one half only.</p>"
@@ -280,12 +267,12 @@ def _constancy(report: Report) -> str:
 
 def _limits(report: Report) -> str:
     rows = []
-    for limit in limits(report):
-        if limit.change < float("inf"):
-            share = f"{limit.share:.1%}" if limit.share > 1e-5 else "–"
-            rows.append([words(limit.name), limit.parameter, amount(limit.change, limit.unit, ".3g"), share])
+    for name, limit in report.limits.items():
+        if limit.change is None or limit.energy_share is None:
+            rows.append([readable(name), limit.parameter, "not by these rides", "–"])
         else:
-            rows.append([words(limit.name), limit.parameter, "not by these rides", "–"])
+            share = f"{limit.energy_share:.1%}" if limit.energy_share > 1e-5 else "–"
+            rows.append([readable(name), limit.parameter, with_unit(limit.change, limit.unit, ".3g"), share])
     return (
         "<h2>What these rides could show</h2><p>The least change that would be found half the time, were it alone.</p>"
         f"<details><summary>Every candidate</summary>{table(['cause', 'parameter', 'change', 'of the energy'], rows)}"
@@ -294,10 +281,10 @@ def _limits(report: Report) -> str:
 
 
 def _separable(report: Report) -> str:
-    look = report.isolability.get("look_alikes", [])
+    look = report.isolability.look_alikes
     if not look:
         return "<p>No two candidates look alike to these rides (cosine above 0.8).</p>"
-    rows = [[words(a), words(b), f"{c:+.2f}"] for a, b, c in look[:20]]
+    rows = [[readable(a), readable(b), f"{c:+.2f}"] for a, b, c in look[:20]]
     return (
         "<p>Causes that look alike to these rides: cosine of what they do to the residuals once biases and scatter are "
         "out. At ±1 no statistics can tell them apart.</p>" + table(["cause", "cause", "cosine"], rows)
@@ -315,158 +302,6 @@ def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     head = "".join(f"<th>{html.escape(text)}</th>" for text in heads)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     return f"<table><tr>{head}</tr>{body}</table>"
-
-
-# --- pictures -----------------------------------------------------------------------------------------------------
-
-
-def overview(
-    before: Sequence[LinearRide],
-    after: Sequence[LinearRide],
-    channels: Sequence[str],
-    over: QuantityReader,
-    named: bool,
-) -> Figure:
-    """Channels by quantities: the share of variance that goes with each, before and after."""
-    quantities = list(QUANTITIES)
-    grids = []
-    for lines in (before, after) if named else (before,):
-        rows = []
-        for channel in channels:
-            rows.append([100 * share_over(*pooled(lines, channel, name, over)[:2]) for name in quantities])
-        grids.append(np.array(rows))
-    width, height = 12.5, 1.5 + 0.3 * len(channels)
-    figure = new_figure(width, height)
-    for i, (grid, title) in enumerate(zip(grids, ("before", "after"), strict=False)):
-        axis = figure.add_axes((0.12 + 0.43 * i, 0.02, 0.385, 1 - 1.35 / height))
-        axis.imshow(grid, cmap="Oranges" if i == 0 else "Blues", vmin=0, vmax=60, aspect="auto")
-        for r in range(len(channels)):
-            for c in range(len(quantities)):
-                value = grid[r, c]
-                if value >= 1:
-                    axis.text(
-                        c,
-                        r,
-                        f"{value:.0f}",
-                        ha="center",
-                        va="center",
-                        fontsize=7.5,
-                        color="white" if value > 40 else INK,
-                    )
-        axis.set_xticks(
-            range(len(quantities)), [words(name) for name in quantities], rotation=38, ha="left", fontsize=8
-        )
-        axis.xaxis.tick_top()
-        axis.set_yticks(range(len(channels)), [words(name) for name in channels] if i == 0 else [], fontsize=8)
-        axis.tick_params(length=0, colors=MUTED)
-        for side in axis.spines.values():
-            side.set_color(GRID)
-        if named:
-            headline(figure, 0.13 + 0.44 * i, 1 - 0.12 / height, title, 10)
-    return figure
-
-
-def panels(
-    before: Sequence[LinearRide],
-    after: Sequence[LinearRide],
-    channel: str,
-    over: QuantityReader,
-    named: bool,
-    names: Sequence[str] = tuple(QUANTITIES),
-) -> Figure:
-    """The residual's mean over each quantity, in bins of as many blocks, one standard error as a band."""
-    drawn = []
-    for name in names:
-        x, y, _ = pooled(before, channel, name, over)
-        if len(x) > 20 and np.ptp(x) > 0:
-            at = edges(x)
-            drawn.append((name, binned(x, y, at), binned(*pooled(after, channel, name, over)[:2], at)))
-    columns = min(4, max(len(drawn), 1))
-    rows = max(1, -(-len(drawn) // columns))
-    height = 0.55 + 2.15 * rows
-    figure = new_figure(12.5, height)
-    if not drawn:
-        return figure
-    grid = figure.add_gridspec(
-        rows, columns, left=0.06, right=0.985, wspace=0.13, hspace=0.42, top=1 - 0.3 / height, bottom=0.48 / height
-    )
-    axes: list[Any] = []
-    for i, (name, first, last) in enumerate(drawn):
-        axis = figure.add_subplot(grid[i // columns, i % columns], sharey=axes[0] if axes else None)
-        axes.append(axis)
-        rule(axis)
-        axis.locator_params(nbins=5)
-        for rows_, colour, label in ((first, BEFORE, "before"), (last, AFTER, "after")):
-            if label == "after" and not named:
-                continue
-            x, y, error = rows_[:, 0], rows_[:, 1], rows_[:, 2]
-            axis.fill_between(x, y - error, y + error, color=colour, alpha=0.2, linewidth=0)
-            axis.plot(x, y, "o-", color=colour, markersize=3, linewidth=1.3, label=label if named else "residual")
-        axis.axhline(0, color=INK, linewidth=0.6)
-        label, unit = QUANTITIES[name]
-        axis.set_xlabel(label if unit == "1" else f"{label} [{unit}]", fontsize=8, color=INK, labelpad=2)
-        if i % columns:
-            axis.tick_params(labelleft=False)
-    legend(axes[min(columns, len(axes)) - 1])
-    figure.text(
-        0.012, 0.5, f"measured less model [{BY_NAME[channel].unit}]", rotation=90, va="center", fontsize=8.5, color=INK
-    )
-    return figure
-
-
-def ranking(report: Report) -> Figure:
-    """The score of every candidate, with the threshold."""
-    rows = report.ranking[::-1]
-    height = 0.9 + 0.21 * len(rows)
-    figure = new_figure(9, height)
-    axis = figure.add_axes((0.2, 0.55 / height, 0.76, 1 - 0.75 / height))
-    rule(axis)
-    chosen = {c.name for c in report.causes}
-    near = {name for group in report.ambiguous for name in group} - chosen
-    colours = [BLUE if name in chosen else "#8fb8de" if name in near else "#cbd2d9" for name, _ in rows]
-    axis.barh([words(name) for name, _ in rows], [max(score, 0.0) for _, score in rows], color=colours, height=0.7)
-    axis.axvline(report.threshold, color=INK, linewidth=1, linestyle=(0, (4, 2)))
-    axis.annotate(
-        "threshold",
-        (report.threshold, 0),
-        (4, 3),
-        xycoords=("data", "axes fraction"),
-        textcoords="offset points",
-        fontsize=8,
-        color=MUTED,
-        va="bottom",
-    )
-    axis.set_xscale("symlog", linthresh=10)
-    axis.set_xlim(0, max(2 * report.threshold, 1.3 * max((score for _, score in rows), default=1)))
-    axis.set_xlabel("score beside the causes named (blue), linear up to 10", fontsize=8.5, color=INK)
-    axis.tick_params(axis="y", colors=INK)
-    axis.margins(y=0.01)
-    return figure
-
-
-def curve(unknown: dict[str, Any]) -> Figure:
-    """The curve of what has no name, with two standard deviations."""
-    figure = new_figure(8, 3.4)
-    axis = figure.add_axes((0.1, 0.16, 0.86, 0.78))
-    rule(axis)
-    x, y, sd = np.array(unknown["curve"], dtype=float).T
-    axis.fill_between(x, y - 2 * sd, y + 2 * sd, color=BEFORE, alpha=0.2, linewidth=0)
-    axis.plot(x, y, "o-", color=BEFORE, linewidth=1.6, markersize=4)
-    axis.set_ylim(*_limits_of(y, sd))
-    axis.axhline(0, color=INK, linewidth=0.6)
-    axis.set_xlabel(f"{words(unknown['quantity'])} [{unknown['unit']}]", fontsize=9, color=INK)
-    left = f"{words(unknown['channel'])} [{BY_NAME[unknown['channel']].unit}]"
-    if unknown["quantity"] == RIDES:
-        left = f"{words(unknown['denies'][0])}, over its mean [1]"
-    axis.set_ylabel(left, fontsize=9, color=INK)
-    return figure
-
-
-def _limits_of(y: np.ndarray[Any, Any], sd: np.ndarray[Any, Any]) -> tuple[float, float]:
-    """Of the ordinate: the curve where it is known; a knot without data does not set the scale."""
-    known = sd < 5 * float(np.median(sd)) + 1e-12
-    low, high = float(np.min((y - 2 * sd)[known])), float(np.max((y + 2 * sd)[known]))
-    return min(low, 0.0) * 1.1, max(high, 0.0) * 1.1 + 1e-9
 
 
 def _picture(figure: Figure) -> str:

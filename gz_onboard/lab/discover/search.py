@@ -42,6 +42,22 @@ class Evidence:
         i = list(index)
         return np.asarray(np.linalg.inv(self.information[np.ix_(i, i)] + RIDGE * np.eye(len(i))))
 
+    def given(self, index: Sequence[int], fixed: Sequence[int], ridge: float = 0.0) -> tuple[Array, Array]:
+        """(information (k, k), score (k,)) of the parameters at `index` once those at `fixed` are fitted beside them.
+
+        ridge: added to the information of those at `index`.
+        """
+        i, f = list(index), list(fixed)
+        inner, score = self.information[np.ix_(i, i)] + ridge * np.eye(len(i)), self.score[i]
+        if not f:
+            return inner, score
+        cross = np.linalg.solve(
+            self.information[np.ix_(f, f)] + RIDGE * np.eye(len(f)),
+            np.column_stack([self.information[np.ix_(f, i)], self.score[f]]),
+        )
+        across = self.information[np.ix_(i, f)]
+        return inner - across @ cross[:, :-1], score - across @ cross[:, -1]
+
     def gain(self, index: Sequence[int]) -> float:
         """Twice the rise of the log likelihood by free changes of the parameters at `index`."""
         return float(self.score[list(index)] @ self.estimate(index)) if len(index) else 0.0

@@ -6,15 +6,15 @@ looked into, with everything free that could be a cause, so that no cause makes 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.grid import Ride
-from gz_onboard.lab.discover.linear import LinearRide, Noise, fit_mixed, learn_noise, normal
-from gz_onboard.lab.discover.mixed_model import MixedModel
+from gz_onboard.lab.discover.linear import Noise, fit_mixed, learn_noise, normal
+from gz_onboard.lab.discover.mixed_model import MixedModel, linearise_all
 from gz_onboard.physics.effect import Port
 
 FREE = 25.0  # variance in scales that is added to that of every parameter while noise and scatter are learned
@@ -39,11 +39,9 @@ NOTE = (
 )
 
 
-def without_baseline(
-    mixed: MixedModel, rides: Sequence[Ride], linearise: Callable[[Sequence[Ride], MixedModel], list[LinearRide]]
-) -> MixedModel:
-    """`mixed` of a vehicle file, to judge `rides` with. linearise: rides at a model."""
-    lines = linearise(rides, mixed)
+def without_baseline(mixed: MixedModel, rides: Sequence[Ride], workers: int = 1) -> MixedModel:
+    """`mixed` of a vehicle file, to judge `rides` with."""
+    lines = linearise_all(rides, mixed, workers)
     noise = mixed.noise
     free = mixed.prior + FREE * np.eye(len(mixed.names))
     for _ in range(ROUNDS):

@@ -12,12 +12,15 @@ import pytest
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.forecast import Forecaster
+from gz_onboard.lab.discover.baseline import adopted
+from gz_onboard.lab.discover.baseline_file import load, restore, write_baseline
 from gz_onboard.lab.discover.curves import hat_functions
-from gz_onboard.lab.discover.discovery import adopted, linearise_all
-from gz_onboard.lab.discover.extension import curve_text, load, modelled_share, write_baseline, write_model
+from gz_onboard.lab.discover.energy import energy_share
+from gz_onboard.lab.discover.extension import MODELLED, curve_text, write_model
 from gz_onboard.lab.discover.linear import LinearRide
-from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel, initial, restore
-from gz_onboard.lab.discover.result import Cause, Report
+from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel, initial, linearise_all
+from gz_onboard.lab.discover.result import Cause, Estimate, Gain, Isolability, Report, Unknown
+from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import bind
 from gz_onboard.simulation.samples import read_samples
@@ -25,8 +28,8 @@ from gz_onboard.vehicle import find_vehicle, read_vehicle
 from tests.support import LOGS
 
 REFERENCE = find_vehicle("reference")
-KNOTS = [[0.0, -4.0, 1.0], [4.0, 1.0, 1.0], [8.0, 6.0, 2.0], [12.0, 2.0, 1.0]]
-CURVE = {"channel": "road_force", "quantity": "speed", "unit": "m/s", "share": 0.03, "score": 40.0, "curve": KNOTS}
+KNOTS = ((0.0, -4.0, 1.0), (4.0, 1.0, 1.0), (8.0, 6.0, 2.0), (12.0, 2.0, 1.0))
+CURVE = Unknown("road_force", "speed", False, "m/s", 40.0, 40.0, KNOTS, share=0.03)
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +42,11 @@ def lines(mixed: MixedModel) -> list[LinearRide]:
     return linearise_all([mixed.ride(read_samples(LOGS / "coastdown.blf", mixed.vehicle))], mixed)
 
 
-def report(
-    mixed: MixedModel, lines: list[LinearRide], *causes: Cause, unknown: dict[str, object] | None = None
-) -> Report:
+def report(mixed: MixedModel, lines: list[LinearRide], *causes: Cause, unknown: Unknown | None = None) -> Discovery:
     verdict = "unknown" if unknown else "cause"
-    return Report(verdict, list(causes), [], unknown, [], {}, {}, [], [], {}, 15.0, mixed=mixed, lines=lines)
+    isolability = Isolability({}, [], [])
+    plain = Report(verdict, list(causes), [], unknown, [], {}, Gain(), [], [], isolability, 15.0)
+    return Discovery(plain, mixed, np.zeros(len(mixed.names)), lines, [])
 
 
 def cornering(share: float = 0.04) -> Cause:
@@ -55,15 +58,15 @@ def rolling() -> Cause:
 
 
 def wind() -> Cause:
-    others = (("wind_east", -1.0, (-2.0, 0.0)),)
-    return Cause("headwind", "wind_north", 3.0, "m/s", (2.0, 4.0), 3.0, 0.01, 30.0, others)
+    others = {"wind_east": Estimate(-1.0, (-2.0, 0.0))}
+    return Cause("headwind", "wind_north", 3.0, "m/s", (2.0, 4.0), 3.0, 0.01, 30.0, parameters=others)
 
 
 def test_causes_become_effects_and_parameters(mixed, lines, tmp_path: Path):
     out = tmp_path / "new.toml"
     found = report(mixed, lines, cornering(), rolling(), wind())
     words = write_model(found, mixed.vehicle, REFERENCE, out)
-    assert found.extended_model == str(out)
+    assert found.report.extended_model == str(out)
     before, after = mixed.vehicle, read_vehicle(str(out))
     added = [e.name for e in after.model.effects][len(before.model.effects) :]
     assert added == ["cornering_drag", "headwind"]
@@ -91,7 +94,7 @@ def test_what_the_model_lacked_leaves_the_forecast_factor(mixed, lines, tmp_path
     change = np.zeros(len(mixed.names))
     place = mixed.names.index("rolling_resistance_constant")
     change[place] = 0.0033 / mixed.scale[place]
-    share = modelled_share(found, change)
+    share = energy_share(found.lines, change, MODELLED)
     assert share > 0.01
     write_model(found, mixed.vehicle, REFERENCE, out)
     before, after = mixed.vehicle.riding, read_vehicle(str(out)).riding
@@ -124,8 +127,8 @@ def test_a_value_beyond_its_bounds_is_written_at_the_bound(mixed, lines, tmp_pat
 @pytest.mark.parametrize("quantity", ["speed", "acceleration", "heading", "time", "lateral_acceleration", "vibration"])
 def test_the_empirical_effect_is_the_curve(mixed, lines, tmp_path: Path, quantity: str):
     top = 6.0 if quantity == "heading" else 12.0
-    knots = [[at * top / 12, value, sd] for at, value, sd in KNOTS]
-    written = curve_text(report(mixed, lines, unknown={**CURVE, "quantity": quantity, "curve": knots}))
+    knots = tuple((at * top / 12, value, sd) for at, value, sd in KNOTS)
+    written = curve_text(report(mixed, lines, unknown=replace(CURVE, quantity=quantity, curve=knots)))
     assert written is not None
     name, text = written
     (tmp_path / f"{name}.py").write_text(text)
@@ -144,9 +147,9 @@ def test_the_empirical_effect_is_the_curve(mixed, lines, tmp_path: Path, quantit
 
 
 def test_a_curve_that_no_effect_can_read_is_not_written(mixed, lines, tmp_path: Path):
-    found = report(mixed, lines, unknown={**CURVE, "quantity": "current_change"})
+    found = report(mixed, lines, unknown=replace(CURVE, quantity="current_change"))
     words = write_model(found, mixed.vehicle, REFERENCE, tmp_path / "new.toml")
-    assert found.extended_model is None
+    assert found.report.extended_model is None
     assert "no effect can read current_change" in words[0]
     assert not list(tmp_path.iterdir())
 

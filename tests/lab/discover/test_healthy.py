@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, f
 
-from benchmarks.trial import LACKS, MARK, Row, alarm, healthy_document, reported, with_section
+from benchmarks.trial import LACKS, MARK, Row, alarm, discovered, healthy_document, reported, with_section
 from gz_onboard.lab.discover.acceptance import with_observed_scatter, within_bounds
+from gz_onboard.lab.discover.baseline import baseline
 from gz_onboard.lab.discover.cross_validation import improves
 from gz_onboard.lab.discover.curves import QUANTITIES, CurveForm, supported_knots
-from gz_onboard.lab.discover.discovery import baseline, discover, linearise_all
+from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.lab.discover.gain import errors
 from gz_onboard.lab.discover.linear import LinearRide, Normal
-from gz_onboard.lab.discover.mixed_model import MixedModel, initial
+from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
 from gz_onboard.lab.discover.search import one_degree
 from gz_onboard.simulation.samples import Samples, read_samples
 from gz_onboard.vehicle import read_vehicle
@@ -38,12 +39,12 @@ def ridden() -> tuple[list[Samples], list[Samples]]:
 
 def test_a_healthy_scooter_of_strangers_is_left_alone(ridden):
     first, later = ridden
-    report = discover(baseline(read_vehicle("reference"), first), later).to_json()
-    assert (report["verdict"], report["causes"], report["unknown"]) == ("none", [], None)
+    report = discover(baseline(read_vehicle("reference"), first), later).report
+    assert (report.verdict, report.causes, report.unknown) == ("none", [], None)
 
 
 def test_against_its_file_alone_it_has_nothing_but_what_the_model_lacks(ridden):
-    report = discover(read_vehicle("reference"), ridden[1]).to_json()
+    report = discovered(read_vehicle("reference"), ridden[1])
     assert reported(report) <= LACKS["file"]  # it is there: the plant's tyres twist on the road when they lean
     assert report["unknown"] is None
 
