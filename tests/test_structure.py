@@ -47,7 +47,7 @@ STAGES = {
     "read": ["grid"],
     "residuals": ["channels"],
     "linear model": ["prior", "candidates", "linear", "mixed_model", "uncalibrated", "baseline_file"],
-    "search": ["search", "curves", "baseline", "selection"],
+    "search": ["search", "curve_forms", "curves", "baseline", "selection"],
     "judgement": ["constancy", "cross_validation", "acceptance", "winds", "energy", "unexplained", "verdict"],
     "report": ["gain", "detectability", "discovery", "breakdown", "summary", "plots", "page", "extension"],
     "command": ["command"],

@@ -7,8 +7,8 @@ A pipeline, each stage with one thing in and one out. A module imports from the 
     linear model  `Ride` -> `LinearRide` about a `MixedModel`                            prior, candidates, linear,
                   of what is known of the vehicle: from its file alone, or a baseline    mixed_model, uncalibrated,
                                                                                          baseline_file
-    search        `SearchProblem` -> `Selection`: the causes that explain the rides      search, curves, baseline,
-                                                                                         selection
+    search        `SearchProblem` -> `Selection`: the causes that explain the rides      search, curve_forms, curves,
+                                                                                         baseline, selection
     judgement     `SearchProblem` -> `Discovery`: those that are accepted, each ride's   constancy, cross_validation,
                   own wind, what has no name; how sure, and what could stand in          acceptance, winds, energy,
                                                                                          unexplained, verdict

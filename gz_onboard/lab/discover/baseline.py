@@ -13,7 +13,7 @@ from gz_onboard.lab.discover.curves import with_inflation
 from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.linear import LinearRide, Noise, Normal, Posterior, fit_mixed, learn_noise, normal
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
-from gz_onboard.lab.discover.prior import FIXED, LOG, WEATHER
+from gz_onboard.lab.discover.prior import FIXED, LOG
 from gz_onboard.lab.discover.search import evidence
 from gz_onboard.physics.parameters import Parameters, Value, declared_parameters
 from gz_onboard.simulation.samples import Samples
@@ -83,7 +83,8 @@ def learn(mixed: MixedModel, rides: Sequence[Ride], progress: Progress, workers:
     progress("scatter between healthy rides")
     lines = linearise_all(rides, replace(mixed, values=values, mean=first - shift, noise=noise), workers)
     normals = [normal(line, noise) for line in lines]
-    weight = np.array([WEATHER_WEIGHT if name in WEATHER else WEIGHT for name in mixed.names])
+    weather = {name for cause in mixed.causes if cause.varies for name in cause.names}
+    weight = np.array([WEATHER_WEIGHT if name in weather else WEIGHT for name in mixed.names])
     post = fit_mixed(normals, first - shift, mixed.prior, mixed.scatter, weight, mixed.free, SCATTER_ROUNDS)
     after = replace(
         mixed,

@@ -9,7 +9,8 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.curves import CurveForm, columns, extended
+from gz_onboard.lab.discover.curve_forms import CurveForm, columns
+from gz_onboard.lab.discover.curves import extended
 from gz_onboard.lab.discover.linear import LinearRide, Normal, fit_mixed, normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.prior import STARTS
@@ -103,7 +104,7 @@ def with_curve(
 def without(line: LinearRide, form: CurveForm, coefficients: Array) -> LinearRide:
     """`line` less the curve."""
     table = line.tables.get(form.channel)
-    knots = columns(line.ride, form.quantity, table) if table else None
+    knots = columns(line.ride, form, table) if table else None
     if table is None or knots is None:
         return line
     less = knots @ form.basis @ coefficients * form.size / table.unit

@@ -8,10 +8,10 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.channels import over_blocks
-from gz_onboard.lab.discover.curves import columns
+from gz_onboard.lab.discover.curve_forms import CurveForm, columns
 from gz_onboard.lab.discover.grid import STEP
 from gz_onboard.lab.discover.linear import LinearRide
-from gz_onboard.lab.discover.result import ResidualSize, Unknown
+from gz_onboard.lab.discover.result import ResidualSize
 
 ROLLING = 2.0  # m/s: where `channels.road_force` holds
 
@@ -66,16 +66,15 @@ def channel_time(line: LinearRide, channel: str) -> float:
     return whole
 
 
-def curve_energy_share(lines: Sequence[LinearRide], unknown: Unknown) -> float:
-    """The part of the energy drawn that the curve takes."""
+def curve_energy_share(lines: Sequence[LinearRide], form: CurveForm, values: Array) -> float:
+    """The part of the energy drawn that the curve of `values` (knots,) takes."""
     drawn = sum(energy_drawn(line) for line in lines)
     more = 0.0
-    values = np.array([row[1] for row in unknown.curve])
     for line in lines:
-        table = line.tables.get(unknown.channel)
-        knots = columns(line.ride, unknown.quantity, table) if table is not None else None
+        table = line.tables.get(form.channel)
+        knots = columns(line.ride, form, table) if table is not None else None
         if table is not None and knots is not None:
-            more += channel_energy(unknown.channel, line, knots @ values / table.unit)
+            more += channel_energy(form.channel, line, knots @ values / table.unit)
     return more / drawn if drawn else 0.0
 
 

@@ -40,7 +40,7 @@ def write_model(found: Discovery, vehicle: Vehicle, base: Path, out: Path) -> li
     it (`lowered`); what came on top of healthy rides is not.
     """
     report = found.report
-    parameters, added = extension(found, vehicle)
+    parameters, added = extension(found)
     words = [f"{name} = {f.value:.4g} ± {with_unit(f.sd, f.unit, '.2g')}" for name, f in parameters.items()]
     folder = out.with_name(f"{out.stem}_effects")
     names = [effect.name for effect in (*vehicle.model.effects, *added)]
@@ -74,12 +74,11 @@ def write_model(found: Discovery, vehicle: Vehicle, base: Path, out: Path) -> li
     return words
 
 
-def extension(found: Discovery, vehicle: Vehicle) -> tuple[dict[str, Found], list[Effect]]:
+def extension(found: Discovery) -> tuple[dict[str, Found], list[Effect]]:
     """The parameters of the causes that `found` named, and the effects that the model lacks for them."""
     mixed = found.mixed
     names = ", ".join(line.ride.name for line in found.lines)
     rides = f"{len(found.lines)} rides ({names})" if len(names) < 150 else f"{len(found.lines)} rides"
-    has = {effect.name for effect in vehicle.model.effects}
     parameters, added = {}, []
     for cause in (c for c in found.report.causes if not c.varies):
         candidate = next(c for c in mixed.causes if c.name == cause.name)
@@ -89,7 +88,7 @@ def extension(found: Discovery, vehicle: Vehicle) -> tuple[dict[str, Found], lis
             low, high = estimate.ci95
             inside = min(max(estimate.value, parameter.low), parameter.high)
             parameters[parameter.name] = Found(inside, (high - low) / 2 / mixed.quantile, parameter.unit, source)
-        if candidate.effect and cause.name not in has:
+        if candidate.effect and candidate in mixed.lacking:
             added.append(candidate.effect)
     return parameters, added
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.cross_validation import Fold, start_equations, with_own_start
-from gz_onboard.lab.discover.curves import CurveForm
 from gz_onboard.lab.discover.energy import channel_energy, energy_drawn, pack_power
 from gz_onboard.lab.discover.linear import LinearRide, normal
-from gz_onboard.lab.discover.result import RIDES, Errors, Gain, Unknown
+from gz_onboard.lab.discover.result import Errors, Gain
+from gz_onboard.lab.discover.unexplained import form_of
 from gz_onboard.lab.discover.verdict import Discovery
 
 WHOLE = {"pack_voltage", "pack_current"}  # without which no one knows what a ride took out of the pack
@@ -33,7 +33,7 @@ def measure_gain(found: Discovery, seed: int, apart: Sequence[LinearRide] = ()) 
     known = len(found.lines)
     folds = [list(range(known, len(lines)))] if apart else [[i] for i in range(known)]
     named = {cause.name for cause in report.causes if not cause.varies}
-    form = form_of(report.unknown) if report.unknown is not None else None
+    form = form_of(report.unknown, mixed.sizes) if report.unknown is not None else None
     control, after = Fold(), Fold([cause for cause in mixed.causes if cause.name in named], form)
     rows: dict[str, list[Triple]] = {}
     for fold in folds:
@@ -60,11 +60,6 @@ def summarised(rows: Sequence[Triple], rng: np.random.Generator) -> Errors:
     draws = rng.integers(0, len(table), (DRAWS, len(table)))
     saved = (table[:, 1] - table[:, 2])[draws].mean(axis=1)
     return Errors(before, control, after, (float(np.quantile(saved, 0.025)), float(np.quantile(saved, 0.975))))
-
-
-def form_of(unknown: Unknown) -> CurveForm | None:
-    """The curve of what has no name; None if it is one of rides."""
-    return None if unknown.quantity == RIDES else CurveForm(unknown.channel, unknown.quantity, unknown.straight)
 
 
 def errors(line: LinearRide, theta: Array) -> dict[str, float]:

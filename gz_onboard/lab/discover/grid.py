@@ -6,7 +6,7 @@ longer than three of its periods (and 0.3 s), the grid says so: nothing is made 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,14 +19,29 @@ from gz_onboard.physics.vibration import Vibration
 from gz_onboard.simulation.samples import Samples
 
 STEP = 0.1  # s
-LAGS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}
-"""By how much later than the inverter's a value is sent [s]; what is left of it is fitted (see `channels`)."""
+USUAL_DELAYS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}
+"""By how much later than the inverter's a value is sent [s], where no message states its `delay`; what is left of it
+is fitted (see `channels`)."""
 NEEDED = ("motor_speed", "motor_current")
 BRAKE_PRESSURE = 0.8e5  # Pa: above what the sensors show at rest
 MOVING = 0.5  # m/s
 SUSPENSION = ("suspension_front", "suspension_rear")
+CRAWL, MOST_STEERING = 1.0, 0.6  # m/s, rad: what a bend tells of slower riding is noise
 SHAKING = 0.034  # s: samples further apart do not show what a road does to a wheel
 LONGEST = 60.0  # s since a brake was touched, or a current changed: what was longer ago is as good as never
+
+
+@dataclass(frozen=True)
+class Dimensions:
+    """Of a vehicle: radius of the driven wheel times the gear ratio [m], mass with payload [kg], torque constant of the
+    motor [N·m/A], wheelbase [m]; by how much later than the inverter's a role's values are sent [s].
+    """
+
+    radius: float
+    mass: float
+    torque_constant: float
+    wheelbase: float
+    delays: Mapping[str, float]
 
 
 @dataclass
@@ -103,9 +118,8 @@ def measured(times: Array, grid: Array) -> Mask:
     return np.asarray((gap < limit) & (grid > times[0] - limit) & (grid < times[-1] + limit))
 
 
-def read_ride(samples: Samples, radius: float, mass: float, torque_constant: float) -> Ride:
-    """`samples` on the grid. radius: of the driven wheel over the gear ratio [m], mass: of vehicle and payload [kg],
-    torque_constant: of the motor [N·m/A].
+def read_ride(samples: Samples, vehicle: Dimensions) -> Ride:
+    """`samples` on the grid.
 
     Raises InputError for a ride without motor speed or current, or shorter than a minute.
     """
@@ -122,12 +136,12 @@ def read_ride(samples: Samples, radius: float, mass: float, torque_constant: flo
     for role, (times, values) in samples.columns.items():
         if len(times) < 20:
             continue
-        at = grid + LAGS.get(role, 0.0)
+        at = grid + vehicle.delays.get(role, 0.0)
         turned = np.unwrap(values) if role == "gps_course" else values
         signals[role] = averaged(times, turned, at)
         valid[role] = measured(times, at)
-    ride = Ride(samples.name, grid - start, signals, valid, radius, samples.rider_mass)
-    ride.quantities = _quantities(ride, mass, torque_constant)
+    ride = Ride(samples.name, grid - start, signals, valid, vehicle.radius, samples.rider_mass)
+    ride.quantities = _quantities(ride, vehicle)
     ride.quantities["since_braking"] = since(ride.braking)
     wheels = [samples.columns[role] for role in SUSPENSION if role in samples.columns]
     if wheels and all(np.median(np.diff(times)) < SHAKING for times, _ in wheels):
@@ -172,7 +186,13 @@ def smooth(values: Array, seconds: float) -> Array:
     return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
 
 
-def _quantities(ride: Ride, mass: float, torque_constant: float) -> dict[str, Array]:
+def steering(speed: Array, lateral_acceleration: Array, wheelbase: float) -> Array:
+    """Angle [rad] of a bicycle without slip: wheelbase over the radius of the bend."""
+    fast = np.maximum(np.abs(speed), CRAWL)
+    return np.asarray(np.clip(wheelbase * lateral_acceleration / fast**2, -MOST_STEERING, MOST_STEERING))
+
+
+def _quantities(ride: Ride, vehicle: Dimensions) -> dict[str, Array]:
     s = ride.signals
     n = len(ride.time)
     motor_speed = s["motor_speed"]
@@ -200,10 +220,11 @@ def _quantities(ride: Ride, mass: float, torque_constant: float) -> dict[str, Ar
         "acceleration": acceleration,
         "grade": grade,
         "grade_cosine": np.asarray(np.sqrt(1 - np.clip(grade, -0.5, 0.5) ** 2)),
-        "mass": np.full(n, mass),
+        "mass": np.full(n, vehicle.mass),
         "air_density": np.full(n, density),
         "headwind": np.zeros(n),
         "lateral_acceleration": lateral,
+        "steering": steering(speed, lateral, vehicle.wheelbase),
         "motor_speed": motor_speed,
         "motor_current": s["motor_current"],
         "motor_temperature": s.get("motor_temperature", ambient),
@@ -211,5 +232,5 @@ def _quantities(ride: Ride, mass: float, torque_constant: float) -> dict[str, Ar
         "cell_temperature": temperature,
         "heading": np.asarray(np.mod(course, 2 * np.pi), dtype=np.float64),
         "time_moving": np.asarray(moved, dtype=np.float64),
-        "torque": torque_constant * s["motor_current"],
+        "torque": vehicle.torque_constant * s["motor_current"],
     }

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -13,43 +14,36 @@ from scipy.stats import t as student
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.candidates import Candidate, candidates
 from gz_onboard.lab.discover.channels import CHANNELS, System, counted_soc, depends
-from gz_onboard.lab.discover.grid import Ride, read_ride
+from gz_onboard.lab.discover.grid import USUAL_DELAYS, Dimensions, Ride, read_ride
 from gz_onboard.lab.discover.linear import LinearRide, Noise, linearise, spread_out, trimmed
-from gz_onboard.lab.discover.prior import BASE, FIXED, LOG, NUISANCES, RIDE_SD, RIDE_SD_SHARE, stepped
-from gz_onboard.physics.effect import Effect
+from gz_onboard.lab.discover.prior import (
+    BASE,
+    BENCH,
+    BY_NAME,
+    FIXED,
+    HEALTHY_SD,
+    LOG,
+    LOG_RIDE_SD,
+    LOG_RIDE_SD_ELSE,
+    NUISANCES,
+    RIDE_SD,
+    RIDE_SD_SHARE,
+    RIDE_SD_STEP,
+    Sizes,
+    nearest_step,
+    sizes_of,
+    stepped,
+)
+from gz_onboard.physics.effect import Effect, Parameter
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
-MEAN_SD = {
-    "cornering_compliance": 0.1,
-    "wind_north": 0.4,
-    "wind_east": 0.4,
-    "brake_drag_force": 1.5,
-    "drivetrain_drag_torque": 0.01,
-    "warm_up_share": 0.2,
-    "regeneration_loss_share": 0.03,
-    "slow_resistance": 0.01,
-    "hysteresis_voltage": 0.005,
-    "cell_resistance_factor": 0.005,
-    "cooling_factor": 0.01,
-    "speed_sensor_scale": 0.001,
-    "pack_voltage_latency": 0.02,
-    "payload_mass": 2.0,
-}
-"""Of what a healthy vehicle may show of a candidate that its model lacks: standard deviation about none."""
-TRANSFER = (
-    "motor_copper_resistance",
-    "motor_iron_linear",
-    "motor_iron_quadratic",
-    "inverter_loss_constant",
-    "inverter_loss_linear",
-    "inverter_loss_quadratic",
-    "torque_constant",
-    "cable_resistance",
-)
 TRANSFERRED = 3.0
-"""Found on a bench at steady points: on the road they hold within so many times their standard deviation."""
+"""What was found on a bench at steady points holds on the road within so many times its standard deviation."""
+MOST_LOG = 0.5  # sd of a logarithm, beyond which a parameter is known to its sign only
+LEAST_STEP = 0.05  # of a standard deviation: the finest scale
+LEAST_SD = 1e-3  # scales: what is certain
 PRIOR_RIDES, LEAST_FREEDOM = 3, 4
 """What is known without healthy rides, worth so many of them; and no scatter is known worse than with so many."""
 
@@ -97,16 +91,25 @@ class MixedModel:
         """Of Student's t: half of a 95 % interval, in standard deviations."""
         return float(student.ppf(0.975, max(self.healthy + PRIOR_RIDES, LEAST_FREEDOM)))
 
+    @cached_property
+    def sizes(self) -> Sizes:
+        """How large the vehicle is."""
+        return sizes_of(self.vehicle)
+
     @property
     def usable_causes(self) -> list[Candidate]:
         """The candidates whose parameters some channel depends on."""
         return [cause for cause in self.causes if set(cause.names) <= set(self.names)]
 
+    @property
+    def lacking(self) -> list[Candidate]:
+        """The candidates whose effect the vehicle's model lacks."""
+        return lacking(self.vehicle, self.causes)
+
     def healthy_value(self, name: str) -> float:
         """The healthy vehicle's value of a parameter: that of its file, 0 for an effect that its model lacks."""
-        has = {effect.name for effect in self.vehicle.model.effects}
-        lacking = {n for c in self.causes if c.effect and c.effect.name not in has for n in c.names}
-        return 0.0 if name in lacking else float(self.vehicle.parameters[name])
+        absent = any(name in cause.names for cause in self.lacking)
+        return 0.0 if absent else float(self.vehicle.parameters[name])
 
     def index(self, names: Sequence[str]) -> list[int]:
         """Where `names` stand."""
@@ -123,86 +126,110 @@ class MixedModel:
         """`samples` on the grid of this vehicle."""
         p = self.vehicle.parameters
         payload = samples.rider_mass if samples.rider_mass is not None else p["payload_mass"]
-        ride = read_ride(
-            samples, p["wheel_radius"] * p["gear_ratio"], p["vehicle_mass"] + payload, p["torque_constant"]
-        )
+        radius, mass = p["wheel_radius"] * p["gear_ratio"], p["vehicle_mass"] + payload
+        stated = self.vehicle.mapping
+        delays = {s.role: stated.delays[s.message] for s in stated.sources if s.message in stated.delays}
+        dimensions = Dimensions(radius, mass, p["torque_constant"], p["wheelbase"], USUAL_DELAYS | delays)
+        ride = read_ride(samples, dimensions)
         if self.system.battery is not None and {"pack_voltage", "pack_current"} <= ride.have:
             ride.quantities["soc"] = counted_soc(ride, self.system)
         return ride
 
 
+def lacking(vehicle: Vehicle, causes: Sequence[Candidate]) -> list[Candidate]:
+    """Those of `causes` whose effect the model of `vehicle` lacks."""
+    has = {effect.name for effect in vehicle.model.effects}
+    return [cause for cause in causes if cause.effect and cause.effect.name not in has]
+
+
 def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
-    """What is known of `vehicle` from its file alone."""
+    """What is known of `vehicle` from its file alone. folder: with effects of the user's own."""
     causes = candidates(folder)
-    lacking = [c.effect for c in causes if c.effect and c.name not in {e.name for e in vehicle.model.effects}]
-    effects: tuple[Effect, ...] = (*vehicle.model.effects, *lacking)
+    absent = {name for cause in lacking(vehicle, causes) for name in cause.names}
+    more = [cause.effect for cause in lacking(vehicle, causes) if cause.effect]
+    effects: tuple[Effect, ...] = (*vehicle.model.effects, *more)
     p = vehicle.parameters
     copper = p.get("motor_copper_resistance", 0.0)
     system = System(effects, vehicle.battery, p["payload_mass"], copper, vehicle.riding.vibration)
+    values = {name: x.prior for name, x in declared_parameters(effects).items()} | dict(p)
+    values |= {nuisance.name: nuisance.value for nuisance in NUISANCES} | dict.fromkeys(absent, 0.0)
+    names = _names(vehicle, causes, more, values)
     declared = declared_parameters(effects)
-    known = vehicle.parameters
-    values = {name: p.prior for name, p in declared.items()} | {name: known[name] for name in known}
-    values |= {nuisance.name: nuisance.value for nuisance in NUISANCES}
-    absent = {name for c in causes if c.effect in lacking for name in c.names}
-    for name in absent:
-        values[name] = 0.0
-    needed: set[str] = set()
-    for channel in CHANNELS:
-        needed |= depends(channel, effects)
-    nuisances = {nuisance.name: nuisance for nuisance in NUISANCES}
-    strengths = {name for c in causes for name in c.names}
-    held = {p.name for e in lacking for p in e.parameters} - strengths
-    of_effects = {p.name for e in vehicle.model.effects for p in e.parameters}
-    names = sorted((needed & (set(BASE) | of_effects | strengths | set(nuisances))) - held)
-    names = [name for name in names if name in nuisances or name in values]
-    scale, sd, ride_sd, bench = [], [], [], []
-    for name in names:
-        if name in nuisances:
-            scatter, spread = nuisances[name].ride_sd, nuisances[name].sd
-        else:
-            spread = known.sd(name) if name in known and name not in absent else declared[name].prior_sd
-            if (
-                name in MEAN_SD and (name in absent or name not in vehicle_file_names(vehicle))
-            ) or name == "payload_mass":
-                spread = MEAN_SD[name]
-            scatter = RIDE_SD.get(name, RIDE_SD_SHARE * declared[name].prior_sd)
-        if name in LOG:
-            spread = min(spread / values[name], 0.5)
-            scatter = 0.1 if name != "pack_heat_capacity" else 0.05
-        wide = spread * (TRANSFERRED if name in TRANSFER else 1.0)
-        step = max(scatter, 0.05 * wide)
-        scale.append(step)
-        sd.append(max(wide / step, 1e-3))
-        bench.append(spread / step)
-        ride_sd.append(max(scatter / step, 1e-3))
-    prior = np.diag(np.array(sd) ** 2)
-    place = {name: i for i, name in enumerate(names)}
-    for pair, r in known.correlations.items():
-        a, b = tuple(pair)
-        if a in place and b in place:
-            # what the bench leaves open goes together; by how much the road differs from the bench does not
-            prior[place[a], place[b]] = prior[place[b], place[a]] = r * bench[place[a]] * bench[place[b]]
-    noise = {channel.name: channel.noise for channel in CHANNELS}
-    free = np.array([name not in FIXED for name in names])
+    priors = {name: _prior(name, vehicle, declared, values[name], name in absent) for name in names}
     return MixedModel(
         vehicle,
         system,
         causes,
         tuple(names),
-        np.array(scale),
+        np.array([prior.scale for prior in priors.values()]),
         values,
         np.zeros(len(names)),
-        prior,
-        np.array(ride_sd) ** 2,
-        noise,
+        _covariance(priors, vehicle.parameters.correlations),
+        np.array([prior.ride_sd for prior in priors.values()]) ** 2,
+        {channel.name: channel.noise for channel in CHANNELS},
         0,
-        free,
+        np.array([name not in FIXED for name in names]),
     )
 
 
-def vehicle_file_names(vehicle: Vehicle) -> set[str]:
-    """The parameters that the vehicle file itself sets."""
-    return {name for name, value in vehicle.parameters.known.items() if not value.source.startswith("prior:")}
+def _names(
+    vehicle: Vehicle, causes: Sequence[Candidate], lacking: Sequence[Effect], values: Mapping[str, float]
+) -> list[str]:
+    """The parameters that are fitted: those that a channel depends on, but those that only shape a lacking effect."""
+    effects = (*vehicle.model.effects, *lacking)
+    needed = {name for channel in CHANNELS for name in depends(channel, effects)}
+    strengths = {name for c in causes for name in c.names}
+    of_effects = {x.name for e in vehicle.model.effects for x in e.parameters}
+    shaping = {x.name for e in lacking for x in e.parameters} - strengths
+    fitted = set(BASE) | of_effects | strengths | {nuisance.name for nuisance in NUISANCES}
+    return sorted(name for name in (needed & fitted) - shaping if name in values)
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """Of one parameter: its scale [unit], and in scales the spread of the vehicle's, of a bench's, between rides."""
+
+    scale: float
+    sd: float
+    bench_sd: float
+    ride_sd: float
+
+
+def _prior(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], value: float, absent: bool) -> _Prior:
+    """Of the parameter `name`, at `value`. absent: it is of an effect that the model lacks."""
+    on_bench = False
+    if name in BY_NAME:
+        size = sizes_of(vehicle).of(BY_NAME[name].of)
+        scatter, spread = BY_NAME[name].ride_sd * size, BY_NAME[name].sd * size
+    else:
+        parameter, known = declared[name], vehicle.parameters
+        on_bench = parameter.bench or name in BENCH
+        stated = name in known and not known.known[name].source.startswith("prior:")
+        healthy = HEALTHY_SD.get(name, parameter.healthy_sd)
+        spread = known.sd(name) if name in known and not absent else parameter.prior_sd
+        if healthy is not None and (absent or not stated or name == "payload_mass"):
+            spread = healthy
+        own = RIDE_SD.get(name, parameter.ride_sd)
+        size = nearest_step(value / parameter.prior, RIDE_SD_STEP) if parameter.prior else 1.0
+        scatter = RIDE_SD_SHARE * parameter.prior_sd if own is None else own * size
+    if name in LOG:
+        spread, scatter = min(spread / value, MOST_LOG), LOG_RIDE_SD.get(name, LOG_RIDE_SD_ELSE)
+    wide = spread * (TRANSFERRED if on_bench else 1.0)
+    step = max(scatter, LEAST_STEP * wide)
+    return _Prior(step, max(wide / step, LEAST_SD), spread / step, max(scatter / step, LEAST_SD))
+
+
+def _covariance(priors: Mapping[str, _Prior], correlations: Mapping[frozenset[str], float]) -> Array:
+    """Of the vehicle's parameters before any ride, in scales, (p, p)."""
+    covariance = np.diag(np.array([prior.sd for prior in priors.values()]) ** 2)
+    place = {name: i for i, name in enumerate(priors)}
+    for pair, r in correlations.items():
+        a, b = tuple(pair)
+        if a in place and b in place:
+            # what the bench leaves open goes together; by how much the road differs from the bench does not
+            both = r * priors[a].bench_sd * priors[b].bench_sd
+            covariance[place[a], place[b]] = covariance[place[b], place[a]] = both
+    return covariance
 
 
 def _linearised(job: tuple[Ride, MixedModel]) -> LinearRide:

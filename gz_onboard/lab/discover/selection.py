@@ -13,7 +13,7 @@ from scipy.stats import t as student
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.curves import curve_forms
+from gz_onboard.lab.discover.curve_forms import curve_forms
 from gz_onboard.lab.discover.linear import LinearRide, Normal, normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.prior import LOG
@@ -64,7 +64,7 @@ def pose(mixed: MixedModel, start: Array, linearised: Linearised) -> SearchProbl
     usable = mixed.usable_causes
     causes = [c for c in usable if not np.any(np.diag(e.information)[mixed.index(c.names)] < VISIBLE)]
     channels = {name for line in lines for name in line.tables}
-    proportions = sum(form.straight and form.channel in channels for form in curve_forms())
+    proportions = sum(form.straight and form.channel in channels for form in curve_forms(mixed.sizes))
     limit = threshold(mixed, tries(e, [i for c in causes for i in mixed.index(c.names)]) + proportions)
     shares = channel_shares(mixed, lines, causes)
     return SearchProblem(mixed, causes, shares, limit, linearised, start, lines, np.zeros_like(start))

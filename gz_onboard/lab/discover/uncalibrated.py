@@ -22,16 +22,8 @@ ROUNDS = 2
 SCATTER_FROM = 3  # rides
 CIRCUIT_TIME = 300.0  # s: what one RC pair lacks relaxes over minutes
 ABSENT = 1e-3  # sd in scales of an effect that the model lacks
-LOSSES = (
-    "motor_copper_resistance",
-    "motor_iron_linear",
-    "motor_iron_quadratic",
-    "inverter_loss_constant",
-    "inverter_loss_linear",
-    "inverter_loss_quadratic",
-)
 BENCH_FACTORS = ("cell_resistance_factor", "cooling_factor")
-"""Factors on what a bench told of one cell and one motor: as sure as they are declared, until a ride has told."""
+"""Factors on what a bench measured of one cell and one motor: as sure as they are declared, without a ride."""
 MAKE_SPREAD = 0.05  # by which losses differ between motors and inverters of one make, sd as a share
 NOTE = (
     "no healthy rides are known of this vehicle (--baseline): it is held against its file, whose model is taken at "
@@ -68,22 +60,21 @@ def prior_of_file(mixed: MixedModel) -> Array:
     """The prior of `mixed` in which an effect that the model lacks is not there, and what no ride has shown to be as it
     should is no surer than the file, or what is declared of every vehicle, says.
     """
-    has = {effect.name for effect in mixed.vehicle.model.effects}
     known = mixed.vehicle.parameters
     prior = mixed.prior.copy()
-    for name in set(LOSSES) & set(mixed.names):
+    losses = {p.name for effect in mixed.vehicle.model.effects for p in effect.parameters if p.bench}
+    for name in losses & set(mixed.names):
         (i,) = mixed.index([name])
         prior[i, i] += (MAKE_SPREAD * known[name] / float(mixed.scale[i])) ** 2
     for name in set(BENCH_FACTORS) & set(mixed.names):
         (i,) = mixed.index([name])
         prior[i, i] = (known.sd(name) / float(mixed.scale[i])) ** 2
-    for cause in mixed.causes:
-        if cause.effect and cause.effect.name not in has:
-            for parameter in (p for p in cause.parameters if p.name in mixed.names):
-                i = mixed.names.index(parameter.name)
-                prior[i, :] = prior[:, i] = 0.0
-                prior[i, i] = ABSENT**2
-                if cause.effect.port is Port.CELL_VOLTAGE:  # every cell has some, in the error that its circuit states
-                    usual = float(np.hypot(parameter.prior, parameter.prior_sd))
-                    prior[i, i] = (usual / float(mixed.scale[i])) ** 2
+    for cause in mixed.lacking:
+        for parameter in (p for p in cause.parameters if p.name in mixed.names):
+            i = mixed.names.index(parameter.name)
+            prior[i, :] = prior[:, i] = 0.0
+            prior[i, i] = ABSENT**2
+            if cause.effect and cause.effect.port is Port.CELL_VOLTAGE:  # every cell has some, as its circuit's error
+                usual = float(np.hypot(parameter.prior, parameter.prior_sd))
+                prior[i, i] = (usual / float(mixed.scale[i])) ** 2
     return prior

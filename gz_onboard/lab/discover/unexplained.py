@@ -10,9 +10,11 @@ import numpy as np
 from gz_onboard.lab.discover.acceptance import with_observed_scatter
 from gz_onboard.lab.discover.constancy import RIDE, unequal
 from gz_onboard.lab.discover.cross_validation import Fold, folds, improves
-from gz_onboard.lab.discover.curves import QUANTITIES, CurveFit, CurveForm, curve_forms, fit_curve
+from gz_onboard.lab.discover.curve_forms import CurveForm, curve_forms
+from gz_onboard.lab.discover.curves import CurveFit, fit_curve
 from gz_onboard.lab.discover.energy import curve_energy_share, energy_share
 from gz_onboard.lab.discover.mixed_model import MixedModel
+from gz_onboard.lab.discover.prior import Sizes
 from gz_onboard.lab.discover.result import RIDES, Split, Unknown
 from gz_onboard.lab.discover.search import one_degree
 from gz_onboard.lab.discover.selection import Selection
@@ -53,7 +55,11 @@ def unexplained(now: Selection, constancy: Sequence[Split], limit: float) -> Unk
         least = max(limit, LEFT * best.chi2)
         denied |= dict.fromkeys(n for n in left if search.step([m for m in left if m != n], n) < least)
         best = replace(best, denies=tuple(denied))
-    return best if best.quantity == RIDES else replace(best, share=curve_energy_share(now.lines, best))
+    form = form_of(best, now.mixed.sizes)
+    if form is None:
+        return best
+    values = np.array([value for _, value, _ in best.curve])
+    return replace(best, share=curve_energy_share(now.lines, form, values))
 
 
 def best_curve(now: Selection, limit: float) -> Unknown | None:
@@ -62,7 +68,7 @@ def best_curve(now: Selection, limit: float) -> Unknown | None:
     index = search.index(chosen)
     total = search.evidence.gain(index)
     best: Unknown | None = None
-    for form in curve_forms():
+    for form in curve_forms(now.mixed.sizes):
         curve = fit_curve(now.mixed, now.lines, now.normals, form, index)
         if curve is None:
             continue
@@ -106,7 +112,7 @@ def rival_curve(now: Selection, limit: float) -> Unknown | None:
     for name in now.chosen:
         rest = [other for other in now.chosen if other != name]
         own = search.step(rest, name)
-        for form in curve_forms():
+        for form in curve_forms(now.mixed.sizes):
             if search.shares.get(name, {}).get(form.channel, 0.0) < OWN_SHARE:
                 continue
             curve = fit_curve(mixed, now.lines, now.normals, form, search.index(rest))
@@ -123,7 +129,7 @@ def rival_curve(now: Selection, limit: float) -> Unknown | None:
 def curve_over_split(now: Selection, split: Split) -> Unknown | None:
     """The curve over the quantity of `split`, with no cause named, in the channel where it has most to say."""
     best: Unknown | None = None
-    for form in curve_forms():
+    for form in curve_forms(now.mixed.sizes):
         if form.quantity != split.quantity or form.straight:
             continue
         curve = fit_curve(now.mixed, now.lines, now.normals, form, [])
@@ -145,6 +151,13 @@ def ride_to_ride(now: Selection, worst: Split, constancy: Sequence[Split]) -> Un
     return Unknown(channel, RIDES, False, "", worst.chi2, worst.chi2, rows, (worst.cause,), share)
 
 
+def form_of(unknown: Unknown, sizes: Sizes) -> CurveForm | None:
+    """The curve of what has no name, in a vehicle of `sizes`; None if it is one of rides."""
+    if unknown.quantity == RIDES:
+        return None
+    return CurveForm(unknown.channel, unknown.quantity, unknown.straight, sizes)
+
+
 def curve_inflation(mixed: MixedModel, form: CurveForm) -> float:
     """By how much the chi-squared of `form` is too high on healthy rides that were left out."""
     healthy = mixed.shapes.get(form.name)
@@ -163,9 +176,8 @@ def least_score(form: CurveForm, limit: float) -> float:
 
 def described(form: CurveForm, curve: CurveFit, score: float, denies: Sequence[str]) -> Unknown:
     """The curve for the report, its share of the energy still open."""
-    knots, unit = QUANTITIES[form.quantity]
-    rows = tuple(zip(knots, curve.values.tolist(), curve.sd.tolist(), strict=True))
-    return Unknown(form.channel, form.quantity, form.straight, unit, score, curve.chi2, rows, tuple(denies))
+    rows = tuple(zip(form.knots.tolist(), curve.values.tolist(), curve.sd.tolist(), strict=True))
+    return Unknown(form.channel, form.quantity, form.straight, form.unit, score, curve.chi2, rows, tuple(denies))
 
 
 def contradicts_causes(curve: CurveFit, inflation: float, size: float, share: float) -> bool:

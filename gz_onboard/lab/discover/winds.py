@@ -13,8 +13,7 @@ from gz_onboard.lab.discover.grid import MOVING
 from gz_onboard.lab.discover.search import one_degree
 from gz_onboard.lab.discover.selection import SearchProblem, Selection, linearised_about, select_causes
 
-AREA = "drag_area"
-SIDE = 0.5  # of (wind over speed)²: what side wind and gusts change of the drag area, in the mean over all directions
+SIDE = 0.5  # of (wind over speed)²: what side wind and gusts change of drag, in the mean over all directions
 
 
 @dataclass(frozen=True)
@@ -80,17 +79,17 @@ def own_winds(now: Selection, wind: Candidate) -> Winds:
 
 def with_winds(problem: SearchProblem, winds: Winds) -> SearchProblem:
     """The search beside the `winds`, each ride about its own: their square is not linear in them, and would be taken
-    for a load. So would side wind and gusts, which no channel shows: the drag area is as unsure as they can make it.
+    for a load. So would side wind and gusts, which no channel shows: what else the effect reads of the model, the drag
+    area, is as unsure as they can make it.
     """
     mixed, w = problem.mixed, winds.index
     scatter = mixed.scatter.copy()
     scatter[w] = np.maximum(scatter[w], np.mean(winds.blown[:, w] ** 2, axis=0))
-    if AREA in mixed.names:
-        (i,) = mixed.index([AREA])
-        rides = (np.abs(line.ride.quantities["speed"]) for line in problem.lines)
-        speeds = np.array([np.mean(speed[speed > MOVING]) for speed in rides])
-        square = np.sum((winds.blown[:, w] * mixed.scale[w]) ** 2, axis=1) / speeds**2
-        scatter[i] += np.mean((SIDE * square * mixed.values[AREA] / mixed.scale[i]) ** 2)
+    rides = (np.abs(line.ride.quantities["speed"]) for line in problem.lines)
+    speeds = np.array([np.mean(speed[speed > MOVING]) for speed in rides])
+    square = np.sum((winds.blown[:, w] * mixed.scale[w]) ** 2, axis=1) / speeds**2
+    for i in mixed.index([name for name in winds.cause.reads if name in mixed.names]):
+        scatter[i] += np.mean((SIDE * square * mixed.values[mixed.names[i]] / mixed.scale[i]) ** 2)
     windy = replace(mixed, scatter=scatter)
     lines = linearised_about(windy, problem.start + winds.blown, problem.linearised)
     causes = [cause for cause in problem.causes if cause.name != winds.cause.name]

@@ -14,7 +14,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.lab.discover.baseline import adopted
 from gz_onboard.lab.discover.baseline_file import load, restore, write_baseline
-from gz_onboard.lab.discover.curves import hat_functions
+from gz_onboard.lab.discover.curve_forms import hat_functions
 from gz_onboard.lab.discover.energy import energy_share
 from gz_onboard.lab.discover.extension import MODELLED, curve_text, write_model
 from gz_onboard.lab.discover.linear import LinearRide

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.lab.discover.curves import IN_PROPORTION, QUANTITIES, curve_forms
+from gz_onboard.lab.discover.curve_forms import IN_PROPORTION, QUANTITIES, curve_forms
 from gz_onboard.lab.discover.grid import LONGEST, since, suspension_speed, vibration
 from gz_onboard.physics.vibration import FAST, SLOW, Vibration
 

@@ -15,7 +15,8 @@ from benchmarks.trial import LACKS, MARK, Row, alarm, discovered, healthy_docume
 from gz_onboard.lab.discover.acceptance import with_observed_scatter, within_bounds
 from gz_onboard.lab.discover.baseline import baseline
 from gz_onboard.lab.discover.cross_validation import improves
-from gz_onboard.lab.discover.curves import QUANTITIES, CurveForm, supported_knots
+from gz_onboard.lab.discover.curve_forms import QUANTITIES, CurveForm
+from gz_onboard.lab.discover.curves import supported_knots
 from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.lab.discover.gain import errors
 from gz_onboard.lab.discover.linear import LinearRide, Normal
