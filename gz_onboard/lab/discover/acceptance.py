@@ -14,7 +14,7 @@ import numpy as np
 
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.constancy import RIDE, splits, unequal
-from gz_onboard.lab.discover.cross_validation import Fold, folds, improves
+from gz_onboard.lab.discover.cross_validation import Fold, held_out, improves, squares
 from gz_onboard.lab.discover.linear import Normal, fit_mixed
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.prior import LOG
@@ -56,8 +56,8 @@ def predicts_held_out(now: Selection, name: str) -> bool:
         return True
     every = [now.search.causes[n] for n in now.chosen]
     others = [c for c in every if c.name != name]
-    held = folds(now.mixed, now.lines, now.normals, Fold(every), Fold(others))
-    return improves(held, now.search.shares.get(name, {}))
+    held = held_out(now.mixed, now.lines, now.normals, Fold(every), Fold(others))
+    return improves(squares(held), now.search.shares.get(name, {}))
 
 
 def rejection(now: Selection, limit: float) -> tuple[str, str] | None:

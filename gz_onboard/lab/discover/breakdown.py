@@ -23,25 +23,25 @@ FREE = 1e6  # variance in scales of a cause that is free
 JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
 OUTSTANDING = 3.5  # standard deviations of what differs between healthy rides
 
-QUANTITIES: dict[str, tuple[str, str]] = {
-    "speed": ("speed", "m/s"),
-    "acceleration": ("acceleration", "m/s²"),
-    "lateral_acceleration": ("lateral acceleration, left positive", "m/s²"),
-    "grade": ("grade", "1"),
-    "heading": ("heading, clockwise from north", "rad"),
-    "ambient_temperature": ("air", "degC"),
-    "motor_temperature": ("motor", "degC"),
-    "cell_temperature": ("cells", "degC"),
-    "soc": ("state of charge", "1"),
-    "pack_current": ("pack current", "A"),
-    "motor_current": ("motor current", "A"),
-    "time": ("time since the start", "s"),
-    "since_change": ("time since the current changed", "s"),
-    "since_braking": ("time since a brake was touched", "s"),
-    "suspension_speed": ("speed of the suspension", "m/s"),
-    "vibration": ("vibration: how rough the road is", "m/s²"),
+QUANTITIES: dict[str, tuple[str, str, str]] = {
+    "speed": ("speed", "m/s", "motor_speed"),
+    "acceleration": ("acceleration", "m/s²", "motor_speed"),
+    "lateral_acceleration": ("lateral acceleration, left positive", "m/s²", "rate_z"),
+    "grade": ("grade", "1", "accel_x"),
+    "heading": ("heading, clockwise from north", "rad", "gps_course"),
+    "ambient_temperature": ("air", "degC", "ambient_temperature"),
+    "motor_temperature": ("motor", "degC", "motor_temperature"),
+    "cell_temperature": ("cells", "degC", "cell_temperature"),
+    "soc": ("state of charge", "1", "pack_current"),
+    "pack_current": ("pack current", "A", "pack_current"),
+    "motor_current": ("motor current", "A", "motor_current"),
+    "time": ("time since the start", "s", "motor_speed"),
+    "since_change": ("time since the current changed", "s", "motor_current"),
+    "since_braking": ("time since a brake was touched", "s", "motor_speed"),
+    "suspension_speed": ("speed of the suspension", "m/s", "motor_speed"),
+    "vibration": ("vibration: how rough the road is", "m/s²", "motor_speed"),
 }
-"""What residuals are looked at over: words and unit."""
+"""What residuals are looked at over: words, unit, and the role without which it is made up."""
 
 
 def before_and_after(found: Discovery) -> tuple[list[LinearRide], list[LinearRide]]:
@@ -101,26 +101,10 @@ class QuantityReader:
         return None if values is None else over_blocks(table.channel, values)[table.used]
 
 
-NEEDS = {
-    "lateral_acceleration": "rate_z",
-    "grade": "accel_x",
-    "heading": "gps_course",
-    "ambient_temperature": "ambient_temperature",
-    "motor_temperature": "motor_temperature",
-    "cell_temperature": "cell_temperature",
-    "pack_current": "pack_current",
-}
-"""The role without which a quantity is made up."""
-
-
 def on_grid(ride: Ride, name: str, mixed: MixedModel) -> Array | None:
     """A quantity on the grid of the ride, shape of its time; None if the ride has it not."""
-    if NEEDS.get(name, "motor_speed") not in ride.have:
+    if QUANTITIES[name][2] not in ride.have:
         return None
-    if name == "time":
-        return ride.time
-    if name == "pack_current":
-        return ride.signals[name]
     if name == "since_change":
         return since_change(ride.signals["motor_current"])
     if name == "soc":
@@ -128,7 +112,7 @@ def on_grid(ride: Ride, name: str, mixed: MixedModel) -> Array | None:
             return None
         soc = np.repeat(cell_circuit(ride, mixed.values, mixed.system)[2], SLOW)
         return np.append(soc, np.full(max(0, len(ride.time) - len(soc)), soc[-1]))
-    return ride.quantities.get(name)
+    return ride.quantity(name)
 
 
 def since_change(current: Array) -> Array:

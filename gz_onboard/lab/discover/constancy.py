@@ -38,7 +38,8 @@ def _halves(name: str) -> Sign:
     """-1 below a value of the quantity, +1 above it, half of the cause's own squared effect on either side."""
 
     def sign(ride: Ride, table: LinearChannel, effect: Array) -> Array:
-        values = ride.time if name == "time" else ride.quantities[name]
+        values = ride.quantity(name)
+        assert values is not None
         at = over_blocks(table.channel, values)[table.used]
         order = np.argsort(at)
         half = np.cumsum(effect[order] ** 2)

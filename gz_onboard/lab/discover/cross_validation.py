@@ -36,30 +36,44 @@ class Fold:
         return line if self.form is None else without(line, self.form, curve)
 
 
-Squares = dict[str, tuple[float, float, float]]  # by channel: mean square before, with the control, after
+Triple = tuple[float, float, float]  # before, with the control, after
+Squares = dict[str, Triple]  # by channel: mean squares
 
 
-def folds(
-    mixed: MixedModel, lines: Sequence[LinearRide], normals: Sequence[Normal], after: Fold, control: Fold
-) -> Iterator[Squares]:
-    """Of each ride in turn, held out of the fit, the mean squares of its residuals: before (the causes of `control`
-    alone moved), with `control` refitted, with `after`; each with its own start.
+def held_out(
+    mixed: MixedModel,
+    lines: Sequence[LinearRide],
+    normals: Sequence[Normal],
+    after: Fold,
+    control: Fold,
+    folds: Sequence[Sequence[int]] | None = None,
+) -> Iterator[list[tuple[LinearRide, Array]]]:
+    """Of each ride in turn, held out of the fit with those of its fold: it, and its parameters (p,) with its own start,
+    before (the causes of `control` alone moved), with `control` refitted, with `after`.
+
+    folds: which rides are held out together; each alone if not given.
     """
-    for i, line in enumerate(lines):
-        rest = [j for j in range(len(lines)) if j != i]
-        some, theirs = [lines[j] for j in rest], [normals[j] for j in rest]
+    for fold in [[i] for i in range(len(lines))] if folds is None else folds:
+        rest = [i for i in range(len(lines)) if i not in fold]
+        some, theirs = [lines[i] for i in rest], [normals[i] for i in rest]
         plain, _ = control.fit(mixed, some, theirs)
         before = mixed.mean.copy()
         index = [k for cause in control.causes for k in mixed.index(cause.names)]
         before[index] = plain[index]
         full, curve = after.fit(mixed, some, theirs)
-        models = ((line, before), (line, plain), (after.shown(line, curve), full))
-        begun = [(shown, with_own_start(mixed, start_equations(mixed, shown), theta)) for shown, theta in models]
-        squares = [
+        for line in (lines[i] for i in fold):
+            models = ((line, before), (line, plain), (after.shown(line, curve), full))
+            yield [(shown, with_own_start(mixed, start_equations(mixed, shown), theta)) for shown, theta in models]
+
+
+def squares(held: Iterator[list[tuple[LinearRide, Array]]]) -> Iterator[Squares]:
+    """The mean squares of what `held_out` leaves of the residuals."""
+    for models in held:
+        before, control, after = (
             {name: float(np.mean((table.y - table.a @ theta) ** 2)) for name, table in shown.tables.items()}
-            for shown, theta in begun
-        ]
-        yield {name: (squares[0][name], squares[1][name], squares[2][name]) for name in squares[0]}
+            for shown, theta in models
+        )
+        yield {name: (before[name], control[name], after[name]) for name in before}
 
 
 def improves(held: Iterator[Squares], shares: Mapping[str, float]) -> bool:

@@ -70,6 +70,7 @@ SCATTER = 0.3
 SCATTERS = {"cell_voltage": 1.0}  # whose model lacks more
 KNOTS_OF = {"speed": "speed", "motor_current": "current", "current_change": "current", "pack_current": "current"}
 """The size of the vehicle that the knots of a quantity grow with; those of others are of roads and riders."""
+SMOOTH, SLOW = 8.0, 2.0  # s, m/s: of a grade by GPS altitude
 ROUND = ("heading",)
 IN_PROPORTION = ("time", "current_change", "steering", "vibration", "suspension_speed")
 """Quantities that something may be in proportion to and that no candidate is: each is a try of its own."""
@@ -128,28 +129,16 @@ def curve_forms(sizes: Sizes = USUAL) -> list[CurveForm]:
 def quantity(ride: Ride, name: str, table: LinearChannel) -> Array | None:
     """The quantity over the blocks of `table`, (m,); None if the ride has it not."""
     channel = table.channel
-    q = ride.quantities
-    if name == "time":
-        values = ride.time
-    elif name == "current_change":
+    values = ride.quantity(name)
+    if name == "current_change":
         n = round(channel.block / STEP)
         mean = over_blocks(channel, ride.signals["motor_current"])
         square = over_blocks(channel, ride.signals["motor_current"] ** 2)
         return np.asarray(np.sqrt(np.maximum(square - mean**2, 0))[table.used]) if n > 1 else None
-    elif name == "pack_current":
-        if name not in ride.signals:
-            return None
-        values = ride.signals[name]
-    elif name in ("soc", "vibration", "suspension_speed"):
-        if name not in q:
-            return None
-        values = q[name]
-    elif name == "grade" and "gps_altitude" in ride.signals:  # not of the accelerometer, whose noise is in the channel
-        rise = np.gradient(smooth(ride.signals["gps_altitude"], 8.0), STEP)
-        values = smooth(rise, 8.0) / np.maximum(smooth(np.abs(q["speed"]), 8.0), 2.0)
-    else:
-        values = q[name]
-    return over_blocks(channel, values)[table.used]
+    if name == "grade" and "gps_altitude" in ride.signals:  # not of the accelerometer, whose noise is in the channel
+        rise = np.gradient(smooth(ride.signals["gps_altitude"], SMOOTH), STEP)
+        values = smooth(rise, SMOOTH) / np.maximum(smooth(np.abs(ride.quantities["speed"]), SMOOTH), SLOW)
+    return None if values is None else over_blocks(channel, values)[table.used]
 
 
 def hat_functions(x: Array, knots: Sequence[float], periodic: bool = False) -> Array:

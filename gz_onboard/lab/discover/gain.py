@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.cross_validation import Fold, start_equations, with_own_start
+from gz_onboard.lab.discover.cross_validation import Fold, Triple, held_out
 from gz_onboard.lab.discover.energy import channel_energy, energy_drawn, pack_power
 from gz_onboard.lab.discover.linear import LinearRide, normal
 from gz_onboard.lab.discover.result import Errors, Gain
@@ -16,7 +16,6 @@ from gz_onboard.lab.discover.verdict import Discovery
 
 WHOLE = {"pack_voltage", "pack_current"}  # without which no one knows what a ride took out of the pack
 DRAWS = 400  # of the bootstrap over rides
-Triple = tuple[float, float, float]  # before, control, after
 
 
 def measure_gain(found: Discovery, seed: int, apart: Sequence[LinearRide] = ()) -> Gain:
@@ -34,18 +33,12 @@ def measure_gain(found: Discovery, seed: int, apart: Sequence[LinearRide] = ()) 
     folds = [list(range(known, len(lines)))] if apart else [[i] for i in range(known)]
     named = {cause.name for cause in report.causes if not cause.varies}
     form = form_of(report.unknown, mixed.sizes) if report.unknown is not None else None
-    control, after = Fold(), Fold([cause for cause in mixed.causes if cause.name in named], form)
+    after = Fold([cause for cause in mixed.causes if cause.name in named], form)
     rows: dict[str, list[Triple]] = {}
-    for fold in folds:
-        rest = [i for i in range(len(lines)) if i not in fold]
-        fitted = mixed, [lines[i] for i in rest], [normals[i] for i in rest]
-        plain, _ = control.fit(*fitted)
-        full, curve = after.fit(*fitted)
-        for i in fold:
-            models = ((lines[i], mixed.mean), (lines[i], plain), (after.shown(lines[i], curve), full))
-            of = [errors(line, with_own_start(mixed, start_equations(mixed, line), theta)) for line, theta in models]
-            for metric in of[0]:
-                rows.setdefault(metric, []).append((of[0][metric], of[1][metric], of[2][metric]))
+    for models in held_out(mixed, lines, normals, after, Fold(), folds):
+        before, control, with_causes = (errors(line, theta) for line, theta in models)
+        for metric, value in before.items():
+            rows.setdefault(metric, []).append((value, control[metric], with_causes[metric]))
     rng = np.random.default_rng(seed)
     held = tuple(lines[i].ride.name for fold in folds for i in fold)
     of_metric = {metric: summarised(triples, rng) for metric, triples in rows.items()}

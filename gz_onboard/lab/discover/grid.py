@@ -27,7 +27,7 @@ BRAKE_PRESSURE = 0.8e5  # Pa: above what the sensors show at rest
 MOVING = 0.5  # m/s
 SUSPENSION = ("suspension_front", "suspension_rear")
 CRAWL, MOST_STEERING = 1.0, 0.6  # m/s, rad: what a bend tells of slower riding is noise
-SHAKING = 0.034  # s: samples further apart do not show what a road does to a wheel
+ROUGH_PERIOD = 0.034  # s: samples further apart do not show what a road does to a wheel
 LONGEST = 60.0  # s since a brake was touched, or a current changed: what was longer ago is as good as never
 
 
@@ -72,6 +72,12 @@ class Ride:
         for role in roles:
             result &= self.valid[role]
         return result
+
+    def quantity(self, name: str) -> Array | None:
+        """A quantity, the time or the pack's current, shape (n,); None if it was not measured."""
+        if name == "time":
+            return self.time
+        return self.signals.get(name) if name == "pack_current" else self.quantities.get(name)
 
     @property
     def distance(self) -> float:
@@ -144,9 +150,9 @@ def read_ride(samples: Samples, vehicle: Dimensions) -> Ride:
     ride.quantities = _quantities(ride, vehicle)
     ride.quantities["since_braking"] = since(ride.braking)
     wheels = [samples.columns[role] for role in SUSPENSION if role in samples.columns]
-    if wheels and all(np.median(np.diff(times)) < SHAKING for times, _ in wheels):
+    if wheels and all(np.median(np.diff(times)) < ROUGH_PERIOD for times, _ in wheels):
         ride.quantities["suspension_speed"] = suspension_speed(wheels, grid)
-    if "accel_z" in samples.columns and np.median(np.diff(samples.columns["accel_z"][0])) < SHAKING:
+    if "accel_z" in samples.columns and np.median(np.diff(samples.columns["accel_z"][0])) < ROUGH_PERIOD:
         ride.quantities["vibration"] = vibration(*samples.columns["accel_z"], grid)
     return ride
 
@@ -160,10 +166,10 @@ def since(happens: Mask) -> Array:
 
 def vibration(times: Array, values: Array, grid: Array) -> Array:
     """How rough the road is [m/s²]: of vertical acceleration `values` at `times`, at `grid`; see `Vibration`."""
-    shaken, rms = Vibration(), []
+    meter, rms = Vibration(), []
     for dt, value in zip(np.diff(times, prepend=times[0]).tolist(), values.tolist(), strict=True):
-        shaken.update(dt, value)
-        rms.append(shaken.value)
+        meter.update(dt, value)
+        rms.append(meter.value)
     return np.asarray(np.interp(grid, times, rms))
 
 

@@ -144,25 +144,27 @@ def trimmed(line: LinearRide, noise: Noise, mean: Array, spread: Array) -> Linea
     """
     tables = line.tables
     for _ in range(3):
-        ride = normal(LinearRide(line.ride, tables), noise)
-        own = mean + np.linalg.solve(np.diag(1 / spread**2) + ride.n, ride.b - ride.n @ mean)
+        own = likeliest(LinearRide(line.ride, tables), noise, mean, spread)
         tables = {name: _trim(table, noise[name], own) for name, table in line.tables.items()}
     return LinearRide(line.ride, tables)
+
+
+def likeliest(line: LinearRide, noise: Noise, mean: Array, spread: Array) -> Array:
+    """The ride's parameters (p,) in scales, before of `mean` and standard deviations `spread` (p,)."""
+    ride = normal(line, noise)
+    return np.asarray(mean + np.linalg.solve(np.diag(1 / spread**2) + ride.n, ride.b - ride.n @ mean))
 
 
 def spread_out(line: LinearRide, noise: Noise, mean: Array, spread: Array) -> LinearRide:
     """`line` with the noise of each channel raised to what this ride shows, where that is more: a ride that no
     parameters make fit counts for less.
     """
-    ride = normal(line, noise)
-    own = mean + np.linalg.solve(np.diag(1 / spread**2) + ride.n, ride.b - ride.n @ mean)
+    own = likeliest(line, noise, mean, spread)
     tables = {}
     for name, table in line.tables.items():
         rest = whitened(table, noise[name], table.y - table.a @ own)
         factor = max(1.0, float(np.sqrt(np.mean(rest**2))))
-        tables[name] = LinearChannel(
-            table.channel, table.y / factor, table.a / factor, table.time, table.used, factor, table.roughness
-        )
+        tables[name] = replace(table, y=table.y / factor, a=table.a / factor, factor=factor)
     return LinearRide(line.ride, tables)
 
 
@@ -176,9 +178,7 @@ def _trim(table: LinearChannel, noise: tuple[float, float, float], own: Array) -
         return table
     used = table.used.copy()
     used[np.flatnonzero(used)[bad]] = False
-    return LinearChannel(
-        table.channel, table.y[~bad], table.a[~bad], table.time[~bad], used, table.factor, table.roughness
-    )
+    return replace(table, y=table.y[~bad], a=table.a[~bad], time=table.time[~bad], used=used)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from gz_onboard.lab.discover.acceptance import with_observed_scatter
 from gz_onboard.lab.discover.constancy import RIDE, unequal
-from gz_onboard.lab.discover.cross_validation import Fold, folds, improves
+from gz_onboard.lab.discover.cross_validation import Fold, held_out, improves, squares
 from gz_onboard.lab.discover.curve_forms import CurveForm, curve_forms
 from gz_onboard.lab.discover.curves import CurveFit, fit_curve
 from gz_onboard.lab.discover.energy import curve_energy_share, energy_share
@@ -100,8 +100,8 @@ def curve_is_accepted(now: Selection, form: CurveForm, rest: Sequence[str], limi
     if curve is None or curve_score(mixed, form, curve) < least_score(form, limit):
         return False
     causes = [search.causes[name] for name in rest]
-    held = folds(mixed, lines, normals, Fold(causes, form), Fold(causes))
-    return len(lines) < 2 or improves(held, {form.channel: 1.0})
+    held = held_out(mixed, lines, normals, Fold(causes, form), Fold(causes))
+    return len(lines) < 2 or improves(squares(held), {form.channel: 1.0})
 
 
 def rival_curve(now: Selection, limit: float) -> Unknown | None:
