@@ -26,9 +26,10 @@ from gz_onboard.lab.calibrate import ocv, pulse
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, voltage
 from gz_onboard.lab.calibrate.result import Result
 from gz_onboard.lab.calibrate.table import Named, Table, read_table
-from gz_onboard.physics.battery import Battery, Mesh
+from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters
+from gz_onboard.physics.tables import Mesh
 from gz_onboard.vehicle import read_vehicle
 
 TEMPERATURES = (25, 10, 0, -10, -20)

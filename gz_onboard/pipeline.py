@@ -20,7 +20,7 @@ from gz_onboard.estimator.ekf import filter_maker
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
-from gz_onboard.physics.battery import drawable
+from gz_onboard.physics.drawable import drawable
 from gz_onboard.vehicle import Vehicle
 
 TICK_NS = 100_000_000  # status at 10 Hz

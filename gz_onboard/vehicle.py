@@ -10,7 +10,8 @@ from pathlib import Path
 from gz_onboard.bus.mapping import Mapping, find_dbc, read_mapping
 from gz_onboard.bus.publisher import RANGE_DBC
 from gz_onboard.errors import InputError, nearest, shown
-from gz_onboard.physics.battery import Battery, read_battery
+from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery_file import read_battery
 from gz_onboard.physics.derating import Derating, read_derating
 from gz_onboard.physics.effect import Effect
 from gz_onboard.physics.model import Model, read_model

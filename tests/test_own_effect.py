@@ -16,7 +16,7 @@ import pytest
 from gz_onboard.cli import main
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.physics.effect import load_effect
-from gz_onboard.physics.model import bind
+from gz_onboard.physics.model import Bound
 from gz_onboard.vehicle import OWN, read_vehicle
 
 ROOT = Path(__file__).parents[1]
@@ -72,7 +72,7 @@ def test_its_commands_give_what_it_shows(folder: Path):
 @pytest.mark.parametrize("name", ["top_box", "flat_spot", "heated_grips"])
 def test_its_effects_keep_to_the_contract(folder: Path, name: str):
     effect = load_effect(name, folder / "effects")
-    values = bind(effect, {**read_vehicle("reference").parameters, **{p.name: p.prior for p in effect.parameters}})
+    values = Bound(effect, {**read_vehicle("reference").parameters, **{p.name: p.prior for p in effect.parameters}})
     rows = [
         {"speed": v, "headwind": 1.0, "air_density": 1.2, "time_moving": 60.0 * v, "ambient_temperature": 10.0}
         for v in (0.0, 3.0, 12.0)

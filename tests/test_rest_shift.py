@@ -15,8 +15,8 @@ from gz_onboard.estimator.ekf import ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Group
-from gz_onboard.lab.discover.channels import rest_at
-from gz_onboard.physics.battery import Battery, drawable
+from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.drawable import drawable
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.recorded import Recorded, rest_soc
 from gz_onboard.simulation.scooter import Scooter
@@ -41,7 +41,7 @@ temperatures = st.floats(-30, 50)
 def test_a_whole_ride_rests_where_each_step_does(points):
     soc, celsius = np.array(points).T
     for battery in (PLAIN, COLD):
-        assert rest_at(battery, soc, celsius) == pytest.approx([battery.ocv(s, t)[0] for s, t in points], abs=1e-12)
+        assert battery.ocv_over(soc, celsius) == pytest.approx([battery.ocv(s, t)[0] for s, t in points], abs=1e-12)
 
 
 def read(folder: Path, table: str) -> Battery:

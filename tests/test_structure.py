@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from gz_onboard.physics.effect import QUANTITIES
+
 PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 
 # The parts of the package, lowest first. A part imports itself and those in the lines above its own.
@@ -45,7 +47,7 @@ ON_REQUEST = {"estimator/ekf_filterpy.py"}
 STAGES = {
     "plain data": ["result", "wording"],
     "read": ["grid"],
-    "residuals": ["channels"],
+    "residuals": ["residuals", "channels"],
     "linear model": ["prior", "candidates", "linear", "mixed_model", "uncalibrated", "baseline_file"],
     "search": ["search", "curve_forms", "curves", "baseline", "selection"],
     "judgement": ["constancy", "cross_validation", "acceptance", "winds", "energy", "unexplained", "verdict"],
@@ -162,6 +164,14 @@ def test_imports_of_the_discovery_go_down_its_stages():
     for module, found in of.items():
         for other in (name.removeprefix(inside) for name in found if name.startswith(inside)):
             assert STAGE[other] < STAGE[module], f"{module} imports {other}, which does not stand before it"
+
+
+def test_the_discovery_knows_effects_by_what_they_declare():
+    effects = {path.stem for path in (PACKAGE / "physics/effects").glob("*.py")} - set(QUANTITIES)
+    for module in (PACKAGE / "lab/discover").glob("*.py"):
+        nodes = ast.walk(ast.parse(module.read_text(encoding="utf-8")))
+        named = {node.value for node in nodes if isinstance(node, ast.Constant)} & effects
+        assert not named, f"{module.name} names {', '.join(named)}"
 
 
 def test_a_constant_of_nature_stands_once():

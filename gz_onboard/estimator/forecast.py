@@ -32,7 +32,8 @@ from math import exp, isfinite, pi, sqrt
 from typing import Any
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.physics.battery import Battery, drawable
+from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.drawable import drawable
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import Model, air_density, stepping
 from gz_onboard.physics.riding import PriorRiding
@@ -163,7 +164,7 @@ class Forecaster:
         parameters = model.parameters
         self.extended = not model.reads <= BASE or any(e.decay for e in model.effects)
         self._by_heading = "heading" in model.reads
-        self._lacks = model.lacks(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
+        self._overpotential = model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
         self._states: dict[str, float] = {}  # of effects with memory between road and pack
         self._capacity_sd = parameters.sd("cell_capacity") / parameters["cell_capacity"]
 
@@ -373,8 +374,8 @@ class Forecaster:
         form = (PRIOR_FORM * prior_power**2 * prior_time + past.power_squares) * (prior_time + past.duration) / mean**2
         form = min(max(form, 1.0), 6.0)
 
-        left = drawable(self.battery, soc, cell_temperature, power, form, self._lacks)
-        colder = drawable(self.battery, soc, cell_temperature - temperature_sd, power, form, self._lacks)
+        left = drawable(self.battery, soc, cell_temperature, power, form, self._overpotential)
+        colder = drawable(self.battery, soc, cell_temperature - temperature_sd, power, form, self._overpotential)
         energy_sd = sqrt(
             (soc_sd * left.slope) ** 2 + (left.energy - colder.energy) ** 2 + (self._capacity_sd * left.energy) ** 2
         )

@@ -14,16 +14,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import repeat
 from typing import Any
 
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.validate_score import Channel
-from gz_onboard.physics.effect import MOVING, QUANTITIES, Effect, Port
-from gz_onboard.physics.model import air_density
+from gz_onboard.physics.battery import discharged, heat, terminal_voltage
+from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
+from gz_onboard.physics.effect import MOVING, QUANTITIES, ROAD_LOAD, Port
+from gz_onboard.physics.model import air_density, drag_torque, over, total
 from gz_onboard.physics.relaxation import relaxed
-from gz_onboard.simulation.scooter import Dynamometer, Scooter
+from gz_onboard.simulation.scooter import Dynamometer
 from gz_onboard.vehicle import Vehicle
 
 
@@ -65,9 +68,7 @@ def components(
         moving = (measured["speed"] > 2.0) & (measured.get("braking", np.zeros(len(speed))) <= 0)
         if "acceleration" in has and ("grade" in has or roller):
             radius = vehicle.parameters["wheel_radius"] * vehicle.parameters["gear_ratio"]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                drag = np.where(moving, idle / np.where(moving, speed, 1.0), 0.0)
-            force = (constant * current - drag) / radius
+            force = (constant * current - drag_torque(idle, speed)) / radius
             needed = road_load(vehicle, measured, ambient, roller)
             found["road_load"] = Component(Channel("N", "road load"), force, needed, moving)
         found |= _temperatures(vehicle, measured, soc, ambient, copper + idle, inverter, every)
@@ -82,13 +83,13 @@ def vibration(vehicle: Vehicle, measured: Mapping[str, Array]) -> Array:
 
 def time_moving(measured: Mapping[str, Array]) -> Array:
     """[s] since the start, per second."""
-    return np.asarray(np.cumsum(measured["speed"] > 1.0), dtype=float)
+    return np.asarray(np.cumsum(measured["speed"] > MOVING), dtype=float)
 
 
 def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float) -> Array:
     """Pack voltage [V] per second by the circuit of `physics.battery`, at rest before the first; sensor's offset in."""
     battery = vehicle.pack
-    n, m = battery.cells_series, battery.cells_parallel
+    m = battery.cells_parallel
     columns = (
         measured["pack_current"],
         measured["cell_temperature"],
@@ -103,11 +104,12 @@ def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float)
         cell = amperes / m
         r0, r1, c1 = (mesh.at(soc, celsius)[0] for mesh in (battery.r0, battery.r1, battery.c1))
         v1, decay = battery.relax(0.5, v1, cell, r1, c1)  # to its middle: what is measured is the second's mean
-        soc -= 0.5 * amperes / (3600 * battery.pack_capacity(celsius))
-        lacking = v1 + sum(states.values())
-        result[i] = n * (battery.ocv(soc, celsius)[0] - r0 * cell - lacking) - battery.series_resistance * amperes
+        half = discharged(amperes, 0.5, battery.pack_capacity(celsius))
+        soc -= half
+        volts = terminal_voltage(battery.ocv(soc, celsius)[0], r0, cell, v1 + sum(states.values()))
+        result[i] = battery.pack_voltage(volts, amperes)
         v1 = relaxed(v1, r1 * cell, decay)
-        soc -= 0.5 * amperes / (3600 * battery.pack_capacity(celsius))
+        soc -= half
         if states:
             q |= {"cell_current": cell, "soc": soc, "cell_temperature": celsius, "vibration": shaken}
             q |= {"cell_capacity": battery.cell_capacity(celsius), "time_moving": moving}
@@ -120,23 +122,10 @@ def losses(vehicle: Vehicle, current: Array, speed: Array, temperature: Array) -
     q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0)
     q |= {"motor_current": current, "motor_speed": speed, "motor_temperature": temperature}
     q["torque"] = vehicle.parameters["torque_constant"] * current
-    motor, inverter = _sum(vehicle, Port.MOTOR_LOSS, q), _sum(vehicle, Port.INVERTER_LOSS, q)
-    idle = _sum(vehicle, Port.MOTOR_LOSS, q | dict.fromkeys(("motor_current", "torque"), 0.0 * current))
+    model, each = vehicle.model, over(1.0)
+    motor, inverter = (0.0 * speed + total(model.at(port), q, each) for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS))
+    idle = 0.0 * speed + model.idle_loss(q)
     return motor - idle, idle, inverter
-
-
-def _sum(vehicle: Vehicle, port: Port, q: Mapping[str, Any]) -> Array:
-    total: Any = 0.0 * q["motor_speed"]
-    for effect in vehicle.model.effects:
-        if effect.port is port:
-            total = total + _term(effect, vehicle, q)
-    result: Array = total
-    return result
-
-
-def _term(effect: Effect, vehicle: Vehicle, q: Mapping[str, Any]) -> Any:
-    values = {name: vehicle.parameters[name] for name in effect.keywords}
-    return effect.term(*[q[name] for name in effect.quantities], **values)
 
 
 def road_load(vehicle: Vehicle, measured: Mapping[str, Array], ambient: float, roller: Dynamometer | None) -> Array:
@@ -161,12 +150,13 @@ def road_load(vehicle: Vehicle, measured: Mapping[str, Array], ambient: float, r
         "time_moving": time_moving(measured),
         "heading": measured.get("gps_course", zero),
     }
+    model, each = vehicle.model, over(1.0)
     if not roller:
-        return _sum(vehicle, Port.WHEEL_FORCE, q) + _sum(vehicle, Port.TYRE, q)
+        return np.asarray(zero + total(model.at(*ROAD_LOAD), q, each))
     rear = 1 - p["cg_to_rear"] / p["wheelbase"]  # of the load: only the driven wheel rolls
     inertia = roller.inertia + p["wheel_inertia_rear"] / p["wheel_radius"] ** 2
-    absorbed = roller.a + roller.b * speed + roller.c * speed**2
-    return rear * _sum(vehicle, Port.TYRE, q) + absorbed + inertia * measured["acceleration"]
+    absorbed = roller.absorbed(speed)
+    return np.asarray(rear * total(model.at(Port.TYRE), q, each) + absorbed + inertia * measured["acceleration"])
 
 
 def _temperatures(
@@ -180,45 +170,27 @@ def _temperatures(
 ) -> dict[str, Component]:
     """The cooling networks with the heat of the measured currents and the measured ambient temperature."""
     air = measured.get("ambient_temperature", np.full(len(every), ambient))
-    parts = Scooter(vehicle, soc=0.5 if soc is None else soc, ambient=ambient)
-    found = {}
+    p, battery = vehicle.parameters, vehicle.battery
+    found: dict[str, Component] = {}
+
+    def add(sensor: str, name: str, network: Network, heat: Array) -> None:
+        flow = repeat(p["cooling_factor"], len(heat))
+        modelled = np.array(temperatures(network, 1.0, heat.tolist(), air.tolist(), flow))
+        found[sensor] = Component(Channel("degC", name, True), measured[sensor], modelled, every)
+
+    def start(sensor: str) -> float:
+        return float(measured[sensor][0])
+
     if "motor_temperature" in measured:
-        motor = parts.motor_cooling
-        motor.stator = motor.rotor = float(measured["motor_temperature"][0])
-        found["motor_temperature"] = Component(
-            Channel("degC", "motor temperature", True),
-            measured["motor_temperature"],
-            _cooled(motor, motor_heat, air),
-            every,
-        )
+        add("motor_temperature", "motor temperature", MotorCooling.of(p, start("motor_temperature")), motor_heat)
     if "inverter_temperature" in measured:
-        inverter = parts.inverter_cooling
-        inverter.board = inverter.box = float(measured["inverter_temperature"][0])
-        found["inverter_temperature"] = Component(
-            Channel("degC", "inverter temperature", True),
-            measured["inverter_temperature"],
-            _cooled(inverter, inverter_heat, air),
-            every,
-        )
-    if measured.keys() >= {"cell_temperature", "pack_current", "pack_voltage"} and soc is not None:
-        battery = vehicle.pack
-        charge = np.cumsum(measured["pack_current"] / 3600) / battery.pack_capacity(
-            float(measured["cell_temperature"][0])
-        )
-        levels = zip((soc - charge).tolist(), measured["cell_temperature"].tolist(), strict=True)
-        source = np.array([battery.ocv(s, celsius)[0] for s, celsius in levels]) * battery.cells_series
-        heat = (source - measured["pack_voltage"]) * measured["pack_current"]
-        pack = parts.pack_cooling
-        pack.temperature = float(measured["cell_temperature"][0])
-        found["cell_temperature"] = Component(
-            Channel("degC", "cell temperature", True), measured["cell_temperature"], _cooled(pack, heat, air), every
-        )
+        network = InverterCooling.of(p, start("inverter_temperature"))
+        add("inverter_temperature", "inverter temperature", network, inverter_heat)
+    if battery and measured.keys() >= {"cell_temperature", "pack_current", "pack_voltage"} and soc is not None:
+        cells, current = measured["cell_temperature"], measured["pack_current"]
+        levels = soc - np.cumsum(discharged(current, 1.0, battery.pack_capacity(start("cell_temperature"))))
+        rest = battery.ocv_over(levels, cells) * battery.cells_series
+        generated = heat(rest, measured["pack_voltage"], current)
+        pack = LumpedCooling.of(p, "pack", start("cell_temperature"))
+        add("cell_temperature", "cell temperature", pack, generated)
     return found
-
-
-def _cooled(part: Any, heat: Array, air: Array) -> Array:
-    result = np.empty(len(heat))
-    for i, (watts, ambient) in enumerate(zip(heat.tolist(), air.tolist(), strict=True)):
-        part.step(1.0, watts, ambient)
-        result[i] = part.temperature
-    return result

@@ -11,6 +11,11 @@ An effect file has
 - if it has memory, ``decay(dt, quantity, ..., *, parameter, ...)``: the factor, 0 to 1, that its state keeps over
   ``dt`` [s]. The effect's value then is not the term but the state x, 0 at the start, which goes to what the term
   says: x' = decay·x + (1 - decay)·term, exact for quantities that are constant over the step;
+- what others need to know of it, if so: ``STORES_ENERGY = True`` (it gives back what it took, and the accelerometer
+  measures it), ``TURNING_LOSS = True`` (a chassis that turns has the same loss);
+- ``variation(quantity, ..., *, nuisance, ...)``, if healthy vehicles are known to differ from the equation: the factor
+  on the term, 1 at nuisances of 0, which discovery fits. It may take parameters too, and what they are on the healthy
+  vehicle as ``healthy_`` before the name;
 - ``SHOWN_BY``, if it is a candidate of the discovery: the data that would show it, and the ride that would split it
   from its look-alikes; ``STRENGTHS``, the parameters that then change, the first if it is not given; ``VARIES = True``
   if it differs from ride to ride by itself; ``CAUSE``, if every model has the effect: what a change of it is called,
@@ -33,7 +38,7 @@ import importlib.util
 import inspect
 import pkgutil
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from functools import cache
@@ -54,6 +59,8 @@ class Port(Enum):
     DC_POWER = "W (DC link)"  # power drawn from the pack beside the inverter
     CELL_VOLTAGE = "V"  # what a cell's terminals lack, beside OCV, R0 and the one RC pair; positive lowers them
 
+
+ROAD_LOAD = (Port.WHEEL_FORCE, Port.TYRE)
 
 QUANTITIES: dict[str, str] = {
     "speed": "m/s",
@@ -132,6 +139,20 @@ VEHICLE_PARAMETERS = (
 
 
 @dataclass(frozen=True)
+class Variation:
+    """How a healthy vehicle may differ from an effect's equation: a factor on its term."""
+
+    factor: Callable[..., Any]
+    quantities: tuple[str, ...]
+    keywords: tuple[str, ...]
+
+    def of(self, quantities: Mapping[str, Any], values: Mapping[str, float]) -> Any:
+        """The factor at these quantities and nuisances."""
+        read = [quantities[name] for name in self.quantities]
+        return self.factor(*read, **{name: values[name] for name in self.keywords})
+
+
+@dataclass(frozen=True)
 class Effect:
     """An effect as loaded from its file."""
 
@@ -146,6 +167,9 @@ class Effect:
     decay_quantities: tuple[str, ...] = ()
     decay_keywords: tuple[str, ...] = ()
     shown_by: str = ""
+    variation: Variation | None = None
+    stores_energy: bool = False
+    turning_loss: bool = False
     strengths: tuple[str, ...] = ()  # parameters that change where it is found, the one that is reported first
     varies: bool = False  # from ride to ride by itself
     cause: tuple[str, str] | None = None  # name and equation of a change, of an effect that every model has
@@ -264,6 +288,9 @@ def _effect(name: str, module: ModuleType) -> Effect:
         decay_quantities=decay_quantities,
         decay_keywords=decay_parameters,
         shown_by=getattr(module, "SHOWN_BY", ""),
+        variation=Variation(vary, *_arguments(vary)) if (vary := getattr(module, "variation", None)) else None,
+        stores_energy=getattr(module, "STORES_ENERGY", False),
+        turning_loss=getattr(module, "TURNING_LOSS", False),
         strengths=getattr(module, "STRENGTHS", tuple(declared[:1])),
         varies=getattr(module, "VARIES", False),
         cause=getattr(module, "CAUSE", None),

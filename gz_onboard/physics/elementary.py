@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
+STANDSTILL = 0.1  # m/s, or rad/s of a shaft: below it friction fades, so that nothing jumps where the sign changes
+
 
 def exp(x: Any) -> Any:
     """e to the power of `x`."""
@@ -31,3 +33,8 @@ def cos(x: Any) -> Any:
     import numpy as np
 
     return np.cos(x)
+
+
+def direction(speed: Any) -> Any:
+    """The sign of `speed` [m/s or rad/s], smooth around standstill: what friction acts with."""
+    return speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from math import exp
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from gz_onboard.arrays import Array
 
 T = TypeVar("T")
 
@@ -30,3 +33,11 @@ def relaxation(targets: Iterable[float], decays: Iterable[float], start: float =
         x = relaxed(x, target, decay)
         result.append(x)
     return result
+
+
+def relaxation_over(targets: Array, decays: Array, start: float = 0.0, before: bool = False) -> Array:
+    """`relaxation` of arrays (n,), shape (n,); before: the values at the beginnings of the steps, from `start` on."""
+    import numpy as np
+
+    ends = relaxation(targets.tolist(), decays.tolist(), start)
+    return np.array([start, *ends[:-1]] if before else ends)

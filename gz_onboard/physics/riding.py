@@ -7,7 +7,7 @@ from itertools import product
 from typing import TYPE_CHECKING
 
 from gz_onboard.physics.effect import QUANTITIES, failed
-from gz_onboard.physics.model import air_density, bind
+from gz_onboard.physics.model import Bound, air_density
 
 if TYPE_CHECKING:
     from gz_onboard.physics.model import Model
@@ -98,7 +98,7 @@ def check_riding(vehicle: Table, riding: PriorRiding, model: Model) -> None:
     }
     for effect, (_, speed, acceleration) in product(model.effects, riding.points):
         try:
-            float(bind(effect, model.parameters)(ordinary | {"speed": speed, "acceleration": acceleration}))
+            float(Bound(effect, model.parameters)(ordinary | {"speed": speed, "acceleration": acceleration}))
         except (Exception, SystemExit) as error:  # of a user's own: better here than on the road
             raise failed(effect.file, error) from error
     power = sum(

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from math import nan
 from typing import TYPE_CHECKING
 
-from gz_onboard.physics.battery import drawable
+from gz_onboard.physics.drawable import drawable
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.scooter import Road, Scooter
 
@@ -316,6 +316,6 @@ def range_by_energy(scooter: Scooter, run: Run, soc: float, temperature: float) 
     battery, consumption = scooter.vehicle.battery, run.consumption
     if battery is None or consumption is None or consumption <= 0:
         return None
-    lacks = scooter.vehicle.model.lacks(battery, {"vibration": scooter.vehicle.riding.vibration})
-    left = drawable(battery, soc, temperature, run.mean_power, run.form, lacks)
+    overpotential = scooter.vehicle.model.overpotential(battery, {"vibration": scooter.vehicle.riding.vibration})
+    left = drawable(battery, soc, temperature, run.mean_power, run.form, overpotential)
     return float(left.energy / consumption)

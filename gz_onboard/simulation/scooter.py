@@ -10,27 +10,27 @@ ledger closes to rounding.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from math import atan, sqrt
 from typing import Any
 
 from gz_onboard.constants import GRAVITY
+from gz_onboard.physics.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Effect, Port
-from gz_onboard.physics.model import air_density, drag_torque
+from gz_onboard.physics.elementary import direction
+from gz_onboard.physics.model import Bound, air_density, drag_torque, remembering
 from gz_onboard.simulation.parts.battery import EffectPack, FirstOrderPack, Pack
 from gz_onboard.simulation.parts.brakes import Brakes
 from gz_onboard.simulation.parts.chassis import STRAIGHT_ON, Chassis, StraightChassis
 from gz_onboard.simulation.parts.controller import Controller
-from gz_onboard.simulation.parts.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
-from gz_onboard.simulation.parts.motor import EffectMotor, Motor
+from gz_onboard.simulation.parts.motor import Call, EffectMotor, Losses, Motor
 from gz_onboard.simulation.parts.tyre import Tyre
 from gz_onboard.vehicle import Vehicle
 
 STEP = 0.01  # s
 WHEEL_ONLY = {"speed", "motor_speed", "time_moving"}
 """What a force may read to act on a dynamometer too: it is at the wheel, not of air, hill or bend."""
-TURNING_EFFECT = "cornering_drag"
 BRAKE_PASSES = 4  # of front and rear brake in turn, where both hold; each leaves a twentieth of what they disagree by
 VOLTAGE_FILTER = 0.3  # s: the controller's own; without one, current and sag would chase each other each step
 
@@ -57,6 +57,10 @@ class Dynamometer:
     a: float = 0.0  # N
     b: float = 0.0  # N·s/m
     c: float = 0.0  # N·s²/m²
+
+    def absorbed(self, speed: Any) -> Any:
+        """The force [N] at a surface speed [m/s]."""
+        return self.a * direction(speed) + self.b * speed + self.c * speed * abs(speed)
 
 
 @dataclass
@@ -104,11 +108,12 @@ class Scooter:
             raise vehicle.error("has no [battery], which a simulation needs")
         p = vehicle.parameters
         self.chassis: Chassis = chassis or StraightChassis()
-        if self.chassis.name != "straight" and any(e.name == TURNING_EFFECT for e in vehicle.model.effects):
-            raise vehicle.error(
-                f"model.effects lists {TURNING_EFFECT}, and the {self.chassis.name} chassis has the same loss: "
-                "it would count twice; take one of them"
-            )
+        for effect in vehicle.model.effects if self.chassis.name != "straight" else ():
+            if effect.turning_loss:
+                raise vehicle.error(
+                    f"model.effects lists {effect.name}, and the {self.chassis.name} chassis has the same loss: "
+                    "it would count twice; take one of them"
+                )
         self.dt = dt
         self.vehicle = vehicle
         self.dynamometer = road if isinstance(road, Dynamometer) else None
@@ -155,15 +160,15 @@ class Scooter:
         forces = [e for e in at[Port.WHEEL_FORCE] if "acceleration" not in e.quantities]
         if self.dynamometer:
             forces = [e for e in forces if e.reads <= WHEEL_ONLY]
-        self._forces = _together(forces, p, dt)
-        # What grade takes is the potential energy.
-        self._force_entries = [(i, e.name) for i, e in enumerate(forces) if e.name != "grade_force"]
-        self._rolling, self._rolling_entries = _together(at[Port.TYRE], p, dt), _names(at[Port.TYRE])
-        self._inverter = _booked(at[Port.INVERTER_LOSS], p, dt)
-        self._dc = _booked(at[Port.DC_POWER], p, dt)
+        self._forces = _calls(forces, p, dt)
+        self._stores = {e.name for e in forces if e.stores_energy}
+        self._rolling = _calls(at[Port.TYRE], p, dt)
+        self._inverter = Losses(_calls(at[Port.INVERTER_LOSS], p, dt), dt)
+        self._dc = Losses(_calls(at[Port.DC_POWER], p, dt), dt)
         constants = p["torque_constant"], p["voltage_constant"]
-        losses = at[Port.MOTOR_LOSS]
-        self.motor: Motor = motor or EffectMotor(_booked(losses, p, dt), _settled(losses, p), *constants, self._q)
+        losses = [Bound(effect, p) for effect in at[Port.MOTOR_LOSS]]
+        booked = Losses([(e.effect.name, remembering(e, dt)) for e in losses], dt)
+        self.motor: Motor = motor or EffectMotor(booked, losses, *constants, self._q)
         self.tyre = Tyre(p["tyre_b"], p["tyre_c"], p["tyre_d"], p["tyre_e"], form=tyre_form)
         self.brakes = Brakes(
             p["brake_torque_limit"],
@@ -174,28 +179,11 @@ class Scooter:
         )
         regeneration = p["regeneration_torque_limit"] / p["torque_constant"]
         self.controller = Controller(p["motor_current_limit"], regeneration, vehicle.derating)
-        cooled = p["cooling_factor"]
-        self.inverter_cooling = InverterCooling(
-            p["inverter_board_capacity"],
-            p["inverter_box_capacity"],
-            p["inverter_board_to_air"],
-            p["inverter_box_to_air"],
-            p["inverter_board_to_box"],
-            cooled * p["inverter_box_to_ambient"],
-            ambient,
-            ambient,
-        )
-        self.motor_cooling = MotorCooling(
-            p["motor_stator_capacity"],
-            p["motor_rotor_capacity"],
-            p["motor_gap_conductance"],
-            cooled * p["motor_rotor_to_ambient"],
-            p["motor_stator_share"],
-            ambient,
-            ambient,
-        )
-        self.pack_cooling = LumpedCooling(p["pack_heat_capacity"], cooled * p["pack_conductance"], cells)
-        self.bms_cooling = LumpedCooling(p["bms_heat_capacity"], p["bms_conductance"], cells)
+        self.inverter_cooling = InverterCooling.of(p, ambient)
+        self.motor_cooling = MotorCooling.of(p, ambient)
+        self.pack_cooling = LumpedCooling.of(p, "pack", cells)
+        self.bms_cooling = LumpedCooling.of(p, "bms", cells)
+        self._air = p["cooling_factor"]
         self._radius = p["wheel_radius"]
         self._gear = p["gear_ratio"]
         self._gear_efficiency = p["gear_efficiency"]
@@ -251,7 +239,7 @@ class Scooter:
         turning = 0.0
         if self._turns:
             turn = self._turn = self.chassis.turn(v, curvature, dt)
-            turning = turn.resistance * normal * v / sqrt(v * v + 0.01)
+            turning = turn.resistance * normal * direction(v)
             q["lean"] = turn.lean
             r *= turn.radius
             # The tyres hold back at the ground: what of their force moves load is what pushes the machine.
@@ -271,21 +259,21 @@ class Scooter:
         torque = self.motor.torque_constant * current - drag_torque(idle, w / gear)
         drive = torque / gear * (self._gear_efficiency if torque * w >= 0 else 1 / self._gear_efficiency)
 
-        forces = self._forces(q)
         against = 0.0
-        for term in forces:
-            against += term
-        rolling = self._rolling(q)
+        forces = [term(q) for _, term in self._forces]
+        for newton in forces:
+            against += newton
+        rolling = [term(q) for _, term in self._rolling]
         rear_rolling = front_rolling = 0.0
         share = rear / normal
         front_share = 0.0 if dynamometer else 1 - share
-        for term in rolling:
-            rear_rolling += share * term
-            front_rolling += front_share * term
+        for newton in rolling:
+            rear_rolling += share * newton
+            front_rolling += front_share * newton
         against += front_rolling + turning
         absorbed = 0.0
         if d := dynamometer:
-            absorbed = (d.a * v / sqrt(v * v + 0.01) if d.a else 0.0) + d.b * v + d.c * v * abs(v)
+            absorbed = d.absorbed(v)
             against += absorbed
 
         # --- wheel, tyre and vehicle together, implicit in the slip (eqs. 2.11, 3.3, 3.8, 3.10-3.12)
@@ -323,15 +311,16 @@ class Scooter:
         self.time += dt
 
         # --- every watt (eqs. 2.2-2.6, 2.9, 2.10, 2.16-2.19)
-        for i, name in self._force_entries:
-            entries[name] += forces[i] * v_mean * dt
+        for (name, _), newton in zip(self._forces, forces, strict=True):
+            if name not in self._stores:  # what stores energy is in the kinetic and potential energy
+                entries[name] += newton * v_mean * dt
         if turning:
             entries["turning"] += turning * v_mean * dt
         if dynamometer:
             entries["dynamometer"] += absorbed * v_mean * dt
         turned = share * r * w_mean + front_share * v_mean
-        for name, term in zip(self._rolling_entries, rolling, strict=True):
-            entries[name] += term * turned * dt
+        for (name, _), newton in zip(self._rolling, rolling, strict=True):
+            entries[name] += newton * turned * dt
         entries["tyre_slip"] += force * (r * w_mean - v_mean) * dt
         entries["brakes"] += (braking * w_mean + front_braking * v_mean) * dt
         motor_speed = w_mean / gear
@@ -340,8 +329,8 @@ class Scooter:
         q["torque"] = self.motor.torque_constant * current
         motor_heat = self.motor.heat(motor_speed, current, self.motor_cooling.stator, dt, entries)
         q["motor_speed"], q["motor_current"] = motor_speed, current
-        inverter_heat = self._inverter(q, entries)
-        power = mechanical + motor_heat + inverter_heat + self._dc(q, entries)
+        inverter_heat = self._inverter.total(q, entries)
+        power = mechanical + motor_heat + inverter_heat + self._dc.total(q, entries)
         bms_heat = self._bms_resistance * self.current * self.current
         entries["bms"] += bms_heat * dt
         power += bms_heat
@@ -380,9 +369,9 @@ class Scooter:
     def _cool(self, dt: float) -> None:
         """The cooling networks, with the mean heat of the period (eqs. 2.25-2.31)."""
         heat = self._heat
-        self.inverter_cooling.step(dt, heat["inverter"] / dt, self.ambient)
-        self.motor_cooling.step(dt, heat["motor"] / dt, self.ambient)
-        self.pack_cooling.step(dt, heat["pack"] / dt, self.ambient)
+        self.inverter_cooling.step(dt, heat["inverter"] / dt, self.ambient, self._air)
+        self.motor_cooling.step(dt, heat["motor"] / dt, self.ambient, self._air)
+        self.pack_cooling.step(dt, heat["pack"] / dt, self.ambient, self._air)
         self.bms_cooling.step(dt, heat["bms"] / dt, self.pack_cooling.temperature)
         for name in heat:
             heat[name] = 0.0
@@ -395,78 +384,5 @@ class Scooter:
         self.controller.watch(motor, inverter, self.pack_cooling.temperature, self.pack.soc)
 
 
-def _names(effects: Sequence[Effect]) -> list[str]:
-    return [effect.name for effect in effects]
-
-
-Terms = Callable[[Mapping[str, float]], tuple[float, ...]]
-Sum = Callable[[Mapping[str, float]], float]
-Booked = Callable[[Mapping[str, float], MutableMapping[str, float]], float]
-# Calls of effects are written out, as they are made a hundred times for each second ridden: a ride takes two thirds
-# of the time that it takes by `model.Bound`. What has memory must be called once each step of `dt` [s].
-
-
-def _together(effects: Sequence[Effect], parameters: Mapping[str, float], dt: float | None) -> Terms:
-    """The effects' values as one function of the quantities; `dt` is None for what each settles at."""
-    calls, scope = _calls(effects, parameters, dt)
-    terms: Terms = eval(f"lambda q: ({''.join(f'{call}, ' for call in calls)})", scope)
-    return terms
-
-
-def _settled(effects: Sequence[Effect], parameters: Mapping[str, float]) -> Sum:
-    """The sum of what the effects settle at."""
-    calls, scope = _calls(effects, parameters, None)
-    total: Sum = eval(f"lambda q: {' + '.join(calls) or '0.0'}", scope)
-    return total
-
-
-def _booked(effects: Sequence[Effect], parameters: Mapping[str, float], dt: float) -> Booked:
-    """The sum of the effects' values, which adds each, times `dt`, to a ledger by its name."""
-    calls, scope = _calls(effects, parameters, dt)
-    lines = ["def booked(q, entries):"]
-    for i, (effect, call) in enumerate(zip(effects, calls, strict=True)):
-        lines += [f"    x{i} = {call}", f"    entries[{effect.name!r}] += x{i} * {dt!r}"]
-    lines.append(f"    return {' + '.join(f'x{i}' for i in range(len(calls))) or '0.0'}")
-    exec("\n".join(lines), scope)
-    booked: Booked = scope["booked"]
-    return booked
-
-
-def _calls(
-    effects: Sequence[Effect], parameters: Mapping[str, float], dt: float | None
-) -> tuple[list[str], dict[str, Any]]:
-    """The effects' calls over ``q`` as text, and the functions that they name."""
-    scope: dict[str, Any] = {}
-    calls = []
-    for i, effect in enumerate(effects):
-        if effect.decay is None or dt is None:
-            scope[f"f{i}"] = effect.term
-            calls.append(f"f{i}({_arguments(effect.quantities, effect.keywords, parameters)})")
-        else:
-            scope[f"f{i}"] = _remembering(effect, effect.decay, parameters, dt)
-            calls.append(f"f{i}(q)")
-    return calls, scope
-
-
-def _remembering(
-    effect: Effect, decay: Callable[..., float], parameters: Mapping[str, float], dt: float
-) -> Callable[[Mapping[str, float]], float]:
-    """The value of an effect with memory, from 0; each call is a step."""
-    term = _arguments(effect.quantities, effect.keywords, parameters)
-    fade = _arguments(effect.decay_quantities, effect.decay_keywords, parameters)
-    scope = {"term": effect.term, "decay": decay, "dt": dt}
-    text = f"lambda q: (term({term}), decay(dt, {fade}))"
-    both: Callable[[Mapping[str, float]], tuple[float, float]] = eval(text, scope)
-    state = 0.0
-
-    def value(q: Mapping[str, float]) -> float:
-        nonlocal state
-        settled, kept = both(q)
-        state = kept * state + (1 - kept) * settled
-        return state
-
-    return value
-
-
-def _arguments(quantities: Iterable[str], keywords: Iterable[str], parameters: Mapping[str, float]) -> str:
-    return ", ".join([f"q[{name!r}]" for name in quantities] + [f"{name}={parameters[name]!r}" for name in keywords])
+def _calls(effects: Iterable[Effect], parameters: Mapping[str, float], dt: float) -> list[Call]:
+    return [(effect.name, remembering(Bound(effect, parameters), dt)) for effect in effects]

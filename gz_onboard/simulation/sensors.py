@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
-from gz_onboard.physics.model import bind
+from gz_onboard.physics.model import Bound, over, total
 from gz_onboard.physics.vibration import FAST
 from gz_onboard.simulation.recorded import BRAKE_FORCE
 from gz_onboard.simulation.run import Command
@@ -163,11 +163,9 @@ class Truth:
             "ambient_temperature": self.ambient,
             "vibration": c["vibration"],
         }
-        power = np.zeros(self.count)
-        for effect in scooter.vehicle.model.effects:
-            if effect.port is Port.DC_POWER:
-                power = power + bind(effect, self.parameters).series(self.dt, q)
-        return power
+        effects = [Bound(effect, self.parameters) for effect in scooter.vehicle.model.effects]
+        drawn = total([e for e in effects if e.effect.port is Port.DC_POWER], q, over(self.dt))
+        return np.asarray(np.zeros(self.count) + drawn)
 
     def __getitem__(self, name: str) -> Array:
         return self.columns[name]

@@ -230,9 +230,9 @@ def test_a_contact_that_loses_voltage_on_rough_roads(tmp_path):
     for vibration in (1e-6, 2.5):
         e = estimated(loose, events(60, vibration))
         assert e._lacking == pytest.approx(0.01 * vibration, rel=0.2, abs=1e-4)
-    lacks = e.forecaster._lacks
-    assert lacks is not None
-    assert lacks(1.0, 0.5, 20.0) == pytest.approx(0.01 * TYPICAL)
+    settled = e.forecaster._overpotential
+    assert settled is not None
+    assert settled(1.0, 0.5, 20.0) == pytest.approx(0.01 * TYPICAL)
 
 
 # --- from frames --------------------------------------------------------------------------------------------------

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.physics.battery import Mesh, drawable
+from gz_onboard.physics.drawable import drawable
+from gz_onboard.physics.tables import Mesh
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")

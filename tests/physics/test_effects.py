@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
 from gz_onboard.physics.effect import QUANTITIES, Port, effects_in, known_effects, load_effect
-from gz_onboard.physics.model import bind, over, stepping
+from gz_onboard.physics.model import Bound, over, stepping
 from gz_onboard.physics.parameters import declared_parameters
 
 EFFECTS = [load_effect(name) for name in known_effects()]
@@ -97,7 +97,7 @@ class TestContract:
 
 
 def bound(effect):
-    return bind(effect, PRIORS)
+    return Bound(effect, PRIORS)
 
 
 @pytest.mark.parametrize("effect", MEMORY, ids=lambda e: e.name)

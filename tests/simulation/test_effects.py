@@ -122,7 +122,7 @@ def test_the_heading_is_that_of_the_road():
 
 def test_slow_relaxation_is_a_second_rc_pair():
     """The same as the pack of two pairs, which is code of its own."""
-    from gz_onboard.simulation.parts.battery import SecondOrderPack
+    from tests.simulation.packs import SecondOrderPack
 
     vehicle = extended("slow_relaxation", slow_resistance=0.012, slow_time=900.0)
     one = ride(vehicle, 96.0)[0]

@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.constants import GRAVITY
+from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.physics.model import air_density
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 from gz_onboard.simulation.parts.brakes import Brakes
-from gz_onboard.simulation.parts.cooling import InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.parts.tyre import Tyre
 from gz_onboard.simulation.scooter import Scooter, straight

@@ -9,11 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.simulation.parts.battery import SecondOrderPack
 from gz_onboard.simulation.parts.motor import MapMotor
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.scooter import Dynamometer, Scooter, straight
 from gz_onboard.vehicle import read_vehicle
+from tests.simulation.packs import SecondOrderPack
 
 VEHICLE = read_vehicle("reference", 75.0)
 BATTERY = VEHICLE.pack
@@ -226,17 +226,6 @@ def test_held_back_by_its_voltage_it_does_not_chatter(soc, ambient):
         voltage.append(scooter.voltage)
     assert max(abs(b - a) for a, b in pairwise(voltage[200:])) < 0.2
     assert scooter.motor_current < 0.95 * VEHICLE.parameters["motor_current_limit"]
-
-
-def test_effects_written_out_are_those_of_the_model():
-    from gz_onboard.physics.effect import QUANTITIES
-    from gz_onboard.physics.model import Bound
-    from gz_onboard.simulation.scooter import _together
-
-    p = VEHICLE.parameters
-    q = {name: 1.5 + i for i, name in enumerate(QUANTITIES)}
-    for effect in VEHICLE.model.effects:
-        assert _together([effect], p, None)(q)[0] == Bound(effect, {name: p[name] for name in effect.keywords})(q)
 
 
 def test_rider_stops_integrating_at_the_end_of_its_command():

@@ -14,7 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.physics.relaxation import relaxation, relaxed
+from gz_onboard.physics.battery import terminal_voltage
+from gz_onboard.physics.relaxation import relaxation_over, relaxed
+from gz_onboard.physics.tables import bilinear_over, extended_over
 
 KELVIN = 273.15
 
@@ -58,17 +60,9 @@ def hats(nodes: Array, x: Array) -> Array:
     return result
 
 
-def at(nodes: Array, rows: Array, table: Array, x: Array, temperature: Array) -> Array:
-    """`table` (len(rows), len(nodes)) at `x` and `temperature`, both (m,), bilinear, the edge beyond: as on board."""
-    if len(rows) == 1:
-        return np.asarray(np.interp(x, nodes, table[0]))
-    across = np.stack([np.interp(x, nodes, row) for row in table], axis=1)
-    return np.asarray(np.sum(across * hats(rows, temperature), axis=1))
-
-
 def follow(current: Array, dt: Array, tau: float | Array) -> Array:
     """x (m,) that follows `current` (m,) [A], which flows for the `dt` (m,) [s] before each sample, with `tau` [s]."""
-    return np.array(relaxation(current.tolist(), np.exp(-dt / tau * np.ones(len(current))).tolist()))
+    return relaxation_over(current, np.exp(-dt / tau * np.ones(len(current))))
 
 
 def follow_slope(current: Array, dt: Array, tau: Array) -> tuple[Array, Array]:
@@ -89,24 +83,20 @@ def voltage(cell: Circuit, flowed: Array, current: Array, dt: Array, soc: Array,
     flowed: the mean current over the `dt` before each sample; current: at the sample. The cell has rested: all
     RC pairs start at zero.
     """
-    r0, r1, c1 = (at(cell.soc, cell.temperature, t, soc, temperature) for t in (cell.r0, cell.r1, cell.c1))
-    rest = ocv_at(cell.ocv_soc, cell.ocv, soc) + cell.ocv_shift(temperature)
-    result = rest - r0 * current - _pair(r1, r1 * c1, flowed, dt)
+    tables = (cell.r0, cell.r1, cell.c1)
+    r0, r1, c1 = (bilinear_over(cell.soc, cell.temperature, t, soc, temperature) for t in tables)
+    pairs = _pair(r1, r1 * c1, flowed, dt)
     if cell.slow_resistance is not None and cell.slow_time is not None:
-        r2 = at(cell.soc, cell.temperature, cell.slow_resistance, soc, temperature)
-        result = result - _pair(r2, at(cell.soc, cell.temperature, cell.slow_time, soc, temperature), flowed, dt)
-    return np.asarray(result)
+        slow = (cell.slow_resistance, cell.slow_time)
+        r2, tau = (bilinear_over(cell.soc, cell.temperature, t, soc, temperature) for t in slow)
+        pairs = pairs + _pair(r2, tau, flowed, dt)
+    rest = extended_over(cell.ocv_soc, cell.ocv, soc) + cell.ocv_shift(temperature)
+    return np.asarray(terminal_voltage(rest, r0, current, pairs))
 
 
 def _pair(resistance: Array, tau: Array, current: Array, dt: Array) -> Array:
     """Voltage (m,) [V] of an RC pair, exact for a current constant over each step (eq. 2.22)."""
-    return np.array(relaxation((resistance * current).tolist(), np.exp(-dt / tau).tolist()))
-
-
-def ocv_at(nodes: Array, values: Array, soc: Array) -> Array:
-    """Open-circuit voltage, beyond the ends along the last slope, as on board."""
-    i = np.clip(np.searchsorted(nodes, soc, side="right") - 1, 0, len(nodes) - 2)
-    return np.asarray(values[i] + (soc - nodes[i]) * (values[i + 1] - values[i]) / (nodes[i + 1] - nodes[i]))
+    return relaxation_over(resistance * current, np.exp(-dt / tau))
 
 
 def riding_current(duration: int = 1200, seed: int = 1) -> Array:

@@ -19,8 +19,8 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.cooling_run import Run
 from gz_onboard.lab.calibrate.fit import Solution, nonlinear, score
 from gz_onboard.lab.calibrate.result import Found, Panel, Result, Trace
+from gz_onboard.physics.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling, temperatures
 from gz_onboard.physics.parameters import declared_parameters
-from gz_onboard.simulation.parts.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.vehicle import Vehicle
 
 LEAST_RISE = 3.0  # K
@@ -44,9 +44,7 @@ def motor_temperatures(p: Values, run: Run) -> dict[str, Array]:
     """
     stator = _first(p, run, "motor_temperature")
     share, iron_share = p["motor_stator_share"], p.get("iron_share")
-    network = MotorCooling(
-        p["motor_stator_capacity"], p["motor_rotor_capacity"], p["motor_gap_conductance"], 1.0, share, stator, stator
-    )
+    network = MotorCooling.of({**p, "motor_rotor_to_ambient": 1.0}, stator)
     shares = np.full_like(run.time, share)
     if iron_share is not None:
         fraction = run.iron / np.where(np.abs(run.motor_heat) > 1.0, run.motor_heat, np.inf)
@@ -54,9 +52,9 @@ def motor_temperatures(p: Values, run: Run) -> dict[str, Array]:
     outside = _outside(p, run, "motor_rotor_to_ambient")
     result = np.empty_like(run.time)
     rows = zip(run.motor_heat.tolist(), run.ambient.tolist(), shares.tolist(), outside.tolist(), strict=True)
-    for k, (heat, ambient, network.stator_share, network.rotor_to_ambient) in enumerate(rows):
+    for k, (heat, ambient, network.stator_share, conductance) in enumerate(rows):
         result[k] = network.stator
-        network.step(PERIOD, heat, ambient)
+        network.step(PERIOD, heat, ambient, conductance)
     return {"motor_temperature": result}
 
 
@@ -66,38 +64,27 @@ def inverter_temperatures(p: Values, run: Run) -> dict[str, Array]:
     box = _first(
         p, run, "inverter_box_temperature" if "inverter_box_temperature" in run.measured else "inverter_temperature"
     )
-    network = InverterCooling(
-        p["inverter_board_capacity"],
-        p["inverter_box_capacity"],
-        p["inverter_board_to_air"],
-        p["inverter_box_to_air"],
-        p["inverter_board_to_box"],
-        1.0,
-        board,
-        box,
-    )
+    network = InverterCooling.of({**p, "inverter_box_to_ambient": 1.0}, board, box)
     outside = _outside(p, run, "inverter_box_to_ambient")
     result = np.empty((2, len(run.time)))
     rows = zip(run.inverter_heat.tolist(), run.ambient.tolist(), outside.tolist(), strict=True)
-    for k, (heat, ambient, network.box_to_ambient) in enumerate(rows):
+    for k, (heat, ambient, conductance) in enumerate(rows):
         result[:, k] = network.board, network.box
-        network.step(PERIOD, heat, ambient)
+        network.step(PERIOD, heat, ambient, conductance)
     return {"inverter_temperature": result[0], "inverter_box_temperature": result[1]}
 
 
 def pack_temperatures(p: Values, run: Run) -> dict[str, Array]:
     """Of the cells."""
     start = _first(p, run, "cell_temperature")
-    return {
-        "cell_temperature": _lumped(p["pack_heat_capacity"], p["pack_conductance"], start, run.pack_heat, run.ambient)
-    }
+    return {"cell_temperature": _lumped(LumpedCooling.of(p, "pack", start), run.pack_heat, run.ambient)}
 
 
 def bms_temperatures(p: Values, run: Run) -> dict[str, Array]:
     """Of the BMS, over the pack's temperature as measured."""
     start = _first(p, run, "bms_temperature")
     heat, cells = p["bms_resistance"] * run.pack_square, run.measured["cell_temperature"]
-    return {"bms_temperature": _lumped(p["bms_heat_capacity"], p["bms_conductance"], start, heat, cells)}
+    return {"bms_temperature": _lumped(LumpedCooling.of(p, "bms", start), heat, cells)}
 
 
 def _first(p: Values, run: Run, sensor: str) -> float:
@@ -108,13 +95,8 @@ def _first(p: Values, run: Run, sensor: str) -> float:
     return float(line[1]) + p.get(f"start:{run.name}:{sensor}", 0.0)
 
 
-def _lumped(capacity: float, conductance: float, start: float, heat: Array, ambient: Array) -> Array:
-    network = LumpedCooling(capacity, conductance, start)
-    result = np.empty_like(heat)
-    for k, (q, a) in enumerate(zip(heat.tolist(), ambient.tolist(), strict=True)):
-        result[k] = network.temperature
-        network.step(PERIOD, q, a)
-    return result
+def _lumped(network: LumpedCooling, heat: Array, ambient: Array) -> Array:
+    return np.array(temperatures(network, PERIOD, heat.tolist(), ambient.tolist()))
 
 
 def _outside(p: Values, run: Run, name: str) -> Array:

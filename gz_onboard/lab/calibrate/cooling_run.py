@@ -12,9 +12,10 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.physics.battery import discharged
+from gz_onboard.physics.cooling import PERIOD
 from gz_onboard.physics.effect import Port
-from gz_onboard.physics.model import Bound
-from gz_onboard.simulation.parts.cooling import PERIOD
+from gz_onboard.physics.model import total
 from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
@@ -60,8 +61,8 @@ def bench_run(table: Table, vehicle: Vehicle) -> Run:
         )
     measured = {name: np.interp(grid, time, table[name]) for name in SENSORS if name in table}
     turning = speed * (np.abs(current) > 1.0)  # the bench's own drive stops with the current
-    iron = _iron(vehicle, turning)
     nothing = np.zeros_like(grid)
+    iron = nothing + vehicle.model.idle_loss({"motor_speed": turning, "motor_temperature": 25.0})
     radius = vehicle.parameters["wheel_radius"] * vehicle.parameters["gear_ratio"]
     return Run(
         table.file.name,
@@ -97,11 +98,10 @@ def ride_run(ride: Samples, vehicle: Vehicle) -> Run:
         "motor_speed": speed,
         "motor_temperature": np.interp(time, *ride.columns["motor_temperature"]),
     }
-    heat = {port: np.zeros_like(time) for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS)}
-    for effect in vehicle.model.effects:
-        if effect.port in heat:
-            values = {name: vehicle.parameters[name] for name in effect.keywords}
-            heat[effect.port] = heat[effect.port] + Bound(effect, values)(quantities)
+    motor_heat, inverter_heat = (
+        np.zeros_like(time) + total(vehicle.model.at(port), quantities)
+        for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS)
+    )
     pack_time, pack_current = ride.columns["pack_current"]
     amperes = (pack_current - vehicle.parameters["pack_current_offset"]) / vehicle.parameters["pack_current_gain"]
     measured = {name: at(name) for name in SENSORS if name in ride.columns}
@@ -119,9 +119,9 @@ def ride_run(ride: Samples, vehicle: Vehicle) -> Run:
         grid,
         at("ambient_temperature"),
         np.abs(_means(*ride.columns["motor_speed"], grid)) * radius,
-        _means(time, heat[Port.MOTOR_LOSS], grid),
-        _means(time, _iron(vehicle, speed), grid),
-        _means(time, heat[Port.INVERTER_LOSS], grid),
+        _means(time, motor_heat, grid),
+        _means(time, np.zeros_like(time) + vehicle.model.idle_loss(quantities), grid),
+        _means(time, inverter_heat, grid),
         pack_heat,
         square,
         measured,
@@ -155,20 +155,6 @@ def _means(time: Array, value: Array, grid: Array) -> Array:
     return result
 
 
-def _iron(vehicle: Vehicle, speed: Array) -> Array:
-    """The motor's loss without current [W]."""
-    total: Array = np.zeros_like(speed)
-    nothing = {
-        "motor_current": np.zeros_like(speed),
-        "motor_speed": speed,
-        "motor_temperature": np.full_like(speed, 25.0),
-    }
-    for effect in vehicle.model.effects:
-        if effect.port is Port.MOTOR_LOSS:
-            total = total + Bound(effect, {name: vehicle.parameters[name] for name in effect.keywords})(nothing)
-    return total
-
-
 def _pack_heat(vehicle: Vehicle, mean: Array, square: Array, temperature: Array, rest: float) -> Array:
     """What the cells turn to heat [W]: R0 with the mean square of current, R1 with what its pair lets through."""
     battery = vehicle.pack
@@ -181,5 +167,5 @@ def _pack_heat(vehicle: Vehicle, mean: Array, square: Array, temperature: Array,
         r0, r1, c1 = (mesh.at(soc, t)[0] for mesh in (battery.r0, battery.r1, battery.c1))
         v1 = battery.relax(PERIOD, v1, i, r1, c1)[0]
         heat[k] = n * m * (r0 * i2 + v1 * v1 / r1)
-        soc -= i * PERIOD / (3600 * battery.cell_capacity(t))
+        soc -= discharged(i, PERIOD, battery.cell_capacity(t))
     return heat

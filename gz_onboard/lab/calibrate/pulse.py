@@ -18,7 +18,7 @@ from scipy.stats import chi2
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.lab.calibrate.cell_circuit import KELVIN, Circuit, ocv_at, riding_current, voltage
+from gz_onboard.lab.calibrate.cell_circuit import KELVIN, Circuit, riding_current, voltage
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
 from gz_onboard.lab.calibrate.cell_fit import (
     TIMES,
@@ -35,6 +35,7 @@ from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.ocv import TESTER
 from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, Result, Trace
 from gz_onboard.lab.calibrate.table import Table
+from gz_onboard.physics.tables import extended_over
 
 SOC = np.array([0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
 FEWEST_PULSES = 6
@@ -223,7 +224,7 @@ def _tested(table: Table, nodes: Array, volts: Array, capacity: Found, result: R
 
     def misses(share: float) -> tuple[Array, float]:
         level = start - drawn / (share * capacity.value)
-        error = at_rest - ocv_at(nodes, volts, level)
+        error = at_rest - extended_over(nodes, volts, level)
         weight = np.where(level > 0.12, 1.0, 0.0)
         offset = float(np.sum(weight * error) / (np.sum(weight) + 1.0))  # prior: 5 mV, as one rest counts
         return np.sqrt(weight) * (error - offset), offset
@@ -309,8 +310,8 @@ def _direct(
 
 
 def _ocv(nodes: Array, volts: Array, level: Array) -> tuple[Array, Array]:
-    up, down = ocv_at(nodes, volts, level + 0.005), ocv_at(nodes, volts, level - 0.005)
-    return ocv_at(nodes, volts, level), (up - down) / 0.01
+    up, down = extended_over(nodes, volts, level + 0.005), extended_over(nodes, volts, level - 0.005)
+    return extended_over(nodes, volts, level), (up - down) / 0.01
 
 
 def _meshes(fitted: list[Branches], reduction: Reduction) -> tuple[list[Array], list[Array]]:

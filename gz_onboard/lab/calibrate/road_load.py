@@ -8,7 +8,7 @@ model. Air density is that of the measured temperature and altitude.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from math import sqrt
 from typing import Any
 
@@ -17,8 +17,8 @@ from scipy.optimize import minimize_scalar
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.coastdown_run import Coast
-from gz_onboard.physics.effect import QUANTITIES, Effect, Port
-from gz_onboard.physics.model import air_density
+from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Port
+from gz_onboard.physics.model import Bound, air_density, total
 from gz_onboard.vehicle import Vehicle
 
 NAMES = ("rolling_resistance_constant", "rolling_resistance_speed", "drag_area")
@@ -30,13 +30,9 @@ class RoadLoad:
     def __init__(self, vehicle: Vehicle, values: Mapping[str, float] | None = None) -> None:
         p = dict(vehicle.parameters) | dict(values or {})
         self.p = p
-        bound = [(e, {name: p[name] for name in e.keywords}) for e in vehicle.model.effects]
-        self._road = [
-            (e, values)
-            for e, values in bound
-            if e.port in (Port.WHEEL_FORCE, Port.TYRE) and "acceleration" not in e.quantities
-        ]
-        self._motor = [(e, values) for e, values in bound if e.port is Port.MOTOR_LOSS]
+        effects = [Bound(effect, p) for effect in vehicle.model.effects]
+        self._road = [e for e in effects if e.effect.port in ROAD_LOAD and "acceleration" not in e.effect.quantities]
+        self._motor = [e for e in effects if e.effect.port is Port.MOTOR_LOSS]
         self._vibration = vehicle.riding.vibration  # a coast-down shows no road that is rougher than others
         self.rotating = (p["wheel_inertia_front"] + p["wheel_inertia_rear"]) / p["wheel_radius"] ** 2
 
@@ -58,15 +54,11 @@ class RoadLoad:
             "ambient_temperature": run.temperature,
             "vibration": self._vibration,
         }
-        return _sum(self._road, q) + _sum(self._motor, q) / speed
+        return total(self._road, q) + total(self._motor, q) / speed
 
     def slowing(self, speed: Any, run: Coast, slope: float, wind: float, density: float = 1.0) -> Any:
         """Deceleration [m/s²]."""
         return self(speed, run, slope, wind, density) / (run.mass + self.p.get("_mass", 0.0) + self.rotating)
-
-
-def _sum(effects: Sequence[tuple[Effect, dict[str, float]]], q: Mapping[str, Any]) -> Any:
-    return sum(effect.term(*[q[name] for name in effect.quantities], **values) for effect, values in effects)
 
 
 def roll(force: RoadLoad, run: Coast, slope: float, wind: float, time: Array) -> Array:

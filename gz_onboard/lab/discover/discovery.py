@@ -11,11 +11,12 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.baseline_file import restore
-from gz_onboard.lab.discover.channels import BY_NAME, usable, voltage_timing
+from gz_onboard.lab.discover.channels import BY_NAME, usable
 from gz_onboard.lab.discover.detectability import limits
 from gz_onboard.lab.discover.gain import measure_gain
 from gz_onboard.lab.discover.grid import STEP, Ride
 from gz_onboard.lab.discover.mixed_model import MixedModel, linearise_all
+from gz_onboard.lab.discover.residuals import voltage_timing
 from gz_onboard.lab.discover.result import Gain
 from gz_onboard.lab.discover.selection import linearised_about, pose
 from gz_onboard.lab.discover.uncalibrated import NOTE, without_baseline

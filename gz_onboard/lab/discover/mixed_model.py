@@ -13,7 +13,7 @@ from scipy.stats import t as student
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.candidates import Candidate, candidates
-from gz_onboard.lab.discover.channels import CHANNELS, System, counted_soc, depends
+from gz_onboard.lab.discover.channels import CHANNELS, depends
 from gz_onboard.lab.discover.grid import USUAL_DELAYS, Dimensions, Ride, read_ride
 from gz_onboard.lab.discover.linear import LinearRide, Noise, linearise, spread_out, trimmed
 from gz_onboard.lab.discover.prior import (
@@ -34,6 +34,7 @@ from gz_onboard.lab.discover.prior import (
     sizes_of,
     stepped,
 )
+from gz_onboard.lab.discover.residuals import System, counted_soc
 from gz_onboard.physics.effect import Effect, Parameter
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.simulation.samples import Samples
@@ -149,8 +150,7 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
     more = [cause.effect for cause in lacking(vehicle, causes) if cause.effect]
     effects: tuple[Effect, ...] = (*vehicle.model.effects, *more)
     p = vehicle.parameters
-    copper = p.get("motor_copper_resistance", 0.0)
-    system = System(effects, vehicle.battery, p["payload_mass"], copper, vehicle.riding.vibration)
+    system = System(effects, vehicle.battery, p["payload_mass"], dict(p), vehicle.riding.vibration)
     values = {name: x.prior for name, x in declared_parameters(effects).items()} | dict(p)
     values |= {nuisance.name: nuisance.value for nuisance in NUISANCES} | dict.fromkeys(absent, 0.0)
     names = _names(vehicle, causes, more, values)

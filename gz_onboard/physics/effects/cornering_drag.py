@@ -13,6 +13,7 @@ from typing import Any
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.elementary import direction
 
 PORT = Port.WHEEL_FORCE
 PARAMETERS = (
@@ -28,14 +29,13 @@ PARAMETERS = (
         healthy_sd=0.1,
     ),
 )
+TURNING_LOSS = True
 SHOWN_BY = (
     "Road load that grows with the square of speed times yaw rate and is absent on the straight; bends at one speed, "
     "left and right, split it from drag area and rolling resistance."
 )
-STANDSTILL = 0.1  # m/s
 
 
 def term(speed: Any, mass: Any, lateral_acceleration: Any, *, cornering_compliance: float) -> Any:
     """Force [N] against the motion."""
-    direction = speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5
-    return cornering_compliance * mass * lateral_acceleration * lateral_acceleration / GRAVITY * direction
+    return cornering_compliance * mass * lateral_acceleration * lateral_acceleration / GRAVITY * direction(speed)

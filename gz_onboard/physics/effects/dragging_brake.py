@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.elementary import direction
 
 PORT = Port.WHEEL_FORCE
 PARAMETERS = (
@@ -27,9 +28,8 @@ SHOWN_BY = (
     "Road load that is the same at all speeds and loads; rides with another payload split it from rolling resistance, "
     "which grows with weight."
 )
-STANDSTILL = 0.1  # m/s
 
 
 def term(speed: Any, *, brake_drag_force: float) -> Any:
     """Force [N] against the motion."""
-    return brake_drag_force * speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5
+    return brake_drag_force * direction(speed)

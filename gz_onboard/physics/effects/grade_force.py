@@ -9,6 +9,7 @@ from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.WHEEL_FORCE
 PARAMETERS: tuple[Parameter, ...] = ()
+STORES_ENERGY = True
 
 
 def term(mass: Any, grade: Any) -> Any:

@@ -8,6 +8,7 @@ from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.WHEEL_FORCE
 PARAMETERS: tuple[Parameter, ...] = ()
+STORES_ENERGY = True
 
 
 def term(

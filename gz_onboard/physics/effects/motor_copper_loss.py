@@ -42,3 +42,11 @@ def term(
         * motor_current
         * motor_current
     )
+
+
+def variation(
+    motor_speed: Any, *, copper_speed: float, motor_copper_resistance: float, healthy_motor_copper_resistance: float
+) -> Any:
+    """Eddy currents grow with frequency in the healthy winding, not in what a fault adds; copper_speed: at 50 rad/s."""
+    own = healthy_motor_copper_resistance / motor_copper_resistance
+    return 1 + own * copper_speed * abs(motor_speed) / 50

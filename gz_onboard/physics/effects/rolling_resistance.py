@@ -9,6 +9,7 @@ from typing import Any
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.elementary import direction
 
 PORT = Port.TYRE
 PARAMETERS = (
@@ -38,12 +39,20 @@ SHOWN_BY = (
     "Road load that is the same at all speeds and grows with weight; rides with another payload split it from a "
     "dragging brake."
 )
-STANDSTILL = 0.1  # m/s
 
 
 def term(
     speed: Any, mass: Any, grade_cosine: Any, *, rolling_resistance_constant: float, rolling_resistance_speed: float
 ) -> Any:
     """Force [N] against the motion."""
-    direction = speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5
-    return mass * GRAVITY * grade_cosine * (rolling_resistance_constant * direction + rolling_resistance_speed * speed)
+    return (
+        mass
+        * GRAVITY
+        * grade_cosine
+        * (rolling_resistance_constant * direction(speed) + rolling_resistance_speed * speed)
+    )
+
+
+def variation(ambient_temperature: Any, *, rolling_cold: float) -> Any:
+    """Cold rubber rolls worse; rolling_cold: by how much more at 0 than at 20 degC."""
+    return 1 + rolling_cold * (20 - ambient_temperature) / 20

@@ -9,7 +9,7 @@ from typing import Any
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import Parameter, Port
-from gz_onboard.physics.elementary import exp
+from gz_onboard.physics.elementary import direction, exp
 
 PORT = Port.TYRE
 PARAMETERS = (
@@ -32,7 +32,6 @@ SHOWN_BY = (
     "Road load that falls within the first 10-20 min ridden, at all speeds, and does not when riding on straight "
     "after; a ride that starts with a warm motor and cold tyres splits it from what the motor's temperature does."
 )
-STANDSTILL = 0.1  # m/s
 
 
 def term(
@@ -46,6 +45,5 @@ def term(
     warm_up_time: float,
 ) -> Any:
     """Force [N] against the motion."""
-    direction = speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5
     cold = warm_up_share * exp(-time_moving / warm_up_time)
-    return mass * GRAVITY * grade_cosine * rolling_resistance_constant * cold * direction
+    return mass * GRAVITY * grade_cosine * rolling_resistance_constant * cold * direction(speed)

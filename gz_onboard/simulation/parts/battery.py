@@ -7,7 +7,7 @@ from itertools import pairwise
 from math import sqrt
 from typing import Protocol
 
-from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery import HOUR, Battery, discharged, heat, terminal_voltage
 from gz_onboard.physics.model import Bound
 from gz_onboard.physics.relaxation import decay_over, relaxed
 
@@ -45,7 +45,7 @@ class FirstOrderPack:
         self._c1 = 1.0
         self._decay = 0.0
         self._decay_dt = 0.0
-        self._charge = 1.0  # A·s of the pack
+        self._capacity = 1.0  # A·h of the pack
         self._shift = 0.0  # V of a cell
         self._drawn = 0.0  # J, up to the last look-up
         self._soc_before = soc  # at the last look-up
@@ -58,7 +58,7 @@ class FirstOrderPack:
         self._r1 = battery.r1.at(soc, temperature)[0]
         self._c1 = battery.c1.at(soc, temperature)[0]
         self._decay, self._decay_dt = decay_over(dt, self._r1 * self._c1), dt
-        self._charge = 3600 * battery.pack_capacity(temperature)
+        self._capacity = battery.pack_capacity(temperature)
         self._shift = battery.rest_shift(temperature)
         self._age = 0.0
 
@@ -75,13 +75,13 @@ class FirstOrderPack:
         source = n * (ocv - self.v1)
         root = source * source - 4 * resistance * power
         current = 2 * power / (source + sqrt(root)) if root > 0 else source / (2 * resistance)
-        step = current * dt / self._charge
+        step = discharged(current, dt, self._capacity)
         # V_oc at the middle of the step, so that charge times voltage is the energy between the two SOCs.
         middle = n * (ocv - slope * step / 2)
-        voltage = middle - n * self.v1 - resistance * current
+        voltage = terminal_voltage(middle, resistance, current, n * self.v1)
         self.soc -= step
         self.v1 = relaxed(self.v1, self._r1 * current / m, self._decay)
-        return current, voltage, (middle - voltage) * current, voltage * current
+        return current, voltage, heat(middle, voltage, current), voltage * current
 
     def chemical_energy_drawn(self) -> float:
         """See `Pack`: the integral of V_oc over the charge between the SOC at the start and now.
@@ -98,26 +98,7 @@ class FirstOrderPack:
         knots = [a, *(x for x in self.battery.ocv_soc[1:-1] if a < x < b), b]
         total = sum((y - x) * (ocv(x)[0] + ocv(y)[0]) / 2 for x, y in pairwise(knots))
         total += (b - a) * self._shift
-        return sign * total * self.battery.cells_series * self._charge
-
-
-class SecondOrderPack(FirstOrderPack):
-    """The same with a second, slow RC pair: what the first-order model lacks (Lord 2016, sec. 3.3)."""
-
-    def __init__(self, battery: Battery, soc: float = 1.0, r2: float = 0.008, tau2: float = 1200.0) -> None:
-        super().__init__(battery, soc)
-        self.r2 = r2  # ohm of a cell
-        self.tau2 = tau2  # s
-        self.v2 = 0.0  # V of a cell
-
-    def draw(self, power: float, dt: float, temperature: float) -> tuple[float, float, float, float]:
-        """See `Pack`."""
-        fast, self.v1 = self.v1, self.v1 + self.v2
-        current, voltage, heat, delivered = super().draw(power, dt, temperature)
-        cell = current / self.battery.cells_parallel
-        self.v1 = relaxed(fast, self._r1 * cell, self._decay)
-        self.v2 = relaxed(self.v2, self.r2 * cell, decay_over(dt, self.tau2))
-        return current, voltage, heat, delivered
+        return sign * total * self.battery.cells_series * HOUR * self._capacity
 
 
 class EffectPack(FirstOrderPack):
@@ -139,12 +120,12 @@ class EffectPack(FirstOrderPack):
         """See `Pack`."""
         fast, states, q = self.v1, self.states, self._q
         self.v1 = fast + sum(states.values())
-        current, voltage, heat, delivered = super().draw(power, dt, temperature)
-        cell = current / self.battery.cells_parallel
+        drawn = super().draw(power, dt, temperature)
+        cell = drawn[0] / self.battery.cells_parallel
         self.v1 = relaxed(fast, self._r1 * cell, self._decay)
         q["cell_current"], q["soc"], q["cell_temperature"] = cell, self.soc, temperature
-        q["cell_capacity"] = self._charge / (3600 * self.battery.cells_parallel)
+        q["cell_capacity"] = self._capacity / self.battery.cells_parallel
         for effect in self._effects:
             name = effect.effect.name
             states[name] = effect.step(states[name], dt, q)
-        return current, voltage, heat, delivered
+        return drawn

@@ -22,7 +22,7 @@ from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel, initia
 from gz_onboard.lab.discover.result import Cause, Estimate, Gain, Isolability, Report, Unknown
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.physics.effect import load_effect
-from gz_onboard.physics.model import bind
+from gz_onboard.physics.model import Bound
 from gz_onboard.simulation.samples import read_samples
 from gz_onboard.vehicle import find_vehicle, read_vehicle
 from tests.support import LOGS
@@ -141,9 +141,9 @@ def test_the_empirical_effect_is_the_curve(mixed, lines, tmp_path: Path, quantit
     fast = {"speed": x if quantity == "speed" else np.full(len(x), 30.0)}
     reads = {q: fast["speed"] if q == "speed" else x for q in effect.quantities}
     fade = fast["speed"] ** 2 / (fast["speed"] ** 2 + 1)
-    assert bind(effect, scale)(reads) == pytest.approx(expected * fade, abs=1e-4)
+    assert Bound(effect, scale)(reads) == pytest.approx(expected * fade, abs=1e-4)
     one = {q: float(v[7]) for q, v in reads.items()}  # on board: floats
-    assert bind(effect, scale)(one) == pytest.approx(expected[7] * fade[7], abs=1e-4)
+    assert Bound(effect, scale)(one) == pytest.approx(expected[7] * fade[7], abs=1e-4)
 
 
 def test_a_curve_that_no_effect_can_read_is_not_written(mixed, lines, tmp_path: Path):

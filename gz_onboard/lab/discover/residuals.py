@@ -1,0 +1,354 @@
+"""Residuals: in each channel, what was measured less what the model says of it, given the other measurements.
+
+The equations are those of `physics`; here each is fed with what was measured, and widened by the nuisances under which
+a healthy vehicle differs from its file. Every function takes the ride and a mapping of parameters, so that a column of
+the linear model is its difference. See `channels` for the table.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.constants import GRAVITY
+from gz_onboard.errors import InputError
+from gz_onboard.lab.discover.grid import STEP, Ride
+from gz_onboard.physics.battery import Battery, discharged, heat, terminal_voltage
+from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
+from gz_onboard.physics.effect import MOVING, ROAD_LOAD, Effect, Port
+from gz_onboard.physics.model import Bound, drag_torque, over, value_of
+from gz_onboard.physics.relaxation import decay_over, relaxation_over, relaxed
+from gz_onboard.physics.riding import VIBRATION
+
+Values = Mapping[str, float]
+SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
+DT = SLOW * STEP
+MID = 200.0  # s: between the pair of the vehicle file and slow relaxation
+FIRST = 20  # steps: what a ride begins with
+# Scales of the nuisances, so that all are of order one.
+WARM, COLDER = 20.0, 20.0  # degC, K below it
+SPIN = 50.0  # rad/s of the motor
+AMPERES = 50.0  # of the motor
+
+
+@dataclass(frozen=True)
+class System:
+    """What the channels are predicted with: the effects (of the model and the candidates) and the battery."""
+
+    effects: tuple[Effect, ...]
+    battery: Battery | None
+    payload: float  # kg, of the vehicle file: what a ride without an entry carries
+    healthy: Values = field(default_factory=dict)  # parameters of the vehicle file
+    vibration: float = VIBRATION  # m/s², of the vehicle file's prior riding: for rides that did not measure it
+
+    @property
+    def pack(self) -> Battery:
+        """The battery of a system that has one."""
+        assert self.battery is not None
+        return self.battery
+
+    def terms(self, q: Mapping[str, Any], p: Values, dt: float, *ports: Port) -> list[tuple[Effect, Any]]:
+        """The effects at these ports and their values over time, at the beginnings of steps of `dt` [s]; but for those
+        that store energy: the accelerometer measures them."""
+        recall = over(np.full(len(next(iter(q.values()))), dt), before=True)
+        found = []
+        for effect in self.effects:
+            if effect.port not in ports or effect.stores_energy:
+                continue
+            known = self._known(q, effect)
+            value = value_of(Bound(effect, p), known, recall)
+            if effect.variation:
+                healthy = {f"healthy_{name}": x for name, x in self.healthy.items()}
+                value = value * effect.variation.of(known, {**p, **healthy})
+            found.append((effect, value))
+        return found
+
+    def _known(self, q: Mapping[str, Any], effect: Effect) -> Mapping[str, Any]:
+        """`q`, and what stands in for what the ride did not measure; InputError if nothing does."""
+        for name in effect.reads - q.keys():
+            if name != "vibration":
+                raise InputError(f"no ride measures {name}, which an effect reads")
+            q = {**q, name: np.where(np.abs(q["speed"]) > MOVING, self.vibration, 0.0)}
+        return q
+
+
+def summed(terms: list[tuple[Effect, Any]]) -> Any:
+    """The sum of the terms; 0 without any."""
+    return sum((term for _, term in terms), 0.0)
+
+
+def recursion(decay: Array, target: Array, start: float = 0.0) -> Array:
+    """`relaxation` at the beginnings of the steps, x[0] = start; shape of `decay`."""
+    return relaxation_over(target, decay, start, before=True)
+
+
+def colder(temperature: Array) -> Array:
+    """How much colder than a warm day, in the nuisances' scale."""
+    return (WARM - temperature) / COLDER
+
+
+def mean_over(values: Array, n: int) -> Array:
+    """Means over blocks of `n`, the rest at the end left out."""
+    blocks = len(values) // n
+    return np.asarray(values[: blocks * n].reshape(blocks, n).mean(axis=1))
+
+
+def moving(ride: Ride, p: Values, system: System) -> dict[str, Array]:
+    """The quantities with the parameters' own radius, sensor scale and mass."""
+    q = dict(ride.quantities)
+    scale = 1 / p.get("speed_sensor_scale", 1.0)
+    radius = p["wheel_radius"] * p["gear_ratio"] * scale / ride.radius
+    q["motor_speed"] = q["motor_speed"] * scale
+    q["speed"] = q["speed"] * radius
+    q["acceleration"] = q["acceleration"] * radius
+    q["lateral_acceleration"] = q["lateral_acceleration"] * radius
+    q["mass"] = np.full(len(ride.time), mass(ride, p, system))
+    q["torque"] = torque_constant(ride, p) * q["motor_current"]
+    return q
+
+
+def mass(ride: Ride, p: Values, system: System) -> float:
+    """Vehicle and payload [kg]: the payload entered, and by how much it is wrong."""
+    entered = ride.payload if ride.payload is not None else system.payload
+    return p["vehicle_mass"] + entered + (p["payload_mass"] - system.payload) + p["payload_error"]
+
+
+def torque_constant(ride: Ride, p: Values) -> Array:
+    """The true one [N·m/A], over motor temperature and current."""
+    q = ride.quantities
+    return np.asarray(
+        p["torque_constant"]
+        * (1 + p["torque_constant_slope"] * (q["motor_temperature"] - 40))
+        * (1 - p["torque_saturation"] * np.abs(q["motor_current"]) / 100)
+    )
+
+
+def motor_losses(ride: Ride, q: Mapping[str, Array], p: Values, system: System) -> tuple[Any, Any]:
+    """(losses fed electrically, losses that drag) [W]. Loss that does not depend on current drags the shaft."""
+    terms = system.terms(q, p, STEP, Port.MOTOR_LOSS)
+    fed = [(effect, term) for effect, term in terms if "motor_current" in effect.quantities]
+    drags = [(effect, term) for effect, term in terms if "motor_current" not in effect.quantities]
+    return summed(fed), summed(drags)
+
+
+def current(ride: Ride, p: Values) -> Array:
+    """The pack's true current [A]."""
+    return np.asarray((ride.signals["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"])
+
+
+def road_force(ride: Ride, p: Values, system: System) -> Array:
+    """[N] at the wheel."""
+    q = moving(ride, p, system)
+    shaft = q["torque"] - drag_torque(motor_losses(ride, q, p, system)[1], q["motor_speed"])
+    entered, m = float(ride.quantities["mass"][0]), mass(ride, p, system)
+    rotating = (p["wheel_inertia_front"] + p["wheel_inertia_rear"]) / p["wheel_radius"] ** 2
+    specific = ride.signals["accel_x"] - p["accel_bias"] - p["pitch_gain"] * q["acceleration"]
+    force = rotating * q["acceleration"] + summed(system.terms(q, p, STEP, *ROAD_LOAD))
+    push = shaft / (p["wheel_radius"] * p["gear_ratio"]) - force
+    # what is noisy stands alone: were the accelerometer multiplied with the mass that is sought, the least noise would
+    # be had with the least mass, and all that it is weighed with would shrink along
+    return np.asarray(entered * (push / m - specific))
+
+
+def altitude(ride: Ride, p: Values, system: System) -> Array:
+    """[m]"""
+    q = moving(ride, p, system)
+    acceleration = q["acceleration"]
+    sine = (ride.signals["accel_x"] - p["accel_bias"] - (1 + p["pitch_gain"]) * acceleration) / GRAVITY
+    height = np.cumsum(sine * q["speed"]) * STEP
+    return np.asarray(ride.signals["gps_altitude"] - height - ride.signals["gps_altitude"][0] - p["altitude_start"])
+
+
+def inverter_power(ride: Ride, p: Values, system: System) -> Array:
+    """[W] on the DC side."""
+    q = moving(ride, p, system)
+    electric, _ = motor_losses(ride, q, p, system)
+    power = q["torque"] * q["motor_speed"] + electric
+    power = power + summed(system.terms(q, p, STEP, Port.INVERTER_LOSS))
+    spin = np.abs(q["motor_speed"]) / SPIN
+    power = power + (p["loss_speed"] + p["loss_cross"] * np.abs(q["motor_current"]) / AMPERES) * spin
+    power = power - p["torque_lag"] * np.gradient(smooth3(np.broadcast_to(power, len(ride.time))), STEP)
+    volts = ride.signals["inverter_voltage"]
+    shown = p["inverter_current_gain"] * power + p["inverter_current_offset"] * volts
+    return np.asarray(ride.signals["inverter_current"] * volts - shown)
+
+
+def pack_balance(ride: Ride, p: Values, system: System) -> Array:
+    """[A]"""
+    s = ride.signals
+    true = (s["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"]
+    true = true + p["pack_inverter_lag"] * np.gradient(smooth3(true), STEP)
+    # beside the auxiliary load there is what is drawn when nothing is: the inverter's own supply
+    inverter = true - s["auxiliary_current"] - p["idle_current"]
+    shown = p["inverter_current_offset"] + p["inverter_current_gain"] * inverter
+    return np.asarray(shown - s["inverter_current"])
+
+
+def smooth3(x: Array) -> Array:
+    """A running mean of three."""
+    return np.asarray(np.convolve(np.pad(x, 1, "edge"), np.ones(3) / 3, "valid"))
+
+
+def auxiliary(ride: Ride, p: Values, system: System) -> Array:
+    """[W]"""
+    s = ride.signals
+    power = summed(system.terms(ride.quantities, p, STEP, Port.DC_POWER))
+    if "brake_switch" in s:
+        power = power + p["brake_light"] * (s["brake_switch"] > 0.5)
+    return np.asarray(s["auxiliary_current"] * s["pack_voltage"] - power)
+
+
+def voltage_balance(ride: Ride, p: Values, system: System) -> Array:
+    """[V]"""
+    s = ride.signals
+    inverter = s["inverter_voltage"] + p["cable_resistance"] * s["inverter_current"] - p["inverter_voltage_offset"]
+    return np.asarray(s["pack_voltage"] - p["pack_voltage_offset"] - inverter)
+
+
+def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, Array]:
+    """(terminal voltage of a cell by the circuit [V], the pack's current [A], SOC) at steps of `DT`."""
+    battery = system.pack
+    cell = mean_over(current(ride, p), SLOW) / battery.cells_parallel
+    temperature = mean_over(ride.quantities["cell_temperature"], SLOW)
+    cold = colder(temperature)
+    capacity = p["cell_capacity"] * battery.capacity_share_over(temperature)
+    taken = discharged(cell, DT, capacity)
+    soc = p["soc_start"] + start_soc(ride, system) - (np.cumsum(taken) - taken / 2)  # at the middle of each step
+    factor = p.get("cell_resistance_factor", 1.0) * (1 + p["resistance_level"] + p["resistance_cold"] * cold)
+    bent = p["resistance_current"] + p["resistance_current_cold"] * cold
+    empty = p["resistance_empty"] + p["resistance_empty_cold"] * cold
+    factor = factor * (1 + empty * (1 - soc) / 0.4 - bent * np.abs(cell) / 5)
+    r0 = battery.r0.over(soc, temperature) * factor
+    r1 = battery.r1.over(soc, temperature)
+    decay = np.exp(-DT / (r1 * battery.c1.over(soc, temperature) * np.exp(p["pair_time"])))
+    settled = r1 * (1 + p["pair_resistance"]) * factor * cell
+    v1 = recursion(decay, settled, p["v1_start"])
+    v1 = (v1 + relaxed(v1, settled, decay)) / 2  # the mean of the step's ends
+    extra: Any = p["drift"] * np.arange(len(cell)) * DT / 600
+    extra = extra + p["mid_resistance"] * recursion(np.full(len(cell), decay_over(DT, MID)), cell)
+    q = {name: mean_over(value, SLOW) for name, value in ride.quantities.items()}
+    q |= {"cell_current": cell, "soc": soc, "cell_temperature": temperature, "cell_capacity": capacity}
+    extra = extra + summed(system.terms(q, p, DT, Port.CELL_VOLTAGE))
+    rest = battery.ocv_over(soc, temperature) + p["ocv_offset"] + p["ocv_tilt"] * (soc - 0.7) + p["ocv_cold"] * cold
+    return np.asarray(terminal_voltage(rest, r0, cell, v1 + extra)), cell * battery.cells_parallel, soc
+
+
+def start_soc(ride: Ride, system: System) -> float:
+    """The SOC that the first voltages point to, with the current taken off by the ohmic resistance."""
+    battery = system.pack
+    amperes = float(np.mean(ride.signals["pack_current"][:FIRST]))
+    volts = battery.cell_voltage(float(np.mean(ride.signals["pack_voltage"][:FIRST])), amperes)
+    temperature = float(ride.quantities["cell_temperature"][0])
+    drop = amperes / battery.cells_parallel * battery.r0.at(0.6, temperature)[0]
+    return battery.soc_at(volts + drop, temperature)
+
+
+def counted_soc(ride: Ride, system: System) -> Array:
+    """SOC by counting the current from where the first voltages point to, shape (n,)."""
+    capacity = system.pack.pack_capacity(float(ride.quantities["cell_temperature"][0]))
+    return np.asarray(start_soc(ride, system) - np.cumsum(discharged(ride.signals["pack_current"], STEP, capacity)))
+
+
+def cell_voltage(ride: Ride, p: Values, system: System) -> Array:
+    """[V] of a mean cell, at steps of `DT`."""
+    battery = replace(system.pack, series_resistance=p["pack_series_resistance"])
+    volts, amperes, _ = cell_circuit(ride, p, system)
+    measured = mean_over(ride.signals["pack_voltage"], SLOW) - p["pack_voltage_offset"]
+    return np.asarray(battery.cell_voltage(measured, amperes) - volts)
+
+
+def voltage_timing(ride: Ride, p: Values, system: System) -> Array:
+    """[V] of a mean cell, at the grid's steps but the last."""
+    battery = system.pack
+    late = p.get("pack_voltage_latency", 0.0)
+    amperes = current(ride, p)
+    if late:
+        amperes = np.interp(ride.time - late, ride.time, amperes)
+    soc = np.full(len(ride.time), start_soc(ride, system))
+    r0 = battery.r0.over(soc, ride.quantities["cell_temperature"])
+    resistance = r0 * p.get("cell_resistance_factor", 1.0) / battery.cells_parallel
+    resistance = resistance + p["pack_series_resistance"] / battery.cells_series
+    fast = p["fast_resistance"] + p["fast_cold"] * colder(ride.quantities["cell_temperature"])
+    resistance = resistance * (1 + fast)
+    step = np.diff(ride.signals["pack_voltage"]) / battery.cells_series + resistance[1:] * np.diff(amperes)
+    return np.append(step, 0.0)
+
+
+def gps_speed(ride: Ride, p: Values, system: System) -> Array:
+    """[m/s]"""
+    q = moving(ride, p, system)
+    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / 100
+    lean = 1 - p["lean_radius"] * (q["lateral_acceleration"] / GRAVITY) ** 2 / 2
+    return np.asarray(ride.signals["gps_speed"] - q["speed"] * slip * lean + p["gps_lag"] * q["acceleration"])
+
+
+def rear_speed(ride: Ride, p: Values, system: System) -> Array:
+    """[m/s]"""
+    q = moving(ride, p, system)
+    return np.asarray(
+        (ride.signals["wheel_speed_rear"] * (1 - p["rear_scale"]) - q["motor_speed"] * p["gear_ratio"]) * ride.radius
+        + p["wheel_lag"] * q["acceleration"]
+    )
+
+
+def front_speed(ride: Ride, p: Values, system: System) -> Array:
+    """[m/s]"""
+    q = moving(ride, p, system)
+    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / 100
+    lean = 1 - p["front_lean"] * (q["lateral_acceleration"] / GRAVITY) ** 2 / 2
+    speed = q["motor_speed"] * p["gear_ratio"] * slip * lean
+    front = ride.signals["wheel_speed_front"] * (1 - p["front_scale"])
+    return np.asarray((front - speed) * ride.radius + p["wheel_lag"] * q["acceleration"])
+
+
+def _heat(ride: Ride, p: Values, system: System) -> tuple[Array, Array]:
+    """(motor's, inverter's) loss [W] at steps of `DT`."""
+    q = moving(ride, p, system)
+    electric, drag = motor_losses(ride, q, p, system)
+    inverter = summed(system.terms(q, p, STEP, Port.INVERTER_LOSS))
+    n = len(ride.time)
+    return mean_over(np.broadcast_to(electric + drag, n), SLOW), mean_over(np.broadcast_to(inverter, n), SLOW)
+
+
+def _cooled(ride: Ride, p: Values, network: Network, watts: Array, airflow: str) -> Array:
+    """What `network` leaves [K] of its sensor at steps of `DT`; airflow: how much more moving air cools."""
+    flow = 1 + p[airflow] * np.abs(mean_over(ride.quantities["speed"], SLOW)) / 10
+    air = p.get("cooling_factor", 1.0) * np.maximum(flow, 0.05)
+    ambient = mean_over(ride.quantities["ambient_temperature"], SLOW)
+    return np.array(temperatures(network, DT, watts.tolist(), ambient.tolist(), air.tolist()))
+
+
+def _first(ride: Ride, sensor: str) -> float:
+    return float(mean_over(ride.signals[sensor], SLOW)[:FIRST].mean())
+
+
+def motor_temperature(ride: Ride, p: Values, system: System) -> Array:
+    """[K] at steps of `DT`."""
+    stator = _first(ride, "motor_temperature") + p["motor_start"]
+    ambient = float(mean_over(ride.quantities["ambient_temperature"], SLOW)[0])
+    network = MotorCooling.of(p, stator, stator + p["rotor_start"] * (stator - ambient) / 10)
+    modelled = _cooled(ride, p, network, _heat(ride, p, system)[0], "motor_airflow")
+    return np.asarray(mean_over(ride.signals["motor_temperature"], SLOW) - modelled)
+
+
+def inverter_temperature(ride: Ride, p: Values, system: System) -> Array:
+    """[K] at steps of `DT`."""
+    board = _first(ride, "inverter_temperature") + p["inverter_start"]
+    network = InverterCooling.of(p, board, board + p["box_start"])
+    modelled = _cooled(ride, p, network, _heat(ride, p, system)[1], "inverter_airflow")
+    return np.asarray(mean_over(ride.signals["inverter_temperature"], SLOW) - modelled)
+
+
+def cell_temperature(ride: Ride, p: Values, system: System) -> Array:
+    """[K] at steps of `DT`."""
+    battery = system.pack
+    volts, amperes, soc = cell_circuit(ride, p, system)
+    rest = battery.ocv_over(soc, mean_over(ride.quantities["cell_temperature"], SLOW))
+    watts = battery.cells_series * heat(rest, volts, amperes)
+    network = LumpedCooling.of(p, "pack", _first(ride, "cell_temperature") + p["cells_start"])
+    modelled = _cooled(ride, p, network, watts, "pack_airflow")
+    return np.asarray(mean_over(ride.signals["cell_temperature"], SLOW) - modelled)

@@ -1,0 +1,104 @@
+"""The battery's tables out of a vehicle file: checked, so that what reads them need not."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.parameters import Parameters
+from gz_onboard.physics.tables import Mesh, Row, linear
+
+if TYPE_CHECKING:
+    from gz_onboard.toml import Table
+
+TEMPERATURE = (-60.0, 100.0)  # degC, of a cell
+RESISTANCE = (1e-6, 10.0)  # ohm, of a cell: from the largest to a frozen one of a watch
+CAPACITANCE = (1e-3, 1e8)  # F, of a cell's RC pair
+SMALLEST_STEP = 1e-6  # of SOC, V or degC, from point to point: a slope must stay a number
+LARGEST_SHIFT = 0.2  # V: real cells rest tens of mV apart from -20 to 25 degC; more is a mistyped unit
+
+
+def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
+    """The battery in the vehicle file; InputError for tables that do not make sense."""
+    table = vehicle.table("battery")
+    table.only(["cells_series", "cells_parallel", "ocv", "rest_shift", "capacity", "r0", "r1", "c1"])
+    ocv = table.table("ocv")
+    ocv.only(["soc", "value", "unit", "sd", "source", "status"])
+    ocv.text("unit", choices=["V"])
+    soc, volts = _axis(ocv, "soc", -0.01, 1.01), _axis(ocv, "value", 0.5, 5.0)
+    if soc[0] > 0.1 or soc[-1] < 0.9:
+        raise ocv.error(f"must reach from 0.1 or less to 0.9 or more, is {soc[0]:g} to {soc[-1]:g}", "soc")
+    if len(soc) != len(volts):
+        raise ocv.error(f"has {len(volts)} numbers for {len(soc)} of soc", "value")
+    temperatures: Row
+    capacities: Row
+    temperatures, capacities = (25.0,), (1.0,)
+    if "capacity" in table.values:
+        capacity = table.table("capacity")
+        capacity.only(["temperature", "value", "unit", "sd_relative", "source", "status"])
+        capacity.text("unit", choices=["A·h"])
+        temperatures, capacities = _axis(capacity, "temperature", *TEMPERATURE), capacity.numbers("value", 0.01, 1000)
+        if len(temperatures) != len(capacities):
+            raise capacity.error(f"must be {len(temperatures)} positive numbers, one for each temperature", "value")
+        at_25 = linear(temperatures, capacities, 25.0)
+        capacities = tuple(value / at_25 for value in capacities)
+        if min(capacities) < 0.05 or max(capacities) > 2:
+            raise capacity.error("must be within 0.05 to 2 times what it is at 25 degC", "value")
+    shift_temperatures, shifts, shift_sd = _rest_shift(table)
+    battery = Battery(
+        cells_series=table.integer("cells_series", 1, 1000),
+        cells_parallel=table.integer("cells_parallel", 1, 1000),
+        capacity=parameters["cell_capacity"],
+        capacity_temperature=temperatures,
+        capacity_share=capacities,
+        cutoff_voltage=parameters["cell_cutoff_voltage"],
+        series_resistance=parameters["pack_series_resistance"],
+        ocv_soc=soc,
+        ocv_value=volts,
+        ocv_sd=ocv.number("sd", 0.005, low=1e-4, high=0.5),
+        r0=_mesh(table.table("r0"), "ohm", *RESISTANCE),
+        r1=_mesh(table.table("r1"), "ohm", *RESISTANCE),
+        c1=_mesh(table.table("c1"), "F", *CAPACITANCE),
+        rest_shift_temperature=shift_temperatures,
+        rest_shift_value=shifts,
+        rest_shift_sd=shift_sd,
+    )
+    return battery.with_parameters(parameters)
+
+
+def _rest_shift(battery: Table) -> tuple[Row, Row, float]:
+    """(temperatures [degC], shifts [V], their sd [V]); nothing if the file does not have the table."""
+    if "rest_shift" not in battery.values:
+        return (), (), 0.0
+    table = battery.table("rest_shift")
+    table.only(["temperature", "value", "unit", "sd", "source", "status"])
+    table.text("unit", choices=["V"])
+    temperatures, shifts = _axis(table, "temperature", *TEMPERATURE), table.numbers("value")
+    if len(shifts) != len(temperatures) or max(map(abs, shifts)) > LARGEST_SHIFT:
+        wanted = f"must be {len(temperatures)} numbers within {-LARGEST_SHIFT:g} to {LARGEST_SHIFT:g} V"
+        raise table.error(f"{wanted}, one for each temperature", "value")
+    return temperatures, shifts, table.number("sd", 0.005, low=0.0, high=LARGEST_SHIFT)
+
+
+def _axis(table: Table, key: str, low: float, high: float, least: int = 2) -> Row:
+    row = table.numbers(key, low, high)
+    for a, b in pairwise(row):
+        if not a < b:
+            raise table.error(f"must increase, but {b:g} follows {a:g}", key)
+        if b - a < SMALLEST_STEP:
+            raise table.error(f"must increase by {SMALLEST_STEP:g} or more, but {b!r} follows {a!r}", key)
+    if len(row) < least:
+        raise table.error(f"must be two numbers or more within {low:g} to {high:g}", key)
+    return row
+
+
+def _mesh(table: Table, unit: str, low: float, high: float) -> Mesh:
+    table.only(["soc", "temperature", "value", "unit", "sd_relative", "source", "status"])
+    table.text("unit", choices=[unit])
+    soc = _axis(table, "soc", -0.01, 1.01)
+    temperature = _axis(table, "temperature", *TEMPERATURE, least=1)
+    rows = table.rows("value", len(soc), f"in {unit}, one for each soc", low, high)
+    if len(rows) != len(temperature):
+        raise table.error(f"must be {len(temperature)} rows, one for each temperature", "value")
+    return Mesh(soc, temperature, rows)

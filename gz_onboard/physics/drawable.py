@@ -1,0 +1,58 @@
+"""What a pack still delivers until its cells reach the cut-off voltage."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from gz_onboard.physics.battery import HOUR, Battery, Overpotential
+
+
+@dataclass(frozen=True)
+class Drawable:
+    """What a pack still delivers until its cells reach the cut-off voltage."""
+
+    energy: float  # J, at the pack's terminals
+    soc_left: float
+    slope: float  # J: how much more energy there would be for more SOC
+
+
+# Gauss-Legendre nodes and weights on [0, 1], of order 8
+_NODES = (0.019855072, 0.101666761, 0.237233795, 0.408282679, 0.591717321, 0.762766205, 0.898333239, 0.980144928)
+_WEIGHTS = (0.050614268, 0.111190517, 0.156853323, 0.181341892, 0.181341892, 0.156853323, 0.111190517, 0.050614268)
+
+
+def drawable(
+    battery: Battery,
+    soc: float,
+    temperature: float,
+    power: float,
+    form: float = 1.0,
+    overpotential: Overpotential | None = None,
+) -> Drawable:
+    """What a pack at `soc` and `temperature` [degC] delivers at a mean `power` [W] until the cut-off.
+
+    At constant power P the charge Q·dSOC passes in dt = Q·dSOC/I, so the energy is P·Q·∫ dSOC/I(SOC), from the
+    SOC at which the terminal voltage at the mean load meets the cut-off: bursts are held back by the vehicle before.
+    `form`, `overpotential`: see `Battery.settled_current`. The RC pair is taken as settled (V1 = R1·I): discharging
+    takes an hour, its time constant is a minute.
+    """
+    low, high = -0.05, soc
+    charge = battery.pack_capacity(temperature) * HOUR
+    cutoff = battery.cutoff_voltage * battery.cells_series
+    current = battery.settled_current(power, soc, temperature, overpotential=overpotential)
+    if current is None or power < cutoff * current:
+        return Drawable(0.0, soc, charge * cutoff)
+    slope = charge * power / current
+    for _ in range(14):  # to 6e-5 of SOC
+        middle = (low + high) / 2
+        current = battery.settled_current(power, middle, temperature, overpotential=overpotential)
+        if current is None or power < cutoff * current:
+            low = middle
+        else:
+            high = middle
+    width = soc - high
+    total = 0.0
+    for node, weight in zip(_NODES, _WEIGHTS, strict=True):
+        current = battery.settled_current(power, high + width * node, temperature, form, overpotential)
+        total += weight / current if current else 0.0
+    return Drawable(power * charge * width * total, high, slope)
