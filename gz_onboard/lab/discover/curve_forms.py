@@ -32,24 +32,7 @@ QUANTITIES: dict[str, tuple[tuple[float, ...], str]] = {
     "since_braking": ((0.0, 4.0, 8.0, 15.0, 30.0, 60.0), "s"),
 }
 PAIRS: tuple[tuple[str, tuple[str, ...]], ...] = (
-    (
-        "road_force",
-        (
-            "speed",
-            "acceleration",
-            "lateral_acceleration",
-            "grade",
-            "heading",
-            "motor_temperature",
-            "time",
-            "motor_current",
-            "current_change",
-            "steering",
-            "vibration",
-            "suspension_speed",
-            "since_braking",
-        ),
-    ),
+    ("road_force", tuple(name for name in QUANTITIES if name not in ("pack_current", "soc"))),
     ("inverter_power", ("speed", "motor_current", "motor_temperature", "time", "current_change")),
     ("auxiliary", ("speed", "motor_temperature", "time", "pack_current", "vibration")),
     ("pack_balance", ("speed", "pack_current", "motor_temperature", "time")),
