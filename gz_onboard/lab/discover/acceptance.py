@@ -67,7 +67,7 @@ def rejection(now: Selection, limit: float) -> tuple[str, str] | None:
     strict = Search(wide, evidence(wide, now.normals), list(search.causes.values()), search.shares)
     index = search.index(now.chosen)
     estimate, sd = search.evidence.estimate(index), np.sqrt(np.diag(search.evidence.covariance(index)))
-    # against a file what differs between rides cannot be told from what its model lacks; healthy rides have shown it
+    # against a file what differs between rides cannot be separated from what its model lacks; a baseline knows it
     parts = [] if mixed.healthy else splits(now)
     uneven = {split.cause for split in parts if unequal(split) and split.quantity.startswith(RIDE)}
     found: list[tuple[float, str, str]] = []

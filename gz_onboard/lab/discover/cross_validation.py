@@ -91,7 +91,7 @@ def improves(held: Iterator[Squares], shares: Mapping[str, float]) -> bool:
 
 
 def start_equations(mixed: MixedModel, line: LinearRide) -> Normal:
-    """What tells how a ride began: not the road force, whose mean would be taken for the accelerometer's bias."""
+    """What shows how a ride began: not the road force, whose mean would be taken for the accelerometer's bias."""
     return normal(line, mixed.noise, [name for name in line.tables if name != "road_force"])
 
 

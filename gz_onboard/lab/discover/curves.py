@@ -65,7 +65,7 @@ class CurveFit:
 
 
 def supported_knots(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
-    """The coefficients of `form` that these rides can tell, (k, free): a knot that less than `ENOUGH` of two rides is
+    """The coefficients of `form` that these rides determine, (k, free): a knot that less than `ENOUGH` of two rides is
     at goes with the nearest that has it, so that no curve bends where hardly anything was measured.
     """
     k = form.basis.shape[1]

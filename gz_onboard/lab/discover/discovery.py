@@ -25,7 +25,7 @@ from gz_onboard.simulation.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
 Progress = Callable[[str], None]
-SHORTEST = 300.0  # m: shorter rides tell nothing
+SHORTEST = 300.0  # m: shorter rides show nothing
 LATENCY = "pack_voltage_latency"
 LATENCY_STEPS = 10  # of the grid of time, to either side, that a delay is sought in
 LINEAR_LATENCY = 0.15  # s: a delay up to which the step of the voltage is linear in it

@@ -17,7 +17,7 @@ ROLLING = 2.0  # m/s: where `channels.road_force` holds
 
 
 def pack_power(table_name: str, line: LinearRide, values: Array) -> Array | None:
-    """A residual of a channel as power at the pack's terminals [W], over its blocks; None if it is none."""
+    """A residual of a channel as power at the pack's terminals [W], over its blocks; None if it is no power."""
     table = line.tables[table_name]
     real = values * table.unit
     if table_name == "road_force":
@@ -30,7 +30,7 @@ def pack_power(table_name: str, line: LinearRide, values: Array) -> Array | None
 
 
 def channel_energy(name: str, line: LinearRide, values: Array) -> float:
-    """A residual of a channel as energy at the pack's terminals [J] over the ride; 0 if it is none."""
+    """A residual of a channel as energy at the pack's terminals [J] over the ride; 0 if it is no power."""
     power = pack_power(name, line, values)
     return 0.0 if power is None or not len(power) else float(np.mean(power)) * channel_time(line, name)
 

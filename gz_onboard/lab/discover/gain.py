@@ -56,7 +56,7 @@ def summarised(rows: Sequence[Triple], rng: np.random.Generator) -> Errors:
 
 
 def errors(line: LinearRide, theta: Array) -> dict[str, float]:
-    """Of one ride with parameters `theta` (p,), by the metrics of `Gain`; without those that cannot be told."""
+    """Of one ride with parameters `theta` (p,), by the metrics of `Gain`; without those that are not known."""
     more, square = 0.0, 0.0
     found: dict[str, float] = {}
     for name, table in line.tables.items():

@@ -26,7 +26,7 @@ NEEDED = ("motor_speed", "motor_current")
 BRAKE_PRESSURE = 0.8e5  # Pa: above what the sensors show at rest
 MOVING = 0.5  # m/s
 SUSPENSION = ("suspension_front", "suspension_rear")
-CRAWL, MOST_STEERING = 1.0, 0.6  # m/s, rad: what a bend tells of slower riding is noise
+CRAWL, MOST_STEERING = 1.0, 0.6  # m/s, rad: of slower riding the angle is noise
 ROUGH_PERIOD = 0.034  # s: samples further apart do not show what a road does to a wheel
 LONGEST = 60.0  # s since a brake was touched, or a current changed: what was longer ago is as good as never
 
@@ -93,7 +93,7 @@ class Ride:
         for role in ("brake_pressure_front", "brake_pressure_rear"):
             if role in self.signals:
                 result |= self.signals[role] > BRAKE_PRESSURE
-        if not {"brake_switch", "brake_pressure_rear"} & self.have:  # regeneration is all that tells
+        if not {"brake_switch", "brake_pressure_rear"} & self.have:  # only regeneration shows it
             result |= self.signals["motor_current"] < -1.0
         wide = np.convolve(result, np.ones(11), mode="same") > 0
         return np.asarray(wide, dtype=bool)

@@ -1,7 +1,7 @@
 """The linear mixed model of all channels, and the small matrices that every question is asked of.
 
 About the present parameters θ the residuals of ride r are y = A·(θ_r − θ) + noise, θ_r = μ + u_r: μ common to all
-(Laird & Ware 1982), u_r the ride's own with covariance T, which healthy rides tell: that the parameters of a healthy
+(Laird & Ware 1982), u_r the ride's own with covariance T, learned from healthy rides: that the parameters of a healthy
 vehicle seem to differ from ride to ride is the model's discrepancy (Brynjarsdóttir & O'Hagan 2014), and nothing
 smaller than it is taken for a cause. Noise is white and exponentially correlated. Of each ride there remain N = AᵀC⁻¹A
 and b = AᵀC⁻¹y. All parameters are in units of their scale.

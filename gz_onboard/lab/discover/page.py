@@ -55,6 +55,7 @@ def page(found: Discovery) -> str:
     """The report as HTML."""
     report = found.report
     before, after = before_and_after(found)
+    stages = {"before": before, "after": after} if report.causes else {"before": before}
     over = QuantityReader(found.mixed)
     channels = [name for name in BY_NAME if any(name in line.tables for line in found.lines)]
     parts = [
@@ -64,12 +65,12 @@ def page(found: Discovery) -> str:
         "<h2>What the residuals are</h2>" + _residuals(report, before, after),
         "<h2>Where they live</h2>",
         f"<p>Share of each residual's variance that goes with a quantity, in percent: before{_named(report)}.</p>",
-        _picture(overview(before, after, channels, over, bool(report.causes))),
+        _picture(overview(stages, channels, over)),
     ]
     shown = _most(found, before, channels)
     for name in [*shown, *(c for c in channels if c not in shown)]:
         title = f"{readable(name)} [{BY_NAME[name].unit}]"
-        picture = _picture(panels(before, after, name, over, bool(report.causes)))
+        picture = _picture(panels(stages, name, over))
         note = _GRADE if name == "road_force" else ""
         parts.append(f"<details{' open' if name in shown else ''}><summary>{title}</summary>{picture}{note}</details>")
     parts += [

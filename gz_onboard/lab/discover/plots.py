@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,28 +18,21 @@ from gz_onboard.simulation.style import BLUE, GRID, INK, MUTED, ORANGE, headline
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-BEFORE, AFTER = ORANGE, BLUE
+COLOURS = {"before": ORANGE, "after": BLUE}
+Stages = Mapping[str, Sequence[LinearRide]]  # the rides "before" the causes and, if there are any, "after" them
 CHOSEN, NEAR, OTHER = BLUE, "#8fb8de", "#cbd2d9"
 
 
-def overview(
-    before: Sequence[LinearRide],
-    after: Sequence[LinearRide],
-    channels: Sequence[str],
-    over: QuantityReader,
-    named: bool,
-) -> Figure:
-    """Channels by quantities: the share of variance that goes with each, before and after."""
+def overview(stages: Stages, channels: Sequence[str], over: QuantityReader) -> Figure:
+    """Channels by quantities: the share of variance that goes with each."""
     quantities = list(QUANTITIES)
-    grids = []
-    for lines in (before, after) if named else (before,):
-        rows = []
-        for channel in channels:
-            rows.append([100 * share_over(*pooled(lines, channel, name, over)) for name in quantities])
-        grids.append(np.array(rows))
+    grids = [
+        np.array([[100 * share_over(*pooled(lines, c, name, over)) for name in quantities] for c in channels])
+        for lines in stages.values()
+    ]
     width, height = 12.5, 1.5 + 0.3 * len(channels)
     figure = new_figure(width, height)
-    for i, (grid, title) in enumerate(zip(grids, ("before", "after"), strict=False)):
+    for i, (grid, title) in enumerate(zip(grids, stages, strict=True)):
         axis = figure.add_axes((0.12 + 0.43 * i, 0.02, 0.385, 1 - 1.35 / height))
         axis.imshow(grid, cmap="Oranges" if i == 0 else "Blues", vmin=0, vmax=60, aspect="auto")
         for r in range(len(channels)):
@@ -63,21 +56,19 @@ def overview(
         axis.tick_params(length=0, colors=MUTED)
         for side in axis.spines.values():
             side.set_color(GRID)
-        if named:
+        if len(stages) > 1:
             headline(figure, 0.13 + 0.44 * i, 1 - 0.12 / height, title, 10)
     return figure
 
 
-def panels(
-    before: Sequence[LinearRide], after: Sequence[LinearRide], channel: str, over: QuantityReader, named: bool
-) -> Figure:
+def panels(stages: Stages, channel: str, over: QuantityReader) -> Figure:
     """The residual's mean over each quantity, in bins of as many blocks, one standard error as a band."""
     drawn = []
     for name in QUANTITIES:
-        x, y = pooled(before, channel, name, over)
+        samples = [pooled(lines, channel, name, over) for lines in stages.values()]
+        x = samples[0][0]
         if len(x) > 20 and np.ptp(x) > 0:
-            at = edges(x)
-            drawn.append((name, binned(x, y, at), binned(*pooled(after, channel, name, over), at)))
+            drawn.append((name, [binned(*sample, edges(x)) for sample in samples]))
     columns = min(4, max(len(drawn), 1))
     rows = max(1, -(-len(drawn) // columns))
     height = 0.55 + 2.15 * rows
@@ -88,17 +79,15 @@ def panels(
         rows, columns, left=0.06, right=0.985, wspace=0.13, hspace=0.42, top=1 - 0.3 / height, bottom=0.48 / height
     )
     axes: list[Any] = []
-    for i, (name, first, last) in enumerate(drawn):
+    for i, (name, curves) in enumerate(drawn):
         axis = figure.add_subplot(grid[i // columns, i % columns], sharey=axes[0] if axes else None)
         axes.append(axis)
         rule(axis)
         axis.locator_params(nbins=5)
-        for rows_, colour, label in ((first, BEFORE, "before"), (last, AFTER, "after")):
-            if label == "after" and not named:
-                continue
-            x, y, error = rows_[:, 0], rows_[:, 1], rows_[:, 2]
+        for (x, y, error, _), stage in zip((rows_.T for rows_ in curves), stages, strict=True):
+            colour, label = COLOURS[stage], stage if len(stages) > 1 else "residual"
             axis.fill_between(x, y - error, y + error, color=colour, alpha=0.2, linewidth=0)
-            axis.plot(x, y, "o-", color=colour, markersize=3, linewidth=1.3, label=label if named else "residual")
+            axis.plot(x, y, "o-", color=colour, markersize=3, linewidth=1.3, label=label)
         axis.axhline(0, color=INK, linewidth=0.6)
         label, unit, _ = QUANTITIES[name]
         axis.set_xlabel(label if unit == "1" else f"{label} [{unit}]", fontsize=8, color=INK, labelpad=2)
@@ -147,8 +136,8 @@ def curve(unknown: Unknown) -> Figure:
     axis = figure.add_axes((0.1, 0.16, 0.86, 0.78))
     rule(axis)
     x, y, sd = np.array(unknown.curve, dtype=float).T
-    axis.fill_between(x, y - 2 * sd, y + 2 * sd, color=BEFORE, alpha=0.2, linewidth=0)
-    axis.plot(x, y, "o-", color=BEFORE, linewidth=1.6, markersize=4)
+    axis.fill_between(x, y - 2 * sd, y + 2 * sd, color=ORANGE, alpha=0.2, linewidth=0)
+    axis.plot(x, y, "o-", color=ORANGE, linewidth=1.6, markersize=4)
     axis.set_ylim(*_limits_of(y, sd))
     axis.axhline(0, color=INK, linewidth=0.6)
     axis.set_xlabel(f"{readable(unknown.quantity)} [{unknown.unit}]", fontsize=9, color=INK)

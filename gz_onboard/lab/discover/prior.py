@@ -3,7 +3,7 @@
 Three kinds. *Base*: the vehicle file's parameters, as sure as their calibration says. *Nuisance*: what no vehicle
 file has and no cause is named after, such as the bias of the accelerometer or a wind; each with a mean over the
 vehicle's life and a scatter between rides. *Candidate*: what a cause would move. `RIDE_SD` is how much a parameter
-is taken to scatter from ride to ride before healthy rides have told (the discrepancy of Brynjarsdóttir & O'Hagan
+is taken to scatter from ride to ride before any healthy ride (the discrepancy of Brynjarsdóttir & O'Hagan
 2014, as a random effect).
 """
 
@@ -167,10 +167,10 @@ FIXED = (
     "box_start",
     "cells_start",
 )
-"""Those whose scatter is of the ride's start or of what was entered: nothing that healthy rides would tell better."""
+"""Those whose scatter is of the ride's start or of what was entered: healthy rides say no more of it."""
 
 STARTS = (*(name for name in FIXED if name != "payload_error"), "accel_bias", "pitch_gain", "gps_lag", "wheel_lag")
-"""Those that are the sensors' or the start's, not the vehicle's: each ride tells its own, whatever the model."""
+"""Those of the sensors or of the start, not of the vehicle: each ride has its own, whatever the model."""
 
 BASE = (
     "wheel_radius",

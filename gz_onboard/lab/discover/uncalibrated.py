@@ -1,4 +1,4 @@
-"""What is known of a vehicle of which no healthy rides are: its file is taken at its word.
+"""What is known of a vehicle without healthy rides: what its file says, taken as true.
 
 An effect that its model lacks is not there; noise and scatter between rides are those of the very rides that are
 looked into, with everything free that could be a cause, so that no cause makes them look noisier than they are.
