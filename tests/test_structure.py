@@ -171,7 +171,7 @@ def test_the_discovery_knows_effects_by_what_they_declare():
     for module in (PACKAGE / "lab/discover").glob("*.py"):
         nodes = ast.walk(ast.parse(module.read_text(encoding="utf-8")))
         named = {node.value for node in nodes if isinstance(node, ast.Constant)} & effects
-        assert not named, f"{module.name} names {', '.join(named)}"
+        assert not named, f"{module.name} names {named}"
 
 
 def test_a_constant_of_nature_stands_once():
