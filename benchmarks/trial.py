@@ -32,9 +32,11 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.lab.discover.engine import baseline, discover
+from gz_onboard.lab.discover.baseline import baseline
+from gz_onboard.lab.discover.discovery import discover
+from gz_onboard.lab.schema import to_json
 from gz_onboard.offline.samples import Samples
-from gz_onboard.vehicle import read_vehicle
+from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests import plant
 from tests.plant.cases import CASES_OF_A_SCOOTER, CHANNEL_CLEAR, EFFECTS, ENERGY_CLEAR
 
@@ -62,6 +64,13 @@ def material(seeds: Sequence[int], keep: Path | None) -> tuple[list[Samples], li
         with file.open("wb") as stream:
             pickle.dump((healthy[number], cases), stream, pickle.HIGHEST_PROTOCOL)
     return healthy[number], cases
+
+
+def discovered(vehicle: Vehicle, rides: Sequence[Samples], seed: int = 0) -> Row:
+    """The JSON of a discovery."""
+    report = to_json(discover(vehicle, rides, seed).report)
+    assert isinstance(report, dict)
+    return report
 
 
 def judge_scooter(seeds: Sequence[int], keep: Path | None = None) -> list[Row]:
@@ -94,7 +103,7 @@ def judge(base: Any, case: plant.Case) -> Row:
     row: Row = {"seed": case.seed, "kind": case.kind, "truths": truths, "accepted": list(case.accepted)}
     began, wall = time.process_time(), time.monotonic()
     try:
-        report = discover(base, case.rides, seed=case.seed).to_json()
+        report = discovered(base, case.rides, case.seed)
     except Exception:
         return row | {"verdict": "error", "error": traceback.format_exc(), "causes": [], "ambiguous": [], "ranking": []}
     row["cpu_s"], row["wall_s"] = time.process_time() - began, time.monotonic() - wall
@@ -102,7 +111,7 @@ def judge(base: Any, case: plant.Case) -> Row:
     row["ranking"] = report["ranking"][:5]
     row["parameters"] = [check for t in case.truths for check in _parameters(report, t)]
     if case.twins and case.kind != "unknown":
-        row["floor"] = discover(base, case.twins, seed=case.seed).to_json()["gain"]
+        row["floor"] = discovered(base, case.twins, case.seed)["gain"]
     return row
 
 
@@ -140,7 +149,7 @@ def judge_healthy(seeds: Sequence[int]) -> list[Row]:
     rows = []
     for seed, rides in zip(seeds, sets, strict=True):
         for against, vehicle in known.items():
-            report = discover(vehicle, rides, seed=seed).to_json()
+            report = discovered(vehicle, rides, seed)
             rows.append(
                 {
                     "seed": seed,

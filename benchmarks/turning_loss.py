@@ -18,10 +18,11 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.cli import main as command
 from gz_onboard.constants import GRAVITY
-from gz_onboard.lab.discover.engine import discover
-from gz_onboard.lab.discover.files import write_model
-from gz_onboard.lab.discover.parts import Over, before_and_after, binned, edges, gathered
-from gz_onboard.lab.discover.result import METRICS, Report
+from gz_onboard.lab.discover.breakdown import QuantityReader, before_and_after, binned, edges, pooled
+from gz_onboard.lab.discover.discovery import discover
+from gz_onboard.lab.discover.extension import write_model
+from gz_onboard.lab.discover.result import METRICS, Gain
+from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, legend, new_figure, ordinate, rule, save
 from gz_onboard.simulation.recorded import read_recorded
@@ -41,7 +42,7 @@ def main() -> None:
     rides = [read_samples(log, vehicle) for log in (*TOWN, OVAL)]
     every = discover(vehicle, rides, workers=2)
     residual(every, output / "turning_loss_residual.png")
-    gain(every, output / "turning_loss_gain.png")
+    gain(every.report.gain, output / "turning_loss_gain.png")
     town = discover(vehicle, rides[:-1], workers=2)
     with tempfile.TemporaryDirectory() as folder:
         extended = Path(folder) / "turning.toml"
@@ -50,21 +51,19 @@ def main() -> None:
     oval(runs, output / "turning_loss_oval.png")
 
 
-def residual(report: Report, file: Path) -> None:
+def residual(found: Discovery, file: Path) -> None:
     """Road force over lateral acceleration, before and after, with what the effect says."""
-    state = report.state
-    assert state is not None
-    cause = next(c for c in report.causes if c.name == "cornering_drag")
-    before, after = before_and_after(report)
-    over = Over(state)
+    cause = next(c for c in found.report.causes if c.name == "cornering_drag")
+    before, after = before_and_after(found)
+    over = QuantityReader(found.mixed)
     figure = new_figure(11, 4.3)
-    mass = float(np.mean([line.ride.quantities["mass"][0] for line in report.lines]))
+    mass = float(np.mean([line.ride.quantities["mass"][0] for line in found.lines]))
     axes: list[Any] = []
     for i, (lines, title) in enumerate(((before, "before"), (after, "after"))):
         axis = figure.add_axes((0.07 + 0.47 * i, 0.12, 0.44, 0.74), sharey=axes[0] if axes else None)
         axes.append(axis)
         rule(axis)
-        x, y, _ = gathered(lines, "road_force", "lateral_acceleration", over)
+        x, y = pooled(lines, "road_force", "lateral_acceleration", over)
         axis.plot(x, y, ".", color=MUTED, markersize=2.5, alpha=0.5, label="means of 4 s")
         rows = binned(x, y, edges(x, 16))
         axis.errorbar(
@@ -95,16 +94,15 @@ def residual(report: Report, file: Path) -> None:
     save(figure, file)
 
 
-def gain(report: Report, file: Path) -> None:
+def gain(found: Gain, file: Path) -> None:
     """Errors on rides held out: before, control, after."""
     figure = new_figure(11, 2.6)
-    names = [name for name in METRICS if name in report.gain]
-    for i, name in enumerate(names):
+    for i, (name, errors) in enumerate(found.errors.items()):
         label, factor, unit = METRICS[name]
         axis = figure.add_axes((0.08 + 0.235 * i, 0.12, 0.17, 0.66))
         rule(axis)
         axis.grid(False, axis="y")
-        values = [report.gain[name][key] * factor for key in ("after", "control", "before")]
+        values = [x * factor for x in (errors.after, errors.control, errors.before)]
         axis.barh(
             ["after", "control", "before"] if i == 0 else ["", " ", "  "],
             values,

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from gz_onboard.physics.effect import QUANTITIES
+
 PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 
 # The parts of the package, lowest first. A part imports itself and those in the lines above its own.
@@ -42,6 +44,20 @@ OFFLINE = ("offline", "simulation", "lab")
 HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow"}
 # Imported only when asked for, or for types: the reference filter behind --filter filterpy, the types of arrays.
 ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py"}
+
+# The stages of a discovery, first to last. A module imports those of the stages before its own, and those of its own
+# that stand before it.
+STAGES = {
+    "plain data": ["result", "wording"],
+    "read": ["grid"],
+    "residuals": ["residuals", "channels"],
+    "linear model": ["prior", "candidates", "linear", "mixed_model", "uncalibrated", "baseline_file"],
+    "search": ["search", "curve_forms", "curves", "baseline", "selection"],
+    "judgement": ["constancy", "cross_validation", "acceptance", "winds", "energy", "unexplained", "verdict"],
+    "report": ["gain", "detectability", "discovery", "breakdown", "summary", "plots", "page", "extension"],
+    "command": ["command"],
+}
+STAGE = {module: place for place, module in enumerate(module for modules in STAGES.values() for module in modules)}
 
 MODULES = sorted(path.relative_to(PACKAGE) for path in PACKAGE.rglob("*.py"))
 
@@ -113,6 +129,53 @@ def test_the_daemon_loads_nothing_heavy(name):
     loaded = set(run.stdout.split())
     assert "gz_onboard" in loaded
     assert not HEAVY & loaded
+
+
+def graph() -> dict[str, set[str]]:
+    """Of each module those of the package that it imports, inside functions too."""
+    names = {".".join(["gz_onboard", *m.with_suffix("").parts]).removesuffix(".__init__"): m for m in MODULES}
+    found = {}
+    for name, module in names.items():
+        tree = ast.parse((PACKAGE / module).read_text(encoding="utf-8"))
+        said = {one for one in imports(ast.walk(tree), module) if one in names}
+        packages = {one for one in said if any(other.startswith(f"{one}.") for other in said)}
+        found[name] = said - packages - {name}
+    return found
+
+
+def circles(of: dict[str, set[str]]) -> list[list[str]]:
+    """What is left once all that import nothing of what is left are taken away, and all that nothing imports."""
+    left = dict(of)
+    while bare := [name for name in left if not left[name] & left.keys()]:
+        left = {name: found for name, found in left.items() if name not in bare}
+    while unused := [name for name in left if not any(name in found for found in left.values())]:
+        left = {name: found for name, found in left.items() if name not in unused}
+    return [sorted(left)] if left else []
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    assert circles(graph()) == []
+
+
+def test_a_circle_is_seen():
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"b", "d"}, "d": set()}) == [["b", "c"]]
+
+
+def test_imports_of_the_discovery_go_down_its_stages():
+    inside = "gz_onboard.lab.discover."
+    of = {name.removeprefix(inside): found for name, found in graph().items() if name.startswith(inside)}
+    assert set(of) == set(STAGE)
+    for module, found in of.items():
+        for other in (name.removeprefix(inside) for name in found if name.startswith(inside)):
+            assert STAGE[other] < STAGE[module], f"{module} imports {other}, which does not stand before it"
+
+
+def test_the_discovery_knows_effects_by_what_they_declare():
+    effects = {path.stem for path in (PACKAGE / "physics/effects").glob("*.py")} - set(QUANTITIES)
+    for module in (PACKAGE / "lab/discover").glob("*.py"):
+        nodes = ast.walk(ast.parse(module.read_text(encoding="utf-8")))
+        named = {node.value for node in nodes if isinstance(node, ast.Constant)} & effects
+        assert not named, f"{module.name} names {named}"
 
 
 def test_a_constant_of_nature_stands_once():

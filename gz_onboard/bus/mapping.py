@@ -41,6 +41,7 @@ MOST_FILES = 20
 LONGEST_FRAME = 64  # bytes, of CAN FD
 SMALLEST, LARGEST = 1e-12, 1e12  # a scale or an offset
 FARTHEST = 1e30  # a limit of a signal; those of 64 bits are written out by some editors
+LONGEST_DELAY = 10.0  # s, of a message
 LONGEST_PROBLEM = 400  # letters of what cantools says, which may quote a whole line
 _END = '\nCM_ "";\n'  # an empty comment: a last statement that is cut off is none to cantools, one in between is wrong
 _MESSAGE_SIZE = re.compile(r"^[ \t]*BO_[ \t]+\d+[ \t]+(\w+)[ \t]*:[ \t]*(\d+)", re.M)
@@ -80,6 +81,7 @@ class Mapping:
     not_available: bool = True
     j1939: bool = False
     roles: tuple[str, ...] = field(default=())
+    delays: dict[str, float] = field(default_factory=dict)  # s, by message: its values are so much older; where stated
 
 
 def find_dbc(name: str, beside: Path | None = None) -> Path:
@@ -202,11 +204,12 @@ def read_mapping(vehicle: Table) -> Mapping:
     bus.only(["not_available", "identifiers", "messages"])
     messages = bus.table("messages")
     protection: dict[str, Protection] = {}
+    delays: dict[str, float] = {}
     periods = {message.name: message.cycle_time / 1000 for message in database.messages if message.cycle_time}
     for name in messages.values:
         message = _message(database, messages, name, name)
         options = messages.table(name)
-        options.only(["crc", "counter", "period"])
+        options.only(["crc", "counter", "period", "delay"])
         for key in ("crc", "counter"):
             if key in options.values:
                 _signal(message, options, key, options.text(key))
@@ -219,6 +222,8 @@ def read_mapping(vehicle: Table) -> Mapping:
         protection[name] = Protection(crc, counter)
         if "period" in options.values:
             periods[name] = options.number("period", low=1e-4, high=3600)
+        if "delay" in options.values:
+            delays[name] = options.number("delay", low=-LONGEST_DELAY, high=LONGEST_DELAY)
 
     j1939 = bus.text("identifiers", "exact", ["exact", "j1939"]) == "j1939"
     if j1939:
@@ -235,6 +240,7 @@ def read_mapping(vehicle: Table) -> Mapping:
         not_available=bus.text("not_available", "all-ones", ["all-ones", "none"]) == "all-ones",
         j1939=j1939,
         roles=tuple(source.role for source in sources),
+        delays=delays,
     )
 
 

@@ -17,7 +17,9 @@ An effect file has
   on the term, 1 at nuisances of 0, which discovery fits. It may take parameters too, and what they are on the healthy
   vehicle as ``healthy_`` before the name;
 - ``SHOWN_BY``, if it is a candidate of the discovery: the data that would show it, and the ride that would split it
-  from its look-alikes.
+  from its look-alikes; ``STRENGTHS``, the parameters that then change, the first if it is not given; ``VARIES = True``
+  if it differs from ride to ride by itself; ``CAUSE``, if every model has the effect: what a change of it is called,
+  and its equation.
 
 Sign conventions
     speed, motor torque, motor current   positive forward, driving
@@ -88,7 +90,11 @@ MOVING = 0.5  # m/s: what counts for time_moving
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of an effect: what it is and what it can be."""
+    """A parameter of an effect: what it is and what it can be.
+
+    ride_sd: by how much what rides show of it scatters from ride to ride [unit], at the prior. healthy_sd: within what
+    a healthy vehicle may show of it where its model lacks the effect. bench: found on one at steady points.
+    """
 
     name: str
     unit: str
@@ -97,6 +103,9 @@ class Parameter:
     low: float
     high: float
     source: str
+    ride_sd: float | None = None
+    healthy_sd: float | None = None
+    bench: bool = False
 
     def __post_init__(self) -> None:
         if not self.low <= self.prior <= self.high:
@@ -161,6 +170,9 @@ class Effect:
     variation: Variation | None = None
     stores_energy: bool = False
     turning_loss: bool = False
+    strengths: tuple[str, ...] = ()  # parameters that change where it is found, the one that is reported first
+    varies: bool = False  # from ride to ride by itself
+    cause: tuple[str, str] | None = None  # name and equation of a change, of an effect that every model has
 
     @property
     def reads(self) -> frozenset[str]:
@@ -279,6 +291,9 @@ def _effect(name: str, module: ModuleType) -> Effect:
         variation=Variation(vary, *_arguments(vary)) if (vary := getattr(module, "variation", None)) else None,
         stores_energy=getattr(module, "STORES_ENERGY", False),
         turning_loss=getattr(module, "TURNING_LOSS", False),
+        strengths=getattr(module, "STRENGTHS", tuple(declared[:1])),
+        varies=getattr(module, "VARIES", False),
+        cause=getattr(module, "CAUSE", None),
     )
 
 

@@ -17,8 +17,8 @@ from gz_onboard.lab.calibrate.cooling_network import motor_temperatures, pack_te
 from gz_onboard.lab.calibrate.cooling_run import CoolingRun
 from gz_onboard.lab.calibrate.road_load import RoadLoad
 from gz_onboard.lab.discover import residuals
-from gz_onboard.lab.discover.grid import Ride, read_ride
-from gz_onboard.lab.discover.state import initial
+from gz_onboard.lab.discover.grid import USUAL_DELAYS, Dimensions, Ride, read_ride
+from gz_onboard.lab.discover.mixed_model import initial
 from gz_onboard.lab.validate_components import battery_voltage, components, losses, road_load
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Port
@@ -51,7 +51,9 @@ def simulated():
 
 def recorded():
     """The same of a recorded one."""
-    ride = read_ride(read_samples(LOG, VEHICLE), P["wheel_radius"] * P["gear_ratio"], VEHICLE.model.mass)
+    radius, mass = P["wheel_radius"] * P["gear_ratio"], VEHICLE.model.mass
+    vehicle = Dimensions(radius, mass, P["torque_constant"], P["wheelbase"], USUAL_DELAYS)
+    ride = read_ride(read_samples(LOG, VEHICLE), vehicle)
     names = ("pack_current", "motor_current", "pack_voltage", "motor_temperature")
     found = {name: residuals.mean_over(ride.signals[name], 10) for name in names}
     return found | {name: residuals.mean_over(ride.quantities[name], 10) for name in ("speed", "cell_temperature")}

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from gz_onboard.physics.effect import Effect, Parameter, effects_in, known_effects, load_effect
+from gz_onboard.physics.effect import Effect, Parameter, Port, effects_in, known_effects, load_effect
 from gz_onboard.physics.model import BASE_EFFECTS
 from gz_onboard.physics.parameters import declared_parameters
 
@@ -32,135 +32,114 @@ class Candidate:
         """The names of its parameters."""
         return tuple(parameter.name for parameter in self.parameters)
 
+    @property
+    def reads(self) -> tuple[str, ...]:
+        """The names of those that its effect takes beside them."""
+        return tuple(name for name in self.effect.keywords if name not in self.names) if self.effect else ()
 
-# name: (parameter, sign of the change that its cause can make, equation, what shows it and splits it)
-MOVABLE: Mapping[str, tuple[str, int, str, str]] = {
-    "rolling_resistance": (
-        "rolling_resistance_constant",
-        0,
-        "F = m·g·cos θ·c0",
-        "Road load that is the same at all speeds and grows with weight; rides with another payload split it from a "
-        "dragging brake.",
-    ),
-    "aero_drag_area": (
-        "drag_area",
-        0,
-        "F = ½·ρ·CdA·V²",
-        "Road load that grows with the square of speed; long stretches at 30 and at 50 km/h in both directions split "
-        "it from drivetrain drag and wind.",
-    ),
+    @property
+    def varies(self) -> bool:
+        """Whether it differs from ride to ride by itself."""
+        return self.effect is not None and self.effect.varies
+
+
+# name: (where it acts, None if it is a sensor or the cooling; parameter, equation, what shows it and splits it)
+VEHICLE_CAUSES: Mapping[str, tuple[Port | None, str, str, str]] = {
     "payload_mass": (
+        Port.WHEEL_FORCE,
         "payload_mass",
-        0,
         "F = m·(dV/dt + g·sin θ + g·c0·cos θ)",
         "Force short in acceleration and uphill, too large downhill; hills and firm starts split it from rolling "
         "resistance.",
     ),
     "tyre_radius": (
+        Port.WHEEL_FORCE,
         "wheel_radius",
-        0,
         "V = ω·r",
         "All wheel-speed sensors and the motor against GPS alike; a straight kilometre at steady speed.",
     ),
-    "auxiliary_load": (
-        "auxiliary_power",
-        0,
-        "P = P_aux",
-        "The auxiliary current sensor, at standstill too; switching lamps one by one splits it from the sensor.",
-    ),
-    "winding_resistance": (
-        "motor_copper_resistance",
-        0,
-        "P = r·(1 + a·(T − 25))·i²",
-        "DC power over air-gap power grows with the square of the current, and the motor warms; full-throttle starts "
-        "split it from inverter loss.",
-    ),
     "torque_constant_loss": (
+        Port.MOTOR_LOSS,
         "torque_constant",
-        0,
         "τ = k·i",
-        "Force and DC power both short per motor current reported, acceleration most; steady climbing splits it from "
-        "the payload.",
-    ),
-    "inverter_loss": (
-        "inverter_loss_linear",
-        0,
-        "P = c1·|i|",
-        "DC power over air-gap power grows with the current itself, and the inverter warms; steady riding at low and "
-        "at high torque splits it from winding resistance.",
+        "Force and DC power both short per motor current reported, acceleration most; steady climbing splits it "
+        "from the payload.",
     ),
     "capacity_fade": (
+        Port.CELL_VOLTAGE,
         "cell_capacity",
-        0,
         "dSOC/dt = −I/(3600·Q)",
-        "Rest voltage falls faster than the charge drawn says; a ride from full to nearly empty splits it from the "
-        "gain of the current sensor, as the inverter's own does.",
+        "Rest voltage falls faster than the charge drawn says; a ride from full to nearly empty splits it from the"
+        " gain of the current sensor, as the inverter's own does.",
     ),
     "resistance_growth": (
+        Port.CELL_VOLTAGE,
         "cell_resistance_factor",
-        0,
         "V = OCV − f·(R0·I + V1)",
         "Voltage sinks more with every load at all temperatures; starts from rest at high and at low SOC.",
     ),
     "cooling_blocked": (
+        None,
         "cooling_factor",
-        0,
         "Q = f·G·(T − T_ambient)",
         "Motor, inverter and cells warm more than their losses say, and cool slower at rest; a hard ride, then rest.",
     ),
     "current_sensor_offset": (
+        None,
         "pack_current_offset",
-        0,
         "I_shown = g·I + I0",
         "Pack current less inverter and auxiliary current is not zero at standstill.",
     ),
     "current_sensor_gain": (
+        None,
         "pack_current_gain",
-        0,
         "I_shown = g·I + I0",
         "Pack current less inverter and auxiliary current grows with the current; charge against rest voltages.",
     ),
     "voltage_sensor_offset": (
+        None,
         "pack_voltage_offset",
-        0,
         "U_shown = U + U0",
         "Pack and inverter voltage differ at no current; the rest voltage of the full pack splits which one errs.",
     ),
     "speed_scale": (
+        None,
         "speed_sensor_scale",
-        0,
         "ω_shown = s·ω",
         "Motor speed against both wheel-speed sensors and GPS; coasting.",
     ),
     "sensor_latency": (
+        None,
         "pack_voltage_latency",
-        0,
         "U_shown(t) = U(t − T)",
         "Voltage answers steps of the current late or early; switching the throttle on and off.",
     ),
 }
-HELD = ("slow_time", "warm_up_time", "hysteresis_rate")
-"""Parameters that shape an effect but are not its strength."""
+PLACES = (Port.TYRE, Port.WHEEL_FORCE, Port.DC_POWER, Port.MOTOR_LOSS, Port.INVERTER_LOSS, Port.CELL_VOLTAGE, None)
+"""The order of the causes that every vehicle can have: from the road to the cells, sensors last."""
 
 
 def candidates(folder: Path | None = None) -> tuple[Candidate, ...]:
-    """Every candidate: the movable parameters, the package's effects beyond `BASE_EFFECTS`, and those in `folder`.
-
-    Raises InputError for a file in `folder` that is no effect.
+    """Every candidate: changes of what every vehicle has, the package's effects beyond `BASE_EFFECTS`, and those in
+    `folder`. Raises InputError for a file in `folder` that is no effect.
     """
     declared = declared_parameters()
-    found = []
-    for name, (parameter, sign, equation, shown_by) in MOVABLE.items():
-        found.append(Candidate(name, (declared[parameter],), equation, shown_by, None, sign))
-    own = [name for name in known_effects() if name not in BASE_EFFECTS]
-    theirs = [name for name in effects_in(folder) if name not in own] if folder else []
-    for name in (*own, *theirs):
-        effect = load_effect(name, folder)
-        strengths = tuple(p for p in effect.parameters if p.name not in HELD)
-        if not strengths:
-            continue
-        first = strengths if name == "headwind" else strengths[:1]
-        equation = effect.doc.splitlines()[0] if effect.doc else name
-        sign = 1 if first[0].low >= 0 else 0
-        found.append(Candidate(name, first, equation, effect.shown_by, effect, sign))
+    own = [load_effect(name) for name in known_effects()]
+    changes: list[tuple[Port | None, Candidate]] = [
+        (e.port, Candidate(e.cause[0], _strengths(e), e.cause[1], e.shown_by)) for e in own if e.cause is not None
+    ]
+    for name, (place, parameter, equation, shown_by) in VEHICLE_CAUSES.items():
+        changes.append((place, Candidate(name, (declared[parameter],), equation, shown_by)))
+    found = [cause for _, cause in sorted(changes, key=lambda row: PLACES.index(row[0]))]
+    packaged = [name for name in known_effects() if name not in BASE_EFFECTS]
+    theirs = [name for name in effects_in(folder) if name not in packaged] if folder else []
+    for effect in (load_effect(name, folder) for name in (*packaged, *theirs)):
+        if strengths := _strengths(effect):
+            equation = effect.doc.splitlines()[0] if effect.doc else effect.name
+            sign = 1 if strengths[0].low >= 0 else 0
+            found.append(Candidate(effect.name, strengths, equation, effect.shown_by, effect, sign))
     return tuple(found)
+
+
+def _strengths(effect: Effect) -> tuple[Parameter, ...]:
+    return tuple(p for name in effect.strengths for p in effect.parameters if p.name == name)

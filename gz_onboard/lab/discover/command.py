@@ -5,52 +5,29 @@ from __future__ import annotations
 import argparse
 import os
 import sys
-import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gz_onboard.bus.logs import log_suffix
+from gz_onboard.bus.logs import log_suffix, logs_among
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.lab.discover.candidates import Candidate, candidates
-from gz_onboard.lab.discover.channels import BY_NAME
-from gz_onboard.lab.discover.engine import baseline, discover
-from gz_onboard.lab.discover.files import write_baseline, write_model
-from gz_onboard.lab.discover.limits import amount, limits, size, strange, unformed, unsettled, words
-from gz_onboard.lab.discover.parts import before_and_after, outstanding
-from gz_onboard.lab.discover.result import METRICS, SCHEMA, VERDICTS, Report
-from gz_onboard.lab.discover.worth import sizes
+from gz_onboard.lab.discover.baseline import baseline
+from gz_onboard.lab.discover.baseline_file import write_baseline
+from gz_onboard.lab.discover.breakdown import outlying_rides
+from gz_onboard.lab.discover.candidates import candidates
+from gz_onboard.lab.discover.detectability import implausible_rides, missing_residuals, remaining_range_error
+from gz_onboard.lab.discover.discovery import discover
+from gz_onboard.lab.discover.extension import write_model
+from gz_onboard.lab.discover.result import SCHEMA, Report
+from gz_onboard.lab.discover.summary import listing, summary
+from gz_onboard.lab.discover.verdict import Discovery
+from gz_onboard.lab.schema import descriptions, to_json
 from gz_onboard.offline.processes import Task, over_rides
-from gz_onboard.offline.results import clock, explain_keys, write_json
+from gz_onboard.offline.results import explain_keys, write_json
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.options import add_shared, keep_old_name
 from gz_onboard.progress import Progress
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
-
-KEYS = {
-    "verdict": "cause, none, ambiguous or unknown",
-    "causes": "name, parameter, value, unit, ci95, change (over the healthy value), energy_share, evidence "
-    "(chi-squared of one degree of freedom), varies (from ride to ride: no model is extended with it), parameters (all "
-    "of them: value, ci95)",
-    "ambiguous": "sets of names that these rides cannot tell apart, the likeliest first",
-    "unknown": "what has no name: channel, quantity, unit, straight (in proportion), share of the energy, curve "
-    "[[at, value, sd], ...], denies (causes that it shows to be none); or null",
-    "ranking": "name, score of every candidate beside the causes named",
-    "residuals": "per channel: mean, rms, autocorrelation, blocks, energy_share, range_share",
-    "gain": "on rides held out: holdout, and per metric before, control (present parameters refitted), after, "
-    "ci95 (of control less after, over rides); apart: whether these rides had no part in the choice either",
-    "extended_model": "the vehicle file written, or null",
-    "advice": "what to ride next",
-    "notes": "what could not be used, and what was left out",
-    "isolability": "signatures: channels of each candidate; same_signature: groups that differ in form alone; "
-    "look_alikes: pairs and the cosine of what they do to the residuals",
-    "threshold": "score that one in twenty such searches of healthy rides exceeds",
-    "constancy": "whether a cause acts alike everywhere: cause, quantity, ratio (half the difference of the halves "
-    "of the quantity over the mean), chi2",
-    "limits": "per candidate: parameter, change, unit, energy_share: the least that would be found half the time",
-}
-_STAGES = ("before", "control", "after")
-_ROWS = 3  # residuals and limits told in the terminal
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -79,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "--jobs", default=jobs, help="number of parallel processes (default: %(default)s)")
     keep_old_name(parser, "--workers", "--jobs")
     add_shared(parser, "--quiet")
-    explain_keys(parser, "the report", SCHEMA, KEYS)
+    explain_keys(parser, "the report", SCHEMA, descriptions(Report))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -101,21 +78,27 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("; ".join(refused))
     holdout = [name.strip() for name in arguments.holdout.split(",")] if arguments.holdout else None
     with _Bar(arguments.quiet) as bar:
-        report = discover(vehicle, rides, arguments.seed, arguments.effects, bar.say, arguments.jobs, holdout)
+        found = discover(vehicle, rides, arguments.seed, arguments.effects, bar.say, arguments.jobs, holdout)
+    report = found.report
     report.notes[:0] = refused
-    report.notes += [*unsettled(report), *outstanding(report), *strange(report), *unformed(report)]
-    told = write_extended(report, vehicle, arguments) if arguments.write_model else []
+    report.notes += [
+        *remaining_range_error(report),
+        *outlying_rides(found),
+        *implausible_rides(found.lines),
+        *missing_residuals(found),
+    ]
+    written = write_extended(found, vehicle, arguments) if arguments.write_model else []
     if arguments.json:
-        write_json(arguments.json, None, document(report))
+        write_json(arguments.json, None, to_json(report))
     if arguments.report:
-        from gz_onboard.lab.discover.report import write_report
+        from gz_onboard.lab.discover.page import write_report
 
         try:
-            write_report(report, arguments.report)
+            write_report(found, arguments.report)
         except OSError as error:
             raise InputError(f"--report {arguments.report}: cannot be written: {error.strerror}") from error
     if arguments.json != "-":
-        print(summary(report, vehicle, told))
+        print(summary(found, written))
         if arguments.report:
             print(f"report       {arguments.report}")
     return 0
@@ -170,28 +153,14 @@ def _check(arguments: argparse.Namespace, logs: Sequence[Path]) -> None:
 
 def find_logs(paths: Sequence[Path]) -> list[Path]:
     """The logs among `paths`, those of folders in the order of their names. InputError for none."""
-    logs: list[Path] = []
-    for path in paths:
-        if path.is_dir():
-            inside = sorted(p for p in path.iterdir() if p.is_file() and _is_log(p))
-            if not inside:
-                raise InputError(f"{path}: this folder holds no log")
-            logs += inside
-        elif path.is_file():
-            log_suffix(path)
-            logs.append(path)
-        else:
-            raise InputError(f"{path}: no such log")
+    logs = logs_among(paths)
     if not logs:
         raise InputError("no ride is given; gz-onboard discover --list prints what could be found in one")
+    for log in logs:
+        if not log.is_file():
+            raise InputError(f"{log}: no such log")
+        log_suffix(log)
     return logs
-
-
-def _is_log(path: Path) -> bool:
-    try:
-        return log_suffix(path) not in ("", ".csv")  # a folder of rides has tables of their routes, too
-    except InputError:
-        return False
 
 
 def stem(log: Path) -> str:
@@ -258,125 +227,21 @@ class _Bar:
         self._bar.refresh()
 
 
-# --- what came out ------------------------------------------------------------------------------------------------
+# --- the extended model -------------------------------------------------------------------------------------------
 
 
-def write_extended(report: Report, vehicle: Vehicle, arguments: argparse.Namespace) -> list[str]:
+def write_extended(found: Discovery, vehicle: Vehicle, arguments: argparse.Namespace) -> list[str]:
     """Write the extended model if there is anything to extend it with; what was done, in words."""
+    report = found.report
     if all(cause.varies for cause in report.causes) and report.unknown is None:
         return ["not written: there is nothing to extend it with"]
     try:
-        added = write_model(report, vehicle, find_vehicle(arguments.vehicle), arguments.write_model)
+        added = write_model(found, vehicle, find_vehicle(arguments.vehicle), arguments.write_model)
     except OSError as error:
         raise InputError(f"--write-model {arguments.write_model}: cannot be written: {error.strerror}") from error
-    told = [str(arguments.write_model), *added] if report.extended_model else ["not written", *added]
+    written = [str(arguments.write_model), *added] if report.extended_model else ["not written", *added]
     if report.ambiguous:
-        told.append(
+        written.append(
             "of causes that cannot be told apart it has the likeliest: right for these rides, perhaps not for others"
         )
-    return told
-
-
-def document(report: Report) -> dict[str, object]:
-    """The JSON: that of the report, and the limits."""
-    rows = {}
-    for limit in limits(report):
-        known = limit.change < float("inf")
-        rows[limit.name] = {
-            "parameter": limit.parameter,
-            "unit": limit.unit,
-            "change": limit.change if known else None,
-            "energy_share": limit.share if known else None,
-        }
-    return {**report.to_json(), "limits": rows}
-
-
-def listing(every: Sequence[Candidate]) -> str:
-    """The candidates with equation, unit, prior and what would show them."""
-    entries = []
-    for c in every:
-        kind = f"effect at {c.effect.port.name}" if c.effect else "parameter of the vehicle file"
-        lines = [f"{c.name}  ({kind})", f"    equation   {c.equation}"]
-        for p in c.parameters:
-            name = f"{p.name} [{p.unit}]"
-            lines.append(f"    parameter  {name}, prior {p.prior:g} ± {p.prior_sd:g}, from {p.low:g} to {p.high:g}")
-        lines += textwrap.wrap(
-            f"shown by   {c.shown_by or 'its file does not say (SHOWN_BY)'}",
-            118,
-            initial_indent="    ",
-            subsequent_indent=" " * 15,
-        )
-        entries.append("\n".join(lines))
-    return "\n\n".join(entries)
-
-
-def summary(report: Report, vehicle: Vehicle, told: Sequence[str] = ()) -> str:
-    """The result in the terminal. told: of the extended model."""
-    way, time, drawn = size(report)
-    state = report.state
-    known = f"{state.healthy} healthy rides" if state and state.healthy else "the vehicle file alone"
-    energy = f", {drawn / 3.6e6:.2f} kWh drawn" if drawn > 0 else ""
-    rides = f"{len(report.lines)} ride{'s' if len(report.lines) > 1 else ''}, {way / 1e3:.1f} km in {clock(time)}"
-    lines = [
-        f"rides        {rides}{energy}; against {vehicle.name} as known from {known}",
-        f"verdict      {report.verdict}: {VERDICTS[report.verdict]}",
-    ]
-    for c in report.causes:
-        lines.append(
-            f"  {c.name:20} {c.parameter} = {amount(c.value, c.unit)} "
-            f"(95 %: {c.ci95[0]:.4g} to {c.ci95[1]:.4g}), "
-            f"{c.energy_share:+.1%} of the energy, score {c.evidence:.0f}"
-        )
-        lines += [f"  {'':20} {name} = {value:.4g} (95 %: {ci[0]:.4g} to {ci[1]:.4g})" for name, value, ci in c.others]
-        if c.varies:
-            lines.append(f"  {'':20} differs from ride to ride: named, but no model is extended with it")
-    for group in report.ambiguous:
-        lines.append(f"  not told apart:      {', '.join(group)}")
-    if report.unknown:
-        u = report.unknown
-        lines.append(
-            f"  no name:             {words(u['channel'])} over {words(u['quantity'])}, "
-            f"{u['share']:+.1%} of the energy, score {u['score']:.0f}"
-        )
-        if u["denies"]:
-            lines.append(f"  denied:              {', '.join(u['denies'])}, which would not act alike everywhere")
-    best = ", ".join(f"{name} {score:.0f}" for name, score in report.ranking[:5])
-    lines.append(f"scores       {best}; healthy rides stay below {report.threshold:.0f}")
-    left = sizes(before_and_after(report)[0])
-    largest = sorted(left.items(), key=lambda row: -abs(row[1]["energy_share"]))[:_ROWS]
-    text = "; ".join(
-        f"{words(name)} {r['mean']:+.3g} ± {r['rms']:.3g} {BY_NAME[name].unit} ({r['energy_share']:+.1%} of the energy)"
-        for name, r in largest
-    )
-    lines.append(f"residuals    {text}")
-    lines += _gain(report)
-    seen = [limit for limit in limits(report) if 0 < limit.share < float("inf")]
-    worst = sorted(seen, key=lambda limit: -limit.share)[:_ROWS]
-    if worst:
-        rows = ", ".join(f"{limit.name} {limit.share:.1%}" for limit in worst)
-        lines.append(f"limits       the least that these rides show, of the energy: {rows}; others less")
-    lines += [f"model        {word}" for word in told]
-    lines += [f"next         {line}" for line in report.advice]
-    lines += [f"note         {note}" for note in report.notes]
-    return "\n".join(
-        part for line in lines for part in (textwrap.wrap(line, 118, subsequent_indent=" " * 13) or [line])
-    )
-
-
-def _gain(report: Report) -> list[str]:
-    lines = []
-    for metric, (label, factor, unit) in METRICS.items():
-        g = report.gain.get(metric)
-        if isinstance(g, dict):
-            before, control, after, low, high = (x * factor for x in (*(g[k] for k in _STAGES), *g["ci95"]))
-            lines.append(
-                f"{label:18} {before:6.3g} before, {control:6.3g} refitted, {after:6.3g} extended  {unit:6} "
-                f"(gain {low:+.2g} to {high:+.2g})"
-            )
-    if not lines:
-        return [f"held out     {report.gain.get('note', 'nothing')}"]
-    head = (
-        "errors on rides held out of the fit; refitted: with the parameters that the model has already; "
-        "gain over that, 95 % over rides"
-    )
-    return [f"held out     {head}", *(f"  {line}" for line in lines)]
+    return written

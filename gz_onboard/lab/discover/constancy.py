@@ -9,26 +9,27 @@ between halves, more so from ride to ride; only what no such difference explains
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.channels import over_blocks
 from gz_onboard.lab.discover.grid import Ride
-from gz_onboard.lab.discover.linear import Linear, Normal, Table, whitened
-from gz_onboard.lab.discover.search import _evidence
-from gz_onboard.lab.discover.state import State
+from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Normal, whitened
+from gz_onboard.lab.discover.mixed_model import MixedModel
+from gz_onboard.lab.discover.result import Split
+from gz_onboard.lab.discover.search import evidence_of
+from gz_onboard.lab.discover.selection import Selection
 
 RATIO_SD, RIDE_SD = 0.15, 0.25  # of a real cause: on all rides, and from ride to ride
 RATIO = 0.5  # beyond which half of the cause is missing in one of the halves
 CHI2 = 9.0  # three standard deviations
 
 
-Sign = Callable[[Ride, Table, Array], Array]
+Sign = Callable[[Ride, LinearChannel, Array], Array]
 
 
-def _side(ride: Ride, table: Table, effect: Array) -> Array:
+def _side(ride: Ride, table: LinearChannel, effect: Array) -> Array:
     """+1 in left bends, -1 in right ones, 0 on the straight."""
     return np.asarray(np.tanh(over_blocks(table.channel, ride.quantities["lateral_acceleration"])[table.used] / 0.3))
 
@@ -36,8 +37,9 @@ def _side(ride: Ride, table: Table, effect: Array) -> Array:
 def _halves(name: str) -> Sign:
     """-1 below a value of the quantity, +1 above it, half of the cause's own squared effect on either side."""
 
-    def sign(ride: Ride, table: Table, effect: Array) -> Array:
-        values = ride.time if name == "time" else ride.quantities[name]
+    def sign(ride: Ride, table: LinearChannel, effect: Array) -> Array:
+        values = ride.quantity(name)
+        assert values is not None
         at = over_blocks(table.channel, values)[table.used]
         order = np.argsort(at)
         half = np.cumsum(effect[order] ** 2)
@@ -53,62 +55,46 @@ def _of_ride(mine: Ride) -> Sign:
 
 SPLITS: Mapping[str, Sign] = {"lateral_acceleration": _side, "time": _halves("time"), "speed": _halves("speed")}
 RIDE = "ride "  # before a ride's name, where the split is that ride against the others
-OF_RIDES = ("headwind",)  # that differ from ride to ride by themselves
 
 
-@dataclass(frozen=True)
-class Split:
-    """How unequal a cause is between the halves of a quantity. ratio: half the difference over the mean."""
-
-    cause: str
-    quantity: str
-    ratio: float
-    chi2: float
-
-    @property
-    def unequal(self) -> bool:
-        """Whether it is not the same cause in both."""
-        return abs(self.ratio) > RATIO and self.chi2 > CHI2
+def unequal(split: Split) -> bool:
+    """Whether it is not the same cause in both halves."""
+    return abs(split.ratio) > RATIO and split.chi2 > CHI2
 
 
-def splits(
-    state: State,
-    lines: Sequence[Linear],
-    normals: Sequence[Normal],
-    place: Mapping[str, Sequence[int]],
-    chosen: Sequence[str],
-    change: Array,
-) -> list[Split]:
-    """Of each of `chosen`, whose parameters stand at `place` and were found to change by `change` (p,), in scales."""
-    fixed = [i for name in chosen for i in place[name]]
+def splits(now: Selection) -> list[Split]:
+    """Of each of the causes chosen, by every quantity of `SPLITS`, and each ride against the others."""
     found = []
-    for name in chosen:
-        index = list(place[name])
+    for name in now.chosen:
         tests = dict(SPLITS)
-        if len(lines) > 2 and name not in OF_RIDES:
-            tests |= {f"{RIDE}{line.ride.name}": _of_ride(line.ride) for line in lines}
+        if len(now.lines) > 2 and not now.search.causes[name].varies:
+            tests |= {f"{RIDE}{line.ride.name}": _of_ride(line.ride) for line in now.lines}
         for quantity, sign in tests.items():
-            rides = [
-                _extended(line, normal, state, index, change[index], sign)
-                for line, normal in zip(lines, normals, strict=True)
-            ]
-            p = len(state.mean)
-            prior = np.zeros((p + 1, p + 1))
-            prior[:p, :p] = state.prior
-            prior[p, p] = RATIO_SD**2
-            e = _evidence(np.append(state.mean, 0.0), prior, np.append(state.scatter, RIDE_SD**2), rides)
-            cross = np.linalg.solve(
-                e.information[np.ix_(fixed, fixed)] + 1e-6 * np.eye(len(fixed)),
-                np.column_stack([e.information[fixed, p], e.score[fixed]]),
-            )
-            inner = e.information[p, p] - e.information[p, fixed] @ cross[:, 0]
-            score = e.score[p] - e.information[p, fixed] @ cross[:, 1]
-            if inner > 1e-6:
-                found.append(Split(name, quantity, float(score / inner), float(score * score / inner)))
+            estimate = _split(now, now.search.place[name], sign)
+            if estimate is not None:
+                found.append(Split(name, quantity, *estimate))
     return found
 
 
-def _extended(line: Linear, normal: Normal, state: State, index: Sequence[int], change: Array, sign: Sign) -> Normal:
+def _split(now: Selection, index: Sequence[int], sign: Sign) -> tuple[float, float] | None:
+    """(ratio, its chi-squared) of the halves of what the parameters at `index` do; None if nothing shows it."""
+    mixed, p = now.mixed, len(now.mixed.mean)
+    fixed = now.search.index(now.chosen)
+    change = now.change[index]
+    rides = [_extended(line, n, mixed, index, change, sign) for line, n in zip(now.lines, now.normals, strict=True)]
+    prior = np.zeros((p + 1, p + 1))
+    prior[:p, :p] = mixed.prior
+    prior[p, p] = RATIO_SD**2
+    e = evidence_of(np.append(mixed.mean, 0.0), prior, np.append(mixed.scatter, RIDE_SD**2), rides)
+    inner, score = e.given([p], fixed)
+    if inner[0, 0] <= 1e-6:
+        return None
+    return float(score[0] / inner[0, 0]), float(score[0] * score[0] / inner[0, 0])
+
+
+def _extended(
+    line: LinearRide, normal: Normal, mixed: MixedModel, index: Sequence[int], change: Array, sign: Sign
+) -> Normal:
     """`normal` with one more column: what the cause does, times the sign."""
     p = len(normal.b)
     n, b = np.zeros((p + 1, p + 1)), np.zeros(p + 1)
@@ -120,7 +106,7 @@ def _extended(line: Linear, normal: Normal, state: State, index: Sequence[int], 
         touched = np.flatnonzero(np.any(table.a != 0, axis=0))
         both = whitened(
             table,
-            state.noise[name],
+            mixed.noise[name],
             np.column_stack([effect * sign(line.ride, table, effect), table.a[:, touched], table.y]),
         )
         split, a, y = both[:, 0], both[:, 1:-1], both[:, -1]

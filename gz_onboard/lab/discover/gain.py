@@ -3,97 +3,73 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.folds import extended_mean, started, with_curve, with_start, without
-from gz_onboard.lab.discover.linear import Linear, fit_mixed, normal
-from gz_onboard.lab.discover.result import Report
-from gz_onboard.lab.discover.shapes import Form
-from gz_onboard.lab.discover.unknown import RIDES
-from gz_onboard.lab.discover.worth import energy, power_of, share_of_time
+from gz_onboard.lab.discover.cross_validation import Fold, Triple, held_out
+from gz_onboard.lab.discover.energy import channel_energy, energy_drawn, pack_power
+from gz_onboard.lab.discover.linear import LinearRide, normal
+from gz_onboard.lab.discover.result import Errors, Gain
+from gz_onboard.lab.discover.unexplained import form_of
+from gz_onboard.lab.discover.verdict import Discovery
 
 WHOLE = {"pack_voltage", "pack_current"}  # without which no one knows what a ride took out of the pack
+DRAWS = 400  # of the bootstrap over rides
 
 
-def measure_gain(report: Report, seed: int, apart: Sequence[Linear] = ()) -> dict[str, Any]:
-    """Errors of rides that were not fitted, with `report`'s causes and without.
+def measure_gain(found: Discovery, seed: int, apart: Sequence[LinearRide] = ()) -> Gain:
+    """Errors of rides that were not fitted, with the causes and the curve of `found` and without.
 
-    apart: rides that had no part in `report`, linearised where it is. Without any, each ride of the report is held out
-    in turn; the choice of the causes is then shared.
+    seed: of the bootstrap. apart: rides that had no part in `found`, linearised where it is. Without any, each ride of
+    it is held out in turn; the choice of the causes is then shared.
     """
-    state = report.state
-    assert state is not None
-    lines = [*report.lines, *apart]
-    normals = [*report.normals, *(normal(line, state.noise) for line in apart)]
+    mixed, report = found.mixed, found.report
+    lines = [*found.lines, *apart]
+    normals = [*found.normals, *(normal(line, mixed.noise) for line in apart)]
     if len(lines) < 2:
-        return {"holdout": [], "note": "one ride: nothing to hold out"}
-    names = [line.ride.name for line in lines]
-    known = len(report.lines)
+        return Gain(note="one ride: nothing to hold out")
+    known = len(found.lines)
     folds = [list(range(known, len(lines)))] if apart else [[i] for i in range(known)]
-    rows: dict[str, list[tuple[float, float, float]]] = {}
-    causes = [c for c in state.causes if c.name in {found.name for found in report.causes if not found.varies}]
-    form = form_of(report.unknown) if report.unknown is not None else None
-    for fold in folds:
-        rest = [n for i, n in enumerate(normals) if i not in fold]
-        if not rest or not fold:
-            continue
-        control = fit_mixed(rest, state.mean, state.prior, state.scatter, 1.0, state.free, 0).mean
-        after, curve = control, np.zeros(0)
-        if form is not None:
-            fitted = [(line, n) for i, (line, n) in enumerate(zip(lines, normals, strict=True)) if i not in fold]
-            after, curve = with_curve(state, fitted, causes, form)
-        elif causes:
-            after = extended_mean(state, rest, causes)
-        for i in fold:
-            shown = lines[i] if form is None else without(lines[i], form, curve)
-            models = ((lines[i], state.mean), (lines[i], control), (shown, after))
-            triple = [errors(line, with_start(state, started(state, line), theta)) for line, theta in models]
-            for metric in triple[0]:
-                rows.setdefault(metric, []).append(tuple(t[metric] for t in triple))  # type: ignore[arg-type]
-    result: dict[str, Any] = {"holdout": [names[i] for fold in folds for i in fold], "apart": bool(apart)}
+    named = {cause.name for cause in report.causes if not cause.varies}
+    form = form_of(report.unknown, mixed.sizes) if report.unknown is not None else None
+    after = Fold([cause for cause in mixed.causes if cause.name in named], form)
+    rows: dict[str, list[Triple]] = {}
+    for models in held_out(mixed, lines, normals, after, Fold(), folds):
+        before, control, with_causes = (errors(line, theta) for line, theta in models)
+        for metric, value in before.items():
+            rows.setdefault(metric, []).append((value, control[metric], with_causes[metric]))
     rng = np.random.default_rng(seed)
-    for metric, triples in rows.items():
-        table = np.array(triples)
-        before, control_, after_ = table.mean(axis=0)
-        draws = rng.integers(0, len(table), (400, len(table)))
-        saved = (table[:, 1] - table[:, 2])[draws].mean(axis=1)
-        result[metric] = {
-            "before": float(before),
-            "control": float(control_),
-            "after": float(after_),
-            "ci95": [float(np.quantile(saved, 0.025)), float(np.quantile(saved, 0.975))],
-        }
-    return result
+    held = tuple(lines[i].ride.name for fold in folds for i in fold)
+    of_metric = {metric: summarised(triples, rng) for metric, triples in rows.items()}
+    metrics = (of_metric.get(metric) for metric in ("voltage", "power", "energy_per_way", "range"))
+    return Gain(held, None, bool(apart), *metrics)
 
 
-def form_of(unknown: dict[str, Any]) -> Form | None:
-    """The curve of what has no name; None if it is one of rides."""
-    if unknown["quantity"] == RIDES:
-        return None
-    return Form(unknown["channel"], unknown["quantity"], unknown["straight"])
+def summarised(rows: Sequence[Triple], rng: np.random.Generator) -> Errors:
+    """The means over rides, and the interval of what is saved by a bootstrap over them."""
+    table = np.array(rows)
+    before, control, after = table.mean(axis=0).tolist()
+    draws = rng.integers(0, len(table), (DRAWS, len(table)))
+    saved = (table[:, 1] - table[:, 2])[draws].mean(axis=1)
+    return Errors(before, control, after, (float(np.quantile(saved, 0.025)), float(np.quantile(saved, 0.975))))
 
 
-def errors(line: Linear, theta: Array) -> dict[str, float]:
-    """Of one ride with parameters `theta` (p,): rms power [W], energy per way [J/m], cell voltage [V], range [1]."""
+def errors(line: LinearRide, theta: Array) -> dict[str, float]:
+    """Of one ride with parameters `theta` (p,), by the metrics of `Gain`; without those that are not known."""
     more, square = 0.0, 0.0
     found: dict[str, float] = {}
     for name, table in line.tables.items():
         rest = table.y - table.a @ theta
-        power = power_of(name, line, rest)
+        power = pack_power(name, line, rest)
         if power is not None and len(power):
-            more += float(np.mean(power)) * share_of_time(line, name)
+            more += channel_energy(name, line, rest)
             square += float(np.mean(power**2))
         if name == "cell_voltage":
             found["voltage"] = float(np.sqrt(np.mean(rest**2)))
     found["power"] = float(np.sqrt(square))
     found["energy_per_way"] = abs(more) / max(line.ride.distance, 1.0)
-    model = energy(line) - more
+    model = energy_drawn(line) - more
     if line.ride.have >= WHOLE and model > 0:
         found["range"] = abs(more) / model
     return found
-
-
-__all__ = ["errors", "measure_gain"]

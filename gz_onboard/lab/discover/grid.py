@@ -6,7 +6,7 @@ longer than three of its periods (and 0.3 s), the grid says so: nothing is made 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,14 +19,29 @@ from gz_onboard.physics.model import air_density
 from gz_onboard.physics.vibration import Vibration
 
 STEP = 0.1  # s
-LAGS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}
-"""By how much later than the inverter's a value is sent [s]; what is left of it is fitted (see `channels`)."""
+USUAL_DELAYS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}
+"""By how much later than the inverter's a value is sent [s], where no message states its `delay`; what is left of it
+is fitted (see `channels`)."""
 NEEDED = ("motor_speed", "motor_current")
 BRAKE_PRESSURE = 0.8e5  # Pa: above what the sensors show at rest
 MOVING = 0.5  # m/s
 SUSPENSION = ("suspension_front", "suspension_rear")
-SHAKING = 0.034  # s: samples further apart do not show what a road does to a wheel
+CRAWL, MOST_STEERING = 1.0, 0.6  # m/s, rad: of slower riding the angle is noise
+ROUGH_PERIOD = 0.034  # s: samples further apart do not show what a road does to a wheel
 LONGEST = 60.0  # s since a brake was touched, or a current changed: what was longer ago is as good as never
+
+
+@dataclass(frozen=True)
+class Dimensions:
+    """Of a vehicle: radius of the driven wheel times the gear ratio [m], mass with payload [kg], torque constant of the
+    motor [N·m/A], wheelbase [m]; by how much later than the inverter's a role's values are sent [s].
+    """
+
+    radius: float
+    mass: float
+    torque_constant: float
+    wheelbase: float
+    delays: Mapping[str, float]
 
 
 @dataclass
@@ -45,7 +60,6 @@ class Ride:
     radius: float
     payload: float | None
     quantities: dict[str, Array] = field(default_factory=dict)
-    missing: tuple[str, ...] = ()
 
     @property
     def have(self) -> set[str]:
@@ -59,9 +73,15 @@ class Ride:
             result &= self.valid[role]
         return result
 
+    def quantity(self, name: str) -> Array | None:
+        """A quantity, the time or the pack's current, shape (n,); None if it was not measured."""
+        if name == "time":
+            return self.time
+        return self.signals.get(name) if name == "pack_current" else self.quantities.get(name)
+
     @property
     def distance(self) -> float:
-        """The way ridden [m]."""
+        """The distance ridden [m]."""
         return float(np.sum(np.abs(self.quantities["speed"])) * STEP)
 
     @property
@@ -73,7 +93,7 @@ class Ride:
         for role in ("brake_pressure_front", "brake_pressure_rear"):
             if role in self.signals:
                 result |= self.signals[role] > BRAKE_PRESSURE
-        if not {"brake_switch", "brake_pressure_rear"} & self.have:  # regeneration is all that tells
+        if not {"brake_switch", "brake_pressure_rear"} & self.have:  # only regeneration shows it
             result |= self.signals["motor_current"] < -1.0
         wide = np.convolve(result, np.ones(11), mode="same") > 0
         return np.asarray(wide, dtype=bool)
@@ -104,8 +124,8 @@ def measured(times: Array, grid: Array) -> Mask:
     return np.asarray((gap < limit) & (grid > times[0] - limit) & (grid < times[-1] + limit))
 
 
-def read_ride(samples: Samples, radius: float, mass: float) -> Ride:
-    """`samples` on the grid. radius: of the driven wheel over the gear ratio [m], mass: of vehicle and payload [kg].
+def read_ride(samples: Samples, vehicle: Dimensions) -> Ride:
+    """`samples` on the grid.
 
     Raises InputError for a ride without motor speed or current, or shorter than a minute.
     """
@@ -122,37 +142,18 @@ def read_ride(samples: Samples, radius: float, mass: float) -> Ride:
     for role, (times, values) in samples.columns.items():
         if len(times) < 20:
             continue
-        at = grid + LAGS.get(role, 0.0)
+        at = grid + vehicle.delays.get(role, 0.0)
         turned = np.unwrap(values) if role == "gps_course" else values
         signals[role] = averaged(times, turned, at)
         valid[role] = measured(times, at)
-    ride = Ride(samples.name, grid - start, signals, valid, radius, samples.rider_mass)
-    ride.quantities = _quantities(ride, mass)
+    ride = Ride(samples.name, grid - start, signals, valid, vehicle.radius, samples.rider_mass)
+    ride.quantities = _quantities(ride, vehicle)
     ride.quantities["since_braking"] = since(ride.braking)
     wheels = [samples.columns[role] for role in SUSPENSION if role in samples.columns]
-    if wheels and all(np.median(np.diff(times)) < SHAKING for times, _ in wheels):
+    if wheels and all(np.median(np.diff(times)) < ROUGH_PERIOD for times, _ in wheels):
         ride.quantities["suspension_speed"] = suspension_speed(wheels, grid)
-    if "accel_z" in samples.columns and np.median(np.diff(samples.columns["accel_z"][0])) < SHAKING:
+    if "accel_z" in samples.columns and np.median(np.diff(samples.columns["accel_z"][0])) < ROUGH_PERIOD:
         ride.quantities["vibration"] = vibration(*samples.columns["accel_z"], grid)
-    wanted = (
-        "accel_x",
-        "rate_z",
-        "gps_speed",
-        "gps_altitude",
-        "gps_course",
-        "pack_voltage",
-        "pack_current",
-        "inverter_voltage",
-        "inverter_current",
-        "auxiliary_current",
-        "cell_temperature",
-        "ambient_temperature",
-        "motor_temperature",
-        "inverter_temperature",
-        "wheel_speed_front",
-        "wheel_speed_rear",
-    )
-    ride.missing = tuple(role for role in wanted if role not in signals)
     return ride
 
 
@@ -165,10 +166,10 @@ def since(happens: Mask) -> Array:
 
 def vibration(times: Array, values: Array, grid: Array) -> Array:
     """How rough the road is [m/s²]: of vertical acceleration `values` at `times`, at `grid`; see `Vibration`."""
-    shaken, rms = Vibration(), []
+    meter, rms = Vibration(), []
     for dt, value in zip(np.diff(times, prepend=times[0]).tolist(), values.tolist(), strict=True):
-        shaken.update(dt, value)
-        rms.append(shaken.value)
+        meter.update(dt, value)
+        rms.append(meter.value)
     return np.asarray(np.interp(grid, times, rms))
 
 
@@ -191,7 +192,13 @@ def smooth(values: Array, seconds: float) -> Array:
     return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
 
 
-def _quantities(ride: Ride, mass: float) -> dict[str, Array]:
+def steering(speed: Array, lateral_acceleration: Array, wheelbase: float) -> Array:
+    """Angle [rad] of a bicycle without slip: wheelbase over the radius of the bend."""
+    fast = np.maximum(np.abs(speed), CRAWL)
+    return np.asarray(np.clip(wheelbase * lateral_acceleration / fast**2, -MOST_STEERING, MOST_STEERING))
+
+
+def _quantities(ride: Ride, vehicle: Dimensions) -> dict[str, Array]:
     s = ride.signals
     n = len(ride.time)
     motor_speed = s["motor_speed"]
@@ -219,10 +226,11 @@ def _quantities(ride: Ride, mass: float) -> dict[str, Array]:
         "acceleration": acceleration,
         "grade": grade,
         "grade_cosine": np.asarray(np.sqrt(1 - np.clip(grade, -0.5, 0.5) ** 2)),
-        "mass": np.full(n, mass),
+        "mass": np.full(n, vehicle.mass),
         "air_density": np.full(n, density),
         "headwind": np.zeros(n),
         "lateral_acceleration": lateral,
+        "steering": steering(speed, lateral, vehicle.wheelbase),
         "motor_speed": motor_speed,
         "motor_current": s["motor_current"],
         "motor_temperature": s.get("motor_temperature", ambient),
@@ -230,5 +238,5 @@ def _quantities(ride: Ride, mass: float) -> dict[str, Array]:
         "cell_temperature": temperature,
         "heading": np.asarray(np.mod(course, 2 * np.pi), dtype=np.float64),
         "time_moving": np.asarray(moved, dtype=np.float64),
-        "torque": s["motor_current"],
+        "torque": vehicle.torque_constant * s["motor_current"],
     }

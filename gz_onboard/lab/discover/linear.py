@@ -1,7 +1,7 @@
 """The linear mixed model of all channels, and the small matrices that every question is asked of.
 
 About the present parameters θ the residuals of ride r are y = A·(θ_r − θ) + noise, θ_r = μ + u_r: μ common to all
-(Laird & Ware 1982), u_r the ride's own with covariance T, which healthy rides tell: that the parameters of a healthy
+(Laird & Ware 1982), u_r the ride's own with covariance T, learned from healthy rides: that the parameters of a healthy
 vehicle seem to differ from ride to ride is the model's discrepancy (Brynjarsdóttir & O'Hagan 2014), and nothing
 smaller than it is taken for a cause. Noise is white and exponentially correlated. Of each ride there remain N = AᵀC⁻¹A
 and b = AᵀC⁻¹y. All parameters are in units of their scale.
@@ -17,15 +17,15 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.channels import CHANNELS, Channel, blocks, depends, roughness, support, usable
 from gz_onboard.lab.discover.grid import Ride
+from gz_onboard.lab.discover.prior import stepped
 from gz_onboard.lab.discover.residuals import System
-from gz_onboard.lab.discover.terms import stepped
 
 LEAST = 0.02  # of the variance before, down to which the scatter between rides is learned
 Noise = dict[str, tuple[float, float, float]]  # by channel: white sd, correlated sd, correlation time [s]
 
 
 @dataclass(frozen=True)
-class Table:
+class LinearChannel:
     """One channel of one ride, linearised: y (m,) [unit], a (m, parameters) [unit per scale], time (m,) [s].
 
     Both are divided by the blocks' `channels.roughness`.
@@ -51,18 +51,20 @@ class Table:
 
 
 @dataclass
-class Linear:
+class LinearRide:
     """A ride, linearised."""
 
     ride: Ride
-    tables: dict[str, Table]
+    tables: dict[str, LinearChannel]
 
-    def seen_from(self, offset: Array) -> Linear:
+    def seen_from(self, offset: Array) -> LinearRide:
         """The same, with residuals as they would be at parameters `offset` (p,) before these, were the model linear."""
-        return Linear(self.ride, {n: replace(t, y=t.y + t.a @ offset) for n, t in self.tables.items()})
+        return LinearRide(self.ride, {n: replace(t, y=t.y + t.a @ offset) for n, t in self.tables.items()})
 
 
-def linearise(ride: Ride, values: Mapping[str, float], names: Sequence[str], scale: Array, system: System) -> Linear:
+def linearise(
+    ride: Ride, values: Mapping[str, float], names: Sequence[str], scale: Array, system: System
+) -> LinearRide:
     """The residuals of `ride` at `values`, and their columns over `names`, each by a forward difference of `scale`."""
     tables = {}
     for channel in CHANNELS:
@@ -84,13 +86,13 @@ def linearise(ride: Ride, values: Mapping[str, float], names: Sequence[str], sca
         index = np.flatnonzero(used)
         used = used.copy()
         used[index[~good]] = False
-        tables[channel.name] = Table(
+        tables[channel.name] = LinearChannel(
             channel, y[good], a[good], np.asarray((index[good] + 0.5) * channel.block), used, 1.0, every
         )
-    return Linear(ride, tables)
+    return LinearRide(ride, tables)
 
 
-def whitened(table: Table, noise: tuple[float, float, float], values: Array) -> Array:
+def whitened(table: LinearChannel, noise: tuple[float, float, float], values: Array) -> Array:
     """`values` (m,) or (m, k) in units of their noise: the innovations of a Kalman filter of white and exponentially
     correlated noise (Anderson & Moore 1979, ch. 9), divided by their standard deviation.
     """
@@ -134,7 +136,7 @@ def likelihoods(times: Array, rest: Array, ratio: Array, time: Array) -> tuple[A
     return quadratic, logarithm
 
 
-def trimmed(line: Linear, noise: Noise, mean: Array, spread: Array) -> Linear:
+def trimmed(line: LinearRide, noise: Noise, mean: Array, spread: Array) -> LinearRide:
     """`line` without the blocks that no likely parameters of the ride make fit: a wheel that lets go, a current limit
     that cuts in, a gap. mean, spread (p,): of the ride's parameters before, in scales.
 
@@ -143,29 +145,31 @@ def trimmed(line: Linear, noise: Noise, mean: Array, spread: Array) -> Linear:
     """
     tables = line.tables
     for _ in range(3):
-        ride = normal(Linear(line.ride, tables), noise)
-        own = mean + np.linalg.solve(np.diag(1 / spread**2) + ride.n, ride.b - ride.n @ mean)
+        own = likeliest(LinearRide(line.ride, tables), noise, mean, spread)
         tables = {name: _trim(table, noise[name], own) for name, table in line.tables.items()}
-    return Linear(line.ride, tables)
+    return LinearRide(line.ride, tables)
 
 
-def spread_out(line: Linear, noise: Noise, mean: Array, spread: Array) -> Linear:
+def likeliest(line: LinearRide, noise: Noise, mean: Array, spread: Array) -> Array:
+    """The ride's parameters (p,) in scales, before of `mean` and standard deviations `spread` (p,)."""
+    ride = normal(line, noise)
+    return np.asarray(mean + np.linalg.solve(np.diag(1 / spread**2) + ride.n, ride.b - ride.n @ mean))
+
+
+def spread_out(line: LinearRide, noise: Noise, mean: Array, spread: Array) -> LinearRide:
     """`line` with the noise of each channel raised to what this ride shows, where that is more: a ride that no
     parameters make fit counts for less.
     """
-    ride = normal(line, noise)
-    own = mean + np.linalg.solve(np.diag(1 / spread**2) + ride.n, ride.b - ride.n @ mean)
+    own = likeliest(line, noise, mean, spread)
     tables = {}
     for name, table in line.tables.items():
         rest = whitened(table, noise[name], table.y - table.a @ own)
         factor = max(1.0, float(np.sqrt(np.mean(rest**2))))
-        tables[name] = Table(
-            table.channel, table.y / factor, table.a / factor, table.time, table.used, factor, table.roughness
-        )
-    return Linear(line.ride, tables)
+        tables[name] = replace(table, y=table.y / factor, a=table.a / factor, factor=factor)
+    return LinearRide(line.ride, tables)
 
 
-def _trim(table: Table, noise: tuple[float, float, float], own: Array) -> Table:
+def _trim(table: LinearChannel, noise: tuple[float, float, float], own: Array) -> LinearChannel:
     rest = table.y - table.a @ own
     rest = rest - np.median(rest)
     limit = 5 * max(float(np.hypot(noise[0], noise[1])), 1.4826 * float(np.median(np.abs(rest))))
@@ -175,7 +179,7 @@ def _trim(table: Table, noise: tuple[float, float, float], own: Array) -> Table:
         return table
     used = table.used.copy()
     used[np.flatnonzero(used)[bad]] = False
-    return Table(table.channel, table.y[~bad], table.a[~bad], table.time[~bad], used, table.factor, table.roughness)
+    return replace(table, y=table.y[~bad], a=table.a[~bad], time=table.time[~bad], used=used)
 
 
 @dataclass(frozen=True)
@@ -186,7 +190,7 @@ class Normal:
     b: Array
 
 
-def normal(linear: Linear, noise: Noise, only: Sequence[str] | None = None) -> Normal:
+def normal(linear: LinearRide, noise: Noise, only: Sequence[str] | None = None) -> Normal:
     """The normal equations of a ride, over all channels or `only` some."""
     size = next(iter(linear.tables.values())).a.shape[1]
     n, b = np.zeros((size, size)), np.zeros(size)
@@ -252,12 +256,12 @@ def fit_mixed(
     return Posterior(common, after, now, np.array(own))
 
 
-def residuals(linear: Linear, shift: Array) -> dict[str, Array]:
+def residuals(linear: LinearRide, shift: Array) -> dict[str, Array]:
     """y − A·shift by channel."""
     return {name: table.y - table.a @ shift for name, table in linear.tables.items()}
 
 
-def learn_noise(rides: Sequence[Linear], shifts: Array, start: Noise) -> Noise:
+def learn_noise(rides: Sequence[LinearRide], shifts: Array, start: Noise) -> Noise:
     """White and correlated noise of each channel by maximum likelihood on a grid, all rides together.
 
     shifts: (rides, p), what each ride's parameters are.

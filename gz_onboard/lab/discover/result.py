@@ -1,14 +1,11 @@
-"""What a discovery found: the report and its JSON."""
+"""What a discovery found, as plain data: the types of the JSON that ``discover --json`` writes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated
 
-from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.constancy import Split
-from gz_onboard.lab.discover.linear import Linear, Normal
-from gz_onboard.lab.discover.state import State
+from gz_onboard.lab.schema import OPTIONAL
 
 SCHEMA = 1
 VERDICTS = {
@@ -23,80 +20,196 @@ METRICS = {
     "range": ("range", 100.0, "%"),
     "voltage": ("voltage of a cell", 1e3, "mV"),
 }
-"""Of the gain: what it says, factor and unit."""
+"""Of the gain: label, factor and unit."""
+RIDES = "ride"  # the quantity of what differs from ride to ride
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A parameter's value once accepted, with its 95 % interval."""
+
+    value: float
+    ci95: Interval
 
 
 @dataclass(frozen=True)
 class Cause:
-    """A cause that was named. value: of the parameter once accepted; change: over the healthy one's."""
+    """A cause that was named. value: of its first parameter once accepted; change: over the healthy one's.
+
+    evidence: chi-squared of one degree of freedom that leaving it out costs. varies: from ride to ride; what these
+    show promises nothing for the next, and no model is extended with it. parameters: all of them, the first first.
+    """
 
     name: str
     parameter: str
     value: float
     unit: str
-    ci95: tuple[float, float]
+    ci95: Interval
     change: float
     energy_share: float
-    evidence: float  # chi-squared with one degree of freedom that leaving it out costs
-    others: tuple[tuple[str, float, tuple[float, float]], ...] = ()  # further parameters: name, value, interval
-    varies: bool = False  # from ride to ride: what these show promises nothing for the next, and no model is extended
+    evidence: float
+    varies: bool = False
+    parameters: dict[str, Estimate] = field(default_factory=dict)
 
-    def to_json(self) -> dict[str, Any]:
-        """As a JSON object."""
-        return {
-            "name": self.name,
-            "parameter": self.parameter,
-            "value": self.value,
-            "unit": self.unit,
-            "ci95": list(self.ci95),
-            "change": self.change,
-            "energy_share": self.energy_share,
-            "evidence": self.evidence,
-            "varies": self.varies,
-            "parameters": {self.parameter: {"value": self.value, "ci95": list(self.ci95)}}
-            | {name: {"value": value, "ci95": list(ci)} for name, value, ci in self.others},
-        }
+    def __post_init__(self) -> None:
+        first = {self.parameter: Estimate(self.value, self.ci95)}
+        object.__setattr__(self, "parameters", first | self.others)
+
+    @property
+    def others(self) -> dict[str, Estimate]:
+        """Its parameters but the first."""
+        return {name: found for name, found in self.parameters.items() if name != self.parameter}
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """What has no name: a curve that a `channel` leaves over a `quantity`, or over the rides (`RIDES`).
+
+    straight: it is in proportion. curve: rows (at [unit], value [the channel's unit], sd). denies: causes that it
+    shows to be none. share: of the energy.
+    """
+
+    channel: str
+    quantity: str
+    straight: bool
+    unit: str
+    score: float
+    chi2: float
+    curve: tuple[tuple[float, float, float], ...]
+    denies: tuple[str, ...] = ()
+    share: float = 0.0
+
+
+@dataclass(frozen=True)
+class Score:
+    """Of a candidate beside the causes named."""
+
+    name: str
+    score: float
+
+
+@dataclass(frozen=True)
+class ResidualSize:
+    """Of a channel's residual, in its unit. autocorrelation: of neighbouring blocks; shares: of energy and range."""
+
+    mean: float
+    rms: float
+    autocorrelation: float
+    blocks: int
+    energy_share: float
+    range_share: float
+
+
+@dataclass(frozen=True)
+class Errors:
+    """On rides held out: before, with the present parameters refitted, after; ci95: of control less after."""
+
+    before: float
+    control: float
+    after: float
+    ci95: Interval
+
+
+@dataclass(frozen=True)
+class Gain:
+    """Errors on rides held out of the fit, by metric. apart: these rides had no part in the choice either.
+
+    voltage: of a cell [V]; power: rms [W]; energy_per_way: [J/m]; range: [1].
+    """
+
+    holdout: tuple[str, ...] = ()
+    note: Annotated[str | None, OPTIONAL] = None
+    apart: Annotated[bool | None, OPTIONAL] = None
+    voltage: Annotated[Errors | None, OPTIONAL] = None
+    power: Annotated[Errors | None, OPTIONAL] = None
+    energy_per_way: Annotated[Errors | None, OPTIONAL] = None
+    range: Annotated[Errors | None, OPTIONAL] = None
+
+    @property
+    def errors(self) -> dict[str, Errors]:
+        """Those that were measured, in the order of `METRICS`."""
+        return {name: found for name in METRICS if (found := getattr(self, name)) is not None}
+
+
+@dataclass(frozen=True)
+class Isolability:
+    """What could be told apart at all. signatures: of each candidate the channels that depend on it (Krysander & Frisk
+    2008). same_signature: those that only the form of what they do separates, no matter how much is measured.
+    look_alikes: pairs that these rides can hardly separate, by the cosine of what they do once nuisances are out.
+    """
+
+    signatures: dict[str, list[str]]
+    same_signature: list[list[str]]
+    look_alikes: list[tuple[str, str, float]]
+
+
+@dataclass(frozen=True)
+class Split:
+    """How unequal a cause is between the halves of a quantity. ratio: half the difference over the mean."""
+
+    cause: str
+    quantity: str
+    ratio: float
+    chi2: float
+
+
+@dataclass(frozen=True)
+class Limit:
+    """The smallest change of a cause that these rides would show, half the time, were it alone.
+
+    change: of its first parameter [unit]; energy_share: as a magnitude, 0 for one that takes none. Both None if the
+    rides say nothing of it.
+    """
+
+    parameter: str
+    unit: str
+    change: float | None
+    energy_share: float | None
 
 
 @dataclass
 class Report:
-    """What was found; the fields up to `advice` are those of the JSON."""
+    """What was found."""
 
-    verdict: str  # cause, none, ambiguous, unknown
-    causes: list[Cause]
-    ambiguous: list[list[str]]
-    unknown: dict[str, Any] | None
-    ranking: list[tuple[str, float]]
-    residuals: dict[str, dict[str, float]]
-    gain: dict[str, Any]
-    advice: list[str]
-    notes: list[str]
-    isolability: dict[str, Any]
-    threshold: float
-    constancy: list[Split] = field(default_factory=list)
-    extended_model: str | None = None
-    state: State | None = field(default=None, repr=False)
-    at: Array | None = field(default=None, repr=False)  # where the rides are linearised, in scales, (p,)
-    lines: list[Linear] = field(default_factory=list, repr=False)
-    normals: list[Normal] = field(default_factory=list, repr=False)
-
-    def to_json(self) -> dict[str, Any]:
-        """The contract's keys; numbers plain."""
-        return {
-            "schema": SCHEMA,
-            "verdict": self.verdict,
-            "causes": [cause.to_json() for cause in self.causes],
-            "ambiguous": self.ambiguous,
-            "unknown": self.unknown,
-            "ranking": [{"name": name, "score": score} for name, score in self.ranking],
-            "residuals": self.residuals,
-            "gain": self.gain,
-            "extended_model": self.extended_model,
-            "advice": self.advice,
-            "notes": self.notes,
-            "isolability": self.isolability,
-            "threshold": self.threshold,
-            "constancy": [
-                {"cause": s.cause, "quantity": s.quantity, "ratio": s.ratio, "chi2": s.chi2} for s in self.constancy
-            ],
-        }
+    schema: int = field(default=SCHEMA, init=False)
+    verdict: Annotated[str, "cause, none, ambiguous or unknown"]
+    causes: Annotated[
+        list[Cause],
+        "name, parameter, value, unit, ci95, change (over the healthy value), energy_share, evidence (chi-squared of "
+        "one degree of freedom), varies (from ride to ride: no model is extended with it), parameters (all of them: "
+        "value, ci95)",
+    ]
+    ambiguous: Annotated[list[list[str]], "sets of names that these rides cannot tell apart, the likeliest first"]
+    unknown: Annotated[
+        Unknown | None,
+        "what has no name: channel, quantity, unit, straight (in proportion), share of the energy, curve [[at, value, "
+        "sd], ...], denies (causes that it shows to be none); or null",
+    ]
+    ranking: Annotated[list[Score], "name, score of every candidate beside the causes named"]
+    residuals: Annotated[
+        dict[str, ResidualSize], "per channel: mean, rms, autocorrelation, blocks, energy_share, range_share"
+    ]
+    gain: Annotated[
+        Gain,
+        "on rides held out: holdout, and per metric before, control (present parameters refitted), after, ci95 (of "
+        "control less after, over rides); apart: whether these rides had no part in the choice either",
+    ]
+    extended_model: Annotated[str | None, "the vehicle file written, or null"] = field(default=None, init=False)
+    advice: Annotated[list[str], "what to ride next"]
+    notes: Annotated[list[str], "what could not be used, and what was left out"]
+    isolability: Annotated[
+        Isolability,
+        "signatures: channels of each candidate; same_signature: groups that differ in form alone; look_alikes: pairs "
+        "and the cosine of what they do to the residuals",
+    ]
+    threshold: Annotated[float, "score that one in twenty such searches of healthy rides exceeds"]
+    constancy: Annotated[
+        list[Split],
+        "whether a cause acts alike everywhere: cause, quantity, ratio (half the difference of the halves of the "
+        "quantity over the mean), chi2",
+    ] = field(default_factory=list)
+    limits: Annotated[
+        dict[str, Limit],
+        "per candidate: parameter, change, unit, energy_share: the least that would be found half the time",
+    ] = field(default_factory=dict)

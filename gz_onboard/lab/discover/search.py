@@ -15,7 +15,7 @@ from scipy.stats import t as student
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.linear import Normal, marginal
-from gz_onboard.lab.discover.state import State
+from gz_onboard.lab.discover.mixed_model import MixedModel
 
 RIDGE = 1e-6
 ALIKE = 0.6  # cosine of two columns, all that is common or random taken off
@@ -42,17 +42,34 @@ class Evidence:
         i = list(index)
         return np.asarray(np.linalg.inv(self.information[np.ix_(i, i)] + RIDGE * np.eye(len(i))))
 
+    def given(self, index: Sequence[int], fixed: Sequence[int], ridge: float = 0.0) -> tuple[Array, Array]:
+        """(information (k, k), score (k,)) of the parameters at `index` once those at `fixed` are fitted beside them.
+
+        ridge: added to the information of those at `index`.
+        """
+        i, f = list(index), list(fixed)
+        inner, score = self.information[np.ix_(i, i)] + ridge * np.eye(len(i)), self.score[i]
+        if not f:
+            return inner, score
+        cross = np.linalg.solve(
+            self.information[np.ix_(f, f)] + RIDGE * np.eye(len(f)),
+            np.column_stack([self.information[np.ix_(f, i)], self.score[f]]),
+        )
+        across = self.information[np.ix_(i, f)]
+        return inner - across @ cross[:, :-1], score - across @ cross[:, -1]
+
     def gain(self, index: Sequence[int]) -> float:
         """Twice the rise of the log likelihood by free changes of the parameters at `index`."""
         return float(self.score[list(index)] @ self.estimate(index)) if len(index) else 0.0
 
 
-def evidence(state: State, normals: Sequence[Normal]) -> Evidence:
-    """Of the rides' `normals`, against what `state` says of the healthy vehicle."""
-    return _evidence(state.mean, state.prior, state.scatter, normals)
+def evidence(mixed: MixedModel, normals: Sequence[Normal]) -> Evidence:
+    """Of the rides' `normals`, against what `mixed` says of the healthy vehicle."""
+    return evidence_of(mixed.mean, mixed.prior, mixed.scatter, normals)
 
 
-def _evidence(mean: Array, prior: Array, scatter: Array, normals: Sequence[Normal]) -> Evidence:
+def evidence_of(mean: Array, prior: Array, scatter: Array, normals: Sequence[Normal]) -> Evidence:
+    """The same; mean, prior: (p,), (p, p) of the common part; scatter: variances between rides, (p,)."""
     parts = [marginal(ride, scatter) for ride in normals]
     m = sum((part.n for part in parts), np.zeros_like(prior))
     c = sum((part.b for part in parts), np.zeros(len(mean)))
@@ -74,14 +91,14 @@ class Search:
 
     def __init__(
         self,
-        state: State,
+        mixed: MixedModel,
         evidence: Evidence,
         causes: Sequence[Candidate],
         shares: Mapping[str, Mapping[str, float]] | None = None,
     ) -> None:
-        self.state, self.evidence, self.shares = state, evidence, shares or {}
+        self.mixed, self.evidence, self.shares = mixed, evidence, shares or {}
         self.causes = {c.name: c for c in causes}
-        self.place = {c.name: state.index(c.names) for c in causes}
+        self.place = {c.name: mixed.index(c.names) for c in causes}
 
     def index(self, names: Sequence[str]) -> list[int]:
         """The parameters of the causes `names`."""
@@ -118,9 +135,9 @@ class Search:
         A cause of two parameters is brought to the scale of one: see `one_degree`.
         """
         more = self.gain([*base, name]) - (self.evidence.gain(self.index(base)) if base else 0.0)
-        more /= self.state.inflation.get(name, 1.0)
+        more /= self.mixed.inflation.get(name, 1.0)
         k = len(self.place[name])
-        return one_degree(more, k, self.state.freedom) if k > 1 else more
+        return one_degree(more, k, self.mixed.freedom) if k > 1 else more
 
     def overlap(self, a: str, b: str) -> float:
         """How much of the evidence for `a` and for `b` comes from the same channels, 0 to 1."""
@@ -157,7 +174,7 @@ class Search:
         chosen.sort(key=lambda n: -self.step([m for m in chosen if m != n], n))
         return Choice(tuple(chosen), self.gain(chosen))
 
-    def stand_ins(self, chosen: Sequence[str], margin: float, least: float) -> list[tuple[str, ...]]:
+    def alternatives(self, chosen: Sequence[str], margin: float, least: float) -> list[tuple[str, ...]]:
         """For each of `chosen` the set of causes that explain nearly as much in its place, itself first.
 
         margin: of chi-squared, on the scale of the less certain of the two. least: that each must score by itself.
@@ -167,7 +184,7 @@ class Search:
             rest = [n for n in chosen if n != name]
             own = self.gain([*rest, name])
             near = {n: self.gain([*rest, n]) for n in self.causes if n not in chosen}
-            inflation = self.state.inflation
+            inflation = self.mixed.inflation
             allowed = {n: margin * max(1.0, inflation.get(n, 1.0), inflation.get(name, 1.0)) for n in near}
             others = sorted(
                 (n for n, g in near.items() if g > own - allowed[n] and self.step(rest, n) > least),

@@ -1,31 +1,25 @@
-"""From evidence to a verdict: which causes, how sure, what could stand in, what has no name."""
+"""From the causes found to a verdict: how sure, what could stand in, what has no name."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import t as student
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.candidates import Candidate
+from gz_onboard.lab.discover.acceptance import within_bounds
 from gz_onboard.lab.discover.constancy import splits
-from gz_onboard.lab.discover.converge import Known, Linearised, about, converged
-from gz_onboard.lab.discover.linear import Linear, normal
-from gz_onboard.lab.discover.result import Cause, Report
-from gz_onboard.lab.discover.search import Evidence, Search, evidence
-from gz_onboard.lab.discover.shapes import forms
-from gz_onboard.lab.discover.stands import possible, standing
-from gz_onboard.lab.discover.state import State
-from gz_onboard.lab.discover.terms import LOG
-from gz_onboard.lab.discover.unknown import RIDES, unexplained
-from gz_onboard.lab.discover.winds import NAME as WIND
-from gz_onboard.lab.discover.winds import about_winds, own_winds
-from gz_onboard.lab.discover.worth import energy_share, sizes
+from gz_onboard.lab.discover.energy import energy_share, residual_sizes
+from gz_onboard.lab.discover.linear import LinearRide, Normal
+from gz_onboard.lab.discover.mixed_model import MixedModel
+from gz_onboard.lab.discover.prior import LOG
+from gz_onboard.lab.discover.result import RIDES, Cause, Estimate, Gain, Isolability, Report, Score, Unknown
+from gz_onboard.lab.discover.search import Search
+from gz_onboard.lab.discover.selection import SearchProblem
+from gz_onboard.lab.discover.unexplained import unexplained
+from gz_onboard.lab.discover.winds import Winds, search_causes
 
-FALSE_ALARMS = 0.05  # of sets of healthy rides, all candidates and curves together
 DISCREPANCY = 0.05  # of a change, sd: the form of an effect is not exactly the real one's
 LUMPED = {
     "cell_voltage": 1,
@@ -37,170 +31,121 @@ LUMPED = {
 """Channels whose model is a circuit or a network of lumps: by how much more than that they err, in shares of it."""
 LEAST = 0.4  # of the threshold, by which a stand-in must explain something itself
 MARGIN = 6.0  # of chi-squared within which another cause explains as well: a likelihood ratio of 20
+LOOK_ALIKE = 0.8  # cosine of what two candidates do
 
 
-def tries(e: Evidence, index: Sequence[int]) -> float:
-    """How many independent tries the columns at `index` are, look-alikes being one (Li & Ji 2005, eq. 5)."""
-    inner = e.information[np.ix_(index, index)]
-    size = np.sqrt(np.maximum(np.diag(inner), 1e-12))
-    values = np.abs(np.linalg.eigvalsh(inner / np.outer(size, size)))
-    return float(np.sum((values >= 1) + (values - np.floor(values))))
+@dataclass
+class Discovery:
+    """A report, and what it was reached on: the rides linearised about `at` (p,), in scales of `mixed`."""
+
+    report: Report
+    mixed: MixedModel
+    at: Array
+    lines: list[LinearRide]
+    normals: list[Normal]
 
 
-def threshold(state: State, tried: float) -> float:
-    """The chi-squared of one cause that healthy rides exceed with `FALSE_ALARMS`, among `tried`.
-
-    Student's t, for the scatter between rides is known from the healthy rides alone; Šidák over the candidates.
-    """
-    one = 1 - (1 - FALSE_ALARMS) ** (1 / tried)
-    return float(student.ppf(1 - one / 2, state.freedom) ** 2)
-
-
-def reach(state: State, notes: list[str], say: Callable[[str], None], linearised: Linearised, start: Array) -> Report:
-    """The verdict. linearised: each ride at its state. start (p,): where to linearise first, in scales."""
-    lines = about(state, start, linearised)
-    normals = [normal(line, state.noise) for line in lines]
-    e = evidence(state, normals)
-    causes = seen(state, e, notes)
-    channels = {name for line in lines for name in line.tables}
-    proportions = sum(form.straight and form.channel in channels for form in forms())
-    limit = threshold(state, tries(e, [i for c in causes for i in state.index(c.names)]) + proportions)
-    shares = channel_shares(state, lines, causes)
-    say(f"{len(causes)} candidates")
-    known = Known(state, causes, shares, limit, linearised)
-    still = np.zeros_like(start)
-    now, known, told = standing(known, converged(known, lines, start, still), lines, start, still)
-    winds = own_winds(now) if WIND in now.search.place and WIND not in now.chosen else None
-    if winds is not None and winds.score > limit:
-        now = about_winds(known, winds, start, [line.ride for line in lines])
-        known = replace(known, state=now.state, causes=list(now.search.causes.values()))
-        now, known, more = standing(known, now, now.lines, start, winds.blown)
-        told += more
-    notes += told
-    state, lines, normals, search, chosen = now.state, now.lines, now.normals, now.search, now.chosen
+def reach(problem: SearchProblem, notes: list[str], say: Callable[[str], None]) -> Discovery:
+    """The verdict, its gain and its limits still open. notes: so far. say: takes the step that begins."""
+    say(f"{len(problem.causes)} candidates")
+    searched = search_causes(problem)
+    now, winds = searched.selection, searched.winds
     say("curves over quantities")
-    change = now.change
-    constancy = splits(state, lines, normals, search.place, chosen, change) if chosen else []
-    unknown = unexplained(state, search, lines, normals, chosen, change, constancy, limit)
-    if unknown is not None:
-        chosen = tuple(name for name in chosen if name not in unknown["denies"])
-    every = Search(state, search.evidence, causes, shares)
-    found = causes_of(state, search, chosen, lines)
-    sets = [able for s in search.stand_ins(chosen, MARGIN, LEAST * limit) if len(able := likely(search, chosen, s)) > 1]
+    constancy = splits(now)
+    unknown = unexplained(now, constancy, problem.limit)
+    chosen = tuple(name for name in now.chosen if unknown is None or name not in unknown.denies)
+    every = Search(now.mixed, now.search.evidence, problem.causes, problem.shares)
+    found = causes_of(now.search, chosen, now.lines)
+    sets = alternatives(now.search, chosen, problem.limit)
     scores = {name: every.step([n for n in chosen if n != name], name) for name in every.causes}
+    notes = [*notes, *unseen(problem), *searched.rejected]
     if winds is not None:
-        scores[WIND] = max(scores.get(WIND, 0.0), winds.score)
-        if winds.score > limit:
-            (wind,) = causes_of(state, every, [*chosen, WIND], lines)[-1:]
-            found = [*found, replace(wind, evidence=round(winds.score, 2), varies=True)]
+        scores[winds.cause.name] = max(scores.get(winds.cause.name, 0.0), winds.score)
+        if winds.score > problem.limit:
+            found = [*found, wind_cause(every, chosen, winds, now.lines)]
             notes.append("the wind differed from ride to ride: " + winds.words)
-    verdict = "none"
-    if unknown is not None and not found:
-        verdict = "unknown"
-    elif sets:
-        verdict = "ambiguous"
-    elif found:
-        verdict = "cause"
-    ranking = sorted(((name, round(score, 2)) for name, score in scores.items()), key=lambda pair: -pair[1])
-    return Report(
-        verdict,
+    ranking = sorted((Score(name, round(score, 2)) for name, score in scores.items()), key=lambda row: -row.score)
+    report = Report(
+        verdict_of(found, sets, unknown),
         found,
         sets,
         unknown,
         ranking,
-        sizes(lines),
-        {},
-        advice(search, sets, unknown),
+        residual_sizes(now.lines),
+        Gain(),
+        advice(now.search, sets, unknown),
         notes,
         isolability(every),
-        limit,
-        constancy=constancy,
-        state=state,
-        at=now.offset,
-        lines=list(lines),
-        normals=normals,
+        problem.limit,
+        constancy,
     )
+    return Discovery(report, now.mixed, now.offset, now.lines, now.normals)
 
 
-def channel_shares(state: State, lines: Sequence[Linear], causes: Sequence[Candidate]) -> dict[str, dict[str, float]]:
-    """Of each cause, by channel, its share of what could be seen of it."""
-    found = {}
-    for cause in causes:
-        index = state.index(cause.names)
-        seen_in: dict[str, float] = {}
-        for line in lines:
-            for name, table in line.tables.items():
-                noise = float(np.hypot(*state.noise[name][:2]))
-                seen_in[name] = seen_in.get(name, 0.0) + float(np.sum((table.a[:, index] / noise) ** 2))
-        whole = sum(seen_in.values()) or 1.0
-        found[cause.name] = {name: value / whole for name, value in seen_in.items()}
-    return found
+def verdict_of(found: Sequence[Cause], sets: Sequence[Sequence[str]], unknown: Unknown | None) -> str:
+    """One of `result.VERDICTS`."""
+    if unknown is not None and not found:
+        return "unknown"
+    if sets:
+        return "ambiguous"
+    return "cause" if found else "none"
 
 
-def seen(state: State, e: Evidence, notes: list[str]) -> list[Candidate]:
-    """The candidates that these rides can say anything of; the others go into `notes`."""
-    found, blind = [], []
-    for cause in state.causes:
-        if not set(cause.names) <= set(state.names):
-            blind.append(cause.name)
-            continue
-        index = state.index(cause.names)
-        if np.any(np.diag(e.information)[index] < 1e-4):
-            blind.append(cause.name)
-        else:
-            found.append(cause)
-    if blind:
-        notes.append("these rides say nothing of " + ", ".join(blind))
-    return found
+def unseen(problem: SearchProblem) -> list[str]:
+    """A note on the candidates that these rides say nothing of."""
+    blind = [cause.name for cause in problem.mixed.causes if cause not in problem.causes]
+    return ["these rides say nothing of " + ", ".join(blind)] if blind else []
 
 
-def causes_of(state: State, search: Search, chosen: Sequence[str], lines: Sequence[Linear]) -> list[Cause]:
+def causes_of(search: Search, chosen: Sequence[str], lines: Sequence[LinearRide]) -> list[Cause]:
     """The chosen causes with values and intervals."""
     if not chosen:
         return []
-    index = search.index(chosen)
+    mixed, index = search.mixed, search.index(chosen)
     estimate = search.evidence.estimate(index)
-    covariance = search.evidence.covariance(index)
-    quantile = float(student.ppf(0.975, max(state.healthy + 3, 4)))
-    result, at = [], 0
+    variance = np.diag(search.evidence.covariance(index))
+    result = []
     for name in chosen:
-        cause = search.causes[name]
-        rows = []
-        evidence_ = search.step([n for n in chosen if n != name], name)
-        inflation = state.inflation.get(name, 1.0)
-        change = np.zeros(len(state.mean))
-        for parameter in cause.parameters:
-            i = index[at]
-            healthy = own_value(state, parameter.name)
-            x = float(estimate[at])
-            shape = DISCREPANCY * (
-                1 + sum(more * search.shares.get(name, {}).get(channel, 0.0) for channel, more in LUMPED.items())
-            )
-            sd = float(np.hypot(np.sqrt(covariance[at, at] * inflation), shape * x))
-            change[i] = x
-            step = float(state.scale[i])
-            if parameter.name in LOG:
-                ends = [healthy * np.exp(step * (x + s * quantile * sd)) for s in (0, -1, 1)]
-            else:
-                ends = [healthy + step * (x + s * quantile * sd) for s in (0, -1, 1)]
-            ends = [float(np.clip(end, parameter.low, parameter.high)) for end in ends]  # nothing that cannot be
-            rows.append((parameter.name, float(ends[0]), (float(ends[1]), float(ends[2])), float(ends[0] - healthy)))
-            at += 1
-        first = rows[0]
-        result.append(
-            Cause(
-                name,
-                first[0],
-                first[1],
-                cause.parameters[0].unit,
-                first[2],
-                first[3],
-                energy_share(state, lines, change),
-                round(evidence_, 2),
-                tuple((n, v, ci) for n, v, ci, _ in rows[1:]),
-            )
-        )
+        own = [index.index(i) for i in search.place[name]]
+        change = np.zeros(len(mixed.mean))
+        change[search.place[name]] = estimate[own]
+        sd = np.sqrt(variance[own] * mixed.inflation.get(name, 1.0))
+        rows = intervals(search, name, estimate[own], sd)
+        first = search.causes[name].parameters[0]
+        value, ci95 = rows[first.name].value, rows[first.name].ci95
+        score = round(search.step([n for n in chosen if n != name], name), 2)
+        more = value - mixed.healthy_value(first.name)
+        share = energy_share(lines, change)
+        result.append(Cause(name, first.name, value, first.unit, ci95, more, share, score, parameters=rows))
     return result
+
+
+def intervals(search: Search, name: str, change: Array, sd: Array) -> dict[str, Estimate]:
+    """The parameters of a cause that change by `change` (k,) [scales], known within `sd` beside the `DISCREPANCY`."""
+    mixed = search.mixed
+    shares = search.shares.get(name, {})
+    form = DISCREPANCY * (1 + sum(more * shares.get(channel, 0.0) for channel, more in LUMPED.items()))
+    rows = {}
+    for parameter, i, x, s in zip(search.causes[name].parameters, search.place[name], change, sd, strict=True):
+        healthy, step = mixed.healthy_value(parameter.name), float(mixed.scale[i])
+        wide = mixed.quantile * float(np.hypot(s, form * x))
+        at = (float(x), float(x) - wide, float(x) + wide)
+        ends = [healthy * np.exp(step * y) if parameter.name in LOG else healthy + step * y for y in at]
+        value, low, high = (float(np.clip(y, parameter.low, parameter.high)) for y in ends)  # nothing that cannot be
+        rows[parameter.name] = Estimate(value, (low, high))
+    return rows
+
+
+def wind_cause(every: Search, chosen: Sequence[str], winds: Winds, lines: Sequence[LinearRide]) -> Cause:
+    """The winds as a cause, of the vector that they have in common."""
+    (wind,) = causes_of(every, [*chosen, winds.cause.name], lines)[-1:]
+    return replace(wind, evidence=round(winds.score, 2), varies=True)
+
+
+def alternatives(search: Search, chosen: Sequence[str], limit: float) -> list[list[str]]:
+    """Of each cause chosen that others could stand in for: itself and these, as far as they can be."""
+    sets = (likely(search, chosen, group) for group in search.alternatives(chosen, MARGIN, LEAST * limit))
+    return [group for group in sets if len(group) > 1]
 
 
 def likely(search: Search, chosen: Sequence[str], group: Sequence[str]) -> list[str]:
@@ -212,27 +157,13 @@ def likely(search: Search, chosen: Sequence[str], group: Sequence[str]) -> list[
         k = len(search.place[name])
         change = search.evidence.estimate(index)[-k:]
         sd = np.sqrt(np.diag(search.evidence.covariance(index)))[-k:]
-        if possible(search.state, search.causes[name], change.tolist(), sd.tolist()):
+        if within_bounds(search.mixed, search.causes[name], change.tolist(), sd.tolist()):
             found.append(name)
     return found
 
 
-def own_value(state: State, name: str) -> float:
-    """The healthy vehicle's value of a parameter: that of its file, 0 for an effect that its model lacks."""
-    absent = {
-        n
-        for c in state.causes
-        if c.effect and c.effect.name not in {x.name for x in state.vehicle.model.effects}
-        for n in c.names
-    }
-    return 0.0 if name in absent else float(state.vehicle.parameters[name])
-
-
-def isolability(search: Search) -> dict[str, Any]:
-    """What could be told apart at all. signatures: of each candidate the channels that depend on it (Krysander & Frisk
-    2008). same_signature: those that only the form of what they do separates, no matter how much is measured.
-    look_alikes: pairs that these rides can hardly separate, by the cosine of what they do once nuisances are out.
-    """
+def isolability(search: Search) -> Isolability:
+    """What could be told apart at all, of all candidates that the rides show."""
     signatures = {
         name: sorted(c for c, share in search.shares.get(name, {}).items() if share > 0) for name in search.place
     }
@@ -246,16 +177,13 @@ def isolability(search: Search) -> dict[str, Any]:
         for b in keys[a_at + 1 :]:
             i, j = search.place[a][0], search.place[b][0]
             scale = np.sqrt(abs(information[i, i] * information[j, j]))
-            if scale > 0 and abs(cosine := information[i, j] / scale) > 0.8:
-                pairs.append([a, b, round(float(cosine), 3)])
-    return {
-        "signatures": signatures,
-        "same_signature": [group for group in groups.values() if len(group) > 1],
-        "look_alikes": sorted(pairs, key=lambda p: -abs(p[2])),
-    }
+            if scale > 0 and abs(cosine := information[i, j] / scale) > LOOK_ALIKE:
+                pairs.append((a, b, round(float(cosine), 3)))
+    alike = [group for group in groups.values() if len(group) > 1]
+    return Isolability(signatures, alike, sorted(pairs, key=lambda p: -abs(p[2])))
 
 
-def advice(search: Search, sets: Sequence[Sequence[str]], unknown: dict[str, Any] | None) -> list[str]:
+def advice(search: Search, sets: Sequence[Sequence[str]], unknown: Unknown | None) -> list[str]:
     """What to ride next."""
     lines = []
     for group in sets:
@@ -264,12 +192,9 @@ def advice(search: Search, sets: Sequence[Sequence[str]], unknown: dict[str, Any
         )
     if unknown is not None:
         lines.append(
-            f"Ride one and the same way several times: what {unknown['channel']} leaves differs from ride to ride."
-            if unknown["quantity"] == RIDES
-            else f"Ride over the whole span of {unknown['quantity']} with all else the same, twice: what "
-            f"{unknown['channel']} leaves goes with it, or with what changes along with it."
+            f"Ride one and the same way several times: what {unknown.channel} leaves differs from ride to ride."
+            if unknown.quantity == RIDES
+            else f"Ride over the whole span of {unknown.quantity} with all else the same, twice: what "
+            f"{unknown.channel} leaves goes with it, or with what changes along with it."
         )
     return lines
-
-
-__all__ = ["own_value", "reach", "threshold"]

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.converge import Converged, Known, about, converged
-from gz_onboard.lab.discover.grid import MOVING, Ride
+from gz_onboard.lab.discover.acceptance import accept
+from gz_onboard.lab.discover.candidates import Candidate
+from gz_onboard.lab.discover.grid import MOVING
 from gz_onboard.lab.discover.search import one_degree
+from gz_onboard.lab.discover.selection import SearchProblem, Selection, linearised_about, select_causes
 
-NAME = "headwind"
-AREA = "drag_area"
-SIDE = 0.5  # of (wind over speed)²: what side wind and gusts change of the drag area, in the mean over all directions
+SIDE = 0.5  # of (wind over speed)²: what side wind and gusts change of drag, in the mean over all directions
 
 
 @dataclass(frozen=True)
@@ -23,48 +22,75 @@ class Winds:
     in scales, at `index`.
     """
 
+    cause: Candidate
     score: float
     words: str
     blown: Array
     index: list[int]
 
 
-def own_winds(now: Converged) -> Winds:
+@dataclass(frozen=True)
+class Searched:
+    """What the search found: the causes, the winds if these are no common cause, and what was rejected, in words."""
+
+    selection: Selection
+    winds: Winds | None
+    rejected: list[str]
+
+
+def search_causes(problem: SearchProblem) -> Searched:
+    """The causes of `problem` that are accepted; beside each ride's own wind, if these are more than healthy ones."""
+    now, problem, rejected = accept(problem, select_causes(problem))
+    wind = next((cause for cause in now.search.causes.values() if cause.varies), None)
+    winds = own_winds(now, wind) if wind is not None and wind.name not in now.chosen else None
+    if winds is not None and winds.score > problem.limit:
+        windy = with_winds(problem, winds)
+        now = select_causes(windy)
+        now, _, more = accept(replace(windy, lines=now.lines), now)
+        rejected = rejected + more
+    return Searched(now, winds, rejected)
+
+
+def own_winds(now: Selection, wind: Candidate) -> Winds:
     """The winds beside the causes. One blows as it likes on another day, so that a common vector misses it."""
-    state, change = now.state, now.change
-    w = list(now.search.place[NAME])
-    blown = np.zeros((len(now.lines), len(state.mean)))
-    rest = [i for i in range(len(state.mean)) if i not in w]
-    spread = state.prior + np.diag(state.scatter)
+    mixed, change = now.mixed, now.change
+    w = list(now.search.place[wind.name])
+    blown = np.zeros((len(now.lines), len(mixed.mean)))
+    rest = [i for i in range(len(mixed.mean)) if i not in w]
+    spread = mixed.prior + np.diag(mixed.scatter)
     inside = np.zeros_like(spread)
     inside[np.ix_(rest, rest)] = np.linalg.inv(spread[np.ix_(rest, rest)])
-    mean = state.mean + change
+    mean = mixed.mean + change
     total, words = 0.0, []
     for i, (line, ride) in enumerate(zip(now.lines, now.normals, strict=True)):
         if np.any(np.diag(ride.n)[w] < 1e-6):
             continue
         covariance = np.linalg.inv(inside + ride.n)
-        wind = (covariance @ (ride.b + inside @ mean))[w] - mean[w]
-        total += float(wind @ np.linalg.solve(spread[np.ix_(w, w)] + covariance[np.ix_(w, w)], wind))
-        blown[i, w] = wind
-        north, east = (wind * state.scale[w]).tolist()
+        own = (covariance @ (ride.b + inside @ mean))[w] - mean[w]
+        total += float(own @ np.linalg.solve(spread[np.ix_(w, w)] + covariance[np.ix_(w, w)], own))
+        blown[i, w] = own
+        north, east = (own * mixed.scale[w]).tolist()
         words.append(
             f"{line.ride.name} {np.hypot(north, east):.1f} m/s from {np.degrees(np.arctan2(east, north)) % 360:.0f}°"
         )
-    return Winds(one_degree(total, 2 * len(words), state.freedom) if words else 0.0, ", ".join(words), blown, w)
+    score = one_degree(total, 2 * len(words), mixed.freedom) if words else 0.0
+    return Winds(wind, score, ", ".join(words), blown, w)
 
 
-def about_winds(known: Known, winds: Winds, start: Array, rides: Sequence[Ride]) -> Converged:
-    """The causes beside the `winds`, each ride about its own: their square is not linear in them, and would be taken
-    for a load. So would side wind and gusts, which no channel shows: the drag area is as unsure as they can make it.
+def with_winds(problem: SearchProblem, winds: Winds) -> SearchProblem:
+    """The search beside the `winds`, each ride about its own: their square is not linear in them, and would be taken
+    for a load. So would side wind and gusts, which no channel shows: what else the effect reads of the model, the drag
+    area, is as unsure as they can make it.
     """
-    state, w = known.state, winds.index
-    scatter = state.scatter.copy()
+    mixed, w = problem.mixed, winds.index
+    scatter = mixed.scatter.copy()
     scatter[w] = np.maximum(scatter[w], np.mean(winds.blown[:, w] ** 2, axis=0))
-    if AREA in state.names:
-        (i,) = state.index([AREA])
-        speeds = np.array([np.mean(speed[speed > MOVING]) for speed in (np.abs(r.quantities["speed"]) for r in rides)])
-        square = np.sum((winds.blown[:, w] * state.scale[w]) ** 2, axis=1) / speeds**2
-        scatter[i] += np.mean((SIDE * square * state.values[AREA] / state.scale[i]) ** 2)
-    windy = replace(known, state=replace(state, scatter=scatter), causes=[c for c in known.causes if c.name != NAME])
-    return converged(windy, about(windy.state, start + winds.blown, known.linearised), start, winds.blown)
+    rides = (np.abs(line.ride.quantities["speed"]) for line in problem.lines)
+    speeds = np.array([np.mean(speed[speed > MOVING]) for speed in rides])
+    square = np.sum((winds.blown[:, w] * mixed.scale[w]) ** 2, axis=1) / speeds**2
+    for i in mixed.index([name for name in winds.cause.reads if name in mixed.names]):
+        scatter[i] += np.mean((SIDE * square * mixed.values[mixed.names[i]] / mixed.scale[i]) ** 2)
+    windy = replace(mixed, scatter=scatter)
+    lines = linearised_about(windy, problem.start + winds.blown, problem.linearised)
+    causes = [cause for cause in problem.causes if cause.name != winds.cause.name]
+    return replace(problem, mixed=windy, causes=causes, lines=lines, own=winds.blown)

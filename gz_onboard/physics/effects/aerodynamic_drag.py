@@ -9,8 +9,20 @@ from gz_onboard.physics.effect import Parameter, Port
 PORT = Port.WHEEL_FORCE
 PARAMETERS = (
     Parameter(
-        "drag_area", "m²", 0.55, 0.15, 0.1, 1.5, "scooter with upright rider: Cossalter 2006, table 3.1, CdA 0.5-0.7"
+        "drag_area",
+        "m²",
+        0.55,
+        0.15,
+        0.1,
+        1.5,
+        "scooter with upright rider: Cossalter 2006, table 3.1, CdA 0.5-0.7",
+        ride_sd=0.01,
     ),
+)
+CAUSE = ("aero_drag_area", "F = ½·ρ·CdA·V²")
+SHOWN_BY = (
+    "Road load that grows with the square of speed; long stretches at 30 and at 50 km/h in both directions split it"
+    " from drivetrain drag and wind."
 )
 
 

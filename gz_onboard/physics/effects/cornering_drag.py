@@ -18,7 +18,15 @@ from gz_onboard.physics.elementary import direction
 PORT = Port.WHEEL_FORCE
 PARAMETERS = (
     Parameter(
-        "cornering_compliance", "rad", 0.1, 0.05, 0.0, 0.5, "Pacejka 2012, ch. 11: slip alone 0.06, lean up to 0.3"
+        "cornering_compliance",
+        "rad",
+        0.1,
+        0.05,
+        0.0,
+        0.5,
+        "Pacejka 2012, ch. 11: slip alone 0.06, lean up to 0.3",
+        ride_sd=0.015,
+        healthy_sd=0.1,
     ),
 )
 TURNING_LOSS = True

@@ -12,7 +12,17 @@ from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.WHEEL_FORCE
 PARAMETERS = (
-    Parameter("drivetrain_drag_torque", "N·m·s/rad", 0.02, 0.02, 0.0, 2.0, "seals and bearings: 1 N·m at 50 rad/s"),
+    Parameter(
+        "drivetrain_drag_torque",
+        "N·m·s/rad",
+        0.02,
+        0.02,
+        0.0,
+        2.0,
+        "seals and bearings: 1 N·m at 50 rad/s",
+        ride_sd=0.005,
+        healthy_sd=0.01,
+    ),
 )
 SHOWN_BY = (
     "Road load in proportion to speed, the same at all payloads; rides over all speeds split it from drag area, which "

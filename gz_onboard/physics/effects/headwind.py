@@ -14,9 +14,31 @@ from gz_onboard.physics.elementary import cos, sin
 
 PORT = Port.WHEEL_FORCE
 PARAMETERS = (
-    Parameter("wind_north", "m/s", 0.0, 2.0, -15.0, 15.0, "at 1 m over ground half of the 3-5 m/s that weather tells"),
-    Parameter("wind_east", "m/s", 0.0, 2.0, -15.0, 15.0, "at 1 m over ground half of the 3-5 m/s that weather tells"),
+    Parameter(
+        "wind_north",
+        "m/s",
+        0.0,
+        2.0,
+        -15.0,
+        15.0,
+        "at 1 m over ground half of the 3-5 m/s that weather tells",
+        ride_sd=1.2,
+        healthy_sd=0.4,
+    ),
+    Parameter(
+        "wind_east",
+        "m/s",
+        0.0,
+        2.0,
+        -15.0,
+        15.0,
+        "at 1 m over ground half of the 3-5 m/s that weather tells",
+        ride_sd=1.2,
+        healthy_sd=0.4,
+    ),
 )
+STRENGTHS = ("wind_north", "wind_east")
+VARIES = True
 SHOWN_BY = (
     "Road load above 5 m/s that goes with the heading once round, as 2·V·w; the same road in both directions splits it "
     "from drag area and grade."

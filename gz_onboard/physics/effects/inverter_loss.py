@@ -8,9 +8,45 @@ from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.INVERTER_LOSS
 PARAMETERS = (
-    Parameter("inverter_loss_constant", "W", 10.0, 6.0, 0.0, 100.0, "control and gate supply of a 48 V inverter"),
-    Parameter("inverter_loss_linear", "W/A", 0.3, 0.2, 0.0, 5.0, "switching loss: grows with current"),
-    Parameter("inverter_loss_quadratic", "W/A²", 3e-3, 2e-3, 0.0, 0.1, "conduction: MOSFET on-resistance"),
+    Parameter(
+        "inverter_loss_constant",
+        "W",
+        10.0,
+        6.0,
+        0.0,
+        100.0,
+        "control and gate supply of a 48 V inverter",
+        ride_sd=0.5,
+        bench=True,
+    ),
+    Parameter(
+        "inverter_loss_linear",
+        "W/A",
+        0.3,
+        0.2,
+        0.0,
+        5.0,
+        "switching loss: grows with current",
+        ride_sd=0.02,
+        bench=True,
+    ),
+    Parameter(
+        "inverter_loss_quadratic",
+        "W/A²",
+        3e-3,
+        2e-3,
+        0.0,
+        0.1,
+        "conduction: MOSFET on-resistance",
+        ride_sd=1e-4,
+        bench=True,
+    ),
+)
+CAUSE = ("inverter_loss", "P = c1·|i|")
+STRENGTHS = ("inverter_loss_linear",)
+SHOWN_BY = (
+    "DC power over air-gap power grows with the current itself, and the inverter warms; steady riding at low and at"
+    " high torque splits it from winding resistance."
 )
 
 

@@ -9,9 +9,27 @@ from gz_onboard.physics.effect import Parameter, Port
 PORT = Port.MOTOR_LOSS
 PARAMETERS = (
     Parameter(
-        "motor_iron_linear", "W·s/rad", 0.5, 0.4, 0.0, 10.0, "Bertotti 1988: hysteresis loss grows with frequency"
+        "motor_iron_linear",
+        "W·s/rad",
+        0.5,
+        0.4,
+        0.0,
+        10.0,
+        "Bertotti 1988: hysteresis loss grows with frequency",
+        ride_sd=0.03,
+        bench=True,
     ),
-    Parameter("motor_iron_quadratic", "W·s²/rad²", 0.01, 0.01, 0.0, 0.5, "Bertotti 1988: eddy loss, its square"),
+    Parameter(
+        "motor_iron_quadratic",
+        "W·s²/rad²",
+        0.01,
+        0.01,
+        0.0,
+        0.5,
+        "Bertotti 1988: eddy loss, its square",
+        ride_sd=0.001,
+        bench=True,
+    ),
 )
 
 

@@ -12,7 +12,17 @@ from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.INVERTER_LOSS
 PARAMETERS = (
-    Parameter("regeneration_loss_share", "1", 0.1, 0.1, 0.0, 1.0, "a guess: a tenth of what the motor takes"),
+    Parameter(
+        "regeneration_loss_share",
+        "1",
+        0.1,
+        0.1,
+        0.0,
+        1.0,
+        "a guess: a tenth of what the motor takes",
+        ride_sd=0.02,
+        healthy_sd=0.03,
+    ),
 )
 SHOWN_BY = (
     "DC power short of the model's while the motor brakes and right while it drives; stops from speed by the motor "

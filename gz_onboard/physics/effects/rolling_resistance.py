@@ -13,8 +13,31 @@ from gz_onboard.physics.elementary import direction
 
 PORT = Port.TYRE
 PARAMETERS = (
-    Parameter("rolling_resistance_constant", "1", 0.015, 0.005, 0.0, 0.06, "scooter tyres: Cossalter 2006, sec. 2.3"),
-    Parameter("rolling_resistance_speed", "s/m", 2e-4, 2e-4, 0.0, 3e-3, "SAE J2452: rises by a few percent per m/s"),
+    Parameter(
+        "rolling_resistance_constant",
+        "1",
+        0.015,
+        0.005,
+        0.0,
+        0.06,
+        "scooter tyres: Cossalter 2006, sec. 2.3",
+        ride_sd=7e-4,
+    ),
+    Parameter(
+        "rolling_resistance_speed",
+        "s/m",
+        2e-4,
+        2e-4,
+        0.0,
+        3e-3,
+        "SAE J2452: rises by a few percent per m/s",
+        ride_sd=2e-5,
+    ),
+)
+CAUSE = ("rolling_resistance", "F = m·g·cos θ·c0")
+SHOWN_BY = (
+    "Road load that is the same at all speeds and grows with weight; rides with another payload split it from a "
+    "dragging brake."
 )
 
 

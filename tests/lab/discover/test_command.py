@@ -10,13 +10,15 @@ import pytest
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.candidates import candidates
-from gz_onboard.lab.discover.command import KEYS
-from gz_onboard.lab.discover.engine import discover
+from gz_onboard.lab.discover.discovery import discover
+from gz_onboard.lab.discover.result import Report
+from gz_onboard.lab.schema import descriptions
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS, ROOT
 from tests.test_vehicle import with_effect
 
+KEYS = descriptions(Report)
 RIDE = LOGS / "city_14C.blf"
 CAR = ROOT / "tests" / "vehicles" / "car" / "car.toml"
 
@@ -115,10 +117,11 @@ def test_the_report_is_one_file_with_its_pictures(alone: Path):
 def test_rides_held_out_by_name_have_no_part_in_anything():
     vehicle = read_vehicle("reference")
     rides = [read_samples(LOGS / f"city_{name}.blf", vehicle) for name in ("14C", "34C")]
-    report = discover(vehicle, rides, holdout=["city_34C"])
-    assert [line.ride.name for line in report.lines] == ["city_14C"]
-    assert report.gain["holdout"] == ["city_34C"] and report.gain["apart"]
-    alone = discover(vehicle, rides[:1])
+    found = discover(vehicle, rides, holdout=["city_34C"])
+    report = found.report
+    assert [line.ride.name for line in found.lines] == ["city_14C"]
+    assert report.gain.holdout == ("city_34C",) and report.gain.apart
+    alone = discover(vehicle, rides[:1]).report
     assert [c.name for c in report.causes] == [c.name for c in alone.causes]
     assert report.ranking == alone.ranking
     with pytest.raises(InputError, match="none is left"):

@@ -12,12 +12,15 @@ import pytest
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.lab.discover.engine import adopted, linearise_all
-from gz_onboard.lab.discover.files import curve_text, load, modelled_share, write_baseline, write_model
-from gz_onboard.lab.discover.linear import Linear
-from gz_onboard.lab.discover.result import Cause, Report
-from gz_onboard.lab.discover.shapes import hats
-from gz_onboard.lab.discover.state import Shape, State, initial, restore
+from gz_onboard.lab.discover.baseline import adopted
+from gz_onboard.lab.discover.baseline_file import load, restore, write_baseline
+from gz_onboard.lab.discover.curve_forms import hat_functions
+from gz_onboard.lab.discover.energy import energy_share
+from gz_onboard.lab.discover.extension import MODELLED, curve_text, write_model
+from gz_onboard.lab.discover.linear import LinearRide
+from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel, initial, linearise_all
+from gz_onboard.lab.discover.result import Cause, Estimate, Gain, Isolability, Report, Unknown
+from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Bound
@@ -25,23 +28,25 @@ from gz_onboard.vehicle import find_vehicle, read_vehicle
 from tests.support import LOGS
 
 REFERENCE = find_vehicle("reference")
-KNOTS = [[0.0, -4.0, 1.0], [4.0, 1.0, 1.0], [8.0, 6.0, 2.0], [12.0, 2.0, 1.0]]
-CURVE = {"channel": "road_force", "quantity": "speed", "unit": "m/s", "share": 0.03, "score": 40.0, "curve": KNOTS}
+KNOTS = ((0.0, -4.0, 1.0), (4.0, 1.0, 1.0), (8.0, 6.0, 2.0), (12.0, 2.0, 1.0))
+CURVE = Unknown("road_force", "speed", False, "m/s", 40.0, 40.0, KNOTS, share=0.03)
 
 
 @pytest.fixture(scope="module")
-def state() -> State:
+def mixed() -> MixedModel:
     return initial(read_vehicle("reference"))
 
 
 @pytest.fixture(scope="module")
-def lines(state: State) -> list[Linear]:
-    return linearise_all([state.ride(read_samples(LOGS / "coastdown.blf", state.vehicle))], state)
+def lines(mixed: MixedModel) -> list[LinearRide]:
+    return linearise_all([mixed.ride(read_samples(LOGS / "coastdown.blf", mixed.vehicle))], mixed)
 
 
-def report(state: State, lines: list[Linear], *causes: Cause, unknown: dict[str, object] | None = None) -> Report:
+def report(mixed: MixedModel, lines: list[LinearRide], *causes: Cause, unknown: Unknown | None = None) -> Discovery:
     verdict = "unknown" if unknown else "cause"
-    return Report(verdict, list(causes), [], unknown, [], {}, {}, [], [], {}, 15.0, state=state, lines=lines)
+    isolability = Isolability({}, [], [])
+    plain = Report(verdict, list(causes), [], unknown, [], {}, Gain(), [], [], isolability, 15.0)
+    return Discovery(plain, mixed, np.zeros(len(mixed.names)), lines, [])
 
 
 def cornering(share: float = 0.04) -> Cause:
@@ -53,16 +58,16 @@ def rolling() -> Cause:
 
 
 def wind() -> Cause:
-    others = (("wind_east", -1.0, (-2.0, 0.0)),)
-    return Cause("headwind", "wind_north", 3.0, "m/s", (2.0, 4.0), 3.0, 0.01, 30.0, others)
+    others = {"wind_east": Estimate(-1.0, (-2.0, 0.0))}
+    return Cause("headwind", "wind_north", 3.0, "m/s", (2.0, 4.0), 3.0, 0.01, 30.0, parameters=others)
 
 
-def test_causes_become_effects_and_parameters(state, lines, tmp_path: Path):
+def test_causes_become_effects_and_parameters(mixed, lines, tmp_path: Path):
     out = tmp_path / "new.toml"
-    found = report(state, lines, cornering(), rolling(), wind())
-    words = write_model(found, state.vehicle, REFERENCE, out)
-    assert found.extended_model == str(out)
-    before, after = state.vehicle, read_vehicle(str(out))
+    found = report(mixed, lines, cornering(), rolling(), wind())
+    words = write_model(found, mixed.vehicle, REFERENCE, out)
+    assert found.report.extended_model == str(out)
+    before, after = mixed.vehicle, read_vehicle(str(out))
     added = [e.name for e in after.model.effects][len(before.model.effects) :]
     assert added == ["cornering_drag", "headwind"]
     assert after.parameters["cornering_compliance"] == 0.25
@@ -82,48 +87,48 @@ def test_causes_become_effects_and_parameters(state, lines, tmp_path: Path):
     assert all(after.parameters.known[name] == before.parameters.known[name] for name in untouched)
 
 
-def test_what_the_model_lacked_leaves_the_forecast_factor(state, lines, tmp_path: Path):
+def test_what_the_model_lacked_leaves_the_forecast_factor(mixed, lines, tmp_path: Path):
     """factor / (1 + s·factor): measured energy stays what it is while the model now gives s of it more."""
     out = tmp_path / "new.toml"
-    found = report(state, lines, rolling())
-    change = np.zeros(len(state.names))
-    place = state.names.index("rolling_resistance_constant")
-    change[place] = 0.0033 / state.scale[place]
-    share = modelled_share(found, change)
+    found = report(mixed, lines, rolling())
+    change = np.zeros(len(mixed.names))
+    place = mixed.names.index("rolling_resistance_constant")
+    change[place] = 0.0033 / mixed.scale[place]
+    share = energy_share(found.lines, change, MODELLED)
     assert share > 0.01
-    write_model(found, state.vehicle, REFERENCE, out)
-    before, after = state.vehicle.riding, read_vehicle(str(out)).riding
+    write_model(found, mixed.vehicle, REFERENCE, out)
+    before, after = mixed.vehicle.riding, read_vehicle(str(out)).riding
     assert after == replace(before, factor=pytest.approx(before.factor / (1 + share * before.factor), rel=1e-5))
     source = tomllib.loads(out.read_text())["forecast"]["source"]
     assert f"{share:.1%}" in source and f"{before.factor:g}" in source
     assert tomllib.loads(REFERENCE.read_text())["forecast"]["source"] in source
 
 
-def test_what_came_on_top_of_healthy_rides_does_not(state, lines, tmp_path: Path):
+def test_what_came_on_top_of_healthy_rides_does_not(mixed, lines, tmp_path: Path):
     """The factor was measured on a vehicle that had not yet changed."""
     out = tmp_path / "new.toml"
-    write_model(report(replace(state, healthy=5), lines, rolling()), state.vehicle, REFERENCE, out)
-    assert read_vehicle(str(out)).riding == state.vehicle.riding
+    write_model(report(replace(mixed, healthy=5), lines, rolling()), mixed.vehicle, REFERENCE, out)
+    assert read_vehicle(str(out)).riding == mixed.vehicle.riding
 
 
-def test_a_sensors_error_is_no_energy(state, lines, tmp_path: Path):
+def test_a_sensors_error_is_no_energy(mixed, lines, tmp_path: Path):
     out = tmp_path / "new.toml"
     gain = Cause("current_sensor_gain", "pack_current_gain", 1.03, "1", (1.02, 1.04), 0.02, 0.02, 50.0)
-    write_model(report(state, lines, gain), state.vehicle, REFERENCE, out)
-    assert read_vehicle(str(out)).riding == state.vehicle.riding
+    write_model(report(mixed, lines, gain), mixed.vehicle, REFERENCE, out)
+    assert read_vehicle(str(out)).riding == mixed.vehicle.riding
 
 
-def test_a_value_beyond_its_bounds_is_written_at_the_bound(state, lines, tmp_path: Path):
+def test_a_value_beyond_its_bounds_is_written_at_the_bound(mixed, lines, tmp_path: Path):
     out = tmp_path / "new.toml"
-    write_model(report(state, lines, replace(cornering(), value=0.9)), state.vehicle, REFERENCE, out)
+    write_model(report(mixed, lines, replace(cornering(), value=0.9)), mixed.vehicle, REFERENCE, out)
     assert read_vehicle(str(out)).parameters["cornering_compliance"] == 0.5
 
 
 @pytest.mark.parametrize("quantity", ["speed", "acceleration", "heading", "time", "lateral_acceleration", "vibration"])
-def test_the_empirical_effect_is_the_curve(state, lines, tmp_path: Path, quantity: str):
+def test_the_empirical_effect_is_the_curve(mixed, lines, tmp_path: Path, quantity: str):
     top = 6.0 if quantity == "heading" else 12.0
-    knots = [[at * top / 12, value, sd] for at, value, sd in KNOTS]
-    written = curve_text(report(state, lines, unknown={**CURVE, "quantity": quantity, "curve": knots}))
+    knots = tuple((at * top / 12, value, sd) for at, value, sd in KNOTS)
+    written = curve_text(report(mixed, lines, unknown=replace(CURVE, quantity=quantity, curve=knots)))
     assert written is not None
     name, text = written
     (tmp_path / f"{name}.py").write_text(text)
@@ -132,7 +137,7 @@ def test_the_empirical_effect_is_the_curve(state, lines, tmp_path: Path, quantit
     scale = {f"{name}_scale": 1.0}
     x = np.linspace(0, 6.2 if quantity == "heading" else 15, 40)
     at, values, _ = np.array(knots).T
-    expected = hats(x, at, quantity == "heading") @ values
+    expected = hat_functions(x, at, quantity == "heading") @ values
     fast = {"speed": x if quantity == "speed" else np.full(len(x), 30.0)}
     reads = {q: fast["speed"] if q == "speed" else x for q in effect.quantities}
     fade = fast["speed"] ** 2 / (fast["speed"] ** 2 + 1)
@@ -141,15 +146,15 @@ def test_the_empirical_effect_is_the_curve(state, lines, tmp_path: Path, quantit
     assert Bound(effect, scale)(one) == pytest.approx(expected[7] * fade[7], abs=1e-4)
 
 
-def test_a_curve_that_no_effect_can_read_is_not_written(state, lines, tmp_path: Path):
-    found = report(state, lines, unknown={**CURVE, "quantity": "current_change"})
-    words = write_model(found, state.vehicle, REFERENCE, tmp_path / "new.toml")
-    assert found.extended_model is None
+def test_a_curve_that_no_effect_can_read_is_not_written(mixed, lines, tmp_path: Path):
+    found = report(mixed, lines, unknown=replace(CURVE, quantity="current_change"))
+    words = write_model(found, mixed.vehicle, REFERENCE, tmp_path / "new.toml")
+    assert found.report.extended_model is None
     assert "no effect can read current_change" in words[0]
     assert not list(tmp_path.iterdir())
 
 
-def test_effects_of_the_users_own_go_along(state, lines, tmp_path: Path):
+def test_effects_of_the_users_own_go_along(mixed, lines, tmp_path: Path):
     own = tmp_path / "mine"
     own.mkdir()
     (own / "top_box.py").write_text(
@@ -159,10 +164,10 @@ def test_effects_of_the_users_own_go_along(state, lines, tmp_path: Path):
     )
     there = tmp_path / "there"
     there.mkdir()
-    known = initial(state.vehicle, own)
+    known = initial(mixed.vehicle, own)
     box = Cause("top_box", "box_area", 0.06, "m²", (0.05, 0.07), 0.06, 0.03, 30.0)
     found = report(known, linearise_all([line.ride for line in lines], known), box, unknown=CURVE)
-    write_model(found, state.vehicle, REFERENCE, there / "new.toml")
+    write_model(found, mixed.vehicle, REFERENCE, there / "new.toml")
     (own / "top_box.py").unlink()  # what was written stands alone
     after = read_vehicle(str(there / "new.toml"))
     assert [e.name for e in after.model.effects][-2:] == ["top_box", "empirical_road_force_speed"]
@@ -170,9 +175,9 @@ def test_effects_of_the_users_own_go_along(state, lines, tmp_path: Path):
 
 
 @pytest.fixture(scope="module")
-def extended(state, lines, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def extended(mixed, lines, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("extended") / "new.toml"
-    write_model(report(state, lines, cornering(), unknown=CURVE), state.vehicle, REFERENCE, out)
+    write_model(report(mixed, lines, cornering(), unknown=CURVE), mixed.vehicle, REFERENCE, out)
     return out
 
 
@@ -201,12 +206,12 @@ def test_the_forecast_on_board_knows_it(extended: Path):
 
 
 @pytest.fixture(scope="module")
-def learned(state: State) -> State:
-    n = len(state.names)
+def learned(mixed: MixedModel) -> MixedModel:
+    n = len(mixed.names)
     rng = np.random.default_rng(4)
-    shape = Shape(rng.normal(size=8), np.eye(8), 1.3)
+    shape = HealthyCurve(rng.normal(size=8), np.eye(8), 1.3)
     return replace(
-        state,
+        mixed,
         mean=rng.normal(size=n) * 0.1,
         prior=np.diag(rng.uniform(0.5, 1, n)),
         scatter=rng.uniform(0.5, 1, n),
@@ -216,7 +221,7 @@ def learned(state: State) -> State:
     )
 
 
-def test_a_baseline_is_read_as_it_was_written(learned: State, tmp_path: Path):
+def test_a_baseline_is_read_as_it_was_written(learned: MixedModel, tmp_path: Path):
     out = tmp_path / "base.toml"
     vehicle = adopted(learned.vehicle, learned)
     write_baseline(vehicle, REFERENCE, out)
@@ -236,7 +241,7 @@ def test_a_baseline_is_read_as_it_was_written(learned: State, tmp_path: Path):
     assert (pair.mean.tolist(), pair.inflation) == (learned.shapes["road_force over speed"].mean.tolist(), 1.3)
 
 
-def test_once_more_gives_one_healthy_table(learned: State, tmp_path: Path):
+def test_once_more_gives_one_healthy_table(learned: MixedModel, tmp_path: Path):
     first, second = tmp_path / "one.toml", tmp_path / "two.toml"
     write_baseline(adopted(learned.vehicle, learned), REFERENCE, first)
     again = read_vehicle(str(first))
@@ -244,7 +249,7 @@ def test_once_more_gives_one_healthy_table(learned: State, tmp_path: Path):
     assert tomllib.loads(second.read_text())["healthy"] == {"file": "two.healthy.npz", "rides": 9}
 
 
-def test_the_extended_model_has_no_statistics_of_before(learned: State, lines, tmp_path: Path):
+def test_the_extended_model_has_no_statistics_of_before(learned: MixedModel, lines, tmp_path: Path):
     base, out = tmp_path / "base.toml", tmp_path / "new.toml"
     write_baseline(adopted(learned.vehicle, learned), REFERENCE, base)
     vehicle = read_vehicle(str(base))
@@ -252,11 +257,11 @@ def test_the_extended_model_has_no_statistics_of_before(learned: State, lines, t
     assert read_vehicle(str(out)).healthy is None
 
 
-def test_statistics_that_cannot_be_read_are_refused(learned: State, state: State, tmp_path: Path):
+def test_statistics_that_cannot_be_read_are_refused(learned: MixedModel, mixed: MixedModel, tmp_path: Path):
     base = tmp_path / "base.toml"
     write_baseline(adopted(learned.vehicle, learned), REFERENCE, base)
     beside = tmp_path / "base.healthy.npz"
-    fewer = replace(state, names=state.names[:-3])
+    fewer = replace(mixed, names=mixed.names[:-3])
     with pytest.raises(InputError, match="another model"):
         load(fewer, beside)
     whole = beside.read_bytes()

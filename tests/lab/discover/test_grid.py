@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gz_onboard.lab.discover.curve_forms import IN_PROPORTION, QUANTITIES, curve_forms
 from gz_onboard.lab.discover.grid import LONGEST, since, suspension_speed, vibration
-from gz_onboard.lab.discover.shapes import IN_PROPORTION, QUANTITIES, forms
 from gz_onboard.physics.vibration import FAST, SLOW, Vibration
 
 RATE = 100.0
@@ -69,9 +69,9 @@ def test_suspension_speed_is_the_rms_of_both():
 
 
 def test_forms_are_curves_and_what_is_in_proportion():
-    straight = [form for form in forms() if form.straight]
+    straight = [form for form in curve_forms() if form.straight]
     assert {form.quantity for form in straight} == set(IN_PROPORTION)
-    assert len({form.name for form in forms()}) == len(forms())
+    assert len({form.name for form in curve_forms()}) == len(curve_forms())
     for form in straight:
         knots = np.array(QUANTITIES[form.quantity][0])
         assert form.basis.shape == (len(knots), 1)

@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, f
 
-from benchmarks.trial import LACKS, MARK, Row, alarm, healthy_document, reported, with_section
-from gz_onboard.lab.discover.engine import baseline, discover, linearise_all
-from gz_onboard.lab.discover.folds import better
+from benchmarks.trial import LACKS, MARK, Row, alarm, discovered, healthy_document, reported, with_section
+from gz_onboard.lab.discover.acceptance import with_observed_scatter, within_bounds
+from gz_onboard.lab.discover.baseline import baseline
+from gz_onboard.lab.discover.cross_validation import improves
+from gz_onboard.lab.discover.curve_forms import QUANTITIES, CurveForm
+from gz_onboard.lab.discover.curves import supported_knots
+from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.lab.discover.gain import errors
-from gz_onboard.lab.discover.linear import Linear, Normal
+from gz_onboard.lab.discover.linear import LinearRide, Normal
+from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
 from gz_onboard.lab.discover.search import one_degree
-from gz_onboard.lab.discover.shapes import QUANTITIES, Form, supported
-from gz_onboard.lab.discover.stands import possible, widened
-from gz_onboard.lab.discover.state import State, initial
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests import plant
@@ -38,46 +40,46 @@ def ridden() -> tuple[list[Samples], list[Samples]]:
 
 def test_a_healthy_scooter_of_strangers_is_left_alone(ridden):
     first, later = ridden
-    report = discover(baseline(read_vehicle("reference"), first), later).to_json()
-    assert (report["verdict"], report["causes"], report["unknown"]) == ("none", [], None)
+    report = discover(baseline(read_vehicle("reference"), first), later).report
+    assert (report.verdict, report.causes, report.unknown) == ("none", [], None)
 
 
 def test_against_its_file_alone_it_has_nothing_but_what_the_model_lacks(ridden):
-    report = discover(read_vehicle("reference"), ridden[1]).to_json()
+    report = discovered(read_vehicle("reference"), ridden[1])
     assert reported(report) <= LACKS["file"]  # it is there: the plant's tyres twist on the road when they lean
     assert report["unknown"] is None
 
 
 @pytest.fixture(scope="module")
-def state() -> State:
+def mixed() -> MixedModel:
     return initial(read_vehicle("reference"))
 
 
 @pytest.fixture(scope="module")
-def line(state: State) -> Linear:
-    (line,) = linearise_all([state.ride(read_samples(LOGS / "city_14C.blf", state.vehicle))], state)
+def line(mixed: MixedModel) -> LinearRide:
+    (line,) = linearise_all([mixed.ride(read_samples(LOGS / "city_14C.blf", mixed.vehicle))], mixed)
     return line
 
 
 @pytest.mark.parametrize("name", ["resistance_growth", "current_sensor_gain", "capacity_fade", "cornering_drag"])
-def test_what_cannot_be_is_no_cause(state: State, name: str):
+def test_what_cannot_be_is_no_cause(mixed: MixedModel, name: str):
     """Beyond its bounds by more than it is unsure: a resistance factor of -1.2, a gain of 0.2."""
-    (cause,) = (c for c in state.causes if c.name == name)
+    (cause,) = (c for c in mixed.causes if c.name == name)
     parameter = cause.parameters[0]
-    (i,) = state.index([parameter.name])
-    low, high = ((bound - state.values[parameter.name]) / state.scale[i] for bound in (parameter.low, parameter.high))
-    assert possible(state, cause, [0.9 * low + 0.1 * high], [1e-6])
+    (i,) = mixed.index([parameter.name])
+    low, high = ((bound - mixed.values[parameter.name]) / mixed.scale[i] for bound in (parameter.low, parameter.high))
+    assert within_bounds(mixed, cause, [0.9 * low + 0.1 * high], [1e-6])
     for bound, outward in ((low, -1.0), (high, 1.0)):
         far = abs(high - low)
-        assert not possible(state, cause, [bound + outward * 0.2 * far], [0.05 * far])
-        assert possible(state, cause, [bound + outward * 0.2 * far], [0.15 * far])  # it may well be inside
+        assert not within_bounds(mixed, cause, [bound + outward * 0.2 * far], [0.05 * far])
+        assert within_bounds(mixed, cause, [bound + outward * 0.2 * far], [0.15 * far])  # it may well be inside
 
 
-def test_a_knot_that_hardly_a_block_is_at_bends_no_curve(line: Linear):
-    form = Form("road_force", "speed")
+def test_a_knot_that_hardly_a_block_is_at_bends_no_curve(line: LinearRide):
+    form = CurveForm("road_force", "speed")
     knots = QUANTITIES["speed"][0]
     speed = line.ride.quantities["speed"]
-    free = supported(form, [line, line])
+    free = supported_knots(form, [line, line])
     assert speed.max() < knots[-1] and free[-1] == pytest.approx(free[-2])  # 15 m/s goes with 13
     assert free.sum(axis=1) == pytest.approx(1.0)  # a constant stays one
     short = replace(
@@ -93,25 +95,25 @@ def test_a_knot_that_hardly_a_block_is_at_bends_no_curve(line: Linear):
             ),
         },
     )
-    assert supported(form, [line, short]).shape[1] == 0  # one ride alone shows nothing that is the scooter's
+    assert supported_knots(form, [line, short]).shape[1] == 0  # one ride alone shows nothing that is the scooter's
 
 
-def rides_at(state: State, name: str, values: list[float]) -> list[Normal]:
+def rides_at(mixed: MixedModel, name: str, values: list[float]) -> list[Normal]:
     """Rides that show nothing but the parameter `name`, each to be so many scales from where it is."""
-    (i,) = state.index([name])
+    (i,) = mixed.index([name])
     rides = []
     for value in values:
-        n, b = np.zeros((len(state.names),) * 2), np.zeros(len(state.names))
-        n[i, i], b[i] = 100.0, 100.0 * (state.mean[i] + value)
+        n, b = np.zeros((len(mixed.names),) * 2), np.zeros(len(mixed.names))
+        n[i, i], b[i] = 100.0, 100.0 * (mixed.mean[i] + value)
         rides.append(Normal(n, b))
     return rides
 
 
-def test_what_differs_between_rides_widens_and_what_is_common_does_not(state: State):
-    known = replace(state, healthy=8)
+def test_what_differs_between_rides_widens_and_what_is_common_does_not(mixed: MixedModel):
+    known = replace(mixed, healthy=8)
     (i,) = known.index(["resistance_cold"])
-    common = widened(known, rides_at(known, "resistance_cold", [4.0, 4.0, 4.0, 4.0]))
-    apart = widened(known, rides_at(known, "resistance_cold", [-4.0, 4.0, -4.0, 4.0]))
+    common = with_observed_scatter(known, rides_at(known, "resistance_cold", [4.0, 4.0, 4.0, 4.0]))
+    apart = with_observed_scatter(known, rides_at(known, "resistance_cold", [-4.0, 4.0, -4.0, 4.0]))
     assert common.scatter[i] == pytest.approx(known.scatter[i], rel=0.05)
     assert apart.scatter[i] > 3 * known.scatter[i]
     assert (apart.scatter >= known.scatter).all()
@@ -122,9 +124,9 @@ def test_a_cause_must_foretell_its_own_channel():
     helps = {"cell_voltage": (4.0, 3.0, 2.0), "auxiliary": (1.0, 1.0, 9.0)}
     worse = {"cell_voltage": (4.0, 3.0, 3.5), "auxiliary": (1.0, 1.0, 0.1)}
     refit_alone_is_worse = {"cell_voltage": (2.0, 9.0, 3.0)}
-    assert better(iter([helps, helps]), shares)
-    assert not better(iter([worse, worse]), shares)
-    assert not better(iter([refit_alone_is_worse]), shares)
+    assert improves(iter([helps, helps]), shares)
+    assert not improves(iter([worse, worse]), shares)
+    assert not improves(iter([refit_alone_is_worse]), shares)
 
 
 def test_the_fewer_the_healthy_rides_the_less_a_curve_of_many_coefficients_says():
@@ -137,12 +139,12 @@ def test_the_fewer_the_healthy_rides_the_less_a_curve_of_many_coefficients_says(
     assert chi2.sf(one_degree(40.0, 8, 1e7), 1) == pytest.approx(f.sf(5.0, 8, 1e7), rel=1e-3)
 
 
-def test_no_error_of_the_range_where_nobody_knows_what_the_pack_gave(state: State, line: Linear):
-    assert "range" in errors(line, state.mean)
+def test_no_error_of_the_range_where_nobody_knows_what_the_pack_gave(mixed: MixedModel, line: LinearRide):
+    assert "range" in errors(line, mixed.mean)
     for role in ("pack_current", "pack_voltage"):
         signals = {name: values for name, values in line.ride.signals.items() if name != role}
         less = replace(line, ride=replace(line.ride, signals=signals))
-        assert "range" not in errors(less, state.mean)
+        assert "range" not in errors(less, mixed.mean)
 
 
 def row(against: str, causes: list[str], unknown: Row | None = None) -> Row:

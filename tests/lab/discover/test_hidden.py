@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import pytest
 
-from benchmarks.trial import Row, interval, judge, reported, right, summary
-from gz_onboard.lab.discover.engine import baseline, discover
+from benchmarks.trial import Row, discovered, interval, judge, reported, right, summary
+from gz_onboard.lab.discover.baseline import baseline
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.plant import cases as plant
@@ -64,7 +64,7 @@ def test_what_has_no_name_is_given_none(rows):
 
 def test_what_rough_roads_take_is_found_over_vibration_and_mended(base):
     (case,) = plant.draw_many([FIRST + 9], "unknown", ("rough_drag",), truths=False)
-    report = discover(base, case.rides).to_json()
+    report = discovered(base, case.rides)
     assert (report["verdict"], report["causes"]) == ("unknown", [])
     assert (report["unknown"]["channel"], report["unknown"]["quantity"]) == ("road_force", "vibration")
     gain = report["gain"]["energy_per_way"]
@@ -72,7 +72,7 @@ def test_what_rough_roads_take_is_found_over_vibration_and_mended(base):
 
 
 def test_windy_days_are_named_but_no_model_is_extended_with_them(base):
-    report = discover(base, plant.windy(FIRST + 9, 4.5)).to_json()
+    report = discovered(base, plant.windy(FIRST + 9, 4.5))
     assert [cause["name"] for cause in report["causes"]] == ["headwind"]
     assert report["causes"][0]["varies"]
     assert any("from ride to ride" in note for note in report["notes"])

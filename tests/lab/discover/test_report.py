@@ -10,25 +10,25 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.lab.discover.alone import as_the_file_says
-from gz_onboard.lab.discover.channels import BY_NAME
-from gz_onboard.lab.discover.engine import linearise_all
-from gz_onboard.lab.discover.limits import limits, strange, unformed, unsettled
-from gz_onboard.lab.discover.linear import normal
-from gz_onboard.lab.discover.parts import (
+from gz_onboard.lab.discover.breakdown import (
     QUANTITIES,
-    Over,
+    QuantityReader,
     before_and_after,
     binned,
     edges,
-    gathered,
-    outstanding,
+    outlying_rides,
+    pooled,
     share_over,
     since_change,
 )
-from gz_onboard.lab.discover.report import page
-from gz_onboard.lab.discover.result import Cause, Report
-from gz_onboard.lab.discover.state import State, initial
+from gz_onboard.lab.discover.channels import BY_NAME
+from gz_onboard.lab.discover.detectability import implausible_rides, limits, missing_residuals, remaining_range_error
+from gz_onboard.lab.discover.linear import normal
+from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
+from gz_onboard.lab.discover.page import page
+from gz_onboard.lab.discover.result import Cause, Errors, Gain, Isolability, Report, ResidualSize, Score, Unknown
+from gz_onboard.lab.discover.uncalibrated import prior_of_file
+from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS
@@ -74,27 +74,19 @@ def samples() -> Samples:
 
 
 @pytest.fixture(scope="module")
-def report(samples: Samples) -> Report:
+def found(samples: Samples) -> Discovery:
     return reported(initial(read_vehicle("reference")), samples)
 
 
-def reported(state: State, samples: Samples) -> Report:
-    state = replace(state, prior=as_the_file_says(state))
-    lines = linearise_all([state.ride(samples)], state)
+def reported(mixed: MixedModel, samples: Samples) -> Discovery:
+    mixed = replace(mixed, prior=prior_of_file(mixed))
+    lines = linearise_all([mixed.ride(samples)], mixed)
     cause = Cause("rolling_resistance", "rolling_resistance_constant", 0.015, "1", (0.014, 0.016), 0.003, 0.1, 50.0)
-    knots = [[float(v), float(v - 5), 0.5] for v in range(0, 16, 3)]
-    unknown = {
-        "channel": "road_force",
-        "quantity": "speed",
-        "unit": "m/s",
-        "share": 0.03,
-        "score": 40.0,
-        "curve": knots,
-        "denies": [],
-    }
-    ranking = [(c.name, 1.0) for c in state.causes]
-    gain = {"holdout": ["a<b", "c"], "power": {"before": 9.0, "control": 8.0, "after": 7.0, "ci95": [0.5, 1.5]}}
-    return Report(
+    knots = tuple((float(v), float(v - 5), 0.5) for v in range(0, 16, 3))
+    unknown = Unknown("road_force", "speed", False, "m/s", 40.0, 40.0, knots, share=0.03)
+    ranking = [Score(c.name, 1.0) for c in mixed.causes]
+    gain = Gain(("a<b", "c"), power=Errors(9.0, 8.0, 7.0, (0.5, 1.5)))
+    report = Report(
         "unknown",
         [cause],
         [["rolling_resistance", "dragging_brake"]],
@@ -104,19 +96,18 @@ def reported(state: State, samples: Samples) -> Report:
         gain,
         ["Ride <more>."],
         ["a note"],
-        {"look_alikes": [["aero_drag_area", "drivetrain_drag", 0.91]]},
+        Isolability({}, [], [("aero_drag_area", "drivetrain_drag", 0.91)]),
         15.0,
-        state=state,
-        lines=lines,
-        normals=[normal(line, state.noise) for line in lines],
     )
+    found = Discovery(report, mixed, np.zeros(len(mixed.names)), lines, [normal(line, mixed.noise) for line in lines])
+    report.limits = limits(found)
+    return found
 
 
-def test_after_is_before_less_what_the_cause_does(report: Report):
-    state = report.state
-    assert state is not None
-    (before,), (after,) = before_and_after(report)
-    place = state.names.index("rolling_resistance_constant")
+def test_after_is_before_less_what_the_cause_does(found: Discovery):
+    mixed = found.mixed
+    (before,), (after,) = before_and_after(found)
+    place = mixed.names.index("rolling_resistance_constant")
     for name, table in before.tables.items():
         column = table.a[:, place]
         difference = table.y - after.tables[name].y
@@ -128,31 +119,22 @@ def test_after_is_before_less_what_the_cause_does(report: Report):
     assert np.std(after.tables["road_force"].y) <= 1.01 * np.std(before.tables["road_force"].y)
 
 
-def test_a_quantity_that_was_not_measured_is_not_made_up(report: Report):
-    state = report.state
-    assert state is not None
-    (line,) = report.lines
+def test_a_quantity_that_was_not_measured_is_not_made_up(found: Discovery):
+    mixed = found.mixed
+    (line,) = found.lines
     ride = line.ride
     bare = replace(ride, signals={k: v for k, v in ride.signals.items() if k not in ("rate_z", "gps_course")})
-    over = Over(state)
+    over = QuantityReader(mixed)
     less = replace(line, ride=bare)
     for name in QUANTITIES:
-        x, y, _ = gathered([less], "road_force", name, over)
+        x, y = pooled([less], "road_force", name, over)
         assert len(x) == len(y)
         assert (len(x) == 0) == (name in ("lateral_acceleration", "heading")), name
 
 
-def test_the_page_says_it_all(report: Report):
-    text = page(
-        replace(
-            report,
-            residuals={
-                "road_force": dict.fromkeys(
-                    ("mean", "rms", "autocorrelation", "blocks", "energy_share", "range_share"), 0.1
-                )
-            },
-        )
-    )
+def test_the_page_says_it_all(found: Discovery):
+    sizes = {"road_force": ResidualSize(0.1, 0.1, 0.1, 1, 0.1, 0.1)}
+    text = page(replace(found, report=replace(found.report, residuals=sizes)))
     said = (
         "none of the candidates",
         "rolling_resistance_constant",
@@ -170,41 +152,41 @@ def test_the_page_says_it_all(report: Report):
         assert words in text, words
     assert "<script" not in text
     assert len(re.findall(r'<img alt="" src="data:image/png;base64,[A-Za-z0-9+/=]{500,}"', text)) >= 4
-    assert text.count("<details") >= sum(name in report.lines[0].tables for name in BY_NAME)
+    assert text.count("<details") >= sum(name in found.lines[0].tables for name in BY_NAME)
 
 
-def test_limits_shrink_with_the_rides(report: Report):
-    twice = replace(report, lines=report.lines * 2, normals=report.normals * 2)
-    one, two = ({limit.name: limit for limit in limits(r)} for r in (report, twice))
-    assert all(two[name].change <= one[name].change for name in one)
-    assert two["auxiliary_load"].change < 0.9 * one["auxiliary_load"].change
-    assert 0.01 < one["rolling_resistance"].share < 1
+def test_limits_shrink_with_the_rides(found: Discovery):
+    twice = replace(found, lines=found.lines * 2, normals=found.normals * 2)
+    one, two = (limits(r) for r in (found, twice))
+    inf = float("inf")
+    assert all((two[name].change or inf) <= (one[name].change or inf) for name in one)
+    assert (two["auxiliary_load"].change or inf) < 0.9 * (one["auxiliary_load"].change or inf)
+    assert 0.01 < (one["rolling_resistance"].energy_share or inf) < 1
 
 
-def test_a_ride_of_another_vehicle_is_suspected(report: Report):
-    assert strange(report) == []
-    (line,) = report.lines
+def test_a_ride_of_another_vehicle_is_suspected(found: Discovery):
+    assert implausible_rides(found.lines) == []
+    (line,) = found.lines
     signals = {**line.ride.signals, "gps_speed": 1.35 * line.ride.signals["gps_speed"]}
-    (said,) = strange(replace(report, lines=[replace(line, ride=replace(line.ride, signals=signals))]))
+    (said,) = implausible_rides([replace(line, ride=replace(line.ride, signals=signals))])
     assert "coastdown: GPS speed is 1.3" in said
 
 
-def test_a_range_that_is_still_missed_is_said(report: Report):
-    errors = {"before": 0.2, "control": 0.1, "after": 0.09, "ci95": [0.0, 0.02]}
-    (said,) = unsettled(replace(report, gain={"range": errors}))
+def test_a_range_that_is_still_missed_is_said(found: Discovery):
+    errors = Errors(0.2, 0.1, 0.09, (0.0, 0.02))
+    (said,) = remaining_range_error(replace(found.report, gain=Gain(range=errors)))
     assert "9% of the range is missed" in said
-    assert unsettled(replace(report, gain={"range": {**errors, "after": 0.02}})) == []
-    assert unsettled(replace(report, gain={"note": "one ride: nothing to hold out"})) == []
+    assert remaining_range_error(replace(found.report, gain=Gain(range=replace(errors, after=0.02)))) == []
+    assert remaining_range_error(replace(found.report, gain=Gain(note="one ride: nothing to hold out"))) == []
 
 
-def test_what_one_ride_alone_shows_is_said(report: Report):
-    state = report.state
-    assert state is not None
-    assert outstanding(report) == []
-    far = np.zeros(len(state.names))
-    far[state.names.index("soc_start")] = 12.0
-    lines = [line.seen_from(far) for line in report.lines]
-    (said,) = outstanding(replace(report, lines=lines, normals=[normal(line, state.noise) for line in lines]))
+def test_what_one_ride_alone_shows_is_said(found: Discovery):
+    mixed = found.mixed
+    assert outlying_rides(found) == []
+    far = np.zeros(len(mixed.names))
+    far[mixed.names.index("soc_start")] = 12.0
+    lines = [line.seen_from(far) for line in found.lines]
+    (said,) = outlying_rides(replace(found, lines=lines, normals=[normal(line, mixed.noise) for line in lines]))
     assert "coastdown alone differs" in said
     assert "soc start +1" in said
 
@@ -213,10 +195,10 @@ def test_what_the_rides_lack_is_said(samples: Samples):
     lacking = ("accel_x", "rate_z", "gps_speed", "gps_course", "gps_altitude")
     less = replace(samples, columns={k: v for k, v in samples.columns.items() if k not in lacking})
     bare = reported(initial(read_vehicle("reference")), less)
-    said = " ".join(unformed(bare))
+    said = " ".join(missing_residuals(bare))
     assert "no ride has accel_x: no road force there" in said
     assert "no residual over lateral acceleration" in said
-    assert {limit.name for limit in limits(bare) if limit.change == float("inf")} >= {
+    assert {name for name, limit in limits(bare).items() if limit.change is None} >= {
         "rolling_resistance",
         "tyre_radius",
     }

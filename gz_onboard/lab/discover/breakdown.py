@@ -14,131 +14,106 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.channels import BY_NAME, over_blocks, usable
 from gz_onboard.lab.discover.grid import STEP, Ride, since
-from gz_onboard.lab.discover.limits import words
-from gz_onboard.lab.discover.linear import Linear, Posterior, Table, fit_mixed
+from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Posterior, fit_mixed
+from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.residuals import SLOW, cell_circuit
-from gz_onboard.lab.discover.result import Report
-from gz_onboard.lab.discover.state import State
+from gz_onboard.lab.discover.verdict import Discovery
+from gz_onboard.lab.discover.wording import readable
 
 FREE = 1e6  # variance in scales of a cause that is free
 JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
 OUTSTANDING = 3.5  # standard deviations of what differs between healthy rides
 
-QUANTITIES: dict[str, tuple[str, str]] = {
-    "speed": ("speed", "m/s"),
-    "acceleration": ("acceleration", "m/s²"),
-    "lateral_acceleration": ("lateral acceleration, left positive", "m/s²"),
-    "grade": ("grade", "1"),
-    "heading": ("heading, clockwise from north", "rad"),
-    "ambient_temperature": ("air", "degC"),
-    "motor_temperature": ("motor", "degC"),
-    "cell_temperature": ("cells", "degC"),
-    "soc": ("state of charge", "1"),
-    "pack_current": ("pack current", "A"),
-    "motor_current": ("motor current", "A"),
-    "time": ("time since the start", "s"),
-    "since_change": ("time since the current changed", "s"),
-    "since_braking": ("time since a brake was touched", "s"),
-    "suspension_speed": ("speed of the suspension", "m/s"),
-    "vibration": ("vibration: how rough the road is", "m/s²"),
+QUANTITIES: dict[str, tuple[str, str, str]] = {
+    "speed": ("speed", "m/s", "motor_speed"),
+    "acceleration": ("acceleration", "m/s²", "motor_speed"),
+    "lateral_acceleration": ("lateral acceleration, left positive", "m/s²", "rate_z"),
+    "grade": ("grade", "1", "accel_x"),
+    "heading": ("heading, clockwise from north", "rad", "gps_course"),
+    "ambient_temperature": ("air", "degC", "ambient_temperature"),
+    "motor_temperature": ("motor", "degC", "motor_temperature"),
+    "cell_temperature": ("cells", "degC", "cell_temperature"),
+    "soc": ("state of charge", "1", "pack_current"),
+    "pack_current": ("pack current", "A", "pack_current"),
+    "motor_current": ("motor current", "A", "motor_current"),
+    "time": ("time since the start", "s", "motor_speed"),
+    "since_change": ("time since the current changed", "s", "motor_current"),
+    "since_braking": ("time since a brake was touched", "s", "motor_speed"),
+    "suspension_speed": ("speed of the suspension", "m/s", "motor_speed"),
+    "vibration": ("vibration: how rough the road is", "m/s²", "motor_speed"),
 }
-"""What residuals are looked at over: words and unit."""
+"""What residuals are looked at over: words, unit, and the role without which it is made up."""
 
 
-def before_and_after(report: Report) -> tuple[list[Linear], list[Linear]]:
-    """The rides of `report` with residuals before and after its causes."""
-    state = report.state
-    assert state is not None
-    index, post = fitted(report)
+def before_and_after(found: Discovery) -> tuple[list[LinearRide], list[LinearRide]]:
+    """The rides of `found` with residuals before and after its causes."""
+    index, post = fitted(found)
     before, after = [], []
-    for line, own in zip(report.lines, post.own, strict=True):
+    for line, own in zip(found.lines, post.own, strict=True):
         theta = post.mean + own
         rest = theta.copy()
-        rest[index] = state.mean[index] + own[index]
+        rest[index] = found.mixed.mean[index] + own[index]
         before.append(line.seen_from(-rest))
         after.append(line.seen_from(-theta))
     return before, after
 
 
-def fitted(report: Report) -> tuple[list[int], Posterior]:
+def fitted(found: Discovery) -> tuple[list[int], Posterior]:
     """Where the parameters of the causes are, and all parameters as the rides show them with these free."""
-    state = report.state
-    assert state is not None
-    index = [i for cause in report.causes for i in _places(state, cause.name)]
-    prior = state.prior.copy()
+    mixed = found.mixed
+    index = [i for cause in found.report.causes for i in mixed.index(list(cause.parameters))]
+    prior = mixed.prior.copy()
     for i in index:
         prior[i, i] += FREE
-    return index, fit_mixed(report.normals, state.mean, prior, state.scatter, 1.0, state.free, 0)
+    return index, fit_mixed(found.normals, mixed.mean, prior, mixed.scatter, 1.0, mixed.free, 0)
 
 
-def outstanding(report: Report) -> list[str]:
+def outlying_rides(found: Discovery) -> list[str]:
     """What differs in single rides by more than `OUTSTANDING` of what healthy rides scatter by, a sentence for each.
 
     No cause is common to them; it may be the day, such as wind, or the ride.
     """
-    state = report.state
-    if state is None or not report.normals:
-        return []
-    index, post = fitted(report)
+    mixed = found.mixed
+    index, post = fitted(found)
     sentences = []
-    for line, own in zip(report.lines, post.own, strict=True):
-        beyond = own / np.sqrt(state.scatter)
+    for line, own in zip(found.lines, post.own, strict=True):
+        beyond = own / np.sqrt(mixed.scatter)
         beyond[index] = 0.0
-        rows = [(abs(z), name, z) for name, z in zip(state.names, beyond, strict=True) if abs(z) > OUTSTANDING]
+        rows = [(abs(z), name, z) for name, z in zip(mixed.names, beyond, strict=True) if abs(z) > OUTSTANDING]
         if rows:
-            told = ", ".join(f"{words(name)} {z:+.1f}" for _, name, z in sorted(rows, reverse=True)[:3])
-            sentences.append(f"{line.ride.name} alone differs by more than rides do: {told} standard deviations")
+            most = ", ".join(f"{readable(name)} {z:+.1f}" for _, name, z in sorted(rows, reverse=True)[:3])
+            sentences.append(f"{line.ride.name} alone differs by more than rides do: {most} standard deviations")
     return sentences
 
 
-def _places(state: State, name: str) -> list[int]:
-    return state.index(next(c for c in state.causes if c.name == name).names)
-
-
-class Over:
+class QuantityReader:
     """The quantities of the rides over the blocks of their channels; those that cost something are kept."""
 
-    def __init__(self, state: State) -> None:
-        self._state = state
+    def __init__(self, mixed: MixedModel) -> None:
+        self._mixed = mixed
         self._kept: dict[tuple[int, str], Array | None] = {}
 
-    def __call__(self, line: Linear, name: str, table: Table) -> Array | None:
+    def __call__(self, line: LinearRide, name: str, table: LinearChannel) -> Array | None:
         """The quantity `name` of `QUANTITIES` over the blocks in `table`, (m,); None if the ride has it not."""
         key = (id(line.ride), name)
         if key not in self._kept:
-            self._kept[key] = on_grid(line.ride, name, self._state)
+            self._kept[key] = on_grid(line.ride, name, self._mixed)
         values = self._kept[key]
         return None if values is None else over_blocks(table.channel, values)[table.used]
 
 
-NEEDS = {
-    "lateral_acceleration": "rate_z",
-    "grade": "accel_x",
-    "heading": "gps_course",
-    "ambient_temperature": "ambient_temperature",
-    "motor_temperature": "motor_temperature",
-    "cell_temperature": "cell_temperature",
-    "pack_current": "pack_current",
-}
-"""The role without which a quantity is made up."""
-
-
-def on_grid(ride: Ride, name: str, state: State) -> Array | None:
+def on_grid(ride: Ride, name: str, mixed: MixedModel) -> Array | None:
     """A quantity on the grid of the ride, shape of its time; None if the ride has it not."""
-    if NEEDS.get(name, "motor_speed") not in ride.have:
+    if QUANTITIES[name][2] not in ride.have:
         return None
-    if name == "time":
-        return ride.time
-    if name == "pack_current":
-        return ride.signals[name]
     if name == "since_change":
         return since_change(ride.signals["motor_current"])
     if name == "soc":
-        if not usable(BY_NAME["cell_voltage"], ride, state.system):
+        if not usable(BY_NAME["cell_voltage"], ride, mixed.system):
             return None
-        soc = np.repeat(cell_circuit(ride, state.values, state.system)[2], SLOW)
+        soc = np.repeat(cell_circuit(ride, mixed.values, mixed.system)[2], SLOW)
         return np.append(soc, np.full(max(0, len(ride.time) - len(soc)), soc[-1]))
-    return ride.quantities.get(name)
+    return ride.quantity(name)
 
 
 def since_change(current: Array) -> Array:
@@ -147,17 +122,16 @@ def since_change(current: Array) -> Array:
     return since(np.abs(current - np.concatenate([np.full(n, current[0]), current[:-n]])) > JUMP)
 
 
-def gathered(lines: Sequence[Linear], channel: str, name: str, over: Over) -> tuple[Array, Array, Array]:
-    """(quantity, residual in the channel's unit, number of the ride) of all blocks, each (m,)."""
-    xs, ys, rides = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
-    for i, line in enumerate(lines):
+def pooled(lines: Sequence[LinearRide], channel: str, name: str, over: QuantityReader) -> tuple[Array, Array]:
+    """(quantity, residual in the channel's unit) of all blocks, each (m,)."""
+    xs, ys = [np.zeros(0)], [np.zeros(0)]
+    for line in lines:
         table = line.tables.get(channel)
         x = over(line, name, table) if table is not None else None
         if table is not None and x is not None:
             xs.append(x)
             ys.append(table.y * table.unit)
-            rides.append(np.full(len(x), float(i)))
-    return np.concatenate(xs), np.concatenate(ys), np.concatenate(rides)
+    return np.concatenate(xs), np.concatenate(ys)
 
 
 def edges(x: Array, count: int = 12) -> Array:

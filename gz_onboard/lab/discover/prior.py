@@ -3,19 +3,72 @@
 Three kinds. *Base*: the vehicle file's parameters, as sure as their calibration says. *Nuisance*: what no vehicle
 file has and no cause is named after, such as the bias of the accelerometer or a wind; each with a mean over the
 vehicle's life and a scatter between rides. *Candidate*: what a cause would move. `RIDE_SD` is how much a parameter
-is taken to scatter from ride to ride before healthy rides have told (the discrepancy of Brynjarsdóttir & O'Hagan
+is taken to scatter from ride to ride before any healthy ride (the discrepancy of Brynjarsdóttir & O'Hagan
 2014, as a random effect).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp
+from math import exp, log
+
+from gz_onboard.physics.parameters import declared_parameters
+from gz_onboard.physics.riding import PriorRiding
+from gz_onboard.vehicle import Vehicle
+
+CELLS = 14  # in series, of a pack of 52 V
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How large a vehicle is over what the absolute numbers of the discovery are for, which is what the declared priors
+    of its parameters are of; to the nearest step, for such numbers are known to a factor only.
+
+    power: and forces, by mass. voltage: of the pack. auxiliary: power of it. speed: the highest of the usual riding.
+    """
+
+    power: float = 1.0
+    current: float = 1.0
+    voltage: float = 1.0
+    auxiliary: float = 1.0
+    speed: float = 1.0
+
+    def of(self, name: str) -> float:
+        """The size called `name`; 1 for none."""
+        return float(getattr(self, name)) if name else 1.0
+
+
+USUAL = Sizes()
+
+
+def nearest_step(ratio: float, step: float = 2**0.5) -> float:
+    """`ratio` as the nearest power of `step`; 1 for what has no sign or no size."""
+    return float(step ** round(log(ratio) / log(step))) if ratio > 0 else 1.0
+
+
+def sizes_of(vehicle: Vehicle) -> Sizes:
+    """Of `vehicle`, by its file."""
+    p, declared = vehicle.parameters, declared_parameters()
+
+    def over(name: str) -> float:
+        return nearest_step(p[name] / declared[name].prior)
+
+    fastest, usual = (max(speed for _, speed, _ in riding.points) for riding in (vehicle.riding, PriorRiding()))
+    cells = vehicle.battery.cells_series if vehicle.battery else CELLS
+    return Sizes(
+        over("vehicle_mass"),
+        over("motor_current_limit"),
+        nearest_step(cells / CELLS),
+        over("auxiliary_power"),
+        nearest_step(fastest / usual),
+    )
 
 
 @dataclass(frozen=True)
 class Nuisance:
-    """A parameter that no vehicle file has: sd is of its mean, ride_sd of its scatter from ride to ride."""
+    """A parameter that no vehicle file has: sd is of its mean, ride_sd of its scatter from ride to ride, both in a
+    vehicle of size 1; of: the size of `Sizes` that they grow with.
+    """
 
     name: str
     unit: str
@@ -23,6 +76,7 @@ class Nuisance:
     sd: float
     ride_sd: float
     text: str
+    of: str = ""
 
 
 NUISANCES = (
@@ -35,14 +89,14 @@ NUISANCES = (
     Nuisance("torque_saturation", "1/(100 A)", 0.0, 0.03, 0.005, "torque per current falls at high current"),
     Nuisance("copper_speed", "s/(50 rad)", 0.0, 0.25, 0.02, "copper loss grows with frequency"),
     Nuisance("inverter_current_gain", "1", 1.0, 0.007, 0.002, "gain of the inverter's current measurement"),
-    Nuisance("inverter_current_offset", "A", 0.0, 0.2, 0.03, "its offset"),
-    Nuisance("idle_current", "A", 0.0, 0.2, 0.01, "drawn beside inverter and auxiliary current sensors"),
+    Nuisance("inverter_current_offset", "A", 0.0, 0.2, 0.03, "its offset", "current"),
+    Nuisance("idle_current", "A", 0.0, 0.2, 0.01, "drawn beside inverter and auxiliary current sensors", "current"),
     Nuisance("pack_inverter_lag", "s", 0.0, 0.1, 0.02, "pack current later than the inverter's, beyond 0.1 s"),
     Nuisance("torque_lag", "s", 0.0, 0.1, 0.02, "DC current later than the motor's"),
-    Nuisance("loss_speed", "W/(50 rad/s)", 0.0, 15.0, 1.0, "loss that grows with speed, beside the model's"),
-    Nuisance("loss_cross", "W/(2500 A·rad/s)", 0.0, 60.0, 2.0, "loss that grows with current times speed"),
-    Nuisance("brake_light", "W", 0.0, 6.0, 0.3, "more auxiliary power while the brake is touched"),
-    Nuisance("inverter_voltage_offset", "V", 0.0, 0.1, 0.01, "offset of the inverter's voltage measurement"),
+    Nuisance("loss_speed", "W/(50 rad/s)", 0.0, 15.0, 1.0, "loss that grows with speed, beside the model's", "power"),
+    Nuisance("loss_cross", "W/(2500 A·rad/s)", 0.0, 60.0, 2.0, "loss that grows with current times speed", "power"),
+    Nuisance("brake_light", "W", 0.0, 6.0, 0.3, "more auxiliary power while the brake is touched", "auxiliary"),
+    Nuisance("inverter_voltage_offset", "V", 0.0, 0.1, 0.01, "offset of the inverter's voltage measurement", "voltage"),
     Nuisance("soc_start", "1", 0.0, 0.0, 0.04, "state of charge at the start, beyond what the first voltage says"),
     Nuisance("v1_start", "V", 0.0, 0.0, 0.01, "relaxation left over from before the ride"),
     Nuisance("ocv_offset", "V", 0.0, 0.006, 0.004, "rest voltage against the table: hysteresis, relaxation"),
@@ -76,6 +130,7 @@ NUISANCES = (
     Nuisance("cells_start", "K", 0.0, 0.3, 0.5, "first cell temperature: quantised"),
     Nuisance("pack_airflow", "1/(10 m/s)", 0.0, 1.0, 0.1, "pack cools better in moving air"),
 )
+BY_NAME = {nuisance.name: nuisance for nuisance in NUISANCES}
 
 LOG = frozenset(
     (
@@ -92,6 +147,8 @@ LOG = frozenset(
     )
 )
 """Those that are positive and known to a factor only: a step is one of their logarithm."""
+LOG_RIDE_SD, LOG_RIDE_SD_ELSE = {"pack_heat_capacity": 0.05}, 0.1
+"""By how much their logarithm scatters from ride to ride."""
 
 
 def stepped(name: str, value: float, step: float) -> float:
@@ -110,13 +167,10 @@ FIXED = (
     "box_start",
     "cells_start",
 )
-"""Those whose scatter is of the ride's start or of what was entered: nothing that healthy rides would tell better."""
-
-WEATHER = ("wind_north", "wind_east")
-"""Those whose scatter is the weather's: a few calm days do not promise more of them."""
+"""Those whose scatter is of the ride's start or of what was entered: healthy rides say no more of it."""
 
 STARTS = (*(name for name in FIXED if name != "payload_error"), "accel_bias", "pitch_gain", "gps_lag", "wheel_lag")
-"""Those that are the sensors' or the start's, not the vehicle's: each ride tells its own, whatever the model."""
+"""Those of the sensors or of the start, not of the vehicle: each ride has its own, whatever the model."""
 
 BASE = (
     "wheel_radius",
@@ -150,29 +204,22 @@ RIDE_SD = {
     "pack_current_offset": 0.03,
     "pack_current_gain": 0.002,
     "pack_voltage_offset": 0.01,
-    "drag_area": 0.01,
-    "rolling_resistance_constant": 7e-4,
-    "rolling_resistance_speed": 2e-5,
-    "motor_copper_resistance": 3e-4,
-    "motor_iron_linear": 0.03,
-    "motor_iron_quadratic": 0.001,
-    "inverter_loss_constant": 0.5,
-    "inverter_loss_linear": 0.02,
-    "inverter_loss_quadratic": 1e-4,
-    "auxiliary_power": 0.7,
-    "cornering_compliance": 0.015,
-    "wind_north": 1.2,
-    "wind_east": 1.2,
-    "brake_drag_force": 1.0,
-    "drivetrain_drag_torque": 0.005,
-    "warm_up_share": 0.05,
-    "regeneration_loss_share": 0.02,
-    "slow_resistance": 0.001,
-    "hysteresis_voltage": 0.001,
     "cell_resistance_factor": 0.01,
     "cooling_factor": 0.08,
     "speed_sensor_scale": 3e-4,
     "pack_voltage_latency": 0.004,
 }
+RIDE_SD_STEP = 4.0  # in which a scatter grows with a parameter over its prior: known to a factor of two
 RIDE_SD_SHARE = 0.1
-"""What a parameter without a row scatters by, as a share of its prior's standard deviation."""
+"""What a parameter scatters by of which nothing is declared, as a share of its prior's standard deviation."""
+HEALTHY_SD = {
+    "cell_resistance_factor": 0.005,
+    "cooling_factor": 0.01,
+    "speed_sensor_scale": 0.001,
+    "pack_voltage_latency": 0.02,
+    "payload_mass": 2.0,
+}
+"""Within what a healthy vehicle may show of it: standard deviation, where the vehicle file says nothing; of the payload
+always, for what was entered is known."""
+BENCH = ("torque_constant", "cable_resistance")
+"""Found on a bench at steady points, as those of effects that say so."""

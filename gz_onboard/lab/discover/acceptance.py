@@ -1,0 +1,102 @@
+"""Which causes are accepted: within their bounds, beyond the scatter of these rides, and right of rides held out.
+
+The spread that healthy rides showed is not that of the healthy world: where they hardly went, and what they happened
+not to vary, the next rides show for the first time. So what differs between the rides at hand by more than healthy ones
+did widens the scatter, beside a common part that is free; and what was found on some rides must predict the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from gz_onboard.lab.discover.candidates import Candidate
+from gz_onboard.lab.discover.constancy import RIDE, splits, unequal
+from gz_onboard.lab.discover.cross_validation import Fold, held_out, improves, squares
+from gz_onboard.lab.discover.linear import Normal, fit_mixed
+from gz_onboard.lab.discover.mixed_model import MixedModel
+from gz_onboard.lab.discover.prior import LOG
+from gz_onboard.lab.discover.search import Search, evidence
+from gz_onboard.lab.discover.selection import SearchProblem, Selection, select_causes
+
+FREE = 25.0  # variance in scales of the common part while the scatter of these rides is sought
+ROUNDS = 25
+SURE = 2.0  # standard deviations: an estimate further beyond a bound is none of its cause
+MAX_REJECTIONS = 6  # names at most that are tried and refused
+
+
+def with_observed_scatter(mixed: MixedModel, normals: Sequence[Normal]) -> MixedModel:
+    """`mixed` with the scatter between rides that these show, where it is more than healthy ones did."""
+    if len(normals) < 2:
+        return mixed
+    free = mixed.prior + FREE * np.eye(len(mixed.names))
+    weight = float(mixed.healthy + 1)
+    found = fit_mixed(normals, mixed.mean, free, mixed.scatter, weight, mixed.free, ROUNDS).scatter
+    return replace(mixed, scatter=np.maximum(found, mixed.scatter))
+
+
+def within_bounds(mixed: MixedModel, cause: Candidate, change: Sequence[float], sd: Sequence[float]) -> bool:
+    """Whether the parameters of `cause` can have changed by `change` [scales], known within `sd`."""
+    for parameter, x, s in zip(cause.parameters, change, sd, strict=True):
+        (i,) = mixed.index([parameter.name])
+        if parameter.name in LOG:
+            continue
+        step = float(mixed.scale[i])
+        value, spread = mixed.values[parameter.name] + x * step, SURE * s * step
+        if not parameter.low - spread <= value <= parameter.high + spread:
+            return False
+    return True
+
+
+def predicts_held_out(now: Selection, name: str) -> bool:
+    """Whether `name` beside the other causes chosen mends its own channels on rides held out of the fit."""
+    if len(now.lines) < 2:
+        return True
+    every = [now.search.causes[n] for n in now.chosen]
+    others = [c for c in every if c.name != name]
+    held = held_out(now.mixed, now.lines, now.normals, Fold(every), Fold(others))
+    return improves(squares(held), now.search.shares.get(name, {}))
+
+
+def rejection(now: Selection, limit: float) -> tuple[str, str] | None:
+    """(the least certain of the causes chosen that cannot be accepted, why); None if all can."""
+    mixed, search = now.mixed, now.search
+    wide = with_observed_scatter(mixed, now.normals)
+    strict = Search(wide, evidence(wide, now.normals), list(search.causes.values()), search.shares)
+    index = search.index(now.chosen)
+    estimate, sd = search.evidence.estimate(index), np.sqrt(np.diag(search.evidence.covariance(index)))
+    # against a file what differs between rides cannot be separated from what its model lacks; a baseline knows it
+    parts = [] if mixed.healthy else splits(now)
+    uneven = {split.cause for split in parts if unequal(split) and split.quantity.startswith(RIDE)}
+    found: list[tuple[float, str, str]] = []
+    at = 0
+    for name in now.chosen:
+        cause = search.causes[name]
+        own = slice(at, at + len(cause.parameters))
+        at = own.stop
+        score = strict.step([n for n in now.chosen if n != name], name)
+        if not within_bounds(mixed, cause, estimate[own].tolist(), sd[own].tolist()):
+            found.append((score, name, "would be beyond what it can be"))
+        elif score < limit:
+            found.append((score, name, "differs from ride to ride as much as it is"))
+        elif name in uneven:
+            found.append((score, name, "acts in some rides and not in others"))
+        elif not predicts_held_out(now, name):
+            found.append((score, name, "does not foretell rides held out"))
+    return min(found)[1:] if found else None
+
+
+def accept(problem: SearchProblem, now: Selection) -> tuple[Selection, SearchProblem, list[str]]:
+    """`now` searched again without each cause that is rejected, the problem less these, and what was rejected."""
+    rejected: list[str] = []
+    while now.chosen and len(rejected) < MAX_REJECTIONS:
+        bad = rejection(now, problem.limit)
+        if bad is None:
+            break
+        name, why = bad
+        rejected.append(f"{name} {why}: not named")
+        problem = replace(problem, causes=[c for c in problem.causes if c.name != name])
+        now = select_causes(problem)
+    return now, problem, rejected

@@ -1,0 +1,124 @@
+"""What healthy rides taught, as files: the vehicle file that they refitted, and the statistics beside it."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from zipfile import BadZipFile
+
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.errors import InputError
+from gz_onboard.lab.calibrate.result import Found, Result
+from gz_onboard.lab.calibrate.toml_text import string, with_keys
+from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged
+from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel, initial
+from gz_onboard.vehicle import Vehicle
+
+
+def restore(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
+    """What healthy rides taught of `vehicle`, or its file alone. folder: with effects of the user's own."""
+    if isinstance(vehicle.healthy, MixedModel):
+        return vehicle.healthy
+    mixed = initial(vehicle, folder)
+    return load(mixed, vehicle.healthy) if isinstance(vehicle.healthy, Path) else mixed
+
+
+def write_baseline(vehicle: Vehicle, base: Path, out: Path) -> None:
+    """Write `vehicle`, as `baseline.baseline` gave it, to `out` after the file `base`, its statistics beside it."""
+    mixed = vehicle.healthy
+    assert isinstance(mixed, MixedModel)
+    found = {
+        name: Found(value.value, value.sd, value.unit, value.source)
+        for name, value in vehicle.parameters.known.items()
+        if "refitted on" in value.source
+    }
+    text = merged(base.read_text(encoding="utf-8"), [Result("baseline", parameters=found)], base, out)
+    beside = out.with_suffix(".healthy.npz")
+    save(mixed, beside)
+    keys = copied_effects(vehicle.model.effects, out) | {
+        ("healthy", "file"): string(beside.name),
+        ("healthy", "rides"): str(mixed.healthy),
+    }
+    write_whole(out, with_keys(text, keys, out))
+
+
+def write_whole(out: Path, text: str) -> None:
+    """Write the file whole or not at all."""
+    temporary = out.with_name(out.name + ".new")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(out)
+
+
+def save(mixed: MixedModel, file: Path) -> None:
+    """Write what healthy rides taught to an npz file."""
+    shapes = {
+        f"shape_{i}_{key}": getattr(shape, key)
+        for i, shape in enumerate(mixed.shapes.values())
+        for key in ("mean", "covariance", "inflation")
+    }
+    with file.open("wb") as stream:
+        np.savez_compressed(
+            stream,
+            names=np.array(mixed.names),
+            scale=mixed.scale,
+            mean=mixed.mean,
+            prior=mixed.prior,
+            scatter=mixed.scatter,
+            healthy=mixed.healthy,
+            value_names=np.array(list(mixed.values)),
+            values=np.array(list(mixed.values.values())),
+            noise_names=np.array(list(mixed.noise)),
+            noise=np.array(list(mixed.noise.values())),
+            inflation_names=np.array(list(mixed.inflation)),
+            inflation=np.array(list(mixed.inflation.values())),
+            shape_names=np.array(list(mixed.shapes)),
+            **shapes,
+        )
+
+
+def load(mixed: MixedModel, file: Path) -> MixedModel:
+    """`mixed` of a vehicle with what the npz `file` holds; InputError for one of another model."""
+    try:
+        with np.load(file) as data:
+            names = [str(name) for name in data["names"]]
+            if not set(names) <= set(mixed.names):
+                raise InputError(f"{file}: was learned for another model list; run discover --baseline again")
+            # candidates that came after it, such as a user's own, keep what is known before any ride
+            at = mixed.index(names)
+            mean, scatter, scale = mixed.mean.copy(), mixed.scatter.copy(), mixed.scale.copy()
+            mean[at], scatter[at], scale[at] = data["mean"], data["scatter"], data["scale"]
+            prior = mixed.prior.copy()
+            prior[at, :] = 0.0
+            prior[:, at] = 0.0
+            prior[np.ix_(at, at)] = data["prior"]
+            pairs = [str(name) for name in data["shape_names"]]
+            return replace(
+                mixed,
+                mean=mean,
+                prior=prior,
+                scatter=scatter,
+                scale=scale,
+                healthy=int(data["healthy"]),
+                values=mixed.values | _mapping(data["value_names"], data["values"]),
+                noise=mixed.noise
+                | {
+                    str(n): (float(a), float(b), float(c))
+                    for n, (a, b, c) in zip(data["noise_names"], data["noise"], strict=True)
+                },
+                inflation=_mapping(data["inflation_names"], data["inflation"]),
+                shapes={
+                    pair: HealthyCurve(
+                        data[f"shape_{i}_mean"], data[f"shape_{i}_covariance"], float(data[f"shape_{i}_inflation"])
+                    )
+                    for i, pair in enumerate(pairs)
+                },
+            )
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
+        raise InputError(f"{file}: cannot be read as what healthy rides taught: {error}") from error
+
+
+def _mapping(names: Array, values: Array) -> dict[str, float]:
+    return {str(name): float(value) for name, value in zip(names, values, strict=True)}

@@ -1,0 +1,144 @@
+"""Rides held out of the fit: what a model that was fitted to the others leaves of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.lab.discover.candidates import Candidate
+from gz_onboard.lab.discover.curve_forms import CurveForm, columns
+from gz_onboard.lab.discover.curves import extended
+from gz_onboard.lab.discover.linear import LinearRide, Normal, fit_mixed, normal
+from gz_onboard.lab.discover.mixed_model import MixedModel
+from gz_onboard.lab.discover.prior import STARTS
+
+WIDE = 100.0  # variance of a curve's coefficients, in units of `CurveForm.size`
+
+
+@dataclass(frozen=True)
+class Fold:
+    """What is free on the rides that a model is fitted to: causes, and the curve of what has no name."""
+
+    causes: Sequence[Candidate] = ()
+    form: CurveForm | None = None
+
+    def fit(self, mixed: MixedModel, lines: Sequence[LinearRide], normals: Sequence[Normal]) -> tuple[Array, Array]:
+        """(the common part (p,), the curve's coefficients (k,)) from these rides."""
+        if self.form is not None:
+            return with_curve(mixed, list(zip(lines, normals, strict=True)), self.causes, self.form)
+        return extended_mean(mixed, normals, self.causes), np.zeros(0)
+
+    def shown(self, line: LinearRide, curve: Array) -> LinearRide:
+        """`line` less the curve."""
+        return line if self.form is None else without(line, self.form, curve)
+
+
+Triple = tuple[float, float, float]  # before, with the control, after
+Squares = dict[str, Triple]  # by channel: mean squares
+
+
+def held_out(
+    mixed: MixedModel,
+    lines: Sequence[LinearRide],
+    normals: Sequence[Normal],
+    after: Fold,
+    control: Fold,
+    folds: Sequence[Sequence[int]] | None = None,
+) -> Iterator[list[tuple[LinearRide, Array]]]:
+    """Of each ride in turn, held out of the fit with those of its fold: it, and its parameters (p,) with its own start,
+    before (the causes of `control` alone moved), with `control` refitted, with `after`.
+
+    folds: which rides are held out together; each alone if not given.
+    """
+    for fold in [[i] for i in range(len(lines))] if folds is None else folds:
+        rest = [i for i in range(len(lines)) if i not in fold]
+        some, theirs = [lines[i] for i in rest], [normals[i] for i in rest]
+        plain, _ = control.fit(mixed, some, theirs)
+        before = mixed.mean.copy()
+        index = [k for cause in control.causes for k in mixed.index(cause.names)]
+        before[index] = plain[index]
+        full, curve = after.fit(mixed, some, theirs)
+        for line in (lines[i] for i in fold):
+            models = ((line, before), (line, plain), (after.shown(line, curve), full))
+            yield [(shown, with_own_start(mixed, start_equations(mixed, shown), theta)) for shown, theta in models]
+
+
+def squares(held: Iterator[list[tuple[LinearRide, Array]]]) -> Iterator[Squares]:
+    """The mean squares of what `held_out` leaves of the residuals."""
+    for models in held:
+        before, control, after = (
+            {name: float(np.mean((table.y - table.a @ theta) ** 2)) for name, table in shown.tables.items()}
+            for shown, theta in models
+        )
+        yield {name: (before[name], control[name], after[name]) for name in before}
+
+
+def improves(held: Iterator[Squares], shares: Mapping[str, float]) -> bool:
+    """Whether rides held out are known better after than before and than with the control, in the channels that have
+    a part of the evidence (`shares`), each by its share.
+    """
+    rows = list(held)
+    total = 0.0
+    for channel, part in shares.items():
+        mine = [row[channel] for row in rows if channel in row]
+        if part > 0.1 and mine:
+            before, control, after = (sum(column) for column in zip(*mine, strict=True))
+            total += part * float(np.log(after / min(before, control)))
+    return total < 0
+
+
+def start_equations(mixed: MixedModel, line: LinearRide) -> Normal:
+    """What shows how a ride began: not the road force, whose mean would be taken for the accelerometer's bias."""
+    return normal(line, mixed.noise, [name for name in line.tables if name != "road_force"])
+
+
+def with_curve(
+    mixed: MixedModel, fitted: Sequence[tuple[LinearRide, Normal]], causes: Sequence[Candidate], form: CurveForm
+) -> tuple[Array, Array]:
+    """(the common part (p,), the coefficients of `form` (k,)) from the rides `fitted`, the `causes` free."""
+    p, k = len(mixed.mean), form.basis.shape[1]
+    shape = mixed.shapes.get(form.name)
+    mean = np.concatenate([mixed.mean, shape.mean if shape else np.zeros(k)])
+    prior = np.diag(np.full(p + k, WIDE))
+    prior[:p, :p] = mixed.prior
+    for i in (i for cause in causes for i in mixed.index(cause.names)):
+        prior[i, i] += 1e6
+    scatter = np.concatenate([mixed.scatter, np.full(k, form.scatter**2)])
+    rides = []
+    for line, plain in fitted:
+        more = extended(line, plain, form, mixed.noise)
+        rides.append(more or Normal(np.pad(plain.n, (0, k)), np.pad(plain.b, (0, k))))
+    both = fit_mixed(rides, mean, prior, scatter, 1.0, np.zeros(p + k, dtype=bool), 0).mean
+    return both[:p], both[p:]
+
+
+def without(line: LinearRide, form: CurveForm, coefficients: Array) -> LinearRide:
+    """`line` less the curve."""
+    table = line.tables.get(form.channel)
+    knots = columns(line.ride, form, table) if table else None
+    if table is None or knots is None:
+        return line
+    less = knots @ form.basis @ coefficients * form.size / table.unit
+    return LinearRide(line.ride, {**line.tables, form.channel: replace(table, y=table.y - less)})
+
+
+def with_own_start(mixed: MixedModel, ride: Normal, theta: Array) -> Array:
+    """`theta` (p,) with what is the ride's own of `prior.STARTS`, which is no merit or fault of a model."""
+    m = [i for i, name in enumerate(mixed.names) if name in STARTS]
+    variance = mixed.scatter[m] + np.diag(mixed.prior)[m]
+    rest = ride.b[m] - ride.n[m] @ theta
+    moved = theta.copy()
+    moved[m] += np.linalg.solve(np.diag(1 / variance) + ride.n[np.ix_(m, m)], rest)
+    return moved
+
+
+def extended_mean(mixed: MixedModel, rest: Sequence[Normal], causes: Sequence[Candidate]) -> Array:
+    """The common part from `rest` with the parameters of `causes` free."""
+    wide = mixed.prior.copy()
+    index = [i for cause in causes for i in mixed.index(cause.names)]
+    for i in index:
+        wide[i, i] += 1e6
+    return fit_mixed(rest, mixed.mean, wide, mixed.scatter, 1.0, mixed.free, 0).mean

@@ -1,0 +1,193 @@
+"""Smooth curves over quantities: what a channel's residual looks like when no cause has its name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.lab.discover.curve_forms import CurveForm, columns, curve_forms
+from gz_onboard.lab.discover.linear import LinearRide, Noise, Normal, fit_mixed, marginal, whitened
+from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel
+from gz_onboard.lab.discover.search import evidence_of
+
+
+def extended(linear: LinearRide, normal: Normal, form: CurveForm, noise: Noise) -> Normal | None:
+    """`normal` with the columns of `form`."""
+    table = linear.tables.get(form.channel)
+    if table is None:
+        return None
+    knots = columns(linear.ride, form, table)
+    if knots is None:
+        return None
+    curve = knots @ form.basis * form.size / table.unit[:, None]
+    k, p = curve.shape[1], len(normal.b)
+    both = whitened(table, noise[form.channel], np.column_stack([curve, table.a, table.y]))
+    b, a, y = both[:, :k], both[:, k:-1], both[:, -1]
+    n = np.zeros((p + k, p + k))
+    n[:p, :p] = normal.n
+    n[p:, p:] = b.T @ b
+    n[p:, :p] = b.T @ a
+    n[:p, p:] = n[p:, :p].T
+    return Normal(n, np.concatenate([normal.b, b.T @ y]))
+
+
+CURVE_RIDGE = 1e-3  # information, in `CurveForm.size`, that keeps knots without data from running away
+OWN_FREE = 100.0  # variance in `CurveForm.size` of the common curve while its scatter between rides is sought
+ENOUGH = 1.0  # sum of squared weights of a ride's blocks at a knot, from which on it counts as visited
+
+
+@dataclass(frozen=True)
+class CurveFit:
+    """What rides show over a quantity. chi2: twice the rise of the log likelihood, of `k` degrees of freedom.
+
+    values (knots,): of the curve at each knot [the channel's unit]; covariance (knots, knots); weights (knots,): how
+    much of the rides is at each, together 1.
+    """
+
+    chi2: float
+    k: int
+    values: Array
+    covariance: Array
+    weights: Array
+
+    @property
+    def sd(self) -> Array:
+        """Of the values, (k,)."""
+        return np.asarray(np.sqrt(np.abs(np.diag(self.covariance))))
+
+    def contrasts(self) -> tuple[Array, Array]:
+        """(values less their mean, standard deviations of these), each (k,): what no constant could be."""
+        d = np.eye(len(self.values)) - self.weights
+        return d @ self.values, np.sqrt(np.abs(np.diag(d @ self.covariance @ d.T)))
+
+
+def supported_knots(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
+    """The coefficients of `form` that these rides determine, (k, free): a knot that less than `ENOUGH` of two rides is
+    at goes with the nearest that has it, so that no curve bends where hardly anything was measured.
+    """
+    k = form.basis.shape[1]
+    if form.straight:
+        return np.eye(1)
+    at = np.zeros(k)
+    for line in linears:
+        table = line.tables.get(form.channel)
+        knots = columns(line.ride, form, table) if table is not None else None
+        if knots is not None:
+            at += (knots**2).sum(axis=0) >= ENOUGH
+    good = np.flatnonzero(at >= min(2, len(linears)))
+    if not len(good):
+        return np.zeros((k, 0))
+    nearest = np.abs(np.arange(k)[:, None] - good).argmin(axis=1)
+    return np.asarray(np.eye(len(good))[nearest])
+
+
+def fit_curve(
+    mixed: MixedModel,
+    linears: Sequence[LinearRide],
+    normals: Sequence[Normal],
+    form: CurveForm,
+    fixed: Sequence[int],
+    own: bool = False,
+) -> CurveFit | None:
+    """What `form` is beside changes at `fixed`; None where no ride has it, or not enough of it.
+
+    own: with the scatter of its coefficients that these rides show, where it is more than `CurveForm.scatter`.
+    """
+    free = supported_knots(form, linears)
+    if not free.shape[1]:
+        return None
+    rides = _with_columns(mixed, linears, normals, form)
+    if not rides:
+        return None
+    p = len(mixed.mean)
+    k = len(rides[0].b) - p
+    healthy = mixed.shapes.get(form.name)
+    mean = np.concatenate([mixed.mean, healthy.mean if healthy else np.zeros(k)])
+    prior = np.zeros((p + k, p + k))
+    prior[:p, :p] = mixed.prior
+    prior[p:, p:] = healthy.covariance if healthy else np.eye(k) * form.scatter**2
+    scatter = np.concatenate([mixed.scatter, np.full(k, form.scatter**2)])
+    if own and len(rides) > 1:
+        wide = prior.copy()
+        wide[p:, p:] += np.eye(k) * OWN_FREE
+        learns = np.arange(p + k) >= p
+        scatter = np.maximum(scatter, fit_mixed(rides, mean, wide, scatter, 1.0, learns, 10).scatter)
+    e = evidence_of(mean, prior, scatter, rides)
+    inner, score = e.given(range(p, p + k), fixed, CURVE_RIDGE)
+    inner = free.T @ (inner + CURVE_RIDGE * np.eye(k)) @ free
+    score = free.T @ score
+    estimate = np.linalg.solve(inner, score)
+    at = form.basis @ free * form.size
+    visits = _visits(form, linears)
+    return CurveFit(
+        float(score @ estimate), free.shape[1], at @ estimate, at @ np.linalg.inv(inner) @ at.T, visits / np.sum(visits)
+    )
+
+
+def _with_columns(
+    mixed: MixedModel, linears: Sequence[LinearRide], normals: Sequence[Normal], form: CurveForm
+) -> list[Normal]:
+    """The normal equations of the rides that have `form`, with its columns."""
+    every = (extended(line, normal, form, mixed.noise) for line, normal in zip(linears, normals, strict=True))
+    return [ride for ride in every if ride is not None]
+
+
+def _visits(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
+    """The sum of squared weights of all blocks at each knot, (knots,)."""
+    visits = np.zeros(len(form.basis))
+    for line in linears:
+        if form.channel in line.tables:
+            knots = columns(line.ride, form, line.tables[form.channel])
+            visits += 0.0 if knots is None else (knots**2).sum(axis=0)
+    return visits
+
+
+def learn_healthy_curves(
+    mixed: MixedModel, linears: Sequence[LinearRide], normals: Sequence[Normal]
+) -> dict[str, HealthyCurve]:
+    """What the healthy rides leave over each quantity, beside what the parameters of `mixed` explain."""
+    found = {}
+    for form in curve_forms(mixed.sizes):
+        rides = _with_columns(mixed, linears, normals, form)
+        if not rides:
+            continue
+        p = len(mixed.mean)
+        k = len(rides[0].b) - p
+        # the parameters stay as they were learned: their values at the mean, the curve what is left
+        m, c = np.zeros((k, k)), np.zeros(k)
+        for ride in rides:
+            v = np.linalg.inv(np.diag(1 / mixed.scatter) + ride.n[:p, :p])
+            u = mixed.mean + v @ (ride.b[:p] - ride.n[:p, :p] @ mixed.mean)
+            inner = ride.n[p:, p:] - ride.n[p:, :p] @ v @ ride.n[:p, p:]
+            score = ride.b[p:] - ride.n[p:, :p] @ u
+            part = marginal(Normal((inner + inner.T) / 2, score), np.full(k, form.scatter**2))
+            m, c = m + part.n, c + part.b
+        covariance = np.linalg.inv(m + np.eye(k))
+        found[form.name] = HealthyCurve(np.asarray(covariance @ c), np.asarray(covariance), 1.0)
+    return found
+
+
+def with_inflation(
+    mixed: MixedModel,
+    folds: Sequence[tuple[MixedModel, Sequence[int]]],
+    linears: Sequence[LinearRide],
+    normals: Sequence[Normal],
+) -> dict[str, HealthyCurve]:
+    """The shapes of `mixed`, each with how much too high its score is on healthy rides left out of `folds`."""
+    total: dict[str, list[float]] = {}
+    for learned, held in folds:
+        rest = [i for i in range(len(linears)) if i not in held]
+        shapes = learn_healthy_curves(learned, [linears[i] for i in rest], [normals[i] for i in rest])
+        blind = replace(learned, shapes=shapes)
+        for form in curve_forms(mixed.sizes):
+            found = fit_curve(blind, [linears[i] for i in held], [normals[i] for i in held], form, [])
+            if found:
+                total.setdefault(form.name, []).append(found.chi2 / found.k)
+    whole = learn_healthy_curves(mixed, linears, normals)
+    return {
+        name: replace(shape, inflation=max(1.0, (2 + sum(total.get(name, []))) / (2 + len(total.get(name, [])))))
+        for name, shape in whole.items()
+    }

@@ -1,0 +1,106 @@
+"""What a set of rides could show at all: the smallest change of each cause, and the residuals they cannot form."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gz_onboard.lab.discover.channels import CHANNELS
+from gz_onboard.lab.discover.energy import energy_drawn, energy_share
+from gz_onboard.lab.discover.linear import LinearRide
+from gz_onboard.lab.discover.prior import LOG
+from gz_onboard.lab.discover.result import Limit, Report
+from gz_onboard.lab.discover.search import evidence
+from gz_onboard.lab.discover.verdict import Discovery
+from gz_onboard.lab.discover.wording import readable
+
+RIDING = 5.0  # m/s
+MISSED = 0.05  # of the range
+FAR = 1.1  # no tyre changes its radius by as much
+
+
+def limits(found: Discovery) -> dict[str, Limit]:
+    """Of every candidate, in the order of the ranking, those that the rides say nothing of last."""
+    mixed, report = found.mixed, found.report
+    information = np.diag(evidence(mixed, found.normals).information)
+    order = {row.name: i for i, row in enumerate(report.ranking)}
+    result = {}
+    for cause in sorted(mixed.causes, key=lambda c: order.get(c.name, len(order))):
+        parameter = cause.parameters[0]
+        place = mixed.names.index(parameter.name) if parameter.name in mixed.names else None
+        if place is None or cause.name not in order or information[place] <= 0:
+            result[cause.name] = Limit(parameter.name, parameter.unit, None, None)
+            continue
+        steps = float(np.sqrt(report.threshold * mixed.inflation.get(cause.name, 1.0) / float(information[place])))
+        change = np.zeros(len(mixed.mean))
+        change[place] = steps
+        step = float(mixed.scale[place]) * (mixed.healthy_value(parameter.name) if parameter.name in LOG else 1.0)
+        share = abs(energy_share(found.lines, change))
+        result[cause.name] = Limit(parameter.name, parameter.unit, steps * step, share)
+    return result
+
+
+def missing_residuals(found: Discovery) -> list[str]:
+    """What measurements the rides lack, and which residuals and candidates that costs, one sentence for each set."""
+    lost: dict[tuple[str, ...], list[str]] = {}
+    for channel in CHANNELS:
+        if channel.battery and found.mixed.system.battery is None:
+            continue
+        for line in found.lines:
+            lacking = tuple(role for role in channel.roles if role not in line.ride.have)
+            if lacking and channel.name not in lost.setdefault(lacking, []):
+                lost[lacking].append(channel.name)
+    for role, name in (("rate_z", "residual over lateral acceleration"), ("gps_course", "anything over heading")):
+        if any(role not in line.ride.have for line in found.lines):
+            lost.setdefault((role,), []).append(name)
+    sentences = []
+    for roles, names in lost.items():
+        without = [line.ride.name for line in found.lines if not set(roles) <= line.ride.have]
+        rides = "no ride has" if len(without) == len(found.lines) else f"{', '.join(without)}: without"
+        sentences.append(f"{rides} {' and '.join(roles)}: no {', no '.join(readable(name) for name in names)} there")
+    return sentences
+
+
+def implausible_rides(lines: Sequence[LinearRide]) -> list[str]:
+    """Rides whose GPS speed does not go with the motor's at all: perhaps they are another vehicle's."""
+    found = []
+    for line in lines:
+        s, speed = line.ride.signals, np.abs(line.ride.quantities["speed"])
+        if "gps_speed" not in s or not np.any(moving := speed > RIDING):
+            continue
+        ratio = float(np.median(s["gps_speed"][moving] / speed[moving]))
+        if not 1 / FAR < ratio < FAR:
+            found.append(
+                f"{line.ride.name}: GPS speed is {ratio:.2f} times what motor speed and wheel radius make; is this "
+                "a ride of this vehicle?"
+            )
+    return found
+
+
+def remaining_range_error(report: Report) -> list[str]:
+    """That the model, whatever was named, still misses much of the range of rides held out of the fit."""
+    error = report.gain.range
+    if error is None or not error.after > MISSED:
+        return []
+    return [
+        f"{error.after:.0%} of the range is missed on rides held out: by what differs from ride to ride, as wind "
+        "does, or is too little alike for a name"
+    ]
+
+
+@dataclass(frozen=True)
+class Extent:
+    """Of the rides that were used: distance [m], time [s], energy drawn from the pack [J]."""
+
+    distance: float
+    time: float
+    energy: float
+
+
+def extent(lines: Sequence[LinearRide]) -> Extent:
+    """How much was ridden in all."""
+    distance = sum(line.ride.distance for line in lines)
+    time = sum(float(line.ride.time[-1] - line.ride.time[0]) for line in lines)
+    return Extent(distance, time, sum(energy_drawn(line) for line in lines))

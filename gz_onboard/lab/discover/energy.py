@@ -1,0 +1,95 @@
+"""Residuals and changes as power at the pack's terminals, and as a share of the energy drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.lab.discover.channels import over_blocks
+from gz_onboard.lab.discover.curve_forms import CurveForm, columns
+from gz_onboard.lab.discover.grid import STEP
+from gz_onboard.lab.discover.linear import LinearRide
+from gz_onboard.lab.discover.result import ResidualSize
+
+ROLLING = 2.0  # m/s: where `channels.road_force` holds
+
+
+def pack_power(table_name: str, line: LinearRide, values: Array) -> Array | None:
+    """A residual of a channel as power at the pack's terminals [W], over its blocks; None if it is no power."""
+    table = line.tables[table_name]
+    real = values * table.unit
+    if table_name == "road_force":
+        return np.asarray(real * over_blocks(table.channel, line.ride.quantities["speed"])[table.used])
+    if table_name in ("inverter_power", "auxiliary"):
+        return np.asarray(real)
+    if table_name == "pack_balance" and "pack_voltage" in line.ride.signals:
+        return np.asarray(real * over_blocks(table.channel, line.ride.signals["pack_voltage"])[table.used])
+    return None
+
+
+def channel_energy(name: str, line: LinearRide, values: Array) -> float:
+    """A residual of a channel as energy at the pack's terminals [J] over the ride; 0 if it is no power."""
+    power = pack_power(name, line, values)
+    return 0.0 if power is None or not len(power) else float(np.mean(power)) * channel_time(line, name)
+
+
+def energy_share(lines: Sequence[LinearRide], change: Array, channels: Collection[str] | None = None) -> float:
+    """The part of the energy drawn that `change` (p,) of the parameters makes over these rides, in some channels."""
+    drawn = sum(energy_drawn(line) for line in lines)
+    more = 0.0
+    for line in lines:
+        for name, table in line.tables.items():
+            if channels is None or name in channels:
+                more += channel_energy(name, line, table.a @ change)
+    return more / drawn if drawn else 0.0
+
+
+def energy_drawn(line: LinearRide) -> float:
+    """What the pack gave over the ride [J]; the motor's work where its current or voltage is not known."""
+    s = line.ride.signals
+    volts, amperes = (
+        ("pack_voltage", "pack_current") if "pack_current" in s else ("inverter_voltage", "inverter_current")
+    )
+    if amperes not in s or volts not in s:
+        q = line.ride.quantities
+        return float(np.sum(np.abs(q["torque"] * q["motor_speed"]))) * STEP
+    return float(np.sum(s[volts] * s[amperes])) * STEP
+
+
+def channel_time(line: LinearRide, channel: str) -> float:
+    """The time [s] for which a channel's mean holds: the ride, or that part of it in which it rolls."""
+    whole = len(line.ride.time) * STEP
+    if channel == "road_force":
+        return float(np.mean(np.abs(line.ride.quantities["speed"]) > ROLLING)) * whole
+    return whole
+
+
+def curve_energy_share(lines: Sequence[LinearRide], form: CurveForm, values: Array) -> float:
+    """The part of the energy drawn that the curve of `values` (knots,) takes."""
+    drawn = sum(energy_drawn(line) for line in lines)
+    more = 0.0
+    for line in lines:
+        table = line.tables.get(form.channel)
+        knots = columns(line.ride, form, table) if table is not None else None
+        if table is not None and knots is not None:
+            more += channel_energy(form.channel, line, knots @ values / table.unit)
+    return more / drawn if drawn else 0.0
+
+
+def residual_sizes(lines: Sequence[LinearRide]) -> dict[str, ResidualSize]:
+    """Of each channel's residual."""
+    result = {}
+    drawn = sum(energy_drawn(line) for line in lines)
+    for name in sorted({name for line in lines for name in line.tables}):
+        tables = [(line, line.tables[name]) for line in lines if name in line.tables]
+        y = np.concatenate([table.y for _, table in tables])
+        pairs = [(table.y[1:], table.y[:-1]) for _, table in tables]
+        late, early = (np.concatenate(side) for side in zip(*pairs, strict=True))
+        correlation = float(np.corrcoef(late, early)[0, 1]) if np.std(late) > 0 and np.std(early) > 0 else 0.0
+        share = sum(channel_energy(name, line, table.y) for line, table in tables) / drawn if drawn else 0.0
+        size = float(np.sqrt(np.mean(y**2)))
+        of_range = -share / (1 + share) if share > -1 else 0.0
+        result[name] = ResidualSize(float(y.mean()), size, correlation, len(y), share, of_range)
+    return result

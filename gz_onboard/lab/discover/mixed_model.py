@@ -1,0 +1,255 @@
+"""What discovery knows of a vehicle before it sees a ride: parameters, priors, scatter and noise of the healthy one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import t as student
+
+from gz_onboard.arrays import Array, Mask
+from gz_onboard.lab.discover.candidates import Candidate, candidates
+from gz_onboard.lab.discover.channels import CHANNELS, depends
+from gz_onboard.lab.discover.grid import USUAL_DELAYS, Dimensions, Ride, read_ride
+from gz_onboard.lab.discover.linear import LinearRide, Noise, linearise, spread_out, trimmed
+from gz_onboard.lab.discover.prior import (
+    BASE,
+    BENCH,
+    BY_NAME,
+    FIXED,
+    HEALTHY_SD,
+    LOG,
+    LOG_RIDE_SD,
+    LOG_RIDE_SD_ELSE,
+    NUISANCES,
+    RIDE_SD,
+    RIDE_SD_SHARE,
+    RIDE_SD_STEP,
+    Sizes,
+    nearest_step,
+    sizes_of,
+    stepped,
+)
+from gz_onboard.lab.discover.residuals import System, counted_soc
+from gz_onboard.offline.samples import Samples
+from gz_onboard.physics.effect import Effect, Parameter
+from gz_onboard.physics.parameters import declared_parameters
+from gz_onboard.vehicle import Vehicle
+
+TRANSFERRED = 3.0
+"""What was found on a bench at steady points holds on the road within so many times its standard deviation."""
+MOST_LOG = 0.5  # sd of a logarithm, beyond which a parameter is known to its sign only
+LEAST_STEP = 0.05  # of a standard deviation: the finest scale
+LEAST_SD = 1e-3  # scales: what is certain
+PRIOR_RIDES, LEAST_FREEDOM = 3, 4
+"""What is known without healthy rides, worth so many of them; and no scatter is known worse than with so many."""
+
+
+@dataclass(frozen=True)
+class HealthyCurve:
+    """What healthy rides leave over a quantity in a channel: coefficients (k,), covariance (k, k), inflation."""
+
+    mean: Array
+    covariance: Array
+    inflation: float
+
+
+@dataclass
+class MixedModel:
+    """The linear model's frame: names (p,), scale (p,), values where it is linearised, and what is known before.
+
+    mean, prior: of the common part less `values`, in scales, (p,), (p, p). scatter: variances between rides, (p,).
+    """
+
+    vehicle: Vehicle
+    system: System
+    causes: tuple[Candidate, ...]
+    names: tuple[str, ...]
+    scale: Array
+    values: dict[str, float]
+    mean: Array
+    prior: Array
+    scatter: Array
+    noise: Noise
+    healthy: int  # rides that it was learned on
+    free: Mask  # whose scatter between rides is learned, (p,)
+    inflation: dict[str, float] = field(
+        default_factory=dict
+    )  # of a cause's score on healthy rides left out, 1 if right
+    shapes: dict[str, HealthyCurve] = field(default_factory=dict)  # what healthy rides show over quantities, by name
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom that the scatter between rides is known with: of a search, two for each ride."""
+        return float(max(2 * (self.healthy + PRIOR_RIDES), 2 * LEAST_FREEDOM))
+
+    @property
+    def quantile(self) -> float:
+        """Of Student's t: half of a 95 % interval, in standard deviations."""
+        return float(student.ppf(0.975, max(self.healthy + PRIOR_RIDES, LEAST_FREEDOM)))
+
+    @cached_property
+    def sizes(self) -> Sizes:
+        """How large the vehicle is."""
+        return sizes_of(self.vehicle)
+
+    @property
+    def usable_causes(self) -> list[Candidate]:
+        """The candidates whose parameters some channel depends on."""
+        return [cause for cause in self.causes if set(cause.names) <= set(self.names)]
+
+    @property
+    def lacking(self) -> list[Candidate]:
+        """The candidates whose effect the vehicle's model lacks."""
+        return lacking(self.vehicle, self.causes)
+
+    def healthy_value(self, name: str) -> float:
+        """The healthy vehicle's value of a parameter: that of its file, 0 for an effect that its model lacks."""
+        absent = any(name in cause.names for cause in self.lacking)
+        return 0.0 if absent else float(self.vehicle.parameters[name])
+
+    def index(self, names: Sequence[str]) -> list[int]:
+        """Where `names` stand."""
+        return [self.names.index(name) for name in names]
+
+    def unit_value(self, vector: Array) -> dict[str, float]:
+        """`values` moved by `vector` (p,) in scales."""
+        moved = dict(self.values)
+        for name, x, scale in zip(self.names, vector, self.scale, strict=True):
+            moved[name] = stepped(name, moved[name], float(np.clip(x * scale, -1, 1) if name in LOG else x * scale))
+        return moved
+
+    def ride(self, samples: Samples) -> Ride:
+        """`samples` on the grid of this vehicle."""
+        p = self.vehicle.parameters
+        payload = samples.rider_mass if samples.rider_mass is not None else p["payload_mass"]
+        radius, mass = p["wheel_radius"] * p["gear_ratio"], p["vehicle_mass"] + payload
+        stated = self.vehicle.mapping
+        delays = {s.role: stated.delays[s.message] for s in stated.sources if s.message in stated.delays}
+        dimensions = Dimensions(radius, mass, p["torque_constant"], p["wheelbase"], USUAL_DELAYS | delays)
+        ride = read_ride(samples, dimensions)
+        if self.system.battery is not None and {"pack_voltage", "pack_current"} <= ride.have:
+            ride.quantities["soc"] = counted_soc(ride, self.system)
+        return ride
+
+
+def lacking(vehicle: Vehicle, causes: Sequence[Candidate]) -> list[Candidate]:
+    """Those of `causes` whose effect the model of `vehicle` lacks."""
+    has = {effect.name for effect in vehicle.model.effects}
+    return [cause for cause in causes if cause.effect and cause.effect.name not in has]
+
+
+def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
+    """What is known of `vehicle` from its file alone. folder: with effects of the user's own."""
+    causes = candidates(folder)
+    absent = {name for cause in lacking(vehicle, causes) for name in cause.names}
+    more = [cause.effect for cause in lacking(vehicle, causes) if cause.effect]
+    effects: tuple[Effect, ...] = (*vehicle.model.effects, *more)
+    p = vehicle.parameters
+    system = System(effects, vehicle.battery, p["payload_mass"], dict(p), vehicle.riding.vibration)
+    values = {name: x.prior for name, x in declared_parameters(effects).items()} | dict(p)
+    values |= {nuisance.name: nuisance.value for nuisance in NUISANCES} | dict.fromkeys(absent, 0.0)
+    names = _names(vehicle, causes, more, values)
+    declared = declared_parameters(effects)
+    priors = {name: _prior(name, vehicle, declared, values[name], name in absent) for name in names}
+    return MixedModel(
+        vehicle,
+        system,
+        causes,
+        tuple(names),
+        np.array([prior.scale for prior in priors.values()]),
+        values,
+        np.zeros(len(names)),
+        _covariance(priors, vehicle.parameters.correlations),
+        np.array([prior.ride_sd for prior in priors.values()]) ** 2,
+        {channel.name: channel.noise for channel in CHANNELS},
+        0,
+        np.array([name not in FIXED for name in names]),
+    )
+
+
+def _names(
+    vehicle: Vehicle, causes: Sequence[Candidate], lacking: Sequence[Effect], values: Mapping[str, float]
+) -> list[str]:
+    """The parameters that are fitted: those that a channel depends on, but those that only shape a lacking effect."""
+    effects = (*vehicle.model.effects, *lacking)
+    needed = {name for channel in CHANNELS for name in depends(channel, effects)}
+    strengths = {name for c in causes for name in c.names}
+    of_effects = {x.name for e in vehicle.model.effects for x in e.parameters}
+    shaping = {x.name for e in lacking for x in e.parameters} - strengths
+    fitted = set(BASE) | of_effects | strengths | {nuisance.name for nuisance in NUISANCES}
+    return sorted(name for name in (needed & fitted) - shaping if name in values)
+
+
+@dataclass(frozen=True)
+class _Prior:
+    """Of one parameter: its scale [unit], and in scales the spread of the vehicle's, of a bench's, between rides."""
+
+    scale: float
+    sd: float
+    bench_sd: float
+    ride_sd: float
+
+
+def _prior(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], value: float, absent: bool) -> _Prior:
+    """Of the parameter `name`, at `value`. absent: it is of an effect that the model lacks."""
+    on_bench = False
+    if name in BY_NAME:
+        size = sizes_of(vehicle).of(BY_NAME[name].of)
+        scatter, spread = BY_NAME[name].ride_sd * size, BY_NAME[name].sd * size
+    else:
+        parameter, known = declared[name], vehicle.parameters
+        on_bench = parameter.bench or name in BENCH
+        stated = name in known and not known.known[name].source.startswith("prior:")
+        healthy = HEALTHY_SD.get(name, parameter.healthy_sd)
+        spread = known.sd(name) if name in known and not absent else parameter.prior_sd
+        if healthy is not None and (absent or not stated or name == "payload_mass"):
+            spread = healthy
+        own = RIDE_SD.get(name, parameter.ride_sd)
+        size = nearest_step(value / parameter.prior, RIDE_SD_STEP) if parameter.prior else 1.0
+        scatter = RIDE_SD_SHARE * parameter.prior_sd if own is None else own * size
+    if name in LOG:
+        spread, scatter = min(spread / value, MOST_LOG), LOG_RIDE_SD.get(name, LOG_RIDE_SD_ELSE)
+    wide = spread * (TRANSFERRED if on_bench else 1.0)
+    step = max(scatter, LEAST_STEP * wide)
+    return _Prior(step, max(wide / step, LEAST_SD), spread / step, max(scatter / step, LEAST_SD))
+
+
+def _covariance(priors: Mapping[str, _Prior], correlations: Mapping[frozenset[str], float]) -> Array:
+    """Of the vehicle's parameters before any ride, in scales, (p, p)."""
+    covariance = np.diag(np.array([prior.sd for prior in priors.values()]) ** 2)
+    place = {name: i for i, name in enumerate(priors)}
+    for pair, r in correlations.items():
+        a, b = tuple(pair)
+        if a in place and b in place:
+            # what the bench leaves open goes together; by how much the road differs from the bench does not
+            both = r * priors[a].bench_sd * priors[b].bench_sd
+            covariance[place[a], place[b]] = covariance[place[b], place[a]] = both
+    return covariance
+
+
+def _linearised(job: tuple[Ride, MixedModel]) -> LinearRide:
+    ride, mixed = job
+    line = linearise(ride, mixed.values, mixed.names, mixed.scale, mixed.system)
+    wide = np.sqrt(np.diag(mixed.prior)) + 3 * np.sqrt(mixed.scatter)
+    for parameter in [parameter for cause in mixed.usable_causes for parameter in cause.parameters]:
+        (i,) = mixed.index([parameter.name])
+        wide[i] += max(10 * float(np.sqrt(mixed.scatter[i])), 3 * parameter.prior_sd / float(mixed.scale[i]))
+    line = trimmed(line, mixed.noise, mixed.mean, wide)
+    return spread_out(line, mixed.noise, mixed.mean, wide) if mixed.healthy else line
+
+
+def linearise_all(
+    rides: Sequence[Ride], mixed: MixedModel | Sequence[MixedModel], workers: int = 1
+) -> list[LinearRide]:
+    """All rides at a model, or each at its own, in `workers` processes."""
+    states = [mixed] * len(rides) if isinstance(mixed, MixedModel) else mixed
+    jobs = list(zip(rides, states, strict=True))
+    if workers < 2 or len(rides) < 2:
+        return [_linearised(job) for job in jobs]
+    with ProcessPoolExecutor(workers) as pool:
+        return list(pool.map(_linearised, jobs))

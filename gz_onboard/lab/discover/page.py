@@ -1,0 +1,311 @@
+"""The discovery's report: one HTML page with its pictures inside."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from gz_onboard.lab.discover.breakdown import QuantityReader, before_and_after
+from gz_onboard.lab.discover.channels import BY_NAME
+from gz_onboard.lab.discover.detectability import extent
+from gz_onboard.lab.discover.energy import residual_sizes
+from gz_onboard.lab.discover.linear import LinearRide
+from gz_onboard.lab.discover.plots import curve, overview, panels, ranking
+from gz_onboard.lab.discover.result import METRICS, VERDICTS, Report
+from gz_onboard.lab.discover.verdict import Discovery
+from gz_onboard.lab.discover.wording import readable, with_unit
+from gz_onboard.offline.results import clock
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_STYLE = """
+body { font: 15px/1.5 system-ui, sans-serif; color: #1f2933; max-width: 1150px; margin: 2rem auto; padding: 0 1.5rem }
+h1 { font-size: 1.7rem; margin-bottom: .2rem } h2 { margin-top: 2.4rem; border-bottom: 1px solid #e4e7eb }
+.verdict { font-size: 1.15rem; margin: .2rem 0 1rem } .muted { color: #7b8794 }
+.cards { display: flex; flex-wrap: wrap; gap: 1rem; margin: 1rem 0 }
+.card { background: #f5f7fa; border-radius: .5rem; padding: .7rem 1.1rem; min-width: 9rem }
+.card b { display: block; font-size: 1.35rem }
+table { border-collapse: collapse; margin: .6rem 0 }
+td, th { padding: .25rem .7rem; text-align: right } td { white-space: nowrap }
+td { border-top: 1px solid #e4e7eb } td:first-child, th:first-child { text-align: left }
+th { color: #7b8794; font-weight: 600; vertical-align: bottom } img { width: 100%; display: block }
+summary { cursor: pointer; font-weight: 600; margin: .6rem 0 }
+"""
+
+
+_GRADE = (
+    '<p class="muted">Grade is made from the accelerometer, whose noise is in the road force too, with the other sign: '
+    "a falling line over grade is that noise.</p>"
+)
+
+
+def write_report(found: Discovery, out: Path) -> None:
+    """Write the report of `found` to the HTML file `out`. Raises OSError."""
+    out.write_text(page(found), encoding="utf-8")
+
+
+def page(found: Discovery) -> str:
+    """The report as HTML."""
+    report = found.report
+    before, after = before_and_after(found)
+    stages = {"before": before, "after": after} if report.causes else {"before": before}
+    over = QuantityReader(found.mixed)
+    channels = [name for name in BY_NAME if any(name in line.tables for line in found.lines)]
+    parts = [
+        _head(found),
+        _causes(report),
+        _next(report),
+        "<h2>What the residuals are</h2>" + _residuals(report, before, after),
+        "<h2>Where they live</h2>",
+        f"<p>Share of each residual's variance that goes with a quantity, in percent: before{_named(report)}.</p>",
+        _picture(overview(stages, channels, over)),
+    ]
+    shown = _most(found, before, channels)
+    for name in [*shown, *(c for c in channels if c not in shown)]:
+        title = f"{readable(name)} [{BY_NAME[name].unit}]"
+        picture = _picture(panels(stages, name, over))
+        note = _GRADE if name == "road_force" else ""
+        parts.append(f"<details{' open' if name in shown else ''}><summary>{title}</summary>{picture}{note}</details>")
+    parts += [
+        "<h2>Which cause</h2>" + _picture(ranking(report)),
+        "<h2>What it is worth: rides held out of the fit</h2>" + _gain(report),
+    ]
+    if report.unknown:
+        parts.append("<h2>What has no name</h2>" + _picture(curve(report.unknown)))
+    parts += [_constancy(report), _limits(report), _separable(report), _notes(report)]
+    body = "\n".join(parts)
+    return (
+        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Discovery: {report.verdict}</title>'
+        f"<style>{_STYLE}</style></head><body>\n{body}\n</body></html>\n"
+    )
+
+
+def _named(report: Report) -> str:
+    if not report.causes:
+        return "hand, each ride's own biases and wind taken off"
+    names = ", ".join(readable(cause.name) for cause in report.causes)
+    return f" and after {html.escape(names)}; each ride's own biases and wind taken off"
+
+
+def _head(found: Discovery) -> str:
+    report, mixed = found.report, found.mixed
+    ridden = extent(found.lines)
+    known = f"{mixed.healthy} healthy rides" if mixed.healthy else "the vehicle file alone"
+    cards = [
+        (f"{len(found.lines)}", "ride" if len(found.lines) == 1 else "rides"),
+        (f"{ridden.distance / 1e3:.1f} km", clock(ridden.time)),
+    ]
+    if ridden.energy > 0:
+        cards.append((f"{ridden.energy / 3.6e6:.2f} kWh", "drawn"))
+    share = sum(cause.energy_share for cause in report.causes)
+    if report.causes:
+        cards.append((f"{share:+.1%}", "of the energy named"))
+    elif report.unknown:
+        cards.append((f"{report.unknown.share:+.1%}", "of the energy, without a name"))
+    if (error := report.gain.range) is not None:
+        cards.append((f"{error.before:.1%} → {error.after:.1%}", "error of the range, held out"))
+    boxes = "".join(f'<div class="card"><b>{value}</b>{text}</div>' for value, text in cards)
+    rides = ", ".join(html.escape(line.ride.name) for line in found.lines)
+    return (
+        f"<h1>{html.escape(mixed.vehicle.name)}: {report.verdict}</h1>"
+        f'<p class="verdict">{VERDICTS[report.verdict].capitalize()}.</p>'
+        f'<p class="muted">{rides}; against the vehicle as known from {known}.</p><div class="cards">{boxes}</div>'
+    )
+
+
+def _causes(report: Report) -> str:
+    text = ""
+    rows = []
+    for c in report.causes:
+        rows.append(
+            [
+                readable(c.name),
+                c.parameter,
+                with_unit(c.value, c.unit),
+                f"{c.ci95[0]:.4g} to {c.ci95[1]:.4g}",
+                f"{c.change:+.4g}",
+                f"{c.energy_share:+.1%}",
+                f"{c.evidence:.0f}",
+            ]
+        )
+        for name, other in c.others.items():
+            low, high = other.ci95
+            rows.append(["", name, f"{other.value:.4g}", f"{low:.4g} to {high:.4g}", "", "", ""])
+    if rows:
+        heads = ["cause", "parameter", "value", "95 % interval", "change", "of the energy", "score"]
+        text += "<h2>Causes</h2>" + table(heads, rows)
+        text += (
+            '<p class="muted">Score: chi-squared of one degree of freedom that the rides lose without it; healthy '
+            f"rides stay below {report.threshold:.1f}.</p>"
+        )
+    for c in report.causes:
+        if c.varies:
+            name = readable(c.name)
+            text += f"<p>The {name} differs from ride to ride: it is named, but no model is extended with it.</p>"
+    for group in report.ambiguous:
+        text += f"<p><b>Not told apart by these rides:</b> {', '.join(readable(name) for name in group)}.</p>"
+    if report.unknown:
+        u = report.unknown
+        text += (
+            f"<p><b>No candidate explains</b> what {readable(u.channel)} leaves over {readable(u.quantity)}: "
+            f"{u.share:+.1%} of the energy, score {u.score:.0f}.</p>"
+        )
+        if u.denies:
+            names = ", ".join(readable(name) for name in u.denies)
+            text += f"<p><b>Denied:</b> {names}, which would not act alike everywhere.</p>"
+    return text
+
+
+def _next(report: Report) -> str:
+    if not report.advice:
+        return ""
+    return "<h2>What to ride next</h2>" + "".join(f"<p>{html.escape(line)}</p>" for line in report.advice)
+
+
+def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[LinearRide]) -> str:
+    raw, first, last = report.residuals, residual_sizes(before), residual_sizes(after)
+    rows = []
+    for name in BY_NAME:
+        if name not in raw:
+            continue
+        r, b, a = raw[name], first.get(name, raw[name]), last.get(name, raw[name])
+        energy = any(abs(x.energy_share) > 0 for x in (b, a))
+        shares = [f"{x:+.1%}" if energy else "–" for x in (b.energy_share, b.range_share, a.energy_share)]
+        rows.append(
+            [
+                readable(name),
+                BY_NAME[name].unit,
+                f"{r.mean:+.2g}",
+                f"{r.rms:.2g}",
+                f"{b.rms:.2g}",
+                f"{b.autocorrelation:.2f}",
+                *shares[:2],
+                f"{a.rms:.2g}",
+                f"{a.autocorrelation:.2f}",
+                shares[2],
+            ]
+        )
+    heads = [
+        "measured less model",
+        "unit",
+        "mean",
+        "rms",
+        "before: rms",
+        "auto­correlation",
+        "of the energy",
+        "of the range",
+        "after: rms",
+        "auto­correlation",
+        "of the energy",
+    ]
+    blocks = ", ".join(
+        f"{readable(n)} {BY_NAME[n].block:g} s" for n in ("road_force", "inverter_power", "cell_voltage")
+    )
+    return table(heads, rows) + (
+        '<p class="muted">Mean and rms as measured, with the bias of each ride\'s sensors and its wind; before and '
+        "after with these taken off, without and with the causes named. Autocorrelation: of neighbouring blocks "
+        f"({blocks}); near 0 nothing is left but noise.</p>"
+    )
+
+
+def _most(found: Discovery, before: Sequence[LinearRide], channels: Sequence[str]) -> list[str]:
+    """The channels whose pictures are open: those that the causes change most, else the road's and the cells'."""
+    report, mixed = found.report, found.mixed
+    if not report.causes:
+        wanted = [report.unknown.channel] if report.unknown else []
+        return [c for c in (*wanted, "road_force", "cell_voltage") if c in channels][:2]
+    most: list[str] = []
+    for cause in report.causes:
+        index = mixed.index(list(cause.parameters))
+        weight = {}
+        for name in channels:
+            tables = [line.tables[name] for line in before if name in line.tables]
+            size_ = sum(float(np.sum(t.a[:, index] ** 2)) for t in tables)
+            noise = sum(float(np.sum(t.y**2)) for t in tables)
+            weight[name] = size_ / noise if noise > 0 else 0.0
+        best = max(weight, key=lambda n: weight[n])
+        if best not in most:
+            most.append(best)
+    return most
+
+
+def _gain(report: Report) -> str:
+    rows = []
+    for metric, errors in report.gain.errors.items():
+        label, factor, unit = METRICS[metric]
+        low, high = (x * factor for x in errors.ci95)
+        values = [f"{x * factor:.3g}" for x in (errors.before, errors.control, errors.after)]
+        rows.append([f"{label} [{unit}]", *values, f"{low:+.3g} to {high:+.3g}"])
+    if not rows:
+        return f"<p>{html.escape(report.gain.note or 'nothing was held out')}</p>"
+    heads = ["error", "before", "control", "after", "gain over control, 95 % over rides"]
+    held = ", ".join(map(html.escape, report.gain.holdout))
+    text = "In no choice and no fit" if report.gain.apart else "Each in turn was held out of the fit"
+    return table(heads, rows) + (
+        f'<p class="muted">{text}: {held}. Control: the parameters that the model has already, refitted on the other '
+        "rides. After: the causes as well.</p>"
+    )
+
+
+def _constancy(report: Report) -> str:
+    splits = report.constancy
+    if not splits:
+        return ""
+    rows = [[readable(s.cause), readable(s.quantity), f"{s.ratio:+.2f}", f"{s.chi2:.1f}"] for s in splits]
+    return (
+        "<h2>Whether a cause acts alike everywhere</h2><p>Half the difference of left and right bends, or of the upper "
+        "and lower half of a quantity, over the mean: 0 for the cause itself, ±1 for what acts in one half only.</p>"
+        + table(["cause", "over", "ratio", "chi-squared"], rows)
+    )
+
+
+def _limits(report: Report) -> str:
+    rows = []
+    for name, limit in report.limits.items():
+        if limit.change is None or limit.energy_share is None:
+            rows.append([readable(name), limit.parameter, "not by these rides", "–"])
+        else:
+            share = f"{limit.energy_share:.1%}" if limit.energy_share > 1e-5 else "–"
+            rows.append([readable(name), limit.parameter, with_unit(limit.change, limit.unit, ".3g"), share])
+    return (
+        "<h2>What these rides could show</h2><p>The least change that would be found half the time, were it alone.</p>"
+        f"<details><summary>Every candidate</summary>{table(['cause', 'parameter', 'change', 'of the energy'], rows)}"
+        "</details>"
+    )
+
+
+def _separable(report: Report) -> str:
+    look = report.isolability.look_alikes
+    if not look:
+        return "<p>No two candidates look alike to these rides (cosine above 0.8).</p>"
+    rows = [[readable(a), readable(b), f"{c:+.2f}"] for a, b, c in look[:20]]
+    return (
+        "<p>Causes that look alike to these rides: cosine of what they do to the residuals once biases and scatter are "
+        "out. At ±1 no statistics can tell them apart.</p>" + table(["cause", "cause", "cosine"], rows)
+    )
+
+
+def _notes(report: Report) -> str:
+    if not report.notes:
+        return ""
+    return "<h2>Notes</h2><ul>" + "".join(f"<li>{html.escape(note)}</li>" for note in report.notes) + "</ul>"
+
+
+def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """An HTML table of texts."""
+    head = "".join(f"<th>{html.escape(text)}</th>" for text in heads)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    return f"<table><tr>{head}</tr>{body}</table>"
+
+
+def _picture(figure: Figure) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=100, metadata={"Software": "gz-onboard"})
+    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">'

@@ -1,0 +1,69 @@
+"""JSON, and the JSON schema of it, from dataclasses: what a command reports stands once, as types.
+
+A field's description stands in its type, `Annotated[float, "of the energy"]`. One that is `Annotated[..., OPTIONAL]` is
+left out of the JSON where it is None. Known are dataclasses, str, int, float, bool, None, lists, tuples, dictionaries
+by name, and unions of these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from types import NoneType, UnionType
+from typing import Annotated, Any, TypeAlias, Union, get_args, get_origin, get_type_hints
+
+Json: TypeAlias = "str | int | float | bool | list[Json] | dict[str, Json] | None"
+OPTIONAL = object()
+_NAMES = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
+
+
+def to_json(value: Any) -> Json:
+    """`value` in the types that a JSON file has; dataclasses as objects, in the order of their fields."""
+    if is_dataclass(value):
+        omitted = _optional(type(value)) if any(getattr(value, f.name) is None for f in fields(value)) else ()
+        pairs = [(f.name, getattr(value, f.name)) for f in fields(value)]
+        return {name: to_json(x) for name, x in pairs if x is not None or name not in omitted}
+    if isinstance(value, Mapping):
+        return {str(key): to_json(x) for key, x in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json(x) for x in value]
+    return value  # type: ignore[no-any-return]
+
+
+def schema(kind: Any) -> dict[str, Json]:
+    """The JSON schema (draft 2020-12) of a type. Raises TypeError for one that JSON does not have."""
+    if is_dataclass(kind):
+        hints, omitted = get_type_hints(kind, include_extras=True), _optional(kind)
+        names = [f.name for f in fields(kind)]
+        properties: dict[str, Json] = {name: schema(hints[name]) for name in names}
+        required: list[Json] = [name for name in names if name not in omitted]
+        return {"type": "object", "properties": properties, "required": required, "additionalProperties": False}
+    origin, arguments = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        text = [x for x in arguments[1:] if isinstance(x, str)]
+        return schema(arguments[0]) | ({"description": text[0]} if text else {})
+    if origin in (Union, UnionType):
+        return {"anyOf": [schema(x) for x in arguments]}
+    if origin is list or (origin is tuple and arguments[1:] == (...,)):
+        return {"type": "array", "items": schema(arguments[0])}
+    if origin is tuple:
+        size = len(arguments)
+        return {"type": "array", "prefixItems": [schema(x) for x in arguments], "minItems": size, "maxItems": size}
+    if origin is dict:
+        return {"type": "object", "additionalProperties": schema(arguments[1])}
+    if kind not in _NAMES:
+        raise TypeError(f"{kind}: JSON has no such type")
+    return {"type": _NAMES[kind]}
+
+
+def descriptions(kind: Any) -> dict[str, str]:
+    """Of each field of a dataclass that has one, in their order."""
+    hints = get_type_hints(kind, include_extras=True)
+    texts = {f.name: [x for x in get_args(hints[f.name])[1:] if isinstance(x, str)] for f in fields(kind)}
+    return {name: text[0] for name, text in texts.items() if text}
+
+
+def _optional(kind: Any) -> frozenset[str]:
+    """The fields of a dataclass that are left out where they are None."""
+    hints = get_type_hints(kind, include_extras=True)
+    return frozenset(f.name for f in fields(kind) if OPTIONAL in getattr(hints[f.name], "__metadata__", ()))

@@ -1,0 +1,125 @@
+"""JSON and its schema from types: what is written fits the schema, for every shape that a report has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import pytest
+
+from gz_onboard.lab.discover.result import (
+    Cause,
+    Errors,
+    Estimate,
+    Gain,
+    Isolability,
+    Limit,
+    Report,
+    ResidualSize,
+    Score,
+    Split,
+    Unknown,
+)
+from gz_onboard.lab.schema import OPTIONAL, descriptions, schema, to_json
+
+
+@dataclass(frozen=True)
+class Inner:
+    """With a key that is left out."""
+
+    at: tuple[float, int]
+    name: Annotated[str | None, OPTIONAL, "what it is called"] = None
+
+
+@dataclass(frozen=True)
+class Outer:
+    """Of every kind."""
+
+    rows: Annotated[tuple[Inner, ...], "the rows"]
+    by_name: dict[str, list[bool]]
+    missing: float | None = None
+
+
+def fits(value: Any, shape: Any) -> bool:
+    """Whether `value` is of the JSON schema `shape`, of those keywords that `schema` writes."""
+    if "anyOf" in shape:
+        return any(fits(value, one) for one in shape["anyOf"])
+    kind = shape["type"]
+    if kind == "object":
+        known, other = shape.get("properties", {}), shape["additionalProperties"]
+        return (
+            isinstance(value, dict)
+            and set(shape.get("required", [])) <= set(value)
+            and all(fits(x, known[k]) if k in known else other and fits(x, other) for k, x in value.items())
+        )
+    if kind == "array":
+        if "prefixItems" in shape:
+            return len(value) == len(shape["prefixItems"]) and all(map(fits, value, shape["prefixItems"]))
+        return isinstance(value, list) and all(fits(x, shape["items"]) for x in value)
+    if kind in ("number", "integer"):
+        return isinstance(value, int if kind == "integer" else int | float) and not isinstance(value, bool)
+    return isinstance(value, {"string": str, "boolean": bool, "null": type(None)}[kind])
+
+
+def test_what_is_none_is_null_or_left_out():
+    value = Outer((Inner((1.0, 2)), Inner((3.0, 4), "a")), {"x": [True]})
+    assert to_json(value) == {
+        "rows": [{"at": [1.0, 2]}, {"at": [3.0, 4], "name": "a"}],
+        "by_name": {"x": [True]},
+        "missing": None,
+    }
+    assert fits(to_json(value), schema(Outer))
+    assert schema(Inner)["required"] == ["at"]
+    assert descriptions(Outer) == {"rows": "the rows"}
+
+
+def test_the_schema_refuses_what_is_of_another_shape():
+    shape = schema(Outer)
+    assert not fits({"rows": [], "by_name": {}}, shape)
+    assert not fits({"rows": [], "by_name": {"x": 1}, "missing": None}, shape)
+    assert not fits({"rows": [], "by_name": {}, "missing": None, "more": 1}, shape)
+    with pytest.raises(TypeError, match="JSON has no such type"):
+        schema(set)
+
+
+def test_the_report_of_a_discovery_has_the_shape_that_it_says():
+    interval = (0.1, 0.2)
+    report = Report(
+        "ambiguous",
+        [
+            Cause(
+                "headwind",
+                "wind_north",
+                3.0,
+                "m/s",
+                interval,
+                3.0,
+                0.1,
+                30.0,
+                True,
+                {"wind_east": Estimate(1.0, interval)},
+            )
+        ],
+        [["a", "b"]],
+        Unknown("road_force", "speed", False, "m/s", 40.0, 41.0, ((1.0, 2.0, 0.5),), ("a",), 0.03),
+        [Score("a", 1.0)],
+        {"road_force": ResidualSize(0.1, 0.2, 0.3, 4, 0.5, 0.6)},
+        Gain(("ride",), apart=False, power=Errors(3.0, 2.0, 1.0, interval)),
+        ["advice"],
+        [],
+        Isolability({"a": ["road_force"]}, [["a", "b"]], [("a", "b", 0.9)]),
+        15.0,
+        [Split("a", "time", 0.1, 2.0)],
+        {"a": Limit("wind_north", "m/s", None, None)},
+    )
+    written = to_json(report)
+    assert fits(written, schema(Report))
+    assert isinstance(written, dict)
+    assert list(written) == ["schema", *descriptions(Report)]
+    assert written["gain"] == {
+        "holdout": ["ride"],
+        "apart": False,
+        "power": {"before": 3.0, "control": 2.0, "after": 1.0, "ci95": [0.1, 0.2]},
+    }
+    (cause,) = report.causes
+    assert list(cause.parameters) == ["wind_north", "wind_east"]
