@@ -13,8 +13,8 @@ from gz_onboard.estimator.ekf import ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, voltage
 from gz_onboard.lab.calibrate.coastdown_run import Coast
-from gz_onboard.lab.calibrate.cooling import motor_temperatures, pack_temperatures
-from gz_onboard.lab.calibrate.cooling_run import Run
+from gz_onboard.lab.calibrate.cooling_network import motor_temperatures, pack_temperatures
+from gz_onboard.lab.calibrate.cooling_run import CoolingRun
 from gz_onboard.lab.calibrate.road_load import RoadLoad
 from gz_onboard.lab.discover import residuals
 from gz_onboard.lab.discover.grid import Ride, read_ride
@@ -180,7 +180,7 @@ def calibration_run(ride, **heats):
     parts = {"motor_heat": nothing, "iron": nothing, "inverter_heat": nothing, "pack_heat": nothing} | heats
     measured = {name: ride[name] for name in ("motor_temperature", "cell_temperature")}
     time = np.arange(len(nothing), dtype=float)
-    return Run(
+    return CoolingRun(
         name="ride",
         still=False,
         time=time,
@@ -253,7 +253,7 @@ def test_everyone_has_the_same_road_load(ride):
 def test_a_coast_down_is_held_back_as_the_model_says(speed, slope):
     """The road load of calibration, with the motor turning along, is what the light model drives against."""
     ends = np.array([0.0, 1.0])
-    run = Coast("run", ends, ends, 1, None, VEHICLE.model.mass, AMBIENT, 0.0, (ends, ends))
+    run = Coast("run", ends, ends, 1, None, VEHICLE.model.mass, AMBIENT, 0.0)
     force = RoadLoad(VEHICLE)(speed, run, slope, 0.0)
     q = dict.fromkeys(QUANTITIES, 0.0) | {"speed": speed, "grade": slope, "grade_cosine": (1 - slope**2) ** 0.5}
     q |= {"mass": VEHICLE.model.mass, "air_density": air_density(AMBIENT), "motor_temperature": AMBIENT}
