@@ -16,7 +16,8 @@ from gz_onboard.bus.export import out_suffix, write_frames_as
 from gz_onboard.bus.layout import raw_range
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, Frame
-from gz_onboard.simulation.sensors import GPS_MESSAGES, ROLLER, SENSORS, TURNS, Sensor, Truth, latency, shaken, spread
+from gz_onboard.simulation.sensors import GPS_MESSAGES, ROLLER, SENSORS, TURNS, Sensor, latency, shaken, spread
+from gz_onboard.simulation.trace import Truth
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -72,7 +73,6 @@ def simulate_frames(
             raise vehicle.error(
                 f"message {message.name}: its DBC file gives no GenMsgCycleTime, the period of its frames"
             )
-    gaps = _gps_gaps(truth, seed, losses or Losses())
     sent = []
     for message in vehicle.mapping.database.messages:
         period = vehicle.mapping.periods.get(message.name)
@@ -83,7 +83,7 @@ def simulate_frames(
             raise vehicle.error(
                 f"message {message.name}: simulated frames have eight bytes and little-endian integers, not multiplexed"
             )
-        sent.append(_send(vehicle, message, sensors, truth, seed, start_ns, losses or Losses(), gaps))
+        sent.append(_send(vehicle, message, sensors, truth, seed, start_ns, losses or Losses()))
     return sent
 
 
@@ -129,7 +129,6 @@ def _send(
     seed: int,
     start_ns: int,
     losses: Losses,
-    gaps: Floats,
 ) -> Sent:
     import numpy as np
 
@@ -141,7 +140,7 @@ def _send(
     seconds: Floats = offsets.astype(float) * 1e-9
     no_fix = np.zeros(len(offsets), dtype=bool)
     if message.name in GPS_MESSAGES:
-        for begin, end in gaps:
+        for begin, end in _gps_gaps(truth, seed, losses):
             no_fix |= (seconds >= begin) & (seconds < end)
     protection = vehicle.mapping.protection.get(message.name)
     counter = protection.counter if protection else None

@@ -16,9 +16,9 @@ from gz_onboard.simulation.frames import Losses, simulate_frames, write_frames
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.run import COLUMNS, Run
 from gz_onboard.simulation.scooter import Scooter
-from gz_onboard.simulation.sensors import Trace
 from gz_onboard.simulation.summary import Summary, measured_columns, summary_text
 from gz_onboard.simulation.sweep import Sweep
+from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle
 
 FORMATS = ("mcap", "parquet", "csv")

@@ -1,24 +1,20 @@
 """What the reference scooter's sensors make of a simulated ride: values with gain, offset, noise and delay.
 
-A `Trace` keeps the scooter's state before each step; `SENSORS` says for each signal of the scooter's DBC files what of
+`trace` keeps the scooter's states; `SENSORS` says for each signal of the scooter's DBC files what of
 it is sensed and how well. Figures are those of docs/reference-scooter.md; where that has none, a guess of this file.
 """
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import cos, pi
 from typing import TYPE_CHECKING
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
-from gz_onboard.physics.model import Bound, over, total
 from gz_onboard.physics.vibration import FAST
 from gz_onboard.simulation.recorded import BRAKE_FORCE
-from gz_onboard.simulation.run import Command
-from gz_onboard.simulation.scooter import Scooter
+from gz_onboard.simulation.trace import Truth
 
 if TYPE_CHECKING:
     from gz_onboard.arrays import Array
@@ -29,174 +25,8 @@ GPS_DELAY = 0.4  # s
 CABLE = 0.0086  # Ω between pack and inverter
 REPORTED_TORQUE = 0.47  # N·m/A, that the inverter makes torque of its current with, whatever the magnets are
 ODOMETER_RADIUS = 0.245  # m, that the odometer assumes
-LEAN_TIME = 1.0  # s that a rider takes into a bend: the road's pieces change their curvature at once
 LATITUDE, LONGITUDE, ALTITUDE = 45.0, 9.0, 200.0  # deg, deg, m: where a simulated road begins, to the north
 _METRES_PER_DEGREE = 111_200.0
-
-_NAMES = (
-    "time",
-    "speed",
-    "wheel_speed",
-    "distance",
-    "climb",
-    "grade",
-    "curvature",
-    "throttle",
-    "brake",
-    "motor_current",
-    "pack_current",
-    "pack_voltage",
-    "soc",
-    "cell",
-    "motor",
-    "inverter",
-    "bms",
-    "tyre_force",
-    "chassis_lean",
-    "vibration",
-)
-
-
-class Trace:
-    """The state of a scooter before each step of a ride; pass `run.drive` what `watch` gives."""
-
-    def __init__(self) -> None:
-        self._rows = array("d")
-
-    def watch(self, command: Command) -> Command:
-        """`command`, with the state that it is given kept."""
-        extend = self._rows.extend
-
-        def watched(s: Scooter) -> tuple[float, float, float]:
-            grade, curvature, _ = (0.0, 0.0, 0.0) if s.dynamometer else s.road(s.distance)
-            extend(
-                (
-                    s.time,
-                    s.speed,
-                    s.wheel_speed,
-                    s.distance,
-                    s.climb,
-                    grade,
-                    curvature,
-                    s.throttle,
-                    s.brake,
-                    s.motor_current,
-                    s.current,
-                    s.voltage,
-                    s.pack.soc,
-                    s.pack_cooling.temperature,
-                    s.motor_cooling.stator,
-                    s.inverter_cooling.board,
-                    s.bms_cooling.temperature,
-                    s.force,
-                    s.lean,
-                    s.vibration,
-                )
-            )
-            return command(s)
-
-        return watched
-
-    def truth(self, scooter: Scooter) -> Truth:
-        """What there was to be sensed on the ride of `scooter`; ValueError if nothing was ridden."""
-        import numpy as np
-
-        if len(self._rows) < 3 * len(_NAMES):
-            raise ValueError("a trace of fewer than three steps")
-        columns = np.frombuffer(self._rows).reshape(-1, len(_NAMES)).T
-        return Truth(dict(zip(_NAMES, columns, strict=True)), scooter)
-
-
-class Truth:
-    """Everything that the sensors read, as arrays over the steps; SI units, temperatures in degC, angles in rad.
-
-    Those of `Trace`, and: ``acceleration`` and ``way`` (of the body over the ground: none on a dynamometer),
-    ``yaw_rate`` (left), ``lean`` (right; of a leaning chassis its own, else `_lean_of`), ``lean_rate``, ``pitch_rate``
-    (nose down), ``heading`` (from north), ``north`` and ``east`` [m], ``auxiliary_power`` (of all effects at the DC
-    link), ``auxiliary_current``. ``vibration`` is 0 unless the model reads it.
-    """
-
-    def __init__(self, columns: Mapping[str, Array], scooter: Scooter) -> None:
-        import numpy as np
-
-        self.parameters = scooter.vehicle.parameters
-        self.ambient = scooter.ambient
-        self.on_dynamometer = scooter.dynamometer is not None
-        self.dt = dt = scooter.dt
-        self.columns = c = dict(columns)
-        self.count = len(c["time"])
-        moving = 0.0 if self.on_dynamometer else 1.0
-        c["way"] = moving * c["speed"]
-        c["acceleration"] = np.gradient(c["way"], dt)
-        width = min(2 * round(LEAN_TIME / dt / 2) + 1, self.count)
-        curvature = _smooth(c["curvature"], width)
-        c["yaw_rate"] = c["way"] * curvature
-        if scooter.chassis.name == "leaning":
-            c["lean"] = _smooth(c["chassis_lean"], width)
-        else:
-            c["lean"] = _lean_of(-np.arctan(c["way"] ** 2 * curvature / GRAVITY), self.parameters)
-        c["lean_rate"] = np.gradient(c["lean"], dt)
-        c["slope"] = np.arcsin(_smooth(c["grade"], width))
-        c["pitch_rate"] = -np.gradient(c["slope"], dt)
-        c["heading"] = scooter.start_heading - np.cumsum(c["yaw_rate"]) * dt
-        c["north"] = np.cumsum(c["way"] * np.cos(c["heading"])) * dt
-        c["east"] = np.cumsum(c["way"] * np.sin(c["heading"])) * dt
-        c["auxiliary_power"] = self._auxiliary(scooter)
-        c["auxiliary_current"] = c["auxiliary_power"] / c["pack_voltage"]
-
-    def _auxiliary(self, scooter: Scooter) -> Array:
-        """What all effects at the DC link draw beside the inverter [W]."""
-        import numpy as np
-
-        c = self.columns
-        q = dict.fromkeys(QUANTITIES, 0.0) | {
-            "speed": c["way"],
-            "acceleration": c["acceleration"],
-            "grade": c["grade"],
-            "soc": c["soc"],
-            "lateral_acceleration": c["way"] * c["yaw_rate"],
-            "heading": c["heading"],
-            "motor_current": c["motor_current"],
-            "motor_temperature": c["motor"],
-            "cell_temperature": c["cell"],
-            "time_moving": np.cumsum(c["way"] > MOVING) * self.dt,
-            "ambient_temperature": self.ambient,
-            "vibration": c["vibration"],
-        }
-        effects = [Bound(effect, self.parameters) for effect in scooter.vehicle.model.effects]
-        drawn = total([e for e in effects if e.effect.port is Port.DC_POWER], q, over(self.dt))
-        return np.asarray(np.zeros(self.count) + drawn)
-
-    def __getitem__(self, name: str) -> Array:
-        return self.columns[name]
-
-    def constant(self, value: float) -> Array:
-        """`value` at every step."""
-        import numpy as np
-
-        return np.full(self.count, value)
-
-
-def _lean_of(ideal: Array, p: Mapping[str, float]) -> Array:
-    """Lean [rad] of a machine on round tyres where a thin disc leans by `ideal`, as `turning.tyre.lean_of`.
-
-    A chassis without lean has nobody on it who leans; its sensors are those of one that does.
-    """
-    import numpy as np
-
-    crown, height = p["tyre_crown_radius"], p["cg_height"]
-    lean: Array = ideal + np.arcsin(np.clip(crown * np.sin(ideal) / (height - crown), -1.0, 1.0))
-    return lean
-
-
-def _smooth(values: Array, width: int) -> Array:
-    """The mean of `width` (odd) values about each."""
-    import numpy as np
-
-    padded = np.pad(values, width // 2, mode="edge")
-    sums = np.cumsum(np.concatenate(([0.0], padded)))
-    smooth: Array = ((sums[width:] - sums[:-width]) / width)[: len(values)]
-    return np.pad(smooth, (0, len(values) - len(smooth)), mode="edge")
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,9 @@ from gz_onboard.simulation.plan import Plan, find_plan, noted_payload
 from gz_onboard.simulation.recorded import rest_soc, scooter_at_start
 from gz_onboard.simulation.run import Run, drive
 from gz_onboard.simulation.scooter import Scooter
-from gz_onboard.simulation.sensors import Trace
 from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION, Variant, cycle_range, summarise, summary_text
 from gz_onboard.simulation.sweep import Sweep, grid, read_sweep, redesigned
+from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 _MOST_HOURS = 48.0  # of riding until empty

@@ -20,7 +20,7 @@ from gz_onboard.physics.vibration import Vibration
 from gz_onboard.simulation.frames import batches, simulate_frames
 from gz_onboard.simulation.run import along, drive
 from gz_onboard.simulation.scooter import Scooter
-from gz_onboard.simulation.sensors import Trace
+from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import GROUPS, Plant
 from tests.support import ridden

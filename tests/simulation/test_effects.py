@@ -15,7 +15,8 @@ from gz_onboard.simulation.parts.battery import EffectPack
 from gz_onboard.simulation.parts.road import Dynamometer, straight
 from gz_onboard.simulation.run import Run, at_steps, drive, follow
 from gz_onboard.simulation.scooter import STEP, Scooter
-from gz_onboard.simulation.sensors import SENSORS, Trace, latency
+from gz_onboard.simulation.sensors import SENSORS, latency
+from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 BASE = read_vehicle("reference")

@@ -21,7 +21,8 @@ from gz_onboard.simulation.parts.chassis import chassis
 from gz_onboard.simulation.parts.road import Dynamometer
 from gz_onboard.simulation.run import along, drive, road_table
 from gz_onboard.simulation.scooter import Scooter
-from gz_onboard.simulation.sensors import ALTITUDE, ROLLER, SENSORS, Trace
+from gz_onboard.simulation.sensors import ALTITUDE, ROLLER, SENSORS
+from gz_onboard.simulation.trace import Trace
 from gz_onboard.simulation.turning.tyre import lean_of
 from gz_onboard.vehicle import read_vehicle
 from tests.support import ROOT, reference, ridden

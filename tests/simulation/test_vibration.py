@@ -22,7 +22,8 @@ from gz_onboard.simulation.parts.road import Dynamometer, straight
 from gz_onboard.simulation.recorded import Recorded, read_recorded
 from gz_onboard.simulation.run import drive
 from gz_onboard.simulation.scooter import STEP, Scooter
-from gz_onboard.simulation.sensors import SENSORS, Trace
+from gz_onboard.simulation.sensors import SENSORS
+from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 from tests.support import LOGS
 

@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.channels import BY_NAME, over_blocks, usable
+from gz_onboard.lab.discover.blocks import over_blocks, usable
+from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.grid import STEP, Ride, since
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Posterior, fit_mixed
 from gz_onboard.lab.discover.mixed_model import MixedModel

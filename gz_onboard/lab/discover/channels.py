@@ -19,16 +19,17 @@ channels, and causes that look alike in the energy drawn (a heavier rider, a wea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover import residuals
-from gz_onboard.lab.discover.grid import STEP, Ride
-from gz_onboard.lab.discover.residuals import SLOW, System, Values, mean_over
-from gz_onboard.physics.effect import Effect, Port
+from gz_onboard.lab.discover.grid import Ride
+from gz_onboard.lab.discover.residuals import SLOW
+from gz_onboard.lab.discover.system import System, Values
+from gz_onboard.physics.effect import Port
 
 
 def _always(ride: Ride) -> Mask:
@@ -332,56 +333,3 @@ CHANNELS = (
     ),
 )
 BY_NAME = {channel.name: channel for channel in CHANNELS}
-
-
-def depends(channel: Channel, effects: Sequence[Effect]) -> set[str]:
-    """The parameters that `channel` depends on."""
-    names = set(channel.parameters)
-    for effect in effects:
-        if effect.port in channel.ports and not effect.stores_energy:
-            names |= {*effect.keywords, *effect.decay_keywords}
-    return names
-
-
-def usable(channel: Channel, ride: Ride, system: System) -> bool:
-    """Whether the ride has what `channel` needs."""
-    return set(channel.roles) <= ride.have and (system.battery is not None or not channel.battery)
-
-
-def support(channel: Channel, ride: Ride) -> Mask:
-    """The blocks of `channel` in which everything was measured and the channel holds, shape (blocks,)."""
-    good = channel.holds(ride) & ride.mask(*channel.roles)
-    n = round(channel.block / STEP)
-    if channel.name == "voltage_timing":
-        good = good & np.roll(good, -1)
-        good[-1] = False
-    return np.asarray(mean_over(good.astype(float), n) > 0.99)
-
-
-def blocks(channel: Channel, ride: Ride, p: Values, system: System) -> Array:
-    """The residual of `channel` averaged over its blocks, shape (blocks,); masked ones too."""
-    fine = channel.residual(ride, p, system)
-    count = len(ride.time) // round(channel.block / STEP)
-    result = mean_over(fine, round(channel.block / STEP / channel.steps))
-    return np.asarray(result[:count])
-
-
-def roughness(channel: Channel, ride: Ride) -> Array:
-    """By how much more a block's residual scatters, shape (blocks,): where the current changes within it, small errors
-    of timing and of dynamics weigh more; on a rough road the accelerometer is noisy.
-    """
-    n = round(channel.block / STEP)
-    shaken = np.ones(len(ride.time) // n)
-    if channel.shaken > 0 and "vibration" in ride.quantities:
-        shaken = shaken + mean_over(ride.quantities["vibration"] ** 2, n) / channel.shaken**2
-    if channel.rough <= 0:
-        return np.asarray(np.sqrt(shaken))
-    amperes = ride.signals["motor_current"]
-    level = mean_over(np.abs(amperes), n)
-    swing = np.sqrt(np.maximum(mean_over(amperes**2, n) - mean_over(amperes, n) ** 2, 0.0))
-    return np.asarray(np.sqrt(shaken * (1 + ((swing + 0.2 * level) / channel.rough) ** 2)))
-
-
-def over_blocks(channel: Channel, values: Array) -> Array:
-    """A quantity on the grid, averaged over the blocks of `channel`."""
-    return mean_over(values, round(channel.block / STEP))

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.channels import over_blocks
+from gz_onboard.lab.discover.blocks import over_blocks
 from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Normal, whitened
 from gz_onboard.lab.discover.mixed_model import MixedModel

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.channels import over_blocks
+from gz_onboard.lab.discover.blocks import over_blocks
 from gz_onboard.lab.discover.grid import STEP, Ride, smooth
 from gz_onboard.lab.discover.linear import LinearChannel
 from gz_onboard.lab.discover.prior import USUAL, Sizes

@@ -11,7 +11,8 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.baseline_file import restore
-from gz_onboard.lab.discover.channels import BY_NAME, usable
+from gz_onboard.lab.discover.blocks import usable
+from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.detectability import limits
 from gz_onboard.lab.discover.gain import measure_gain
 from gz_onboard.lab.discover.grid import STEP, Ride

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.channels import over_blocks
+from gz_onboard.lab.discover.blocks import over_blocks
 from gz_onboard.lab.discover.curve_forms import CurveForm, columns
 from gz_onboard.lab.discover.grid import STEP
 from gz_onboard.lab.discover.linear import LinearRide

@@ -15,10 +15,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.lab.discover.channels import CHANNELS, Channel, blocks, depends, roughness, support, usable
+from gz_onboard.lab.discover.blocks import blocks, depends, roughness, support, usable
+from gz_onboard.lab.discover.channels import CHANNELS, Channel
 from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.prior import stepped
-from gz_onboard.lab.discover.residuals import System
+from gz_onboard.lab.discover.system import System
 
 LEAST = 0.02  # of the variance before, down to which the scatter between rides is learned
 Noise = dict[str, tuple[float, float, float]]  # by channel: white sd, correlated sd, correlation time [s]

@@ -12,8 +12,9 @@ import numpy as np
 from scipy.stats import t as student
 
 from gz_onboard.arrays import Array, Mask
+from gz_onboard.lab.discover.blocks import depends
 from gz_onboard.lab.discover.candidates import Candidate, candidates
-from gz_onboard.lab.discover.channels import CHANNELS, depends
+from gz_onboard.lab.discover.channels import CHANNELS
 from gz_onboard.lab.discover.grid import USUAL_DELAYS, Dimensions, Ride, read_ride
 from gz_onboard.lab.discover.linear import LinearRide, Noise, linearise, spread_out, trimmed
 from gz_onboard.lab.discover.prior import (
@@ -34,7 +35,8 @@ from gz_onboard.lab.discover.prior import (
     sizes_of,
     stepped,
 )
-from gz_onboard.lab.discover.residuals import System, counted_soc
+from gz_onboard.lab.discover.residuals import counted_soc
+from gz_onboard.lab.discover.system import System
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import Effect, Parameter
 from gz_onboard.physics.parameters import declared_parameters

@@ -119,16 +119,8 @@ class Planar:
         dv = (load_f * y_f + load_r * y_r) / m.mass - u * r
         dr = (load_f * (a * y_f + twist_f) + load_r * (twist_r - b * y_r)) / m.yaw_inertia
         ch, sh = cos(heading), sin(heading)
-        change = (
-            du,
-            dv,
-            dr,
-            u * ch - v * sh,
-            u * sh + v * ch,
-            r,
-            m.front.slip_rate(slip_f, along_f, across_f),
-            m.rear.slip_rate(slip_r, along_r, across_r),
-        )
+        slips = m.front.slip_rate(slip_f, along_f, across_f), m.rear.slip_rate(slip_r, along_r, across_r)
+        change = (du, dv, dr, u * ch - v * sh, u * sh + v * ch, r, *slips)
         power = {
             "aerodynamic drag": drag * u,
             "rolling": load_f * rolling_f * along_f + load_r * rolling_r * along_r,
@@ -137,24 +129,10 @@ class Planar:
             "grade": slope * u,
             "drive": -drive * u,
         }
-        seen = {
-            "speed": u,
-            "acceleration": du,
-            "drive": drive,
-            "lateral_acceleration": u * r,
-            "yaw_rate": r,
-            "lean": p.lean,
-            "steer": p.steer,
-            "load_front": load_f,
-            "load_rear": load_r,
-            "plane_load_front": load_f * plane_f,
-            "plane_load_rear": load_r * plane_r,
-            "rolling_radius": p.radius,
-            "slip_front": slip_f,
-            "slip_rear": slip_r,
-            "side_front": load_f * side_f,
-            "side_rear": load_r * side_r,
-        }
+        seen = {"speed": u, "acceleration": du, "drive": drive, "lateral_acceleration": u * r, "yaw_rate": r}
+        seen |= {"lean": p.lean, "steer": p.steer, "load_front": load_f, "load_rear": load_r}
+        seen |= {"plane_load_front": load_f * plane_f, "plane_load_rear": load_r * plane_r, "rolling_radius": p.radius}
+        seen |= {"slip_front": slip_f, "slip_rear": slip_r, "side_front": load_f * side_f, "side_rear": load_r * side_r}
         fastest = max(m.front.slip_decay(along_f), m.rear.slip_decay(along_r))
         return Rates(change, power, seen, fastest)
 

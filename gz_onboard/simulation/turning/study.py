@@ -195,6 +195,11 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+COLOURS = dict(zip(ROLLS, ("#1f2933", "#1667b7", "#2f855a", "#d9730d", "#c53030"), strict=True))
+STYLES = {"straight": ":", "planar": "--", "leaning": "-"}
+PARTS = {"aerodynamic drag": "#9fb3c8", "rolling": "#52606d", "sideslip": "#d9730d", "twisting": "#c53030"}
+
+
 def plot(runs: dict[tuple[str, float], CoastDown], output: Path) -> list[Path]:
     """Two pictures of the runs in the folder `output`; their paths."""
     import matplotlib as mpl
@@ -202,42 +207,33 @@ def plot(runs: dict[tuple[str, float], CoastDown], output: Path) -> list[Path]:
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    colours = dict(zip(ROLLS, ("#1f2933", "#1667b7", "#2f855a", "#d9730d", "#c53030"), strict=True))
-    styles = {"straight": ":", "planar": "--", "leaning": "-"}
-
-    def lines(axes: Axes, value: Callable[[CoastDown], tuple[list[float], list[float]]], title: str) -> None:
-        for (model, roll), run in runs.items():
-            if model != "straight" or roll == 0:
-                axes.plot(*value(run), styles[model], color=colours[roll], linewidth=1.4)
-        axes.set_title(title, fontsize=10, loc="left")
-        axes.grid(color="#e4e7eb")
-        axes.spines[["top", "right"]].set_visible(False)
-
-    def legend(axes: Axes) -> None:
-        from matplotlib.lines import Line2D
-
-        handles = [Line2D([], [], color=colours[roll], label=f"{roll:.0f}°") for roll in ROLLS]
-        for model in MODELS:
-            handles += axes.plot([], [], styles[model], color="#7b8794", label=model)
-        axes.legend(handles=handles, fontsize=8, frameon=False, ncols=2)
-
     paths = []
-    figure, grid = plt.subplots(1, 3, figsize=(11.5, 3.8), layout="constrained")
-    lines(grid[0], lambda run: (run.time, [s["speed"] for s in run.seen]), "Speed [m/s] over time [s]")
-    legend(grid[0])
+    for name, draw, panels, size in (
+        ("turning_energy.png", _draw_energy, 3, (11.5, 3.8)),
+        ("turning_tyres.png", _draw_tyres, 4, (13, 3.6)),
+    ):
+        figure, grid = plt.subplots(1, panels, figsize=size, layout="constrained")
+        draw(runs, grid)
+        paths.append(output / name)
+        figure.savefig(paths[-1], dpi=90)
+    plt.close("all")
+    return paths
+
+
+def _draw_energy(runs: dict[tuple[str, float], CoastDown], grid: Sequence[Axes]) -> None:
+    _lines(runs, grid[0], lambda run: (run.time, [s["speed"] for s in run.seen]), "Speed [m/s] over time [s]")
+    _legend(grid[0])
     turned = {key: run for key, run in runs.items() if key[1] and key[0] != "straight"}
     for (model, roll), run in turned.items():
-        grid[1].plot([s[3] for s in run.states], [s[4] for s in run.states], styles[model], color=colours[roll])
+        grid[1].plot([s[3] for s in run.states], [s[4] for s in run.states], STYLES[model], color=COLOURS[roll])
     grid[1].set_aspect("equal", adjustable="datalim")
     grid[1].set_title("Path of the coast-down [m]", fontsize=10, loc="left")
     grid[1].grid(color="#e4e7eb")
-    names = ("aerodynamic drag", "rolling", "sideslip", "twisting")
-    shades = ("#9fb3c8", "#52606d", "#d9730d", "#c53030")
     bottoms = [0.0] * (len(ROLLS) * len(MODELS))
     keys = [(model, roll) for roll in ROLLS for model in MODELS]
     rows = [row(model, roll, runs[model, roll]) for model, roll in keys]
     places = [i + i // len(MODELS) for i in range(len(keys))]
-    for name, shade in zip(names, shades, strict=True):
+    for name, shade in PARTS.items():
         heights = [r["parts"][name] / 1000 for r in rows]
         grid[2].bar(places, heights, bottom=bottoms, color=shade, label=name, width=0.85)
         bottoms = [low + height for low, height in zip(bottoms, heights, strict=True)]
@@ -247,10 +243,9 @@ def plot(runs: dict[tuple[str, float], CoastDown], output: Path) -> list[Path]:
     grid[2].legend(fontsize=8, frameon=False, ncols=2)
     grid[2].set_title(f"Lost in {DISTANCE:.0f} m [kJ]: straight, planar, leaning", fontsize=10, loc="left")
     grid[2].spines[["top", "right"]].set_visible(False)
-    paths.append(output / "turning_energy.png")
-    figure.savefig(paths[-1], dpi=90)
 
-    figure, grid = plt.subplots(1, 4, figsize=(13, 3.6), layout="constrained")
+
+def _draw_tyres(runs: dict[tuple[str, float], CoastDown], grid: Sequence[Axes]) -> None:
     panels = (
         ("load_front", 1.0, "Front load [N] over speed [m/s]"),
         ("rolling_radius", 1000.0, "Rolling radius [mm]"),
@@ -258,13 +253,32 @@ def plot(runs: dict[tuple[str, float], CoastDown], output: Path) -> list[Path]:
         ("slip_rear", -180 / pi, "Rear slip into the turn [°]"),
     )
     for axes, (name, factor, title) in zip(grid, panels, strict=True):
-        lines(axes, lambda run: ([s["speed"] for s in run.seen], [factor * s[name] for s in run.seen]), title)  # noqa: B023
+        _lines(runs, axes, lambda run: ([s["speed"] for s in run.seen], [factor * s[name] for s in run.seen]), title)  # noqa: B023
         axes.invert_xaxis()
-    legend(grid[0])
-    paths.append(output / "turning_tyres.png")
-    figure.savefig(paths[-1], dpi=90)
-    plt.close("all")
-    return paths
+    _legend(grid[0])
+
+
+def _lines(
+    runs: dict[tuple[str, float], CoastDown],
+    axes: Axes,
+    value: Callable[[CoastDown], tuple[list[float], list[float]]],
+    title: str,
+) -> None:
+    for (model, roll), run in runs.items():
+        if model != "straight" or roll == 0:
+            axes.plot(*value(run), STYLES[model], color=COLOURS[roll], linewidth=1.4)
+    axes.set_title(title, fontsize=10, loc="left")
+    axes.grid(color="#e4e7eb")
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _legend(axes: Axes) -> None:
+    from matplotlib.lines import Line2D
+
+    handles = [Line2D([], [], color=COLOURS[roll], label=f"{roll:.0f}°") for roll in ROLLS]
+    for model in MODELS:
+        handles += axes.plot([], [], STYLES[model], color="#7b8794", label=model)
+    axes.legend(handles=handles, fontsize=8, frameon=False, ncols=2)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
