@@ -36,8 +36,8 @@ DRIFT = 0.055  # relative sd: the rest of the ride is not the ride so far; the e
 FACTOR_WALK = 0.01  # sd of its change over a segment: wind, tyres, traffic
 SEGMENT_SD = 0.18  # relative: measured against modelled energy of one segment, of the eight commissioning rides
 HEIGHT_WALK = 0.75  # m per sqrt(m): roads climb or fall by 60 m on 6 km; where no sensor showed the grade
-PRIOR_BURSTS = 2.5  # mean square of the power over the square of its mean, of the eight commissioning rides
-BURSTS = 1.0, 6.0  # the same, of any riding
+PRIOR_FORM_FACTOR_SQUARED = 2.5  # mean square of the power over its mean squared, of the eight commissioning rides
+FORM_FACTOR_SQUARED = 1.0, 6.0  # the same, of any riding
 PRIOR_SCATTER = 0.25  # relative sd of segments of a riding not yet known
 LEAST_SCATTER = 0.1  # the same, of any riding
 ACCELERATION = 15.0  # m/s²: no road gives more; a second that shows more is left out
@@ -71,7 +71,7 @@ class Expected:
 
     consumption: float  # J/m
     power: float  # W, mean
-    bursts: float  # mean square of the power over the square of its mean
+    form_factor_squared: float  # mean square of the power over the square of its mean
     scatter: float  # relative variance of the consumption of segments
     distance: float  # m of riding that this is known from
 
@@ -241,7 +241,9 @@ class Forecaster:
         )
 
     def _drawable(self, soc: float, temperature: float, expected: Expected) -> Drawable:
-        return drawable(self.battery, soc, temperature, expected.power, expected.bursts, self._overpotential)
+        return drawable(
+            self.battery, soc, temperature, expected.power, expected.form_factor_squared, self._overpotential
+        )
 
     def _expected(self, ambient: float, altitude: float) -> Expected:
         r, past, now = self.riding, self._past, self.riding.current
@@ -255,15 +257,15 @@ class Forecaster:
         # Downhill next to nothing is drawn in the mean; what is to come is not all downhill.
         energy = prior_power * prior_time + max(past.measured, r.factor * past.level)
         energy = max(energy, LEAST * prior_power * prior_time)
-        squares = PRIOR_BURSTS * prior_power**2 * prior_time + past.power_squares
-        bursts = squares * (prior_time + past.duration) / energy**2
+        squares = PRIOR_FORM_FACTOR_SQUARED * prior_power**2 * prior_time + past.power_squares
+        form_factor_squared = squares * (prior_time + past.duration) / energy**2
         closed = PRIOR_LENGTH + fade * past.distance
         squares = (PRIOR_LENGTH * prior**2 * (1 + PRIOR_SCATTER**2) + fade * past.squares) / closed
         mean = max((PRIOR_LENGTH * prior + fade * past.level) / closed, LEAST * prior)
         return Expected(
             consumption,
             consumption * speed,
-            bursts=min(max(bursts, BURSTS[0]), BURSTS[1]),
+            form_factor_squared=min(max(form_factor_squared, FORM_FACTOR_SQUARED[0]), FORM_FACTOR_SQUARED[1]),
             scatter=max(squares / mean**2 - 1, LEAST_SCATTER**2),
             distance=distance,
         )

@@ -165,19 +165,19 @@ class Battery:
         power: float,
         soc: float,
         temperature: float,
-        form: float = 1.0,
+        form_factor_squared: float = 1.0,
         overpotential: Overpotential | None = None,
     ) -> float | None:
         """Mean pack current [A] that delivers a mean `power` [W] once the RC pair has settled; None if none can.
 
-        `form` is the mean square of the current over the square of its mean: in traffic the current comes in
-        bursts, which heat R0 more than a steady one; the RC pair smooths them. `overpotential`: what a cell's
+        form_factor_squared: the mean square of the current over the square of its mean: in traffic the current comes
+        in bursts, which heat R0 more than a steady one; the RC pair smooths them. overpotential: what a cell's
         voltage lacks beside R0 and the RC pair.
         """
         n, m = self.cells_series, self.cells_parallel
         source = n * self.ocv(soc, temperature)[0]
-        cell = form * self.r0.at(soc, temperature)[0] + self.r1.at(soc, temperature)[0]
-        resistance = n * cell / m + form * self.series_resistance
+        cell = form_factor_squared * self.r0.at(soc, temperature)[0] + self.r1.at(soc, temperature)[0]
+        resistance = n * cell / m + form_factor_squared * self.series_resistance
         root = source * source - 4 * resistance * power
         if root < 0:
             return None

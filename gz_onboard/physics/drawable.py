@@ -26,15 +26,15 @@ def drawable(
     soc: float,
     temperature: float,
     power: float,
-    form: float = 1.0,
+    form_factor_squared: float = 1.0,
     overpotential: Overpotential | None = None,
 ) -> Drawable:
     """What a pack at `soc` and `temperature` [degC] delivers at a mean `power` [W] until the cut-off.
 
     At constant power P the charge Q·dSOC passes in dt = Q·dSOC/I, so the energy is P·Q·∫ dSOC/I(SOC), from the
     SOC at which the terminal voltage at the mean load meets the cut-off: bursts are held back by the vehicle before.
-    `form`, `overpotential`: see `Battery.settled_current`. The RC pair is taken as settled (V1 = R1·I): discharging
-    takes an hour, its time constant is a minute.
+    form_factor_squared, overpotential: see `Battery.settled_current`. The RC pair is taken as settled (V1 = R1·I):
+    discharging takes an hour, its time constant is a minute.
     """
     low, high = -0.05, soc
     charge = battery.pack_capacity(temperature) * HOUR
@@ -53,6 +53,6 @@ def drawable(
     width = soc - high
     total = 0.0
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
-        current = battery.settled_current(power, high + width * node, temperature, form, overpotential)
+        current = battery.settled_current(power, high + width * node, temperature, form_factor_squared, overpotential)
         total += weight / current if current else 0.0
     return Drawable(power * charge * width * total, high, slope)

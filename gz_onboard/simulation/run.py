@@ -87,7 +87,7 @@ class Run:
     soc_start: float
     soc_end: float
     mean_power: float  # W, at the terminals
-    form: float  # mean square of the pack current over the square of its mean
+    form_factor_squared: float  # mean square of the pack current over the square of its mean
     empty: bool = False  # the ride ended because the pack was empty
     shortfalls: list[Shortfall] = field(default_factory=list)
 
@@ -152,8 +152,8 @@ def drive(
             break
     if done % every:
         rows.append(_row(scooter, wanted, energy))
-    form = max(squares * done / (charge * charge), 1.0) if charge else 1.0
-    return _finished(scooter, rows, before, _Totals(energy, recovered, form, done * dt, empty))
+    form_factor_squared = max(squares * done / (charge * charge), 1.0) if charge else 1.0
+    return _finished(scooter, rows, before, _Totals(energy, recovered, form_factor_squared, done * dt, empty))
 
 
 class _Totals(NamedTuple):
@@ -161,7 +161,7 @@ class _Totals(NamedTuple):
 
     energy: float
     recovered: float
-    form: float
+    form_factor_squared: float
     duration: float
     empty: bool
 
@@ -190,7 +190,7 @@ def _finished(scooter: Scooter, rows: Sequence[tuple[float, ...]], before: tuple
         soc_start=soc_start,
         soc_end=scooter.pack.soc,
         mean_power=energy / duration if duration else 0.0,
-        form=totals.form,
+        form_factor_squared=totals.form_factor_squared,
         empty=totals.empty,
         shortfalls=shortfalls(series),
     )
@@ -327,11 +327,11 @@ def shortfalls(series: dict[str, Array]) -> list[Shortfall]:
 def range_by_energy(scooter: Scooter, run: Run, soc: float, temperature: float) -> float | None:
     """How far [m] a pack at `soc` and `temperature` [degC] goes at the consumption of `run`; None if that is not known.
 
-    The energy left is that down to the cut-off voltage at the run's mean power and form of current.
+    The energy left is that down to the cut-off voltage at the run's mean power and form factor of the current.
     """
     battery, consumption = scooter.vehicle.battery, run.consumption
     if battery is None or consumption is None or consumption <= 0:
         return None
     overpotential = scooter.vehicle.model.overpotential(battery, {"vibration": scooter.vehicle.riding.vibration})
-    left = drawable(battery, soc, temperature, run.mean_power, run.form, overpotential)
+    left = drawable(battery, soc, temperature, run.mean_power, run.form_factor_squared, overpotential)
     return float(left.energy / consumption)

@@ -122,7 +122,7 @@ def test_drawable_equals_a_step_by_step_discharge(soc, temperature):
 def test_bursts_cost_energy_as_a_step_by_step_discharge_says():
     burst = 2.5
     steady = drawable(BATTERY, 0.9, 10.0, 700.0)
-    bursts = drawable(BATTERY, 0.9, 10.0, 700.0, form=burst)
+    bursts = drawable(BATTERY, 0.9, 10.0, 700.0, form_factor_squared=burst)
     real = discharge(0.9, 10.0, 700.0, burst=burst)
     assert bursts.energy == pytest.approx(real, rel=0.01)
     assert abs(bursts.energy - real) < 0.3 * abs(steady.energy - real)

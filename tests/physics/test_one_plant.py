@@ -19,6 +19,7 @@ from gz_onboard.lab.calibrate.road_load import RoadLoad
 from gz_onboard.lab.discover import residuals
 from gz_onboard.lab.discover.grid import USUAL_DELAYS, Dimensions, Ride, read_ride
 from gz_onboard.lab.discover.mixed_model import initial
+from gz_onboard.lab.discover.system import summed
 from gz_onboard.lab.validate_components import battery_voltage, components, losses, road_load
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Port
@@ -207,7 +208,7 @@ def test_everyone_books_the_same_losses_of_motor_and_inverter(ride):
     grid = on_grid(ride)
     fed, drags = residuals.motor_losses(grid, residuals.moving(grid, values, system), values, system)
     assert residuals.mean_over(fed + drags, 10) == pytest.approx(by_model, rel=1e-6, abs=1e-6)
-    by_discovery = residuals.summed(system.terms(grid.quantities, values, 0.1, Port.INVERTER_LOSS))
+    by_discovery = summed(system.terms(grid.quantities, values, 0.1, Port.INVERTER_LOSS))
     assert residuals.mean_over(by_discovery, 10) == pytest.approx(inverter, rel=1e-6, abs=1e-6)
     scooter = Scooter(VEHICLE, soc=SOC, ambient=AMBIENT)
     motor = scooter.motor
@@ -247,7 +248,7 @@ def test_everyone_has_the_same_road_load(ride):
         / ride["speed"][moving]
     )
     terms = system.terms(on_grid(ride).quantities, values, 0.1, *ROAD_LOAD)
-    by_discovery = residuals.mean_over(np.broadcast_to(residuals.summed(terms), 10 * n), 10)[moving]
+    by_discovery = residuals.mean_over(np.broadcast_to(summed(terms), 10 * n), 10)[moving]
     assert by_discovery == pytest.approx(held, rel=1e-6)
 
 
