@@ -23,6 +23,7 @@ from gz_onboard.offline.style import (
     stack,
     time_unit,
 )
+from gz_onboard.physics.effect import Effect, Port
 from gz_onboard.simulation.run import Run
 from gz_onboard.simulation.summary import Variant
 
@@ -30,18 +31,15 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-STAGES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "battery": ("#6b46c1", ("battery_heat", "bms", "not_delivered")),
-    "auxiliary": ("#7b8794", ("auxiliary_load",)),
-    "drive": ("#1667b7", ("inverter_loss", "motor_copper_loss", "motor_iron_loss", "motor_map_loss", "gearing")),
-    "road": (
-        "#2f855a",
-        ("tyre_slip", "rolling_resistance", "aerodynamic_drag", "cornering_drag", "turning", "dynamometer"),
-    ),
-    "brakes": ("#c53030", ("brakes",)),
-    "stored": ("#d9730d", ("kinetic_energy", "potential_energy")),
+STAGES: dict[str, tuple[str, tuple[Port, ...], tuple[str, ...]]] = {
+    "battery": ("#6b46c1", (Port.CELL_VOLTAGE,), ("battery_heat", "bms", "not_delivered")),
+    "auxiliary": ("#7b8794", (Port.DC_POWER,), ()),
+    "drive": ("#1667b7", (Port.INVERTER_LOSS, Port.MOTOR_LOSS), ("motor_map_loss", "gearing")),
+    "road": ("#2f855a", (Port.TYRE, Port.WHEEL_FORCE), ("tyre_slip", "turning", "dynamometer")),
+    "brakes": ("#c53030", (), ("brakes",)),
+    "stored": ("#d9730d", (), ("kinetic_energy", "potential_energy")),
 }
-"""The entries of a ledger in the order in which energy passes them, each stage with its colour."""
+"""In the order in which energy passes them: colour, where effects act, and the ledger's other entries."""
 _LEAST_SHARE = 5e-5  # of all energy: less cannot be seen
 
 
@@ -113,17 +111,17 @@ Flow = tuple[str, float, str]
 """Name, energy [J] and colour."""
 
 
-def sankey(ledger: Mapping[str, float], title: str) -> Figure:
+def sankey(ledger: Mapping[str, float], effects: Sequence[Effect], title: str) -> Figure:
     """Where the energy went: sources on the left, on the right what took it, as thick as it is much.
 
-    ledger: J by name; what is negative gave energy and is on the left with the cells.
+    ledger: J by name, of `effects` and other entries; what is negative gave energy and is on the left with the cells.
     """
     from matplotlib.patches import Rectangle
 
     figure = new_figure(11, 7.2)
     axis = figure.add_axes((0.02, 0.02, 0.96, 0.86))
     axis.set_axis_off()
-    sources, sinks, total = _flows(ledger)
+    sources, sinks, total = _flows(ledger, effects)
     gap = 0.028
     left, right = 0.17, 0.62
     height = 1.0 - gap * max(len(sinks) - 1, 1)
@@ -151,9 +149,12 @@ def sankey(ledger: Mapping[str, float], title: str) -> Figure:
     return figure
 
 
-def _flows(ledger: Mapping[str, float]) -> tuple[list[Flow], list[Flow], float]:
+def _flows(ledger: Mapping[str, float], effects: Sequence[Effect]) -> tuple[list[Flow], list[Flow], float]:
     """(what gave energy, what took it, the sum of the latter [J]), without what is too little to be seen."""
-    order = [(name, colour) for colour, names in STAGES.values() for name in names]
+    order = []
+    for colour, ports, others in STAGES.values():
+        own = [effect.name for port in ports for effect in effects if effect.port is port]
+        order += [(name, colour) for name in (*own, *others)]
     order += [(name, MUTED) for name in ledger if name not in {n for n, _ in order}]
     sinks = [(name, ledger[name], colour) for name, colour in order if ledger.get(name, 0.0) > 0]
     gives = [(name, -ledger[name], colour) for name, colour in order if ledger.get(name, 0.0) < 0]

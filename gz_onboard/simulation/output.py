@@ -26,7 +26,7 @@ _TOPIC = "simulation"
 
 
 def write(
-    arguments: argparse.Namespace, plan: Plan, result: Run, summary: Summary, sweeps: Sequence[Sweep]
+    arguments: argparse.Namespace, vehicle: Vehicle, plan: Plan, result: Run, summary: Summary, sweeps: Sequence[Sweep]
 ) -> list[str]:
     """The time series and the pictures; gives their names. Raises InputError if they cannot be written."""
     mode = ".predictive" if arguments.predictive else ""
@@ -43,7 +43,7 @@ def write(
             metadata = {"vehicle": summary.vehicle, "source": summary.what}
             write_series(result, file(f".{arguments.format}"), metadata)
         if not arguments.no_plot:
-            _draw(file, plan, result, summary, sweeps)
+            _draw(file, vehicle, plan, result, summary, sweeps)
     return [str(file) for file in files]
 
 
@@ -56,11 +56,14 @@ def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, s
     return str(arguments.frames)
 
 
-def _draw(file: Callable[[str], Path], plan: Plan, result: Run, summary: Summary, sweeps: Sequence[Sweep]) -> None:
+def _draw(
+    file: Callable[[str], Path], vehicle: Vehicle, plan: Plan, result: Run, summary: Summary, sweeps: Sequence[Sweep]
+) -> None:
     from gz_onboard.simulation import figures
 
     title = f"{plan.name}, {summary.kind} · {summary.vehicle}, payload {summary.payload_kg:g} kg"
-    drawn = [("", figures.overview(result, title)), (".ledger", figures.sankey(result.ledger, f"{title}: energy"))]
+    energy = figures.sankey(result.ledger, vehicle.model.effects, f"{title}: energy")
+    drawn = [("", figures.overview(result, title)), (".ledger", energy)]
     if plan.recorded:
         columns = measured_columns(plan.recorded, result)
         drawn.append((".measured", figures.comparison(result, columns, title)))

@@ -124,7 +124,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     found = summarise(vehicle, plan, arguments, result, scooter)
     found = replace(found, payload_from=payload_from, wall_s=wall, sweep=variants)
-    files = write(arguments, plan, result, found, sweeps)
+    files = write(arguments, vehicle, plan, result, found, sweeps)
     if trace:
         files.append(write_trace(arguments, vehicle, trace, scooter))
     summary = replace(found, files=files)

@@ -23,7 +23,6 @@ _SPOKEN = {
     "mass": "vehicle_mass",
     "payload": "payload_mass",
     "cda": "drag_area",
-    "rolling_resistance": "rolling_resistance_constant",
 }
 """What is said for a parameter, so that the nearest by letters is the one that is meant."""
 _STEPS = 5
@@ -58,7 +57,7 @@ def read_sweep(text: str, vehicle: Vehicle) -> Sweep:
     name = _SHORT.get(name.strip(), name.strip())
     declared = declared_parameters(vehicle.model.effects)
     if name not in (*declared, *CELLS):
-        raise InputError(f"--sweep {text}: no parameter is called {name!r}{_meant(name, declared)}")
+        raise InputError(f"--sweep {text}: no parameter is called {name!r}{_meant(name, declared, vehicle)}")
     low_bound, high_bound, unit = (1.0, 1000.0, "1")
     if name in declared:
         low_bound, high_bound, unit = declared[name].low, declared[name].high, declared[name].unit
@@ -87,9 +86,10 @@ def read_sweep(text: str, vehicle: Vehicle) -> Sweep:
     return Sweep(name, unit, tuple(values))
 
 
-def _meant(name: str, declared: Iterable[str]) -> str:
+def _meant(name: str, declared: Iterable[str], vehicle: Vehicle) -> str:
     """The hint at the parameter meant by `name`, of which the last of its dotted parts counts."""
-    known = {name: name for name in declared} | _SPOKEN
+    first = {effect.name: effect.parameters[0].name for effect in vehicle.model.effects if effect.parameters}
+    known = {name: name for name in declared} | _SPOKEN | first
     last = name.rpartition(".")[2].lower()
     match = difflib.get_close_matches(last, known, n=1, cutoff=0.6)
     return f" (did you mean {known[match[0]]!r}?)" if match else nearest(last, known)
