@@ -34,8 +34,8 @@ import numpy as np
 
 from gz_onboard.lab.discover.baseline import baseline
 from gz_onboard.lab.discover.discovery import discover
-from gz_onboard.lab.schema import to_json
 from gz_onboard.offline.samples import Samples
+from gz_onboard.offline.schema import to_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests import plant
 from tests.plant.cases import CASES_OF_A_SCOOTER, CHANNEL_CLEAR, EFFECTS, ENERGY_CLEAR

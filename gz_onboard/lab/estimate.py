@@ -17,11 +17,12 @@ from gz_onboard.events import Reason
 from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, Summary, estimate_log, known_vehicle
 from gz_onboard.lab.plot import reason_words
 from gz_onboard.offline.processes import collect, over_rides
-from gz_onboard.offline.results import clock, explain_keys, keys_of, number, output_names, text_rows, write_json
+from gz_onboard.offline.results import clock, explain_keys, number, output_names, text_rows, write_json
+from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
 from gz_onboard.progress import Progress, progress_bar
 
-KEYS = keys_of(Summary)
+KEYS = descriptions(Summary)
 """What the summary of a ride holds."""
 
 

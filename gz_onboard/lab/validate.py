@@ -17,14 +17,15 @@ from gz_onboard.errors import BAD_INPUT, FAILED, OK, writing
 from gz_onboard.lab.validate_ride import log_size, validate_ride
 from gz_onboard.lab.validate_score import Means, PooledMeans, Ride, SimulationVerdict, pooled
 from gz_onboard.offline.processes import Task, collect, over_rides
-from gz_onboard.offline.results import explain_keys, keys_of, output_names, write_json
+from gz_onboard.offline.results import explain_keys, output_names, write_json
 from gz_onboard.offline.samples import ride_name
+from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
 from gz_onboard.progress import progress_bar
 from gz_onboard.vehicle import read_vehicle
 
 SUMMARY_VERSION = 1
-KEYS = keys_of(SimulationVerdict) | keys_of(Ride)
+KEYS = descriptions(SimulationVerdict) | descriptions(Ride)
 """What ``--json`` holds of a ride: {"version", "rides", "pooled": splits of all rides, "failed": [{file, error}]}."""
 
 FORMS = {

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated
 
 from gz_onboard.errors import InputError, writing
+from gz_onboard.offline.schema import to_json
 
 _WIDTH = 110  # of a line in a terminal
 
@@ -26,12 +26,6 @@ class Failure:
     error: Annotated[str, "why"]
 
 
-def keys_of(result: type) -> dict[str, str]:
-    """The keys that a dataclass has as JSON, and what they mean: its fields with the text of their Annotated types."""
-    hints = get_type_hints(result, include_extras=True)
-    return {field.name: " ".join(getattr(hints[field.name], "__metadata__", ())) for field in fields(result)}
-
-
 def explain_keys(parser: argparse.ArgumentParser, of: str, version: int, keys: Mapping[str, str]) -> None:
     """The keys of a JSON result and their meaning, below the options in the help."""
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
@@ -39,23 +33,6 @@ def explain_keys(parser: argparse.ArgumentParser, of: str, version: int, keys: M
     rows = "\n".join(wrap.fill(f"  {key:20} {meaning}") for key, meaning in keys.items())
     before = f"{parser.epilog}\n\n" if parser.epilog else ""
     parser.epilog = f"{before}JSON keys of {of}, version {version}:\n{rows}"
-
-
-def plain(value: object) -> Any:
-    """`value` as JSON has it: dataclasses as objects, arrays as lists, numbers that are not finite as null."""
-    if value is None or isinstance(value, str | bool | int):
-        return value
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    if is_dataclass(value) and not isinstance(value, type):
-        return {field.name: plain(getattr(value, field.name)) for field in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, Sequence):
-        return [plain(item) for item in value]
-    if hasattr(value, "tolist"):  # of numpy
-        return plain(value.tolist())
-    return str(value)
 
 
 def write_json(file: str | None, version: int | None, result: object) -> None:
@@ -66,7 +43,7 @@ def write_json(file: str | None, version: int | None, result: object) -> None:
     if file is None:
         return
     head = {} if version is None else {"version": version}
-    text = json.dumps(head | plain(result), indent=1, ensure_ascii=False)
+    text = json.dumps(head | to_json(result), indent=1, ensure_ascii=False)
     if file == "-":
         print(text)
         return

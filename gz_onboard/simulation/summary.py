@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
 from gz_onboard.bus.publisher import WH, WH_PER_KM
-from gz_onboard.offline.results import clock, keys_of, number, text_rows, times
+from gz_onboard.offline.results import clock, number, text_rows, times
+from gz_onboard.offline.schema import descriptions
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.recorded import Recorded
 from gz_onboard.simulation.run import COLUMNS, Run, range_by_energy
@@ -113,7 +114,7 @@ class Summary:
     )
 
 
-KEYS = keys_of(Summary)
+KEYS = descriptions(Summary)
 
 
 def cycle_range(result: Run, scooter: Scooter) -> tuple[float | None, str | None]:

@@ -12,7 +12,8 @@ import pytest
 
 from gz_onboard.errors import InputError
 from gz_onboard.offline.page import Failed, Group, html_table, markdown_table
-from gz_onboard.offline.results import clock, keys_of, number, plain, text_rows, times, write_json
+from gz_onboard.offline.results import clock, number, text_rows, times, write_json
+from gz_onboard.offline.schema import descriptions, to_json
 
 NAN = float("nan")
 
@@ -30,7 +31,7 @@ class Outer:
 
 
 def test_keys_and_their_meaning():
-    assert keys_of(Outer) == {"first": "the first", "second": "the second", "third": ""}
+    assert descriptions(Outer) == {"first": "the first", "second": "the second"}
 
 
 @pytest.mark.parametrize(
@@ -44,7 +45,7 @@ def test_keys_and_their_meaning():
     ],
 )
 def test_what_json_has_of_a_value(value, expected):
-    found = plain(value)
+    found = to_json(value)
     assert found == expected
     assert json.loads(json.dumps(found, allow_nan=False)) == expected
 

@@ -39,7 +39,10 @@ def test_it_knows_of_the_package_nothing_but_the_form_of_a_ride():
                     names.add(node.module)
                 elif isinstance(node, ast.Import):
                     names |= {alias.name for alias in node.names}
-    assert {name for name in names if name.startswith("gz_onboard")} == {"gz_onboard.offline.samples"}
+    assert {name for name in names if name.startswith("gz_onboard")} == {
+        "gz_onboard.arrays",  # a type
+        "gz_onboard.offline.samples",
+    }
 
 
 def test_a_ride_does_not_depend_on_its_company(healthy):

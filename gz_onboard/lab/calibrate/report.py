@@ -16,7 +16,7 @@ from gz_onboard.lab.calibrate import thesis
 from gz_onboard.lab.calibrate.fit import correlation
 from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Panel, Result
 from gz_onboard.offline.page import html_table, svg, write_page
-from gz_onboard.offline.results import keys_of
+from gz_onboard.offline.schema import descriptions
 from gz_onboard.offline.style import INK, MUTED, new_figure, rule
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class Document:
     thesis: Annotated[list[dict[str, str]], "what the thesis gives beside what was found here"]
 
 
-KEYS = keys_of(Document) | {f"  {key}": text for key, text in keys_of(ProcedureEntry).items()}
+KEYS = descriptions(Document) | {f"  {key}": text for key, text in descriptions(ProcedureEntry).items()}
 
 
 def document(results: Sequence[Result], vehicle: str, out: str | None) -> Document:

@@ -18,13 +18,13 @@ from gz_onboard.lab.discover.candidates import candidates
 from gz_onboard.lab.discover.detectability import implausible_rides, missing_residuals, remaining_range_error
 from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.lab.discover.extension import write_model
-from gz_onboard.lab.discover.result import SCHEMA, Report
+from gz_onboard.lab.discover.result import VERSION, Report
 from gz_onboard.lab.discover.summary import listing, summary
 from gz_onboard.lab.discover.verdict import Discovery
-from gz_onboard.lab.schema import descriptions, to_json
 from gz_onboard.offline.processes import Task, over_rides
 from gz_onboard.offline.results import explain_keys, write_json
 from gz_onboard.offline.samples import Samples, read_samples
+from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared, keep_old_name
 from gz_onboard.progress import Progress
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "--jobs", default=jobs, help="number of parallel processes (default: %(default)s)")
     keep_old_name(parser, "--workers", "--jobs")
     add_shared(parser, "--quiet")
-    explain_keys(parser, "the report", SCHEMA, descriptions(Report))
+    explain_keys(parser, "the report", VERSION, descriptions(Report))
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -89,7 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
     ]
     written = write_extended(found, vehicle, arguments) if arguments.write_model else []
     if arguments.json:
-        write_json(arguments.json, None, to_json(report))
+        write_json(arguments.json, None, report)
     if arguments.report:
         from gz_onboard.lab.discover.page import write_report
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from gz_onboard.lab.schema import OPTIONAL
+from gz_onboard.offline.schema import OPTIONAL
 
-SCHEMA = 1
+VERSION = 1
 VERDICTS = {
     "cause": "something differs from the model, and it has a name",
     "none": "nothing is wrong that these rides could show",
@@ -172,7 +172,7 @@ class Limit:
 class Report:
     """What was found."""
 
-    schema: int = field(default=SCHEMA, init=False)
+    version: int = field(default=VERSION, init=False)
     verdict: Annotated[str, "cause, none, ambiguous or unknown"]
     causes: Annotated[
         list[Cause],

@@ -12,8 +12,8 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.candidates import candidates
 from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.lab.discover.result import Report
-from gz_onboard.lab.schema import descriptions
 from gz_onboard.offline.samples import read_samples
+from gz_onboard.offline.schema import descriptions
 from gz_onboard.vehicle import read_vehicle
 from tests.support import LOGS, ROOT
 from tests.test_vehicle import with_effect
@@ -96,7 +96,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_one_healthy_ride(alone: Path):
     found = json.loads((alone / "out.json").read_text())
-    assert set(found) <= {"schema", *KEYS}
+    assert set(found) <= {"version", *KEYS}
     assert set(KEYS) - {"constancy"} <= set(found)
     assert found["verdict"] == "none"
     assert found["causes"] == []

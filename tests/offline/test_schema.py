@@ -20,7 +20,7 @@ from gz_onboard.lab.discover.result import (
     Split,
     Unknown,
 )
-from gz_onboard.lab.schema import OPTIONAL, descriptions, schema, to_json
+from gz_onboard.offline.schema import OPTIONAL, descriptions, schema, to_json
 
 
 @dataclass(frozen=True)
@@ -115,7 +115,7 @@ def test_the_report_of_a_discovery_has_the_shape_that_it_says():
     written = to_json(report)
     assert fits(written, schema(Report))
     assert isinstance(written, dict)
-    assert list(written) == ["schema", *descriptions(Report)]
+    assert list(written) == ["version", *descriptions(Report)]
     assert written["gain"] == {
         "holdout": ["ride"],
         "apart": False,

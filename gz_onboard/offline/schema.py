@@ -7,8 +7,9 @@ by name, and unions of these.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
+from math import isfinite
 from types import NoneType, UnionType
 from typing import Annotated, Any, TypeAlias, Union, get_args, get_origin, get_type_hints
 
@@ -17,17 +18,26 @@ OPTIONAL = object()
 _NAMES = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
 
 
-def to_json(value: Any) -> Json:
-    """`value` in the types that a JSON file has; dataclasses as objects, in the order of their fields."""
-    if is_dataclass(value):
+def to_json(value: Any) -> Any:
+    """`value` in the types that a JSON file has; dataclasses as objects, in the order of their fields.
+
+    Arrays become lists, numbers that are not finite None.
+    """
+    if value is None or isinstance(value, str | bool | int):
+        return value
+    if isinstance(value, float):
+        return float(value) if isfinite(value) else None
+    if is_dataclass(value) and not isinstance(value, type):
         omitted = _optional(type(value)) if any(getattr(value, f.name) is None for f in fields(value)) else ()
         pairs = [(f.name, getattr(value, f.name)) for f in fields(value)]
         return {name: to_json(x) for name, x in pairs if x is not None or name not in omitted}
     if isinstance(value, Mapping):
         return {str(key): to_json(x) for key, x in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, Sequence):
         return [to_json(x) for x in value]
-    return value  # type: ignore[no-any-return]
+    if hasattr(value, "tolist"):  # of numpy
+        return to_json(value.tolist())
+    return str(value)
 
 
 def schema(kind: Any) -> dict[str, Json]:
