@@ -65,6 +65,7 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
         "implementation of the SOC filter (default: %(default)s)",
         {"default": "scalar", "choices": ("scalar", "filterpy")},
     ),
+    "--interface": ("interface of python-can (default: %(default)s)", {"default": "socketcan", "metavar": "NAME"}),
     "--from": ("start, seconds into the log", {"dest": "start", "type": float, "default": 0.0, "metavar": "S"}),
     "--to": ("end, seconds into the log", {"dest": "end", "type": float, "metavar": "S"}),
     "--jobs": ("number of parallel processes (default: one per processor)", {"type": _jobs("--jobs"), "metavar": "N"}),

@@ -158,8 +158,7 @@ def bus_sender(bus: can.BusABC) -> Send:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``gz-onboard replay``."""
-    add_shared(parser, "log")
-    parser.add_argument("--interface", default="socketcan", help="interface of python-can (default: %(default)s)")
+    add_shared(parser, "log", "--interface")
     channel = (
         "where to send (default: %(default)s, so that no recording reaches a vehicle unasked); several by commas: the "
         "log's channels 0, 1, ... in this order"

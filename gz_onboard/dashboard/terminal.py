@@ -26,6 +26,7 @@ from gz_onboard.bus.publisher import RANGE_DBC
 from gz_onboard.dashboard.screen import Style, rendered, screen, summary_line
 from gz_onboard.dashboard.view import View
 from gz_onboard.errors import FAILED, InputError
+from gz_onboard.options import add_shared
 
 POLL = 0.05  # s
 REDRAW = 0.2  # s
@@ -35,13 +36,13 @@ ONCE_WITHIN = 5.0  # s: how long --once waits for every message
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard dashboard``."""
     add = parser.add_argument
-    add("--interface", default="socketcan", help="python-can's interface (%(default)s)")
-    add("--channel", default="can0", metavar="NAME", help="channel, as the daemon's (%(default)s)")
+    add_shared(parser, "--interface")
+    add("--channel", default="can0", metavar="NAME", help="channel, as the daemon's (default: %(default)s)")
     add(
         "--dbc",
         default=RANGE_DBC,
         metavar="FILE",
-        help="DBC file of the range frames, the vehicle's range_dbc (%(default)s)",
+        help="DBC file of the range frames, the vehicle's range_dbc (default: %(default)s)",
     )
     add("--once", action="store_true", help="print one picture as soon as every message has come, and end")
     add("--duration", type=float, metavar="S", help="end after this long")
