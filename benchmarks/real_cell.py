@@ -200,6 +200,15 @@ def estimator_of(setting: Setting) -> Estimator:
     groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
     estimator = Estimator(groups, battery, model, vehicle.riding, setting.make)
     estimator._forecast_time = float("inf")  # no range is asked for
+    # A scooter's riding, of which the first state of charge expects a polarisation, is one cell's share of it here.
+    cells, load = vehicle.pack.cells_series * vehicle.pack.cells_parallel, estimator.forecaster.load
+    prior_ride = load.prior_ride
+
+    def of_one_cell(ambient: float, altitude: float) -> tuple[float, float]:
+        power, speed = prior_ride(ambient, altitude)
+        return power / cells, speed
+
+    load.prior_ride = of_one_cell  # type: ignore[method-assign]
     return estimator
 
 

@@ -133,6 +133,9 @@ def first_filter(
     # The polarisation of a ride that was not seen: certain if the vehicle rides, possible at standstill.
     r0, r1 = battery.r0.at(soc, temperature)[0], battery.r1.at(soc, temperature)[0]
     ridden = r1 * at.riding_power / first.voltage / battery.cells_parallel
+    room = battery.ocv(1.0, temperature)[0] - cell_voltage - r0 * cell_current  # V: no cell is more than full
+    if ridden > room > 0:  # at the middle of what can be: a table beyond its data promises any polarisation
+        ridden = room / 2
     v1, v1_sd = (ridden, ridden) if loaded else (0.0, STOPPED_SHARE * ridden)
     drop_sd, model_sd = RESISTANCE_SD * r0 * cell_current, uncertainty.model if loaded else 0.0
     voltage_sd = hypot(uncertainty.rest, at.voltage_sd, drop_sd, model_sd, at.unsteady_sd)
