@@ -132,20 +132,19 @@ NUISANCES = (
 )
 BY_NAME = {nuisance.name: nuisance for nuisance in NUISANCES}
 
-LOG = frozenset(
-    (
-        "motor_stator_capacity",
-        "motor_rotor_capacity",
-        "motor_gap_conductance",
-        "motor_rotor_to_ambient",
-        "inverter_board_capacity",
-        "inverter_box_capacity",
-        "inverter_board_to_box",
-        "inverter_box_to_ambient",
-        "pack_heat_capacity",
-        "pack_conductance",
-    )
+COOLING = (
+    "motor_stator_capacity",
+    "motor_rotor_capacity",
+    "motor_gap_conductance",
+    "motor_rotor_to_ambient",
+    "inverter_board_capacity",
+    "inverter_box_capacity",
+    "inverter_board_to_box",
+    "inverter_box_to_ambient",
+    "pack_heat_capacity",
+    "pack_conductance",
 )
+LOG = frozenset(COOLING)
 """Those that are positive and known to a factor only: a step is one of their logarithm."""
 LOG_RIDE_SD, LOG_RIDE_SD_ELSE = {"pack_heat_capacity": 0.05}, 0.1
 """By how much their logarithm scatters from ride to ride."""
@@ -181,16 +180,7 @@ BASE = (
     "pack_current_offset",
     "pack_current_gain",
     "pack_voltage_offset",
-    "pack_heat_capacity",
-    "pack_conductance",
-    "motor_stator_capacity",
-    "motor_rotor_capacity",
-    "motor_gap_conductance",
-    "motor_rotor_to_ambient",
-    "inverter_board_capacity",
-    "inverter_box_capacity",
-    "inverter_board_to_box",
-    "inverter_box_to_ambient",
+    *COOLING,
 )
 """Of the vehicle's own parameters those that a channel depends on; those of the model's effects come on top."""
 
