@@ -36,6 +36,11 @@ class InnovationGate:
         """Whether the voltage has contradicted the state of charge for long."""
         return self._contradicted >= CONTRADICTED
 
+    def blame_both(self) -> None:
+        """The last error may be the cell model's as well: it is believed to no better than that."""
+        self._error_square = (self.innovation or 0.0) ** 2
+        self._contradicted = 0.0
+
     def update(self, dt: float, error: float, own: float, slow: float) -> float | None:
         """The variance [V²] with which a voltage is to be taken in, of which `error` [V] is off; None: not at all.
 

@@ -16,8 +16,8 @@ from gz_onboard.physics.effect import MOVING
 
 START_WAIT = 1.5  # s to wait for what comes once a second before the first estimate
 STEADY_TIME = 0.5  # s over which the first voltage must hold still; an inverter that is being charged does not
-STEADY_SHARE = 0.02  # of the span of the rest voltage: by more no cell's voltage moves meanwhile without a load,
-STEADY_DROP = 3.0  # and with one by no more than so many times the drop over R0, cold and aged cells included
+STEADY_SHARE = 0.02  # of the span of the rest voltage: by more no cell's voltage moves meanwhile without a load
+DROP_FACTOR = 3.0  # of the drop by a load that the tables give: no cell has more, cold and aged ones included
 STEADY_AFTER = 10.0  # s over which it must hold still after it has once been seen to move
 STEADY_WAIT = 60.0  # s after which it is begun with whatever there is, knowing nothing
 STEADY_SD = 4.0  # of the movement: how much may be still to come
@@ -95,7 +95,7 @@ class SteadyVoltage:
         battery = self._battery
         r0 = battery.r0.at(HALF_FULL, temperature)[0] * battery.cells_series / battery.cells_parallel
         drop = battery.cell_voltage(r0, 1.0) * abs(current - first.current)
-        return max(abs(voltage - first.voltage) / battery.cells_series - STEADY_DROP * drop, 0.0)
+        return max(abs(voltage - first.voltage) / battery.cells_series - DROP_FACTOR * drop, 0.0)
 
 
 @dataclass(frozen=True, slots=True)

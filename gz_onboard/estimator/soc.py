@@ -9,7 +9,7 @@ from typing import Protocol
 from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.ekf import FilterMaker, SocFilter
 from gz_onboard.estimator.gate import ERROR_TIME, InnovationGate
-from gz_onboard.estimator.initial import RELAXED, Situation, SteadyVoltage, first_filter
+from gz_onboard.estimator.initial import DROP_FACTOR, RELAXED, Situation, SteadyVoltage, first_filter
 from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.rest import RestUpdate
 from gz_onboard.estimator.signals import Signal, Signals
@@ -227,7 +227,7 @@ class StateOfCharge:
         error, own = filter_.innovation(cell_voltage, cell_current, temperature)
         variance = self.gate.update(dt, error, own, slow)
         if self.gate.refuted:
-            self._begin_anew(now)
+            self._refute(now, filter_, error, r0 * cell_current + filter_.v1)
         elif variance is not None:
             # What errs the same way for ERROR_TIME counts as one sample in that time, not one each step.
             variance *= max(2 * ERROR_TIME / max(dt, SHORTEST), 1.0)
@@ -239,8 +239,19 @@ class StateOfCharge:
         r0 = battery.r0.at(self.filter.soc if self.filter else HALF_FULL, temperature)[0]
         return plausible(battery, battery.cell_voltage(voltage, current) + r0 * current / battery.cells_parallel)
 
-    def _begin_anew(self, now: float) -> None:
-        """The voltage has contradicted the state of charge for long: begin again from it."""
+    def _refute(self, now: float, filter_: SocFilter, error: float, drop: float) -> None:
+        """The voltage of a cell has been off by `error` [V] for long, at a predicted `drop` by its load [V].
+
+        Where tables that are wrong for these cells explain it, as in the cold, a loaded voltage proves nothing: the
+        state of charge is as uncertain as it is contradicted until a rest. Else it is begun from the voltage.
+        """
+        if abs(error) < DROP_FACTOR * abs(drop):
+            emf = self._battery.ocv(filter_.soc)[0]
+            apart = self._battery.soc_at(emf + error) - filter_.soc
+            p00, p01, p11 = filter_.covariance
+            filter_.covariance = min(p00 + apart**2, SOC_UNKNOWN_SD**2), p01, p11
+            self.gate.blame_both()
+            return
         self._wait_again()
         self.gate = InnovationGate()
         self.saved = None

@@ -45,6 +45,7 @@ class Scooter:
     time: float = 0.0
     distance: float = 3_210_000.0  # m
     energy: float = 0.0  # J at the terminals
+    resistance: float = 1.0  # of the cells, over that of the vehicle file
     fast: float = 0.0  # V
     slow: float = 0.0  # V
     speed: float = 0.0
@@ -67,12 +68,12 @@ class Scooter:
                 yield from self._told(current, voltage, charge, step // every)
 
     def _draw(self, power: float, charge: float) -> tuple[float, float]:
-        resistance = 0.066
+        resistance = 0.066 * self.resistance
         source = 14 * (float(np.interp(self.soc, BATTERY.ocv_soc, BATTERY.ocv_value)) - self.fast - self.slow)
         current = (source - sqrt(max(source**2 - 4 * resistance * power, 0))) / (2 * resistance) - charge
         voltage = source - resistance * current
         cell = current / 12
-        self.fast = exp(-STEP / 25) * self.fast + 0.018 * (1 - exp(-STEP / 25)) * cell
+        self.fast = exp(-STEP / 25) * self.fast + 0.018 * self.resistance * (1 - exp(-STEP / 25)) * cell
         self.slow = exp(-STEP / 1200) * self.slow + 0.008 * (1 - exp(-STEP / 1200)) * cell
         self.soc -= current * STEP / 3600 / self.capacity
         self.distance += self.speed * STEP
