@@ -28,12 +28,12 @@ from gz_onboard.estimator.road import RoadState
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.soc import PackState, StateOfCharge
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources
-from gz_onboard.estimator.start import BRIDGE
 from gz_onboard.estimator.temperatures import Temperatures
 from gz_onboard.estimator.timing import SLOW_GAP, SLOWEST, MessageTiming
 from gz_onboard.estimator.vibration import VibrationMonitor
 from gz_onboard.events import STALE_PERIODS, Activity, Estimate, Event, Group, Reason, State
 from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.riding import PriorRiding
 
@@ -140,8 +140,7 @@ class Estimator:
         self._reading = self._read_pack(now, elapsed)
         self._compare_grades(now, elapsed)
         temperature = self._temperatures.step(now, dt)
-        if dt > BRIDGE:
-            self.soc.interrupt(dt, self._temperatures.cells_or_bench, self._expected_consumption)
+        self.soc.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self._expected_consumption)
         self.soc.step(now, dt, PackState(self._reading, temperature, road.speed), self._present)
         self._follow_activity(now, dt)
         self._ride(now, dt)
@@ -163,8 +162,11 @@ class Estimator:
         evidence = CellEvidence(error, road_power, self.soc.gate.rms)
         reading = self._sources.read(now, dt, self.road.speed, evidence)
         self.soc.doubt(now, reading.voltage_doubted)
-        if reading.current is None and self.road.speed is not None and reading.voltage:
-            return replace(reading, current=self._present.power(now) / reading.voltage, source=CurrentSource.MODEL)
+        speed = self.road.speed
+        # At standstill a pack of which nothing is measured may be charged.
+        if reading.current is None and speed is not None and (reading.voltage or abs(speed) > MOVING):
+            voltage = reading.voltage or self.soc.rest_voltage
+            return replace(reading, current=self._present.power(now) / voltage, source=CurrentSource.MODEL)
         return reading
 
     def _compare_grades(self, now: float, dt: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
-from gz_onboard.estimator.signals import FIX_2D, Signals
+from gz_onboard.estimator.signals import FIX_3D, Signals
 from gz_onboard.events import Reason
 
 # What is missing makes the consumption to come less certain; relative sd, from the errors on the rides without each.
@@ -47,7 +47,8 @@ class MissingSignals:
         if not any(signal.fresh(now) for signal in self._speeds):
             reasons |= Reason.NO_SPEED
         position = signals.gps_speed.fresh(now) or signals.latitude.fresh(now)
-        if signals.fix_below(now, FIX_2D) or not position:
+        altitude = signals.gps_altitude.fresh(now) or not signals.gps_altitude.stale_after
+        if signals.fix_below(now, FIX_3D) or not position or not altitude:
             reasons |= Reason.NO_GPS
         return reasons
 

@@ -59,6 +59,7 @@ class RoadState:
     slow_yaw: float = 0.0  # rad/s, low-passed
     accelerometer_grade: float = 0.0
     grade_offset: float = 0.0
+    levelled: float = 0.0  # m over which the offset was sought: before, an accelerometer shows its mounting, too
 
     def step(self, now: float, dt: float, signals: Signals, wheel_radius: float, gear_ratio: float) -> None:
         """Go `dt` [s] ahead to `now` [s]."""
@@ -139,7 +140,8 @@ class RoadState:
         altitude = None if signals.fix_below(now, FIX_3D) else signals.gps_altitude.get(now)
         distrusted = not (signals.accel_x.trusted and signals.gps_altitude.trusted)
         nothing = forward is None and altitude is None and (distrusted or self.altitude is None)
-        if self.speed is None or nothing:
+        mounting = altitude is None and self.levelled < ALTITUDE_LENGTH
+        if self.speed is None or nothing or mounting:
             self.grade = None
             return
         if forward is not None and self.acceleration is not None:
@@ -160,6 +162,7 @@ class RoadState:
             share = min(distance / length, LARGEST_SHARE)  # critically damped over distance
             self.altitude += 2 * share * error
             self.grade_offset += share * error / length
+            self.levelled += distance
         if self.altitude is not None:
             self.altitude = min(max(self.altitude, ALTITUDES[0]), ALTITUDES[1])
         self.grade = min(max(self.accelerometer_grade + self.grade_offset, -STEEPEST), STEEPEST)

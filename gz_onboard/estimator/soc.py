@@ -14,7 +14,7 @@ from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.rest import RestUpdate
 from gz_onboard.estimator.signals import Signal, Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading, Synchroniser
-from gz_onboard.estimator.start import HOUR, SOC_UNKNOWN_SD, Saved, bounded, plausible
+from gz_onboard.estimator.start import BRIDGE, HOUR, SOC_UNKNOWN_SD, Saved, bounded, plausible
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
@@ -77,10 +77,17 @@ class StateOfCharge:
         self._started_from: tuple[Saved | None, float | None] = (None, None)  # and what it was made from, how old
         self._doubted = False  # a voltage
         self._restarted_at = -inf  # s
+        self._gap: tuple[float, Saved] | None = None  # when the pack was last measured [s], and what was known then
         self._voltage_time: float | None = None  # s, of the message whose voltage was taken in last
         self._voltage_taken = -inf  # s: when
 
     # --- what others ask --------------------------------------------------------------------------------------
+
+    @property
+    def rest_voltage(self) -> float:
+        """Of the pack at this state of charge [V]."""
+        soc = self.filter.soc if self.filter else HALF_FULL
+        return self._battery.ocv(soc)[0] * self._battery.cells_series
 
     def cell_error(self, voltage: float, current: float, temperature: float) -> float | None:
         """Measured less predicted voltage of a cell [V] for those of the pack; None before there is a filter."""
@@ -100,19 +107,28 @@ class StateOfCharge:
             self._wait_again()
         self._doubted = doubted
 
-    def interrupt(self, gap: float, temperature: float, consumption: float | None) -> None:
-        """A silence [s] as long as a restart: the voltage and what was known before are weighed anew.
+    def follow_gap(self, now: float, dt: float, reading: PackReading, temperature: float, price: float | None) -> None:
+        """After a gap as long as a restart's the voltage and what was known before it are weighed anew.
 
-        temperature: of the cells [degC]; consumption: that is expected [J/m].
+        A gap of all messages, or of the pack's: it may have been charged meanwhile. dt: of this step [s]; temperature:
+        of the cells [degC]; price: the consumption that is expected [J/m].
         """
-        filter_ = self.filter
+        filter_, blind = self.filter, unmeasured(reading)
         if filter_ is None:
+            self._gap = None
             return
-        known = self.current, self._odometer, self._own_soc, consumption
-        self.saved, self.saved_age = Saved(filter_.soc, filter_.v1, filter_.covariance, *known), gap
-        if self.effects:
-            self.effects.step(gap, 0.0, filter_.soc, temperature)
-        self._wait_again()
+        if self._gap is None and (blind or dt > BRIDGE):
+            known = self.current, self._odometer, self._own_soc, price
+            self._gap = now - dt, Saved(filter_.soc, filter_.v1, filter_.covariance, *known)
+        if self._gap is None or blind:
+            return
+        began, saved = self._gap
+        self._gap = None
+        if now - began > BRIDGE:
+            self.saved, self.saved_age = saved, now - began
+            if self.effects and dt > BRIDGE:
+                self.effects.step(dt, 0.0, filter_.soc, temperature)
+            self._wait_again()
 
     def _wait_again(self) -> None:
         self.filter = self.gate.innovation = None
@@ -187,10 +203,10 @@ class StateOfCharge:
         counted = (
             pack.reading.source if sampled <= SLOWEST else CurrentSource.NONE
         )  # beyond, most that flows is not seen
-        checked = self._signals.inverter_current.fresh(now)
-        q = self._charge.counted(min(dt, pause), mean * dt / charge, charge, CURRENT_ERRORS[counted], checked)
+        checked, apart = self._signals.inverter_current.fresh(now), pack.reading.current_apart
+        q = self._charge.counted(min(dt, pause), mean * dt / charge, charge, CURRENT_ERRORS[counted], checked, apart)
         q += self._charge.between_samples(dt, sampled)
-        if dt > pause:
+        if dt > pause or (counted is CurrentSource.NONE and unmeasured(pack.reading)):
             q += self._charge.of_pause(dt, sqrt(filter_.covariance[0]))
             self._rest.interrupt()
         filter_.predict(dt, mean / battery.cells_parallel, temperature, (q, V1_WALK * min(dt, RELAXED)))
@@ -280,6 +296,11 @@ class StateOfCharge:
         self.filter = first_filter(self._battery, self._make, self.uncertainty, first, at, self._signals, restored)
         mean = (first.current + current) / 2 / self._battery.cells_parallel
         self.filter.predict(now - first.time, mean, pack.temperature, STEADY_NOISE)
+
+
+def unmeasured(reading: PackReading) -> bool:
+    """Whether no sensor shows anything of the pack."""
+    return reading.voltage is None and reading.source in (CurrentSource.MODEL, CurrentSource.NONE)
 
 
 def last(signal: Signal) -> float | None:

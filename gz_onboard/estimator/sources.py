@@ -38,6 +38,7 @@ class PackReading:
     source: CurrentSource = CurrentSource.NONE
     reported_current: float | None = None  # A, trusted or not
     voltage_sd: float = 0.0  # V of a cell
+    current_apart: float = 0.0  # A: by so much the two currents differ in the mean
     voltage_doubted: bool = False  # the two voltages differ, or one of them is faulty
 
 
@@ -95,6 +96,7 @@ class PackSources:
             source,
             readings.through_inverter if readings.pack is None else readings.pack,
             hypot(self._voltage_sd, voltages.apart, voltages.spread),
+            self._difference,
             bool(voltages.apart or any(counter.faulty for counter in voltages.counters.values())),
         )
 

@@ -47,13 +47,15 @@ class ChargeUncertainty:
         self._charge_sd = sqrt((p.sd("cell_capacity") / p["cell_capacity"]) ** 2 + p.sd("pack_current_gain") ** 2)
         self._unseen = 0.0  # of SOC: sd that the pauses left
 
-    def counted(self, dt: float, flowed: float, charge: float, error: CurrentError, checked: bool) -> float:
+    def counted(
+        self, dt: float, flowed: float, charge: float, error: CurrentError, checked: bool, apart: float
+    ) -> float:
         """Variance after `dt` [s] in which a share `flowed` of the capacity `charge` [A·s] was counted.
 
-        checked: a second sensor confirms the first.
+        checked: a second sensor confirms the first, but for what they are `apart` in the mean [A].
         """
         unchecked = 0.0 if checked else UNCHECKED_SD
-        sd = sqrt(self._offset_sd**2 + (error.sd**2 + unchecked**2) * self._rated**2)
+        sd = sqrt(self._offset_sd**2 + apart**2 + (error.sd**2 + unchecked**2) * self._rated**2)
         return (sd / charge) ** 2 * 2 * error.time * dt + self._charge_sd**2 * abs(flowed)
 
     @staticmethod
@@ -82,6 +84,11 @@ class VoltageUncertainty:
         self._empty = p.sd("cell_voltage_error_empty")
         self._capacity_scatter = p.sd("cell_capacity") / p["cell_capacity"]
 
+    def loaded(self, soc: float) -> float:
+        """Sd of the cell model under load [V]: it errs more near empty."""
+        empty = min(max((EMPTY_BELOW - soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
+        return self.model + empty * (self._empty - self.model)
+
     def variance(
         self, soc: float, r0: float, current: float, source: CurrentSource, temperature_known: bool, voltage_sd: float
     ) -> float:
@@ -91,8 +98,7 @@ class VoltageUncertainty:
         """
         resistance_sd = RESISTANCE_SD if temperature_known else RESISTANCE_SD_COLD
         current_sd = CURRENT_ERRORS[source].sd * self._battery.cell_capacity(BENCH_TEMPERATURE)
-        empty = min(max((EMPTY_BELOW - soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
-        model_sd = self.model + empty * (self._empty - self.model)
+        model_sd = self.loaded(soc)
         # The pack's cells are not the bench's: where SOC lies on their curve is known to their capacity's scatter.
         axis_sd = self._capacity_scatter * (1 - soc) * self._battery.ocv(soc)[1]
         resistance = (resistance_sd * r0 * current) ** 2 + (r0 * current_sd) ** 2

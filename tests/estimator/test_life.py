@@ -10,7 +10,7 @@ import pytest
 from gz_onboard.estimator.activity import STOP_TIME
 from gz_onboard.estimator.start import from_voltage
 from gz_onboard.events import Activity, Group, Reason, State
-from tests.estimator.life import BATTERY, GROUPS, MOTOR, OTHERS, PACK, Scooter, estimator, follow, knows, worst
+from tests.estimator.life import BATTERY, GROUPS, INVERTER, MOTOR, OTHERS, PACK, Scooter, estimator, follow, knows, worst
 
 
 def restarted(e, age):
@@ -177,6 +177,39 @@ def test_cells_of_another_resistance_do_not_make_it_leave_a_right_estimate(resis
     assert any(row.reasons & Reason.VOLTAGE_MISMATCH for _, row in rows)
     assert worst(rows) < 3
     assert max(abs(row.soc - true) for true, row in rows) < 0.1
+
+
+# --- the pack's messages are lost -----------------------------------------------------------------------------------
+
+
+def without_pack(events):
+    """What comes while the battery's own controller and the inverter are silent and the others go on."""
+    return (event for event in events if event[1] not in (PACK, INVERTER))
+
+
+@pytest.mark.parametrize("own_soc", [True, False])
+def test_charged_while_only_the_pack_was_silent(own_soc):
+    scooter, e = Scooter(soc=0.3), estimator()
+    follow(e, heard(scooter.live(300, 9.0), own_soc=own_soc), scooter)
+    follow(e, scooter.live(30), scooter)
+    follow(e, without_pack(scooter.live(2.5 * 3600, charge=6.0)), scooter)
+    rows = follow(e, heard(scooter.live(60), own_soc=own_soc), scooter)
+    true, end = rows[-1]
+    assert true > 0.6
+    assert abs(end.soc - true) < min(3 * end.soc_sd, 0.05)
+    assert all(abs(row.soc - true) < 3 * row.soc_sd for true, row in rows if row.soc is not None)
+
+
+def test_ridden_while_the_pack_was_silent_the_road_load_counts():
+    scooter, e = Scooter(soc=0.8), estimator()
+    follow(e, scooter.live(300, 9.0), scooter)
+    before = scooter.soc
+    lost = follow(e, without_pack(scooter.live(1200, 9.0)), scooter)
+    true, end = lost[-1]
+    assert end.reasons & Reason.NO_PACK_CURRENT
+    assert abs(end.soc - true) < 0.3 * (before - true)
+    assert worst(lost) < 3
+    assert worst(follow(e, scooter.live(600, 9.0), scooter)) < 3
 
 
 # --- restarts -------------------------------------------------------------------------------------------------------

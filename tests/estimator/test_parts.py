@@ -78,9 +78,26 @@ def test_errors_of_currents_go_with_the_size_of_the_pack():
         battery = replace(BATTERY, cells_parallel=parallel)
         charge = 3600 * battery.pack_capacity(25.0)
         uncertainty = ChargeUncertainty(battery, VEHICLE.parameters)
-        variances.append(uncertainty.counted(60.0, 0.0, charge, CURRENT_ERRORS[CurrentSource.NONE], True))
+        variances.append(uncertainty.counted(60.0, 0.0, charge, CURRENT_ERRORS[CurrentSource.NONE], True, 0.0))
     assert variances[1] == pytest.approx(variances[0], rel=1e-4)
     assert variances[0] ** 0.5 == pytest.approx(15.0 / 32.8 / 60 * 2**0.5, rel=1e-3)
+
+
+def test_two_currents_that_differ_confirm_each_other_to_no_better():
+    battery, charge = BATTERY, 3600 * BATTERY.pack_capacity(25.0)
+    uncertainty = ChargeUncertainty(battery, VEHICLE.parameters)
+    sd = uncertainty.counted(3600.0, 0.0, charge, CURRENT_ERRORS[CurrentSource.PACK], True, 2.5) ** 0.5
+    assert sd > 2.5 * 3600 / charge, "as if it were an offset of that"
+
+
+def test_an_altitude_that_is_missing_is_no_full_position():
+    signals = everything()
+    missing = MissingSignals(signals).reasons
+    signals.gps_fix.value = 2.0
+    assert missing(1.0) == Reason.NO_GPS
+    signals.gps_fix.value = 3.0
+    signals.gps_altitude.time = -100.0
+    assert missing(1.0) == Reason.NO_GPS
 
 
 def test_reasons_and_what_they_cost():

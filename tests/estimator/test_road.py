@@ -47,6 +47,17 @@ def drive(seconds, motion, *, without=(), seed=0, dt=0.1):
     return road, rows
 
 
+def test_an_accelerometer_alone_shows_no_grade_before_an_altitude_has_levelled_it():
+    def level(t):
+        return min(9.0, t), 0.0, 0.0, 0.0, 100.0
+
+    road, rows = drive(120, level, without=("gps_altitude",))
+    assert road.speed is not None
+    assert all(row[2] is None for row in rows), "its mounting would be a hill"
+    road, rows = drive(120, level)
+    assert road.grade == pytest.approx(0.0, abs=0.02)
+
+
 def turning(t):
     """Half a minute at rest, then curves left and right at 9 m/s."""
     if t < 30:
