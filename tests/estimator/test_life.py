@@ -10,7 +10,19 @@ import pytest
 from gz_onboard.estimator.activity import STOP_TIME
 from gz_onboard.estimator.start import from_voltage
 from gz_onboard.events import Activity, Group, Reason, State
-from tests.estimator.life import BATTERY, GROUPS, INVERTER, MOTOR, OTHERS, PACK, Scooter, estimator, follow, knows, worst
+from tests.estimator.life import (
+    BATTERY,
+    GROUPS,
+    INVERTER,
+    MOTOR,
+    OTHERS,
+    PACK,
+    Scooter,
+    estimator,
+    follow,
+    knows,
+    worst,
+)
 
 
 def restarted(e, age):
