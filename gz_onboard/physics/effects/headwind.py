@@ -13,29 +13,10 @@ from gz_onboard.physics.effect import Parameter, Port
 from gz_onboard.physics.elementary import cos, sin
 
 PORT = Port.WHEEL_FORCE
+WEATHER = "at 1 m over ground half of the 3-5 m/s that weather tells"
 PARAMETERS = (
-    Parameter(
-        "wind_north",
-        "m/s",
-        0.0,
-        2.0,
-        -15.0,
-        15.0,
-        "at 1 m over ground half of the 3-5 m/s that weather tells",
-        ride_sd=1.2,
-        healthy_sd=0.4,
-    ),
-    Parameter(
-        "wind_east",
-        "m/s",
-        0.0,
-        2.0,
-        -15.0,
-        15.0,
-        "at 1 m over ground half of the 3-5 m/s that weather tells",
-        ride_sd=1.2,
-        healthy_sd=0.4,
-    ),
+    Parameter("wind_north", "m/s", 0.0, 2.0, -15.0, 15.0, WEATHER, ride_sd=1.2, healthy_sd=0.4),
+    Parameter("wind_east", "m/s", 0.0, 2.0, -15.0, 15.0, WEATHER, ride_sd=1.2, healthy_sd=0.4),
 )
 STRENGTHS = ("wind_north", "wind_east")
 VARIES = True

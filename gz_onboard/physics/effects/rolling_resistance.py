@@ -12,27 +12,11 @@ from gz_onboard.physics.effect import Parameter, Port
 from gz_onboard.physics.elementary import direction
 
 PORT = Port.TYRE
+TYRES = "scooter tyres: Cossalter 2006, sec. 2.3"
+RISE = "SAE J2452: rises by a few percent per m/s"
 PARAMETERS = (
-    Parameter(
-        "rolling_resistance_constant",
-        "1",
-        0.015,
-        0.005,
-        0.0,
-        0.06,
-        "scooter tyres: Cossalter 2006, sec. 2.3",
-        ride_sd=7e-4,
-    ),
-    Parameter(
-        "rolling_resistance_speed",
-        "s/m",
-        2e-4,
-        2e-4,
-        0.0,
-        3e-3,
-        "SAE J2452: rises by a few percent per m/s",
-        ride_sd=2e-5,
-    ),
+    Parameter("rolling_resistance_constant", "1", 0.015, 0.005, 0.0, 0.06, TYRES, ride_sd=7e-4),
+    Parameter("rolling_resistance_speed", "s/m", 2e-4, 2e-4, 0.0, 3e-3, RISE, ride_sd=2e-5),
 )
 CAUSE = ("rolling_resistance", "F = m·g·cos θ·c0")
 SHOWN_BY = (

@@ -12,21 +12,11 @@ from gz_onboard.physics.effect import Parameter, Port
 from gz_onboard.physics.elementary import direction, exp
 
 PORT = Port.TYRE
+SHARE = "a guess: as cold days over warm ones, 20 to 40 %"
+RUNNING = "ISO 28580: warm after 30 min of running: three times this"
 PARAMETERS = (
-    Parameter(
-        "warm_up_share",
-        "1",
-        0.3,
-        0.2,
-        0.0,
-        2.0,
-        "a guess: as cold days over warm ones, 20 to 40 %",
-        ride_sd=0.05,
-        healthy_sd=0.2,
-    ),
-    Parameter(
-        "warm_up_time", "s", 600.0, 200.0, 60.0, 3600.0, "ISO 28580: warm after 30 min of running: three times this"
-    ),
+    Parameter("warm_up_share", "1", 0.3, 0.2, 0.0, 2.0, SHARE, ride_sd=0.05, healthy_sd=0.2),
+    Parameter("warm_up_time", "s", 600.0, 200.0, 60.0, 3600.0, RUNNING),
 )
 SHOWN_BY = (
     "Road load that falls within the first 10-20 min ridden, at all speeds, and does not when riding on straight "
