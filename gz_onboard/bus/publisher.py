@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.layout import first_bit, identifier_of, raw_range
 from gz_onboard.bus.mapping import find_dbc, load_database
+from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import ROLES, TRANSMITTED, Estimate, Frame, Reason, State
 
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
     from cantools.database.can.signal import Signal
 
 RANGE_DBC = "range.dbc"
-WH = 3600.0  # J
-WH_PER_KM = 3.6  # J/m
 
 
 @dataclass(frozen=True)

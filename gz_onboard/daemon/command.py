@@ -19,6 +19,7 @@ from pathlib import Path
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.codec import known_identifiers
 from gz_onboard.bus.recorder import Limits, Recorder
+from gz_onboard.constants import HOUR
 from gz_onboard.daemon.loop import TICK, Daemon, state_text
 from gz_onboard.errors import FAILED, InputError
 from gz_onboard.options import add_shared
@@ -109,7 +110,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
             attachments=dbc_texts(vehicle),
             limits=Limits(
                 max_file_bytes=round(arguments.log_file_mb * 1e6),
-                max_age_s=arguments.log_file_hours * 3600,
+                max_age_s=arguments.log_file_hours * HOUR,
                 max_total_bytes=round(arguments.log_total_mb * 1e6),
             ),
         )

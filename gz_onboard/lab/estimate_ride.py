@@ -14,7 +14,8 @@ from typing import Annotated, cast
 from gz_onboard.bus import _can  # noqa: F401 - before cantools, which would import it with asammdf and pandas
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import LogDamage, read_frames
-from gz_onboard.bus.publisher import WH, WH_PER_KM, Counts, Publisher
+from gz_onboard.bus.publisher import Counts, Publisher
+from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.errors import InputError, writing
 from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log

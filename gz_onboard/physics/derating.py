@@ -6,15 +6,14 @@ those of the reference scooter, where its file says how they were found; the oth
 
 from __future__ import annotations
 
-from bisect import bisect_right
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
+from gz_onboard.physics.tables import Row, linear
+
 if TYPE_CHECKING:
     from gz_onboard.toml import Table
-
-Row = tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -23,32 +22,10 @@ class Curve:
 
     at: Row
     share: Row
-    full: tuple[float, float] = field(init=False, repr=False, compare=False)  # within it nothing is taken off
-
-    def __post_init__(self) -> None:
-        inf = float("inf")
-        ones = [i for i, share in enumerate(self.share) if share == 1.0]
-        low, high = inf, -inf
-        if ones:
-            first = last = ones[0]
-            while last + 1 in ones:
-                last += 1
-            low = -inf if first == 0 else self.at[first]
-            high = inf if last == len(self.at) - 1 else self.at[last]
-        object.__setattr__(self, "full", (low, high))
 
     def __call__(self, x: float) -> float:
         """The share at `x`."""
-        low, high = self.full
-        if low <= x <= high:
-            return 1.0
-        xs, ys = self.at, self.share
-        if x <= xs[0]:
-            return ys[0]
-        if x >= xs[-1]:
-            return ys[-1]
-        i = bisect_right(xs, x) - 1
-        return ys[i] + (ys[i + 1] - ys[i]) * (x - xs[i]) / (xs[i + 1] - xs[i])
+        return linear(self.at, self.share, x)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gz_onboard.physics.battery import HOUR, Battery, Overpotential
+from gz_onboard.constants import HOUR
+from gz_onboard.physics.battery import Battery, Overpotential
 
 
 @dataclass(frozen=True)

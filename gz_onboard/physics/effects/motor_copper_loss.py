@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from gz_onboard.physics.battery import BENCH_TEMPERATURE
 from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.MOTOR_LOSS
@@ -29,7 +30,7 @@ def term(
     """Heat [W]."""
     return (
         motor_copper_resistance
-        * (1 + motor_copper_temperature_coefficient * (motor_temperature - 25))
+        * (1 + motor_copper_temperature_coefficient * (motor_temperature - BENCH_TEMPERATURE))
         * motor_current
         * motor_current
     )

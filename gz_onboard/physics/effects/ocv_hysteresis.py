@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import Parameter, Port
 from gz_onboard.physics.elementary import exp
 
@@ -32,4 +33,4 @@ def term(cell_current: Any, *, hysteresis_voltage: float) -> Any:
 
 def decay(dt: Any, cell_current: Any, cell_capacity: Any, *, hysteresis_rate: float) -> Any:
     """The share that is left after `dt` [s] of `cell_current` [A]."""
-    return exp(-hysteresis_rate * abs(cell_current) * dt / (3600 * cell_capacity))
+    return exp(-hysteresis_rate * discharged(abs(cell_current), dt, cell_capacity))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from gz_onboard.constants import GRAVITY
+from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.physics.effect import Parameter, Port
 from gz_onboard.physics.elementary import direction
 
@@ -39,4 +39,4 @@ def term(
 
 def variation(ambient_temperature: Any, *, rolling_cold: float) -> Any:
     """Cold rubber rolls worse; rolling_cold: by how much more at 0 than at 20 degC."""
-    return 1 + rolling_cold * (20 - ambient_temperature) / 20
+    return 1 + rolling_cold * (MILD - ambient_temperature) / MILD

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import Parameter, Port
-from gz_onboard.physics.elementary import direction, exp
+from gz_onboard.physics.effects.rolling_resistance import term as rolling
+from gz_onboard.physics.elementary import exp
 
 PORT = Port.TYRE
 SHARE = "a guess: as cold days over warm ones, 20 to 40 %"
@@ -35,5 +35,5 @@ def term(
     warm_up_time: float,
 ) -> Any:
     """Force [N] against the motion."""
-    cold = warm_up_share * exp(-time_moving / warm_up_time)
-    return mass * GRAVITY * grade_cosine * rolling_resistance_constant * cold * direction(speed)
+    more = rolling_resistance_constant * warm_up_share * exp(-time_moving / warm_up_time)
+    return rolling(speed, mass, grade_cosine, rolling_resistance_constant=more, rolling_resistance_speed=0.0)

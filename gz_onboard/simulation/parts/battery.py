@@ -7,7 +7,8 @@ from itertools import pairwise
 from math import sqrt
 from typing import Protocol
 
-from gz_onboard.physics.battery import HOUR, Battery, discharged, heat, terminal_voltage
+from gz_onboard.constants import HOUR
+from gz_onboard.physics.battery import Battery, discharged, heat, terminal_voltage
 from gz_onboard.physics.model import Bound
 from gz_onboard.physics.relaxation import decay_over, relaxed
 
