@@ -29,7 +29,6 @@ NOT_AVAILABLE = "not available"
 RANGE = "out of range"
 TIME = "implausible time"
 UNDECODABLE = "undecodable"
-REASONS = (LENGTH, CRC, COUNTER, NOT_AVAILABLE, RANGE, TIME, UNDECODABLE)
 
 _BACK_NS = 50_000_000  # frames of two channels may overtake each other by a little
 _AHEAD_NS = 30_000_000_000
@@ -112,10 +111,6 @@ class Codec:
     def seconds(self, time_ns: int) -> float:
         """`time_ns` on the timeline of the events."""
         return 0.0 if self._origin_ns is None else (time_ns - self._origin_ns) * 1e-9
-
-    def nanoseconds(self, time: float) -> int:
-        """The inverse of `seconds`."""
-        return (self._origin_ns or 0) + round(time * 1e9)
 
     def clock_set(self, delta_ns: int) -> None:
         """The clock that stamps the frames was set by `delta_ns`; the timeline goes on."""

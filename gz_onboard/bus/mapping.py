@@ -80,7 +80,6 @@ class Mapping:
     periods: dict[str, float]  # s, by message; only where known
     not_available: bool = True
     j1939: bool = False
-    roles: tuple[str, ...] = field(default=())
     delays: dict[str, float] = field(default_factory=dict)  # s, by message: its values are so much older; where stated
 
 
@@ -239,7 +238,6 @@ def read_mapping(vehicle: Table) -> Mapping:
         periods=periods,
         not_available=bus.text("not_available", "all-ones", ["all-ones", "none"]) == "all-ones",
         j1939=j1939,
-        roles=tuple(source.role for source in sources),
         delays=delays,
     )
 

@@ -150,10 +150,10 @@ class Tally:
 class _Mute(Publisher):
     """No bus, no range frames: encoding them would take a third of the time."""
 
-    def range(self, estimate: Estimate, counts: Counts, time_ns: int, channel: int = 0) -> list[Frame]:
+    def range(self, estimate: Estimate, counts: Counts, time_ns: int) -> list[Frame]:
         return []
 
-    def status(self, estimate: Estimate, time_ns: int, channel: int = 0) -> list[Frame]:
+    def status(self, estimate: Estimate, time_ns: int) -> list[Frame]:
         return []
 
 

@@ -49,12 +49,6 @@ class Samples:
     facts: dict[str, object] = field(default_factory=dict)
 
     @property
-    def duration(self) -> float:
-        """From the first sample to the last [s]."""
-        starts, ends = zip(*((t[0], t[-1]) for t, _ in self.columns.values()), strict=True)
-        return float(max(ends) - min(starts))
-
-    @property
     def rider_mass(self) -> float | None:
         """The mass of rider and luggage as entered [kg], or None."""
         return rider_mass(self.facts)

@@ -12,18 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
-from gz_onboard.bus.codec import (
-    COUNTER,
-    CRC,
-    LENGTH,
-    NOT_AVAILABLE,
-    RANGE,
-    REASONS,
-    TIME,
-    UNDECODABLE,
-    Codec,
-    known_identifiers,
-)
+from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, TIME, UNDECODABLE, Codec, known_identifiers
 from gz_onboard.bus.layout import identifier_of, is_not_available, raw_values
 from gz_onboard.bus.mapping import Mapping, Source, find_dbc, load_database, read_mapping
 from gz_onboard.bus.units import to_si
@@ -327,7 +316,6 @@ def test_times_are_seconds_since_the_first_frame():
     events = codec.decode([temperatures(EPOCH), temperatures(EPOCH + 1500 * MS)])
     assert [time for time, _, _ in events] == [0.0, 1.5]
     assert codec.seconds(EPOCH + S) == 1.0
-    assert codec.nanoseconds(1.0) == EPOCH + S
 
 
 @pytest.mark.parametrize("start", [0, 1, -5 * S, 1_049 * MS, EPOCH, 2**62, -(2**62), -(2**63), -(2**70)])
@@ -607,7 +595,7 @@ def test_whatever_the_bus_brings(frames):
                     assert low <= value <= high, (role, value)
             assert not absent or any(r in (NOT_AVAILABLE, RANGE) for _, r in codec.faults)
         assert all(v is None or math.isfinite(v) for v in codec.values(frame[1], frame[2]).values())
-    assert {reason for _, reason in codec.faults} <= set(REASONS)
+    assert {reason for _, reason in codec.faults} <= {LENGTH, CRC, COUNTER, NOT_AVAILABLE, RANGE, TIME, UNDECODABLE}
 
 
 @settings(max_examples=150, deadline=None)

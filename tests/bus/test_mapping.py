@@ -103,7 +103,7 @@ def test_a_dbc_may_be_written_in_utf8_or_as_windows_does(tmp_path):
 def test_signals_of_no_message_as_vector_writes_them_do_no_harm(tmp_path):
     free = 'BO_ 3221225472 VECTOR__INDEPENDENT_SIG_MSG: 0 Vector__XXX\n SG_ Free : 0|8@1+ (1,0) [0|0] "" A\n\n'
     got = mapping(tmp_path, 'pack_voltage = "Voltage"', dbc=DBC.replace("BO_ 256 Pack", free + "BO_ 256 Pack", 1))
-    assert got.roles == ("pack_voltage",)
+    assert [source.role for source in got.sources] == ["pack_voltage"]
 
 
 # --- units ------------------------------------------------------------------------------------------------------
