@@ -14,8 +14,9 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.checksum import sae_j1850_tables
-from gz_onboard.bus.layout import MappedMessage, identifier_of, is_not_available, raw_range, raw_values
+from gz_onboard.bus.layout import MappedMessage, identifier_of, is_not_available, raw_values
 from gz_onboard.bus.mapping import Mapping, Protection, Source, pgn
+from gz_onboard.bus.signals import MessageSignals, Values
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Event, Frame, Group
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ class Codec:
         self.latest: dict[int, tuple[int, bytes]] = {}  # identifier -> time [ns], data of the last good frame
         self._events: list[Event] = []
         self._origin_ns: int | None = None
-        self._limits: dict[str, list[tuple[str, Any, float, float]]] = {}  # message -> signal, conversion, low, high
+        self._signals: dict[str, MessageSignals] = {}  # by message, of those that were asked for
         self._last_ns = -(1 << 80)  # before any frame: far from every time
         self._suspects = 0
         self._suspect_ns = 0  # the time of the last suspect
@@ -175,21 +176,14 @@ class Codec:
 
     # --- what is known of a message ---------------------------------------------------------------------------
 
-    def values(self, identifier: int, data: bytes) -> dict[str, Any]:
-        """Every signal of a frame in the units of the DBC; None where not available or out of the DBC's range."""
+    def values(self, identifier: int, data: bytes) -> Values:
+        """Every signal of a frame in the units of the DBC, see `MessageSignals.values`; none of an unknown frame."""
         message = self._message(identifier)
-        raw = raw_values(message, data) if message else None
-        if message is None or raw is None:
+        if message is None:
             return {}
-        values: dict[str, Any] = {}
-        limits = self._limits.get(message.name)
-        if limits is None:
-            limits = [(s.name, s.conversion, *raw_range(s, self.mapping.not_available)) for s in message.signals]
-            self._limits[message.name] = limits
-        for name, conversion, low, high in limits:
-            if (value := raw.get(name)) is not None:  # NaN is not between any limits
-                values[name] = conversion.raw_to_scaled(value, False) if low <= value <= high else None
-        return values
+        if (signals := self._signals.get(message.name)) is None:
+            self._signals[message.name] = signals = MessageSignals(message, self.mapping.not_available)
+        return signals.values(data) or {}
 
     def message_name(self, identifier: int) -> str | None:
         """The name of the message with this identifier."""
