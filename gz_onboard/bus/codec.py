@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.checksum import sae_j1850_tables
 from gz_onboard.bus.layout import MappedMessage, identifier_of, is_not_available, raw_values
-from gz_onboard.bus.mapping import Mapping, Protection, Source, pgn
+from gz_onboard.bus.mapping import BusMapping, Protection, Source, pgn
 from gz_onboard.bus.signals import MessageSignals, Values
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Event, Frame, Group
 
@@ -43,7 +43,7 @@ Handler = Callable[[float, bytes], bool | None]
 class Codec:
     """Decodes frames of one vehicle. Its state is what the checks need: counters, the last time, the counts."""
 
-    def __init__(self, mapping: Mapping) -> None:
+    def __init__(self, mapping: BusMapping) -> None:
         self.mapping = mapping
         self.groups: list[Group] = []
         self.faults: dict[tuple[str, str], int] = {}  # (message, reason) -> frames or signals dropped
@@ -269,7 +269,7 @@ class Codec:
         self.lost[message] = self.lost.get(message, 0) + lost
 
 
-def known_identifiers(mapping: Mapping) -> list[int] | None:
+def known_identifiers(mapping: BusMapping) -> list[int] | None:
     """The identifiers (with flags) that the database knows, for the kernel's filters; None if it goes by PGN."""
     if mapping.j1939:
         return None

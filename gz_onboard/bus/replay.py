@@ -42,7 +42,7 @@ _PROGRESS_NS = 500_000_000
 
 
 @dataclass
-class Summary:
+class Sent:
     """What was sent: numbers of frames, time it took [s], and how late the latest frame was [s]."""
 
     sent: int = 0
@@ -67,15 +67,15 @@ def replay(
     batches: Iterable[Sequence[Frame]],
     send: Send,
     speed: float = 1.0,
-    summary: Summary | None = None,
+    summary: Sent | None = None,
     progress: Callable[[float], None] | None = None,
-) -> Summary:
+) -> Sent:
     """Send the frames at the times they have in the log, `speed` times as fast; 0: without waiting.
 
     progress is called about twice a second with the seconds of log sent. A `summary` that is given is added to,
     and is up to date when KeyboardInterrupt ends the replay.
     """
-    summary = summary or Summary()
+    summary = summary or Sent()
     begin_ns = time.monotonic_ns()
     before_s = summary.duration_s
     first_ns: int | None = None
@@ -180,7 +180,7 @@ def run(arguments: argparse.Namespace) -> int:
     received_only = log_suffix(arguments.log) == ".mcap" and not arguments.all
     names = [name for name in arguments.channel.split(",") if name]
     buses = _open_buses(arguments.interface, names)
-    summary = Summary()
+    summary = Sent()
     damages: list[LogDamage] = []
     status = OK
     try:
@@ -224,7 +224,7 @@ def log_section(path: Path, start_s: float, end_s: float | None) -> tuple[int | 
 
 
 def _sendable(
-    batches: Iterable[list[Frame]], received_only: bool, channels: int, summary: Summary
+    batches: Iterable[list[Frame]], received_only: bool, channels: int, summary: Sent
 ) -> Iterable[list[Frame]]:
     """Without error frames, which no host can send, and what is not for the channels at hand."""
     for batch in batches:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.logs import read_frames
-from gz_onboard.bus.mapping import Mapping, Source
+from gz_onboard.bus.mapping import BusMapping, Source
 from gz_onboard.errors import InputError
 from gz_onboard.events import Event
 from gz_onboard.vehicle import Vehicle
@@ -123,7 +123,7 @@ def rider_mass(facts: dict[str, object]) -> float | None:
     return float(mass) if isinstance(mass, int | float) else None
 
 
-def extended(mapping: Mapping) -> Mapping:
+def extended(mapping: BusMapping) -> BusMapping:
     """`mapping` and those of `INSTRUMENTS` that its database has."""
     sources = list(mapping.sources)
     for role, message, signal, factor in INSTRUMENTS:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.bus.codec import Codec
-from gz_onboard.bus.mapping import Mapping, find_dbc, load_database, pgn, read_mapping
+from gz_onboard.bus.mapping import BusMapping, find_dbc, load_database, pgn, read_mapping
 from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError
 from gz_onboard.events import ROLES
@@ -35,7 +35,7 @@ BA_ "GenMsgCycleTime" BO_ 256 100;
 """
 
 
-def mapping(folder: Path, roles: str = "", bus: str = "", dbc: str = DBC, names: str = '["v.dbc"]') -> Mapping:
+def mapping(folder: Path, roles: str = "", bus: str = "", dbc: str = DBC, names: str = '["v.dbc"]') -> BusMapping:
     (folder / "v.dbc").write_text(dbc, encoding="utf-8")
     (folder / "v.toml").write_text(f"dbc = {names}\n[bus]\n{bus}\n[roles]\n{roles}\n", encoding="utf-8")
     return read_mapping(Table.read(folder / "v.toml"))
