@@ -18,7 +18,7 @@ from gz_onboard.bus.mapping import pgn
 from gz_onboard.bus.publisher import KNOWN, Counts, Publisher
 from gz_onboard.constants import WH
 from gz_onboard.errors import InputError
-from gz_onboard.estimator.backends import filter_maker
+from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
@@ -74,6 +74,15 @@ class Log(Protocol):
 
     def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
         """Log one JSON object."""
+
+
+def filter_maker(name: str) -> FilterMaker:
+    """The backend of the SOC filter: ``scalar`` or ``filterpy``; the second imports numpy and scipy."""
+    if name != "filterpy":
+        return ScalarFilter
+    from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
+
+    return FilterpyFilter
 
 
 class Pipeline:
