@@ -37,8 +37,7 @@ DURATIONS = 1e-3, 1e9  # s
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard dashboard``."""
     add = parser.add_argument
-    add_shared(parser, "--interface")
-    add_shared(parser, "--channel", help="channel, as the daemon's (default: %(default)s)")
+    add_shared(parser, "--interface", "--channel")
     add(
         "--dbc",
         default=RANGE_DBC,
