@@ -19,7 +19,7 @@ from typing import Any
 import fastsim  # type: ignore[import-not-found, unused-ignore]
 import numpy as np
 
-from gz_onboard.physics.derating import Curve
+from gz_onboard.physics.derating import DeratingCurve
 from gz_onboard.physics.model import Model
 from gz_onboard.simulation.backward import Conditions, backward
 from gz_onboard.simulation.cycles import cycle
@@ -201,9 +201,9 @@ def electric_braking(vehicle: Vehicle, **values: float) -> Vehicle:
 def unlimited(scooter: Scooter) -> Scooter:
     scooter.controller.derating = replace(
         scooter.controller.derating,
-        current_by_motor_speed=Curve((0.0,), (1.0,)),
-        regeneration_by_motor_speed=Curve((0.0, 0.5), (0.0, 1.0)),
-        regeneration_by_soc=Curve((0.0,), (1.0,)),
+        current_by_motor_speed=DeratingCurve((0.0,), (1.0,)),
+        regeneration_by_motor_speed=DeratingCurve((0.0, 0.5), (0.0, 1.0)),
+        regeneration_by_soc=DeratingCurve((0.0,), (1.0,)),
         regeneration_gain=1.0,
     )
     return scooter

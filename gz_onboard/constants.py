@@ -1,3 +1,9 @@
-"""Constants of nature."""
+"""Constants of nature and of units, and the usual temperature."""
 
 GRAVITY = 9.80665  # m/s², standard acceleration of free fall (CGPM 1901)
+KELVIN = 273.15  # K: 0 degC
+HOUR = 3600.0  # s
+WH = HOUR  # J
+WH_PER_KM = 3.6  # J/m
+
+MILD = 20.0  # degC: of a vehicle and of the air where nothing else is known

@@ -15,6 +15,8 @@ MOST_JOBS = 256
 """Processes: each takes some 100 MB and keeps a processor busy."""
 MOST_PAYLOAD = 300.0  # kg
 MOST_SEED = 2**32 - 1
+LONGEST_LOG = 1e9  # s, thirty years
+CHANNEL = "can0"
 
 
 def number(
@@ -66,8 +68,15 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
         {"default": "scalar", "choices": ("scalar", "filterpy")},
     ),
     "--interface": ("interface of python-can (default: %(default)s)", {"default": "socketcan", "metavar": "NAME"}),
-    "--from": ("start, seconds into the log", {"dest": "start", "type": float, "default": 0.0, "metavar": "S"}),
-    "--to": ("end, seconds into the log", {"dest": "end", "type": float, "metavar": "S"}),
+    "--channel": ("channel (default: %(default)s)", {"default": CHANNEL, "metavar": "NAME"}),
+    "--from": (
+        "start, seconds into the log",
+        {"dest": "start", "type": number("--from", 0.0, LONGEST_LOG, "s"), "default": 0.0, "metavar": "S"},
+    ),
+    "--to": (
+        "end, seconds into the log",
+        {"dest": "end", "type": number("--to", 0.0, LONGEST_LOG, "s"), "metavar": "S"},
+    ),
     "--jobs": ("number of parallel processes (default: one per processor)", {"type": _jobs("--jobs"), "metavar": "N"}),
     "--json": (
         "write the result as JSON to FILE, or instead of text to standard output",

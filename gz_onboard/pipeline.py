@@ -15,12 +15,14 @@ from typing import Any, Protocol
 from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE, Codec
 from gz_onboard.bus.logfile import object_schema
 from gz_onboard.bus.mapping import pgn
-from gz_onboard.bus.publisher import KNOWN, WH, Counts, Publisher
+from gz_onboard.bus.publisher import KNOWN, Counts, Publisher
+from gz_onboard.constants import WH
 from gz_onboard.errors import InputError
-from gz_onboard.estimator.backends import filter_maker
+from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
+from gz_onboard.physics.battery import BENCH_TEMPERATURE
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.vehicle import Vehicle
 
@@ -72,6 +74,15 @@ class Log(Protocol):
 
     def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
         """Log one JSON object."""
+
+
+def filter_maker(name: str) -> FilterMaker:
+    """The backend of the SOC filter: ``scalar`` or ``filterpy``; the second imports numpy and scipy."""
+    if name != "filterpy":
+        return ScalarFilter
+    from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
+
+    return FilterpyFilter
 
 
 class Pipeline:
@@ -243,10 +254,9 @@ def range_publisher(vehicle: Vehicle) -> Publisher:
         names = ", ".join(f"{identifier & ~EFF_FLAG:#x}" for identifier in sorted(clash))
         raise vehicle.error(f"its DBC files take the identifiers of our own range frames ({publisher.file}): {names}")
     if vehicle.battery:
-        full = drawable(vehicle.battery, 1.0, 25.0, 1.0).energy / WH
-        reach = (
-            Forecaster(vehicle.model, vehicle.battery, vehicle.riding).forecast(1.0, 0.0, 25.0, 0.0, 25.0, 0.0).range
-        )
+        full = drawable(vehicle.battery, 1.0, BENCH_TEMPERATURE, 1.0).energy / WH
+        forecaster = Forecaster(vehicle.model, vehicle.battery, vehicle.riding)
+        reach = forecaster.forecast(1.0, 0.0, BENCH_TEMPERATURE, 0.0, BENCH_TEMPERATURE, 0.0).range
         for what, value, signal, unit in (
             ("the battery holds", full, "RANGE_EnergyLeft", "Wh"),
             ("the expected range from full is", reach * 1e-3, "RANGE_Remaining", "km"),

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gz_onboard.bus.mapping import Mapping, find_dbc, read_mapping
+from gz_onboard.bus.mapping import BusMapping, find_dbc, read_mapping
 from gz_onboard.bus.publisher import RANGE_DBC
 from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.physics.battery import Battery
@@ -29,7 +29,7 @@ class Vehicle:
 
     name: str
     file: Path
-    mapping: Mapping
+    mapping: BusMapping
     parameters: Parameters
     battery: Battery | None
     model: Model

@@ -31,7 +31,7 @@ def changed(folder: Path, old: str, new: str) -> tuple[Path, int]:
 def test_the_packages_own_vehicles_are_whole(name):
     vehicle = read_vehicle(name)
     assert vehicle.battery is not None
-    assert {"pack_voltage", "pack_current"} <= set(vehicle.mapping.roles)
+    assert {"pack_voltage", "pack_current"} <= {source.role for source in vehicle.mapping.sources}
     assert all(value.source and value.status for value in vehicle.parameters.known.values())
     assert vehicle.name in vehicle.key
 

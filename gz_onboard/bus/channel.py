@@ -39,13 +39,7 @@ class CanChannel:
     """One channel. `index` is put into its frames; `identifiers` are all that the kernel shall let through."""
 
     def __init__(
-        self,
-        interface: str,
-        channel: str,
-        index: int = 0,
-        identifiers: Sequence[int] | None = None,
-        wall: Any = time.time_ns,
-        **options: Any,
+        self, interface: str, channel: str, index: int = 0, identifiers: Sequence[int] | None = None, **options: Any
     ) -> None:
         self.interface = interface
         self.name = channel
@@ -56,7 +50,6 @@ class CanChannel:
         self._identifiers = identifiers
         self._wanted = None if identifiers is None else {*identifiers, *(ERR_FLAG | bit for bit in (0, EFF_FLAG))}
         self._options = options
-        self._wall = wall
         self._bus: Any = None
         self._socket: socket.socket | None = None
         self._kernel_count = 0
@@ -156,7 +149,7 @@ class CanChannel:
                 identifier, length, _, payload = _FD_FRAME.unpack(data)
             if length < len(payload):
                 payload = payload[:length]
-            frames.append((time_ns or self._wall(), identifier, payload, index))
+            frames.append((time_ns or time.time_ns(), identifier, payload, index))
             if not number & 31 and now() > until:
                 return
 
@@ -170,7 +163,7 @@ class CanChannel:
             if self._wanted is not None and identifier & ~RTR_FLAG not in self._wanted:
                 continue
             # Only the kernel's stamps are of one clock; other interfaces have clocks of their own.
-            frames.append((self._wall(), identifier, bytes(message.data), self.index))
+            frames.append((time.time_ns(), identifier, bytes(message.data), self.index))
 
     def send(self, frame: Frame) -> bool:
         """Send `frame`; False if the bus does not take it now."""

@@ -14,8 +14,9 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.checksum import sae_j1850_tables
-from gz_onboard.bus.layout import MappedMessage, identifier_of, is_not_available, raw_range, raw_values
-from gz_onboard.bus.mapping import Mapping, Protection, Source, pgn
+from gz_onboard.bus.layout import MappedMessage, identifier_of, is_not_available, raw_values
+from gz_onboard.bus.mapping import BusMapping, Protection, Source, pgn
+from gz_onboard.bus.signals import MessageSignals, Values
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Event, Frame, Group
 
 if TYPE_CHECKING:
@@ -29,7 +30,6 @@ NOT_AVAILABLE = "not available"
 RANGE = "out of range"
 TIME = "implausible time"
 UNDECODABLE = "undecodable"
-REASONS = (LENGTH, CRC, COUNTER, NOT_AVAILABLE, RANGE, TIME, UNDECODABLE)
 
 _BACK_NS = 50_000_000  # frames of two channels may overtake each other by a little
 _AHEAD_NS = 30_000_000_000
@@ -43,7 +43,7 @@ Handler = Callable[[float, bytes], bool | None]
 class Codec:
     """Decodes frames of one vehicle. Its state is what the checks need: counters, the last time, the counts."""
 
-    def __init__(self, mapping: Mapping) -> None:
+    def __init__(self, mapping: BusMapping) -> None:
         self.mapping = mapping
         self.groups: list[Group] = []
         self.faults: dict[tuple[str, str], int] = {}  # (message, reason) -> frames or signals dropped
@@ -55,7 +55,7 @@ class Codec:
         self.latest: dict[int, tuple[int, bytes]] = {}  # identifier -> time [ns], data of the last good frame
         self._events: list[Event] = []
         self._origin_ns: int | None = None
-        self._limits: dict[str, list[tuple[str, Any, float, float]]] = {}  # message -> signal, conversion, low, high
+        self._signals: dict[str, MessageSignals] = {}  # by message, of those that were asked for
         self._last_ns = -(1 << 80)  # before any frame: far from every time
         self._suspects = 0
         self._suspect_ns = 0  # the time of the last suspect
@@ -112,10 +112,6 @@ class Codec:
     def seconds(self, time_ns: int) -> float:
         """`time_ns` on the timeline of the events."""
         return 0.0 if self._origin_ns is None else (time_ns - self._origin_ns) * 1e-9
-
-    def nanoseconds(self, time: float) -> int:
-        """The inverse of `seconds`."""
-        return (self._origin_ns or 0) + round(time * 1e9)
 
     def clock_set(self, delta_ns: int) -> None:
         """The clock that stamps the frames was set by `delta_ns`; the timeline goes on."""
@@ -180,21 +176,14 @@ class Codec:
 
     # --- what is known of a message ---------------------------------------------------------------------------
 
-    def values(self, identifier: int, data: bytes) -> dict[str, Any]:
-        """Every signal of a frame in the units of the DBC; None where not available or out of the DBC's range."""
+    def values(self, identifier: int, data: bytes) -> Values:
+        """Every signal of a frame in the units of the DBC, see `MessageSignals.values`; none of an unknown frame."""
         message = self._message(identifier)
-        raw = raw_values(message, data) if message else None
-        if message is None or raw is None:
+        if message is None:
             return {}
-        values: dict[str, Any] = {}
-        limits = self._limits.get(message.name)
-        if limits is None:
-            limits = [(s.name, s.conversion, *raw_range(s, self.mapping.not_available)) for s in message.signals]
-            self._limits[message.name] = limits
-        for name, conversion, low, high in limits:
-            if (value := raw.get(name)) is not None:  # NaN is not between any limits
-                values[name] = conversion.raw_to_scaled(value, False) if low <= value <= high else None
-        return values
+        if (signals := self._signals.get(message.name)) is None:
+            self._signals[message.name] = signals = MessageSignals(message, self.mapping.not_available)
+        return signals.values(data) or {}
 
     def message_name(self, identifier: int) -> str | None:
         """The name of the message with this identifier."""
@@ -280,7 +269,7 @@ class Codec:
         self.lost[message] = self.lost.get(message, 0) + lost
 
 
-def known_identifiers(mapping: Mapping) -> list[int] | None:
+def known_identifiers(mapping: BusMapping) -> list[int] | None:
     """The identifiers (with flags) that the database knows, for the kernel's filters; None if it goes by PGN."""
     if mapping.j1939:
         return None

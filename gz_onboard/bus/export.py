@@ -9,7 +9,8 @@ The name of the output says what is written:
 With --estimates, and of a log that holds nothing else (that of ``gz-onboard estimate``), the estimates: .csv, .parquet
 or a directory, a row for each estimate.
 
-Signals have the units of the DBC files, in their names: ``BMS_PackVoltage[V]``. What was not available is null.
+Signals have the units of the DBC files, in their names: ``BMS_PackVoltage[V]``. What was not available, or is out of
+the DBC's range, is null.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import heapq
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from itertools import chain
 from pathlib import Path
@@ -30,7 +31,7 @@ from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.replay import log_section
 from gz_onboard.bus.signals import Decoder
 from gz_onboard.bus.writers import write_blf, write_candump
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import OK, InputError, nearest, writing
 from gz_onboard.events import Frame
 from gz_onboard.options import add_shared
 
@@ -173,17 +174,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "--from", "--to")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(arguments: argparse.Namespace) -> int:
     """Run ``gz-onboard export``; raises InputError for what cannot be used."""
-    log, out = args.log, args.out
+    log, out = arguments.log, arguments.out
     suffix = out_suffix(out)
     if out.exists() and out.resolve() == log.resolve():
         raise InputError(f"{out}: is the log itself")
-    if args.estimates or _holds_only_estimates(log):
-        count = _written(out, lambda: _write_estimates(log, out, suffix, args.table_format, (args.start, args.end)))
+    if arguments.estimates or _holds_only_estimates(log):
+        with writing(out):
+            count = _write_estimates(log, out, suffix, arguments.table_format, (arguments.start, arguments.end))
         print(f"wrote {out}: {count} estimates")
-        return 0
-    section = log_section(log, args.start, args.end)
+        return OK
+    section = log_section(log, arguments.start, arguments.end)
     damages: list[logs.LogDamage] = []
     rest = logs.read_frames(log, *section, damages.append)
     first = next(rest, None)
@@ -192,25 +194,19 @@ def run(args: argparse.Namespace) -> int:
         why = "".join(f"; damaged at {damage.place}: {damage.reason}" for damage in damages)
         raise InputError(f"{log}: no frames in {where}{why}")
     batches = chain([first], rest)
-    if suffix in (".parquet", ".mcap", "") or args.signals:
-        decoder = Decoder(_database(log, args.dbc))
-        count = _written(out, lambda: _export_signals(log, out, suffix, args.table_format, decoder, batches, section))
+    if suffix in (".parquet", ".mcap", "") or arguments.signals:
+        decoder = Decoder(_database(log, arguments.dbc))
+        with writing(out):
+            count = _export_signals(log, out, suffix, arguments.table_format, decoder, batches, section)
         left = f"; {decoder.unknown} frames are in no DBC file, {decoder.undecodable} do not fit theirs"
     else:
-        count = _written(out, lambda: write_frames_as(out, suffix, batches))
+        with writing(out):
+            count = write_frames_as(out, suffix, batches)
         left = ""
     for damage in damages:
         print(f"damaged log: {damage}")
     print(f"wrote {out}: {count} {'samples' if suffix == '.mcap' else 'frames'}{left}")
-    return 0
-
-
-def _written(out: Path, write: Callable[[], int]) -> int:
-    """What `write` gives; InputError for what the operating system refuses."""
-    try:
-        return write()
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror or error}") from None
+    return OK
 
 
 def _holds_only_estimates(log: Path) -> bool:

@@ -70,7 +70,7 @@ class Protection:
 
 
 @dataclass(frozen=True)
-class Mapping:
+class BusMapping:
     """The bus of one vehicle: its database, and the roles that its signals play."""
 
     database: Database
@@ -80,7 +80,6 @@ class Mapping:
     periods: dict[str, float]  # s, by message; only where known
     not_available: bool = True
     j1939: bool = False
-    roles: tuple[str, ...] = field(default=())
     delays: dict[str, float] = field(default_factory=dict)  # s, by message: its values are so much older; where stated
 
 
@@ -187,7 +186,7 @@ def _message_line(text: str, name: str) -> int | None:
     return text.count("\n", 0, found[-1].end()) + 1 if found else None
 
 
-def read_mapping(vehicle: Table) -> Mapping:
+def read_mapping(vehicle: Table) -> BusMapping:
     """The bus part of the vehicle file `vehicle`; InputError for whatever does not fit its DBC files."""
     names = vehicle.texts("dbc", "DBC file names")
     if len(names) > MOST_FILES:
@@ -231,7 +230,7 @@ def read_mapping(vehicle: Table) -> Mapping:
     roles = vehicle.table("roles")
     roles.only(ROLES)
     sources = tuple(_source(database, roles, role) for role in roles.values)
-    return Mapping(
+    return BusMapping(
         database=database,
         dbc_files=tuple(files),
         sources=sources,
@@ -239,7 +238,6 @@ def read_mapping(vehicle: Table) -> Mapping:
         periods=periods,
         not_available=bus.text("not_available", "all-ones", ["all-ones", "none"]) == "all-ones",
         j1939=j1939,
-        roles=tuple(source.role for source in sources),
         delays=delays,
     )
 

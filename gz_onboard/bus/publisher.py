@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.layout import first_bit, identifier_of, raw_range
 from gz_onboard.bus.mapping import find_dbc, load_database
+from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import ROLES, TRANSMITTED, Estimate, Frame, Reason, State
 
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
     from cantools.database.can.signal import Signal
 
 RANGE_DBC = "range.dbc"
-WH = 3600.0  # J
-WH_PER_KM = 3.6  # J/m
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ class Publisher:
         field = self._fields[signal]
         return max(limit * field.scale + field.offset for limit in (field.low, field.high))
 
-    def range(self, estimate: Estimate, counts: Counts, time_ns: int, channel: int = 0) -> list[Frame]:
+    def range(self, estimate: Estimate, counts: Counts, time_ns: int) -> list[Frame]:
         """The frames of every second."""
         e = estimate
         state, remaining, p10, p90 = self.reported(e)
@@ -83,9 +82,9 @@ class Publisher:
             },
             "RANGE_Sensors": {signal: role in e.distrusted for role, signal in self._sensor_signals},
         }
-        return [self._frame(name, values, time_ns, channel) for name, values in frames.items()]
+        return [self._frame(name, values, time_ns) for name, values in frames.items()]
 
-    def status(self, estimate: Estimate, time_ns: int, channel: int = 0) -> list[Frame]:
+    def status(self, estimate: Estimate, time_ns: int) -> list[Frame]:
         """The frame of every tenth of a second."""
         state = self.reported(estimate)[0]
         soc, sigma = _scaled(estimate.soc, 100), _scaled(estimate.soc_sd, 100)
@@ -100,7 +99,7 @@ class Publisher:
         reasons = int(estimate.reasons)
         for bit, signal in _REASON_SIGNALS:
             values[signal] = reasons & bit != 0
-        return [self._frame("RANGE_Status", values, time_ns, channel)]
+        return [self._frame("RANGE_Status", values, time_ns)]
 
     def reported(self, e: Estimate) -> tuple[State, float | None, float | None, float | None]:
         """(state, range, P10, P90) [km] as they are sent: never valid unless all three are there and in their order."""
@@ -123,7 +122,7 @@ class Publisher:
     def _can_say(self, signal: str, value: float | None) -> bool:
         return self._fields[signal].raw(value) is not None
 
-    def _frame(self, name: str, values: dict[str, float | None], time_ns: int, channel: int) -> Frame:
+    def _frame(self, name: str, values: dict[str, float | None], time_ns: int) -> Frame:
         layout = self._layouts[name]
         counter = self._counters[name]
         self._counters[name] = (counter + 1) % layout.counts
@@ -132,7 +131,7 @@ class Publisher:
         for field in layout.fields:
             word |= field.bits(values.get(field.name))  # None: not one of ours
         data = word.to_bytes(7, layout.order)
-        return time_ns, layout.identifier, data + bytes((crc8_sae_j1850(data),)), channel | TRANSMITTED
+        return time_ns, layout.identifier, data + bytes((crc8_sae_j1850(data),)), TRANSMITTED
 
 
 SOC, SIGMA = "RANGE_StateOfCharge", "RANGE_StateOfChargeSigma"

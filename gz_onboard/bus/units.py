@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from math import pi
 
-from gz_onboard.constants import GRAVITY
+from gz_onboard.constants import GRAVITY, KELVIN
 from gz_onboard.events import ROLES
 
 # (unit in a DBC, SI unit) -> factor, offset
 _CONVERSIONS: dict[tuple[str, str], tuple[float, float]] = {
     ("mV", "V"): (1e-3, 0.0),
     ("mA", "A"): (1e-3, 0.0),
-    ("K", "degC"): (1.0, -273.15),
+    ("K", "degC"): (1.0, -KELVIN),
     ("degF", "degC"): (5 / 9, -160 / 9),
     ("rpm", "rad/s"): (2 * pi / 60, 0.0),
     ("rev/s", "rad/s"): (2 * pi, 0.0),

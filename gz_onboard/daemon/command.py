@@ -19,14 +19,17 @@ from pathlib import Path
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.codec import known_identifiers
 from gz_onboard.bus.recorder import Limits, Recorder
+from gz_onboard.constants import HOUR
 from gz_onboard.daemon.loop import TICK, Daemon, state_text
-from gz_onboard.errors import FAILED, InputError
-from gz_onboard.options import add_shared
+from gz_onboard.errors import FAILED, OK, InputError
+from gz_onboard.options import CHANNEL, add_shared, number
 from gz_onboard.physics.trust import ROOT
 from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 LOCK_S = 3.0  # to wait for one that is ending
+SHORTEST_TICK = 0.005  # s
+LOG_LIMITS = 1e-3, 1e9  # MB, or h
 
 log = logging.getLogger("gz-onboard")
 
@@ -35,8 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard run``."""
     add_shared(parser, "--vehicle", "--interface")
     add = parser.add_argument
-    channel = "channel (default: can0), the vehicle's bus; twice, for a second bus"
-    add("--channel", action="append", metavar="NAME", help=channel)
+    channel = f"channel (default: {CHANNEL}), the vehicle's bus; twice, for a second bus"
+    add_shared(parser, "--channel", action="append", default=None, help=channel)
     add_shared(parser, "--payload", help="mass of rider and luggage (default: from the vehicle file)")
     add_shared(parser, "--effects", "--filter")
     add(
@@ -46,21 +49,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for MCAP logs (default: none)",
     )
-    add(
-        "--log-file-mb",
-        type=float,
-        default=64,
-        metavar="MB",
-        help="begin a new log at this size (default: %(default)g)",
-    )
-    add("--log-file-hours", type=float, default=6, metavar="H", help="or at this age (default: %(default)g)")
-    add(
-        "--log-total-mb",
-        type=float,
-        default=2048,
-        metavar="MB",
-        help="delete the oldest beyond this (default: %(default)g)",
-    )
+    for option, default, unit, text in (
+        ("--log-file-mb", 64, "MB", "begin a new log at this size"),
+        ("--log-file-hours", 6, "h", "or at this age"),
+        ("--log-total-mb", 2048, "MB", "delete the oldest beyond this"),
+    ):
+        limit = number(option, *LOG_LIMITS, unit)
+        add(option, type=limit, default=default, metavar=unit.upper(), help=f"{text} (default: %(default)g)")
     add(
         "--state-dir",
         type=Path,
@@ -69,7 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder for the saved state (default: none)",
     )
     add("--all-frames", action="store_true", help="take in, count and log identifiers that the DBC files do not know")
-    add("--tick", type=float, default=TICK, metavar="S", help="read the bus this often (default: %(default)g)")
+    tick = number("--tick", SHORTEST_TICK, TICK_NS * 1e-9, counted="s")
+    add("--tick", type=tick, default=TICK, metavar="S", help="read the bus this often (default: %(default)g)")
 
 
 def _directory(variable: str) -> Path | None:
@@ -83,12 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
         level=logging.INFO, format="%(message)s" if "JOURNAL_STREAM" in os.environ else "%(asctime)s %(message)s"
     )
     logging.getLogger("can").setLevel(logging.WARNING)
-    if not 0.005 <= arguments.tick <= TICK_NS * 1e-9:
-        raise InputError(f"--tick {arguments.tick:g}: must be 0.005 to {TICK_NS * 1e-9:g} s")
-    for option in ("log_file_mb", "log_file_hours", "log_total_mb"):
-        if not 1e-3 <= (value := getattr(arguments, option)) <= 1e9:
-            raise InputError(f"--{option.replace('_', '-')} {value:g}: must be 0.001 to 1e9")
-    names = arguments.channel or ["can0"]
+    names = arguments.channel or [CHANNEL]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"--channel {name}: given twice; each of its frames would come twice")
@@ -109,7 +100,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
             attachments=dbc_texts(vehicle),
             limits=Limits(
                 max_file_bytes=round(arguments.log_file_mb * 1e6),
-                max_age_s=arguments.log_file_hours * 3600,
+                max_age_s=arguments.log_file_hours * HOUR,
                 max_total_bytes=round(arguments.log_total_mb * 1e6),
             ),
         )
@@ -129,7 +120,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
         sys.stdout.flush()
         logging.shutdown()
         os._exit(FAILED)
-    return 0
+    return OK
 
 
 def _lock(locks: ExitStack, interface: str, names: list[str], state_dir: Path | None) -> None:

@@ -25,19 +25,19 @@ from gz_onboard.bus.mapping import find_dbc
 from gz_onboard.bus.publisher import RANGE_DBC
 from gz_onboard.dashboard.screen import Style, rendered, screen, summary_line
 from gz_onboard.dashboard.view import View
-from gz_onboard.errors import FAILED, InputError
-from gz_onboard.options import add_shared
+from gz_onboard.errors import FAILED, OK, InputError
+from gz_onboard.options import add_shared, number
 
 POLL = 0.05  # s
 REDRAW = 0.2  # s
 ONCE_WITHIN = 5.0  # s: how long --once waits for every message
+DURATIONS = 1e-3, 1e9  # s
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard dashboard``."""
     add = parser.add_argument
-    add_shared(parser, "--interface")
-    add("--channel", default="can0", metavar="NAME", help="channel, as the daemon's (default: %(default)s)")
+    add_shared(parser, "--interface", "--channel")
     add(
         "--dbc",
         default=RANGE_DBC,
@@ -45,13 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="DBC file of the range frames, the vehicle's range_dbc (default: %(default)s)",
     )
     add("--once", action="store_true", help="print one picture as soon as every message has come, and end")
-    add("--duration", type=float, metavar="S", help="end after this long")
+    add("--duration", type=number("--duration", *DURATIONS, "s"), metavar="S", help="end after this long")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard dashboard``: 0, also when ended by Ctrl-C; 1 if --once found no range frames."""
-    if arguments.duration is not None and not arguments.duration > 0:
-        raise InputError(f"--duration {arguments.duration:g}: must be more than 0 s")
     out: TextIO | None = sys.stdout
     if out is None:  # closed by who called us
         raise InputError("there is no standard output to show anything on")
@@ -81,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"standard output: {error.strerror}") from error
     finally:
         channel.close()
-    return FAILED if arguments.once and math.isinf(view.age(time.monotonic())) else 0
+    return FAILED if arguments.once and math.isinf(view.age(time.monotonic())) else OK
 
 
 def _is_screen(out: IO[str]) -> bool:

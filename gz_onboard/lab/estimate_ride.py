@@ -14,7 +14,8 @@ from typing import Annotated, cast
 from gz_onboard.bus import _can  # noqa: F401 - before cantools, which would import it with asammdf and pandas
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import LogDamage, read_frames
-from gz_onboard.bus.publisher import WH, WH_PER_KM, Counts, Publisher
+from gz_onboard.bus.publisher import Counts, Publisher
+from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.errors import InputError, writing
 from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log
@@ -149,10 +150,10 @@ class Tally:
 class _Mute(Publisher):
     """No bus, no range frames: encoding them would take a third of the time."""
 
-    def range(self, estimate: Estimate, counts: Counts, time_ns: int, channel: int = 0) -> list[Frame]:
+    def range(self, estimate: Estimate, counts: Counts, time_ns: int) -> list[Frame]:
         return []
 
-    def status(self, estimate: Estimate, time_ns: int, channel: int = 0) -> list[Frame]:
+    def status(self, estimate: Estimate, time_ns: int) -> list[Frame]:
         return []
 
 

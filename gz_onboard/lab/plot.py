@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.logs import read_metadata, read_samples
-from gz_onboard.bus.publisher import WH_PER_KM
+from gz_onboard.constants import WH_PER_KM
 from gz_onboard.errors import OK, InputError, writing
 from gz_onboard.events import Reason, State
 from gz_onboard.offline.style import (

@@ -18,7 +18,7 @@ from gz_onboard.lab.validate_score import (
     Ride,
     SimulationVerdict,
 )
-from gz_onboard.offline.page import Failed, Group, html_table, image, markdown_table, write_page
+from gz_onboard.offline.page import Failed, Subheading, html_table, image, markdown_table, write_page
 from gz_onboard.offline.results import number
 
 Forms = Mapping[str, Mapping[str, Mapping[str, Mapping[str, PooledMeans]]]]
@@ -104,7 +104,7 @@ def _failures(forms: Forms) -> Table:
     before = ""
     for by, kind, time, means in failures(forms):
         if by != before:
-            rows.append([Group(LABELS[by])])
+            rows.append([Subheading(LABELS[by])])
             before = by
         values = ["–" if cell is None else f"{cell[0]:+.3g} ({cell[1]:+.1f} %)" for cell in means]
         rows.append([kind, f"{time / 60:.0f}", *values])

@@ -32,7 +32,7 @@ class Failed(str):
     __slots__ = ()
 
 
-class Group(str):
+class Subheading(str):
     """The only cell of a row that names those below it."""
 
     __slots__ = ()
@@ -58,7 +58,7 @@ def html_table(heads: Sequence[str], rows: Sequence[Sequence[str]], numbers: Seq
 
     lines = ["".join(f"<th{' class=n' if i in numbers else ''}>{html.escape(h)}</th>" for i, h in enumerate(heads))]
     for row in rows:
-        if isinstance(row[0], Group):
+        if isinstance(row[0], Subheading):
             lines.append(f"<th colspan={len(heads)}>{html.escape(row[0])}</th>")
         else:
             lines.append("".join(cell(i, text) for i, text in enumerate(row)))
@@ -69,7 +69,7 @@ def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """The same as Markdown; what failed in bold."""
 
     def line(row: Sequence[str]) -> list[str]:
-        if isinstance(row[0], Group):
+        if isinstance(row[0], Subheading):
             return [f"*{row[0]}*", *[""] * (len(heads) - 1)]
         return [f"**{text}**" if isinstance(text, Failed) else text for text in row]
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.logs import read_frames
-from gz_onboard.bus.mapping import Mapping, Source
+from gz_onboard.bus.mapping import BusMapping, Source
 from gz_onboard.errors import InputError
 from gz_onboard.events import Event
 from gz_onboard.vehicle import Vehicle
@@ -47,12 +47,6 @@ class Samples:
     name: str
     columns: dict[str, tuple[Array, Array]]
     facts: dict[str, object] = field(default_factory=dict)
-
-    @property
-    def duration(self) -> float:
-        """From the first sample to the last [s]."""
-        starts, ends = zip(*((t[0], t[-1]) for t, _ in self.columns.values()), strict=True)
-        return float(max(ends) - min(starts))
 
     @property
     def rider_mass(self) -> float | None:
@@ -129,7 +123,7 @@ def rider_mass(facts: dict[str, object]) -> float | None:
     return float(mass) if isinstance(mass, int | float) else None
 
 
-def extended(mapping: Mapping) -> Mapping:
+def extended(mapping: BusMapping) -> BusMapping:
     """`mapping` and those of `INSTRUMENTS` that its database has."""
     sources = list(mapping.sources)
     for role, message, signal, factor in INSTRUMENTS:

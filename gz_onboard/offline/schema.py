@@ -1,8 +1,7 @@
-"""JSON, and the JSON schema of it, from dataclasses: what a command reports stands once, as types.
+"""JSON from dataclasses, and what its keys mean: what a command reports stands once, as types.
 
 A field's description stands in its type, `Annotated[float, "of the energy"]`. One that is `Annotated[..., OPTIONAL]` is
-left out of the JSON where it is None. Known are dataclasses, str, int, float, bool, None, lists, tuples, dictionaries
-by name, and unions of these.
+left out of the JSON where it is None.
 """
 
 from __future__ import annotations
@@ -10,12 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from math import isfinite
-from types import NoneType, UnionType
-from typing import Annotated, Any, TypeAlias, Union, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_type_hints
 
-Json: TypeAlias = "str | int | float | bool | list[Json] | dict[str, Json] | None"
 OPTIONAL = object()
-_NAMES = {str: "string", int: "integer", float: "number", bool: "boolean", NoneType: "null"}
 
 
 def to_json(value: Any) -> Any:
@@ -38,32 +34,6 @@ def to_json(value: Any) -> Any:
     if hasattr(value, "tolist"):  # of numpy
         return to_json(value.tolist())
     return str(value)
-
-
-def schema(kind: Any) -> dict[str, Json]:
-    """The JSON schema (draft 2020-12) of a type. Raises TypeError for one that JSON does not have."""
-    if is_dataclass(kind):
-        hints, omitted = get_type_hints(kind, include_extras=True), _optional(kind)
-        names = [f.name for f in fields(kind)]
-        properties: dict[str, Json] = {name: schema(hints[name]) for name in names}
-        required: list[Json] = [name for name in names if name not in omitted]
-        return {"type": "object", "properties": properties, "required": required, "additionalProperties": False}
-    origin, arguments = get_origin(kind), get_args(kind)
-    if origin is Annotated:
-        text = [x for x in arguments[1:] if isinstance(x, str)]
-        return schema(arguments[0]) | ({"description": text[0]} if text else {})
-    if origin in (Union, UnionType):
-        return {"anyOf": [schema(x) for x in arguments]}
-    if origin is list or (origin is tuple and arguments[1:] == (...,)):
-        return {"type": "array", "items": schema(arguments[0])}
-    if origin is tuple:
-        size = len(arguments)
-        return {"type": "array", "prefixItems": [schema(x) for x in arguments], "minItems": size, "maxItems": size}
-    if origin is dict:
-        return {"type": "object", "additionalProperties": schema(arguments[1])}
-    if kind not in _NAMES:
-        raise TypeError(f"{kind}: JSON has no such type")
-    return {"type": _NAMES[kind]}
 
 
 def descriptions(kind: Any) -> dict[str, str]:

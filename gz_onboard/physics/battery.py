@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from math import sqrt
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from gz_onboard.constants import HOUR
 from gz_onboard.physics.relaxation import decay_over, relaxed
 from gz_onboard.physics.tables import Mesh, Row, extended, extended_over, linear
 
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 Overpotential = Callable[[float, float, float], float]
 """What a cell's voltage lacks [V] beside R0 and the RC pair, at a cell's current [A], SOC and temperature [degC]."""
-HOUR = 3600.0  # s
 BENCH_TEMPERATURE = 25.0  # degC, at which capacities are given
 HALF_FULL = 0.5  # SOC that is taken where it is not known
 
@@ -39,6 +39,12 @@ def terminal_voltage(rest: Any, r0: Any, current: Any, overpotential: Any) -> An
 def discharged(current: Any, dt: Any, capacity: Any) -> Any:
     """The share of SOC that `current` [A] takes in `dt` [s] out of `capacity` [A·h] (eq. 2.21)."""
     return current * dt / (HOUR * capacity)
+
+
+def current_of(power: float, source: float, resistance: float) -> float | None:
+    """Current [A] that delivers `power` [W] from a `source` [V] behind `resistance` [ohm]; None if none can."""
+    root = source * source - 4 * resistance * power
+    return None if root < 0 else 2 * power / (source + sqrt(root))
 
 
 def heat(rest: Any, terminal: Any, current: Any) -> Any:
@@ -95,7 +101,7 @@ class Battery:
         """(open-circuit voltage of a cell [V], its slope [V]) at `temperature` [degC]; None: as tabulated over SOC."""
         volts, slope = extended(self.ocv_soc, self.ocv_value, soc)
         if temperature is not None and self.rest_shift_value:
-            volts += linear(self.rest_shift_temperature, self.rest_shift_value, temperature)
+            volts += self.rest_shift(temperature)
         return volts, slope
 
     def ocv_over(self, soc: Array, temperature: Array) -> Array:
@@ -109,8 +115,8 @@ class Battery:
 
     def soc_at(self, ocv: float, temperature: float | None = None) -> float:
         """The SOC at which the open-circuit voltage of a cell is `ocv` [V]; `temperature` as for `ocv`."""
-        if temperature is not None and self.rest_shift_value:
-            ocv -= linear(self.rest_shift_temperature, self.rest_shift_value, temperature)
+        if temperature is not None:
+            ocv -= self.rest_shift(temperature)
         return extended(self.ocv_value, self.ocv_soc, ocv)[0]
 
     def cell_voltage(self, pack_voltage: T, pack_current: T) -> T:
@@ -178,16 +184,10 @@ class Battery:
         source = n * self.ocv(soc, temperature)[0]
         cell = form_factor_squared * self.r0.at(soc, temperature)[0] + self.r1.at(soc, temperature)[0]
         resistance = n * cell / m + form_factor_squared * self.series_resistance
-        root = source * source - 4 * resistance * power
-        if root < 0:
-            return None
-        current = 2 * power / (source + sqrt(root))
+        current = current_of(power, source, resistance)
         if overpotential is None:
             return current
         for _ in range(2):  # it moves the current by a percent, and that moves it by a percent of itself
-            lower = source - n * overpotential(current / m, soc, temperature)
-            root = lower * lower - 4 * resistance * power
-            if root < 0:
-                return None
-            current = 2 * power / (lower + sqrt(root))
+            if current is not None:
+                current = current_of(power, source - n * overpotential(current / m, soc, temperature), resistance)
         return current

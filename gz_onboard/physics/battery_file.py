@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery import BENCH_TEMPERATURE, Battery
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.tables import Mesh, Row, linear
 
@@ -31,9 +31,8 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         raise ocv.error(f"must reach from 0.1 or less to 0.9 or more, is {soc[0]:g} to {soc[-1]:g}", "soc")
     if len(soc) != len(volts):
         raise ocv.error(f"has {len(volts)} numbers for {len(soc)} of soc", "value")
-    temperatures: Row
-    capacities: Row
-    temperatures, capacities = (25.0,), (1.0,)
+    temperatures: Row = (BENCH_TEMPERATURE,)
+    capacities: Row = (1.0,)
     if "capacity" in table.values:
         capacity = table.table("capacity")
         capacity.only(["temperature", "value", "unit", "sd_relative", "source", "status"])
@@ -41,10 +40,10 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         temperatures, capacities = _axis(capacity, "temperature", *TEMPERATURE), capacity.numbers("value", 0.01, 1000)
         if len(temperatures) != len(capacities):
             raise capacity.error(f"must be {len(temperatures)} positive numbers, one for each temperature", "value")
-        at_25 = linear(temperatures, capacities, 25.0)
-        capacities = tuple(value / at_25 for value in capacities)
+        rated = linear(temperatures, capacities, BENCH_TEMPERATURE)
+        capacities = tuple(value / rated for value in capacities)
         if min(capacities) < 0.05 or max(capacities) > 2:
-            raise capacity.error("must be within 0.05 to 2 times what it is at 25 degC", "value")
+            raise capacity.error(f"must be within 0.05 to 2 times what it is at {BENCH_TEMPERATURE:g} degC", "value")
     shift_temperatures, shifts, shift_sd = _rest_shift(table)
     battery = Battery(
         cells_series=table.integer("cells_series", 1, 1000),

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gz_onboard.physics.battery import HOUR, Battery, Overpotential
+from gz_onboard.constants import HOUR
+from gz_onboard.physics.battery import Battery, Overpotential
 
 
 @dataclass(frozen=True)
@@ -12,7 +13,6 @@ class Drawable:
     """What a pack still delivers until its cells reach the cut-off voltage."""
 
     energy: float  # J, at the pack's terminals
-    soc_left: float
     slope: float  # J: how much more energy there would be for more SOC
 
 
@@ -41,7 +41,7 @@ def drawable(
     cutoff = battery.cutoff_voltage * battery.cells_series
     current = battery.settled_current(power, soc, temperature, overpotential=overpotential)
     if current is None or power < cutoff * current:
-        return Drawable(0.0, soc, charge * cutoff)
+        return Drawable(0.0, charge * cutoff)
     slope = charge * power / current
     for _ in range(14):  # to 6e-5 of SOC
         middle = (low + high) / 2
@@ -55,4 +55,4 @@ def drawable(
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
         current = battery.settled_current(power, high + width * node, temperature, form_factor_squared, overpotential)
         total += weight / current if current else 0.0
-    return Drawable(power * charge * width * total, high, slope)
+    return Drawable(power * charge * width * total, slope)

@@ -3,7 +3,7 @@
 An effect file has
 - a docstring: what it is, its equation, its source;
 - ``PORT``: where it acts (one of `Port`);
-- ``PARAMETERS``: a tuple of `Parameter`;
+- ``PARAMETERS``: a tuple of `Parameter` (name, unit, prior, its sd, low, high, source);
 - ``term(quantity, ..., *, parameter, ...)``: the equation. Its positional arguments are the quantities that it
   reads (names from `QUANTITIES`), its keyword arguments are its parameters, or
   those of the vehicle (`VEHICLE_PARAMETERS`), or those of the package's other effects. Pure; floats and numpy arrays

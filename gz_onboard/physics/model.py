@@ -12,6 +12,7 @@ from pathlib import Path
 from types import FunctionType
 from typing import TYPE_CHECKING, Any
 
+from gz_onboard.constants import KELVIN
 from gz_onboard.errors import InputError, shown
 from gz_onboard.physics.battery import Battery, Overpotential
 from gz_onboard.physics.effect import QUANTITIES, Effect, Port, effect_file, load_effect
@@ -41,7 +42,7 @@ GAS_CONSTANT_AIR = 287.05  # J/(kg·K)
 def air_density(temperature: float, altitude: float = 0.0) -> float:
     """Density of dry air [kg/m³] at `temperature` [degC] and `altitude` [m] (ISO 2533: pressure)."""
     pressure = 101325 * (1 - 2.25577e-5 * altitude) ** 5.25588
-    return float(pressure / (GAS_CONSTANT_AIR * (temperature + 273.15)))
+    return float(pressure / (GAS_CONSTANT_AIR * (temperature + KELVIN)))
 
 
 class Bound:

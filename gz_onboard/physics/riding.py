@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
 
+from gz_onboard.constants import MILD
 from gz_onboard.physics.effect import QUANTITIES, failed
 from gz_onboard.physics.model import Bound, air_density
 
@@ -80,17 +81,17 @@ def read_riding(vehicle: Table) -> PriorRiding:
 
 
 def check_riding(vehicle: Table, riding: PriorRiding, model: Model) -> None:
-    """InputError if `riding` costs no energy by `model`, on a level road at 20 degC: then there would be no range.
+    """InputError if `riding` costs no energy by `model`, on a level road in mild air: then there would be no range.
 
     Also if the code of an effect raises at it.
     """
     ordinary = dict.fromkeys(QUANTITIES, 0.0) | {
         "grade_cosine": 1.0,
         "mass": model.mass,
-        "air_density": air_density(20.0),
-        "motor_temperature": 20.0,
-        "ambient_temperature": 20.0,
-        "cell_temperature": 20.0,
+        "air_density": air_density(MILD),
+        "motor_temperature": MILD,
+        "ambient_temperature": MILD,
+        "cell_temperature": MILD,
         "cell_capacity": model.parameters["cell_capacity"],
         "soc": 0.5,
         "lateral_acceleration": riding.lateral_acceleration,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus.publisher import WH
+from gz_onboard.constants import WH
 from gz_onboard.offline.style import (
     BLUE,
     GREEN,

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.bus.publisher import WH_PER_KM
+from gz_onboard.constants import WH_PER_KM
 from gz_onboard.errors import OK, InputError
 from gz_onboard.offline.results import explain_keys, times, write_json
 from gz_onboard.options import add_shared, number

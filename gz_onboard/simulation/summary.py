@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated
 
-from gz_onboard.bus.publisher import WH, WH_PER_KM
+from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.offline.results import clock, number, text_rows, times
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.simulation.plan import Plan

@@ -12,20 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
-from gz_onboard.bus.codec import (
-    COUNTER,
-    CRC,
-    LENGTH,
-    NOT_AVAILABLE,
-    RANGE,
-    REASONS,
-    TIME,
-    UNDECODABLE,
-    Codec,
-    known_identifiers,
-)
+from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, TIME, UNDECODABLE, Codec, known_identifiers
 from gz_onboard.bus.layout import identifier_of, is_not_available, raw_values
-from gz_onboard.bus.mapping import Mapping, Source, find_dbc, load_database, read_mapping
+from gz_onboard.bus.mapping import BusMapping, Source, find_dbc, load_database, read_mapping
 from gz_onboard.bus.units import to_si
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, PLAUSIBLE, ROLES, RTR_FLAG, Event
 from gz_onboard.toml import Table
@@ -45,11 +34,11 @@ def any_value() -> Iterator[None]:
 
 
 @cache
-def reference() -> Mapping:
+def reference() -> BusMapping:
     return read_vehicle("reference").mapping
 
 
-def mapping_of(folder: Path, dbc: str, roles: str, bus: str = "") -> Mapping:
+def mapping_of(folder: Path, dbc: str, roles: str, bus: str = "") -> BusMapping:
     (folder / "v.dbc").write_text(f'VERSION "1"\nNS_ :\nBS_:\nBU_: A\n{dbc}\n', encoding="utf-8")
     (folder / "v.toml").write_text(f'dbc = ["v.dbc"]\n[bus]\n{bus}\n[roles]\n{roles}\n', encoding="utf-8")
     return read_mapping(Table.read(folder / "v.toml"))
@@ -80,7 +69,7 @@ def value_of(codec: Codec, event: Event, role: str):
 # --- layouts: the same as cantools ----------------------------------------------------------------------------
 
 
-def mapping_of_all(database: Database, message_name: str) -> Mapping:
+def mapping_of_all(database: Database, message_name: str) -> BusMapping:
     """Each signal of a message plays some role, in the unit of the DBC."""
     message = database.get_message_by_name(message_name)
     sources = tuple(
@@ -88,7 +77,7 @@ def mapping_of_all(database: Database, message_name: str) -> Mapping:
         for role, s in zip(ROLES, message.signals, strict=False)
     )
     assert len(sources) == len(message.signals)
-    return Mapping(database, (), sources, {}, {})
+    return BusMapping(database, (), sources, {}, {})
 
 
 def expected(message, signal, raw):
@@ -327,7 +316,6 @@ def test_times_are_seconds_since_the_first_frame():
     events = codec.decode([temperatures(EPOCH), temperatures(EPOCH + 1500 * MS)])
     assert [time for time, _, _ in events] == [0.0, 1.5]
     assert codec.seconds(EPOCH + S) == 1.0
-    assert codec.nanoseconds(1.0) == EPOCH + S
 
 
 @pytest.mark.parametrize("start", [0, 1, -5 * S, 1_049 * MS, EPOCH, 2**62, -(2**62), -(2**63), -(2**70)])
@@ -566,7 +554,7 @@ def recordings(draw: st.DrawFn) -> list[tuple[int, int, bytes, int]]:
     return frames
 
 
-def limits_of(mapping: Mapping, source: Source) -> tuple[float, float]:
+def limits_of(mapping: BusMapping, source: Source) -> tuple[float, float]:
     """The limits that the DBC gives to a signal, in the unit of its role."""
     signal = mapping.database.get_message_by_name(source.message).get_signal_by_name(source.signal)
     factor, offset = to_si(signal.unit or "", source.role) or (math.nan, math.nan)
@@ -607,7 +595,7 @@ def test_whatever_the_bus_brings(frames):
                     assert low <= value <= high, (role, value)
             assert not absent or any(r in (NOT_AVAILABLE, RANGE) for _, r in codec.faults)
         assert all(v is None or math.isfinite(v) for v in codec.values(frame[1], frame[2]).values())
-    assert {reason for _, reason in codec.faults} <= set(REASONS)
+    assert {reason for _, reason in codec.faults} <= {LENGTH, CRC, COUNTER, NOT_AVAILABLE, RANGE, TIME, UNDECODABLE}
 
 
 @settings(max_examples=150, deadline=None)

@@ -13,11 +13,14 @@ import pytest
 from mcap.reader import make_reader
 
 from gz_onboard.bus import export as command
+from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.logs import read_frames, read_samples
+from gz_onboard.bus.signals import Decoder, column_name
 from gz_onboard.bus.writers import write_candump
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame
+from gz_onboard.vehicle import read_vehicle
 
 START = 1_750_000_000_000_000_000
 
@@ -146,6 +149,21 @@ def test_tables_have_a_row_for_each_frame_and_null_for_what_was_not_available(tm
         for name in rows[0][1]:
             assert table.column(name).to_pylist() == [values[name] for _, values in rows]
     assert sorted(p.name for p in (tmp_path / "tables").iterdir()) == ["Muxed.parquet", "Pack.parquet"]
+
+
+def test_what_is_beyond_the_range_of_the_dbc_is_null_as_on_board(tmp_path: Path) -> None:
+    """On board such a value is dropped and counted: a table that gives the number would be believed."""
+    codec = Codec(read_vehicle("reference").mapping)
+    message = next(m for m in codec.mapping.database.messages if m.name == "BMS_Pack")
+    raw = message.encode(
+        {s.name: 120.0 if s.name == "BMS_StateOfCharge" else 0.0 for s in message.signals}, strict=False
+    )
+    decoder = Decoder(codec.mapping.database)
+    ((_, name, values),) = decoder.decode([[(START, message.frame_id, raw, 0)]])
+    on_board = codec.values(message.frame_id, raw)
+    assert name == "BMS_Pack"
+    assert on_board["BMS_StateOfCharge"] is None
+    assert values == {column_name(s): on_board[s.name] for s in message.signals}
 
 
 def test_tables_as_csv_say_the_same(tmp_path: Path, log: Path) -> None:

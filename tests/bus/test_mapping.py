@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.bus.codec import Codec
-from gz_onboard.bus.mapping import Mapping, find_dbc, load_database, pgn, read_mapping
+from gz_onboard.bus.mapping import BusMapping, find_dbc, load_database, pgn, read_mapping
 from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError
 from gz_onboard.events import ROLES
@@ -35,7 +35,7 @@ BA_ "GenMsgCycleTime" BO_ 256 100;
 """
 
 
-def mapping(folder: Path, roles: str = "", bus: str = "", dbc: str = DBC, names: str = '["v.dbc"]') -> Mapping:
+def mapping(folder: Path, roles: str = "", bus: str = "", dbc: str = DBC, names: str = '["v.dbc"]') -> BusMapping:
     (folder / "v.dbc").write_text(dbc, encoding="utf-8")
     (folder / "v.toml").write_text(f"dbc = {names}\n[bus]\n{bus}\n[roles]\n{roles}\n", encoding="utf-8")
     return read_mapping(Table.read(folder / "v.toml"))
@@ -103,7 +103,7 @@ def test_a_dbc_may_be_written_in_utf8_or_as_windows_does(tmp_path):
 def test_signals_of_no_message_as_vector_writes_them_do_no_harm(tmp_path):
     free = 'BO_ 3221225472 VECTOR__INDEPENDENT_SIG_MSG: 0 Vector__XXX\n SG_ Free : 0|8@1+ (1,0) [0|0] "" A\n\n'
     got = mapping(tmp_path, 'pack_voltage = "Voltage"', dbc=DBC.replace("BO_ 256 Pack", free + "BO_ 256 Pack", 1))
-    assert got.roles == ("pack_voltage",)
+    assert [source.role for source in got.sources] == ["pack_voltage"]
 
 
 # --- units ------------------------------------------------------------------------------------------------------

@@ -369,8 +369,8 @@ def test_counters_and_checksums_as_a_receiver_checks_them():
     estimate = SCOOTER
     counters: dict[int, list[int]] = {}
     for i in range(40):
-        frames = publisher.range(estimate, Counts(), i) + publisher.status(estimate, i, channel=1)
-        assert [f[3] for f in frames] == [TRANSMITTED] * 4 + [1 | TRANSMITTED]
+        frames = publisher.range(estimate, Counts(), i) + publisher.status(estimate, i)
+        assert [f[3] for f in frames] == [TRANSMITTED] * 5
         for time_ns, identifier, data, _ in frames:
             assert time_ns == i
             assert len(data) == 8

@@ -15,7 +15,7 @@ import pytest
 from gz_onboard.bus import replay as command
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.readers.pycan import frame_of
-from gz_onboard.bus.replay import Summary, bus_sender, replay
+from gz_onboard.bus.replay import Sent, bus_sender, replay
 from gz_onboard.bus.writers import write_candump
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
@@ -234,5 +234,5 @@ def test_a_missing_channel_is_named(tmp_path: Path) -> None:
 
 
 def test_summary_tells_what_matters() -> None:
-    text = str(Summary(sent=5, duration_s=1.25, worst_lateness_s=0.0123, loops=2))
+    text = str(Sent(sent=5, duration_s=1.25, worst_lateness_s=0.0123, loops=2))
     assert text == "5 frames in 1.2 s, at worst 12.3 ms late, 2 rounds"

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.backends import filter_maker
 from gz_onboard.estimator.ekf import ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
+from gz_onboard.pipeline import filter_maker
 from gz_onboard.vehicle import read_vehicle
 
 BATTERY = read_vehicle("reference").pack

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.offline.page import Failed, Group, html_table, markdown_table
+from gz_onboard.offline.page import Failed, Subheading, html_table, markdown_table
 from gz_onboard.offline.results import clock, number, text_rows, times, write_json
 from gz_onboard.offline.schema import descriptions, to_json
 
@@ -72,7 +72,7 @@ def test_numbers_as_text():
 
 def test_the_same_table_as_html_and_markdown():
     heads = ["ride", "%"]
-    rows: list[list[str]] = [[Group("speed <")], ["a", "1.0"], ["b", Failed("9.0")]]
+    rows: list[list[str]] = [[Subheading("speed <")], ["a", "1.0"], ["b", Failed("9.0")]]
     page = html_table(heads, rows, [1])
     assert "<th colspan=2>speed &lt;</th>" in page
     assert "<td class=bad>9.0</td>" in page

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gz_onboard.physics.battery import current_of
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.physics.tables import Mesh
 from gz_onboard.vehicle import read_vehicle
@@ -72,6 +73,16 @@ def test_terminal_voltage_and_its_slope(soc, current, temperature):
 def test_a_mesh_of_one_temperature():
     mesh = Mesh((0.0, 1.0), (25.0,), ((1.0, 3.0),))
     assert mesh.at(0.25, -40) == (1.5, 2.0)
+
+
+@given(power=st.floats(-5000, 20_000), source=st.floats(20, 100), resistance=st.floats(0.005, 0.5))
+def test_the_current_delivers_the_power_or_there_is_none(power, source, resistance):
+    current = current_of(power, source, resistance)
+    if current is None:
+        assert power > source**2 / (4 * resistance)
+    else:
+        assert (source - resistance * current) * current == pytest.approx(power, rel=1e-6, abs=1e-6)
+        assert current <= source / (2 * resistance) * (1 + 1e-9)  # the smaller of the two
 
 
 def discharge(soc, temperature, power, *, burst=1.0, dt=1.0):

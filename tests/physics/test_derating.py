@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
-from gz_onboard.physics.derating import Curve, Derating
+from gz_onboard.physics.derating import Derating, DeratingCurve
 from gz_onboard.vehicle import OWN, read_vehicle
 
 REFERENCE = (OWN / "reference.toml").read_text(encoding="utf-8")
@@ -26,14 +26,19 @@ def test_a_curve_is_linear_between_its_points_and_constant_beyond(points, x):
 
     at = np.cumsum([width for width, _ in points])
     share = [y for _, y in points]
-    curve = Curve(tuple(at.tolist()), tuple(share))
+    curve = DeratingCurve(tuple(at.tolist()), tuple(share))
     assert curve(x) == pytest.approx(float(np.interp(x, at, share)), abs=1e-9)
 
 
-def test_without_a_table_it_is_the_default(tmp_path):
+def test_without_a_table_nothing_is_taken_off(tmp_path):
+    """The reference scooter's limits would give a geared motor no torque above 55 rad/s."""
     file = tmp_path / "v.toml"
     file.write_text(REFERENCE.replace(CONTROLLER, ""))
-    assert read_vehicle(str(file)).derating == Derating() == read_vehicle("reference").derating
+    derating = read_vehicle(str(file)).derating
+    assert derating == Derating() != read_vehicle("reference").derating
+    assert derating.regeneration_gain == 1.0
+    curves = [getattr(derating, entry.name) for entry in fields(Derating) if entry.name != "regeneration_gain"]
+    assert all(curve(x) == 1.0 for curve in curves for x in (-40.0, 0.0, 0.02, 1.0, 55.4, 150.0, 5000.0))
 
 
 def test_what_the_file_says_counts_the_rest_is_default(tmp_path):

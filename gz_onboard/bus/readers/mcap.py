@@ -13,6 +13,8 @@ import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
+from mcap.opcode import Opcode
+
 from gz_onboard.bus import framelog
 from gz_onboard.bus.readers.common import TIME_LIMIT_NS, Contents, Damage
 from gz_onboard.errors import InputError
@@ -25,8 +27,6 @@ _MESSAGE = struct.Struct("<HLQQ")  # channel, sequence, log time, publish time
 _U16 = struct.Struct("<H")
 _U32 = struct.Struct("<L")
 _U64 = struct.Struct("<Q")
-_FOOTER, _SCHEMA, _CHANNEL, MESSAGE, _CHUNK_OP = 0x02, 0x03, 0x04, 0x05, 0x06
-_ATTACHMENT, _METADATA, _DATA_END = 0x09, 0x0C, 0x0F
 _ZSTD_CHUNK = b"\x04\x00\x00\x00zstd"
 BROKEN = (ValueError, struct.error)  # what reading a broken record raises
 _LARGEST_CHUNK = 64 << 20  # bytes, unpacked; ours have 300 kB
@@ -40,9 +40,9 @@ def read(path: Path, data: Contents, damage: Damage, start: int | None, end: int
     for opcode, position, limit in records(path, data, damage):
         blocks = []
         try:
-            if opcode == _CHANNEL:
+            if opcode == Opcode.CHANNEL:
                 _channel(data, position, channels, topics)
-            elif opcode == _CHUNK_OP:
+            elif opcode == Opcode.CHUNK:
                 first, last, _, _, _ = CHUNK.unpack_from(data, position)
                 # The first chunk declares the channels, so it is always unpacked.
                 wanted = (start is None or last + _MARGIN_NS >= start) and (end is None or first - _MARGIN_NS < end)
@@ -50,13 +50,13 @@ def read(path: Path, data: Contents, damage: Damage, start: int | None, end: int
                     continue
                 content = unpack_chunk(data, position, limit)
                 for inner, at, until in records_in(content):
-                    if inner == MESSAGE:
+                    if inner == Opcode.MESSAGE:
                         if _U16.unpack_from(content, at)[0] in channels:
                             blocks.append(content[at + _MESSAGE.size : until])
-                    elif inner == _CHANNEL:
+                    elif inner == Opcode.CHANNEL:
                         _channel(content, at, channels, topics)
         except BROKEN as error:
-            damage.add(f"byte {position}", f"a {'chunk' if opcode == _CHUNK_OP else 'record'} is broken ({error})")
+            damage.add(f"byte {position}", f"a {'chunk' if opcode == Opcode.CHUNK else 'record'} is broken ({error})")
         for block in blocks:
             try:
                 yield framelog.decode_block(block)
@@ -73,7 +73,7 @@ def attachments(path: Path, data: Contents) -> dict[str, bytes]:
     """The attached files by name."""
     found = {}
     for opcode, start, end in records(path, data, Damage()):
-        if opcode == _ATTACHMENT:
+        if opcode == Opcode.ATTACHMENT:
             with contextlib.suppress(*BROKEN):
                 name, position = _string(data, start + 16)
                 _, position = _string(data, position)
@@ -87,7 +87,7 @@ def metadata(path: Path, data: Contents) -> dict[str, str]:
     """The entries of the metadata record ``gz_onboard``."""
     entries: dict[str, str] = {}
     for opcode, start, _ in records(path, data, Damage()):
-        if opcode == _METADATA:
+        if opcode == Opcode.METADATA:
             with contextlib.suppress(*BROKEN):
                 name, position = _string(data, start)
                 if name == "gz_onboard":
@@ -101,11 +101,11 @@ def json_channels(path: Path, data: Contents) -> dict[str, tuple[bytes, dict[str
     found = {}
     for opcode, content in _unpacked_records(path, data, Damage()):
         with contextlib.suppress(*BROKEN):
-            if opcode == _SCHEMA:
+            if opcode == Opcode.SCHEMA:
                 _, position = _string(content, 2)
                 _, position = _string(content, position)
                 schemas[_U16.unpack_from(content)[0]] = content[position + 4 :]
-            elif opcode == _CHANNEL:
+            elif opcode == Opcode.CHANNEL:
                 topic, position = _string(content, 4)
                 encoding, position = _string(content, position)
                 schema = schemas.get(_U16.unpack_from(content, 2)[0], b"{}")
@@ -121,9 +121,9 @@ def samples(
     topics: dict[int, str] = {}
     for opcode, content in _unpacked_records(path, data, damage):
         try:
-            if opcode == MESSAGE:
+            if opcode == Opcode.MESSAGE:
                 channel, _, time_ns, _ = _MESSAGE.unpack_from(content)
-            elif opcode == _CHANNEL:
+            elif opcode == Opcode.CHANNEL:
                 topic, position = _string(content, 4)
                 encoding, _ = _string(content, position)
                 if encoding == "json":
@@ -131,7 +131,7 @@ def samples(
         except BROKEN as error:
             damage.add("a record", str(error))
             continue
-        if opcode == MESSAGE and channel in topics:
+        if opcode == Opcode.MESSAGE and channel in topics:
             if time_ns >= TIME_LIMIT_NS:
                 damage.add(f"a sample of {topics[channel]}", f"{time_ns} ns is no time")
             elif (start is None or time_ns >= start) and (end is None or time_ns < end):
@@ -141,7 +141,7 @@ def samples(
 def _unpacked_records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, bytes]]:
     """Opcode and content of all records, those in chunks among them."""
     for opcode, start, end in records(path, data, damage):
-        if opcode != _CHUNK_OP:
+        if opcode != Opcode.CHUNK:
             yield opcode, data[start:end]
             continue
         try:
@@ -160,15 +160,17 @@ def records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, i
     while position + RECORD.size <= len(data):
         opcode, length = RECORD.unpack_from(data, position)
         content = position + RECORD.size
-        if opcode in (_DATA_END, _FOOTER):
+        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
             return
-        if 0 < opcode <= _DATA_END and content + length <= len(data):
+        if 0 < opcode <= Opcode.DATA_END and content + length <= len(data):
             yield opcode, content, content + length
             position = content + length
             continue
         following = _next_chunk(data, position + 1)
         if following < 0:
-            damage.add(f"byte {position}", "the file ends within a record" if opcode <= _DATA_END else "no record here")
+            damage.add(
+                f"byte {position}", "the file ends within a record" if opcode <= Opcode.DATA_END else "no record here"
+            )
             return
         damage.add(f"byte {position}", f"{following - position} bytes are not records")
         position = following
@@ -181,7 +183,7 @@ def _next_chunk(data: Contents, position: int) -> int:
     found = data.find(_ZSTD_CHUNK, position + offset)
     while found >= 0:
         opcode, length = RECORD.unpack_from(data, found - offset)
-        if opcode == _CHUNK_OP and found - offset + RECORD.size + length <= len(data):
+        if opcode == Opcode.CHUNK and found - offset + RECORD.size + length <= len(data):
             return found - offset
         found = data.find(_ZSTD_CHUNK, found + 1)
     return -1

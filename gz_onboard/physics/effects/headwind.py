@@ -10,32 +10,14 @@ from __future__ import annotations
 from typing import Any
 
 from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.effects.aerodynamic_drag import term as drag
 from gz_onboard.physics.elementary import cos, sin
 
 PORT = Port.WHEEL_FORCE
+WEATHER = "at 1 m over ground half of the 3-5 m/s that weather tells"
 PARAMETERS = (
-    Parameter(
-        "wind_north",
-        "m/s",
-        0.0,
-        2.0,
-        -15.0,
-        15.0,
-        "at 1 m over ground half of the 3-5 m/s that weather tells",
-        ride_sd=1.2,
-        healthy_sd=0.4,
-    ),
-    Parameter(
-        "wind_east",
-        "m/s",
-        0.0,
-        2.0,
-        -15.0,
-        15.0,
-        "at 1 m over ground half of the 3-5 m/s that weather tells",
-        ride_sd=1.2,
-        healthy_sd=0.4,
-    ),
+    Parameter("wind_north", "m/s", 0.0, 2.0, -15.0, 15.0, WEATHER, ride_sd=1.2, healthy_sd=0.4),
+    Parameter("wind_east", "m/s", 0.0, 2.0, -15.0, 15.0, WEATHER, ride_sd=1.2, healthy_sd=0.4),
 )
 STRENGTHS = ("wind_north", "wind_east")
 VARIES = True
@@ -49,6 +31,6 @@ def term(
     speed: Any, headwind: Any, heading: Any, air_density: Any, *, drag_area: float, wind_north: float, wind_east: float
 ) -> Any:
     """Force [N] against the motion."""
-    still = speed + headwind
-    flow = still + wind_north * cos(heading) + wind_east * sin(heading)
-    return 0.5 * air_density * drag_area * (flow * abs(flow) - still * abs(still))
+    wind = wind_north * cos(heading) + wind_east * sin(heading)
+    still = drag(speed, headwind, air_density, drag_area=drag_area)
+    return drag(speed, headwind + wind, air_density, drag_area=drag_area) - still

@@ -8,23 +8,16 @@ from __future__ import annotations
 
 from typing import Any
 
+from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import Parameter, Port
 from gz_onboard.physics.elementary import exp
 
 PORT = Port.CELL_VOLTAGE
+HYSTERESIS = "NMC: Barai et al. 2015, 5 to 20 mV"
+SETTLING = "Plett 2004, part 2: settles within 5 % of SOC"
 PARAMETERS = (
-    Parameter(
-        "hysteresis_voltage",
-        "V",
-        0.01,
-        0.008,
-        0.0,
-        0.1,
-        "NMC: Barai et al. 2015, 5 to 20 mV",
-        ride_sd=0.001,
-        healthy_sd=0.005,
-    ),
-    Parameter("hysteresis_rate", "1", 30.0, 15.0, 1.0, 1000.0, "Plett 2004, part 2: settles within 5 % of SOC"),
+    Parameter("hysteresis_voltage", "V", 0.01, 0.008, 0.0, 0.1, HYSTERESIS, ride_sd=0.001, healthy_sd=0.005),
+    Parameter("hysteresis_rate", "1", 30.0, 15.0, 1.0, 1000.0, SETTLING),
 )
 SHOWN_BY = (
     "Voltage that stays low at rest after riding and high after charging or long braking, without coming back; rests "
@@ -40,4 +33,4 @@ def term(cell_current: Any, *, hysteresis_voltage: float) -> Any:
 
 def decay(dt: Any, cell_current: Any, cell_capacity: Any, *, hysteresis_rate: float) -> Any:
     """The share that is left after `dt` [s] of `cell_current` [A]."""
-    return exp(-hysteresis_rate * abs(cell_current) * dt / (3600 * cell_capacity))
+    return exp(-hysteresis_rate * discharged(abs(cell_current), dt, cell_capacity))

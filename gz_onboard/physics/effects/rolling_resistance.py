@@ -7,32 +7,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from gz_onboard.constants import GRAVITY
+from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.physics.effect import Parameter, Port
 from gz_onboard.physics.elementary import direction
 
 PORT = Port.TYRE
+TYRES = "scooter tyres: Cossalter 2006, sec. 2.3"
+RISE = "SAE J2452: rises by a few percent per m/s"
 PARAMETERS = (
-    Parameter(
-        "rolling_resistance_constant",
-        "1",
-        0.015,
-        0.005,
-        0.0,
-        0.06,
-        "scooter tyres: Cossalter 2006, sec. 2.3",
-        ride_sd=7e-4,
-    ),
-    Parameter(
-        "rolling_resistance_speed",
-        "s/m",
-        2e-4,
-        2e-4,
-        0.0,
-        3e-3,
-        "SAE J2452: rises by a few percent per m/s",
-        ride_sd=2e-5,
-    ),
+    Parameter("rolling_resistance_constant", "1", 0.015, 0.005, 0.0, 0.06, TYRES, ride_sd=7e-4),
+    Parameter("rolling_resistance_speed", "s/m", 2e-4, 2e-4, 0.0, 3e-3, RISE, ride_sd=2e-5),
 )
 CAUSE = ("rolling_resistance", "F = m·g·cos θ·c0")
 SHOWN_BY = (
@@ -55,4 +39,4 @@ def term(
 
 def variation(ambient_temperature: Any, *, rolling_cold: float) -> Any:
     """Cold rubber rolls worse; rolling_cold: by how much more at 0 than at 20 degC."""
-    return 1 + rolling_cold * (20 - ambient_temperature) / 20
+    return 1 + rolling_cold * (MILD - ambient_temperature) / MILD

@@ -12,19 +12,11 @@ from gz_onboard.physics.effect import Parameter, Port
 from gz_onboard.physics.elementary import exp
 
 PORT = Port.CELL_VOLTAGE
+RESISTANCE = "18650 NMC at 25 degC: a fifth to half of R0"
+DIFFUSION = "diffusion in 5-10 µm particles: 10 to 40 min"
 PARAMETERS = (
-    Parameter(
-        "slow_resistance",
-        "ohm",
-        0.008,
-        0.006,
-        0.0,
-        0.3,
-        "18650 NMC at 25 degC: a fifth to half of R0",
-        ride_sd=0.001,
-        healthy_sd=0.01,
-    ),
-    Parameter("slow_time", "s", 1200.0, 400.0, 120.0, 7200.0, "diffusion in 5-10 µm particles: 10 to 40 min"),
+    Parameter("slow_resistance", "ohm", 0.008, 0.006, 0.0, 0.3, RESISTANCE, ride_sd=0.001, healthy_sd=0.01),
+    Parameter("slow_time", "s", 1200.0, 400.0, 120.0, 7200.0, DIFFUSION),
 )
 SHOWN_BY = (
     "Pack voltage that sinks over tens of minutes of riding and comes back over tens of minutes of rest; a rest of "

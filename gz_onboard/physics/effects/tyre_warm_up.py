@@ -7,26 +7,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import Parameter, Port
-from gz_onboard.physics.elementary import direction, exp
+from gz_onboard.physics.effects.rolling_resistance import term as rolling
+from gz_onboard.physics.elementary import exp
 
 PORT = Port.TYRE
+SHARE = "a guess: as cold days over warm ones, 20 to 40 %"
+RUNNING = "ISO 28580: warm after 30 min of running: three times this"
 PARAMETERS = (
-    Parameter(
-        "warm_up_share",
-        "1",
-        0.3,
-        0.2,
-        0.0,
-        2.0,
-        "a guess: as cold days over warm ones, 20 to 40 %",
-        ride_sd=0.05,
-        healthy_sd=0.2,
-    ),
-    Parameter(
-        "warm_up_time", "s", 600.0, 200.0, 60.0, 3600.0, "ISO 28580: warm after 30 min of running: three times this"
-    ),
+    Parameter("warm_up_share", "1", 0.3, 0.2, 0.0, 2.0, SHARE, ride_sd=0.05, healthy_sd=0.2),
+    Parameter("warm_up_time", "s", 600.0, 200.0, 60.0, 3600.0, RUNNING),
 )
 SHOWN_BY = (
     "Road load that falls within the first 10-20 min ridden, at all speeds, and does not when riding on straight "
@@ -45,5 +35,5 @@ def term(
     warm_up_time: float,
 ) -> Any:
     """Force [N] against the motion."""
-    cold = warm_up_share * exp(-time_moving / warm_up_time)
-    return mass * GRAVITY * grade_cosine * rolling_resistance_constant * cold * direction(speed)
+    more = rolling_resistance_constant * warm_up_share * exp(-time_moving / warm_up_time)
+    return rolling(speed, mass, grade_cosine, rolling_resistance_constant=more, rolling_resistance_speed=0.0)

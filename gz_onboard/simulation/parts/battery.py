@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import MutableMapping, Sequence
 from itertools import pairwise
-from math import sqrt
 from typing import Protocol
 
-from gz_onboard.physics.battery import HOUR, Battery, discharged, heat, terminal_voltage
+from gz_onboard.constants import HOUR
+from gz_onboard.physics.battery import Battery, current_of, discharged, heat, terminal_voltage
 from gz_onboard.physics.model import Bound
 from gz_onboard.physics.relaxation import decay_over, relaxed
 
@@ -73,8 +73,9 @@ class FirstOrderPack:
         ocv += self._shift
         resistance = n * self._r0 / m + battery.series_resistance
         source = n * (ocv - self.v1)
-        root = source * source - 4 * resistance * power
-        current = 2 * power / (source + sqrt(root)) if root > 0 else source / (2 * resistance)
+        current = current_of(power, source, resistance)
+        if current is None:
+            current = source / (2 * resistance)
         step = discharged(current, dt, self._capacity)
         # V_oc at the middle of the step, so that charge times voltage is the energy between the two SOCs.
         middle = n * (ocv - slope * step / 2)
