@@ -76,6 +76,11 @@ ROLES: dict[str, str] = {
     "brake_switch": "1",
 }
 
+# The roles whose sensors are checked against each other: each must have a signal of its own.
+VOLTAGES = ("pack_voltage", "inverter_voltage")
+CURRENTS = ("pack_current", "inverter_current", "auxiliary_current")
+SPEEDS = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed", "gps_speed")
+
 # What a road vehicle can have at most, by unit, whatever its DBC allows: many give no limits.
 PLAUSIBLE: dict[str, tuple[float, float]] = {
     "V": (0.0, 1500.0),
