@@ -137,6 +137,7 @@ class Reason(IntFlag):
     SENSOR_DISTRUSTED = 1 << 16  # a sensor contradicts the others and is left out; RANGE_Sensors says which
     SIGNALS_SLOW = 1 << 17  # pack current or voltage comes too slowly to be integrated
     SOC_RESTARTED = 1 << 18  # the state of charge was contradicted for long and was begun anew from the voltage
+    SAVE_FAILED = 1 << 19  # the state cannot be saved for the next start
 
 
 @dataclass(slots=True)
