@@ -76,6 +76,11 @@ ROLES: dict[str, str] = {
     "brake_switch": "1",
 }
 
+# The roles whose sensors are checked against each other: each must have a signal of its own.
+VOLTAGES = ("pack_voltage", "inverter_voltage")
+CURRENTS = ("pack_current", "inverter_current", "auxiliary_current")
+SPEEDS = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed", "gps_speed")
+
 # What a road vehicle can have at most, by unit, whatever its DBC allows: many give no limits.
 PLAUSIBLE: dict[str, tuple[float, float]] = {
     "V": (0.0, 1500.0),
@@ -132,6 +137,7 @@ class Reason(IntFlag):
     SENSOR_DISTRUSTED = 1 << 16  # a sensor contradicts the others and is left out; RANGE_Sensors says which
     SIGNALS_SLOW = 1 << 17  # pack current or voltage comes too slowly to be integrated
     SOC_RESTARTED = 1 << 18  # the state of charge was contradicted for long and was begun anew from the voltage
+    SAVE_FAILED = 1 << 19  # the state cannot be saved for the next start
 
 
 @dataclass(slots=True)

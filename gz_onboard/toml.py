@@ -14,9 +14,16 @@ from gz_onboard.errors import LONGEST_NAME, InputError, nearest, shown
 LARGEST_FILE = 1_000_000  # bytes; that of the reference scooter has 20 000
 LONGEST_LIST = 1000
 LONGEST_PATH = 200  # letters, of up to four bytes: no file system takes much more
+MOST_PARTS = 10  # of a key or header; the time to read one grows with their square, and four are the most in use
 FEW = 30  # names that a message lists
 
 _HEADER = re.compile(r"^[ \t]*\[\[?[ \t]*[A-Za-z_\"']", re.M)  # not a row of a list of numbers
+_STRING = r'"(?:[^"\\\n]|\\.)*+"?|\'[^\'\n]*+\'?'  # on one line; each takes all there is where its end is missing
+_TOKEN = re.compile(
+    rf"(?P<deep>(?:(?:[\w-]++|{_STRING})[ \t]*\.[ \t]*){{{MOST_PARTS}}})"
+    rf'|"""(?:[^\\]|\\.)*?(?:"{{3,5}}|\Z)|\'\'\'.*?(?:\'{{3,5}}|\Z)|{_STRING}|#[^\n]*|[\w-]+',
+    re.S,
+)
 
 
 def _quoted(name: str) -> str:
@@ -40,6 +47,9 @@ class Table:
     def read(cls, file: Path) -> Table:
         """Read `file`; InputError if it is missing, larger than `LARGEST_FILE`, or not TOML."""
         text = read_text(file, LARGEST_FILE)
+        if deep := next((token for token in _TOKEN.finditer(text) if token["deep"]), None):
+            line = text.count("\n", 0, deep.start()) + 1
+            raise InputError(f"{file}:{line}: {shown(deep[0])}: a key has at most {MOST_PARTS} parts")
         try:
             return cls(tomllib.loads(text), file, text)
         except ValueError as error:  # not TOML, or a number of thousands of digits

@@ -8,6 +8,7 @@ import logging
 import os
 import re
 import resource
+import shutil
 import subprocess
 import sys
 import threading
@@ -361,6 +362,36 @@ def test_a_state_that_cannot_be_saved_stops_nothing(bus: str, tmp_path: Path, ca
     assert caplog.text.count("cannot save the state") == 1
 
 
+def test_a_state_that_cannot_be_saved_is_told_and_counts_at_the_end(
+    bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+):
+    channel = CanChannel("virtual", bus)
+    channel.open()
+    sent: list[Frame] = []
+    monkeypatch.setattr(channel, "send", sent.append)
+    daemon = Daemon(reference(), [channel], None, tmp_path / "folder" / "scooter.json")
+    assert daemon._keeper is not None
+    keeper, folder, frames = daemon._keeper, tmp_path / "folder", Scooter().steady(1.0)
+
+    def told(second: int) -> float:
+        later = [(frame[0] + second * S, *frame[1:]) for frame in frames]
+        daemon.step(later, later[-1][0])
+        assert keeper._thread.wait(20)
+        daemon.step([], later[-1][0] + TICK_NS)
+        return check_frames(sent)["RANGE_Status"][-1]["RANGE_SaveFailed"]
+
+    folder.write_text("in the way")
+    assert told(0) == 1
+    folder.unlink()
+    assert told(20) == 0
+    shutil.rmtree(folder)
+    folder.write_text("in the way")
+    assert told(40) == 1
+    daemon.close()
+    assert not daemon.finished
+    assert "the last state is not saved" in caplog.text
+
+
 @pytest.mark.parametrize("delta", [3600.0, -7200.0, 40.0])
 def test_the_clock_is_set_in_the_middle_of_a_round(bus: str, monkeypatch: pytest.MonkeyPatch, delta: float):
     """Between the reading of the clock and that of the frames: no time is left out, none comes twice."""
@@ -670,7 +701,7 @@ def test_at_the_end_a_log_that_hangs_does_not_cost_the_state(
             break
     daemon.close()
     assert "its end is lost" in caplog.text
-    assert "state in time" not in caplog.text
+    assert "not saved" not in caplog.text
     answer.set()
     last = daemon.pipeline.last
     found = state.load(file, time.time())

@@ -159,6 +159,35 @@ def test_a_file_that_is_not_toml(tmp_path, content, parts):
         assert part in str(caught.value)
 
 
+DEEP = ".".join("abcdefghijk")  # eleven parts
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        f"[{DEEP}]",
+        f"[[ {DEEP.replace('.', ' . ')} ]]",
+        f"{DEEP} = 1",
+        f"x = {{ y = 1, {DEEP} = 1 }}",
+        "'a.b'." + DEEP[2:] + " = 1",
+        '"a\\"b".' * 10 + "k = 1",
+        f'x = [\'a\', """b"""", "c", """d\\"""", {{ {DEEP} = 1 }}]',
+    ],
+)
+def test_a_key_of_many_parts_is_refused(tmp_path, line):
+    """Reading it would take a time that grows with the square of their number."""
+    (tmp_path / "t.toml").write_text(f'text = """\n\n"""\n{line}\n')
+    with pytest.raises(InputError, match=r"t\.toml:4: .*at most 10 parts"):
+        Table.read(tmp_path / "t.toml")
+
+
+def test_dots_that_part_no_key_are_allowed(tmp_path):
+    strings = [f'"{DEEP}"', f"'{DEEP}'", f'"\\"{DEEP}"', f'""".{DEEP}"""', f"'''.{DEEP}'''", f"'''\n{DEEP} = 1'''''"]
+    text = f"{DEEP[:-2]} = 1\nnumbers = [{'1.5, ' * 20}]  # {DEEP}\n# {DEEP} = 1\ntexts = [{', '.join(strings)}]\n"
+    (tmp_path / "t.toml").write_text(text)
+    assert Table.read(tmp_path / "t.toml").values["texts"][3] == f".{DEEP}"
+
+
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(InputError, match=r"none\.toml: cannot be read: No such file"):
         Table.read(tmp_path / "none.toml")

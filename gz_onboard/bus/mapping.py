@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING
 
 from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown
-from gz_onboard.events import ROLES
+from gz_onboard.events import CURRENTS, ROLES, SPEEDS, VOLTAGES
 from gz_onboard.toml import is_file, read_text
 
 if TYPE_CHECKING:
@@ -218,6 +218,8 @@ def read_mapping(vehicle: Table) -> BusMapping:
         counter = options.text("counter", "") or None
         if counter:
             _check_counter(message, options, counter)
+            if counter == crc:
+                raise options.error(f"{counter!r} is the crc of {name}: it cannot be its counter too", "counter")
         protection[name] = Protection(crc, counter)
         if "period" in options.values:
             periods[name] = options.number("period", low=1e-4, high=3600)
@@ -230,6 +232,7 @@ def read_mapping(vehicle: Table) -> BusMapping:
     roles = vehicle.table("roles")
     roles.only(ROLES)
     sources = tuple(_source(database, roles, role) for role in roles.values)
+    _check_witnesses(sources, roles)
     return BusMapping(
         database=database,
         dbc_files=tuple(files),
@@ -280,6 +283,19 @@ def _source(database: Database, roles: Table, role: str) -> Source:
     conversion = signal.conversion
     factor = float(conversion.scale) * si[0] * scale
     return Source(role, message.name, signal.name, factor, (float(conversion.offset) * si[0] + si[1]) * scale + shift)
+
+
+def _check_witnesses(sources: tuple[Source, ...], where: Table) -> None:
+    """Roles that are checked against each other have signals of their own: one signal would agree with itself."""
+    for group in (VOLTAGES, CURRENTS, SPEEDS):
+        played: dict[tuple[str, str], str] = {}
+        for source in (source for source in sources if source.role in group):
+            other = played.setdefault((source.message, source.signal), source.role)
+            if other != source.role:
+                raise where.error(
+                    f"{source.signal!r} of {source.message} is also {other}; the two are checked against each other",
+                    source.role,
+                )
 
 
 def _message(database: Database, where: Table, key: str, name: str) -> Message:

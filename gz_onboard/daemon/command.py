@@ -116,7 +116,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
     signal.signal(signal.SIGINT, daemon.stop)
     daemon.run()
     _summary(daemon)
-    if not daemon.finished:  # a thread still waits for its disk: the interpreter would abort over its files
+    if not daemon.finished:  # a thread may still wait for its disk: the interpreter would abort over its files
         sys.stdout.flush()
         logging.shutdown()
         os._exit(FAILED)

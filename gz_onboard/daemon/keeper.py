@@ -30,6 +30,11 @@ class StateKeeper:
         self._saved_soc: float | None = None
         self._failing = self._stuck = False
 
+    @property
+    def failing(self) -> bool:
+        """Whether the state cannot be saved: an error, or a disk that does not answer."""
+        return self._failing or self._thread.stuck > STATE_STUCK_S
+
     def restore(self, pipeline: Pipeline, anew: Callable[[], Pipeline]) -> tuple[Pipeline, dict[str, Any] | None]:
         """(the pipeline to go on with, the latest saved state that could be used). Others are set aside.
 
@@ -78,7 +83,7 @@ class StateKeeper:
         try:
             text = state.encode(snapshot, now_ns * 1e-9, _uptime())
         except (ValueError, TypeError) as error:
-            self._warn(error)
+            self._thread.call(self._warn, error, weight=0)  # in its turn: what waits may still be saved
         else:
             self._thread.call(self._write, text, weight=0 if self._thread.load else 1)
 
@@ -90,8 +95,8 @@ class StateKeeper:
         self._stuck = stuck
 
     def close(self, seconds: float) -> bool:
-        """Wait until all is saved; False if that takes longer than `seconds`."""
-        return self._thread.close(seconds)
+        """Wait until all is saved; False if it cannot be, or if that takes longer than `seconds`."""
+        return self._thread.close(seconds) and not self._failing
 
     def _write(self, text: bytes) -> None:
         try:

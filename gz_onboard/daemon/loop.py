@@ -110,7 +110,7 @@ class Daemon:
             log.warning("the disk does not take the log in time: its end is lost")
             self.finished = False
         if self._keeper and not self._keeper.close(max(until - time.monotonic(), 1.0)):
-            log.warning("the disk does not take the state in time")
+            log.warning("the last state is not saved")
             self.finished = False
         for channel in self.channels:
             channel.close()
@@ -167,6 +167,8 @@ class Daemon:
             pipeline.log_lost = self._log.lost_frames
             if self._log.failing:
                 reasons |= Reason.LOG_FAILED
+        if self._keeper and self._keeper.failing:
+            reasons |= Reason.SAVE_FAILED
         pipeline.extra_reasons = reasons
         for frame in pipeline.advance(frames, now_ns):
             self.channels[0].send(frame)

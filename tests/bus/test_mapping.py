@@ -54,7 +54,7 @@ def test_sources_have_sign_scale_and_unit(tmp_path):
     roles = """
 pack_voltage = "Voltage"
 pack_current = { signal = "Current", scale = -1 }
-inverter_current = { message = "Pack", signal = "Current", scale = 2, offset = 0.5 }
+motor_current = { message = "Pack", signal = "Current", scale = 2, offset = 0.5 }
 motor_speed = { signal = "Speed", unit = "rev/s" }
 motor_temperature = "Heat"
 ambient_temperature = { signal = "Heat", scale = 2, offset = 1 }
@@ -63,7 +63,7 @@ ambient_temperature = { signal = "Heat", scale = 2, offset = 1 }
     assert got == {
         "pack_voltage": ("Pack", "Voltage", pytest.approx(0.01), 0.0),
         "pack_current": ("Pack", "Current", pytest.approx(-0.1), 0.0),
-        "inverter_current": ("Pack", "Current", pytest.approx(0.2), 0.5),
+        "motor_current": ("Pack", "Current", pytest.approx(0.2), 0.5),
         "motor_speed": ("Motor", "Speed", pytest.approx(6.283185307), 0.0),
         "motor_temperature": ("Motor", "Heat", 1.0, pytest.approx(-313.15)),
         "ambient_temperature": ("Motor", "Heat", 2.0, pytest.approx(-625.3)),
@@ -189,6 +189,18 @@ def test_known_units_are_known(role):
             'motor_speed = { signal = "Speed", offset = nan }',
             [":5:", "roles.motor_speed.offset", "must be a finite number, is nan"],
         ),
+        (
+            'inverter_voltage = "Voltage"\npack_voltage = { message = "Pack", signal = "Voltage", scale = 2 }',
+            [":6:", "roles.pack_voltage:", "'Voltage' of Pack is also inverter_voltage"],
+        ),
+        (
+            'pack_current = "Current"\nauxiliary_current = "Current"',
+            [":6:", "roles.auxiliary_current:", "'Current' of Pack is also pack_current"],
+        ),
+        (
+            'motor_speed = "Speed"\nvehicle_speed = { signal = "Speed", unit = "km/h" }',
+            [":6:", "roles.vehicle_speed:", "'Speed' of Motor is also motor_speed"],
+        ),
     ],
 )
 def test_roles_that_do_not_fit(tmp_path, roles, parts):
@@ -216,6 +228,10 @@ def test_roles_that_do_not_fit(tmp_path, roles, parts):
         (
             '[bus.messages.Pack]\ncounter = "Current"',
             [":4:", "bus.messages.Pack.counter", "'Current'", "unsigned integer"],
+        ),
+        (
+            '[bus.messages.Pack]\ncrc = "Sum"\ncounter = "Sum"',
+            [":5:", "bus.messages.Pack.counter", "'Sum' is the crc of Pack"],
         ),
         ("messages = 3", [":3:", "bus.messages", "must be a table"]),
         ("[bus.messages]\nPack = 3", [":4:", "bus.messages.Pack", "must be a table"]),

@@ -178,14 +178,14 @@ def test_what_the_vehicle_does(activity):
 
 
 def test_sensors_left_out_are_named():
-    reasons = Reason.SENSOR_DISTRUSTED | Reason.SIGNALS_SLOW | Reason.SOC_RESTARTED
+    reasons = Reason.SENSOR_DISTRUSTED | Reason.SIGNALS_SLOW | Reason.SOC_RESTARTED | Reason.SAVE_FAILED
     view = seen(replace(ESTIMATE, reasons=reasons, distrusted=("accel_x", "gps_altitude", "bms_state_of_charge")))
     text = picture(view, 100.0)
     assert "Sensors left out  acceleration x, GPS altitude, BMS state of charge\n" in text
-    for shown in "sensor distrusted", "signals slow", "SOC restarted":
+    for shown in "sensor distrusted", "signals slow", "SOC restarted", "save failed":
         assert shown in text
     assert screen.summary_line(view, 100.0).endswith(
-        "; because: sensor distrusted, signals slow, SOC restarted; "
+        "; because: sensor distrusted, signals slow, SOC restarted, save failed; "
         "left out: acceleration x, GPS altitude, BMS state of charge"
     )
     assert "GPS altitude" not in picture(view, 111.0)  # stale

@@ -10,6 +10,7 @@ from gz_onboard.estimator.redundancy.checks import AGREES, NO_SENSOR, counters, 
 from gz_onboard.estimator.redundancy.electric import ERROR_LEAST, CellError, Readings, ResidualComparison
 from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.road import STANDSTILL
+from gz_onboard.events import CURRENTS
 
 FAST_TIME, SKEW_TIME, MEAN_TIME = 0.5, 2.0, 10.0  # s: low passes; the sensors do not sample at the same time
 APART, APART_RELATIVE = 0.10, 0.10  # 1/h and 1: two currents that differ by more contradict each other
@@ -33,7 +34,7 @@ class CellEvidence:
 class CurrentCheck:
     """Compares once a step; see `Redundancy`."""
 
-    ROLES = ("pack_current", "inverter_current", "auxiliary_current")
+    ROLES = CURRENTS
 
     def __init__(self, capacity: float) -> None:
         self._capacity = capacity  # A·h of the pack

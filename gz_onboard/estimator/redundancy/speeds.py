@@ -8,6 +8,7 @@ from statistics import median
 from gz_onboard.estimator.redundancy.checks import MOVING, NO_SENSOR, STUCK_AFTER, StepInputs, counters
 from gz_onboard.estimator.road import accelerated
 from gz_onboard.estimator.signals import FIX_2D
+from gz_onboard.events import SPEEDS
 
 REVERSE = 4.0  # m/s: no road vehicle goes back faster; slower, wheels and GPS do not show the direction
 SPEED_APART, SPEED_APART_RELATIVE = 1.0, 0.12  # m/s and 1: two speeds that differ by more contradict each other
@@ -50,7 +51,7 @@ def vote(speeds: Mapping[str, float], apart: Mapping[str, float]) -> tuple[froze
 class SpeedCheck:
     """See `SensorCheck`."""
 
-    ROLES = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed", "gps_speed")
+    ROLES = SPEEDS
 
     def __init__(self, radius: float, gear: float) -> None:
         self._scale = {"motor_speed": radius * gear, "wheel_speed_rear": radius, "wheel_speed_front": radius}

@@ -6,6 +6,7 @@ from math import sqrt
 
 from gz_onboard.estimator.redundancy.checks import AGREES, counters, faulty, share_of_new
 from gz_onboard.estimator.redundancy.electric import CellError, Readings, ResidualComparison
+from gz_onboard.events import VOLTAGES
 from gz_onboard.physics.battery import Battery
 
 MEAN_TIME, APART, GROSS = 10.0, 0.07, 0.3  # s, V, V at once
@@ -19,7 +20,7 @@ LOWEST, HIGHEST = 0.6, 1.12  # of the cut-off voltage, of that of a full cell at
 class VoltageCheck:
     """Compares once a step; see `Redundancy`."""
 
-    ROLES = ("pack_voltage", "inverter_voltage")
+    ROLES = VOLTAGES
 
     def __init__(self, battery: Battery, capacity: float) -> None:
         self._series = battery.cells_series
