@@ -87,7 +87,7 @@ def time_moving(measured: Mapping[str, Array]) -> Array:
 
 
 def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float) -> Array:
-    """Pack voltage [V] per second by the circuit of `physics.battery`, at rest before the first; sensor's offset in."""
+    """Pack voltage [V] per second by the circuit of `physics.battery`, at rest before the first."""
     battery = vehicle.pack
     m = battery.cells_parallel
     columns = (
@@ -114,7 +114,7 @@ def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float)
             q |= {"cell_current": cell, "soc": soc, "cell_temperature": celsius, "vibration": shaken}
             q |= {"cell_capacity": battery.cell_capacity(celsius), "time_moving": moving}
             states = {name: effect.step(states[name], 1.0, q) for name, effect in vehicle.model.cell_voltage}
-    return result + vehicle.parameters["pack_voltage_offset"]
+    return result
 
 
 def losses(vehicle: Vehicle, current: Array, speed: Array, temperature: Array) -> tuple[Array, Array, Array]:

@@ -141,7 +141,7 @@ def _measured(log: Path, vehicle: Vehicle, size: int, progress: Progress) -> Mea
 
     recorded = read_recorded(log, vehicle, frames)
     progress(_READ * size - counted)
-    measured = per_second(recorded, vehicle)
+    measured = per_second(recorded)
     if len(measured["speed"]) < SHORTEST:
         raise InputError(f"{log}: {len(measured['speed'])} s are too short a ride to judge; at least {SHORTEST} s")
     road, grade = _road(recorded, log)
@@ -150,11 +150,8 @@ def _measured(log: Path, vehicle: Vehicle, size: int, progress: Progress) -> Mea
     return Measured(recorded, vehicle, measured, road, rest_soc(recorded, vehicle))
 
 
-def per_second(recorded: Recorded, vehicle: Vehicle) -> dict[str, Array]:
-    """What was measured, as means over seconds, by role; and acceleration, yaw_rate, braking, pack_power.
-
-    The pack's current is that which flows: the sensor's known gain and offset are taken off.
-    """
+def per_second(recorded: Recorded) -> dict[str, Array]:
+    """What was measured, as means over seconds, by role; and acceleration, yaw_rate, braking, pack_power."""
     rate = round(1 / recorded.dt)
     measured = {role: seconds(values, rate) for role, values in recorded.signals.items()}
     smooth = _averaged_speed(recorded)
@@ -165,11 +162,8 @@ def per_second(recorded: Recorded, vehicle: Vehicle) -> dict[str, Array]:
         measured["yaw_rate"] = measured["rate_z"]
     if "brake" in measured:
         measured["braking"] = (measured["brake"] > 0).astype(float)
-    if "pack_current" in measured:
-        p = vehicle.parameters
-        measured["pack_current"] = (measured["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"]
-        if "pack_voltage" in measured:
-            measured["pack_power"] = measured["pack_voltage"] * measured["pack_current"]
+    if {"pack_current", "pack_voltage"} <= measured.keys():
+        measured["pack_power"] = measured["pack_voltage"] * measured["pack_current"]
     return measured
 
 

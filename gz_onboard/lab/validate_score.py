@@ -139,7 +139,7 @@ class Ride:
     duration_s: Annotated[float, "of the ride"]
     distance_km: Annotated[float, "of the ride"]
     ambient_c: Annotated[float | None, "air, mean"]
-    energy_wh: Annotated[float | None, "measured at the pack's terminals, sensor's known gain and offset taken off"]
+    energy_wh: Annotated[float | None, "measured at the pack's terminals, sensors' known gain and offsets taken off"]
     open_loop: Annotated[
         SimulationVerdict | None,
         "simulated with the measured throttle and brake, or null: channels, energy_percent, passed",

@@ -17,6 +17,8 @@ from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Event
 from gz_onboard.offline.samples import INSTRUMENTS, extended, read_roles
+from gz_onboard.physics.battery import discharged
+from gz_onboard.physics.sensors import speed_role, true_columns
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
 from gz_onboard.simulation.run import road_table
 from gz_onboard.simulation.scooter import STEP, Scooter
@@ -39,9 +41,10 @@ _MOVING = 2.0  # m/s: slower than this, yaw rate over speed is no curvature
 class Recorded:
     """A recorded ride, at even steps.
 
-    signals: by role, in its SI unit, arrays of one length; only what was recorded. ``speed`` [m/s] (of the driven
-    wheel), ``distance`` [m], ``brake`` (0..1, of `brake_torque_limit`) and ``soc`` (counted charge) are worked out;
-    ``vibration`` [m/s²] too, if the vehicle's model reads it and the ride tells it.
+    signals: by role, in its SI unit, arrays of one length; only what was recorded, without what the vehicle's sensors
+    are known to err by (`physics.sensors`). ``speed`` [m/s] (of the driven wheel), ``distance`` [m], ``brake`` (0..1,
+    of `brake_torque_limit`) and ``soc`` (counted charge) are worked out; ``vibration`` [m/s²] too, if the vehicle's
+    model reads it and the ride tells it.
     """
 
     name: str
@@ -131,7 +134,7 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
             if reads_vibration:
                 rough.append((event[0], road.distance, estimator.vibration(event[0])))
 
-    columns = read_roles(log, vehicle, codec, progress, observe)
+    columns = true_columns(read_roles(log, vehicle, codec, progress, observe), vehicle.parameters)
     felt = np.array(rough) if rough and "accel_z" in columns else None
     if felt is not None:
         columns["vibration"] = felt[:, 0], felt[:, 2]
@@ -148,21 +151,16 @@ def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicl
     """All on one grid of steps: the speeds interpolated, what comes in steps as it was last told."""
     import numpy as np
 
-    radius, gear = vehicle.parameters["wheel_radius"], vehicle.parameters["gear_ratio"]
-    pace = next((r for r in ("motor_speed", "wheel_speed_rear", "vehicle_speed", "gps_speed") if r in columns), None)
-    if pace is None:
-        raise InputError(f"{log}: has no speed: neither motor_speed, wheel_speed_rear, vehicle_speed nor gps_speed")
+    pace, factor = speed_role(str(log), columns, vehicle.parameters)
     time = columns[pace][0]
     grid = np.arange(time[0], time[-1], STEP)
     signals = {role: np.interp(grid, t, v) for role, (t, v) in columns.items()}
     if "brake_switch" in columns:
         t, v = columns["brake_switch"]
         signals["brake_switch"] = v[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(v) - 1)]
-    scale = vehicle.parameters["speed_sensor_scale"]
-    factor = {"motor_speed": gear * radius / scale, "wheel_speed_rear": radius}.get(pace, 1.0)
     signals["speed"] = np.maximum(signals[pace] * factor, 0.0)
     signals["distance"] = np.concatenate(([0.0], np.cumsum(signals["speed"][1:] * STEP)))
-    limit = vehicle.parameters["brake_torque_limit"] / radius
+    limit = vehicle.parameters["brake_torque_limit"] / vehicle.parameters["wheel_radius"]
     pressed = signals.get("brake_switch")
     if "brake_pressure_front" in signals and "brake_pressure_rear" in signals:
         pressure = signals["brake_pressure_front"] + signals["brake_pressure_rear"]
@@ -247,15 +245,13 @@ def _rest_soc(signals: dict[str, Array], vehicle: Vehicle) -> float | None:
 
 
 def _counted_soc(signals: dict[str, Array], vehicle: Vehicle) -> Array:
-    """SOC by counting the measured charge from that at the start, the sensor's known offset and gain taken off."""
+    """SOC by counting the measured charge from that at the start."""
     import numpy as np
 
-    battery, p = vehicle.battery, vehicle.parameters
-    assert battery
-    current = (signals["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"]
-    temperature = float(signals["cell_temperature"][0]) if "cell_temperature" in signals else 20.0
-    charge = np.cumsum(current) * STEP / (3600 * battery.pack_capacity(temperature))
-    soc: Array = (_rest_soc(signals, vehicle) or 1.0) - charge
+    start = _rest_soc(signals, vehicle)
+    assert start is not None
+    temperature = float(signals["cell_temperature"][0]) if "cell_temperature" in signals else AMBIENT
+    soc: Array = start - discharged(np.cumsum(signals["pack_current"]), STEP, vehicle.pack.pack_capacity(temperature))
     return soc
 
 

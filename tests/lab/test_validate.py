@@ -22,6 +22,7 @@ from gz_onboard.lab.validate_components import components
 from gz_onboard.lab.validate_report import COLUMNS, failures
 from gz_onboard.lab.validate_ride import per_second
 from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, conditions, errors, pooled, seconds, split
+from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters
@@ -136,7 +137,7 @@ def city():
     vehicle = read_vehicle("reference", 75.0)
     recorded = read_recorded(LOGS / "city_34C.blf", vehicle)
     road = recorded.road()
-    measured = per_second(recorded, vehicle)
+    measured = per_second(recorded)
     place = seconds(recorded.signals["distance"], 100)
     return vehicle, measured | {"grade": np.array([road(at)[0] for at in place])}, rest_soc(recorded, vehicle)
 
@@ -180,10 +181,13 @@ def test_a_wrong_parameter_shows_in_its_component(city, component, change):
 
 def test_current_is_that_which_flows(city):
     vehicle, *_ = city
-    recorded = read_recorded(LOGS / "coastdown.blf", vehicle)
-    raw = seconds(recorded.signals["pack_current"], 100)
+    log = LOGS / "coastdown.blf"
+    recorded = read_recorded(log, vehicle)
+    columns = read_samples(log, vehicle).columns
+    grid = np.arange(columns["motor_speed"][0][0], columns["motor_speed"][0][-1], recorded.dt)
+    raw = seconds(np.interp(grid, *columns["pack_current"]), 100)
     p = vehicle.parameters
-    flows = per_second(recorded, vehicle)["pack_current"]
+    flows = per_second(recorded)["pack_current"]
     assert flows * p["pack_current_gain"] + p["pack_current_offset"] == pytest.approx(raw)
 
 
