@@ -232,15 +232,11 @@ def _rest_soc(signals: dict[str, Array], vehicle: Vehicle) -> float | None:
     battery = vehicle.battery
     if battery is None or "pack_voltage" not in signals:
         return None
-    n = round(1 / STEP)
-    zero = signals["pack_voltage"][:n] * 0
-    current = float(signals.get("pack_current", zero)[:n].mean())
-    cell = battery.cell_voltage(float(signals["pack_voltage"][:n].mean()), current)
-    temperature = float(signals.get("cell_temperature", zero + 20)[:n].mean())
-    soc = 0.5
-    for _ in range(5):  # R0 depends on SOC
-        rest = cell + battery.r0.at(soc, temperature)[0] * current / battery.cells_parallel
-        soc = battery.soc_at(rest, temperature)
+
+    def first(role: str, default: float) -> float:
+        return float(signals[role][: round(1 / STEP)].mean()) if role in signals else default
+
+    soc = battery.first_soc(first("pack_voltage", 0.0), first("pack_current", 0.0), first("cell_temperature", AMBIENT))
     return min(max(soc, 0.0), 1.0)
 
 
