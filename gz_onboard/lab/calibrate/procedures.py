@@ -26,7 +26,7 @@ from gz_onboard.lab.calibrate.cell_data import cell_test
 from gz_onboard.lab.calibrate.coastdown_run import samples as coastdown_samples
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.manifest import Option, Slot
-from gz_onboard.lab.calibrate.result import Curve, Found, Panel, PlotLine, Result
+from gz_onboard.lab.calibrate.result import Curve, Found, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.sensors import true_columns
@@ -98,21 +98,8 @@ def _pulse(given: Given) -> Result:
         result.fits.append(score("cell voltage", "V", measured, model, held_out=True, source=table.file.name))
         near = float(np.mean(np.abs(model - measured) <= THESIS_VOLTS))
         result.notes.append(f"{table.file.name}: {100 * near:.0f} % of the samples within ±{THESIS_VOLTS:g} V")
-        minutes = test.time / 60
-        result.panels += [
-            Panel(
-                f"{table.file.name}, held out",
-                "time [min]",
-                "cell voltage [V]",
-                (PlotLine("measured", minutes, measured), PlotLine("model", minutes, model)),
-            ),
-            Panel(
-                f"{table.file.name}: residual",
-                "time [min]",
-                "model less measured [mV]",
-                (PlotLine("", minutes, 1000 * (model - measured)),),
-            ),
-        ]
+        title = f"{table.file.name}, held out"
+        result.panels += compared(title, "time [min]", "cell voltage [V]", test.time / 60, measured, model)
     return result
 
 
