@@ -11,6 +11,7 @@ from pathlib import Path
 
 from gz_onboard.errors import InputError, nearest
 
+LEAST_ROWS = 2
 _KMH = re.compile(r"km?/h|km?ph", re.I)
 
 
@@ -43,8 +44,8 @@ class Columns:
                 raise self.error(row, f"{name}: {values[row]:g} {unit} does not increase (before: {values[row - 1]:g})")
 
 
-def read_columns(file: Path, known: Collection[str], rows: int = 2) -> Columns:
-    """Read a CSV `file` of finite numbers whose header names columns out of `known`, with at least `rows` rows.
+def read_columns(file: Path, known: Collection[str]) -> Columns:
+    """Read a CSV `file` of finite numbers whose header names columns out of `known`, with at least two rows.
 
     Blank lines are passed over. Raises InputError, naming file, line and column, if the file cannot be read, a
     column is unknown or there twice, a row has too few or too many fields, or a field is no finite number.
@@ -66,8 +67,8 @@ def read_columns(file: Path, known: Collection[str], rows: int = 2) -> Columns:
             raise InputError(f"{file}:{line}: unknown column {name!r}{meant}; known are {', '.join(known)}")
         if name in header[:column]:
             raise InputError(f"{file}:{line}: column {name!r} is there twice")
-    if len(records) <= rows:
-        raise InputError(f"{file}: has {len(records) - 1} rows below its header, must have at least {rows}")
+    if len(records) <= LEAST_ROWS:
+        raise InputError(f"{file}: has {len(records) - 1} rows below its header, must have at least {LEAST_ROWS}")
     table: list[list[float]] = []
     for line, record in records[1:]:
         if len(record) != len(header):

@@ -21,6 +21,7 @@ from scipy.signal import lfilter
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cell_circuit import KELVIN, follow, follow_slope, hats
 from gz_onboard.lab.calibrate.cell_data import CellTest
+from gz_onboard.physics.relaxation import decay_over
 
 # s. A pair between two of them is made of both, and one pair made of these is off by the square of their distance: C1
 # of a pair of 30 s by -10 % for a factor of 4 from each to the next, -1 % for the 1.75 of these.
@@ -219,11 +220,11 @@ class Pairs:
 
 
 class Reduction:
-    """From many pairs to `count` pairs, under `loads`: currents from rest, one value for each `step` [s]."""
+    """From many pairs to `count` pairs, under `loads`: currents from rest, one value a second."""
 
-    def __init__(self, loads: Sequence[Array], step: float = 1.0, count: int = 1) -> None:
+    def __init__(self, loads: Sequence[Array], count: int = 1) -> None:
         def filtered_by(tau: float) -> Array:
-            a = np.exp(-step / tau)
+            a = decay_over(1.0, tau)
             return np.concatenate([lfilter([1 - a], [1, -a], x) for x in loads])
 
         load = np.concatenate(list(loads))
