@@ -24,6 +24,7 @@ from gz_onboard.arrays import Array, Mask
 
 GATE, COMPONENT_GATE = 20.0, 10.0  # percent: Lord 2016, ch. 3
 LEAST_RISE = 10.0  # K
+ROLLING = 2.0  # m/s: below, road load is lost in what speed and torque err by
 LEAST_SECONDS = 20  # of a condition; fewer mean nothing
 
 
@@ -176,7 +177,7 @@ def conditions(measured: Mapping[str, Array]) -> tuple[dict[str, dict[str, Mask]
     ``ambient_temperature`` [degC], ``braking`` (share of the second).
     """
     speed = measured["speed"]
-    moving = speed > 2.0
+    moving = speed > ROLLING
     straight = moving.copy()
     missing = []
     found: dict[str, dict[str, Mask]] = {}

@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
-from gz_onboard.physics.model import Bound, over, total
+from gz_onboard.physics.effect import MOVING, Port
+from gz_onboard.physics.model import Bound, all_quantities, over, total
 from gz_onboard.simulation.run import Command
 from gz_onboard.simulation.scooter import Scooter
 
@@ -132,20 +132,20 @@ class Truth:
         import numpy as np
 
         c = self.columns
-        q = dict.fromkeys(QUANTITIES, 0.0) | {
-            "speed": c["way"],
-            "acceleration": c["acceleration"],
-            "grade": c["grade"],
-            "soc": c["soc"],
-            "lateral_acceleration": c["way"] * c["yaw_rate"],
-            "heading": c["heading"],
-            "motor_current": c["motor_current"],
-            "motor_temperature": c["motor"],
-            "cell_temperature": c["cell"],
-            "time_moving": np.cumsum(c["way"] > MOVING) * self.dt,
-            "ambient_temperature": self.ambient,
-            "vibration": c["vibration"],
-        }
+        q = all_quantities(
+            speed=c["way"],
+            acceleration=c["acceleration"],
+            grade=c["grade"],
+            soc=c["soc"],
+            lateral_acceleration=c["way"] * c["yaw_rate"],
+            heading=c["heading"],
+            motor_current=c["motor_current"],
+            motor_temperature=c["motor"],
+            cell_temperature=c["cell"],
+            time_moving=np.cumsum(c["way"] > MOVING) * self.dt,
+            ambient_temperature=self.ambient,
+            vibration=c["vibration"],
+        )
         effects = [Bound(effect, self.parameters) for effect in scooter.vehicle.model.effects]
         drawn = total([e for e in effects if e.effect.port is Port.DC_POWER], q, over(self.dt))
         return np.asarray(np.zeros(self.count) + drawn)
