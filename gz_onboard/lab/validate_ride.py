@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, block_means, running_mean
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.validate_components import Component, components
@@ -27,7 +27,6 @@ from gz_onboard.lab.validate_score import (
     Verdict,
     conditions,
     errors,
-    seconds,
     split,
 )
 from gz_onboard.offline.processes import Task
@@ -153,7 +152,7 @@ def _measured(log: Path, vehicle: Vehicle, size: int, progress: Progress) -> Mea
 def per_second(recorded: Recorded) -> dict[str, Array]:
     """What was measured, as means over seconds, by role; and acceleration, yaw_rate, braking, pack_power."""
     rate = round(1 / recorded.dt)
-    measured = {role: seconds(values, rate) for role, values in recorded.signals.items()}
+    measured = {role: block_means(values, rate) for role, values in recorded.signals.items()}
     smooth = _averaged_speed(recorded)
     n = len(measured["speed"])
     ends = np.minimum(np.arange(n + 1) * rate, len(smooth) - 1)
@@ -169,9 +168,7 @@ def per_second(recorded: Recorded) -> dict[str, Array]:
 
 def _averaged_speed(recorded: Recorded) -> Array:
     """The measured speed [m/s], each sample the mean over `AVERAGED` about it."""
-    reach = round(AVERAGED / recorded.dt / 2)
-    width = 2 * reach + 1
-    return np.convolve(np.pad(recorded.signals["speed"], reach, mode="edge"), np.ones(width) / width, "valid")
+    return running_mean(recorded.signals["speed"], 2 * round(AVERAGED / recorded.dt / 2) + 1)
 
 
 def _road(recorded: Recorded, log: Path) -> tuple[RoadProfile | Dynamometer, Array | None]:
@@ -185,7 +182,7 @@ def _road(recorded: Recorded, log: Path) -> tuple[RoadProfile | Dynamometer, Arr
     else:
         road = recorded.road()
     distance = recorded.signals["distance"]
-    at = seconds(distance, round(1 / recorded.dt))
+    at = block_means(distance, round(1 / recorded.dt))
     return road, np.array([road(place)[0] for place in at.tolist()])
 
 
@@ -259,8 +256,8 @@ def _ride(ride: Measured, command: Command, progress: Progress) -> Run:
 def _series(run: Run) -> dict[str, Array]:
     """A run as means over seconds."""
     rate = round(1 / float(run.series["time"][1] - run.series["time"][0]))
-    series = {name: seconds(values, rate) for name, values in run.series.items()}
-    series["pack_power"] = seconds(run.series["pack_voltage"] * run.series["pack_current"], rate)
+    series = {name: block_means(values, rate) for name, values in run.series.items()}
+    series["pack_power"] = block_means(run.series["pack_voltage"] * run.series["pack_current"], rate)
     return series
 
 

@@ -163,13 +163,6 @@ class Ride:
         return {form: verdict for form, verdict in every.items() if verdict}
 
 
-def seconds(values: Array, per_second: int) -> Array:
-    """Means over whole seconds of a signal with `per_second` samples in each."""
-    n = len(values) // per_second
-    result: Array = values[: n * per_second].reshape(n, per_second).mean(axis=1)
-    return result
-
-
 def conditions(measured: Mapping[str, Array]) -> tuple[dict[str, dict[str, Mask]], list[str]]:
     """(the seconds of each condition, by what they are sorted by; what could not be sorted by, and why).
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import pi
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from gz_onboard.bus.codec import Codec
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Event
-from gz_onboard.offline.samples import INSTRUMENTS, extended, read_roles
+from gz_onboard.offline.samples import INSTRUMENTS, extended, read_roles, ride_name
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.sensors import speed_role, true_columns
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
@@ -34,6 +35,8 @@ BRAKE_PRESSED = 0.5e5  # Pa: below this the sensors show noise
 BRAKE_MEAN = 90.0  # N: the mean of the same rides while the switch is on, where there are no pressures
 ROAD_PIECE = 5.0  # m
 AMBIENT = 20.0  # degC: of the air, where it was not measured
+SPAN, ROLLING, LEAST_SPANS = 2.0, 1.0, 10  # s, m/s and count: of spans of a roller's run that moves
+LEAST_HEADINGS = 10  # of a ride whose heading counts as known
 _MOVING = 2.0  # m/s: slower than this, yaw rate over speed is no curvature
 
 
@@ -83,14 +86,12 @@ class Recorded:
 
     def heading_at(self, distance: float) -> float:
         """The heading [rad] at `distance` [m]; north where none is known."""
-        if self.heading is None:
-            return 0.0
-        return float(self.heading[min(max(int(distance / ROAD_PIECE), 0), len(self.heading) - 1)])
+        return 0.0 if self.heading is None else _at(self.heading, distance)
 
     def vibration_at(self, distance: float) -> float:
         """How rough the road is [m/s²] at `distance` [m]; only if `vibration` is known."""
         assert self.vibration is not None
-        return float(self.vibration[min(max(int(distance / ROAD_PIECE), 0), len(self.vibration) - 1)])
+        return _at(self.vibration, distance)
 
     def road(self, headwind: float = 0.0) -> RoadProfile:
         """The road that was ridden."""
@@ -141,23 +142,29 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     signals = _signals(log, columns, vehicle)
     if "pack_voltage" in signals and "pack_current" in signals:
         signals["soc"] = _counted_soc(signals, vehicle)
-    grade, curvature = _by_distance(np.array(rows))
-    name = log.name.removesuffix(".gz")
-    vibration = None if felt is None else _vibration(felt[:, 1], felt[:, 2])
-    return Recorded(Path(name).stem, STEP, signals, grade, curvature, _headings(headings), vibration)
+    way, grade, curvature = (np.array(column) for column in zip(*rows, strict=True))
+    vibration = None if felt is None else _over_road(felt[:, 1], felt[:, 2])
+    heading = None
+    if len(headings) >= LEAST_HEADINGS:
+        course = np.array(headings)
+        heading = _over_road(course[:, 0], course[:, 1], period=2 * pi)
+    stood = way[0] == way[-1]
+    slope, bend = (np.zeros(1) if stood else _over_road(way, values) for values in (grade, curvature))
+    return Recorded(ride_name(log), STEP, signals, slope, bend, heading, vibration)
 
 
 def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicle) -> dict[str, Array]:
     """All on one grid of steps: the speeds interpolated, what comes in steps as it was last told."""
     import numpy as np
 
+    from gz_onboard.arrays import held_at
+
     pace, factor = speed_role(str(log), columns, vehicle.parameters)
     time = columns[pace][0]
     grid = np.arange(time[0], time[-1], STEP)
     signals = {role: np.interp(grid, t, v) for role, (t, v) in columns.items()}
     if "brake_switch" in columns:
-        t, v = columns["brake_switch"]
-        signals["brake_switch"] = v[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(v) - 1)]
+        signals["brake_switch"] = held_at(grid, *columns["brake_switch"])
     signals["speed"] = np.maximum(signals[pace] * factor, 0.0)
     signals["distance"] = np.concatenate(([0.0], np.cumsum(signals["speed"][1:] * STEP)))
     limit = vehicle.parameters["brake_torque_limit"] / vehicle.parameters["wheel_radius"]
@@ -173,34 +180,21 @@ def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicl
     return signals
 
 
-def _by_distance(rows: Array) -> tuple[Array, Array]:
-    """Grade and curvature at even distances; where the scooter stood, the last that it had there."""
-    import numpy as np
+def _over_road(distance: Array, values: Array, period: float | None = None) -> Array:
+    """`values` (n,) at `distance` (n,) [m], each `ROAD_PIECE` of the way; where the scooter stood, as it came there.
 
-    distance, keep = np.unique(rows[:, 0], return_index=True)
-    if len(distance) < 2:
-        return np.zeros(1), np.zeros(1)
-    at = np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE)
-    return np.interp(at, distance, rows[keep, 1]), np.interp(at, distance, rows[keep, 2])
-
-
-def _vibration(distance: Array, values: Array) -> Array:
-    """The vibration at even distances; where the scooter stood, as it came there."""
+    period: of an angle, which then goes on over a whole turn.
+    """
     import numpy as np
 
     distance, keep = np.unique(distance, return_index=True)
-    return np.interp(np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE), distance, values[keep])
+    found = values[keep] if period is None else np.unwrap(values[keep], period=period)
+    return np.interp(np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE), distance, found)
 
 
-def _headings(rows: list[tuple[float, float]]) -> Array | None:
-    """The heading at even distances, going on over a whole turn; None if hardly any is known."""
-    import numpy as np
-
-    if len(rows) < 10:
-        return None
-    distance, keep = np.unique([row[0] for row in rows], return_index=True)
-    heading = np.unwrap(np.array([row[1] for row in rows])[keep])
-    return np.interp(np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE), distance, heading)
+def _at(table: Array, distance: float) -> float:
+    """What `table`, each `ROAD_PIECE`, has at `distance` [m]; beyond its ends the edge."""
+    return float(table[min(max(int(distance / ROAD_PIECE), 0), len(table) - 1)])
 
 
 def scooter_at_start(
@@ -251,29 +245,25 @@ def _counted_soc(signals: dict[str, Array], vehicle: Vehicle) -> Array:
     return soc
 
 
-def fit_dynamometer(recorded: Recorded, inertia: float | None = None) -> Dynamometer:
+def fit_dynamometer(recorded: Recorded) -> Dynamometer:
     """The roller of a recorded dynamometer run: F = M·dV/dt + A + B·V + C·V², by least squares over spans of 2 s.
 
-    `inertia` [kg] is held if given. Raises InputError if there was no roller, or it did not move.
+    Raises InputError if there was no roller, or it did not move.
     """
     import numpy as np
 
+    from gz_onboard.arrays import block_means
+
     if not recorded.on_dynamometer:
         raise InputError(f"{recorded.name}: no roller of a dynamometer was recorded")
-    n = round(2 / recorded.dt)
+    n = round(SPAN / recorded.dt)
     speed, force = recorded.signals["roller_speed"], recorded.signals["roller_force"]
-    spans = len(speed) // n
-    mean_v, mean_f = (x[: spans * n].reshape(spans, n).mean(axis=1) for x in (speed, force))
-    square = (speed[: spans * n].reshape(spans, n) ** 2).mean(axis=1)
+    mean_v, mean_f, square = (block_means(x, n) for x in (speed, force, speed**2))
+    spans = len(mean_v)
     edges = np.interp(np.arange(spans + 1) * n, np.arange(len(speed)), np.convolve(speed, np.ones(21) / 21, "same"))
     acceleration = np.diff(edges) / (n * recorded.dt)
-    moving = mean_v > 1.0
-    if moving.sum() < 10:
+    moving = mean_v > ROLLING
+    if moving.sum() < LEAST_SPANS:
         raise InputError(f"{recorded.name}: its roller hardly moves; give --dyno KG,A,B,C")
-    terms = [np.ones(spans), mean_v, square]
-    rest = mean_f - (inertia or 0.0) * acceleration
-    if inertia is None:
-        terms.append(acceleration)
-    matrix: Any = np.stack(terms, axis=1)[moving]
-    solution = np.linalg.lstsq(matrix, rest[moving], rcond=None)[0].tolist()
-    return Dynamometer(solution[3] if inertia is None else inertia, *solution[:3])
+    matrix: Any = np.stack([acceleration, np.ones(spans), mean_v, square], axis=1)[moving]
+    return Dynamometer(*np.linalg.lstsq(matrix, mean_f[moving], rcond=None)[0].tolist())

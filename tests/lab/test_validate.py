@@ -16,12 +16,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gz_onboard.arrays import block_means
 from gz_onboard.cli import main
 from gz_onboard.lab.validate import KEYS, pool
 from gz_onboard.lab.validate_components import components
 from gz_onboard.lab.validate_report import COLUMNS, failures
 from gz_onboard.lab.validate_ride import per_second
-from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, conditions, errors, pooled, seconds, split
+from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, conditions, errors, pooled, split
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
@@ -62,7 +63,7 @@ def test_nothing_measured_is_no_pass():
 @given(st.integers(1, 40), st.integers(1, 20), st.integers(0, 19))
 def test_seconds_keep_the_mean(count, rate, rest):
     values = np.random.default_rng(count).normal(size=count * rate + min(rest, rate - 1))
-    means = seconds(values, rate)
+    means = block_means(values, rate)
     assert len(means) == count
     assert means.mean() == pytest.approx(values[: count * rate].mean())
 
@@ -138,7 +139,7 @@ def city():
     recorded = read_recorded(LOGS / "city_34C.blf", vehicle)
     road = recorded.road()
     measured = per_second(recorded)
-    place = seconds(recorded.signals["distance"], 100)
+    place = block_means(recorded.signals["distance"], 100)
     return vehicle, measured | {"grade": np.array([road(at)[0] for at in place])}, rest_soc(recorded, vehicle)
 
 
@@ -185,7 +186,7 @@ def test_current_is_that_which_flows(city):
     recorded = read_recorded(log, vehicle)
     columns = read_samples(log, vehicle).columns
     grid = np.arange(columns["motor_speed"][0][0], columns["motor_speed"][0][-1], recorded.dt)
-    raw = seconds(np.interp(grid, *columns["pack_current"]), 100)
+    raw = block_means(np.interp(grid, *columns["pack_current"]), 100)
     p = vehicle.parameters
     flows = per_second(recorded)["pack_current"]
     assert flows * p["pack_current_gain"] + p["pack_current_offset"] == pytest.approx(raw)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, held_integral
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples
@@ -141,9 +141,8 @@ def _grid(time: Array, name: str) -> Array:
 
 def _means(time: Array, value: Array, grid: Array) -> Array:
     """The mean of `value`, held from each of its times to the next, over each period of `grid`."""
-    sums = np.concatenate([[0.0], np.cumsum(np.diff(time) * value[:-1])])
     edges = np.append(grid, grid[-1] + PERIOD)
-    result: Array = np.diff(np.interp(edges, time, sums)) / PERIOD
+    result: Array = np.diff(np.interp(edges, time, held_integral(time, value))) / PERIOD
     if edges[-1] > time[-1]:
         result[-1] = value[-1]
     return result

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, held_integral
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, linear, score
 from gz_onboard.lab.calibrate.offsets import read_pair, window_means
@@ -161,7 +161,7 @@ def cell_steps(pulses: Sequence[Measurements]) -> tuple[Array, Array]:
     rows = []
     for pulse in pulses:
         time, current, voltage = pulse["time"], pulse["current"], pulse["voltage"]
-        charge = np.concatenate([[0.0], np.cumsum(np.diff(time) * current[:-1])])
+        charge = held_integral(time, current)
         jump = np.flatnonzero(np.abs(np.diff(current)) > 0.3 * np.max(np.abs(current)))
         ohm = []
         for k in jump:
