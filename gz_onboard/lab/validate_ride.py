@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.arrays import Array, block_means, running_mean
+from gz_onboard.bus.publisher import WH
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.validate_components import Component, components
@@ -294,4 +295,4 @@ def _even(a: Array, b: Array) -> tuple[Array, Array]:
 
 def _energy(series: Mapping[str, Array]) -> float | None:
     """[Wh] at the pack's terminals."""
-    return float(series["pack_power"].sum()) / 3600 if "pack_power" in series else None
+    return float(series["pack_power"].sum()) / WH if "pack_power" in series else None
