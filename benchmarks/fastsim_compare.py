@@ -86,7 +86,7 @@ def with_values(vehicle: Vehicle, **values: float) -> Vehicle:
 
 def cycles() -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
     udds, wmtc = cycle("udds"), cycle("wmtc_class1")
-    factor = 45 / 3.6 / udds.max_speed  # what the scooter reaches on the level, with some power left
+    factor = 45 / 3.6 / max(udds.speed)  # what the scooter reaches on the level, with some power left
     return {
         "UDDS scaled to 45 km/h": (udds.time, tuple(factor * v for v in udds.speed)),
         "WMTC class 1": (wmtc.time, wmtc.speed),

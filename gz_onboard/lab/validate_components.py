@@ -15,17 +15,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import repeat
-from typing import Any
 
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
-from gz_onboard.lab.validate_score import CHANNELS, Quantity
+from gz_onboard.estimator.cell_effects import CellEffects
+from gz_onboard.lab.validate_score import CHANNELS, ROLLING, Quantity
 from gz_onboard.physics.battery import discharged, heat, terminal_voltage
 from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
-from gz_onboard.physics.effect import MOVING, QUANTITIES, ROAD_LOAD, Port
-from gz_onboard.physics.model import air_density, drag_torque, over, total
+from gz_onboard.physics.effect import MOVING, ROAD_LOAD, Port
+from gz_onboard.physics.model import air_density, all_quantities, drag_torque, over, total
 from gz_onboard.physics.relaxation import relaxed
+from gz_onboard.physics.sensors import road_speed
 from gz_onboard.simulation.parts.road import Dynamometer
 from gz_onboard.vehicle import Vehicle
 
@@ -65,10 +66,9 @@ def components(
             found["motor_torque"] = Component(
                 CHANNELS["motor_torque"], measured["motor_torque"], constant * current, every
             )
-        moving = (measured["speed"] > 2.0) & (measured.get("braking", np.zeros(len(speed))) <= 0)
+        moving = (measured["speed"] > ROLLING) & (measured.get("braking", np.zeros(len(speed))) <= 0)
         if "acceleration" in has and ("grade" in has or roller):
-            radius = vehicle.parameters["wheel_radius"] * vehicle.parameters["gear_ratio"]
-            force = (constant * current - drag_torque(idle, speed)) / radius
+            force = (constant * current - drag_torque(idle, speed)) / road_speed(1.0, vehicle.parameters)
             needed = road_load(vehicle, measured, ambient, roller)
             found["road_load"] = Component(Quantity("N", "road load"), force, needed, moving)
         found |= _temperatures(vehicle, measured, soc, ambient, copper + idle, inverter, every)
@@ -87,7 +87,7 @@ def time_moving(measured: Mapping[str, Array]) -> Array:
 
 
 def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float) -> Array:
-    """Pack voltage [V] per second by the circuit of `physics.battery`, at rest before the first; sensor's offset in."""
+    """Pack voltage [V] per second by the circuit of `physics.battery`, at rest before the first."""
     battery = vehicle.pack
     m = battery.cells_parallel
     columns = (
@@ -97,31 +97,27 @@ def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float)
         time_moving(measured),
     )
     v1, result = 0.0, np.empty(len(columns[0]))
-    states = {name: 0.0 for name, _ in vehicle.model.cell_voltage}  # V of a cell, of effects in it
-    q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0)
+    effects = CellEffects(vehicle.model, battery)
     rows = zip(*(column.tolist() for column in columns), strict=True)
     for i, (amperes, celsius, shaken, moving) in enumerate(rows):
         cell = amperes / m
-        r0, r1, c1 = (mesh.at(soc, celsius)[0] for mesh in (battery.r0, battery.r1, battery.c1))
+        r0, r1, c1 = battery.circuit(soc, celsius)
         v1, decay = battery.relax(0.5, v1, cell, r1, c1)  # to its middle: what is measured is the second's mean
         half = discharged(amperes, 0.5, battery.pack_capacity(celsius))
         soc -= half
-        volts = terminal_voltage(battery.ocv(soc, celsius)[0], r0, cell, v1 + sum(states.values()))
+        volts = terminal_voltage(battery.ocv(soc, celsius)[0], r0, cell, v1 + effects.overpotential)
         result[i] = battery.pack_voltage(volts, amperes)
         v1 = relaxed(v1, r1 * cell, decay)
         soc -= half
-        if states:
-            q |= {"cell_current": cell, "soc": soc, "cell_temperature": celsius, "vibration": shaken}
-            q |= {"cell_capacity": battery.cell_capacity(celsius), "time_moving": moving}
-            states = {name: effect.step(states[name], 1.0, q) for name, effect in vehicle.model.cell_voltage}
-    return result + vehicle.parameters["pack_voltage_offset"]
+        if effects:
+            effects.step(1.0, cell, soc, celsius, {"vibration": shaken, "time_moving": moving})
+    return result
 
 
 def losses(vehicle: Vehicle, current: Array, speed: Array, temperature: Array) -> tuple[Array, Array, Array]:
     """(motor loss that comes with current, motor loss without current, inverter loss), all W of shape (n,)."""
-    q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0)
-    q |= {"motor_current": current, "motor_speed": speed, "motor_temperature": temperature}
-    q["torque"] = vehicle.parameters["torque_constant"] * current
+    torque = vehicle.parameters["torque_constant"] * current
+    q = all_quantities(motor_current=current, motor_speed=speed, motor_temperature=temperature, torque=torque)
     model, each = vehicle.model, over(1.0)
     motor, inverter = (0.0 * speed + total(model.at(port), q, each) for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS))
     idle = 0.0 * speed + model.idle_loss(q)
@@ -132,24 +128,21 @@ def road_load(vehicle: Vehicle, measured: Mapping[str, Array], ambient: float, r
     """The force [N] at the driven wheel that the measured motion asks for, by the vehicle's effects."""
     p, speed = vehicle.parameters, measured["speed"]
     zero = np.zeros(len(speed))
-    grade = zero if roller else measured["grade"]
-    q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0)
-    q |= {
-        "speed": speed,
-        "acceleration": measured["acceleration"],
-        "grade": grade,
-        "grade_cosine": np.sqrt(1 - grade**2),
-        "mass": vehicle.model.mass,
-        "air_density": air_density(ambient),
-        "lateral_acceleration": speed * measured.get("yaw_rate", zero),
-        "vibration": vibration(vehicle, measured),
-        "motor_current": zero,
-        "motor_temperature": ambient,
-        "ambient_temperature": measured.get("ambient_temperature", zero + ambient),
-        "motor_speed": measured["motor_speed"],
-        "time_moving": time_moving(measured),
-        "heading": measured.get("gps_course", zero),
-    }
+    q = all_quantities(
+        speed=speed,
+        acceleration=measured["acceleration"],
+        grade=zero if roller else measured["grade"],
+        mass=vehicle.model.mass,
+        air_density=air_density(ambient),
+        lateral_acceleration=speed * measured.get("yaw_rate", zero),
+        vibration=vibration(vehicle, measured),
+        motor_current=zero,
+        motor_temperature=ambient,
+        ambient_temperature=measured.get("ambient_temperature", zero + ambient),
+        motor_speed=measured["motor_speed"],
+        time_moving=time_moving(measured),
+        heading=measured.get("gps_course", zero),
+    )
     model, each = vehicle.model, over(1.0)
     if not roller:
         return np.asarray(zero + total(model.at(*ROAD_LOAD), q, each))

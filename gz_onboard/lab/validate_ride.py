@@ -12,7 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, block_means, running_mean
+from gz_onboard.bus.publisher import WH
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.validate_components import Component, components
@@ -27,7 +28,6 @@ from gz_onboard.lab.validate_score import (
     Verdict,
     conditions,
     errors,
-    seconds,
     split,
 )
 from gz_onboard.offline.processes import Task
@@ -141,7 +141,7 @@ def _measured(log: Path, vehicle: Vehicle, size: int, progress: Progress) -> Mea
 
     recorded = read_recorded(log, vehicle, frames)
     progress(_READ * size - counted)
-    measured = per_second(recorded, vehicle)
+    measured = per_second(recorded)
     if len(measured["speed"]) < SHORTEST:
         raise InputError(f"{log}: {len(measured['speed'])} s are too short a ride to judge; at least {SHORTEST} s")
     road, grade = _road(recorded, log)
@@ -150,13 +150,10 @@ def _measured(log: Path, vehicle: Vehicle, size: int, progress: Progress) -> Mea
     return Measured(recorded, vehicle, measured, road, rest_soc(recorded, vehicle))
 
 
-def per_second(recorded: Recorded, vehicle: Vehicle) -> dict[str, Array]:
-    """What was measured, as means over seconds, by role; and acceleration, yaw_rate, braking, pack_power.
-
-    The pack's current is that which flows: the sensor's known gain and offset are taken off.
-    """
+def per_second(recorded: Recorded) -> dict[str, Array]:
+    """What was measured, as means over seconds, by role; and acceleration, yaw_rate, braking, pack_power."""
     rate = round(1 / recorded.dt)
-    measured = {role: seconds(values, rate) for role, values in recorded.signals.items()}
+    measured = {role: block_means(values, rate) for role, values in recorded.signals.items()}
     smooth = _averaged_speed(recorded)
     n = len(measured["speed"])
     ends = np.minimum(np.arange(n + 1) * rate, len(smooth) - 1)
@@ -165,19 +162,14 @@ def per_second(recorded: Recorded, vehicle: Vehicle) -> dict[str, Array]:
         measured["yaw_rate"] = measured["rate_z"]
     if "brake" in measured:
         measured["braking"] = (measured["brake"] > 0).astype(float)
-    if "pack_current" in measured:
-        p = vehicle.parameters
-        measured["pack_current"] = (measured["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"]
-        if "pack_voltage" in measured:
-            measured["pack_power"] = measured["pack_voltage"] * measured["pack_current"]
+    if {"pack_current", "pack_voltage"} <= measured.keys():
+        measured["pack_power"] = measured["pack_voltage"] * measured["pack_current"]
     return measured
 
 
 def _averaged_speed(recorded: Recorded) -> Array:
     """The measured speed [m/s], each sample the mean over `AVERAGED` about it."""
-    reach = round(AVERAGED / recorded.dt / 2)
-    width = 2 * reach + 1
-    return np.convolve(np.pad(recorded.signals["speed"], reach, mode="edge"), np.ones(width) / width, "valid")
+    return running_mean(recorded.signals["speed"], 2 * round(AVERAGED / recorded.dt / 2) + 1)
 
 
 def _road(recorded: Recorded, log: Path) -> tuple[RoadProfile | Dynamometer, Array | None]:
@@ -191,7 +183,7 @@ def _road(recorded: Recorded, log: Path) -> tuple[RoadProfile | Dynamometer, Arr
     else:
         road = recorded.road()
     distance = recorded.signals["distance"]
-    at = seconds(distance, round(1 / recorded.dt))
+    at = block_means(distance, round(1 / recorded.dt))
     return road, np.array([road(place)[0] for place in at.tolist()])
 
 
@@ -265,8 +257,8 @@ def _ride(ride: Measured, command: Command, progress: Progress) -> Run:
 def _series(run: Run) -> dict[str, Array]:
     """A run as means over seconds."""
     rate = round(1 / float(run.series["time"][1] - run.series["time"][0]))
-    series = {name: seconds(values, rate) for name, values in run.series.items()}
-    series["pack_power"] = seconds(run.series["pack_voltage"] * run.series["pack_current"], rate)
+    series = {name: block_means(values, rate) for name, values in run.series.items()}
+    series["pack_power"] = block_means(run.series["pack_voltage"] * run.series["pack_current"], rate)
     return series
 
 
@@ -303,4 +295,4 @@ def _even(a: Array, b: Array) -> tuple[Array, Array]:
 
 def _energy(series: Mapping[str, Array]) -> float | None:
     """[Wh] at the pack's terminals."""
-    return float(series["pack_power"].sum()) / 3600 if "pack_power" in series else None
+    return float(series["pack_power"].sum()) / WH if "pack_power" in series else None

@@ -24,6 +24,7 @@ from gz_onboard.arrays import Array, Mask
 
 GATE, COMPONENT_GATE = 20.0, 10.0  # percent: Lord 2016, ch. 3
 LEAST_RISE = 10.0  # K
+ROLLING = 2.0  # m/s: below, road load is lost in what speed and torque err by
 LEAST_SECONDS = 20  # of a condition; fewer mean nothing
 
 
@@ -139,7 +140,7 @@ class Ride:
     duration_s: Annotated[float, "of the ride"]
     distance_km: Annotated[float, "of the ride"]
     ambient_c: Annotated[float | None, "air, mean"]
-    energy_wh: Annotated[float | None, "measured at the pack's terminals, sensor's known gain and offset taken off"]
+    energy_wh: Annotated[float | None, "measured at the pack's terminals, sensors' known gain and offsets taken off"]
     open_loop: Annotated[
         SimulationVerdict | None,
         "simulated with the measured throttle and brake, or null: channels, energy_percent, passed",
@@ -162,13 +163,6 @@ class Ride:
         return {form: verdict for form, verdict in every.items() if verdict}
 
 
-def seconds(values: Array, per_second: int) -> Array:
-    """Means over whole seconds of a signal with `per_second` samples in each."""
-    n = len(values) // per_second
-    result: Array = values[: n * per_second].reshape(n, per_second).mean(axis=1)
-    return result
-
-
 def conditions(measured: Mapping[str, Array]) -> tuple[dict[str, dict[str, Mask]], list[str]]:
     """(the seconds of each condition, by what they are sorted by; what could not be sorted by, and why).
 
@@ -176,7 +170,7 @@ def conditions(measured: Mapping[str, Array]) -> tuple[dict[str, dict[str, Mask]
     ``ambient_temperature`` [degC], ``braking`` (share of the second).
     """
     speed = measured["speed"]
-    moving = speed > 2.0
+    moving = speed > ROLLING
     straight = moving.copy()
     missing = []
     found: dict[str, dict[str, Mask]] = {}

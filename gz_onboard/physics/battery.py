@@ -29,6 +29,7 @@ Overpotential = Callable[[float, float, float], float]
 """What a cell's voltage lacks [V] beside R0 and the RC pair, at a cell's current [A], SOC and temperature [degC]."""
 BENCH_TEMPERATURE = 25.0  # degC, at which capacities are given
 HALF_FULL = 0.5  # SOC that is taken where it is not known
+SOC_ROUNDS = 5  # of the search for a SOC under load: R0 depends on it
 
 
 def terminal_voltage(rest: Any, r0: Any, current: Any, overpotential: Any) -> Any:
@@ -53,6 +54,15 @@ def heat(rest: Any, terminal: Any, current: Any) -> Any:
     It counts what the RC pair's capacitor stores for a minute as heat, as the printed form does.
     """
     return (rest - terminal) * current
+
+
+def dissipation(r0: Any, r1: Any, current_squared: Any, v1: Any) -> Any:
+    """Heat [W] of a cell's resistors alone; current_squared: mean square of its current [A²].
+
+    It is `heat` but for what the RC pair's capacitor takes in and gives back; over a ride both sum to the same. This
+    one takes bursts faster than its steps, by their mean square.
+    """
+    return r0 * current_squared + v1 * v1 / r1
 
 
 @dataclass(frozen=True)
@@ -118,6 +128,25 @@ class Battery:
         if temperature is not None:
             ocv -= self.rest_shift(temperature)
         return extended(self.ocv_value, self.ocv_soc, ocv)[0]
+
+    def soc_at_load(self, voltage: float, current: float, temperature: float, v1: float = 0.0) -> float:
+        """The SOC of a cell with this `voltage` [V] at a `current` [A] and `temperature` [degC]; v1 [V]: its RC pair's.
+
+        It may be below 0 or above 1, as the open-circuit voltage goes on there.
+        """
+        soc = HALF_FULL
+        for _ in range(SOC_ROUNDS):
+            soc = self.soc_at(voltage + self.r0.at(soc, temperature)[0] * current + v1, temperature)
+        return soc
+
+    def first_soc(self, pack_voltage: float, pack_current: float, temperature: float) -> float:
+        """`soc_at_load` out of a ride's first pack voltage [V] and current [A], as if it had been at rest before."""
+        cell = self.cell_voltage(pack_voltage, pack_current)
+        return self.soc_at_load(cell, pack_current / self.cells_parallel, temperature)
+
+    def circuit(self, soc: float, temperature: float) -> tuple[float, float, float]:
+        """(R0 [ohm], R1 [ohm], C1 [F]) of a cell at `temperature` [degC]."""
+        return self.r0.at(soc, temperature)[0], self.r1.at(soc, temperature)[0], self.c1.at(soc, temperature)[0]
 
     def cell_voltage(self, pack_voltage: T, pack_current: T) -> T:
         """Voltage of the mean cell [V] out of pack voltage [V] and current [A]."""

@@ -35,6 +35,15 @@ def cos(x: Any) -> Any:
     return np.cos(x)
 
 
+def sqrt(x: Any) -> Any:
+    """The square root of `x`."""
+    if isinstance(x, float | int):
+        return math.sqrt(x)
+    import numpy as np
+
+    return np.sqrt(x)
+
+
 def direction(speed: Any) -> Any:
     """The sign of `speed` [m/s or rad/s], smooth around standstill: what friction acts with."""
     return speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5

@@ -16,7 +16,7 @@ from gz_onboard.constants import KELVIN
 from gz_onboard.errors import InputError, shown
 from gz_onboard.physics.battery import Battery, Overpotential
 from gz_onboard.physics.effect import QUANTITIES, Effect, Port, effect_file, load_effect
-from gz_onboard.physics.elementary import STANDSTILL
+from gz_onboard.physics.elementary import STANDSTILL, sqrt
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.relaxation import relaxation_over, relaxed
 from gz_onboard.physics.trust import changeable, trusted_users
@@ -162,6 +162,12 @@ def total(effects: Iterable[Bound], quantities: Mapping[str, Any], recall: Recal
     for effect in effects:
         result = result + value_of(effect, quantities, recall)
     return result
+
+
+def all_quantities(**known: Any) -> dict[str, Any]:
+    """What effects read, floats or arrays: `known`, the cosine of its ``grade``, and 0 for everything else."""
+    cosine = sqrt(1 - known["grade"] * known["grade"]) if "grade" in known else 1.0
+    return dict.fromkeys(QUANTITIES, 0.0) | {"grade_cosine": cosine} | known
 
 
 def drag_torque(power: Any, motor_speed: Any) -> Any:

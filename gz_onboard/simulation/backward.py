@@ -10,8 +10,8 @@ from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.physics.effect import MOVING, QUANTITIES
-from gz_onboard.physics.model import air_density, over
+from gz_onboard.physics.effect import MOVING
+from gz_onboard.physics.model import air_density, all_quantities, over
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -98,20 +98,17 @@ def _quantities(
     import numpy as np
 
     c = conditions
-    sine = _middle(c.grade)
-    q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0)
-    q |= {
-        "speed": middle,
-        "acceleration": acceleration,
-        "grade": sine,
-        "grade_cosine": np.sqrt(1 - sine * sine) if np.any(sine) else 1.0,
-        "mass": vehicle.model.mass,
-        "air_density": air_density(c.ambient, c.altitude),
-        "headwind": _middle(c.headwind),
-        "lateral_acceleration": middle * middle * _middle(c.curvature) if np.any(c.curvature) else 0.0,
-        "ambient_temperature": c.ambient,
-        "motor_temperature": c.ambient if c.motor_temperature is None else _middle(c.motor_temperature),
-    }
+    q = all_quantities(
+        speed=middle,
+        acceleration=acceleration,
+        grade=_middle(c.grade),
+        mass=vehicle.model.mass,
+        air_density=air_density(c.ambient, c.altitude),
+        headwind=_middle(c.headwind),
+        lateral_acceleration=middle * middle * _middle(c.curvature) if np.any(c.curvature) else 0.0,
+        ambient_temperature=c.ambient,
+        motor_temperature=c.ambient if c.motor_temperature is None else _middle(c.motor_temperature),
+    )
     if "heading" in vehicle.model.reads:
         turn = -np.cumsum(middle * _middle(c.curvature) * dt)
         q["heading"] = turn if c.heading is None else _middle(c.heading)

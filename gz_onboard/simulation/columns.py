@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import csv
+import gzip
 import math
 import re
+import zlib
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 from gz_onboard.errors import InputError, nearest
 
+LEAST_ROWS = 2
 _KMH = re.compile(r"km?/h|km?ph", re.I)
 
 
@@ -43,20 +46,25 @@ class Columns:
                 raise self.error(row, f"{name}: {values[row]:g} {unit} does not increase (before: {values[row - 1]:g})")
 
 
-def read_columns(file: Path, known: Collection[str], rows: int = 2) -> Columns:
-    """Read a CSV `file` of finite numbers whose header names columns out of `known`, with at least `rows` rows.
+def csv_rows(file: Path) -> list[tuple[int, list[str]]]:
+    """(line, fields) of each line of a CSV `file` (also .csv.gz) but empty ones. InputError if it cannot be read."""
+    try:
+        with (gzip.open if file.suffix == ".gz" else open)(file, "rt", encoding="utf-8-sig", newline="") as stream:
+            reader = csv.reader(stream)
+            return [(reader.line_num, row) for row in reader if row]
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{file}: not a CSV file: {error}") from error
+    except (OSError, EOFError, zlib.error) as error:
+        raise InputError(f"{file}: {getattr(error, 'strerror', None) or error}") from error
+
+
+def read_columns(file: Path, known: Collection[str]) -> Columns:
+    """Read a CSV `file` of finite numbers whose header names columns out of `known`, with at least two rows.
 
     Blank lines are passed over. Raises InputError, naming file, line and column, if the file cannot be read, a
     column is unknown or there twice, a row has too few or too many fields, or a field is no finite number.
     """
-    try:
-        with file.open(encoding="utf-8-sig", newline="") as stream:
-            reader = csv.reader(stream)
-            records = [(reader.line_num, record) for record in reader if any(field.strip() for field in record)]
-    except OSError as error:
-        raise InputError(f"{file}: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{file}: not a CSV file: {error}") from error
+    records = [(line, record) for line, record in csv_rows(file) if any(field.strip() for field in record)]
     if not records:
         raise InputError(f"{file}: is empty; its first line must name columns out of {', '.join(known)}")
     line, header = records[0][0], [name.strip() for name in records[0][1]]
@@ -66,8 +74,8 @@ def read_columns(file: Path, known: Collection[str], rows: int = 2) -> Columns:
             raise InputError(f"{file}:{line}: unknown column {name!r}{meant}; known are {', '.join(known)}")
         if name in header[:column]:
             raise InputError(f"{file}:{line}: column {name!r} is there twice")
-    if len(records) <= rows:
-        raise InputError(f"{file}: has {len(records) - 1} rows below its header, must have at least {rows}")
+    if len(records) <= LEAST_ROWS:
+        raise InputError(f"{file}: has {len(records) - 1} rows below its header, must have at least {LEAST_ROWS}")
     table: list[list[float]] = []
     for line, record in records[1:]:
         if len(record) != len(header):

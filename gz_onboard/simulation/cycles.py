@@ -6,9 +6,8 @@ Where the built-in speeds come from, and how they compare with other tables, is 
 from __future__ import annotations
 
 import csv
-from bisect import bisect_right
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
@@ -67,43 +66,6 @@ class Cycle:
     def duration(self) -> float:
         """Time from the first sample to the last [s]."""
         return self.time[-1] - self.time[0]
-
-    @cached_property
-    def distance(self) -> float:
-        """Distance covered [m], the speed being linear between samples."""
-        samples = zip(self.time, self.speed, strict=True)
-        return sum((t1 - t0) * (v0 + v1) / 2 for (t0, v0), (t1, v1) in pairwise(samples))
-
-    @property
-    def max_speed(self) -> float:
-        """Highest speed [m/s]."""
-        return max(self.speed)
-
-    @cached_property
-    def accelerations(self) -> tuple[float, ...]:
-        """Acceleration from each sample to the next [m/s²]; one fewer than samples."""
-        samples = zip(self.time, self.speed, strict=True)
-        return tuple((v1 - v0) / (t1 - t0) for (t0, v0), (t1, v1) in pairwise(samples))
-
-    @property
-    def max_acceleration(self) -> float:
-        """Highest acceleration [m/s²]."""
-        return max(self.accelerations)
-
-    @property
-    def max_deceleration(self) -> float:
-        """Highest deceleration [m/s²], positive where the cycle brakes."""
-        return -min(self.accelerations)
-
-    def speed_at(self, time: float) -> float:
-        """Speed [m/s] at `time` [s], linear between samples; before the first and after the last as there."""
-        after = bisect_right(self.time, time)
-        if after == 0:
-            return self.speed[0]
-        if after == len(self.time):
-            return self.speed[-1]
-        t0, v0, v1 = self.time[after - 1], self.speed[after - 1], self.speed[after]
-        return v0 + (v1 - v0) * (time - t0) / (self.time[after] - t0)
 
     def repeated(self, count: int) -> Cycle:
         """The cycle `count` times, one after the other, the last sample of one being the first of the next.

@@ -55,10 +55,8 @@ class Sent:
     dropped: int  # that were lost
 
 
-def simulate_frames(
-    vehicle: Vehicle, truth: Truth, seed: int = 0, start_ns: int = START_NS, losses: Losses | None = None
-) -> list[Sent]:
-    """The messages that the sensors of a ride send, from `start_ns` on.
+def simulate_frames(vehicle: Vehicle, truth: Truth, seed: int = 0, losses: Losses | None = None) -> list[Sent]:
+    """The messages that the sensors of a ride send, from `START_NS` on.
 
     Raises InputError if the vehicle's DBC files have none of the sensors' signals, or a message that has no
     period or cannot be packed.
@@ -83,7 +81,7 @@ def simulate_frames(
             raise vehicle.error(
                 f"message {message.name}: simulated frames have eight bytes and little-endian integers, not multiplexed"
             )
-        sent.append(_send(vehicle, message, sensors, truth, seed, start_ns, losses or Losses()))
+        sent.append(_send(vehicle, message, sensors, truth, seed, losses or Losses()))
     return sent
 
 
@@ -122,13 +120,7 @@ def write_frames(out: Path, sent: list[Sent]) -> int:
 
 
 def _send(
-    vehicle: Vehicle,
-    message: Message,
-    sensors: dict[str, Sensor],
-    truth: Truth,
-    seed: int,
-    start_ns: int,
-    losses: Losses,
+    vehicle: Vehicle, message: Message, sensors: dict[str, Sensor], truth: Truth, seed: int, losses: Losses
 ) -> Sent:
     import numpy as np
 
@@ -170,7 +162,7 @@ def _send(
         words = _seal(words)
     kept = np.random.default_rng([seed, message.frame_id, _LOSS]).random(len(offsets)) >= losses.frames
     identifier = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
-    return Sent(message.name, identifier, start_ns + offsets[kept], words[kept], int((~kept).sum()))
+    return Sent(message.name, identifier, START_NS + offsets[kept], words[kept], int((~kept).sum()))
 
 
 def _values(sensor: Sensor | None, truth: Truth, seconds: Floats, period: float, rng: np.random.Generator) -> Floats:

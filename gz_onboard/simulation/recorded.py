@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from math import pi
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,9 @@ from gz_onboard.bus.codec import Codec
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Event
-from gz_onboard.offline.samples import INSTRUMENTS, extended, read_roles
+from gz_onboard.offline.samples import INSTRUMENTS, extended, read_roles, ride_name
+from gz_onboard.physics.battery import discharged
+from gz_onboard.physics.sensors import speed_role, true_columns
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
 from gz_onboard.simulation.run import road_table
 from gz_onboard.simulation.scooter import STEP, Scooter
@@ -32,6 +35,8 @@ BRAKE_PRESSED = 0.5e5  # Pa: below this the sensors show noise
 BRAKE_MEAN = 90.0  # N: the mean of the same rides while the switch is on, where there are no pressures
 ROAD_PIECE = 5.0  # m
 AMBIENT = 20.0  # degC: of the air, where it was not measured
+SPAN, ROLLING, LEAST_SPANS = 2.0, 1.0, 10  # s, m/s and count: of spans of a roller's run that moves
+LEAST_HEADINGS = 10  # of a ride whose heading counts as known
 _MOVING = 2.0  # m/s: slower than this, yaw rate over speed is no curvature
 
 
@@ -39,9 +44,10 @@ _MOVING = 2.0  # m/s: slower than this, yaw rate over speed is no curvature
 class Recorded:
     """A recorded ride, at even steps.
 
-    signals: by role, in its SI unit, arrays of one length; only what was recorded. ``speed`` [m/s] (of the driven
-    wheel), ``distance`` [m], ``brake`` (0..1, of `brake_torque_limit`) and ``soc`` (counted charge) are worked out;
-    ``vibration`` [m/s²] too, if the vehicle's model reads it and the ride tells it.
+    signals: by role, in its SI unit, arrays of one length; only what was recorded, without what the vehicle's sensors
+    are known to err by (`physics.sensors`). ``speed`` [m/s] (of the driven wheel), ``distance`` [m], ``brake`` (0..1,
+    of `brake_torque_limit`) and ``soc`` (counted charge) are worked out; ``vibration`` [m/s²] too, if the vehicle's
+    model reads it and the ride tells it.
     """
 
     name: str
@@ -80,14 +86,12 @@ class Recorded:
 
     def heading_at(self, distance: float) -> float:
         """The heading [rad] at `distance` [m]; north where none is known."""
-        if self.heading is None:
-            return 0.0
-        return float(self.heading[min(max(int(distance / ROAD_PIECE), 0), len(self.heading) - 1)])
+        return 0.0 if self.heading is None else _at(self.heading, distance)
 
     def vibration_at(self, distance: float) -> float:
         """How rough the road is [m/s²] at `distance` [m]; only if `vibration` is known."""
         assert self.vibration is not None
-        return float(self.vibration[min(max(int(distance / ROAD_PIECE), 0), len(self.vibration) - 1)])
+        return _at(self.vibration, distance)
 
     def road(self, headwind: float = 0.0) -> RoadProfile:
         """The road that was ridden."""
@@ -131,38 +135,39 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
             if reads_vibration:
                 rough.append((event[0], road.distance, estimator.vibration(event[0])))
 
-    columns = read_roles(log, vehicle, codec, progress, observe)
+    columns = true_columns(read_roles(log, vehicle, codec, progress, observe), vehicle.parameters)
     felt = np.array(rough) if rough and "accel_z" in columns else None
     if felt is not None:
         columns["vibration"] = felt[:, 0], felt[:, 2]
     signals = _signals(log, columns, vehicle)
     if "pack_voltage" in signals and "pack_current" in signals:
         signals["soc"] = _counted_soc(signals, vehicle)
-    grade, curvature = _by_distance(np.array(rows))
-    name = log.name.removesuffix(".gz")
-    vibration = None if felt is None else _vibration(felt[:, 1], felt[:, 2])
-    return Recorded(Path(name).stem, STEP, signals, grade, curvature, _headings(headings), vibration)
+    way, grade, curvature = (np.array(column) for column in zip(*rows, strict=True))
+    vibration = None if felt is None else _over_road(felt[:, 1], felt[:, 2])
+    heading = None
+    if len(headings) >= LEAST_HEADINGS:
+        course = np.array(headings)
+        heading = _over_road(course[:, 0], course[:, 1], period=2 * pi)
+    stood = way[0] == way[-1]
+    slope, bend = (np.zeros(1) if stood else _over_road(way, values) for values in (grade, curvature))
+    return Recorded(ride_name(log), STEP, signals, slope, bend, heading, vibration)
 
 
 def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicle) -> dict[str, Array]:
     """All on one grid of steps: the speeds interpolated, what comes in steps as it was last told."""
     import numpy as np
 
-    radius, gear = vehicle.parameters["wheel_radius"], vehicle.parameters["gear_ratio"]
-    pace = next((r for r in ("motor_speed", "wheel_speed_rear", "vehicle_speed", "gps_speed") if r in columns), None)
-    if pace is None:
-        raise InputError(f"{log}: has no speed: neither motor_speed, wheel_speed_rear, vehicle_speed nor gps_speed")
+    from gz_onboard.arrays import held_at
+
+    pace, factor = speed_role(str(log), columns, vehicle.parameters)
     time = columns[pace][0]
     grid = np.arange(time[0], time[-1], STEP)
     signals = {role: np.interp(grid, t, v) for role, (t, v) in columns.items()}
     if "brake_switch" in columns:
-        t, v = columns["brake_switch"]
-        signals["brake_switch"] = v[np.clip(np.searchsorted(t, grid, side="right") - 1, 0, len(v) - 1)]
-    scale = vehicle.parameters["speed_sensor_scale"]
-    factor = {"motor_speed": gear * radius / scale, "wheel_speed_rear": radius}.get(pace, 1.0)
+        signals["brake_switch"] = held_at(grid, *columns["brake_switch"])
     signals["speed"] = np.maximum(signals[pace] * factor, 0.0)
     signals["distance"] = np.concatenate(([0.0], np.cumsum(signals["speed"][1:] * STEP)))
-    limit = vehicle.parameters["brake_torque_limit"] / radius
+    limit = vehicle.parameters["brake_torque_limit"] / vehicle.parameters["wheel_radius"]
     pressed = signals.get("brake_switch")
     if "brake_pressure_front" in signals and "brake_pressure_rear" in signals:
         pressure = signals["brake_pressure_front"] + signals["brake_pressure_rear"]
@@ -175,34 +180,21 @@ def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicl
     return signals
 
 
-def _by_distance(rows: Array) -> tuple[Array, Array]:
-    """Grade and curvature at even distances; where the scooter stood, the last that it had there."""
-    import numpy as np
+def _over_road(distance: Array, values: Array, period: float | None = None) -> Array:
+    """`values` (n,) at `distance` (n,) [m], each `ROAD_PIECE` of the way; where the scooter stood, as it came there.
 
-    distance, keep = np.unique(rows[:, 0], return_index=True)
-    if len(distance) < 2:
-        return np.zeros(1), np.zeros(1)
-    at = np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE)
-    return np.interp(at, distance, rows[keep, 1]), np.interp(at, distance, rows[keep, 2])
-
-
-def _vibration(distance: Array, values: Array) -> Array:
-    """The vibration at even distances; where the scooter stood, as it came there."""
+    period: of an angle, which then goes on over a whole turn.
+    """
     import numpy as np
 
     distance, keep = np.unique(distance, return_index=True)
-    return np.interp(np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE), distance, values[keep])
+    found = values[keep] if period is None else np.unwrap(values[keep], period=period)
+    return np.interp(np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE), distance, found)
 
 
-def _headings(rows: list[tuple[float, float]]) -> Array | None:
-    """The heading at even distances, going on over a whole turn; None if hardly any is known."""
-    import numpy as np
-
-    if len(rows) < 10:
-        return None
-    distance, keep = np.unique([row[0] for row in rows], return_index=True)
-    heading = np.unwrap(np.array([row[1] for row in rows])[keep])
-    return np.interp(np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE), distance, heading)
+def _at(table: Array, distance: float) -> float:
+    """What `table`, each `ROAD_PIECE`, has at `distance` [m]; beyond its ends the edge."""
+    return float(table[min(max(int(distance / ROAD_PIECE), 0), len(table) - 1)])
 
 
 def scooter_at_start(
@@ -234,54 +226,44 @@ def _rest_soc(signals: dict[str, Array], vehicle: Vehicle) -> float | None:
     battery = vehicle.battery
     if battery is None or "pack_voltage" not in signals:
         return None
-    n = round(1 / STEP)
-    zero = signals["pack_voltage"][:n] * 0
-    current = float(signals.get("pack_current", zero)[:n].mean())
-    cell = battery.cell_voltage(float(signals["pack_voltage"][:n].mean()), current)
-    temperature = float(signals.get("cell_temperature", zero + 20)[:n].mean())
-    soc = 0.5
-    for _ in range(5):  # R0 depends on SOC
-        rest = cell + battery.r0.at(soc, temperature)[0] * current / battery.cells_parallel
-        soc = battery.soc_at(rest, temperature)
+
+    def first(role: str, default: float) -> float:
+        return float(signals[role][: round(1 / STEP)].mean()) if role in signals else default
+
+    soc = battery.first_soc(first("pack_voltage", 0.0), first("pack_current", 0.0), first("cell_temperature", AMBIENT))
     return min(max(soc, 0.0), 1.0)
 
 
 def _counted_soc(signals: dict[str, Array], vehicle: Vehicle) -> Array:
-    """SOC by counting the measured charge from that at the start, the sensor's known offset and gain taken off."""
+    """SOC by counting the measured charge from that at the start."""
     import numpy as np
 
-    battery, p = vehicle.battery, vehicle.parameters
-    assert battery
-    current = (signals["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"]
-    temperature = float(signals["cell_temperature"][0]) if "cell_temperature" in signals else 20.0
-    charge = np.cumsum(current) * STEP / (3600 * battery.pack_capacity(temperature))
-    soc: Array = (_rest_soc(signals, vehicle) or 1.0) - charge
+    start = _rest_soc(signals, vehicle)
+    assert start is not None
+    temperature = float(signals["cell_temperature"][0]) if "cell_temperature" in signals else AMBIENT
+    soc: Array = start - discharged(np.cumsum(signals["pack_current"]), STEP, vehicle.pack.pack_capacity(temperature))
     return soc
 
 
-def fit_dynamometer(recorded: Recorded, inertia: float | None = None) -> Dynamometer:
+def fit_dynamometer(recorded: Recorded) -> Dynamometer:
     """The roller of a recorded dynamometer run: F = M·dV/dt + A + B·V + C·V², by least squares over spans of 2 s.
 
-    `inertia` [kg] is held if given. Raises InputError if there was no roller, or it did not move.
+    Raises InputError if there was no roller, or it did not move.
     """
     import numpy as np
 
+    from gz_onboard.arrays import block_means
+
     if not recorded.on_dynamometer:
         raise InputError(f"{recorded.name}: no roller of a dynamometer was recorded")
-    n = round(2 / recorded.dt)
+    n = round(SPAN / recorded.dt)
     speed, force = recorded.signals["roller_speed"], recorded.signals["roller_force"]
-    spans = len(speed) // n
-    mean_v, mean_f = (x[: spans * n].reshape(spans, n).mean(axis=1) for x in (speed, force))
-    square = (speed[: spans * n].reshape(spans, n) ** 2).mean(axis=1)
+    mean_v, mean_f, square = (block_means(x, n) for x in (speed, force, speed**2))
+    spans = len(mean_v)
     edges = np.interp(np.arange(spans + 1) * n, np.arange(len(speed)), np.convolve(speed, np.ones(21) / 21, "same"))
     acceleration = np.diff(edges) / (n * recorded.dt)
-    moving = mean_v > 1.0
-    if moving.sum() < 10:
+    moving = mean_v > ROLLING
+    if moving.sum() < LEAST_SPANS:
         raise InputError(f"{recorded.name}: its roller hardly moves; give --dyno KG,A,B,C")
-    terms = [np.ones(spans), mean_v, square]
-    rest = mean_f - (inertia or 0.0) * acceleration
-    if inertia is None:
-        terms.append(acceleration)
-    matrix: Any = np.stack(terms, axis=1)[moving]
-    solution = np.linalg.lstsq(matrix, rest[moving], rcond=None)[0].tolist()
-    return Dynamometer(solution[3] if inertia is None else inertia, *solution[:3])
+    matrix: Any = np.stack([acceleration, np.ones(spans), mean_v, square], axis=1)[moving]
+    return Dynamometer(*np.linalg.lstsq(matrix, mean_f[moving], rcond=None)[0].tolist())

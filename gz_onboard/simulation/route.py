@@ -15,7 +15,6 @@ from bisect import bisect_right
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from pathlib import Path
-from typing import NamedTuple
 
 from gz_onboard.errors import InputError
 from gz_onboard.simulation.columns import Columns, read_columns
@@ -29,75 +28,37 @@ _LIMITS = {"speed_limit_mps": 1.0, "speed_limit_kmh": 1 / 3.6}
 _KNOWN = ("distance_m", "latitude_deg", "longitude_deg", "altitude_m", "curvature_1pm", *_LIMITS)
 
 
-class RoutePoint(NamedTuple):
-    """What a route is like at one distance."""
-
-    grade: float  # sine of the road's angle, positive uphill
-    curvature: float  # [1/m], positive to the left
-    heading: float  # [rad] clockwise from north, 0 to 2π
-    speed_limit: float  # [m/s], infinite if none is given
-    altitude: float  # [m] as given, not smoothed
-    latitude: float  # [deg], NaN if positions are not given
-    longitude: float  # [deg], as latitude
-
-
 @dataclass(frozen=True)
 class Route:
     """Tuples of one length (two at least) over `distance` [m], which begins with 0 and increases.
 
-    Units and signs are those of RoutePoint, except that `heading` is not reduced to one turn, so that it can be
-    interpolated. A speed limit holds from its point to the next.
+    `heading` is not reduced to one turn, so that it can be interpolated. A speed limit holds up to the next point.
     """
 
     name: str
     distance: tuple[float, ...]
-    grade: tuple[float, ...]
-    curvature: tuple[float, ...]
-    heading: tuple[float, ...]
-    speed_limit: tuple[float, ...]
-    altitude: tuple[float, ...]
-    latitude: tuple[float, ...]
-    longitude: tuple[float, ...]
+    grade: tuple[float, ...]  # sine of the road's angle, positive uphill
+    curvature: tuple[float, ...]  # 1/m, positive to the left
+    heading: tuple[float, ...]  # rad clockwise from north
+    speed_limit: tuple[float, ...]  # m/s, infinite if none is given
 
     @property
     def length(self) -> float:
         """Length of the route [m]."""
         return self.distance[-1]
 
-    def at(self, distance: float) -> RoutePoint:
-        """The route at `distance` [m]: linear between points; before its begin and past its end as there."""
-        i = max(0, min(bisect_right(self.distance, distance), len(self.distance) - 1) - 1)
-        start = self.distance[i]
-        part = max(0.0, min(1.0, (distance - start) / (self.distance[i + 1] - start)))
 
-        def between(values: tuple[float, ...]) -> float:
-            return values[i] + part * (values[i + 1] - values[i])
-
-        return RoutePoint(
-            between(self.grade),
-            between(self.curvature),
-            between(self.heading) % math.tau,
-            self.speed_limit[i if part < 1 else i + 1],
-            between(self.altitude),
-            between(self.latitude),
-            between(self.longitude),
-        )
-
-
-def read_route(file: Path | str, *, grade_length: float = GRADE_LENGTH, curve_length: float = CURVE_LENGTH) -> Route:
+def read_route(file: Path | str) -> Route:
     """The route in a CSV `file`.
 
     Columns: altitude_m; distance_m along the road or latitude_deg and longitude_deg, or all three; optionally
     curvature_1pm (otherwise from the positions, 0 without these) and speed_limit_mps or speed_limit_kmh. Altitude
-    is smoothed over `grade_length` [m], the heading for curvature over `curve_length` [m].
+    is smoothed over `GRADE_LENGTH`, the heading for curvature over `CURVE_LENGTH`.
 
     Raises InputError, naming file and line, for what read_columns refuses, missing columns, a distance that does
     not increase, positions that do not move or do not fit the distance, and values that no road has.
     """
     file = Path(file)
-    for name, length in (("grade_length", grade_length), ("curve_length", curve_length)):
-        if not (math.isfinite(length) and length > 0):
-            raise InputError(f"{name}: {length:g} m, must be above 0 m")
     columns = read_columns(file, _KNOWN)
     values = columns.values
     if "altitude_m" not in values:
@@ -113,12 +74,11 @@ def read_route(file: Path | str, *, grade_length: float = GRADE_LENGTH, curve_le
         raise InputError(f"{file}: needs column distance_m, or latitude_deg and longitude_deg")
     if positions:
         _check_moving(columns, positions, distance)
-    heading, curvature = _course(columns, positions, distance, curve_length)
-    grade = _slopes(distance, values["altitude_m"], distance, grade_length)
+    heading, curvature = _course(columns, positions, distance)
+    grade = _slopes(distance, values["altitude_m"], distance, GRADE_LENGTH)
     for row, sine in enumerate(grade):
         if abs(sine) > _STEEPEST:
             raise columns.error(row, f"altitude_m: a grade of {100 * sine:.0f} % is no road's; are distances in m?")
-    none = (math.nan,) * len(columns)
     return Route(
         file.name.removesuffix(".csv").removesuffix(".route"),
         distance,
@@ -126,9 +86,6 @@ def read_route(file: Path | str, *, grade_length: float = GRADE_LENGTH, curve_le
         curvature,
         heading,
         _speed_limits(columns),
-        values["altitude_m"],
-        values["latitude_deg"] if positions else none,
-        values["longitude_deg"] if positions else none,
     )
 
 
@@ -171,9 +128,11 @@ def _check_moving(columns: Columns, positions: list[tuple[float, float]], distan
 
 
 def _course(
-    columns: Columns, positions: list[tuple[float, float]], distance: tuple[float, ...], curve_length: float
+    columns: Columns, positions: list[tuple[float, float]], distance: tuple[float, ...]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Heading [rad] and curvature [1/m] at each point; what is not given follows from what is."""
+    import numpy as np
+
     middles: list[float] = []
     headings: list[float] = []
     last = 0
@@ -190,22 +149,13 @@ def _course(
         columns.check("curvature_1pm", -1.0, 1.0, "1/m")
         curvature = columns.values["curvature_1pm"]
     elif len(middles) > 1:
-        curvature = tuple(-slope for slope in _slopes(tuple(middles), tuple(headings), distance, curve_length))
+        curvature = tuple(-slope for slope in _slopes(tuple(middles), tuple(headings), distance, CURVE_LENGTH))
     else:
         curvature = (0.0,) * len(distance)
     if middles:
-        return tuple(_interpolated(middles, headings, d) for d in distance), curvature
+        return tuple(np.interp(distance, middles, headings).tolist()), curvature
     turns = ((d1 - d0) * (k0 + k1) / 2 for (d0, k0), (d1, k1) in pairwise(zip(distance, curvature, strict=True)))
     return tuple(-turn for turn in accumulate(turns, initial=0.0)), curvature
-
-
-def _interpolated(x: list[float], y: list[float], at: float) -> float:
-    i = max(0, min(bisect_right(x, at), len(x) - 1) - 1)
-    if len(x) == 1 or at <= x[0]:
-        return y[0]
-    if at >= x[-1]:
-        return y[-1]
-    return y[i] + (y[i + 1] - y[i]) * (at - x[i]) / (x[i + 1] - x[i])
 
 
 def _speed_limits(columns: Columns) -> tuple[float, ...]:

@@ -47,6 +47,7 @@ COLUMNS = {
 }
 """The time series of a run, with their units; signs as in `physics.effect`, current positive discharging."""
 
+SAMPLE = 0.1  # s: from row to row of the series
 TOLERANCE = 3.2 / 3.6  # m/s
 TOLERANCE_TIME = 1.0  # s
 """How far from its speed a cycle may be ridden: 3.2 km/h from any speed within 1 s (UN GTR No. 2, par. 7.2; 40 CFR
@@ -108,17 +109,16 @@ def drive(
     command: Command,
     seconds: float,
     *,
-    sample: float = 0.1,
     until_empty: bool = False,
     finish: float | None = None,
     progress: Progress | None = None,
 ) -> Run:
-    """Ride for `seconds`; a row of the series each `sample` [s], the first before the first step.
+    """Ride for `seconds`; a row of the series each `SAMPLE`, the first before the first step.
 
     until_empty: end where the cells reach the cut-off voltage or SOC 0. finish: end at this distance [m].
     """
     dt = scooter.dt
-    every = max(round(sample / dt), 1)
+    every = max(round(SAMPLE / dt), 1)
     battery = scooter.vehicle.battery
     assert battery  # a Scooter has one
     cutoff = battery.cutoff_voltage * battery.cells_series if until_empty else -1.0

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from math import atan, sqrt
+from math import sqrt
 from typing import TypedDict, Unpack
 
 from gz_onboard.constants import GRAVITY
@@ -94,7 +94,7 @@ class Scooter:
         self.throttle = self.brake = 0.0
         self.force = self.rear_load = self.front_load = 0.0  # N; of the driven tyre, on the axles
         self.ledger = Ledger()
-        self._q: dict[str, float] = dict.fromkeys((*QUANTITIES, "yaw_rate", "lean"), 0.0)
+        self._q: dict[str, float] = dict.fromkeys(QUANTITIES, 0.0)
         self._begin(options)
         cells = options.get("cell_temperature")
         self._build_electric(options, self.ambient if cells is None else cells)
@@ -246,18 +246,13 @@ class Scooter:
         grade, curvature, headwind = self.road(self.distance)
         cosine = sqrt(1 - grade * grade) if grade else 1.0
         q["speed"], q["grade"], q["grade_cosine"], q["headwind"] = v, grade, cosine, headwind
-        if curvature:
-            lateral = v * v * curvature
-            q["yaw_rate"], q["lateral_acceleration"], q["lean"] = v * curvature, lateral, -atan(lateral / GRAVITY)
-        elif q["yaw_rate"]:
-            q["yaw_rate"] = q["lateral_acceleration"] = q["lean"] = 0.0
+        q["lateral_acceleration"] = v * v * curvature
         if self._tracks:
             self._track(curvature)
         normal = self._weight * cosine
         if self._turns:
             turn = self._turn = self.chassis.turn(v, curvature, self.dt)
             turning = turn.resistance * normal * direction(v)
-            q["lean"] = turn.lean
             radius *= turn.radius
             # The tyres hold back at the ground: what of their force moves load is what pushes the machine.
             shift = (self.force - turning) * self._lever * turn.height - turn.front_load * normal

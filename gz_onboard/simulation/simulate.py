@@ -140,7 +140,8 @@ def ride(
     """Ride `plan` with the options of the command line; what these do not say of the start is as it was recorded."""
     recorded, soc = plan.recorded, arguments.soc
     if soc is None:
-        soc = (rest_soc(recorded, vehicle) if recorded else None) or 1.0
+        measured = rest_soc(recorded, vehicle) if recorded else None
+        soc = 1.0 if measured is None else measured
     scooter = scooter_at_start(
         recorded,
         vehicle,

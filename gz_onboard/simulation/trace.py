@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
-from gz_onboard.physics.model import Bound, over, total
+from gz_onboard.physics.effect import MOVING, Port
+from gz_onboard.physics.model import Bound, all_quantities, over, total
 from gz_onboard.simulation.run import Command
 from gz_onboard.simulation.scooter import Scooter
 
@@ -102,6 +102,8 @@ class Truth:
     def __init__(self, columns: Mapping[str, Array], scooter: Scooter) -> None:
         import numpy as np
 
+        from gz_onboard.arrays import running_mean
+
         self.parameters = scooter.vehicle.parameters
         self.ambient = scooter.ambient
         self.on_dynamometer = scooter.dynamometer is not None
@@ -112,14 +114,14 @@ class Truth:
         c["way"] = moving * c["speed"]
         c["acceleration"] = np.gradient(c["way"], dt)
         width = min(2 * round(LEAN_TIME / dt / 2) + 1, self.count)
-        curvature = _smooth(c["curvature"], width)
+        curvature = running_mean(c["curvature"], width)
         c["yaw_rate"] = c["way"] * curvature
         if scooter.chassis.name == "leaning":
-            c["lean"] = _smooth(c["chassis_lean"], width)
+            c["lean"] = running_mean(c["chassis_lean"], width)
         else:
             c["lean"] = _lean_of(-np.arctan(c["way"] ** 2 * curvature / GRAVITY), self.parameters)
         c["lean_rate"] = np.gradient(c["lean"], dt)
-        c["slope"] = np.arcsin(_smooth(c["grade"], width))
+        c["slope"] = np.arcsin(running_mean(c["grade"], width))
         c["pitch_rate"] = -np.gradient(c["slope"], dt)
         c["heading"] = scooter.start_heading - np.cumsum(c["yaw_rate"]) * dt
         c["north"] = np.cumsum(c["way"] * np.cos(c["heading"])) * dt
@@ -132,20 +134,20 @@ class Truth:
         import numpy as np
 
         c = self.columns
-        q = dict.fromkeys(QUANTITIES, 0.0) | {
-            "speed": c["way"],
-            "acceleration": c["acceleration"],
-            "grade": c["grade"],
-            "soc": c["soc"],
-            "lateral_acceleration": c["way"] * c["yaw_rate"],
-            "heading": c["heading"],
-            "motor_current": c["motor_current"],
-            "motor_temperature": c["motor"],
-            "cell_temperature": c["cell"],
-            "time_moving": np.cumsum(c["way"] > MOVING) * self.dt,
-            "ambient_temperature": self.ambient,
-            "vibration": c["vibration"],
-        }
+        q = all_quantities(
+            speed=c["way"],
+            acceleration=c["acceleration"],
+            grade=c["grade"],
+            soc=c["soc"],
+            lateral_acceleration=c["way"] * c["yaw_rate"],
+            heading=c["heading"],
+            motor_current=c["motor_current"],
+            motor_temperature=c["motor"],
+            cell_temperature=c["cell"],
+            time_moving=np.cumsum(c["way"] > MOVING) * self.dt,
+            ambient_temperature=self.ambient,
+            vibration=c["vibration"],
+        )
         effects = [Bound(effect, self.parameters) for effect in scooter.vehicle.model.effects]
         drawn = total([e for e in effects if e.effect.port is Port.DC_POWER], q, over(self.dt))
         return np.asarray(np.zeros(self.count) + drawn)
@@ -170,13 +172,3 @@ def _lean_of(ideal: Array, p: Mapping[str, float]) -> Array:
     crown, height = p["tyre_crown_radius"], p["cg_height"]
     lean: Array = ideal + np.arcsin(np.clip(crown * np.sin(ideal) / (height - crown), -1.0, 1.0))
     return lean
-
-
-def _smooth(values: Array, width: int) -> Array:
-    """The mean of `width` (odd) values about each."""
-    import numpy as np
-
-    padded = np.pad(values, width // 2, mode="edge")
-    sums = np.cumsum(np.concatenate(([0.0], padded)))
-    smooth: Array = ((sums[width:] - sums[:-width]) / width)[: len(values)]
-    return np.pad(smooth, (0, len(values) - len(smooth)), mode="edge")

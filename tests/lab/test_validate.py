@@ -16,12 +16,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gz_onboard.arrays import block_means
 from gz_onboard.cli import main
 from gz_onboard.lab.validate import KEYS, pool
 from gz_onboard.lab.validate_components import components
 from gz_onboard.lab.validate_report import COLUMNS, failures
 from gz_onboard.lab.validate_ride import per_second
-from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, conditions, errors, pooled, seconds, split
+from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, conditions, errors, pooled, split
+from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters
@@ -61,7 +63,7 @@ def test_nothing_measured_is_no_pass():
 @given(st.integers(1, 40), st.integers(1, 20), st.integers(0, 19))
 def test_seconds_keep_the_mean(count, rate, rest):
     values = np.random.default_rng(count).normal(size=count * rate + min(rest, rate - 1))
-    means = seconds(values, rate)
+    means = block_means(values, rate)
     assert len(means) == count
     assert means.mean() == pytest.approx(values[: count * rate].mean())
 
@@ -136,8 +138,8 @@ def city():
     vehicle = read_vehicle("reference", 75.0)
     recorded = read_recorded(LOGS / "city_34C.blf", vehicle)
     road = recorded.road()
-    measured = per_second(recorded, vehicle)
-    place = seconds(recorded.signals["distance"], 100)
+    measured = per_second(recorded)
+    place = block_means(recorded.signals["distance"], 100)
     return vehicle, measured | {"grade": np.array([road(at)[0] for at in place])}, rest_soc(recorded, vehicle)
 
 
@@ -180,10 +182,13 @@ def test_a_wrong_parameter_shows_in_its_component(city, component, change):
 
 def test_current_is_that_which_flows(city):
     vehicle, *_ = city
-    recorded = read_recorded(LOGS / "coastdown.blf", vehicle)
-    raw = seconds(recorded.signals["pack_current"], 100)
+    log = LOGS / "coastdown.blf"
+    recorded = read_recorded(log, vehicle)
+    columns = read_samples(log, vehicle).columns
+    grid = np.arange(columns["motor_speed"][0][0], columns["motor_speed"][0][-1], recorded.dt)
+    raw = block_means(np.interp(grid, *columns["pack_current"]), 100)
     p = vehicle.parameters
-    flows = per_second(recorded, vehicle)["pack_current"]
+    flows = per_second(recorded)["pack_current"]
     assert flows * p["pack_current_gain"] + p["pack_current_offset"] == pytest.approx(raw)
 
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.physics.battery import current_of
+from gz_onboard.physics.battery import current_of, dissipation, heat, terminal_voltage
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.physics.tables import Mesh
 from gz_onboard.vehicle import read_vehicle
@@ -41,6 +41,30 @@ def test_slopes_are_the_differences(soc, temperature):
 @given(st.floats(-0.05, 1.05))
 def test_soc_at_inverts_ocv(soc):
     assert BATTERY.soc_at(BATTERY.ocv(soc)[0]) == pytest.approx(soc, abs=1e-9)
+
+
+@given(st.floats(0.1, 0.95), st.floats(-1, 4), st.floats(0, 40), st.floats(-0.02, 0.05))
+def test_soc_at_load_inverts_terminal_voltage(soc, current, temperature, v1):
+    voltage = BATTERY.terminal_voltage(soc, v1, current, temperature)[0]
+    assert BATTERY.soc_at_load(voltage, current, temperature, v1) == pytest.approx(soc, abs=2e-3)
+    voltage = BATTERY.terminal_voltage(soc, 0.0, current, temperature)[0]
+    amperes = BATTERY.cells_parallel * current
+    first = BATTERY.first_soc(BATTERY.pack_voltage(voltage, amperes), amperes, temperature)
+    assert first == pytest.approx(BATTERY.soc_at_load(voltage, current, temperature), abs=1e-9)
+
+
+def test_what_the_resistors_take_and_the_chemistry_gives_is_the_same_over_a_ride():
+    soc, v1, parts = 0.8, 0.0, []
+    for i in [5.0] * 300 + [0.0] * 600:
+        r0, r1, _ = BATTERY.circuit(soc, 25.0)
+        rest = BATTERY.ocv(soc)[0]
+        soc, later, _ = BATTERY.advanced(0.1, soc, v1, i, 25.0)
+        volts = terminal_voltage(rest, r0, i, (v1 + later) / 2)
+        parts.append((heat(rest, volts, i), dissipation(r0, r1, i * i, (v1 + later) / 2)))
+        v1 = later
+    chemistry, resistors = (sum(column) for column in zip(*parts, strict=True))
+    assert resistors == pytest.approx(chemistry, rel=0.05)
+    assert parts[0][0] > parts[0][1]
 
 
 @given(st.floats(0.01, 100), st.floats(-0.2, 0.2), st.floats(-10, 10), st.floats(0.005, 0.5), st.floats(100, 5000))

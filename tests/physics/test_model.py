@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.physics.model import air_density
+from gz_onboard.physics.effect import QUANTITIES
+from gz_onboard.physics.model import air_density, all_quantities
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")
@@ -124,3 +125,11 @@ def test_a_motor_without_current_takes_nothing_from_the_pack_and_slows_the_scoot
     assert rolling["motor_copper_loss"] == pytest.approx(0, abs=1e-4)
     idle = P["inverter_loss_constant"] + P["auxiliary_power"]
     assert sum(rolling.values()) == pytest.approx(idle, abs=0.05)
+
+
+def test_all_quantities_are_there_and_the_cosine_goes_with_the_grade():
+    q = all_quantities(speed=3.0, grade=0.6)
+    assert set(q) == set(QUANTITIES)
+    assert (q["speed"], q["grade_cosine"], q["mass"]) == (3.0, pytest.approx(0.8), 0.0)
+    assert all_quantities()["grade_cosine"] == 1.0
+    assert all_quantities(grade=np.array([0.0, 0.6]))["grade_cosine"] == pytest.approx([1.0, 0.8])

@@ -116,7 +116,7 @@ def test_the_filter_predicts_the_voltage_of_a_cell(ride, backend):
 
 
 def test_validation_has_the_same_voltage_of_a_cell(ride):
-    pack = battery_voltage(VEHICLE, ride, SOC) - P["pack_voltage_offset"]
+    pack = battery_voltage(VEHICLE, ride, SOC)
     assert PACK.cell_voltage(pack, ride["pack_current"]) == pytest.approx(written_out(ride)[0], abs=0.1 * MILLIVOLT)
 
 

@@ -34,6 +34,25 @@ def test_signals_stand_on_one_grid(city):
     assert not city.on_dynamometer
 
 
+def test_the_sensors_known_errors_are_taken_off(city):
+    """Energy, speed and SOC of a ride are those of what flowed and turned, not of what was shown."""
+    errors = {"pack_current_offset": 2.0, "pack_current_gain": 1.2, "pack_voltage_offset": 1.5}
+    wrong = VEHICLE.changed(VEHICLE.parameters.replaced(**errors, speed_sensor_scale=1.1))
+    right = VEHICLE.changed(
+        VEHICLE.parameters.replaced(**dict.fromkeys(errors, 0.0) | {"pack_current_gain": 1.0}, speed_sensor_scale=1.0)
+    )
+    shown, ride = (read_recorded(LOGS / "city_14C.blf", vehicle) for vehicle in (right, wrong))
+    volts, amperes = shown.signals["pack_voltage"] - 1.5, (shown.signals["pack_current"] - 2.0) / 1.2
+    assert ride.signals["pack_voltage"] == pytest.approx(volts)
+    assert ride.signals["pack_current"] == pytest.approx(amperes)
+    assert ride.energy() == pytest.approx(float((volts * amperes).sum() * ride.dt))
+    assert ride.signals["motor_speed"] == pytest.approx(shown.signals["motor_speed"] / 1.1)
+    assert ride.distance == pytest.approx(shown.distance / 1.1)
+    drawn = amperes.sum() * ride.dt / 3600 / wrong.pack.pack_capacity(ride.first("cell_temperature", 20.0))
+    soc = ride.signals["soc"]
+    assert soc[0] - soc[-1] == pytest.approx(drawn, rel=0.01)
+
+
 def test_brake_follows_its_switch(city):
     pressed = city.signals["brake_switch"] > 0.5
     assert (city.signals["brake"][pressed] > 0).all()

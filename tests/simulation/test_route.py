@@ -1,11 +1,14 @@
 """Routes: grade and curvature of roads made here, the speed they are ridden with, and what is refused."""
 
+import csv
 import math
 import os
 import random
+from bisect import bisect_right
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,6 +24,14 @@ def write(folder: Path, text: str) -> Path:
     file = folder / "way.route.csv"
     file.write_text(text, encoding="utf-8")
     return file
+
+
+def at(way, name, distance):
+    """A quantity of `way` at `distance` [m]: between points on a line, of a limit that of the point before."""
+    values = getattr(way, name)
+    if name == "speed_limit":
+        return values[max(bisect_right(way.distance, distance) - 1, 0)]
+    return float(np.interp(distance, way.distance, values))
 
 
 def road(folder, points, header="distance_m,altitude_m"):
@@ -54,9 +65,9 @@ def test_circle_has_its_curvature_all_round(tmp_path, radius, step, side):
 def test_heading_is_clockwise_from_north_and_goes_round(tmp_path):
     way = road(tmp_path, circle(100.0, 5.0, turns=2.5, side=-1), POSITIONS)
     for distance in (150.0, 400.0, 900.0):
-        assert way.at(distance).heading == pytest.approx((distance / 100.0) % math.tau, abs=0.01)
+        assert at(way, "heading", distance) == pytest.approx(distance / 100.0, abs=0.01)
     east = road(tmp_path, [(*degrees(20.0 * i, 0.0), 0.0) for i in range(9)], POSITIONS)
-    assert east.at(70.0).heading == pytest.approx(math.pi / 2, abs=1e-3)
+    assert at(east, "heading", 70.0) == pytest.approx(math.pi / 2, abs=1e-3)
     assert east.curvature == pytest.approx([0.0] * 9, abs=1e-6)
 
 
@@ -71,9 +82,9 @@ def test_straight_then_bend_then_straight_turns_by_the_right_angle(tmp_path):
         (d1 - d0) * (k0 + k1) / 2 for (d0, k0), (d1, k1) in pairwise(zip(way.distance, way.curvature, strict=True))
     )
     assert turned == pytest.approx(-heading, rel=0.01)
-    assert way.at(100.0).curvature == pytest.approx(0.0, abs=1e-4)
-    assert way.at(240.0).curvature == pytest.approx(-0.02, rel=0.03)
-    assert way.at(450.0).curvature == pytest.approx(0.0, abs=1e-4)
+    assert at(way, "curvature", 100.0) == pytest.approx(0.0, abs=1e-4)
+    assert at(way, "curvature", 240.0) == pytest.approx(-0.02, rel=0.03)
+    assert at(way, "curvature", 450.0) == pytest.approx(0.0, abs=1e-4)
 
 
 def test_date_line_is_crossed_in_a_short_step(tmp_path):
@@ -84,10 +95,9 @@ def test_date_line_is_crossed_in_a_short_step(tmp_path):
 def test_given_curvature_is_kept_and_gives_the_heading(tmp_path):
     header = "distance_m,altitude_m,curvature_1pm"
     way = road(tmp_path, [(20.0 * i, 0.0, 0.0 if i < 5 else 0.01) for i in range(11)], header)
-    assert way.at(180.0).curvature == 0.01
-    assert way.at(90.0).curvature == pytest.approx(0.005)
-    assert way.at(200.0).heading == pytest.approx(math.tau - 1.1)
-    assert math.isnan(way.at(0.0).latitude)
+    assert at(way, "curvature", 180.0) == 0.01
+    assert at(way, "curvature", 90.0) == pytest.approx(0.005)
+    assert at(way, "heading", 200.0) == pytest.approx(-1.1)
 
 
 @given(slope=st.floats(-0.1, 0.1), start=st.floats(-100, 1000), spacing=st.sampled_from([1.0, 7.0, 20.0, 500.0]))
@@ -115,14 +125,11 @@ def test_altitude_noise_makes_no_spikes(tmp_path, seed):
     assert math.sqrt(sum(e * e for e in errors) / len(errors)) < 0.006
 
 
-def test_at_is_linear_between_points_and_held_outside(tmp_path):
+def test_distance_begins_with_zero_and_limits_are_in_metres_per_second(tmp_path):
     points = [(100.0, 10.0, 36.0), (150.0, 20.0, 72.0), (200.0, 20.0, 18.0)]
     way = road(tmp_path, points, "distance_m,altitude_m,speed_limit_kmh")
     assert (way.length, way.name) == (100.0, "way")
-    assert way.at(25.0).altitude == 15.0
-    assert way.at(-5.0)[:5] == way.at(0.0)[:5]  # no positions: the rest is NaN
-    assert way.at(1e9)[:5] == way.at(100.0)[:5]
-    assert [way.at(d).speed_limit for d in (0.0, 49.9, 50.0, 99.9, 100.0)] == pytest.approx([10, 10, 20, 20, 5])
+    assert way.speed_limit == pytest.approx([10, 20, 5])
 
 
 @pytest.mark.parametrize(
@@ -151,19 +158,13 @@ def test_route_refused(tmp_path, text, message):
         read_route(write(tmp_path, text))
 
 
-def test_lengths_to_smooth_over_must_be_positive(tmp_path):
-    file = write(tmp_path, "distance_m,altitude_m\n0,0\n1,0\n")
-    with pytest.raises(InputError, match="grade_length: 0 m, must be above 0 m"):
-        read_route(file, grade_length=0.0)
-
-
 def made(spacings, curvatures, limits):
     distance = [0.0]
     for spacing in spacings:
         distance.append(distance[-1] + spacing)
     n = len(distance)
     zero = (0.0,) * n
-    return Route("made", tuple(distance), zero, tuple(curvatures[:n]), zero, tuple(limits[:n]), zero, zero, zero)
+    return Route("made", tuple(distance), zero, tuple(curvatures[:n]), zero, tuple(limits[:n]))
 
 
 @st.composite
@@ -180,9 +181,9 @@ def routes(draw):
 def test_no_limit_is_exceeded_anywhere(way, a_y, a, b, where):
     profile = speed_profile(way, lateral_acceleration=a_y, acceleration=a, deceleration=b)
     distance = where * way.length
-    here, speed = way.at(distance), profile.speed_at(distance)
-    assert speed <= here.speed_limit * (1 + 1e-9)
-    assert speed**2 * abs(here.curvature) <= a_y * (1 + 1e-9)
+    speed = profile.speed_at(distance)
+    assert speed <= at(way, "speed_limit", distance) * (1 + 1e-9)
+    assert speed**2 * abs(at(way, "curvature", distance)) <= a_y * (1 + 1e-9)
     assert profile.speed[0] == profile.speed[-1] == 0.0
     for (d0, v0, t0), (d1, v1, t1) in pairwise(zip(profile.distance, profile.speed, profile.time, strict=True)):
         change = (v1 * v1 - v0 * v0) / (2 * (d1 - d0))
@@ -237,6 +238,8 @@ def test_routes_of_recorded_rides():
         way = read_route(file)
         assert max(map(abs, way.grade)) < 0.06
         climb = sum((d1 - d0) * g for (d0, d1), g in zip(pairwise(way.distance), way.grade, strict=False))
-        assert climb == pytest.approx(way.altitude[-1] - way.altitude[0], abs=3.0)
+        with file.open(newline="") as stream:
+            altitude = [float(row["altitude_m"]) for row in csv.DictReader(stream)]
+        assert climb == pytest.approx(altitude[-1] - altitude[0], abs=3.0)
         profile = speed_profile(way)
         assert 5.0 < way.length / profile.time[-1] < max(way.speed_limit)

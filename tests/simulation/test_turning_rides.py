@@ -22,9 +22,9 @@ from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.turning.leaning import Leaning
 from gz_onboard.simulation.turning.machine import Machine, Road
 from gz_onboard.simulation.turning.planar import Planar
-from gz_onboard.simulation.turning.study import held
 from gz_onboard.toml import Table
 from gz_onboard.vehicle import find_vehicle, read_vehicle
+from tests.simulation.turning.reference import held
 
 VEHICLE = read_vehicle("reference", 80.0)
 P = VEHICLE.parameters

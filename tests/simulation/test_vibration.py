@@ -152,7 +152,7 @@ def test_of_a_vehicle_that_does_not_read_it_nothing_is_worked_out():
 
 def test_the_road_load_alone_has_the_measured(folder: Path, recorded: Recorded):
     vehicle = extended(folder, "rough_road")
-    measured = per_second(recorded, vehicle)
+    measured = per_second(recorded)
     measured["grade"] = np.zeros(len(measured["speed"]))
     more = road_load(vehicle, measured, 20.0, None) - road_load(BASE, measured, 20.0, None)
     assert more == pytest.approx(NEWTONS * measured["vibration"])
@@ -164,7 +164,7 @@ def test_the_road_load_alone_has_the_measured(folder: Path, recorded: Recorded):
 
 def test_the_battery_alone_has_the_measured_and_the_time_moving(folder: Path, recorded: Recorded, tmp_path: Path):
     vehicle = extended(folder, "loose_contact")
-    measured = per_second(recorded, vehicle)
+    measured = per_second(recorded)
     fewer = battery_voltage(BASE, measured, 0.8) - battery_voltage(vehicle, measured, 0.8)
     assert fewer[1:] == pytest.approx(BASE.pack.cells_series * 0.01 * measured["vibration"][:-1], abs=1e-9)
     (tmp_path / "wearing.py").write_text(

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, Mask, held_at
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.result import Found, Panel, PlotLine, Result
@@ -31,7 +31,7 @@ def auxiliary_power(rides: Sequence[Samples]) -> Result:
             continue
         time, current = ride.columns["auxiliary_current"]
         power = current * np.interp(time, *ride.columns["pack_voltage"])
-        light = _held(ride, "brake_switch", time) > 0.5
+        light = _light(ride, time)
         rows.append((power.mean(), _mean(power[~light]), _mean(power[light]), light.mean(), len(power)))
         names.append(ride.name)
     if not rows:
@@ -67,10 +67,8 @@ def _mean(values: Array) -> float:
     return float(values.mean()) if len(values) > 9 else float("nan")
 
 
-def _held(ride: Samples, role: str, time: Array) -> Array:
-    """`role` at each of `time`: its last sample before; zero if the ride has none."""
-    if role not in ride.columns:
-        return np.zeros_like(time)
-    times, values = ride.columns[role]
-    result: Array = values[np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(values) - 1)]
-    return result
+def _light(ride: Samples, time: Array) -> Mask:
+    """Whether the brake light shone at each of `time`; it did not if the ride has no brake switch."""
+    if "brake_switch" not in ride.columns:
+        return np.zeros(len(time), dtype=bool)
+    return np.asarray(held_at(time, *ride.columns["brake_switch"]) > 0.5)

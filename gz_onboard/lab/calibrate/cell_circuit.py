@@ -60,9 +60,12 @@ def hats(nodes: Array, x: Array) -> Array:
     return result
 
 
-def follow(current: Array, dt: Array, tau: float | Array) -> Array:
-    """x (m,) that follows `current` (m,) [A], which flows for the `dt` (m,) [s] before each sample, with `tau` [s]."""
-    return relaxation_over(current, np.exp(-dt / tau * np.ones(len(current))))
+def follow(target: Array, dt: Array, tau: float | Array) -> Array:
+    """x (m,) that follows `target` (m,), which holds for the `dt` (m,) [s] before each sample, with `tau` [s].
+
+    A target of R·I gives the voltage of an RC pair, exact for a current constant over each step (eq. 2.22).
+    """
+    return relaxation_over(target, np.exp(-dt / tau * np.ones(len(target))))
 
 
 def follow_slope(current: Array, dt: Array, tau: Array) -> tuple[Array, Array]:
@@ -85,18 +88,13 @@ def voltage(cell: Circuit, flowed: Array, current: Array, dt: Array, soc: Array,
     """
     tables = (cell.r0, cell.r1, cell.c1)
     r0, r1, c1 = (bilinear_over(cell.soc, cell.temperature, t, soc, temperature) for t in tables)
-    pairs = _pair(r1, r1 * c1, flowed, dt)
+    pairs = follow(r1 * flowed, dt, r1 * c1)
     if cell.slow_resistance is not None and cell.slow_time is not None:
         slow = (cell.slow_resistance, cell.slow_time)
         r2, tau = (bilinear_over(cell.soc, cell.temperature, t, soc, temperature) for t in slow)
-        pairs = pairs + _pair(r2, tau, flowed, dt)
+        pairs = pairs + follow(r2 * flowed, dt, tau)
     rest = extended_over(cell.ocv_soc, cell.ocv, soc) + cell.ocv_shift(temperature)
     return np.asarray(terminal_voltage(rest, r0, current, pairs))
-
-
-def _pair(resistance: Array, tau: Array, current: Array, dt: Array) -> Array:
-    """Voltage (m,) [V] of an RC pair, exact for a current constant over each step (eq. 2.22)."""
-    return relaxation_over(resistance * current, np.exp(-dt / tau))
 
 
 def riding_current(duration: int = 1200, seed: int = 1) -> Array:

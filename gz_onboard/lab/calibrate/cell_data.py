@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.table import Measurements
+from gz_onboard.physics.battery import HOUR
 
 FEWEST = 50  # samples
 LONGEST_GAP = 150.0  # s between samples while a current flows
@@ -69,7 +70,7 @@ def cell_test(table: Measurements) -> CellTest:
         sign = 1.0 if float(np.dot(np.diff(counter), flowed[1:])) >= 0 else -1.0
         drawn = sign * counter
         long = dt > 5.0
-        flowed = np.where(long, np.diff(drawn, prepend=0.0) * 3600 / np.where(dt > 0, dt, 1.0), flowed)
+        flowed = np.where(long, np.diff(drawn, prepend=0.0) * HOUR / np.where(dt > 0, dt, 1.0), flowed)
     else:
         gap = (dt > LONGEST_GAP) & (on | np.concatenate([on[:1], on[:-1]]))
         if np.any(gap):
@@ -79,7 +80,7 @@ def cell_test(table: Measurements) -> CellTest:
                 "meanwhile is not known; a column 'charge' (the tester's counter, Ah) would tell",
                 row,
             )
-        drawn = np.cumsum(flowed * dt) / 3600
+        drawn = np.cumsum(flowed * dt) / HOUR
     _check_sign(table, current, volts, dt, drawn, largest)
     _check_clipped(table, current, volts, on)
     starts = on & ~np.concatenate([[False], on[:-1]])

@@ -18,9 +18,10 @@ from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.optimize import nnls
 from scipy.signal import lfilter
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, bends
 from gz_onboard.lab.calibrate.cell_circuit import KELVIN, follow, follow_slope, hats
 from gz_onboard.lab.calibrate.cell_data import CellTest
+from gz_onboard.physics.relaxation import decay_over
 
 # s. A pair between two of them is made of both, and one pair made of these is off by the square of their distance: C1
 # of a pair of 30 s by -10 % for a factor of 4 from each to the next, -1 % for the 1.75 of these.
@@ -194,12 +195,8 @@ def left_out(a: Array, residual: Array, labels: NDArray[Any], normal: Array) -> 
 def _smoothness(soc: Array, scale: Array, n: int, branches: int) -> Array:
     """The normal matrix of the priors: tables bend little from node to node, rest voltages stay near the OCV."""
     total = np.zeros((n * (branches + 1), n * (branches + 1)))
-    bend = np.zeros((n - 2, n))
-    for k in range(n - 2):
-        left, right = soc[k + 1] - soc[k], soc[k + 2] - soc[k + 1]
-        # As far as a straight line through the neighbours misses the middle one, in steps of 0.05.
-        w = right / (left + right)
-        bend[k, k : k + 3] = np.array([w, -1.0, 1 - w]) / max(2 * left * right / (left + right) / 0.05, 0.3)
+    left, right = np.diff(soc)[:-1], np.diff(soc)[1:]
+    bend = bends(soc) / np.maximum(2 * left * right / (left + right) / 0.05, 0.3)[:, None]  # in steps of 0.05
     for j in range(branches):
         block = slice(j * n, (j + 1) * n)
         total[block, block] = bend.T @ bend / (BEND_SD * scale[j]) ** 2 + 1e-4 / scale[j] ** 2 * np.eye(n)
@@ -219,11 +216,11 @@ class Pairs:
 
 
 class Reduction:
-    """From many pairs to `count` pairs, under `loads`: currents from rest, one value for each `step` [s]."""
+    """From many pairs to `count` pairs, under `loads`: currents from rest, one value a second."""
 
-    def __init__(self, loads: Sequence[Array], step: float = 1.0, count: int = 1) -> None:
+    def __init__(self, loads: Sequence[Array], count: int = 1) -> None:
         def filtered_by(tau: float) -> Array:
-            a = np.exp(-step / tau)
+            a = decay_over(1.0, tau)
             return np.concatenate([lfilter([1 - a], [1, -a], x) for x in loads])
 
         load = np.concatenate(list(loads))

@@ -172,7 +172,7 @@ def _panels(force: RoadLoad, road: RoadFit, runs: Sequence[Coast], speeds: Seque
     for run, model in zip(runs, speeds, strict=True):
         time = run.time - run.time[0]
         lines += [PlotLine(run.name, time, run.speed, "."), PlotLine("", time, model, "-")]
-        errors.append(PlotLine(run.name, time, model - run.speed, "-"))
+        errors.append(PlotLine(run.name, time, run.speed - model, "-"))
         level = run.slowing * (run.mass + force.rotating) - run.direction * slope * run.mass * GRAVITY
         loads.append(PlotLine(run.name, run.middle, level, "."))
     v = np.linspace(SLOWEST, FASTEST, 50)
@@ -183,7 +183,7 @@ def _panels(force: RoadLoad, road: RoadFit, runs: Sequence[Coast], speeds: Seque
     loads.append(PlotLine("model, still air, motor included", v, force(v, still, 0.0, 0.0), "-"))
     return [
         Panel("Coast-downs", "time [s]", "speed [m/s]", tuple(lines)),
-        Panel("Speed, modelled less measured", "time [s]", "error [m/s]", tuple(errors)),
+        Panel("Coast-downs: residual", "time [s]", "measured less model [m/s]", tuple(errors)),
         Panel("Road load, slope taken off", "speed [m/s]", "force [N]", tuple(loads)),
     ]
 

@@ -12,6 +12,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples, read_facts
+from gz_onboard.physics.sensors import speed_role, true_columns
 from gz_onboard.vehicle import Vehicle
 
 SPAN = 2.0  # s
@@ -91,7 +92,9 @@ def coast(run: Samples, vehicle: Vehicle, direction: int) -> Coast:
     Raises InputError for a run that has no speed, is too short, in which the motor drives or the speed rises.
     """
     p = vehicle.parameters
-    time, speed = _speed(run, p)
+    columns = true_columns(run.columns, p)
+    role, factor = speed_role(run.name, columns, p)
+    time, speed = columns[role][0], columns[role][1] * factor
     rolling = np.ones(len(time), dtype=bool)
     if "throttle" in run.columns:
         rolling &= np.interp(time, *run.columns["throttle"]) < CLOSED
@@ -131,20 +134,6 @@ def coast(run: Samples, vehicle: Vehicle, direction: int) -> Coast:
 def run_start(run: Samples) -> float:
     """The time of the first sample [s]."""
     return float(min(t[0] for t, _ in run.columns.values()))
-
-
-def _speed(run: Samples, p: Mapping[str, float]) -> tuple[Array, Array]:
-    factors = {
-        "motor_speed": p["gear_ratio"] * p["wheel_radius"],
-        "wheel_speed_rear": p["wheel_radius"],
-        "vehicle_speed": 1.0,
-        "gps_speed": 1.0,
-    }
-    for role, factor in factors.items():
-        if role in run.columns:
-            time, speed = run.columns[role]
-            return time, speed * factor
-    raise InputError(f"{run.name}: has no speed: none of {', '.join(factors)}")
 
 
 def _temperature(run: Samples) -> float:

@@ -75,11 +75,11 @@ def _panels(job: Job, values: network.Values, runs: Sequence[CoolingRun], held: 
                     PlotLine(f"{label}, measured", x, run.measured[sensor], "."),
                     PlotLine(f"{label}, model", x, model),
                 ]
-                left.append(PlotLine(label, x, model - run.measured[sensor]))
+                left.append(PlotLine(label, x, run.measured[sensor] - model))
         title = f"{run.name}{' (held out)' if run in held else ''}"
         panels += [
             Panel(title, "time [s]", "temperature [degC]", tuple(traces)),
-            Panel(f"{title}: residual", "time [s]", "model less measured [K]", tuple(left)),
+            Panel(f"{title}: residual", "time [s]", "measured less model [K]", tuple(left)),
         ]
     return panels
 

@@ -9,16 +9,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, held_integral
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.battery import discharged
+from gz_onboard.physics.battery import BENCH_TEMPERATURE, Battery, dissipation
 from gz_onboard.physics.cooling import PERIOD
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import total
+from gz_onboard.physics.sensors import road_speed, true_columns
 from gz_onboard.vehicle import Vehicle
 
+FIRST = 5  # periods whose mean voltage tells the state of charge at the start
 SHORTEST = 300.0  # s: less says nothing of time constants of minutes
 
 
@@ -62,14 +64,13 @@ def bench_run(table: Measurements, vehicle: Vehicle) -> CoolingRun:
     measured = {name: np.interp(grid, time, table[name]) for name in SENSORS if name in table}
     turning = speed * (np.abs(current) > 1.0)  # the bench's own drive stops with the current
     nothing = np.zeros_like(grid)
-    iron = nothing + vehicle.model.idle_loss({"motor_speed": turning, "motor_temperature": 25.0})
-    radius = vehicle.parameters["wheel_radius"] * vehicle.parameters["gear_ratio"]
+    iron = nothing + vehicle.model.idle_loss({"motor_speed": turning, "motor_temperature": BENCH_TEMPERATURE})
     return CoolingRun(
         table.file.name,
         True,
         grid,
         np.interp(grid, time, table["ambient_temperature"]),
-        speed * radius,
+        road_speed(speed, vehicle.parameters),
         motor_heat,
         iron,
         inverter_heat,
@@ -84,41 +85,40 @@ def ride_run(ride: Samples, vehicle: Vehicle) -> CoolingRun:
     for role in ("motor_speed", "motor_current", "motor_temperature", "ambient_temperature", "pack_current"):
         if role not in ride.columns:
             raise InputError(f"{ride.name}: no {role}, without which no heat is known")
-    start = max(t[0] for t, _ in ride.columns.values())
-    end = min(t[-1] for t, _ in ride.columns.values())
+    columns = true_columns(ride.columns, vehicle.parameters)
+    start = max(t[0] for t, _ in columns.values())
+    end = min(t[-1] for t, _ in columns.values())
     grid = _grid(np.array([start, end]), ride.name)
 
     def at(role: str) -> Array:
-        return np.interp(grid, *ride.columns[role])
+        return np.interp(grid, *columns[role])
 
-    time, current = ride.columns["motor_current"]
-    speed = np.interp(time, *ride.columns["motor_speed"])
+    time, current = columns["motor_current"]
+    speed = np.interp(time, *columns["motor_speed"])
     quantities = {
         "motor_current": current,
         "motor_speed": speed,
-        "motor_temperature": np.interp(time, *ride.columns["motor_temperature"]),
+        "motor_temperature": np.interp(time, *columns["motor_temperature"]),
     }
     motor_heat, inverter_heat = (
         np.zeros_like(time) + total(vehicle.model.at(port), quantities)
         for port in (Port.MOTOR_LOSS, Port.INVERTER_LOSS)
     )
-    pack_time, pack_current = ride.columns["pack_current"]
-    amperes = (pack_current - vehicle.parameters["pack_current_offset"]) / vehicle.parameters["pack_current_gain"]
-    measured = {name: at(name) for name in SENSORS if name in ride.columns}
-    inside = [at(role) for role in ride.columns if role.startswith("pack_temperature_")]
+    pack_time, amperes = columns["pack_current"]
+    measured = {name: at(name) for name in SENSORS if name in columns}
+    inside = [at(role) for role in columns if role.startswith("pack_temperature_")]
     if inside:  # the mean of thermocouples is finer than the BMS's whole degrees
         measured["cell_temperature"] = np.mean(inside, axis=0)
     mean, square = _means(pack_time, amperes, grid), _means(pack_time, amperes**2, grid)
-    radius = vehicle.parameters["wheel_radius"] * vehicle.parameters["gear_ratio"]
     pack_heat = np.zeros_like(grid)
-    if vehicle.battery and "cell_temperature" in measured and "pack_voltage" in ride.columns:
-        pack_heat = _pack_heat(vehicle, mean, square, measured["cell_temperature"], at("pack_voltage")[:5].mean())
+    if vehicle.battery and "cell_temperature" in measured and "pack_voltage" in columns:
+        pack_heat = _pack_heat(vehicle.battery, mean, square, measured["cell_temperature"], at("pack_voltage"))
     return CoolingRun(
         ride.name,
-        "roller_speed" in ride.columns,
+        "roller_speed" in columns,
         grid,
         at("ambient_temperature"),
-        np.abs(_means(*ride.columns["motor_speed"], grid)) * radius,
+        road_speed(np.abs(_means(*columns["motor_speed"], grid)), vehicle.parameters),
         _means(time, motor_heat, grid),
         _means(time, np.zeros_like(time) + vehicle.model.idle_loss(quantities), grid),
         _means(time, inverter_heat, grid),
@@ -141,25 +141,22 @@ def _grid(time: Array, name: str) -> Array:
 
 def _means(time: Array, value: Array, grid: Array) -> Array:
     """The mean of `value`, held from each of its times to the next, over each period of `grid`."""
-    sums = np.concatenate([[0.0], np.cumsum(np.diff(time) * value[:-1])])
     edges = np.append(grid, grid[-1] + PERIOD)
-    result: Array = np.diff(np.interp(edges, time, sums)) / PERIOD
+    result: Array = np.diff(np.interp(edges, time, held_integral(time, value))) / PERIOD
     if edges[-1] > time[-1]:
         result[-1] = value[-1]
     return result
 
 
-def _pack_heat(vehicle: Vehicle, mean: Array, square: Array, temperature: Array, rest: float) -> Array:
-    """What the cells turn to heat [W]: R0 with the mean square of current, R1 with what its pair lets through."""
-    battery = vehicle.pack
+def _pack_heat(battery: Battery, mean: Array, square: Array, temperature: Array, voltage: Array) -> Array:
+    """What the cells turn to heat [W] by mean and mean square of the pack's current; voltage: the pack's, all (n,)."""
     n, m = battery.cells_series, battery.cells_parallel
-    soc = battery.soc_at((rest - vehicle.parameters["pack_voltage_offset"]) / n)
+    soc = battery.soc_at(float(voltage[:FIRST].mean()) / n)  # as if without load, which moves the heat capacity found
     heat, v1 = np.empty_like(mean), 0.0
     for k, (i, i2, t) in enumerate(
         zip((mean / m).tolist(), (square / m**2).tolist(), temperature.tolist(), strict=True)
     ):
-        r0, r1, c1 = (mesh.at(soc, t)[0] for mesh in (battery.r0, battery.r1, battery.c1))
-        v1 = battery.relax(PERIOD, v1, i, r1, c1)[0]
-        heat[k] = n * m * (r0 * i2 + v1 * v1 / r1)
-        soc -= discharged(i, PERIOD, battery.cell_capacity(t))
+        r0, r1, _ = battery.circuit(soc, t)
+        soc, v1, _ = battery.advanced(PERIOD, soc, v1, i, t)
+        heat[k] = n * m * dissipation(r0, r1, i2, v1)
     return heat

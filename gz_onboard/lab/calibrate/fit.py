@@ -2,7 +2,7 @@
 
 Two fits, `linear` and `nonlinear`, give a `Solution`. Its covariance is that of independent residuals; for samples
 that depend on each other (one run, one ride) give `groups`: then it is the sandwich of Liang & Zeger (1986), which
-takes whole groups as the independent pieces. `profile` says what a solution does not.
+takes whole groups as the independent pieces.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
-from scipy.stats import chi2
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.errors import InputError
@@ -45,10 +44,6 @@ class Solution:
         """The standard deviation of `name`."""
         i = self.names.index(name)
         return float(np.sqrt(self.covariance[i, i]))
-
-    def correlation(self) -> Array:
-        """(n, n); zero for a parameter without spread."""
-        return correlation(self.covariance)
 
     def part(self, names: Sequence[str]) -> Array:
         """The covariance of `names`, in that order."""
@@ -82,14 +77,14 @@ def linear(
     """The parameters p (one for each of `columns`, shape (m,)) for which sum(p·column) is nearest to y, shape (m,).
 
     sd: of y, of one sample or of each; without it the residuals give it. prior: (value, sd) of parameters that more is
-    known of. groups: label of each sample, (m,), where samples of one label depend on each other.
+    known of; it needs the sd of y. groups: label of each sample, (m,), where samples of one label depend on each other.
     Raises InputError for fewer samples than parameters, or columns that depend on each other without a prior.
     """
     names = tuple(columns)
     a = np.column_stack([np.broadcast_to(np.asarray(c, dtype=float), y.shape) for c in columns.values()])
     weight = np.broadcast_to(1.0 if sd is None else 1.0 / np.asarray(sd, dtype=float), y.shape)
     jacobian = a * weight[:, None]
-    rows, targets = _prior_rows(names, prior, 1.0 if sd is not None else None, jacobian, y * weight)
+    rows, targets = _prior_rows(names, prior, sd is not None)
     full, target = np.vstack([jacobian, rows]), np.concatenate([y * weight, targets])
     size = np.linalg.norm(full, axis=0)
     _check(names, full, len(y), size)
@@ -120,27 +115,23 @@ def nonlinear(
     prior: Mapping[str, tuple[float, float]] | None = None,
     groups: NDArray[Any] | None = None,
     known_sd: bool = False,
-    loss: str = "linear",
 ) -> Solution:
     """The parameters near `start` for which `residual` (of an array in its order, weighted, shape (m,)) is least.
 
     known_sd: the residual is in units of its true sd, so that its size is not scaled to 1 (a size above 1 still is:
-    what the model cannot follow makes parameters less sure); a prior needs it. loss: as of
-    `scipy.optimize.least_squares`. The rest as for `linear`.
+    what the model cannot follow makes parameters less sure); a prior needs it. The rest as for `linear`.
     """
-    if prior and not known_sd:
-        raise ValueError("a prior needs a residual in units of its sd to be weighed against")
     names = tuple(start)
     x0 = np.array([start[name] for name in names], dtype=float)
     low = np.array([(bounds or {}).get(name, (-np.inf, np.inf))[0] for name in names])
     high = np.array([(bounds or {}).get(name, (-np.inf, np.inf))[1] for name in names])
     scale = np.where(x0 != 0, np.abs(x0), 1.0)
-    rows, targets = _prior_rows(names, prior, 1.0, np.empty((0, len(names))), np.empty(0))
+    rows, targets = _prior_rows(names, prior, known_sd)
 
     def everything(x: Array) -> Array:
         return np.concatenate([residual(x), rows @ x - targets])
 
-    best = least_squares(everything, x0, bounds=(low, high), x_scale=scale, loss=loss)
+    best = least_squares(everything, x0, bounds=(low, high), x_scale=scale)
     m = len(best.fun) - len(rows)
     jacobian = best.jac[:m]
     _check(names, best.jac, m, np.linalg.norm(best.jac, axis=0))
@@ -148,23 +139,15 @@ def nonlinear(
 
 
 def _prior_rows(
-    names: tuple[str, ...],
-    prior: Mapping[str, tuple[float, float]] | None,
-    unit: float | None,
-    jacobian: Array,
-    target: Array,
+    names: tuple[str, ...], prior: Mapping[str, tuple[float, float]] | None, known_sd: bool
 ) -> tuple[Array, Array]:
-    """A row for each prior, as one more measurement; `unit` the sd of a weighted residual, found first if None."""
-    if not prior:
-        return np.empty((0, len(names))), np.empty(0)
-    if unit is None:  # without an sd of the data their own residual is what a prior is weighed against
-        rest = np.linalg.lstsq(jacobian, target, rcond=None)[0]
-        freedom = max(len(target) - len(names), 1)
-        unit = float(np.sqrt(np.sum((jacobian @ rest - target) ** 2) / freedom)) or 1e-12
-    rows = np.zeros((len(prior), len(names)))
-    for row, (name, (_, sd)) in zip(rows, prior.items(), strict=True):
-        row[names.index(name)] = unit / sd
-    return rows, np.array([unit * value / sd for value, sd in prior.values()])
+    """A row for each prior, as one more measurement whose weighted residual has an sd of 1."""
+    if prior and not known_sd:
+        raise ValueError("a prior needs a residual in units of its sd to be weighed against")
+    rows = np.zeros((len(prior or {}), len(names)))
+    for row, (name, (_, sd)) in zip(rows, (prior or {}).items(), strict=True):
+        row[names.index(name)] = 1.0 / sd
+    return rows, np.array([value / sd for value, sd in (prior or {}).values()])
 
 
 def _check(names: tuple[str, ...], jacobian: Array, points: int, size: Array) -> None:
@@ -225,85 +208,8 @@ def every_second(labels: NDArray[Any]) -> Mask:
 
 def score(what: str, unit: str, data: Array, model: Array, *, held_out: bool, source: str) -> Fit:
     """How well `model` follows `data`, both of shape (m,). r2 is None for data without spread."""
-    error = np.asarray(model) - np.asarray(data)
+    error = np.asarray(data) - np.asarray(model)
     spread = float(np.sum((data - np.mean(data)) ** 2))
     r2 = 1 - float(error @ error) / spread if spread > 0 else None
     rms = float(np.sqrt(np.mean(error**2)))
     return Fit(what, unit, rms, float(np.max(np.abs(error))), r2, len(error), held_out, source)
-
-
-@dataclass(frozen=True)
-class Profile:
-    """The profile likelihood of one parameter (Raue et al. 2009): all others fitted anew at each of its values.
-
-    value, excess: shape (k,): chi-square over its least. low, high: the 95 % interval, infinite where it leaves the
-    values tried: then the data do not bound the parameter.
-    """
-
-    name: str
-    value: Array
-    excess: Array
-    low: float
-    high: float
-
-
-def profile(
-    residual: Residual,
-    solution: Solution,
-    name: str,
-    values: Array,
-    *,
-    bounds: Mapping[str, tuple[float, float]] | None = None,
-    prior: Mapping[str, tuple[float, float]] | None = None,
-) -> Profile:
-    """The profile of `name` over increasing `values` that hold the solution's, for a `residual` as of `nonlinear`."""
-    others = [n for n in solution.names if n != name]
-    inner = {n: p for n, p in (prior or {}).items() if n != name}
-    place = solution.names.index(name)
-    excess = np.empty(len(values))
-    least = _with_prior(solution, prior)
-    around = int(np.searchsorted(values, solution[name]))
-    order = [*range(around, len(values)), *range(around - 1, -1, -1)]  # outwards, each from its neighbour's optimum
-    start = {n: solution[n] for n in others}
-    for i in order:
-        if i == around - 1:
-            start = {n: solution[n] for n in others}
-
-        def fixed(x: Array, at: float = float(values[i])) -> Array:
-            return residual(np.insert(x, place, at))
-
-        if others:
-            best = nonlinear(fixed, start, bounds=bounds, prior=inner, known_sd=True)
-            start = {n: best[n] for n in others}
-            total = _with_prior(best, inner)
-        else:
-            r = fixed(np.empty(0))
-            total = float(r @ r)
-        if prior and name in prior:
-            total += ((float(values[i]) - prior[name][0]) / prior[name][1]) ** 2
-        excess[i] = (total - least) / solution.variance
-    limit = chi2.ppf(0.95, 1)
-    return Profile(
-        name,
-        values,
-        excess,
-        _crossing(values[:around], excess[:around], -1, limit, solution[name]),
-        _crossing(values[around:], excess[around:], 1, limit, solution[name]),
-    )
-
-
-def _with_prior(solution: Solution, prior: Mapping[str, tuple[float, float]] | None) -> float:
-    away = sum(((solution[name] - value) / sd) ** 2 for name, (value, sd) in (prior or {}).items())
-    return float(solution.residual @ solution.residual) + away
-
-
-def _crossing(values: Array, excess: Array, sign: int, limit: float, best: float) -> float:
-    """Where the excess, followed outwards from `best`, first passes `limit`; infinite if it does not."""
-    xs = [best, *(values if sign > 0 else values[::-1])]
-    es = [0.0, *(excess if sign > 0 else excess[::-1])]
-    for i in range(1, len(xs)):
-        if es[i] > limit:
-            inner, outer = np.sqrt(max(es[i - 1], 0.0)), np.sqrt(es[i])  # a parabola's root is straight
-            share = (np.sqrt(limit) - inner) / (outer - inner)
-            return float(xs[i - 1] + share * (xs[i] - xs[i - 1]))
-    return sign * np.inf

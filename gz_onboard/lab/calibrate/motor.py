@@ -17,6 +17,7 @@ from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.calibrate.fit import Solution, line, linear, score, split
 from gz_onboard.lab.calibrate.result import Fit, Panel, PlotLine, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
+from gz_onboard.physics.battery import BENCH_TEMPERATURE
 from gz_onboard.physics.effects import motor_copper_loss
 
 RIDING_CURRENT = 120.0  # A: larger ones are short, and the constant falls with them
@@ -100,7 +101,7 @@ def solve(bench: Bench, use: Mask) -> Solution:
     with that sd; what its two equations share makes the covariance that of whole points.
     """
     w, i = bench.speed[use], bench.current[use]
-    copper = i**2 * (1 + COPPER * (bench.temperature[use] - 25))
+    copper = i**2 * (1 + COPPER * (bench.temperature[use] - BENCH_TEMPERATURE))
     nothing, sign = np.zeros_like(w), np.sign(w)
     columns = {
         "torque_constant": np.concatenate([i, nothing]),

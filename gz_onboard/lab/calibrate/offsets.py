@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask
+from gz_onboard.arrays import Array, Mask, block_means
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD
 from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, score
@@ -117,9 +117,7 @@ def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
 def window_means(pair: Pair, values: Array, seconds: float) -> Array:
     """Means of `values` over windows of that length: timing counts less."""
     count = max(round(seconds / max(float(np.median(np.diff(pair.time))), 1e-3)), 1)
-    whole = len(values) // count * count
-    means: Array = values[:whole].reshape(-1, count).mean(axis=1)
-    return means
+    return block_means(values, count)
 
 
 def _gain(result: Result, pairs: Sequence[Pair]) -> None:

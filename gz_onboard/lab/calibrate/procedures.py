@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -26,9 +26,10 @@ from gz_onboard.lab.calibrate.cell_data import cell_test
 from gz_onboard.lab.calibrate.coastdown_run import samples as coastdown_samples
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.manifest import Option, Slot
-from gz_onboard.lab.calibrate.result import Curve, Found, Panel, PlotLine, Result
+from gz_onboard.lab.calibrate.result import Curve, Found, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples
+from gz_onboard.physics.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
 
@@ -87,7 +88,7 @@ THESIS_VOLTS = 0.02  # V: what Lord 2016 gives for a cell on a road profile
 
 def _pulse(given: Given) -> Result:
     curve, capacity = _open_circuit(given)
-    loads = [_load(ride) for ride in given.rides.get("load", [])]
+    loads = [_load(ride) for ride in _true(given, "load")]
     method = str(given.options["method"])
     result = pulse.calibrate(given.tables["data"], curve, capacity, loads=loads or None, method=method)
     cell = pulse.circuit(result)
@@ -97,21 +98,8 @@ def _pulse(given: Given) -> Result:
         result.fits.append(score("cell voltage", "V", measured, model, held_out=True, source=table.file.name))
         near = float(np.mean(np.abs(model - measured) <= THESIS_VOLTS))
         result.notes.append(f"{table.file.name}: {100 * near:.0f} % of the samples within ±{THESIS_VOLTS:g} V")
-        minutes = test.time / 60
-        result.panels += [
-            Panel(
-                f"{table.file.name}, held out",
-                "time [min]",
-                "cell voltage [V]",
-                (PlotLine("measured", minutes, measured), PlotLine("model", minutes, model)),
-            ),
-            Panel(
-                f"{table.file.name}: residual",
-                "time [min]",
-                "model less measured [mV]",
-                (PlotLine("", minutes, 1000 * (model - measured)),),
-            ),
-        ]
+        title = f"{table.file.name}, held out"
+        result.panels += compared(title, "time [min]", "cell voltage [V]", test.time / 60, measured, model)
     return result
 
 
@@ -126,6 +114,12 @@ def _open_circuit(given: Given) -> tuple[Curve, Found]:
         {"soc": np.array(battery.ocv_soc)}, value, np.full(len(value), battery.ocv_sd), "V", given.vehicle.file.name
     )
     return curve, Found(known.value, known.sd, known.unit, known.source)
+
+
+def _true(given: Given, data: str) -> list[Samples]:
+    """The rides without what the vehicle's sensors are known to err by."""
+    parameters = given.vehicle.parameters
+    return [replace(ride, columns=true_columns(ride.columns, parameters)) for ride in given.rides.get(data, [])]
 
 
 def _load(ride: Samples) -> Array:
@@ -217,7 +211,7 @@ PROCEDURES: dict[str, Procedure] = {
     "auxiliary": Procedure(
         "power of lamps, dashboard and control",
         {"data": Slot("ride", "rides with auxiliary current", 1)},
-        lambda given: auxiliary.auxiliary_power(given.rides["data"]),
+        lambda given: auxiliary.auxiliary_power(_true(given, "data")),
     ),
     "offsets": Procedure(
         "offset, gain and noise of the pack's sensors",

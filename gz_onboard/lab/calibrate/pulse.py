@@ -22,8 +22,9 @@ from gz_onboard.lab.calibrate.ocv import TESTER
 from gz_onboard.lab.calibrate.pulse_mesh import direct, mesh_quality, meshes
 from gz_onboard.lab.calibrate.pulse_rests import rest_shift, rests_over_soc, shift_of_rests
 from gz_onboard.lab.calibrate.pulse_test import Tested, moved_pieces, tested
-from gz_onboard.lab.calibrate.result import Curve, Found, Panel, PlotLine, Result
+from gz_onboard.lab.calibrate.result import Curve, Found, Panel, PlotLine, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
+from gz_onboard.physics.battery import HOUR
 
 SOC = np.array([0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
 METHODS = ("reduced", "direct")
@@ -168,13 +169,8 @@ def _voltages(result: Result, tests: Sequence[Tested], names: str) -> None:
                     result.fits.append(fit)
                     if what == "one pair":
                         rms[name].append(fit.rms)
-        hours, model, title = test.time / 3600, models["one pair"], f"Pulse test at {at} °C"
-        lines = PlotLine("measured", hours, test.voltage, "."), PlotLine("model", hours, model)
-        left = PlotLine("", hours, 1000 * (model - test.voltage))
-        result.panels += [
-            Panel(title, "time [h]", "voltage [V]", lines),
-            Panel(f"{title}: residual", "time [h]", "model less measured [mV]", (left,)),
-        ]
+        hours, model, title = test.time / HOUR, models["one pair"], f"Pulse test at {at} °C"
+        result.panels += compared(title, "time [h]", "voltage [V]", hours, test.voltage, model)
     for key, unit, factor in (("r0", "mΩ", 1e3), ("r1", "mΩ", 1e3), ("c1", "F", 1.0)):
         mesh = result.curves[f"battery.{key}"]
         rows = zip(mesh.axes["temperature"], mesh.value, strict=True)

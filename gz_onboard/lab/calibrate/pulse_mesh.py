@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask
+from gz_onboard.arrays import Array, Mask, bends
 from gz_onboard.lab.calibrate.cell_fit import Branches, Pieces, Reduction, fit_branches, fit_direct, jackknife
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.pulse_test import Tested, ocv_and_slope
@@ -71,13 +71,7 @@ def _smooth(soc: Array, logs: Array, sds: Array) -> Array:
     result = np.empty_like(logs)
     for j in range(logs.shape[1]):
         weight = 1 / np.maximum(sds[:, j], 0.02)
-        rows = [np.diag(weight)]
-        for k in range(n - 2):
-            left, right = soc[k + 1] - soc[k], soc[k + 2] - soc[k + 1]
-            bend = np.zeros(n)
-            w = right / (left + right)
-            bend[k : k + 3] = np.array([w, -1.0, 1 - w]) / (SMOOTH * max(left + right, 0.1) / 0.2)
-            rows.append(bend[None])
+        rows = [np.diag(weight), bends(soc) / (SMOOTH * np.maximum(soc[2:] - soc[:-2], 0.1) / 0.2)[:, None]]
         if j >= (logs.shape[1] + 1) // 2:  # time constants hardly depend on SOC, and are known worst
             slope = np.diff(np.eye(n), axis=0) / (LEVEL * np.maximum(np.diff(soc), 0.05) / 0.1)[:, None]
             rows.append(slope)

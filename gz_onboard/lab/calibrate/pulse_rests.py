@@ -9,6 +9,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cell_fit import Branches, jackknife
 from gz_onboard.lab.calibrate.pulse_test import FULL_WITHIN, Tested
 from gz_onboard.lab.calibrate.result import Curve, Result
+from gz_onboard.physics.battery import BENCH_TEMPERATURE
 
 SURE = 0.99  # how surely the rests must show that temperature moves them, before the vehicle file says so
 
@@ -80,4 +81,4 @@ def shift_of_rests(rests: Curve, tests: list[Tested], names: str, result: Result
 
 
 def _nearest(tests: list[Tested]) -> int:
-    return min(range(len(tests)), key=lambda k: abs(tests[k].temperature - 25))
+    return min(range(len(tests)), key=lambda k: abs(tests[k].temperature - BENCH_TEMPERATURE))

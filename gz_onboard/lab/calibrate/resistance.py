@@ -10,18 +10,22 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, held_integral
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, linear, score
 from gz_onboard.lab.calibrate.offsets import read_pair, window_means
 from gz_onboard.lab.calibrate.result import Found, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples
+from gz_onboard.physics.battery import discharged
+from gz_onboard.physics.relaxation import decay_over
+from gz_onboard.physics.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
 STEP_TIME = 0.2  # s
 LEAST_STEP = 15.0  # A
 LEAST_STEPS = 20
+FIRST = 5  # readings whose medians tell the state of charge at the start
 LEAST_SPAN = 10.0  # A: of current, for a line
 MEAN_OF = 1.0  # s: timing counts less then
 WARM = 20.0  # degC: below the cells' resistance is many times that of bars and fuse
@@ -119,23 +123,25 @@ def _ride_steps(
 
     None for a ride without large steps, or at a temperature at which the cells' part is too large or not known.
     """
-    battery, p = vehicle.pack, vehicle.parameters
+    battery = vehicle.pack
     temperature = _mean_of(ride, "cell_temperature")
     if temperature < WARM:
         result.notes.append(f"{ride.name}: cells at {temperature:.0f} degC, left out: {WARM:g} degC are needed")
         return None
-    time, current = ride.columns["pack_current"]
-    voltage = np.interp(time, *ride.columns["pack_voltage"])
-    current = (current - p["pack_current_offset"]) / p["pack_current_gain"]
+    columns = true_columns(ride.columns, vehicle.parameters)
+    time, current = columns["pack_current"]
+    voltage = np.interp(time, *columns["pack_voltage"])
     stride = max(round(STEP_TIME / float(np.median(np.diff(time)))), 1)
     step, drop = current[stride:] - current[:-stride], -(voltage[stride:] - voltage[:-stride])
     big = np.abs(step) > LEAST_STEP
     if not big.any():
         return None
     if by_temperature is None:
-        soc = _soc(ride, vehicle)
-        r0, r1, c1 = (mesh.at(soc, temperature)[0] for mesh in (battery.r0, battery.r1, battery.c1))
-        cell_ohm = r0 + r1 * (1 - float(np.exp(-STEP_TIME / 2 / (r1 * c1))))
+        start = battery.first_soc(float(np.median(voltage[:FIRST])), float(np.median(current[:FIRST])), temperature)
+        charge = float(np.trapezoid(current, time))  # A·s; what half of it takes is the middle of the ride
+        soc = start - discharged(charge, 0.5, battery.pack_capacity(temperature))
+        r0, r1, c1 = battery.circuit(soc, temperature)
+        cell_ohm = r0 + r1 * (1 - decay_over(STEP_TIME / 2, r1 * c1))
     else:
         low, high = by_temperature[0][[0, -1]]
         if not low <= temperature <= high:
@@ -155,7 +161,7 @@ def cell_steps(pulses: Sequence[Measurements]) -> tuple[Array, Array]:
     rows = []
     for pulse in pulses:
         time, current, voltage = pulse["time"], pulse["current"], pulse["voltage"]
-        charge = np.concatenate([[0.0], np.cumsum(np.diff(time) * current[:-1])])
+        charge = held_integral(time, current)
         jump = np.flatnonzero(np.abs(np.diff(current)) > 0.3 * np.max(np.abs(current)))
         ohm = []
         for k in jump:
@@ -176,13 +182,3 @@ def _mean_of(ride: Samples, role: str) -> float:
     if role not in ride.columns:
         raise InputError(f"{ride.name}: no {role}, without which the cells' part of a step is unknown")
     return float(ride.columns[role][1].mean())
-
-
-def _soc(ride: Samples, vehicle: Vehicle) -> float:
-    """The state of charge in the middle of a ride, by its first voltage and its charge."""
-    battery = vehicle.pack
-    first = float(np.median(ride.columns["pack_voltage"][1][:5]))
-    start = battery.soc_at((first - vehicle.parameters["pack_voltage_offset"]) / battery.cells_series)
-    time, current = ride.columns["pack_current"]
-    charge = float(np.trapezoid(current, time)) / 3600
-    return start - 0.5 * charge / battery.pack_capacity(25.0)

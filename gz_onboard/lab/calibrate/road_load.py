@@ -9,7 +9,6 @@ model. Air density is that of the measured temperature and altitude.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import sqrt
 from typing import Any
 
 import numpy as np
@@ -17,8 +16,9 @@ from scipy.optimize import minimize_scalar
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.coastdown_run import Coast
-from gz_onboard.physics.effect import QUANTITIES, ROAD_LOAD, Port
-from gz_onboard.physics.model import Bound, air_density, total
+from gz_onboard.physics.effect import ROAD_LOAD, Port
+from gz_onboard.physics.model import Bound, air_density, all_quantities, total
+from gz_onboard.physics.sensors import road_speed
 from gz_onboard.vehicle import Vehicle
 
 NAMES = ("rolling_resistance_constant", "rolling_resistance_speed", "drag_area")
@@ -42,18 +42,17 @@ class RoadLoad:
         density: factor on the air's density.
         """
         grade = run.direction * slope
-        q: dict[str, Any] = dict.fromkeys(QUANTITIES, 0.0) | {  # straight on, no current
-            "speed": speed,
-            "grade": grade,
-            "grade_cosine": sqrt(1 - grade * grade),
-            "mass": run.mass + self.p.get("_mass", 0.0),
-            "air_density": density * air_density(run.temperature, run.altitude),
-            "headwind": wind,
-            "motor_speed": speed / (self.p["wheel_radius"] * self.p["gear_ratio"]),
-            "motor_temperature": run.temperature,
-            "ambient_temperature": run.temperature,
-            "vibration": self._vibration,
-        }
+        q = all_quantities(  # straight on, no current
+            speed=speed,
+            grade=grade,
+            mass=run.mass + self.p.get("_mass", 0.0),
+            air_density=density * air_density(run.temperature, run.altitude),
+            headwind=wind,
+            motor_speed=speed / road_speed(1.0, self.p),
+            motor_temperature=run.temperature,
+            ambient_temperature=run.temperature,
+            vibration=self._vibration,
+        )
         return total(self._road, q) + total(self._motor, q) / speed
 
     def slowing(self, speed: Any, run: Coast, slope: float, wind: float, density: float = 1.0) -> Any:

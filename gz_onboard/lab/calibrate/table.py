@@ -10,11 +10,8 @@ quantity, in SI units and degC. For tables of other people a mapping says which 
 
 from __future__ import annotations
 
-import csv
-import gzip
 import math
 import re
-import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +21,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError, nearest
+from gz_onboard.simulation.columns import csv_rows
 
 if TYPE_CHECKING:
     from gz_onboard.toml import Table
@@ -246,34 +244,18 @@ def _number(value: object) -> float:
 
 def _read_csv(file: Path) -> tuple[list[str], list[list[object]], list[int]]:
     """(names, columns as text, line of each row)."""
-    try:
-        with (
-            gzip.open(file, "rt", encoding="utf-8-sig", newline="")
-            if file.suffix == ".gz"
-            else file.open(encoding="utf-8-sig", newline="") as stream
-        ):
-            reader = csv.reader(stream)
-            names = [name.strip() for name in next(reader, [])]
-            if not names or not any(names):
-                raise InputError(f"{file}: is empty; the first line must name the columns, such as time_s,current_A")
-            rows: list[list[str]] = []
-            lines: list[int] = []
-            for row in reader:
-                if not row:
-                    continue
-                if len(row) != len(names):
-                    raise InputError(f"{file}:{reader.line_num}: {len(row)} values for {len(names)} columns")
-                rows.append(row)
-                lines.append(reader.line_num)
-    except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"{file}: {getattr(error, 'strerror', None) or error}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{file}: not a CSV file: {error}") from error
+    (_, header), *rows = csv_rows(file) or [(1, [])]
+    names = [name.strip() for name in header]
+    if not any(names):
+        raise InputError(f"{file}: is empty; the first line must name the columns, such as time_s,current_A")
+    for line, row in rows:
+        if len(row) != len(names):
+            raise InputError(f"{file}:{line}: {len(row)} values for {len(names)} columns")
     if all(_number(name) == _number(name) for name in names):
         raise InputError(f"{file}:1: {', '.join(names[:3])} ... are numbers, not names of columns such as time_s")
     if not rows:
         raise InputError(f"{file}: has no rows")
-    return names, [list(column) for column in zip(*rows, strict=True)], lines
+    return names, [list(column) for column in zip(*(row for _, row in rows), strict=True)], [line for line, _ in rows]
 
 
 def _read_parquet(file: Path) -> tuple[list[str], list[list[object]], list[int]]:

@@ -6,7 +6,7 @@ radius: it is the one that turns motor speed into the vehicle's speed.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.result import Fit, Found, Panel, PlotLine, Result
 from gz_onboard.offline.samples import Samples
+from gz_onboard.physics.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
 SLOWEST = 5.0  # m/s: below, a receiver's speed is poor
@@ -29,7 +30,6 @@ def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     Raises InputError if none of them has.
     """
     result = Result("wheel")
-    gear = vehicle.parameters["gear_ratio"]
     radii: list[float] = []
     names: list[str] = []
     traces: list[PlotLine] = []
@@ -38,7 +38,7 @@ def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         if "gps_speed" not in ride.columns or "motor_speed" not in ride.columns:
             result.refusals.append(f"{ride.name}: has no gps_speed or no motor_speed")
             continue
-        over_ground, wheel = _steady(ride, gear)
+        over_ground, wheel = _steady(true_columns(ride.columns, vehicle.parameters), vehicle.parameters["gear_ratio"])
         if len(wheel) < FEWEST:
             result.refusals.append(
                 f"{ride.name}: {len(wheel)} fixes at steady speed above {SLOWEST:g} m/s; {FEWEST} needed"
@@ -76,13 +76,13 @@ def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     return result
 
 
-def _steady(ride: Samples, gear: float) -> tuple[Array, Array]:
+def _steady(columns: Mapping[str, tuple[Array, Array]], gear: float) -> tuple[Array, Array]:
     """(GPS speed [m/s], speed of the driven wheel [rad/s]) at fixes within steady riding."""
-    time, speed = ride.columns["gps_speed"]
-    at, motor = ride.columns["motor_speed"]
+    time, speed = columns["gps_speed"]
+    at, motor = columns["motor_speed"]
     good = (speed > SLOWEST) & (time > at[0] + LONGEST) & (time < at[-1] - LONGEST)
-    if "gps_fix" in ride.columns:
-        good &= np.interp(time, *ride.columns["gps_fix"]) > 1.5
+    if "gps_fix" in columns:
+        good &= np.interp(time, *columns["gps_fix"]) > 1.5
     if not good.any():
         return np.empty(0), np.empty(0)
     time, speed = time[good], speed[good]

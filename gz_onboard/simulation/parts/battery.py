@@ -54,9 +54,7 @@ class FirstOrderPack:
         battery, soc = self.battery, self.soc
         self._drawn += self._between(self._soc_before, soc)
         self._soc_before = soc
-        self._r0 = battery.r0.at(soc, temperature)[0]
-        self._r1 = battery.r1.at(soc, temperature)[0]
-        self._c1 = battery.c1.at(soc, temperature)[0]
+        self._r0, self._r1, self._c1 = battery.circuit(soc, temperature)
         self._decay, self._decay_dt = decay_over(dt, self._r1 * self._c1), dt
         self._capacity = battery.pack_capacity(temperature)
         self._shift = battery.rest_shift(temperature)

@@ -48,7 +48,7 @@ class Driveline:
     def step(self, tyre: Tyre, brakes: Brakes, acting: Acting, v: float, w: float, brake: float, dt: float) -> Moved:
         """One step of `dt` [s] from vehicle and wheel speeds `v` [m/s], `w` [rad/s]; brake: 0..1. Moves the slip on."""
         drive, against, rolling, load, r = acting
-        base, gain, _ = tyre.linear(r * w, v, dt)
+        base, gain = tyre.linear(r * w, v, dt)
         mu, slope = tyre.friction(base + gain * (r * w - v))
         grip, stiffness = load * mu, load * (slope if slope > 0.0 else 0.0) * gain
         m, j = self.moving_mass / dt, self.wheel_inertia / dt

@@ -33,13 +33,13 @@ class Tyre:
         inner = 1 - self.e * (1 - 1 / (1 + x * x))
         return self.d * sin(angle), self.d * cos(angle) * self.c / (1 + y * y) * inner * self.b
 
-    def linear(self, rim: float, speed: float, dt: float) -> tuple[float, float, float]:
+    def linear(self, rim: float, speed: float, dt: float) -> tuple[float, float]:
         """The slip at the end of the step as base + gain·(rim speed - vehicle speed at the end) [m/s].
 
-        Gives (base, gain, decay), with the vehicle's speed taken from the start: implicit where it is stiff.
+        Gives (base, gain), with the vehicle's speed taken from the start: implicit where it is stiff.
         """
         if self.form == "steady":
             scale = max(abs(speed), abs(rim), self.epsilon)
-            return 0.0, 1 / scale, 0.0
+            return 0.0, 1 / scale
         decay = 1 / (1 + dt * abs(speed) / self.relaxation_length)
-        return self.slip * decay, dt / self.relaxation_length * decay, decay
+        return self.slip * decay, dt / self.relaxation_length * decay

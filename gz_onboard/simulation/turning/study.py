@@ -108,12 +108,10 @@ class Rider:
         return replace(rates, change=(*rates.change, STEER_INTEGRAL * error, 1.0))
 
 
-def coast_down(
-    chassis: Chassis, roll: float, *, fast: float = FAST, slow: float = SLOW, road: Road | None = None, dt: float = STEP
-) -> CoastDown:
-    """Lean to `roll` [rad] at `fast` [m/s], let go, and record until `slow` [m/s] (at most 10 minutes)."""
-    rider = Rider(chassis, roll, road or Road())
-    state = rider.start(fast)
+def coast_down(chassis: Chassis, roll: float, *, slow: float = SLOW, dt: float = STEP) -> CoastDown:
+    """Lean to `roll` [rad] at `FAST`, let go, and record until `slow` [m/s] (at most 10 minutes)."""
+    rider = Rider(chassis, roll, Road())
+    state = rider.start(FAST)
     for _ in range(round(LEAD_IN / dt)):
         state, _ = step(rider.rates, state, dt)
     rider.let_go = True
@@ -136,15 +134,6 @@ def coast_down(
             lost[name] += value
         state = after
     return record
-
-
-def held(chassis: Chassis, roll: float, speed: float, *, dt: float = STEP, seconds: float = 12.0) -> Rates:
-    """The steady turn at `roll` [rad] and `speed` [m/s], held by the drive: its power and what else is seen."""
-    rider = Rider(chassis, roll, Road())
-    state = rider.start(speed)
-    for _ in range(round(seconds / dt)):
-        state, _ = step(rider.rates, state, dt)
-    return rider.rates(state)
 
 
 def row(model: str, roll: float, run: CoastDown) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, linear, nonlinear, profile, score, split
+from gz_onboard.lab.calibrate.fit import as_groups, correlation, every_second, line, linear, nonlinear, score, split
 from gz_onboard.lab.calibrate.result import compared
 
 SEEDS = 400
@@ -65,7 +65,7 @@ def test_a_prior_is_weighed_against_the_data_and_grows_when_they_say_nothing():
     found = linear({"a": ones, "b": ones}, 5 * ones, 1.0, prior={"a": (2.0, 0.1)})
     assert found["a"] == pytest.approx(2) and found["b"] == pytest.approx(3)
     assert found.sd("a") == pytest.approx(0.1) and found.sd("b") == pytest.approx(np.hypot(0.1, 1 / np.sqrt(10)))
-    assert found.correlation()[0, 1] < 0
+    assert correlation(found.covariance)[0, 1] < 0
     with pytest.raises(InputError, match="cannot separate a and b"):
         linear({"a": ones, "b": ones}, 5 * ones)
 
@@ -88,31 +88,6 @@ def test_score():
     fit = score("x", "W", np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 4.0]), held_out=True, source="here")
     assert (fit.largest, fit.r2, fit.points) == (1.0, 0.5, 3) and fit.rms == pytest.approx(np.sqrt(1 / 3))
     assert score("x", "W", np.ones(3), np.ones(3), held_out=True, source="here").r2 is None
-
-
-def heating(seed, end):
-    """Temperature of one mass with a constant heat, capacity 1000 J/K, conductance 2 W/K, seen until `end` [s]."""
-    t = np.linspace(0, end, 80)
-    data = 100 / 2 * (1 - np.exp(-2 * t / 1000)) + np.random.default_rng(seed).normal(0, 0.2, 80)
-    return lambda p: (100 / p[1] * (1 - np.exp(-p[1] * t / p[0])) - data) / 0.2
-
-
-def test_profile_is_the_interval_of_a_parameter_that_the_data_tell():
-    start = {"capacity": 700.0, "conductance": 3.0}
-    residual = heating(1, 2000)
-    found = nonlinear(residual, start, known_sd=True)
-    assert np.all(inside(found, {"capacity": 1000, "conductance": 2}))
-    p = profile(residual, found, "conductance", np.linspace(1.98, 2.02, 21))
-    assert p.high - p.low == pytest.approx(2 * 1.96 * found.sd("conductance"), rel=0.05)
-
-
-def test_profile_is_open_where_the_data_tell_nothing():
-    start = {"capacity": 700.0, "conductance": 3.0}
-    bounds = {"capacity": (1.0, 1e5), "conductance": (1e-6, 100.0)}
-    residual = heating(1, 20)  # over before any heat has left
-    found = nonlinear(residual, start, known_sd=True, bounds=bounds)
-    p = profile(residual, found, "conductance", np.linspace(0.01, 60, 13), bounds=bounds)
-    assert p.low == -np.inf  # as well none at all
 
 
 def test_a_line_of_all_points_and_of_some():

@@ -13,6 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import root
 
+from gz_onboard.simulation.turning.machine import Rates, Road, step
+from gz_onboard.simulation.turning.study import STEP, Chassis, Rider
+
 G = 9.80665
 
 
@@ -107,3 +110,12 @@ def steady_turn(machine, speed: float, lean: float, *, upright: bool = False, fu
     twisting = front[2] * (along / radius * np.sin(camber) - x[0]) + rear[2] * (speed / radius * np.sin(tilt) - x[0])
     r, v, bar, load_f, load_r, drive = map(float, x)
     return Turn(r, v, bar, load_f, load_r, drive, slip_f, slip_r, side_f, side_r, sliding + twisting)
+
+
+def held(chassis: Chassis, roll: float, speed: float, *, dt: float = STEP, seconds: float = 12.0) -> Rates:
+    """The steady turn at `roll` [rad] and `speed` [m/s], held by the drive: its power and what else is seen."""
+    rider = Rider(chassis, roll, Road())
+    state = rider.start(speed)
+    for _ in range(round(seconds / dt)):
+        state, _ = step(rider.rates, state, dt)
+    return rider.rates(state)

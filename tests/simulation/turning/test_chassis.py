@@ -15,8 +15,9 @@ from gz_onboard.simulation.turning.leaning import Leaning
 from gz_onboard.simulation.turning.machine import Road, step
 from gz_onboard.simulation.turning.planar import Planar
 from gz_onboard.simulation.turning.straight import Straight
-from gz_onboard.simulation.turning.study import coast_down, held
+from gz_onboard.simulation.turning.study import coast_down
 from gz_onboard.simulation.turning.tyre import ideal_of
+from tests.simulation.turning.reference import held
 
 G = 9.80665
 CHASSIS = [Straight, Planar, Leaning]

@@ -8,8 +8,7 @@ import pytest
 
 from gz_onboard.simulation.turning.leaning import Leaning
 from gz_onboard.simulation.turning.planar import Planar
-from gz_onboard.simulation.turning.study import held
-from tests.simulation.turning.reference import steady_turn
+from tests.simulation.turning.reference import held, steady_turn
 
 SAME = ("slip_front", "slip_rear", "side_front", "side_rear")
 CASES = [(12.0, 5.0), (12.0, 30.0), (8.0, 20.0), (5.0, 10.0), (5.0, 30.0)]

@@ -1,0 +1,61 @@
+"""What the vehicle's own sensors show, and what is: offset, gain and scale that its file knows are taken off here.
+
+The functions take floats and arrays alike; `parameters` are those of the vehicle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from gz_onboard.errors import InputError
+
+if TYPE_CHECKING:
+    from gz_onboard.arrays import Array
+
+    Columns = Mapping[str, tuple[Array, Array]]
+
+
+def true_current(reading: Any, parameters: Mapping[str, float]) -> Any:
+    """The pack's current [A] of which the sensor shows `reading` [A]."""
+    return (reading - parameters["pack_current_offset"]) / parameters["pack_current_gain"]
+
+
+def true_voltage(reading: Any, parameters: Mapping[str, float]) -> Any:
+    """The pack's voltage [V] of which the sensor shows `reading` [V]."""
+    return reading - parameters["pack_voltage_offset"]
+
+
+def true_motor_speed(reading: Any, parameters: Mapping[str, float]) -> Any:
+    """The motor's speed of which the sensor shows `reading`, in the same unit."""
+    return reading / parameters["speed_sensor_scale"]
+
+
+TRUE = {"pack_current": true_current, "pack_voltage": true_voltage, "motor_speed": true_motor_speed}
+"""What is, out of what is shown, by role; other sensors have no error that a file knows."""
+
+
+def true_columns(columns: Columns, parameters: Mapping[str, float]) -> dict[str, tuple[Array, Array]]:
+    """The columns of a ride (times and values by role) with what the sensors are known to err by taken off."""
+    return {role: (t, TRUE[role](v, parameters) if role in TRUE else v) for role, (t, v) in columns.items()}
+
+
+def road_speed(motor_speed: Any, parameters: Mapping[str, float]) -> Any:
+    """Speed [m/s] of the driven wheel at the motor's true speed [rad/s], without slip."""
+    return motor_speed * (parameters["wheel_radius"] * parameters["gear_ratio"])
+
+
+def speed_role(name: str, columns: Columns, parameters: Mapping[str, float]) -> tuple[str, float]:
+    """(the best speed among the true `columns` of ride `name`, the factor that makes m/s of it): motor or wheel, before
+    what is told of the vehicle. InputError if there is none.
+    """
+    factors = {
+        "motor_speed": road_speed(1.0, parameters),
+        "wheel_speed_rear": parameters["wheel_radius"],
+        "vehicle_speed": 1.0,
+        "gps_speed": 1.0,
+    }
+    for role, factor in factors.items():
+        if role in columns:
+            return role, factor
+    raise InputError(f"{name}: has no speed: none of {', '.join(factors)}")
