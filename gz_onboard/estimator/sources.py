@@ -17,6 +17,7 @@ from gz_onboard.physics.parameters import Parameters
 
 MISMATCH = 0.09145416  # 1/h between the two current sensors, over ten seconds or so: 3 A of 32.8 A·h
 MISMATCH_SHARE = 0.01  # of a step: the low pass of that
+APART_TIME = 300.0  # s: over so long the two are compared for the count of charge, which adds up what stays
 
 
 class CurrentSource(Enum):
@@ -55,6 +56,7 @@ class PackSources:
         self._usual_voltage = battery.ocv(HALF_FULL)[0] * battery.cells_series
         self._mismatch = MISMATCH * battery.pack_capacity(BENCH_TEMPERATURE)  # A
         self._difference = 0.0  # A, low-passed
+        self._apart = 0.0  # A, the same over `APART_TIME`
 
     @property
     def currents_differ(self) -> bool:
@@ -96,7 +98,7 @@ class PackSources:
             source,
             readings.through_inverter if readings.pack is None else readings.pack,
             hypot(self._voltage_sd, voltages.apart, voltages.spread),
-            self._difference,
+            self._apart,
             bool(voltages.apart or any(counter.faulty for counter in voltages.counters.values())),
         )
 
@@ -114,6 +116,7 @@ class PackSources:
         if pack is not None and inverter is not None:
             if together and not readings.charging:
                 self._difference += MISMATCH_SHARE * (pack - inverter - self._difference)
+                self._apart += min(dt / APART_TIME, 1.0) * (pack - inverter - self._apart)
             if currents.disputed:
                 return (pack + inverter) / 2, CurrentSource.DISPUTED
         if pack is not None and signals.pack_current.trusted:

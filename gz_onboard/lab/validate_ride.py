@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.arrays import Array, block_means, running_mean
-from gz_onboard.bus.publisher import WH
-from gz_onboard.constants import GRAVITY
+from gz_onboard.constants import GRAVITY, WH
 from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.validate_components import Component, components
 from gz_onboard.lab.validate_score import (

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array
+from gz_onboard.constants import HOUR
 from gz_onboard.lab.calibrate.table import Measurements
-from gz_onboard.physics.battery import HOUR
 
 FEWEST = 50  # samples
 LONGEST_GAP = 150.0  # s between samples while a current flows

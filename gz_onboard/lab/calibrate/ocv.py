@@ -13,11 +13,11 @@ from functools import cached_property
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
+from gz_onboard.constants import HOUR
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.result import Curve, Found, Panel, PlotLine, Result
 from gz_onboard.lab.calibrate.table import Measurements
-from gz_onboard.physics.battery import HOUR
 
 _SOC = (
     "0 0.005 0.01 0.02 0.03 0.05 0.075 0.1 0.125 0.15 0.2 0.25 0.3 0.35 0.4 0.45 0.5 0.55 0.6 0.65 0.7 0.75 0.8 0.85 "

@@ -13,6 +13,7 @@ from itertools import pairwise
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
+from gz_onboard.constants import HOUR
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, riding_current, voltage
 from gz_onboard.lab.calibrate.cell_data import CellTest
@@ -24,7 +25,6 @@ from gz_onboard.lab.calibrate.pulse_rests import rest_shift, rests_over_soc, shi
 from gz_onboard.lab.calibrate.pulse_test import Tested, moved_pieces, tested
 from gz_onboard.lab.calibrate.result import Curve, Found, Panel, PlotLine, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
-from gz_onboard.physics.battery import HOUR
 
 SOC = np.array([0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
 METHODS = ("reduced", "direct")
