@@ -17,7 +17,7 @@ from gz_onboard.lab.discover.constancy import RIDE, splits, unequal
 from gz_onboard.lab.discover.cross_validation import Fold, held_out, improves, squares
 from gz_onboard.lab.discover.linear import Normal, fit_mixed
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.prior import LOG
+from gz_onboard.lab.discover.prior import LOG_SCALED
 from gz_onboard.lab.discover.search import Search, evidence
 from gz_onboard.lab.discover.selection import SearchProblem, Selection, select_causes
 
@@ -41,7 +41,7 @@ def within_bounds(mixed: MixedModel, cause: Candidate, change: Sequence[float], 
     """Whether the parameters of `cause` can have changed by `change` [scales], known within `sd`."""
     for parameter, x, s in zip(cause.parameters, change, sd, strict=True):
         (i,) = mixed.index([parameter.name])
-        if parameter.name in LOG:
+        if parameter.name in LOG_SCALED:
             continue
         step = float(mixed.scale[i])
         value, spread = mixed.values[parameter.name] + x * step, SURE * s * step

@@ -13,7 +13,7 @@ from gz_onboard.lab.discover.curves import with_inflation
 from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.linear import LinearRide, Noise, Normal, Posterior, fit_mixed, learn_noise, normal
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
-from gz_onboard.lab.discover.prior import FIXED, LOG
+from gz_onboard.lab.discover.prior import GIVEN_SCATTER, LOG_SCALED
 from gz_onboard.lab.discover.search import evidence
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.parameters import Parameters, Value, declared_parameters
@@ -50,13 +50,13 @@ def adopted(vehicle: Vehicle, mixed: MixedModel) -> Vehicle:
     """`vehicle` with the values and standard deviations of its own parameters that `mixed` has learned."""
     known = dict(vehicle.parameters.known)
     sd = np.sqrt(np.diag(mixed.prior)) * mixed.scale
-    at = mixed.unit_value(mixed.mean)
+    at = mixed.values_at(mixed.mean)
     declared = declared_parameters(vehicle.model.effects)
     model = {name for effect in vehicle.model.effects for name in effect.keywords}
     for name, s in zip(mixed.names, sd, strict=True):
         if name in known and (name in model or not known[name].source.startswith("prior:")):
             old = known[name]
-            wide = float(s * (old.value if name in LOG else 1.0))
+            wide = float(s * (old.value if name in LOG_SCALED else 1.0))
             source = f"{old.source}; refitted on {mixed.healthy} healthy rides"
             bounds = declared[name]
             known[name] = Value(float(np.clip(at[name], bounds.low, bounds.high)), wide, old.unit, "measured", source)
@@ -79,7 +79,7 @@ def learn(mixed: MixedModel, rides: Sequence[Ride], progress: Progress, workers:
         post = fit_mixed(normals, first - shift, mixed.prior, mixed.scatter, WEIGHT, mixed.free, 0)
         noise = learned_noise(mixed, lines, post, noise)
         shift = shift + post.mean
-        values = mixed.unit_value(shift)
+        values = mixed.values_at(shift)
     progress("scatter between healthy rides")
     lines = linearise_all(rides, replace(mixed, values=values, mean=first - shift, noise=noise), workers)
     normals = [normal(line, noise) for line in lines]
@@ -104,7 +104,7 @@ def learned_noise(mixed: MixedModel, lines: Sequence[LinearRide], post: Posterio
     """`noise` as the residuals show it, each ride at its own parameters; of the cells at its own start alone, for there
     what differs between rides is the circuit's lack, and would be taken for knowledge.
     """
-    starts = np.array([name in FIXED for name in mixed.names])
+    starts = np.array([name in GIVEN_SCATTER for name in mixed.names])
     free = learn_noise(lines, post.mean + post.own, noise)
     held = learn_noise(lines, post.mean + post.own * starts, noise)
     return {name: (held if name == "cell_voltage" else free)[name] for name in free}

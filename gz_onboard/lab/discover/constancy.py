@@ -86,7 +86,7 @@ def _split(now: Selection, index: Sequence[int], sign: Sign) -> tuple[float, flo
     prior[:p, :p] = mixed.prior
     prior[p, p] = RATIO_SD**2
     e = evidence_of(np.append(mixed.mean, 0.0), prior, np.append(mixed.scatter, RIDE_SD**2), rides)
-    inner, score = e.given([p], fixed)
+    inner, score = e.profiled([p], fixed)
     if inner[0, 0] <= 1e-6:
         return None
     return float(score[0] / inner[0, 0]), float(score[0] * score[0] / inner[0, 0])

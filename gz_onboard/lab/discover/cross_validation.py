@@ -13,7 +13,7 @@ from gz_onboard.lab.discover.curve_forms import CurveForm, columns
 from gz_onboard.lab.discover.curves import extended
 from gz_onboard.lab.discover.linear import LinearRide, Normal, fit_mixed, normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.prior import STARTS
+from gz_onboard.lab.discover.prior import EACH_RIDES_OWN
 
 WIDE = 100.0  # variance of a curve's coefficients, in units of `CurveForm.size`
 
@@ -126,8 +126,8 @@ def without(line: LinearRide, form: CurveForm, coefficients: Array) -> LinearRid
 
 
 def with_own_start(mixed: MixedModel, ride: Normal, theta: Array) -> Array:
-    """`theta` (p,) with what is the ride's own of `prior.STARTS`, which is no merit or fault of a model."""
-    m = [i for i, name in enumerate(mixed.names) if name in STARTS]
+    """`theta` (p,) with what is the ride's own of `prior.EACH_RIDES_OWN`, which is no merit or fault of a model."""
+    m = [i for i, name in enumerate(mixed.names) if name in EACH_RIDES_OWN]
     variance = mixed.scatter[m] + np.diag(mixed.prior)[m]
     rest = ride.b[m] - ride.n[m] @ theta
     moved = theta.copy()

@@ -11,7 +11,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.blocks import over_blocks
 from gz_onboard.lab.discover.grid import STEP, Ride, smooth
 from gz_onboard.lab.discover.linear import LinearChannel
-from gz_onboard.lab.discover.prior import USUAL, Sizes
+from gz_onboard.lab.discover.prior import USUAL_SIZES, Sizes
 
 # knots of the hat functions, of a vehicle of size 1 (see `KNOTS_OF`); unit
 QUANTITIES: dict[str, tuple[tuple[float, ...], str]] = {
@@ -66,7 +66,7 @@ class CurveForm:
     channel: str
     quantity: str
     straight: bool = False
-    sizes: Sizes = USUAL
+    sizes: Sizes = USUAL_SIZES
 
     @property
     def name(self) -> str:
@@ -103,7 +103,7 @@ class CurveForm:
         return QUANTITIES[self.quantity][1]
 
 
-def curve_forms(sizes: Sizes = USUAL) -> list[CurveForm]:
+def curve_forms(sizes: Sizes = USUAL_SIZES) -> list[CurveForm]:
     """A curve for every pair of channel and quantity, and what is in proportion to some; of a vehicle of `sizes`."""
     every = [CurveForm(channel, quantity, sizes=sizes) for channel, quantities in PAIRS for quantity in quantities]
     return [*every, *(replace(form, straight=True) for form in every if form.quantity in IN_PROPORTION)]

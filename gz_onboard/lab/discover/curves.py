@@ -116,7 +116,7 @@ def fit_curve(
         learns = np.arange(p + k) >= p
         scatter = np.maximum(scatter, fit_mixed(rides, mean, wide, scatter, 1.0, learns, 10).scatter)
     e = evidence_of(mean, prior, scatter, rides)
-    inner, score = e.given(range(p, p + k), fixed, CURVE_RIDGE)
+    inner, score = e.profiled(range(p, p + k), fixed, CURVE_RIDGE)
     inner = free.T @ (inner + CURVE_RIDGE * np.eye(k)) @ free
     score = free.T @ score
     estimate = np.linalg.solve(inner, score)

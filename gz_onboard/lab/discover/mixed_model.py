@@ -18,18 +18,18 @@ from gz_onboard.lab.discover.channels import CHANNELS
 from gz_onboard.lab.discover.grid import USUAL_DELAYS, Dimensions, Ride, read_ride
 from gz_onboard.lab.discover.linear import LinearRide, Noise, linearise, spread_out, trimmed
 from gz_onboard.lab.discover.prior import (
-    BASE,
     BENCH,
     BY_NAME,
-    FIXED,
+    GIVEN_SCATTER,
     HEALTHY_SD,
-    LOG,
     LOG_RIDE_SD,
     LOG_RIDE_SD_ELSE,
+    LOG_SCALED,
     NUISANCES,
     RIDE_SD,
     RIDE_SD_SHARE,
     RIDE_SD_STEP,
+    VEHICLE_PARAMETERS,
     Sizes,
     nearest_step,
     sizes_of,
@@ -118,11 +118,13 @@ class MixedModel:
         """Where `names` stand."""
         return [self.names.index(name) for name in names]
 
-    def unit_value(self, vector: Array) -> dict[str, float]:
+    def values_at(self, vector: Array) -> dict[str, float]:
         """`values` moved by `vector` (p,) in scales."""
         moved = dict(self.values)
         for name, x, scale in zip(self.names, vector, self.scale, strict=True):
-            moved[name] = stepped(name, moved[name], float(np.clip(x * scale, -1, 1) if name in LOG else x * scale))
+            moved[name] = stepped(
+                name, moved[name], float(np.clip(x * scale, -1, 1) if name in LOG_SCALED else x * scale)
+            )
         return moved
 
     def ride(self, samples: Samples) -> Ride:
@@ -170,7 +172,7 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
         np.array([prior.ride_sd for prior in priors.values()]) ** 2,
         {channel.name: channel.noise for channel in CHANNELS},
         0,
-        np.array([name not in FIXED for name in names]),
+        np.array([name not in GIVEN_SCATTER for name in names]),
     )
 
 
@@ -183,7 +185,7 @@ def _names(
     strengths = {name for c in causes for name in c.names}
     of_effects = {x.name for e in vehicle.model.effects for x in e.parameters}
     shaping = {x.name for e in lacking for x in e.parameters} - strengths
-    fitted = set(BASE) | of_effects | strengths | {nuisance.name for nuisance in NUISANCES}
+    fitted = set(VEHICLE_PARAMETERS) | of_effects | strengths | {nuisance.name for nuisance in NUISANCES}
     return sorted(name for name in (needed & fitted) - shaping if name in values)
 
 
@@ -214,7 +216,7 @@ def _prior(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], value
         own = RIDE_SD.get(name, parameter.ride_sd)
         size = nearest_step(value / parameter.prior, RIDE_SD_STEP) if parameter.prior else 1.0
         scatter = RIDE_SD_SHARE * parameter.prior_sd if own is None else own * size
-    if name in LOG:
+    if name in LOG_SCALED:
         spread, scatter = min(spread / value, MOST_LOG), LOG_RIDE_SD.get(name, LOG_RIDE_SD_ELSE)
     wide = spread * (TRANSFERRED if on_bench else 1.0)
     step = max(scatter, LEAST_STEP * wide)

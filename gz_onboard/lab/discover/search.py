@@ -42,7 +42,7 @@ class Evidence:
         i = list(index)
         return np.asarray(np.linalg.inv(self.information[np.ix_(i, i)] + RIDGE * np.eye(len(i))))
 
-    def given(self, index: Sequence[int], fixed: Sequence[int], ridge: float = 0.0) -> tuple[Array, Array]:
+    def profiled(self, index: Sequence[int], fixed: Sequence[int], ridge: float = 0.0) -> tuple[Array, Array]:
         """(information (k, k), score (k,)) of the parameters at `index` once those at `fixed` are fitted beside them.
 
         ridge: added to the information of those at `index`.

@@ -16,7 +16,7 @@ from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.curve_forms import curve_forms
 from gz_onboard.lab.discover.linear import LinearRide, Normal, normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.prior import LOG
+from gz_onboard.lab.discover.prior import LOG_SCALED
 from gz_onboard.lab.discover.search import Evidence, Search, evidence
 
 MAX_ROUNDS = 5
@@ -32,9 +32,9 @@ def linearised_about(mixed: MixedModel, offset: Array, linearised: Linearised) -
     values of `mixed`.
     """
     if offset.ndim == 1:
-        moved = replace(mixed, values=mixed.unit_value(offset)) if np.any(offset) else mixed
+        moved = replace(mixed, values=mixed.values_at(offset)) if np.any(offset) else mixed
         return [line.seen_from(offset) for line in linearised(moved)]
-    lines = linearised([replace(mixed, values=mixed.unit_value(own)) for own in offset])
+    lines = linearised([replace(mixed, values=mixed.values_at(own)) for own in offset])
     return [line.seen_from(own) for line, own in zip(lines, offset, strict=True)]
 
 
@@ -57,7 +57,7 @@ class SearchProblem:
     own: Array
 
 
-def pose(mixed: MixedModel, start: Array, linearised: Linearised) -> SearchProblem:
+def search_problem(mixed: MixedModel, start: Array, linearised: Linearised) -> SearchProblem:
     """The search for the candidates of `mixed`, in rides linearised first at `start` (p,), in scales."""
     lines = linearised_about(mixed, start, linearised)
     e = evidence(mixed, [normal(line, mixed.noise) for line in lines])
@@ -153,7 +153,7 @@ def limited_step(mixed: MixedModel, i: int, x: float) -> float:
     """
     name, value = mixed.names[i], mixed.values[mixed.names[i]]
     bounds = next((p for c in mixed.causes for p in c.parameters if p.name == name), None)
-    if name in LOG or bounds is None:
+    if name in LOG_SCALED or bounds is None:
         return x
     low = max(bounds.low, value / MOST) if bounds.low > 0 else bounds.low
     moved = float(np.clip(value + x * float(mixed.scale[i]), low, bounds.high))

@@ -13,7 +13,7 @@ from gz_onboard.lab.discover.constancy import splits
 from gz_onboard.lab.discover.energy import energy_share, residual_sizes
 from gz_onboard.lab.discover.linear import LinearRide, Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.prior import LOG
+from gz_onboard.lab.discover.prior import LOG_SCALED
 from gz_onboard.lab.discover.result import RIDES, Cause, Estimate, Gain, Isolability, Report, Score, Unknown
 from gz_onboard.lab.discover.search import Search
 from gz_onboard.lab.discover.selection import SearchProblem
@@ -45,7 +45,7 @@ class Discovery:
     normals: list[Normal]
 
 
-def reach(problem: SearchProblem, notes: list[str], say: Callable[[str], None]) -> Discovery:
+def conclude(problem: SearchProblem, notes: list[str], say: Callable[[str], None]) -> Discovery:
     """The verdict, its gain and its limits still open. notes: so far. say: takes the step that begins."""
     say(f"{len(problem.causes)} candidates")
     searched = search_causes(problem)
@@ -75,7 +75,7 @@ def reach(problem: SearchProblem, notes: list[str], say: Callable[[str], None]) 
         Gain(),
         advice(now.search, sets, unknown),
         notes,
-        isolability(every),
+        separability(every),
         problem.limit,
         constancy,
     )
@@ -130,7 +130,7 @@ def intervals(search: Search, name: str, change: Array, sd: Array) -> dict[str, 
         healthy, step = mixed.healthy_value(parameter.name), float(mixed.scale[i])
         wide = mixed.quantile * float(np.hypot(s, form * x))
         at = (float(x), float(x) - wide, float(x) + wide)
-        ends = [healthy * np.exp(step * y) if parameter.name in LOG else healthy + step * y for y in at]
+        ends = [healthy * np.exp(step * y) if parameter.name in LOG_SCALED else healthy + step * y for y in at]
         value, low, high = (float(np.clip(y, parameter.low, parameter.high)) for y in ends)  # nothing that cannot be
         rows[parameter.name] = Estimate(value, (low, high))
     return rows
@@ -162,7 +162,7 @@ def likely(search: Search, chosen: Sequence[str], group: Sequence[str]) -> list[
     return found
 
 
-def isolability(search: Search) -> Isolability:
+def separability(search: Search) -> Isolability:
     """What could be told apart at all, of all candidates that the rides show."""
     signatures = {
         name: sorted(c for c, share in search.shares.get(name, {}).items() if share > 0) for name in search.place
