@@ -15,13 +15,12 @@ import numpy as np
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.constancy import RIDE, splits, unequal
 from gz_onboard.lab.discover.cross_validation import Fold, held_out, improves, squares
-from gz_onboard.lab.discover.linear import Normal, fit_mixed
+from gz_onboard.lab.discover.linear import Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.prior import LOG_SCALED
 from gz_onboard.lab.discover.search import Search, evidence
 from gz_onboard.lab.discover.selection import SearchProblem, Selection, select_causes
 
-FREE = 25.0  # variance in scales of the common part while the scatter of these rides is sought
 ROUNDS = 25
 SURE = 2.0  # standard deviations: an estimate further beyond a bound is none of its cause
 MAX_REJECTIONS = 6  # names at most that are tried and refused
@@ -31,9 +30,7 @@ def with_observed_scatter(mixed: MixedModel, normals: Sequence[Normal]) -> Mixed
     """`mixed` with the scatter between rides that these show, where it is more than healthy ones did."""
     if len(normals) < 2:
         return mixed
-    free = mixed.prior + FREE * np.eye(len(mixed.names))
-    weight = float(mixed.healthy + 1)
-    found = fit_mixed(normals, mixed.mean, free, mixed.scatter, weight, mixed.free, ROUNDS).scatter
+    found = mixed.widened().learned_scatter(normals, float(mixed.healthy + 1), ROUNDS).scatter
     return replace(mixed, scatter=np.maximum(found, mixed.scatter))
 
 

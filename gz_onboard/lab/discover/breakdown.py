@@ -15,13 +15,12 @@ from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.blocks import over_blocks, usable
 from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.grid import STEP, Ride, since
-from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Posterior, fit_mixed
+from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Posterior
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.residuals import SLOW, cell_circuit
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import readable
 
-FREE = 1e6  # variance in scales of a cause that is free
 JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
 OUTSTANDING = 3.5  # standard deviations of what differs between healthy rides
 
@@ -61,12 +60,8 @@ def before_and_after(found: Discovery) -> tuple[list[LinearRide], list[LinearRid
 
 def fitted(found: Discovery) -> tuple[list[int], Posterior]:
     """Where the parameters of the causes are, and all parameters as the rides show them with these free."""
-    mixed = found.mixed
-    index = [i for cause in found.report.causes for i in mixed.index(list(cause.parameters))]
-    prior = mixed.prior.copy()
-    for i in index:
-        prior[i, i] += FREE
-    return index, fit_mixed(found.normals, mixed.mean, prior, mixed.scatter, 1.0, mixed.free, 0)
+    index = found.mixed.index(name for cause in found.report.causes for name in cause.parameters)
+    return index, found.mixed.freed(index).fit(found.normals)
 
 
 def outlying_rides(found: Discovery) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.blocks import over_blocks
 from gz_onboard.lab.discover.grid import STEP, Ride, smooth
-from gz_onboard.lab.discover.linear import LinearChannel
+from gz_onboard.lab.discover.linear import LinearChannel, LinearRide
 from gz_onboard.lab.discover.prior import USUAL_SIZES, Sizes
 
 # knots of the hat functions, of a vehicle of size 1 (see `KNOTS_OF`); unit
@@ -137,7 +137,8 @@ def hat_functions(x: Array, knots: Sequence[float], periodic: bool = False) -> A
     return np.asarray(full)
 
 
-def columns(ride: Ride, form: CurveForm, table: LinearChannel) -> Array | None:
-    """The curve's columns over the blocks of `table`, (m, knots); None if the ride has not what they are over."""
-    x = quantity(ride, form.quantity, table)
+def columns_of(line: LinearRide, form: CurveForm) -> Array | None:
+    """The curve's columns over the blocks of its channel, (m, knots); None if the ride has not what they are over."""
+    table = line.tables.get(form.channel)
+    x = quantity(line.ride, form.quantity, table) if table is not None else None
     return None if x is None else hat_functions(x, form.knots.tolist(), form.quantity in ROUND)

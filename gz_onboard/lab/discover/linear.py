@@ -13,16 +13,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.blocks import blocks, depends, roughness, support, usable
-from gz_onboard.lab.discover.channels import CHANNELS, Channel
+from gz_onboard.lab.discover.channels import CHANNELS, Channel, ChannelNoise
 from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.prior import stepped
 from gz_onboard.lab.discover.system import System
 
-LEAST = 0.02  # of the variance before, down to which the scatter between rides is learned
-Noise = dict[str, tuple[float, float, float]]  # by channel: white sd, correlated sd, correlation time [s]
+Index = NDArray[np.intp] | slice
+LEAST, MOST = 0.02, 9.0  # of the variance before, within which the scatter between rides is learned
+Noise = dict[str, ChannelNoise]  # by channel
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,11 @@ class LinearChannel:
     def unit(self) -> Array:
         """What y is to be multiplied with to be in the channel's unit, (m,)."""
         return self.factor * self.rough
+
+    @property
+    def touched(self) -> NDArray[np.intp]:
+        """Which parameters move it."""
+        return np.flatnonzero(np.any(self.a != 0, axis=0))
 
     @property
     def rough(self) -> Array:
@@ -93,7 +100,7 @@ def linearise(
     return LinearRide(ride, tables)
 
 
-def whitened(table: LinearChannel, noise: tuple[float, float, float], values: Array) -> Array:
+def whitened(table: LinearChannel, noise: ChannelNoise, values: Array) -> Array:
     """`values` (m,) or (m, k) in units of their noise: the innovations of a Kalman filter of white and exponentially
     correlated noise (Anderson & Moore 1979, ch. 9), divided by their standard deviation.
     """
@@ -170,10 +177,10 @@ def spread_out(line: LinearRide, noise: Noise, mean: Array, spread: Array) -> Li
     return LinearRide(line.ride, tables)
 
 
-def _trim(table: LinearChannel, noise: tuple[float, float, float], own: Array) -> LinearChannel:
+def _trim(table: LinearChannel, noise: ChannelNoise, own: Array) -> LinearChannel:
     rest = table.y - table.a @ own
     rest = rest - np.median(rest)
-    limit = 5 * max(float(np.hypot(noise[0], noise[1])), 1.4826 * float(np.median(np.abs(rest))))
+    limit = 5 * max(noise.sd, 1.4826 * float(np.median(np.abs(rest))))
     bad = np.abs(rest) > max(limit, float(np.quantile(np.abs(rest), 0.95)))
     bad = bad | np.append(bad[1:], False) | np.insert(bad[:-1], 0, False)
     if not bad.any() or bad.mean() > 0.2:
@@ -190,6 +197,22 @@ class Normal:
     n: Array
     b: Array
 
+    def padded(self, k: int) -> Normal:
+        """The same of `k` parameters more, of which nothing is known yet."""
+        return Normal(np.pad(self.n, (0, k)), np.pad(self.b, (0, k)))
+
+    def with_columns(self, table: LinearChannel, noise: ChannelNoise, columns: Array, own: Index) -> Normal:
+        """The same with `columns` (m, k) of a channel for the last k parameters; own: where its others are."""
+        k = columns.shape[1]
+        both = whitened(table, noise, np.column_stack([columns, table.a[:, own], table.y]))
+        new, a, y = both[:, :k], both[:, k:-1], both[:, -1]
+        n, b = self.n.copy(), self.b.copy()
+        n[-k:, -k:] += new.T @ new
+        n[-k:, own] += new.T @ a
+        n[:-k, -k:] = n[-k:, :-k].T
+        b[-k:] += new.T @ y
+        return Normal(n, b)
+
 
 def normal(linear: LinearRide, noise: Noise, only: Sequence[str] | None = None) -> Normal:
     """The normal equations of a ride, over all channels or `only` some."""
@@ -198,7 +221,7 @@ def normal(linear: LinearRide, noise: Noise, only: Sequence[str] | None = None) 
     for name, table in linear.tables.items():
         if only is not None and name not in only:
             continue
-        touched = np.flatnonzero(np.any(table.a != 0, axis=0))
+        touched = table.touched
         both = whitened(table, noise[name], np.column_stack([table.a[:, touched], table.y]))
         a, y = both[:, :-1], both[:, -1]
         n[np.ix_(touched, touched)] += a.T @ a
@@ -228,14 +251,15 @@ def fit_mixed(
     mean: Array,
     prior: Array,
     scatter: Array,
-    weight: Array | float,
-    free: Mask,
-    rounds: int = 60,
+    weight: Array | float = 0.0,
+    free: Mask | None = None,
+    rounds: int = 0,
 ) -> Posterior:
-    """Common part, and the scatter between rides by expectation and maximisation (Dempster, Laird & Rubin 1977).
+    """Common part, and the scatter between rides in `rounds` of expectation and maximisation (Dempster, Laird & Rubin
+    1977); none: it stays.
 
     mean, prior: (p,), (p, p) of the common part before. scatter: (p,) variances before, worth `weight` (p,) rides;
-    only those of `free` (p,) are learned, down to `LEAST` of what they were.
+    only those of `free` (p,) are learned, from `LEAST` to `MOST` of what they were.
     """
     before = scatter.copy()
     now = scatter.copy()
@@ -252,8 +276,8 @@ def fit_mixed(
             vn = v @ ride.n
             total = total + u**2 + np.diag(v) + np.einsum("ij,jk,ik->i", vn, after, vn)
             own.append(u)
-        if rounds > 0:
-            now = np.where(free, np.clip(total / (weight + len(rides)), LEAST * before, 9 * before), before)
+        if free is not None:
+            now = np.where(free, np.clip(total / (weight + len(rides)), LEAST * before, MOST * before), before)
     return Posterior(common, after, now, np.array(own))
 
 
@@ -281,7 +305,8 @@ def learn_noise(rides: Sequence[LinearRide], shifts: Array, start: Noise) -> Noi
         spread = float(1.4826 * np.median(np.abs(pooled - np.median(pooled)))) or float(np.std(pooled)) or 1e-9
         rows = [(t, np.clip(rest, -6 * spread, 6 * spread)) for t, rest in rows]
         if not channel.correlated:
-            result[channel.name] = (float(np.sqrt(np.mean(np.concatenate([r for _, r in rows]) ** 2))), 0.0, 10.0)
+            white = float(np.sqrt(np.mean(np.concatenate([rest for _, rest in rows]) ** 2)))
+            result[channel.name] = ChannelNoise(white, 0.0, channel.noise.time)
             continue
         grid = [
             (q, t)
@@ -295,5 +320,5 @@ def learn_noise(rides: Sequence[LinearRide], shifts: Array, start: Noise) -> Noi
         quadratic = sum((q for q, _ in parts), np.zeros(len(ratio)))
         i = int(np.argmin(count * np.log(quadratic / count) + sum(part[1] for part in parts)))
         sd = float(np.sqrt(quadratic[i] / count))
-        result[channel.name] = (sd, float(ratio[i]) * sd, float(time[i]))
+        result[channel.name] = ChannelNoise(sd, float(ratio[i]) * sd, float(time[i]))
     return result

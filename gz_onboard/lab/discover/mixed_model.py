@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -16,7 +16,17 @@ from gz_onboard.lab.discover.blocks import depends
 from gz_onboard.lab.discover.candidates import Candidate, candidates
 from gz_onboard.lab.discover.channels import CHANNELS
 from gz_onboard.lab.discover.grid import USUAL_DELAYS, Dimensions, Ride, read_ride
-from gz_onboard.lab.discover.linear import LinearRide, Noise, linearise, spread_out, trimmed
+from gz_onboard.lab.discover.linear import (
+    LinearRide,
+    Noise,
+    Normal,
+    Posterior,
+    fit_mixed,
+    linearise,
+    normal,
+    spread_out,
+    trimmed,
+)
 from gz_onboard.lab.discover.prior import (
     BENCH,
     BY_NAME,
@@ -47,6 +57,8 @@ TRANSFERRED = 3.0
 MOST_LOG = 0.5  # sd of a logarithm, beyond which a parameter is known to its sign only
 LEAST_STEP = 0.05  # of a standard deviation: the finest scale
 LEAST_SD = 1e-3  # scales: what is certain
+FREED = 1e6  # variance in scales of what nothing is known of
+WIDENED = 25.0  # variance in scales, five times a usual change
 PRIOR_RIDES, LEAST_FREEDOM = 3, 4
 """What is known without healthy rides, worth so many of them; and no scatter is known worse than with so many."""
 
@@ -114,9 +126,35 @@ class MixedModel:
         absent = any(name in cause.names for cause in self.lacking)
         return 0.0 if absent else float(self.vehicle.parameters[name])
 
-    def index(self, names: Sequence[str]) -> list[int]:
+    def index(self, names: Iterable[str]) -> list[int]:
         """Where `names` stand."""
         return [self.names.index(name) for name in names]
+
+    def index_of(self, causes: Iterable[Candidate]) -> list[int]:
+        """Where the parameters of `causes` stand."""
+        return self.index(name for cause in causes for name in cause.names)
+
+    def normals(self, lines: Iterable[LinearRide]) -> list[Normal]:
+        """The normal equations of each ride at this noise."""
+        return [normal(line, self.noise) for line in lines]
+
+    def fit(self, rides: Sequence[Normal]) -> Posterior:
+        """The common part and each ride's own as `rides` show them, the scatter as it is."""
+        return fit_mixed(rides, self.mean, self.prior, self.scatter)
+
+    def learned_scatter(self, rides: Sequence[Normal], weight: Array | float, rounds: int) -> Posterior:
+        """The same with the scatter that `rides` show; see `linear.fit_mixed`."""
+        return fit_mixed(rides, self.mean, self.prior, self.scatter, weight, self.free, rounds)
+
+    def freed(self, index: Sequence[int]) -> MixedModel:
+        """With nothing known of the common part at `index`."""
+        prior = self.prior.copy()
+        prior[index, index] += FREED
+        return replace(self, prior=prior)
+
+    def widened(self) -> MixedModel:
+        """With a common part of which little is known, while scatter or noise of the very rides is sought."""
+        return replace(self, prior=self.prior + WIDENED * np.eye(len(self.names)))
 
     def values_at(self, vector: Array) -> dict[str, float]:
         """`values` moved by `vector` (p,) in scales."""

@@ -196,7 +196,7 @@ def channel_effect(now: Selection, channel: str) -> tuple[float, float]:
     for line in now.lines:
         for name, table in line.tables.items():
             effect = table.a @ change
-            strength = float(np.sum((effect / np.hypot(*now.mixed.noise[name][:2])) ** 2))
+            strength = float(np.sum((effect / now.mixed.noise[name].sd) ** 2))
             everywhere += strength
             if name == channel:
                 here += strength
