@@ -22,6 +22,16 @@ from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.prior import stepped
 from gz_onboard.lab.discover.system import System
 
+LEAST_BLOCKS = 10  # of a channel in a ride, to say anything
+WHITE = 1e-9  # of the white noise: correlated noise of less is none
+TRIMS = 3  # rounds of fitting a ride and trimming it
+OUTLYING, KEPT, MOST_TRIMMED = 5.0, 0.95, 0.2
+"""Standard deviations of a block that is trimmed; share of a channel that is never; where more would be, nothing is."""
+NORMAL = 1.4826  # standard deviation over median absolute deviation of the normal distribution
+CLIPPED = 6.0  # robust standard deviations, beyond which a residual counts no more for its noise
+RATIOS = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0)  # of correlated over white noise, of which the likeliest is taken
+BLOCKS, TIMES = (3, 10), (60.0, 200.0, 600.0)  # correlation times likewise, in blocks and in s
+SLOW_RATIO = 0.5  # the least of a channel whose noise is known to be slow
 Index = NDArray[np.intp] | slice
 LEAST, MOST = 0.02, 9.0  # of the variance before, within which the scatter between rides is learned
 Noise = dict[str, ChannelNoise]  # by channel
@@ -79,7 +89,7 @@ def linearise(
         if not usable(channel, ride, system):
             continue
         used = support(channel, ride)
-        if used.sum() < 10:
+        if used.sum() < LEAST_BLOCKS:
             continue
         mine = depends(channel, system.effects)
         y = blocks(channel, ride, values, system)[used]
@@ -105,7 +115,7 @@ def whitened(table: LinearChannel, noise: ChannelNoise, values: Array) -> Array:
     correlated noise (Anderson & Moore 1979, ch. 9), divided by their standard deviation.
     """
     white, slow, time = noise
-    if not table.channel.correlated or slow < 1e-9 * white:
+    if not table.channel.correlated or slow < WHITE * white:
         return np.asarray(values / white)
     decay = np.exp(-np.diff(table.time, prepend=table.time[0]) / time)
     variance = slow**2
@@ -152,7 +162,7 @@ def trimmed(line: LinearRide, noise: Noise, mean: Array, spread: Array) -> Linea
     1987), with their neighbours; a tenth of a channel at most.
     """
     tables = line.tables
-    for _ in range(3):
+    for _ in range(TRIMS):
         own = likeliest(LinearRide(line.ride, tables), noise, mean, spread)
         tables = {name: _trim(table, noise[name], own) for name, table in line.tables.items()}
     return LinearRide(line.ride, tables)
@@ -180,10 +190,10 @@ def spread_out(line: LinearRide, noise: Noise, mean: Array, spread: Array) -> Li
 def _trim(table: LinearChannel, noise: ChannelNoise, own: Array) -> LinearChannel:
     rest = table.y - table.a @ own
     rest = rest - np.median(rest)
-    limit = 5 * max(noise.sd, 1.4826 * float(np.median(np.abs(rest))))
-    bad = np.abs(rest) > max(limit, float(np.quantile(np.abs(rest), 0.95)))
+    limit = OUTLYING * max(noise.sd, NORMAL * float(np.median(np.abs(rest))))
+    bad = np.abs(rest) > max(limit, float(np.quantile(np.abs(rest), KEPT)))
     bad = bad | np.append(bad[1:], False) | np.insert(bad[:-1], 0, False)
-    if not bad.any() or bad.mean() > 0.2:
+    if not bad.any() or bad.mean() > MOST_TRIMMED:
         return table
     used = table.used.copy()
     used[np.flatnonzero(used)[bad]] = False
@@ -302,17 +312,17 @@ def learn_noise(rides: Sequence[LinearRide], shifts: Array, start: Noise) -> Noi
         if not rows:
             continue
         pooled = np.concatenate([rest for _, rest in rows])
-        spread = float(1.4826 * np.median(np.abs(pooled - np.median(pooled)))) or float(np.std(pooled)) or 1e-9
-        rows = [(t, np.clip(rest, -6 * spread, 6 * spread)) for t, rest in rows]
+        spread = float(NORMAL * np.median(np.abs(pooled - np.median(pooled)))) or float(np.std(pooled)) or 1e-9
+        rows = [(t, np.clip(rest, -CLIPPED * spread, CLIPPED * spread)) for t, rest in rows]
         if not channel.correlated:
             white = float(np.sqrt(np.mean(np.concatenate([rest for _, rest in rows]) ** 2)))
             result[channel.name] = ChannelNoise(white, 0.0, channel.noise.time)
             continue
         grid = [
             (q, t)
-            for t in (3 * channel.block, 10 * channel.block, 60.0, 200.0, 600.0)
-            for q in (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0)
-            if not channel.slow or (t >= channel.slow and q >= 0.5)
+            for t in (*(n * channel.block for n in BLOCKS), *TIMES)
+            for q in RATIOS
+            if not channel.slow or (t >= channel.slow and q >= SLOW_RATIO)
         ]
         ratio, time = (np.array(column) for column in zip(*grid, strict=True))
         parts = [likelihoods(table.time, rest, ratio, time) for table, rest in rows]

@@ -9,9 +9,9 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.acceptance import accept
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.grid import MOVING
 from gz_onboard.lab.discover.search import one_degree
 from gz_onboard.lab.discover.selection import SearchProblem, Selection, linearised_about, select_causes
+from gz_onboard.physics.effect import MOVING
 
 SIDE = 0.5  # of (wind over speed)²: what side wind and gusts change of drag, in the mean over all directions
 
