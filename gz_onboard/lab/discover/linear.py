@@ -135,7 +135,8 @@ def whitened(table: LinearChannel, noise: ChannelNoise, values: Array) -> Array:
 
 def likelihoods(times: Array, rest: Array, ratio: Array, time: Array) -> tuple[Array, Array]:
     """For each pair of `ratio` (correlated over white sd) and `time` [s], shape (k,): the sum of squares in units of
-    the white noise, and the sum of the logarithms of the innovations' variances.
+    the white noise, and the sum of the logarithms of the innovations' variances. The recursion of `whitened`, whose
+    variances are one number a step; here they are arrays, and as few operations as can be.
     """
     steps = np.exp(-np.diff(times, prepend=times[0])[:, None] / time)
     power = ratio**2
