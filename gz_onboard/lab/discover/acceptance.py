@@ -7,7 +7,7 @@ did widens the scatter, beside a common part that is free; and what was found on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -34,7 +34,7 @@ def with_observed_scatter(mixed: MixedModel, normals: Sequence[Normal]) -> Mixed
     return replace(mixed, scatter=np.maximum(found, mixed.scatter))
 
 
-def within_bounds(mixed: MixedModel, cause: Candidate, change: Sequence[float], sd: Sequence[float]) -> bool:
+def within_bounds(mixed: MixedModel, cause: Candidate, change: Iterable[float], sd: Iterable[float]) -> bool:
     """Whether the parameters of `cause` can have changed by `change` [scales], known within `sd`."""
     for parameter, x, s in zip(cause.parameters, change, sd, strict=True):
         (i,) = mixed.index([parameter.name])
@@ -62,19 +62,13 @@ def rejection(now: Selection, limit: float) -> tuple[str, str] | None:
     mixed, search = now.mixed, now.search
     wide = with_observed_scatter(mixed, now.normals)
     strict = Search(wide, evidence(wide, now.normals), list(search.causes.values()), search.shares)
-    index = search.index(now.chosen)
-    estimate, sd = search.evidence.estimate(index), np.sqrt(np.diag(search.evidence.covariance(index)))
     # against a file what differs between rides cannot be separated from what its model lacks; a baseline knows it
     parts = [] if mixed.healthy else splits(now)
     uneven = {split.cause for split in parts if unequal(split) and split.quantity.startswith(RIDE)}
     found: list[tuple[float, str, str]] = []
-    at = 0
-    for name in now.chosen:
-        cause = search.causes[name]
-        own = slice(at, at + len(cause.parameters))
-        at = own.stop
-        score = strict.step([n for n in now.chosen if n != name], name)
-        if not within_bounds(mixed, cause, estimate[own].tolist(), sd[own].tolist()):
+    for name, (change, variance) in search.fitted(now.chosen).items():
+        score = strict.part(now.chosen, name)
+        if not within_bounds(mixed, search.causes[name], change, np.sqrt(variance)):
             found.append((score, name, "would be beyond what it can be"))
         elif score < limit:
             found.append((score, name, "differs from ride to ride as much as it is"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from gz_onboard.lab.discover.linear import LinearRide, Noise, Normal, Posterior,
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
 from gz_onboard.lab.discover.prior import GIVEN_SCATTER, LOG_SCALED
 from gz_onboard.lab.discover.search import evidence
+from gz_onboard.lab.discover.wording import Say
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.parameters import Parameters, Value, declared_parameters
 from gz_onboard.vehicle import Vehicle
@@ -25,14 +26,13 @@ ROUNDS = 3
 SCATTER_ROUNDS = 120  # of expectation and maximisation
 LEAST = 0.6  # of an inflation
 LEAST_RIDES = 3
-Progress = Callable[[str], None]
 
 
 def baseline(
     vehicle: Vehicle,
     healthy: Sequence[Samples],
     folder: Path | None = None,
-    progress: Progress | None = None,
+    progress: Say | None = None,
     workers: int = 1,
 ) -> Vehicle:
     """`vehicle` as `healthy` rides show it: parameters refitted within their calibration, and the null statistics.
@@ -64,7 +64,7 @@ def adopted(vehicle: Vehicle, mixed: MixedModel) -> Vehicle:
     return replace(learned, healthy=replace(mixed, vehicle=learned))
 
 
-def learn(mixed: MixedModel, rides: Sequence[Ride], progress: Progress, workers: int = 1) -> MixedModel:
+def learn(mixed: MixedModel, rides: Sequence[Ride], progress: Say, workers: int = 1) -> MixedModel:
     """`mixed` as `rides` of the healthy vehicle teach it: common part and noise first, then the scatter of rides.
 
     In this order, for a scatter that is free while the noise is learned takes what is noise for its own.

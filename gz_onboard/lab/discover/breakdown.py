@@ -22,6 +22,7 @@ from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import readable
 
 JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
+FINEST = 25  # bins of the least width that are the span of a quantity
 OUTSTANDING = 3.5  # standard deviations of what differs between healthy rides
 
 QUANTITIES: dict[str, tuple[str, str, str]] = {
@@ -133,7 +134,7 @@ def pooled(lines: Sequence[LinearRide], channel: str, name: str, over: QuantityR
 def edges(x: Array, count: int = 12) -> Array:
     """Edges of `count` bins of as many of `x`, fewer where many are alike: none is narrower than a 25th of the span."""
     at = np.quantile(x, np.linspace(0, 1, count + 1))
-    least = (np.quantile(x, 0.98) - np.quantile(x, 0.02)) / 25
+    least = (np.quantile(x, 0.98) - np.quantile(x, 0.02)) / FINEST
     kept = [at[0]]
     for edge in at[1:-1]:
         if edge - kept[-1] >= least and at[-1] - edge >= least:

@@ -125,16 +125,14 @@ def quantity(ride: Ride, name: str, table: LinearChannel) -> Array | None:
 
 
 def hat_functions(x: Array, knots: Sequence[float], periodic: bool = False) -> Array:
-    """Linear hat functions over `knots` but the one that most is at, (m, k)."""
-    at = np.array(knots)
+    """Linear hat functions over `knots`, (m, k); periodic: of an angle [rad], the last goes over into the first."""
+    at = [*knots, 2 * np.pi] if periodic else knots
+    inside = np.mod(x, 2 * np.pi) if periodic else x
+    full: Array = np.array([np.interp(inside, at, hat) for hat in np.eye(len(at))]).T
     if periodic:
-        at = np.append(at, 2 * np.pi)
-        full = np.array([np.interp(np.mod(x, 2 * np.pi), at, np.eye(len(at))[i]) for i in range(len(at))]).T
         full[:, 0] += full[:, -1]
         full = full[:, :-1]
-    else:
-        full = np.array([np.interp(x, at, np.eye(len(at))[i]) for i in range(len(at))]).T
-    return np.asarray(full)
+    return full
 
 
 def columns_of(line: LinearRide, form: CurveForm) -> Array | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,10 +22,10 @@ from gz_onboard.lab.discover.result import Gain
 from gz_onboard.lab.discover.selection import linearised_about, search_problem
 from gz_onboard.lab.discover.uncalibrated import NOTE, without_baseline
 from gz_onboard.lab.discover.verdict import Discovery, conclude
+from gz_onboard.lab.discover.wording import Say
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
-Progress = Callable[[str], None]
 SHORTEST = 300.0  # m: shorter rides show nothing
 LATENCY = "pack_voltage_latency"
 LATENCY_STEPS = 10  # of the grid of time, to either side, that a delay is sought in
@@ -37,7 +37,7 @@ def discover(
     rides: Sequence[Samples],
     seed: int = 0,
     folder: Path | None = None,
-    progress: Progress | None = None,
+    progress: Say | None = None,
     workers: int = 1,
     holdout: Sequence[str] | None = None,
 ) -> Discovery:

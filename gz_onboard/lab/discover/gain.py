@@ -42,8 +42,7 @@ def measure_gain(found: Discovery, seed: int, apart: Sequence[LinearRide] = ()) 
     rng = np.random.default_rng(seed)
     held = tuple(lines[i].ride.name for fold in folds for i in fold)
     of_metric = {metric: summarised(triples, rng) for metric, triples in rows.items()}
-    metrics = (of_metric.get(metric) for metric in ("voltage", "power", "energy_per_way", "range"))
-    return Gain(held, None, bool(apart), *metrics)
+    return Gain(held, None, bool(apart), **of_metric)
 
 
 def summarised(rows: Sequence[Triple], rng: np.random.Generator) -> Errors:

@@ -55,17 +55,12 @@ class LinearChannel:
     @property
     def unit(self) -> Array:
         """What y is to be multiplied with to be in the channel's unit, (m,)."""
-        return self.factor * self.rough
+        return self.factor * self.roughness[self.used]
 
     @property
     def touched(self) -> NDArray[np.intp]:
         """Which parameters move it."""
         return np.flatnonzero(np.any(self.a != 0, axis=0))
-
-    @property
-    def rough(self) -> Array:
-        """The roughness of its blocks, (m,)."""
-        return self.roughness[self.used]
 
 
 @dataclass
@@ -292,24 +287,15 @@ def fit_mixed(
     return Posterior(common, after, now, np.array(own))
 
 
-def residuals(linear: LinearRide, shift: Array) -> dict[str, Array]:
-    """y − A·shift by channel."""
-    return {name: table.y - table.a @ shift for name, table in linear.tables.items()}
-
-
 def learn_noise(rides: Sequence[LinearRide], shifts: Array, start: Noise) -> Noise:
     """White and correlated noise of each channel by maximum likelihood on a grid, all rides together.
 
     shifts: (rides, p), what each ride's parameters are.
     """
     result = dict(start)
-    every = [residuals(ride, shift) for ride, shift in zip(rides, shifts, strict=True)]
+    every = [ride.seen_from(-shift).tables for ride, shift in zip(rides, shifts, strict=True)]
     for channel in CHANNELS:
-        rows = [
-            (ride.tables[channel.name], rest[channel.name])
-            for ride, rest in zip(rides, every, strict=True)
-            if channel.name in rest
-        ]
+        rows = [(table, table.y) for tables in every if (table := tables.get(channel.name)) is not None]
         if not rows:
             continue
         pooled = np.concatenate([rest for _, rest in rows])

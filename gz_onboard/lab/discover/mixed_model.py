@@ -77,6 +77,7 @@ class MixedModel:
     """The linear model's frame: names (p,), scale (p,), values where it is linearised, and what is known before.
 
     mean, prior: of the common part less `values`, in scales, (p,), (p, p). scatter: variances between rides, (p,).
+    inflation: of a cause's score on healthy rides left out, 1 if right. shapes: what these show over quantities.
     """
 
     vehicle: Vehicle
@@ -91,10 +92,8 @@ class MixedModel:
     noise: Noise
     healthy: int  # rides that it was learned on
     free: Mask  # whose scatter between rides is learned, (p,)
-    inflation: dict[str, float] = field(
-        default_factory=dict
-    )  # of a cause's score on healthy rides left out, 1 if right
-    shapes: dict[str, HealthyCurve] = field(default_factory=dict)  # what healthy rides show over quantities, by name
+    inflation: dict[str, float] = field(default_factory=dict)
+    shapes: dict[str, HealthyCurve] = field(default_factory=dict)
 
     @property
     def freedom(self) -> float:
@@ -199,18 +198,18 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
     declared = declared_parameters(effects)
     priors = {name: _prior(name, vehicle, declared, values[name], name in absent) for name in names}
     return MixedModel(
-        vehicle,
-        system,
-        causes,
-        tuple(names),
-        np.array([prior.scale for prior in priors.values()]),
-        values,
-        np.zeros(len(names)),
-        _covariance(priors, vehicle.parameters.correlations),
-        np.array([prior.ride_sd for prior in priors.values()]) ** 2,
-        {channel.name: channel.noise for channel in CHANNELS},
-        0,
-        np.array([name not in GIVEN_SCATTER for name in names]),
+        vehicle=vehicle,
+        system=system,
+        causes=causes,
+        names=tuple(names),
+        scale=np.array([prior.scale for prior in priors.values()]),
+        values=values,
+        mean=np.zeros(len(names)),
+        prior=_covariance(priors, vehicle.parameters.correlations),
+        scatter=np.array([prior.ride_sd for prior in priors.values()]) ** 2,
+        noise={channel.name: channel.noise for channel in CHANNELS},
+        healthy=0,
+        free=np.array([name not in GIVEN_SCATTER for name in names]),
     )
 
 

@@ -82,7 +82,8 @@ def _head(found: Discovery) -> str:
     known = f"{mixed.healthy} healthy rides" if mixed.healthy else "the vehicle file alone"
     cards = [
         (f"{len(found.lines)}", "ride" if len(found.lines) == 1 else "rides"),
-        (f"{ridden.distance / 1e3:.1f} km", clock(ridden.time)),
+        (f"{ridden.distance / 1e3:.1f} km", "ridden"),
+        (clock(ridden.time), "in"),
     ]
     if ridden.energy > 0:
         cards.append((f"{ridden.energy / 3.6e6:.2f} kWh", "drawn"))

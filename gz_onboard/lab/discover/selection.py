@@ -131,7 +131,7 @@ def select_causes(problem: SearchProblem) -> Selection:
     def searched(lines: list[LinearRide], offset: Array) -> Selection:
         normals = mixed.normals(lines)
         search = Search(mixed, evidence(mixed, normals), problem.causes, problem.shares)
-        return Selection(mixed, lines, normals, search, search.select(problem.limit).names, offset)
+        return Selection(mixed, lines, normals, search, search.select(problem.limit), offset)
 
     now = searched(problem.lines, offset)
     for _ in range(MAX_ROUNDS):
