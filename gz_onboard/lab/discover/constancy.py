@@ -25,6 +25,8 @@ from gz_onboard.lab.discover.selection import Selection
 RATIO_SD, RIDE_SD = 0.15, 0.25  # of a real cause: on all rides, and from ride to ride
 RATIO = 0.5  # beyond which half of the cause is missing in one of the halves
 CHI2 = 9.0  # three standard deviations
+BEND = 0.3  # m/s² of lateral acceleration, from which on a bend is one
+UNSEEN = 1e-6  # information of a ratio, below which nothing shows it
 
 
 Sign = Callable[[Ride, LinearChannel, Array], Array]
@@ -32,7 +34,7 @@ Sign = Callable[[Ride, LinearChannel, Array], Array]
 
 def _side(ride: Ride, table: LinearChannel, effect: Array) -> Array:
     """+1 in left bends, -1 in right ones, 0 on the straight."""
-    return np.asarray(np.tanh(over_blocks(table.channel, ride.quantities["lateral_acceleration"])[table.used] / 0.3))
+    return np.asarray(np.tanh(over_blocks(table.channel, ride.quantities["lateral_acceleration"])[table.used] / BEND))
 
 
 def _halves(name: str) -> Sign:
@@ -86,7 +88,7 @@ def _split(now: Selection, index: Sequence[int], sign: Sign) -> tuple[float, flo
     prior = block_diag(mixed.prior, RATIO_SD**2)
     e = evidence_of(np.append(mixed.mean, 0.0), prior, np.append(mixed.scatter, RIDE_SD**2), rides)
     inner, score = e.profiled([p], fixed)
-    if inner[0, 0] <= 1e-6:
+    if inner[0, 0] <= UNSEEN:
         return None
     return float(score[0] / inner[0, 0]), float(score[0] * score[0] / inner[0, 0])
 

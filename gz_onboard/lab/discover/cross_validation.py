@@ -15,6 +15,7 @@ from gz_onboard.lab.discover.linear import LinearRide, Normal, fit_mixed, normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.prior import EACH_RIDES_OWN
 
+PART = 0.1  # of the evidence: a channel with less has no say
 WIDE = 100.0  # variance of a curve's coefficients, in units of `CurveForm.size`
 
 
@@ -84,7 +85,7 @@ def improves(held: Iterator[Squares], shares: Mapping[str, float]) -> bool:
     total = 0.0
     for channel, part in shares.items():
         mine = [row[channel] for row in rows if channel in row]
-        if part > 0.1 and mine:
+        if part > PART and mine:
             before, control, after = (sum(column) for column in zip(*mine, strict=True))
             total += part * float(np.log(after / min(before, control)))
     return total < 0
