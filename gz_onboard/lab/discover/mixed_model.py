@@ -265,7 +265,7 @@ def _covariance(priors: Mapping[str, _Prior], correlations: Mapping[frozenset[st
     covariance = np.diag(np.array([prior.sd for prior in priors.values()]) ** 2)
     place = {name: i for i, name in enumerate(priors)}
     for pair, r in correlations.items():
-        a, b = tuple(pair)
+        a, b = sorted(pair)  # of a set, whose order differs from run to run, and with it the last digits
         if a in place and b in place:
             # what the bench leaves open goes together; by how much the road differs from the bench does not
             both = r * priors[a].bench_sd * priors[b].bench_sd
