@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.channels import BY_NAME, ChannelNoise
 from gz_onboard.lab.discover.grid import Ride
@@ -17,10 +18,12 @@ NOISE = ChannelNoise(white=2.0, slow=1.5, time=30.0)
 RIDE = Ride("made up", np.zeros(0), {}, {}, 0.25, None)
 
 
-def table(columns: np.ndarray, y: np.ndarray) -> LinearChannel:
+def table(columns: Array, y: Array) -> LinearChannel:
     m = len(y)
-    used, even = np.ones(m, dtype=bool), np.ones(m)
-    return LinearChannel(BY_NAME["road_force"], y, columns, 4.0 * np.arange(m), used, roughness=even)
+    used: Mask = np.ones(m, dtype=bool)
+    even: Array = np.ones(m)
+    time: Array = 4.0 * np.arange(m, dtype=np.float64)
+    return LinearChannel(BY_NAME["road_force"], y, columns, time, used, roughness=even)
 
 
 @pytest.fixture(scope="module")
