@@ -36,15 +36,9 @@ def channel_energy(name: str, line: LinearRide, values: Array) -> float:
 
 def energy_share(lines: Sequence[LinearRide], change: Array, channels: Collection[str] | None = None) -> float:
     """The part of the energy drawn that `change` (p,) of the parameters makes over these rides, in some channels."""
-    return _share(
-        lines,
-        (
-            (name, line, table.a @ change)
-            for line in lines
-            for name, table in line.tables.items()
-            if channels is None or name in channels
-        ),
-    )
+    every = ((name, line, table) for line in lines for name, table in line.tables.items())
+    parts = ((name, line, table.a @ change) for name, line, table in every if channels is None or name in channels)
+    return _share(lines, parts)
 
 
 def _share(lines: Sequence[LinearRide], residuals: Iterable[tuple[str, LinearRide, Array]]) -> float:
@@ -75,15 +69,9 @@ def channel_time(line: LinearRide, channel: str) -> float:
 
 def curve_energy_share(lines: Sequence[LinearRide], form: CurveForm, values: Array) -> float:
     """The part of the energy drawn that the curve of `values` (knots,) takes."""
-    every = ((line, columns_of(line, form)) for line in lines)
-    return _share(
-        lines,
-        (
-            (form.channel, line, knots @ values / line.tables[form.channel].unit)
-            for line, knots in every
-            if knots is not None
-        ),
-    )
+    name, every = form.channel, ((line, columns_of(line, form)) for line in lines)
+    parts = ((name, line, knots @ values / line.tables[name].unit) for line, knots in every if knots is not None)
+    return _share(lines, parts)
 
 
 def residual_sizes(lines: Sequence[LinearRide]) -> dict[str, ResidualSize]:
