@@ -86,7 +86,7 @@ def judge_scooter(seeds: Sequence[int], keep: Path | None = None) -> list[Row]:
     return rows
 
 
-def judge(base: Any, case: plant.Case) -> Row:
+def judge(base: Vehicle, case: plant.Case) -> Row:
     """What the tool says of one case, beside the truth."""
     truths = [
         {

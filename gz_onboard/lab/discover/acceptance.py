@@ -7,7 +7,7 @@ did widens the scatter, beside a common part that is free; and what was found on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,13 +15,12 @@ import numpy as np
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.constancy import RIDE, splits, unequal
 from gz_onboard.lab.discover.cross_validation import Fold, held_out, improves, squares
-from gz_onboard.lab.discover.linear import Normal, fit_mixed
+from gz_onboard.lab.discover.linear import Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.prior import LOG
+from gz_onboard.lab.discover.prior import LOG_SCALED
 from gz_onboard.lab.discover.search import Search, evidence
 from gz_onboard.lab.discover.selection import SearchProblem, Selection, select_causes
 
-FREE = 25.0  # variance in scales of the common part while the scatter of these rides is sought
 ROUNDS = 25
 SURE = 2.0  # standard deviations: an estimate further beyond a bound is none of its cause
 MAX_REJECTIONS = 6  # names at most that are tried and refused
@@ -31,17 +30,15 @@ def with_observed_scatter(mixed: MixedModel, normals: Sequence[Normal]) -> Mixed
     """`mixed` with the scatter between rides that these show, where it is more than healthy ones did."""
     if len(normals) < 2:
         return mixed
-    free = mixed.prior + FREE * np.eye(len(mixed.names))
-    weight = float(mixed.healthy + 1)
-    found = fit_mixed(normals, mixed.mean, free, mixed.scatter, weight, mixed.free, ROUNDS).scatter
+    found = mixed.widened().learned_scatter(normals, float(mixed.healthy + 1), ROUNDS).scatter
     return replace(mixed, scatter=np.maximum(found, mixed.scatter))
 
 
-def within_bounds(mixed: MixedModel, cause: Candidate, change: Sequence[float], sd: Sequence[float]) -> bool:
+def within_bounds(mixed: MixedModel, cause: Candidate, change: Iterable[float], sd: Iterable[float]) -> bool:
     """Whether the parameters of `cause` can have changed by `change` [scales], known within `sd`."""
     for parameter, x, s in zip(cause.parameters, change, sd, strict=True):
         (i,) = mixed.index([parameter.name])
-        if parameter.name in LOG:
+        if parameter.name in LOG_SCALED:
             continue
         step = float(mixed.scale[i])
         value, spread = mixed.values[parameter.name] + x * step, SURE * s * step
@@ -65,19 +62,13 @@ def rejection(now: Selection, limit: float) -> tuple[str, str] | None:
     mixed, search = now.mixed, now.search
     wide = with_observed_scatter(mixed, now.normals)
     strict = Search(wide, evidence(wide, now.normals), list(search.causes.values()), search.shares)
-    index = search.index(now.chosen)
-    estimate, sd = search.evidence.estimate(index), np.sqrt(np.diag(search.evidence.covariance(index)))
     # against a file what differs between rides cannot be separated from what its model lacks; a baseline knows it
     parts = [] if mixed.healthy else splits(now)
     uneven = {split.cause for split in parts if unequal(split) and split.quantity.startswith(RIDE)}
     found: list[tuple[float, str, str]] = []
-    at = 0
-    for name in now.chosen:
-        cause = search.causes[name]
-        own = slice(at, at + len(cause.parameters))
-        at = own.stop
-        score = strict.step([n for n in now.chosen if n != name], name)
-        if not within_bounds(mixed, cause, estimate[own].tolist(), sd[own].tolist()):
+    for name, (change, variance) in search.fitted(now.chosen).items():
+        score = strict.part(now.chosen, name)
+        if not within_bounds(mixed, search.causes[name], change, np.sqrt(variance)):
             found.append((score, name, "would be beyond what it can be"))
         elif score < limit:
             found.append((score, name, "differs from ride to ride as much as it is"))

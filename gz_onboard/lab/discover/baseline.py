@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,10 +11,11 @@ import numpy as np
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.curves import with_inflation
 from gz_onboard.lab.discover.grid import Ride
-from gz_onboard.lab.discover.linear import LinearRide, Noise, Normal, Posterior, fit_mixed, learn_noise, normal
+from gz_onboard.lab.discover.linear import LinearRide, Noise, Normal, Posterior, learn_noise
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
-from gz_onboard.lab.discover.prior import FIXED, LOG
+from gz_onboard.lab.discover.prior import GIVEN_SCATTER, LOG_SCALED
 from gz_onboard.lab.discover.search import evidence
+from gz_onboard.lab.discover.wording import Say
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.parameters import Parameters, Value, declared_parameters
 from gz_onboard.vehicle import Vehicle
@@ -25,14 +26,13 @@ ROUNDS = 3
 SCATTER_ROUNDS = 120  # of expectation and maximisation
 LEAST = 0.6  # of an inflation
 LEAST_RIDES = 3
-Progress = Callable[[str], None]
 
 
 def baseline(
     vehicle: Vehicle,
     healthy: Sequence[Samples],
     folder: Path | None = None,
-    progress: Progress | None = None,
+    progress: Say | None = None,
     workers: int = 1,
 ) -> Vehicle:
     """`vehicle` as `healthy` rides show it: parameters refitted within their calibration, and the null statistics.
@@ -50,13 +50,13 @@ def adopted(vehicle: Vehicle, mixed: MixedModel) -> Vehicle:
     """`vehicle` with the values and standard deviations of its own parameters that `mixed` has learned."""
     known = dict(vehicle.parameters.known)
     sd = np.sqrt(np.diag(mixed.prior)) * mixed.scale
-    at = mixed.unit_value(mixed.mean)
+    at = mixed.values_at(mixed.mean)
     declared = declared_parameters(vehicle.model.effects)
     model = {name for effect in vehicle.model.effects for name in effect.keywords}
     for name, s in zip(mixed.names, sd, strict=True):
         if name in known and (name in model or not known[name].source.startswith("prior:")):
             old = known[name]
-            wide = float(s * (old.value if name in LOG else 1.0))
+            wide = float(s * (old.value if name in LOG_SCALED else 1.0))
             source = f"{old.source}; refitted on {mixed.healthy} healthy rides"
             bounds = declared[name]
             known[name] = Value(float(np.clip(at[name], bounds.low, bounds.high)), wide, old.unit, "measured", source)
@@ -64,49 +64,39 @@ def adopted(vehicle: Vehicle, mixed: MixedModel) -> Vehicle:
     return replace(learned, healthy=replace(mixed, vehicle=learned))
 
 
-def learn(mixed: MixedModel, rides: Sequence[Ride], progress: Progress, workers: int = 1) -> MixedModel:
+def learn(mixed: MixedModel, rides: Sequence[Ride], progress: Say, workers: int = 1) -> MixedModel:
     """`mixed` as `rides` of the healthy vehicle teach it: common part and noise first, then the scatter of rides.
 
     In this order, for a scatter that is free while the noise is learned takes what is noise for its own.
     """
-    noise = mixed.noise
-    values, first = dict(mixed.values), mixed.mean
+    now = mixed
     shift = np.zeros(len(mixed.names))
     for i in range(ROUNDS):
         progress(f"healthy rides, round {i + 1} of {ROUNDS}")
-        lines = linearise_all(rides, replace(mixed, values=values, mean=first - shift, noise=noise), workers)
-        normals = [normal(line, noise) for line in lines]
-        post = fit_mixed(normals, first - shift, mixed.prior, mixed.scatter, WEIGHT, mixed.free, 0)
-        noise = learned_noise(mixed, lines, post, noise)
+        lines = linearise_all(rides, now, workers)
+        post = now.fit(now.normals(lines))
+        noise = learned_noise(lines, post, now)
         shift = shift + post.mean
-        values = mixed.unit_value(shift)
+        now = replace(mixed, values=mixed.values_at(shift), mean=mixed.mean - shift, noise=noise)
     progress("scatter between healthy rides")
-    lines = linearise_all(rides, replace(mixed, values=values, mean=first - shift, noise=noise), workers)
-    normals = [normal(line, noise) for line in lines]
+    lines = linearise_all(rides, now, workers)
+    normals = now.normals(lines)
     weather = {name for cause in mixed.causes if cause.varies for name in cause.names}
     weight = np.array([WEATHER_WEIGHT if name in weather else WEIGHT for name in mixed.names])
-    post = fit_mixed(normals, first - shift, mixed.prior, mixed.scatter, weight, mixed.free, SCATTER_ROUNDS)
-    after = replace(
-        mixed,
-        values=values,
-        mean=post.mean,
-        prior=post.covariance,
-        scatter=post.scatter,
-        noise=noise,
-        healthy=len(rides),
-    )
-    before = replace(after, mean=first - shift, prior=mixed.prior)
+    post = now.learned_scatter(normals, weight, SCATTER_ROUNDS)
+    before = replace(now, scatter=post.scatter, healthy=len(rides))
+    after = replace(before, mean=post.mean, prior=post.covariance)
     folds = left_out(before, normals)
     return replace(after, inflation=inflation(folds, normals), shapes=with_inflation(after, folds, lines, normals))
 
 
-def learned_noise(mixed: MixedModel, lines: Sequence[LinearRide], post: Posterior, noise: Noise) -> Noise:
-    """`noise` as the residuals show it, each ride at its own parameters; of the cells at its own start alone, for there
-    what differs between rides is the circuit's lack, and would be taken for knowledge.
+def learned_noise(lines: Sequence[LinearRide], post: Posterior, now: MixedModel) -> Noise:
+    """The noise of `now` as the residuals show it, each ride at its own parameters; of the cells at its own start
+    alone, for there what differs between rides is the circuit's lack, and would be taken for knowledge.
     """
-    starts = np.array([name in FIXED for name in mixed.names])
-    free = learn_noise(lines, post.mean + post.own, noise)
-    held = learn_noise(lines, post.mean + post.own * starts, noise)
+    starts = np.array([name in GIVEN_SCATTER for name in now.names])
+    free = learn_noise(lines, post.mean + post.own, now.noise)
+    held = learn_noise(lines, post.mean + post.own * starts, now.noise)
     return {name: (held if name == "cell_voltage" else free)[name] for name in free}
 
 
@@ -117,7 +107,7 @@ def left_out(before: MixedModel, normals: Sequence[Normal], size: int = 2) -> li
         held = list(range(start, min(start + size, len(normals))))
         rest = [n for i, n in enumerate(normals) if i not in held]
         if len(rest) >= 2:
-            post = fit_mixed(rest, before.mean, before.prior, before.scatter, WEIGHT, before.free, 0)
+            post = before.fit(rest)
             folds.append((replace(before, mean=post.mean, prior=post.covariance), held))
     return folds
 

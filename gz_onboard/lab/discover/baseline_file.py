@@ -14,6 +14,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.result import Found, Result
 from gz_onboard.lab.calibrate.toml_text import string, with_keys
 from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged
+from gz_onboard.lab.discover.channels import ChannelNoise
 from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel, initial
 from gz_onboard.vehicle import Vehicle
 
@@ -105,8 +106,8 @@ def load(mixed: MixedModel, file: Path) -> MixedModel:
                 values=mixed.values | _mapping(data["value_names"], data["values"]),
                 noise=mixed.noise
                 | {
-                    str(n): (float(a), float(b), float(c))
-                    for n, (a, b, c) in zip(data["noise_names"], data["noise"], strict=True)
+                    str(name): ChannelNoise(*row.tolist())
+                    for name, row in zip(data["noise_names"], data["noise"], strict=True)
                 },
                 inflation=_mapping(data["inflation_names"], data["inflation"]),
                 shapes={

@@ -13,6 +13,9 @@ from gz_onboard.lab.discover.residuals import mean_over
 from gz_onboard.lab.discover.system import System, Values
 from gz_onboard.physics.effect import Effect
 
+WHOLE = 0.99  # of a block: rounding apart, all of it
+STEADY = 0.2  # of the current, as if that much of it changed: gains err in proportion
+
 
 def depends(channel: Channel, effects: Sequence[Effect]) -> set[str]:
     """The parameters that `channel` depends on."""
@@ -35,7 +38,7 @@ def support(channel: Channel, ride: Ride) -> Mask:
     if channel.name == "voltage_timing":
         good = good & np.roll(good, -1)
         good[-1] = False
-    return np.asarray(mean_over(good.astype(float), n) > 0.99)
+    return np.asarray(mean_over(good.astype(float), n) > WHOLE)
 
 
 def blocks(channel: Channel, ride: Ride, p: Values, system: System) -> Array:
@@ -59,7 +62,7 @@ def roughness(channel: Channel, ride: Ride) -> Array:
     amperes = ride.signals["motor_current"]
     level = mean_over(np.abs(amperes), n)
     swing = np.sqrt(np.maximum(mean_over(amperes**2, n) - mean_over(amperes, n) ** 2, 0.0))
-    return np.asarray(np.sqrt(shaken * (1 + ((swing + 0.2 * level) / channel.rough) ** 2)))
+    return np.asarray(np.sqrt(shaken * (1 + ((swing + STEADY * level) / channel.rough) ** 2)))
 
 
 def over_blocks(channel: Channel, values: Array) -> Array:

@@ -15,14 +15,14 @@ from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.blocks import over_blocks, usable
 from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.grid import STEP, Ride, since
-from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Posterior, fit_mixed
+from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Posterior
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.residuals import SLOW, cell_circuit
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import readable
 
-FREE = 1e6  # variance in scales of a cause that is free
 JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
+FINEST = 25  # bins of the least width that are the span of a quantity
 OUTSTANDING = 3.5  # standard deviations of what differs between healthy rides
 
 QUANTITIES: dict[str, tuple[str, str, str]] = {
@@ -61,12 +61,8 @@ def before_and_after(found: Discovery) -> tuple[list[LinearRide], list[LinearRid
 
 def fitted(found: Discovery) -> tuple[list[int], Posterior]:
     """Where the parameters of the causes are, and all parameters as the rides show them with these free."""
-    mixed = found.mixed
-    index = [i for cause in found.report.causes for i in mixed.index(list(cause.parameters))]
-    prior = mixed.prior.copy()
-    for i in index:
-        prior[i, i] += FREE
-    return index, fit_mixed(found.normals, mixed.mean, prior, mixed.scatter, 1.0, mixed.free, 0)
+    index = found.mixed.index(name for cause in found.report.causes for name in cause.parameters)
+    return index, found.mixed.freed(index).fit(found.normals)
 
 
 def outlying_rides(found: Discovery) -> list[str]:
@@ -138,7 +134,7 @@ def pooled(lines: Sequence[LinearRide], channel: str, name: str, over: QuantityR
 def edges(x: Array, count: int = 12) -> Array:
     """Edges of `count` bins of as many of `x`, fewer where many are alike: none is narrower than a 25th of the span."""
     at = np.quantile(x, np.linspace(0, 1, count + 1))
-    least = (np.quantile(x, 0.98) - np.quantile(x, 0.02)) / 25
+    least = (np.quantile(x, 0.98) - np.quantile(x, 0.02)) / FINEST
     kept = [at[0]]
     for edge in at[1:-1]:
         if edge - kept[-1] >= least and at[-1] - edge >= least:

@@ -21,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,22 +32,38 @@ from gz_onboard.lab.discover.residuals import SLOW
 from gz_onboard.lab.discover.system import System, Values
 from gz_onboard.physics.effect import Port
 
+ROLLING, COASTING, FAST = 2.0, 3.0, 4.0  # m/s: above these the wheel rolls freely, coasts, GPS shows its speed well
+FIX = 2.5  # quality of a GPS fix, between that of two dimensions and of three
+
 
 def _always(ride: Ride) -> Mask:
     return np.ones(len(ride.time), dtype=bool)
 
 
 def _rolling(ride: Ride) -> Mask:
-    return np.asarray((np.abs(ride.quantities["speed"]) > 2.0) & ~ride.braking)
+    return np.asarray((np.abs(ride.quantities["speed"]) > ROLLING) & ~ride.braking)
 
 
 def _fast(ride: Ride) -> Mask:
-    fix = ride.signals["gps_fix"] > 2.5 if "gps_fix" in ride.signals else np.ones(len(ride.time), dtype=bool)
-    return np.asarray((np.abs(ride.quantities["speed"]) > 4.0) & fix)
+    fix = ride.signals["gps_fix"] > FIX if "gps_fix" in ride.signals else np.ones(len(ride.time), dtype=bool)
+    return np.asarray((np.abs(ride.quantities["speed"]) > FAST) & fix)
 
 
 def _coasting(ride: Ride) -> Mask:
-    return np.asarray((np.abs(ride.quantities["speed"]) > 3.0) & ~ride.braking)
+    return np.asarray((np.abs(ride.quantities["speed"]) > COASTING) & ~ride.braking)
+
+
+class ChannelNoise(NamedTuple):
+    """Of a channel's blocks: standard deviations of the white and of the exponentially correlated part [unit]."""
+
+    white: float
+    slow: float
+    time: float  # s: of the correlation
+
+    @property
+    def sd(self) -> float:
+        """Of one block."""
+        return float(np.hypot(self.white, self.slow))
 
 
 @dataclass(frozen=True)
@@ -59,13 +76,13 @@ class Channel:
     name: str
     unit: str
     block: float  # s
-    steps: int  # grid steps to one of the function's
     roles: tuple[str, ...]
     residual: Callable[[Ride, Values, System], Array]
-    holds: Callable[[Ride], Mask]
     parameters: tuple[str, ...]
+    noise: ChannelNoise  # before any healthy ride
+    steps: int = 1  # grid steps to one of the function's
+    holds: Callable[[Ride], Mask] = _always
     ports: tuple[Port, ...] = ()
-    noise: tuple[float, float, float] = (1.0, 1.0, 60.0)  # white sd, correlated sd, s: before any healthy ride
     battery: bool = False
     correlated: bool = True
     slow: float = 0.0  # s: the shortest correlation that its noise can have; what its model lacks is slow
@@ -101,38 +118,32 @@ CHANNELS = (
     Channel(
         "road_force",
         "N",
-        4.0,
-        1,
-        ("motor_speed", "motor_current", "accel_x"),
-        residuals.road_force,
-        _rolling,
-        (*_TORQUE, *_SPEED, "payload_mass", "payload_error", "accel_bias", "pitch_gain", "rolling_cold"),
-        (Port.WHEEL_FORCE, Port.TYRE, Port.MOTOR_LOSS),
-        (5.0, 2.0, 60.0),
+        block=4.0,
+        roles=("motor_speed", "motor_current", "accel_x"),
+        residual=residuals.road_force,
+        holds=_rolling,
+        parameters=(*_TORQUE, *_SPEED, "payload_mass", "payload_error", "accel_bias", "pitch_gain", "rolling_cold"),
+        ports=(Port.WHEEL_FORCE, Port.TYRE, Port.MOTOR_LOSS),
+        noise=ChannelNoise(white=5.0, slow=2.0, time=60.0),
         rough=60.0,
         shaken=0.85,
     ),
     Channel(
         "altitude",
         "m",
-        10.0,
-        1,
-        ("accel_x", "gps_altitude"),
-        residuals.altitude,
-        _always,
-        ("accel_bias", "pitch_gain", "altitude_start", "wheel_radius", "speed_sensor_scale"),
-        (),
-        (0.5, 2.5, 120.0),
+        block=10.0,
+        roles=("accel_x", "gps_altitude"),
+        residual=residuals.altitude,
+        parameters=("accel_bias", "pitch_gain", "altitude_start", "wheel_radius", "speed_sensor_scale"),
+        noise=ChannelNoise(white=0.5, slow=2.5, time=120.0),
     ),
     Channel(
         "inverter_power",
         "W",
-        2.0,
-        1,
-        ("inverter_voltage", "inverter_current", "motor_speed", "motor_current"),
-        residuals.inverter_power,
-        _always,
-        (
+        block=2.0,
+        roles=("inverter_voltage", "inverter_current", "motor_speed", "motor_current"),
+        residual=residuals.inverter_power,
+        parameters=(
             *_TORQUE,
             "speed_sensor_scale",
             "copper_speed",
@@ -142,19 +153,17 @@ CHANNELS = (
             "loss_speed",
             "loss_cross",
         ),
-        (Port.MOTOR_LOSS, Port.INVERTER_LOSS),
-        (6.0, 4.0, 60.0),
+        ports=(Port.MOTOR_LOSS, Port.INVERTER_LOSS),
+        noise=ChannelNoise(white=6.0, slow=4.0, time=60.0),
         rough=10.0,
     ),
     Channel(
         "pack_balance",
         "A",
-        2.0,
-        1,
-        ("pack_current", "inverter_current", "auxiliary_current"),
-        residuals.pack_balance,
-        _always,
-        (
+        block=2.0,
+        roles=("pack_current", "inverter_current", "auxiliary_current"),
+        residual=residuals.pack_balance,
+        parameters=(
             "pack_current_offset",
             "pack_current_gain",
             "inverter_current_offset",
@@ -162,58 +171,49 @@ CHANNELS = (
             "idle_current",
             "pack_inverter_lag",
         ),
-        (),
-        (0.1, 0.03, 60.0),
+        noise=ChannelNoise(white=0.1, slow=0.03, time=60.0),
         rough=30.0,
     ),
     Channel(
         "auxiliary",
         "W",
-        4.0,
-        1,
-        ("auxiliary_current", "pack_voltage"),
-        residuals.auxiliary,
-        _always,
-        ("brake_light",),
-        (Port.DC_POWER,),
-        (1.0, 1.0, 60.0),
+        block=4.0,
+        roles=("auxiliary_current", "pack_voltage"),
+        residual=residuals.auxiliary,
+        parameters=("brake_light",),
+        ports=(Port.DC_POWER,),
+        noise=ChannelNoise(white=1.0, slow=1.0, time=60.0),
     ),
     Channel(
         "voltage_balance",
         "V",
-        2.0,
-        1,
-        ("pack_voltage", "inverter_voltage", "inverter_current"),
-        residuals.voltage_balance,
-        _always,
-        ("pack_voltage_offset", "inverter_voltage_offset", "cable_resistance"),
-        (),
-        (0.03, 0.01, 60.0),
+        block=2.0,
+        roles=("pack_voltage", "inverter_voltage", "inverter_current"),
+        residual=residuals.voltage_balance,
+        parameters=("pack_voltage_offset", "inverter_voltage_offset", "cable_resistance"),
+        noise=ChannelNoise(white=0.03, slow=0.01, time=60.0),
     ),
     Channel(
         "cell_voltage",
         "V",
-        2.0,
-        SLOW,
-        ("pack_voltage", "pack_current"),
-        residuals.cell_voltage,
-        _always,
-        (*_CELL, "pack_voltage_offset", "pack_series_resistance"),
-        (Port.CELL_VOLTAGE,),
-        (0.002, 0.008, 300.0),
-        True,
+        block=2.0,
+        steps=SLOW,
+        roles=("pack_voltage", "pack_current"),
+        residual=residuals.cell_voltage,
+        parameters=(*_CELL, "pack_voltage_offset", "pack_series_resistance"),
+        ports=(Port.CELL_VOLTAGE,),
+        noise=ChannelNoise(white=0.002, slow=0.008, time=300.0),
+        battery=True,
         slow=60.0,
         rough=10.0,
     ),
     Channel(
         "voltage_timing",
         "V",
-        0.1,
-        1,
-        ("pack_voltage", "pack_current"),
-        residuals.voltage_timing,
-        _always,
-        (
+        block=0.1,
+        roles=("pack_voltage", "pack_current"),
+        residual=residuals.voltage_timing,
+        parameters=(
             "pack_current_gain",
             "pack_voltage_latency",
             "fast_resistance",
@@ -221,57 +221,49 @@ CHANNELS = (
             "cell_resistance_factor",
             "pack_series_resistance",
         ),
-        (),
-        (0.002, 0.0, 10.0),
-        True,
-        False,
+        noise=ChannelNoise(white=0.002, slow=0.0, time=10.0),
+        battery=True,
+        correlated=False,
         rough=3.0,
     ),
     Channel(
         "gps_speed",
         "m/s",
-        2.0,
-        1,
-        ("gps_speed", "motor_speed"),
-        residuals.gps_speed,
-        _fast,
-        (*_SPEED, "slip_per_force", "lean_radius", "gps_lag"),
-        (),
-        (0.1, 0.05, 30.0),
+        block=2.0,
+        roles=("gps_speed", "motor_speed"),
+        residual=residuals.gps_speed,
+        holds=_fast,
+        parameters=(*_SPEED, "slip_per_force", "lean_radius", "gps_lag"),
+        noise=ChannelNoise(white=0.1, slow=0.05, time=30.0),
     ),
     Channel(
         "rear_speed",
         "m/s",
-        2.0,
-        1,
-        ("wheel_speed_rear", "motor_speed"),
-        residuals.rear_speed,
-        _coasting,
-        ("speed_sensor_scale", "rear_scale", "wheel_lag"),
-        (),
-        (0.02, 0.01, 30.0),
+        block=2.0,
+        roles=("wheel_speed_rear", "motor_speed"),
+        residual=residuals.rear_speed,
+        holds=_coasting,
+        parameters=("speed_sensor_scale", "rear_scale", "wheel_lag"),
+        noise=ChannelNoise(white=0.02, slow=0.01, time=30.0),
     ),
     Channel(
         "front_speed",
         "m/s",
-        2.0,
-        1,
-        ("wheel_speed_front", "motor_speed"),
-        residuals.front_speed,
-        _coasting,
-        ("speed_sensor_scale", "front_scale", "front_lean", "slip_per_force", "wheel_lag"),
-        (),
-        (0.05, 0.02, 30.0),
+        block=2.0,
+        roles=("wheel_speed_front", "motor_speed"),
+        residual=residuals.front_speed,
+        holds=_coasting,
+        parameters=("speed_sensor_scale", "front_scale", "front_lean", "slip_per_force", "wheel_lag"),
+        noise=ChannelNoise(white=0.05, slow=0.02, time=30.0),
     ),
     Channel(
         "motor_temperature",
         "K",
-        10.0,
-        SLOW,
-        ("motor_temperature", "ambient_temperature"),
-        residuals.motor_temperature,
-        _always,
-        (
+        block=10.0,
+        steps=SLOW,
+        roles=("motor_temperature", "ambient_temperature"),
+        residual=residuals.motor_temperature,
+        parameters=(
             "motor_start",
             "rotor_start",
             "motor_stator_share",
@@ -283,19 +275,18 @@ CHANNELS = (
             "cooling_factor",
             "copper_speed",
         ),
-        (Port.MOTOR_LOSS,),
-        (0.4, 0.7, 200.0),
+        ports=(Port.MOTOR_LOSS,),
+        noise=ChannelNoise(white=0.4, slow=0.7, time=200.0),
         slow=200.0,
     ),
     Channel(
         "inverter_temperature",
         "K",
-        10.0,
-        SLOW,
-        ("inverter_temperature", "ambient_temperature"),
-        residuals.inverter_temperature,
-        _always,
-        (
+        block=10.0,
+        steps=SLOW,
+        roles=("inverter_temperature", "ambient_temperature"),
+        residual=residuals.inverter_temperature,
+        parameters=(
             "inverter_start",
             "box_start",
             "inverter_board_to_box",
@@ -305,19 +296,18 @@ CHANNELS = (
             "inverter_airflow",
             "cooling_factor",
         ),
-        (Port.INVERTER_LOSS,),
-        (0.4, 0.7, 200.0),
+        ports=(Port.INVERTER_LOSS,),
+        noise=ChannelNoise(white=0.4, slow=0.7, time=200.0),
         slow=200.0,
     ),
     Channel(
         "cell_temperature",
         "K",
-        10.0,
-        SLOW,
-        ("cell_temperature", "ambient_temperature", "pack_voltage", "pack_current"),
-        residuals.cell_temperature,
-        _always,
-        (
+        block=10.0,
+        steps=SLOW,
+        roles=("cell_temperature", "ambient_temperature", "pack_voltage", "pack_current"),
+        residual=residuals.cell_temperature,
+        parameters=(
             "cells_start",
             "pack_heat_capacity",
             "pack_conductance",
@@ -326,9 +316,9 @@ CHANNELS = (
             "cell_resistance_factor",
             "pack_current_gain",
         ),
-        (Port.CELL_VOLTAGE,),
-        (0.3, 0.5, 300.0),
-        True,
+        ports=(Port.CELL_VOLTAGE,),
+        noise=ChannelNoise(white=0.3, slow=0.5, time=300.0),
+        battery=True,
         slow=200.0,
     ),
 )

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gz_onboard.bus.logs import log_suffix, logs_among
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, nearest, writing
 from gz_onboard.lab.discover.baseline import baseline
 from gz_onboard.lab.discover.baseline_file import write_baseline
 from gz_onboard.lab.discover.breakdown import outlying_rides
@@ -23,10 +22,10 @@ from gz_onboard.lab.discover.summary import listing, summary
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.offline.processes import Task, over_rides
 from gz_onboard.offline.results import explain_keys, write_json
-from gz_onboard.offline.samples import Samples, read_samples
+from gz_onboard.offline.samples import Samples, read_samples, ride_name
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared, keep_old_name
-from gz_onboard.progress import Progress
+from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 
@@ -77,8 +76,8 @@ def run(arguments: argparse.Namespace) -> int:
     if not rides:
         raise InputError("; ".join(refused))
     holdout = [name.strip() for name in arguments.holdout.split(",")] if arguments.holdout else None
-    with _Bar(arguments.quiet) as bar:
-        found = discover(vehicle, rides, arguments.seed, arguments.effects, bar.say, arguments.jobs, holdout)
+    with progress_bar(lambda: None, quiet=arguments.quiet) as display:
+        found = discover(vehicle, rides, arguments.seed, arguments.effects, display.step, arguments.jobs, holdout)
     report = found.report
     report.notes[:0] = refused
     report.notes += [
@@ -93,10 +92,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.report:
         from gz_onboard.lab.discover.page import write_report
 
-        try:
+        with writing(f"--report {arguments.report}"):
             write_report(found, arguments.report)
-        except OSError as error:
-            raise InputError(f"--report {arguments.report}: cannot be written: {error.strerror}") from error
     if arguments.json != "-":
         print(summary(found, written))
         if arguments.report:
@@ -108,8 +105,8 @@ def run_baseline(arguments: argparse.Namespace, vehicle: Vehicle, rides: list[Sa
     """Learn from healthy rides and write the vehicle file; 0."""
     healthy = [ride for ride in rides if on_road(ride)]
     left = [ride.name for ride in rides if not on_road(ride)]
-    with _Bar(arguments.quiet) as bar:
-        found = baseline(vehicle, healthy, arguments.effects, bar.say, arguments.jobs)
+    with progress_bar(lambda: None, quiet=arguments.quiet) as display:
+        found = baseline(vehicle, healthy, arguments.effects, display.step, arguments.jobs)
     write_baseline(found, find_vehicle(arguments.vehicle), arguments.baseline)
     print(
         f"{arguments.baseline}: {vehicle.name} as {len(healthy)} healthy rides show it; what healthy rides look like "
@@ -138,7 +135,7 @@ def _check(arguments: argparse.Namespace, logs: Sequence[Path]) -> None:
         file = getattr(arguments, option)
         if file and str(file) != "-" and not Path(file).resolve().parent.is_dir():
             raise InputError(f"--{option.replace('_', '-')} {file}: no folder {Path(file).parent}")
-    names = [stem(log) for log in logs]
+    names = [ride_name(log) for log in logs]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"two rides are called {twice[0]}: rides are told apart by their names; rename one")
     for name in filter(None, (part.strip() for part in (arguments.holdout or "").split(","))):
@@ -163,11 +160,6 @@ def find_logs(paths: Sequence[Path]) -> list[Path]:
     return logs
 
 
-def stem(log: Path) -> str:
-    """The name of the ride in a log."""
-    return Path(log.name.removesuffix(".gz")).stem
-
-
 @dataclass(frozen=True)
 class _Reading(Task):
     """A log to be read; its payload is for one whose facts have none."""
@@ -184,18 +176,16 @@ def _read(task: _Reading, _: Progress) -> Samples:
 
 def read_rides(logs: Sequence[Path], arguments: argparse.Namespace) -> tuple[list[Samples], list[str]]:
     """The rides, and why a log is none. InputError if no log is one."""
-    from tqdm import tqdm
-
     tasks = [_Reading(log, log, arguments.vehicle, arguments.payload, effects=arguments.effects) for log in logs]
     rides: list[Samples] = []
     refused: list[str] = []
-    with tqdm(total=len(tasks), desc="reading", unit=" rides", leave=False, disable=arguments.quiet or None) as bar:
+    with progress_bar(lambda: len(tasks), "rides", quiet=arguments.quiet) as display:
         for _, result in over_rides(_read, tasks, arguments.jobs):
             if isinstance(result, InputError):
                 refused.append(str(result))
             else:
                 rides.append(result)
-            bar.update()
+            display.update(1)
     if not rides:
         raise InputError("; ".join(refused))
     return rides, refused
@@ -206,27 +196,6 @@ def on_road(ride: Samples) -> bool:
     return "roller_speed" not in ride.columns and ride.facts.get("kind") != "coastdown"
 
 
-class _Bar:
-    """The steps of a discovery, counted and named on a terminal."""
-
-    def __init__(self, quiet: bool) -> None:
-        from tqdm import tqdm
-
-        form = "{desc} {elapsed} {postfix}"
-        self._bar = tqdm(desc="discover", bar_format=form, leave=False, disable=quiet or None, file=sys.stderr)
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.close()
-
-    def say(self, text: str) -> None:
-        """Name the step that begins."""
-        self._bar.set_postfix_str(text)
-        self._bar.refresh()
-
-
 # --- the extended model -------------------------------------------------------------------------------------------
 
 
@@ -235,10 +204,8 @@ def write_extended(found: Discovery, vehicle: Vehicle, arguments: argparse.Names
     report = found.report
     if all(cause.varies for cause in report.causes) and report.unknown is None:
         return ["not written: there is nothing to extend it with"]
-    try:
+    with writing(f"--write-model {arguments.write_model}"):
         added = write_model(found, vehicle, find_vehicle(arguments.vehicle), arguments.write_model)
-    except OSError as error:
-        raise InputError(f"--write-model {arguments.write_model}: cannot be written: {error.strerror}") from error
     written = [str(arguments.write_model), *added] if report.extended_model else ["not written", *added]
     if report.ambiguous:
         written.append(

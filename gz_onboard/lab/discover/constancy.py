@@ -11,11 +11,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.blocks import over_blocks
 from gz_onboard.lab.discover.grid import Ride
-from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Normal, whitened
+from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.result import Split
 from gz_onboard.lab.discover.search import evidence_of
@@ -24,6 +25,8 @@ from gz_onboard.lab.discover.selection import Selection
 RATIO_SD, RIDE_SD = 0.15, 0.25  # of a real cause: on all rides, and from ride to ride
 RATIO = 0.5  # beyond which half of the cause is missing in one of the halves
 CHI2 = 9.0  # three standard deviations
+BEND = 0.3  # m/s² of lateral acceleration, from which on a bend is one
+UNSEEN = 1e-6  # information of a ratio, below which nothing shows it
 
 
 Sign = Callable[[Ride, LinearChannel, Array], Array]
@@ -31,7 +34,7 @@ Sign = Callable[[Ride, LinearChannel, Array], Array]
 
 def _side(ride: Ride, table: LinearChannel, effect: Array) -> Array:
     """+1 in left bends, -1 in right ones, 0 on the straight."""
-    return np.asarray(np.tanh(over_blocks(table.channel, ride.quantities["lateral_acceleration"])[table.used] / 0.3))
+    return np.asarray(np.tanh(over_blocks(table.channel, ride.quantities["lateral_acceleration"])[table.used] / BEND))
 
 
 def _halves(name: str) -> Sign:
@@ -82,12 +85,10 @@ def _split(now: Selection, index: Sequence[int], sign: Sign) -> tuple[float, flo
     fixed = now.search.index(now.chosen)
     change = now.change[index]
     rides = [_extended(line, n, mixed, index, change, sign) for line, n in zip(now.lines, now.normals, strict=True)]
-    prior = np.zeros((p + 1, p + 1))
-    prior[:p, :p] = mixed.prior
-    prior[p, p] = RATIO_SD**2
+    prior = block_diag(mixed.prior, RATIO_SD**2)
     e = evidence_of(np.append(mixed.mean, 0.0), prior, np.append(mixed.scatter, RIDE_SD**2), rides)
-    inner, score = e.given([p], fixed)
-    if inner[0, 0] <= 1e-6:
+    inner, score = e.profiled([p], fixed)
+    if inner[0, 0] <= UNSEEN:
         return None
     return float(score[0] / inner[0, 0]), float(score[0] * score[0] / inner[0, 0])
 
@@ -96,22 +97,10 @@ def _extended(
     line: LinearRide, normal: Normal, mixed: MixedModel, index: Sequence[int], change: Array, sign: Sign
 ) -> Normal:
     """`normal` with one more column: what the cause does, times the sign."""
-    p = len(normal.b)
-    n, b = np.zeros((p + 1, p + 1)), np.zeros(p + 1)
-    n[:p, :p], b[:p] = normal.n, normal.b
+    more = normal.padded(1)
     for name, table in line.tables.items():
         effect = table.a[:, index] @ change
-        if not np.any(effect):
-            continue
-        touched = np.flatnonzero(np.any(table.a != 0, axis=0))
-        both = whitened(
-            table,
-            mixed.noise[name],
-            np.column_stack([effect * sign(line.ride, table, effect), table.a[:, touched], table.y]),
-        )
-        split, a, y = both[:, 0], both[:, 1:-1], both[:, -1]
-        n[p, p] += split @ split
-        n[p, touched] += split @ a
-        n[touched, p] += split @ a
-        b[p] += split @ y
-    return Normal(n, b)
+        if np.any(effect):
+            split = effect * sign(line.ride, table, effect)
+            more = more.with_columns(table, mixed.noise[name], split[:, None], table.touched)
+    return more

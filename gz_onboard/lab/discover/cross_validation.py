@@ -9,12 +9,13 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.curve_forms import CurveForm, columns
-from gz_onboard.lab.discover.curves import extended
+from gz_onboard.lab.discover.curve_forms import CurveForm, columns_of
+from gz_onboard.lab.discover.curves import bordered, extended
 from gz_onboard.lab.discover.linear import LinearRide, Normal, fit_mixed, normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.prior import STARTS
+from gz_onboard.lab.discover.prior import EACH_RIDES_OWN
 
+PART = 0.1  # of the evidence: a channel with less has no say
 WIDE = 100.0  # variance of a curve's coefficients, in units of `CurveForm.size`
 
 
@@ -29,7 +30,7 @@ class Fold:
         """(the common part (p,), the curve's coefficients (k,)) from these rides."""
         if self.form is not None:
             return with_curve(mixed, list(zip(lines, normals, strict=True)), self.causes, self.form)
-        return extended_mean(mixed, normals, self.causes), np.zeros(0)
+        return mixed.freed(mixed.index_of(self.causes)).fit(normals).mean, np.zeros(0)
 
     def shown(self, line: LinearRide, curve: Array) -> LinearRide:
         """`line` less the curve."""
@@ -58,7 +59,7 @@ def held_out(
         some, theirs = [lines[i] for i in rest], [normals[i] for i in rest]
         plain, _ = control.fit(mixed, some, theirs)
         before = mixed.mean.copy()
-        index = [k for cause in control.causes for k in mixed.index(cause.names)]
+        index = mixed.index_of(control.causes)
         before[index] = plain[index]
         full, curve = after.fit(mixed, some, theirs)
         for line in (lines[i] for i in fold):
@@ -84,7 +85,7 @@ def improves(held: Iterator[Squares], shares: Mapping[str, float]) -> bool:
     total = 0.0
     for channel, part in shares.items():
         mine = [row[channel] for row in rows if channel in row]
-        if part > 0.1 and mine:
+        if part > PART and mine:
             before, control, after = (sum(column) for column in zip(*mine, strict=True))
             total += part * float(np.log(after / min(before, control)))
     return total < 0
@@ -99,46 +100,28 @@ def with_curve(
     mixed: MixedModel, fitted: Sequence[tuple[LinearRide, Normal]], causes: Sequence[Candidate], form: CurveForm
 ) -> tuple[Array, Array]:
     """(the common part (p,), the coefficients of `form` (k,)) from the rides `fitted`, the `causes` free."""
-    p, k = len(mixed.mean), form.basis.shape[1]
-    shape = mixed.shapes.get(form.name)
-    mean = np.concatenate([mixed.mean, shape.mean if shape else np.zeros(k)])
-    prior = np.diag(np.full(p + k, WIDE))
-    prior[:p, :p] = mixed.prior
-    for i in (i for cause in causes for i in mixed.index(cause.names)):
-        prior[i, i] += 1e6
-    scatter = np.concatenate([mixed.scatter, np.full(k, form.scatter**2)])
-    rides = []
-    for line, plain in fitted:
-        more = extended(line, plain, form, mixed.noise)
-        rides.append(more or Normal(np.pad(plain.n, (0, k)), np.pad(plain.b, (0, k))))
-    both = fit_mixed(rides, mean, prior, scatter, 1.0, np.zeros(p + k, dtype=bool), 0).mean
-    return both[:p], both[p:]
+    k = form.basis.shape[1]
+    free = mixed.freed(mixed.index_of(causes))
+    rides = [extended(line, plain, form, mixed.noise) or plain.padded(k) for line, plain in fitted]
+    both = fit_mixed(rides, *bordered(free, form, WIDE * np.eye(k))).mean
+    return both[:-k], both[-k:]
 
 
 def without(line: LinearRide, form: CurveForm, coefficients: Array) -> LinearRide:
     """`line` less the curve."""
-    table = line.tables.get(form.channel)
-    knots = columns(line.ride, form, table) if table else None
-    if table is None or knots is None:
+    knots = columns_of(line, form)
+    if knots is None:
         return line
+    table = line.tables[form.channel]
     less = knots @ form.basis @ coefficients * form.size / table.unit
     return LinearRide(line.ride, {**line.tables, form.channel: replace(table, y=table.y - less)})
 
 
 def with_own_start(mixed: MixedModel, ride: Normal, theta: Array) -> Array:
-    """`theta` (p,) with what is the ride's own of `prior.STARTS`, which is no merit or fault of a model."""
-    m = [i for i, name in enumerate(mixed.names) if name in STARTS]
+    """`theta` (p,) with what is the ride's own of `prior.EACH_RIDES_OWN`, which is no merit or fault of a model."""
+    m = [i for i, name in enumerate(mixed.names) if name in EACH_RIDES_OWN]
     variance = mixed.scatter[m] + np.diag(mixed.prior)[m]
     rest = ride.b[m] - ride.n[m] @ theta
     moved = theta.copy()
     moved[m] += np.linalg.solve(np.diag(1 / variance) + ride.n[np.ix_(m, m)], rest)
     return moved
-
-
-def extended_mean(mixed: MixedModel, rest: Sequence[Normal], causes: Sequence[Candidate]) -> Array:
-    """The common part from `rest` with the parameters of `causes` free."""
-    wide = mixed.prior.copy()
-    index = [i for cause in causes for i in mixed.index(cause.names)]
-    for i in index:
-        wide[i, i] += 1e6
-    return fit_mixed(rest, mixed.mean, wide, mixed.scatter, 1.0, mixed.free, 0).mean

@@ -10,8 +10,8 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.blocks import over_blocks
 from gz_onboard.lab.discover.grid import STEP, Ride, smooth
-from gz_onboard.lab.discover.linear import LinearChannel
-from gz_onboard.lab.discover.prior import USUAL, Sizes
+from gz_onboard.lab.discover.linear import LinearChannel, LinearRide
+from gz_onboard.lab.discover.prior import USUAL_SIZES, Sizes
 
 # knots of the hat functions, of a vehicle of size 1 (see `KNOTS_OF`); unit
 QUANTITIES: dict[str, tuple[tuple[float, ...], str]] = {
@@ -66,7 +66,7 @@ class CurveForm:
     channel: str
     quantity: str
     straight: bool = False
-    sizes: Sizes = USUAL
+    sizes: Sizes = USUAL_SIZES
 
     @property
     def name(self) -> str:
@@ -103,7 +103,7 @@ class CurveForm:
         return QUANTITIES[self.quantity][1]
 
 
-def curve_forms(sizes: Sizes = USUAL) -> list[CurveForm]:
+def curve_forms(sizes: Sizes = USUAL_SIZES) -> list[CurveForm]:
     """A curve for every pair of channel and quantity, and what is in proportion to some; of a vehicle of `sizes`."""
     every = [CurveForm(channel, quantity, sizes=sizes) for channel, quantities in PAIRS for quantity in quantities]
     return [*every, *(replace(form, straight=True) for form in every if form.quantity in IN_PROPORTION)]
@@ -125,19 +125,18 @@ def quantity(ride: Ride, name: str, table: LinearChannel) -> Array | None:
 
 
 def hat_functions(x: Array, knots: Sequence[float], periodic: bool = False) -> Array:
-    """Linear hat functions over `knots` but the one that most is at, (m, k)."""
-    at = np.array(knots)
+    """Linear hat functions over `knots`, (m, k); periodic: of an angle [rad], the last goes over into the first."""
+    at = [*knots, 2 * np.pi] if periodic else knots
+    inside = np.mod(x, 2 * np.pi) if periodic else x
+    full: Array = np.array([np.interp(inside, at, hat) for hat in np.eye(len(at))]).T
     if periodic:
-        at = np.append(at, 2 * np.pi)
-        full = np.array([np.interp(np.mod(x, 2 * np.pi), at, np.eye(len(at))[i]) for i in range(len(at))]).T
         full[:, 0] += full[:, -1]
         full = full[:, :-1]
-    else:
-        full = np.array([np.interp(x, at, np.eye(len(at))[i]) for i in range(len(at))]).T
-    return np.asarray(full)
+    return full
 
 
-def columns(ride: Ride, form: CurveForm, table: LinearChannel) -> Array | None:
-    """The curve's columns over the blocks of `table`, (m, knots); None if the ride has not what they are over."""
-    x = quantity(ride, form.quantity, table)
+def columns_of(line: LinearRide, form: CurveForm) -> Array | None:
+    """The curve's columns over the blocks of its channel, (m, knots); None if the ride has not what they are over."""
+    table = line.tables.get(form.channel)
+    x = quantity(line.ride, form.quantity, table) if table is not None else None
     return None if x is None else hat_functions(x, form.knots.tolist(), form.quantity in ROUND)

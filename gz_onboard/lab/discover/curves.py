@@ -6,32 +6,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.curve_forms import CurveForm, columns, curve_forms
-from gz_onboard.lab.discover.linear import LinearRide, Noise, Normal, fit_mixed, marginal, whitened
+from gz_onboard.lab.discover.curve_forms import CurveForm, columns_of, curve_forms
+from gz_onboard.lab.discover.linear import LinearRide, Noise, Normal, fit_mixed, marginal
 from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel
 from gz_onboard.lab.discover.search import evidence_of
 
 
 def extended(linear: LinearRide, normal: Normal, form: CurveForm, noise: Noise) -> Normal | None:
     """`normal` with the columns of `form`."""
-    table = linear.tables.get(form.channel)
-    if table is None:
-        return None
-    knots = columns(linear.ride, form, table)
+    knots = columns_of(linear, form)
     if knots is None:
         return None
+    table = linear.tables[form.channel]
     curve = knots @ form.basis * form.size / table.unit[:, None]
-    k, p = curve.shape[1], len(normal.b)
-    both = whitened(table, noise[form.channel], np.column_stack([curve, table.a, table.y]))
-    b, a, y = both[:, :k], both[:, k:-1], both[:, -1]
-    n = np.zeros((p + k, p + k))
-    n[:p, :p] = normal.n
-    n[p:, p:] = b.T @ b
-    n[p:, :p] = b.T @ a
-    n[:p, p:] = n[p:, :p].T
-    return Normal(n, np.concatenate([normal.b, b.T @ y]))
+    return normal.padded(curve.shape[1]).with_columns(table, noise[form.channel], curve, slice(len(normal.b)))
 
 
 CURVE_RIDGE = 1e-3  # information, in `CurveForm.size`, that keeps knots without data from running away
@@ -73,8 +64,7 @@ def supported_knots(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
         return np.eye(1)
     at = np.zeros(k)
     for line in linears:
-        table = line.tables.get(form.channel)
-        knots = columns(line.ride, form, table) if table is not None else None
+        knots = columns_of(line, form)
         if knots is not None:
             at += (knots**2).sum(axis=0) >= ENOUGH
     good = np.flatnonzero(at >= min(2, len(linears)))
@@ -105,18 +95,14 @@ def fit_curve(
     p = len(mixed.mean)
     k = len(rides[0].b) - p
     healthy = mixed.shapes.get(form.name)
-    mean = np.concatenate([mixed.mean, healthy.mean if healthy else np.zeros(k)])
-    prior = np.zeros((p + k, p + k))
-    prior[:p, :p] = mixed.prior
-    prior[p:, p:] = healthy.covariance if healthy else np.eye(k) * form.scatter**2
-    scatter = np.concatenate([mixed.scatter, np.full(k, form.scatter**2)])
+    mean, prior, scatter = bordered(mixed, form, healthy.covariance if healthy else np.eye(k) * form.scatter**2)
     if own and len(rides) > 1:
         wide = prior.copy()
         wide[p:, p:] += np.eye(k) * OWN_FREE
         learns = np.arange(p + k) >= p
         scatter = np.maximum(scatter, fit_mixed(rides, mean, wide, scatter, 1.0, learns, 10).scatter)
     e = evidence_of(mean, prior, scatter, rides)
-    inner, score = e.given(range(p, p + k), fixed, CURVE_RIDGE)
+    inner, score = e.profiled(range(p, p + k), fixed, CURVE_RIDGE)
     inner = free.T @ (inner + CURVE_RIDGE * np.eye(k)) @ free
     score = free.T @ score
     estimate = np.linalg.solve(inner, score)
@@ -125,6 +111,15 @@ def fit_curve(
     return CurveFit(
         float(score @ estimate), free.shape[1], at @ estimate, at @ np.linalg.inv(inner) @ at.T, visits / np.sum(visits)
     )
+
+
+def bordered(mixed: MixedModel, form: CurveForm, covariance: Array) -> tuple[Array, Array, Array]:
+    """(mean (p + k,), prior (p + k, p + k), scatter (p + k,)) of `mixed` with the coefficients of `form`, which are
+    known within `covariance` (k, k).
+    """
+    k, healthy = len(covariance), mixed.shapes.get(form.name)
+    mean = np.concatenate([mixed.mean, healthy.mean if healthy else np.zeros(k)])
+    return mean, block_diag(mixed.prior, covariance), np.concatenate([mixed.scatter, np.full(k, form.scatter**2)])
 
 
 def _with_columns(
@@ -139,9 +134,8 @@ def _visits(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
     """The sum of squared weights of all blocks at each knot, (knots,)."""
     visits = np.zeros(len(form.basis))
     for line in linears:
-        if form.channel in line.tables:
-            knots = columns(line.ride, form, line.tables[form.channel])
-            visits += 0.0 if knots is None else (knots**2).sum(axis=0)
+        knots = columns_of(line, form)
+        visits += 0.0 if knots is None else (knots**2).sum(axis=0)
     return visits
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from gz_onboard.lab.discover.channels import CHANNELS
 from gz_onboard.lab.discover.energy import energy_drawn, energy_share
 from gz_onboard.lab.discover.linear import LinearRide
-from gz_onboard.lab.discover.prior import LOG
+from gz_onboard.lab.discover.prior import LOG_SCALED
 from gz_onboard.lab.discover.result import Limit, Report
 from gz_onboard.lab.discover.search import evidence
 from gz_onboard.lab.discover.verdict import Discovery
@@ -36,7 +36,9 @@ def limits(found: Discovery) -> dict[str, Limit]:
         steps = float(np.sqrt(report.threshold * mixed.inflation.get(cause.name, 1.0) / float(information[place])))
         change = np.zeros(len(mixed.mean))
         change[place] = steps
-        step = float(mixed.scale[place]) * (mixed.healthy_value(parameter.name) if parameter.name in LOG else 1.0)
+        step = float(mixed.scale[place]) * (
+            mixed.healthy_value(parameter.name) if parameter.name in LOG_SCALED else 1.0
+        )
         share = abs(energy_share(found.lines, change))
         result[cause.name] = Limit(parameter.name, parameter.unit, steps * step, share)
     return result

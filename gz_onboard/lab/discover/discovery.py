@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,13 +19,13 @@ from gz_onboard.lab.discover.grid import STEP, Ride
 from gz_onboard.lab.discover.mixed_model import MixedModel, linearise_all
 from gz_onboard.lab.discover.residuals import voltage_timing
 from gz_onboard.lab.discover.result import Gain
-from gz_onboard.lab.discover.selection import linearised_about, pose
+from gz_onboard.lab.discover.selection import linearised_about, search_problem
 from gz_onboard.lab.discover.uncalibrated import NOTE, without_baseline
-from gz_onboard.lab.discover.verdict import Discovery, reach
+from gz_onboard.lab.discover.verdict import Discovery, conclude
+from gz_onboard.lab.discover.wording import Say
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
-Progress = Callable[[str], None]
 SHORTEST = 300.0  # m: shorter rides show nothing
 LATENCY = "pack_voltage_latency"
 LATENCY_STEPS = 10  # of the grid of time, to either side, that a delay is sought in
@@ -37,7 +37,7 @@ def discover(
     rides: Sequence[Samples],
     seed: int = 0,
     folder: Path | None = None,
-    progress: Progress | None = None,
+    progress: Say | None = None,
     workers: int = 1,
     holdout: Sequence[str] | None = None,
 ) -> Discovery:
@@ -58,8 +58,8 @@ def discover(
     if not mixed.healthy:
         notes.append(NOTE)
         mixed = without_baseline(mixed, found, workers)
-    problem = pose(mixed, first_offset(mixed, found), lambda at: linearise_all(found, at, workers))
-    discovery = reach(problem, notes, say)
+    problem = search_problem(mixed, first_offset(mixed, found), lambda at: linearise_all(found, at, workers))
+    discovery = conclude(problem, notes, say)
     say("gain on rides held out")
     held = linearised_about(mixed, discovery.at, lambda at: linearise_all(apart, at, workers)) if apart else []
     report = discovery.report
@@ -99,7 +99,7 @@ def first_offset(mixed: MixedModel, rides: Sequence[Ride]) -> Array:
     if LATENCY not in mixed.names or not mine:
         return offset
     i = mixed.names.index(LATENCY)
-    healthy = mixed.unit_value(mixed.mean)
+    healthy = mixed.values_at(mixed.mean)
     spread = {
         late: sum(float(np.mean(np.abs(voltage_timing(r, {**healthy, LATENCY: late}, mixed.system)))) for r in mine)
         for late in (healthy[LATENCY] + STEP * k for k in range(-LATENCY_STEPS, LATENCY_STEPS + 1))

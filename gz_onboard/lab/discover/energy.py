@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.blocks import over_blocks
-from gz_onboard.lab.discover.curve_forms import CurveForm, columns
+from gz_onboard.lab.discover.channels import ROLLING
+from gz_onboard.lab.discover.curve_forms import CurveForm, columns_of
 from gz_onboard.lab.discover.grid import STEP
 from gz_onboard.lab.discover.linear import LinearRide
 from gz_onboard.lab.discover.result import ResidualSize
-
-ROLLING = 2.0  # m/s: where `channels.road_force` holds
 
 
 def pack_power(table_name: str, line: LinearRide, values: Array) -> Array | None:
@@ -37,13 +36,15 @@ def channel_energy(name: str, line: LinearRide, values: Array) -> float:
 
 def energy_share(lines: Sequence[LinearRide], change: Array, channels: Collection[str] | None = None) -> float:
     """The part of the energy drawn that `change` (p,) of the parameters makes over these rides, in some channels."""
+    every = ((name, line, table) for line in lines for name, table in line.tables.items())
+    parts = ((name, line, table.a @ change) for name, line, table in every if channels is None or name in channels)
+    return _share(lines, parts)
+
+
+def _share(lines: Sequence[LinearRide], residuals: Iterable[tuple[str, LinearRide, Array]]) -> float:
+    """The part of the energy drawn over `lines` that residuals make, each (channel, ride, values)."""
     drawn = sum(energy_drawn(line) for line in lines)
-    more = 0.0
-    for line in lines:
-        for name, table in line.tables.items():
-            if channels is None or name in channels:
-                more += channel_energy(name, line, table.a @ change)
-    return more / drawn if drawn else 0.0
+    return sum(channel_energy(*residual) for residual in residuals) / drawn if drawn else 0.0
 
 
 def energy_drawn(line: LinearRide) -> float:
@@ -68,27 +69,21 @@ def channel_time(line: LinearRide, channel: str) -> float:
 
 def curve_energy_share(lines: Sequence[LinearRide], form: CurveForm, values: Array) -> float:
     """The part of the energy drawn that the curve of `values` (knots,) takes."""
-    drawn = sum(energy_drawn(line) for line in lines)
-    more = 0.0
-    for line in lines:
-        table = line.tables.get(form.channel)
-        knots = columns(line.ride, form, table) if table is not None else None
-        if table is not None and knots is not None:
-            more += channel_energy(form.channel, line, knots @ values / table.unit)
-    return more / drawn if drawn else 0.0
+    name, every = form.channel, ((line, columns_of(line, form)) for line in lines)
+    parts = ((name, line, knots @ values / line.tables[name].unit) for line, knots in every if knots is not None)
+    return _share(lines, parts)
 
 
 def residual_sizes(lines: Sequence[LinearRide]) -> dict[str, ResidualSize]:
     """Of each channel's residual."""
     result = {}
-    drawn = sum(energy_drawn(line) for line in lines)
     for name in sorted({name for line in lines for name in line.tables}):
         tables = [(line, line.tables[name]) for line in lines if name in line.tables]
         y = np.concatenate([table.y for _, table in tables])
         pairs = [(table.y[1:], table.y[:-1]) for _, table in tables]
         late, early = (np.concatenate(side) for side in zip(*pairs, strict=True))
         correlation = float(np.corrcoef(late, early)[0, 1]) if np.std(late) > 0 and np.std(early) > 0 else 0.0
-        share = sum(channel_energy(name, line, table.y) for line, table in tables) / drawn if drawn else 0.0
+        share = _share(lines, ((name, line, table.y) for line, table in tables))
         size = float(np.sqrt(np.mean(y**2)))
         of_range = -share / (1 + share) if share > -1 else 0.0
         result[name] = ResidualSize(float(y.mean()), size, correlation, len(y), share, of_range)

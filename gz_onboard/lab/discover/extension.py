@@ -30,6 +30,11 @@ MODELLED = ("road_force", "inverter_power", "auxiliary")
 """The channels whose residual is energy that the model lacks; elsewhere it is a sensor's."""
 
 
+FACTORS = (0.3, 3.0)  # within which a forecast's factor is believed
+NEGLIGIBLE = 1e-4  # of the energy
+LONGEST = 150  # characters of the rides' names, beyond which they are counted only
+
+
 def write_model(found: Discovery, vehicle: Vehicle, base: Path, out: Path) -> list[str]:
     """Write the vehicle extended by what was `found`, or by a curve for what has no name; what was done, in words.
 
@@ -79,7 +84,7 @@ def extension(found: Discovery) -> tuple[dict[str, Found], list[Effect]]:
     """The parameters of the causes that `found` named, and the effects that the model lacks for them."""
     mixed = found.mixed
     names = ", ".join(line.ride.name for line in found.lines)
-    rides = f"{len(found.lines)} rides ({names})" if len(names) < 150 else f"{len(found.lines)} rides"
+    rides = f"{len(found.lines)} rides ({names})" if len(names) < LONGEST else f"{len(found.lines)} rides"
     parameters, added = {}, []
     for cause in (c for c in found.report.causes if not c.varies):
         candidate = next(c for c in mixed.causes if c.name == cause.name)
@@ -105,7 +110,7 @@ def lowered(found: Discovery, vehicle: Vehicle, curve: bool) -> tuple[float, str
     if curve and report.unknown is not None and report.unknown.channel in MODELLED:
         share += report.unknown.share
     factor = vehicle.riding.factor
-    if abs(share) < 1e-4 or not 0.3 < (value := factor / (1 + share * factor)) < 3:
+    if abs(share) < NEGLIGIBLE or not FACTORS[0] < (value := factor / (1 + share * factor)) < FACTORS[1]:
         return None
     what = ", ".join(
         [*(cause.name for cause in report.causes if not cause.varies), *(["a curve without a name"] if curve else [])]

@@ -9,7 +9,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.cross_validation import Fold, Triple, held_out
 from gz_onboard.lab.discover.energy import channel_energy, energy_drawn, pack_power
-from gz_onboard.lab.discover.linear import LinearRide, normal
+from gz_onboard.lab.discover.linear import LinearRide
 from gz_onboard.lab.discover.result import Errors, Gain
 from gz_onboard.lab.discover.unexplained import form_of
 from gz_onboard.lab.discover.verdict import Discovery
@@ -26,7 +26,7 @@ def measure_gain(found: Discovery, seed: int, apart: Sequence[LinearRide] = ()) 
     """
     mixed, report = found.mixed, found.report
     lines = [*found.lines, *apart]
-    normals = [*found.normals, *(normal(line, mixed.noise) for line in apart)]
+    normals = [*found.normals, *mixed.normals(apart)]
     if len(lines) < 2:
         return Gain(note="one ride: nothing to hold out")
     known = len(found.lines)
@@ -42,8 +42,7 @@ def measure_gain(found: Discovery, seed: int, apart: Sequence[LinearRide] = ()) 
     rng = np.random.default_rng(seed)
     held = tuple(lines[i].ride.name for fold in folds for i in fold)
     of_metric = {metric: summarised(triples, rng) for metric, triples in rows.items()}
-    metrics = (of_metric.get(metric) for metric in ("voltage", "power", "energy_per_way", "range"))
-    return Gain(held, None, bool(apart), *metrics)
+    return Gain(held, None, bool(apart), **of_metric)
 
 
 def summarised(rows: Sequence[Triple], rng: np.random.Generator) -> Errors:

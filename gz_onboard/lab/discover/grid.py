@@ -15,6 +15,7 @@ from gz_onboard.arrays import Array, Mask
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.offline.samples import Samples
+from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import air_density
 from gz_onboard.physics.vibration import Vibration
 
@@ -24,10 +25,18 @@ USUAL_DELAYS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_
 is fitted (see `channels`)."""
 NEEDED = ("motor_speed", "motor_current")
 BRAKE_PRESSURE = 0.8e5  # Pa: above what the sensors show at rest
-MOVING = 0.5  # m/s
+STANDSTILL, STANDING = 0.05, 30  # m/s, grid steps: below it, for more of them the median of a rate is its bias
+LEAST_GAP, GAP = 0.3, 3.0  # s, periods of a signal: it is missing for more than both
+SHORTEST, LEAST_SAMPLES = 60.0, 20  # s of a ride; samples of a role
+SWITCHED, REGENERATING = 0.01, -1.0  # of the brake switch; A of the motor: a brake is touched
+TOUCHED = 11  # grid steps: half a second to either side
+ACCELERATING, YAWING, CLIMBING = 0.4, 0.5, 2.0  # s: running means that take noise off acceleration, yaw rate, grade
+STEEPEST_LEAN, STEEPEST = 0.85, 0.5  # sine of the lean, and of the slope: beyond, the sensors err
+USUAL_AIR = 20.0  # degC, of a ride that did not measure it
 SUSPENSION = ("suspension_front", "suspension_rear")
 CRAWL, MOST_STEERING = 1.0, 0.6  # m/s, rad: of slower riding the angle is noise
 ROUGH_PERIOD = 0.034  # s: samples further apart do not show what a road does to a wheel
+SHAKING = 2.0  # s, over which the suspension is as fast as the road is rough
 LONGEST = 60.0  # s since a brake was touched, or a current changed: what was longer ago is as good as never
 
 
@@ -89,13 +98,13 @@ class Ride:
         """Where a brake is touched, or was within 0.5 s, shape (n,)."""
         result = np.zeros(len(self.time), dtype=bool)
         if "brake_switch" in self.signals:
-            result |= self.signals["brake_switch"] > 0.01
+            result |= self.signals["brake_switch"] > SWITCHED
         for role in ("brake_pressure_front", "brake_pressure_rear"):
             if role in self.signals:
                 result |= self.signals[role] > BRAKE_PRESSURE
         if not {"brake_switch", "brake_pressure_rear"} & self.have:  # only regeneration shows it
-            result |= self.signals["motor_current"] < -1.0
-        wide = np.convolve(result, np.ones(11), mode="same") > 0
+            result |= self.signals["motor_current"] < REGENERATING
+        wide = np.convolve(result, np.ones(TOUCHED), mode="same") > 0
         return np.asarray(wide, dtype=bool)
 
 
@@ -118,7 +127,7 @@ def averaged(times: Array, values: Array, grid: Array, width: float = STEP) -> A
 
 def measured(times: Array, grid: Array) -> Mask:
     """Where `grid` lies within three periods (and 0.3 s) of a sample on both sides, shape of `grid`."""
-    limit = max(0.3, 3 * float(np.median(np.diff(times))))
+    limit = max(LEAST_GAP, GAP * float(np.median(np.diff(times))))
     i = np.clip(np.searchsorted(times, grid), 1, len(times) - 1)
     gap = times[i] - times[i - 1]
     return np.asarray((gap < limit) & (grid > times[0] - limit) & (grid < times[-1] + limit))
@@ -134,13 +143,13 @@ def read_ride(samples: Samples, vehicle: Dimensions) -> Ride:
             raise InputError(f"ride {samples.name}: has no {role}, without which nothing can be compared")
     start = max(samples.columns[role][0][0] for role in NEEDED)
     end = min(samples.columns[role][0][-1] for role in NEEDED)
-    if end - start < 60:
+    if end - start < SHORTEST:
         raise InputError(f"ride {samples.name}: {end - start:.0f} s of motor speed and current; a minute is the least")
     grid = np.arange(start, end, STEP)
     signals: dict[str, Array] = {}
     valid: dict[str, Mask] = {}
     for role, (times, values) in samples.columns.items():
-        if len(times) < 20:
+        if len(times) < LEAST_SAMPLES:
             continue
         at = grid + vehicle.delays.get(role, 0.0)
         turned = np.unwrap(values) if role == "gps_course" else values
@@ -173,15 +182,15 @@ def vibration(times: Array, values: Array, grid: Array) -> Array:
     return np.asarray(np.interp(grid, times, rms))
 
 
-def suspension_speed(wheels: Sequence[tuple[Array, Array]], grid: Array, width: float = 2.0) -> Array:
-    """The RMS [m/s] over `width` [s] of how fast the suspension moves, of all `wheels` together, at `grid`.
+def suspension_speed(wheels: Sequence[tuple[Array, Array]], grid: Array) -> Array:
+    """The RMS [m/s] over `SHAKING` of how fast the suspension moves, of all `wheels` together, at `grid`.
 
     wheels: (times [s], travel [m]) of each.
     """
     square = np.zeros_like(grid)
     for times, travel in wheels:
         speed = np.gradient(travel, times)
-        square += averaged(times, speed * speed, grid, width)
+        square += averaged(times, speed * speed, grid, SHAKING)
     return np.asarray(np.sqrt(np.maximum(square, 0.0)))
 
 
@@ -203,20 +212,20 @@ def _quantities(ride: Ride, vehicle: Dimensions) -> dict[str, Array]:
     n = len(ride.time)
     motor_speed = s["motor_speed"]
     speed = motor_speed * ride.radius
-    acceleration: Array = np.gradient(smooth(speed, 0.4), STEP)
-    ambient = s.get("ambient_temperature", np.full(n, 20.0))
+    acceleration: Array = np.gradient(smooth(speed, ACCELERATING), STEP)
+    ambient = s.get("ambient_temperature", np.full(n, USUAL_AIR))
     temperature = s.get("cell_temperature", ambient)
-    still = np.abs(speed) < 0.05
+    still = np.abs(speed) < STANDSTILL
     yaw = np.zeros(n)
     if "rate_z" in s:
-        bias = float(np.median(s["rate_z"][still])) if still.sum() > 30 else float(np.median(s["rate_z"]))
-        yaw = smooth(s["rate_z"] - bias, 0.5)
+        bias = float(np.median(s["rate_z"][still])) if still.sum() > STANDING else float(np.median(s["rate_z"]))
+        yaw = smooth(s["rate_z"] - bias, YAWING)
     # the body leans: its yaw rate is r·cos φ, and tan φ = v·r/g, so sin φ = v·rate/g
-    sine = np.clip(speed * yaw / GRAVITY, -0.85, 0.85)
+    sine = np.clip(speed * yaw / GRAVITY, -STEEPEST_LEAN, STEEPEST_LEAN)
     lateral = GRAVITY * sine / np.sqrt(1 - sine**2)
     grade = np.zeros(n)
     if "accel_x" in s:
-        grade = smooth((s["accel_x"] - acceleration) / GRAVITY, 2.0)
+        grade = smooth((s["accel_x"] - acceleration) / GRAVITY, CLIMBING)
     moved = np.cumsum(np.abs(speed) > MOVING) * STEP
     course = s.get("gps_course", np.zeros(n))
     altitude = float(np.median(s["gps_altitude"])) if "gps_altitude" in s else 0.0
@@ -225,7 +234,7 @@ def _quantities(ride: Ride, vehicle: Dimensions) -> dict[str, Array]:
         "speed": speed,
         "acceleration": acceleration,
         "grade": grade,
-        "grade_cosine": np.asarray(np.sqrt(1 - np.clip(grade, -0.5, 0.5) ** 2)),
+        "grade_cosine": np.asarray(np.sqrt(1 - np.clip(grade, -STEEPEST, STEEPEST) ** 2)),
         "mass": np.full(n, vehicle.mass),
         "air_density": np.full(n, density),
         "headwind": np.zeros(n),

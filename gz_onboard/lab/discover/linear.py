@@ -13,16 +13,28 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.blocks import blocks, depends, roughness, support, usable
-from gz_onboard.lab.discover.channels import CHANNELS, Channel
+from gz_onboard.lab.discover.channels import CHANNELS, Channel, ChannelNoise
 from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.prior import stepped
 from gz_onboard.lab.discover.system import System
 
-LEAST = 0.02  # of the variance before, down to which the scatter between rides is learned
-Noise = dict[str, tuple[float, float, float]]  # by channel: white sd, correlated sd, correlation time [s]
+LEAST_BLOCKS = 10  # of a channel in a ride, to say anything
+WHITE = 1e-9  # of the white noise: correlated noise of less is none
+TRIMS = 3  # rounds of fitting a ride and trimming it
+OUTLYING, KEPT, MOST_TRIMMED = 5.0, 0.95, 0.2
+"""Standard deviations of a block that is trimmed; share of a channel that is never; where more would be, nothing is."""
+NORMAL = 1.4826  # standard deviation over median absolute deviation of the normal distribution
+CLIPPED = 6.0  # robust standard deviations, beyond which a residual counts no more for its noise
+RATIOS = (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0)  # of correlated over white noise, of which the likeliest is taken
+BLOCKS, TIMES = (3, 10), (60.0, 200.0, 600.0)  # correlation times likewise, in blocks and in s
+SLOW_RATIO = 0.5  # the least of a channel whose noise is known to be slow
+Index = NDArray[np.intp] | slice
+LEAST, MOST = 0.02, 9.0  # of the variance before, within which the scatter between rides is learned
+Noise = dict[str, ChannelNoise]  # by channel
 
 
 @dataclass(frozen=True)
@@ -43,12 +55,12 @@ class LinearChannel:
     @property
     def unit(self) -> Array:
         """What y is to be multiplied with to be in the channel's unit, (m,)."""
-        return self.factor * self.rough
+        return self.factor * self.roughness[self.used]
 
     @property
-    def rough(self) -> Array:
-        """The roughness of its blocks, (m,)."""
-        return self.roughness[self.used]
+    def touched(self) -> NDArray[np.intp]:
+        """Which parameters move it."""
+        return np.flatnonzero(np.any(self.a != 0, axis=0))
 
 
 @dataclass
@@ -72,7 +84,7 @@ def linearise(
         if not usable(channel, ride, system):
             continue
         used = support(channel, ride)
-        if used.sum() < 10:
+        if used.sum() < LEAST_BLOCKS:
             continue
         mine = depends(channel, system.effects)
         y = blocks(channel, ride, values, system)[used]
@@ -93,12 +105,12 @@ def linearise(
     return LinearRide(ride, tables)
 
 
-def whitened(table: LinearChannel, noise: tuple[float, float, float], values: Array) -> Array:
+def whitened(table: LinearChannel, noise: ChannelNoise, values: Array) -> Array:
     """`values` (m,) or (m, k) in units of their noise: the innovations of a Kalman filter of white and exponentially
     correlated noise (Anderson & Moore 1979, ch. 9), divided by their standard deviation.
     """
     white, slow, time = noise
-    if not table.channel.correlated or slow < 1e-9 * white:
+    if not table.channel.correlated or slow < WHITE * white:
         return np.asarray(values / white)
     decay = np.exp(-np.diff(table.time, prepend=table.time[0]) / time)
     variance = slow**2
@@ -118,7 +130,8 @@ def whitened(table: LinearChannel, noise: tuple[float, float, float], values: Ar
 
 def likelihoods(times: Array, rest: Array, ratio: Array, time: Array) -> tuple[Array, Array]:
     """For each pair of `ratio` (correlated over white sd) and `time` [s], shape (k,): the sum of squares in units of
-    the white noise, and the sum of the logarithms of the innovations' variances.
+    the white noise, and the sum of the logarithms of the innovations' variances. The recursion of `whitened`, whose
+    variances are one number a step; here they are arrays, and as few operations as can be.
     """
     steps = np.exp(-np.diff(times, prepend=times[0])[:, None] / time)
     power = ratio**2
@@ -145,7 +158,7 @@ def trimmed(line: LinearRide, noise: Noise, mean: Array, spread: Array) -> Linea
     1987), with their neighbours; a tenth of a channel at most.
     """
     tables = line.tables
-    for _ in range(3):
+    for _ in range(TRIMS):
         own = likeliest(LinearRide(line.ride, tables), noise, mean, spread)
         tables = {name: _trim(table, noise[name], own) for name, table in line.tables.items()}
     return LinearRide(line.ride, tables)
@@ -170,13 +183,13 @@ def spread_out(line: LinearRide, noise: Noise, mean: Array, spread: Array) -> Li
     return LinearRide(line.ride, tables)
 
 
-def _trim(table: LinearChannel, noise: tuple[float, float, float], own: Array) -> LinearChannel:
+def _trim(table: LinearChannel, noise: ChannelNoise, own: Array) -> LinearChannel:
     rest = table.y - table.a @ own
     rest = rest - np.median(rest)
-    limit = 5 * max(float(np.hypot(noise[0], noise[1])), 1.4826 * float(np.median(np.abs(rest))))
-    bad = np.abs(rest) > max(limit, float(np.quantile(np.abs(rest), 0.95)))
+    limit = OUTLYING * max(noise.sd, NORMAL * float(np.median(np.abs(rest))))
+    bad = np.abs(rest) > max(limit, float(np.quantile(np.abs(rest), KEPT)))
     bad = bad | np.append(bad[1:], False) | np.insert(bad[:-1], 0, False)
-    if not bad.any() or bad.mean() > 0.2:
+    if not bad.any() or bad.mean() > MOST_TRIMMED:
         return table
     used = table.used.copy()
     used[np.flatnonzero(used)[bad]] = False
@@ -190,6 +203,22 @@ class Normal:
     n: Array
     b: Array
 
+    def padded(self, k: int) -> Normal:
+        """The same of `k` parameters more, of which nothing is known yet."""
+        return Normal(np.pad(self.n, (0, k)), np.pad(self.b, (0, k)))
+
+    def with_columns(self, table: LinearChannel, noise: ChannelNoise, columns: Array, own: Index) -> Normal:
+        """The same with `columns` (m, k) of a channel for the last k parameters; own: where its others are."""
+        k = columns.shape[1]
+        both = whitened(table, noise, np.column_stack([columns, table.a[:, own], table.y]))
+        new, a, y = both[:, :k], both[:, k:-1], both[:, -1]
+        n, b = self.n.copy(), self.b.copy()
+        n[-k:, -k:] += new.T @ new
+        n[-k:, own] += new.T @ a
+        n[:-k, -k:] = n[-k:, :-k].T
+        b[-k:] += new.T @ y
+        return Normal(n, b)
+
 
 def normal(linear: LinearRide, noise: Noise, only: Sequence[str] | None = None) -> Normal:
     """The normal equations of a ride, over all channels or `only` some."""
@@ -198,7 +227,7 @@ def normal(linear: LinearRide, noise: Noise, only: Sequence[str] | None = None) 
     for name, table in linear.tables.items():
         if only is not None and name not in only:
             continue
-        touched = np.flatnonzero(np.any(table.a != 0, axis=0))
+        touched = table.touched
         both = whitened(table, noise[name], np.column_stack([table.a[:, touched], table.y]))
         a, y = both[:, :-1], both[:, -1]
         n[np.ix_(touched, touched)] += a.T @ a
@@ -228,14 +257,15 @@ def fit_mixed(
     mean: Array,
     prior: Array,
     scatter: Array,
-    weight: Array | float,
-    free: Mask,
-    rounds: int = 60,
+    weight: Array | float = 0.0,
+    free: Mask | None = None,
+    rounds: int = 0,
 ) -> Posterior:
-    """Common part, and the scatter between rides by expectation and maximisation (Dempster, Laird & Rubin 1977).
+    """Common part, and the scatter between rides in `rounds` of expectation and maximisation (Dempster, Laird & Rubin
+    1977); none: it stays.
 
     mean, prior: (p,), (p, p) of the common part before. scatter: (p,) variances before, worth `weight` (p,) rides;
-    only those of `free` (p,) are learned, down to `LEAST` of what they were.
+    only those of `free` (p,) are learned, from `LEAST` to `MOST` of what they were.
     """
     before = scatter.copy()
     now = scatter.copy()
@@ -252,14 +282,9 @@ def fit_mixed(
             vn = v @ ride.n
             total = total + u**2 + np.diag(v) + np.einsum("ij,jk,ik->i", vn, after, vn)
             own.append(u)
-        if rounds > 0:
-            now = np.where(free, np.clip(total / (weight + len(rides)), LEAST * before, 9 * before), before)
+        if free is not None:
+            now = np.where(free, np.clip(total / (weight + len(rides)), LEAST * before, MOST * before), before)
     return Posterior(common, after, now, np.array(own))
-
-
-def residuals(linear: LinearRide, shift: Array) -> dict[str, Array]:
-    """y − A·shift by channel."""
-    return {name: table.y - table.a @ shift for name, table in linear.tables.items()}
 
 
 def learn_noise(rides: Sequence[LinearRide], shifts: Array, start: Noise) -> Noise:
@@ -268,26 +293,23 @@ def learn_noise(rides: Sequence[LinearRide], shifts: Array, start: Noise) -> Noi
     shifts: (rides, p), what each ride's parameters are.
     """
     result = dict(start)
-    every = [residuals(ride, shift) for ride, shift in zip(rides, shifts, strict=True)]
+    every = [ride.seen_from(-shift).tables for ride, shift in zip(rides, shifts, strict=True)]
     for channel in CHANNELS:
-        rows = [
-            (ride.tables[channel.name], rest[channel.name])
-            for ride, rest in zip(rides, every, strict=True)
-            if channel.name in rest
-        ]
+        rows = [(table, table.y) for tables in every if (table := tables.get(channel.name)) is not None]
         if not rows:
             continue
         pooled = np.concatenate([rest for _, rest in rows])
-        spread = float(1.4826 * np.median(np.abs(pooled - np.median(pooled)))) or float(np.std(pooled)) or 1e-9
-        rows = [(t, np.clip(rest, -6 * spread, 6 * spread)) for t, rest in rows]
+        spread = float(NORMAL * np.median(np.abs(pooled - np.median(pooled)))) or float(np.std(pooled)) or 1e-9
+        rows = [(t, np.clip(rest, -CLIPPED * spread, CLIPPED * spread)) for t, rest in rows]
         if not channel.correlated:
-            result[channel.name] = (float(np.sqrt(np.mean(np.concatenate([r for _, r in rows]) ** 2))), 0.0, 10.0)
+            white = float(np.sqrt(np.mean(np.concatenate([rest for _, rest in rows]) ** 2)))
+            result[channel.name] = ChannelNoise(white, 0.0, channel.noise.time)
             continue
         grid = [
             (q, t)
-            for t in (3 * channel.block, 10 * channel.block, 60.0, 200.0, 600.0)
-            for q in (0.0, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0)
-            if not channel.slow or (t >= channel.slow and q >= 0.5)
+            for t in (*(n * channel.block for n in BLOCKS), *TIMES)
+            for q in RATIOS
+            if not channel.slow or (t >= channel.slow and q >= SLOW_RATIO)
         ]
         ratio, time = (np.array(column) for column in zip(*grid, strict=True))
         parts = [likelihoods(table.time, rest, ratio, time) for table, rest in rows]
@@ -295,5 +317,5 @@ def learn_noise(rides: Sequence[LinearRide], shifts: Array, start: Noise) -> Noi
         quadratic = sum((q for q, _ in parts), np.zeros(len(ratio)))
         i = int(np.argmin(count * np.log(quadratic / count) + sum(part[1] for part in parts)))
         sd = float(np.sqrt(quadratic[i] / count))
-        result[channel.name] = (sd, float(ratio[i]) * sd, float(time[i]))
+        result[channel.name] = ChannelNoise(sd, float(ratio[i]) * sd, float(time[i]))
     return result

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -16,20 +16,30 @@ from gz_onboard.lab.discover.blocks import depends
 from gz_onboard.lab.discover.candidates import Candidate, candidates
 from gz_onboard.lab.discover.channels import CHANNELS
 from gz_onboard.lab.discover.grid import USUAL_DELAYS, Dimensions, Ride, read_ride
-from gz_onboard.lab.discover.linear import LinearRide, Noise, linearise, spread_out, trimmed
+from gz_onboard.lab.discover.linear import (
+    LinearRide,
+    Noise,
+    Normal,
+    Posterior,
+    fit_mixed,
+    linearise,
+    normal,
+    spread_out,
+    trimmed,
+)
 from gz_onboard.lab.discover.prior import (
-    BASE,
     BENCH,
     BY_NAME,
-    FIXED,
+    GIVEN_SCATTER,
     HEALTHY_SD,
-    LOG,
     LOG_RIDE_SD,
     LOG_RIDE_SD_ELSE,
+    LOG_SCALED,
     NUISANCES,
     RIDE_SD,
     RIDE_SD_SHARE,
     RIDE_SD_STEP,
+    VEHICLE_PARAMETERS,
     Sizes,
     nearest_step,
     sizes_of,
@@ -47,6 +57,8 @@ TRANSFERRED = 3.0
 MOST_LOG = 0.5  # sd of a logarithm, beyond which a parameter is known to its sign only
 LEAST_STEP = 0.05  # of a standard deviation: the finest scale
 LEAST_SD = 1e-3  # scales: what is certain
+FREED = 1e6  # variance in scales of what nothing is known of
+WIDENED = 25.0  # variance in scales, five times a usual change
 PRIOR_RIDES, LEAST_FREEDOM = 3, 4
 """What is known without healthy rides, worth so many of them; and no scatter is known worse than with so many."""
 
@@ -65,6 +77,7 @@ class MixedModel:
     """The linear model's frame: names (p,), scale (p,), values where it is linearised, and what is known before.
 
     mean, prior: of the common part less `values`, in scales, (p,), (p, p). scatter: variances between rides, (p,).
+    inflation: of a cause's score on healthy rides left out, 1 if right. shapes: what these show over quantities.
     """
 
     vehicle: Vehicle
@@ -79,10 +92,8 @@ class MixedModel:
     noise: Noise
     healthy: int  # rides that it was learned on
     free: Mask  # whose scatter between rides is learned, (p,)
-    inflation: dict[str, float] = field(
-        default_factory=dict
-    )  # of a cause's score on healthy rides left out, 1 if right
-    shapes: dict[str, HealthyCurve] = field(default_factory=dict)  # what healthy rides show over quantities, by name
+    inflation: dict[str, float] = field(default_factory=dict)
+    shapes: dict[str, HealthyCurve] = field(default_factory=dict)
 
     @property
     def freedom(self) -> float:
@@ -114,15 +125,43 @@ class MixedModel:
         absent = any(name in cause.names for cause in self.lacking)
         return 0.0 if absent else float(self.vehicle.parameters[name])
 
-    def index(self, names: Sequence[str]) -> list[int]:
+    def index(self, names: Iterable[str]) -> list[int]:
         """Where `names` stand."""
         return [self.names.index(name) for name in names]
 
-    def unit_value(self, vector: Array) -> dict[str, float]:
+    def index_of(self, causes: Iterable[Candidate]) -> list[int]:
+        """Where the parameters of `causes` stand."""
+        return self.index(name for cause in causes for name in cause.names)
+
+    def normals(self, lines: Iterable[LinearRide]) -> list[Normal]:
+        """The normal equations of each ride at this noise."""
+        return [normal(line, self.noise) for line in lines]
+
+    def fit(self, rides: Sequence[Normal]) -> Posterior:
+        """The common part and each ride's own as `rides` show them, the scatter as it is."""
+        return fit_mixed(rides, self.mean, self.prior, self.scatter)
+
+    def learned_scatter(self, rides: Sequence[Normal], weight: Array | float, rounds: int) -> Posterior:
+        """The same with the scatter that `rides` show; see `linear.fit_mixed`."""
+        return fit_mixed(rides, self.mean, self.prior, self.scatter, weight, self.free, rounds)
+
+    def freed(self, index: Sequence[int]) -> MixedModel:
+        """With nothing known of the common part at `index`."""
+        prior = self.prior.copy()
+        prior[index, index] += FREED
+        return replace(self, prior=prior)
+
+    def widened(self) -> MixedModel:
+        """With a common part of which little is known, while scatter or noise of the very rides is sought."""
+        return replace(self, prior=self.prior + WIDENED * np.eye(len(self.names)))
+
+    def values_at(self, vector: Array) -> dict[str, float]:
         """`values` moved by `vector` (p,) in scales."""
         moved = dict(self.values)
         for name, x, scale in zip(self.names, vector, self.scale, strict=True):
-            moved[name] = stepped(name, moved[name], float(np.clip(x * scale, -1, 1) if name in LOG else x * scale))
+            moved[name] = stepped(
+                name, moved[name], float(np.clip(x * scale, -1, 1) if name in LOG_SCALED else x * scale)
+            )
         return moved
 
     def ride(self, samples: Samples) -> Ride:
@@ -159,18 +198,18 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
     declared = declared_parameters(effects)
     priors = {name: _prior(name, vehicle, declared, values[name], name in absent) for name in names}
     return MixedModel(
-        vehicle,
-        system,
-        causes,
-        tuple(names),
-        np.array([prior.scale for prior in priors.values()]),
-        values,
-        np.zeros(len(names)),
-        _covariance(priors, vehicle.parameters.correlations),
-        np.array([prior.ride_sd for prior in priors.values()]) ** 2,
-        {channel.name: channel.noise for channel in CHANNELS},
-        0,
-        np.array([name not in FIXED for name in names]),
+        vehicle=vehicle,
+        system=system,
+        causes=causes,
+        names=tuple(names),
+        scale=np.array([prior.scale for prior in priors.values()]),
+        values=values,
+        mean=np.zeros(len(names)),
+        prior=_covariance(priors, vehicle.parameters.correlations),
+        scatter=np.array([prior.ride_sd for prior in priors.values()]) ** 2,
+        noise={channel.name: channel.noise for channel in CHANNELS},
+        healthy=0,
+        free=np.array([name not in GIVEN_SCATTER for name in names]),
     )
 
 
@@ -183,7 +222,7 @@ def _names(
     strengths = {name for c in causes for name in c.names}
     of_effects = {x.name for e in vehicle.model.effects for x in e.parameters}
     shaping = {x.name for e in lacking for x in e.parameters} - strengths
-    fitted = set(BASE) | of_effects | strengths | {nuisance.name for nuisance in NUISANCES}
+    fitted = set(VEHICLE_PARAMETERS) | of_effects | strengths | {nuisance.name for nuisance in NUISANCES}
     return sorted(name for name in (needed & fitted) - shaping if name in values)
 
 
@@ -214,7 +253,7 @@ def _prior(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], value
         own = RIDE_SD.get(name, parameter.ride_sd)
         size = nearest_step(value / parameter.prior, RIDE_SD_STEP) if parameter.prior else 1.0
         scatter = RIDE_SD_SHARE * parameter.prior_sd if own is None else own * size
-    if name in LOG:
+    if name in LOG_SCALED:
         spread, scatter = min(spread / value, MOST_LOG), LOG_RIDE_SD.get(name, LOG_RIDE_SD_ELSE)
     wide = spread * (TRANSFERRED if on_bench else 1.0)
     step = max(scatter, LEAST_STEP * wide)
@@ -226,7 +265,7 @@ def _covariance(priors: Mapping[str, _Prior], correlations: Mapping[frozenset[st
     covariance = np.diag(np.array([prior.sd for prior in priors.values()]) ** 2)
     place = {name: i for i, name in enumerate(priors)}
     for pair, r in correlations.items():
-        a, b = tuple(pair)
+        a, b = sorted(pair)  # of a set, whose order differs from run to run, and with it the last digits
         if a in place and b in place:
             # what the bench leaves open goes together; by how much the road differs from the bench does not
             both = r * priors[a].bench_sd * priors[b].bench_sd

@@ -20,39 +20,25 @@ from gz_onboard.lab.discover.plots import curve, overview, panels, ranking
 from gz_onboard.lab.discover.result import METRICS, VERDICTS, Report
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import readable, with_unit
+from gz_onboard.offline.page import html_table, write_page
 from gz_onboard.offline.results import clock
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_STYLE = """
-body { font: 15px/1.5 system-ui, sans-serif; color: #1f2933; max-width: 1150px; margin: 2rem auto; padding: 0 1.5rem }
-h1 { font-size: 1.7rem; margin-bottom: .2rem } h2 { margin-top: 2.4rem; border-bottom: 1px solid #e4e7eb }
-.verdict { font-size: 1.15rem; margin: .2rem 0 1rem } .muted { color: #7b8794 }
-.cards { display: flex; flex-wrap: wrap; gap: 1rem; margin: 1rem 0 }
-.card { background: #f5f7fa; border-radius: .5rem; padding: .7rem 1.1rem; min-width: 9rem }
-.card b { display: block; font-size: 1.35rem }
-table { border-collapse: collapse; margin: .6rem 0 }
-td, th { padding: .25rem .7rem; text-align: right } td { white-space: nowrap }
-td { border-top: 1px solid #e4e7eb } td:first-child, th:first-child { text-align: left }
-th { color: #7b8794; font-weight: 600; vertical-align: bottom } img { width: 100%; display: block }
-summary { cursor: pointer; font-weight: 600; margin: .6rem 0 }
-"""
-
-
 _GRADE = (
-    '<p class="muted">Grade is made from the accelerometer, whose noise is in the road force too, with the other sign: '
+    "<p>Grade is made from the accelerometer, whose noise is in the road force too, with the other sign: "
     "a falling line over grade is that noise.</p>"
 )
 
 
 def write_report(found: Discovery, out: Path) -> None:
     """Write the report of `found` to the HTML file `out`. Raises OSError."""
-    out.write_text(page(found), encoding="utf-8")
+    write_page(out, f"{found.mixed.vehicle.name}: {found.report.verdict}", [body(found)])
 
 
-def page(found: Discovery) -> str:
-    """The report as HTML."""
+def body(found: Discovery) -> str:
+    """The report as HTML, below its title."""
     report = found.report
     before, after = before_and_after(found)
     stages = {"before": before, "after": after} if report.causes else {"before": before}
@@ -80,11 +66,7 @@ def page(found: Discovery) -> str:
     if report.unknown:
         parts.append("<h2>What has no name</h2>" + _picture(curve(report.unknown)))
     parts += [_constancy(report), _limits(report), _separable(report), _notes(report)]
-    body = "\n".join(parts)
-    return (
-        f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Discovery: {report.verdict}</title>'
-        f"<style>{_STYLE}</style></head><body>\n{body}\n</body></html>\n"
-    )
+    return "\n".join(parts)
 
 
 def _named(report: Report) -> str:
@@ -100,7 +82,8 @@ def _head(found: Discovery) -> str:
     known = f"{mixed.healthy} healthy rides" if mixed.healthy else "the vehicle file alone"
     cards = [
         (f"{len(found.lines)}", "ride" if len(found.lines) == 1 else "rides"),
-        (f"{ridden.distance / 1e3:.1f} km", clock(ridden.time)),
+        (f"{ridden.distance / 1e3:.1f} km", "ridden"),
+        (clock(ridden.time), "in"),
     ]
     if ridden.energy > 0:
         cards.append((f"{ridden.energy / 3.6e6:.2f} kWh", "drawn"))
@@ -111,12 +94,11 @@ def _head(found: Discovery) -> str:
         cards.append((f"{report.unknown.share:+.1%}", "of the energy, without a name"))
     if (error := report.gain.range) is not None:
         cards.append((f"{error.before:.1%} → {error.after:.1%}", "error of the range, held out"))
-    boxes = "".join(f'<div class="card"><b>{value}</b>{text}</div>' for value, text in cards)
+    values, words = zip(*cards, strict=True)
     rides = ", ".join(html.escape(line.ride.name) for line in found.lines)
     return (
-        f"<h1>{html.escape(mixed.vehicle.name)}: {report.verdict}</h1>"
-        f'<p class="verdict">{VERDICTS[report.verdict].capitalize()}.</p>'
-        f'<p class="muted">{rides}; against the vehicle as known from {known}.</p><div class="cards">{boxes}</div>'
+        f"<p>{VERDICTS[report.verdict].capitalize()}.</p>"
+        f"<p>{rides}; against the vehicle as known from {known}.</p>{html_table(words, [values])}"
     )
 
 
@@ -140,9 +122,9 @@ def _causes(report: Report) -> str:
             rows.append(["", name, f"{other.value:.4g}", f"{low:.4g} to {high:.4g}", "", "", ""])
     if rows:
         heads = ["cause", "parameter", "value", "95 % interval", "change", "of the energy", "score"]
-        text += "<h2>Causes</h2>" + table(heads, rows)
+        text += "<h2>Causes</h2>" + html_table(heads, rows, range(2, len(heads)))
         text += (
-            '<p class="muted">Score: chi-squared of one degree of freedom that the rides lose without it; healthy '
+            "<p>Score: chi-squared of one degree of freedom that the rides lose without it; healthy "
             f"rides stay below {report.threshold:.1f}.</p>"
         )
     for c in report.causes:
@@ -208,8 +190,8 @@ def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[Lin
     blocks = ", ".join(
         f"{readable(n)} {BY_NAME[n].block:g} s" for n in ("road_force", "inverter_power", "cell_voltage")
     )
-    return table(heads, rows) + (
-        '<p class="muted">Mean and rms as measured, with the bias of each ride\'s sensors and its wind; before and '
+    return html_table(heads, rows, range(2, len(heads))) + (
+        "<p>Mean and rms as measured, with the bias of each ride's sensors and its wind; before and "
         "after with these taken off, without and with the causes named. Autocorrelation: of neighbouring blocks "
         f"({blocks}); near 0 nothing is left but noise.</p>"
     )
@@ -248,8 +230,8 @@ def _gain(report: Report) -> str:
     heads = ["error", "before", "control", "after", "gain over control, 95 % over rides"]
     held = ", ".join(map(html.escape, report.gain.holdout))
     text = "In no choice and no fit" if report.gain.apart else "Each in turn was held out of the fit"
-    return table(heads, rows) + (
-        f'<p class="muted">{text}: {held}. Control: the parameters that the model has already, refitted on the other '
+    return html_table(heads, rows, range(1, len(heads))) + (
+        f"<p>{text}: {held}. Control: the parameters that the model has already, refitted on the other "
         "rides. After: the causes as well.</p>"
     )
 
@@ -262,7 +244,7 @@ def _constancy(report: Report) -> str:
     return (
         "<h2>Whether a cause acts alike everywhere</h2><p>Half the difference of left and right bends, or of the upper "
         "and lower half of a quantity, over the mean: 0 for the cause itself, ±1 for what acts in one half only.</p>"
-        + table(["cause", "over", "ratio", "chi-squared"], rows)
+        + html_table(["cause", "over", "ratio", "chi-squared"], rows, (2, 3))
     )
 
 
@@ -274,9 +256,10 @@ def _limits(report: Report) -> str:
         else:
             share = f"{limit.energy_share:.1%}" if limit.energy_share > 1e-5 else "–"
             rows.append([readable(name), limit.parameter, with_unit(limit.change, limit.unit, ".3g"), share])
+    heads = ["cause", "parameter", "change", "of the energy"]
     return (
         "<h2>What these rides could show</h2><p>The least change that would be found half the time, were it alone.</p>"
-        f"<details><summary>Every candidate</summary>{table(['cause', 'parameter', 'change', 'of the energy'], rows)}"
+        f"<details><summary>Every candidate</summary>{html_table(heads, rows, (2, 3))}"
         "</details>"
     )
 
@@ -288,7 +271,7 @@ def _separable(report: Report) -> str:
     rows = [[readable(a), readable(b), f"{c:+.2f}"] for a, b, c in look[:20]]
     return (
         "<p>Causes that look alike to these rides: cosine of what they do to the residuals once biases and scatter are "
-        "out. At ±1 no statistics can tell them apart.</p>" + table(["cause", "cause", "cosine"], rows)
+        "out. At ±1 no statistics can tell them apart.</p>" + html_table(["cause", "cause", "cosine"], rows, (2,))
     )
 
 
@@ -296,13 +279,6 @@ def _notes(report: Report) -> str:
     if not report.notes:
         return ""
     return "<h2>Notes</h2><ul>" + "".join(f"<li>{html.escape(note)}</li>" for note in report.notes) + "</ul>"
-
-
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """An HTML table of texts."""
-    head = "".join(f"<th>{html.escape(text)}</th>" for text in heads)
-    body = "".join("<tr>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table><tr>{head}</tr>{body}</table>"
 
 
 def _picture(figure: Figure) -> str:

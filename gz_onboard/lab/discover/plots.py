@@ -39,15 +39,8 @@ def overview(stages: Stages, channels: Sequence[str], over: QuantityReader) -> F
             for c in range(len(quantities)):
                 value = grid[r, c]
                 if value >= 1:
-                    axis.text(
-                        c,
-                        r,
-                        f"{value:.0f}",
-                        ha="center",
-                        va="center",
-                        fontsize=7.5,
-                        color="white" if value > 40 else INK,
-                    )
+                    colour = "white" if value > 40 else INK
+                    axis.text(c, r, f"{value:.0f}", ha="center", va="center", fontsize=7.5, color=colour)
         axis.set_xticks(
             range(len(quantities)), [readable(name) for name in quantities], rotation=38, ha="left", fontsize=8
         )

@@ -38,7 +38,7 @@ class Sizes:
         return float(getattr(self, name)) if name else 1.0
 
 
-USUAL = Sizes()
+USUAL_SIZES = Sizes()
 
 
 def nearest_step(ratio: float, step: float = 2**0.5) -> float:
@@ -144,7 +144,7 @@ COOLING = (
     "pack_heat_capacity",
     "pack_conductance",
 )
-LOG = frozenset(COOLING)
+LOG_SCALED = frozenset(COOLING)
 """Those that are positive and known to a factor only: a step is one of their logarithm."""
 LOG_RIDE_SD, LOG_RIDE_SD_ELSE = {"pack_heat_capacity": 0.05}, 0.1
 """By how much their logarithm scatters from ride to ride."""
@@ -152,10 +152,10 @@ LOG_RIDE_SD, LOG_RIDE_SD_ELSE = {"pack_heat_capacity": 0.05}, 0.1
 
 def stepped(name: str, value: float, step: float) -> float:
     """`value` of the parameter `name` after a step, in its unit, or of the logarithm."""
-    return value * exp(step) if name in LOG else value + step
+    return value * exp(step) if name in LOG_SCALED else value + step
 
 
-FIXED = (
+GIVEN_SCATTER = (
     "soc_start",
     "v1_start",
     "altitude_start",
@@ -168,10 +168,16 @@ FIXED = (
 )
 """Those whose scatter is of the ride's start or of what was entered: healthy rides say no more of it."""
 
-STARTS = (*(name for name in FIXED if name != "payload_error"), "accel_bias", "pitch_gain", "gps_lag", "wheel_lag")
+EACH_RIDES_OWN = (
+    *(name for name in GIVEN_SCATTER if name != "payload_error"),
+    "accel_bias",
+    "pitch_gain",
+    "gps_lag",
+    "wheel_lag",
+)
 """Those of the sensors or of the start, not of the vehicle: each ride has its own, whatever the model."""
 
-BASE = (
+VEHICLE_PARAMETERS = (
     "wheel_radius",
     "payload_mass",
     "torque_constant",

@@ -20,6 +20,7 @@ from gz_onboard.lab.discover.system import System, Values, summed
 from gz_onboard.physics.battery import discharged, heat, terminal_voltage
 from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.physics.effect import ROAD_LOAD, Port
+from gz_onboard.physics.effects import inertia
 from gz_onboard.physics.model import drag_torque
 from gz_onboard.physics.relaxation import decay_over, relaxation_over, relaxed
 
@@ -27,15 +28,22 @@ SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
 DT = SLOW * STEP
 MID = 200.0  # s: between the pair of the vehicle file and slow relaxation
 FIRST = 20  # steps: what a ride begins with
+START_SOC = 0.6  # whose ohmic resistance takes the current off the first voltages
+BRAKING = 0.5  # of the switch: between open and closed
+LEAST_COOLING = 0.05  # of the conductance at standstill: moving air does not heat
 # Scales of the nuisances, so that all are of order one.
 WARM, COLDER = 20.0, 20.0  # degC, K below it
 SPIN = 50.0  # rad/s of the motor
 AMPERES = 50.0  # of the motor
-
-
-def recursion(decay: Array, target: Array, start: float = 0.0) -> Array:
-    """`relaxation` at the beginnings of the steps, x[0] = start; shape of `decay`."""
-    return relaxation_over(target, decay, start, before=True)
+MAGNETS = 40.0  # degC of the motor, at which its torque constant is the vehicle file's
+SATURATING = 100.0  # A of the motor
+SLIPPING = 100.0  # N at the wheel
+DRIFT_TIME = 600.0  # s
+EMPTIER = 0.4  # of SOC below full
+BENT = 5.0  # A of a cell
+MIDDLE = 0.7  # SOC about which the rest voltage tilts
+WIND = 10.0  # m/s of air past the vehicle
+WARMER = 10.0  # K of the stator above the air
 
 
 def colder(temperature: Array) -> Array:
@@ -74,8 +82,8 @@ def torque_constant(ride: Ride, p: Values) -> Array:
     q = ride.quantities
     return np.asarray(
         p["torque_constant"]
-        * (1 + p["torque_constant_slope"] * (q["motor_temperature"] - 40))
-        * (1 - p["torque_saturation"] * np.abs(q["motor_current"]) / 100)
+        * (1 + p["torque_constant_slope"] * (q["motor_temperature"] - MAGNETS))
+        * (1 - p["torque_saturation"] * np.abs(q["motor_current"]) / SATURATING)
     )
 
 
@@ -93,13 +101,13 @@ def current(ride: Ride, p: Values) -> Array:
 
 
 def road_force(ride: Ride, p: Values, system: System) -> Array:
-    """[N] at the wheel."""
+    """Force [N] at the wheel: of the motor less the road load, less what the accelerometer shows."""
     q = moving(ride, p, system)
     shaft = q["torque"] - drag_torque(motor_losses(ride, q, p, system)[1], q["motor_speed"])
     entered, m = float(ride.quantities["mass"][0]), mass(ride, p, system)
-    rotating = (p["wheel_inertia_front"] + p["wheel_inertia_rear"]) / p["wheel_radius"] ** 2
     specific = ride.signals["accel_x"] - p["accel_bias"] - p["pitch_gain"] * q["acceleration"]
-    force = rotating * q["acceleration"] + summed(system.terms(q, p, STEP, *ROAD_LOAD))
+    rotating = {name: p[name] for name in ("wheel_inertia_front", "wheel_inertia_rear", "wheel_radius")}
+    force = inertia.term(q["acceleration"], 0.0, **rotating) + summed(system.terms(q, p, STEP, *ROAD_LOAD))
     push = shaft / (p["wheel_radius"] * p["gear_ratio"]) - force
     # what is noisy stands alone: were the accelerometer multiplied with the mass that is sought, the least noise would
     # be had with the least mass, and all that it is weighed with would shrink along
@@ -107,7 +115,7 @@ def road_force(ride: Ride, p: Values, system: System) -> Array:
 
 
 def altitude(ride: Ride, p: Values, system: System) -> Array:
-    """[m]"""
+    """GPS altitude [m] above the start, less the way times the grade that the accelerometer shows."""
     q = moving(ride, p, system)
     acceleration = q["acceleration"]
     sine = (ride.signals["accel_x"] - p["accel_bias"] - (1 + p["pitch_gain"]) * acceleration) / GRAVITY
@@ -116,7 +124,7 @@ def altitude(ride: Ride, p: Values, system: System) -> Array:
 
 
 def inverter_power(ride: Ride, p: Values, system: System) -> Array:
-    """[W] on the DC side."""
+    """The inverter's power [W] on the DC side, less air-gap power and losses."""
     q = moving(ride, p, system)
     electric, _ = motor_losses(ride, q, p, system)
     power = q["torque"] * q["motor_speed"] + electric
@@ -130,9 +138,9 @@ def inverter_power(ride: Ride, p: Values, system: System) -> Array:
 
 
 def pack_balance(ride: Ride, p: Values, system: System) -> Array:
-    """[A]"""
+    """Pack current [A] less the auxiliaries', less the inverter's."""
     s = ride.signals
-    true = (s["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"]
+    true = current(ride, p)
     true = true + p["pack_inverter_lag"] * np.gradient(smooth3(true), STEP)
     # beside the auxiliary load there is what is drawn when nothing is: the inverter's own supply
     inverter = true - s["auxiliary_current"] - p["idle_current"]
@@ -146,16 +154,16 @@ def smooth3(x: Array) -> Array:
 
 
 def auxiliary(ride: Ride, p: Values, system: System) -> Array:
-    """[W]"""
+    """The auxiliaries' power [W] less that of the vehicle file and the brake light."""
     s = ride.signals
     power = summed(system.terms(ride.quantities, p, STEP, Port.DC_POWER))
     if "brake_switch" in s:
-        power = power + p["brake_light"] * (s["brake_switch"] > 0.5)
+        power = power + p["brake_light"] * (s["brake_switch"] > BRAKING)
     return np.asarray(s["auxiliary_current"] * s["pack_voltage"] - power)
 
 
 def voltage_balance(ride: Ride, p: Values, system: System) -> Array:
-    """[V]"""
+    """Pack voltage [V] less the inverter's and the drop of the cable."""
     s = ride.signals
     inverter = s["inverter_voltage"] + p["cable_resistance"] * s["inverter_current"] - p["inverter_voltage_offset"]
     return np.asarray(s["pack_voltage"] - p["pack_voltage_offset"] - inverter)
@@ -173,19 +181,20 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, A
     factor = p.get("cell_resistance_factor", 1.0) * (1 + p["resistance_level"] + p["resistance_cold"] * cold)
     bent = p["resistance_current"] + p["resistance_current_cold"] * cold
     empty = p["resistance_empty"] + p["resistance_empty_cold"] * cold
-    factor = factor * (1 + empty * (1 - soc) / 0.4 - bent * np.abs(cell) / 5)
+    factor = factor * (1 + empty * (1 - soc) / EMPTIER - bent * np.abs(cell) / BENT)
     r0 = battery.r0.over(soc, temperature) * factor
     r1 = battery.r1.over(soc, temperature)
     decay = np.exp(-DT / (r1 * battery.c1.over(soc, temperature) * np.exp(p["pair_time"])))
     settled = r1 * (1 + p["pair_resistance"]) * factor * cell
-    v1 = recursion(decay, settled, p["v1_start"])
+    v1 = relaxation_over(settled, decay, p["v1_start"], before=True)
     v1 = (v1 + relaxed(v1, settled, decay)) / 2  # the mean of the step's ends
-    extra: Any = p["drift"] * np.arange(len(cell)) * DT / 600
-    extra = extra + p["mid_resistance"] * recursion(np.full(len(cell), decay_over(DT, MID)), cell)
+    extra: Any = p["drift"] * np.arange(len(cell)) * DT / DRIFT_TIME
+    mid = relaxation_over(cell, np.full(len(cell), decay_over(DT, MID)), before=True)
+    extra = extra + p["mid_resistance"] * mid
     q = {name: mean_over(value, SLOW) for name, value in ride.quantities.items()}
     q |= {"cell_current": cell, "soc": soc, "cell_temperature": temperature, "cell_capacity": capacity}
     extra = extra + summed(system.terms(q, p, DT, Port.CELL_VOLTAGE))
-    rest = battery.ocv_over(soc, temperature) + p["ocv_offset"] + p["ocv_tilt"] * (soc - 0.7) + p["ocv_cold"] * cold
+    rest = battery.ocv_over(soc, temperature) + p["ocv_offset"] + p["ocv_tilt"] * (soc - MIDDLE) + p["ocv_cold"] * cold
     return np.asarray(terminal_voltage(rest, r0, cell, v1 + extra)), cell * battery.cells_parallel, soc
 
 
@@ -195,7 +204,7 @@ def start_soc(ride: Ride, system: System) -> float:
     amperes = float(np.mean(ride.signals["pack_current"][:FIRST]))
     volts = battery.cell_voltage(float(np.mean(ride.signals["pack_voltage"][:FIRST])), amperes)
     temperature = float(ride.quantities["cell_temperature"][0])
-    drop = amperes / battery.cells_parallel * battery.r0.at(0.6, temperature)[0]
+    drop = amperes / battery.cells_parallel * battery.r0.at(START_SOC, temperature)[0]
     return battery.soc_at(volts + drop, temperature)
 
 
@@ -206,7 +215,7 @@ def counted_soc(ride: Ride, system: System) -> Array:
 
 
 def cell_voltage(ride: Ride, p: Values, system: System) -> Array:
-    """[V] of a mean cell, at steps of `DT`."""
+    """Voltage [V] of a mean cell less that of its circuit at the current measured, at steps of `DT`."""
     battery = replace(system.pack, series_resistance=p["pack_series_resistance"])
     volts, amperes, _ = cell_circuit(ride, p, system)
     measured = mean_over(ride.signals["pack_voltage"], SLOW) - p["pack_voltage_offset"]
@@ -214,7 +223,7 @@ def cell_voltage(ride: Ride, p: Values, system: System) -> Array:
 
 
 def voltage_timing(ride: Ride, p: Values, system: System) -> Array:
-    """[V] of a mean cell, at the grid's steps but the last."""
+    """Steps [V] of a mean cell from one grid step to the next, less those of the current by its resistance."""
     battery = system.pack
     late = p.get("pack_voltage_latency", 0.0)
     amperes = current(ride, p)
@@ -231,15 +240,15 @@ def voltage_timing(ride: Ride, p: Values, system: System) -> Array:
 
 
 def gps_speed(ride: Ride, p: Values, system: System) -> Array:
-    """[m/s]"""
+    """GPS speed [m/s] less the motor's by wheel radius, slip and lean."""
     q = moving(ride, p, system)
-    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / 100
+    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / SLIPPING
     lean = 1 - p["lean_radius"] * (q["lateral_acceleration"] / GRAVITY) ** 2 / 2
     return np.asarray(ride.signals["gps_speed"] - q["speed"] * slip * lean + p["gps_lag"] * q["acceleration"])
 
 
 def rear_speed(ride: Ride, p: Values, system: System) -> Array:
-    """[m/s]"""
+    """The rear wheel's speed [m/s] less the motor's."""
     q = moving(ride, p, system)
     return np.asarray(
         (ride.signals["wheel_speed_rear"] * (1 - p["rear_scale"]) - q["motor_speed"] * p["gear_ratio"]) * ride.radius
@@ -248,9 +257,9 @@ def rear_speed(ride: Ride, p: Values, system: System) -> Array:
 
 
 def front_speed(ride: Ride, p: Values, system: System) -> Array:
-    """[m/s]"""
+    """The front wheel's speed [m/s] less the motor's by slip and lean."""
     q = moving(ride, p, system)
-    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / 100
+    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / SLIPPING
     lean = 1 - p["front_lean"] * (q["lateral_acceleration"] / GRAVITY) ** 2 / 2
     speed = q["motor_speed"] * p["gear_ratio"] * slip * lean
     front = ride.signals["wheel_speed_front"] * (1 - p["front_scale"])
@@ -268,8 +277,8 @@ def _heat(ride: Ride, p: Values, system: System) -> tuple[Array, Array]:
 
 def _cooled(ride: Ride, p: Values, network: Network, watts: Array, airflow: str) -> Array:
     """What `network` leaves [K] of its sensor at steps of `DT`; airflow: how much more moving air cools."""
-    flow = 1 + p[airflow] * np.abs(mean_over(ride.quantities["speed"], SLOW)) / 10
-    air = p.get("cooling_factor", 1.0) * np.maximum(flow, 0.05)
+    flow = 1 + p[airflow] * np.abs(mean_over(ride.quantities["speed"], SLOW)) / WIND
+    air = p.get("cooling_factor", 1.0) * np.maximum(flow, LEAST_COOLING)
     ambient = mean_over(ride.quantities["ambient_temperature"], SLOW)
     return np.array(temperatures(network, DT, watts.tolist(), ambient.tolist(), air.tolist()))
 
@@ -279,16 +288,16 @@ def _first(ride: Ride, sensor: str) -> float:
 
 
 def motor_temperature(ride: Ride, p: Values, system: System) -> Array:
-    """[K] at steps of `DT`."""
+    """The stator's temperature [K] less that of the cooling network at the modelled loss, at steps of `DT`."""
     stator = _first(ride, "motor_temperature") + p["motor_start"]
     ambient = float(mean_over(ride.quantities["ambient_temperature"], SLOW)[0])
-    network = MotorCooling.of(p, stator, stator + p["rotor_start"] * (stator - ambient) / 10)
+    network = MotorCooling.of(p, stator, stator + p["rotor_start"] * (stator - ambient) / WARMER)
     modelled = _cooled(ride, p, network, _heat(ride, p, system)[0], "motor_airflow")
     return np.asarray(mean_over(ride.signals["motor_temperature"], SLOW) - modelled)
 
 
 def inverter_temperature(ride: Ride, p: Values, system: System) -> Array:
-    """[K] at steps of `DT`."""
+    """The board's temperature [K] less that of the cooling network at the modelled loss, at steps of `DT`."""
     board = _first(ride, "inverter_temperature") + p["inverter_start"]
     network = InverterCooling.of(p, board, board + p["box_start"])
     modelled = _cooled(ride, p, network, _heat(ride, p, system)[1], "inverter_airflow")
@@ -296,7 +305,7 @@ def inverter_temperature(ride: Ride, p: Values, system: System) -> Array:
 
 
 def cell_temperature(ride: Ride, p: Values, system: System) -> Array:
-    """[K] at steps of `DT`."""
+    """The cells' temperature [K] less that of the lump at the circuit's heat, at steps of `DT`."""
     battery = system.pack
     volts, amperes, soc = cell_circuit(ride, p, system)
     rest = battery.ocv_over(soc, mean_over(ride.quantities["cell_temperature"], SLOW))

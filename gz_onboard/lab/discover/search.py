@@ -17,7 +17,8 @@ from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.linear import Normal, marginal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 
-RIDGE = 1e-6
+RIDGE = 1e-6  # information of any change, in scales: none is without bounds
+MOST_CAUSES, EXCHANGES = 3, 3  # that are named together; rounds of exchanging each for what explains more
 ALIKE = 0.6  # cosine of two columns, all that is common or random taken off
 BEND = 0.02  # of a cause's evidence: no effect has exactly the form of the real one, and others take up what is left
 
@@ -42,7 +43,7 @@ class Evidence:
         i = list(index)
         return np.asarray(np.linalg.inv(self.information[np.ix_(i, i)] + RIDGE * np.eye(len(i))))
 
-    def given(self, index: Sequence[int], fixed: Sequence[int], ridge: float = 0.0) -> tuple[Array, Array]:
+    def profiled(self, index: Sequence[int], fixed: Sequence[int], ridge: float = 0.0) -> tuple[Array, Array]:
         """(information (k, k), score (k,)) of the parameters at `index` once those at `fixed` are fitted beside them.
 
         ridge: added to the information of those at `index`.
@@ -78,14 +79,6 @@ def evidence_of(mean: Array, prior: Array, scatter: Array, normals: Sequence[Nor
     return Evidence(m - m @ k @ m, e - m @ k @ e)
 
 
-@dataclass(frozen=True)
-class Choice:
-    """A set of causes and the rise of twice the log likelihood that it gives."""
-
-    names: tuple[str, ...]
-    gain: float
-
-
 class Search:
     """The hypotheses over one `Evidence`."""
 
@@ -103,6 +96,13 @@ class Search:
     def index(self, names: Sequence[str]) -> list[int]:
         """The parameters of the causes `names`."""
         return [i for name in names for i in self.place[name]]
+
+    def fitted(self, names: Sequence[str]) -> dict[str, tuple[Array, Array]]:
+        """(changes (k,), variances (k,)) of the parameters of each of `names`, all fitted together, in scales."""
+        index = self.index(names)
+        ends = np.cumsum([len(self.place[name]) for name in names])[:-1]
+        change, variance = self.evidence.estimate(index), np.diag(self.evidence.covariance(index))
+        return dict(zip(names, zip(np.split(change, ends), np.split(variance, ends), strict=True), strict=True))
 
     def allowed(self, names: Sequence[str]) -> bool:
         """Whether each cause of the set changes its parameter in a direction that it can."""
@@ -139,6 +139,10 @@ class Search:
         k = len(self.place[name])
         return one_degree(more, k, self.mixed.freedom) if k > 1 else more
 
+    def part(self, chosen: Sequence[str], name: str) -> float:
+        """What `name` adds to the others of `chosen`: see `step`."""
+        return self.step([other for other in chosen if other != name], name)
+
     def overlap(self, a: str, b: str) -> float:
         """How much of the evidence for `a` and for `b` comes from the same channels, 0 to 1."""
         mine, theirs = self.shares.get(a, {}), self.shares.get(b, {})
@@ -146,18 +150,18 @@ class Search:
 
     def bend(self, base: Sequence[str], name: str) -> float:
         """What `name` would add to `base` if it only mended the form of what is there: see `BEND`."""
-        return BEND * sum(self.step([m for m in base if m != n], n) * self.overlap(n, name) for n in base)
+        return BEND * sum(self.part(base, n) * self.overlap(n, name) for n in base)
 
-    def select(self, threshold: float, most: int = 3) -> Choice:
+    def select(self, threshold: float) -> tuple[str, ...]:
         """Causes one after the other, each exchanged for what explains more together with the rest."""
         chosen: list[str] = []
-        while len(chosen) < most:
+        while len(chosen) < MOST_CAUSES:
             steps = {n: self.step(chosen, n) for n in self.causes if n not in chosen}
             best = max(steps, key=lambda n: steps[n])
             if steps[best] < max(threshold, self.bend(chosen, best)):
                 break
             chosen.append(best)
-            for _ in range(3):
+            for _ in range(EXCHANGES):
                 before = list(chosen)
                 for old in before:
                     rest = [n for n in chosen if n != old]
@@ -171,8 +175,8 @@ class Search:
             rest = [n for n in chosen if n != old]
             if rest and self.step(rest, old) < max(threshold, self.bend(rest, old)):
                 chosen.remove(old)
-        chosen.sort(key=lambda n: -self.step([m for m in chosen if m != n], n))
-        return Choice(tuple(chosen), self.gain(chosen))
+        chosen.sort(key=lambda n: -self.part(chosen, n))
+        return tuple(chosen)
 
     def alternatives(self, chosen: Sequence[str], margin: float, least: float) -> list[tuple[str, ...]]:
         """For each of `chosen` the set of causes that explain nearly as much in its place, itself first.

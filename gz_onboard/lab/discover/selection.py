@@ -14,9 +14,9 @@ from scipy.stats import t as student
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.curve_forms import curve_forms
-from gz_onboard.lab.discover.linear import LinearRide, Normal, normal
+from gz_onboard.lab.discover.linear import LinearRide, Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.prior import LOG
+from gz_onboard.lab.discover.prior import LOG_SCALED
 from gz_onboard.lab.discover.search import Evidence, Search, evidence
 
 MAX_ROUNDS = 5
@@ -32,9 +32,9 @@ def linearised_about(mixed: MixedModel, offset: Array, linearised: Linearised) -
     values of `mixed`.
     """
     if offset.ndim == 1:
-        moved = replace(mixed, values=mixed.unit_value(offset)) if np.any(offset) else mixed
+        moved = replace(mixed, values=mixed.values_at(offset)) if np.any(offset) else mixed
         return [line.seen_from(offset) for line in linearised(moved)]
-    lines = linearised([replace(mixed, values=mixed.unit_value(own)) for own in offset])
+    lines = linearised([replace(mixed, values=mixed.values_at(own)) for own in offset])
     return [line.seen_from(own) for line, own in zip(lines, offset, strict=True)]
 
 
@@ -57,15 +57,15 @@ class SearchProblem:
     own: Array
 
 
-def pose(mixed: MixedModel, start: Array, linearised: Linearised) -> SearchProblem:
+def search_problem(mixed: MixedModel, start: Array, linearised: Linearised) -> SearchProblem:
     """The search for the candidates of `mixed`, in rides linearised first at `start` (p,), in scales."""
     lines = linearised_about(mixed, start, linearised)
-    e = evidence(mixed, [normal(line, mixed.noise) for line in lines])
+    e = evidence(mixed, mixed.normals(lines))
     usable = mixed.usable_causes
     causes = [c for c in usable if not np.any(np.diag(e.information)[mixed.index(c.names)] < VISIBLE)]
     channels = {name for line in lines for name in line.tables}
     proportions = sum(form.straight and form.channel in channels for form in curve_forms(mixed.sizes))
-    limit = threshold(mixed, tries(e, [i for c in causes for i in mixed.index(c.names)]) + proportions)
+    limit = threshold(mixed, tries(e, mixed.index_of(causes)) + proportions)
     shares = channel_shares(mixed, lines, causes)
     return SearchProblem(mixed, causes, shares, limit, linearised, start, lines, np.zeros_like(start))
 
@@ -97,8 +97,8 @@ def channel_shares(
         seen_in: dict[str, float] = {}
         for line in lines:
             for name, table in line.tables.items():
-                noise = float(np.hypot(*mixed.noise[name][:2]))
-                seen_in[name] = seen_in.get(name, 0.0) + float(np.sum((table.a[:, index] / noise) ** 2))
+                weighted = table.a[:, index] / mixed.noise[name].sd
+                seen_in[name] = seen_in.get(name, 0.0) + float(np.sum(weighted**2))
         whole = sum(seen_in.values()) or 1.0
         found[cause.name] = {name: value / whole for name, value in seen_in.items()}
     return found
@@ -129,9 +129,9 @@ def select_causes(problem: SearchProblem) -> Selection:
     mixed, offset = problem.mixed, problem.start
 
     def searched(lines: list[LinearRide], offset: Array) -> Selection:
-        normals = [normal(line, mixed.noise) for line in lines]
+        normals = mixed.normals(lines)
         search = Search(mixed, evidence(mixed, normals), problem.causes, problem.shares)
-        return Selection(mixed, lines, normals, search, search.select(problem.limit).names, offset)
+        return Selection(mixed, lines, normals, search, search.select(problem.limit), offset)
 
     now = searched(problem.lines, offset)
     for _ in range(MAX_ROUNDS):
@@ -153,7 +153,7 @@ def limited_step(mixed: MixedModel, i: int, x: float) -> float:
     """
     name, value = mixed.names[i], mixed.values[mixed.names[i]]
     bounds = next((p for c in mixed.causes for p in c.parameters if p.name == name), None)
-    if name in LOG or bounds is None:
+    if name in LOG_SCALED or bounds is None:
         return x
     low = max(bounds.low, value / MOST) if bounds.low > 0 else bounds.low
     moved = float(np.clip(value + x * float(mixed.scale[i]), low, bounds.high))

@@ -12,13 +12,14 @@ from dataclasses import replace
 import numpy as np
 
 from gz_onboard.arrays import Array
+from gz_onboard.lab.discover.channels import ChannelNoise
 from gz_onboard.lab.discover.grid import Ride
-from gz_onboard.lab.discover.linear import Noise, fit_mixed, learn_noise, normal
+from gz_onboard.lab.discover.linear import Noise, learn_noise
 from gz_onboard.lab.discover.mixed_model import MixedModel, linearise_all
 from gz_onboard.physics.effect import Port
 
-FREE = 25.0  # variance in scales that is added to that of every parameter while noise and scatter are learned
-ROUNDS = 2
+ROUNDS = 2  # of parameters and noise in turn
+SCATTER_ROUNDS = 60  # of expectation and maximisation
 SCATTER_FROM = 3  # rides
 CIRCUIT_TIME = 300.0  # s: what one RC pair lacks relaxes over minutes
 ABSENT = 1e-3  # sd in scales of an effect that the model lacks
@@ -34,17 +35,14 @@ NOTE = (
 def without_baseline(mixed: MixedModel, rides: Sequence[Ride], workers: int = 1) -> MixedModel:
     """`mixed` of a vehicle file, to judge `rides` with."""
     lines = linearise_all(rides, mixed, workers)
-    noise = mixed.noise
-    free = mixed.prior + FREE * np.eye(len(mixed.names))
+    wide = mixed.widened()
     for _ in range(ROUNDS):
-        post = fit_mixed([normal(line, noise) for line in lines], mixed.mean, free, mixed.scatter, 1.0, mixed.free, 0)
-        noise = learn_noise(lines, post.mean + post.own, noise)
+        post = wide.fit(wide.normals(lines))
+        wide = replace(wide, noise=learn_noise(lines, post.mean + post.own, wide.noise))
     scatter = mixed.scatter
     if len(rides) >= SCATTER_FROM:
-        normals = [normal(line, noise) for line in lines]
-        scatter = fit_mixed(normals, mixed.mean, free, mixed.scatter, 1.0, mixed.free, 60).scatter
-    noise = noise_of_file(noise, mixed)
-    return replace(mixed, noise=noise, scatter=scatter, prior=prior_of_file(mixed))
+        scatter = wide.learned_scatter(wide.normals(lines), 1.0, SCATTER_ROUNDS).scatter
+    return replace(mixed, noise=noise_of_file(wide.noise, mixed), scatter=scatter, prior=prior_of_file(mixed))
 
 
 def noise_of_file(noise: Noise, mixed: MixedModel) -> Noise:
@@ -53,7 +51,7 @@ def noise_of_file(noise: Noise, mixed: MixedModel) -> Noise:
         return noise
     white, slow, time = noise["cell_voltage"]
     stated = mixed.vehicle.parameters.sd("cell_voltage_error")
-    return {**noise, "cell_voltage": (white, max(slow, stated), max(time, CIRCUIT_TIME))}
+    return {**noise, "cell_voltage": ChannelNoise(white, max(slow, stated), max(time, CIRCUIT_TIME))}
 
 
 def prior_of_file(mixed: MixedModel) -> Array:

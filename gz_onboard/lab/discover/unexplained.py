@@ -53,7 +53,7 @@ def unexplained(now: Selection, constancy: Sequence[Split], limit: float) -> Unk
         denied = dict.fromkeys([*best.denies, *(s.cause for s in uneven)])
         left = [name for name in now.chosen if name not in denied]  # what else was found must be enough without it
         least = max(limit, LEFT * best.chi2)
-        denied |= dict.fromkeys(n for n in left if search.step([m for m in left if m != n], n) < least)
+        denied |= dict.fromkeys(n for n in left if search.part(left, n) < least)
         best = replace(best, denies=tuple(denied))
     form = form_of(best, now.mixed.sizes)
     if form is None:
@@ -77,7 +77,7 @@ def best_curve(now: Selection, limit: float) -> Unknown | None:
         if score < least_score(form, limit):
             continue
         mine = [name for name in chosen if search.shares.get(name, {}).get(form.channel, 0.0) > OWN_SHARE]
-        theirs = sum(search.step([other for other in chosen if other != name], name) for name in mine)
+        theirs = sum(search.part(chosen, name) for name in mine)
         unlike = contradicts_causes(curve, inflation, *channel_effect(now, form.channel))
         unlike = unlike or bool(mine and curve.chi2 / inflation > RIVAL * theirs)
         if chosen and curve.chi2 < (UNLIKE_LEFT if unlike else LEFT) * total:
@@ -196,7 +196,7 @@ def channel_effect(now: Selection, channel: str) -> tuple[float, float]:
     for line in now.lines:
         for name, table in line.tables.items():
             effect = table.a @ change
-            strength = float(np.sum((effect / np.hypot(*now.mixed.noise[name][:2])) ** 2))
+            strength = float(np.sum((effect / now.mixed.noise[name].sd) ** 2))
             everywhere += strength
             if name == channel:
                 here += strength

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,12 +13,13 @@ from gz_onboard.lab.discover.constancy import splits
 from gz_onboard.lab.discover.energy import energy_share, residual_sizes
 from gz_onboard.lab.discover.linear import LinearRide, Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.prior import LOG
+from gz_onboard.lab.discover.prior import stepped
 from gz_onboard.lab.discover.result import RIDES, Cause, Estimate, Gain, Isolability, Report, Score, Unknown
 from gz_onboard.lab.discover.search import Search
 from gz_onboard.lab.discover.selection import SearchProblem
 from gz_onboard.lab.discover.unexplained import unexplained
 from gz_onboard.lab.discover.winds import Winds, search_causes
+from gz_onboard.lab.discover.wording import Say
 
 DISCREPANCY = 0.05  # of a change, sd: the form of an effect is not exactly the real one's
 LUMPED = {
@@ -45,7 +46,7 @@ class Discovery:
     normals: list[Normal]
 
 
-def reach(problem: SearchProblem, notes: list[str], say: Callable[[str], None]) -> Discovery:
+def conclude(problem: SearchProblem, notes: list[str], say: Say) -> Discovery:
     """The verdict, its gain and its limits still open. notes: so far. say: takes the step that begins."""
     say(f"{len(problem.causes)} candidates")
     searched = search_causes(problem)
@@ -57,7 +58,7 @@ def reach(problem: SearchProblem, notes: list[str], say: Callable[[str], None]) 
     every = Search(now.mixed, now.search.evidence, problem.causes, problem.shares)
     found = causes_of(now.search, chosen, now.lines)
     sets = alternatives(now.search, chosen, problem.limit)
-    scores = {name: every.step([n for n in chosen if n != name], name) for name in every.causes}
+    scores = {name: every.part(chosen, name) for name in every.causes}
     notes = [*notes, *unseen(problem), *searched.rejected]
     if winds is not None:
         scores[winds.cause.name] = max(scores.get(winds.cause.name, 0.0), winds.score)
@@ -66,18 +67,18 @@ def reach(problem: SearchProblem, notes: list[str], say: Callable[[str], None]) 
             notes.append("the wind differed from ride to ride: " + winds.words)
     ranking = sorted((Score(name, round(score, 2)) for name, score in scores.items()), key=lambda row: -row.score)
     report = Report(
-        verdict_of(found, sets, unknown),
-        found,
-        sets,
-        unknown,
-        ranking,
-        residual_sizes(now.lines),
-        Gain(),
-        advice(now.search, sets, unknown),
-        notes,
-        isolability(every),
-        problem.limit,
-        constancy,
+        verdict=verdict_of(found, sets, unknown),
+        causes=found,
+        ambiguous=sets,
+        unknown=unknown,
+        ranking=ranking,
+        residuals=residual_sizes(now.lines),
+        gain=Gain(),
+        advice=advice(now.search, sets, unknown),
+        notes=notes,
+        isolability=separability(every),
+        threshold=problem.limit,
+        constancy=constancy,
     )
     return Discovery(report, now.mixed, now.offset, now.lines, now.normals)
 
@@ -99,21 +100,15 @@ def unseen(problem: SearchProblem) -> list[str]:
 
 def causes_of(search: Search, chosen: Sequence[str], lines: Sequence[LinearRide]) -> list[Cause]:
     """The chosen causes with values and intervals."""
-    if not chosen:
-        return []
-    mixed, index = search.mixed, search.index(chosen)
-    estimate = search.evidence.estimate(index)
-    variance = np.diag(search.evidence.covariance(index))
+    mixed = search.mixed
     result = []
-    for name in chosen:
-        own = [index.index(i) for i in search.place[name]]
+    for name, (own, variance) in search.fitted(chosen).items() if chosen else ():
         change = np.zeros(len(mixed.mean))
-        change[search.place[name]] = estimate[own]
-        sd = np.sqrt(variance[own] * mixed.inflation.get(name, 1.0))
-        rows = intervals(search, name, estimate[own], sd)
+        change[search.place[name]] = own
+        rows = intervals(search, name, own, np.sqrt(variance * mixed.inflation.get(name, 1.0)))
         first = search.causes[name].parameters[0]
         value, ci95 = rows[first.name].value, rows[first.name].ci95
-        score = round(search.step([n for n in chosen if n != name], name), 2)
+        score = round(search.part(chosen, name), 2)
         more = value - mixed.healthy_value(first.name)
         share = energy_share(lines, change)
         result.append(Cause(name, first.name, value, first.unit, ci95, more, share, score, parameters=rows))
@@ -130,7 +125,7 @@ def intervals(search: Search, name: str, change: Array, sd: Array) -> dict[str, 
         healthy, step = mixed.healthy_value(parameter.name), float(mixed.scale[i])
         wide = mixed.quantile * float(np.hypot(s, form * x))
         at = (float(x), float(x) - wide, float(x) + wide)
-        ends = [healthy * np.exp(step * y) if parameter.name in LOG else healthy + step * y for y in at]
+        ends = [stepped(parameter.name, healthy, step * y) for y in at]
         value, low, high = (float(np.clip(y, parameter.low, parameter.high)) for y in ends)  # nothing that cannot be
         rows[parameter.name] = Estimate(value, (low, high))
     return rows
@@ -153,16 +148,13 @@ def likely(search: Search, chosen: Sequence[str], group: Sequence[str]) -> list[
     rest = [name for name in chosen if name != group[0]]
     found = []
     for name in group:
-        index = search.index([*rest, name])
-        k = len(search.place[name])
-        change = search.evidence.estimate(index)[-k:]
-        sd = np.sqrt(np.diag(search.evidence.covariance(index)))[-k:]
-        if within_bounds(search.mixed, search.causes[name], change.tolist(), sd.tolist()):
+        change, variance = search.fitted([*rest, name])[name]
+        if within_bounds(search.mixed, search.causes[name], change, np.sqrt(variance)):
             found.append(name)
     return found
 
 
-def isolability(search: Search) -> Isolability:
+def separability(search: Search) -> Isolability:
     """What could be told apart at all, of all candidates that the rides show."""
     signatures = {
         name: sorted(c for c, share in search.shares.get(name, {}).items() if share > 0) for name in search.place

@@ -9,10 +9,11 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.acceptance import accept
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.grid import MOVING
 from gz_onboard.lab.discover.search import one_degree
 from gz_onboard.lab.discover.selection import SearchProblem, Selection, linearised_about, select_causes
+from gz_onboard.physics.effect import MOVING
 
+UNSEEN = 1e-6  # information per scale squared, below which a ride says nothing of its wind
 SIDE = 0.5  # of (wind over speed)²: what side wind and gusts change of drag, in the mean over all directions
 
 
@@ -63,7 +64,7 @@ def own_winds(now: Selection, wind: Candidate) -> Winds:
     mean = mixed.mean + change
     total, words = 0.0, []
     for i, (line, ride) in enumerate(zip(now.lines, now.normals, strict=True)):
-        if np.any(np.diag(ride.n)[w] < 1e-6):
+        if np.any(np.diag(ride.n)[w] < UNSEEN):
             continue
         covariance = np.linalg.inv(inside + ride.n)
         own = (covariance @ (ride.b + inside @ mean))[w] - mean[w]

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+Say = Callable[[str], None]
+"""Takes the step that begins, in words."""
+
 
 def with_unit(value: float, unit: str, form: str = ".4g") -> str:
     """A value with its unit; that of a pure number is not said."""

@@ -13,7 +13,7 @@ from gz_onboard.lab.discover.candidates import candidates
 from gz_onboard.lab.discover.curve_forms import QUANTITIES, CurveForm
 from gz_onboard.lab.discover.grid import MOST_STEERING, steering
 from gz_onboard.lab.discover.mixed_model import initial
-from gz_onboard.lab.discover.prior import BY_NAME, USUAL, nearest_step, sizes_of
+from gz_onboard.lab.discover.prior import BY_NAME, USUAL_SIZES, nearest_step, sizes_of
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import known_effects, load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -37,7 +37,7 @@ def scooter() -> Vehicle:
 
 
 def test_absolute_numbers_grow_with_the_vehicle(scooter: Vehicle):
-    assert sizes_of(scooter) == USUAL
+    assert sizes_of(scooter) == USUAL_SIZES
     p = scooter.parameters
     heavy = scooter.changed(p.replaced(vehicle_mass=4 * p["vehicle_mass"], motor_current_limit=4 * 211.0))
     sizes = sizes_of(heavy)
@@ -47,7 +47,7 @@ def test_absolute_numbers_grow_with_the_vehicle(scooter: Vehicle):
     assert large.scale[place] == pytest.approx(4 * small.scale[place])
     form = CurveForm("road_force", "motor_current", sizes=sizes)
     assert form.knots == pytest.approx(4 * np.array(QUANTITIES["motor_current"][0]))
-    assert form.size == pytest.approx(4 * replace(form, sizes=USUAL).size)
+    assert form.size == pytest.approx(4 * replace(form, sizes=USUAL_SIZES).size)
     assert {nuisance.of for nuisance in BY_NAME.values()} == {"", "power", "current", "voltage", "auxiliary"}
 
 

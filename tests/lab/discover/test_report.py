@@ -25,7 +25,7 @@ from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.detectability import implausible_rides, limits, missing_residuals, remaining_range_error
 from gz_onboard.lab.discover.linear import normal
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
-from gz_onboard.lab.discover.page import page
+from gz_onboard.lab.discover.page import body
 from gz_onboard.lab.discover.result import Cause, Errors, Gain, Isolability, Report, ResidualSize, Score, Unknown
 from gz_onboard.lab.discover.uncalibrated import prior_of_file
 from gz_onboard.lab.discover.verdict import Discovery
@@ -134,7 +134,7 @@ def test_a_quantity_that_was_not_measured_is_not_made_up(found: Discovery):
 
 def test_the_page_says_it_all(found: Discovery):
     sizes = {"road_force": ResidualSize(0.1, 0.1, 0.1, 1, 0.1, 0.1)}
-    text = page(replace(found, report=replace(found.report, residuals=sizes)))
+    text = body(replace(found, report=replace(found.report, residuals=sizes)))
     said = (
         "none of the candidates",
         "rolling_resistance_constant",
@@ -202,4 +202,4 @@ def test_what_the_rides_lack_is_said(samples: Samples):
         "rolling_resistance",
         "tyre_radius",
     }
-    assert "not by these rides" in page(bare)
+    assert "not by these rides" in body(bare)
