@@ -170,6 +170,15 @@ def test_votes():
     assert vote(two_and_two, apart) == (NO_SENSOR, frozenset(two_and_two))
 
 
+def test_a_first_speed_is_no_acceleration():
+    """A start in the middle of a ride: the first step has no duration."""
+    signals, speeds = Signals((role, 2.0) for role in ROLES), SpeedCheck(RADIUS, GEAR)
+    for t in (0.0, STEP):
+        signals.motor_speed.value, signals.motor_speed.time = 10 * HONEST["motor_speed"], t
+        speeds.step(StepInputs(t, t, t, signals, None))
+        assert speeds.acceleration == 0
+
+
 # --- currents -----------------------------------------------------------------------------------------------------
 
 

@@ -74,9 +74,10 @@ class SpeedCheck:
             self.middle = None
             return
         middle = median([v for role, v in speeds.items() if not self.counters[role].faulty] or speeds.values())
+        if self.middle is None:
+            self._slow = middle
         if dt > 0:
-            before = middle if self.middle is None else self._slow
-            self._slow, self.acceleration = accelerated(before, middle, dt)
+            self._slow, self.acceleration = accelerated(self._slow, middle, dt)
         self.middle = middle
         if len(speeds) < 2:
             for role in speeds:
