@@ -7,7 +7,7 @@ from statistics import fmean, median
 
 from gz_onboard.estimator.redundancy.checks import MOVING, NO_SENSOR, STUCK_AFTER, StepInputs, counters
 from gz_onboard.estimator.road import accelerated
-from gz_onboard.estimator.signals import FIX_2D
+from gz_onboard.estimator.signals import FIX_2D, Signals
 
 REVERSE = 4.0  # m/s: no road vehicle goes back faster; slower, wheels and GPS do not show the direction
 SPEED_APART, SPEED_APART_RELATIVE = 1.0, 0.12  # m/s and 1: two speeds that differ by more contradict each other
@@ -90,10 +90,11 @@ class SpeedCheck:
         self._scale = {"motor_speed": radius * gear, "wheel_speed_rear": radius, "wheel_speed_front": radius}
         self.counters = counters(self.ROLES)
         self._last = dict.fromkeys(self.ROLES, 0.0)  # m/s
-        self._still = dict.fromkeys(self.ROLES, 0.0)  # s without a change
+        self.still = dict.fromkeys(self.ROLES, 0.0)  # s without a change
         self._apart = dict.fromkeys(self.ROLES, 0.0)  # m/s, low-passed, from the median
         self._median = 0.0  # m/s, low-passed
         self._axle = AxleRatio()
+        self.reporting: tuple[str, ...] = ()  # roles
         self.middle: float | None = None  # m/s, median
         self.acceleration = 0.0  # m/s², of the median
         self._slow = 0.0  # m/s
@@ -105,6 +106,7 @@ class SpeedCheck:
         dt, signals = step.observed, step.signals
         speeds, apart = self._speeds(step)
         self.unsettled = self.on_road = False
+        self.reporting = tuple(speeds)
         if not speeds:
             self.middle = None
             return
@@ -131,7 +133,7 @@ class SpeedCheck:
         if tied:
             if believed and believed != speeds and agree(believed, apart):  # nothing new: found out before
                 outvoted, tied = tied - believed.keys(), NO_SENSOR
-            stuck = frozenset(role for role in tied if self._still[role] >= STUCK_AFTER)
+            stuck = frozenset(role for role in tied if self.still[role] >= STUCK_AFTER)
             if stuck and stuck != tied:
                 outvoted, tied = stuck, NO_SENSOR
         self.unsettled |= bool(tied)
@@ -143,8 +145,15 @@ class SpeedCheck:
         for role in speeds:
             counter = self.counters[role]
             against = role in outvoted or role in tied
-            counter.update(dt, against if against or (moving and self._still[role] < STUCK_AFTER) else None)
+            counter.update(dt, against if against or (moving and self.still[role] < STUCK_AFTER) else None)
             signals[role].trusted = not (counter.faulty or role in outvoted)
+
+    def judge(self, role: str, time: float, contradicted: bool, signals: Signals) -> None:
+        """What another witness says, over `time` [s], of a speed that is all there is."""
+        counter = self.counters[role]
+        counter.update(time, contradicted)
+        signals[role].trusted = not counter.faulty
+        self.unsettled |= counter.faulty
 
     def _speeds(self, step: StepInputs) -> tuple[dict[str, float], dict[str, float]]:
         """(speeds [m/s], how far each may be from another [m/s]) by role, of those that report."""
@@ -160,7 +169,7 @@ class SpeedCheck:
             speed = reported * self._scale.get(role, 1.0)
             speeds[role] = speed if speed < -REVERSE else abs(speed)
             apart[role] = SPEED_APART + SPEED_APART_RELATIVE * abs(speed) + BRAKING * max(step.now - signal.time, 0.0)
-            self._still[role] = 0.0 if speed != self._last[role] else self._still[role] + step.observed
+            self.still[role] = 0.0 if speed != self._last[role] else self.still[role] + step.observed
             self._last[role] = speed
         return speeds, apart
 
