@@ -17,6 +17,8 @@ MOVING_AFTER = 1.0  # s of motion: a single sample of a noisy sensor is none
 CHARGING_RATE = 0.02  # 1/h: a charging current of a fiftieth of the capacity; current sensors' offsets are smaller
 CHARGING_AFTER = 3.0  # s of it at standstill: the last of a regenerative brake is over
 SILENT_CHARGING_AFTER = 30.0  # s of it with no speed known and a silent inverter
+DRAWING_RATE = 0.2  # 1/h: what lies above is no light and no heated grip, but a drive
+DRAWING_AFTER, DRAWING_MOST = 10.0, 30.0  # s of it at speed 0, less those without: the speed is wrong; most that counts
 PLUGGED_IN = 0.5  # of a signal that is 0 or 1
 
 
@@ -28,6 +30,7 @@ class Activities:
         self._still = inf  # s since the last motion; none yet
         self._moving = 0.0  # s of motion
         self._charging = 0.0  # s of a charging current without motion
+        self._drawing = 0.0  # s of a drive's current without motion, less those without it
 
     def step(
         self, dt: float, speed: float | None, c_rate: float | None, plug: float | None, inverter_silent: bool
@@ -40,6 +43,10 @@ class Activities:
         moving = speed is not None and abs(speed) > MOVING
         self._moving = self._moving + dt if moving else 0.0
         self._still = 0.0 if self._moving >= MOVING_AFTER else self._still + dt
+        drawing = c_rate is not None and c_rate > DRAWING_RATE
+        self._drawing = 0.0 if moving else min(max(self._drawing + (dt if drawing else -dt), 0.0), DRAWING_MOST)
+        if self._drawing >= DRAWING_AFTER:
+            speed = None
         charged = c_rate is not None and c_rate < -CHARGING_RATE and not moving
         self._charging = self._charging + dt if charged else 0.0
         enough = CHARGING_AFTER if speed is not None else SILENT_CHARGING_AFTER if inverter_silent else inf
@@ -55,4 +62,5 @@ class Activities:
     @property
     def teaches(self) -> bool:
         """Whether what flows now is part of a ride: motion, or a short stop."""
-        return self.now is not Activity.CHARGING and self._charging == 0 and self._still <= STOP_TIME
+        known = self.now is not Activity.CHARGING and self._drawing < DRAWING_AFTER
+        return known and self._charging == 0 and self._still <= STOP_TIME

@@ -182,8 +182,9 @@ class Estimator:
         if grades.faulty != before:
             self.road.forget_grade(grades.offset, self.signals.gps_altitude.fresh(now))
         distrusted = self.redundancy.distrusted
-        if any(role in LEARNED_FROM and role not in self._distrusted for role in distrusted):
-            self.forecaster.forget(UNLEARNED)
+        learned = LEARNED_FROM if self.road.speed is not None else LEARNED_FROM.union(SpeedCheck.ROLES)
+        if any(role in learned and role not in self._distrusted for role in distrusted):
+            self.forecaster.forget(max(UNLEARNED, self.redundancy.odometer.compared))
         self._distrusted = distrusted
 
     # --- riding and range -------------------------------------------------------------------------------------

@@ -25,6 +25,7 @@ HONEST: Mapping[str, float] = {  # what each sensor says at 1 m/s
     "vehicle_speed": 1.0,
     "gps_speed": 1.0,
 }
+AXLE_ROLES = "motor_speed", "wheel_speed_rear"
 FOUR = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "gps_speed")
 Fault = Callable[[float, float], float | None]
 
@@ -110,6 +111,32 @@ def test_a_roller_bench_and_a_spinning_wheel_are_no_faults():
         assert signals.motor_speed.trusted
 
 
+def test_a_driven_axle_at_a_constant_ratio_to_the_ground_is_no_wheelspin():
+    """Both in the wrong unit: wheels that spin for seconds hold no ratio, and on a roller bench the ground stands."""
+    late: Fault = lambda t, v: town(t - 1.0)  # noqa: E731
+    scaled: dict[str, Fault] = {"motor_speed": lambda t, v: 3.6 * v, "wheel_speed_rear": lambda t, v: 3.6 * v}
+    for roles in (FOUR, (*FOUR, "vehicle_speed")):
+        speeds, signals = ridden(120.0, roles, {**scaled, "vehicle_speed": lambda t, v: 3.6 * v, "gps_speed": late})
+        assert faulty(speeds.counters) == set(roles) - {"wheel_speed_front", "gps_speed"}
+        assert signals.wheel_speed_front.trusted
+    speeds, _ = ridden(120.0, (*AXLE_ROLES, "gps_speed"), {**scaled, "gps_speed": late})
+    assert faulty(speeds.counters) == {*AXLE_ROLES, "gps_speed"}, "nothing decides"
+
+
+def test_two_that_were_found_out_do_not_make_the_third_doubtful():
+    """The fourth, which decided, is silent: in a tunnel."""
+    speeds, _ = ridden(60.0, FOUR, dict.fromkeys(AXLE_ROLES, lambda t, v: 3.6 * v))
+    speeds, signals = ridden(60.0, FOUR[:3], dict.fromkeys(AXLE_ROLES, lambda t, v: 3.6 * v), town, speeds, 60.0)
+    assert faulty(speeds.counters) == set(AXLE_ROLES)
+    assert signals.wheel_speed_front.trusted
+
+
+def test_wheelspin_now_and_then_is_no_fault():
+    spins: Fault = lambda t, v: v * (2 + sin(t)) if t % 30 < 8 else v  # noqa: E731
+    speeds, _ = ridden(600.0, FOUR, dict.fromkeys(AXLE_ROLES, spins))
+    assert faulty(speeds.counters) == set()
+
+
 def test_a_vehicle_speed_made_from_the_motors_does_not_outvote_the_gps():
     roles = ("motor_speed", "vehicle_speed", "gps_speed")
     double: Fault = lambda t, v: 2 * v  # noqa: E731
@@ -168,6 +195,15 @@ def test_votes():
     assert vote({"motor_speed": 5.0, "gps_speed": 9.5}, apart) == (NO_SENSOR, frozenset({"motor_speed", "gps_speed"}))
     two_and_two = {"motor_speed": 5.0, "gps_speed": 5.2, "wheel_speed_rear": 0.0, "wheel_speed_front": 0.0}
     assert vote(two_and_two, apart) == (NO_SENSOR, frozenset(two_and_two))
+
+
+def test_a_first_speed_is_no_acceleration():
+    """A start in the middle of a ride: the first step has no duration."""
+    signals, speeds = Signals((role, 2.0) for role in ROLES), SpeedCheck(RADIUS, GEAR)
+    for t in (0.0, STEP):
+        signals.motor_speed.value, signals.motor_speed.time = 10 * HONEST["motor_speed"], t
+        speeds.step(StepInputs(t, t, t, signals, None))
+        assert speeds.acceleration == 0
 
 
 # --- currents -----------------------------------------------------------------------------------------------------

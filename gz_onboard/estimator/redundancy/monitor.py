@@ -6,6 +6,8 @@ from gz_onboard.estimator.redundancy.checks import SensorCheck, StepInputs
 from gz_onboard.estimator.redundancy.currents import CurrentCheck
 from gz_onboard.estimator.redundancy.grades import GradeCheck
 from gz_onboard.estimator.redundancy.inertial import InertialCheck
+from gz_onboard.estimator.redundancy.motion import MotionCheck
+from gz_onboard.estimator.redundancy.odometer import OdometerCheck
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.redundancy.temperatures import TemperatureCheck
 from gz_onboard.estimator.redundancy.voltages import VoltageCheck
@@ -23,9 +25,17 @@ class Redundancy:
     def __init__(self, radius: float, gear: float, mass: float, level: float, battery: Battery) -> None:
         capacity = battery.pack_capacity(BENCH_TEMPERATURE)
         self.speeds = SpeedCheck(radius, gear)
+        self.odometer = OdometerCheck(self.speeds)
         self.grades = GradeCheck(mass, level)
         self.currents, self.voltages = CurrentCheck(capacity), VoltageCheck(battery, capacity)
-        self._checks: tuple[SensorCheck, ...] = (TemperatureCheck(), self.speeds, self.grades, InertialCheck())
+        self._checks: tuple[SensorCheck, ...] = (
+            TemperatureCheck(),
+            self.speeds,
+            self.odometer,
+            MotionCheck(self.speeds, capacity),
+            self.grades,
+            InertialCheck(),
+        )
         counters = [self.voltages.counters, self.currents.counters, *(check.counters for check in self._checks)]
         self._counters = {role: counter for part in counters for role, counter in part.items()}
 

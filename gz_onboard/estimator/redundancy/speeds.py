@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from statistics import median
+from statistics import fmean, median
 
 from gz_onboard.estimator.redundancy.checks import MOVING, NO_SENSOR, STUCK_AFTER, StepInputs, counters
 from gz_onboard.estimator.road import accelerated
-from gz_onboard.estimator.signals import FIX_2D
+from gz_onboard.estimator.signals import FIX_2D, Signals
 from gz_onboard.events import SPEEDS
 
 REVERSE = 4.0  # m/s: no road vehicle goes back faster; slower, wheels and GPS do not show the direction
@@ -19,6 +19,11 @@ AXLE = frozenset(
     {"motor_speed", "wheel_speed_rear"}
 )  # what turns on a roller bench or spins while the vehicle does not move
 GROUND = "wheel_speed_front", "gps_speed"
+SPIN_TIME, SPIN_MOST = (
+    20.0,
+    30.0,
+)  # s: wheels hold no ratio to the ground they spin on for so long; most that is counted
+RATIO_APART = 0.15  # ratios that differ by less are the same: speeds are late by a second while the vehicle accelerates
 ODOMETRY = frozenset({"motor_speed", "wheel_speed_rear", "wheel_speed_front"})  # what a vehicle speed is made from
 
 
@@ -27,10 +32,38 @@ def weight(group: frozenset[str]) -> int:
     return len(group - {"vehicle_speed"} if group & ODOMETRY else group)
 
 
-def vote(speeds: Mapping[str, float], apart: Mapping[str, float]) -> tuple[frozenset[str], frozenset[str]]:
+def agree(speeds: Mapping[str, float], apart: Mapping[str, float]) -> bool:
+    """Whether none of them contradicts the others: `vote`."""
+    return not any(vote(speeds, apart, spins=False))
+
+
+class AxleRatio:
+    """The driven axle over the moving ground. Spinning wheels hold no ratio; on a roller bench the ground stands."""
+
+    def __init__(self) -> None:
+        self._ratio = 1.0
+        self._time = 0.0  # s of this ratio, less those of another
+        self.moving = False  # both
+
+    def wrong(self, dt: float, speeds: Mapping[str, float]) -> bool:
+        """Whether the ratio is another than 1 and is none of wheelspin, after `dt` [s] at `speeds` [m/s] by role."""
+        axle, ground = ([speeds[role] for role in side if role in speeds] for side in (AXLE, GROUND))
+        self.moving = bool(axle and ground) and min(axle + ground) > MOVING
+        if self.moving:
+            ratio = fmean(axle) / fmean(ground)
+            same = abs(ratio - 1) > RATIO_APART > abs(ratio / self._ratio - 1)
+            self._time = min(max(self._time + (dt if same else -dt), 0.0), SPIN_MOST)
+            self._ratio = self._ratio if self._time else ratio
+        return self._time >= SPIN_TIME
+
+
+def vote(
+    speeds: Mapping[str, float], apart: Mapping[str, float], spins: bool = True
+) -> tuple[frozenset[str], frozenset[str]]:
     """(roles that are outvoted, roles that contradict each other with nothing to decide by).
 
-    speeds [m/s] by role; apart: how far [m/s] the speed of each role may be from another.
+    speeds [m/s] by role; apart: how far [m/s] the speed of each role may be from another; spins: a driven axle that
+    contradicts the ground may be wheelspin; else it is one witness, for one wheel radius scales it.
     """
     groups = {
         frozenset(b for b, w in speeds.items() if abs(v - w) <= max(apart[a], apart[b])) for a, v in speeds.items()
@@ -38,12 +71,13 @@ def vote(speeds: Mapping[str, float], apart: Mapping[str, float]) -> tuple[froze
     everyone = frozenset(speeds)
     if everyone in groups:
         return NO_SENSOR, NO_SENSOR
-    best = max(groups, key=lambda group: (weight(group), sorted(group)))
+    weights = {group: weight(group) - (not spins and group >= AXLE) for group in groups}
+    best = max(groups, key=lambda group: (weights[group], sorted(group)))
     others = everyone - best
     # Two sensors of the driven axle agree and the ground does not: wheelspin or a roller bench, and no fault.
-    if any(everyone & AXLE == side == AXLE for side in (best - {"vehicle_speed"}, others - {"vehicle_speed"})):
+    if spins and any(side - {"vehicle_speed"} == AXLE for side in (best, others)):
         return NO_SENSOR, NO_SENSOR
-    if any(weight(group) >= weight(best) for group in groups if not group & best):
+    if any(weights[group] >= weights[best] for group in groups if not group & best):
         return NO_SENSOR, everyone
     return others, NO_SENSOR
 
@@ -57,9 +91,11 @@ class SpeedCheck:
         self._scale = {"motor_speed": radius * gear, "wheel_speed_rear": radius, "wheel_speed_front": radius}
         self.counters = counters(self.ROLES)
         self._last = dict.fromkeys(self.ROLES, 0.0)  # m/s
-        self._still = dict.fromkeys(self.ROLES, 0.0)  # s without a change
+        self.still = dict.fromkeys(self.ROLES, 0.0)  # s without a change
         self._apart = dict.fromkeys(self.ROLES, 0.0)  # m/s, low-passed, from the median
         self._median = 0.0  # m/s, low-passed
+        self._axle = AxleRatio()
+        self.reporting: tuple[str, ...] = ()  # roles
         self.middle: float | None = None  # m/s, median
         self.acceleration = 0.0  # m/s², of the median
         self._slow = 0.0  # m/s
@@ -71,28 +107,37 @@ class SpeedCheck:
         dt, signals = step.observed, step.signals
         speeds, apart = self._speeds(step)
         self.unsettled = self.on_road = False
+        self.reporting = tuple(speeds)
         if not speeds:
             self.middle = None
             return
-        middle = median([v for role, v in speeds.items() if not self.counters[role].faulty] or speeds.values())
+        believed = {role: speed for role, speed in speeds.items() if not self.counters[role].faulty}
+        middle = median((believed or speeds).values())
+        self.unsettled = not believed
+        if self.middle is None:
+            self._slow = middle
         if dt > 0:
-            before = middle if self.middle is None else self._slow
-            self._slow, self.acceleration = accelerated(before, middle, dt)
+            self._slow, self.acceleration = accelerated(self._slow, middle, dt)
         self.middle = middle
         if len(speeds) < 2:
             for role in speeds:
                 signals[role].trusted = not self.counters[role].faulty
             return
         outvoted, tied = NO_SENSOR, NO_SENSOR
+        spins = not self._axle.wrong(dt, speeds)
         if max(speeds.values()) - min(speeds.values()) > min(apart.values()):
-            outvoted, tied = vote(speeds, apart)
+            outvoted, tied = vote(speeds, apart, spins)
+            if not (outvoted or tied) and self._axle.moving:
+                self.unsettled |= not agree(speeds, apart)
         elif len(speeds) > 2:
             outvoted = self._drifted(dt, speeds, middle)
         if tied:
-            stuck = frozenset(role for role in tied if self._still[role] >= STUCK_AFTER)
+            if believed and believed != speeds and agree(believed, apart):  # nothing new: found out before
+                outvoted, tied = tied - believed.keys(), NO_SENSOR
+            stuck = frozenset(role for role in tied if self.still[role] >= STUCK_AFTER)
             if stuck and stuck != tied:
                 outvoted, tied = stuck, NO_SENSOR
-        self.unsettled = bool(tied)
+        self.unsettled |= bool(tied)
         doubted = tied | {role for role in outvoted if not self.counters[role].faulty}
         self.on_road = not doubted and any(
             role in speeds and role not in outvoted and abs(speeds[role] - middle) <= apart[role] for role in GROUND
@@ -101,8 +146,15 @@ class SpeedCheck:
         for role in speeds:
             counter = self.counters[role]
             against = role in outvoted or role in tied
-            counter.update(dt, against if against or (moving and self._still[role] < STUCK_AFTER) else None)
+            counter.update(dt, against if against or (moving and self.still[role] < STUCK_AFTER) else None)
             signals[role].trusted = not (counter.faulty or role in outvoted)
+
+    def judge(self, role: str, time: float, contradicted: bool, signals: Signals) -> None:
+        """What another witness says, over `time` [s], of a speed that is all there is."""
+        counter = self.counters[role]
+        counter.update(time, contradicted)
+        signals[role].trusted = not counter.faulty
+        self.unsettled |= counter.faulty
 
     def _speeds(self, step: StepInputs) -> tuple[dict[str, float], dict[str, float]]:
         """(speeds [m/s], how far each may be from another [m/s]) by role, of those that report."""
@@ -118,7 +170,7 @@ class SpeedCheck:
             speed = reported * self._scale.get(role, 1.0)
             speeds[role] = speed if speed < -REVERSE else abs(speed)
             apart[role] = SPEED_APART + SPEED_APART_RELATIVE * abs(speed) + BRAKING * max(step.now - signal.time, 0.0)
-            self._still[role] = 0.0 if speed != self._last[role] else self._still[role] + step.observed
+            self.still[role] = 0.0 if speed != self._last[role] else self.still[role] + step.observed
             self._last[role] = speed
         return speeds, apart
 

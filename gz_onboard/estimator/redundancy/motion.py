@@ -1,0 +1,47 @@
+"""A speed that is all there is and does not change, against the pack's current and the tremor of the accelerometer."""
+
+from __future__ import annotations
+
+from gz_onboard.estimator.redundancy.checks import FAULTY_AFTER, MOVING, FaultCounter, StepInputs, share_of_new
+from gz_onboard.estimator.redundancy.speeds import SpeedCheck
+
+TIME = 5.0  # s, low pass
+STUCK_AFTER, CONTRADICTED = 10.0, 10.0  # s of one speed; s, in the main, in which both others contradict it
+DRIVES, IDLE = 0.2, 0.05  # 1/h: of a drive, and of lights and electronics
+TREMBLES, RESTS = 0.2, 0.15  # m/s², rms from step to step; riding 0.23 and more, standing 0.13, after a stop up to 0.2
+
+
+class MotionCheck:
+    """See `SensorCheck`: the counter of a speed is that of `SpeedCheck`. capacity: of the pack [A·h]."""
+
+    def __init__(self, speeds: SpeedCheck, capacity: float) -> None:
+        self.counters: dict[str, FaultCounter] = {}
+        self._speeds, self._capacity = speeds, capacity
+        self._forward = 0.0  # m/s²
+        self._square = self._rate = 0.0  # (m/s²)², 1/h; low-passed
+        self._time = 0.0  # s of contradiction, less those without
+        self._named: str | None = None
+
+    def step(self, step: StepInputs) -> None:
+        """See `SensorCheck`."""
+        dt, signals, speeds = step.observed, step.signals, self._speeds
+        forward, current = signals.accel_x.reported(step.now), signals.pack_current.reported(step.now)
+        current = signals.inverter_current.reported(step.now) if current is None else current
+        if forward is None or current is None or speeds.middle is None or len(speeds.reporting) != 1:
+            self._time = 0.0
+            return
+        share = share_of_new(dt, TIME)
+        self._square += ((forward - self._forward) ** 2 - self._square) * share
+        self._rate += (current / self._capacity - self._rate) * share
+        self._forward = forward
+        (role,), moving = speeds.reporting, speeds.middle > MOVING
+        stands = self._square < RESTS**2 and abs(self._rate) < IDLE
+        drives = self._square > TREMBLES**2 and self._rate > DRIVES
+        wrong = speeds.still[role] > STUCK_AFTER and (stands if moving else drives)
+        self._time = min(max(self._time + (dt if wrong else -dt), 0.0), CONTRADICTED)
+        if wrong and self._time >= CONTRADICTED:
+            self._named = role
+            speeds.judge(role, FAULTY_AFTER, True, signals)
+        elif self._named == role and moving and not speeds.still[role]:
+            speeds.judge(role, dt, False, signals)
+            self._named = role if speeds.counters[role].faulty else None
