@@ -5,7 +5,8 @@ from __future__ import annotations
 import difflib
 import reprlib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 EXIT_STATUSES = {
@@ -46,6 +47,30 @@ def shown(value: object) -> str:
         return _SHORT.repr(value)
     except ValueError:  # Python does not write out an integer of thousands of digits
         return "a number of thousands of digits"
+
+
+def not_an_input(outputs: Iterable[Path | str | None], inputs: Iterable[Path]) -> None:
+    """InputError if a file to be written is an input, or the ``rides.json`` beside one, by whatever name.
+
+    outputs: a name may be None, or ``-`` for standard output.
+    """
+    read = {
+        identity: file
+        for given in inputs
+        for file in (given.parent / "rides.json", given)
+        if (identity := _identity(file))
+    }
+    for out in outputs:
+        if out is not None and str(out) != "-" and (identity := _identity(out)) in read:
+            raise InputError(f"{out}: would overwrite the input {read[identity]}; give another name or folder")
+
+
+def _identity(file: Path | str) -> tuple[int, int] | None:
+    """What two names of the same file have in common; None if there is none."""
+    with suppress(OSError):
+        found = Path(file).stat()
+        return found.st_dev, found.st_ino
+    return None
 
 
 @contextmanager

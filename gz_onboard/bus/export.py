@@ -30,7 +30,7 @@ from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.replay import log_section
 from gz_onboard.bus.signals import Decoder
 from gz_onboard.bus.writers import write_blf, write_candump
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, nearest, not_an_input
 from gz_onboard.events import Frame
 from gz_onboard.options import add_shared
 
@@ -177,8 +177,7 @@ def run(args: argparse.Namespace) -> int:
     """Run ``gz-onboard export``; raises InputError for what cannot be used."""
     log, out = args.log, args.out
     suffix = out_suffix(out)
-    if out.exists() and out.resolve() == log.resolve():
-        raise InputError(f"{out}: is the log itself")
+    not_an_input([out], [log, *(args.dbc or [])])
     if args.estimates or _holds_only_estimates(log):
         count = _written(out, lambda: _write_estimates(log, out, suffix, args.table_format, (args.start, args.end)))
         print(f"wrote {out}: {count} estimates")

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard.bus.publisher import WH_PER_KM
-from gz_onboard.errors import OK, InputError
+from gz_onboard.errors import OK, InputError, not_an_input
 from gz_onboard.offline.results import explain_keys, times, write_json
 from gz_onboard.options import add_shared, number
 from gz_onboard.progress import Progress, progress_bar
@@ -29,7 +29,7 @@ from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION, Variant, cycle_range, summarise, summary_text
 from gz_onboard.simulation.sweep import Sweep, grid, read_sweep, redesigned
 from gz_onboard.simulation.trace import Trace
-from gz_onboard.vehicle import Vehicle, read_vehicle
+from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 _MOST_HOURS = 48.0  # of riding until empty
 
@@ -109,6 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--sweep {sweeps[0].name}: given twice")
     if arguments.frames:
         check_output(arguments.frames)
+    not_an_input((arguments.frames, arguments.json), [Path(arguments.what), find_vehicle(arguments.vehicle)])
     plan = find_plan(arguments, vehicle)
     if arguments.chassis != "straight" and (plan.kind == "cycle" or isinstance(plan.road, Dynamometer)):
         where = "on a dynamometer" if isinstance(plan.road, Dynamometer) else "in a drive cycle"

@@ -339,7 +339,11 @@ def test_a_log_without_dbc_files_asks_for_them(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("out", "said"),
-    [("out.bfl", "did you mean '.blf'"), ("out.blf.gz", "only .* can be written with .gz"), ("ride.mcap", "the log")],
+    [
+        ("out.bfl", "did you mean '.blf'"),
+        ("out.blf.gz", "only .* can be written with .gz"),
+        ("ride.mcap", "overwrite the input"),
+    ],
 )
 def test_outputs_that_cannot_be_written_are_named(tmp_path: Path, log: Path, out: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
