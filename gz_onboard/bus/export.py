@@ -115,10 +115,11 @@ def _message_schema(message: Message, columns: Mapping[str, str]) -> dict[str, A
 
 
 def _write_estimates(log: Path, out: Path, suffix: str, table_format: str, section: tuple[float, float | None]) -> int:
-    """The rows of the topic of estimates, a column for each field, with its unit; gives how many."""
+    """The rows of the topic of estimates, a column for each field, with its unit; gives how many. Prints damage."""
     if suffix not in (".csv", ".parquet", ""):
         raise InputError(f"{out}: estimates can be written into .csv, .parquet or a directory")
-    found = [(time_ns, values) for topic, time_ns, values in logs.read_samples(log) if topic == ESTIMATE_TOPIC]
+    samples = logs.read_samples(log, on_damage=lambda damage: print(f"damaged log: {damage}"))
+    found = [(time_ns, values) for topic, time_ns, values in samples if topic == ESTIMATE_TOPIC]
     if not found:
         raise InputError(f"{log}: holds no estimates ({ESTIMATE_TOPIC})")
     start_s, end_s = section

@@ -303,6 +303,16 @@ def test_estimates_in_parquet(tmp_path: Path, estimated: Path) -> None:
     assert table["state"].to_pylist() == ["VALID"] * 3
 
 
+def test_estimates_of_a_damaged_log_say_what_is_missing(
+    tmp_path: Path, estimated: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = estimated.read_bytes()
+    chunk = data.index(b"\x04\0\0\0zstd") - 28
+    estimated.write_bytes(data[: chunk + int.from_bytes(data[chunk - 8 : chunk], "little")])  # without its end
+    assert run(estimated, tmp_path / "out.csv") == 0
+    assert "damaged log: " in capsys.readouterr().out
+
+
 def test_estimates_beside_frames_are_asked_for(tmp_path: Path, log: Path) -> None:
     assert run(log, tmp_path / "out.csv", "--estimates") == 0
     with (tmp_path / "out.csv").open() as stream:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from gz_onboard import cli
 from gz_onboard.bus.logfile import LogFile
+from gz_onboard.bus.logs import LogDamage
 from gz_onboard.errors import InputError
 from gz_onboard.events import Reason
 from gz_onboard.lab import plot
@@ -78,6 +79,52 @@ def test_a_cut_log_is_drawn_as_far_as_it_goes(tmp_path, log):
     assert 100 < len(rows) < len(everything)
     assert rows == everything[: len(rows)]
     assert cli.main(["plot", str(cut), str(tmp_path / "cut.png")]) == 0
+
+
+@pytest.fixture
+def holed(tmp_path):
+    """A log of 30 s whose second chunk of three, 10 s, is broken."""
+    path = tmp_path / "holed.mcap"
+    ranges = {"range": 5.0, "range_p10": 4.0, "range_p90": 6.0, "speed": 10.0}
+    file = LogFile(path.open("wb"), 0)
+    file.channel("/estimate", {})
+    for t in range(30):
+        row = {"time": float(t), "distance": 10.0 * t, "soc": 0.5, "soc_sd": 0.1, "state": "VALID", "reasons": ""}
+        file.sample("/estimate", t * 10**9, row | ranges)
+        if t % 10 == 9:
+            file.flush()
+    file.close()
+    data = bytearray(path.read_bytes())
+    places = [at for at in range(len(data)) if data.startswith(b"\4\0\0\0zstd", at)]
+    data[places[1] + 20] ^= 0xFF
+    path.write_bytes(data)
+    return path
+
+
+def test_nothing_is_drawn_through_a_hole_in_the_log(holed):
+    damages: list[LogDamage] = []
+    rows, times, status = plot.read_ride(holed, damages.append)
+    assert [row["time"] for row in rows] == [*range(10), *range(20, 30)]
+    assert "a chunk is broken" in damages[0].reason
+    figure = plot.draw(rows, times, status, ("", ""))
+    (speed,) = (line for axis in figure.axes for line in axis.get_lines() if line.get_label() == "speed")
+    x, y = np.asarray(speed.get_xdata()), np.asarray(speed.get_ydata())
+    assert np.isnan(y[(x[:-1] < 15).sum() - 1])  # the last point before the hole
+    assert np.isfinite(y).sum() == len(rows)
+    state = figure.axes[6].collections[1].get_paths()  # one bar before the hole, one after
+    assert [(path.vertices[:, 0].min(), path.vertices[:, 0].max()) for path in state] == [(0, 9), (20, 29)]
+
+
+def test_what_is_missing_of_a_log_is_told(holed, tmp_path, capsys, monkeypatch):
+    titles = []
+    real = plot.draw
+    monkeypatch.setattr(plot, "draw", lambda *given: titles.append(given[3][1]) or real(*given))
+    picture = tmp_path / "x.png"
+    assert cli.main(["plot", str(holed), str(picture)]) == 0
+    told = capsys.readouterr()
+    assert "holed.mcap: byte" in told.err and "a chunk is broken" in told.err
+    assert told.out.strip() == str(picture)
+    assert "damaged log" in titles[0]
 
 
 def test_what_cannot_be_drawn_is_told(tmp_path, log, capsys):
