@@ -112,8 +112,10 @@ def naive_range(rows: Sequence[Logged]) -> list[float | None]:
         voltage, current, time = row.get("pack_voltage"), row.get("pack_current"), row["time"]
         if voltage is not None and current is not None and before is not None and 0 < time - before <= 10:
             drawn += voltage * current * (time - before)
-        before = time
         distance = row.get("distance") or 0.0
+        if before is not None and time - before > 10:  # a hole, whose energy is not known
+            ridden = deque([(distance, drawn)])
+        before = time
         if distance > ridden[-1][0]:
             ridden.append((distance, drawn))
         while len(ridden) > 1 and distance - ridden[1][0] >= NAIVE_LENGTH:
@@ -132,8 +134,8 @@ def plot_log(log: Path, picture: Path, over: str = "time") -> list[LogDamage]:
     damages: list[LogDamage] = []
     rows, times, status = read_ride(log, damages.append)
     title, about = _title(log, rows, times)
-    note = "  ·  damaged log, parts may be missing" if damages else ""
-    save(draw(rows, times, status, (title, about + note), over), picture)
+    note = "damaged log  ·  " if damages else ""
+    save(draw(rows, times, status, (title, note + about), over), picture)
     return damages
 
 

@@ -203,6 +203,14 @@ def test_the_naive_range_of_steady_riding_is_energy_over_consumption(speed, cons
             assert naive == pytest.approx(left / consumption)
 
 
+def test_the_naive_range_begins_anew_after_a_hole():
+    steady = {"pack_voltage": 50.0, "pack_current": 16.0, "energy_left": 8e6}
+    rows: list[plot.Logged] = [{"time": t, "distance": 10.0 * t, **steady} for t in range(900) if not 300 < t < 600]
+    naive = plot.naive_range(rows)
+    assert naive[301] is None
+    assert naive[-1] == pytest.approx(100_000)
+
+
 def test_the_naive_range_forgets_what_is_more_than_25_km_ago():
     rows: list[plot.Logged] = []
     distance = 0.0
