@@ -111,14 +111,19 @@ def test_nothing_is_drawn_through_a_hole_in_the_log(holed):
     x, y = np.asarray(speed.get_xdata()), np.asarray(speed.get_ydata())
     assert np.isnan(y[(x[:-1] < 15).sum() - 1])  # the last point before the hole
     assert np.isfinite(y).sum() == len(rows)
-    state = figure.axes[6].collections[1].get_paths()  # one bar before the hole, one after
+    state: Any = figure.axes[6].collections[1].get_paths()  # one bar before the hole, one after
     assert [(path.vertices[:, 0].min(), path.vertices[:, 0].max()) for path in state] == [(0, 9), (20, 29)]
 
 
 def test_what_is_missing_of_a_log_is_told(holed, tmp_path, capsys, monkeypatch):
-    titles = []
+    titles: list[str] = []
     real = plot.draw
-    monkeypatch.setattr(plot, "draw", lambda *given: titles.append(given[3][1]) or real(*given))
+
+    def noted(*given: Any) -> Any:
+        titles.append(given[3][1])
+        return real(*given)
+
+    monkeypatch.setattr(plot, "draw", noted)
     picture = tmp_path / "x.png"
     assert cli.main(["plot", str(holed), str(picture)]) == 0
     told = capsys.readouterr()
