@@ -256,16 +256,14 @@ def out_suffix(out: Path) -> str:
 
 
 def _database(log: Path, files: list[Path] | None) -> Database:
-    from gz_onboard.bus.mapping import load_database
+    from gz_onboard.bus.mapping import empty_database, load_database
 
     if files:
         return load_database(files)
-    import cantools.database
-
     attached = {name: data for name, data in logs.read_attachments(log).items() if name.lower().endswith(".dbc")}
     if not attached:
         raise InputError(f"{log}: no DBC file is attached to this log; say which to decode by, with --dbc FILE")
-    database = cantools.database.can.Database()
+    database = empty_database()
     for name, data in attached.items():
         try:
             database.add_dbc_string(data.decode("utf-8", "replace"))

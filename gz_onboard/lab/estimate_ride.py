@@ -11,7 +11,6 @@ from math import sqrt
 from pathlib import Path
 from typing import Annotated, cast
 
-from gz_onboard.bus import _can  # noqa: F401 - before cantools, which would import it with asammdf and pandas
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import LogDamage, read_frames
 from gz_onboard.bus.publisher import WH, WH_PER_KM, Counts, Publisher
