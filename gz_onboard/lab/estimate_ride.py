@@ -68,7 +68,9 @@ class Summary:
     distance_km: Annotated[float, "ridden"]
     speed_max_km_h: Annotated[float | None, "greatest speed, or null"]
     energy_wh: Annotated[
-        float | None, "drawn from the pack, less what was recovered; null if voltage or current was never known"
+        float | None,
+        "drawn from the pack, less what was recovered, the sensors' known gain and offsets taken off; "
+        "null if voltage or current was never known",
     ]
     energy_recovered_wh: Annotated[float | None, "charged into the pack while riding, or null"]
     consumption_wh_km: Annotated[float | None, "energy over distance; null below 0.1 km"]
