@@ -49,6 +49,11 @@ def shown(value: object) -> str:
         return "a number of thousands of digits"
 
 
+def writable(text: str) -> str:
+    """`text` without what no encoding has: the bytes of a file's name that are not UTF-8."""
+    return text.encode("utf-8", "replace").decode()
+
+
 def not_an_input(outputs: Iterable[Path | str | None], inputs: Iterable[Path]) -> None:
     """InputError if a file to be written is an input, or the ``rides.json`` beside one, by whatever name.
 

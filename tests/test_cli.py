@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import io
 import re
 import signal
 import subprocess
@@ -202,6 +203,13 @@ def test_a_disk_that_is_full():
     assert run.returncode
     assert "gz-onboard discover: [Errno 28] No space left on device" in run.stderr
     assert "Traceback" not in run.stderr
+
+
+def test_a_terminal_without_the_signs_of_a_summary(monkeypatch: pytest.MonkeyPatch):
+    out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", out)
+    assert status("discover", "--list") == 0
+    assert b"?" in out.buffer.getvalue()  # for ±
 
 
 def test_ctrl_c_before_anything_is_read(monkeypatch: pytest.MonkeyPatch):

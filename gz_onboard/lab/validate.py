@@ -103,7 +103,7 @@ def _write_tables(arguments: argparse.Namespace, rides: list[Ride], together: Po
             write_report(written[-1], rides, together)
         if arguments.markdown:
             written.append(arguments.markdown)
-            arguments.markdown.write_text(markdown(rides, together), encoding="utf-8")
+            arguments.markdown.write_text(markdown(rides, together), encoding="utf-8", errors="replace")
     if arguments.json != "-" and written:
         print(f"written: {', '.join(map(str, written))}")
 

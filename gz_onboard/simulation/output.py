@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from gz_onboard.errors import writing
+from gz_onboard.errors import writable, writing
 from gz_onboard.offline.page import svg, write_page
 from gz_onboard.offline.style import save
 from gz_onboard.simulation.frames import Losses, simulate_frames, write_frames
@@ -89,7 +89,9 @@ def write_series(result: Run, file: Path, metadata: dict[str, str]) -> None:
 
         columns = [pa.array(column, from_pandas=True) for column in result.series.values()]
         table = pa.table(columns, names=names)
-        pq.write_table(table.replace_schema_metadata(metadata), file)
+        named = {key: writable(text) for key, text in metadata.items()}
+        with file.open("wb") as binary:  # pyarrow opens no name that is not UTF-8
+            pq.write_table(table.replace_schema_metadata(named), binary)
         return
     rows = zip(*(column.tolist() for column in result.series.values()), strict=True)
     if file.suffix == ".csv":

@@ -48,7 +48,7 @@ _GRADE = (
 
 def write_report(found: Discovery, out: Path) -> None:
     """Write the report of `found` to the HTML file `out`. Raises OSError."""
-    out.write_text(page(found), encoding="utf-8")
+    out.write_text(page(found), encoding="utf-8", errors="replace")
 
 
 def page(found: Discovery) -> str:
