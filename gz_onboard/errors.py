@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import reprlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -16,6 +17,7 @@ EXIT_STATUSES = {
     INTERRUPTED: "interrupted by Ctrl-C",
 }
 """What the exit status of a command means."""
+_DISK_FAILED = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 LONGEST_NAME = 100  # beyond it no near name is looked for, which takes the square of the length
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict = 3, 8, 4
@@ -80,8 +82,14 @@ def _identity(file: Path | str) -> tuple[int, int] | None:
 
 @contextmanager
 def writing(place: object) -> Iterator[None]:
-    """InputError for what the operating system refuses within, naming the file, or else `place`."""
+    """InputError for what the operating system refuses within, naming the file, or else `place`.
+
+    OSError where the fault is not the name's: a full disk, a broken one.
+    """
     try:
         yield
     except OSError as error:
-        raise InputError(f"{error.filename or place}: cannot be written: {error.strerror or error}") from error
+        message = f"{error.filename or place}: cannot be written: {error.strerror or error}"
+        if error.errno in _DISK_FAILED:
+            raise OSError(error.errno, message) from error
+        raise InputError(message) from error

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import io
+import os
 import re
 import signal
 import subprocess
@@ -203,6 +205,20 @@ def test_a_disk_that_is_full():
     assert run.returncode
     assert "gz-onboard discover: [Errno 28] No space left on device" in run.stderr
     assert "Traceback" not in run.stderr
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EIO])
+def test_a_disk_that_fails_is_no_bad_input(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+):
+    def failing(out: Path, *_: object) -> int:
+        out.write_text("half")
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("gz_onboard.bus.export.write_frames_as", failing)
+    assert status("export", RIDE, str(tmp_path / "x.log")) == 1
+    assert f"x.log: cannot be written: {os.strerror(number)}" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_terminal_without_the_signs_of_a_summary(monkeypatch: pytest.MonkeyPatch):

@@ -19,8 +19,8 @@ import heapq
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,7 +30,7 @@ from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.replay import log_section
 from gz_onboard.bus.signals import Decoder
 from gz_onboard.bus.writers import write_blf, write_candump
-from gz_onboard.errors import InputError, nearest, not_an_input
+from gz_onboard.errors import InputError, nearest, not_an_input, writing
 from gz_onboard.events import Frame
 from gz_onboard.options import add_shared
 
@@ -180,7 +180,8 @@ def run(args: argparse.Namespace) -> int:
     suffix = out_suffix(out)
     not_an_input([out], [log, *(args.dbc or [])])
     if args.estimates or _holds_only_estimates(log):
-        count = _written(out, lambda: _write_estimates(log, out, suffix, args.table_format, (args.start, args.end)))
+        with _whole(out, suffix) as part:
+            count = _write_estimates(log, part, suffix, args.table_format, (args.start, args.end))
         print(f"wrote {out}: {count} estimates")
         return 0
     section = log_section(log, args.start, args.end)
@@ -194,10 +195,12 @@ def run(args: argparse.Namespace) -> int:
     batches = chain([first], rest)
     if suffix in (".parquet", ".mcap", "") or args.signals:
         decoder = Decoder(_database(log, args.dbc))
-        count = _written(out, lambda: _export_signals(log, out, suffix, args.table_format, decoder, batches, section))
+        with _whole(out, suffix) as part:
+            count = _export_signals(log, part, suffix, args.table_format, decoder, batches, section)
         left = f"; {decoder.unknown} frames are in no DBC file, {decoder.undecodable} do not fit theirs"
     else:
-        count = _written(out, lambda: write_frames_as(out, suffix, batches))
+        with _whole(out, suffix) as part:
+            count = write_frames_as(part, suffix, batches)
         left = ""
     for damage in damages:
         print(f"damaged log: {damage}")
@@ -205,12 +208,25 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _written(out: Path, write: Callable[[], int]) -> int:
-    """What `write` gives; InputError for what the operating system refuses."""
-    try:
-        return write()
-    except OSError as error:
-        raise InputError(f"{out}: cannot be written: {error.strerror or error}") from None
+@contextmanager
+def _whole(out: Path, suffix: str) -> Iterator[Path]:
+    """Where to write `out` within, which has its name once it is complete; but a folder of tables at once.
+
+    Errors are as of `writing`.
+    """
+    part = out.with_name(f".part.{out.name}") if suffix else out
+    with writing(out):
+        try:
+            yield part
+            if suffix:
+                part.replace(out)
+        except OSError as error:
+            error.filename = None  # `out` is what the user knows
+            raise
+        finally:
+            if suffix:
+                with suppress(OSError):  # there is none
+                    part.unlink()
 
 
 def _holds_only_estimates(log: Path) -> bool:

@@ -360,6 +360,23 @@ def test_outputs_that_cannot_be_written_are_named(tmp_path: Path, log: Path, out
         run(log, tmp_path / out)
 
 
+@pytest.mark.parametrize("name", ["out.log", "out.log.gz", "out.blf", "out.parquet", "out.mcap"])
+def test_nothing_half_written_has_the_name(
+    tmp_path: Path, log: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / name).write_text("before")
+
+    def interrupted(*given: Any, **more: Any) -> Any:
+        yield from list(read_frames(*given, **more))[:2]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gz_onboard.bus.logs.read_frames", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(log, tmp_path / name)
+    assert (tmp_path / name).read_text() == "before"
+    assert {file.name for file in tmp_path.iterdir()} == {"ride.mcap", name}
+
+
 def test_a_missing_directory_is_named(tmp_path: Path, log: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere.*cannot be written"):
         run(log, tmp_path / "nowhere" / "out.blf")

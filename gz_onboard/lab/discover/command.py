@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gz_onboard.bus.logs import log_suffix, logs_among
-from gz_onboard.errors import InputError, nearest, not_an_input
+from gz_onboard.errors import InputError, nearest, not_an_input, writing
 from gz_onboard.lab.discover.baseline import baseline
 from gz_onboard.lab.discover.baseline_file import write_baseline
 from gz_onboard.lab.discover.breakdown import outlying_rides
@@ -93,10 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.report:
         from gz_onboard.lab.discover.page import write_report
 
-        try:
+        with writing(arguments.report):
             write_report(found, arguments.report)
-        except OSError as error:
-            raise InputError(f"--report {arguments.report}: cannot be written: {error.strerror}") from error
     if arguments.json != "-":
         print(summary(found, written))
         if arguments.report:
@@ -236,10 +234,8 @@ def write_extended(found: Discovery, vehicle: Vehicle, arguments: argparse.Names
     report = found.report
     if all(cause.varies for cause in report.causes) and report.unknown is None:
         return ["not written: there is nothing to extend it with"]
-    try:
+    with writing(arguments.write_model):
         added = write_model(found, vehicle, find_vehicle(arguments.vehicle), arguments.write_model)
-    except OSError as error:
-        raise InputError(f"--write-model {arguments.write_model}: cannot be written: {error.strerror}") from error
     written = [str(arguments.write_model), *added] if report.extended_model else ["not written", *added]
     if report.ambiguous:
         written.append(
