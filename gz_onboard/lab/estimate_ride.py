@@ -19,7 +19,7 @@ from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.results import times
-from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, range_publisher, reason_names
+from gz_onboard.pipeline import STATUS_TOPIC, TICK_NS, Pipeline, dbc_texts, range_publisher, reason_names
 from gz_onboard.progress import Progress
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -224,6 +224,8 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> Summar
             feed(pipeline, _chained(batch, ours), progress)
             if not pipeline.codec.latest:
                 raise _unknown(task, vehicle, pipeline)
+            if tally.last:  # what came after the last whole second counts too
+                log.sample(STATUS_TOPIC, batch[0][0] + round(tally.last.time * 1e9), pipeline.status())
             log.close()
             task.part.replace(task.log)
         finally:

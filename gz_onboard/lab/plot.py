@@ -33,7 +33,7 @@ from gz_onboard.offline.style import (
     time_unit,
 )
 from gz_onboard.options import add_shared
-from gz_onboard.pipeline import ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
+from gz_onboard.pipeline import DROPPING, ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -284,10 +284,12 @@ def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Logged], reasons: Sequ
     axis.set_yticks(range(len(labels)), labels, fontsize=7)
     legend(axis)
     if status:
-        faults = sum(sum(places.values()) for places in status.get("faults", {}).values())
+        faults = {reason: sum(places.values()) for reason, places in status.get("faults", {}).items()}
+        dropped = sum(count for reason, count in faults.items() if reason in DROPPING)
         text = (
             f"{status.get('received', 0)} frames received, {sum(status.get('lost', {}).values())} lost, "
-            f"{faults} frames or signals dropped, {len(status.get('unknown', {}))} unknown identifiers"
+            f"{dropped} dropped, {len(status.get('unknown', {}))} unknown identifiers; "
+            f"{sum(faults.values()) - dropped} signals not available or implausible"
         )
         axis.annotate(
             text,

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import json
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,19 @@ def test_the_panels_show_what_the_log_says(log):
     assert shown[0] == "state"
     assert set(shown[1:]) == {plot.reason_words(Reason[name]) for row in rows for name in row["reasons"].split()}
     figure.savefig(io.BytesIO(), format="png", dpi=30)
+
+
+def test_the_picture_counts_what_the_summary_counts(tmp_path, capsys):
+    assert cli.main(["estimate", str(LOGS / "city_34C.blf"), "--output", str(tmp_path), "--no-plot", "--json"]) == 0
+    (ride,) = json.loads(capsys.readouterr().out)["rides"]
+    rows, times, status = plot.read_ride(tmp_path / "city_34C.estimate.mcap")
+    figure = plot.draw(rows, times, status, ("", ""))
+    (told,) = (t.get_text() for axis in figure.axes for t in axis.texts if "frames received" in t.get_text())
+    withheld = sum(sum(places.values()) for places in ride["faults"].values()) - ride["dropped"]
+    assert told == (
+        f"{ride['frames']} frames received, {ride['lost']} lost, {ride['dropped']} dropped, "
+        f"{ride['unknown']} unknown identifiers; {withheld} signals not available or implausible"
+    )
 
 
 def test_by_default_the_picture_is_beside_the_log(log, capsys):
