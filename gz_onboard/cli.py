@@ -41,7 +41,9 @@ class _Parser(argparse.ArgumentParser):
             message += nearest(wrong.strip("'"), re.findall(r"[^\s',)]+", choices))
         elif message.startswith("unrecognized arguments: "):
             wrong = next((word for word in message.split()[2:] if word.startswith("-")), "")
-            message += nearest(wrong.partition("=")[0], self.known_options()) if wrong else ""
+            message += (
+                nearest(wrong.partition("=")[0], self.known_options()) if wrong else "; files go before the options"
+            )
         super().error(message)
 
     def known_options(self) -> list[str]:
