@@ -97,12 +97,25 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["estimate", RIDE, "--vehicle", "referenz"], "did you mean 'reference'"),
         (["export", "nowhere.blf", "x.log"], "nowhere.blf"),
         (["plot", "nowhere.mcap"], "nowhere.mcap"),
+        (["plot", "a.mcap", "--over", "distance", "d.png"], "d.png; files go before the options"),
+        (["estimate", RIDE, "--no-plot", RIDE], "; files go before the options"),
+        (["replay", "nowhere.blf", "--channel", "a"], "nowhere.blf"),
+        (["run", "--vehicle", f"{LOGS}/"], "is a folder; give the vehicle file in it"),
         (["dashboard", "--interface", "virtul"], "virtul"),
     ],
     ids=lambda value: " ".join(value).replace(RIDE, "RIDE")[:60] if isinstance(value, list) else "",
 )
 def test_command_line(capsys: pytest.CaptureFixture[str], arguments: list[str], said: str):
     assert said in refused(capsys, *arguments)
+
+
+def test_a_kernel_without_can(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    def none(**_: object) -> None:
+        raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+
+    monkeypatch.setattr("can.Bus", none)
+    for arguments in ["run"], ["replay", RIDE]:
+        assert "this kernel has no CAN sockets" in refused(capsys, *arguments, "--channel", "a")
 
 
 VEHICLE = (ROOT / "gz_onboard" / "vehicles" / "reference.toml").read_text(encoding="utf-8")

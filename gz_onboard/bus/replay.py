@@ -180,6 +180,7 @@ def run(args: argparse.Namespace) -> int:
         raise InputError(f"--speed {args.speed:g}: must be 0 (as fast as possible) or a factor of {SLOWEST:g} or more")
     start_ns, end_ns = log_section(args.log, args.start, args.end)
     received_only = log_suffix(args.log) == ".mcap" and not args.all
+    read_frames(args.log)  # that it is missing comes before what is wrong with the bus
     names = [name for name in args.channel.split(",") if name]
     buses = _open_buses(args.interface, names)
     summary = Summary()
@@ -261,7 +262,7 @@ def _sender(bus: can.BusABC) -> Send:
 
 
 def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
-    from gz_onboard.bus._can import can, check_interface
+    from gz_onboard.bus._can import NO_SOCKETS, can, check_interface
 
     check_interface(interface)
     buses: list[can.BusABC] = []
@@ -272,8 +273,9 @@ def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
             for bus in buses:
                 bus.shutdown()
             there = sorted(name for _, name in socket.if_nameindex()) if interface == "socketcan" else []
+            why = NO_SOCKETS if getattr(error, "errno", None) == errno.EAFNOSUPPORT else error
             raise InputError(
-                f"--channel {name}: cannot be opened by {interface}: {error}{nearest(name, there)}"
+                f"--channel {name}: cannot be opened by {interface}: {why}{nearest(name, there)}"
             ) from None
     if not buses:
         raise InputError("--channel: no channel is named")

@@ -119,7 +119,7 @@ def summary_text(ride: Summary) -> str:
     rows = [
         (
             "ride",
-            f"{clock(ride.duration_s)}, {ride.distance_km:.2f} km, "
+            f"{clock(ride.duration_s)}, {ride.distance_km:z.2f} km, "
             f"at most {number(ride.speed_max_km_h, '.0f', 'km/h')}",
         ),
         (
