@@ -96,6 +96,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["estimate", str(ROOT / "dbc")], "dbc: this folder holds no log"),
         (["estimate", RIDE, "--vehicle", "referenz"], "did you mean 'reference'"),
         (["export", "nowhere.blf", "x.log"], "nowhere.blf"),
+        (["export", RIDE, "x.csv", "--table-format", "csv"], "is for a folder of tables, and x.csv is a file"),
         (["plot", "nowhere.mcap"], "nowhere.mcap"),
         (["plot", "a.mcap", "--over", "distance", "d.png"], "d.png; files go before the options"),
         (["estimate", RIDE, "--no-plot", RIDE], "; files go before the options"),

@@ -167,8 +167,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, metavar="OUT", help=out)
     parser.add_argument("--estimates", action="store_true", help="write the estimates, one row each")
     parser.add_argument("--signals", action="store_true", help="write signals, not frames, to .csv")
-    tables = "format of the tables in a folder (default: %(default)s)"
-    parser.add_argument("--table-format", choices=["parquet", "csv"], default="parquet", help=tables)
+    tables = "format of the tables in a folder (default: parquet)"
+    parser.add_argument("--table-format", choices=["parquet", "csv"], help=tables)
     dbc = "DBC files to decode the signals (default: those attached to the log)"
     parser.add_argument("--dbc", type=Path, nargs="+", metavar="FILE", help=dbc)
     add_shared(parser, "--from", "--to")
@@ -178,10 +178,13 @@ def run(args: argparse.Namespace) -> int:
     """Run ``gz-onboard export``; raises InputError for what cannot be used."""
     log, out = args.log, args.out
     suffix = out_suffix(out)
+    if suffix and args.table_format:
+        raise InputError(f"--table-format {args.table_format}: is for a folder of tables, and {out} is a file")
+    table_format = args.table_format or "parquet"
     not_an_input([out], [log, *(args.dbc or [])])
     if args.estimates or _holds_only_estimates(log):
         with _whole(out, suffix) as part:
-            count = _write_estimates(log, part, suffix, args.table_format, (args.start, args.end))
+            count = _write_estimates(log, part, suffix, table_format, (args.start, args.end))
         print(f"wrote {out}: {count} estimates")
         return 0
     section = log_section(log, args.start, args.end)
@@ -196,7 +199,7 @@ def run(args: argparse.Namespace) -> int:
     if suffix in (".parquet", ".mcap", "") or args.signals:
         decoder = Decoder(_database(log, args.dbc))
         with _whole(out, suffix) as part:
-            count = _export_signals(log, part, suffix, args.table_format, decoder, batches, section)
+            count = _export_signals(log, part, suffix, table_format, decoder, batches, section)
         left = f"; {decoder.unknown} frames are in no DBC file, {decoder.undecodable} do not fit theirs"
     else:
         with _whole(out, suffix) as part:

@@ -49,7 +49,8 @@ def write(
 
 def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, scooter: Scooter) -> str:
     """Write the ride's frames; gives the file's name. InputError if it cannot be written."""
-    sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, losses=Losses(frames=arguments.frame_loss))
+    losses = Losses() if arguments.frame_loss is None else Losses(frames=arguments.frame_loss)
+    sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, losses=losses)
     with writing(arguments.frames):
         arguments.frames.parent.mkdir(parents=True, exist_ok=True)
         write_frames(arguments.frames, sent)

@@ -83,8 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     frames = "write the ride as CAN frames of the vehicle's sensors: .blf .log .asc .trc .csv .mf4"
     add("--frames", type=Path, metavar="FILE", help=frames)
     add_shared(parser, "--seed", help="seed of the noise and losses of --frames (default: %(default)s)")
-    lost = "share of frames that the bus loses (default: %(default)g)"
-    _number(parser, "--frame-loss", 0.0, 1.0, default=Losses.frames, metavar="SHARE", help=lost)
+    lost = f"share of the --frames that the bus loses (default: {Losses.frames:g})"
+    _number(parser, "--frame-loss", 0.0, 1.0, metavar="SHARE", help=lost)
     add_shared(parser, "--quiet")
 
 
@@ -109,6 +109,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--sweep {sweeps[0].name}: given twice")
     if arguments.frames:
         check_output(arguments.frames)
+    elif arguments.frame_loss is not None:
+        raise InputError(f"--frame-loss {arguments.frame_loss:g}: is for --frames FILE")
     not_an_input((arguments.frames, arguments.json), [Path(arguments.what), find_vehicle(arguments.vehicle)])
     plan = find_plan(arguments, vehicle)
     if arguments.chassis != "straight" and (plan.kind == "cycle" or isinstance(plan.road, Dynamometer)):
