@@ -25,7 +25,6 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -34,6 +33,7 @@ import numpy as np
 
 from gz_onboard.lab.discover.baseline import baseline
 from gz_onboard.lab.discover.discovery import discover
+from gz_onboard.offline.processes import worker_pool
 from gz_onboard.offline.samples import Samples
 from gz_onboard.offline.schema import to_json
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -438,7 +438,7 @@ def run(first: int, count: int, jobs: int, judge_one: Callable[[Sequence[int]], 
         groups.setdefault(seed // CASES_OF_A_SCOOTER, []).append(seed)
     rows: list[Row] = []
     os.environ["OMP_NUM_THREADS"] = os.environ["OPENBLAS_NUM_THREADS"] = "1"  # for numpy of the processes to come
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+    with worker_pool(jobs, context=multiprocessing.get_context("spawn")) as pool:
         for done in pool.map(judge_one, groups.values()):
             rows += done
             print(f"{len({row['seed'] for row in rows})} of {count} cases", file=sys.stderr, flush=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import io
 import os
 import re
 import sys
@@ -40,7 +41,9 @@ class _Parser(argparse.ArgumentParser):
             message += nearest(wrong.strip("'"), re.findall(r"[^\s',)]+", choices))
         elif message.startswith("unrecognized arguments: "):
             wrong = next((word for word in message.split()[2:] if word.startswith("-")), "")
-            message += nearest(wrong.partition("=")[0], self.known_options()) if wrong else ""
+            message += (
+                nearest(wrong.partition("=")[0], self.known_options()) if wrong else "; files go before the options"
+            )
         super().error(message)
 
     def known_options(self) -> list[str]:
@@ -78,6 +81,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line `argv`; gives the exit status: 0, or one of those in `errors`."""
     # Our matrices are small, and large work runs in processes of its own: threads would only get in each other's way.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    if isinstance(sys.stdout, io.TextIOWrapper):  # names of files that are not UTF-8, or a terminal that has no ±
+        sys.stdout.reconfigure(errors="replace")
     argv = list(sys.argv[1:] if argv is None else argv)
     called = next((word for word in argv if not word.startswith("-")), "")
     try:

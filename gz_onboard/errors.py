@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import reprlib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 EXIT_STATUSES = {
@@ -15,6 +17,7 @@ EXIT_STATUSES = {
     INTERRUPTED: "interrupted by Ctrl-C",
 }
 """What the exit status of a command means."""
+_DISK_FAILED = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 LONGEST_NAME = 100  # beyond it no near name is looked for, which takes the square of the length
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict = 3, 8, 4
@@ -48,10 +51,45 @@ def shown(value: object) -> str:
         return "a number of thousands of digits"
 
 
+def writable(text: str) -> str:
+    """`text` without what no encoding has: the bytes of a file's name that are not UTF-8."""
+    return text.encode("utf-8", "replace").decode()
+
+
+def not_an_input(outputs: Iterable[Path | str | None], inputs: Iterable[Path]) -> None:
+    """InputError if a file to be written is an input, or the ``rides.json`` beside one, by whatever name.
+
+    outputs: a name may be None, or ``-`` for standard output.
+    """
+    read = {
+        identity: file
+        for given in inputs
+        for file in (given.parent / "rides.json", given)
+        if (identity := _identity(file))
+    }
+    for out in outputs:
+        if out is not None and str(out) != "-" and (identity := _identity(out)) in read:
+            raise InputError(f"{out}: would overwrite the input {read[identity]}; give another name or folder")
+
+
+def _identity(file: Path | str) -> tuple[int, int] | None:
+    """What two names of the same file have in common; None if there is none."""
+    with suppress(OSError):
+        found = Path(file).stat()
+        return found.st_dev, found.st_ino
+    return None
+
+
 @contextmanager
 def writing(place: object) -> Iterator[None]:
-    """InputError for what the operating system refuses within, naming the file, or else `place`."""
+    """InputError for what the operating system refuses within, naming the file, or else `place`.
+
+    OSError where the fault is not the name's: a full disk, a broken one.
+    """
     try:
         yield
     except OSError as error:
-        raise InputError(f"{error.filename or place}: cannot be written: {error.strerror or error}") from error
+        message = f"{error.filename or place}: cannot be written: {error.strerror or error}"
+        if error.errno in _DISK_FAILED:
+            raise OSError(error.errno, message) from error
+        raise InputError(message) from error

@@ -77,6 +77,8 @@ def find_vehicle(name: str | Path, beside: Path | None = None) -> Path:
     if isinstance(name, Path) or "/" in name or name.endswith(".toml"):
         if is_file(path):
             return path
+        if path.is_dir():
+            raise InputError(f"{path}: is a folder; give the vehicle file in it")
         raise InputError(f"{path if beside else name}: no such vehicle file; {there_are}{nearest(str(name), own)}")
     if name in own:
         return OWN / f"{name}.toml"

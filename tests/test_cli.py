@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import errno
+import io
+import os
 import re
 import signal
 import subprocess
@@ -93,13 +96,27 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["estimate", str(ROOT / "dbc")], "dbc: this folder holds no log"),
         (["estimate", RIDE, "--vehicle", "referenz"], "did you mean 'reference'"),
         (["export", "nowhere.blf", "x.log"], "nowhere.blf"),
+        (["export", RIDE, "x.csv", "--table-format", "csv"], "is for a folder of tables, and x.csv is a file"),
         (["plot", "nowhere.mcap"], "nowhere.mcap"),
+        (["plot", "a.mcap", "--over", "distance", "d.png"], "d.png; files go before the options"),
+        (["estimate", RIDE, "--no-plot", RIDE], "; files go before the options"),
+        (["replay", "nowhere.blf", "--channel", "a"], "nowhere.blf"),
+        (["run", "--vehicle", f"{LOGS}/"], "is a folder; give the vehicle file in it"),
         (["dashboard", "--interface", "virtul"], "virtul"),
     ],
     ids=lambda value: " ".join(value).replace(RIDE, "RIDE")[:60] if isinstance(value, list) else "",
 )
 def test_command_line(capsys: pytest.CaptureFixture[str], arguments: list[str], said: str):
     assert said in refused(capsys, *arguments)
+
+
+def test_a_kernel_without_can(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch):
+    def none(**_: object) -> None:
+        raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+
+    monkeypatch.setattr("can.Bus", none)
+    for arguments in ["run"], ["replay", RIDE]:
+        assert "this kernel has no CAN sockets" in refused(capsys, *arguments, "--channel", "a")
 
 
 VEHICLE = (ROOT / "gz_onboard" / "vehicles" / "reference.toml").read_text(encoding="utf-8")
@@ -202,6 +219,27 @@ def test_a_disk_that_is_full():
     assert run.returncode
     assert "gz-onboard discover: [Errno 28] No space left on device" in run.stderr
     assert "Traceback" not in run.stderr
+
+
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EDQUOT, errno.EIO])
+def test_a_disk_that_fails_is_no_bad_input(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int
+):
+    def failing(out: Path, *_: object) -> int:
+        out.write_text("half")
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("gz_onboard.bus.export.write_frames_as", failing)
+    assert status("export", RIDE, str(tmp_path / "x.log")) == 1
+    assert f"x.log: cannot be written: {os.strerror(number)}" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_terminal_without_the_signs_of_a_summary(monkeypatch: pytest.MonkeyPatch):
+    out = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", out)
+    assert status("discover", "--list") == 0
+    assert b"?" in out.buffer.getvalue()  # for ±
 
 
 def test_ctrl_c_before_anything_is_read(monkeypatch: pytest.MonkeyPatch):

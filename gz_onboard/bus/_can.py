@@ -28,7 +28,9 @@ _import_without_asammdf()
 
 import can  # noqa: E402
 
-__all__ = ["can", "check_interface", "flagged"]
+__all__ = ["NO_SOCKETS", "can", "check_interface", "flagged"]
+
+NO_SOCKETS = "this kernel has no CAN sockets (AF_CAN)"  # what EAFNOSUPPORT of socketcan means
 
 
 def check_interface(name: str) -> None:

@@ -14,7 +14,7 @@ import struct
 import time
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus._can import can, check_interface, flagged
+from gz_onboard.bus._can import NO_SOCKETS, can, check_interface, flagged
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Frame
 
@@ -64,7 +64,7 @@ class CanChannel:
             raise InputError(f"--interface {self.interface}: {error}") from error
         except (OSError, can.CanError) as error:
             if self.interface == "socketcan" and getattr(error, "errno", None) == errno.EAFNOSUPPORT:
-                raise InputError("--interface socketcan: this kernel has no CAN sockets (AF_CAN)") from error
+                raise InputError(f"--interface socketcan: {NO_SOCKETS}") from error
             self._close()  # not there yet: a bus may come up later
 
     def _open(self) -> None:

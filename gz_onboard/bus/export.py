@@ -21,7 +21,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,7 +31,7 @@ from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.replay import log_section
 from gz_onboard.bus.signals import Decoder
 from gz_onboard.bus.writers import write_blf, write_candump
-from gz_onboard.errors import OK, InputError, nearest, writing
+from gz_onboard.errors import OK, InputError, nearest, not_an_input, writing
 from gz_onboard.events import Frame
 from gz_onboard.options import add_shared
 
@@ -116,10 +116,11 @@ def _message_schema(message: Message, columns: Mapping[str, str]) -> dict[str, A
 
 
 def _write_estimates(log: Path, out: Path, suffix: str, table_format: str, section: tuple[float, float | None]) -> int:
-    """The rows of the topic of estimates, a column for each field, with its unit; gives how many."""
+    """The rows of the topic of estimates, a column for each field, with its unit; gives how many. Prints damage."""
     if suffix not in (".csv", ".parquet", ""):
         raise InputError(f"{out}: estimates can be written into .csv, .parquet or a directory")
-    found = [(time_ns, values) for topic, time_ns, values in logs.read_samples(log) if topic == ESTIMATE_TOPIC]
+    samples = logs.read_samples(log, on_damage=lambda damage: print(f"damaged log: {damage}"))
+    found = [(time_ns, values) for topic, time_ns, values in samples if topic == ESTIMATE_TOPIC]
     if not found:
         raise InputError(f"{log}: holds no estimates ({ESTIMATE_TOPIC})")
     start_s, end_s = section
@@ -167,8 +168,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, metavar="OUT", help=out)
     parser.add_argument("--estimates", action="store_true", help="write the estimates, one row each")
     parser.add_argument("--signals", action="store_true", help="write signals, not frames, to .csv")
-    tables = "format of the tables in a folder (default: %(default)s)"
-    parser.add_argument("--table-format", choices=["parquet", "csv"], default="parquet", help=tables)
+    tables = "format of the tables in a folder (default: parquet)"
+    parser.add_argument("--table-format", choices=["parquet", "csv"], help=tables)
     dbc = "DBC files to decode the signals (default: those attached to the log)"
     parser.add_argument("--dbc", type=Path, nargs="+", metavar="FILE", help=dbc)
     add_shared(parser, "--from", "--to")
@@ -178,11 +179,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Run ``gz-onboard export``; raises InputError for what cannot be used."""
     log, out = arguments.log, arguments.out
     suffix = out_suffix(out)
-    if out.exists() and out.resolve() == log.resolve():
-        raise InputError(f"{out}: is the log itself")
+    if suffix and arguments.table_format:
+        raise InputError(f"--table-format {arguments.table_format}: is for a folder of tables, and {out} is a file")
+    table_format = arguments.table_format or "parquet"
+    not_an_input([out], [log, *(arguments.dbc or [])])
     if arguments.estimates or _holds_only_estimates(log):
-        with writing(out):
-            count = _write_estimates(log, out, suffix, arguments.table_format, (arguments.start, arguments.end))
+        with _whole(out, suffix) as part:
+            count = _write_estimates(log, part, suffix, table_format, (arguments.start, arguments.end))
         print(f"wrote {out}: {count} estimates")
         return OK
     section = log_section(log, arguments.start, arguments.end)
@@ -196,17 +199,38 @@ def run(arguments: argparse.Namespace) -> int:
     batches = chain([first], rest)
     if suffix in (".parquet", ".mcap", "") or arguments.signals:
         decoder = Decoder(_database(log, arguments.dbc))
-        with writing(out):
-            count = _export_signals(log, out, suffix, arguments.table_format, decoder, batches, section)
+        with _whole(out, suffix) as part:
+            count = _export_signals(log, part, suffix, table_format, decoder, batches, section)
         left = f"; {decoder.unknown} frames are in no DBC file, {decoder.undecodable} do not fit theirs"
     else:
-        with writing(out):
-            count = write_frames_as(out, suffix, batches)
+        with _whole(out, suffix) as part:
+            count = write_frames_as(part, suffix, batches)
         left = ""
     for damage in damages:
         print(f"damaged log: {damage}")
     print(f"wrote {out}: {count} {'samples' if suffix == '.mcap' else 'frames'}{left}")
     return OK
+
+
+@contextmanager
+def _whole(out: Path, suffix: str) -> Iterator[Path]:
+    """Where to write `out` within, which has its name once it is complete; but a folder of tables at once.
+
+    Errors are as of `writing`.
+    """
+    part = out.with_name(f".part.{out.name}") if suffix else out
+    with writing(out):
+        try:
+            yield part
+            if suffix:
+                part.replace(out)
+        except OSError as error:
+            error.filename = None  # `out` is what the user knows
+            raise
+        finally:
+            if suffix:
+                with suppress(OSError):  # there is none
+                    part.unlink()
 
 
 def _holds_only_estimates(log: Path) -> bool:
@@ -252,16 +276,14 @@ def out_suffix(out: Path) -> str:
 
 
 def _database(log: Path, files: list[Path] | None) -> Database:
-    from gz_onboard.bus.mapping import load_database
+    from gz_onboard.bus.mapping import empty_database, load_database
 
     if files:
         return load_database(files)
-    import cantools.database
-
     attached = {name: data for name, data in logs.read_attachments(log).items() if name.lower().endswith(".dbc")}
     if not attached:
         raise InputError(f"{log}: no DBC file is attached to this log; say which to decode by, with --dbc FILE")
-    database = cantools.database.can.Database()
+    database = empty_database()
     for name, data in attached.items():
         try:
             database.add_dbc_string(data.decode("utf-8", "replace"))

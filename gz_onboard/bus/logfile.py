@@ -14,6 +14,7 @@ from mcap.writer import CompressionType, Writer
 
 from gz_onboard import __version__
 from gz_onboard.bus import framelog
+from gz_onboard.errors import writable
 from gz_onboard.events import Frame
 
 BLOCK_FRAMES = 512
@@ -46,7 +47,8 @@ class LogFile:
         self._channels: dict[str, int] = {}
         self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library=f"gz-onboard {__version__}")
-        self._writer.add_metadata("gz_onboard", {"version": __version__, **(metadata or {})})
+        named = {key: writable(text) for key, text in (metadata or {}).items()}
+        self._writer.add_metadata("gz_onboard", {"version": __version__, **named})
         for name, data in (attachments or {}).items():
             self._writer.add_attachment(start_ns, start_ns, name, "text/plain", data)
         schema = self._writer.register_schema(framelog.SCHEMA_NAME, framelog.ENCODING, framelog.SCHEMA_TEXT.encode())

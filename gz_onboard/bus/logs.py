@@ -122,27 +122,33 @@ def json_channels(path: str | Path) -> dict[str, tuple[bytes, dict[str, str]]]:
 
 
 def read_samples(
-    path: str | Path, start_ns: int | None = None, end_ns: int | None = None
+    path: str | Path,
+    start_ns: int | None = None,
+    end_ns: int | None = None,
+    on_damage: Callable[[LogDamage], None] | None = None,
 ) -> Iterator[tuple[str, int, dict[str, Any]]]:
     """Topic, time [ns] and values of the samples in one of our own logs, as they stand in it; others have none.
 
-    Damage is passed over: `read_frames` reports it.
+    on_damage: as of `read_frames`; without it damage is passed over, for one who reads the frames too.
     """
-    if not (own := _own(path)):
+    damage = Damage()
+    if not (own := _own(path, damage)):
         return
-    for topic, time_ns, text in mcap.samples(*own, Damage(), start_ns, end_ns):
+    for topic, time_ns, text in mcap.samples(*own, damage, start_ns, end_ns):
         try:
             values = json.loads(text)
         except (ValueError, RecursionError):
             continue
         if isinstance(values, dict):
             yield topic, time_ns, values
+    if damage.count and on_damage:
+        on_damage(LogDamage(Path(path), damage.count, damage.place, damage.reason))
 
 
-def _own(path: str | Path) -> tuple[Path, Contents] | None:
+def _own(path: str | Path, damage: Damage | None = None) -> tuple[Path, Contents] | None:
     """(path, contents) of a log in our own format; None for other formats."""
     path = Path(path)
-    return (path, unpacked(path, _load(path), Damage())) if log_suffix(path) == ".mcap" else None
+    return (path, unpacked(path, _load(path), damage or Damage())) if log_suffix(path) == ".mcap" else None
 
 
 def _warn(damage: LogDamage) -> None:

@@ -95,15 +95,22 @@ def find_dbc(name: str, beside: Path | None = None) -> Path:
     raise InputError(f"{name}: no such DBC file beside {beside or 'the vehicle file'} or in dbc/{nearest(name, own)}")
 
 
+def empty_database() -> Database:
+    """A cantools database, to which DBC files are added."""
+    from gz_onboard.bus import _can  # noqa: F401 - before cantools, which would import it with asammdf and pandas
+
+    logging.getLogger("cantools").setLevel(logging.ERROR)  # its warnings are of what is an error here
+    from cantools.database.can import Database
+
+    return Database()
+
+
 def load_database(files: list[Path]) -> Database:
     """One cantools database out of several DBC files.
 
     InputError naming file and line for what is not a valid DBC file, and for messages that cannot be told apart.
     """
-    from cantools.database.can import Database
-
-    logging.getLogger("cantools").setLevel(logging.ERROR)  # its warnings are of what is an error here
-    database = Database()
+    database = empty_database()
     origin: dict[str, tuple[Path, str]] = {}  # by name and by identifier
     for file in files:
         text = _read_text(file)

@@ -178,6 +178,7 @@ def run(arguments: argparse.Namespace) -> int:
         )
     start_ns, end_ns = log_section(arguments.log, arguments.start, arguments.end)
     received_only = log_suffix(arguments.log) == ".mcap" and not arguments.all
+    read_frames(arguments.log)  # that it is missing comes before what is wrong with the bus
     names = [name for name in arguments.channel.split(",") if name]
     buses = _open_buses(arguments.interface, names)
     summary = Sent()
@@ -254,7 +255,7 @@ def _sender(bus: can.BusABC) -> Send:
 
 
 def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
-    from gz_onboard.bus._can import can, check_interface
+    from gz_onboard.bus._can import NO_SOCKETS, can, check_interface
 
     check_interface(interface)
     buses: list[can.BusABC] = []
@@ -265,8 +266,9 @@ def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
             for bus in buses:
                 bus.shutdown()
             there = sorted(name for _, name in socket.if_nameindex()) if interface == "socketcan" else []
+            why = NO_SOCKETS if getattr(error, "errno", None) == errno.EAFNOSUPPORT else error
             raise InputError(
-                f"--channel {name}: cannot be opened by {interface}: {error}{nearest(name, there)}"
+                f"--channel {name}: cannot be opened by {interface}: {why}{nearest(name, there)}"
             ) from None
     if not buses:
         raise InputError("--channel: no channel is named")

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from gz_onboard.bus.logs import logs_among
-from gz_onboard.errors import BAD_INPUT, OK, InputError
+from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
 from gz_onboard.events import Reason
 from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, Summary, estimate_log, known_vehicle
 from gz_onboard.lab.plot import reason_words
@@ -21,6 +21,7 @@ from gz_onboard.offline.results import clock, explain_keys, number, output_names
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
 from gz_onboard.progress import Progress, progress_bar
+from gz_onboard.vehicle import find_vehicle
 
 KEYS = descriptions(Summary)
 """What the summary of a ride holds."""
@@ -40,6 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard estimate``: `OK` if every log could be estimated, else `BAD_INPUT`."""
     tasks = _tasks(arguments)
+    written = [arguments.json, *(file for task in tasks for file in (task.log, task.picture))]
+    not_an_input(written, [*(task.path for task in tasks), find_vehicle(arguments.vehicle)])
     known_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
     with progress_bar(lambda: _frames(tasks), "frames", quiet=arguments.quiet) as display:
         results = _results(tasks, arguments.jobs, display.update)
@@ -116,7 +119,7 @@ def summary_text(ride: Summary) -> str:
     rows = [
         (
             "ride",
-            f"{clock(ride.duration_s)}, {ride.distance_km:.2f} km, "
+            f"{clock(ride.duration_s)}, {ride.distance_km:z.2f} km, "
             f"at most {number(ride.speed_max_km_h, '.0f', 'km/h')}",
         ),
         (

@@ -11,7 +11,6 @@ from math import sqrt
 from pathlib import Path
 from typing import Annotated, cast
 
-from gz_onboard.bus import _can  # noqa: F401 - before cantools, which would import it with asammdf and pandas
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import LogDamage, read_frames
 from gz_onboard.bus.publisher import Counts, Publisher
@@ -21,7 +20,7 @@ from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.results import times
-from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, range_publisher, reason_names
+from gz_onboard.pipeline import STATUS_TOPIC, TICK_NS, Pipeline, dbc_texts, range_publisher, reason_names
 from gz_onboard.progress import Progress
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -70,7 +69,9 @@ class Summary:
     distance_km: Annotated[float, "ridden"]
     speed_max_km_h: Annotated[float | None, "greatest speed, or null"]
     energy_wh: Annotated[
-        float | None, "drawn from the pack, less what was recovered; null if voltage or current was never known"
+        float | None,
+        "drawn from the pack, less what was recovered, the sensors' known gain and offsets taken off; "
+        "null if voltage or current was never known",
     ]
     energy_recovered_wh: Annotated[float | None, "charged into the pack while riding, or null"]
     consumption_wh_km: Annotated[float | None, "energy over distance; null below 0.1 km"]
@@ -224,6 +225,8 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> Summar
             feed(pipeline, _chained(batch, ours), progress)
             if not pipeline.codec.latest:
                 raise _unknown(task, vehicle, pipeline)
+            if tally.last:  # what came after the last whole second counts too
+                log.sample(STATUS_TOPIC, batch[0][0] + round(tally.last.time * 1e9), pipeline.status())
             log.close()
             task.part.replace(task.log)
         finally:

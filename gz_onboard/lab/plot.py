@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
+from itertools import pairwise
 from math import degrees, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus.logs import read_metadata, read_samples
+from gz_onboard.bus.logs import LogDamage, read_metadata, read_samples
 from gz_onboard.constants import WH_PER_KM
 from gz_onboard.errors import OK, InputError, writing
 from gz_onboard.events import Reason, State
@@ -31,7 +33,7 @@ from gz_onboard.offline.style import (
     time_unit,
 )
 from gz_onboard.options import add_shared
-from gz_onboard.pipeline import ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
+from gz_onboard.pipeline import DROPPING, ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -44,17 +46,20 @@ NAIVE_LENGTH = 25_000.0  # m: what usual displays average the consumption over
 NAIVE_FROM = 1_000.0  # m
 _STATES = {State.STARTING: "#9fb3c8", State.VALID: "#3f9d6b", State.DEGRADED: "#e8a33d", State.INVALID: "#c53030"}
 _NAN = float("nan")
+_HOLE = 3.0  # s: estimates further apart than this have a hole between them; they come at least once a second
 
 
-def read_ride(log: Path) -> tuple[list[Logged], list[int], Logged]:
+def read_ride(
+    log: Path, on_damage: Callable[[LogDamage], None] | None = None
+) -> tuple[list[Logged], list[int], Logged]:
     """(estimates, their times [ns], the last status) of one of our logs, whole or cut off.
 
-    Raises InputError if the log holds no estimates.
+    on_damage: is called if something could not be read. Raises InputError if the log holds no estimates.
     """
     rows: list[Logged] = []
     times: list[int] = []
     status: Logged = {}
-    for topic, time_ns, values in read_samples(log):
+    for topic, time_ns, values in read_samples(log, on_damage=on_damage):
         if topic == ESTIMATE_TOPIC:
             if _is_estimate(values):
                 rows.append(values)
@@ -107,8 +112,10 @@ def naive_range(rows: Sequence[Logged]) -> list[float | None]:
         voltage, current, time = row.get("pack_voltage"), row.get("pack_current"), row["time"]
         if voltage is not None and current is not None and before is not None and 0 < time - before <= 10:
             drawn += voltage * current * (time - before)
-        before = time
         distance = row.get("distance") or 0.0
+        if before is not None and time - before > 10:  # a hole, whose energy is not known
+            ridden = deque([(distance, drawn)])
+        before = time
         if distance > ridden[-1][0]:
             ridden.append((distance, drawn))
         while len(ridden) > 1 and distance - ridden[1][0] >= NAIVE_LENGTH:
@@ -119,17 +126,35 @@ def naive_range(rows: Sequence[Logged]) -> list[float | None]:
     return result
 
 
-def plot_log(log: Path, picture: Path, over: str = "time") -> None:
-    """Draw the ride in `log` into the PNG `picture`, over ``time`` or ``distance``. Raises InputError, OSError."""
-    rows, times, status = read_ride(log)
-    figure = draw(rows, times, status, _title(log, rows, times), over)
-    save(figure, picture)
+def plot_log(log: Path, picture: Path, over: str = "time") -> list[LogDamage]:
+    """Draw the ride in `log` into the PNG `picture`, over ``time`` or ``distance``; gives what could not be read.
+
+    Raises InputError, OSError.
+    """
+    damages: list[LogDamage] = []
+    rows, times, status = read_ride(log, damages.append)
+    title, about = _title(log, rows, times)
+    note = "damaged log  ·  " if damages else ""
+    save(draw(rows, times, status, (title, note + about), over), picture)
+    return damages
+
+
+def _with_holes(rows: Sequence[Logged]) -> list[Logged]:
+    """`rows` with an empty one in each hole of the log, through which no line is drawn."""
+    shown = list(rows[:1])
+    for before, row in pairwise(rows):
+        if row["time"] - before["time"] > _HOLE:
+            kept = {"time": before["time"], "distance": before["distance"], "state": "", "reasons": ""}
+            shown.append(dict.fromkeys(before) | kept)
+        shown.append(row)
+    return shown
 
 
 def draw(
     rows: Sequence[Logged], times: Sequence[int], status: Logged, title: tuple[str, str], over: str = "time"
 ) -> Figure:
     """The overview of a ride as a figure, over ``time`` or ``distance``."""
+    rows = _with_holes(rows)
     reasons = [reason for reason in Reason if any(str(reason.name) in row["reasons"].split() for row in rows)]
     strip = 0.34 + 0.17 * len(reasons)
     heights = [2.0, 1.3, 1.3, 1.0, 1.3, 1.3, strip]
@@ -259,10 +284,12 @@ def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Logged], reasons: Sequ
     axis.set_yticks(range(len(labels)), labels, fontsize=7)
     legend(axis)
     if status:
-        faults = sum(sum(places.values()) for places in status.get("faults", {}).values())
+        faults = {reason: sum(places.values()) for reason, places in status.get("faults", {}).items()}
+        dropped = sum(count for reason, count in faults.items() if reason in DROPPING)
         text = (
             f"{status.get('received', 0)} frames received, {sum(status.get('lost', {}).values())} lost, "
-            f"{faults} frames or signals dropped, {len(status.get('unknown', {}))} unknown identifiers"
+            f"{dropped} dropped, {len(status.get('unknown', {}))} unknown identifiers; "
+            f"{sum(faults.values()) - dropped} signals not available or implausible"
         )
         axis.annotate(
             text,
@@ -312,6 +339,7 @@ def run(arguments: argparse.Namespace) -> int:
     if picture.suffix.lower() != ".png":
         raise InputError(f"{picture}: the picture's name has to end in .png")
     with writing(picture):
-        plot_log(arguments.log, picture, arguments.over)
+        for damage in plot_log(arguments.log, picture, arguments.over):
+            print(f"gz-onboard plot: {damage}", file=sys.stderr)
     print(picture)
     return OK

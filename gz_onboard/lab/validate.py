@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gz_onboard.bus.logs import logs_among
-from gz_onboard.errors import BAD_INPUT, FAILED, OK, writing
+from gz_onboard.errors import BAD_INPUT, FAILED, OK, not_an_input, writing
 from gz_onboard.lab.validate_ride import log_size, validate_ride
 from gz_onboard.lab.validate_score import Means, PooledMeans, Ride, SimulationVerdict, pooled
 from gz_onboard.offline.processes import Task, collect, over_rides
@@ -22,9 +22,10 @@ from gz_onboard.offline.samples import ride_name
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
 from gz_onboard.progress import progress_bar
-from gz_onboard.vehicle import read_vehicle
+from gz_onboard.vehicle import find_vehicle, read_vehicle
 
 SUMMARY_VERSION = 1
+PAGE = "validation.html"
 KEYS = descriptions(SimulationVerdict) | descriptions(Ride)
 """What ``--json`` holds of a ride: {"version", "rides", "pooled": splits of all rides, "failed": [{file, error}]}."""
 
@@ -74,6 +75,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard validate``: `OK`; `BAD_INPUT` if a ride cannot be judged; `FAILED` if with --gate one fails."""
     tasks = _tasks(arguments)
+    written = [arguments.json, arguments.markdown, arguments.output / PAGE]
+    written += [task.output(".validation.png") for task in tasks]
+    not_an_input(written, [*(task.path for task in tasks), find_vehicle(arguments.vehicle)])
     read_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
     with writing(arguments.output):
         arguments.output.mkdir(parents=True, exist_ok=True)
@@ -95,11 +99,11 @@ def _write_tables(arguments: argparse.Namespace, rides: list[Ride], together: Po
     written = []
     with writing(arguments.output):
         if not arguments.no_plot:
-            written.append(arguments.output / "validation.html")
+            written.append(arguments.output / PAGE)
             write_report(written[-1], rides, together)
         if arguments.markdown:
             written.append(arguments.markdown)
-            arguments.markdown.write_text(markdown(rides, together), encoding="utf-8")
+            arguments.markdown.write_text(markdown(rides, together), encoding="utf-8", errors="replace")
     if arguments.json != "-" and written:
         print(f"written: {', '.join(map(str, written))}")
 

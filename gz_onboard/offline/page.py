@@ -46,6 +46,7 @@ def write_page(file: Path, title: str, body: Sequence[str]) -> None:
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{named}</title><style>{_STYLE}</style>'
         f"</head><body><h1>{named}</h1>\n{lines}\n</body></html>\n",
         encoding="utf-8",
+        errors="replace",
     )
 
 

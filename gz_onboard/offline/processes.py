@@ -5,11 +5,14 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
-from multiprocessing import Value
+from multiprocessing import Value, active_children, parent_process
+from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -54,7 +57,7 @@ def over_rides(
             yield task, _attempt(function, task, progress)
         return
     done = Value("d")
-    with ProcessPoolExecutor(jobs, initializer=_begin, initargs=(done,)) as pool:
+    with worker_pool(jobs, done) as pool:
         futures = [pool.submit(_attempt, function, task) for task in tasks]
         counted = 0.0
         for task, future in zip(tasks, futures, strict=True):
@@ -68,6 +71,23 @@ def over_rides(
             except BrokenProcessPool:
                 answer = InputError(f"{task.path}: the process was killed; is there enough memory? Try --jobs 1")
             yield task, answer
+
+
+@contextmanager
+def worker_pool(jobs: int, done: Any = None, context: BaseContext | None = None) -> Iterator[ProcessPoolExecutor]:
+    """A pool of processes that end with the context if it is left by an exception, and with this process.
+
+    done: a shared number, for functions that count their work. context: how they start.
+    """
+    others = set(active_children())
+    with ProcessPoolExecutor(jobs, context, _begin, (done,)) as pool:
+        try:
+            yield pool
+        except BaseException:  # Ctrl-C too, which reaches this process alone if it is sent to its number
+            for process in set(active_children()) - others:
+                process.terminate()
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def collect(
@@ -99,11 +119,18 @@ _done: Any = None  # work done by all processes of the pool
 
 
 def _begin(done: Any) -> None:
-    """In each process of the pool: Ctrl-C ends it without a word; the parent process reports it."""
+    """In each process of the pool: Ctrl-C ends it without a word, which the parent process reports; so does its end."""
     global _done  # noqa: PLW0603 - the only way into a process of the pool
     _done = done
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # as a shell has it that started us in the background
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    if parent := parent_process():
+        parent.join()
+        os._exit(1)
 
 
 def _count(work: float) -> None:

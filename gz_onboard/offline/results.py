@@ -48,7 +48,7 @@ def write_json(file: str | None, version: int | None, result: object) -> None:
         print(text)
         return
     with writing(file):
-        Path(file).write_text(text + "\n", encoding="utf-8")
+        Path(file).write_text(text + "\n", encoding="utf-8", errors="replace")
 
 
 # --- names of files -----------------------------------------------------------------------------------------------

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from gz_onboard.errors import writable
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -116,4 +118,4 @@ def time_unit(duration: float) -> tuple[float, str]:
 
 def headline(figure: Figure, x: float, y: float, text: str, size: float = 13) -> None:
     """The title, left, at a place in shares of the figure."""
-    figure.text(x, y, text, fontsize=size, fontweight="bold", color=INK, va="center")
+    figure.text(x, y, writable(text), fontsize=size, fontweight="bold", color=INK, va="center")

@@ -129,7 +129,8 @@ def read_cycle(file: Path | str) -> Cycle:
     step = min(after - before for before, after in pairwise(time))
     for row, (before, after) in enumerate(pairwise(time), start=1):
         if after - before > 1.1 * step:  # rounded times are even enough
-            raise columns.error(row, f"time_s: gap from {before:g} s to {after:g} s, other steps are {step:g} s")
+            gap = f"gap from {before:g} s to {after:g} s, other steps are {step:g} s; resample the cycle to even steps"
+            raise columns.error(row, f"time_s: {gap}")
     columns.check(column, 0.0, _MAX_SPEED / speeds[column], column.removeprefix("speed_"))
     return Cycle(
         file.stem,

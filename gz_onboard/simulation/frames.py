@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from gz_onboard.bus.checksum import sae_j1850_tables
 from gz_onboard.bus.export import out_suffix, write_frames_as
 from gz_onboard.bus.layout import raw_range
-from gz_onboard.errors import InputError
+from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import EFF_FLAG, Frame
 from gz_onboard.simulation.sensors import GPS_MESSAGES, ROLLER, SENSORS, TURNS, Sensor, latency, shaken, spread
 from gz_onboard.simulation.trace import Truth
@@ -108,9 +108,10 @@ def batches(sent: list[Sent]) -> Iterator[list[Frame]]:
 
 def check_output(out: Path) -> str:
     """The format of `out` by its suffix; InputError if frames cannot be written into it."""
-    suffix = out_suffix(out)
+    last = out.suffix.lower()
+    suffix = out_suffix(out) if last in (".gz", *FORMATS) else last
     if suffix not in FORMATS:
-        raise InputError(f"{out}: frames are written as {' '.join(FORMATS)}")
+        raise InputError(f"{out}: frames are written as {' '.join(FORMATS)}{nearest(suffix, FORMATS)}")
     return suffix
 
 

@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from gz_onboard.errors import writing
+from gz_onboard.errors import writable, writing
 from gz_onboard.offline.page import svg, write_page
 from gz_onboard.offline.style import save
 from gz_onboard.simulation.frames import Losses, simulate_frames, write_frames
@@ -49,7 +49,8 @@ def write(
 
 def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, scooter: Scooter) -> str:
     """Write the ride's frames; gives the file's name. InputError if it cannot be written."""
-    sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, losses=Losses(frames=arguments.frame_loss))
+    losses = Losses() if arguments.frame_loss is None else Losses(frames=arguments.frame_loss)
+    sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, losses=losses)
     with writing(arguments.frames):
         arguments.frames.parent.mkdir(parents=True, exist_ok=True)
         write_frames(arguments.frames, sent)
@@ -89,7 +90,9 @@ def write_series(result: Run, file: Path, metadata: dict[str, str]) -> None:
 
         columns = [pa.array(column, from_pandas=True) for column in result.series.values()]
         table = pa.table(columns, names=names)
-        pq.write_table(table.replace_schema_metadata(metadata), file)
+        named = {key: writable(text) for key, text in metadata.items()}
+        with file.open("wb") as binary:  # pyarrow opens no name that is not UTF-8
+            pq.write_table(table.replace_schema_metadata(named), binary)
         return
     rows = zip(*(column.tolist() for column in result.series.values()), strict=True)
     if file.suffix == ".csv":

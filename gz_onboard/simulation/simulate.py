@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard.constants import WH_PER_KM
-from gz_onboard.errors import OK, InputError
+from gz_onboard.errors import OK, InputError, not_an_input
 from gz_onboard.offline.results import explain_keys, times, write_json
 from gz_onboard.options import add_shared, number
 from gz_onboard.progress import Progress, progress_bar
@@ -29,7 +29,7 @@ from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION, Variant, cycle_range, summarise, summary_text
 from gz_onboard.simulation.sweep import Sweep, grid, read_sweep, redesigned
 from gz_onboard.simulation.trace import Trace
-from gz_onboard.vehicle import Vehicle, read_vehicle
+from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 _MOST_HOURS = 48.0  # of riding until empty
 
@@ -83,8 +83,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     frames = "write the ride as CAN frames of the vehicle's sensors: .blf .log .asc .trc .csv .mf4"
     add("--frames", type=Path, metavar="FILE", help=frames)
     add_shared(parser, "--seed", help="seed of the noise and losses of --frames (default: %(default)s)")
-    lost = "share of frames that the bus loses (default: %(default)g)"
-    _number(parser, "--frame-loss", 0.0, 1.0, default=Losses.frames, metavar="SHARE", help=lost)
+    lost = f"share of the --frames that the bus loses (default: {Losses.frames:g})"
+    _number(parser, "--frame-loss", 0.0, 1.0, metavar="SHARE", help=lost)
     add_shared(parser, "--quiet")
 
 
@@ -109,6 +109,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--sweep {sweeps[0].name}: given twice")
     if arguments.frames:
         check_output(arguments.frames)
+    elif arguments.frame_loss is not None:
+        raise InputError(f"--frame-loss {arguments.frame_loss:g}: is for --frames FILE")
+    not_an_input((arguments.frames, arguments.json), [Path(arguments.what), find_vehicle(arguments.vehicle)])
     plan = find_plan(arguments, vehicle)
     if arguments.chassis != "straight" and (plan.kind == "cycle" or isinstance(plan.road, Dynamometer)):
         where = "on a dynamometer" if isinstance(plan.road, Dynamometer) else "in a drive cycle"

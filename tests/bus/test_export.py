@@ -321,6 +321,16 @@ def test_estimates_in_parquet(tmp_path: Path, estimated: Path) -> None:
     assert table["state"].to_pylist() == ["VALID"] * 3
 
 
+def test_estimates_of_a_damaged_log_say_what_is_missing(
+    tmp_path: Path, estimated: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = estimated.read_bytes()
+    chunk = data.index(b"\x04\0\0\0zstd") - 28
+    estimated.write_bytes(data[: chunk + int.from_bytes(data[chunk - 8 : chunk], "little")])  # without its end
+    assert run(estimated, tmp_path / "out.csv") == 0
+    assert "damaged log: " in capsys.readouterr().out
+
+
 def test_estimates_beside_frames_are_asked_for(tmp_path: Path, log: Path) -> None:
     assert run(log, tmp_path / "out.csv", "--estimates") == 0
     with (tmp_path / "out.csv").open() as stream:
@@ -357,11 +367,32 @@ def test_a_log_without_dbc_files_asks_for_them(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("out", "said"),
-    [("out.bfl", "did you mean '.blf'"), ("out.blf.gz", "only .* can be written with .gz"), ("ride.mcap", "the log")],
+    [
+        ("out.bfl", "did you mean '.blf'"),
+        ("out.blf.gz", "only .* can be written with .gz"),
+        ("ride.mcap", "overwrite the input"),
+    ],
 )
 def test_outputs_that_cannot_be_written_are_named(tmp_path: Path, log: Path, out: str, said: str) -> None:
     with pytest.raises(InputError, match=said):
         run(log, tmp_path / out)
+
+
+@pytest.mark.parametrize("name", ["out.log", "out.log.gz", "out.blf", "out.parquet", "out.mcap"])
+def test_nothing_half_written_has_the_name(
+    tmp_path: Path, log: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / name).write_text("before")
+
+    def interrupted(*given: Any, **more: Any) -> Any:
+        yield from list(read_frames(*given, **more))[:2]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gz_onboard.bus.logs.read_frames", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(log, tmp_path / name)
+    assert (tmp_path / name).read_text() == "before"
+    assert {file.name for file in tmp_path.iterdir()} == {"ride.mcap", name}
 
 
 def test_a_missing_directory_is_named(tmp_path: Path, log: Path) -> None:

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import logging
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -312,6 +314,14 @@ def test_a_dbc_that_was_cut_anywhere_says_nothing_of_what_is_not_in_it(tmp_path)
         except InputError as error:
             assert str(error).startswith(f"{file}:")
             assert "CM_" not in str(error)
+
+
+def test_a_dbc_is_read_without_what_only_mf4_files_need():
+    """asammdf takes a second, in which its imports swallow Ctrl-C."""
+    code = "import sys; from gz_onboard.bus.mapping import *; load_database([find_dbc('vehicle.dbc')]); "
+    code += "print({'asammdf', 'pandas', 'sympy'} & sys.modules.keys())"
+    run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert run.stdout.strip() == "set()"
 
 
 def test_a_dbc_that_cannot_be_read(tmp_path):

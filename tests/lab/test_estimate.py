@@ -174,6 +174,18 @@ def test_a_broken_log_does_not_stop_the_others(tmp_path, frames, capsys, jobs):
     assert one == two
 
 
+def test_a_name_that_is_not_utf8_stops_nothing(tmp_path, frames, capsys):
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    names = [os.fsdecode(b"r\xfcde.log"), "whole.log"]
+    for name in names:
+        candump(folder / name, frames[:2000])
+    assert run(folder, "--output", tmp_path, "--jobs", 1, "--json", tmp_path / "s.json") == 0
+    assert len(json.loads((tmp_path / "s.json").read_text())["rides"]) == 2
+    assert "r?de.log" in capsys.readouterr().out
+    assert read_metadata(tmp_path / os.fsdecode(b"r\xfcde.estimate.mcap"))["source"] == "r?de.log"
+
+
 def test_a_cut_log_is_estimated_as_far_as_it_goes(tmp_path, capsys):
     cut = tmp_path / "cut.blf"
     cut.write_bytes(COASTDOWN.read_bytes()[:200_000])

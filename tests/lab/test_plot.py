@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import io
+import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from gz_onboard import cli
 from gz_onboard.bus.logfile import LogFile
+from gz_onboard.bus.logs import LogDamage
 from gz_onboard.errors import InputError
 from gz_onboard.events import Reason
 from gz_onboard.lab import plot
@@ -61,6 +63,19 @@ def test_the_panels_show_what_the_log_says(log):
     figure.savefig(io.BytesIO(), format="png", dpi=30)
 
 
+def test_the_picture_counts_what_the_summary_counts(tmp_path, capsys):
+    assert cli.main(["estimate", str(LOGS / "city_34C.blf"), "--output", str(tmp_path), "--no-plot", "--json"]) == 0
+    (ride,) = json.loads(capsys.readouterr().out)["rides"]
+    rows, times, status = plot.read_ride(tmp_path / "city_34C.estimate.mcap")
+    figure = plot.draw(rows, times, status, ("", ""))
+    (told,) = (t.get_text() for axis in figure.axes for t in axis.texts if "frames received" in t.get_text())
+    withheld = sum(sum(places.values()) for places in ride["faults"].values()) - ride["dropped"]
+    assert told == (
+        f"{ride['frames']} frames received, {ride['lost']} lost, {ride['dropped']} dropped, "
+        f"{ride['unknown']} unknown identifiers; {withheld} signals not available or implausible"
+    )
+
+
 def test_by_default_the_picture_is_beside_the_log(log, capsys):
     assert cli.main(["plot", str(log)]) == 0
     assert capsys.readouterr().out.strip() == str(log.with_suffix(".png"))
@@ -78,6 +93,57 @@ def test_a_cut_log_is_drawn_as_far_as_it_goes(tmp_path, log):
     assert 100 < len(rows) < len(everything)
     assert rows == everything[: len(rows)]
     assert cli.main(["plot", str(cut), str(tmp_path / "cut.png")]) == 0
+
+
+@pytest.fixture
+def holed(tmp_path):
+    """A log of 30 s whose second chunk of three, 10 s, is broken."""
+    path = tmp_path / "holed.mcap"
+    ranges = {"range": 5.0, "range_p10": 4.0, "range_p90": 6.0, "speed": 10.0}
+    file = LogFile(path.open("wb"), 0)
+    file.channel("/estimate", {})
+    for t in range(30):
+        row = {"time": float(t), "distance": 10.0 * t, "soc": 0.5, "soc_sd": 0.1, "state": "VALID", "reasons": ""}
+        file.sample("/estimate", t * 10**9, row | ranges)
+        if t % 10 == 9:
+            file.flush()
+    file.close()
+    data = bytearray(path.read_bytes())
+    places = [at for at in range(len(data)) if data.startswith(b"\4\0\0\0zstd", at)]
+    data[places[1] + 20] ^= 0xFF
+    path.write_bytes(data)
+    return path
+
+
+def test_nothing_is_drawn_through_a_hole_in_the_log(holed):
+    damages: list[LogDamage] = []
+    rows, times, status = plot.read_ride(holed, damages.append)
+    assert [row["time"] for row in rows] == [*range(10), *range(20, 30)]
+    assert "a chunk is broken" in damages[0].reason
+    figure = plot.draw(rows, times, status, ("", ""))
+    (speed,) = (line for axis in figure.axes for line in axis.get_lines() if line.get_label() == "speed")
+    x, y = np.asarray(speed.get_xdata()), np.asarray(speed.get_ydata())
+    assert np.isnan(y[(x[:-1] < 15).sum() - 1])  # the last point before the hole
+    assert np.isfinite(y).sum() == len(rows)
+    state: Any = figure.axes[6].collections[1].get_paths()  # one bar before the hole, one after
+    assert [(path.vertices[:, 0].min(), path.vertices[:, 0].max()) for path in state] == [(0, 9), (20, 29)]
+
+
+def test_what_is_missing_of_a_log_is_told(holed, tmp_path, capsys, monkeypatch):
+    titles: list[str] = []
+    real = plot.draw
+
+    def noted(*given: Any) -> Any:
+        titles.append(given[3][1])
+        return real(*given)
+
+    monkeypatch.setattr(plot, "draw", noted)
+    picture = tmp_path / "x.png"
+    assert cli.main(["plot", str(holed), str(picture)]) == 0
+    told = capsys.readouterr()
+    assert "holed.mcap: byte" in told.err and "a chunk is broken" in told.err
+    assert told.out.strip() == str(picture)
+    assert "damaged log" in titles[0]
 
 
 def test_what_cannot_be_drawn_is_told(tmp_path, log, capsys):
@@ -154,6 +220,14 @@ def test_the_naive_range_of_steady_riding_is_energy_over_consumption(speed, cons
             assert naive is None
         else:
             assert naive == pytest.approx(left / consumption)
+
+
+def test_the_naive_range_begins_anew_after_a_hole():
+    steady = {"pack_voltage": 50.0, "pack_current": 16.0, "energy_left": 8e6}
+    rows: list[plot.Logged] = [{"time": t, "distance": 10.0 * t, **steady} for t in range(900) if not 300 < t < 600]
+    naive = plot.naive_range(rows)
+    assert naive[301] is None
+    assert naive[-1] == pytest.approx(100_000)
 
 
 def test_the_naive_range_forgets_what_is_more_than_25_km_ago():

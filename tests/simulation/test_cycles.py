@@ -138,7 +138,7 @@ def test_own_cycle_may_have_rounded_times(tmp_path):
         ("time_s,speed_mps\n0,0\n1,120\n", r":3: speed_mps: 120 mps is outside 0 to 100 mps"),
         ("time_s,speed_kmh\n0,0\n1,1\n1,2\n", r":4: time_s: 1 s does not increase \(before: 1\)"),
         ("time_s,speed_kmh\n0,0\n2,1\n1,2\n", r":4: time_s: 1 s does not increase \(before: 2\)"),
-        ("time_s,speed_kmh\n0,0\n1,1\n\n4,2\n5,2\n", r":5: time_s: gap from 1 s to 4 s, other steps are 1 s"),
+        ("time_s,speed_kmh\n0,0\n1,1\n\n4,2\n5,2\n", r":5: time_s: gap from 1 s to 4 s, other steps are 1 s; resample"),
         ("time_s,speed_kmh\n0,0\n1.5,1\n2.5,2\n", r":3: time_s: gap from 0 s to 1\.5 s"),
     ],
 )

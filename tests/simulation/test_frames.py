@@ -279,8 +279,10 @@ def test_a_vehicle_whose_bus_cannot_carry_them_is_refused(tmp_path):
     [
         (["--frames", "ride.blff"], ".blf"),
         (["--frames", "ride.parquet"], "frames are written as"),
+        (["--frames", "ride.bfl"], "frames are written as .blf .log .asc .trc .csv .mf4 (did you mean '.blf'?)"),
         (["--frames", "ride.blf", "--seed", "-1"], "--seed"),
         (["--frames", "ride.blf", "--frame-loss", "2"], "--frame-loss"),
+        (["--frame-loss", "0.2"], "--frame-loss 0.2: is for --frames FILE"),
     ],
 )
 def test_what_cannot_be_put_out_is_refused(arguments, word, capsys):

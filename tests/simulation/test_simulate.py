@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from pathlib import Path
 
 import pyarrow.parquet as pq
@@ -70,6 +71,13 @@ def test_the_summary_has_its_keys_and_adds_up(short, tmp_path, capsys):
     assert found["consumption_wh_km"] == pytest.approx(found["energy_wh"] / found["distance_km"])
     assert found["kind"] == "cycle"
     assert found["files"] == [str(tmp_path / "short.simulation.parquet")]
+
+
+def test_a_name_that_is_not_utf8(short, tmp_path, capsys):
+    odd = short.rename(tmp_path / os.fsdecode(b"k\xfcrz.csv"))
+    assert simulate(odd, "--output", tmp_path) == 0
+    assert "k?rz.csv" in capsys.readouterr().out
+    assert (tmp_path / os.fsdecode(b"k\xfcrz.simulation.parquet")).exists()
 
 
 def test_same_series_in_each_format(short, tmp_path):

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.bus.logs import logs_among
-from gz_onboard.errors import OK, InputError, nearest, writing
+from gz_onboard.errors import OK, InputError, nearest, not_an_input, writing
 from gz_onboard.lab.calibrate import manifest, report
 from gz_onboard.lab.calibrate.manifest import Option, Step, check_count
 from gz_onboard.lab.calibrate.procedures import PROCEDURES, Given, Procedure
@@ -140,6 +140,11 @@ def run(arguments: argparse.Namespace) -> int:
     for file in (arguments.output, arguments.report, arguments.json):
         if file is not None and str(file) != "-" and not Path(file).parent.is_dir():
             raise InputError(f"{file}: there is no folder {Path(file).parent}")
+    if arguments.output and arguments.output.suffix != ".toml":
+        raise InputError(f"--output {arguments.output}: a vehicle file is a .toml")
+    read = [file for step in steps for files in step.files.values() for file in files]
+    named = [base, *arguments.data, *(folder / manifest.NAME for folder in arguments.data)]
+    not_an_input((arguments.output, arguments.report, arguments.json), [*read, *named])
     total = sum(len(files) for step in steps for files in step.files.values()) + len(steps)
     with progress_bar(lambda: total, "steps", quiet=arguments.quiet) as display:
         results, seconds = calibrate(steps, base, lambda text: display.step(text, 1))

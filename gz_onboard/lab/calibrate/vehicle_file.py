@@ -29,7 +29,7 @@ def write_vehicle(base: Path, results: Sequence[Result], out: Path) -> None:
     if base.resolve().parent != out.resolve().parent:
         text = with_keys(text, copied_effects(read_vehicle(base).model.effects, out), out)
     temporary = out.with_name(out.name + ".new")
-    temporary.write_text(text, encoding="utf-8")
+    temporary.write_text(text, encoding="utf-8", errors="replace")
     temporary.replace(out)
 
 

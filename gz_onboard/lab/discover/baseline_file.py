@@ -49,7 +49,7 @@ def write_baseline(vehicle: Vehicle, base: Path, out: Path) -> None:
 def write_whole(out: Path, text: str) -> None:
     """Write the file whole or not at all."""
     temporary = out.with_name(out.name + ".new")
-    temporary.write_text(text, encoding="utf-8")
+    temporary.write_text(text, encoding="utf-8", errors="replace")
     temporary.replace(out)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gz_onboard.bus.logs import log_suffix, logs_among
-from gz_onboard.errors import InputError, nearest, writing
+from gz_onboard.errors import InputError, nearest, not_an_input, writing
 from gz_onboard.lab.discover.baseline import baseline
 from gz_onboard.lab.discover.baseline_file import write_baseline
 from gz_onboard.lab.discover.breakdown import outlying_rides
@@ -135,6 +135,7 @@ def _check(arguments: argparse.Namespace, logs: Sequence[Path]) -> None:
         file = getattr(arguments, option)
         if file and str(file) != "-" and not Path(file).resolve().parent.is_dir():
             raise InputError(f"--{option.replace('_', '-')} {file}: no folder {Path(file).parent}")
+    not_an_input((getattr(arguments, option) for option in ("baseline", "write_model", "report", "json")), [own, *logs])
     names = [ride_name(log) for log in logs]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise InputError(f"two rides are called {twice[0]}: rides are told apart by their names; rename one")

@@ -46,9 +46,11 @@ def measure_gain(found: Discovery, seed: int, apart: Sequence[LinearRide] = ()) 
 
 
 def summarised(rows: Sequence[Triple], rng: np.random.Generator) -> Errors:
-    """The means over rides, and the interval of what is saved by a bootstrap over them."""
+    """The means over rides, and the interval of what is saved by a bootstrap over them; None for one."""
     table = np.array(rows)
     before, control, after = table.mean(axis=0).tolist()
+    if len(table) < 2:
+        return Errors(before, control, after, None)
     draws = rng.integers(0, len(table), (DRAWS, len(table)))
     saved = (table[:, 1] - table[:, 2])[draws].mean(axis=1)
     return Errors(before, control, after, (float(np.quantile(saved, 0.025)), float(np.quantile(saved, 0.975))))

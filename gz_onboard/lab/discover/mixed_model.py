@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -47,6 +46,7 @@ from gz_onboard.lab.discover.prior import (
 )
 from gz_onboard.lab.discover.residuals import counted_soc
 from gz_onboard.lab.discover.system import System
+from gz_onboard.offline.processes import worker_pool
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import Effect, Parameter
 from gz_onboard.physics.parameters import declared_parameters
@@ -292,5 +292,5 @@ def linearise_all(
     jobs = list(zip(rides, states, strict=True))
     if workers < 2 or len(rides) < 2:
         return [_linearised(job) for job in jobs]
-    with ProcessPoolExecutor(workers) as pool:
+    with worker_pool(workers) as pool:
         return list(pool.map(_linearised, jobs))

@@ -17,7 +17,7 @@ from gz_onboard.lab.discover.detectability import extent
 from gz_onboard.lab.discover.energy import residual_sizes
 from gz_onboard.lab.discover.linear import LinearRide
 from gz_onboard.lab.discover.plots import curve, overview, panels, ranking
-from gz_onboard.lab.discover.result import METRICS, VERDICTS, Report
+from gz_onboard.lab.discover.result import METRICS, NO_INTERVAL, VERDICTS, Report
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import readable, with_unit
 from gz_onboard.offline.page import html_table, write_page
@@ -222,9 +222,9 @@ def _gain(report: Report) -> str:
     rows = []
     for metric, errors in report.gain.errors.items():
         label, factor, unit = METRICS[metric]
-        low, high = (x * factor for x in errors.ci95)
+        ci95 = NO_INTERVAL if errors.ci95 is None else "{:+.3g} to {:+.3g}".format(*(x * factor for x in errors.ci95))
         values = [f"{x * factor:.3g}" for x in (errors.before, errors.control, errors.after)]
-        rows.append([f"{label} [{unit}]", *values, f"{low:+.3g} to {high:+.3g}"])
+        rows.append([f"{label} [{unit}]", *values, ci95])
     if not rows:
         return f"<p>{html.escape(report.gain.note or 'nothing was held out')}</p>"
     heads = ["error", "before", "control", "after", "gain over control, 95 % over rides"]

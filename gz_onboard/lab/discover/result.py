@@ -23,6 +23,7 @@ METRICS = {
 """Of the gain: label, factor and unit."""
 RIDES = "ride"  # the quantity of what differs from ride to ride
 Interval = tuple[float, float]
+NO_INTERVAL = "one ride: no interval"
 
 
 @dataclass(frozen=True)
@@ -103,12 +104,15 @@ class ResidualSize:
 
 @dataclass(frozen=True)
 class Errors:
-    """On rides held out: before, with the present parameters refitted, after; ci95: of control less after."""
+    """On rides held out: before, with the present parameters refitted, after; ci95: of control less after.
+
+    ci95: None for one ride, which says nothing of the spread of rides.
+    """
 
     before: float
     control: float
     after: float
-    ci95: Interval
+    ci95: Interval | None
 
 
 @dataclass(frozen=True)

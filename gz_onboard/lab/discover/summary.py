@@ -10,7 +10,7 @@ from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.detectability import extent
 from gz_onboard.lab.discover.energy import residual_sizes
-from gz_onboard.lab.discover.result import METRICS, VERDICTS, Gain, Limit, Report
+from gz_onboard.lab.discover.result import METRICS, NO_INTERVAL, VERDICTS, Gain, Limit, Report
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import readable, with_unit
 from gz_onboard.offline.results import clock
@@ -118,11 +118,10 @@ def _gain(gain: Gain) -> list[str]:
     lines = []
     for metric, errors in gain.errors.items():
         label, factor, unit = METRICS[metric]
-        values = (errors.before, errors.control, errors.after, *errors.ci95)
-        before, control, after, low, high = (x * factor for x in values)
+        before, control, after = (x * factor for x in (errors.before, errors.control, errors.after))
+        ci95 = "gain {:+.2g} to {:+.2g}".format(*(x * factor for x in errors.ci95)) if errors.ci95 else NO_INTERVAL
         lines.append(
-            f"{label:18} {before:6.3g} before, {control:6.3g} refitted, {after:6.3g} extended  {unit:6} "
-            f"(gain {low:+.2g} to {high:+.2g})"
+            f"{label:18} {before:6.3g} before, {control:6.3g} refitted, {after:6.3g} extended  {unit:6} ({ci95})"
         )
     if not lines:
         return [f"held out     {gain.note or 'nothing'}"]

@@ -23,10 +23,12 @@ from gz_onboard.lab.discover.breakdown import (
 )
 from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.detectability import implausible_rides, limits, missing_residuals, remaining_range_error
+from gz_onboard.lab.discover.gain import summarised
 from gz_onboard.lab.discover.linear import normal
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
 from gz_onboard.lab.discover.page import body
 from gz_onboard.lab.discover.result import Cause, Errors, Gain, Isolability, Report, ResidualSize, Score, Unknown
+from gz_onboard.lab.discover.summary import summary
 from gz_onboard.lab.discover.uncalibrated import prior_of_file
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.offline.samples import Samples, read_samples
@@ -178,6 +180,16 @@ def test_a_range_that_is_still_missed_is_said(found: Discovery):
     assert "9% of the range is missed" in said
     assert remaining_range_error(replace(found.report, gain=Gain(range=replace(errors, after=0.02)))) == []
     assert remaining_range_error(replace(found.report, gain=Gain(note="one ride: nothing to hold out"))) == []
+
+
+def test_one_ride_held_out_has_no_interval(found: Discovery):
+    rng = np.random.default_rng(0)
+    errors = summarised([(9.0, 8.0, 7.0)], rng)
+    assert errors == Errors(9.0, 8.0, 7.0, None)
+    assert summarised([(9.0, 8.0, 7.0), (9.0, 8.0, 6.0)], rng).ci95 == (1.0, 2.0)
+    report = replace(found.report, gain=Gain(("a",), power=errors))
+    for text in body(replace(found, report=report)), summary(replace(found, report=report)):
+        assert "one ride: no interval" in text
 
 
 def test_what_one_ride_alone_shows_is_said(found: Discovery):
