@@ -163,8 +163,9 @@ class Estimator:
         reading = self._sources.read(now, dt, self.road.speed, evidence)
         self.soc.doubt(now, reading.voltage_doubted)
         speed = self.road.speed
-        # At standstill a pack of which nothing is measured may be charged.
-        if reading.current is None and speed is not None and (reading.voltage or abs(speed) > MOVING):
+        # At standstill a pack of which nothing is measured may be charged; over a pause there is no acceleration.
+        rides = speed is not None and abs(speed) > MOVING and dt < self._timing.pause
+        if reading.current is None and speed is not None and (reading.voltage or rides):
             voltage = reading.voltage or self.soc.rest_voltage
             return replace(reading, current=self._present.power(now) / voltage, source=CurrentSource.MODEL)
         return reading

@@ -203,8 +203,8 @@ class StateOfCharge:
         counted = (
             pack.reading.source if sampled <= SLOWEST else CurrentSource.NONE
         )  # beyond, most that flows is not seen
-        checked, apart = self._signals.inverter_current.fresh(now), pack.reading.current_apart
-        q = self._charge.counted(min(dt, pause), mean * dt / charge, charge, CURRENT_ERRORS[counted], checked, apart)
+        error, apart = CURRENT_ERRORS[counted], pack.reading.current_apart
+        q = self._charge.counted(min(dt, pause), mean * dt / charge, charge, error, apart)
         q += self._charge.between_samples(dt, sampled)
         if dt > pause or (counted is CurrentSource.NONE and unmeasured(pack.reading)):
             q += self._charge.of_pause(dt, sqrt(filter_.covariance[0]))

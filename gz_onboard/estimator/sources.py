@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, replace
 from enum import Enum, auto
-from math import hypot, isinf
+from math import hypot, inf, isinf
 
 from gz_onboard.estimator.redundancy.currents import CellEvidence
 from gz_onboard.estimator.redundancy.electric import Readings
@@ -39,7 +39,7 @@ class PackReading:
     source: CurrentSource = CurrentSource.NONE
     reported_current: float | None = None  # A, trusted or not
     voltage_sd: float = 0.0  # V of a cell
-    current_apart: float = 0.0  # A: by so much the two currents differ in the mean
+    current_apart: float | None = None  # A: by so much the two currents differ in the mean; None: only one is known
     voltage_doubted: bool = False  # the two voltages differ, or one of them is faulty
 
 
@@ -57,6 +57,7 @@ class PackSources:
         self._mismatch = MISMATCH * battery.pack_capacity(BENCH_TEMPERATURE)  # A
         self._difference = 0.0  # A, low-passed
         self._apart = 0.0  # A, the same over `APART_TIME`
+        self._compared = -inf  # s: when they were compared last
 
     @property
     def currents_differ(self) -> bool:
@@ -98,7 +99,7 @@ class PackSources:
             source,
             readings.through_inverter if readings.pack is None else readings.pack,
             hypot(self._voltage_sd, voltages.apart, voltages.spread),
-            self._apart,
+            self._apart if now - self._compared < APART_TIME and signals.inverter_current.fresh(now) else None,
             bool(voltages.apart or any(counter.faulty for counter in voltages.counters.values())),
         )
 
@@ -117,6 +118,7 @@ class PackSources:
             if together and not readings.charging:
                 self._difference += MISMATCH_SHARE * (pack - inverter - self._difference)
                 self._apart += min(dt / APART_TIME, 1.0) * (pack - inverter - self._apart)
+                self._compared = signals.pack_current.time
             if currents.disputed:
                 return (pack + inverter) / 2, CurrentSource.DISPUTED
         if pack is not None and signals.pack_current.trusted:

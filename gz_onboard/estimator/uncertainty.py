@@ -47,15 +47,13 @@ class ChargeUncertainty:
         self._charge_sd = sqrt((p.sd("cell_capacity") / p["cell_capacity"]) ** 2 + p.sd("pack_current_gain") ** 2)
         self._unseen = 0.0  # of SOC: sd that the pauses left
 
-    def counted(
-        self, dt: float, flowed: float, charge: float, error: CurrentError, checked: bool, apart: float
-    ) -> float:
+    def counted(self, dt: float, flowed: float, charge: float, error: CurrentError, apart: float | None) -> float:
         """Variance after `dt` [s] in which a share `flowed` of the capacity `charge` [A·s] was counted.
 
-        checked: a second sensor confirms the first, but for what they are `apart` in the mean [A].
+        apart: a second sensor confirms the first, but for what they differ in the mean [A]; None: there is none.
         """
-        unchecked = 0.0 if checked else UNCHECKED_SD
-        sd = sqrt(self._offset_sd**2 + apart**2 + (error.sd**2 + unchecked**2) * self._rated**2)
+        checked = UNCHECKED_SD * self._rated if apart is None else apart
+        sd = sqrt(self._offset_sd**2 + checked**2 + (error.sd * self._rated) ** 2)
         return (sd / charge) ** 2 * 2 * error.time * dt + self._charge_sd**2 * abs(flowed)
 
     @staticmethod

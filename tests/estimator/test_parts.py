@@ -78,7 +78,7 @@ def test_errors_of_currents_go_with_the_size_of_the_pack():
         battery = replace(BATTERY, cells_parallel=parallel)
         charge = 3600 * battery.pack_capacity(25.0)
         uncertainty = ChargeUncertainty(battery, VEHICLE.parameters)
-        variances.append(uncertainty.counted(60.0, 0.0, charge, CURRENT_ERRORS[CurrentSource.NONE], True, 0.0))
+        variances.append(uncertainty.counted(60.0, 0.0, charge, CURRENT_ERRORS[CurrentSource.NONE], 0.0))
     assert variances[1] == pytest.approx(variances[0], rel=1e-4)
     assert variances[0] ** 0.5 == pytest.approx(15.0 / 32.8 / 60 * 2**0.5, rel=1e-3)
 
@@ -86,7 +86,7 @@ def test_errors_of_currents_go_with_the_size_of_the_pack():
 def test_two_currents_that_differ_confirm_each_other_to_no_better():
     battery, charge = BATTERY, 3600 * BATTERY.pack_capacity(25.0)
     uncertainty = ChargeUncertainty(battery, VEHICLE.parameters)
-    sd = uncertainty.counted(3600.0, 0.0, charge, CURRENT_ERRORS[CurrentSource.PACK], True, 2.5) ** 0.5
+    sd = uncertainty.counted(3600.0, 0.0, charge, CURRENT_ERRORS[CurrentSource.PACK], 2.5) ** 0.5
     assert sd > 2.5 * 3600 / charge, "as if it were an offset of that"
 
 
