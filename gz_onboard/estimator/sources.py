@@ -99,9 +99,14 @@ class PackSources:
             source,
             readings.through_inverter if readings.pack is None else readings.pack,
             hypot(self._voltage_sd, voltages.apart, voltages.spread),
-            self._apart if now - self._compared < APART_TIME and signals.inverter_current.fresh(now) else None,
+            self._apart if self._confirmed(now) else None,
             bool(voltages.apart or any(counter.faulty for counter in voltages.counters.values())),
         )
+
+    def _confirmed(self, now: float) -> bool:
+        """Whether the two currents are believed, and were compared of late."""
+        both = self._signals.pack_current.fresh(now) and self._signals.inverter_current.fresh(now)
+        return both and now - self._compared < APART_TIME
 
     def _current(self, dt: float, readings: Readings, evidence: CellEvidence) -> tuple[float | None, CurrentSource]:
         """(pack current [A], where it comes from): None if no sensor is to be believed."""
@@ -117,8 +122,9 @@ class PackSources:
         if pack is not None and inverter is not None:
             if together and not readings.charging:
                 self._difference += MISMATCH_SHARE * (pack - inverter - self._difference)
-                self._apart += min(dt / APART_TIME, 1.0) * (pack - inverter - self._apart)
-                self._compared = signals.pack_current.time
+                if not distrusted:
+                    self._apart += min(dt / APART_TIME, 1.0) * (pack - inverter - self._apart)
+                    self._compared = signals.pack_current.time
             if currents.disputed:
                 return (pack + inverter) / 2, CurrentSource.DISPUTED
         if pack is not None and signals.pack_current.trusted:
