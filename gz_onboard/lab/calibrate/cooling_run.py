@@ -20,7 +20,7 @@ from gz_onboard.physics.model import total
 from gz_onboard.physics.sensors import road_speed, true_columns
 from gz_onboard.vehicle import Vehicle
 
-FIRST = 5  # periods whose mean voltage tells the state of charge at the start
+FIRST = 5  # periods whose mean voltage and current tell the state of charge at the start
 SHORTEST = 300.0  # s: less says nothing of time constants of minutes
 
 
@@ -151,7 +151,7 @@ def _means(time: Array, value: Array, grid: Array) -> Array:
 def _pack_heat(battery: Battery, mean: Array, square: Array, temperature: Array, voltage: Array) -> Array:
     """What the cells turn to heat [W] by mean and mean square of the pack's current; voltage: the pack's, all (n,)."""
     n, m = battery.cells_series, battery.cells_parallel
-    soc = battery.soc_at(float(voltage[:FIRST].mean()) / n)  # as if without load, which moves the heat capacity found
+    soc = battery.first_soc(*(float(column[:FIRST].mean()) for column in (voltage, mean, temperature)))
     heat, v1 = np.empty_like(mean), 0.0
     for k, (i, i2, t) in enumerate(
         zip((mean / m).tolist(), (square / m**2).tolist(), temperature.tolist(), strict=True)

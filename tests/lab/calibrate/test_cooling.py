@@ -214,6 +214,13 @@ def test_ride_run_takes_the_heat_of_the_vehicles_own_losses():
     cell = (24 - p["pack_current_offset"]) / p["pack_current_gain"] / 12
     settled = 168 * cell**2 * (VEHICLE.pack.r0.at(0.5, 25)[0] + VEHICLE.pack.r1.at(0.5, 25)[0])
     assert run.pack_heat[-1] == pytest.approx(settled, rel=0.2)
+    battery, temperature = VEHICLE.pack, 25.0  # nearly empty and under load, where the resistance depends most on SOC
+    r0 = battery.r0.at(0.1, temperature)[0]
+    columns["pack_voltage"] = (
+        fast,
+        np.full(len(fast), battery.pack_voltage(battery.ocv(0.1, temperature)[0] - r0 * cell, 24.0)),
+    )
+    assert ride_run(Samples("low", columns), VEHICLE).pack_heat[0] == pytest.approx(168 * cell**2 * r0, rel=0.02)
     with pytest.raises(InputError, match="steady: no motor_current"):
         ride_run(Samples("steady", {k: v for k, v in columns.items() if k != "motor_current"}), VEHICLE)
 
