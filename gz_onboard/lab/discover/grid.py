@@ -18,6 +18,7 @@ from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import air_density
 from gz_onboard.physics.vibration import Vibration
+from gz_onboard.vehicle import Vehicle
 
 STEP = 0.1  # s
 USUAL_DELAYS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}
@@ -38,19 +39,6 @@ CRAWL, MOST_STEERING = 1.0, 0.6  # m/s, rad: of slower riding the angle is noise
 ROUGH_PERIOD = 0.034  # s: samples further apart do not show what a road does to a wheel
 SHAKING = 2.0  # s, over which the suspension is as fast as the road is rough
 LONGEST = 60.0  # s since a brake was touched, or a current changed: what was longer ago is as good as never
-
-
-@dataclass(frozen=True)
-class Dimensions:
-    """Of a vehicle: radius of the driven wheel times the gear ratio [m], mass with payload [kg], torque constant of the
-    motor [N·m/A], wheelbase [m]; by how much later than the inverter's a role's values are sent [s].
-    """
-
-    radius: float
-    mass: float
-    torque_constant: float
-    wheelbase: float
-    delays: Mapping[str, float]
 
 
 @dataclass
@@ -133,8 +121,8 @@ def measured(times: Array, grid: Array) -> Mask:
     return np.asarray((gap < limit) & (grid > times[0] - limit) & (grid < times[-1] + limit))
 
 
-def read_ride(samples: Samples, vehicle: Dimensions) -> Ride:
-    """`samples` on the grid.
+def read_ride(samples: Samples, vehicle: Vehicle) -> Ride:
+    """`samples` on the grid, of `vehicle`.
 
     Raises InputError for a ride without motor speed or current, or shorter than a minute.
     """
@@ -146,17 +134,20 @@ def read_ride(samples: Samples, vehicle: Dimensions) -> Ride:
     if end - start < SHORTEST:
         raise InputError(f"ride {samples.name}: {end - start:.0f} s of motor speed and current; a minute is the least")
     grid = np.arange(start, end, STEP)
+    stated = vehicle.mapping
+    delays = USUAL_DELAYS | {s.role: stated.delays[s.message] for s in stated.sources if s.message in stated.delays}
     signals: dict[str, Array] = {}
     valid: dict[str, Mask] = {}
     for role, (times, values) in samples.columns.items():
         if len(times) < LEAST_SAMPLES:
             continue
-        at = grid + vehicle.delays.get(role, 0.0)
+        at = grid + delays.get(role, 0.0)
         turned = np.unwrap(values) if role == "gps_course" else values
         signals[role] = averaged(times, turned, at)
         valid[role] = measured(times, at)
-    ride = Ride(samples.name, grid - start, signals, valid, vehicle.radius, samples.rider_mass)
-    ride.quantities = _quantities(ride, vehicle)
+    p = vehicle.parameters
+    ride = Ride(samples.name, grid - start, signals, valid, p["wheel_radius"] * p["gear_ratio"], samples.rider_mass)
+    ride.quantities = _quantities(ride, p)
     ride.quantities["since_braking"] = since(ride.braking)
     wheels = [samples.columns[role] for role in SUSPENSION if role in samples.columns]
     if wheels and all(np.median(np.diff(times)) < ROUGH_PERIOD for times, _ in wheels):
@@ -207,7 +198,7 @@ def steering(speed: Array, lateral_acceleration: Array, wheelbase: float) -> Arr
     return np.asarray(np.clip(wheelbase * lateral_acceleration / fast**2, -MOST_STEERING, MOST_STEERING))
 
 
-def _quantities(ride: Ride, vehicle: Dimensions) -> dict[str, Array]:
+def _quantities(ride: Ride, p: Mapping[str, float]) -> dict[str, Array]:
     s = ride.signals
     n = len(ride.time)
     motor_speed = s["motor_speed"]
@@ -235,11 +226,11 @@ def _quantities(ride: Ride, vehicle: Dimensions) -> dict[str, Array]:
         "acceleration": acceleration,
         "grade": grade,
         "grade_cosine": np.asarray(np.sqrt(1 - np.clip(grade, -STEEPEST, STEEPEST) ** 2)),
-        "mass": np.full(n, vehicle.mass),
+        "mass": np.full(n, p["vehicle_mass"] + (p["payload_mass"] if ride.payload is None else ride.payload)),
         "air_density": np.full(n, density),
         "headwind": np.zeros(n),
         "lateral_acceleration": lateral,
-        "steering": steering(speed, lateral, vehicle.wheelbase),
+        "steering": steering(speed, lateral, p["wheelbase"]),
         "motor_speed": motor_speed,
         "motor_current": s["motor_current"],
         "motor_temperature": s.get("motor_temperature", ambient),
@@ -247,5 +238,5 @@ def _quantities(ride: Ride, vehicle: Dimensions) -> dict[str, Array]:
         "cell_temperature": temperature,
         "heading": np.asarray(np.mod(course, 2 * np.pi), dtype=np.float64),
         "time_moving": np.asarray(moved, dtype=np.float64),
-        "torque": vehicle.torque_constant * s["motor_current"],
+        "torque": p["torque_constant"] * s["motor_current"],
     }

@@ -14,7 +14,7 @@ from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.blocks import depends
 from gz_onboard.lab.discover.candidates import Candidate, candidates
 from gz_onboard.lab.discover.channels import CHANNELS
-from gz_onboard.lab.discover.grid import USUAL_DELAYS, Dimensions, Ride, read_ride
+from gz_onboard.lab.discover.grid import Ride, read_ride
 from gz_onboard.lab.discover.linear import (
     LinearRide,
     Noise,
@@ -166,13 +166,7 @@ class MixedModel:
 
     def ride(self, samples: Samples) -> Ride:
         """`samples` on the grid of this vehicle."""
-        p = self.vehicle.parameters
-        payload = samples.rider_mass if samples.rider_mass is not None else p["payload_mass"]
-        radius, mass = p["wheel_radius"] * p["gear_ratio"], p["vehicle_mass"] + payload
-        stated = self.vehicle.mapping
-        delays = {s.role: stated.delays[s.message] for s in stated.sources if s.message in stated.delays}
-        dimensions = Dimensions(radius, mass, p["torque_constant"], p["wheelbase"], USUAL_DELAYS | delays)
-        ride = read_ride(samples, dimensions)
+        ride = read_ride(samples, self.vehicle)
         if self.system.battery is not None and {"pack_voltage", "pack_current"} <= ride.have:
             ride.quantities["soc"] = counted_soc(ride, self.system)
         return ride

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, block_means
 from gz_onboard.constants import GRAVITY
 from gz_onboard.lab.discover.grid import STEP, Ride
 from gz_onboard.lab.discover.system import System, Values, summed
@@ -23,6 +23,7 @@ from gz_onboard.physics.effect import ROAD_LOAD, Port
 from gz_onboard.physics.effects import inertia
 from gz_onboard.physics.model import drag_torque
 from gz_onboard.physics.relaxation import decay_over, relaxation_over, relaxed
+from gz_onboard.physics.sensors import true_current, true_voltage
 
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
 DT = SLOW * STEP
@@ -49,12 +50,6 @@ WARMER = 10.0  # K of the stator above the air
 def colder(temperature: Array) -> Array:
     """How much colder than a warm day, in the nuisances' scale."""
     return (WARM - temperature) / COLDER
-
-
-def mean_over(values: Array, n: int) -> Array:
-    """Means over blocks of `n`, the rest at the end left out."""
-    blocks = len(values) // n
-    return np.asarray(values[: blocks * n].reshape(blocks, n).mean(axis=1))
 
 
 def moving(ride: Ride, p: Values, system: System) -> dict[str, Array]:
@@ -93,11 +88,6 @@ def motor_losses(ride: Ride, q: Mapping[str, Array], p: Values, system: System) 
     fed = [(effect, term) for effect, term in terms if "motor_current" in effect.quantities]
     drags = [(effect, term) for effect, term in terms if "motor_current" not in effect.quantities]
     return summed(fed), summed(drags)
-
-
-def current(ride: Ride, p: Values) -> Array:
-    """The pack's true current [A]."""
-    return np.asarray((ride.signals["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"])
 
 
 def road_force(ride: Ride, p: Values, system: System) -> Array:
@@ -140,7 +130,7 @@ def inverter_power(ride: Ride, p: Values, system: System) -> Array:
 def pack_balance(ride: Ride, p: Values, system: System) -> Array:
     """Pack current [A] less the auxiliaries', less the inverter's."""
     s = ride.signals
-    true = current(ride, p)
+    true = true_current(s["pack_current"], p)
     true = true + p["pack_inverter_lag"] * np.gradient(smooth3(true), STEP)
     # beside the auxiliary load there is what is drawn when nothing is: the inverter's own supply
     inverter = true - s["auxiliary_current"] - p["idle_current"]
@@ -166,14 +156,14 @@ def voltage_balance(ride: Ride, p: Values, system: System) -> Array:
     """Pack voltage [V] less the inverter's and the drop of the cable."""
     s = ride.signals
     inverter = s["inverter_voltage"] + p["cable_resistance"] * s["inverter_current"] - p["inverter_voltage_offset"]
-    return np.asarray(s["pack_voltage"] - p["pack_voltage_offset"] - inverter)
+    return np.asarray(true_voltage(s["pack_voltage"], p) - inverter)
 
 
 def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, Array]:
     """(terminal voltage of a cell by the circuit [V], the pack's current [A], SOC) at steps of `DT`."""
     battery = system.pack
-    cell = mean_over(current(ride, p), SLOW) / battery.cells_parallel
-    temperature = mean_over(ride.quantities["cell_temperature"], SLOW)
+    cell = block_means(true_current(ride.signals["pack_current"], p), SLOW) / battery.cells_parallel
+    temperature = block_means(ride.quantities["cell_temperature"], SLOW)
     cold = colder(temperature)
     capacity = p["cell_capacity"] * battery.capacity_share_over(temperature)
     taken = discharged(cell, DT, capacity)
@@ -191,7 +181,7 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, A
     extra: Any = p["drift"] * np.arange(len(cell)) * DT / DRIFT_TIME
     mid = relaxation_over(cell, np.full(len(cell), decay_over(DT, MID)), before=True)
     extra = extra + p["mid_resistance"] * mid
-    q = {name: mean_over(value, SLOW) for name, value in ride.quantities.items()}
+    q = {name: block_means(value, SLOW) for name, value in ride.quantities.items()}
     q |= {"cell_current": cell, "soc": soc, "cell_temperature": temperature, "cell_capacity": capacity}
     extra = extra + summed(system.terms(q, p, DT, Port.CELL_VOLTAGE))
     rest = battery.ocv_over(soc, temperature) + p["ocv_offset"] + p["ocv_tilt"] * (soc - MIDDLE) + p["ocv_cold"] * cold
@@ -218,7 +208,7 @@ def cell_voltage(ride: Ride, p: Values, system: System) -> Array:
     """Voltage [V] of a mean cell less that of its circuit at the current measured, at steps of `DT`."""
     battery = replace(system.pack, series_resistance=p["pack_series_resistance"])
     volts, amperes, _ = cell_circuit(ride, p, system)
-    measured = mean_over(ride.signals["pack_voltage"], SLOW) - p["pack_voltage_offset"]
+    measured = true_voltage(block_means(ride.signals["pack_voltage"], SLOW), p)
     return np.asarray(battery.cell_voltage(measured, amperes) - volts)
 
 
@@ -226,7 +216,7 @@ def voltage_timing(ride: Ride, p: Values, system: System) -> Array:
     """Steps [V] of a mean cell from one grid step to the next, less those of the current by its resistance."""
     battery = system.pack
     late = p.get("pack_voltage_latency", 0.0)
-    amperes = current(ride, p)
+    amperes = true_current(ride.signals["pack_current"], p)
     if late:
         amperes = np.interp(ride.time - late, ride.time, amperes)
     soc = np.full(len(ride.time), start_soc(ride, system))
@@ -272,44 +262,42 @@ def _heat(ride: Ride, p: Values, system: System) -> tuple[Array, Array]:
     electric, drag = motor_losses(ride, q, p, system)
     inverter = summed(system.terms(q, p, STEP, Port.INVERTER_LOSS))
     n = len(ride.time)
-    return mean_over(np.broadcast_to(electric + drag, n), SLOW), mean_over(np.broadcast_to(inverter, n), SLOW)
+    return block_means(np.broadcast_to(electric + drag, n), SLOW), block_means(np.broadcast_to(inverter, n), SLOW)
 
 
-def _cooled(ride: Ride, p: Values, network: Network, watts: Array, airflow: str) -> Array:
-    """What `network` leaves [K] of its sensor at steps of `DT`; airflow: how much more moving air cools."""
-    flow = 1 + p[airflow] * np.abs(mean_over(ride.quantities["speed"], SLOW)) / WIND
+def _warmed(ride: Ride, p: Values, sensor: str, network: Network, watts: Array, airflow: str) -> Array:
+    """What `network`, heated by `watts`, leaves [K] of its `sensor`; airflow: how much more moving air cools."""
+    flow = 1 + p[airflow] * np.abs(block_means(ride.quantities["speed"], SLOW)) / WIND
     air = p.get("cooling_factor", 1.0) * np.maximum(flow, LEAST_COOLING)
-    ambient = mean_over(ride.quantities["ambient_temperature"], SLOW)
-    return np.array(temperatures(network, DT, watts.tolist(), ambient.tolist(), air.tolist()))
+    ambient = block_means(ride.quantities["ambient_temperature"], SLOW)
+    modelled: Array = np.array(temperatures(network, DT, watts.tolist(), ambient.tolist(), air.tolist()))
+    return block_means(ride.signals[sensor], SLOW) - modelled
 
 
 def _first(ride: Ride, sensor: str) -> float:
-    return float(mean_over(ride.signals[sensor], SLOW)[:FIRST].mean())
+    return float(block_means(ride.signals[sensor], SLOW)[:FIRST].mean())
 
 
 def motor_temperature(ride: Ride, p: Values, system: System) -> Array:
     """The stator's temperature [K] less that of the cooling network at the modelled loss, at steps of `DT`."""
     stator = _first(ride, "motor_temperature") + p["motor_start"]
-    ambient = float(mean_over(ride.quantities["ambient_temperature"], SLOW)[0])
+    ambient = float(block_means(ride.quantities["ambient_temperature"], SLOW)[0])
     network = MotorCooling.of(p, stator, stator + p["rotor_start"] * (stator - ambient) / WARMER)
-    modelled = _cooled(ride, p, network, _heat(ride, p, system)[0], "motor_airflow")
-    return np.asarray(mean_over(ride.signals["motor_temperature"], SLOW) - modelled)
+    return _warmed(ride, p, "motor_temperature", network, _heat(ride, p, system)[0], "motor_airflow")
 
 
 def inverter_temperature(ride: Ride, p: Values, system: System) -> Array:
     """The board's temperature [K] less that of the cooling network at the modelled loss, at steps of `DT`."""
     board = _first(ride, "inverter_temperature") + p["inverter_start"]
     network = InverterCooling.of(p, board, board + p["box_start"])
-    modelled = _cooled(ride, p, network, _heat(ride, p, system)[1], "inverter_airflow")
-    return np.asarray(mean_over(ride.signals["inverter_temperature"], SLOW) - modelled)
+    return _warmed(ride, p, "inverter_temperature", network, _heat(ride, p, system)[1], "inverter_airflow")
 
 
 def cell_temperature(ride: Ride, p: Values, system: System) -> Array:
     """The cells' temperature [K] less that of the lump at the circuit's heat, at steps of `DT`."""
     battery = system.pack
     volts, amperes, soc = cell_circuit(ride, p, system)
-    rest = battery.ocv_over(soc, mean_over(ride.quantities["cell_temperature"], SLOW))
+    rest = battery.ocv_over(soc, block_means(ride.quantities["cell_temperature"], SLOW))
     watts = battery.cells_series * heat(rest, volts, amperes)
     network = LumpedCooling.of(p, "pack", _first(ride, "cell_temperature") + p["cells_start"])
-    modelled = _cooled(ride, p, network, watts, "pack_airflow")
-    return np.asarray(mean_over(ride.signals["cell_temperature"], SLOW) - modelled)
+    return _warmed(ride, p, "cell_temperature", network, watts, "pack_airflow")
