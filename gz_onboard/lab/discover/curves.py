@@ -55,22 +55,23 @@ class CurveFit:
         return d @ self.values, np.sqrt(np.abs(np.diag(d @ self.covariance @ d.T)))
 
 
+def visits(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
+    """The sum of squared weights of each ride's blocks at each knot, (rides that have it, knots)."""
+    columns = (columns_of(line, form) for line in linears)
+    rows = [(knots**2).sum(axis=0) for knots in columns if knots is not None]
+    return np.array(rows).reshape(-1, len(form.knots))
+
+
 def supported_knots(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
     """The coefficients of `form` that these rides determine, (k, free): a knot that less than `ENOUGH` of two rides is
     at goes with the nearest that has it, so that no curve bends where hardly anything was measured.
     """
-    k = form.basis.shape[1]
     if form.straight:
         return np.eye(1)
-    at = np.zeros(k)
-    for line in linears:
-        knots = columns_of(line, form)
-        if knots is not None:
-            at += (knots**2).sum(axis=0) >= ENOUGH
-    good = np.flatnonzero(at >= min(2, len(linears)))
+    good = np.flatnonzero((visits(form, linears) >= ENOUGH).sum(axis=0) >= min(2, len(linears)))
     if not len(good):
-        return np.zeros((k, 0))
-    nearest = np.abs(np.arange(k)[:, None] - good).argmin(axis=1)
+        return np.zeros((len(form.knots), 0))
+    nearest = np.abs(np.arange(len(form.knots))[:, None] - good).argmin(axis=1)
     return np.asarray(np.eye(len(good))[nearest])
 
 
@@ -87,10 +88,8 @@ def fit_curve(
     own: with the scatter of its coefficients that these rides show, where it is more than `CurveForm.scatter`.
     """
     free = supported_knots(form, linears)
-    if not free.shape[1]:
-        return None
     rides = _with_columns(mixed, linears, normals, form)
-    if not rides:
+    if not rides or not free.shape[1]:
         return None
     p = len(mixed.mean)
     k = len(rides[0].b) - p
@@ -107,10 +106,9 @@ def fit_curve(
     score = free.T @ score
     estimate = np.linalg.solve(inner, score)
     at = form.basis @ free * form.size
-    visits = _visits(form, linears)
-    return CurveFit(
-        float(score @ estimate), free.shape[1], at @ estimate, at @ np.linalg.inv(inner) @ at.T, visits / np.sum(visits)
-    )
+    visited = visits(form, linears).sum(axis=0)
+    weights = visited / np.sum(visited)
+    return CurveFit(float(score @ estimate), free.shape[1], at @ estimate, at @ np.linalg.inv(inner) @ at.T, weights)
 
 
 def bordered(mixed: MixedModel, form: CurveForm, covariance: Array) -> tuple[Array, Array, Array]:
@@ -128,15 +126,6 @@ def _with_columns(
     """The normal equations of the rides that have `form`, with its columns."""
     every = (extended(line, normal, form, mixed.noise) for line, normal in zip(linears, normals, strict=True))
     return [ride for ride in every if ride is not None]
-
-
-def _visits(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
-    """The sum of squared weights of all blocks at each knot, (knots,)."""
-    visits = np.zeros(len(form.basis))
-    for line in linears:
-        knots = columns_of(line, form)
-        visits += 0.0 if knots is None else (knots**2).sum(axis=0)
-    return visits
 
 
 def learn_healthy_curves(

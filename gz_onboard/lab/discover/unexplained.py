@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -62,16 +62,22 @@ def unexplained(now: Selection, constancy: Sequence[Split], limit: float) -> Unk
     return replace(best, share=curve_energy_share(now.lines, form, values))
 
 
+def curves_beside(
+    now: Selection, chosen: Sequence[str], forms: Iterable[CurveForm]
+) -> Iterator[tuple[CurveForm, CurveFit]]:
+    """Each of `forms` that the rides have, fitted beside the causes `chosen`."""
+    for form in forms:
+        curve = fit_curve(now.mixed, now.lines, now.normals, form, now.search.index(chosen))
+        if curve is not None:
+            yield form, curve
+
+
 def best_curve(now: Selection, limit: float) -> Unknown | None:
     """The curve that explains most beside the causes chosen, and those of its channel if it is no bend of theirs."""
     search, chosen = now.search, now.chosen
-    index = search.index(chosen)
-    total = search.evidence.gain(index)
+    total = search.evidence.gain(search.index(chosen))
     best: Unknown | None = None
-    for form in curve_forms(now.mixed.sizes):
-        curve = fit_curve(now.mixed, now.lines, now.normals, form, index)
-        if curve is None:
-            continue
+    for form, curve in curves_beside(now, chosen, curve_forms(now.mixed.sizes)):
         inflation = curve_inflation(now.mixed, form)
         score = curve_score(now.mixed, form, curve)
         if score < least_score(form, limit):
@@ -112,14 +118,11 @@ def rival_curve(now: Selection, limit: float) -> Unknown | None:
     for name in now.chosen:
         rest = [other for other in now.chosen if other != name]
         own = search.step(rest, name)
-        for form in curve_forms(now.mixed.sizes):
-            if search.shares.get(name, {}).get(form.channel, 0.0) < OWN_SHARE:
-                continue
-            curve = fit_curve(mixed, now.lines, now.normals, form, search.index(rest))
-            if curve is None:
-                continue
-            inflation = curve_inflation(mixed, form)
-            ahead = curve.chi2 / inflation - 2 * (curve.k - 1) - own * max(mixed.inflation.get(name, 1.0), 1.0)
+        shares = search.shares.get(name, {})
+        mine = (form for form in curve_forms(mixed.sizes) if shares.get(form.channel, 0.0) >= OWN_SHARE)
+        for form, curve in curves_beside(now, rest, mine):
+            evidence = curve.chi2 / curve_inflation(mixed, form) - 2 * (curve.k - 1)
+            ahead = evidence - own * max(mixed.inflation.get(name, 1.0), 1.0)
             if ahead > max(most, UNLIKE_LEFT * own) and curve_is_accepted(now, form, rest, limit):
                 most = ahead
                 best = described(form, curve, curve_score(mixed, form, curve), [name])
@@ -128,17 +131,12 @@ def rival_curve(now: Selection, limit: float) -> Unknown | None:
 
 def curve_over_split(now: Selection, split: Split) -> Unknown | None:
     """The curve over the quantity of `split`, with no cause named, in the channel where it has most to say."""
-    best: Unknown | None = None
-    for form in curve_forms(now.mixed.sizes):
-        if form.quantity != split.quantity or form.straight:
-            continue
-        curve = fit_curve(now.mixed, now.lines, now.normals, form, [])
-        if curve is None:
-            continue
-        score = curve_score(now.mixed, form, curve)
-        if best is None or score > best.score:
-            best = described(form, curve, score, [split.cause])
-    return best
+    forms = (f for f in curve_forms(now.mixed.sizes) if f.quantity == split.quantity and not f.straight)
+    found = [
+        described(form, curve, curve_score(now.mixed, form, curve), [split.cause])
+        for form, curve in curves_beside(now, [], forms)
+    ]
+    return max(found, key=lambda curve: curve.score, default=None)
 
 
 def ride_to_ride(now: Selection, worst: Split, constancy: Sequence[Split]) -> Unknown:
