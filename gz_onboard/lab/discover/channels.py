@@ -3,18 +3,7 @@
 Each channel is an analytical redundancy relation (Gertler 1998; Krysander & Frisk 2008): a balance of one part of the
 vehicle that takes its inputs from sensors, not from the model of another part. So a fault in one part shows in few
 channels, and causes that look alike in the energy drawn (a heavier rider, a weaker magnet) do not in all of them.
-
-    road_force           N      torque at the wheel, less road load; mass times the accelerometer is grade and inertia
-    altitude             m      GPS altitude, less the way times the grade that the accelerometer shows
-    inverter_power       W      DC power of the inverter, less air-gap power and losses
-    pack_balance         A      pack current less auxiliary current, less inverter current
-    auxiliary            W      what the auxiliary current sensor shows
-    voltage_balance      V      pack voltage, less inverter voltage and cable drop
-    cell_voltage         V      of a mean cell, less the equivalent circuit at the current measured
-    voltage_timing       V      its step in 0.1 s, less that of the current
-    gps_speed            m/s    less motor speed times wheel radius
-    rear_speed, front_speed   m/s    wheel-speed sensors, less motor speed
-    motor_temperature, inverter_temperature, cell_temperature   K   less the cooling networks at the modelled heat
+`residuals` says what is measured and what is taken off.
 """
 
 from __future__ import annotations

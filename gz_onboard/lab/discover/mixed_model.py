@@ -27,20 +27,13 @@ from gz_onboard.lab.discover.linear import (
     trimmed,
 )
 from gz_onboard.lab.discover.prior import (
-    BENCH,
-    BY_NAME,
     GIVEN_SCATTER,
-    HEALTHY_SD,
-    LOG_RIDE_SD,
-    LOG_RIDE_SD_ELSE,
     LOG_SCALED,
     NUISANCES,
-    RIDE_SD,
-    RIDE_SD_SHARE,
-    RIDE_SD_STEP,
     VEHICLE_PARAMETERS,
     Sizes,
-    nearest_step,
+    prior_covariance,
+    prior_of,
     sizes_of,
     stepped,
 )
@@ -48,15 +41,10 @@ from gz_onboard.lab.discover.residuals import counted_soc
 from gz_onboard.lab.discover.system import System
 from gz_onboard.offline.processes import worker_pool
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.effect import Effect, Parameter
+from gz_onboard.physics.effect import Effect
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import Vehicle
 
-TRANSFERRED = 3.0
-"""What was found on a bench at steady points holds on the road within so many times its standard deviation."""
-MOST_LOG = 0.5  # sd of a logarithm, beyond which a parameter is known to its sign only
-LEAST_STEP = 0.05  # of a standard deviation: the finest scale
-LEAST_SD = 1e-3  # scales: what is certain
 FREED = 1e6  # variance in scales of what nothing is known of
 WIDENED = 25.0  # variance in scales, five times a usual change
 PRIOR_RIDES, LEAST_FREEDOM = 3, 4
@@ -190,7 +178,7 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
     values |= {nuisance.name: nuisance.value for nuisance in NUISANCES} | dict.fromkeys(absent, 0.0)
     names = _names(vehicle, causes, more, values)
     declared = declared_parameters(effects)
-    priors = {name: _prior(name, vehicle, declared, values[name], name in absent) for name in names}
+    priors = {name: prior_of(name, vehicle, declared, values[name], name in absent) for name in names}
     return MixedModel(
         vehicle=vehicle,
         system=system,
@@ -199,7 +187,7 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
         scale=np.array([prior.scale for prior in priors.values()]),
         values=values,
         mean=np.zeros(len(names)),
-        prior=_covariance(priors, vehicle.parameters.correlations),
+        prior=prior_covariance(priors, vehicle.parameters.correlations),
         scatter=np.array([prior.ride_sd for prior in priors.values()]) ** 2,
         noise={channel.name: channel.noise for channel in CHANNELS},
         healthy=0,
@@ -218,53 +206,6 @@ def _names(
     shaping = {x.name for e in lacking for x in e.parameters} - strengths
     fitted = set(VEHICLE_PARAMETERS) | of_effects | strengths | {nuisance.name for nuisance in NUISANCES}
     return sorted(name for name in (needed & fitted) - shaping if name in values)
-
-
-@dataclass(frozen=True)
-class _Prior:
-    """Of one parameter: its scale [unit], and in scales the spread of the vehicle's, of a bench's, between rides."""
-
-    scale: float
-    sd: float
-    bench_sd: float
-    ride_sd: float
-
-
-def _prior(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], value: float, absent: bool) -> _Prior:
-    """Of the parameter `name`, at `value`. absent: it is of an effect that the model lacks."""
-    on_bench = False
-    if name in BY_NAME:
-        size = sizes_of(vehicle).of(BY_NAME[name].of)
-        scatter, spread = BY_NAME[name].ride_sd * size, BY_NAME[name].sd * size
-    else:
-        parameter, known = declared[name], vehicle.parameters
-        on_bench = parameter.bench or name in BENCH
-        stated = name in known and not known.known[name].source.startswith("prior:")
-        healthy = HEALTHY_SD.get(name, parameter.healthy_sd)
-        spread = known.sd(name) if name in known and not absent else parameter.prior_sd
-        if healthy is not None and (absent or not stated or name == "payload_mass"):
-            spread = healthy
-        own = RIDE_SD.get(name, parameter.ride_sd)
-        size = nearest_step(value / parameter.prior, RIDE_SD_STEP) if parameter.prior else 1.0
-        scatter = RIDE_SD_SHARE * parameter.prior_sd if own is None else own * size
-    if name in LOG_SCALED:
-        spread, scatter = min(spread / value, MOST_LOG), LOG_RIDE_SD.get(name, LOG_RIDE_SD_ELSE)
-    wide = spread * (TRANSFERRED if on_bench else 1.0)
-    step = max(scatter, LEAST_STEP * wide)
-    return _Prior(step, max(wide / step, LEAST_SD), spread / step, max(scatter / step, LEAST_SD))
-
-
-def _covariance(priors: Mapping[str, _Prior], correlations: Mapping[frozenset[str], float]) -> Array:
-    """Of the vehicle's parameters before any ride, in scales, (p, p)."""
-    covariance = np.diag(np.array([prior.sd for prior in priors.values()]) ** 2)
-    place = {name: i for i, name in enumerate(priors)}
-    for pair, r in correlations.items():
-        a, b = sorted(pair)  # of a set, whose order differs from run to run, and with it the last digits
-        if a in place and b in place:
-            # what the bench leaves open goes together; by how much the road differs from the bench does not
-            both = r * priors[a].bench_sd * priors[b].bench_sd
-            covariance[place[a], place[b]] = covariance[place[b], place[a]] = both
-    return covariance
 
 
 def _linearised(job: tuple[Ride, MixedModel]) -> LinearRide:

@@ -162,35 +162,24 @@ def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[Lin
         shares = [f"{x:+.1%}" if energy else "–" for x in (b.energy_share, b.range_share, a.energy_share)]
         rows.append(
             [
-                readable(name),
-                BY_NAME[name].unit,
-                f"{r.mean:+.2g}",
-                f"{r.rms:.2g}",
-                f"{b.rms:.2g}",
-                f"{b.autocorrelation:.2f}",
-                *shares[:2],
-                f"{a.rms:.2g}",
-                f"{a.autocorrelation:.2f}",
-                shares[2],
+                ("measured less model", readable(name)),
+                ("unit", BY_NAME[name].unit),
+                ("mean", f"{r.mean:+.2g}"),
+                ("rms", f"{r.rms:.2g}"),
+                ("before: rms", f"{b.rms:.2g}"),
+                ("auto­correlation", f"{b.autocorrelation:.2f}"),
+                ("of the energy", shares[0]),
+                ("of the range", shares[1]),
+                ("after: rms", f"{a.rms:.2g}"),
+                ("auto­correlation", f"{a.autocorrelation:.2f}"),
+                ("of the energy", shares[2]),
             ]
         )
-    heads = [
-        "measured less model",
-        "unit",
-        "mean",
-        "rms",
-        "before: rms",
-        "auto­correlation",
-        "of the energy",
-        "of the range",
-        "after: rms",
-        "auto­correlation",
-        "of the energy",
-    ]
+    heads = [head for head, _ in next(iter(rows), [])]
     blocks = ", ".join(
         f"{readable(n)} {BY_NAME[n].block:g} s" for n in ("road_force", "inverter_power", "cell_voltage")
     )
-    return html_table(heads, rows, range(2, len(heads))) + (
+    return html_table(heads, [[cell for _, cell in row] for row in rows], range(2, len(heads))) + (
         "<p>Mean and rms as measured, with the bias of each ride's sensors and its wind; before and "
         "after with these taken off, without and with the causes named. Autocorrelation: of neighbouring blocks "
         f"({blocks}); near 0 nothing is left but noise.</p>"

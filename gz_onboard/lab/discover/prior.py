@@ -9,9 +9,14 @@ is taken to scatter from ride to ride before any healthy ride (the discrepancy o
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import exp, log
 
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.physics.effect import Parameter
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.physics.riding import PriorRiding
 from gz_onboard.vehicle import Vehicle
@@ -219,3 +224,56 @@ HEALTHY_SD = {
 always, for what was entered is known."""
 BENCH = ("torque_constant", "cable_resistance")
 """Found on a bench at steady points, as those of effects that say so."""
+
+TRANSFERRED = 3.0
+"""What was found on a bench at steady points holds on the road within so many times its standard deviation."""
+MOST_LOG = 0.5  # sd of a logarithm, beyond which a parameter is known to its sign only
+LEAST_STEP = 0.05  # of a standard deviation: the finest scale
+LEAST_SD = 1e-3  # scales: what is certain
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Of one parameter: its scale [unit], and in scales the spread of the vehicle's, of a bench's, between rides."""
+
+    scale: float
+    sd: float
+    bench_sd: float
+    ride_sd: float
+
+
+def prior_of(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], value: float, absent: bool) -> Prior:
+    """Of the parameter `name`, at `value`. absent: it is of an effect that the model lacks."""
+    on_bench = False
+    if name in BY_NAME:
+        size = sizes_of(vehicle).of(BY_NAME[name].of)
+        scatter, spread = BY_NAME[name].ride_sd * size, BY_NAME[name].sd * size
+    else:
+        parameter, known = declared[name], vehicle.parameters
+        on_bench = parameter.bench or name in BENCH
+        stated = name in known and not known.known[name].source.startswith("prior:")
+        healthy = HEALTHY_SD.get(name, parameter.healthy_sd)
+        spread = known.sd(name) if name in known and not absent else parameter.prior_sd
+        if healthy is not None and (absent or not stated or name == "payload_mass"):
+            spread = healthy
+        own = RIDE_SD.get(name, parameter.ride_sd)
+        size = nearest_step(value / parameter.prior, RIDE_SD_STEP) if parameter.prior else 1.0
+        scatter = RIDE_SD_SHARE * parameter.prior_sd if own is None else own * size
+    if name in LOG_SCALED:
+        spread, scatter = min(spread / value, MOST_LOG), LOG_RIDE_SD.get(name, LOG_RIDE_SD_ELSE)
+    wide = spread * (TRANSFERRED if on_bench else 1.0)
+    step = max(scatter, LEAST_STEP * wide)
+    return Prior(step, max(wide / step, LEAST_SD), spread / step, max(scatter / step, LEAST_SD))
+
+
+def prior_covariance(priors: Mapping[str, Prior], correlations: Mapping[frozenset[str], float]) -> Array:
+    """Of the vehicle's parameters before any ride, in scales, (p, p)."""
+    covariance = np.diag(np.array([prior.sd for prior in priors.values()]) ** 2)
+    place = {name: i for i, name in enumerate(priors)}
+    for pair, r in correlations.items():
+        a, b = sorted(pair)  # of a set, whose order differs from run to run, and with it the last digits
+        if a in place and b in place:
+            # what the bench leaves open goes together; by how much the road differs from the bench does not
+            both = r * priors[a].bench_sd * priors[b].bench_sd
+            covariance[place[a], place[b]] = covariance[place[b], place[a]] = both
+    return covariance

@@ -2,7 +2,7 @@
 
 The equations are those of `physics`; here each is fed with what was measured, and widened by the nuisances under which
 a healthy vehicle differs from its file. Every function takes the ride and a mapping of parameters, so that a column of
-the linear model is its difference. See `channels` for the table.
+the linear model is its difference.
 """
 
 from __future__ import annotations
