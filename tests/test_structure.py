@@ -51,7 +51,7 @@ ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py"}
 STAGES = {
     "plain data": ["result", "wording"],
     "read": ["grid"],
-    "residuals": ["system", "residuals", "channels", "blocks"],
+    "residuals": ["sizes", "system", "residuals", "channels", "blocks"],
     "linear model": ["prior", "candidates", "linear", "mixed_model", "uncalibrated", "baseline_file"],
     "search": ["search", "curve_forms", "curves", "baseline", "selection"],
     "judgement": ["constancy", "cross_validation", "acceptance", "winds", "energy", "unexplained", "verdict"],

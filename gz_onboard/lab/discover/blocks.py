@@ -48,20 +48,21 @@ def blocks(channel: Channel, ride: Ride, p: Values, system: System) -> Array:
     return np.asarray(result[:count])
 
 
-def roughness(channel: Channel, ride: Ride) -> Array:
+def roughness(channel: Channel, ride: Ride, system: System) -> Array:
     """By how much more a block's residual scatters, shape (blocks,): where the current changes within it, small errors
     of timing and of dynamics weigh more; on a rough road the accelerometer is noisy.
     """
+    doubling = channel.rough * system.sizes.current
     n = round(channel.block / STEP)
     shaken = np.ones(len(ride.time) // n)
     if channel.shaken > 0 and "vibration" in ride.quantities:
         shaken = shaken + block_means(ride.quantities["vibration"] ** 2, n) / channel.shaken**2
-    if channel.rough <= 0:
+    if doubling <= 0:
         return np.asarray(np.sqrt(shaken))
     amperes = ride.signals["motor_current"]
     level = block_means(np.abs(amperes), n)
     swing = np.sqrt(np.maximum(block_means(amperes**2, n) - block_means(amperes, n) ** 2, 0.0))
-    return np.asarray(np.sqrt(shaken * (1 + ((swing + STEADY * level) / channel.rough) ** 2)))
+    return np.asarray(np.sqrt(shaken * (1 + ((swing + STEADY * level) / doubling) ** 2)))
 
 
 def over_blocks(channel: Channel, values: Array) -> Array:

@@ -21,7 +21,7 @@ from gz_onboard.lab.discover.residuals import SLOW, cell_circuit
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import readable
 
-JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
+JUMP, WITHIN = 10.0, 0.5  # A, of a vehicle of size 1, within s: the motor current has changed
 FINEST = 25  # bins of the least width that are the span of a quantity
 OUTSTANDING = 3.5  # standard deviations of what differs between healthy rides
 
@@ -104,7 +104,7 @@ def on_grid(ride: Ride, name: str, mixed: MixedModel) -> Array | None:
     if QUANTITIES[name][2] not in ride.have:
         return None
     if name == "since_change":
-        return since_change(ride.signals["motor_current"])
+        return since_change(ride.signals["motor_current"] / mixed.sizes.current)
     if name == "soc":
         if not usable(BY_NAME["cell_voltage"], ride, mixed.system):
             return None

@@ -54,6 +54,10 @@ class ChannelNoise(NamedTuple):
         """Of one block."""
         return float(np.hypot(self.white, self.slow))
 
+    def scaled(self, size: float) -> ChannelNoise:
+        """Of a channel whose unit weighs so much less."""
+        return ChannelNoise(self.white * size, self.slow * size, self.time)
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -68,14 +72,15 @@ class Channel:
     roles: tuple[str, ...]
     residual: Callable[[Ride, Values, System], Array]
     parameters: tuple[str, ...]
-    noise: ChannelNoise  # before any healthy ride
+    noise: ChannelNoise  # before any healthy ride, in a vehicle of size 1
+    size: str = ""  # the size of `Sizes` that the noise grows with
     steps: int = 1  # grid steps to one of the function's
     holds: Callable[[Ride], Mask] = _always
     ports: tuple[Port, ...] = ()
     battery: bool = False
     correlated: bool = True
     slow: float = 0.0  # s: the shortest correlation that its noise can have; what its model lacks is slow
-    rough: float = 0.0  # A of motor current within a block that double its variance; 0: none do
+    rough: float = 0.0  # A of motor current, in a vehicle of size 1, that double a block's variance; 0: none do
     shaken: float = 0.0  # m/s² of vibration that do; 0: none
 
 
@@ -103,6 +108,10 @@ _CELL = (
     "resistance_current_cold",
 )
 
+# A block is as long as what the residual is of stays the same: 0.1 s where a delay shows, 2 s for currents, voltages
+# and speeds, 4 s where noise is to average out (of the accelerometer, of lamps), 10 s for heights and temperatures.
+# Noise is as on healthy rides of the reference scooter, until a baseline, or the rides themselves, say more.
+# rough: some of what a rider changes the current by; the less, the more two sensors' timing matters to the residual.
 CHANNELS = (
     Channel(
         "road_force",
@@ -114,6 +123,7 @@ CHANNELS = (
         parameters=(*_TORQUE, *_SPEED, "payload_mass", "payload_error", "accel_bias", "pitch_gain", "rolling_cold"),
         ports=(Port.WHEEL_FORCE, Port.TYRE, Port.MOTOR_LOSS),
         noise=ChannelNoise(white=5.0, slow=2.0, time=60.0),
+        size="power",
         rough=60.0,
         shaken=0.85,
     ),
@@ -144,6 +154,7 @@ CHANNELS = (
         ),
         ports=(Port.MOTOR_LOSS, Port.INVERTER_LOSS),
         noise=ChannelNoise(white=6.0, slow=4.0, time=60.0),
+        size="power",
         rough=10.0,
     ),
     Channel(
@@ -161,6 +172,7 @@ CHANNELS = (
             "pack_inverter_lag",
         ),
         noise=ChannelNoise(white=0.1, slow=0.03, time=60.0),
+        size="current",
         rough=30.0,
     ),
     Channel(
@@ -172,6 +184,7 @@ CHANNELS = (
         parameters=("brake_light",),
         ports=(Port.DC_POWER,),
         noise=ChannelNoise(white=1.0, slow=1.0, time=60.0),
+        size="auxiliary",
     ),
     Channel(
         "voltage_balance",
@@ -181,6 +194,7 @@ CHANNELS = (
         residual=residuals.voltage_balance,
         parameters=("pack_voltage_offset", "inverter_voltage_offset", "cable_resistance"),
         noise=ChannelNoise(white=0.03, slow=0.01, time=60.0),
+        size="voltage",
     ),
     Channel(
         "cell_voltage",

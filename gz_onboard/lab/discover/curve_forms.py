@@ -9,9 +9,10 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.blocks import over_blocks
+from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.grid import STEP, Ride, smooth
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide
-from gz_onboard.lab.discover.prior import USUAL_SIZES, Sizes
+from gz_onboard.lab.discover.sizes import USUAL_SIZES, Sizes
 
 # knots of the hat functions, of a vehicle of size 1 (see `KNOTS_OF`); unit
 QUANTITIES: dict[str, tuple[tuple[float, ...], str]] = {
@@ -40,15 +41,9 @@ PAIRS: tuple[tuple[str, tuple[str, ...]], ...] = (
 )
 
 
-COEFFICIENT_UNITS = {
-    "road_force": (5.0, "power"),
-    "inverter_power": (10.0, "power"),
-    "auxiliary": (2.0, "auxiliary"),
-    "pack_balance": (0.1, "current"),
-    "cell_voltage": (0.005, ""),
-}
-"""Unit of a curve's coefficients, in the channel's, and which of the vehicle's sizes it grows with; `SCATTER` of it is
-taken to differ between rides."""
+UNITS = {"road_force": 5.0, "inverter_power": 10.0, "auxiliary": 2.0, "pack_balance": 0.1, "cell_voltage": 0.005}
+"""Of a curve's coefficients, in the channel's, of a vehicle of size 1; they grow as the channel's noise does, and
+`SCATTER` of them is taken to differ between rides."""
 SCATTER = 0.3
 SCATTERS = {"cell_voltage": 1.0}  # whose model lacks more
 KNOTS_OF = {"speed": "speed", "motor_current": "current", "current_change": "current", "pack_current": "current"}
@@ -76,8 +71,7 @@ class CurveForm:
     @property
     def size(self) -> float:
         """Unit of its coefficients, in the channel's."""
-        unit, of = COEFFICIENT_UNITS[self.channel]
-        return unit * self.sizes.of(of)
+        return UNITS[self.channel] * self.sizes.of(BY_NAME[self.channel].size)
 
     @property
     def scatter(self) -> float:

@@ -93,7 +93,7 @@ def linearise(
             if name in mine:
                 moved = {**values, name: stepped(name, values[name], float(scale[i]))}
                 a[:, i] = y - blocks(channel, ride, moved, system)[used]
-        every = roughness(channel, ride)
+        every = roughness(channel, ride, system)
         y, a = y / every[used], a / every[used][:, None]
         good = np.isfinite(y) & np.isfinite(a).all(axis=1)
         index = np.flatnonzero(used)

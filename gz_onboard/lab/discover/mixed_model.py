@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -31,13 +30,12 @@ from gz_onboard.lab.discover.prior import (
     LOG_SCALED,
     NUISANCES,
     VEHICLE_PARAMETERS,
-    Sizes,
     prior_covariance,
     prior_of,
-    sizes_of,
     stepped,
 )
 from gz_onboard.lab.discover.residuals import counted_soc
+from gz_onboard.lab.discover.sizes import Sizes, sizes_of
 from gz_onboard.lab.discover.system import System
 from gz_onboard.offline.processes import worker_pool
 from gz_onboard.offline.samples import Samples
@@ -93,10 +91,10 @@ class MixedModel:
         """Of Student's t: half of a 95 % interval, in standard deviations."""
         return float(student.ppf(0.975, max(self.healthy + PRIOR_RIDES, LEAST_FREEDOM)))
 
-    @cached_property
+    @property
     def sizes(self) -> Sizes:
         """How large the vehicle is."""
-        return sizes_of(self.vehicle)
+        return self.system.sizes
 
     @property
     def usable_causes(self) -> list[Candidate]:
@@ -173,7 +171,8 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
     more = [cause.effect for cause in lacking(vehicle, causes) if cause.effect]
     effects: tuple[Effect, ...] = (*vehicle.model.effects, *more)
     p = vehicle.parameters
-    system = System(effects, vehicle.battery, p["payload_mass"], dict(p), vehicle.riding.vibration)
+    sizes = sizes_of(vehicle)
+    system = System(effects, vehicle.battery, p["payload_mass"], dict(p), vehicle.riding.vibration, sizes)
     values = {name: x.prior for name, x in declared_parameters(effects).items()} | dict(p)
     values |= {nuisance.name: nuisance.value for nuisance in NUISANCES} | dict.fromkeys(absent, 0.0)
     names = _names(vehicle, causes, more, values)
@@ -189,7 +188,7 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
         mean=np.zeros(len(names)),
         prior=prior_covariance(priors, vehicle.parameters.correlations),
         scatter=np.array([prior.ride_sd for prior in priors.values()]) ** 2,
-        noise={channel.name: channel.noise for channel in CHANNELS},
+        noise={channel.name: channel.noise.scaled(sizes.of(channel.size)) for channel in CHANNELS},
         healthy=0,
         free=np.array([name not in GIVEN_SCATTER for name in names]),
     )

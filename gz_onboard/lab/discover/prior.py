@@ -11,62 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import exp, log
+from math import exp
 
 import numpy as np
 
 from gz_onboard.arrays import Array
+from gz_onboard.lab.discover.sizes import nearest_step, sizes_of
 from gz_onboard.physics.effect import Parameter
-from gz_onboard.physics.parameters import declared_parameters
-from gz_onboard.physics.riding import PriorRiding
 from gz_onboard.vehicle import Vehicle
-
-CELLS = 14  # in series, of a pack of 52 V
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """How large a vehicle is over what the absolute numbers of the discovery are for, which is what the declared priors
-    of its parameters are of; to the nearest step, for such numbers are known to a factor only.
-
-    power: and forces, by mass. voltage: of the pack. auxiliary: power of it. speed: the highest of the usual riding.
-    """
-
-    power: float = 1.0
-    current: float = 1.0
-    voltage: float = 1.0
-    auxiliary: float = 1.0
-    speed: float = 1.0
-
-    def of(self, name: str) -> float:
-        """The size called `name`; 1 for none."""
-        return float(getattr(self, name)) if name else 1.0
-
-
-USUAL_SIZES = Sizes()
-
-
-def nearest_step(ratio: float, step: float = 2**0.5) -> float:
-    """`ratio` as the nearest power of `step`; 1 for what has no sign or no size."""
-    return float(step ** round(log(ratio) / log(step))) if ratio > 0 else 1.0
-
-
-def sizes_of(vehicle: Vehicle) -> Sizes:
-    """Of `vehicle`, by its file."""
-    p, declared = vehicle.parameters, declared_parameters()
-
-    def over(name: str) -> float:
-        return nearest_step(p[name] / declared[name].prior)
-
-    fastest, usual = (max(speed for _, speed, _ in riding.points) for riding in (vehicle.riding, PriorRiding()))
-    cells = vehicle.battery.cells_series if vehicle.battery else CELLS
-    return Sizes(
-        over("vehicle_mass"),
-        over("motor_current_limit"),
-        nearest_step(cells / CELLS),
-        over("auxiliary_power"),
-        nearest_step(fastest / usual),
-    )
 
 
 @dataclass(frozen=True)
@@ -111,7 +63,7 @@ NUISANCES = (
     Nuisance("drift", "V/(600 s)", 0.0, 0.001, 0.004, "what no circuit of the model follows over a ride"),
     Nuisance("pair_resistance", "1", 0.0, 0.3, 0.02, "R1 of one pair where a second one has the slow part"),
     Nuisance("pair_time", "1", 0.0, 0.4, 0.03, "its time constant, logarithm of the share"),
-    Nuisance("mid_resistance", "ohm", 0.0, 0.02, 0.001, "a pair between it and the slow one"),
+    Nuisance("mid_resistance", "ohm", 0.0, 0.02, 0.001, "a pair between it and the slow one", "resistance"),
     Nuisance("resistance_empty", "1", 0.0, 0.3, 0.05, "cell resistance at SOC 0.6 less that at 1.0, as a share"),
     Nuisance("resistance_current", "1/(5 A)", 0.0, 0.1, 0.01, "cell resistance falls with current"),
     Nuisance("resistance_current_cold", "1/(5 A·20 K)", 0.0, 0.1, 0.01, "the more so below 20 degC"),

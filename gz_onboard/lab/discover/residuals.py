@@ -32,17 +32,18 @@ FIRST = 20  # steps: what a ride begins with
 START_SOC = 0.6  # whose ohmic resistance takes the current off the first voltages
 BRAKING = 0.5  # of the switch: between open and closed
 LEAST_COOLING = 0.05  # of the conductance at standstill: moving air does not heat
-# Scales of the nuisances, so that all are of order one.
-WARM, COLDER = 20.0, 20.0  # degC, K below it
-SPIN = 50.0  # rad/s of the motor
-AMPERES = 50.0  # of the motor
-MAGNETS = 40.0  # degC of the motor, at which its torque constant is the vehicle file's
-SATURATING = 100.0  # A of the motor
-SLIPPING = 100.0  # N at the wheel
-DRIFT_TIME = 600.0  # s
-EMPTIER = 0.4  # of SOC below full
-BENT = 5.0  # A of a cell
-MIDDLE = 0.7  # SOC about which the rest voltage tilts
+# Scales of the nuisances, so that all are of order one. Those of currents, forces and speeds of the motor are of a
+# vehicle of size 1, and grow with `Sizes`; air, time and charge are the same in every vehicle.
+WARM, COLDER = 20.0, 20.0  # degC, K below it: from a mild day to frost
+SPIN = 50.0  # rad/s of the motor, near its highest
+AMPERES = 50.0  # of the motor: half of a usual acceleration
+MAGNETS = 40.0  # degC of the motor, at which its torque constant is the vehicle file's: of a motor at work
+SATURATING = 100.0  # A of the motor: half of its limit
+SLIPPING = 100.0  # N at the wheel: a steep hill
+DRIFT_TIME = 600.0  # s: a short ride
+EMPTIER = 0.4  # of SOC below full: what a usual ride takes
+BENT = 5.0  # A of a cell, some 2 C
+MIDDLE = 0.7  # SOC about which the rest voltage tilts: of most rides
 WIND = 10.0  # m/s of air past the vehicle
 WARMER = 10.0  # K of the stator above the air
 
@@ -62,7 +63,7 @@ def moving(ride: Ride, p: Values, system: System) -> dict[str, Array]:
     q["acceleration"] = q["acceleration"] * radius
     q["lateral_acceleration"] = q["lateral_acceleration"] * radius
     q["mass"] = np.full(len(ride.time), mass(ride, p, system))
-    q["torque"] = torque_constant(ride, p) * q["motor_current"]
+    q["torque"] = torque_constant(ride, p, system) * q["motor_current"]
     return q
 
 
@@ -72,13 +73,13 @@ def mass(ride: Ride, p: Values, system: System) -> float:
     return p["vehicle_mass"] + entered + (p["payload_mass"] - system.payload) + p["payload_error"]
 
 
-def torque_constant(ride: Ride, p: Values) -> Array:
+def torque_constant(ride: Ride, p: Values, system: System) -> Array:
     """The true one [N·m/A], over motor temperature and current."""
     q = ride.quantities
     return np.asarray(
         p["torque_constant"]
         * (1 + p["torque_constant_slope"] * (q["motor_temperature"] - MAGNETS))
-        * (1 - p["torque_saturation"] * np.abs(q["motor_current"]) / SATURATING)
+        * (1 - p["torque_saturation"] * np.abs(q["motor_current"]) / (SATURATING * system.sizes.current))
     )
 
 
@@ -119,8 +120,9 @@ def inverter_power(ride: Ride, p: Values, system: System) -> Array:
     electric, _ = motor_losses(ride, q, p, system)
     power = q["torque"] * q["motor_speed"] + electric
     power = power + summed(system.terms(q, p, STEP, Port.INVERTER_LOSS))
-    spin = np.abs(q["motor_speed"]) / SPIN
-    power = power + (p["loss_speed"] + p["loss_cross"] * np.abs(q["motor_current"]) / AMPERES) * spin
+    spin = np.abs(q["motor_speed"]) / (SPIN * system.sizes.spin)
+    cross = p["loss_cross"] * np.abs(q["motor_current"]) / (AMPERES * system.sizes.current)
+    power = power + (p["loss_speed"] + cross) * spin
     power = power - p["torque_lag"] * np.gradient(smooth3(np.broadcast_to(power, len(ride.time))), STEP)
     volts = ride.signals["inverter_voltage"]
     shown = p["inverter_current_gain"] * power + p["inverter_current_offset"] * volts
@@ -171,7 +173,7 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, A
     factor = p.get("cell_resistance_factor", 1.0) * (1 + p["resistance_level"] + p["resistance_cold"] * cold)
     bent = p["resistance_current"] + p["resistance_current_cold"] * cold
     empty = p["resistance_empty"] + p["resistance_empty_cold"] * cold
-    factor = factor * (1 + empty * (1 - soc) / EMPTIER - bent * np.abs(cell) / BENT)
+    factor = factor * (1 + empty * (1 - soc) / EMPTIER - bent * np.abs(cell) * system.sizes.resistance / BENT)
     r0 = battery.r0.over(soc, temperature) * factor
     r1 = battery.r1.over(soc, temperature)
     decay = np.exp(-DT / (r1 * battery.c1.over(soc, temperature) * np.exp(p["pair_time"])))
@@ -232,7 +234,7 @@ def voltage_timing(ride: Ride, p: Values, system: System) -> Array:
 def gps_speed(ride: Ride, p: Values, system: System) -> Array:
     """GPS speed [m/s] less the motor's by wheel radius, slip and lean."""
     q = moving(ride, p, system)
-    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / SLIPPING
+    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / (SLIPPING * system.sizes.power)
     lean = 1 - p["lean_radius"] * (q["lateral_acceleration"] / GRAVITY) ** 2 / 2
     return np.asarray(ride.signals["gps_speed"] - q["speed"] * slip * lean + p["gps_lag"] * q["acceleration"])
 
@@ -249,7 +251,7 @@ def rear_speed(ride: Ride, p: Values, system: System) -> Array:
 def front_speed(ride: Ride, p: Values, system: System) -> Array:
     """The front wheel's speed [m/s] less the motor's by slip and lean."""
     q = moving(ride, p, system)
-    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / SLIPPING
+    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / (SLIPPING * system.sizes.power)
     lean = 1 - p["front_lean"] * (q["lateral_acceleration"] / GRAVITY) ** 2 / 2
     speed = q["motor_speed"] * p["gear_ratio"] * slip * lean
     front = ride.signals["wheel_speed_front"] * (1 - p["front_scale"])
