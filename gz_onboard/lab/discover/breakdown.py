@@ -25,7 +25,7 @@ JUMP, WITHIN = 10.0, 0.5  # A, of a vehicle of size 1, within s: the motor curre
 FINEST = 25  # bins of the least width that are the span of a quantity
 OUTSTANDING = 3.5  # standard deviations of what differs between healthy rides
 
-QUANTITIES: dict[str, tuple[str, str, str]] = {
+COVARIATES: dict[str, tuple[str, str, str]] = {
     "speed": ("speed", "m/s", "motor_speed"),
     "acceleration": ("acceleration", "m/s²", "motor_speed"),
     "lateral_acceleration": ("lateral acceleration, left positive", "m/s²", "rate_z"),
@@ -91,7 +91,7 @@ class QuantityReader:
         self._kept: dict[tuple[int, str], Array | None] = {}
 
     def __call__(self, line: LinearRide, name: str, table: LinearChannel) -> Array | None:
-        """The quantity `name` of `QUANTITIES` over the blocks in `table`, (m,); None if the ride has it not."""
+        """The quantity `name` of `COVARIATES` over the blocks in `table`, (m,); None if the ride has it not."""
         key = (id(line.ride), name)
         if key not in self._kept:
             self._kept[key] = on_grid(line.ride, name, self._mixed)
@@ -101,7 +101,7 @@ class QuantityReader:
 
 def on_grid(ride: Ride, name: str, mixed: MixedModel) -> Array | None:
     """A quantity on the grid of the ride, shape of its time; None if the ride has it not."""
-    if QUANTITIES[name][2] not in ride.have:
+    if COVARIATES[name][2] not in ride.have:
         return None
     if name == "since_change":
         return since_change(ride.signals["motor_current"] / mixed.sizes.current)

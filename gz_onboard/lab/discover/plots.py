@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.breakdown import QUANTITIES, QuantityReader, binned, edges, pooled, share_over
+from gz_onboard.lab.discover.breakdown import COVARIATES, QuantityReader, binned, edges, pooled, share_over
 from gz_onboard.lab.discover.channels import BY_NAME
 from gz_onboard.lab.discover.linear import LinearRide
 from gz_onboard.lab.discover.result import RIDES, Report, Unknown
@@ -25,7 +25,7 @@ CHOSEN, NEAR, OTHER = BLUE, "#8fb8de", "#cbd2d9"
 
 def overview(stages: Stages, channels: Sequence[str], over: QuantityReader) -> Figure:
     """Channels by quantities: the share of variance that goes with each."""
-    quantities = list(QUANTITIES)
+    quantities = list(COVARIATES)
     grids = [
         np.array([[100 * share_over(*pooled(lines, c, name, over)) for name in quantities] for c in channels])
         for lines in stages.values()
@@ -57,7 +57,7 @@ def overview(stages: Stages, channels: Sequence[str], over: QuantityReader) -> F
 def panels(stages: Stages, channel: str, over: QuantityReader) -> Figure:
     """The residual's mean over each quantity, in bins of as many blocks, one standard error as a band."""
     drawn = []
-    for name in QUANTITIES:
+    for name in COVARIATES:
         samples = [pooled(lines, channel, name, over) for lines in stages.values()]
         x = samples[0][0]
         if len(x) > 20 and np.ptp(x) > 0:
@@ -82,7 +82,7 @@ def panels(stages: Stages, channel: str, over: QuantityReader) -> Figure:
             axis.fill_between(x, y - error, y + error, color=colour, alpha=0.2, linewidth=0)
             axis.plot(x, y, "o-", color=colour, markersize=3, linewidth=1.3, label=label)
         axis.axhline(0, color=INK, linewidth=0.6)
-        label, unit, _ = QUANTITIES[name]
+        label, unit, _ = COVARIATES[name]
         axis.set_xlabel(label if unit == "1" else f"{label} [{unit}]", fontsize=8, color=INK, labelpad=2)
         if i % columns:
             axis.tick_params(labelleft=False)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.lab.discover.candidates import candidates
-from gz_onboard.lab.discover.curve_forms import QUANTITIES, CurveForm
+from gz_onboard.lab.discover.curve_forms import KNOTS, CurveForm
 from gz_onboard.lab.discover.grid import MOST_STEERING, steering
 from gz_onboard.lab.discover.mixed_model import initial
 from gz_onboard.lab.discover.prior import BY_NAME
@@ -50,7 +50,7 @@ def test_absolute_numbers_grow_with_the_vehicle(scooter: Vehicle):
     assert (geared.spin, geared.resistance) == pytest.approx((4.0, 1 / 4))
     assert large.noise["road_force"].white == pytest.approx(4 * small.noise["road_force"].white)
     form = CurveForm("road_force", "motor_current", sizes=sizes)
-    assert form.knots == pytest.approx(4 * np.array(QUANTITIES["motor_current"][0]))
+    assert form.knots == pytest.approx(4 * np.array(KNOTS["motor_current"][0]))
     assert form.size == pytest.approx(4 * replace(form, sizes=USUAL_SIZES).size)
     assert {nuisance.of for nuisance in BY_NAME.values()} == {
         "",

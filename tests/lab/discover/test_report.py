@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.lab.discover.breakdown import (
-    QUANTITIES,
+    COVARIATES,
     QuantityReader,
     before_and_after,
     binned,
@@ -128,7 +128,7 @@ def test_a_quantity_that_was_not_measured_is_not_made_up(found: Discovery):
     bare = replace(ride, signals={k: v for k, v in ride.signals.items() if k not in ("rate_z", "gps_course")})
     over = QuantityReader(mixed)
     less = replace(line, ride=bare)
-    for name in QUANTITIES:
+    for name in COVARIATES:
         x, y = pooled([less], "road_force", name, over)
         assert len(x) == len(y)
         assert (len(x) == 0) == (name in ("lateral_acceleration", "heading")), name
