@@ -13,7 +13,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.blocks import over_blocks, usable
-from gz_onboard.lab.discover.channels import BY_NAME
+from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.grid import STEP, Ride, since
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Posterior
 from gz_onboard.lab.discover.mixed_model import MixedModel
@@ -106,7 +106,7 @@ def on_grid(ride: Ride, name: str, mixed: MixedModel) -> Array | None:
     if name == "since_change":
         return since_change(ride.signals["motor_current"] / mixed.sizes.current)
     if name == "soc":
-        if not usable(BY_NAME["cell_voltage"], ride, mixed.system):
+        if not usable(CHANNEL["cell_voltage"], ride, mixed.system):
             return None
         soc = np.repeat(cell_circuit(ride, mixed.values, mixed.system)[2], SLOW)
         return np.append(soc, np.full(max(0, len(ride.time) - len(soc)), soc[-1]))

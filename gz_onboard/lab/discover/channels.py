@@ -325,4 +325,4 @@ CHANNELS = (
         slow=200.0,
     ),
 )
-BY_NAME = {channel.name: channel for channel in CHANNELS}
+CHANNEL = {channel.name: channel for channel in CHANNELS}

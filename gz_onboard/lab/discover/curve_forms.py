@@ -9,7 +9,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.blocks import over_blocks
-from gz_onboard.lab.discover.channels import BY_NAME
+from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.grid import STEP, Ride, smooth
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide
 from gz_onboard.lab.discover.sizes import USUAL_SIZES, Sizes
@@ -71,7 +71,7 @@ class CurveForm:
     @property
     def size(self) -> float:
         """Unit of its coefficients, in the channel's."""
-        return UNITS[self.channel] * self.sizes.of(BY_NAME[self.channel].size)
+        return UNITS[self.channel] * self.sizes.of(CHANNEL[self.channel].size)
 
     @property
     def scatter(self) -> float:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from gz_onboard.lab.discover.breakdown import QuantityReader, before_and_after
-from gz_onboard.lab.discover.channels import BY_NAME
+from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.detectability import extent
 from gz_onboard.lab.discover.energy import residual_sizes
 from gz_onboard.lab.discover.linear import LinearRide
@@ -43,7 +43,7 @@ def body(found: Discovery) -> str:
     before, after = before_and_after(found)
     stages = {"before": before, "after": after} if report.causes else {"before": before}
     over = QuantityReader(found.mixed)
-    channels = [name for name in BY_NAME if any(name in line.tables for line in found.lines)]
+    channels = [name for name in CHANNEL if any(name in line.tables for line in found.lines)]
     parts = [
         _head(found),
         _causes(report),
@@ -55,7 +55,7 @@ def body(found: Discovery) -> str:
     ]
     shown = _most(found, before, channels)
     for name in [*shown, *(c for c in channels if c not in shown)]:
-        title = f"{readable(name)} [{BY_NAME[name].unit}]"
+        title = f"{readable(name)} [{CHANNEL[name].unit}]"
         picture = _picture(panels(stages, name, over))
         note = _GRADE if name == "road_force" else ""
         parts.append(f"<details{' open' if name in shown else ''}><summary>{title}</summary>{picture}{note}</details>")
@@ -154,7 +154,7 @@ def _next(report: Report) -> str:
 def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[LinearRide]) -> str:
     raw, first, last = report.residuals, residual_sizes(before), residual_sizes(after)
     rows = []
-    for name in BY_NAME:
+    for name in CHANNEL:
         if name not in raw:
             continue
         r, b, a = raw[name], first.get(name, raw[name]), last.get(name, raw[name])
@@ -163,7 +163,7 @@ def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[Lin
         rows.append(
             [
                 ("measured less model", readable(name)),
-                ("unit", BY_NAME[name].unit),
+                ("unit", CHANNEL[name].unit),
                 ("mean", f"{r.mean:+.2g}"),
                 ("rms", f"{r.rms:.2g}"),
                 ("before: rms", f"{b.rms:.2g}"),
@@ -177,7 +177,7 @@ def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[Lin
         )
     heads = [head for head, _ in next(iter(rows), [])]
     blocks = ", ".join(
-        f"{readable(n)} {BY_NAME[n].block:g} s" for n in ("road_force", "inverter_power", "cell_voltage")
+        f"{readable(n)} {CHANNEL[n].block:g} s" for n in ("road_force", "inverter_power", "cell_voltage")
     )
     return html_table(heads, [[cell for _, cell in row] for row in rows], range(2, len(heads))) + (
         "<p>Mean and rms as measured, with the bias of each ride's sensors and its wind; before and "

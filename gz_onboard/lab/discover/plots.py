@@ -9,7 +9,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.breakdown import COVARIATES, QuantityReader, binned, edges, pooled, share_over
-from gz_onboard.lab.discover.channels import BY_NAME
+from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.linear import LinearRide
 from gz_onboard.lab.discover.result import RIDES, Report, Unknown
 from gz_onboard.lab.discover.wording import readable
@@ -88,7 +88,7 @@ def panels(stages: Stages, channel: str, over: QuantityReader) -> Figure:
             axis.tick_params(labelleft=False)
     legend(axes[min(columns, len(axes)) - 1])
     figure.text(
-        0.012, 0.5, f"measured less model [{BY_NAME[channel].unit}]", rotation=90, va="center", fontsize=8.5, color=INK
+        0.012, 0.5, f"measured less model [{CHANNEL[channel].unit}]", rotation=90, va="center", fontsize=8.5, color=INK
     )
     return figure
 
@@ -134,7 +134,7 @@ def curve(unknown: Unknown) -> Figure:
     axis.set_ylim(*_limits_of(y, sd))
     axis.axhline(0, color=INK, linewidth=0.6)
     axis.set_xlabel(f"{readable(unknown.quantity)} [{unknown.unit}]", fontsize=9, color=INK)
-    left = f"{readable(unknown.channel)} [{BY_NAME[unknown.channel].unit}]"
+    left = f"{readable(unknown.channel)} [{CHANNEL[unknown.channel].unit}]"
     if unknown.quantity == RIDES:
         left = f"{readable(unknown.denies[0])}, over its mean [1]"
     axis.set_ylabel(left, fontsize=9, color=INK)

@@ -87,7 +87,7 @@ NUISANCES = (
     Nuisance("cells_start", "K", 0.0, 0.3, 0.5, "first cell temperature: quantised"),
     Nuisance("pack_airflow", "1/(10 m/s)", 0.0, 1.0, 0.1, "pack cools better in moving air"),
 )
-BY_NAME = {nuisance.name: nuisance for nuisance in NUISANCES}
+NUISANCE = {nuisance.name: nuisance for nuisance in NUISANCES}
 
 COOLING = (
     "motor_stator_capacity",
@@ -197,9 +197,9 @@ class Prior:
 def prior_of(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], value: float, absent: bool) -> Prior:
     """Of the parameter `name`, at `value`. absent: it is of an effect that the model lacks."""
     on_bench = False
-    if name in BY_NAME:
-        size = sizes_of(vehicle).of(BY_NAME[name].of)
-        scatter, spread = BY_NAME[name].ride_sd * size, BY_NAME[name].sd * size
+    if name in NUISANCE:
+        size = sizes_of(vehicle).of(NUISANCE[name].of)
+        scatter, spread = NUISANCE[name].ride_sd * size, NUISANCE[name].sd * size
     else:
         parameter, known = declared[name], vehicle.parameters
         on_bench = parameter.bench or name in BENCH

@@ -7,7 +7,7 @@ import pytest
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.channels import BY_NAME, ChannelNoise
+from gz_onboard.lab.discover.channels import CHANNEL, ChannelNoise
 from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Normal, normal
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial
@@ -23,7 +23,7 @@ def table(columns: Array, y: Array) -> LinearChannel:
     used: Mask = np.ones(m, dtype=bool)
     even: Array = np.ones(m)
     time: Array = 4.0 * np.arange(m, dtype=np.float64)
-    return LinearChannel(BY_NAME["road_force"], y, columns, time, used, roughness=even)
+    return LinearChannel(CHANNEL["road_force"], y, columns, time, used, roughness=even)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from gz_onboard.lab.discover.candidates import candidates
 from gz_onboard.lab.discover.curve_forms import KNOTS, CurveForm
 from gz_onboard.lab.discover.grid import MOST_STEERING, steering
 from gz_onboard.lab.discover.mixed_model import initial
-from gz_onboard.lab.discover.prior import BY_NAME
+from gz_onboard.lab.discover.prior import NUISANCE
 from gz_onboard.lab.discover.sizes import USUAL_SIZES, nearest_step, sizes_of
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import known_effects, load_effect
@@ -52,7 +52,7 @@ def test_absolute_numbers_grow_with_the_vehicle(scooter: Vehicle):
     form = CurveForm("road_force", "motor_current", sizes=sizes)
     assert form.knots == pytest.approx(4 * np.array(KNOTS["motor_current"][0]))
     assert form.size == pytest.approx(4 * replace(form, sizes=USUAL_SIZES).size)
-    assert {nuisance.of for nuisance in BY_NAME.values()} == {
+    assert {nuisance.of for nuisance in NUISANCE.values()} == {
         "",
         "power",
         "current",

@@ -21,7 +21,7 @@ from gz_onboard.lab.discover.breakdown import (
     share_over,
     since_change,
 )
-from gz_onboard.lab.discover.channels import BY_NAME
+from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.detectability import implausible_rides, limits, missing_residuals, remaining_range_error
 from gz_onboard.lab.discover.gain import summarised
 from gz_onboard.lab.discover.linear import normal
@@ -154,7 +154,7 @@ def test_the_page_says_it_all(found: Discovery):
         assert words in text, words
     assert "<script" not in text
     assert len(re.findall(r'<img alt="" src="data:image/png;base64,[A-Za-z0-9+/=]{500,}"', text)) >= 4
-    assert text.count("<details") >= sum(name in found.lines[0].tables for name in BY_NAME)
+    assert text.count("<details") >= sum(name in found.lines[0].tables for name in CHANNEL)
 
 
 def test_limits_shrink_with_the_rides(found: Discovery):
