@@ -57,7 +57,7 @@ def _of_ride(mine: Ride) -> Sign:
 
 
 SPLITS: Mapping[str, Sign] = {"lateral_acceleration": _side, "time": _halves("time"), "speed": _halves("speed")}
-RIDE = "ride "  # before a ride's name, where the split is that ride against the others
+RIDE_PREFIX = "ride "  # before a ride's name, where the split is that ride against the others
 
 
 def unequal(split: Split) -> bool:
@@ -71,7 +71,7 @@ def splits(now: Selection) -> list[Split]:
     for name in now.chosen:
         tests = dict(SPLITS)
         if len(now.lines) > 2 and not now.search.causes[name].varies:
-            tests |= {f"{RIDE}{line.ride.name}": _of_ride(line.ride) for line in now.lines}
+            tests |= {f"{RIDE_PREFIX}{line.ride.name}": _of_ride(line.ride) for line in now.lines}
         for quantity, sign in tests.items():
             estimate = _split(now, now.search.place[name], sign)
             if estimate is not None:

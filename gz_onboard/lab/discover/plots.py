@@ -11,7 +11,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.breakdown import COVARIATES, QuantityReader, binned, edges, pooled, share_over
 from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.linear import LinearRide
-from gz_onboard.lab.discover.result import RIDES, Report, Unknown
+from gz_onboard.lab.discover.result import RIDE_TO_RIDE, Report, Unknown
 from gz_onboard.lab.discover.wording import readable
 from gz_onboard.offline.style import BLUE, GRID, INK, MUTED, ORANGE, headline, legend, new_figure, rule
 
@@ -135,7 +135,7 @@ def curve(unknown: Unknown) -> Figure:
     axis.axhline(0, color=INK, linewidth=0.6)
     axis.set_xlabel(f"{readable(unknown.quantity)} [{unknown.unit}]", fontsize=9, color=INK)
     left = f"{readable(unknown.channel)} [{CHANNEL[unknown.channel].unit}]"
-    if unknown.quantity == RIDES:
+    if unknown.quantity == RIDE_TO_RIDE:
         left = f"{readable(unknown.denies[0])}, over its mean [1]"
     axis.set_ylabel(left, fontsize=9, color=INK)
     return figure

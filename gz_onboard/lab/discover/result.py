@@ -21,7 +21,7 @@ METRICS = {
     "voltage": ("voltage of a cell", 1e3, "mV"),
 }
 """Of the gain: label, factor and unit."""
-RIDES = "ride"  # the quantity of what differs from ride to ride
+RIDE_TO_RIDE = "ride"  # the quantity of what differs from ride to ride
 Interval = tuple[float, float]
 NO_INTERVAL = "one ride: no interval"
 
@@ -65,7 +65,7 @@ class Cause:
 
 @dataclass(frozen=True)
 class Unknown:
-    """What has no name: a curve that a `channel` leaves over a `quantity`, or over the rides (`RIDES`).
+    """What has no name: a curve that a `channel` leaves over a `quantity`, or over the rides (`RIDE_TO_RIDE`).
 
     straight: it is in proportion. curve: rows (at [unit], value [the channel's unit], sd). denies: causes that it
     shows to be none. share: of the energy.

@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from gz_onboard.lab.discover.acceptance import with_observed_scatter
-from gz_onboard.lab.discover.constancy import RIDE, unequal
+from gz_onboard.lab.discover.constancy import RIDE_PREFIX, unequal
 from gz_onboard.lab.discover.cross_validation import Fold, held_out, improves, squares
 from gz_onboard.lab.discover.curve_forms import CurveForm, curve_forms
 from gz_onboard.lab.discover.curves import CurveFit, fit_curve
 from gz_onboard.lab.discover.energy import curve_energy_share, energy_share
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.result import RIDES, Split, Unknown
+from gz_onboard.lab.discover.result import RIDE_TO_RIDE, Split, Unknown
 from gz_onboard.lab.discover.search import one_degree
 from gz_onboard.lab.discover.selection import Selection
 from gz_onboard.lab.discover.sizes import Sizes
@@ -143,15 +143,15 @@ def ride_to_ride(now: Selection, worst: Split, constancy: Sequence[Split]) -> Un
     """What no cause is that acts in some rides and not in others: by how much more or less in each."""
     channels = {name for line in now.lines for name in line.tables}
     channel = max(channels, key=lambda name: channel_effect(now, name)[1])
-    mine = [s for s in constancy if s.cause == worst.cause and s.quantity.startswith(RIDE)]
+    mine = [s for s in constancy if s.cause == worst.cause and s.quantity.startswith(RIDE_PREFIX)]
     rows = tuple((float(i), s.ratio, abs(s.ratio) / max(s.chi2, 1e-9) ** 0.5) for i, s in enumerate(mine))
     share = energy_share(now.lines, now.change)
-    return Unknown(channel, RIDES, False, "", worst.chi2, worst.chi2, rows, (worst.cause,), share)
+    return Unknown(channel, RIDE_TO_RIDE, False, "", worst.chi2, worst.chi2, rows, (worst.cause,), share)
 
 
 def form_of(unknown: Unknown, sizes: Sizes) -> CurveForm | None:
     """The curve of what has no name, in a vehicle of `sizes`; None if it is one of rides."""
-    if unknown.quantity == RIDES:
+    if unknown.quantity == RIDE_TO_RIDE:
         return None
     return CurveForm(unknown.channel, unknown.quantity, unknown.straight, sizes)
 

@@ -14,7 +14,7 @@ from gz_onboard.lab.discover.energy import energy_share, residual_sizes
 from gz_onboard.lab.discover.linear import LinearRide, Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.prior import stepped
-from gz_onboard.lab.discover.result import RIDES, Cause, Estimate, Gain, Isolability, Report, Score, Unknown
+from gz_onboard.lab.discover.result import RIDE_TO_RIDE, Cause, Estimate, Gain, Isolability, Report, Score, Unknown
 from gz_onboard.lab.discover.search import Search
 from gz_onboard.lab.discover.selection import SearchProblem
 from gz_onboard.lab.discover.unexplained import unexplained
@@ -185,7 +185,7 @@ def advice(search: Search, sets: Sequence[Sequence[str]], unknown: Unknown | Non
     if unknown is not None:
         lines.append(
             f"Ride one and the same way several times: what {unknown.channel} leaves differs from ride to ride."
-            if unknown.quantity == RIDES
+            if unknown.quantity == RIDE_TO_RIDE
             else f"Ride over the whole span of {unknown.quantity} with all else the same, twice: what "
             f"{unknown.channel} leaves goes with it, or with what changes along with it."
         )
