@@ -69,7 +69,7 @@ def errors(line: LinearRide, theta: Array) -> dict[str, float]:
         if name == "cell_voltage":
             found["voltage"] = float(np.sqrt(np.mean(rest**2)))
     found["power"] = float(np.sqrt(square))
-    found["energy_per_way"] = abs(more) / max(line.ride.distance, 1.0)
+    found["consumption"] = abs(more) / max(line.ride.distance, 1.0)
     model = energy_drawn(line) - more
     if line.ride.have >= WHOLE and model > 0:
         found["range"] = abs(more) / model

@@ -7,7 +7,7 @@ from typing import Annotated
 
 from gz_onboard.offline.schema import OPTIONAL
 
-VERSION = 1
+VERSION = 2  # of the keys: 1 had energy_per_way for consumption
 VERDICTS = {
     "cause": "something differs from the model, and it has a name",
     "none": "nothing is wrong that these rides could show",
@@ -16,7 +16,7 @@ VERDICTS = {
 }
 METRICS = {
     "power": ("power, rms", 1.0, "W"),
-    "energy_per_way": ("consumption", 1 / 3.6, "Wh/km"),
+    "consumption": ("consumption", 1 / 3.6, "Wh/km"),
     "range": ("range", 100.0, "%"),
     "voltage": ("voltage of a cell", 1e3, "mV"),
 }
@@ -119,7 +119,7 @@ class Errors:
 class Gain:
     """Errors on rides held out of the fit, by metric. apart: these rides had no part in the choice either.
 
-    voltage: of a cell [V]; power: rms [W]; energy_per_way: [J/m]; range: [1].
+    voltage: of a cell [V]; power: rms [W]; consumption: [J/m]; range: [1].
     """
 
     holdout: tuple[str, ...] = ()
@@ -127,7 +127,7 @@ class Gain:
     apart: Annotated[bool | None, OPTIONAL] = None
     voltage: Annotated[Errors | None, OPTIONAL] = None
     power: Annotated[Errors | None, OPTIONAL] = None
-    energy_per_way: Annotated[Errors | None, OPTIONAL] = None
+    consumption: Annotated[Errors | None, OPTIONAL] = None
     range: Annotated[Errors | None, OPTIONAL] = None
 
     @property
