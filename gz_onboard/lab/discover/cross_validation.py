@@ -34,7 +34,7 @@ class Fold:
         k = form.basis.shape[1]
         pairs = zip(lines, normals, strict=True)
         rides = [extended(line, plain, form, mixed.noise) or plain.padded(k) for line, plain in pairs]
-        both = fit_mixed(rides, *bordered(free, form, WIDE * np.eye(k))).mean
+        both = fit_mixed(rides, bordered(free, form, WIDE * np.eye(k))).mean
         return both[:-k], both[-k:]
 
     def shown(self, line: LinearRide, curve: Array) -> LinearRide:

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.blocks import blocks, depends, roughness, support, usable
@@ -243,6 +244,22 @@ def marginal(ride: Normal, scatter: Array) -> Normal:
 
 
 @dataclass(frozen=True)
+class Population:
+    """What is known of all rides, in scales: mean (p,), covariance `prior` (p, p) of what is common to them, variances
+    `scatter` (p,) of what is each one's own.
+    """
+
+    mean: Array
+    prior: Array
+    scatter: Array
+
+    def bordered(self, mean: Array, prior: Array, scatter: Array) -> Population:
+        """With k more parameters, of which these (k,), (k, k), (k,) are known."""
+        both = block_diag(self.prior, prior)
+        return Population(np.append(self.mean, mean), both, np.append(self.scatter, scatter))
+
+
+@dataclass(frozen=True)
 class Posterior:
     """mean (p,), covariance (p, p) of the common part; scatter (p,) variances of the rides' own; own (rides, p)."""
 
@@ -253,27 +270,21 @@ class Posterior:
 
 
 def fit_mixed(
-    rides: Sequence[Normal],
-    mean: Array,
-    prior: Array,
-    scatter: Array,
-    weight: Array | float = 0.0,
-    free: Mask | None = None,
-    rounds: int = 0,
+    rides: Sequence[Normal], known: Population, weight: Array | float = 0.0, free: Mask | None = None, rounds: int = 0
 ) -> Posterior:
     """Common part, and the scatter between rides in `rounds` of expectation and maximisation (Dempster, Laird & Rubin
     1977); none: it stays.
 
-    mean, prior: (p,), (p, p) of the common part before. scatter: (p,) variances before, worth `weight` (p,) rides;
-    only those of `free` (p,) are learned, from `LEAST` to `MOST` of what they were.
+    known: before, its scatter worth `weight` (p,) rides; only that of `free` (p,) is learned, from `LEAST` to `MOST` of
+    what it was.
     """
-    before = scatter.copy()
-    now = scatter.copy()
-    information = np.linalg.inv(prior)
+    before = known.scatter.copy()
+    now = known.scatter.copy()
+    information = np.linalg.inv(known.prior)
     for _ in range(max(rounds, 1)):
         parts = [marginal(ride, now) for ride in rides]
         after = np.linalg.inv(information + sum(part.n for part in parts))
-        common = after @ (information @ mean + sum(part.b for part in parts))
+        common = after @ (information @ known.mean + sum(part.b for part in parts))
         total = weight * before
         own = []
         for ride in rides:

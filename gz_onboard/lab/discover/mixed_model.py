@@ -18,6 +18,7 @@ from gz_onboard.lab.discover.linear import (
     LinearRide,
     Noise,
     Normal,
+    Population,
     Posterior,
     fit_mixed,
     linearise,
@@ -58,11 +59,11 @@ class HealthyCurve:
     inflation: float
 
 
-@dataclass
-class MixedModel:
-    """The linear model's frame: names (p,), scale (p,), values where it is linearised, and what is known before.
+@dataclass(frozen=True)
+class MixedModel(Population):
+    """The linear model's frame: names (p,), scale (p,), values where it is linearised, and what is known before, as
+    differences from `values`.
 
-    mean, prior: of the common part less `values`, in scales, (p,), (p, p). scatter: variances between rides, (p,).
     inflation: of a cause's score on healthy rides left out, 1 if right. shapes: what these show over quantities.
     """
 
@@ -72,9 +73,6 @@ class MixedModel:
     names: tuple[str, ...]
     scale: Array
     values: dict[str, float]
-    mean: Array
-    prior: Array
-    scatter: Array
     noise: Noise
     healthy: int  # rides that it was learned on
     free: Mask  # whose scatter between rides is learned, (p,)
@@ -125,11 +123,11 @@ class MixedModel:
 
     def fit(self, rides: Sequence[Normal]) -> Posterior:
         """The common part and each ride's own as `rides` show them, the scatter as it is."""
-        return fit_mixed(rides, self.mean, self.prior, self.scatter)
+        return fit_mixed(rides, self)
 
     def learned_scatter(self, rides: Sequence[Normal], weight: Array | float, rounds: int) -> Posterior:
         """The same with the scatter that `rides` show; see `linear.fit_mixed`."""
-        return fit_mixed(rides, self.mean, self.prior, self.scatter, weight, self.free, rounds)
+        return fit_mixed(rides, self, weight, self.free, rounds)
 
     def freed(self, index: Sequence[int]) -> MixedModel:
         """With nothing known of the common part at `index`."""
