@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -29,17 +30,13 @@ def _always(ride: Ride) -> Mask:
     return np.ones(len(ride.time), dtype=bool)
 
 
-def _rolling(ride: Ride) -> Mask:
-    return np.asarray((np.abs(ride.quantities["speed"]) > ROLLING) & ~ride.braking)
+def _unbraked(faster: float, ride: Ride) -> Mask:
+    return np.asarray((np.abs(ride.quantities["speed"]) > faster) & ~ride.braking)
 
 
 def _fast(ride: Ride) -> Mask:
     fix = ride.signals["gps_fix"] > FIX if "gps_fix" in ride.signals else np.ones(len(ride.time), dtype=bool)
     return np.asarray((np.abs(ride.quantities["speed"]) > FAST) & fix)
-
-
-def _coasting(ride: Ride) -> Mask:
-    return np.asarray((np.abs(ride.quantities["speed"]) > COASTING) & ~ride.braking)
 
 
 class ChannelNoise(NamedTuple):
@@ -86,9 +83,11 @@ class Channel:
 
 _TORQUE = ("torque_constant", "torque_constant_slope", "torque_saturation")
 _SPEED = ("wheel_radius", "speed_sensor_scale")
+_PACK_CURRENT = ("pack_current_offset", "pack_current_gain")
+_INVERTER_CURRENT = ("inverter_current_offset", "inverter_current_gain")
+_LOSSES = ("copper_speed", "loss_speed", "loss_cross", "torque_lag")
 _CELL = (
-    "pack_current_offset",
-    "pack_current_gain",
+    *_PACK_CURRENT,
     "cell_capacity",
     "soc_start",
     "cell_resistance_factor",
@@ -119,7 +118,7 @@ CHANNELS = (
         block=4.0,
         roles=("motor_speed", "motor_current", "accel_x"),
         residual=residuals.road_force,
-        holds=_rolling,
+        holds=partial(_unbraked, ROLLING),
         parameters=(*_TORQUE, *_SPEED, "payload_mass", "payload_error", "accel_bias", "pitch_gain", "rolling_cold"),
         ports=(Port.WHEEL_FORCE, Port.TYRE, Port.MOTOR_LOSS),
         noise=ChannelNoise(white=5.0, slow=2.0, time=60.0),
@@ -142,16 +141,7 @@ CHANNELS = (
         block=2.0,
         roles=("inverter_voltage", "inverter_current", "motor_speed", "motor_current"),
         residual=residuals.inverter_power,
-        parameters=(
-            *_TORQUE,
-            "speed_sensor_scale",
-            "copper_speed",
-            "inverter_current_gain",
-            "inverter_current_offset",
-            "torque_lag",
-            "loss_speed",
-            "loss_cross",
-        ),
+        parameters=(*_TORQUE, "speed_sensor_scale", *_LOSSES, *_INVERTER_CURRENT),
         ports=(Port.MOTOR_LOSS, Port.INVERTER_LOSS),
         noise=ChannelNoise(white=6.0, slow=4.0, time=60.0),
         size="power",
@@ -163,14 +153,7 @@ CHANNELS = (
         block=2.0,
         roles=("pack_current", "inverter_current", "auxiliary_current"),
         residual=residuals.pack_balance,
-        parameters=(
-            "pack_current_offset",
-            "pack_current_gain",
-            "inverter_current_offset",
-            "inverter_current_gain",
-            "idle_current",
-            "pack_inverter_lag",
-        ),
+        parameters=(*_PACK_CURRENT, *_INVERTER_CURRENT, "idle_current", "pack_inverter_lag"),
         noise=ChannelNoise(white=0.1, slow=0.03, time=60.0),
         size="current",
         rough=30.0,
@@ -245,7 +228,7 @@ CHANNELS = (
         block=2.0,
         roles=("wheel_speed_rear", "motor_speed"),
         residual=residuals.rear_speed,
-        holds=_coasting,
+        holds=partial(_unbraked, COASTING),
         parameters=("speed_sensor_scale", "rear_scale", "wheel_lag"),
         noise=ChannelNoise(white=0.02, slow=0.01, time=30.0),
     ),
@@ -255,7 +238,7 @@ CHANNELS = (
         block=2.0,
         roles=("wheel_speed_front", "motor_speed"),
         residual=residuals.front_speed,
-        holds=_coasting,
+        holds=partial(_unbraked, COASTING),
         parameters=("speed_sensor_scale", "front_scale", "front_lean", "slip_per_force", "wheel_lag"),
         noise=ChannelNoise(white=0.05, slow=0.02, time=30.0),
     ),

@@ -138,20 +138,15 @@ def wind_cause(every: Search, chosen: Sequence[str], winds: Winds, lines: Sequen
 
 
 def alternatives(search: Search, chosen: Sequence[str], limit: float) -> list[list[str]]:
-    """Of each cause chosen that others could stand in for: itself and these, as far as they can be."""
-    sets = (likely(search, chosen, group) for group in search.alternatives(chosen, MARGIN, LEAST * limit))
+    """Of each cause chosen that others could stand in for: itself and these, if their parameters can be what they would
+    have to be.
+    """
+    sets = []
+    for group in search.alternatives(chosen, MARGIN, LEAST * limit):
+        rest = [name for name in chosen if name != group[0]]
+        fits = [(name, *search.fitted([*rest, name])[name]) for name in group]
+        sets.append([n for n, x, v in fits if within_bounds(search.mixed, search.causes[n], x, np.sqrt(v))])
     return [group for group in sets if len(group) > 1]
-
-
-def likely(search: Search, chosen: Sequence[str], group: Sequence[str]) -> list[str]:
-    """Those of `group`, stand-ins of its first, whose parameters could be what they would have to be."""
-    rest = [name for name in chosen if name != group[0]]
-    found = []
-    for name in group:
-        change, variance = search.fitted([*rest, name])[name]
-        if within_bounds(search.mixed, search.causes[name], change, np.sqrt(variance)):
-            found.append(name)
-    return found
 
 
 def separability(search: Search) -> Isolability:
