@@ -9,8 +9,9 @@ and b = AᵀC⁻¹y. All parameters are in units of their scale.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,48 +107,44 @@ def linearise(
     return LinearRide(ride, tables)
 
 
-def whitened(table: LinearChannel, noise: ChannelNoise, values: Array) -> Array:
-    """`values` (m,) or (m, k) in units of their noise: the innovations of a Kalman filter of white and exponentially
-    correlated noise (Anderson & Moore 1979, ch. 9), divided by their standard deviation.
-    """
-    white, slow, time = noise
-    if not table.channel.correlated or slow < WHITE * white:
-        return np.asarray(values / white)
-    decay = np.exp(-np.diff(table.time, prepend=table.time[0]) / time)
-    variance = slow**2
-    state = np.zeros(values.shape[1:])
-    out = np.empty_like(values)
-    for i, factor in enumerate(decay.tolist()):
-        state = factor * state
-        variance = factor * factor * variance + (1 - factor * factor) * slow**2
-        total = variance + white**2
-        innovation = values[i] - state
-        out[i] = innovation / total**0.5
-        gain = variance / total
-        state = state + gain * innovation
-        variance *= 1 - gain
-    return out
+def innovations(times: Array, values: Iterable[Any], ratio: Any, time: Any) -> Iterator[tuple[Any, Any]]:
+    """Of `values` at `times` (m,) [s], the innovations of a Kalman filter of white and exponentially correlated noise,
+    and their variances over that of the white noise (Anderson & Moore 1979, ch. 9).
 
-
-def likelihoods(times: Array, rest: Array, ratio: Array, time: Array) -> tuple[Array, Array]:
-    """For each pair of `ratio` (correlated over white sd) and `time` [s], shape (k,): the sum of squares in units of
-    the white noise, and the sum of the logarithms of the innovations' variances. The recursion of `whitened`, whose
-    variances are one number a step; here they are arrays, and as few operations as can be.
+    values: numbers or rows. ratio, time [s]: of the correlated noise, its standard deviation over that of the white
+    one; floats, or arrays (k,) of as many filters of one series of numbers: each step costs a few operations.
     """
-    steps = np.exp(-np.diff(times, prepend=times[0])[:, None] / time)
-    power = ratio**2
-    variance, state = power.copy(), np.zeros(len(ratio))
-    quadratic, logarithm = np.zeros(len(ratio)), np.zeros(len(ratio))
-    for factor, y in zip(steps, rest.tolist(), strict=True):
-        state = factor * state
-        variance = factor * factor * (variance - power) + power
+    decays = np.exp(np.divide.outer(-np.diff(times, prepend=times[0]), time))
+    power, state = ratio**2, 0.0
+    variance = power
+    for decay, value in zip(decays if decays.ndim > 1 else decays.tolist(), values, strict=True):
+        state = decay * state
+        variance = decay * decay * (variance - power) + power
         total = variance + 1
-        innovation = y - state
-        quadratic += innovation * innovation / total
-        logarithm += np.log(total)
+        innovation = value - state
+        yield innovation, total
         gain = variance / total
         state = state + gain * innovation
         variance = variance * (1 - gain)
+
+
+def whitened(table: LinearChannel, noise: ChannelNoise, values: Array) -> Array:
+    """`values` (m,) or (m, k) in units of their noise: innovations over their standard deviations."""
+    white, slow, time = noise
+    if not table.channel.correlated or slow < WHITE * white:
+        return np.asarray(values / white)
+    every = innovations(table.time, values / white, slow / white, time)
+    return np.array([innovation / variance**0.5 for innovation, variance in every]).reshape(values.shape)
+
+
+def likelihoods(times: Array, rest: Array, ratio: Array, time: Array) -> tuple[Array, Array]:
+    """For each pair of `ratio` and `time`, shape (k,), see `innovations`: the sum of squares of `rest` (m,) in units of
+    the white noise, and the sum of the logarithms of the innovations' variances.
+    """
+    quadratic, logarithm = np.zeros(len(ratio)), np.zeros(len(ratio))
+    for innovation, variance in innovations(times, rest.tolist(), ratio, time):
+        quadratic += innovation * innovation / variance
+        logarithm += np.log(variance)
     return quadratic, logarithm
 
 
