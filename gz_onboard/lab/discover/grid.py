@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask
+from gz_onboard.arrays import Array, Mask, running_mean
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.offline.samples import Samples
@@ -186,10 +186,8 @@ def suspension_speed(wheels: Sequence[tuple[Array, Array]], grid: Array) -> Arra
 
 
 def smooth(values: Array, seconds: float) -> Array:
-    """The running mean over about `seconds`, shape kept; the ends are those of a shorter window."""
-    n = max(1, round(seconds / STEP / 2) * 2 + 1)
-    kernel = np.ones(n)
-    return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
+    """The running mean over about `seconds`, shape kept."""
+    return running_mean(values, round(seconds / STEP / 2) * 2 + 1)
 
 
 def steering(speed: Array, lateral_acceleration: Array, wheelbase: float) -> Array:

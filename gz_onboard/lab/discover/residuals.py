@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.arrays import Array, block_means
+from gz_onboard.arrays import Array, block_means, running_mean
 from gz_onboard.constants import GRAVITY
 from gz_onboard.lab.discover.grid import STEP, Ride
 from gz_onboard.lab.discover.system import System, Values, summed
@@ -28,6 +28,7 @@ from gz_onboard.physics.sensors import true_current, true_voltage
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
 DT = SLOW * STEP
 MID = 200.0  # s: between the pair of the vehicle file and slow relaxation
+LAGGED = 3  # grid steps that the slope of what comes later is a mean of
 FIRST = 20  # steps: what a ride begins with
 START_SOC = 0.6  # whose ohmic resistance takes the current off the first voltages
 BRAKING = 0.5  # of the switch: between open and closed
@@ -123,7 +124,7 @@ def inverter_power(ride: Ride, p: Values, system: System) -> Array:
     spin = np.abs(q["motor_speed"]) / (SPIN * system.sizes.spin)
     cross = p["loss_cross"] * np.abs(q["motor_current"]) / (AMPERES * system.sizes.current)
     power = power + (p["loss_speed"] + cross) * spin
-    power = power - p["torque_lag"] * np.gradient(smooth3(np.broadcast_to(power, len(ride.time))), STEP)
+    power = power - p["torque_lag"] * np.gradient(running_mean(np.broadcast_to(power, len(ride.time)), LAGGED), STEP)
     volts = ride.signals["inverter_voltage"]
     shown = p["inverter_current_gain"] * power + p["inverter_current_offset"] * volts
     return np.asarray(ride.signals["inverter_current"] * volts - shown)
@@ -133,16 +134,11 @@ def pack_balance(ride: Ride, p: Values, system: System) -> Array:
     """Pack current [A] less the auxiliaries', less the inverter's."""
     s = ride.signals
     true = true_current(s["pack_current"], p)
-    true = true + p["pack_inverter_lag"] * np.gradient(smooth3(true), STEP)
+    true = true + p["pack_inverter_lag"] * np.gradient(running_mean(true, LAGGED), STEP)
     # beside the auxiliary load there is what is drawn when nothing is: the inverter's own supply
     inverter = true - s["auxiliary_current"] - p["idle_current"]
     shown = p["inverter_current_offset"] + p["inverter_current_gain"] * inverter
     return np.asarray(shown - s["inverter_current"])
-
-
-def smooth3(x: Array) -> Array:
-    """A running mean of three."""
-    return np.asarray(np.convolve(np.pad(x, 1, "edge"), np.ones(3) / 3, "valid"))
 
 
 def auxiliary(ride: Ride, p: Values, system: System) -> Array:
