@@ -14,6 +14,7 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask, running_mean
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
+from gz_onboard.lab.discover.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import air_density
@@ -38,6 +39,7 @@ SUSPENSION = ("suspension_front", "suspension_rear")
 CRAWL, MOST_STEERING = 1.0, 0.6  # m/s, rad: of slower riding the angle is noise
 ROUGH_PERIOD = 0.034  # s: samples further apart do not show what a road does to a wheel
 SHAKING = 2.0  # s, over which the suspension is as fast as the road is rough
+JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
 LONGEST = 60.0  # s since a brake was touched, or a current changed: what was longer ago is as good as never
 
 
@@ -149,6 +151,7 @@ def read_ride(samples: Samples, vehicle: Vehicle) -> Ride:
     ride = Ride(samples.name, grid - start, signals, valid, p["wheel_radius"] * p["gear_ratio"], samples.rider_mass)
     ride.quantities = _quantities(ride, p)
     ride.quantities["since_braking"] = since(ride.braking)
+    ride.quantities["since_change"] = since_change(signals["motor_current"] / sizes_of(vehicle).current)
     wheels = [samples.columns[role] for role in SUSPENSION if role in samples.columns]
     if wheels and all(np.median(np.diff(times)) < ROUGH_PERIOD for times, _ in wheels):
         ride.quantities["suspension_speed"] = suspension_speed(wheels, grid)
@@ -162,6 +165,12 @@ def since(happens: Mask) -> Array:
     steps = np.arange(len(happens))
     last = np.maximum.accumulate(np.where(happens, steps, -round(LONGEST / STEP)))
     return np.asarray(np.minimum((steps - last) * STEP, LONGEST))
+
+
+def since_change(current: Array) -> Array:
+    """Time [s] since `current` (n,), in a vehicle of size 1, changed by `JUMP` within `WITHIN`; at most `LONGEST`."""
+    n = round(WITHIN / STEP)
+    return since(np.abs(current - np.concatenate([np.full(n, current[0]), current[:-n]])) > JUMP)
 
 
 def vibration(times: Array, values: Array, grid: Array) -> Array:

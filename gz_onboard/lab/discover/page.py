@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gz_onboard.lab.discover.breakdown import QuantityReader, before_and_after
+from gz_onboard.lab.discover.breakdown import before_and_after
 from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.detectability import extent
 from gz_onboard.lab.discover.energy import residual_sizes
@@ -42,7 +42,6 @@ def body(found: Discovery) -> str:
     report = found.report
     before, after = before_and_after(found)
     stages = {"before": before, "after": after} if report.causes else {"before": before}
-    over = QuantityReader(found.mixed)
     channels = [name for name in CHANNEL if any(name in line.tables for line in found.lines)]
     parts = [
         _head(found),
@@ -51,12 +50,12 @@ def body(found: Discovery) -> str:
         "<h2>What the residuals are</h2>" + _residuals(report, before, after),
         "<h2>Where they live</h2>",
         f"<p>Share of each residual's variance that goes with a quantity, in percent: before{_named(report)}.</p>",
-        _picture(overview(stages, channels, over)),
+        _picture(overview(stages, channels)),
     ]
     shown = _most(found, before, channels)
     for name in [*shown, *(c for c in channels if c not in shown)]:
         title = f"{readable(name)} [{CHANNEL[name].unit}]"
-        picture = _picture(panels(stages, name, over))
+        picture = _picture(panels(stages, name))
         note = _GRADE if name == "road_force" else ""
         parts.append(f"<details{' open' if name in shown else ''}><summary>{title}</summary>{picture}{note}</details>")
     parts += [

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.breakdown import COVARIATES, QuantityReader, binned, edges, pooled, share_over
+from gz_onboard.lab.discover.breakdown import COVARIATES, binned, edges, pooled, share_over
 from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.linear import LinearRide
 from gz_onboard.lab.discover.result import RIDE_TO_RIDE, Report, Unknown
@@ -23,11 +23,11 @@ Stages = Mapping[str, Sequence[LinearRide]]  # the rides "before" the causes and
 CHOSEN, NEAR, OTHER = BLUE, "#8fb8de", "#cbd2d9"
 
 
-def overview(stages: Stages, channels: Sequence[str], over: QuantityReader) -> Figure:
+def overview(stages: Stages, channels: Sequence[str]) -> Figure:
     """Channels by quantities: the share of variance that goes with each."""
     quantities = list(COVARIATES)
     grids = [
-        np.array([[100 * share_over(*pooled(lines, c, name, over)) for name in quantities] for c in channels])
+        np.array([[100 * share_over(*pooled(lines, c, name)) for name in quantities] for c in channels])
         for lines in stages.values()
     ]
     width, height = 12.5, 1.5 + 0.3 * len(channels)
@@ -54,11 +54,11 @@ def overview(stages: Stages, channels: Sequence[str], over: QuantityReader) -> F
     return figure
 
 
-def panels(stages: Stages, channel: str, over: QuantityReader) -> Figure:
+def panels(stages: Stages, channel: str) -> Figure:
     """The residual's mean over each quantity, in bins of as many blocks, one standard error as a band."""
     drawn = []
     for name in COVARIATES:
-        samples = [pooled(lines, channel, name, over) for lines in stages.values()]
+        samples = [pooled(lines, channel, name) for lines in stages.values()]
         x = samples[0][0]
         if len(x) > 20 and np.ptp(x) > 0:
             drawn.append((name, [binned(*sample, edges(x)) for sample in samples]))
