@@ -24,7 +24,7 @@ from gz_onboard.vehicle import Vehicle
 @dataclass(frozen=True)
 class Nuisance:
     """A parameter that no vehicle file has: sd is of its mean, ride_sd of its scatter from ride to ride, both in a
-    vehicle of size 1; of: the size of `Sizes` that they grow with.
+    vehicle of size 1; size: the one of `Sizes` that they grow with.
     """
 
     name: str
@@ -33,7 +33,7 @@ class Nuisance:
     sd: float
     ride_sd: float
     text: str
-    of: str = ""
+    size: str = ""
 
 
 NUISANCES = (
@@ -198,7 +198,7 @@ def prior_of(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], val
     """Of the parameter `name`, at `value`. absent: it is of an effect that the model lacks."""
     on_bench = False
     if name in NUISANCE:
-        size = sizes_of(vehicle).of(NUISANCE[name].of)
+        size = sizes_of(vehicle).of(NUISANCE[name].size)
         scatter, spread = NUISANCE[name].ride_sd * size, NUISANCE[name].sd * size
     else:
         parameter, known = declared[name], vehicle.parameters

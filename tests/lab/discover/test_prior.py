@@ -52,7 +52,7 @@ def test_absolute_numbers_grow_with_the_vehicle(scooter: Vehicle):
     form = CurveForm("road_force", "motor_current", sizes=sizes)
     assert form.knots == pytest.approx(4 * np.array(KNOTS["motor_current"][0]))
     assert form.size == pytest.approx(4 * replace(form, sizes=USUAL_SIZES).size)
-    assert {nuisance.of for nuisance in NUISANCE.values()} == {
+    assert {nuisance.size for nuisance in NUISANCE.values()} == {
         "",
         "power",
         "current",
