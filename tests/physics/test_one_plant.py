@@ -124,7 +124,7 @@ def test_discovery_has_the_same_voltage_of_a_cell(ride):
     grid = on_grid(ride)
     start = SOC - residuals.start_soc(grid, system)
     exact = values | {"soc_start": start, "pack_current_offset": 0.0, "pack_current_gain": 1.0}
-    volts = residuals.cell_circuit(grid, exact, system)[0]
+    volts = residuals.cell_circuit(grid, exact, system).voltage
     assert block_means(volts, 2) == pytest.approx(written_out(ride)[0], abs=MILLIVOLT)  # of two half seconds
 
 

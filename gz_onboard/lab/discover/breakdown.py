@@ -80,7 +80,7 @@ def outlying_rides(found: Discovery) -> list[str]:
 
 def over(line: LinearRide, name: str, table: LinearChannel) -> Array | None:
     """The quantity `name` of `COVARIATES` over the blocks in `table`, (m,); None if the ride has it not."""
-    values = line.ride.quantity(name) if COVARIATES[name][2] in line.ride.have else None
+    values = line.ride.quantities.get(name) if COVARIATES[name][2] in line.ride.have else None
     return None if values is None else over_blocks(table.channel, values)[table.used]
 
 

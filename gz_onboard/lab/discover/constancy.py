@@ -40,9 +40,7 @@ def _halves(name: str) -> Sign:
     """-1 below a value of the quantity, +1 above it, half of the cause's own squared effect on either side."""
 
     def sign(ride: Ride, table: LinearChannel, effect: Array) -> Array:
-        values = ride.quantity(name)
-        assert values is not None
-        at = over_blocks(table.channel, values)[table.used]
+        at = over_blocks(table.channel, ride.quantities[name])[table.used]
         order = np.argsort(at)
         half = np.cumsum(effect[order] ** 2)
         return np.asarray(np.sign(at - at[order][np.searchsorted(half, half[-1] / 2)]))

@@ -106,7 +106,7 @@ def curve_forms(sizes: Sizes = USUAL_SIZES) -> list[CurveForm]:
 def quantity(ride: Ride, name: str, table: LinearChannel) -> Array | None:
     """The quantity over the blocks of `table`, (m,); None if the ride has it not."""
     channel = table.channel
-    values = ride.quantity(name)
+    values = ride.quantities.get(name)
     if name == "current_change":
         n = round(channel.block / STEP)
         mean = over_blocks(channel, ride.signals["motor_current"])

@@ -18,6 +18,7 @@ from gz_onboard.lab.discover.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import air_density
+from gz_onboard.physics.sensors import true_current, true_voltage
 from gz_onboard.physics.vibration import Vibration
 from gz_onboard.vehicle import Vehicle
 
@@ -48,8 +49,8 @@ class Ride:
     """A ride on the grid.
 
     time: shape (n,) [s from the start]. signals: by role, shape (n,); valid: likewise, where it was measured.
-    quantities: what effects read (names of `physics.effect.QUANTITIES`), shape (n,) or a float, with the vehicle's
-    nominal mass and radius. have: the roles that are there.
+    quantities: what effects read (names of `physics.effect.QUANTITIES`) and residuals are looked at over, shape (n,),
+    with the vehicle's nominal mass and radius. energy: see `energy_drawn`. have: the roles that are there.
     """
 
     name: str
@@ -59,6 +60,7 @@ class Ride:
     radius: float
     payload: float | None
     quantities: dict[str, Array] = field(default_factory=dict)
+    energy: float = 0.0
 
     @property
     def have(self) -> set[str]:
@@ -71,12 +73,6 @@ class Ride:
         for role in roles:
             result &= self.valid[role]
         return result
-
-    def quantity(self, name: str) -> Array | None:
-        """A quantity, the time or the pack's current, shape (n,); None if it was not measured."""
-        if name == "time":
-            return self.time
-        return self.signals.get(name) if name == "pack_current" else self.quantities.get(name)
 
     @property
     def distance(self) -> float:
@@ -150,6 +146,9 @@ def read_ride(samples: Samples, vehicle: Vehicle) -> Ride:
     p = vehicle.parameters
     ride = Ride(samples.name, grid - start, signals, valid, p["wheel_radius"] * p["gear_ratio"], samples.rider_mass)
     ride.quantities = _quantities(ride, p)
+    ride.energy = energy_drawn(ride, p)
+    if "pack_current" in signals:
+        ride.quantities["pack_current"] = true_current(signals["pack_current"], p)
     ride.quantities["since_braking"] = since(ride.braking)
     ride.quantities["since_change"] = since_change(signals["motor_current"] / sizes_of(vehicle).current)
     wheels = [samples.columns[role] for role in SUSPENSION if role in samples.columns]
@@ -158,6 +157,18 @@ def read_ride(samples: Samples, vehicle: Vehicle) -> Ride:
     if "accel_z" in samples.columns and np.median(np.diff(samples.columns["accel_z"][0])) < ROUGH_PERIOD:
         ride.quantities["vibration"] = vibration(*samples.columns["accel_z"], grid)
     return ride
+
+
+def energy_drawn(ride: Ride, p: Mapping[str, float]) -> float:
+    """What the pack gave over the ride [J], its sensors' errors taken off; the motor's work where that is not known."""
+    s, q = ride.signals, ride.quantities
+    if {"pack_voltage", "pack_current"} <= ride.have:
+        power = true_voltage(s["pack_voltage"], p) * true_current(s["pack_current"], p)
+    elif {"inverter_voltage", "inverter_current"} <= ride.have:
+        power = s["inverter_voltage"] * s["inverter_current"]
+    else:
+        power = np.abs(q["torque"] * q["motor_speed"])
+    return float(np.sum(power)) * STEP
 
 
 def since(happens: Mask) -> Array:
@@ -244,6 +255,7 @@ def _quantities(ride: Ride, p: Mapping[str, float]) -> dict[str, Array]:
         "ambient_temperature": ambient,
         "cell_temperature": temperature,
         "heading": np.asarray(np.mod(course, 2 * np.pi), dtype=np.float64),
+        "time": ride.time,
         "time_moving": np.asarray(moved, dtype=np.float64),
         "torque": p["torque_constant"] * s["motor_current"],
     }

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -30,7 +30,6 @@ DT = SLOW * STEP
 MID = 200.0  # s: between the pair of the vehicle file and slow relaxation
 LAGGED = 3  # grid steps that the slope of what comes later is a mean of
 FIRST = 20  # steps: what a ride begins with
-START_SOC = 0.6  # whose ohmic resistance takes the current off the first voltages
 BRAKING = 0.5  # of the switch: between open and closed
 LEAST_COOLING = 0.05  # of the conductance at standstill: moving air does not heat
 # Scales of the nuisances, so that all are of order one. Those of currents, forces and speeds of the motor are of a
@@ -157,8 +156,17 @@ def voltage_balance(ride: Ride, p: Values, system: System) -> Array:
     return np.asarray(true_voltage(s["pack_voltage"], p) - inverter)
 
 
-def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, Array]:
-    """(terminal voltage of a cell by the circuit [V], the pack's current [A], SOC) at steps of `DT`."""
+class CellCircuit(NamedTuple):
+    """What the circuit says of a mean cell, at steps of `DT`."""
+
+    voltage: Array  # V, at its terminals
+    rest: Array  # V, without a current
+    current: Array  # A, of the pack
+    soc: Array
+
+
+def cell_circuit(ride: Ride, p: Values, system: System) -> CellCircuit:
+    """The circuit of a mean cell at the current measured."""
     battery = system.pack
     cell = block_means(true_current(ride.signals["pack_current"], p), SLOW) / battery.cells_parallel
     temperature = block_means(ride.quantities["cell_temperature"], SLOW)
@@ -183,31 +191,29 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, A
     q |= {"cell_current": cell, "soc": soc, "cell_temperature": temperature, "cell_capacity": capacity}
     extra = extra + summed(system.terms(q, p, DT, Port.CELL_VOLTAGE))
     rest = battery.ocv_over(soc, temperature) + p["ocv_offset"] + p["ocv_tilt"] * (soc - MIDDLE) + p["ocv_cold"] * cold
-    return np.asarray(terminal_voltage(rest, r0, cell, v1 + extra)), cell * battery.cells_parallel, soc
+    return CellCircuit(terminal_voltage(rest, r0, cell, v1 + extra), rest, cell * battery.cells_parallel, soc)
 
 
 def start_soc(ride: Ride, system: System) -> float:
-    """The SOC that the first voltages point to, with the current taken off by the ohmic resistance."""
-    battery = system.pack
-    amperes = float(np.mean(ride.signals["pack_current"][:FIRST]))
-    volts = battery.cell_voltage(float(np.mean(ride.signals["pack_voltage"][:FIRST])), amperes)
-    temperature = float(ride.quantities["cell_temperature"][0])
-    drop = amperes / battery.cells_parallel * battery.r0.at(START_SOC, temperature)[0]
-    return battery.soc_at(volts + drop, temperature)
+    """The SOC that the first voltages point to, by the vehicle file: `soc_start` counts from there, whatever moves."""
+    volts = true_voltage(float(np.mean(ride.signals["pack_voltage"][:FIRST])), system.healthy)
+    amperes = true_current(float(np.mean(ride.signals["pack_current"][:FIRST])), system.healthy)
+    return system.pack.first_soc(volts, amperes, float(ride.quantities["cell_temperature"][0]))
 
 
 def counted_soc(ride: Ride, system: System) -> Array:
     """SOC by counting the current from where the first voltages point to, shape (n,)."""
     capacity = system.pack.pack_capacity(float(ride.quantities["cell_temperature"][0]))
-    return np.asarray(start_soc(ride, system) - np.cumsum(discharged(ride.signals["pack_current"], STEP, capacity)))
+    amperes = true_current(ride.signals["pack_current"], system.healthy)
+    return np.asarray(start_soc(ride, system) - np.cumsum(discharged(amperes, STEP, capacity)))
 
 
 def cell_voltage(ride: Ride, p: Values, system: System) -> Array:
     """Voltage [V] of a mean cell less that of its circuit at the current measured, at steps of `DT`."""
     battery = replace(system.pack, series_resistance=p["pack_series_resistance"])
-    volts, amperes, _ = cell_circuit(ride, p, system)
+    cell = cell_circuit(ride, p, system)
     measured = true_voltage(block_means(ride.signals["pack_voltage"], SLOW), p)
-    return np.asarray(battery.cell_voltage(measured, amperes) - volts)
+    return np.asarray(battery.cell_voltage(measured, cell.current) - cell.voltage)
 
 
 def voltage_timing(ride: Ride, p: Values, system: System) -> Array:
@@ -293,9 +299,7 @@ def inverter_temperature(ride: Ride, p: Values, system: System) -> Array:
 
 def cell_temperature(ride: Ride, p: Values, system: System) -> Array:
     """The cells' temperature [K] less that of the lump at the circuit's heat, at steps of `DT`."""
-    battery = system.pack
-    volts, amperes, soc = cell_circuit(ride, p, system)
-    rest = battery.ocv_over(soc, block_means(ride.quantities["cell_temperature"], SLOW))
-    watts = battery.cells_series * heat(rest, volts, amperes)
+    cell = cell_circuit(ride, p, system)
+    watts = system.pack.cells_series * heat(cell.rest, cell.voltage, cell.current)
     network = LumpedCooling.of(p, "pack", _first(ride, "cell_temperature") + p["cells_start"])
     return _warmed(ride, p, "cell_temperature", network, watts, "pack_airflow")
