@@ -69,8 +69,9 @@ def moving(ride: Ride, p: Values, system: System) -> dict[str, Array]:
 
 def mass(ride: Ride, p: Values, system: System) -> float:
     """Vehicle and payload [kg]: the payload entered, and by how much it is wrong."""
-    entered = ride.payload if ride.payload is not None else system.payload
-    return p["vehicle_mass"] + entered + (p["payload_mass"] - system.payload) + p["payload_error"]
+    usual = system.healthy["payload_mass"]
+    entered = ride.payload if ride.payload is not None else usual
+    return p["vehicle_mass"] + entered + (p["payload_mass"] - usual) + p["payload_error"]
 
 
 def torque_constant(ride: Ride, p: Values, system: System) -> Array:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -25,8 +25,7 @@ class System:
 
     effects: tuple[Effect, ...]
     battery: Battery | None
-    payload: float  # kg, of the vehicle file: what a ride without an entry carries
-    healthy: Values = field(default_factory=dict)  # parameters of the vehicle file
+    healthy: Values  # parameters of the vehicle file
     vibration: float = VIBRATION  # m/s², of the vehicle file's prior riding: for rides that did not measure it
     sizes: Sizes = USUAL_SIZES
 
