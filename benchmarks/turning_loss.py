@@ -18,7 +18,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.cli import main as command
 from gz_onboard.constants import GRAVITY
-from gz_onboard.lab.discover.breakdown import QuantityReader, before_and_after, binned, edges, pooled
+from gz_onboard.lab.discover.breakdown import before_and_after, binned, edges, pooled
 from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.lab.discover.extension import write_model
 from gz_onboard.lab.discover.result import METRICS, Gain
@@ -55,7 +55,6 @@ def residual(found: Discovery, file: Path) -> None:
     """Road force over lateral acceleration, before and after, with what the effect says."""
     cause = next(c for c in found.report.causes if c.name == "cornering_drag")
     before, after = before_and_after(found)
-    over = QuantityReader(found.mixed)
     figure = new_figure(11, 4.3)
     mass = float(np.mean([line.ride.quantities["mass"][0] for line in found.lines]))
     axes: list[Any] = []
@@ -63,7 +62,7 @@ def residual(found: Discovery, file: Path) -> None:
         axis = figure.add_axes((0.07 + 0.47 * i, 0.12, 0.44, 0.74), sharey=axes[0] if axes else None)
         axes.append(axis)
         rule(axis)
-        x, y = pooled(lines, "road_force", "lateral_acceleration", over)
+        x, y = pooled(lines, "road_force", "lateral_acceleration")
         axis.plot(x, y, ".", color=MUTED, markersize=2.5, alpha=0.5, label="means of 4 s")
         rows = binned(x, y, edges(x, 16))
         axis.errorbar(

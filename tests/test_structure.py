@@ -50,7 +50,7 @@ ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py"}
 # that stand before it.
 STAGES = {
     "plain data": ["result", "wording"],
-    "read": ["grid"],
+    "read": ["sizes", "grid"],
     "residuals": ["system", "residuals", "channels", "blocks"],
     "linear model": ["prior", "candidates", "linear", "mixed_model", "uncalibrated", "baseline_file"],
     "search": ["search", "curve_forms", "curves", "baseline", "selection"],

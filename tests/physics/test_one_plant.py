@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gz_onboard.arrays import block_means
 from gz_onboard.estimator.ekf import ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, voltage
@@ -17,7 +18,7 @@ from gz_onboard.lab.calibrate.cooling_network import motor_temperatures, pack_te
 from gz_onboard.lab.calibrate.cooling_run import CoolingRun
 from gz_onboard.lab.calibrate.road_load import RoadLoad
 from gz_onboard.lab.discover import residuals
-from gz_onboard.lab.discover.grid import USUAL_DELAYS, Dimensions, Ride, read_ride
+from gz_onboard.lab.discover.grid import Ride, read_ride
 from gz_onboard.lab.discover.mixed_model import initial
 from gz_onboard.lab.discover.system import summed
 from gz_onboard.lab.validate_components import battery_voltage, components, losses, road_load
@@ -52,12 +53,10 @@ def simulated():
 
 def recorded():
     """The same of a recorded one."""
-    radius, mass = P["wheel_radius"] * P["gear_ratio"], VEHICLE.model.mass
-    vehicle = Dimensions(radius, mass, P["torque_constant"], P["wheelbase"], USUAL_DELAYS)
-    ride = read_ride(read_samples(LOG, VEHICLE), vehicle)
+    ride = read_ride(read_samples(LOG, VEHICLE), VEHICLE)
     names = ("pack_current", "motor_current", "pack_voltage", "motor_temperature")
-    found = {name: residuals.mean_over(ride.signals[name], 10) for name in names}
-    return found | {name: residuals.mean_over(ride.quantities[name], 10) for name in ("speed", "cell_temperature")}
+    found = {name: block_means(ride.signals[name], 10) for name in names}
+    return found | {name: block_means(ride.quantities[name], 10) for name in ("speed", "cell_temperature")}
 
 
 @pytest.fixture(scope="module", params=[simulated, recorded])
@@ -125,8 +124,8 @@ def test_discovery_has_the_same_voltage_of_a_cell(ride):
     grid = on_grid(ride)
     start = SOC - residuals.start_soc(grid, system)
     exact = values | {"soc_start": start, "pack_current_offset": 0.0, "pack_current_gain": 1.0}
-    volts = residuals.cell_circuit(grid, exact, system)[0]
-    assert residuals.mean_over(volts, 2) == pytest.approx(written_out(ride)[0], abs=MILLIVOLT)  # of two half seconds
+    volts = residuals.cell_circuit(grid, exact, system).voltage
+    assert block_means(volts, 2) == pytest.approx(written_out(ride)[0], abs=MILLIVOLT)  # of two half seconds
 
 
 def test_calibration_has_the_same_voltage_of_a_cell(ride):
@@ -207,9 +206,9 @@ def test_everyone_books_the_same_losses_of_motor_and_inverter(ride):
     values, system = healthy()
     grid = on_grid(ride)
     fed, drags = residuals.motor_losses(grid, residuals.moving(grid, values, system), values, system)
-    assert residuals.mean_over(fed + drags, 10) == pytest.approx(by_model, rel=1e-6, abs=1e-6)
+    assert block_means(fed + drags, 10) == pytest.approx(by_model, rel=1e-6, abs=1e-6)
     by_discovery = summed(system.terms(grid.quantities, values, 0.1, Port.INVERTER_LOSS))
-    assert residuals.mean_over(by_discovery, 10) == pytest.approx(inverter, rel=1e-6, abs=1e-6)
+    assert block_means(by_discovery, 10) == pytest.approx(inverter, rel=1e-6, abs=1e-6)
     scooter = Scooter(VEHICLE, soc=SOC, ambient=AMBIENT)
     motor = scooter.motor
     rows = zip(ride["motor_speed"], ride["motor_current"], ride["motor_temperature"], strict=True)
@@ -221,11 +220,9 @@ def test_calibration_and_discovery_warm_the_motor_alike(ride):
     values, system = healthy()
     grid = on_grid(ride)
     still = values | {"motor_start": 0.0, "rotor_start": 0.0, "motor_airflow": 0.0}
-    modelled = residuals.mean_over(grid.signals["motor_temperature"], 5) - residuals.motor_temperature(
-        grid, still, system
-    )
+    modelled = block_means(grid.signals["motor_temperature"], 5) - residuals.motor_temperature(grid, still, system)
     heat = residuals._heat(grid, values, system)[0]
-    run = calibration_run(ride, motor_heat=residuals.mean_over(heat, 2))
+    run = calibration_run(ride, motor_heat=block_means(heat, 2))
     start = modelled[0] - motor_temperatures(P, run)["motor_temperature"][0]
     by_calibration = motor_temperatures(dict(P) | {"start:ride:motor_temperature": start}, run)["motor_temperature"]
     assert modelled[::2] == pytest.approx(by_calibration, abs=0.05)  # steps of half a second and of a second
@@ -248,7 +245,7 @@ def test_everyone_has_the_same_road_load(ride):
         / ride["speed"][moving]
     )
     terms = system.terms(on_grid(ride).quantities, values, 0.1, *ROAD_LOAD)
-    by_discovery = residuals.mean_over(np.broadcast_to(summed(terms), 10 * n), 10)[moving]
+    by_discovery = block_means(np.broadcast_to(summed(terms), 10 * n), 10)[moving]
     assert by_discovery == pytest.approx(held, rel=1e-6)
 
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.constancy import RIDE, splits, unequal
+from gz_onboard.lab.discover.constancy import RIDE_PREFIX, splits, unequal
 from gz_onboard.lab.discover.cross_validation import Fold, held_out, improves, squares
 from gz_onboard.lab.discover.linear import Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
@@ -64,7 +64,7 @@ def rejection(now: Selection, limit: float) -> tuple[str, str] | None:
     strict = Search(wide, evidence(wide, now.normals), list(search.causes.values()), search.shares)
     # against a file what differs between rides cannot be separated from what its model lacks; a baseline knows it
     parts = [] if mixed.healthy else splits(now)
-    uneven = {split.cause for split in parts if unequal(split) and split.quantity.startswith(RIDE)}
+    uneven = {split.cause for split in parts if unequal(split) and split.quantity.startswith(RIDE_PREFIX)}
     found: list[tuple[float, str, str]] = []
     for name, (change, variance) in search.fitted(now.chosen).items():
         score = strict.part(now.chosen, name)

@@ -60,24 +60,12 @@ def save(mixed: MixedModel, file: Path) -> None:
         for i, shape in enumerate(mixed.shapes.values())
         for key in ("mean", "covariance", "inflation")
     }
+    arrays = {name: getattr(mixed, name) for name in ("names", "scale", "mean", "prior", "scatter", "healthy")}
+    for key, names in (("values", "value_names"), ("noise", "noise_names"), ("inflation", "inflation_names")):
+        table = getattr(mixed, key)
+        arrays |= {names: np.array(list(table)), key: np.array(list(table.values()))}
     with file.open("wb") as stream:
-        np.savez_compressed(
-            stream,
-            names=np.array(mixed.names),
-            scale=mixed.scale,
-            mean=mixed.mean,
-            prior=mixed.prior,
-            scatter=mixed.scatter,
-            healthy=mixed.healthy,
-            value_names=np.array(list(mixed.values)),
-            values=np.array(list(mixed.values.values())),
-            noise_names=np.array(list(mixed.noise)),
-            noise=np.array(list(mixed.noise.values())),
-            inflation_names=np.array(list(mixed.inflation)),
-            inflation=np.array(list(mixed.inflation.values())),
-            shape_names=np.array(list(mixed.shapes)),
-            **shapes,
-        )
+        np.savez_compressed(stream, shape_names=np.array(list(mixed.shapes)), **arrays, **shapes)
 
 
 def load(mixed: MixedModel, file: Path) -> MixedModel:
@@ -95,7 +83,13 @@ def load(mixed: MixedModel, file: Path) -> MixedModel:
             prior[at, :] = 0.0
             prior[:, at] = 0.0
             prior[np.ix_(at, at)] = data["prior"]
-            pairs = [str(name) for name in data["shape_names"]]
+            noise = (ChannelNoise(*row) for row in data["noise"].tolist())
+            shapes = (
+                HealthyCurve(
+                    data[f"shape_{i}_mean"], data[f"shape_{i}_covariance"], float(data[f"shape_{i}_inflation"])
+                )
+                for i in range(len(data["shape_names"]))
+            )
             return replace(
                 mixed,
                 mean=mean,
@@ -104,22 +98,13 @@ def load(mixed: MixedModel, file: Path) -> MixedModel:
                 scale=scale,
                 healthy=int(data["healthy"]),
                 values=mixed.values | _mapping(data["value_names"], data["values"]),
-                noise=mixed.noise
-                | {
-                    str(name): ChannelNoise(*row.tolist())
-                    for name, row in zip(data["noise_names"], data["noise"], strict=True)
-                },
+                noise=mixed.noise | dict(zip(data["noise_names"].tolist(), noise, strict=True)),
                 inflation=_mapping(data["inflation_names"], data["inflation"]),
-                shapes={
-                    pair: HealthyCurve(
-                        data[f"shape_{i}_mean"], data[f"shape_{i}_covariance"], float(data[f"shape_{i}_inflation"])
-                    )
-                    for i, pair in enumerate(pairs)
-                },
+                shapes=dict(zip(data["shape_names"].tolist(), shapes, strict=True)),
             )
     except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
         raise InputError(f"{file}: cannot be read as what healthy rides taught: {error}") from error
 
 
 def _mapping(names: Array, values: Array) -> dict[str, float]:
-    return {str(name): float(value) for name, value in zip(names, values, strict=True)}
+    return dict(zip(names.tolist(), values.tolist(), strict=True))

@@ -6,10 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask
+from gz_onboard.arrays import Array, Mask, block_means
 from gz_onboard.lab.discover.channels import Channel
 from gz_onboard.lab.discover.grid import STEP, Ride
-from gz_onboard.lab.discover.residuals import mean_over
 from gz_onboard.lab.discover.system import System, Values
 from gz_onboard.physics.effect import Effect
 
@@ -38,33 +37,34 @@ def support(channel: Channel, ride: Ride) -> Mask:
     if channel.name == "voltage_timing":
         good = good & np.roll(good, -1)
         good[-1] = False
-    return np.asarray(mean_over(good.astype(float), n) > WHOLE)
+    return np.asarray(block_means(good.astype(float), n) > WHOLE)
 
 
 def blocks(channel: Channel, ride: Ride, p: Values, system: System) -> Array:
     """The residual of `channel` averaged over its blocks, shape (blocks,); masked ones too."""
     fine = channel.residual(ride, p, system)
     count = len(ride.time) // round(channel.block / STEP)
-    result = mean_over(fine, round(channel.block / STEP / channel.steps))
+    result = block_means(fine, round(channel.block / STEP / channel.steps))
     return np.asarray(result[:count])
 
 
-def roughness(channel: Channel, ride: Ride) -> Array:
+def roughness(channel: Channel, ride: Ride, system: System) -> Array:
     """By how much more a block's residual scatters, shape (blocks,): where the current changes within it, small errors
     of timing and of dynamics weigh more; on a rough road the accelerometer is noisy.
     """
+    doubling = channel.rough * system.sizes.current
     n = round(channel.block / STEP)
     shaken = np.ones(len(ride.time) // n)
     if channel.shaken > 0 and "vibration" in ride.quantities:
-        shaken = shaken + mean_over(ride.quantities["vibration"] ** 2, n) / channel.shaken**2
-    if channel.rough <= 0:
+        shaken = shaken + block_means(ride.quantities["vibration"] ** 2, n) / channel.shaken**2
+    if doubling <= 0:
         return np.asarray(np.sqrt(shaken))
     amperes = ride.signals["motor_current"]
-    level = mean_over(np.abs(amperes), n)
-    swing = np.sqrt(np.maximum(mean_over(amperes**2, n) - mean_over(amperes, n) ** 2, 0.0))
-    return np.asarray(np.sqrt(shaken * (1 + ((swing + STEADY * level) / channel.rough) ** 2)))
+    level = block_means(np.abs(amperes), n)
+    swing = np.sqrt(np.maximum(block_means(amperes**2, n) - block_means(amperes, n) ** 2, 0.0))
+    return np.asarray(np.sqrt(shaken * (1 + ((swing + STEADY * level) / doubling) ** 2)))
 
 
 def over_blocks(channel: Channel, values: Array) -> Array:
     """A quantity on the grid, averaged over the blocks of `channel`."""
-    return mean_over(values, round(channel.block / STEP))
+    return block_means(values, round(channel.block / STEP))

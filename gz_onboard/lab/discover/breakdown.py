@@ -12,20 +12,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.blocks import over_blocks, usable
-from gz_onboard.lab.discover.channels import BY_NAME
-from gz_onboard.lab.discover.grid import STEP, Ride, since
+from gz_onboard.lab.discover.blocks import over_blocks
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Posterior
-from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.residuals import SLOW, cell_circuit
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import readable
 
-JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
 FINEST = 25  # bins of the least width that are the span of a quantity
 OUTSTANDING = 3.5  # standard deviations of what differs between healthy rides
 
-QUANTITIES: dict[str, tuple[str, str, str]] = {
+COVARIATES: dict[str, tuple[str, str, str]] = {
     "speed": ("speed", "m/s", "motor_speed"),
     "acceleration": ("acceleration", "m/s²", "motor_speed"),
     "lateral_acceleration": ("lateral acceleration, left positive", "m/s²", "rate_z"),
@@ -83,43 +78,13 @@ def outlying_rides(found: Discovery) -> list[str]:
     return sentences
 
 
-class QuantityReader:
-    """The quantities of the rides over the blocks of their channels; those that cost something are kept."""
-
-    def __init__(self, mixed: MixedModel) -> None:
-        self._mixed = mixed
-        self._kept: dict[tuple[int, str], Array | None] = {}
-
-    def __call__(self, line: LinearRide, name: str, table: LinearChannel) -> Array | None:
-        """The quantity `name` of `QUANTITIES` over the blocks in `table`, (m,); None if the ride has it not."""
-        key = (id(line.ride), name)
-        if key not in self._kept:
-            self._kept[key] = on_grid(line.ride, name, self._mixed)
-        values = self._kept[key]
-        return None if values is None else over_blocks(table.channel, values)[table.used]
+def over(line: LinearRide, name: str, table: LinearChannel) -> Array | None:
+    """The quantity `name` of `COVARIATES` over the blocks in `table`, (m,); None if the ride has it not."""
+    values = line.ride.quantities.get(name) if COVARIATES[name][2] in line.ride.have else None
+    return None if values is None else over_blocks(table.channel, values)[table.used]
 
 
-def on_grid(ride: Ride, name: str, mixed: MixedModel) -> Array | None:
-    """A quantity on the grid of the ride, shape of its time; None if the ride has it not."""
-    if QUANTITIES[name][2] not in ride.have:
-        return None
-    if name == "since_change":
-        return since_change(ride.signals["motor_current"])
-    if name == "soc":
-        if not usable(BY_NAME["cell_voltage"], ride, mixed.system):
-            return None
-        soc = np.repeat(cell_circuit(ride, mixed.values, mixed.system)[2], SLOW)
-        return np.append(soc, np.full(max(0, len(ride.time) - len(soc)), soc[-1]))
-    return ride.quantity(name)
-
-
-def since_change(current: Array) -> Array:
-    """Time [s] since `current` (n,) changed by more than `JUMP` within `WITHIN`, at most `grid.LONGEST`, (n,)."""
-    n = round(WITHIN / STEP)
-    return since(np.abs(current - np.concatenate([np.full(n, current[0]), current[:-n]])) > JUMP)
-
-
-def pooled(lines: Sequence[LinearRide], channel: str, name: str, over: QuantityReader) -> tuple[Array, Array]:
+def pooled(lines: Sequence[LinearRide], channel: str, name: str) -> tuple[Array, Array]:
     """(quantity, residual in the channel's unit) of all blocks, each (m,)."""
     xs, ys = [np.zeros(0)], [np.zeros(0)]
     for line in lines:

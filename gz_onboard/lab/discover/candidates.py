@@ -15,9 +15,8 @@ from gz_onboard.physics.parameters import declared_parameters
 class Candidate:
     """A cause.
 
-    parameters: those whose value is its strength, the first the one that is reported. low, high: how far each may
-    change from its healthy value, in its unit. effect: the file it comes with, None for a parameter that every
-    vehicle file has.
+    parameters: those whose value is its strength, the first the one that is reported. effect: the file it comes with,
+    None for a parameter that every vehicle file has.
     """
 
     name: str

@@ -3,24 +3,14 @@
 Each channel is an analytical redundancy relation (Gertler 1998; Krysander & Frisk 2008): a balance of one part of the
 vehicle that takes its inputs from sensors, not from the model of another part. So a fault in one part shows in few
 channels, and causes that look alike in the energy drawn (a heavier rider, a weaker magnet) do not in all of them.
-
-    road_force           N      torque at the wheel, less road load; mass times the accelerometer is grade and inertia
-    altitude             m      GPS altitude, less the way times the grade that the accelerometer shows
-    inverter_power       W      DC power of the inverter, less air-gap power and losses
-    pack_balance         A      pack current less auxiliary current, less inverter current
-    auxiliary            W      what the auxiliary current sensor shows
-    voltage_balance      V      pack voltage, less inverter voltage and cable drop
-    cell_voltage         V      of a mean cell, less the equivalent circuit at the current measured
-    voltage_timing       V      its step in 0.1 s, less that of the current
-    gps_speed            m/s    less motor speed times wheel radius
-    rear_speed, front_speed   m/s    wheel-speed sensors, less motor speed
-    motor_temperature, inverter_temperature, cell_temperature   K   less the cooling networks at the modelled heat
+`residuals` says what is measured and what is taken off.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -40,17 +30,13 @@ def _always(ride: Ride) -> Mask:
     return np.ones(len(ride.time), dtype=bool)
 
 
-def _rolling(ride: Ride) -> Mask:
-    return np.asarray((np.abs(ride.quantities["speed"]) > ROLLING) & ~ride.braking)
+def _unbraked(faster: float, ride: Ride) -> Mask:
+    return np.asarray((np.abs(ride.quantities["speed"]) > faster) & ~ride.braking)
 
 
 def _fast(ride: Ride) -> Mask:
     fix = ride.signals["gps_fix"] > FIX if "gps_fix" in ride.signals else np.ones(len(ride.time), dtype=bool)
     return np.asarray((np.abs(ride.quantities["speed"]) > FAST) & fix)
-
-
-def _coasting(ride: Ride) -> Mask:
-    return np.asarray((np.abs(ride.quantities["speed"]) > COASTING) & ~ride.braking)
 
 
 class ChannelNoise(NamedTuple):
@@ -64,6 +50,10 @@ class ChannelNoise(NamedTuple):
     def sd(self) -> float:
         """Of one block."""
         return float(np.hypot(self.white, self.slow))
+
+    def scaled(self, size: float) -> ChannelNoise:
+        """Of a channel whose unit weighs so much less."""
+        return ChannelNoise(self.white * size, self.slow * size, self.time)
 
 
 @dataclass(frozen=True)
@@ -79,22 +69,25 @@ class Channel:
     roles: tuple[str, ...]
     residual: Callable[[Ride, Values, System], Array]
     parameters: tuple[str, ...]
-    noise: ChannelNoise  # before any healthy ride
+    noise: ChannelNoise  # before any healthy ride, in a vehicle of size 1
+    size: str = ""  # the size of `Sizes` that the noise grows with
     steps: int = 1  # grid steps to one of the function's
     holds: Callable[[Ride], Mask] = _always
     ports: tuple[Port, ...] = ()
     battery: bool = False
     correlated: bool = True
     slow: float = 0.0  # s: the shortest correlation that its noise can have; what its model lacks is slow
-    rough: float = 0.0  # A of motor current within a block that double its variance; 0: none do
+    rough: float = 0.0  # A of motor current, in a vehicle of size 1, that double a block's variance; 0: none do
     shaken: float = 0.0  # m/s² of vibration that do; 0: none
 
 
 _TORQUE = ("torque_constant", "torque_constant_slope", "torque_saturation")
 _SPEED = ("wheel_radius", "speed_sensor_scale")
+_PACK_CURRENT = ("pack_current_offset", "pack_current_gain")
+_INVERTER_CURRENT = ("inverter_current_offset", "inverter_current_gain")
+_LOSSES = ("copper_speed", "loss_speed", "loss_cross", "torque_lag")
 _CELL = (
-    "pack_current_offset",
-    "pack_current_gain",
+    *_PACK_CURRENT,
     "cell_capacity",
     "soc_start",
     "cell_resistance_factor",
@@ -114,6 +107,10 @@ _CELL = (
     "resistance_current_cold",
 )
 
+# A block is as long as what the residual is of stays the same: 0.1 s where a delay shows, 2 s for currents, voltages
+# and speeds, 4 s where noise is to average out (of the accelerometer, of lamps), 10 s for heights and temperatures.
+# Noise is as on healthy rides of the reference scooter, until a baseline, or the rides themselves, say more.
+# rough: some of what a rider changes the current by; the less, the more two sensors' timing matters to the residual.
 CHANNELS = (
     Channel(
         "road_force",
@@ -121,10 +118,11 @@ CHANNELS = (
         block=4.0,
         roles=("motor_speed", "motor_current", "accel_x"),
         residual=residuals.road_force,
-        holds=_rolling,
+        holds=partial(_unbraked, ROLLING),
         parameters=(*_TORQUE, *_SPEED, "payload_mass", "payload_error", "accel_bias", "pitch_gain", "rolling_cold"),
         ports=(Port.WHEEL_FORCE, Port.TYRE, Port.MOTOR_LOSS),
         noise=ChannelNoise(white=5.0, slow=2.0, time=60.0),
+        size="power",
         rough=60.0,
         shaken=0.85,
     ),
@@ -143,18 +141,10 @@ CHANNELS = (
         block=2.0,
         roles=("inverter_voltage", "inverter_current", "motor_speed", "motor_current"),
         residual=residuals.inverter_power,
-        parameters=(
-            *_TORQUE,
-            "speed_sensor_scale",
-            "copper_speed",
-            "inverter_current_gain",
-            "inverter_current_offset",
-            "torque_lag",
-            "loss_speed",
-            "loss_cross",
-        ),
+        parameters=(*_TORQUE, "speed_sensor_scale", *_LOSSES, *_INVERTER_CURRENT),
         ports=(Port.MOTOR_LOSS, Port.INVERTER_LOSS),
         noise=ChannelNoise(white=6.0, slow=4.0, time=60.0),
+        size="power",
         rough=10.0,
     ),
     Channel(
@@ -163,15 +153,9 @@ CHANNELS = (
         block=2.0,
         roles=("pack_current", "inverter_current", "auxiliary_current"),
         residual=residuals.pack_balance,
-        parameters=(
-            "pack_current_offset",
-            "pack_current_gain",
-            "inverter_current_offset",
-            "inverter_current_gain",
-            "idle_current",
-            "pack_inverter_lag",
-        ),
+        parameters=(*_PACK_CURRENT, *_INVERTER_CURRENT, "idle_current", "pack_inverter_lag"),
         noise=ChannelNoise(white=0.1, slow=0.03, time=60.0),
+        size="current",
         rough=30.0,
     ),
     Channel(
@@ -183,6 +167,7 @@ CHANNELS = (
         parameters=("brake_light",),
         ports=(Port.DC_POWER,),
         noise=ChannelNoise(white=1.0, slow=1.0, time=60.0),
+        size="auxiliary",
     ),
     Channel(
         "voltage_balance",
@@ -192,6 +177,7 @@ CHANNELS = (
         residual=residuals.voltage_balance,
         parameters=("pack_voltage_offset", "inverter_voltage_offset", "cable_resistance"),
         noise=ChannelNoise(white=0.03, slow=0.01, time=60.0),
+        size="voltage",
     ),
     Channel(
         "cell_voltage",
@@ -242,7 +228,7 @@ CHANNELS = (
         block=2.0,
         roles=("wheel_speed_rear", "motor_speed"),
         residual=residuals.rear_speed,
-        holds=_coasting,
+        holds=partial(_unbraked, COASTING),
         parameters=("speed_sensor_scale", "rear_scale", "wheel_lag"),
         noise=ChannelNoise(white=0.02, slow=0.01, time=30.0),
     ),
@@ -252,7 +238,7 @@ CHANNELS = (
         block=2.0,
         roles=("wheel_speed_front", "motor_speed"),
         residual=residuals.front_speed,
-        holds=_coasting,
+        holds=partial(_unbraked, COASTING),
         parameters=("speed_sensor_scale", "front_scale", "front_lean", "slip_per_force", "wheel_lag"),
         noise=ChannelNoise(white=0.05, slow=0.02, time=30.0),
     ),
@@ -322,4 +308,4 @@ CHANNELS = (
         slow=200.0,
     ),
 )
-BY_NAME = {channel.name: channel for channel in CHANNELS}
+CHANNEL = {channel.name: channel for channel in CHANNELS}

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.blocks import over_blocks
@@ -19,7 +18,7 @@ from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.result import Split
-from gz_onboard.lab.discover.search import evidence_of
+from gz_onboard.lab.discover.search import evidence
 from gz_onboard.lab.discover.selection import Selection
 
 RATIO_SD, RIDE_SD = 0.15, 0.25  # of a real cause: on all rides, and from ride to ride
@@ -41,9 +40,7 @@ def _halves(name: str) -> Sign:
     """-1 below a value of the quantity, +1 above it, half of the cause's own squared effect on either side."""
 
     def sign(ride: Ride, table: LinearChannel, effect: Array) -> Array:
-        values = ride.quantity(name)
-        assert values is not None
-        at = over_blocks(table.channel, values)[table.used]
+        at = over_blocks(table.channel, ride.quantities[name])[table.used]
         order = np.argsort(at)
         half = np.cumsum(effect[order] ** 2)
         return np.asarray(np.sign(at - at[order][np.searchsorted(half, half[-1] / 2)]))
@@ -57,7 +54,7 @@ def _of_ride(mine: Ride) -> Sign:
 
 
 SPLITS: Mapping[str, Sign] = {"lateral_acceleration": _side, "time": _halves("time"), "speed": _halves("speed")}
-RIDE = "ride "  # before a ride's name, where the split is that ride against the others
+RIDE_PREFIX = "ride "  # before a ride's name, where the split is that ride against the others
 
 
 def unequal(split: Split) -> bool:
@@ -71,7 +68,7 @@ def splits(now: Selection) -> list[Split]:
     for name in now.chosen:
         tests = dict(SPLITS)
         if len(now.lines) > 2 and not now.search.causes[name].varies:
-            tests |= {f"{RIDE}{line.ride.name}": _of_ride(line.ride) for line in now.lines}
+            tests |= {f"{RIDE_PREFIX}{line.ride.name}": _of_ride(line.ride) for line in now.lines}
         for quantity, sign in tests.items():
             estimate = _split(now, now.search.place[name], sign)
             if estimate is not None:
@@ -85,9 +82,8 @@ def _split(now: Selection, index: Sequence[int], sign: Sign) -> tuple[float, flo
     fixed = now.search.index(now.chosen)
     change = now.change[index]
     rides = [_extended(line, n, mixed, index, change, sign) for line, n in zip(now.lines, now.normals, strict=True)]
-    prior = block_diag(mixed.prior, RATIO_SD**2)
-    e = evidence_of(np.append(mixed.mean, 0.0), prior, np.append(mixed.scatter, RIDE_SD**2), rides)
-    inner, score = e.profiled([p], fixed)
+    healthy = mixed.bordered(np.zeros(1), np.full((1, 1), RATIO_SD**2), np.full(1, RIDE_SD**2))
+    inner, score = evidence(healthy, rides).profiled([p], fixed)
     if inner[0, 0] <= UNSEEN:
         return None
     return float(score[0] / inner[0, 0]), float(score[0] * score[0] / inner[0, 0])

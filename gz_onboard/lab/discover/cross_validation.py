@@ -28,13 +28,23 @@ class Fold:
 
     def fit(self, mixed: MixedModel, lines: Sequence[LinearRide], normals: Sequence[Normal]) -> tuple[Array, Array]:
         """(the common part (p,), the curve's coefficients (k,)) from these rides."""
-        if self.form is not None:
-            return with_curve(mixed, list(zip(lines, normals, strict=True)), self.causes, self.form)
-        return mixed.freed(mixed.index_of(self.causes)).fit(normals).mean, np.zeros(0)
+        free = mixed.freed(mixed.index_of(self.causes))
+        if (form := self.form) is None:
+            return free.fit(normals).mean, np.zeros(0)
+        k = form.basis.shape[1]
+        pairs = zip(lines, normals, strict=True)
+        rides = [extended(line, plain, form, mixed.noise) or plain.padded(k) for line, plain in pairs]
+        both = fit_mixed(rides, bordered(free, form, WIDE * np.eye(k))).mean
+        return both[:-k], both[-k:]
 
     def shown(self, line: LinearRide, curve: Array) -> LinearRide:
-        """`line` less the curve."""
-        return line if self.form is None else without(line, self.form, curve)
+        """`line` less the curve of these coefficients (k,)."""
+        knots = columns_of(line, self.form) if self.form is not None else None
+        if self.form is None or knots is None:
+            return line
+        table = line.tables[self.form.channel]
+        less = knots @ self.form.basis @ curve * self.form.size / table.unit
+        return LinearRide(line.ride, {**line.tables, self.form.channel: replace(table, y=table.y - less)})
 
 
 Triple = tuple[float, float, float]  # before, with the control, after
@@ -94,27 +104,6 @@ def improves(held: Iterator[Squares], shares: Mapping[str, float]) -> bool:
 def start_equations(mixed: MixedModel, line: LinearRide) -> Normal:
     """What shows how a ride began: not the road force, whose mean would be taken for the accelerometer's bias."""
     return normal(line, mixed.noise, [name for name in line.tables if name != "road_force"])
-
-
-def with_curve(
-    mixed: MixedModel, fitted: Sequence[tuple[LinearRide, Normal]], causes: Sequence[Candidate], form: CurveForm
-) -> tuple[Array, Array]:
-    """(the common part (p,), the coefficients of `form` (k,)) from the rides `fitted`, the `causes` free."""
-    k = form.basis.shape[1]
-    free = mixed.freed(mixed.index_of(causes))
-    rides = [extended(line, plain, form, mixed.noise) or plain.padded(k) for line, plain in fitted]
-    both = fit_mixed(rides, *bordered(free, form, WIDE * np.eye(k))).mean
-    return both[:-k], both[-k:]
-
-
-def without(line: LinearRide, form: CurveForm, coefficients: Array) -> LinearRide:
-    """`line` less the curve."""
-    knots = columns_of(line, form)
-    if knots is None:
-        return line
-    table = line.tables[form.channel]
-    less = knots @ form.basis @ coefficients * form.size / table.unit
-    return LinearRide(line.ride, {**line.tables, form.channel: replace(table, y=table.y - less)})
 
 
 def with_own_start(mixed: MixedModel, ride: Normal, theta: Array) -> Array:

@@ -9,12 +9,13 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.blocks import over_blocks
+from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.grid import STEP, Ride, smooth
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide
-from gz_onboard.lab.discover.prior import USUAL_SIZES, Sizes
+from gz_onboard.lab.discover.sizes import USUAL_SIZES, Sizes
 
-# knots of the hat functions, of a vehicle of size 1 (see `KNOTS_OF`); unit
-QUANTITIES: dict[str, tuple[tuple[float, ...], str]] = {
+# knots of the hat functions, of a vehicle of size 1 (see `KNOT_SIZES`); unit
+KNOTS: dict[str, tuple[tuple[float, ...], str]] = {
     "speed": ((2.0, 4.5, 6.5, 8.5, 10.0, 11.5, 13.0, 15.0), "m/s"),
     "acceleration": ((-2.0, -1.0, -0.3, 0.0, 0.3, 1.0, 2.0), "m/s²"),
     "lateral_acceleration": ((-4.0, -2.0, -0.7, 0.0, 0.7, 2.0, 4.0), "m/s²"),
@@ -32,7 +33,7 @@ QUANTITIES: dict[str, tuple[tuple[float, ...], str]] = {
     "since_braking": ((0.0, 4.0, 8.0, 15.0, 30.0, 60.0), "s"),
 }
 PAIRS: tuple[tuple[str, tuple[str, ...]], ...] = (
-    ("road_force", tuple(name for name in QUANTITIES if name not in ("pack_current", "soc"))),
+    ("road_force", tuple(name for name in KNOTS if name not in ("pack_current", "soc"))),
     ("inverter_power", ("speed", "motor_current", "motor_temperature", "time", "current_change")),
     ("auxiliary", ("speed", "motor_temperature", "time", "pack_current", "vibration")),
     ("pack_balance", ("speed", "pack_current", "motor_temperature", "time")),
@@ -40,18 +41,12 @@ PAIRS: tuple[tuple[str, tuple[str, ...]], ...] = (
 )
 
 
-COEFFICIENT_UNITS = {
-    "road_force": (5.0, "power"),
-    "inverter_power": (10.0, "power"),
-    "auxiliary": (2.0, "auxiliary"),
-    "pack_balance": (0.1, "current"),
-    "cell_voltage": (0.005, ""),
-}
-"""Unit of a curve's coefficients, in the channel's, and which of the vehicle's sizes it grows with; `SCATTER` of it is
-taken to differ between rides."""
+UNITS = {"road_force": 5.0, "inverter_power": 10.0, "auxiliary": 2.0, "pack_balance": 0.1, "cell_voltage": 0.005}
+"""Of a curve's coefficients, in the channel's, of a vehicle of size 1; they grow as the channel's noise does, and
+`SCATTER` of them is taken to differ between rides."""
 SCATTER = 0.3
 SCATTERS = {"cell_voltage": 1.0}  # whose model lacks more
-KNOTS_OF = {"speed": "speed", "motor_current": "current", "current_change": "current", "pack_current": "current"}
+KNOT_SIZES = {"speed": "speed", "motor_current": "current", "current_change": "current", "pack_current": "current"}
 """The size of the vehicle that the knots of a quantity grow with; those of others are of roads and riders."""
 SMOOTH, SLOW = 8.0, 2.0  # s, m/s: of a grade by GPS altitude
 ROUND = ("heading",)
@@ -76,8 +71,7 @@ class CurveForm:
     @property
     def size(self) -> float:
         """Unit of its coefficients, in the channel's."""
-        unit, of = COEFFICIENT_UNITS[self.channel]
-        return unit * self.sizes.of(of)
+        return UNITS[self.channel] * self.sizes.of(CHANNEL[self.channel].size)
 
     @property
     def scatter(self) -> float:
@@ -95,12 +89,12 @@ class CurveForm:
     @property
     def knots(self) -> Array:
         """Where its pieces meet, in the quantity's unit, (knots,)."""
-        return np.array(QUANTITIES[self.quantity][0]) * self.sizes.of(KNOTS_OF.get(self.quantity, ""))
+        return np.array(KNOTS[self.quantity][0]) * self.sizes.of(KNOT_SIZES.get(self.quantity, ""))
 
     @property
     def unit(self) -> str:
         """Of the quantity."""
-        return QUANTITIES[self.quantity][1]
+        return KNOTS[self.quantity][1]
 
 
 def curve_forms(sizes: Sizes = USUAL_SIZES) -> list[CurveForm]:
@@ -112,7 +106,7 @@ def curve_forms(sizes: Sizes = USUAL_SIZES) -> list[CurveForm]:
 def quantity(ride: Ride, name: str, table: LinearChannel) -> Array | None:
     """The quantity over the blocks of `table`, (m,); None if the ride has it not."""
     channel = table.channel
-    values = ride.quantity(name)
+    values = ride.quantities.get(name)
     if name == "current_change":
         n = round(channel.block / STEP)
         mean = over_blocks(channel, ride.signals["motor_current"])

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.curve_forms import CurveForm, columns_of, curve_forms
-from gz_onboard.lab.discover.linear import LinearRide, Noise, Normal, fit_mixed, marginal
+from gz_onboard.lab.discover.linear import LinearRide, Noise, Normal, Population, fit_mixed, marginal
 from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel
-from gz_onboard.lab.discover.search import evidence_of
+from gz_onboard.lab.discover.search import evidence
 
 
 def extended(linear: LinearRide, normal: Normal, form: CurveForm, noise: Noise) -> Normal | None:
@@ -26,6 +25,7 @@ def extended(linear: LinearRide, normal: Normal, form: CurveForm, noise: Noise) 
 
 
 CURVE_RIDGE = 1e-3  # information, in `CurveForm.size`, that keeps knots without data from running away
+OWN_ROUNDS = 10  # of expectation and maximisation
 OWN_FREE = 100.0  # variance in `CurveForm.size` of the common curve while its scatter between rides is sought
 ENOUGH = 1.0  # sum of squared weights of a ride's blocks at a knot, from which on it counts as visited
 
@@ -55,22 +55,23 @@ class CurveFit:
         return d @ self.values, np.sqrt(np.abs(np.diag(d @ self.covariance @ d.T)))
 
 
+def visits(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
+    """The sum of squared weights of each ride's blocks at each knot, (rides that have it, knots)."""
+    columns = (columns_of(line, form) for line in linears)
+    rows = [(knots**2).sum(axis=0) for knots in columns if knots is not None]
+    return np.array(rows).reshape(-1, len(form.knots))
+
+
 def supported_knots(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
     """The coefficients of `form` that these rides determine, (k, free): a knot that less than `ENOUGH` of two rides is
     at goes with the nearest that has it, so that no curve bends where hardly anything was measured.
     """
-    k = form.basis.shape[1]
     if form.straight:
         return np.eye(1)
-    at = np.zeros(k)
-    for line in linears:
-        knots = columns_of(line, form)
-        if knots is not None:
-            at += (knots**2).sum(axis=0) >= ENOUGH
-    good = np.flatnonzero(at >= min(2, len(linears)))
+    good = np.flatnonzero((visits(form, linears) >= ENOUGH).sum(axis=0) >= min(2, len(linears)))
     if not len(good):
-        return np.zeros((k, 0))
-    nearest = np.abs(np.arange(k)[:, None] - good).argmin(axis=1)
+        return np.zeros((len(form.knots), 0))
+    nearest = np.abs(np.arange(len(form.knots))[:, None] - good).argmin(axis=1)
     return np.asarray(np.eye(len(good))[nearest])
 
 
@@ -87,39 +88,32 @@ def fit_curve(
     own: with the scatter of its coefficients that these rides show, where it is more than `CurveForm.scatter`.
     """
     free = supported_knots(form, linears)
-    if not free.shape[1]:
-        return None
     rides = _with_columns(mixed, linears, normals, form)
-    if not rides:
+    if not rides or not free.shape[1]:
         return None
     p = len(mixed.mean)
     k = len(rides[0].b) - p
     healthy = mixed.shapes.get(form.name)
-    mean, prior, scatter = bordered(mixed, form, healthy.covariance if healthy else np.eye(k) * form.scatter**2)
+    covariance = healthy.covariance if healthy else np.eye(k) * form.scatter**2
+    known = bordered(mixed, form, covariance)
     if own and len(rides) > 1:
-        wide = prior.copy()
-        wide[p:, p:] += np.eye(k) * OWN_FREE
-        learns = np.arange(p + k) >= p
-        scatter = np.maximum(scatter, fit_mixed(rides, mean, wide, scatter, 1.0, learns, 10).scatter)
-    e = evidence_of(mean, prior, scatter, rides)
-    inner, score = e.profiled(range(p, p + k), fixed, CURVE_RIDGE)
+        wide = bordered(mixed, form, covariance + np.eye(k) * OWN_FREE)
+        shown = fit_mixed(rides, wide, 1.0, np.arange(p + k) >= p, OWN_ROUNDS).scatter
+        known = replace(known, scatter=np.maximum(known.scatter, shown))
+    inner, score = evidence(known, rides).profiled(range(p, p + k), fixed, CURVE_RIDGE)
     inner = free.T @ (inner + CURVE_RIDGE * np.eye(k)) @ free
     score = free.T @ score
     estimate = np.linalg.solve(inner, score)
     at = form.basis @ free * form.size
-    visits = _visits(form, linears)
-    return CurveFit(
-        float(score @ estimate), free.shape[1], at @ estimate, at @ np.linalg.inv(inner) @ at.T, visits / np.sum(visits)
-    )
+    visited = visits(form, linears).sum(axis=0)
+    weights = visited / np.sum(visited)
+    return CurveFit(float(score @ estimate), free.shape[1], at @ estimate, at @ np.linalg.inv(inner) @ at.T, weights)
 
 
-def bordered(mixed: MixedModel, form: CurveForm, covariance: Array) -> tuple[Array, Array, Array]:
-    """(mean (p + k,), prior (p + k, p + k), scatter (p + k,)) of `mixed` with the coefficients of `form`, which are
-    known within `covariance` (k, k).
-    """
+def bordered(mixed: MixedModel, form: CurveForm, covariance: Array) -> Population:
+    """`mixed` with the coefficients of `form`, which are known within `covariance` (k, k)."""
     k, healthy = len(covariance), mixed.shapes.get(form.name)
-    mean = np.concatenate([mixed.mean, healthy.mean if healthy else np.zeros(k)])
-    return mean, block_diag(mixed.prior, covariance), np.concatenate([mixed.scatter, np.full(k, form.scatter**2)])
+    return mixed.bordered(healthy.mean if healthy else np.zeros(k), covariance, np.full(k, form.scatter**2))
 
 
 def _with_columns(
@@ -128,15 +122,6 @@ def _with_columns(
     """The normal equations of the rides that have `form`, with its columns."""
     every = (extended(line, normal, form, mixed.noise) for line, normal in zip(linears, normals, strict=True))
     return [ride for ride in every if ride is not None]
-
-
-def _visits(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
-    """The sum of squared weights of all blocks at each knot, (knots,)."""
-    visits = np.zeros(len(form.basis))
-    for line in linears:
-        knots = columns_of(line, form)
-        visits += 0.0 if knots is None else (knots**2).sum(axis=0)
-    return visits
 
 
 def learn_healthy_curves(

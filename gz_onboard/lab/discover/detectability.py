@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gz_onboard.lab.discover.channels import CHANNELS
-from gz_onboard.lab.discover.energy import energy_drawn, energy_share
+from gz_onboard.lab.discover.energy import energy_share
 from gz_onboard.lab.discover.linear import LinearRide
 from gz_onboard.lab.discover.prior import LOG_SCALED
 from gz_onboard.lab.discover.result import Limit, Report
@@ -105,4 +105,4 @@ def extent(lines: Sequence[LinearRide]) -> Extent:
     """How much was ridden in all."""
     distance = sum(line.ride.distance for line in lines)
     time = sum(float(line.ride.time[-1] - line.ride.time[0]) for line in lines)
-    return Extent(distance, time, sum(energy_drawn(line) for line in lines))
+    return Extent(distance, time, sum(line.ride.energy for line in lines))

@@ -12,7 +12,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.baseline_file import restore
 from gz_onboard.lab.discover.blocks import usable
-from gz_onboard.lab.discover.channels import BY_NAME
+from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.detectability import limits
 from gz_onboard.lab.discover.gain import measure_gain
 from gz_onboard.lab.discover.grid import STEP, Ride
@@ -95,7 +95,7 @@ def first_offset(mixed: MixedModel, rides: Sequence[Ride]) -> Array:
     more than the time between two frames is no linear change.
     """
     offset = np.zeros(len(mixed.names))
-    mine = [ride for ride in rides if usable(BY_NAME["voltage_timing"], ride, mixed.system)]
+    mine = [ride for ride in rides if usable(CHANNEL["voltage_timing"], ride, mixed.system)]
     if LATENCY not in mixed.names or not mine:
         return offset
     i = mixed.names.index(LATENCY)

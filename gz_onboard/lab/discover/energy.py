@@ -43,20 +43,8 @@ def energy_share(lines: Sequence[LinearRide], change: Array, channels: Collectio
 
 def _share(lines: Sequence[LinearRide], residuals: Iterable[tuple[str, LinearRide, Array]]) -> float:
     """The part of the energy drawn over `lines` that residuals make, each (channel, ride, values)."""
-    drawn = sum(energy_drawn(line) for line in lines)
+    drawn = sum(line.ride.energy for line in lines)
     return sum(channel_energy(*residual) for residual in residuals) / drawn if drawn else 0.0
-
-
-def energy_drawn(line: LinearRide) -> float:
-    """What the pack gave over the ride [J]; the motor's work where its current or voltage is not known."""
-    s = line.ride.signals
-    volts, amperes = (
-        ("pack_voltage", "pack_current") if "pack_current" in s else ("inverter_voltage", "inverter_current")
-    )
-    if amperes not in s or volts not in s:
-        q = line.ride.quantities
-        return float(np.sum(np.abs(q["torque"] * q["motor_speed"]))) * STEP
-    return float(np.sum(s[volts] * s[amperes])) * STEP
 
 
 def channel_time(line: LinearRide, channel: str) -> float:

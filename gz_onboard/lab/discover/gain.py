@@ -8,7 +8,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.cross_validation import Fold, Triple, held_out
-from gz_onboard.lab.discover.energy import channel_energy, energy_drawn, pack_power
+from gz_onboard.lab.discover.energy import channel_energy, pack_power
 from gz_onboard.lab.discover.linear import LinearRide
 from gz_onboard.lab.discover.result import Errors, Gain
 from gz_onboard.lab.discover.unexplained import form_of
@@ -69,8 +69,8 @@ def errors(line: LinearRide, theta: Array) -> dict[str, float]:
         if name == "cell_voltage":
             found["voltage"] = float(np.sqrt(np.mean(rest**2)))
     found["power"] = float(np.sqrt(square))
-    found["energy_per_way"] = abs(more) / max(line.ride.distance, 1.0)
-    model = energy_drawn(line) - more
+    found["consumption"] = abs(more) / max(line.ride.distance, 1.0)
+    model = line.ride.energy - more
     if line.ride.have >= WHOLE and model > 0:
         found["range"] = abs(more) / model
     return found

@@ -11,13 +11,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask
+from gz_onboard.arrays import Array, Mask, running_mean
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
+from gz_onboard.lab.discover.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import air_density
+from gz_onboard.physics.sensors import true_current, true_voltage
 from gz_onboard.physics.vibration import Vibration
+from gz_onboard.vehicle import Vehicle
 
 STEP = 0.1  # s
 USUAL_DELAYS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}
@@ -37,20 +40,8 @@ SUSPENSION = ("suspension_front", "suspension_rear")
 CRAWL, MOST_STEERING = 1.0, 0.6  # m/s, rad: of slower riding the angle is noise
 ROUGH_PERIOD = 0.034  # s: samples further apart do not show what a road does to a wheel
 SHAKING = 2.0  # s, over which the suspension is as fast as the road is rough
+JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
 LONGEST = 60.0  # s since a brake was touched, or a current changed: what was longer ago is as good as never
-
-
-@dataclass(frozen=True)
-class Dimensions:
-    """Of a vehicle: radius of the driven wheel times the gear ratio [m], mass with payload [kg], torque constant of the
-    motor [N·m/A], wheelbase [m]; by how much later than the inverter's a role's values are sent [s].
-    """
-
-    radius: float
-    mass: float
-    torque_constant: float
-    wheelbase: float
-    delays: Mapping[str, float]
 
 
 @dataclass
@@ -58,8 +49,8 @@ class Ride:
     """A ride on the grid.
 
     time: shape (n,) [s from the start]. signals: by role, shape (n,); valid: likewise, where it was measured.
-    quantities: what effects read (names of `physics.effect.QUANTITIES`), shape (n,) or a float, with the vehicle's
-    nominal mass and radius. have: the roles that are there.
+    quantities: what effects read (names of `physics.effect.QUANTITIES`) and residuals are looked at over, shape (n,),
+    with the vehicle's nominal mass and radius. energy: see `energy_drawn`. have: the roles that are there.
     """
 
     name: str
@@ -69,6 +60,7 @@ class Ride:
     radius: float
     payload: float | None
     quantities: dict[str, Array] = field(default_factory=dict)
+    energy: float = 0.0
 
     @property
     def have(self) -> set[str]:
@@ -81,12 +73,6 @@ class Ride:
         for role in roles:
             result &= self.valid[role]
         return result
-
-    def quantity(self, name: str) -> Array | None:
-        """A quantity, the time or the pack's current, shape (n,); None if it was not measured."""
-        if name == "time":
-            return self.time
-        return self.signals.get(name) if name == "pack_current" else self.quantities.get(name)
 
     @property
     def distance(self) -> float:
@@ -133,8 +119,8 @@ def measured(times: Array, grid: Array) -> Mask:
     return np.asarray((gap < limit) & (grid > times[0] - limit) & (grid < times[-1] + limit))
 
 
-def read_ride(samples: Samples, vehicle: Dimensions) -> Ride:
-    """`samples` on the grid.
+def read_ride(samples: Samples, vehicle: Vehicle) -> Ride:
+    """`samples` on the grid, of `vehicle`.
 
     Raises InputError for a ride without motor speed or current, or shorter than a minute.
     """
@@ -146,18 +132,25 @@ def read_ride(samples: Samples, vehicle: Dimensions) -> Ride:
     if end - start < SHORTEST:
         raise InputError(f"ride {samples.name}: {end - start:.0f} s of motor speed and current; a minute is the least")
     grid = np.arange(start, end, STEP)
+    stated = vehicle.mapping
+    delays = USUAL_DELAYS | {s.role: stated.delays[s.message] for s in stated.sources if s.message in stated.delays}
     signals: dict[str, Array] = {}
     valid: dict[str, Mask] = {}
     for role, (times, values) in samples.columns.items():
         if len(times) < LEAST_SAMPLES:
             continue
-        at = grid + vehicle.delays.get(role, 0.0)
+        at = grid + delays.get(role, 0.0)
         turned = np.unwrap(values) if role == "gps_course" else values
         signals[role] = averaged(times, turned, at)
         valid[role] = measured(times, at)
-    ride = Ride(samples.name, grid - start, signals, valid, vehicle.radius, samples.rider_mass)
-    ride.quantities = _quantities(ride, vehicle)
+    p = vehicle.parameters
+    ride = Ride(samples.name, grid - start, signals, valid, p["wheel_radius"] * p["gear_ratio"], samples.rider_mass)
+    ride.quantities = _quantities(ride, p)
+    ride.energy = energy_drawn(ride, p)
+    if "pack_current" in signals:
+        ride.quantities["pack_current"] = true_current(signals["pack_current"], p)
     ride.quantities["since_braking"] = since(ride.braking)
+    ride.quantities["since_change"] = since_change(signals["motor_current"] / sizes_of(vehicle).current)
     wheels = [samples.columns[role] for role in SUSPENSION if role in samples.columns]
     if wheels and all(np.median(np.diff(times)) < ROUGH_PERIOD for times, _ in wheels):
         ride.quantities["suspension_speed"] = suspension_speed(wheels, grid)
@@ -166,11 +159,29 @@ def read_ride(samples: Samples, vehicle: Dimensions) -> Ride:
     return ride
 
 
+def energy_drawn(ride: Ride, p: Mapping[str, float]) -> float:
+    """What the pack gave over the ride [J], its sensors' errors taken off; the motor's work where that is not known."""
+    s, q = ride.signals, ride.quantities
+    if {"pack_voltage", "pack_current"} <= ride.have:
+        power = true_voltage(s["pack_voltage"], p) * true_current(s["pack_current"], p)
+    elif {"inverter_voltage", "inverter_current"} <= ride.have:
+        power = s["inverter_voltage"] * s["inverter_current"]
+    else:
+        power = np.abs(q["torque"] * q["motor_speed"])
+    return float(np.sum(power)) * STEP
+
+
 def since(happens: Mask) -> Array:
     """Time [s] since `happens` (n,) was last True, at most `LONGEST`, (n,)."""
     steps = np.arange(len(happens))
     last = np.maximum.accumulate(np.where(happens, steps, -round(LONGEST / STEP)))
     return np.asarray(np.minimum((steps - last) * STEP, LONGEST))
+
+
+def since_change(current: Array) -> Array:
+    """Time [s] since `current` (n,), in a vehicle of size 1, changed by `JUMP` within `WITHIN`; at most `LONGEST`."""
+    n = round(WITHIN / STEP)
+    return since(np.abs(current - np.concatenate([np.full(n, current[0]), current[:-n]])) > JUMP)
 
 
 def vibration(times: Array, values: Array, grid: Array) -> Array:
@@ -195,10 +206,8 @@ def suspension_speed(wheels: Sequence[tuple[Array, Array]], grid: Array) -> Arra
 
 
 def smooth(values: Array, seconds: float) -> Array:
-    """The running mean over about `seconds`, shape kept; the ends are those of a shorter window."""
-    n = max(1, round(seconds / STEP / 2) * 2 + 1)
-    kernel = np.ones(n)
-    return np.convolve(values, kernel, "same") / np.convolve(np.ones(len(values)), kernel, "same")
+    """The running mean over about `seconds`, shape kept."""
+    return running_mean(values, round(seconds / STEP / 2) * 2 + 1)
 
 
 def steering(speed: Array, lateral_acceleration: Array, wheelbase: float) -> Array:
@@ -207,7 +216,7 @@ def steering(speed: Array, lateral_acceleration: Array, wheelbase: float) -> Arr
     return np.asarray(np.clip(wheelbase * lateral_acceleration / fast**2, -MOST_STEERING, MOST_STEERING))
 
 
-def _quantities(ride: Ride, vehicle: Dimensions) -> dict[str, Array]:
+def _quantities(ride: Ride, p: Mapping[str, float]) -> dict[str, Array]:
     s = ride.signals
     n = len(ride.time)
     motor_speed = s["motor_speed"]
@@ -235,17 +244,18 @@ def _quantities(ride: Ride, vehicle: Dimensions) -> dict[str, Array]:
         "acceleration": acceleration,
         "grade": grade,
         "grade_cosine": np.asarray(np.sqrt(1 - np.clip(grade, -STEEPEST, STEEPEST) ** 2)),
-        "mass": np.full(n, vehicle.mass),
+        "mass": np.full(n, p["vehicle_mass"] + (p["payload_mass"] if ride.payload is None else ride.payload)),
         "air_density": np.full(n, density),
         "headwind": np.zeros(n),
         "lateral_acceleration": lateral,
-        "steering": steering(speed, lateral, vehicle.wheelbase),
+        "steering": steering(speed, lateral, p["wheelbase"]),
         "motor_speed": motor_speed,
         "motor_current": s["motor_current"],
         "motor_temperature": s.get("motor_temperature", ambient),
         "ambient_temperature": ambient,
         "cell_temperature": temperature,
         "heading": np.asarray(np.mod(course, 2 * np.pi), dtype=np.float64),
+        "time": ride.time,
         "time_moving": np.asarray(moved, dtype=np.float64),
-        "torque": vehicle.torque_constant * s["motor_current"],
+        "torque": p["torque_constant"] * s["motor_current"],
     }

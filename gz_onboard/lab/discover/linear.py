@@ -9,11 +9,13 @@ and b = AᵀC⁻¹y. All parameters are in units of their scale.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.blocks import blocks, depends, roughness, support, usable
@@ -93,7 +95,7 @@ def linearise(
             if name in mine:
                 moved = {**values, name: stepped(name, values[name], float(scale[i]))}
                 a[:, i] = y - blocks(channel, ride, moved, system)[used]
-        every = roughness(channel, ride)
+        every = roughness(channel, ride, system)
         y, a = y / every[used], a / every[used][:, None]
         good = np.isfinite(y) & np.isfinite(a).all(axis=1)
         index = np.flatnonzero(used)
@@ -105,48 +107,44 @@ def linearise(
     return LinearRide(ride, tables)
 
 
-def whitened(table: LinearChannel, noise: ChannelNoise, values: Array) -> Array:
-    """`values` (m,) or (m, k) in units of their noise: the innovations of a Kalman filter of white and exponentially
-    correlated noise (Anderson & Moore 1979, ch. 9), divided by their standard deviation.
-    """
-    white, slow, time = noise
-    if not table.channel.correlated or slow < WHITE * white:
-        return np.asarray(values / white)
-    decay = np.exp(-np.diff(table.time, prepend=table.time[0]) / time)
-    variance = slow**2
-    state = np.zeros(values.shape[1:])
-    out = np.empty_like(values)
-    for i, factor in enumerate(decay.tolist()):
-        state = factor * state
-        variance = factor * factor * variance + (1 - factor * factor) * slow**2
-        total = variance + white**2
-        innovation = values[i] - state
-        out[i] = innovation / total**0.5
-        gain = variance / total
-        state = state + gain * innovation
-        variance *= 1 - gain
-    return out
+def innovations(times: Array, values: Iterable[Any], ratio: Any, time: Any) -> Iterator[tuple[Any, Any]]:
+    """Of `values` at `times` (m,) [s], the innovations of a Kalman filter of white and exponentially correlated noise,
+    and their variances over that of the white noise (Anderson & Moore 1979, ch. 9).
 
-
-def likelihoods(times: Array, rest: Array, ratio: Array, time: Array) -> tuple[Array, Array]:
-    """For each pair of `ratio` (correlated over white sd) and `time` [s], shape (k,): the sum of squares in units of
-    the white noise, and the sum of the logarithms of the innovations' variances. The recursion of `whitened`, whose
-    variances are one number a step; here they are arrays, and as few operations as can be.
+    values: numbers or rows. ratio, time [s]: of the correlated noise, its standard deviation over that of the white
+    one; floats, or arrays (k,) of as many filters of one series of numbers: each step costs a few operations.
     """
-    steps = np.exp(-np.diff(times, prepend=times[0])[:, None] / time)
-    power = ratio**2
-    variance, state = power.copy(), np.zeros(len(ratio))
-    quadratic, logarithm = np.zeros(len(ratio)), np.zeros(len(ratio))
-    for factor, y in zip(steps, rest.tolist(), strict=True):
-        state = factor * state
-        variance = factor * factor * (variance - power) + power
+    decays = np.exp(np.divide.outer(-np.diff(times, prepend=times[0]), time))
+    power, state = ratio**2, 0.0
+    variance = power
+    for decay, value in zip(decays if decays.ndim > 1 else decays.tolist(), values, strict=True):
+        state = decay * state
+        variance = decay * decay * (variance - power) + power
         total = variance + 1
-        innovation = y - state
-        quadratic += innovation * innovation / total
-        logarithm += np.log(total)
+        innovation = value - state
+        yield innovation, total
         gain = variance / total
         state = state + gain * innovation
         variance = variance * (1 - gain)
+
+
+def whitened(table: LinearChannel, noise: ChannelNoise, values: Array) -> Array:
+    """`values` (m,) or (m, k) in units of their noise: innovations over their standard deviations."""
+    white, slow, time = noise
+    if not table.channel.correlated or slow < WHITE * white:
+        return np.asarray(values / white)
+    every = innovations(table.time, values / white, slow / white, time)
+    return np.array([innovation / variance**0.5 for innovation, variance in every]).reshape(values.shape)
+
+
+def likelihoods(times: Array, rest: Array, ratio: Array, time: Array) -> tuple[Array, Array]:
+    """For each pair of `ratio` and `time`, shape (k,), see `innovations`: the sum of squares of `rest` (m,) in units of
+    the white noise, and the sum of the logarithms of the innovations' variances.
+    """
+    quadratic, logarithm = np.zeros(len(ratio)), np.zeros(len(ratio))
+    for innovation, variance in innovations(times, rest.tolist(), ratio, time):
+        quadratic += innovation * innovation / variance
+        logarithm += np.log(variance)
     return quadratic, logarithm
 
 
@@ -243,6 +241,22 @@ def marginal(ride: Normal, scatter: Array) -> Normal:
 
 
 @dataclass(frozen=True)
+class Population:
+    """What is known of all rides, in scales: mean (p,), covariance `prior` (p, p) of what is common to them, variances
+    `scatter` (p,) of what is each one's own.
+    """
+
+    mean: Array
+    prior: Array
+    scatter: Array
+
+    def bordered(self, mean: Array, prior: Array, scatter: Array) -> Population:
+        """With k more parameters, of which these (k,), (k, k), (k,) are known."""
+        both = block_diag(self.prior, prior)
+        return Population(np.append(self.mean, mean), both, np.append(self.scatter, scatter))
+
+
+@dataclass(frozen=True)
 class Posterior:
     """mean (p,), covariance (p, p) of the common part; scatter (p,) variances of the rides' own; own (rides, p)."""
 
@@ -253,27 +267,21 @@ class Posterior:
 
 
 def fit_mixed(
-    rides: Sequence[Normal],
-    mean: Array,
-    prior: Array,
-    scatter: Array,
-    weight: Array | float = 0.0,
-    free: Mask | None = None,
-    rounds: int = 0,
+    rides: Sequence[Normal], known: Population, weight: Array | float = 0.0, free: Mask | None = None, rounds: int = 0
 ) -> Posterior:
     """Common part, and the scatter between rides in `rounds` of expectation and maximisation (Dempster, Laird & Rubin
     1977); none: it stays.
 
-    mean, prior: (p,), (p, p) of the common part before. scatter: (p,) variances before, worth `weight` (p,) rides;
-    only those of `free` (p,) are learned, from `LEAST` to `MOST` of what they were.
+    known: before, its scatter worth `weight` (p,) rides; only that of `free` (p,) is learned, from `LEAST` to `MOST` of
+    what it was.
     """
-    before = scatter.copy()
-    now = scatter.copy()
-    information = np.linalg.inv(prior)
+    before = known.scatter.copy()
+    now = known.scatter.copy()
+    information = np.linalg.inv(known.prior)
     for _ in range(max(rounds, 1)):
         parts = [marginal(ride, now) for ride in rides]
         after = np.linalg.inv(information + sum(part.n for part in parts))
-        common = after @ (information @ mean + sum(part.b for part in parts))
+        common = after @ (information @ known.mean + sum(part.b for part in parts))
         total = weight * before
         own = []
         for ride in rides:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -14,11 +13,12 @@ from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.blocks import depends
 from gz_onboard.lab.discover.candidates import Candidate, candidates
 from gz_onboard.lab.discover.channels import CHANNELS
-from gz_onboard.lab.discover.grid import USUAL_DELAYS, Dimensions, Ride, read_ride
+from gz_onboard.lab.discover.grid import Ride, read_ride
 from gz_onboard.lab.discover.linear import (
     LinearRide,
     Noise,
     Normal,
+    Population,
     Posterior,
     fit_mixed,
     linearise,
@@ -27,36 +27,23 @@ from gz_onboard.lab.discover.linear import (
     trimmed,
 )
 from gz_onboard.lab.discover.prior import (
-    BENCH,
-    BY_NAME,
     GIVEN_SCATTER,
-    HEALTHY_SD,
-    LOG_RIDE_SD,
-    LOG_RIDE_SD_ELSE,
     LOG_SCALED,
     NUISANCES,
-    RIDE_SD,
-    RIDE_SD_SHARE,
-    RIDE_SD_STEP,
     VEHICLE_PARAMETERS,
-    Sizes,
-    nearest_step,
-    sizes_of,
+    prior_covariance,
+    prior_of,
     stepped,
 )
 from gz_onboard.lab.discover.residuals import counted_soc
+from gz_onboard.lab.discover.sizes import Sizes, sizes_of
 from gz_onboard.lab.discover.system import System
 from gz_onboard.offline.processes import worker_pool
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.effect import Effect, Parameter
+from gz_onboard.physics.effect import Effect
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import Vehicle
 
-TRANSFERRED = 3.0
-"""What was found on a bench at steady points holds on the road within so many times its standard deviation."""
-MOST_LOG = 0.5  # sd of a logarithm, beyond which a parameter is known to its sign only
-LEAST_STEP = 0.05  # of a standard deviation: the finest scale
-LEAST_SD = 1e-3  # scales: what is certain
 FREED = 1e6  # variance in scales of what nothing is known of
 WIDENED = 25.0  # variance in scales, five times a usual change
 PRIOR_RIDES, LEAST_FREEDOM = 3, 4
@@ -72,11 +59,11 @@ class HealthyCurve:
     inflation: float
 
 
-@dataclass
-class MixedModel:
-    """The linear model's frame: names (p,), scale (p,), values where it is linearised, and what is known before.
+@dataclass(frozen=True)
+class MixedModel(Population):
+    """The linear model's frame: names (p,), scale (p,), values where it is linearised, and what is known before, as
+    differences from `values`.
 
-    mean, prior: of the common part less `values`, in scales, (p,), (p, p). scatter: variances between rides, (p,).
     inflation: of a cause's score on healthy rides left out, 1 if right. shapes: what these show over quantities.
     """
 
@@ -86,9 +73,6 @@ class MixedModel:
     names: tuple[str, ...]
     scale: Array
     values: dict[str, float]
-    mean: Array
-    prior: Array
-    scatter: Array
     noise: Noise
     healthy: int  # rides that it was learned on
     free: Mask  # whose scatter between rides is learned, (p,)
@@ -105,10 +89,10 @@ class MixedModel:
         """Of Student's t: half of a 95 % interval, in standard deviations."""
         return float(student.ppf(0.975, max(self.healthy + PRIOR_RIDES, LEAST_FREEDOM)))
 
-    @cached_property
+    @property
     def sizes(self) -> Sizes:
         """How large the vehicle is."""
-        return sizes_of(self.vehicle)
+        return self.system.sizes
 
     @property
     def usable_causes(self) -> list[Candidate]:
@@ -139,11 +123,11 @@ class MixedModel:
 
     def fit(self, rides: Sequence[Normal]) -> Posterior:
         """The common part and each ride's own as `rides` show them, the scatter as it is."""
-        return fit_mixed(rides, self.mean, self.prior, self.scatter)
+        return fit_mixed(rides, self)
 
     def learned_scatter(self, rides: Sequence[Normal], weight: Array | float, rounds: int) -> Posterior:
         """The same with the scatter that `rides` show; see `linear.fit_mixed`."""
-        return fit_mixed(rides, self.mean, self.prior, self.scatter, weight, self.free, rounds)
+        return fit_mixed(rides, self, weight, self.free, rounds)
 
     def freed(self, index: Sequence[int]) -> MixedModel:
         """With nothing known of the common part at `index`."""
@@ -166,13 +150,7 @@ class MixedModel:
 
     def ride(self, samples: Samples) -> Ride:
         """`samples` on the grid of this vehicle."""
-        p = self.vehicle.parameters
-        payload = samples.rider_mass if samples.rider_mass is not None else p["payload_mass"]
-        radius, mass = p["wheel_radius"] * p["gear_ratio"], p["vehicle_mass"] + payload
-        stated = self.vehicle.mapping
-        delays = {s.role: stated.delays[s.message] for s in stated.sources if s.message in stated.delays}
-        dimensions = Dimensions(radius, mass, p["torque_constant"], p["wheelbase"], USUAL_DELAYS | delays)
-        ride = read_ride(samples, dimensions)
+        ride = read_ride(samples, self.vehicle)
         if self.system.battery is not None and {"pack_voltage", "pack_current"} <= ride.have:
             ride.quantities["soc"] = counted_soc(ride, self.system)
         return ride
@@ -191,12 +169,13 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
     more = [cause.effect for cause in lacking(vehicle, causes) if cause.effect]
     effects: tuple[Effect, ...] = (*vehicle.model.effects, *more)
     p = vehicle.parameters
-    system = System(effects, vehicle.battery, p["payload_mass"], dict(p), vehicle.riding.vibration)
+    sizes = sizes_of(vehicle)
+    system = System(effects, vehicle.battery, dict(p), vehicle.riding.vibration, sizes)
     values = {name: x.prior for name, x in declared_parameters(effects).items()} | dict(p)
     values |= {nuisance.name: nuisance.value for nuisance in NUISANCES} | dict.fromkeys(absent, 0.0)
     names = _names(vehicle, causes, more, values)
     declared = declared_parameters(effects)
-    priors = {name: _prior(name, vehicle, declared, values[name], name in absent) for name in names}
+    priors = {name: prior_of(name, vehicle, declared, values[name], name in absent) for name in names}
     return MixedModel(
         vehicle=vehicle,
         system=system,
@@ -205,9 +184,9 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
         scale=np.array([prior.scale for prior in priors.values()]),
         values=values,
         mean=np.zeros(len(names)),
-        prior=_covariance(priors, vehicle.parameters.correlations),
+        prior=prior_covariance(priors, vehicle.parameters.correlations),
         scatter=np.array([prior.ride_sd for prior in priors.values()]) ** 2,
-        noise={channel.name: channel.noise for channel in CHANNELS},
+        noise={channel.name: channel.noise.scaled(sizes.of(channel.size)) for channel in CHANNELS},
         healthy=0,
         free=np.array([name not in GIVEN_SCATTER for name in names]),
     )
@@ -224,53 +203,6 @@ def _names(
     shaping = {x.name for e in lacking for x in e.parameters} - strengths
     fitted = set(VEHICLE_PARAMETERS) | of_effects | strengths | {nuisance.name for nuisance in NUISANCES}
     return sorted(name for name in (needed & fitted) - shaping if name in values)
-
-
-@dataclass(frozen=True)
-class _Prior:
-    """Of one parameter: its scale [unit], and in scales the spread of the vehicle's, of a bench's, between rides."""
-
-    scale: float
-    sd: float
-    bench_sd: float
-    ride_sd: float
-
-
-def _prior(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], value: float, absent: bool) -> _Prior:
-    """Of the parameter `name`, at `value`. absent: it is of an effect that the model lacks."""
-    on_bench = False
-    if name in BY_NAME:
-        size = sizes_of(vehicle).of(BY_NAME[name].of)
-        scatter, spread = BY_NAME[name].ride_sd * size, BY_NAME[name].sd * size
-    else:
-        parameter, known = declared[name], vehicle.parameters
-        on_bench = parameter.bench or name in BENCH
-        stated = name in known and not known.known[name].source.startswith("prior:")
-        healthy = HEALTHY_SD.get(name, parameter.healthy_sd)
-        spread = known.sd(name) if name in known and not absent else parameter.prior_sd
-        if healthy is not None and (absent or not stated or name == "payload_mass"):
-            spread = healthy
-        own = RIDE_SD.get(name, parameter.ride_sd)
-        size = nearest_step(value / parameter.prior, RIDE_SD_STEP) if parameter.prior else 1.0
-        scatter = RIDE_SD_SHARE * parameter.prior_sd if own is None else own * size
-    if name in LOG_SCALED:
-        spread, scatter = min(spread / value, MOST_LOG), LOG_RIDE_SD.get(name, LOG_RIDE_SD_ELSE)
-    wide = spread * (TRANSFERRED if on_bench else 1.0)
-    step = max(scatter, LEAST_STEP * wide)
-    return _Prior(step, max(wide / step, LEAST_SD), spread / step, max(scatter / step, LEAST_SD))
-
-
-def _covariance(priors: Mapping[str, _Prior], correlations: Mapping[frozenset[str], float]) -> Array:
-    """Of the vehicle's parameters before any ride, in scales, (p, p)."""
-    covariance = np.diag(np.array([prior.sd for prior in priors.values()]) ** 2)
-    place = {name: i for i, name in enumerate(priors)}
-    for pair, r in correlations.items():
-        a, b = sorted(pair)  # of a set, whose order differs from run to run, and with it the last digits
-        if a in place and b in place:
-            # what the bench leaves open goes together; by how much the road differs from the bench does not
-            both = r * priors[a].bench_sd * priors[b].bench_sd
-            covariance[place[a], place[b]] = covariance[place[b], place[a]] = both
-    return covariance
 
 
 def _linearised(job: tuple[Ride, MixedModel]) -> LinearRide:

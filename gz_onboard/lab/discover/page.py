@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gz_onboard.lab.discover.breakdown import QuantityReader, before_and_after
-from gz_onboard.lab.discover.channels import BY_NAME
+from gz_onboard.lab.discover.breakdown import before_and_after
+from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.detectability import extent
 from gz_onboard.lab.discover.energy import residual_sizes
 from gz_onboard.lab.discover.linear import LinearRide
@@ -42,8 +42,7 @@ def body(found: Discovery) -> str:
     report = found.report
     before, after = before_and_after(found)
     stages = {"before": before, "after": after} if report.causes else {"before": before}
-    over = QuantityReader(found.mixed)
-    channels = [name for name in BY_NAME if any(name in line.tables for line in found.lines)]
+    channels = [name for name in CHANNEL if any(name in line.tables for line in found.lines)]
     parts = [
         _head(found),
         _causes(report),
@@ -51,12 +50,12 @@ def body(found: Discovery) -> str:
         "<h2>What the residuals are</h2>" + _residuals(report, before, after),
         "<h2>Where they live</h2>",
         f"<p>Share of each residual's variance that goes with a quantity, in percent: before{_named(report)}.</p>",
-        _picture(overview(stages, channels, over)),
+        _picture(overview(stages, channels)),
     ]
     shown = _most(found, before, channels)
     for name in [*shown, *(c for c in channels if c not in shown)]:
-        title = f"{readable(name)} [{BY_NAME[name].unit}]"
-        picture = _picture(panels(stages, name, over))
+        title = f"{readable(name)} [{CHANNEL[name].unit}]"
+        picture = _picture(panels(stages, name))
         note = _GRADE if name == "road_force" else ""
         parts.append(f"<details{' open' if name in shown else ''}><summary>{title}</summary>{picture}{note}</details>")
     parts += [
@@ -154,7 +153,7 @@ def _next(report: Report) -> str:
 def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[LinearRide]) -> str:
     raw, first, last = report.residuals, residual_sizes(before), residual_sizes(after)
     rows = []
-    for name in BY_NAME:
+    for name in CHANNEL:
         if name not in raw:
             continue
         r, b, a = raw[name], first.get(name, raw[name]), last.get(name, raw[name])
@@ -162,35 +161,24 @@ def _residuals(report: Report, before: Sequence[LinearRide], after: Sequence[Lin
         shares = [f"{x:+.1%}" if energy else "–" for x in (b.energy_share, b.range_share, a.energy_share)]
         rows.append(
             [
-                readable(name),
-                BY_NAME[name].unit,
-                f"{r.mean:+.2g}",
-                f"{r.rms:.2g}",
-                f"{b.rms:.2g}",
-                f"{b.autocorrelation:.2f}",
-                *shares[:2],
-                f"{a.rms:.2g}",
-                f"{a.autocorrelation:.2f}",
-                shares[2],
+                ("measured less model", readable(name)),
+                ("unit", CHANNEL[name].unit),
+                ("mean", f"{r.mean:+.2g}"),
+                ("rms", f"{r.rms:.2g}"),
+                ("before: rms", f"{b.rms:.2g}"),
+                ("auto­correlation", f"{b.autocorrelation:.2f}"),
+                ("of the energy", shares[0]),
+                ("of the range", shares[1]),
+                ("after: rms", f"{a.rms:.2g}"),
+                ("auto­correlation", f"{a.autocorrelation:.2f}"),
+                ("of the energy", shares[2]),
             ]
         )
-    heads = [
-        "measured less model",
-        "unit",
-        "mean",
-        "rms",
-        "before: rms",
-        "auto­correlation",
-        "of the energy",
-        "of the range",
-        "after: rms",
-        "auto­correlation",
-        "of the energy",
-    ]
+    heads = [head for head, _ in next(iter(rows), [])]
     blocks = ", ".join(
-        f"{readable(n)} {BY_NAME[n].block:g} s" for n in ("road_force", "inverter_power", "cell_voltage")
+        f"{readable(n)} {CHANNEL[n].block:g} s" for n in ("road_force", "inverter_power", "cell_voltage")
     )
-    return html_table(heads, rows, range(2, len(heads))) + (
+    return html_table(heads, [[cell for _, cell in row] for row in rows], range(2, len(heads))) + (
         "<p>Mean and rms as measured, with the bias of each ride's sensors and its wind; before and "
         "after with these taken off, without and with the causes named. Autocorrelation: of neighbouring blocks "
         f"({blocks}); near 0 nothing is left but noise.</p>"

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.breakdown import QUANTITIES, QuantityReader, binned, edges, pooled, share_over
-from gz_onboard.lab.discover.channels import BY_NAME
+from gz_onboard.lab.discover.breakdown import COVARIATES, binned, edges, pooled, share_over
+from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.linear import LinearRide
-from gz_onboard.lab.discover.result import RIDES, Report, Unknown
+from gz_onboard.lab.discover.result import RIDE_TO_RIDE, Report, Unknown
 from gz_onboard.lab.discover.wording import readable
 from gz_onboard.offline.style import BLUE, GRID, INK, MUTED, ORANGE, headline, legend, new_figure, rule
 
@@ -23,11 +23,11 @@ Stages = Mapping[str, Sequence[LinearRide]]  # the rides "before" the causes and
 CHOSEN, NEAR, OTHER = BLUE, "#8fb8de", "#cbd2d9"
 
 
-def overview(stages: Stages, channels: Sequence[str], over: QuantityReader) -> Figure:
+def overview(stages: Stages, channels: Sequence[str]) -> Figure:
     """Channels by quantities: the share of variance that goes with each."""
-    quantities = list(QUANTITIES)
+    quantities = list(COVARIATES)
     grids = [
-        np.array([[100 * share_over(*pooled(lines, c, name, over)) for name in quantities] for c in channels])
+        np.array([[100 * share_over(*pooled(lines, c, name)) for name in quantities] for c in channels])
         for lines in stages.values()
     ]
     width, height = 12.5, 1.5 + 0.3 * len(channels)
@@ -54,11 +54,11 @@ def overview(stages: Stages, channels: Sequence[str], over: QuantityReader) -> F
     return figure
 
 
-def panels(stages: Stages, channel: str, over: QuantityReader) -> Figure:
+def panels(stages: Stages, channel: str) -> Figure:
     """The residual's mean over each quantity, in bins of as many blocks, one standard error as a band."""
     drawn = []
-    for name in QUANTITIES:
-        samples = [pooled(lines, channel, name, over) for lines in stages.values()]
+    for name in COVARIATES:
+        samples = [pooled(lines, channel, name) for lines in stages.values()]
         x = samples[0][0]
         if len(x) > 20 and np.ptp(x) > 0:
             drawn.append((name, [binned(*sample, edges(x)) for sample in samples]))
@@ -82,13 +82,13 @@ def panels(stages: Stages, channel: str, over: QuantityReader) -> Figure:
             axis.fill_between(x, y - error, y + error, color=colour, alpha=0.2, linewidth=0)
             axis.plot(x, y, "o-", color=colour, markersize=3, linewidth=1.3, label=label)
         axis.axhline(0, color=INK, linewidth=0.6)
-        label, unit, _ = QUANTITIES[name]
+        label, unit, _ = COVARIATES[name]
         axis.set_xlabel(label if unit == "1" else f"{label} [{unit}]", fontsize=8, color=INK, labelpad=2)
         if i % columns:
             axis.tick_params(labelleft=False)
     legend(axes[min(columns, len(axes)) - 1])
     figure.text(
-        0.012, 0.5, f"measured less model [{BY_NAME[channel].unit}]", rotation=90, va="center", fontsize=8.5, color=INK
+        0.012, 0.5, f"measured less model [{CHANNEL[channel].unit}]", rotation=90, va="center", fontsize=8.5, color=INK
     )
     return figure
 
@@ -134,8 +134,8 @@ def curve(unknown: Unknown) -> Figure:
     axis.set_ylim(*_limits_of(y, sd))
     axis.axhline(0, color=INK, linewidth=0.6)
     axis.set_xlabel(f"{readable(unknown.quantity)} [{unknown.unit}]", fontsize=9, color=INK)
-    left = f"{readable(unknown.channel)} [{BY_NAME[unknown.channel].unit}]"
-    if unknown.quantity == RIDES:
+    left = f"{readable(unknown.channel)} [{CHANNEL[unknown.channel].unit}]"
+    if unknown.quantity == RIDE_TO_RIDE:
         left = f"{readable(unknown.denies[0])}, over its mean [1]"
     axis.set_ylabel(left, fontsize=9, color=INK)
     return figure

@@ -9,65 +9,22 @@ is taken to scatter from ride to ride before any healthy ride (the discrepancy o
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from math import exp, log
+from math import exp
 
-from gz_onboard.physics.parameters import declared_parameters
-from gz_onboard.physics.riding import PriorRiding
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.lab.discover.sizes import nearest_step, sizes_of
+from gz_onboard.physics.effect import Parameter
 from gz_onboard.vehicle import Vehicle
-
-CELLS = 14  # in series, of a pack of 52 V
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """How large a vehicle is over what the absolute numbers of the discovery are for, which is what the declared priors
-    of its parameters are of; to the nearest step, for such numbers are known to a factor only.
-
-    power: and forces, by mass. voltage: of the pack. auxiliary: power of it. speed: the highest of the usual riding.
-    """
-
-    power: float = 1.0
-    current: float = 1.0
-    voltage: float = 1.0
-    auxiliary: float = 1.0
-    speed: float = 1.0
-
-    def of(self, name: str) -> float:
-        """The size called `name`; 1 for none."""
-        return float(getattr(self, name)) if name else 1.0
-
-
-USUAL_SIZES = Sizes()
-
-
-def nearest_step(ratio: float, step: float = 2**0.5) -> float:
-    """`ratio` as the nearest power of `step`; 1 for what has no sign or no size."""
-    return float(step ** round(log(ratio) / log(step))) if ratio > 0 else 1.0
-
-
-def sizes_of(vehicle: Vehicle) -> Sizes:
-    """Of `vehicle`, by its file."""
-    p, declared = vehicle.parameters, declared_parameters()
-
-    def over(name: str) -> float:
-        return nearest_step(p[name] / declared[name].prior)
-
-    fastest, usual = (max(speed for _, speed, _ in riding.points) for riding in (vehicle.riding, PriorRiding()))
-    cells = vehicle.battery.cells_series if vehicle.battery else CELLS
-    return Sizes(
-        over("vehicle_mass"),
-        over("motor_current_limit"),
-        nearest_step(cells / CELLS),
-        over("auxiliary_power"),
-        nearest_step(fastest / usual),
-    )
 
 
 @dataclass(frozen=True)
 class Nuisance:
     """A parameter that no vehicle file has: sd is of its mean, ride_sd of its scatter from ride to ride, both in a
-    vehicle of size 1; of: the size of `Sizes` that they grow with.
+    vehicle of size 1; size: the one of `Sizes` that they grow with.
     """
 
     name: str
@@ -76,7 +33,7 @@ class Nuisance:
     sd: float
     ride_sd: float
     text: str
-    of: str = ""
+    size: str = ""
 
 
 NUISANCES = (
@@ -106,7 +63,7 @@ NUISANCES = (
     Nuisance("drift", "V/(600 s)", 0.0, 0.001, 0.004, "what no circuit of the model follows over a ride"),
     Nuisance("pair_resistance", "1", 0.0, 0.3, 0.02, "R1 of one pair where a second one has the slow part"),
     Nuisance("pair_time", "1", 0.0, 0.4, 0.03, "its time constant, logarithm of the share"),
-    Nuisance("mid_resistance", "ohm", 0.0, 0.02, 0.001, "a pair between it and the slow one"),
+    Nuisance("mid_resistance", "ohm", 0.0, 0.02, 0.001, "a pair between it and the slow one", "resistance"),
     Nuisance("resistance_empty", "1", 0.0, 0.3, 0.05, "cell resistance at SOC 0.6 less that at 1.0, as a share"),
     Nuisance("resistance_current", "1/(5 A)", 0.0, 0.1, 0.01, "cell resistance falls with current"),
     Nuisance("resistance_current_cold", "1/(5 A·20 K)", 0.0, 0.1, 0.01, "the more so below 20 degC"),
@@ -130,7 +87,7 @@ NUISANCES = (
     Nuisance("cells_start", "K", 0.0, 0.3, 0.5, "first cell temperature: quantised"),
     Nuisance("pack_airflow", "1/(10 m/s)", 0.0, 1.0, 0.1, "pack cools better in moving air"),
 )
-BY_NAME = {nuisance.name: nuisance for nuisance in NUISANCES}
+NUISANCE = {nuisance.name: nuisance for nuisance in NUISANCES}
 
 COOLING = (
     "motor_stator_capacity",
@@ -219,3 +176,56 @@ HEALTHY_SD = {
 always, for what was entered is known."""
 BENCH = ("torque_constant", "cable_resistance")
 """Found on a bench at steady points, as those of effects that say so."""
+
+TRANSFERRED = 3.0
+"""What was found on a bench at steady points holds on the road within so many times its standard deviation."""
+MOST_LOG = 0.5  # sd of a logarithm, beyond which a parameter is known to its sign only
+LEAST_STEP = 0.05  # of a standard deviation: the finest scale
+LEAST_SD = 1e-3  # scales: what is certain
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Of one parameter: its scale [unit], and in scales the spread of the vehicle's, of a bench's, between rides."""
+
+    scale: float
+    sd: float
+    bench_sd: float
+    ride_sd: float
+
+
+def prior_of(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], value: float, absent: bool) -> Prior:
+    """Of the parameter `name`, at `value`. absent: it is of an effect that the model lacks."""
+    on_bench = False
+    if name in NUISANCE:
+        size = sizes_of(vehicle).of(NUISANCE[name].size)
+        scatter, spread = NUISANCE[name].ride_sd * size, NUISANCE[name].sd * size
+    else:
+        parameter, known = declared[name], vehicle.parameters
+        on_bench = parameter.bench or name in BENCH
+        stated = name in known and not known.known[name].source.startswith("prior:")
+        healthy = HEALTHY_SD.get(name, parameter.healthy_sd)
+        spread = known.sd(name) if name in known and not absent else parameter.prior_sd
+        if healthy is not None and (absent or not stated or name == "payload_mass"):
+            spread = healthy
+        own = RIDE_SD.get(name, parameter.ride_sd)
+        size = nearest_step(value / parameter.prior, RIDE_SD_STEP) if parameter.prior else 1.0
+        scatter = RIDE_SD_SHARE * parameter.prior_sd if own is None else own * size
+    if name in LOG_SCALED:
+        spread, scatter = min(spread / value, MOST_LOG), LOG_RIDE_SD.get(name, LOG_RIDE_SD_ELSE)
+    wide = spread * (TRANSFERRED if on_bench else 1.0)
+    step = max(scatter, LEAST_STEP * wide)
+    return Prior(step, max(wide / step, LEAST_SD), spread / step, max(scatter / step, LEAST_SD))
+
+
+def prior_covariance(priors: Mapping[str, Prior], correlations: Mapping[frozenset[str], float]) -> Array:
+    """Of the vehicle's parameters before any ride, in scales, (p, p)."""
+    covariance = np.diag(np.array([prior.sd for prior in priors.values()]) ** 2)
+    place = {name: i for i, name in enumerate(priors)}
+    for pair, r in correlations.items():
+        a, b = sorted(pair)  # of a set, whose order differs from run to run, and with it the last digits
+        if a in place and b in place:
+            # what the bench leaves open goes together; by how much the road differs from the bench does not
+            both = r * priors[a].bench_sd * priors[b].bench_sd
+            covariance[place[a], place[b]] = covariance[place[b], place[a]] = both
+    return covariance

@@ -2,18 +2,18 @@
 
 The equations are those of `physics`; here each is fed with what was measured, and widened by the nuisances under which
 a healthy vehicle differs from its file. Every function takes the ride and a mapping of parameters, so that a column of
-the linear model is its difference. See `channels` for the table.
+the linear model is its difference.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, block_means, running_mean
 from gz_onboard.constants import GRAVITY
 from gz_onboard.lab.discover.grid import STEP, Ride
 from gz_onboard.lab.discover.system import System, Values, summed
@@ -23,25 +23,27 @@ from gz_onboard.physics.effect import ROAD_LOAD, Port
 from gz_onboard.physics.effects import inertia
 from gz_onboard.physics.model import drag_torque
 from gz_onboard.physics.relaxation import decay_over, relaxation_over, relaxed
+from gz_onboard.physics.sensors import true_current, true_voltage
 
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
 DT = SLOW * STEP
 MID = 200.0  # s: between the pair of the vehicle file and slow relaxation
+LAGGED = 3  # grid steps that the slope of what comes later is a mean of
 FIRST = 20  # steps: what a ride begins with
-START_SOC = 0.6  # whose ohmic resistance takes the current off the first voltages
 BRAKING = 0.5  # of the switch: between open and closed
 LEAST_COOLING = 0.05  # of the conductance at standstill: moving air does not heat
-# Scales of the nuisances, so that all are of order one.
-WARM, COLDER = 20.0, 20.0  # degC, K below it
-SPIN = 50.0  # rad/s of the motor
-AMPERES = 50.0  # of the motor
-MAGNETS = 40.0  # degC of the motor, at which its torque constant is the vehicle file's
-SATURATING = 100.0  # A of the motor
-SLIPPING = 100.0  # N at the wheel
-DRIFT_TIME = 600.0  # s
-EMPTIER = 0.4  # of SOC below full
-BENT = 5.0  # A of a cell
-MIDDLE = 0.7  # SOC about which the rest voltage tilts
+# Scales of the nuisances, so that all are of order one. Those of currents, forces and speeds of the motor are of a
+# vehicle of size 1, and grow with `Sizes`; air, time and charge are the same in every vehicle.
+WARM, COLDER = 20.0, 20.0  # degC, K below it: from a mild day to frost
+SPIN = 50.0  # rad/s of the motor, near its highest
+AMPERES = 50.0  # of the motor: half of a usual acceleration
+MAGNETS = 40.0  # degC of the motor, at which its torque constant is the vehicle file's: of a motor at work
+SATURATING = 100.0  # A of the motor: half of its limit
+SLIPPING = 100.0  # N at the wheel: a steep hill
+DRIFT_TIME = 600.0  # s: a short ride
+EMPTIER = 0.4  # of SOC below full: what a usual ride takes
+BENT = 5.0  # A of a cell, some 2 C
+MIDDLE = 0.7  # SOC about which the rest voltage tilts: of most rides
 WIND = 10.0  # m/s of air past the vehicle
 WARMER = 10.0  # K of the stator above the air
 
@@ -49,12 +51,6 @@ WARMER = 10.0  # K of the stator above the air
 def colder(temperature: Array) -> Array:
     """How much colder than a warm day, in the nuisances' scale."""
     return (WARM - temperature) / COLDER
-
-
-def mean_over(values: Array, n: int) -> Array:
-    """Means over blocks of `n`, the rest at the end left out."""
-    blocks = len(values) // n
-    return np.asarray(values[: blocks * n].reshape(blocks, n).mean(axis=1))
 
 
 def moving(ride: Ride, p: Values, system: System) -> dict[str, Array]:
@@ -67,23 +63,24 @@ def moving(ride: Ride, p: Values, system: System) -> dict[str, Array]:
     q["acceleration"] = q["acceleration"] * radius
     q["lateral_acceleration"] = q["lateral_acceleration"] * radius
     q["mass"] = np.full(len(ride.time), mass(ride, p, system))
-    q["torque"] = torque_constant(ride, p) * q["motor_current"]
+    q["torque"] = torque_constant(ride, p, system) * q["motor_current"]
     return q
 
 
 def mass(ride: Ride, p: Values, system: System) -> float:
     """Vehicle and payload [kg]: the payload entered, and by how much it is wrong."""
-    entered = ride.payload if ride.payload is not None else system.payload
-    return p["vehicle_mass"] + entered + (p["payload_mass"] - system.payload) + p["payload_error"]
+    usual = system.healthy["payload_mass"]
+    entered = ride.payload if ride.payload is not None else usual
+    return p["vehicle_mass"] + entered + (p["payload_mass"] - usual) + p["payload_error"]
 
 
-def torque_constant(ride: Ride, p: Values) -> Array:
+def torque_constant(ride: Ride, p: Values, system: System) -> Array:
     """The true one [N·m/A], over motor temperature and current."""
     q = ride.quantities
     return np.asarray(
         p["torque_constant"]
         * (1 + p["torque_constant_slope"] * (q["motor_temperature"] - MAGNETS))
-        * (1 - p["torque_saturation"] * np.abs(q["motor_current"]) / SATURATING)
+        * (1 - p["torque_saturation"] * np.abs(q["motor_current"]) / (SATURATING * system.sizes.current))
     )
 
 
@@ -93,11 +90,6 @@ def motor_losses(ride: Ride, q: Mapping[str, Array], p: Values, system: System) 
     fed = [(effect, term) for effect, term in terms if "motor_current" in effect.quantities]
     drags = [(effect, term) for effect, term in terms if "motor_current" not in effect.quantities]
     return summed(fed), summed(drags)
-
-
-def current(ride: Ride, p: Values) -> Array:
-    """The pack's true current [A]."""
-    return np.asarray((ride.signals["pack_current"] - p["pack_current_offset"]) / p["pack_current_gain"])
 
 
 def road_force(ride: Ride, p: Values, system: System) -> Array:
@@ -129,9 +121,10 @@ def inverter_power(ride: Ride, p: Values, system: System) -> Array:
     electric, _ = motor_losses(ride, q, p, system)
     power = q["torque"] * q["motor_speed"] + electric
     power = power + summed(system.terms(q, p, STEP, Port.INVERTER_LOSS))
-    spin = np.abs(q["motor_speed"]) / SPIN
-    power = power + (p["loss_speed"] + p["loss_cross"] * np.abs(q["motor_current"]) / AMPERES) * spin
-    power = power - p["torque_lag"] * np.gradient(smooth3(np.broadcast_to(power, len(ride.time))), STEP)
+    spin = np.abs(q["motor_speed"]) / (SPIN * system.sizes.spin)
+    cross = p["loss_cross"] * np.abs(q["motor_current"]) / (AMPERES * system.sizes.current)
+    power = power + (p["loss_speed"] + cross) * spin
+    power = power - p["torque_lag"] * np.gradient(running_mean(np.broadcast_to(power, len(ride.time)), LAGGED), STEP)
     volts = ride.signals["inverter_voltage"]
     shown = p["inverter_current_gain"] * power + p["inverter_current_offset"] * volts
     return np.asarray(ride.signals["inverter_current"] * volts - shown)
@@ -140,17 +133,12 @@ def inverter_power(ride: Ride, p: Values, system: System) -> Array:
 def pack_balance(ride: Ride, p: Values, system: System) -> Array:
     """Pack current [A] less the auxiliaries', less the inverter's."""
     s = ride.signals
-    true = current(ride, p)
-    true = true + p["pack_inverter_lag"] * np.gradient(smooth3(true), STEP)
+    true = true_current(s["pack_current"], p)
+    true = true + p["pack_inverter_lag"] * np.gradient(running_mean(true, LAGGED), STEP)
     # beside the auxiliary load there is what is drawn when nothing is: the inverter's own supply
     inverter = true - s["auxiliary_current"] - p["idle_current"]
     shown = p["inverter_current_offset"] + p["inverter_current_gain"] * inverter
     return np.asarray(shown - s["inverter_current"])
-
-
-def smooth3(x: Array) -> Array:
-    """A running mean of three."""
-    return np.asarray(np.convolve(np.pad(x, 1, "edge"), np.ones(3) / 3, "valid"))
 
 
 def auxiliary(ride: Ride, p: Values, system: System) -> Array:
@@ -166,14 +154,23 @@ def voltage_balance(ride: Ride, p: Values, system: System) -> Array:
     """Pack voltage [V] less the inverter's and the drop of the cable."""
     s = ride.signals
     inverter = s["inverter_voltage"] + p["cable_resistance"] * s["inverter_current"] - p["inverter_voltage_offset"]
-    return np.asarray(s["pack_voltage"] - p["pack_voltage_offset"] - inverter)
+    return np.asarray(true_voltage(s["pack_voltage"], p) - inverter)
 
 
-def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, Array]:
-    """(terminal voltage of a cell by the circuit [V], the pack's current [A], SOC) at steps of `DT`."""
+class CellCircuit(NamedTuple):
+    """What the circuit says of a mean cell, at steps of `DT`."""
+
+    voltage: Array  # V, at its terminals
+    rest: Array  # V, without a current
+    current: Array  # A, of the pack
+    soc: Array
+
+
+def cell_circuit(ride: Ride, p: Values, system: System) -> CellCircuit:
+    """The circuit of a mean cell at the current measured."""
     battery = system.pack
-    cell = mean_over(current(ride, p), SLOW) / battery.cells_parallel
-    temperature = mean_over(ride.quantities["cell_temperature"], SLOW)
+    cell = block_means(true_current(ride.signals["pack_current"], p), SLOW) / battery.cells_parallel
+    temperature = block_means(ride.quantities["cell_temperature"], SLOW)
     cold = colder(temperature)
     capacity = p["cell_capacity"] * battery.capacity_share_over(temperature)
     taken = discharged(cell, DT, capacity)
@@ -181,7 +178,7 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, A
     factor = p.get("cell_resistance_factor", 1.0) * (1 + p["resistance_level"] + p["resistance_cold"] * cold)
     bent = p["resistance_current"] + p["resistance_current_cold"] * cold
     empty = p["resistance_empty"] + p["resistance_empty_cold"] * cold
-    factor = factor * (1 + empty * (1 - soc) / EMPTIER - bent * np.abs(cell) / BENT)
+    factor = factor * (1 + empty * (1 - soc) / EMPTIER - bent * np.abs(cell) * system.sizes.resistance / BENT)
     r0 = battery.r0.over(soc, temperature) * factor
     r1 = battery.r1.over(soc, temperature)
     decay = np.exp(-DT / (r1 * battery.c1.over(soc, temperature) * np.exp(p["pair_time"])))
@@ -191,42 +188,40 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> tuple[Array, Array, A
     extra: Any = p["drift"] * np.arange(len(cell)) * DT / DRIFT_TIME
     mid = relaxation_over(cell, np.full(len(cell), decay_over(DT, MID)), before=True)
     extra = extra + p["mid_resistance"] * mid
-    q = {name: mean_over(value, SLOW) for name, value in ride.quantities.items()}
+    q = {name: block_means(value, SLOW) for name, value in ride.quantities.items()}
     q |= {"cell_current": cell, "soc": soc, "cell_temperature": temperature, "cell_capacity": capacity}
     extra = extra + summed(system.terms(q, p, DT, Port.CELL_VOLTAGE))
     rest = battery.ocv_over(soc, temperature) + p["ocv_offset"] + p["ocv_tilt"] * (soc - MIDDLE) + p["ocv_cold"] * cold
-    return np.asarray(terminal_voltage(rest, r0, cell, v1 + extra)), cell * battery.cells_parallel, soc
+    return CellCircuit(terminal_voltage(rest, r0, cell, v1 + extra), rest, cell * battery.cells_parallel, soc)
 
 
 def start_soc(ride: Ride, system: System) -> float:
-    """The SOC that the first voltages point to, with the current taken off by the ohmic resistance."""
-    battery = system.pack
-    amperes = float(np.mean(ride.signals["pack_current"][:FIRST]))
-    volts = battery.cell_voltage(float(np.mean(ride.signals["pack_voltage"][:FIRST])), amperes)
-    temperature = float(ride.quantities["cell_temperature"][0])
-    drop = amperes / battery.cells_parallel * battery.r0.at(START_SOC, temperature)[0]
-    return battery.soc_at(volts + drop, temperature)
+    """The SOC that the first voltages point to, by the vehicle file: `soc_start` counts from there, whatever moves."""
+    volts = true_voltage(float(np.mean(ride.signals["pack_voltage"][:FIRST])), system.healthy)
+    amperes = true_current(float(np.mean(ride.signals["pack_current"][:FIRST])), system.healthy)
+    return system.pack.first_soc(volts, amperes, float(ride.quantities["cell_temperature"][0]))
 
 
 def counted_soc(ride: Ride, system: System) -> Array:
     """SOC by counting the current from where the first voltages point to, shape (n,)."""
     capacity = system.pack.pack_capacity(float(ride.quantities["cell_temperature"][0]))
-    return np.asarray(start_soc(ride, system) - np.cumsum(discharged(ride.signals["pack_current"], STEP, capacity)))
+    amperes = true_current(ride.signals["pack_current"], system.healthy)
+    return np.asarray(start_soc(ride, system) - np.cumsum(discharged(amperes, STEP, capacity)))
 
 
 def cell_voltage(ride: Ride, p: Values, system: System) -> Array:
     """Voltage [V] of a mean cell less that of its circuit at the current measured, at steps of `DT`."""
     battery = replace(system.pack, series_resistance=p["pack_series_resistance"])
-    volts, amperes, _ = cell_circuit(ride, p, system)
-    measured = mean_over(ride.signals["pack_voltage"], SLOW) - p["pack_voltage_offset"]
-    return np.asarray(battery.cell_voltage(measured, amperes) - volts)
+    cell = cell_circuit(ride, p, system)
+    measured = true_voltage(block_means(ride.signals["pack_voltage"], SLOW), p)
+    return np.asarray(battery.cell_voltage(measured, cell.current) - cell.voltage)
 
 
 def voltage_timing(ride: Ride, p: Values, system: System) -> Array:
     """Steps [V] of a mean cell from one grid step to the next, less those of the current by its resistance."""
     battery = system.pack
     late = p.get("pack_voltage_latency", 0.0)
-    amperes = current(ride, p)
+    amperes = true_current(ride.signals["pack_current"], p)
     if late:
         amperes = np.interp(ride.time - late, ride.time, amperes)
     soc = np.full(len(ride.time), start_soc(ride, system))
@@ -242,7 +237,7 @@ def voltage_timing(ride: Ride, p: Values, system: System) -> Array:
 def gps_speed(ride: Ride, p: Values, system: System) -> Array:
     """GPS speed [m/s] less the motor's by wheel radius, slip and lean."""
     q = moving(ride, p, system)
-    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / SLIPPING
+    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / (SLIPPING * system.sizes.power)
     lean = 1 - p["lean_radius"] * (q["lateral_acceleration"] / GRAVITY) ** 2 / 2
     return np.asarray(ride.signals["gps_speed"] - q["speed"] * slip * lean + p["gps_lag"] * q["acceleration"])
 
@@ -259,7 +254,7 @@ def rear_speed(ride: Ride, p: Values, system: System) -> Array:
 def front_speed(ride: Ride, p: Values, system: System) -> Array:
     """The front wheel's speed [m/s] less the motor's by slip and lean."""
     q = moving(ride, p, system)
-    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / SLIPPING
+    slip = 1 - p["slip_per_force"] * q["torque"] / p["wheel_radius"] / (SLIPPING * system.sizes.power)
     lean = 1 - p["front_lean"] * (q["lateral_acceleration"] / GRAVITY) ** 2 / 2
     speed = q["motor_speed"] * p["gear_ratio"] * slip * lean
     front = ride.signals["wheel_speed_front"] * (1 - p["front_scale"])
@@ -272,44 +267,40 @@ def _heat(ride: Ride, p: Values, system: System) -> tuple[Array, Array]:
     electric, drag = motor_losses(ride, q, p, system)
     inverter = summed(system.terms(q, p, STEP, Port.INVERTER_LOSS))
     n = len(ride.time)
-    return mean_over(np.broadcast_to(electric + drag, n), SLOW), mean_over(np.broadcast_to(inverter, n), SLOW)
+    return block_means(np.broadcast_to(electric + drag, n), SLOW), block_means(np.broadcast_to(inverter, n), SLOW)
 
 
-def _cooled(ride: Ride, p: Values, network: Network, watts: Array, airflow: str) -> Array:
-    """What `network` leaves [K] of its sensor at steps of `DT`; airflow: how much more moving air cools."""
-    flow = 1 + p[airflow] * np.abs(mean_over(ride.quantities["speed"], SLOW)) / WIND
+def _warmed(ride: Ride, p: Values, sensor: str, network: Network, watts: Array, airflow: str) -> Array:
+    """What `network`, heated by `watts`, leaves [K] of its `sensor`; airflow: how much more moving air cools."""
+    flow = 1 + p[airflow] * np.abs(block_means(ride.quantities["speed"], SLOW)) / WIND
     air = p.get("cooling_factor", 1.0) * np.maximum(flow, LEAST_COOLING)
-    ambient = mean_over(ride.quantities["ambient_temperature"], SLOW)
-    return np.array(temperatures(network, DT, watts.tolist(), ambient.tolist(), air.tolist()))
+    ambient = block_means(ride.quantities["ambient_temperature"], SLOW)
+    modelled: Array = np.array(temperatures(network, DT, watts.tolist(), ambient.tolist(), air.tolist()))
+    return block_means(ride.signals[sensor], SLOW) - modelled
 
 
 def _first(ride: Ride, sensor: str) -> float:
-    return float(mean_over(ride.signals[sensor], SLOW)[:FIRST].mean())
+    return float(block_means(ride.signals[sensor], SLOW)[:FIRST].mean())
 
 
 def motor_temperature(ride: Ride, p: Values, system: System) -> Array:
     """The stator's temperature [K] less that of the cooling network at the modelled loss, at steps of `DT`."""
     stator = _first(ride, "motor_temperature") + p["motor_start"]
-    ambient = float(mean_over(ride.quantities["ambient_temperature"], SLOW)[0])
+    ambient = float(block_means(ride.quantities["ambient_temperature"], SLOW)[0])
     network = MotorCooling.of(p, stator, stator + p["rotor_start"] * (stator - ambient) / WARMER)
-    modelled = _cooled(ride, p, network, _heat(ride, p, system)[0], "motor_airflow")
-    return np.asarray(mean_over(ride.signals["motor_temperature"], SLOW) - modelled)
+    return _warmed(ride, p, "motor_temperature", network, _heat(ride, p, system)[0], "motor_airflow")
 
 
 def inverter_temperature(ride: Ride, p: Values, system: System) -> Array:
     """The board's temperature [K] less that of the cooling network at the modelled loss, at steps of `DT`."""
     board = _first(ride, "inverter_temperature") + p["inverter_start"]
     network = InverterCooling.of(p, board, board + p["box_start"])
-    modelled = _cooled(ride, p, network, _heat(ride, p, system)[1], "inverter_airflow")
-    return np.asarray(mean_over(ride.signals["inverter_temperature"], SLOW) - modelled)
+    return _warmed(ride, p, "inverter_temperature", network, _heat(ride, p, system)[1], "inverter_airflow")
 
 
 def cell_temperature(ride: Ride, p: Values, system: System) -> Array:
     """The cells' temperature [K] less that of the lump at the circuit's heat, at steps of `DT`."""
-    battery = system.pack
-    volts, amperes, soc = cell_circuit(ride, p, system)
-    rest = battery.ocv_over(soc, mean_over(ride.quantities["cell_temperature"], SLOW))
-    watts = battery.cells_series * heat(rest, volts, amperes)
+    cell = cell_circuit(ride, p, system)
+    watts = system.pack.cells_series * heat(cell.rest, cell.voltage, cell.current)
     network = LumpedCooling.of(p, "pack", _first(ride, "cell_temperature") + p["cells_start"])
-    modelled = _cooled(ride, p, network, watts, "pack_airflow")
-    return np.asarray(mean_over(ride.signals["cell_temperature"], SLOW) - modelled)
+    return _warmed(ride, p, "cell_temperature", network, watts, "pack_airflow")

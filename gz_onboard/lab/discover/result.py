@@ -7,7 +7,7 @@ from typing import Annotated
 
 from gz_onboard.offline.schema import OPTIONAL
 
-VERSION = 1
+VERSION = 2  # of the keys: 1 had energy_per_way for consumption
 VERDICTS = {
     "cause": "something differs from the model, and it has a name",
     "none": "nothing is wrong that these rides could show",
@@ -16,12 +16,12 @@ VERDICTS = {
 }
 METRICS = {
     "power": ("power, rms", 1.0, "W"),
-    "energy_per_way": ("consumption", 1 / 3.6, "Wh/km"),
+    "consumption": ("consumption", 1 / 3.6, "Wh/km"),
     "range": ("range", 100.0, "%"),
     "voltage": ("voltage of a cell", 1e3, "mV"),
 }
 """Of the gain: label, factor and unit."""
-RIDES = "ride"  # the quantity of what differs from ride to ride
+RIDE_TO_RIDE = "ride"  # the quantity of what differs from ride to ride
 Interval = tuple[float, float]
 NO_INTERVAL = "one ride: no interval"
 
@@ -65,7 +65,7 @@ class Cause:
 
 @dataclass(frozen=True)
 class Unknown:
-    """What has no name: a curve that a `channel` leaves over a `quantity`, or over the rides (`RIDES`).
+    """What has no name: a curve that a `channel` leaves over a `quantity`, or over the rides (`RIDE_TO_RIDE`).
 
     straight: it is in proportion. curve: rows (at [unit], value [the channel's unit], sd). denies: causes that it
     shows to be none. share: of the energy.
@@ -119,7 +119,7 @@ class Errors:
 class Gain:
     """Errors on rides held out of the fit, by metric. apart: these rides had no part in the choice either.
 
-    voltage: of a cell [V]; power: rms [W]; energy_per_way: [J/m]; range: [1].
+    voltage: of a cell [V]; power: rms [W]; consumption: [J/m]; range: [1].
     """
 
     holdout: tuple[str, ...] = ()
@@ -127,7 +127,7 @@ class Gain:
     apart: Annotated[bool | None, OPTIONAL] = None
     voltage: Annotated[Errors | None, OPTIONAL] = None
     power: Annotated[Errors | None, OPTIONAL] = None
-    energy_per_way: Annotated[Errors | None, OPTIONAL] = None
+    consumption: Annotated[Errors | None, OPTIONAL] = None
     range: Annotated[Errors | None, OPTIONAL] = None
 
     @property

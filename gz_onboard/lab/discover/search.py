@@ -14,7 +14,7 @@ from scipy.stats import t as student
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.linear import Normal, marginal
+from gz_onboard.lab.discover.linear import Normal, Population, marginal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 
 RIDGE = 1e-6  # information of any change, in scales: none is without bounds
@@ -64,18 +64,13 @@ class Evidence:
         return float(self.score[list(index)] @ self.estimate(index)) if len(index) else 0.0
 
 
-def evidence(mixed: MixedModel, normals: Sequence[Normal]) -> Evidence:
-    """Of the rides' `normals`, against what `mixed` says of the healthy vehicle."""
-    return evidence_of(mixed.mean, mixed.prior, mixed.scatter, normals)
-
-
-def evidence_of(mean: Array, prior: Array, scatter: Array, normals: Sequence[Normal]) -> Evidence:
-    """The same; mean, prior: (p,), (p, p) of the common part; scatter: variances between rides, (p,)."""
-    parts = [marginal(ride, scatter) for ride in normals]
-    m = sum((part.n for part in parts), np.zeros_like(prior))
-    c = sum((part.b for part in parts), np.zeros(len(mean)))
-    e = c - m @ mean
-    k = np.linalg.inv(np.linalg.inv(prior) + m)
+def evidence(healthy: Population, normals: Sequence[Normal]) -> Evidence:
+    """Of the rides' `normals`, against what is known of the `healthy` vehicle."""
+    parts = [marginal(ride, healthy.scatter) for ride in normals]
+    m = sum((part.n for part in parts), np.zeros_like(healthy.prior))
+    c = sum((part.b for part in parts), np.zeros(len(healthy.mean)))
+    e = c - m @ healthy.mean
+    k = np.linalg.inv(np.linalg.inv(healthy.prior) + m)
     return Evidence(m - m @ k @ m, e - m @ k @ e)
 
 

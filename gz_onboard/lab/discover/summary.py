@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from gz_onboard.lab.discover.breakdown import before_and_after
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.channels import BY_NAME
+from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.detectability import extent
 from gz_onboard.lab.discover.energy import residual_sizes
 from gz_onboard.lab.discover.result import METRICS, NO_INTERVAL, VERDICTS, Gain, Limit, Report
@@ -99,7 +99,7 @@ def _scores(found: Discovery) -> list[str]:
     left = residual_sizes(before_and_after(found)[0])
     largest = sorted(left.items(), key=lambda row: -abs(row[1].energy_share))[:ROWS]
     text = "; ".join(
-        f"{readable(name)} {r.mean:+.3g} ± {r.rms:.3g} {BY_NAME[name].unit} ({r.energy_share:+.1%} of the energy)"
+        f"{readable(name)} {r.mean:+.3g} ± {r.rms:.3g} {CHANNEL[name].unit} ({r.energy_share:+.1%} of the energy)"
         for name, r in largest
     )
     return [f"scores       {best}; healthy rides stay below {report.threshold:.0f}", f"residuals    {text}"]

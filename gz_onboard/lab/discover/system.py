@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from gz_onboard.errors import InputError
+from gz_onboard.lab.discover.sizes import USUAL_SIZES, Sizes
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING, Effect, Port
 from gz_onboard.physics.model import Bound, over, value_of
@@ -24,9 +25,9 @@ class System:
 
     effects: tuple[Effect, ...]
     battery: Battery | None
-    payload: float  # kg, of the vehicle file: what a ride without an entry carries
-    healthy: Values = field(default_factory=dict)  # parameters of the vehicle file
+    healthy: Values  # parameters of the vehicle file
     vibration: float = VIBRATION  # m/s², of the vehicle file's prior riding: for rides that did not measure it
+    sizes: Sizes = USUAL_SIZES
 
     @property
     def pack(self) -> Battery:

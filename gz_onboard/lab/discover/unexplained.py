@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from gz_onboard.lab.discover.acceptance import with_observed_scatter
-from gz_onboard.lab.discover.constancy import RIDE, unequal
+from gz_onboard.lab.discover.constancy import RIDE_PREFIX, unequal
 from gz_onboard.lab.discover.cross_validation import Fold, held_out, improves, squares
 from gz_onboard.lab.discover.curve_forms import CurveForm, curve_forms
 from gz_onboard.lab.discover.curves import CurveFit, fit_curve
 from gz_onboard.lab.discover.energy import curve_energy_share, energy_share
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.prior import Sizes
-from gz_onboard.lab.discover.result import RIDES, Split, Unknown
+from gz_onboard.lab.discover.result import RIDE_TO_RIDE, Split, Unknown
 from gz_onboard.lab.discover.search import one_degree
 from gz_onboard.lab.discover.selection import Selection
+from gz_onboard.lab.discover.sizes import Sizes
 
 LEFT = 0.1  # of what causes explain: a curve beside them that takes less is the bend of a large effect
 CURVE = 1.5  # a curve's evidence over that of a cause: their knots are chosen by eye; lines count as tries instead
@@ -62,16 +62,22 @@ def unexplained(now: Selection, constancy: Sequence[Split], limit: float) -> Unk
     return replace(best, share=curve_energy_share(now.lines, form, values))
 
 
+def curves_beside(
+    now: Selection, chosen: Sequence[str], forms: Iterable[CurveForm]
+) -> Iterator[tuple[CurveForm, CurveFit]]:
+    """Each of `forms` that the rides have, fitted beside the causes `chosen`."""
+    for form in forms:
+        curve = fit_curve(now.mixed, now.lines, now.normals, form, now.search.index(chosen))
+        if curve is not None:
+            yield form, curve
+
+
 def best_curve(now: Selection, limit: float) -> Unknown | None:
     """The curve that explains most beside the causes chosen, and those of its channel if it is no bend of theirs."""
     search, chosen = now.search, now.chosen
-    index = search.index(chosen)
-    total = search.evidence.gain(index)
+    total = search.evidence.gain(search.index(chosen))
     best: Unknown | None = None
-    for form in curve_forms(now.mixed.sizes):
-        curve = fit_curve(now.mixed, now.lines, now.normals, form, index)
-        if curve is None:
-            continue
+    for form, curve in curves_beside(now, chosen, curve_forms(now.mixed.sizes)):
         inflation = curve_inflation(now.mixed, form)
         score = curve_score(now.mixed, form, curve)
         if score < least_score(form, limit):
@@ -112,14 +118,11 @@ def rival_curve(now: Selection, limit: float) -> Unknown | None:
     for name in now.chosen:
         rest = [other for other in now.chosen if other != name]
         own = search.step(rest, name)
-        for form in curve_forms(now.mixed.sizes):
-            if search.shares.get(name, {}).get(form.channel, 0.0) < OWN_SHARE:
-                continue
-            curve = fit_curve(mixed, now.lines, now.normals, form, search.index(rest))
-            if curve is None:
-                continue
-            inflation = curve_inflation(mixed, form)
-            ahead = curve.chi2 / inflation - 2 * (curve.k - 1) - own * max(mixed.inflation.get(name, 1.0), 1.0)
+        shares = search.shares.get(name, {})
+        mine = (form for form in curve_forms(mixed.sizes) if shares.get(form.channel, 0.0) >= OWN_SHARE)
+        for form, curve in curves_beside(now, rest, mine):
+            evidence = curve.chi2 / curve_inflation(mixed, form) - 2 * (curve.k - 1)
+            ahead = evidence - own * max(mixed.inflation.get(name, 1.0), 1.0)
             if ahead > max(most, UNLIKE_LEFT * own) and curve_is_accepted(now, form, rest, limit):
                 most = ahead
                 best = described(form, curve, curve_score(mixed, form, curve), [name])
@@ -128,32 +131,27 @@ def rival_curve(now: Selection, limit: float) -> Unknown | None:
 
 def curve_over_split(now: Selection, split: Split) -> Unknown | None:
     """The curve over the quantity of `split`, with no cause named, in the channel where it has most to say."""
-    best: Unknown | None = None
-    for form in curve_forms(now.mixed.sizes):
-        if form.quantity != split.quantity or form.straight:
-            continue
-        curve = fit_curve(now.mixed, now.lines, now.normals, form, [])
-        if curve is None:
-            continue
-        score = curve_score(now.mixed, form, curve)
-        if best is None or score > best.score:
-            best = described(form, curve, score, [split.cause])
-    return best
+    forms = (f for f in curve_forms(now.mixed.sizes) if f.quantity == split.quantity and not f.straight)
+    found = [
+        described(form, curve, curve_score(now.mixed, form, curve), [split.cause])
+        for form, curve in curves_beside(now, [], forms)
+    ]
+    return max(found, key=lambda curve: curve.score, default=None)
 
 
 def ride_to_ride(now: Selection, worst: Split, constancy: Sequence[Split]) -> Unknown:
     """What no cause is that acts in some rides and not in others: by how much more or less in each."""
     channels = {name for line in now.lines for name in line.tables}
     channel = max(channels, key=lambda name: channel_effect(now, name)[1])
-    mine = [s for s in constancy if s.cause == worst.cause and s.quantity.startswith(RIDE)]
+    mine = [s for s in constancy if s.cause == worst.cause and s.quantity.startswith(RIDE_PREFIX)]
     rows = tuple((float(i), s.ratio, abs(s.ratio) / max(s.chi2, 1e-9) ** 0.5) for i, s in enumerate(mine))
     share = energy_share(now.lines, now.change)
-    return Unknown(channel, RIDES, False, "", worst.chi2, worst.chi2, rows, (worst.cause,), share)
+    return Unknown(channel, RIDE_TO_RIDE, False, "", worst.chi2, worst.chi2, rows, (worst.cause,), share)
 
 
 def form_of(unknown: Unknown, sizes: Sizes) -> CurveForm | None:
     """The curve of what has no name, in a vehicle of `sizes`; None if it is one of rides."""
-    if unknown.quantity == RIDES:
+    if unknown.quantity == RIDE_TO_RIDE:
         return None
     return CurveForm(unknown.channel, unknown.quantity, unknown.straight, sizes)
 

@@ -14,7 +14,7 @@ from gz_onboard.lab.discover.energy import energy_share, residual_sizes
 from gz_onboard.lab.discover.linear import LinearRide, Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.prior import stepped
-from gz_onboard.lab.discover.result import RIDES, Cause, Estimate, Gain, Isolability, Report, Score, Unknown
+from gz_onboard.lab.discover.result import RIDE_TO_RIDE, Cause, Estimate, Gain, Isolability, Report, Score, Unknown
 from gz_onboard.lab.discover.search import Search
 from gz_onboard.lab.discover.selection import SearchProblem
 from gz_onboard.lab.discover.unexplained import unexplained
@@ -138,20 +138,15 @@ def wind_cause(every: Search, chosen: Sequence[str], winds: Winds, lines: Sequen
 
 
 def alternatives(search: Search, chosen: Sequence[str], limit: float) -> list[list[str]]:
-    """Of each cause chosen that others could stand in for: itself and these, as far as they can be."""
-    sets = (likely(search, chosen, group) for group in search.alternatives(chosen, MARGIN, LEAST * limit))
+    """Of each cause chosen that others could stand in for: itself and these, if their parameters can be what they would
+    have to be.
+    """
+    sets = []
+    for group in search.alternatives(chosen, MARGIN, LEAST * limit):
+        rest = [name for name in chosen if name != group[0]]
+        fits = [(name, *search.fitted([*rest, name])[name]) for name in group]
+        sets.append([n for n, x, v in fits if within_bounds(search.mixed, search.causes[n], x, np.sqrt(v))])
     return [group for group in sets if len(group) > 1]
-
-
-def likely(search: Search, chosen: Sequence[str], group: Sequence[str]) -> list[str]:
-    """Those of `group`, stand-ins of its first, whose parameters could be what they would have to be."""
-    rest = [name for name in chosen if name != group[0]]
-    found = []
-    for name in group:
-        change, variance = search.fitted([*rest, name])[name]
-        if within_bounds(search.mixed, search.causes[name], change, np.sqrt(variance)):
-            found.append(name)
-    return found
 
 
 def separability(search: Search) -> Isolability:
@@ -185,7 +180,7 @@ def advice(search: Search, sets: Sequence[Sequence[str]], unknown: Unknown | Non
     if unknown is not None:
         lines.append(
             f"Ride one and the same way several times: what {unknown.channel} leaves differs from ride to ride."
-            if unknown.quantity == RIDES
+            if unknown.quantity == RIDE_TO_RIDE
             else f"Ride over the whole span of {unknown.quantity} with all else the same, twice: what "
             f"{unknown.channel} leaves goes with it, or with what changes along with it."
         )

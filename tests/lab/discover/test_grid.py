@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.lab.discover.curve_forms import IN_PROPORTION, QUANTITIES, curve_forms
+from gz_onboard.lab.discover.curve_forms import IN_PROPORTION, KNOTS, curve_forms
 from gz_onboard.lab.discover.grid import LONGEST, since, suspension_speed, vibration
 from gz_onboard.physics.vibration import FAST, SLOW, Vibration
 
@@ -73,6 +73,6 @@ def test_forms_are_curves_and_what_is_in_proportion():
     assert {form.quantity for form in straight} == set(IN_PROPORTION)
     assert len({form.name for form in curve_forms()}) == len(curve_forms())
     for form in straight:
-        knots = np.array(QUANTITIES[form.quantity][0])
+        knots = np.array(KNOTS[form.quantity][0])
         assert form.basis.shape == (len(knots), 1)
         assert form.basis[:, 0] == pytest.approx(knots / np.abs(knots).max())

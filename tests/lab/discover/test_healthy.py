@@ -15,7 +15,7 @@ from benchmarks.trial import LACKS, MARK, Row, alarm, discovered, healthy_docume
 from gz_onboard.lab.discover.acceptance import with_observed_scatter, within_bounds
 from gz_onboard.lab.discover.baseline import baseline
 from gz_onboard.lab.discover.cross_validation import improves
-from gz_onboard.lab.discover.curve_forms import QUANTITIES, CurveForm
+from gz_onboard.lab.discover.curve_forms import KNOTS, CurveForm
 from gz_onboard.lab.discover.curves import supported_knots
 from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.lab.discover.gain import errors
@@ -77,7 +77,7 @@ def test_what_cannot_be_is_no_cause(mixed: MixedModel, name: str):
 
 def test_a_knot_that_hardly_a_block_is_at_bends_no_curve(line: LinearRide):
     form = CurveForm("road_force", "speed")
-    knots = QUANTITIES["speed"][0]
+    knots = KNOTS["speed"][0]
     speed = line.ride.quantities["speed"]
     free = supported_knots(form, [line, line])
     assert speed.max() < knots[-1] and free[-1] == pytest.approx(free[-2])  # 15 m/s goes with 13

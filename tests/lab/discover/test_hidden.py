@@ -67,7 +67,7 @@ def test_what_rough_roads_take_is_found_over_vibration_and_mended(base):
     report = discovered(base, case.rides)
     assert (report["verdict"], report["causes"]) == ("unknown", [])
     assert (report["unknown"]["channel"], report["unknown"]["quantity"]) == ("road_force", "vibration")
-    gain = report["gain"]["energy_per_way"]
+    gain = report["gain"]["consumption"]
     assert gain["after"] < 0.6 * gain["control"]  # on rides that the curve was not fitted to
 
 
@@ -76,7 +76,7 @@ def test_windy_days_are_named_but_no_model_is_extended_with_them(base):
     assert [cause["name"] for cause in report["causes"]] == ["headwind"]
     assert report["causes"][0]["varies"]
     assert any("from ride to ride" in note for note in report["notes"])
-    for metric in ("power", "energy_per_way", "range"):
+    for metric in ("power", "consumption", "range"):
         assert report["gain"][metric]["after"] == report["gain"][metric]["control"]
 
 

@@ -7,9 +7,9 @@ import pytest
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover.candidates import Candidate
-from gz_onboard.lab.discover.channels import BY_NAME, ChannelNoise
+from gz_onboard.lab.discover.channels import CHANNEL, ChannelNoise
 from gz_onboard.lab.discover.grid import Ride
-from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Normal, normal
+from gz_onboard.lab.discover.linear import LinearChannel, LinearRide, Normal, likelihoods, normal, whitened
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial
 from gz_onboard.lab.discover.search import Evidence, Search
 from gz_onboard.vehicle import read_vehicle
@@ -23,7 +23,7 @@ def table(columns: Array, y: Array) -> LinearChannel:
     used: Mask = np.ones(m, dtype=bool)
     even: Array = np.ones(m)
     time: Array = 4.0 * np.arange(m, dtype=np.float64)
-    return LinearChannel(BY_NAME["road_force"], y, columns, time, used, roughness=even)
+    return LinearChannel(CHANNEL["road_force"], y, columns, time, used, roughness=even)
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +44,21 @@ def test_a_border_is_what_the_wider_matrix_gives():
         assert found.n == pytest.approx(expected.n)
         assert found.b == pytest.approx(expected.b)
     assert narrow.touched.tolist() == [0, 1, 2, 3, 5]
+
+
+def test_whitening_and_likelihood_are_those_of_the_noises_covariance():
+    rng = np.random.default_rng(4)
+    rows = table(np.zeros((40, 1)), rng.normal(size=40))
+    apart = np.abs(np.subtract.outer(rows.time, rows.time))
+    covariance = NOISE.white**2 * np.eye(40) + NOISE.slow**2 * np.exp(-apart / NOISE.time)
+    white = whitened(rows, NOISE, rows.y)
+    assert white @ white == pytest.approx(rows.y @ np.linalg.solve(covariance, rows.y))
+    columns = whitened(rows, NOISE, np.column_stack([rows.y, 2 * rows.y]))
+    assert columns == pytest.approx(np.column_stack([white, 2 * white]))
+    ratio, time = np.array([0.0, NOISE.slow / NOISE.white]), np.full(2, NOISE.time)
+    quadratic, logarithm = likelihoods(rows.time, rows.y, ratio, time)
+    assert quadratic == pytest.approx([rows.y @ rows.y, white @ white * NOISE.white**2])
+    assert logarithm == pytest.approx([0.0, np.linalg.slogdet(covariance / NOISE.white**2).logabsdet])
 
 
 def test_the_spread_of_one_block():

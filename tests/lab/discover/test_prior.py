@@ -10,10 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.lab.discover.candidates import candidates
-from gz_onboard.lab.discover.curve_forms import QUANTITIES, CurveForm
+from gz_onboard.lab.discover.curve_forms import KNOTS, CurveForm
 from gz_onboard.lab.discover.grid import MOST_STEERING, steering
 from gz_onboard.lab.discover.mixed_model import initial
-from gz_onboard.lab.discover.prior import BY_NAME, USUAL_SIZES, nearest_step, sizes_of
+from gz_onboard.lab.discover.prior import NUISANCE
+from gz_onboard.lab.discover.sizes import USUAL_SIZES, nearest_step, sizes_of
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import known_effects, load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -45,10 +46,20 @@ def test_absolute_numbers_grow_with_the_vehicle(scooter: Vehicle):
     small, large = initial(scooter), initial(heavy)
     place = small.names.index("loss_speed")
     assert large.scale[place] == pytest.approx(4 * small.scale[place])
+    geared = sizes_of(scooter.changed(p.replaced(gear_ratio=p["gear_ratio"] / 4, cell_capacity=4 * p["cell_capacity"])))
+    assert (geared.spin, geared.resistance) == pytest.approx((4.0, 1 / 4))
+    assert large.noise["road_force"].white == pytest.approx(4 * small.noise["road_force"].white)
     form = CurveForm("road_force", "motor_current", sizes=sizes)
-    assert form.knots == pytest.approx(4 * np.array(QUANTITIES["motor_current"][0]))
+    assert form.knots == pytest.approx(4 * np.array(KNOTS["motor_current"][0]))
     assert form.size == pytest.approx(4 * replace(form, sizes=USUAL_SIZES).size)
-    assert {nuisance.of for nuisance in BY_NAME.values()} == {"", "power", "current", "voltage", "auxiliary"}
+    assert {nuisance.size for nuisance in NUISANCE.values()} == {
+        "",
+        "power",
+        "current",
+        "voltage",
+        "auxiliary",
+        "resistance",
+    }
 
 
 def test_a_message_may_state_how_old_its_values_are(scooter: Vehicle):

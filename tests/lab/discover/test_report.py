@@ -11,19 +11,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.lab.discover.breakdown import (
-    QUANTITIES,
-    QuantityReader,
+    COVARIATES,
     before_and_after,
     binned,
     edges,
     outlying_rides,
     pooled,
     share_over,
-    since_change,
 )
-from gz_onboard.lab.discover.channels import BY_NAME
+from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.detectability import implausible_rides, limits, missing_residuals, remaining_range_error
 from gz_onboard.lab.discover.gain import summarised
+from gz_onboard.lab.discover.grid import since_change
 from gz_onboard.lab.discover.linear import normal
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
 from gz_onboard.lab.discover.page import body
@@ -122,14 +121,12 @@ def test_after_is_before_less_what_the_cause_does(found: Discovery):
 
 
 def test_a_quantity_that_was_not_measured_is_not_made_up(found: Discovery):
-    mixed = found.mixed
     (line,) = found.lines
     ride = line.ride
     bare = replace(ride, signals={k: v for k, v in ride.signals.items() if k not in ("rate_z", "gps_course")})
-    over = QuantityReader(mixed)
     less = replace(line, ride=bare)
-    for name in QUANTITIES:
-        x, y = pooled([less], "road_force", name, over)
+    for name in COVARIATES:
+        x, y = pooled([less], "road_force", name)
         assert len(x) == len(y)
         assert (len(x) == 0) == (name in ("lateral_acceleration", "heading")), name
 
@@ -154,7 +151,7 @@ def test_the_page_says_it_all(found: Discovery):
         assert words in text, words
     assert "<script" not in text
     assert len(re.findall(r'<img alt="" src="data:image/png;base64,[A-Za-z0-9+/=]{500,}"', text)) >= 4
-    assert text.count("<details") >= sum(name in found.lines[0].tables for name in BY_NAME)
+    assert text.count("<details") >= sum(name in found.lines[0].tables for name in CHANNEL)
 
 
 def test_limits_shrink_with_the_rides(found: Discovery):
