@@ -276,7 +276,7 @@ def out_suffix(out: Path) -> str:
 
 
 def _database(log: Path, files: list[Path] | None) -> Database:
-    from gz_onboard.bus.mapping import empty_database, load_database
+    from gz_onboard.bus.dbc import empty_database, load_database
 
     if files:
         return load_database(files)

@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.bus import export, logs
+from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import LogDamage, json_channels, read_attachments, read_frames, read_metadata, read_samples
-from gz_onboard.bus.mapping import find_dbc
 from gz_onboard.bus.readers.common import ChannelNumbers
 from gz_onboard.bus.readers.pycan import frame_of
 from gz_onboard.bus.writers import write_blf, write_candump

@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.bus.codec import Codec
-from gz_onboard.bus.mapping import BusMapping, find_dbc, load_database, pgn, read_mapping
+from gz_onboard.bus.dbc import find_dbc, load_database
+from gz_onboard.bus.mapping import BusMapping, pgn, read_mapping
 from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError
 from gz_onboard.events import ROLES
@@ -318,7 +319,7 @@ def test_a_dbc_that_was_cut_anywhere_says_nothing_of_what_is_not_in_it(tmp_path)
 
 def test_a_dbc_is_read_without_what_only_mf4_files_need():
     """asammdf takes a second, in which its imports swallow Ctrl-C."""
-    code = "import sys; from gz_onboard.bus.mapping import *; load_database([find_dbc('vehicle.dbc')]); "
+    code = "import sys; from gz_onboard.bus.dbc import *; load_database([find_dbc('vehicle.dbc')]); "
     code += "print({'asammdf', 'pandas', 'sympy'} & sys.modules.keys())"
     run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert run.stdout.strip() == "set()"
