@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gz_onboard.bus.dbc import LARGEST, SMALLEST, find_dbc, load_database
+from gz_onboard.bus.dbc import LARGEST, SMALLEST, LeftOut, find_dbc, load_database
 from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.events import CURRENTS, ROLES, SPEEDS, VOLTAGES
@@ -82,7 +82,8 @@ def read_mapping(vehicle: Table) -> BusMapping:
         files = [find_dbc(name, vehicle.file.parent) for name in names]
     except InputError as error:
         raise vehicle.error(str(error), "dbc") from error
-    database = load_database(files)
+    left_out: LeftOut = {}
+    database = load_database(files, left_out)
 
     bus = vehicle.table("bus")
     bus.only(["not_available", "identifiers", "messages"])
@@ -116,7 +117,7 @@ def read_mapping(vehicle: Table) -> BusMapping:
         _check_groups(database, bus)
     roles = vehicle.table("roles")
     roles.only(ROLES)
-    sources = tuple(_source(database, roles, role) for role in roles.values)
+    sources = tuple(_source(database, left_out, roles, role) for role in roles.values)
     _check_witnesses(sources, roles)
     return BusMapping(
         database=database,
@@ -130,7 +131,7 @@ def read_mapping(vehicle: Table) -> BusMapping:
     )
 
 
-def _source(database: Database, roles: Table, role: str) -> Source:
+def _source(database: Database, left_out: LeftOut, roles: Table, role: str) -> Source:
     value = roles.values[role]
     options = roles.table(role) if isinstance(value, dict) else None
     if options:
@@ -139,6 +140,11 @@ def _source(database: Database, roles: Table, role: str) -> Source:
     else:
         name = roles.text(role)
     where, key = (options, "signal") if options else (roles, role)
+    of = options.text("message", "") if options else ""
+    for (message_name, signal_name), why in left_out.items():
+        if signal_name in (name, "") and of in (message_name, "" if signal_name else None):
+            what = f"signal {shown(name)} of {message_name}" if signal_name else f"message {message_name}"
+            raise where.error(f"{what} is left out of the DBC file, for it cannot be read: {why}", key)
     if options and "message" in options.values:
         message = _message(database, options, "message", options.text("message"))
         signal = _signal(message, options, "signal", name)
