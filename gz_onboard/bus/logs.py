@@ -59,7 +59,7 @@ _FIRST_LINES = {
     ".trc": re.compile(r";\$(FILEVERSION|STARTTIME|COLUMNS)\b"),
     ".crtd": lines.CRTD_LINE,
     ".log": re.compile(rf"(?:{candump.SCREEN_LINE.pattern})\s*$|\([\d.]+\)\s+\S+\s+[0-9A-Fa-f]+#"),
-    _TABLE: re.compile(r"\s*\"?(time|timestamp|t)\b[^,;]*[,;]", re.I),
+    _TABLE: re.compile(r"\s*\"?(time|timestamp|t)(\b|_m?s\b)[^,;]*[,;]", re.I),
 }
 """What a line of a text log looks like, by format: of its header or its frames."""
 _HEAD = 8192  # bytes within which a text log shows what it is

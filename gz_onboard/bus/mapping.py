@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gz_onboard.bus.dbc import LARGEST, SMALLEST, LeftOut, find_dbc, load_database
+from gz_onboard.bus.dbc import LARGEST, SMALLEST, LeftOut, empty_database, find_dbc, load_database
 from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.events import CURRENTS, ROLES, SPEEDS, VOLTAGES
@@ -69,10 +69,20 @@ class BusMapping:
     not_available: bool = True
     j1939: bool = False
     delays: dict[str, float] = field(default_factory=dict)  # s, by message: its values are so much older; where stated
+    columns: Table | None = None  # the roles of a vehicle without DBC files: their signals are columns of a table
 
 
 def read_mapping(vehicle: Table) -> BusMapping:
-    """The bus part of the vehicle file `vehicle`; InputError for whatever does not fit its DBC files."""
+    """The bus part of the vehicle file `vehicle`; InputError for whatever does not fit its DBC files.
+
+    Of a vehicle without DBC files only tables of signals can be read; it has a mapping without sources.
+    """
+    if "dbc" not in vehicle.values:
+        if "bus" in vehicle.values:
+            raise vehicle.error("describes frames, for which dbc is missing", "bus")
+        roles = vehicle.table("roles")
+        roles.only(ROLES)
+        return BusMapping(empty_database(), (), (), {}, {}, columns=roles if roles.values else None)
     names = vehicle.texts("dbc", "DBC file names")
     if len(names) > MOST_FILES:
         raise vehicle.error(f"names {len(names)} files, the most are {MOST_FILES}", "dbc")
@@ -174,6 +184,16 @@ def _source(database: Database, left_out: LeftOut, roles: Table, role: str) -> S
     conversion = signal.conversion
     factor = float(conversion.scale) * si[0] * scale
     return Source(role, message.name, signal.name, factor, (float(conversion.offset) * si[0] + si[1]) * scale + shift)
+
+
+def column_sources(database: Database, roles: Table, file: Path) -> tuple[Source, ...]:
+    """The sources of `roles` among the columns of the table `file`, each of which is a signal of `database`."""
+    try:
+        sources = tuple(_source(database, {}, roles, role) for role in roles.values)
+        _check_witnesses(sources, roles)
+    except InputError as error:
+        raise InputError(f"{file}: its columns do not fit: {error}") from error
+    return sources
 
 
 def _check_witnesses(sources: tuple[Source, ...], where: Table) -> None:
