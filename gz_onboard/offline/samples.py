@@ -71,14 +71,24 @@ def open_ride(
 ) -> tuple[BusMapping, Iterator[list[Frame]]]:
     """The mapping that the ride in `log` is decoded by, and its frames: those of a log, or of a table of signals.
 
-    on_damage: as of `read_frames`. Raises InputError for what is neither, and for a log of a vehicle without DBC files.
+    on_damage: as of `read_frames`. Raises InputError for what is neither, for frames without times, and for a log of a
+    vehicle without DBC files.
     """
     if is_table(log):
         return read_signal_table(log, vehicle.mapping)
     frames = read_frames(log, on_damage=on_damage)
     if not vehicle.mapping.dbc_files:
         raise vehicle.error(f"dbc is missing: without it a table of signals can be read, but no frames as in {log}")
-    return vehicle.mapping, frames
+    return vehicle.mapping, _timed(log, frames)
+
+
+def _timed(log: Path, frames: Iterator[list[Frame]]) -> Iterator[list[Frame]]:
+    """`frames`; InputError if they have no times."""
+    first = next(frames, [])
+    if len(first) > 1 and not any(frame[0] for frame in first):
+        raise InputError(f"{log}: its frames have no times, without which a ride says nothing; candump -L writes them")
+    yield first
+    yield from frames
 
 
 def read_roles(

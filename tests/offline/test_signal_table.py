@@ -170,6 +170,12 @@ def test_frames_cannot_be_read_and_the_daemon_does_not_start(tmp_path, without_d
     assert cli.main(["run", "--vehicle", str(without_dbc), "--interface", "virtual", "--state-dir", ""]) == 2
 
 
+def test_frames_without_times_are_no_ride(tmp_path):
+    (tmp_path / "ride.log").write_text("  can0  120   [1]  11\n  can0  121   [1]  11\n")
+    with pytest.raises(InputError, match=r"ride\.log: its frames have no times"):
+        read_samples(tmp_path / "ride.log", REFERENCE)
+
+
 # --- the commands -------------------------------------------------------------------------------------------------
 
 
