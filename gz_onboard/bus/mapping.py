@@ -83,15 +83,7 @@ def read_mapping(vehicle: Table) -> BusMapping:
         roles = vehicle.table("roles")
         roles.only(ROLES)
         return BusMapping(empty_database(), (), (), {}, {}, columns=roles if roles.values else None)
-    names = vehicle.texts("dbc", "DBC file names")
-    if len(names) > MOST_FILES:
-        raise vehicle.error(f"names {len(names)} files, the most are {MOST_FILES}", "dbc")
-    for name in names:
-        vehicle.check_path("dbc", name)
-    try:
-        files = [find_dbc(name, vehicle.file.parent) for name in names]
-    except InputError as error:
-        raise vehicle.error(str(error), "dbc") from error
+    files = _dbc_files(vehicle)
     left_out: LeftOut = {}
     database = load_database(files, left_out)
 
@@ -139,6 +131,19 @@ def read_mapping(vehicle: Table) -> BusMapping:
         j1939=j1939,
         delays=delays,
     )
+
+
+def _dbc_files(vehicle: Table) -> list[Path]:
+    """The DBC files that a vehicle file names."""
+    names = vehicle.texts("dbc", "DBC file names")
+    if len(names) > MOST_FILES:
+        raise vehicle.error(f"names {len(names)} files, the most are {MOST_FILES}", "dbc")
+    for name in names:
+        vehicle.check_path("dbc", name)
+    try:
+        return [find_dbc(name, vehicle.file.parent) for name in names]
+    except InputError as error:
+        raise vehicle.error(str(error), "dbc") from error
 
 
 def _source(database: Database, left_out: LeftOut, roles: Table, role: str) -> Source:

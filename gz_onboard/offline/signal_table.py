@@ -115,7 +115,13 @@ def _parquet(file: Path) -> tuple[list[str], Rows]:
         table = pyarrow.parquet.read_table(file)
     except (OSError, pyarrow.ArrowException) as error:
         raise InputError(f"{file}: not a Parquet file: {error}") from error
-    return table.column_names, list(enumerate(zip(*(c.to_pylist() for c in table.columns), strict=True), 1))
+    columns = [
+        column.cast(pyarrow.timestamp("us", column.type.tz), safe=False)  # of ns, datetime has none
+        if pyarrow.types.is_timestamp(column.type)
+        else column
+        for column in table.columns
+    ]
+    return table.column_names, list(enumerate(zip(*(column.to_pylist() for column in columns), strict=True), 1))
 
 
 def _times(file: Path, name: str, rows: Rows) -> list[int]:

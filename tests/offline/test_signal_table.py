@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import gzip
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -83,7 +85,7 @@ def test_parquet(tmp_path, monkeypatch):
     import pyarrow.parquet as pq
 
     columns = {
-        "time": pa.array([10_000_000_000, 10_500_000_000, 11_000_000_000], pa.timestamp("ns", "UTC")),
+        "time": pa.array([10_000_000_001, 10_500_000_002, 11_000_000_003], pa.timestamp("ns", "UTC")),
         "pack_voltage[V]": [52.5, None, 52.25],
         "pack_current[mA]": [3000, 3500, 4000],
         "vehicle_speed[m/s]": [10.0, 11.0, float("nan")],
@@ -228,3 +230,19 @@ def test_logs_of_frames_and_tables_are_told_apart_in_the_errors_of_replay(tmp_pa
     (tmp_path / "ride.csv").write_text(RIDE)
     assert cli.main(["export", str(tmp_path / "ride.csv"), str(tmp_path / "out.log")]) == 2
     assert "is a table of signals, not a log of frames" in capsys.readouterr().err
+
+
+def test_the_trips_of_a_car_have_the_way_and_energy_of_their_index(tmp_path, without_dbc):
+    folder = Path(os.environ.get("GZ_ONBOARD_DATA", "nowhere")) / "real" / "ev_bmw_i3_trips"
+    if not folder.is_dir():
+        pytest.skip("GZ_ONBOARD_DATA names no folder with real/ev_bmw_i3_trips")
+    text = without_dbc.read_text(encoding="utf-8")
+    pack = 'pack_voltage = { signal = "v_batt_V", unit = "V" }'
+    without_dbc.write_text(text.replace('pack_voltage = "U"', pack).replace('"i"', '"i_batt_A"'), encoding="utf-8")
+    for row in list(csv.DictReader((folder / "INDEX.csv").open()))[:5]:
+        columns = read_samples(folder / f"{row['trip']}_2hz.csv.gz", read_vehicle(without_dbc)).columns
+        time, volts = columns["pack_voltage"]
+        power = volts * np.interp(time, *columns["pack_current"])
+        assert np.trapezoid(power, time) / 3.6e6 == pytest.approx(float(row["e_batt_kWh"]), rel=0.01)
+        speed = columns["vehicle_speed"]
+        assert np.trapezoid(speed[1], speed[0]) / 1000 == pytest.approx(float(row["km"]), rel=0.01)

@@ -18,7 +18,9 @@ if TYPE_CHECKING:
 ASC_BASE = re.compile(r"^\s*base\s+(?P<base>hex|dec)(?:\s+timestamps\s+(?P<times>absolute|relative))?", re.I | re.M)
 _ASC_HEAD = 4000  # characters within which the base stands
 _ASC_STAMP = re.compile(r"\s*(\d+\.\d+)(?=\s)")
-_ASC_OTHER = re.compile(r"\s*(//|date\b|base\b|(begin|end)\s+trigger|(no\s+)?internal\s+events|\d+\.\d+\s|$)", re.I)
+_ASC_LINE = re.compile(
+    r"\s*(?:\d+\.\d+\s|//|date\b|base\b|(?:begin|end)\s+trigger|(?:no\s+)?internal\s+events|$)", re.I
+)
 
 
 class _LineFeed:
@@ -38,7 +40,7 @@ class _LineFeed:
         def checked() -> Iterator[str]:
             nonlocal now
             for line in lines:
-                if not _ASC_OTHER.match(line):
+                if not _ASC_LINE.match(line):
                     damage.add(f"line {self.number + 1}", f"not a line of an ASC log: {line.strip()[:60]!r}")
                 stamp = _ASC_STAMP.match(line) if relative else None
                 now += float(stamp[1]) if stamp else 0.0
