@@ -14,13 +14,13 @@ import csv
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, date, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from struct import Struct
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gz_onboard.bus.mapping import BusMapping, Source, column_sources
 from gz_onboard.bus.readers.common import BATCH, Damage, unpacked
@@ -41,13 +41,12 @@ _VALUE = Struct("<d")
 _1970 = datetime(1970, 1, 1, tzinfo=UTC)
 
 
-@dataclass(frozen=True)
-class _Column:
-    """A column; values: None for an empty cell."""
+class _Column(NamedTuple):
+    """A column as its header says; at: its index."""
 
     name: str
     unit: str
-    values: list[float | None]
+    at: int
 
 
 def read_signal_table(file: Path, mapping: BusMapping) -> tuple[BusMapping, Iterator[list[Frame]]]:
@@ -61,16 +60,17 @@ def read_signal_table(file: Path, mapping: BusMapping) -> tuple[BusMapping, Iter
     if len(header) < 2:
         raise InputError(f"{file}:1: a table of signals has a column of times and one for each signal")
     times = _times(file, header[0], rows)
-    columns = [_column(file, rows, i, name) for i, name in enumerate(header[1:], 1)]
+    columns = [_column(text, at) for at, text in enumerate(header) if at]
     database = _database(file, columns)
     sources = column_sources(database, mapping.columns, file) if mapping.columns else _by_role(file, columns)
     played = {source.signal: source.role for source in sources}
     order = {role: i for i, role in enumerate(_LAST)}
     used = sorted((c for c in columns if c.name in played), key=lambda c: order.get(played[c.name], -1))
-    periods = {column.name: period for column in used if (period := _period(times, column))}
+    values = {column.name: _values(file, rows, column) for column in used}
+    periods = {name: period for name, found in values.items() if (period := _period(times, found))}
     numbers = {m.name: m.frame_id | EFF_FLAG for m in database.messages}
     made = replace(mapping, database=database, sources=sources, protection={}, periods=periods, j1939=False)
-    return made, _frames(times, [(numbers[column.name], column.values) for column in used])
+    return made, _frames(times, [(numbers[name], found) for name, found in values.items()])
 
 
 def _is_parquet(file: Path) -> bool:
@@ -163,11 +163,16 @@ def _nanoseconds(cell: object, factor: float) -> int:
     return round(cell * factor * 1e9)
 
 
-def _column(file: Path, rows: Rows, at: int, name: str) -> _Column:
-    header = _COLUMN.fullmatch(name)
+def _column(text: str, at: int) -> _Column:
+    header = _COLUMN.fullmatch(text)
+    return _Column(header["name"], header["unit"] or "", at) if header else _Column(text, "", at)
+
+
+def _values(file: Path, rows: Rows, column: _Column) -> list[float | None]:
+    """The values of a column, None for an empty cell."""
     values: list[float | None] = []
     for line, row in rows:
-        cell = row[at]
+        cell = row[column.at]
         if cell is None or (isinstance(cell, str) and cell.strip().lower() in _MISSING):
             values.append(None)
             continue
@@ -176,9 +181,10 @@ def _column(file: Path, rows: Rows, at: int, name: str) -> _Column:
         except (ValueError, TypeError):
             value = math.inf
         if math.isinf(value):
-            raise InputError(f"{file}:{line}: column {name!r}: {shown(cell)} is not a finite number")
+            unit = f" [{column.unit}]" if column.unit else ""
+            raise InputError(f"{file}:{line}: column {column.name!r}{unit}: {shown(cell)} is not a finite number")
         values.append(None if math.isnan(value) else value)
-    return _Column(header["name"] if header else name, (header["unit"] or "") if header else "", values)
+    return values
 
 
 def _database(file: Path, columns: Sequence[_Column]) -> Database:
@@ -192,10 +198,12 @@ def _database(file: Path, columns: Sequence[_Column]) -> Database:
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise InputError(f"{file}:1: two columns are called {twice!r}")
     database = empty_database()
-    for i, column in enumerate(columns):
+    for column in columns:
         conversion = BaseConversion.factory(is_float=True)
         signal = Signal(column.name, 0, 64, conversion=conversion, unit=column.unit or None)
-        database.messages.append(Message(_FIRST_IDENTIFIER + i, column.name, 8, [signal], is_extended_frame=True))
+        database.messages.append(
+            Message(_FIRST_IDENTIFIER + column.at, column.name, 8, [signal], is_extended_frame=True)
+        )
     database.refresh()
     return database
 
@@ -223,9 +231,9 @@ def _by_role(file: Path, columns: Sequence[_Column]) -> tuple[Source, ...]:
     return tuple(sources.values())
 
 
-def _period(times: Sequence[int], column: _Column) -> float | None:
-    """The usual time from one value of a column to the next [s]; None if there are too few."""
-    known = [time for time, value in zip(times, column.values, strict=True) if value is not None]
+def _period(times: Sequence[int], values: Sequence[float | None]) -> float | None:
+    """The usual time from one of a column's values to the next [s]; None if there are too few."""
+    known = [time for time, value in zip(times, values, strict=True) if value is not None]
     steps = [after - before for before, after in pairwise(known) if after > before]
     return median(steps) * 1e-9 if steps else None
 
