@@ -7,7 +7,8 @@ from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from gz_onboard.bus.mapping import BusMapping, find_dbc, read_mapping
+from gz_onboard.bus.dbc import find_dbc
+from gz_onboard.bus.mapping import BusMapping, read_mapping
 from gz_onboard.bus.publisher import RANGE_DBC
 from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.physics.battery import Battery

@@ -12,8 +12,8 @@ from typing import Any
 from cantools.database.can import Database, Message
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
+from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.logs import read_frames
-from gz_onboard.bus.mapping import find_dbc, load_database
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Estimate, Frame, Reason, State
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.pipeline import TICK_NS, Pipeline

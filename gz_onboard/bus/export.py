@@ -276,17 +276,15 @@ def out_suffix(out: Path) -> str:
 
 
 def _database(log: Path, files: list[Path] | None) -> Database:
-    from gz_onboard.bus.mapping import empty_database, load_database
+    from gz_onboard.bus.dbc import database_of, load_database
 
     if files:
-        return load_database(files)
+        return load_database(files, {})
     attached = {name: data for name, data in logs.read_attachments(log).items() if name.lower().endswith(".dbc")}
     if not attached:
         raise InputError(f"{log}: no DBC file is attached to this log; say which to decode by, with --dbc FILE")
-    database = empty_database()
-    for name, data in attached.items():
-        try:
-            database.add_dbc_string(data.decode("utf-8", "replace"))
-        except Exception as error:  # cantools has several types of its own
-            raise InputError(f"{log}, attached {name}: {error}; give the right one with --dbc FILE") from None
-    return database
+    texts = [(Path(f"{log}, attached {name}"), data.decode("utf-8", "replace")) for name, data in attached.items()]
+    try:
+        return database_of(texts, {})
+    except InputError as error:
+        raise InputError(f"{error}; give the right one with --dbc FILE") from error

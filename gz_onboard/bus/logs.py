@@ -1,8 +1,9 @@
-"""Reading recorded frames: our own MCAP and the formats of python-can, each also gzipped.
+"""Reading recorded frames: our own MCAP, the formats of python-can, SavvyCAN's and OVMS's, each also gzipped.
 
 BLF, candump and our own files have a reader of their own, five to ten times as fast as one that builds a message
-object for each frame; the rest is read by python-can. A damaged log is read as far as it can be: what is lost is
-counted and reported once (`LogDamage`), never silently and never by giving up.
+object for each frame; python-can reads the rest of what it knows. The content tells the format; the name only where
+the content does not. A damaged log is read as far as it can be: what is lost is counted and reported once
+(`LogDamage`), never silently and never by giving up. Times that are not since 1970 are said in a warning.
 
 A frame has the kernel's identifier flags. The data of a remote frame are as many zero bytes as it asked for. A
 CAN FD frame of up to 8 bytes cannot be distinguished from a classic one.
@@ -13,17 +14,29 @@ from __future__ import annotations
 import json
 import logging
 import mmap
+import re
+import zlib
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.bus.readers import blf, candump, mcap, pycan
+from gz_onboard.bus.readers import blf, candump, lines, mcap, pycan
 from gz_onboard.bus.readers.common import TIME_LIMIT_NS, Contents, Damage, Reader, unpacked
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.events import Frame
 
 _LOG = logging.getLogger(__name__)
+
+_SAVVYCAN, _TABLE = "SavvyCAN's CSV", "a table"
+
+
+def _refuse_table(path: Path, _data: Contents, _damage: Damage, _start: int | None, _end: int | None) -> Any:
+    raise InputError(
+        f"{path}: is a table of signals, not a log of frames; estimate, validate, calibrate and discover read it"
+    )
+
 
 _READERS: dict[str, Reader] = {
     ".mcap": mcap.read,
@@ -31,7 +44,25 @@ _READERS: dict[str, Reader] = {
     ".log": candump.read,
     **{suffix: pycan.text_reader(suffix) for suffix in (".asc", ".csv", ".trc")},
     ".mf4": pycan.read_mf4,
+    ".crtd": lines.read_crtd,
+    _SAVVYCAN: lines.read_savvycan,
+    _TABLE: _refuse_table,
 }
+_MAGIC = {b"LOGG": ".blf", mcap.MAGIC: ".mcap", b"MDF ": ".mf4", b"PAR1": _TABLE}
+_FIRST_LINES = {
+    _SAVVYCAN: lines.SAVVYCAN_HEADER,
+    ".csv": re.compile(r"timestamp,arbitration_id,"),
+    ".asc": re.compile(
+        rf"{pycan.ASC_BASE.pattern}|begin triggerblock|\s*\d+\.\d+\s+(CANFD|\d+)\s+(\d+\s+)?\w+\s+([RT]x|ErrorFrame)\b",
+        re.I,
+    ),
+    ".trc": re.compile(r";\$(FILEVERSION|STARTTIME|COLUMNS)\b"),
+    ".crtd": lines.CRTD_LINE,
+    ".log": re.compile(rf"(?:{candump.SCREEN_LINE.pattern})\s*$|\([\d.]+\)\s+\S+\s+[0-9A-Fa-f]+#"),
+    _TABLE: re.compile(r"\s*\"?(time|timestamp|t)(\b|_m?s\b)[^,;]*[,;]", re.I),
+}
+"""What a line of a text log looks like, by format: of its header or its frames."""
+_HEAD = 8192  # bytes within which a text log shows what it is
 
 
 @dataclass(frozen=True)
@@ -68,7 +99,10 @@ def read_frames(
 
 
 def log_suffix(path: Path) -> str:
-    """The format of a log by its name, such as ``.blf`` for ``ride.BLF.gz``; InputError if it is none we read."""
+    """The format of a log, such as ``.blf``, by its content, or else by its name. InputError if it is none we read."""
+    head = _head(path)
+    if found := _by_content(head):
+        return found
     suffixes = [suffix.lower() for suffix in path.suffixes]
     if suffixes[-1:] == [".gz"]:
         suffixes.pop()
@@ -76,18 +110,46 @@ def log_suffix(path: Path) -> str:
     if suffix not in _READERS:
         if path.is_dir():
             raise InputError(f"{path}: is a folder; give the log in it")
-        known = ", ".join(_READERS)
+        known = ", ".join(name for name in _READERS if name.startswith("."))
+        first = head.partition(b"\n")[0].decode("latin-1").strip()
         raise InputError(
             f"{path}: {f'unknown log format {suffix!r}' if suffix else 'a log needs a suffix that tells its format'}"
-            f"{nearest(suffix, _READERS) if suffix else ''}; known are {known}, each also with .gz"
+            f"{nearest(suffix, _READERS) if suffix else ''}{f', and it begins with {shown(first)}' if first else ''}; "
+            f"known are {known}, each also with .gz"
         )
     return suffix
+
+
+def is_table(path: Path) -> bool:
+    """Whether a file is a table of signals instead of a log of frames, by its content."""
+    return _by_content(_head(path)) == _TABLE
+
+
+def _head(path: Path) -> bytes:
+    """The first bytes of a file, unpacked; none of one that cannot be read."""
+    head = b""
+    with suppress(OSError), path.open("rb") as file:
+        head = file.read(_HEAD)
+    if head.startswith(b"\x1f\x8b"):
+        with suppress(zlib.error):
+            return zlib.decompressobj(wbits=31).decompress(head, _HEAD)
+    return head
+
+
+def _by_content(head: bytes) -> str | None:
+    """The format of a file that begins with `head`; None if that is of none."""
+    if found := next((form for magic, form in _MAGIC.items() if head.startswith(magic)), None):
+        return found
+    for line in str(head, "latin-1").removeprefix("\xef\xbb\xbf").splitlines():
+        if found := next((form for form, first in _FIRST_LINES.items() if first.match(line.strip())), None):
+            return found
+    return None
 
 
 def logs_among(paths: Iterable[Path]) -> list[Path]:
     """`paths`, with the logs in it instead of each folder, by name. InputError for a folder without any.
 
-    Of a folder neither .csv, which are mostly tables, nor what ``gz-onboard estimate`` wrote.
+    Of a folder no .csv or .txt, which are mostly something else, and nothing that ``gz-onboard estimate`` wrote.
     """
     logs: list[Path] = []
     for path in paths:
@@ -186,5 +248,7 @@ def _filtered(
             frames = [frame for frame in frames if earliest <= frame[0] < latest]
         if frames:
             yield frames
+    for note in damage.notes:
+        _LOG.warning("%s: %s", path, note)
     if damage.count:
         on_damage(LogDamage(path, damage.count, damage.place, damage.reason))

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
+from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.layout import first_bit, identifier_of, raw_range
-from gz_onboard.bus.mapping import find_dbc, load_database
 from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import ROLES, TRANSMITTED, Estimate, Frame, Reason, State

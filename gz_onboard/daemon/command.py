@@ -85,6 +85,8 @@ def run(arguments: argparse.Namespace) -> int:
             raise InputError(f"--channel {name}: given twice; each of its frames would come twice")
     # Nobody watches a daemon: the vehicle file's own code runs only if it is root's.
     vehicle = read_vehicle(arguments.vehicle, arguments.payload, arguments.effects, users={ROOT})
+    if not vehicle.mapping.dbc_files:
+        raise vehicle.error("dbc is missing: the daemon reads frames")
     with ExitStack() as locks:
         _lock(locks, arguments.interface, names, arguments.state_dir)
         return _run(arguments, vehicle, names)

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import IO, TextIO
 
 from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.mapping import find_dbc
+from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.publisher import RANGE_DBC
 from gz_onboard.dashboard.screen import Style, rendered, screen, summary_line
 from gz_onboard.dashboard.view import View

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
+from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.layout import identifier_of, raw_range
-from gz_onboard.bus.mapping import find_dbc
 from gz_onboard.bus.publisher import KNOWN, RANGE_DBC, range_messages, reason_signal, sensor_signal
 from gz_onboard.events import ROLES, STALE_PERIODS, Activity, Frame, Reason, State
 

@@ -11,7 +11,7 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from gz_onboard.bus.logs import logs_among
+from gz_onboard.bus.logs import is_table, logs_among
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
 from gz_onboard.events import Reason
 from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, Summary, estimate_log, known_vehicle
@@ -107,6 +107,8 @@ def _expected(path: Path) -> int | None:
             head = file.read(65536)
         if path.suffix.lower() == ".blf":
             return int.from_bytes(head[32:36], "little")
+        if is_table(path):
+            return None
         if path.suffix.lower() in (".log", ".asc", ".trc", ".csv"):
             return path.stat().st_size * head.count(b"\n") // max(len(head), 1)
     except OSError:

@@ -6,13 +6,13 @@ import functools
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import sqrt
 from pathlib import Path
 from typing import Annotated, cast
 
 from gz_onboard.bus.logfile import LogFile
-from gz_onboard.bus.logs import LogDamage, read_frames
+from gz_onboard.bus.logs import LogDamage
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.errors import InputError, writing
@@ -20,6 +20,7 @@ from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.results import times
+from gz_onboard.offline.samples import open_ride
 from gz_onboard.pipeline import STATUS_TOPIC, TICK_NS, Pipeline, dbc_texts, range_publisher, reason_names
 from gz_onboard.progress import Progress
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -202,7 +203,10 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> Summar
     vehicle = known_vehicle(task.vehicle, task.payload)
     damages: list[LogDamage] = []
     cpu, wall = time.process_time(), time.perf_counter()
-    batches = read_frames(task.path, on_damage=damages.append)
+    mapping, batches = open_ride(task.path, vehicle, damages.append)
+    if task.frames and mapping is not vehicle.mapping:
+        raise InputError(f"{task.path}: is a table of signals: --frames has nothing to log")
+    vehicle = replace(vehicle, mapping=mapping)
     own = range_publisher(vehicle).identifiers
     ours = ([frame for frame in batch if frame[1] not in own] for batch in batches)  # an earlier run's estimates
     batch = next((batch for batch in ours if batch), None)

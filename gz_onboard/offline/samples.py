@@ -6,16 +6,17 @@ The lab knows no other form of a ride. A log, a simulated ride and any other sou
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.codec import Codec
-from gz_onboard.bus.logs import read_frames
+from gz_onboard.bus.logs import LogDamage, is_table, read_frames
 from gz_onboard.bus.mapping import BusMapping, Source
 from gz_onboard.errors import InputError
-from gz_onboard.events import Event
+from gz_onboard.events import Event, Frame
+from gz_onboard.offline.signal_table import read_signal_table
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -60,27 +61,54 @@ def read_samples(log: Path, vehicle: Vehicle, progress: Callable[[int], None] | 
     progress: called with the number of frames read. Raises InputError for a log that cannot be read or is not of the
     vehicle.
     """
-    columns = read_roles(log, vehicle, Codec(extended(vehicle.mapping)), progress)
+    mapping, frames = open_ride(log, vehicle)
+    columns = read_roles(log, vehicle, (Codec(extended(mapping)), frames), progress)
     return Samples(ride_name(log), columns, facts_of(log))
+
+
+def open_ride(
+    log: Path, vehicle: Vehicle, on_damage: Callable[[LogDamage], None] | None = None
+) -> tuple[BusMapping, Iterator[list[Frame]]]:
+    """The mapping that the ride in `log` is decoded by, and its frames: those of a log, or of a table of signals.
+
+    on_damage: as of `read_frames`. Raises InputError for what is neither, for frames without times, and for a log of a
+    vehicle without DBC files.
+    """
+    if is_table(log):
+        return read_signal_table(log, vehicle.mapping)
+    frames = read_frames(log, on_damage=on_damage)
+    if not vehicle.mapping.dbc_files:
+        raise vehicle.error(f"dbc is missing: without it a table of signals can be read, but no frames as in {log}")
+    return vehicle.mapping, _timed(log, frames)
+
+
+def _timed(log: Path, frames: Iterator[list[Frame]]) -> Iterator[list[Frame]]:
+    """`frames`; InputError if they have no times."""
+    first = next(frames, [])
+    if len(first) > 1 and not any(frame[0] for frame in first):
+        raise InputError(f"{log}: its frames have no times, without which a ride says nothing; candump -L writes them")
+    yield first
+    yield from frames
 
 
 def read_roles(
     log: Path,
     vehicle: Vehicle,
-    codec: Codec,
+    source: tuple[Codec, Iterable[list[Frame]]],
     progress: Callable[[int], None] | None = None,
     observe: Callable[[Event], None] | None = None,
 ) -> dict[str, tuple[Array, Array]]:
-    """(times [s], values) by role of all that `codec` decodes in `log` more than once; `observe` gets every event.
+    """(times [s], values) by role of all that is decoded in `log` more than once; `observe` gets every event.
 
-    progress: called with the number of frames read. Raises InputError for a log that cannot be read or is not of the
-    vehicle.
+    source: the codec and the frames of the log. progress: called with the number of frames read. Raises InputError for
+    a log that cannot be read or is not of the vehicle.
     """
     import numpy as np
 
+    codec, frames = source
     found: dict[str, tuple[list[float], list[float]]] = {}
     slots = [[found.setdefault(role, ([], [])) for role in group.roles] for group in codec.groups]
-    for batch in read_frames(log):
+    for batch in frames:
         for event in codec.decode(batch):
             time, group, values = event
             for (times, column), value in zip(slots[group], values, strict=True):

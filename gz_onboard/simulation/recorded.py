@@ -17,7 +17,7 @@ from gz_onboard.bus.codec import Codec
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Event
-from gz_onboard.offline.samples import INSTRUMENTS, extended, read_roles, ride_name
+from gz_onboard.offline.samples import INSTRUMENTS, extended, open_ride, read_roles, ride_name
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.sensors import speed_role, true_columns
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
@@ -108,7 +108,8 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
 
     if vehicle.battery is None:
         raise vehicle.error("has no [battery], which a simulation needs")
-    codec = Codec(extended(vehicle.mapping))
+    mapping, frames = open_ride(log, vehicle)
+    codec = Codec(extended(mapping))
     own = {role for role, *_ in INSTRUMENTS}
     estimator_groups = [replace(g, roles=()) if own & set(g.roles) else g for g in codec.groups]
     estimator = Estimator(estimator_groups, vehicle.battery, vehicle.model, vehicle.riding)
@@ -135,7 +136,7 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
             if reads_vibration:
                 rough.append((event[0], road.distance, estimator.vibration(event[0])))
 
-    columns = true_columns(read_roles(log, vehicle, codec, progress, observe), vehicle.parameters)
+    columns = true_columns(read_roles(log, vehicle, (codec, frames), progress, observe), vehicle.parameters)
     felt = np.array(rough) if rough and "accel_z" in columns else None
     if felt is not None:
         columns["vibration"] = felt[:, 0], felt[:, 2]

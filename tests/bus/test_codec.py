@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, TIME, UNDECODABLE, Codec, known_identifiers
+from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.layout import identifier_of, is_not_available, raw_values
-from gz_onboard.bus.mapping import BusMapping, Source, find_dbc, load_database, read_mapping
+from gz_onboard.bus.mapping import BusMapping, Source, read_mapping
 from gz_onboard.bus.units import to_si
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, PLAUSIBLE, ROLES, RTR_FLAG, Event
 from gz_onboard.toml import Table

@@ -18,9 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.bus import export, logs
+from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import LogDamage, json_channels, read_attachments, read_frames, read_metadata, read_samples
-from gz_onboard.bus.mapping import find_dbc
 from gz_onboard.bus.readers.common import ChannelNumbers
 from gz_onboard.bus.readers.pycan import frame_of
 from gz_onboard.bus.writers import write_blf, write_candump
@@ -379,12 +379,15 @@ def test_broken_lines_of_python_cans_formats_are_skipped_too(tmp_path: Path, suf
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
-        ("a.log", b"time,speed\n1,2\n", "line 1"),
-        ("a.csv", b"time,speed\n1,2\n3,4\n", "line 2"),
+        ("a.log", b"hello\n1,2\n", "line 1"),
+        ("a.log", b"time,speed\n1,2\n", "a table of signals"),
+        ("a.csv", b"time,speed\n1,2\n3,4\n", "a table of signals"),
+        ("a.csv", b"moment,speed\n1,2\n3,4\n", "line 2.*SavvyCAN"),
+        ("a.txt", b"hello\nworld\n", "'hello'"),
         ("a.trc", b"hello\n", "line 1"),
         ("a.asc", b"hello\nworld\n", "line 1"),
-        ("a.blf", b"(1.0) can0 123#00\n" * 50, "not a BLF"),
-        ("a.mcap", b"LOGG" + bytes(500), "not an MCAP"),
+        ("a.blf", b"hello\n" * 50, "not a BLF"),
+        ("a.mcap", b"GLOG" + bytes(500), "not an MCAP"),
         ("a.log.gz", b"(1.0) can0 123#00\n", "not a gzip"),
     ],
 )

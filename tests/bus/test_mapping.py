@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -8,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.bus.codec import Codec
-from gz_onboard.bus.mapping import BusMapping, find_dbc, load_database, pgn, read_mapping
+from gz_onboard.bus.dbc import find_dbc, load_database
+from gz_onboard.bus.mapping import BusMapping, pgn, read_mapping
 from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError
 from gz_onboard.events import ROLES
@@ -300,9 +302,71 @@ def test_dbc_files_that_cannot_be_had(tmp_path, names, parts):
 def test_a_broken_dbc(tmp_path, change, parts):
     old, new = change
     assert old in DBC
-    message = complaint(tmp_path, dbc=DBC.replace(old, new, 1))
-    for part in [str(tmp_path / "v.dbc"), *parts]:
+    file = tmp_path / "v.dbc"
+    file.write_text(DBC.replace(old, new, 1), encoding="utf-8")
+    with pytest.raises(InputError) as caught:
+        load_database([file])
+    for part in [str(file), *parts]:
+        assert part in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("change", "lost", "why"),
+    [
+        (('(0.01,0) [0|100] "V"', '(0.01,0 [0|100] "V"'), {"Pack.Voltage"}, "line 6: Invalid syntax"),
+        (("16|16@1- (0.1", "8|16@1- (0.1"), {"Pack.Voltage", "Pack.Current"}, "line 5: The signals .* overlapping"),
+        (("24|8@1+ (1,-40)", "28|8@1+ (1,-40)"), {"Motor.Heat"}, "line 12: The signal Heat does not fit"),
+        (("16|16@1- (0.1,0)", "16|16@1- (0,0)"), {"Pack.Current"}, "line 5: signal Current has a scale of 0"),
+        (("BO_ 256 Pack", "BO_ 4096 Pack"), {"Pack.*"}, "line 5: Standard frame id 0x1000 is more than 11 bits"),
+        (("BO_ 256 Pack", "BO_ 256 2Pack"), {"2Pack.*"}, "line 5: Invalid syntax"),
+        (("0|16@1- (1", "100000|16@1- (1"), {"Motor.Speed"}, "line 13: .*beyond the longest frame"),
+        (("BO_ 257", 'CM_ "no end"\nBO_ 257'), set(), "line 12: Invalid syntax"),
+        (
+            ("BA_DEF_ BO_", 'VAL_ 256 Charge 0 "a" 1 "b" ;\nBA_DEF_ BO_'),
+            set(),
+            "line 17: there is no signal for VAL_ 256",
+        ),
+    ],
+)
+def test_what_cantools_refuses_is_left_out_and_said_once(tmp_path, caplog, change, lost, why):
+    old, new = change
+    text = DBC.replace(old, new, 1)
+    assert text != DBC
+    dropped = {name for name in lost if not name.endswith("*")}
+    whole = {name[:-2] for name in lost - dropped}
+    there = {f"{m}.{s}" for m, signals in SIGNALS.items() for s in signals if not {m, f"2{m}"} & whole}
+    for _ in range(2):
+        got = mapping(tmp_path, dbc=text).database
+    assert {f"{m.name}.{s.name}" for m in got.messages for s in m.signals} == there - dropped
+    (record,) = caplog.records
+    assert re.search(f"v.dbc: what cannot be read of it is left out: {why}", record.getMessage())
+
+
+SIGNALS = {"Pack": ["Voltage", "Current", "State", "Counter", "Sum"], "Motor": ["Speed", "State", "Heat"]}
+
+
+@pytest.mark.parametrize(
+    ("role", "parts"),
+    [
+        ('pack_voltage = "Voltage"', ["Voltage", "Pack", "v.dbc, line 5: The signals", "overlapping"]),
+        ('pack_current = { message = "Pack", signal = "Current" }', ["Current", "v.dbc, line 5: The signals"]),
+        ('motor_speed = "Speed"', ["Speed", "Motor", "v.dbc, line 12: Standard frame id 0x1001"]),
+        ('motor_speed = { message = "Motor", signal = "Speed" }', ["message Motor", "v.dbc, line 12: "]),
+    ],
+)
+def test_a_role_of_a_signal_that_was_left_out_says_why(tmp_path, role, parts):
+    text = DBC.replace("16|16@1- (0.1", "8|16@1- (0.1").replace("BO_ 257 Motor", "BO_ 4097 Motor")
+    message = complaint(tmp_path, dbc=text, roles=role)
+    for part in [":5: roles.", "is left out of the DBC file", *parts]:
         assert part in message
+
+
+def test_a_line_that_decides_how_others_are_read_is_not_left_out(tmp_path):
+    text = DBC.replace("BA_DEF_ BO_", "SIG_VALTYPE_ 256 Voltage 1;\nBA_DEF_ BO_", 1).replace(
+        "Voltage 1;", "Voltage : : 1;"
+    )
+    assert "Invalid syntax at line 17" in complaint(tmp_path, dbc=text)
+    assert "Is the file whole?" in complaint(tmp_path, dbc=DBC.rstrip().removesuffix(";"))
 
 
 def test_a_dbc_that_was_cut_anywhere_says_nothing_of_what_is_not_in_it(tmp_path):
@@ -318,7 +382,7 @@ def test_a_dbc_that_was_cut_anywhere_says_nothing_of_what_is_not_in_it(tmp_path)
 
 def test_a_dbc_is_read_without_what_only_mf4_files_need():
     """asammdf takes a second, in which its imports swallow Ctrl-C."""
-    code = "import sys; from gz_onboard.bus.mapping import *; load_database([find_dbc('vehicle.dbc')]); "
+    code = "import sys; from gz_onboard.bus.dbc import *; load_database([find_dbc('vehicle.dbc')]); "
     code += "print({'asammdf', 'pandas', 'sympy'} & sys.modules.keys())"
     run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert run.stdout.strip() == "set()"

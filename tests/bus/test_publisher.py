@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.codec import Codec
-from gz_onboard.bus.mapping import find_dbc, load_database, read_mapping
+from gz_onboard.bus.dbc import find_dbc, load_database
+from gz_onboard.bus.mapping import read_mapping
 from gz_onboard.bus.publisher import SIGMA, SOC, Counts, Publisher, reason_signal, sensor_signal
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ROLES, TRANSMITTED, Activity, Estimate, Reason, State

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 
 from gz_onboard import cli
 from gz_onboard.bus._can import can
-from gz_onboard.bus.mapping import find_dbc
+from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.dashboard import screen
 from gz_onboard.dashboard.screen import Style

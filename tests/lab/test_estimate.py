@@ -17,8 +17,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard import cli
+from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.logs import read_attachments, read_frames, read_metadata, read_samples
-from gz_onboard.bus.mapping import find_dbc, load_database
 from gz_onboard.events import EFF_FLAG, Estimate
 from gz_onboard.lab import estimate
 from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, Summary, Tally, feed

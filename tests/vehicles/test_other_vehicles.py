@@ -18,8 +18,9 @@ from pathlib import Path
 import pytest
 
 from gz_onboard.bus.codec import LENGTH, NOT_AVAILABLE, RANGE, UNDECODABLE, Codec
+from gz_onboard.bus.dbc import load_database
 from gz_onboard.bus.logs import LogDamage, read_frames
-from gz_onboard.bus.mapping import load_database, pgn, read_mapping
+from gz_onboard.bus.mapping import pgn, read_mapping
 from gz_onboard.events import EFF_FLAG, PLAUSIBLE, ROLES, Estimate, Event, Frame, Reason, State
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.toml import Table

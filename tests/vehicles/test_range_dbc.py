@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.bus.mapping import find_dbc, load_database
+from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, State
 from gz_onboard.lab.estimate_ride import feed

@@ -1,23 +1,28 @@
-"""candump -L text logs."""
+"""candump text logs: those of ``candump -L``, and what candump shows on the screen, with a time or without."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
-from gz_onboard.bus.readers.common import ChannelNumbers, Contents, Damage, text_pieces
+from gz_onboard.bus.readers.common import FD_LENGTHS, ChannelNumbers, Clock, Contents, Damage, stamp_ns, text_pieces
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 
-_CANDUMP_LINE = re.compile(
+CANDUMP_LINE = re.compile(
     r"\((?P<s>\d+)(?:\.(?P<fraction>\d{1,9}))?\)\s+(?P<channel>\S+)\s+(?P<id>[0-9A-Fa-f]{1,8})#"
     r"(?:#(?P<fd>[0-9A-Fa-f](?:[0-9A-Fa-f]{2}){0,64})|[Rr](?P<remote>[0-8]?)|(?P<data>(?:[0-9A-Fa-f]{2}){0,8}))"
     r"(?:\s+(?P<direction>[RrTt]))?"
 )
+SCREEN_LINE = re.compile(
+    r"(?:\((?P<stamp>[^)]+)\)\s+)?(?P<channel>[^\s(]\S*)\s+(?:(?P<direction>[RT])X\s+\S\s+\S\s+)?"
+    r"(?P<id>[0-9A-Fa-f]{1,8})\s+\[(?P<length>\d{1,2})\](?:\s+(?P<remote>remote request)|"
+    r"(?P<data>(?:\s*[0-9A-Fa-f]{2})*))\s*(?:'.*'|ERRORFRAME)?"
+)
 _SCALE = {digits + 1: 10 ** (9 - digits) for digits in range(1, 10)}
 """Length of the fraction with the closing bracket -> ns in a unit of its last digit."""
-_FD_LENGTHS = frozenset((*range(9), 12, 16, 20, 24, 32, 48, 64))
 
 
 class _Identifiers(dict[str, int]):
@@ -37,6 +42,7 @@ def read(path: Path, data: Contents, damage: Damage, _start: int | None, _end: i
     """The frames of a candump log; lines that are none are noted as damage."""
     identifiers = _Identifiers()
     channels = ChannelNumbers()
+    clock = Clock(damage)
     line = 1
     any_frame = False
     for text in text_pieces(data):
@@ -47,7 +53,7 @@ def read(path: Path, data: Contents, damage: Damage, _start: int | None, _end: i
                 raise InputError(f"{path}, {damage.place}: {damage.reason}; no line before it is one either")
         if batch:
             any_frame = True
-            yield batch
+            yield clock.timed(batch)
         line += text.count("\n")
 
 
@@ -88,15 +94,17 @@ def _candump_lines(
     frames = []
     lines = text.split("\n")
     for number, line in enumerate(map(str.strip, lines), first):
-        if not line:
+        if not line or lines[number - first].startswith("\t"):  # what an error frame means, under it
             continue
-        match = _CANDUMP_LINE.fullmatch(line)
         try:
-            if not match:
+            if match := CANDUMP_LINE.fullmatch(line):
+                if number == first + len(lines) - 1 and len(match["data"] or "") < 16:
+                    raise ValueError("the last line has no end, so data may be missing")
+                frames.append(_candump_frame(match, identifiers, channels))
+            elif match := SCREEN_LINE.fullmatch(line):
+                frames.append(_screen_frame(match, identifiers, channels))
+            else:
                 raise ValueError("not a line of a candump log")
-            if number == first + len(lines) - 1 and len(match["data"] or "") < 16:
-                raise ValueError("the last line has no end, so data may be missing")
-            frames.append(_candump_frame(match, identifiers, channels))
         except ValueError as error:
             damage.add(f"line {number}", f"{error}: {line[:60]!r}")
     return frames
@@ -106,7 +114,7 @@ def _candump_frame(match: re.Match[str], identifiers: _Identifiers, channels: Ch
     identifier = identifiers[match["id"]]
     if match["fd"]:
         data = bytes.fromhex(match["fd"][1:])
-        if len(data) not in _FD_LENGTHS:
+        if len(data) not in FD_LENGTHS:
             raise ValueError(f"no CAN FD frame has {len(data)} bytes")
     elif match["remote"] is not None:
         identifier |= RTR_FLAG
@@ -118,3 +126,20 @@ def _candump_frame(match: re.Match[str], identifiers: _Identifiers, channels: Ch
         channel |= TRANSMITTED
     time_ns = int(match["s"]) * 1_000_000_000 + int((match["fraction"] or "0").ljust(9, "0"))
     return time_ns, identifier, data, channel
+
+
+def _screen_frame(match: re.Match[str], identifiers: _Identifiers, channels: ChannelNumbers) -> Frame:
+    """The frame of a line as candump shows it; at 0 s if it has no time. A date is taken as UTC."""
+    identifier, length, stamp = identifiers[match["id"]], int(match["length"]), match["stamp"]
+    if match["remote"]:
+        identifier |= RTR_FLAG
+        data = bytes(min(length, 8))
+    else:
+        data = bytes.fromhex(match["data"])
+        if len(data) != length or length not in FD_LENGTHS:
+            raise ValueError(f"{len(data)} bytes where there should be {length}")
+    channel = channels[match["channel"]] | (TRANSMITTED if match["direction"] == "T" else 0)
+    if stamp and "-" in stamp:
+        since = datetime.fromisoformat(stamp).replace(tzinfo=UTC) - datetime(1970, 1, 1, tzinfo=UTC)
+        return since // timedelta(microseconds=1) * 1000, identifier, data, channel
+    return stamp_ns(stamp, 1_000_000_000) if stamp else 0, identifier, data, channel

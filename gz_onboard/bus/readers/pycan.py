@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
-from gz_onboard.bus.readers.common import BATCH, ChannelNumbers, Contents, Damage, Reader, text_pieces
+from gz_onboard.bus.readers.common import BATCH, ChannelNumbers, Clock, Contents, Damage, Reader, text_pieces
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 
@@ -14,15 +15,39 @@ if TYPE_CHECKING:
     import can
 
 
+ASC_BASE = re.compile(r"^\s*base\s+(?P<base>hex|dec)(?:\s+timestamps\s+(?P<times>absolute|relative))?", re.I | re.M)
+_ASC_HEAD = 4000  # characters within which the base stands
+_ASC_STAMP = re.compile(r"\s*(\d+\.\d+)(?=\s)")
+_ASC_LINE = re.compile(
+    r"\s*(?:\d+\.\d+\s|//|date\b|base\b|(?:begin|end)\s+trigger|(?:no\s+)?internal\s+events|$)", re.I
+)
+
+
 class _LineFeed:
     """Lines for python-can's text readers, counted; `resume` lets a reader go on after one that it choked on."""
 
     def __init__(self, data: Contents) -> None:
-        self._lines = (line for piece in text_pieces(data) for line in piece.splitlines(keepends=True))
+        self._lines: Iterator[str] = (line for piece in text_pieces(data) for line in piece.splitlines(keepends=True))
         self._again = False
         self.number = 0
         self.line = ""
         self.name = ""
+
+    def asc(self, damage: Damage, relative: bool) -> None:
+        """The lines are those of an ASC log: note what is none. relative: each time is that since the line before."""
+        lines, now = self._lines, 0.0
+
+        def checked() -> Iterator[str]:
+            nonlocal now
+            for line in lines:
+                if not _ASC_LINE.match(line):
+                    damage.add(f"line {self.number + 1}", f"not a line of an ASC log: {line.strip()[:60]!r}")
+                stamp = _ASC_STAMP.match(line) if relative else None
+                now += float(stamp[1]) if stamp else 0.0
+                yield f"{now:.9f}{line[stamp.end() :]}" if stamp else line
+
+        self._lines = checked()
+        self.resume()  # python-can takes the first line for a header, even if it is a frame
 
     def __iter__(self) -> _LineFeed:
         return self
@@ -50,12 +75,17 @@ def text_reader(suffix: str) -> Reader:
         from gz_onboard.bus._can import can
 
         readers: dict[str, Callable[[TextIO], can.io.generic.MessageReader]] = {
-            ".asc": can.ASCReader,
             ".csv": can.CSVReader,
             ".trc": can.TRCReader,
         }
-        feed = _LineFeed(data)
-        reader = readers[suffix](cast("TextIO", feed))
+        feed, clock = _LineFeed(data), Clock(damage)
+        reader: can.io.generic.MessageReader
+        if suffix == ".asc":
+            base = ASC_BASE.search(str(data[:_ASC_HEAD], "latin-1"))
+            feed.asc(damage, relative=bool(base and (base["times"] or "").lower() == "relative"))
+            reader = can.ASCReader(cast("TextIO", feed), base["base"].lower() if base else "hex")
+        else:
+            reader = readers[suffix](cast("TextIO", feed))
         channels = ChannelNumbers()
         any_frame = False
         messages = iter(reader)
@@ -65,8 +95,9 @@ def text_reader(suffix: str) -> Reader:
                 message = next(messages, None)
                 if message is None:
                     break
-                if len(message.data) != message.dlc and not (message.is_remote_frame or message.is_error_frame):
-                    raise ValueError(f"{len(message.data)} bytes of data where there should be {message.dlc}")
+                length = _length(message, suffix)
+                if len(message.data) != length and not (message.is_remote_frame or message.is_error_frame):
+                    raise ValueError(f"{len(message.data)} bytes of data where there should be {length}")
                 batch.append(frame_of(message, channels))
             except (ValueError, LookupError, TypeError, AttributeError, NotImplementedError) as error:
                 damage.add(f"line {feed.number}", f"{str(error) or type(error).__name__}: {feed.line.strip()[:60]!r}")
@@ -77,17 +108,27 @@ def text_reader(suffix: str) -> Reader:
                 continue
             any_frame = True
             if len(batch) >= BATCH:
-                yield batch
+                yield clock.timed(batch)
                 batch = []
         if not any_frame and feed.number:
             if damage.count:
-                raise InputError(f"{path}, {damage.place}: not a line of the format {suffix}: {damage.reason}")
+                other = ", and the first line is no header of SavvyCAN's or of a table" if suffix == ".csv" else ""
+                raise InputError(f"{path}, {damage.place}: not a line of the format {suffix}: {damage.reason}{other}")
             if not _looks_like(suffix, data):
                 raise InputError(f"{path}, line 1: not a log in the format {suffix}: it has no header of that format")
         if batch:
-            yield batch
+            yield clock.timed(batch)
 
     return read
+
+
+def _length(message: can.Message, suffix: str) -> int:
+    """How many bytes of data a message should have, by what python-can's reader of the format makes of its DLC."""
+    from gz_onboard.bus._can import can
+
+    if suffix == ".trc":  # the code of 9 to 15 for 12 to 64 bytes
+        return int(can.util.dlc2len(message.dlc))
+    return message.dlc if message.is_fd or suffix != ".asc" else min(message.dlc, 8)  # a classic frame has no more
 
 
 def _looks_like(suffix: str, data: Contents) -> bool:

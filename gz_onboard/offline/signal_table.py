@@ -1,0 +1,250 @@
+"""A ride as a table of signals, CSV or Parquet, in place of a log of frames.
+
+    time [s],pack_voltage [V],pack_current [A],speed [km/h]
+    0.0,52.1,3.2,0.0
+    0.1,,3.4,0.2
+
+Each value travels as a frame of its own, a message of one floating-point signal, so that all that is done with frames
+is done with it too: no command knows of tables.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from datetime import UTC, date, datetime, timedelta
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from struct import Struct
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from gz_onboard.bus.mapping import BusMapping, Source, column_sources
+from gz_onboard.bus.readers.common import BATCH, Damage, unpacked
+from gz_onboard.bus.units import known_units, to_si
+from gz_onboard.errors import InputError, nearest, shown
+from gz_onboard.events import EFF_FLAG, ROLES, Frame
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
+
+_FIRST_IDENTIFIER = 0x1000_0000  # of 29 bits: no range frames have it
+_COLUMN = re.compile(r"\s*(?P<name>.*?)\s*(?:[\[(]\s*(?P<unit>[^\])]*?)\s*[\])])?\s*")
+_TIME = re.compile(r"\s*(?:time|timestamp|t)(?:_|\s*[\[(])?\s*(?P<unit>s|ms)?\s*[\])]?\s*", re.I)
+_ALSO = {"speed": "vehicle_speed"}
+_MISSING = ("", "nan", "null", "none", "n/a")
+_LAST = ("motor_speed", "inverter_voltage", "pack_voltage")  # the estimator makes its step with the last that is there
+_VALUE = Struct("<d")
+_1970 = datetime(1970, 1, 1, tzinfo=UTC)
+
+
+class _Column(NamedTuple):
+    """A column as its header says; at: its index."""
+
+    name: str
+    unit: str
+    at: int
+
+
+def read_signal_table(file: Path, mapping: BusMapping) -> tuple[BusMapping, Iterator[list[Frame]]]:
+    """The mapping that the ride in a table is decoded by, and its frames, for a vehicle with `mapping`.
+
+    The columns have the names of roles; or, for a vehicle without DBC files, those that its roles name. Raises
+    InputError naming file, line, column, value and unit for what is neither a time nor a number nor an empty cell, for
+    a time that decreases, and for a column that is no role or has a unit that is none of its role's.
+    """
+    header, rows = _parquet(file) if _is_parquet(file) else _csv(file)
+    if len(header) < 2:
+        raise InputError(f"{file}:1: a table of signals has a column of times and one for each signal")
+    times = _times(file, header[0], rows)
+    columns = [_column(text, at) for at, text in enumerate(header) if at]
+    database = _database(file, columns)
+    sources = column_sources(database, mapping.columns, file) if mapping.columns else _by_role(file, columns)
+    played = {source.signal: source.role for source in sources}
+    order = {role: i for i, role in enumerate(_LAST)}
+    used = sorted((c for c in columns if c.name in played), key=lambda c: order.get(played[c.name], -1))
+    values = {column.name: _values(file, rows, column) for column in used}
+    periods = {name: period for name, found in values.items() if (period := _period(times, found))}
+    numbers = {m.name: m.frame_id | EFF_FLAG for m in database.messages}
+    made = replace(mapping, database=database, sources=sources, protection={}, periods=periods, j1939=False)
+    return made, _frames(times, [(numbers[name], found) for name, found in values.items()])
+
+
+def _is_parquet(file: Path) -> bool:
+    with file.open("rb") as stream:
+        return stream.read(4) == b"PAR1"
+
+
+Rows = Sequence[tuple[int, Sequence[Any]]]
+"""(line, or row from 1 of a Parquet file, and its cells), one for each row."""
+
+
+def _csv(file: Path) -> tuple[list[str], Rows]:
+    try:
+        data = bytes(unpacked(file, file.read_bytes(), Damage()))
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read: {error.strerror}") from error
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("cp1252", "replace")
+    first = text.partition("\n")[0]
+    semicolons = first.count(";") > first.count(",")
+    reader = csv.reader(text.splitlines(), delimiter=";" if semicolons else ",")
+    header = next(reader, [])
+    rows = []
+    for row in reader:
+        if not any(map(str.strip, row)):
+            continue
+        if len(row) != len(header):
+            raise InputError(f"{file}:{reader.line_num}: {len(row)} cells for {len(header)} columns")
+        rows.append((reader.line_num, [cell.replace(",", ".") for cell in row] if semicolons else row))
+    return header, rows
+
+
+def _parquet(file: Path) -> tuple[list[str], Rows]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise InputError(f"{file}: Parquet needs pyarrow: pip install pyarrow; or give the table as CSV") from error
+    try:
+        table = pyarrow.parquet.read_table(file)
+    except (OSError, pyarrow.ArrowException) as error:
+        raise InputError(f"{file}: not a Parquet file: {error}") from error
+    columns = [
+        column.cast(pyarrow.timestamp("us", column.type.tz), safe=False)  # of ns, datetime has none
+        if pyarrow.types.is_timestamp(column.type)
+        else column
+        for column in table.columns
+    ]
+    return table.column_names, list(enumerate(zip(*(column.to_pylist() for column in columns), strict=True), 1))
+
+
+def _times(file: Path, name: str, rows: Rows) -> list[int]:
+    """The time of each row [ns]."""
+    header = _TIME.fullmatch(name)
+    if not header:
+        raise InputError(
+            f"{file}:1: the first column must be the time, such as 'time [s]' (in s, ms or ISO 8601), is {shown(name)}"
+        )
+    factor = 1e-3 if header["unit"] == "ms" else 1.0
+    times: list[int] = []
+    for line, row in rows:
+        try:
+            times.append(_nanoseconds(row[0], factor))
+        except (ValueError, OverflowError):
+            raise InputError(
+                f"{file}:{line}: {name}: {shown(row[0])} is neither a number nor a time of ISO 8601"
+            ) from None
+        if len(times) > 1 and times[-1] < times[-2]:
+            raise InputError(f"{file}:{line}: {name}: {shown(row[0])} is before the time of the row above")
+    if len(times) < 2:
+        raise InputError(f"{file}: {len(times)} rows are no ride")
+    return [time - times[0] for time in times] if times[0] < 0 else times
+
+
+def _nanoseconds(cell: object, factor: float) -> int:
+    """A time [ns]: a number in units of `factor` s, or since 1970 that of a date, which is UTC if it has no zone."""
+    if isinstance(cell, str):
+        try:
+            return round(float(cell) * factor * 1e9)
+        except ValueError:
+            cell = datetime.fromisoformat(cell.strip())
+    if isinstance(cell, date):
+        cell = cell if isinstance(cell, datetime) else datetime(cell.year, cell.month, cell.day)
+        moment = cell if cell.tzinfo else cell.replace(tzinfo=UTC)
+        return (moment - _1970) // timedelta(microseconds=1) * 1000
+    if not isinstance(cell, int | float):
+        raise ValueError
+    return round(cell * factor * 1e9)
+
+
+def _column(text: str, at: int) -> _Column:
+    header = _COLUMN.fullmatch(text)
+    return _Column(header["name"], header["unit"] or "", at) if header else _Column(text, "", at)
+
+
+def _values(file: Path, rows: Rows, column: _Column) -> list[float | None]:
+    """The values of a column, None for an empty cell."""
+    values: list[float | None] = []
+    for line, row in rows:
+        cell = row[column.at]
+        if cell is None or (isinstance(cell, str) and cell.strip().lower() in _MISSING):
+            values.append(None)
+            continue
+        try:
+            value = float(cell)
+        except (ValueError, TypeError):
+            value = math.inf
+        if math.isinf(value):
+            unit = f" [{column.unit}]" if column.unit else ""
+            raise InputError(f"{file}:{line}: column {column.name!r}{unit}: {shown(cell)} is not a finite number")
+        values.append(None if math.isnan(value) else value)
+    return values
+
+
+def _database(file: Path, columns: Sequence[_Column]) -> Database:
+    """A message for each column, with one signal of the same name."""
+    from cantools.database.can import Message, Signal
+    from cantools.database.conversion import BaseConversion
+
+    from gz_onboard.bus.dbc import empty_database  # before cantools
+
+    names = [column.name for column in columns]
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        raise InputError(f"{file}:1: two columns are called {twice!r}")
+    database = empty_database()
+    for column in columns:
+        conversion = BaseConversion.factory(is_float=True)
+        signal = Signal(column.name, 0, 64, conversion=conversion, unit=column.unit or None)
+        database.messages.append(
+            Message(_FIRST_IDENTIFIER + column.at, column.name, 8, [signal], is_extended_frame=True)
+        )
+    database.refresh()
+    return database
+
+
+def _by_role(file: Path, columns: Sequence[_Column]) -> tuple[Source, ...]:
+    """The source of each role, from columns that have the roles' names."""
+    sources: dict[str, Source] = {}
+    for column in columns:
+        role = _ALSO.get(column.name, column.name)
+        if role not in ROLES:
+            raise InputError(
+                f"{file}:1: column {column.name!r} is no role{nearest(role, ROLES)}; rename it, leave it out, "
+                "or name it in the [roles] of a vehicle file without dbc"
+            )
+        if role in sources:
+            raise InputError(f"{file}:1: columns {sources[role].signal!r} and {column.name!r} are both {role}")
+        si = to_si(column.unit, role)
+        if si is None:
+            units = ", ".join(known_units(role))
+            raise InputError(
+                f"{file}:1: column {column.name!r} has {f'unit {column.unit!r}' if column.unit else 'no unit'}; "
+                f"write one of {units} behind it, such as {column.name} [{ROLES[role]}]"
+            )
+        sources[role] = Source(role, column.name, column.name, *si)
+    return tuple(sources.values())
+
+
+def _period(times: Sequence[int], values: Sequence[float | None]) -> float | None:
+    """The usual time from one of a column's values to the next [s]; None if there are too few."""
+    known = [time for time, value in zip(times, values, strict=True) if value is not None]
+    steps = [after - before for before, after in pairwise(known) if after > before]
+    return median(steps) * 1e-9 if steps else None
+
+
+def _frames(times: Sequence[int], columns: Sequence[tuple[int, list[float | None]]]) -> Iterator[list[Frame]]:
+    pack: Callable[[float], bytes] = _VALUE.pack
+    batch: list[Frame] = []
+    for row, time in enumerate(times):
+        batch += [(time, identifier, pack(v), 0) for identifier, values in columns if (v := values[row]) is not None]
+        if len(batch) >= BATCH:
+            yield batch
+            batch = []
+    if batch:
+        yield batch

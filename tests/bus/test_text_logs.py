@@ -1,0 +1,191 @@
+"""Text logs as other tools write them: SavvyCAN, OVMS, candump on the screen, Vector and PEAK."""
+
+from __future__ import annotations
+
+import gzip
+import logging
+from pathlib import Path
+
+import pytest
+
+from gz_onboard.bus.logs import LogDamage, read_frames
+from gz_onboard.errors import InputError
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
+
+MS = 1_000_000
+S = 1000 * MS
+
+
+def frames_of(folder: Path, text: str, name: str = "ride.txt", damages: list[LogDamage] | None = None) -> list[Frame]:
+    file = folder / name
+    file.write_text(text, encoding="latin-1")
+    found = [] if damages is None else damages
+    frames = [frame for batch in read_frames(file, on_damage=found.append) for frame in batch]
+    assert damages is not None or not found
+    return frames
+
+
+SAVVYCAN = "Time Stamp,ID,Extended,Dir,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n"
+
+
+@pytest.mark.parametrize("name", ["ride.csv", "ride.txt", "ride.log"])
+def test_savvycan_with_the_direction(tmp_path, name):
+    text = f"{SAVVYCAN}1674224,0000015F,false,Rx,0,8,90,F8,00,7D,00,EE,00,7D,\n1674311,18FF50E5,true,Tx,1,2,F3,FF,\n"
+    assert frames_of(tmp_path, text, name) == [
+        (1674224_000, 0x15F, bytes.fromhex("90F8007D00EE007D"), 0),
+        (1674311_000, 0x18FF50E5 | EFF_FLAG, b"\xf3\xff", 1 | TRANSMITTED),
+    ]
+
+
+def test_savvycan_without_the_direction_and_its_zeros_behind_the_data(tmp_path):
+    text = (
+        "Time Stamp,ID,Extended,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\n166064000,0000021A,false,3,2,FE,36,00,00,00,00,00,00\n"
+    )
+    assert frames_of(tmp_path, text, "r.csv") == [(166064000_000, 0x21A, b"\xfe\x36", 3)]
+    text = "Time Stamp (uS),ID,Extended,Bus,LEN,D1,D2,D3,D4,D5,D6,D7,D8\r\n005336724,0F1,0,1,2, 00,02,\r\n"
+    assert frames_of(tmp_path, text) == [(5336724_000, 0x0F1, b"\x00\x02", 1)]
+
+
+def test_savvycan_times_before_its_clock_was_set_begin_at_zero(tmp_path, caplog):
+    text = f"{SAVVYCAN}-1621841258567223,1D0,false,Rx,0,1,6C,\n-1621841258567009,2C4,false,Rx,0,1,FF,\n"
+    assert [frame[0] for frame in frames_of(tmp_path, text, "r.csv")] == [0, 214_000]
+    assert "unknown start" in caplog.text
+
+
+def test_savvycan_lines_that_are_none_are_counted_and_the_first_named(tmp_path):
+    bad = (
+        "2000,15F,false,Rx,0,8,90,F8\n3000,15F,false,Rx,0,9,00,00,00,00,00,00,00,00,00,\nhello\n4000,15F,false,Rx,0,1,0"
+    )
+    damages: list[LogDamage] = []
+    frames = frames_of(tmp_path, f"{SAVVYCAN}1000,15F,false,Rx,0,1,90,\n{bad}", "r.csv", damages)
+    assert len(frames) == 1
+    assert [(damage.count, damage.place) for damage in damages] == [(4, "line 3")]
+    assert "2000,15F" in damages[0].reason
+
+
+def test_a_savvycan_header_over_something_else_is_refused(tmp_path):
+    with pytest.raises(InputError, match=r"line 2: not a line of SavvyCAN's CSV.*'hello'"):
+        frames_of(tmp_path, f"{SAVVYCAN}hello\nworld\n", "r.csv")
+
+
+def test_crtd(tmp_path):
+    text = (
+        "# a ride\n1542473901.000000 CXX OVMS CRTD\n1542473901.020305 1R11 7E8 01 02 0F\n"
+        "1542473901.030305 2CEV something\n1542473901.040305 2T29 18DAF110 \n1542473901.05 R11 0000021A FE\n"
+    )
+    at = 1542473901 * S
+    assert frames_of(tmp_path, text, "ride.crtd") == [
+        (at + 20305_000, 0x7E8, b"\x01\x02\x0f", 0),
+        (at + 40305_000, 0x18DAF110 | EFF_FLAG, b"", 1 | TRANSMITTED),
+        (at + 50 * MS, 0x21A, b"\xfe", 0),
+    ]
+    damages: list[LogDamage] = []
+    frames_of(tmp_path, f"{text}1542473902.0 1R11 FFF 00\n1542473902.0 1R11 100 0\n", "ride.log", damages)
+    assert [(damage.count, damage.place) for damage in damages] == [(2, "line 7")]
+
+
+def test_candump_as_on_the_screen(tmp_path):
+    text = (
+        " (1436509052.249713)  can0  120   [4]  11 22 33 44   '.\"3D'\n"
+        " (1436509052.250713)  can1  RX - -  18FF50E5   [2]  1122\n"
+        " (1436509052.251713)  can0  TX B -  123  [12]  00 01 02 03 04 05 06 07 08 09 0A 0B\n"
+        " (1436509052.252713)  can0  321   [3]  remote request\n"
+        " (1436509052.253713)  can0  20000004   [8]  00 04 00 00 00 00 00 00   ERRORFRAME\n"
+        "\tcontroller-problem{rx-overflow}\n"
+        " (2015-07-10 06:17:32.254713)  can0  100   [0] \n"
+    )
+    at = 1436509052_249713_000
+    assert frames_of(tmp_path, text) == [
+        (at, 0x120, b"\x11\x22\x33\x44", 0),
+        (at + MS, 0x18FF50E5 | EFF_FLAG, b"\x11\x22", 1),
+        (at + 2 * MS, 0x123, bytes(range(12)), TRANSMITTED),
+        (at + 3 * MS, 0x321 | RTR_FLAG, bytes(3), 0),
+        (at + 4 * MS, 4 | ERR_FLAG, bytes.fromhex("0004000000000000"), 0),
+        (at + 5 * MS, 0x100, b"", 0),
+    ]
+
+
+def test_candump_without_a_time_is_at_zero_and_says_so(tmp_path, caplog):
+    frames = frames_of(tmp_path, "  can0  120   [4]  11 22 33 44\n  can0  121   [1]  11\n", "ride.log")
+    assert [(frame[0], frame[1]) for frame in frames] == [(0, 0x120), (0, 0x121)]
+    assert "has no times" in caplog.text
+
+
+def test_candump_times_since_the_start_and_since_the_frame_before(tmp_path, caplog):
+    caplog.set_level(logging.WARNING)
+    zero = "".join(f" (000.{i}00000)  can0  120   [1]  0{i}\n" for i in range(9))
+    assert [frame[0] for frame in frames_of(tmp_path, zero)] == [100 * MS * i for i in range(9)]
+    assert "unknown start" in caplog.text
+    steps = [0, 100, 5, 200, 5, 100, 5, 200]
+    delta = "".join(f"(000.{step:03}000) can0 120#00\n" for step in steps)
+    assert [frame[0] // MS for frame in frames_of(tmp_path, delta)] == [sum(steps[: i + 1]) for i in range(len(steps))]
+    assert "added up" in caplog.text
+
+
+def test_a_screen_line_of_another_length_than_it_says_is_no_frame(tmp_path):
+    damages: list[LogDamage] = []
+    text = " (1.0)  can0  120   [4]  11 22 33 44\n (1.1)  can0  120   [4]  11 22 33\n"
+    assert len(frames_of(tmp_path, text, damages=damages)) == 1
+    assert damages[0].place == "line 2"
+
+
+ASC = "0.100000 1  64              Rx   d 2 64 0A\n   0.200000 2  1Fx             Tx   d 1 10\n"
+
+
+def test_asc_without_a_header_loses_no_frame(tmp_path):
+    expected = [(100 * MS, 0x64, b"\x64\x0a", 0), (200 * MS, 0x1F | EFF_FLAG, b"\x10", 1 | TRANSMITTED)]
+    for name in ("ride.asc", "ride.txt"):
+        assert frames_of(tmp_path, ASC, name) == expected
+
+
+def test_asc_of_base_ten_behind_a_line_that_python_can_does_not_know(tmp_path):
+    text = "\ndate Tue May 27 04:09:35.000 pm 2014\n// hello\nbase dec  timestamps absolute\n" + ASC.replace("0A", "10")
+    damages: list[LogDamage] = []
+    frames = frames_of(tmp_path, text.replace("1Fx", "31x"), "ride.asc", damages)
+    assert [(frame[1], frame[2]) for frame in frames] == [(64, b"\x40\x0a"), (31 | EFF_FLAG, b"\x0a")]
+
+
+def test_asc_with_times_since_the_line_before(tmp_path):
+    text = (
+        f"date Tue May 27 04:09:35.000 pm 2014\nbase hex  timestamps relative\n{ASC}   0.5 1  Statistic: D 0 R 0\n{ASC}"
+    )
+    assert [frame[0] // MS for frame in frames_of(tmp_path, text, "ride.asc")] == [100, 300, 900, 1100]
+
+
+def test_asc_fd_remote_and_error_frames_and_a_length_code_beyond_eight(tmp_path):
+    text = (
+        "date Tue May 27 04:09:35.000 pm 2014\nbase hex  timestamps absolute\ninternal events logged\n"
+        "  1.0 CANFD   1 Rx        300                                   1 0 9 12 "
+        "00 01 02 03 04 05 06 07 08 09 0A 0B 102203 130 303000 0 0 0 0 0\n"
+        "  1.1 2  321             Rx   r 4\n  1.2 1  ErrorFrame\n"
+        "  1.3 1  3FF             Tx   d D 55 AA 01 02 03 04 05 06  Length = 232016 BitCount = 119 ID = 1023\n"
+        "  1.4 CAN 1 Status:chip status error active\n"
+    )
+    frames = frames_of(tmp_path, text, "ride.asc")
+    assert [(frame[1], frame[2]) for frame in frames] == [
+        (0x300, bytes(range(12))),
+        (0x321 | RTR_FLAG, bytes(4)),
+        (ERR_FLAG | EFF_FLAG, b""),
+        (0x3FF, bytes.fromhex("55AA010203040506")),
+    ]
+    damages: list[LogDamage] = []
+    frames_of(tmp_path, f"{text}this is no line\n", "ride.asc", damages)
+    assert [(damage.count, damage.place) for damage in damages] == [(1, "line 9")]
+
+
+def test_trc_with_can_fd(tmp_path):
+    text = (
+        ";$FILEVERSION=2.1\n;$STARTTIME=43008.9206666667\n;$COLUMNS=N,O,T,B,I,d,R,L,D\n"
+        "      1      1059.900 FD 1     0300 Rx -  9    00 01 02 03 04 05 06 07 08 09 0A 0B\n"
+        "      2      1283.231 DT 1     0321 Tx -  2    01 02\n"
+    )
+    assert [(frame[1], frame[2]) for frame in frames_of(tmp_path, text, "ride.trc")] == [
+        (0x300, bytes(range(12))),
+        (0x321, b"\x01\x02"),
+    ]
+
+
+def test_the_content_tells_the_format_also_of_a_packed_log_and_against_its_name(tmp_path):
+    file = tmp_path / "ride.blf.gz"
+    file.write_bytes(gzip.compress(f"{SAVVYCAN}1000,15F,false,Rx,0,1,90,\n".encode()))
+    assert [len(batch) for batch in read_frames(file)] == [1]

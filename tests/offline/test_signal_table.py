@@ -1,0 +1,248 @@
+"""Rides as tables of signals, in place of logs of frames."""
+
+from __future__ import annotations
+
+import csv
+import gzip
+import json
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gz_onboard import cli
+from gz_onboard.bus.codec import Codec
+from gz_onboard.bus.logs import read_frames
+from gz_onboard.bus.logs import read_samples as logged_samples
+from gz_onboard.errors import InputError
+from gz_onboard.offline.samples import Samples, open_ride, read_samples
+from gz_onboard.vehicle import read_vehicle
+
+REFERENCE = read_vehicle("reference")
+TLMOTO = Path(__file__).resolve().parents[1] / "vehicles" / "tlmoto"
+RIDE = """time [s],pack_voltage [V],pack_current [mA],speed [km/h],cell_temperature (°C),charge_plug
+10.0,52.5,3000,36,25,0
+10.5,,3500,39.6,nan,0
+11.0,52.25,4000,,26,0
+"""
+
+
+def samples_of(folder: Path, text: str, name: str = "ride.csv", vehicle: object = REFERENCE) -> Samples:
+    (folder / name).write_text(text, encoding="utf-8")
+    return read_samples(folder / name, vehicle)  # type: ignore[arg-type]
+
+
+def plain(samples: Samples) -> dict[str, tuple[list[float], list[float]]]:
+    return {
+        role: (times.tolist(), [round(value, 9) for value in values.tolist()])
+        for role, (times, values) in samples.columns.items()
+    }
+
+
+EXPECTED = {
+    "pack_voltage": ([0.0, 1.0], [52.5, 52.25]),
+    "pack_current": ([0.0, 0.5, 1.0], [3.0, 3.5, 4.0]),
+    "vehicle_speed": ([0.0, 0.5], [10.0, 11.0]),
+    "cell_temperature": ([0.0, 1.0], [25.0, 26.0]),
+    "charge_plug": ([0.0, 0.5, 1.0], [0.0, 0.0, 0.0]),
+}
+
+
+def test_columns_play_the_roles_of_their_names_in_si_and_empty_cells_are_missing(tmp_path):
+    assert plain(samples_of(tmp_path, RIDE)) == EXPECTED
+
+
+def test_semicolons_with_decimal_commas_and_other_encodings_and_packed(tmp_path):
+    text = RIDE.replace(",", ";").replace(".", ",")
+    file = tmp_path / "ride.csv.gz"
+    file.write_bytes(gzip.compress(text.encode("cp1252")))
+    assert plain(read_samples(file, REFERENCE)) == EXPECTED
+
+
+@pytest.mark.parametrize(
+    ("head", "times"),
+    [
+        ("time", ["10.0", "10.5", "11.0"]),
+        ("t_ms", ["10000", "10500", "11000"]),
+        ("Timestamp", ["2024-05-01T10:00:00Z", "2024-05-01T10:00:00.5Z", "2024-05-01 12:00:01+02:00"]),
+        ("time [s]", ["-1", "-0.5", "0"]),
+    ],
+)
+def test_times_in_s_or_ms_or_iso_8601(tmp_path, head, times):
+    _, *rows = RIDE.splitlines()
+    lines = [RIDE.splitlines()[0].replace("time [s]", head)]
+    lines += [",".join([time, *row.split(",")[1:]]) for time, row in zip(times, rows, strict=True)]
+    assert plain(samples_of(tmp_path, "\n".join(lines))) == EXPECTED
+    _, frames = open_ride(tmp_path / "ride.csv", REFERENCE)
+    since_1970 = 1714557600 * 10**9 if head == "Timestamp" else 0 if "-" in times[0] else 10 * 10**9
+    assert next(frames)[0][0] == since_1970
+
+
+def test_parquet(tmp_path, monkeypatch):
+    pa = pytest.importorskip("pyarrow")
+    import pyarrow.parquet as pq
+
+    columns = {
+        "time": pa.array([10_000_000_001, 10_500_000_002, 11_000_000_003], pa.timestamp("ns", "UTC")),
+        "pack_voltage[V]": [52.5, None, 52.25],
+        "pack_current[mA]": [3000, 3500, 4000],
+        "vehicle_speed[m/s]": [10.0, 11.0, float("nan")],
+        "cell_temperature[K]": [298.15, None, 299.15],
+        "charge_plug": [0, 0, 0],
+    }
+    file = tmp_path / "ride.parquet"
+    pq.write_table(pa.table(columns), file)
+    assert plain(read_samples(file, REFERENCE)) == EXPECTED
+    with pytest.raises(InputError, match="a table of signals"):
+        list(read_frames(file))
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(InputError, match=r"ride\.parquet: Parquet needs pyarrow"):
+        read_samples(file, REFERENCE)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "parts"),
+    [
+        ("pack_current [mA]", "pack_curent [mA]", [":1:", "'pack_curent' is no role", "did you mean 'pack_current'"]),
+        ("pack_current [mA]", "pack_current [V]", [":1:", "'pack_current' has unit 'V'", "one of A, mA"]),
+        ("pack_current [mA]", "pack_current", [":1:", "'pack_current' has no unit", "pack_current [A]"]),
+        ("pack_current [mA]", "pack_voltage [V]", [":1:", "two columns are called 'pack_voltage'"]),
+        ("pack_current [mA]", "vehicle_speed [m/s]", [":1:", "'vehicle_speed' and 'speed' are both vehicle_speed"]),
+        ("11.0,", "10.4,", [":4: time [s]: '10.4' is before"]),
+        ("11.0,", "soon,", [":4: time [s]: 'soon' is neither"]),
+        ("10.5,", ",", [":3: time [s]: '' is neither"]),
+        ("3500", "much", [":3: column 'pack_current' [mA]: 'much' is not a finite number"]),
+        ("3500", "inf", [":3: column", "'inf' is not"]),
+        ("3500,", "", [":3: 5 cells for 6 columns"]),
+    ],
+)
+def test_what_is_wrong_is_said_with_its_line(tmp_path, old, new, parts):
+    with pytest.raises(InputError) as caught:
+        samples_of(tmp_path, RIDE.replace(old, new, 1))
+    for part in [str(tmp_path / "ride.csv"), *parts]:
+        assert part in str(caught.value)
+
+
+# --- a vehicle without DBC files ----------------------------------------------------------------------------------
+
+ROLES = """
+vehicle_speed = { signal = "v_kmh", unit = "km/h" }
+pack_voltage = "U"
+pack_current = { signal = "i", unit = "A", scale = -1 }
+"""
+TRIP = "t_s,v_kmh,elev_m,U [V],i\n" + "".join(
+    f"{0.5 * i},36,500,{110 - 0.01 * i:.2f},{-10 - i % 3}\n" for i in range(240)
+)
+
+
+@pytest.fixture
+def without_dbc(tmp_path: Path) -> Path:
+    text = (TLMOTO / "tlmoto.toml").read_text(encoding="utf-8").replace('dbc = ["tlmoto.dbc"]\n', "")
+    before, _, rest = text.partition("[bus]")
+    file = tmp_path / "mine.toml"
+    file.write_text(f"{before}[roles]{ROLES}\n{rest[rest.index('[forecast]') :]}", encoding="utf-8")
+    return file
+
+
+def test_its_roles_name_the_columns_and_others_are_unused(tmp_path, without_dbc):
+    found = plain(samples_of(tmp_path, TRIP.replace("500", "hill"), vehicle=read_vehicle(without_dbc)))
+    assert set(found) == {"vehicle_speed", "pack_voltage", "pack_current"}
+    assert found["vehicle_speed"][1][:2] == [10.0, 10.0]
+    assert found["pack_current"][1][:3] == [10.0, 11.0, 12.0]
+    with pytest.raises(InputError, match=r"ride\.csv.*mine\.toml:\d+: roles\.pack_voltage.*'U'"):
+        samples_of(tmp_path, TRIP.replace("U [V]", "W [V]"), vehicle=read_vehicle(without_dbc))
+
+
+def test_its_roles_are_checked(tmp_path, without_dbc):
+    text = without_dbc.read_text(encoding="utf-8")
+    without_dbc.write_text(text.replace("vehicle_speed =", "vehicle_sped ="), encoding="utf-8")
+    with pytest.raises(InputError, match=r"vehicle_sped: unknown key .did you mean 'vehicle_speed'"):
+        read_vehicle(without_dbc)
+    without_dbc.write_text(f"{text}\n[bus]\nnot_available = 'none'\n", encoding="utf-8")
+    with pytest.raises(InputError, match=r"bus: describes frames, for which dbc is missing"):
+        read_vehicle(without_dbc)
+
+
+def test_frames_cannot_be_read_and_the_daemon_does_not_start(tmp_path, without_dbc):
+    (tmp_path / "ride.log").write_text("(1.0) can0 123#00\n")
+    with pytest.raises(InputError, match=r"mine\.toml: dbc is missing.*ride\.log"):
+        read_samples(tmp_path / "ride.log", read_vehicle(without_dbc))
+    assert cli.main(["run", "--vehicle", str(without_dbc), "--interface", "virtual", "--state-dir", ""]) == 2
+
+
+def test_frames_without_times_are_no_ride(tmp_path):
+    (tmp_path / "ride.log").write_text("  can0  120   [1]  11\n  can0  121   [1]  11\n")
+    with pytest.raises(InputError, match=r"ride\.log: its frames have no times"):
+        read_samples(tmp_path / "ride.log", REFERENCE)
+
+
+# --- the commands -------------------------------------------------------------------------------------------------
+
+
+def estimate(tmp_path: Path, *arguments: object) -> dict[str, float]:
+    out = tmp_path / "result.json"
+    given = ["estimate", "--no-plot", "--quiet", "--output", tmp_path, "--json", out, *arguments]
+    assert cli.main([str(argument) for argument in given]) == 0
+    (ride,) = json.loads(out.read_text())["rides"]
+    return dict(ride)
+
+
+def test_estimate_of_a_trip_of_a_vehicle_without_dbc(tmp_path, without_dbc, capsys):
+    (tmp_path / "trip.csv").write_text(TRIP)
+    ride = estimate(tmp_path, "--vehicle", without_dbc, "--signals", tmp_path / "trip.csv")
+    assert ride["distance_km"] == pytest.approx(1.19, abs=0.02)
+    assert ride["energy_wh"] == pytest.approx(109 * 11 * 119.5 / 3600, rel=0.02)
+    assert ride["frames"] == 3 * 240
+    topics = {topic for topic, _, _ in logged_samples(tmp_path / "trip.estimate.mcap")}
+    assert topics == {"/estimate", "/status", "/can/v_kmh", "/can/U", "/can/i"}
+    arguments = ["estimate", "--vehicle", str(without_dbc), "--frames", "--output", str(tmp_path)]
+    assert cli.main([*arguments, str(tmp_path / "trip.csv")]) == 2
+    assert "--frames has nothing to log" in capsys.readouterr().err
+
+
+def test_a_table_of_a_ride_gives_the_estimate_of_its_frames(tmp_path):
+    log = Path(__file__).resolve().parents[2] / "replay_logs" / "coastdown.blf"
+    head = [frame for _, batch in zip(range(25), read_frames(log), strict=False) for frame in batch]
+    start, codec = head[0][0], Codec(REFERENCE.mapping)
+    rows: dict[float, dict[str, float]] = {}
+    for time, group, values in codec.decode(head):
+        named = zip(codec.groups[group].roles, values, strict=True)
+        rows.setdefault(time, {}).update({role: value for role, value in named if value is not None})
+    from gz_onboard.events import ROLES as UNITS
+
+    roles = sorted({role for row in rows.values() for role in row})
+    lines = ["time," + ",".join(f"{role} [{UNITS[role]}]" for role in roles)]
+    lines += [f"{start * 1e-9 + t:.6f}," + ",".join(str(row.get(r, "")) for r in roles) for t, row in rows.items()]
+    (tmp_path / "table.csv").write_text("\n".join(lines))
+    from gz_onboard.bus.writers import write_candump
+
+    with (tmp_path / "frames.log").open("w") as stream:
+        write_candump(stream, [head])
+    ours, theirs = (estimate(tmp_path, tmp_path / name) for name in ("table.csv", "frames.log"))
+    for key in ("soc_end", "soc_end_sd", "distance_km", "energy_wh", "range_end_km", "innovation_rms_v"):
+        assert ours[key] == pytest.approx(theirs[key], rel=2e-3), key
+    assert np.isfinite(ours["range_end_km"])
+
+
+def test_logs_of_frames_and_tables_are_told_apart_in_the_errors_of_replay(tmp_path, capsys):
+    (tmp_path / "ride.csv").write_text(RIDE)
+    assert cli.main(["export", str(tmp_path / "ride.csv"), str(tmp_path / "out.log")]) == 2
+    assert "is a table of signals, not a log of frames" in capsys.readouterr().err
+
+
+def test_the_trips_of_a_car_have_the_way_and_energy_of_their_index(tmp_path, without_dbc):
+    folder = Path(os.environ.get("GZ_ONBOARD_DATA", "nowhere")) / "real" / "ev_bmw_i3_trips"
+    if not folder.is_dir():
+        pytest.skip("GZ_ONBOARD_DATA names no folder with real/ev_bmw_i3_trips")
+    text = without_dbc.read_text(encoding="utf-8")
+    pack = 'pack_voltage = { signal = "v_batt_V", unit = "V" }'
+    without_dbc.write_text(text.replace('pack_voltage = "U"', pack).replace('"i"', '"i_batt_A"'), encoding="utf-8")
+    for row in list(csv.DictReader((folder / "INDEX.csv").open()))[:5]:
+        columns = read_samples(folder / f"{row['trip']}_2hz.csv.gz", read_vehicle(without_dbc)).columns
+        time, volts = columns["pack_voltage"]
+        power = volts * np.interp(time, *columns["pack_current"])
+        assert np.trapezoid(power, time) / 3.6e6 == pytest.approx(float(row["e_batt_kWh"]), rel=0.01)
+        speed = columns["vehicle_speed"]
+        assert np.trapezoid(speed[1], speed[0]) / 1000 == pytest.approx(float(row["km"]), rel=0.01)
