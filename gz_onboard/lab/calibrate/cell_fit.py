@@ -30,7 +30,7 @@ VOLTAGE_SD = 0.004  # V: what the model leaves, independent every CORRELATED sam
 SOC_SD = 0.003  # how far the state of charge may be off, which matters where the OCV is steep
 CORRELATED = 20
 BEND_SD = 0.3  # relative: how far a table may bend from node to node, per 0.05 of SOC
-LEAST = 1e-6  # ohm
+LEAST = 2e-5  # ohm: of a pair that the data do not show; with the longest of TIMES its C1 is what a file can hold
 LEFT_OUT = (0.1, 1.0)  # of a piece's weight, to see how much hangs on it: see `jackknife`
 TIME_BEND = 0.5  # of ln τ, as BEND_SD
 TURNS = 8  # of Gauss and Newton
@@ -322,6 +322,7 @@ def fit_direct(
         step[2 * n : 3 * n] = np.clip(step[2 * n : 3 * n], -0.5, 0.5)
         p = p + step
         p[: 2 * n] = np.maximum(p[: 2 * n], LEAST)
+        p[2 * n : 3 * n] = np.clip(p[2 * n : 3 * n], np.log(TIMES[0]), np.log(TIMES[-1]))
     bread = cho_solve(cho_factor(normal), np.eye(len(normal)))
     covariance = left_out(a, b, test.block, normal) + bread @ prior @ bread
     of_logs = np.zeros((4 * n, 4 * n))  # ln R0, ln R1, ln τ, and ln τ less ln R1, from R0, R1, ln τ

@@ -28,6 +28,8 @@ SLOWEST_HOURS = 8.0  # a discharge faster than that is not slow
 TESTER = 0.005  # relative: what a tester's current may be off
 UNSURE = 0.2  # relative: the resistance of steady current, out of that of its steps
 LEAST_SLOPE = 1e-3  # V over all of SOC: what a flat or falling part is given
+LEAST_STEP = 2e-5  # V from node to node: twice the last digit that a vehicle file holds
+VOLTMETER = 5e-4  # V: no tester's voltage is surer than that
 CLOSED = 0.97  # of the capacity: what a charge that closes the loop brings back at least
 
 
@@ -155,7 +157,8 @@ def _between(sweep: _Sweep, soc: Array, half: Array, result: Result) -> tuple[Ar
     """(voltage, its sd) [V] at the nodes: the discharge moved up by half the gap, where that is known or near."""
     discharge = _smooth(sweep.level[sweep.down], sweep.test.voltage[sweep.down], soc)
     resistive, both = sweep.resistive, np.isfinite(half)
-    value, sd = discharge + half, np.hypot(np.maximum(half - resistive, 0.0), UNSURE * resistive)
+    value = discharge + half
+    sd = np.maximum(np.hypot(np.maximum(half - resistive, 0.0), UNSURE * resistive), VOLTMETER)
     missing = ~both & np.isfinite(discharge) & (soc > 0) & (soc < 1)
     if np.any(missing):
         # The gap of the covered nodes nearest to those that are not, else the resistive part alone.
@@ -254,11 +257,16 @@ def _monotonic(soc: Array, value: Array, result: Result, name: str) -> Array:
     if not np.all(good):
         result.refusals.append(f"{name}: no voltage at SOC {', '.join(f'{s:g}' for s in soc[~good])}")
         value = np.interp(soc, soc[good], value[good])
-    line = LEAST_SLOPE * soc
-    rising = np.maximum.accumulate(value - line) + line
+    rising = increasing(soc, value)
     moved = rising - value
     if float(moved.max()) > 5e-4:
         result.notes.append(
             f"{name}: raised by up to {1e3 * moved.max():.1f} mV at SOC {soc[int(np.argmax(moved))]:g} to be monotonic"
         )
-    return np.asarray(rising)
+    return rising
+
+
+def increasing(soc: Array, volts: Array) -> Array:
+    """`volts` (n,) at `soc` (n,), raised where they fall or are flat, so that they increase when rounded too."""
+    line = np.concatenate([[0.0], np.cumsum(np.maximum(LEAST_SLOPE * np.diff(soc), LEAST_STEP))])
+    return np.asarray(np.maximum.accumulate(volts - line) + line)

@@ -7,6 +7,7 @@ from scipy.stats import chi2
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cell_fit import Branches, jackknife
+from gz_onboard.lab.calibrate.ocv import increasing
 from gz_onboard.lab.calibrate.pulse_test import FULL_WITHIN, Tested
 from gz_onboard.lab.calibrate.result import Curve, Result
 from gz_onboard.physics.battery import BENCH_TEMPERATURE
@@ -20,8 +21,7 @@ def rest_shift(fitted: list[Branches], tests: list[Tested], nodes: Array, ocv: C
     shift = np.interp(nodes, fitted[nearest].soc, fitted[nearest].shift)
     scatter = np.std([np.interp(nodes, f.soc, f.shift) for f in fitted], axis=0) if len(fitted) > 1 else np.abs(shift)
     shift[nodes == 1] = 0.0 if abs(tests[nearest].test.voltage[0] - ocv.value[-1]) < FULL_WITHIN else shift[-1]
-    moved = ocv.value + shift
-    shift = np.maximum.accumulate(moved + 1e-3 * (nodes[-1] - nodes)) - 1e-3 * (nodes[-1] - nodes) - ocv.value
+    shift = increasing(nodes, ocv.value + shift) - ocv.value
     return shift, np.hypot(np.minimum(ocv.sd, np.abs(shift) + 0.003), scatter)
 
 
