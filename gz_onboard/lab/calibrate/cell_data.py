@@ -44,6 +44,11 @@ class CellTest:
         """The file's name."""
         return self.table.file.name
 
+    def rested(self, row: int) -> float:
+        """How long [s] no current has flowed at `row`; below zero while one flows."""
+        moving = np.flatnonzero(~self.rest[: row + 1])
+        return float(self.time[row] - self.time[min(moving[-1] + 1, len(self) - 1) if len(moving) else 0])
+
 
 def cell_test(table: Measurements) -> CellTest:
     """The test in `table`: columns time, current, voltage, cell_temperature and, where it has one, charge.

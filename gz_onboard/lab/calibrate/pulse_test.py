@@ -37,6 +37,10 @@ class Tested:
 def tested(table: Measurements, nodes: Array, volts: Array, capacity: Found, result: Result) -> Tested:
     """`table` with its capacity: the one with which its rest voltages lie best on the OCV above 10 % SOC."""
     test = cell_test(table)
+    if not test.rest[0]:
+        raise table.error(
+            f"begins under a current of {test.current[0]:.3g} A: its first voltage must be one at rest", 0
+        )
     rests = _long_rests(test, capacity)
     start = 1.0
     if test.voltage[0] < volts[-1] - FULL_WITHIN:
@@ -72,8 +76,7 @@ def _long_rests(test: CellTest, capacity: Found) -> NDArray[np.int_]:
     if pulses < FEWEST_PULSES:
         raise table.error(f"has {pulses} pulses; at least {FEWEST_PULSES} are needed")
     ends = np.flatnonzero(test.rest & ~np.concatenate([test.rest[1:], [False]]))
-    began = np.array([_began(test, int(k)) for k in ends])
-    rests: NDArray[np.int_] = ends[test.time[ends] - test.time[began] >= REST]
+    rests: NDArray[np.int_] = ends[np.array([test.rested(int(k)) >= REST for k in ends])]
     used = float(test.drawn.max() - test.drawn.min())
     levels = np.unique(np.round(test.drawn[rests] / max(used, 1e-9) * 50))
     if len(levels) < FEWEST_LEVELS:
@@ -85,12 +88,6 @@ def _long_rests(test: CellTest, capacity: Found) -> NDArray[np.int_]:
             f"draws {used:.3f} of {capacity.value:.3f} A·h: pulses over at least half of the range of SOC are needed"
         )
     return rests
-
-
-def _began(test: CellTest, end: int) -> int:
-    """The first row of the rest that ends at row `end`."""
-    moving = np.flatnonzero(~test.rest[:end])
-    return int(moving[-1]) + 1 if len(moving) else 0
 
 
 def moved_pieces(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.cli import main
+from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate import ocv, pulse
 from gz_onboard.lab.calibrate.command import for_file
 from gz_onboard.lab.calibrate.result import Curve, Found, Result
@@ -53,8 +54,12 @@ def test_a_flat_curve_still_increases_when_rounded(tmp_path, knee):
     table = flat_test()
     rest = len(table) - 1 - int(np.argmax(table["current"][::-1] > 0)) + 1
     table["voltage"][rest : rest + 61] += knee  # the cell rests far above the lowest voltages of its discharge
-    battery = written(tmp_path, ocv.calibrate(table)).pack
-    assert np.all(np.diff(battery.ocv_value) >= 1e-5)
+    result = ocv.calibrate(table)
+    assert np.all(np.diff(written(tmp_path, result).pack.ocv_value) >= 1e-5)
+    notes = " ".join(result.notes)
+    assert "(585 mΩ within minutes) would make 146" in notes
+    assert "all of the gap counts as hysteresis" in notes
+    assert re.search(r"is flat .* SOC 0.1.*, 0.9: .* rest_voltage_error, .* be 30 mV or more", notes)
 
 
 def test_branches_that_lie_upon_each_other_are_known_within_what_a_file_holds(tmp_path):
@@ -125,3 +130,66 @@ def test_a_value_out_of_bounds_is_named(tmp_path, monkeypatch, capsys):
     assert main(["calibrate", "ocv", file, "--output", str(tmp_path / "v.toml"), "--report", str(page)]) == 2
     assert "cell_capacity: 0.05 A·h was found, outside 0.1 to 500 A·h" in capsys.readouterr().err
     assert page.exists()
+
+
+def counted(share, **plant):
+    """A slow test whose tester counts `share` of the charge that it brings back."""
+    table, cell = slow_test(**plant)
+    table["current"][table["current"] < 0] *= share
+    return table, cell
+
+
+@pytest.mark.parametrize("share", [0.94, 1.068])
+def test_branches_of_different_charge_are_each_by_their_own_and_it_is_said(share):
+    table, cell = counted(share, hysteresis=0.005)
+    result = ocv.calibrate(table)
+    curve, capacity = result.curves["battery.ocv"], result.parameters["cell_capacity"]
+    assert capacity.value == pytest.approx(cell.capacity, rel=1e-3)
+    assert capacity.sd > 0.9 * abs(1 - share) * cell.capacity
+    inside = (ocv.SOC > 0.1) & (ocv.SOC < 1)
+    assert np.abs(curve.value - cell.ocv(ocv.SOC))[inside].max() < 0.004
+    assert f"brings back {share * cell.capacity:.3f} of {cell.capacity:.3f} A·h" in " ".join(result.refusals)
+
+
+def test_a_charge_that_no_cell_takes_is_refused():
+    with pytest.raises(InputError, match=r"ocv.csv: the charge brings back 3.\d+ of 2.500 A·h.*10 %"):
+        ocv.calibrate(counted(1.25)[0])
+
+
+def test_a_fast_charge_is_not_averaged_with_a_slow_discharge():
+    cell = Plant()
+    pieces = [(0, 600, 60), (0.125, 72000, 60), (0, 3600, 60), (-1.25, 7200, 60), (0, 600, 60)]
+    result = ocv.calibrate(cell.run(pieces, name="ocv.csv"))
+    assert "1.25 A" in result.refusals[0]
+    middle = (ocv.SOC > 0.1) & (ocv.SOC < 0.9)
+    assert np.abs(result.curves["battery.ocv"].value - cell.ocv(ocv.SOC))[middle].max() < 0.006
+
+
+def test_a_charge_before_the_discharge_is_a_branch_too():
+    cell = Plant(soc=0.0, hysteresis=0.005)
+    pieces = [(0, 600, 60), (-0.125, 72000, 60), (0, 3600, 60), (0.125, 72000, 60), (0, 3600, 60)]
+    result = ocv.calibrate(cell.run(pieces, name="ocv.csv"))
+    inside = (ocv.SOC > 0.05) & (ocv.SOC < 1)
+    assert np.abs(result.curves["battery.ocv"].value - cell.ocv(ocv.SOC))[inside].max() < 0.003
+    assert not result.refusals
+
+
+@pytest.mark.parametrize("before", [[], [(-0.125, 3600, 60)], [(-1.25, 360, 60), (0, 120, 60)]])
+def test_without_a_rest_before_the_discharge_full_is_not_its_first_voltage(before):
+    cell = Plant(soc=1.0 - sum(-current * seconds for current, seconds, _ in before) / 3600 / 2.5)
+    table = cell.run([*before, (0.125, 72000, 60), (0, 3600, 60), (-0.125, 72000, 60), (0, 600, 60)], name="ocv.csv")
+    if not before:
+        table = replace(table, columns={name: column[2:] for name, column in table.columns.items()})
+    result = ocv.calibrate(table)
+    curve = result.curves["battery.ocv"]
+    assert re.search(r"ocv.csv: no rest before the discharge .* moved by", result.refusals[-1])
+    assert abs(curve.value[-1] - cell.ocv(1.0)) < min(curve.sd[-1], 0.012)
+
+
+def test_a_pulse_test_that_begins_under_load_is_refused():
+    slow = ocv.calibrate(slow_test()[0])
+    table, _ = pulse_test(25.0, 5)
+    begin = int(np.argmax(table["current"] > 0)) + 2
+    loaded = replace(table, columns={name: column[begin:] for name, column in table.columns.items()})
+    with pytest.raises(InputError, match=r"begins under a current of 1 A.*at rest"):
+        pulse.calibrate([loaded], slow.curves["battery.ocv"], slow.parameters["cell_capacity"])
