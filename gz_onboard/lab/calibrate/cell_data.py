@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 from gz_onboard.arrays import Array
 from gz_onboard.constants import HOUR
 from gz_onboard.lab.calibrate.table import Measurements
+from gz_onboard.physics.battery_file import TEMPERATURE
 
 FEWEST = 50  # samples
+VOLTAGE = (0.2, 6.0)  # V: of one cell of any chemistry, under any load
+SHORTEST = 600.0  # s: no test of a cell is shorter
 LONGEST_GAP = 150.0  # s between samples while a current flows
 STEP = 0.1  # of the largest current: what counts as switching it
 
@@ -54,13 +57,14 @@ def cell_test(table: Measurements) -> CellTest:
     """The test in `table`: columns time, current, voltage, cell_temperature and, where it has one, charge.
 
     ``charge`` [A·h] is the tester's own counter, of either sign; with it a gap in the samples does no harm. Raises
-    InputError, with the line: missing columns, too few samples, a gap while a current flows, a current of the wrong
-    sign, a voltage that is clipped.
+    InputError, with the line: missing columns, too few samples, values that no cell has, a gap while a current flows, a
+    current of the wrong sign, a voltage that is clipped.
     """
     time, current, volts = table["time"], table["current"], table["voltage"]
     temperature = table["cell_temperature"]
     if len(time) < FEWEST:
         raise table.error(f"{len(time)} samples are too few for a test of a cell, at least {FEWEST} are needed")
+    _check_units(table)
     largest = float(np.max(np.abs(current)))
     if largest < 1e-3:
         raise table.error(f"no current flows: the largest is {largest:g} A")
@@ -90,6 +94,19 @@ def cell_test(table: Measurements) -> CellTest:
     _check_clipped(table, current, volts, on)
     starts = on & ~np.concatenate([[False], on[:-1]])
     return CellTest(table, time, dt, flowed, current, volts, temperature, drawn, np.cumsum(starts), ~on)
+
+
+def _check_units(table: Measurements) -> None:
+    """What no cell has is a wrong unit, a pack, or a sample that was lost."""
+    for name, unit, (low, high) in (("voltage", "V", VOLTAGE), ("cell_temperature", "degC", TEMPERATURE)):
+        outside = np.flatnonzero((table[name] < low) | (table[name] > high))
+        if len(outside):
+            row, more = int(outside[0]), f" (and at {len(outside) - 1} more samples)" if len(outside) > 1 else ""
+            raise table.error(
+                f"{name} is {table[name][row]:g} {unit}, not {low:g} to {high:g} {unit} as of one cell{more}", row
+            )
+    if (duration := float(np.ptp(table["time"]))) < SHORTEST:
+        raise table.error(f"is {duration:.3g} s long; a test of a cell takes {SHORTEST:g} s or more. Is time in s?")
 
 
 def _check_sign(table: Measurements, current: Array, volts: Array, dt: Array, drawn: Array, largest: float) -> None:

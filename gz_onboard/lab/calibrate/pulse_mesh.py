@@ -103,6 +103,9 @@ def mesh_quality(
             part.append(fit_branches(x, group[np.searchsorted(t.test.block, x.label)] % 2 == odd))
         covered &= np.array([f.covered for f in part])
         halves.append(meshes(part, one)[0])
+    if not covered.any():
+        result.refusals.append("meshes: the pulses are too few to compare half of them with the other half")
+        return
     single = list(np.exp([one.logs(f.resistance) for f in fitted]).transpose(2, 0, 1))
     names = ", ".join(t.test.name for t in tests)
     for name, unit, number in (("R0", "ohm", 0), ("R1", "ohm", 1), ("C1", "F", 2)):

@@ -8,16 +8,15 @@ from scipy.stats import chi2
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cell_fit import Branches, jackknife
 from gz_onboard.lab.calibrate.ocv import increasing
-from gz_onboard.lab.calibrate.pulse_test import FULL_WITHIN, Tested
+from gz_onboard.lab.calibrate.pulse_test import FULL_WITHIN, Tested, nearest_to_bench
 from gz_onboard.lab.calibrate.result import Curve, Result
-from gz_onboard.physics.battery import BENCH_TEMPERATURE
 
 SURE = 0.99  # how surely the rests must show that temperature moves them, before the vehicle file says so
 
 
 def rest_shift(fitted: list[Branches], tests: list[Tested], nodes: Array, ocv: Curve) -> tuple[Array, Array]:
     """(shift, sd) (len(nodes),) [V] from the OCV to where the cell rests after discharging, near 25 degC."""
-    nearest = _nearest(tests)
+    nearest = nearest_to_bench(tests)
     shift = np.interp(nodes, fitted[nearest].soc, fitted[nearest].shift)
     scatter = np.std([np.interp(nodes, f.soc, f.shift) for f in fitted], axis=0) if len(fitted) > 1 else np.abs(shift)
     shift[nodes == 1] = 0.0 if abs(tests[nearest].test.voltage[0] - ocv.value[-1]) < FULL_WITHIN else shift[-1]
@@ -33,7 +32,7 @@ def rests_over_soc(fitted: list[Branches], tests: list[Tested], names: str) -> C
     covered = np.array([f.covered for f in fitted])
     return Curve(
         axes,
-        shifts - shifts[_nearest(tests)],
+        shifts - shifts[nearest_to_bench(tests)],
         np.where(covered, sd, np.nan),
         "V",
         f"{names}: rest voltage against that near 25 degC",
@@ -45,7 +44,7 @@ def shift_of_rests(rests: Curve, tests: list[Tested], names: str, result: Result
 
     The mean over 15 to 95 % SOC; its sd holds how it varies there, since one number is to stand for all of it.
     """
-    reference = _nearest(tests)
+    reference = nearest_to_bench(tests)
     soc = rests.axes["soc"]
     middle = (soc > 0.15) & (soc < 0.95)
     if len(tests) < 2:
@@ -78,7 +77,3 @@ def shift_of_rests(rests: Curve, tests: list[Tested], names: str, result: Result
         f"{names}: mean over 15 to 95 % SOC of the rests against those near 25 degC",
     )
     return mean
-
-
-def _nearest(tests: list[Tested]) -> int:
-    return min(range(len(tests)), key=lambda k: abs(tests[k].temperature - BENCH_TEMPERATURE))

@@ -14,10 +14,15 @@ from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
 from gz_onboard.lab.calibrate.cell_fit import Pieces, filtered, fit_branches, pieces
 from gz_onboard.lab.calibrate.result import Fit, Found, Result
 from gz_onboard.lab.calibrate.table import Measurements
+from gz_onboard.physics.battery import BENCH_TEMPERATURE
 from gz_onboard.physics.tables import extended_over
 
 FEWEST_PULSES = 6
 FEWEST_LEVELS = 3
+MOST_DRAWN = 1.3  # of the capacity of the slow test: what no cell like that holds
+UNTOLD = 0.03  # relative sd of a capacity that the rests do not tell: they lie where the OCV is flat
+TAKEN = 0.1  # relative sd of the slow test's capacity where it is taken for another temperature
+APART = 0.03  # relative: how far the capacities of a pulse test and a slow test may differ unsaid
 REST = 1200.0  # s without current, after which a voltage is that of rest
 FULL_WITHIN = 0.03  # V: a first voltage so near to the full cell's is that of a full cell
 
@@ -62,8 +67,14 @@ def tested(table: Measurements, nodes: Array, volts: Array, capacity: Found, res
     error = misses(share)
     curvature = (np.sum((misses(share + 1e-3) - error) ** 2)) / 1e-6
     sd = float(np.sqrt(max(np.sum(error**2) / max(len(error) - 2, 1), 1e-6) / max(curvature, 1e-12)))
-    found = share * capacity.value
     temperature = float(np.round(np.median(test.temperature[rests]))) + 0.0  # no -0
+    if sd > UNTOLD:
+        result.refusals.append(
+            f"{test.name}: the rests at {temperature:g} degC lie where the open-circuit voltage is flat and do not "
+            f"tell the capacity (± {100 * sd:.0f} %): that of the slow test is taken, ± {100 * TAKEN:.0f} %"
+        )
+        share, sd = max(1.0, float(drawn.max()) / (start * capacity.value)), TAKEN
+    found = share * capacity.value
     what, rms = f"rest voltage at {temperature:g} degC, SOC above 0.12", float(np.sqrt(np.mean(error**2)))
     result.fits.append(Fit(what, "V", rms, float(np.abs(error).max()), None, len(error), False, test.name))
     found_sd = float(np.hypot(sd * capacity.value, 0.005 * found))
@@ -83,11 +94,21 @@ def _long_rests(test: CellTest, capacity: Found) -> NDArray[np.int_]:
         raise table.error(
             f"rests of {REST / 60:.0f} min at {len(levels)} states of charge; at least {FEWEST_LEVELS} are needed"
         )
+    if used > MOST_DRAWN * capacity.value:
+        raise table.error(
+            f"draws {used:.3f} of {capacity.value:.3f} A·h: more than the cell holds. Is it the cell of the slow test, "
+            "and the current in A?"
+        )
     if used < 0.5 * capacity.value:
         raise table.error(
             f"draws {used:.3f} of {capacity.value:.3f} A·h: pulses over at least half of the range of SOC are needed"
         )
     return rests
+
+
+def nearest_to_bench(tests: list[Tested]) -> int:
+    """Which of the tests is nearest to the temperature at which capacities are given."""
+    return min(range(len(tests)), key=lambda k: abs(tests[k].temperature - BENCH_TEMPERATURE))
 
 
 def moved_pieces(

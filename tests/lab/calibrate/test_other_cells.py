@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from gz_onboard.lab.calibrate.result import Curve, Found, Result
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.lab.calibrate.vehicle_file import write_vehicle
 from gz_onboard.vehicle import OWN, read_vehicle
-from tests.lab.calibrate.cells import Plant, pulse_test, slow_test
+from tests.lab.calibrate.cells import Plant, pulse_pieces, pulse_test, slow_test
 
 REFERENCE = OWN / "reference.toml"
 
@@ -193,3 +194,62 @@ def test_a_pulse_test_that_begins_under_load_is_refused():
     loaded = replace(table, columns={name: column[begin:] for name, column in table.columns.items()})
     with pytest.raises(InputError, match=r"begins under a current of 1 A.*at rest"):
         pulse.calibrate([loaded], slow.curves["battery.ocv"], slow.parameters["cell_capacity"])
+
+
+@cache
+def slow():
+    result = ocv.calibrate(slow_test()[0])
+    return result.curves["battery.ocv"], result.parameters["cell_capacity"]
+
+
+def test_pulses_on_a_flat_curve_take_the_capacity_of_the_slow_test(tmp_path):
+    flat = ocv.calibrate(flat_test())
+    table = Flat(hysteresis=0.02).run(pulse_pieces(levels=6), name="flat.csv")
+    found = pulse.calibrate([table], flat.curves["battery.ocv"], flat.parameters["cell_capacity"])
+    assert "do not tell the capacity" in " ".join(found.refusals)
+    assert found.curves["battery.capacity"].value[0] == pytest.approx(2.5, rel=0.02)
+    assert found.curves["battery.capacity"].sd[0] > 0.1
+    battery = written(tmp_path, flat, found).pack
+    assert abs(battery.ocv(0.5)[0] - 3.31) < 0.035
+    assert found.parameters["cell_voltage_error"].sd < 0.03
+
+
+def test_pulses_of_another_capacity_than_the_slow_test_are_told():
+    curve, capacity = slow()
+    found = pulse.calibrate([pulse_test(25.0, 6)[0]], curve, replace(capacity, value=2.7))
+    assert re.search(r"pulse_25C.csv: .* 2.5\d+ A·h at 25 degC, cell_capacity is 2.700", " ".join(found.notes))
+    assert "cell_capacity" not in " ".join(pulse.calibrate([pulse_test(25.0, 6)[0]], *slow()).notes)
+
+
+def test_meshes_of_few_pulses_are_not_compared():
+    pieces: list[tuple[float, float, float]] = [(0, 1500, 10)]
+    for seconds in (6550, 150, 150):  # to 9, 7 and 5 % of charge
+        pieces += [(1.25, seconds / 2, 5), (0, 60, 5), (1.25, seconds / 2, 5), (0, 1500, 10)]
+    found = pulse.calibrate([Plant().run(pieces, name="few.csv")], *slow())
+    assert "mesh" not in " ".join(f.what for f in found.fits)
+    assert "meshes" in " ".join(found.refusals)
+
+
+@pytest.mark.parametrize(
+    ("column", "factor", "more", "words"),
+    [
+        ("voltage", 1000, 0, r"cell.csv:1: voltage is 4\d+.* V, not 0.2 to 6 V as of one cell"),
+        ("voltage", 14, 0, "not 0.2 to 6 V as of one cell"),
+        ("cell_temperature", 1, 273.15, "cell_temperature is 298.* degC, not -60 to 100 degC"),
+        ("current", 1000, 0, "draws 2.* of 2.500 A·h: more than the cell holds"),
+        ("time", 1 / 3600, 0, "is 6.14 s long; .* Is time in s"),
+    ],
+)
+def test_a_wrong_unit_is_named(column, factor, more, words):
+    table, _ = pulse_test(25.0, 6)
+    table = replace(table, file=table.file.with_name("cell.csv"))
+    table.columns[column] = table.columns[column] * factor + more
+    with pytest.raises(InputError, match=words):
+        pulse.calibrate([table], *slow())
+
+
+def test_a_lost_sample_is_named_with_its_line():
+    table, _ = slow_test()
+    table["voltage"][500] = 0.0
+    with pytest.raises(InputError, match=r"ocv.csv:501: voltage is 0 V"):
+        ocv.calibrate(table)
