@@ -118,9 +118,7 @@ def _tests(tables: Sequence[Measurements], ocv: Curve, capacity: Found, result: 
     """The tests by temperature; InputError for none, or two at one temperature."""
     if not tables:
         raise InputError("no pulse test is given")
-    tests = sorted(
-        (tested(t, ocv.axes["soc"], ocv.value, capacity, result) for t in tables), key=lambda t: t.temperature
-    )
+    tests = sorted((tested(t, ocv, capacity, result) for t in tables), key=lambda t: t.temperature)
     for cold, warm in pairwise(tests):
         if warm.temperature - cold.temperature < 2:
             raise InputError(

@@ -12,7 +12,8 @@ from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cell_circuit import KELVIN
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
 from gz_onboard.lab.calibrate.cell_fit import Pieces, filtered, fit_branches, pieces
-from gz_onboard.lab.calibrate.result import Fit, Found, Result
+from gz_onboard.lab.calibrate.ocv import FLAT
+from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Result
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.physics.battery import BENCH_TEMPERATURE
 from gz_onboard.physics.tables import extended_over
@@ -39,9 +40,9 @@ class Tested:
     rests: NDArray[np.int_]  # rows at the ends of rests
 
 
-def tested(table: Measurements, nodes: Array, volts: Array, capacity: Found, result: Result) -> Tested:
+def tested(table: Measurements, ocv: Curve, capacity: Found, result: Result) -> Tested:
     """`table` with its capacity: the one with which its rest voltages lie best on the OCV above 10 % SOC."""
-    test = cell_test(table)
+    test, nodes, volts = cell_test(table), ocv.axes["soc"], ocv.value
     if not test.rest[0]:
         raise table.error(
             f"begins under a current of {test.current[0]:.3g} A: its first voltage must be one at rest", 0
@@ -50,6 +51,11 @@ def tested(table: Measurements, nodes: Array, volts: Array, capacity: Found, res
     start = 1.0
     if test.voltage[0] < volts[-1] - FULL_WITHIN:
         start = float(np.interp(test.voltage[0], volts, nodes))
+        if np.interp(start, nodes, ocv.sd / np.gradient(volts, nodes)) > FLAT:
+            raise table.error(
+                f"begins at {test.voltage[0]:.3f} V, not full and where the open-circuit voltage is flat: how much "
+                "charge it holds is not known; let it begin full"
+            )
         result.notes.append(f"{test.name}: begins at {test.voltage[0]:.3f} V, SOC {start:.3f}, not full")
     drawn, at_rest = test.drawn[rests], test.voltage[rests]
 

@@ -253,3 +253,10 @@ def test_a_lost_sample_is_named_with_its_line():
     table["voltage"][500] = 0.0
     with pytest.raises(InputError, match=r"ocv.csv:501: voltage is 0 V"):
         ocv.calibrate(table)
+
+
+def test_pulses_that_begin_on_a_flat_part_are_refused():
+    flat = ocv.calibrate(flat_test())
+    table = Flat(soc=0.8, hysteresis=0.02).run(pulse_pieces(levels=6)[:71], name="flat.csv")
+    with pytest.raises(InputError, match=r"flat.csv: begins at 3.3.. V, .* flat.* begin full"):
+        pulse.calibrate([table], flat.curves["battery.ocv"], flat.parameters["cell_capacity"])
