@@ -19,7 +19,8 @@ from scipy.optimize import nnls
 from scipy.signal import lfilter
 
 from gz_onboard.arrays import Array, bends
-from gz_onboard.lab.calibrate.cell_circuit import KELVIN, follow, follow_slope, hats
+from gz_onboard.constants import KELVIN
+from gz_onboard.lab.calibrate.cell_circuit import follow, follow_slope, hats
 from gz_onboard.lab.calibrate.cell_data import CellTest
 from gz_onboard.physics.relaxation import decay_over
 
@@ -277,16 +278,6 @@ class Reduction:
         return np.log([[pairs.r0, *pairs.resistance, *pairs.time] for pairs in found])
 
 
-@dataclass(frozen=True)
-class Direct:
-    """One pair at one temperature: R0, R1 [ohm], τ [s], each (n,), and the relative sd of these and of C1, (4, n)."""
-
-    r0: Array
-    r1: Array
-    time: Array
-    sd: Array
-
-
 def fit_direct(
     test: CellTest,
     level: Array,
@@ -294,8 +285,10 @@ def fit_direct(
     start: Branches,
     pairs: tuple[Array, Array, Array],
     activation: tuple[float, float] = (0.0, 0.0),
-) -> Direct:
+) -> tuple[Array, Array]:
     """The one pair whose voltage is nearest to that of `test`, from `pairs` (R0, R1, τ over the nodes of `start`).
+
+    Gives R0, R1 [ohm], τ [s], (3, n), and the relative sd of these and of C1, (4, n).
 
     Gauss and Newton: the voltage is linear in R0, R1 and the shift of the rest voltage, and its slope over ln τ is
     that of the filtered current. The rest as for `fit_branches`.
@@ -329,4 +322,4 @@ def fit_direct(
     of_logs[: 3 * n, : 3 * n] = np.diag(1 / np.concatenate([p[: 2 * n], np.ones(n)]))
     of_logs[3 * n :] = of_logs[2 * n : 3 * n] - of_logs[n : 2 * n]
     sd = np.sqrt(np.diag(of_logs @ covariance @ of_logs.T)).reshape(4, n)
-    return Direct(p[:n], p[n : 2 * n], np.exp(p[2 * n : 3 * n]), sd)
+    return np.array([p[:n], p[n : 2 * n], np.exp(p[2 * n : 3 * n])]), sd

@@ -106,8 +106,6 @@ def _fitted(
 
 
 def _coasting_current(run: Samples, c: Coast) -> float:
-    if "motor_current" not in run.columns:
-        return 0.0
     t, current = run.columns["motor_current"]
     inside = (t >= c.time[0]) & (t <= c.time[-1])
     return float(current[inside].mean()) if inside.any() else 0.0

@@ -158,8 +158,7 @@ def _covariance(run: Coast, drag_area: float, noise: CoastdownNoise) -> Array:
     push = air_density(run.temperature, run.altitude) * drag_area * run.middle / run.mass * noise.gust
     gusts = np.outer(push, push) * np.exp(-np.abs(at[:, None] - at[None, :]) / noise.lasting)
     ends = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
-    result: Array = gusts + (noise.speed / dt) ** 2 * ends + 1e-10 * np.eye(n)
-    return result
+    return np.asarray(gusts + (noise.speed / dt) ** 2 * ends + 1e-10 * np.eye(n))
 
 
 def _likely(here: _Linear, prior: Mapping[str, tuple[float, float]], start: CoastdownNoise) -> CoastdownNoise:
@@ -210,8 +209,7 @@ def covariance_with_nuisance(
     moved: list[tuple[str, Callable[[Coast], Array]]] = []
 
     def at(force: RoadLoad, run: Coast, density: float = 1.0) -> Array:
-        result: Array = force.slowing(run.middle, run, value["slope"], value[f"wind {run.name}"], density)
-        return result
+        return np.asarray(force.slowing(run.middle, run, value["slope"], value[f"wind {run.name}"], density))
 
     def shifted(force: RoadLoad, scale: float, run: Coast) -> Array:
         return at(force, run) - at(here, run) * scale
@@ -231,10 +229,8 @@ def covariance_with_nuisance(
     x, d = white[:, : len(solution.names)], white[:, -len(moved) :]
     shift = -solution.covariance / solution.variance @ x.T @ d  # by one sd of each
     correlation = np.eye(len(moved))
-    known = p.covariance(drag)
-    for i, a in enumerate(drag):
-        for j, b in enumerate(drag):
-            correlation[i, j] = known[i][j] / (p.sd(a) * p.sd(b))
+    sds = np.array([p.sd(name) for name in drag])
+    correlation[: len(drag), : len(drag)] = np.array(p.covariance(drag)) / np.outer(sds, sds)
     at_names = [solution.names.index(name) for name in names]
     covariance = solution.part(list(names)) + (shift @ correlation @ shift.T)[np.ix_(at_names, at_names)]
     row = solution.names.index("drag_area")

@@ -72,8 +72,7 @@ class Job:
 
         def residual(x: Array) -> Array:
             values = {**self.held, **dict(zip(names, x.tolist(), strict=True))}
-            error: Array = np.concatenate([self.error(values, run) for run in runs]) / sd
-            return error
+            return np.asarray(np.concatenate([self.error(values, run) for run in runs]) / sd)
 
         found = nonlinear(residual, start, bounds=bounds, prior=prior, known_sd=True, groups=self._pieces(runs))
         return found, {**self.held, **dict(zip(names, found.value.tolist(), strict=True))}

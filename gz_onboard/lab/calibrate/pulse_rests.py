@@ -39,20 +39,18 @@ def rests_over_soc(fitted: list[Branches], tests: list[Tested], names: str) -> C
     )
 
 
-def shift_of_rests(rests: Curve, tests: list[Tested], names: str, result: Result) -> Array | None:
-    """The shift (temperatures,) [V] of the open-circuit voltage, as ``battery.rest_shift``; None if it is not sure.
+def shift_of_rests(rests: Curve, tests: list[Tested], names: str, result: Result) -> None:
+    """The shift (temperatures,) [V] of the open-circuit voltage, as ``battery.rest_shift``, if it is sure.
 
     The mean over 15 to 95 % SOC; its sd holds how it varies there, since one number is to stand for all of it.
     """
     reference = nearest_to_bench(tests)
     soc = rests.axes["soc"]
     middle = (soc > 0.15) & (soc < 0.95)
-    if len(tests) < 2:
-        return None
     known = [row[middle & np.isfinite(sd)] for row, sd in zip(rests.value, rests.sd, strict=True)]
     within = [sd[middle & np.isfinite(sd)] for sd in rests.sd]
-    if not all(map(len, known)):
-        return None
+    if len(tests) < 2 or not all(map(len, known)):
+        return
     mean = np.array([row.mean() for row in known])
     sd = np.array([np.hypot(row.std(), s.mean()) for row, s in zip(known, within, strict=True)])
     others = np.arange(len(tests)) != reference
@@ -67,7 +65,7 @@ def shift_of_rests(rests: Curve, tests: list[Tested], names: str, result: Result
             f"rests do not move with temperature beyond how they scatter over the state of charge: {moves}; "
             "the open-circuit voltage is one for all temperatures"
         )
-        return None
+        return
     result.notes.append(f"the cell rests {moves} against {tests[reference].temperature:g} degC")
     result.curves["battery.rest_shift"] = Curve(
         {"temperature": rests.axes["temperature"]},
@@ -76,4 +74,3 @@ def shift_of_rests(rests: Curve, tests: list[Tested], names: str, result: Result
         "V",
         f"{names}: mean over 15 to 95 % SOC of the rests against those near 25 degC",
     )
-    return mean

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.calibrate.cell_circuit import KELVIN
+from gz_onboard.constants import KELVIN
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
 from gz_onboard.lab.calibrate.cell_fit import Pieces, filtered, fit_branches, pieces
 from gz_onboard.lab.calibrate.ocv import FLAT
@@ -65,8 +65,7 @@ def tested(table: Measurements, ocv: Curve, capacity: Found, result: Result) -> 
         error = at_rest - extended_over(nodes, volts, level)
         weight = np.where(level > 0.12, 1.0, 0.0)
         offset = float(np.sum(weight * error) / (np.sum(weight) + 1.0))  # prior: 5 mV, as one rest counts
-        result: Array = np.sqrt(weight) * (error - offset)
-        return result
+        return np.asarray(np.sqrt(weight) * (error - offset))
 
     best = minimize_scalar(lambda x: float(np.sum(misses(x) ** 2)), bounds=(0.6, 1.15), method="bounded")
     share = float(best.x)
