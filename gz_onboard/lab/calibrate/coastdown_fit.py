@@ -189,7 +189,7 @@ def _likely(here: _Linear, prior: Mapping[str, tuple[float, float]], start: Coas
     return CoastdownNoise(*np.exp(best.x).tolist())
 
 
-def covariance_with_nuisance(
+def covariance_with_inputs(
     road: RoadFit, about: RoadFit, runs: Sequence[Coast], vehicle: Vehicle, names: Sequence[str]
 ) -> tuple[Array, dict[str, float]]:
     """(covariance of `names` with what else is not known well; the share of each of these in the sd of drag area).
