@@ -7,15 +7,14 @@ sec. 2.8 and 2.10): the standard deviation given.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 
-from gz_onboard.arrays import Array, Mask
-from gz_onboard.constants import HOUR
-from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
+from gz_onboard.arrays import Array
+from gz_onboard.lab.calibrate.cell_data import cell_test
 from gz_onboard.lab.calibrate.fit import score
+from gz_onboard.lab.calibrate.ocv_sweep import REST, REST_AT_BEGIN, UNEXPLAINED, Sweep, find_sweep
 from gz_onboard.lab.calibrate.result import Curve, Found, Panel, PlotLine, Result
 from gz_onboard.lab.calibrate.table import Measurements
 
@@ -24,98 +23,13 @@ _SOC = (
     "0.9 0.95 0.98 0.99 1"
 )
 SOC = np.array(_SOC.split(), dtype=float)
-SLOWEST_HOURS = 8.0  # a discharge faster than that is not slow
 TESTER = 0.005  # relative: what a tester's current may be off
 UNSURE = 0.2  # relative: the resistance of steady current, out of that of its steps
 LEAST_SLOPE = 1e-3  # V over all of SOC: what a flat or falling part is given
 LEAST_STEP = 2e-5  # V from node to node: twice the last digit that a vehicle file holds
 VOLTMETER = 5e-4  # V: no tester's voltage is surer than that
-REST = 600.0  # s without current, after which a voltage is that of rest
-REST_AT_BEGIN = 60.0  # s: the same where the file begins with it, as what was before is not in it
-FULL_WITHIN = 0.01  # V: a charge that comes so near to the full cell's voltage is complete
-UNEXPLAINED = 0.03  # of the capacity: what coulombic efficiency and a tester leave between the branches at most
-MOST_APART = 0.1  # of the capacity: branches of charges that differ more are not of one cell between the same ends
-ALIKE = 1.5  # currents of both branches whose ratio is smaller move them by the same voltage
 NO_SURER = 0.02  # V: sd of a full cell's voltage that is not one at rest
-SWITCHED, LONGEST_SWITCH = 120.0, 1000.0  # s after switching the current: where its step is read; no gap may be longer
 FLAT = 0.1  # of SOC: where the sd of the voltage is worth more, the report says so
-
-
-@dataclass(frozen=True)
-class _Sweep:
-    """A slow discharge, and the charge that belongs to it; `down` and `up` are their samples, `up` may be empty.
-
-    own: whether the charge's state of charge is by its own charge, since that of the discharge does not agree.
-    resistance [ohm]: within minutes of switching the current.
-    """
-
-    test: CellTest
-    down: Mask
-    up: Mask
-    own: bool = False
-    resistance: float = 0.0
-
-    @cached_property
-    def first(self) -> int:
-        """The first row of the discharge."""
-        return int(np.flatnonzero(self.down)[0])
-
-    @cached_property
-    def before(self) -> int:
-        """The row before the discharge."""
-        return max(self.first - 1, 0)
-
-    @cached_property
-    def rested(self) -> bool:
-        """Whether the cell rested before the discharge."""
-        rest = self.test.rested(self.before)
-        return rest >= (REST_AT_BEGIN if rest == self.test.time[self.before] - self.test.time[0] else REST)
-
-    @property
-    def full(self) -> float:
-        """The voltage of the full cell [V], at rest or as near to that as can be had."""
-        volts = self.test.voltage
-        return float(volts[self.before]) if self.rested else float(volts[self.first]) + self.resistive
-
-    @cached_property
-    def last(self) -> int:
-        """The last row of the discharge."""
-        return int(np.flatnonzero(self.down)[-1])
-
-    @cached_property
-    def capacity(self) -> float:
-        """What is discharged [A·h]."""
-        return float(self.test.drawn[self.last] - self.test.drawn[self.before])
-
-    @cached_property
-    def charged(self) -> float:
-        """What is brought back [A·h]."""
-        rows = np.flatnonzero(self.up)
-        return float(self.test.drawn[max(rows[0] - 1, 0)] - self.test.drawn[rows[-1]]) if len(rows) else 0.0
-
-    @cached_property
-    def level(self) -> Array:
-        """The state of charge of each sample, 1 before the discharge."""
-        level: Array = 1 - (self.test.drawn - self.test.drawn[self.before]) / self.capacity
-        if self.own:
-            drawn = self.test.drawn[self.up]
-            level[self.up] = 1 - (drawn - drawn[-1]) / self.charged
-        return level
-
-    @cached_property
-    def hours(self) -> float:
-        """What the discharge takes."""
-        return float(np.sum(self.test.dt[self.down])) / HOUR
-
-    @cached_property
-    def current(self) -> float:
-        """The mean of the discharge [A]."""
-        return float(np.mean(self.test.current[self.down]))
-
-    @property
-    def resistive(self) -> float:
-        """How far resistance moves the discharge [V]."""
-        return self.resistance * self.current
 
 
 def calibrate(table: Measurements) -> Result:
@@ -128,15 +42,7 @@ def calibrate(table: Measurements) -> Result:
     """
     test = cell_test(table)
     result = Result("ocv")
-    sweep = _Sweep(test, *_branches(test))
-    if not np.any(sweep.down):
-        raise table.error("there is no discharge: its current must be positive")
-    if sweep.hours < SLOWEST_HOURS:
-        raise table.error(
-            f"the discharge takes {sweep.hours:.1f} h: at such a current the voltage is not the open-circuit voltage; "
-            f"at least {SLOWEST_HOURS:.0f} h (C/{SLOWEST_HOURS:.0f}) without a pause are needed"
-        )
-    sweep = _paired(replace(sweep, resistance=_resistance(sweep)), result)
+    sweep = find_sweep(test, result)
     sweep, half = _half_gap(sweep, result)
     value, sd = _between(sweep, half, result)
     value, sd = _ends(sweep, value, sd, result)
@@ -148,9 +54,10 @@ def calibrate(table: Measurements) -> Result:
         f"{table.file.name}: discharge at {sweep.current:.3f} A in {sweep.hours:.1f} h at "
         f"{np.mean(test.temperature[sweep.down]):.1f} degC, {np.count_nonzero(sweep.down)} points"
     )
+    how = "mean of discharge and charge" if np.any(sweep.up) else "discharge moved by its resistance"
     ends = f"from {test.voltage[sweep.before]:.3f} V to {test.voltage[sweep.last]:.3f} V"
     result.parameters["cell_capacity"] = Found(sweep.capacity, sd_tester, "A·h", f"{source}, {ends}")
-    result.curves["battery.ocv"] = Curve({"soc": SOC}, value, sd, "V", f"{source}; mean of discharge and charge")
+    result.curves["battery.ocv"] = Curve({"soc": SOC}, value, sd, "V", f"{source}; {how}")
     _flatness(value, sd, result)
     middle = sweep.down & (sweep.level > SOC[0]) & (sweep.level < 1)
     back = np.interp(sweep.level[middle], SOC, value - np.where(np.isfinite(half), half, 0.0))
@@ -160,40 +67,7 @@ def calibrate(table: Measurements) -> Result:
     return result
 
 
-def _paired(sweep: _Sweep, result: Result) -> _Sweep:
-    """`sweep` without a charge that is no counterpart of its discharge, or with that by its own charge."""
-    test, up = sweep.test, sweep.up
-    if not np.any(up):
-        return sweep
-    share, current = sweep.charged / sweep.capacity, -float(np.mean(test.current[up]))
-    reached = float(test.voltage[up].max())
-    counts = f"the charge brings back {sweep.charged:.3f} of {sweep.capacity:.3f} A·h"
-    if not sweep.current / ALIKE < current < sweep.current * ALIKE:
-        why = f"the charge at {current:.3g} A is no counterpart of the discharge at {sweep.current:.3g} A"
-    elif abs(share - 1) <= UNEXPLAINED or (share < 1 and reached <= sweep.full - FULL_WITHIN):
-        return sweep
-    elif abs(share - 1) <= MOST_APART:
-        result.refusals.append(
-            f"{test.name}: {counts}: they differ by {100 * abs(share - 1):.1f} %, of which coulombic efficiency and "
-            f"tester explain {100 * UNEXPLAINED:.0f} % at most. The capacity is what was discharged, its sd holds the "
-            "difference; each branch's state of charge is by its own charge"
-        )
-        return replace(sweep, own=True)
-    elif share > 1:
-        raise test.table.error(
-            f"{counts}, over {100 * MOST_APART:.0f} % more: the discharge did not begin full or end empty, or a "
-            "current is wrong"
-        )
-    else:
-        why = (
-            f"the charge reaches {reached:.3f} V, as full as the discharge began ({sweep.full:.3f} V), after "
-            f"{sweep.charged:.3f} of {sweep.capacity:.3f} A·h: the branches do not close, their mean would be wrong"
-        )
-    result.refusals.append(f"{test.name}: {why}. The discharge alone is used, moved by its resistance")
-    return replace(sweep, up=np.zeros(len(test), dtype=bool))
-
-
-def _half_gap(sweep: _Sweep, result: Result) -> tuple[_Sweep, Array]:
+def _half_gap(sweep: Sweep, result: Result) -> tuple[Sweep, Array]:
     """(`sweep`, its resistance none if it is more than the gap holds; half the gap [V] at the nodes, or nan)."""
     test = sweep.test
     if not np.any(sweep.up):
@@ -227,7 +101,7 @@ def _flatness(value: Array, sd: Array, result: Result) -> None:
         )
 
 
-def _between(sweep: _Sweep, half: Array, result: Result) -> tuple[Array, Array]:
+def _between(sweep: Sweep, half: Array, result: Result) -> tuple[Array, Array]:
     """(voltage, its sd) [V] at the nodes: the discharge moved up by half the gap, where that is known or near."""
     discharge = _smooth(sweep.level[sweep.down], sweep.test.voltage[sweep.down], SOC)
     resistive, both = sweep.resistive, np.isfinite(half)
@@ -252,7 +126,7 @@ def _between(sweep: _Sweep, half: Array, result: Result) -> tuple[Array, Array]:
     return value, np.where(ends & ~np.isfinite(sd), np.nanmax(sd), sd)
 
 
-def _panels(sweep: _Sweep, value: Array, sd: Array, half: Array) -> list[Panel]:
+def _panels(sweep: Sweep, value: Array, sd: Array, half: Array) -> list[Panel]:
     branches = [
         PlotLine(name, sweep.level[part], sweep.test.voltage[part], ".")
         for name, part in (("discharge", sweep.down), ("charge", sweep.up))
@@ -263,36 +137,6 @@ def _panels(sweep: _Sweep, value: Array, sd: Array, half: Array) -> list[Panel]:
         Panel("Open-circuit voltage", "state of charge", "voltage [V]", (*branches, PlotLine("OCV", SOC, value))),
         Panel("Half the gap of the branches", "state of charge", "mV", gap),
     ]
-
-
-def _branches(test: CellTest) -> tuple[Mask, Mask]:
-    """The longest discharge (by charge) and the longest charge after it, or before it if there is none after."""
-    flows = np.sign(np.where(test.rest, 0.0, test.current))
-    run = np.cumsum(np.concatenate([[True], flows[1:] != flows[:-1]]))
-
-    def longest(sign: int, after: int = -1) -> Mask:
-        mine = (flows == sign) & (np.arange(len(test)) > after)
-        if not np.any(mine):
-            return np.zeros(len(test), dtype=bool)
-        amount = np.bincount(run[mine], np.abs(test.flowed * test.dt)[mine])
-        return np.asarray(mine & (run == int(np.argmax(amount))))
-
-    down = longest(1)
-    after = longest(-1, int(np.flatnonzero(down)[-1]) if np.any(down) else 0)
-    return down, after if np.any(after) else longest(-1)
-
-
-def _resistance(sweep: _Sweep) -> float:
-    """Resistance [ohm] within some two minutes of switching the current on, else at switching it off."""
-    test, first, last = sweep.test, sweep.first, sweep.last
-    if sweep.rested and test.dt[first] < LONGEST_SWITCH:
-        later = min(int(np.searchsorted(test.time, test.time[first] + SWITCHED)), last)
-        fall = (test.voltage[first - 1] - test.voltage[later]) / np.mean(test.current[first : later + 1])
-    elif last + 1 < len(test):
-        fall = (test.voltage[last + 1] - test.voltage[last]) / test.current[last]
-    else:
-        return 0.0
-    return max(float(fall), 0.0)
 
 
 def _smooth(level: Array, volts: Array, soc: Array) -> Array:
@@ -309,7 +153,7 @@ def _smooth(level: Array, volts: Array, soc: Array) -> Array:
     return result
 
 
-def _ends(sweep: _Sweep, value: Array, sd: Array, result: Result) -> tuple[Array, Array]:
+def _ends(sweep: Sweep, value: Array, sd: Array, result: Result) -> tuple[Array, Array]:
     """Full and empty are where the cell rested, if it did: there the branches differ by their transients most."""
     value, sd = value.copy(), sd.copy()
     test, last = sweep.test, sweep.last

@@ -260,3 +260,23 @@ def test_pulses_that_begin_on_a_flat_part_are_refused():
     table = Flat(soc=0.8, hysteresis=0.02).run(pulse_pieces(levels=6)[:71], name="flat.csv")
     with pytest.raises(InputError, match=r"flat.csv: begins at 3.3.. V, .* flat.* begin full"):
         pulse.calibrate([table], flat.curves["battery.ocv"], flat.parameters["cell_capacity"])
+
+
+def test_a_short_pause_does_not_end_a_discharge():
+    cell = Plant()
+    pieces = [(0, 600, 60), (0.125, 43200, 60), (0, 120, 60), (0.125, 28800, 60), (0, 3600, 60), (-0.125, 72000, 60)]
+    result = ocv.calibrate(cell.run([*pieces, (0, 600, 60)], name="ocv.csv"))
+    assert result.parameters["cell_capacity"].value == pytest.approx(2.5, rel=1e-3)
+    assert not result.refusals
+    assert "mean of discharge and charge" in result.curves["battery.ocv"].source
+
+
+def test_a_discharge_in_pieces_is_refused():
+    pieces = [(0, 600, 60), (0.125, 43200, 60), (0, 3600, 60), (0.125, 28800, 60), (0, 3600, 60)]
+    with pytest.raises(InputError, match=r"ocv.csv: 2.5\d* A·h are drawn in pieces.* 1.5\d* of it without a pause"):
+        ocv.calibrate(Plant().run(pieces, name="ocv.csv"))
+
+
+def test_the_source_says_when_there_is_no_charge():
+    source = ocv.calibrate(slow_test(charge=0)[0]).curves["battery.ocv"].source
+    assert source.endswith("; discharge moved by its resistance")
