@@ -17,6 +17,9 @@ VOLTAGE = (0.2, 6.0)  # V: of one cell of any chemistry, under any load
 SHORTEST = 600.0  # s: no test of a cell is shorter
 LONGEST_GAP = 150.0  # s between samples while a current flows
 STEP = 0.1  # of the largest current: what counts as switching it
+REST_CURRENT = 0.02  # of the largest current: up to it the cell rests
+EDGE_STEP = 0.2  # of the largest current: a step whose voltage shows the sign
+SAMPLED, GAP = 0.3, 5.0  # s: quicker samples show a switch by themselves; over longer ones the counter counts
 
 
 @dataclass(frozen=True)
@@ -72,13 +75,13 @@ def cell_test(table: Measurements) -> CellTest:
     before = np.concatenate([current[:1], current[:-1]])
     # A tester writes a sample when it switches: until then the current before it flowed.
     switched = np.abs(current - before) > STEP * largest
-    flowed = np.where(switched & (dt > 0.3), before, (before + current) / 2)
-    on = np.abs(current) > 0.02 * largest
+    flowed = np.where(switched & (dt > SAMPLED), before, (before + current) / 2)
+    on = np.abs(current) > REST_CURRENT * largest
     if "charge" in table:
         counter = table["charge"] - table["charge"][0]
         sign = 1.0 if float(np.dot(np.diff(counter), flowed[1:])) >= 0 else -1.0
         drawn = sign * counter
-        long = dt > 5.0
+        long = dt > GAP
         flowed = np.where(long, np.diff(drawn, prepend=0.0) * HOUR / np.where(dt > 0, dt, 1.0), flowed)
     else:
         gap = (dt > LONGEST_GAP) & (on | np.concatenate([on[:1], on[:-1]]))
@@ -115,7 +118,7 @@ def _check_sign(table: Measurements, current: Array, volts: Array, dt: Array, dr
     drawn: the charge [Ah] at each sample, positive when discharging.
     """
     step, change = np.diff(current), np.diff(volts)
-    steps = (np.abs(step) > 0.2 * largest) & (dt[1:] < LONGEST_GAP)
+    steps = (np.abs(step) > EDGE_STEP * largest) & (dt[1:] < LONGEST_GAP)
     jumps = change[steps] * np.sign(step[steps])
     noise = 1.4826 * float(np.median(np.abs(change - np.median(change))))  # as an sd (Hampel 1974)
     if jumps.size and abs(float(np.median(jumps))) > 4 * noise / np.sqrt(jumps.size):

@@ -222,9 +222,9 @@ def covariance_with_inputs(
     heavy = RoadLoad(vehicle, base | {"_mass": mass_sd})
     moved.append(("mass", lambda run: at(heavy, run) - at(here, run)))
     moved.append(("air density", lambda run: at(here, run, 1 + _DENSITY_SD) - at(here, run)))
-    linear_ = _linearised(runs, vehicle, value, solution.names, road.noise.gust)
+    local = _linearised(runs, vehicle, value, solution.names, road.noise.gust)
     moves = [np.column_stack([move(run) for _, move in moved]) for run in runs]
-    wide = replace(linear_, blocks=[np.hstack(pair) for pair in zip(linear_.blocks, moves, strict=True)])
+    wide = replace(local, blocks=[np.hstack(pair) for pair in zip(local.blocks, moves, strict=True)])
     white = np.vstack([white for _, white in wide.whitened(road.noise)])
     x, d = white[:, : len(solution.names)], white[:, -len(moved) :]
     shift = -solution.covariance / solution.variance @ x.T @ d  # by one sd of each

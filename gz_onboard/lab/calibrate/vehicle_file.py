@@ -185,14 +185,14 @@ def _correlations(
             groups[name] = ([group["parameters"][i] for i in kept], matrix, group.get("source", ""))
     last = {name: i for i, result in enumerate(results) for name in result.parameters}
     for i, result in enumerate(results):
-        for number_, (names, covariance) in enumerate(result.covariance):
+        for place, (names, covariance) in enumerate(result.covariance):
             for name in names:
                 if name not in last:
                     raise InputError(f"{base}: {result.procedure}: a covariance of {name}, which was not found")
             kept = [k for k, name in enumerate(names) if last[name] <= i]  # a later procedure knows better
             if len(kept) < 2:
                 continue
-            key = result.procedure if number_ == 0 else f"{result.procedure}_{number_ + 1}"
+            key = result.procedure if place == 0 else f"{result.procedure}_{place + 1}"
             matrix = correlation(np.asarray(covariance)[np.ix_(kept, kept)])
             groups[key] = ([names[k] for k in kept], matrix, f"of {result.procedure}")
     return {name: _group(name, *group) for name, group in groups.items()}
