@@ -116,9 +116,10 @@ def _between(sweep: Sweep, half: Array, result: Result) -> tuple[Array, Array]:
         charge = (
             f"it brings back {sweep.charged:.3f} of {sweep.capacity:.3f} A·h" if np.any(sweep.up) else "there is none"
         )
+        where = " to ".join(dict.fromkeys(f"{s:g}" for s in SOC[missing][[0, -1]]))
         by = "the half gap at the nearest SOC that has both" if np.any(both) else "resistance times current"
         result.refusals.append(
-            f"{sweep.test.name}: no charge branch at SOC {SOC[missing].min():g} to {SOC[missing].max():g} ({charge}); "
+            f"{sweep.test.name}: no charge branch at SOC {where} ({charge}); "
             f"there the discharge is moved by {by}, {1e3 * float(np.mean(near[missing])):.1f} mV"
         )
     ends = (SOC == 0) | (SOC == 1)

@@ -280,3 +280,7 @@ def test_a_discharge_in_pieces_is_refused():
 def test_the_source_says_when_there_is_no_charge():
     source = ocv.calibrate(slow_test(charge=0)[0]).curves["battery.ocv"].source
     assert source.endswith("; discharge moved by its resistance")
+
+
+def test_one_node_without_a_charge_is_no_range():
+    assert "no charge branch at SOC 0.99 (it brings" in ocv.calibrate(slow_test(charge=0.985)[0]).refusals[0]
