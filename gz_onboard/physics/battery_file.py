@@ -37,7 +37,8 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         capacity = table.table("capacity")
         capacity.only(["temperature", "value", "unit", "sd_relative", "source", "status"])
         capacity.text("unit", choices=["A·h"])
-        temperatures, capacities = _axis(capacity, "temperature", *TEMPERATURE), capacity.numbers("value", 0.01, 1000)
+        temperatures = _axis(capacity, "temperature", *TEMPERATURE, least=1)
+        capacities = capacity.numbers("value", 0.01, 1000)
         if len(temperatures) != len(capacities):
             raise capacity.error(f"must be {len(temperatures)} positive numbers, one for each temperature", "value")
         rated = linear(temperatures, capacities, BENCH_TEMPERATURE)

@@ -57,9 +57,9 @@ def auxiliary_power(rides: Sequence[Samples]) -> Result:
         by = f"each of {len(mean)} rides by the others"
         result.fits.append(score("auxiliary power, mean of a ride", "W", mean, others, held_out=True, source=by))
     x = np.arange(len(mean), dtype=float)
-    points_ = PlotLine("without brake light", x, without, "."), PlotLine("with brake light", x, lit, ".")
+    marks = PlotLine("without brake light", x, without, "."), PlotLine("with brake light", x, lit, ".")
     mean_line = PlotLine("mean", x, np.full(len(x), value))
-    result.panels.append(Panel("Auxiliary power", "ride", "power [W]", (*points_, mean_line)))
+    result.panels.append(Panel("Auxiliary power", "ride", "power [W]", (*marks, mean_line)))
     return result
 
 

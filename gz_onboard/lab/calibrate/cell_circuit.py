@@ -18,8 +18,6 @@ from gz_onboard.physics.battery import terminal_voltage
 from gz_onboard.physics.relaxation import relaxation_over, relaxed
 from gz_onboard.physics.tables import bilinear_over, extended_over
 
-KELVIN = 273.15
-
 
 @dataclass(frozen=True)
 class Circuit:

@@ -10,10 +10,16 @@ from numpy.typing import NDArray
 from gz_onboard.arrays import Array
 from gz_onboard.constants import HOUR
 from gz_onboard.lab.calibrate.table import Measurements
+from gz_onboard.physics.battery_file import TEMPERATURE
 
 FEWEST = 50  # samples
+VOLTAGE = (0.2, 6.0)  # V: of one cell of any chemistry, under any load
+SHORTEST = 600.0  # s: no test of a cell is shorter
 LONGEST_GAP = 150.0  # s between samples while a current flows
 STEP = 0.1  # of the largest current: what counts as switching it
+REST_CURRENT = 0.02  # of the largest current: up to it the cell rests
+EDGE_STEP = 0.2  # of the largest current: a step whose voltage shows the sign
+SAMPLED, GAP = 0.3, 5.0  # s: quicker samples show a switch by themselves; over longer ones the counter counts
 
 
 @dataclass(frozen=True)
@@ -44,18 +50,24 @@ class CellTest:
         """The file's name."""
         return self.table.file.name
 
+    def rested(self, row: int) -> float:
+        """How long [s] no current has flowed at `row`; below zero while one flows."""
+        moving = np.flatnonzero(~self.rest[: row + 1])
+        return float(self.time[row] - self.time[min(moving[-1] + 1, len(self) - 1) if len(moving) else 0])
+
 
 def cell_test(table: Measurements) -> CellTest:
     """The test in `table`: columns time, current, voltage, cell_temperature and, where it has one, charge.
 
     ``charge`` [A·h] is the tester's own counter, of either sign; with it a gap in the samples does no harm. Raises
-    InputError, with the line: missing columns, too few samples, a gap while a current flows, a current of the wrong
-    sign, a voltage that is clipped.
+    InputError, with the line: missing columns, too few samples, values that no cell has, a gap while a current flows, a
+    current of the wrong sign, a voltage that is clipped.
     """
     time, current, volts = table["time"], table["current"], table["voltage"]
     temperature = table["cell_temperature"]
     if len(time) < FEWEST:
         raise table.error(f"{len(time)} samples are too few for a test of a cell, at least {FEWEST} are needed")
+    _check_units(table)
     largest = float(np.max(np.abs(current)))
     if largest < 1e-3:
         raise table.error(f"no current flows: the largest is {largest:g} A")
@@ -63,13 +75,13 @@ def cell_test(table: Measurements) -> CellTest:
     before = np.concatenate([current[:1], current[:-1]])
     # A tester writes a sample when it switches: until then the current before it flowed.
     switched = np.abs(current - before) > STEP * largest
-    flowed = np.where(switched & (dt > 0.3), before, (before + current) / 2)
-    on = np.abs(current) > 0.02 * largest
+    flowed = np.where(switched & (dt > SAMPLED), before, (before + current) / 2)
+    on = np.abs(current) > REST_CURRENT * largest
     if "charge" in table:
         counter = table["charge"] - table["charge"][0]
         sign = 1.0 if float(np.dot(np.diff(counter), flowed[1:])) >= 0 else -1.0
         drawn = sign * counter
-        long = dt > 5.0
+        long = dt > GAP
         flowed = np.where(long, np.diff(drawn, prepend=0.0) * HOUR / np.where(dt > 0, dt, 1.0), flowed)
     else:
         gap = (dt > LONGEST_GAP) & (on | np.concatenate([on[:1], on[:-1]]))
@@ -87,13 +99,26 @@ def cell_test(table: Measurements) -> CellTest:
     return CellTest(table, time, dt, flowed, current, volts, temperature, drawn, np.cumsum(starts), ~on)
 
 
+def _check_units(table: Measurements) -> None:
+    """What no cell has is a wrong unit, a pack, or a sample that was lost."""
+    for name, unit, (low, high) in (("voltage", "V", VOLTAGE), ("cell_temperature", "degC", TEMPERATURE)):
+        outside = np.flatnonzero((table[name] < low) | (table[name] > high))
+        if len(outside):
+            row, more = int(outside[0]), f" (and at {len(outside) - 1} more samples)" if len(outside) > 1 else ""
+            raise table.error(
+                f"{name} is {table[name][row]:g} {unit}, not {low:g} to {high:g} {unit} as of one cell{more}", row
+            )
+    if (duration := float(np.ptp(table["time"]))) < SHORTEST:
+        raise table.error(f"is {duration:.3g} s long; a test of a cell takes {SHORTEST:g} s or more. Is time in s?")
+
+
 def _check_sign(table: Measurements, current: Array, volts: Array, dt: Array, drawn: Array, largest: float) -> None:
     """Discharging must lower the voltage: at once at the steps of the current, or by and by if those are lost in noise.
 
     drawn: the charge [Ah] at each sample, positive when discharging.
     """
     step, change = np.diff(current), np.diff(volts)
-    steps = (np.abs(step) > 0.2 * largest) & (dt[1:] < LONGEST_GAP)
+    steps = (np.abs(step) > EDGE_STEP * largest) & (dt[1:] < LONGEST_GAP)
     jumps = change[steps] * np.sign(step[steps])
     noise = 1.4826 * float(np.median(np.abs(change - np.median(change))))  # as an sd (Hampel 1974)
     if jumps.size and abs(float(np.median(jumps))) > 4 * noise / np.sqrt(jumps.size):

@@ -19,7 +19,8 @@ from scipy.optimize import nnls
 from scipy.signal import lfilter
 
 from gz_onboard.arrays import Array, bends
-from gz_onboard.lab.calibrate.cell_circuit import KELVIN, follow, follow_slope, hats
+from gz_onboard.constants import KELVIN
+from gz_onboard.lab.calibrate.cell_circuit import follow, follow_slope, hats
 from gz_onboard.lab.calibrate.cell_data import CellTest
 from gz_onboard.physics.relaxation import decay_over
 
@@ -30,7 +31,7 @@ VOLTAGE_SD = 0.004  # V: what the model leaves, independent every CORRELATED sam
 SOC_SD = 0.003  # how far the state of charge may be off, which matters where the OCV is steep
 CORRELATED = 20
 BEND_SD = 0.3  # relative: how far a table may bend from node to node, per 0.05 of SOC
-LEAST = 1e-6  # ohm
+LEAST = 2e-5  # ohm: of a pair that the data do not show; with the longest of TIMES its C1 is what a file can hold
 LEFT_OUT = (0.1, 1.0)  # of a piece's weight, to see how much hangs on it: see `jackknife`
 TIME_BEND = 0.5  # of ln τ, as BEND_SD
 TURNS = 8  # of Gauss and Newton
@@ -277,16 +278,6 @@ class Reduction:
         return np.log([[pairs.r0, *pairs.resistance, *pairs.time] for pairs in found])
 
 
-@dataclass(frozen=True)
-class Direct:
-    """One pair at one temperature: R0, R1 [ohm], τ [s], each (n,), and the relative sd of these and of C1, (4, n)."""
-
-    r0: Array
-    r1: Array
-    time: Array
-    sd: Array
-
-
 def fit_direct(
     test: CellTest,
     level: Array,
@@ -294,8 +285,10 @@ def fit_direct(
     start: Branches,
     pairs: tuple[Array, Array, Array],
     activation: tuple[float, float] = (0.0, 0.0),
-) -> Direct:
+) -> tuple[Array, Array]:
     """The one pair whose voltage is nearest to that of `test`, from `pairs` (R0, R1, τ over the nodes of `start`).
+
+    Gives R0, R1 [ohm], τ [s], (3, n), and the relative sd of these and of C1, (4, n).
 
     Gauss and Newton: the voltage is linear in R0, R1 and the shift of the rest voltage, and its slope over ln τ is
     that of the filtered current. The rest as for `fit_branches`.
@@ -322,10 +315,11 @@ def fit_direct(
         step[2 * n : 3 * n] = np.clip(step[2 * n : 3 * n], -0.5, 0.5)
         p = p + step
         p[: 2 * n] = np.maximum(p[: 2 * n], LEAST)
+        p[2 * n : 3 * n] = np.clip(p[2 * n : 3 * n], np.log(TIMES[0]), np.log(TIMES[-1]))
     bread = cho_solve(cho_factor(normal), np.eye(len(normal)))
     covariance = left_out(a, b, test.block, normal) + bread @ prior @ bread
     of_logs = np.zeros((4 * n, 4 * n))  # ln R0, ln R1, ln τ, and ln τ less ln R1, from R0, R1, ln τ
     of_logs[: 3 * n, : 3 * n] = np.diag(1 / np.concatenate([p[: 2 * n], np.ones(n)]))
     of_logs[3 * n :] = of_logs[2 * n : 3 * n] - of_logs[n : 2 * n]
     sd = np.sqrt(np.diag(of_logs @ covariance @ of_logs.T)).reshape(4, n)
-    return Direct(p[:n], p[n : 2 * n], np.exp(p[2 * n : 3 * n]), sd)
+    return np.array([p[:n], p[n : 2 * n], np.exp(p[2 * n : 3 * n])]), sd

@@ -16,7 +16,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.coastdown_fit import RoadFit, covariance_with_nuisance, fit_road
+from gz_onboard.lab.calibrate.coastdown_fit import RoadFit, covariance_with_inputs, fit_road
 from gz_onboard.lab.calibrate.coastdown_run import FASTEST, SLOWEST, SPAN, Coast, coast, directions
 from gz_onboard.lab.calibrate.fit import correlation, score
 from gz_onboard.lab.calibrate.result import Fit, Found, Panel, PlotLine, Result
@@ -85,12 +85,12 @@ def _fitted(
     Rolling resistance is held independent of speed, with a refusal, where that cannot be separated from drag.
     """
     free = fit_road(coasts, vehicle, {}, wind_sd, slope_sd)
-    covariance, shares = covariance_with_nuisance(free, free, coasts, vehicle, NAMES)
+    covariance, shares = covariance_with_inputs(free, free, coasts, vehicle, NAMES)
     if free.value(NAMES[1]) >= 2 * sqrt(covariance[1, 1]) and free.value(NAMES[2]) > 0:
         return free, covariance, shares
     best = fit_road(coasts, vehicle, {NAMES[1]: 0.0}, wind_sd, slope_sd, free.noise)
     wide = fit_road(coasts, vehicle, {}, wind_sd, slope_sd, free.noise, best)
-    covariance, shares = covariance_with_nuisance(wide, best, coasts, vehicle, NAMES)
+    covariance, shares = covariance_with_inputs(wide, best, coasts, vehicle, NAMES)
     speed_term, speed_sd = wide.value(NAMES[1]), sqrt(covariance[1, 1])
     tie = covariance[:, 1] / covariance[1, 1]
     # About the value that is held, not about the most likely one: its distance counts as an error too.
@@ -106,8 +106,6 @@ def _fitted(
 
 
 def _coasting_current(run: Samples, c: Coast) -> float:
-    if "motor_current" not in run.columns:
-        return 0.0
     t, current = run.columns["motor_current"]
     inside = (t >= c.time[0]) & (t <= c.time[-1])
     return float(current[inside].mean()) if inside.any() else 0.0

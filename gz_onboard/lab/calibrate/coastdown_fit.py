@@ -158,8 +158,7 @@ def _covariance(run: Coast, drag_area: float, noise: CoastdownNoise) -> Array:
     push = air_density(run.temperature, run.altitude) * drag_area * run.middle / run.mass * noise.gust
     gusts = np.outer(push, push) * np.exp(-np.abs(at[:, None] - at[None, :]) / noise.lasting)
     ends = 2 * np.eye(n) - np.eye(n, k=1) - np.eye(n, k=-1)
-    result: Array = gusts + (noise.speed / dt) ** 2 * ends + 1e-10 * np.eye(n)
-    return result
+    return np.asarray(gusts + (noise.speed / dt) ** 2 * ends + 1e-10 * np.eye(n))
 
 
 def _likely(here: _Linear, prior: Mapping[str, tuple[float, float]], start: CoastdownNoise) -> CoastdownNoise:
@@ -190,7 +189,7 @@ def _likely(here: _Linear, prior: Mapping[str, tuple[float, float]], start: Coas
     return CoastdownNoise(*np.exp(best.x).tolist())
 
 
-def covariance_with_nuisance(
+def covariance_with_inputs(
     road: RoadFit, about: RoadFit, runs: Sequence[Coast], vehicle: Vehicle, names: Sequence[str]
 ) -> tuple[Array, dict[str, float]]:
     """(covariance of `names` with what else is not known well; the share of each of these in the sd of drag area).
@@ -210,8 +209,7 @@ def covariance_with_nuisance(
     moved: list[tuple[str, Callable[[Coast], Array]]] = []
 
     def at(force: RoadLoad, run: Coast, density: float = 1.0) -> Array:
-        result: Array = force.slowing(run.middle, run, value["slope"], value[f"wind {run.name}"], density)
-        return result
+        return np.asarray(force.slowing(run.middle, run, value["slope"], value[f"wind {run.name}"], density))
 
     def shifted(force: RoadLoad, scale: float, run: Coast) -> Array:
         return at(force, run) - at(here, run) * scale
@@ -224,17 +222,15 @@ def covariance_with_nuisance(
     heavy = RoadLoad(vehicle, base | {"_mass": mass_sd})
     moved.append(("mass", lambda run: at(heavy, run) - at(here, run)))
     moved.append(("air density", lambda run: at(here, run, 1 + _DENSITY_SD) - at(here, run)))
-    linear_ = _linearised(runs, vehicle, value, solution.names, road.noise.gust)
+    local = _linearised(runs, vehicle, value, solution.names, road.noise.gust)
     moves = [np.column_stack([move(run) for _, move in moved]) for run in runs]
-    wide = replace(linear_, blocks=[np.hstack(pair) for pair in zip(linear_.blocks, moves, strict=True)])
+    wide = replace(local, blocks=[np.hstack(pair) for pair in zip(local.blocks, moves, strict=True)])
     white = np.vstack([white for _, white in wide.whitened(road.noise)])
     x, d = white[:, : len(solution.names)], white[:, -len(moved) :]
     shift = -solution.covariance / solution.variance @ x.T @ d  # by one sd of each
     correlation = np.eye(len(moved))
-    known = p.covariance(drag)
-    for i, a in enumerate(drag):
-        for j, b in enumerate(drag):
-            correlation[i, j] = known[i][j] / (p.sd(a) * p.sd(b))
+    sds = np.array([p.sd(name) for name in drag])
+    correlation[: len(drag), : len(drag)] = np.array(p.covariance(drag)) / np.outer(sds, sds)
     at_names = [solution.names.index(name) for name in names]
     covariance = solution.part(list(names)) + (shift @ correlation @ shift.T)[np.ix_(at_names, at_names)]
     row = solution.names.index("drag_area")

@@ -54,8 +54,7 @@ class Coast:
     @property
     def slowing(self) -> Array:
         """Deceleration over the spans [m/s²]."""
-        result: Array = -np.diff(self.speed) / np.diff(self.time)
-        return result
+        return np.asarray(-np.diff(self.speed) / np.diff(self.time))
 
 
 def samples(table: Measurements, facts: Mapping[str, object] | None = None) -> Samples:

@@ -28,15 +28,14 @@ from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 def calibrate(
     steps: Sequence[Step], base: Path, begin: Callable[[str], None] = lambda _: None
-) -> tuple[list[Result], dict[str, float]]:
-    """(what the `steps` found, seconds that each took), each with what those before it found put into `base`.
+) -> Iterator[tuple[Result, float]]:
+    """(what it found, seconds that it took) of each of the `steps`, with what those before it found put into `base`.
 
     begin: is called with the name of each part of the work that begins. Raises InputError for data that cannot be
     used, naming the procedure.
     """
     read: dict[Path, Samples] = {}
     results: list[Result] = []
-    seconds: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as folder:
         for step in steps:
             start = time.perf_counter()
@@ -57,8 +56,7 @@ def calibrate(
                 results.append(procedure.run(given))
             except InputError as error:
                 raise InputError(f"{step.procedure}: {error}") from error
-            seconds[step.procedure] = time.perf_counter() - start
-    return results, seconds
+            yield results[-1], time.perf_counter() - start
 
 
 def is_table(file: Path, kind: str) -> bool:
@@ -86,8 +84,10 @@ def _known_by_now(base: Path, results: Sequence[Result], file: Path) -> Vehicle:
     """The vehicle with what was found so far; its complaints name the base file."""
     if not results:
         return read_vehicle(base)
-    write_vehicle(base, for_file(results, read_vehicle(base)), file)
-    return replace(read_vehicle(file), file=base)
+    try:
+        return replace(write_vehicle(base, for_file(results, read_vehicle(base)), file), file=base)
+    except InputError as error:
+        raise InputError(str(error).replace(str(file), str(base))) from error
 
 
 # --- command line -------------------------------------------------------------------------------------------------
@@ -145,26 +145,44 @@ def run(arguments: argparse.Namespace) -> int:
     read = [file for step in steps for files in step.files.values() for file in files]
     named = [base, *arguments.data, *(folder / manifest.NAME for folder in arguments.data)]
     not_an_input((arguments.output, arguments.report, arguments.json), [*read, *named])
-    total = sum(len(files) for step in steps for files in step.files.values()) + len(steps)
-    with progress_bar(lambda: total, "steps", quiet=arguments.quiet) as display:
-        results, seconds = calibrate(steps, base, lambda text: display.step(text, 1))
+    results, took, trouble = _found(steps, base, arguments.quiet)
     text = arguments.json != "-"
     if text:
-        for result in results:
-            print(f"{report.text(result)}\n  ({seconds[result.procedure]:.1f} s)")
+        for result, seconds in zip(results, took, strict=True):
+            print(f"{report.text(result)}\n  ({seconds:.1f} s)")
     with writing(base):
-        if arguments.output:
-            write_vehicle(base, for_file(results, read_vehicle(base)), arguments.output)
-            read_vehicle(arguments.output)
+        if arguments.output and not trouble:
+            try:
+                write_vehicle(base, for_file(results, read_vehicle(base)), arguments.output)
+            except InputError as error:
+                trouble = error
         if arguments.report:
-            report.write_report(arguments.report, f"Calibration of {read_vehicle(base).name}", results)
-    out = str(arguments.output) if arguments.output else None
+            report.write_report(arguments.report, f"Calibration of {read_vehicle(base).name}", results, trouble)
+    out = str(arguments.output) if arguments.output and not trouble else None
     write_json(arguments.json, report.VERSION, report.document(results, str(base), out))
     if text:
-        for file in (arguments.output, arguments.report):
+        for file in (out, arguments.report):
             if file:
                 print(f"{file} written")
+    if trouble:
+        raise trouble
     return OK
+
+
+def _found(steps: Sequence[Step], base: Path, quiet: bool) -> tuple[list[Result], list[float], InputError | None]:
+    """(results, seconds that each took, why there are no more); InputError if there is none."""
+    results, took = [], []
+    total = sum(len(files) for step in steps for files in step.files.values()) + len(steps)
+    with progress_bar(lambda: total, "steps", quiet=quiet) as display:
+        try:
+            for result, seconds in calibrate(steps, base, lambda text: display.step(text, 1)):
+                results.append(result)
+                took.append(seconds)
+        except InputError as error:
+            if not results:
+                raise
+            return results, took, error
+    return results, took, None
 
 
 def _asked(arguments: argparse.Namespace) -> tuple[Path, list[Step]]:

@@ -24,6 +24,9 @@ from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import Vehicle
 
 LEAST_RISE = 3.0  # K
+BETTER, MUCH_BETTER = 0.95, 0.8  # of the rms on held-out runs: what a term more must bring to be asked for, to be noted
+SAME = 1.05  # between the rms of fits that the data cannot tell apart
+LITTLE = 0.1  # of a conductance or a heat: less counts as none
 
 
 def _likely(vehicle: Vehicle, name: str) -> tuple[float, float]:
@@ -149,9 +152,9 @@ def _outside_notes(result: Result, job: Job, fitted: Fitted, runs: Sequence[Cool
     plain, (found, values) = outer.fit(part)[1], outer.fit(part, per_speed=0.01)
     slope, sd = found["per_speed"], found.sd("per_speed")
     before, after = job.rms(plain, held), job.rms(values, held)
-    if slope < 2 * sd or after > 0.95 * before:
+    if slope < 2 * sd or after > BETTER * before:
         verdict = "not asked for"
-    elif values[name] < 0.1 * plain[name]:
+    elif values[name] < LITTLE * plain[name]:
         verdict = "no airflow that is zero at standstill: something else that grows with speed is meant"
     else:
         verdict = "asked for, but the network has one constant"
@@ -197,7 +200,7 @@ def _share_refusal(result: Result, job: Job, runs: Sequence[CoolingRun]) -> None
         other = replace(job, held={"motor_stator_share": share})
         rms[share] = other.rms(other.fit(some)[1], some)
     text = ", ".join(f"{value:.3f} K at {share:g}" for share, value in rms.items())
-    if max(rms.values()) < 1.05 * min(rms.values()):
+    if max(rms.values()) < SAME * min(rms.values()):
         result.refusals.append(
             f"motor_stator_share: the data cannot separate it from the two capacities (profile: rms {text}); held at "
             f"{job.held['motor_stator_share']:g}"
@@ -209,13 +212,13 @@ def _share_refusal(result: Result, job: Job, runs: Sequence[CoolingRun]) -> None
 def _iron_note(result: Result, job: Job, runs: Sequence[CoolingRun], validation: Sequence[CoolingRun]) -> None:
     """What a share of its own for the iron loss would do, which the network does not know."""
     part, held = halves(runs)
-    if not held or not any(run.iron.sum() > 0.1 * run.motor_heat.sum() for run in runs):
+    if not held or not any(run.iron.sum() > LITTLE * run.motor_heat.sum() for run in runs):
         return
     check = [*held, *validation]
     before = job.rms(fit_networks(job, part).values, check)
     found, values = replace(job, held={"motor_stator_share": 1.0}).fit(part, iron_share=0.8)
     after = job.rms(values, check)
-    if after < 0.8 * before:
+    if after < MUCH_BETTER * before:
         result.notes.append(
             f"if iron loss had a share of its own, {found['iron_share']:.2f} ± {found.sd('iron_share'):.2f} of it "
             f"would warm the stator: held-out rms {after:.2f} K instead of {before:.2f} K, {job.outside} "

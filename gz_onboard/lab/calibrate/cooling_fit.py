@@ -72,8 +72,7 @@ class Job:
 
         def residual(x: Array) -> Array:
             values = {**self.held, **dict(zip(names, x.tolist(), strict=True))}
-            error: Array = np.concatenate([self.error(values, run) for run in runs]) / sd
-            return error
+            return np.asarray(np.concatenate([self.error(values, run) for run in runs]) / sd)
 
         found = nonlinear(residual, start, bounds=bounds, prior=prior, known_sd=True, groups=self._pieces(runs))
         return found, {**self.held, **dict(zip(names, found.value.tolist(), strict=True))}
@@ -137,12 +136,12 @@ def with_doubt_of_held(job: Job, fitted: Fitted, runs: Sequence[CoolingRun]) -> 
     return Fitted(still, riding, fitted.values)
 
 
-def _moved(sum_: Solution | None, one: Solution | None, other: Solution | None) -> Solution | None:
-    """`sum_` with half the square of `other` less `one` in its covariance: of two values as likely as each other."""
-    if sum_ is None or one is None or other is None:
-        return sum_
+def _moved(so_far: Solution | None, one: Solution | None, other: Solution | None) -> Solution | None:
+    """`so_far` with half the square of `other` less `one` in its covariance: of two values as likely as each other."""
+    if so_far is None or one is None or other is None:
+        return so_far
     change = other.value - one.value
-    return replace(sum_, covariance=sum_.covariance + 0.5 * np.outer(change, change))
+    return replace(so_far, covariance=so_far.covariance + 0.5 * np.outer(change, change))
 
 
 def halves(runs: Sequence[CoolingRun]) -> tuple[list[CoolingRun], list[CoolingRun]]:

@@ -84,5 +84,4 @@ def _outside(p: Values, run: CoolingRun, name: str) -> Array:
     """The conductance to the ambient [W/K], shape (n,)."""
     if run.still and "room" in p:
         return np.full_like(run.time, p["room"])
-    conductance: Array = np.full_like(run.time, p[name]) + p.get("per_speed", 0.0) * run.speed
-    return conductance
+    return np.asarray(np.full_like(run.time, p[name]) + p.get("per_speed", 0.0) * run.speed)

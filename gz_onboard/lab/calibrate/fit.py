@@ -62,8 +62,7 @@ def correlation(covariance: Array) -> Array:
     matrix = np.clip(covariance / np.outer(scale, scale), -1.0, 1.0)
     matrix = (matrix + matrix.T) / 2
     np.fill_diagonal(matrix, 1.0)
-    result: Array = matrix
-    return result
+    return np.asarray(matrix)
 
 
 def linear(

@@ -58,7 +58,9 @@ def motor_losses(dyno: Measurements, largest_current: float = RIDING_CURRENT) ->
         )
     result.panels += [
         *compared("Motor loss", CURRENT, "loss [W]", bench.current, bench.loss, model, "x"),
-        _efficiency("Motor efficiency (derived)", bench.speed, bench.torque, bench.loss, model),
+        _efficiency(
+            "Motor efficiency (derived)", "torque [N·m]", bench.torque, bench.torque * bench.speed, bench.loss, model
+        ),
     ]
     return result
 
@@ -125,11 +127,9 @@ def inverter_losses(dyno: Measurements, largest_current: float = RIDING_CURRENT)
         + ("which the effect does not know" if sure else "no term is asked for")
     )
     power = dyno["ac_power"]
-    measured = PlotLine("measured", power, _ratio(power, loss), ".")
-    lines = measured, PlotLine("model", power, _ratio(power, model), "x")
     result.panels += [
         *compared("Inverter loss", CURRENT, "loss [W]", current, loss, model, "x"),
-        Panel("Inverter efficiency (derived)", "AC power [W]", "efficiency [%]", lines),
+        _efficiency("Inverter efficiency (derived)", "AC power [W]", power, power, loss, model),
     ]
     return result
 
@@ -156,8 +156,7 @@ def _error(columns: dict[str, Array], found: Solution, y: Array) -> Array:
 
 
 def _inverter_model(found: Solution, current: Array) -> Array:
-    result: Array = inverter_loss.term(current, **{name: found[name] for name in found.names})
-    return result
+    return np.asarray(inverter_loss.term(current, **{name: found[name] for name in found.names}))
 
 
 def _ratio(power: Array, loss: Array) -> Array:
@@ -168,10 +167,6 @@ def _ratio(power: Array, loss: Array) -> Array:
     return np.where(np.abs(power) > 0.02 * np.max(np.abs(power)), value, np.nan)
 
 
-def _efficiency(title: str, speed: Array, torque: Array, loss: Array, model: Array) -> Panel:
-    power = torque * speed
-    traces = (
-        PlotLine("measured", torque, _ratio(power, loss), "."),
-        PlotLine("model", torque, _ratio(power, model), "x"),
-    )
-    return Panel(title, "torque [N·m]", "efficiency [%]", traces)
+def _efficiency(title: str, x_label: str, x: Array, power: Array, loss: Array, model: Array) -> Panel:
+    lines = PlotLine("measured", x, _ratio(power, loss), "."), PlotLine("model", x, _ratio(power, model), "x")
+    return Panel(title, x_label, "efficiency [%]", lines)

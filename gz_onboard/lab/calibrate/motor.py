@@ -124,8 +124,7 @@ def solve(bench: Bench, use: Mask) -> Solution:
 def torque(solution: Solution, bench: Bench) -> Array:
     """Shaft torque [N·m] of the model at all points."""
     drag = solution["motor_iron_linear"] * np.sign(bench.speed) + solution["motor_iron_quadratic"] * bench.speed
-    result: Array = solution["torque_constant"] * bench.current - drag
-    return result
+    return np.asarray(solution["torque_constant"] * bench.current - drag)
 
 
 def torque_constant(

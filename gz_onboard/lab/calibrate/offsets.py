@@ -26,6 +26,7 @@ MOVING, DRIVING = 0.3, 3.0  # rad/s and A of the motor: below is rest
 LEAST_REST = 20  # samples
 WINDOW = 2.0  # s: means over that separate gains from timing
 DRIFT_SD = 0.02  # A: of a current sensor's zero from day to day, the least that is believed
+AUXILIARY = 0.85  # A: of lamps and control, by which the auxiliary sensor's class counts
 GAIN_SD = 0.007  # of a current sensor of 1 % class
 
 
@@ -84,7 +85,7 @@ def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     offset = float(np.mean(apart - own))
     result.parameters["pack_current_offset"] = Found(
         offset,
-        float(np.hypot(max(spread, DRIFT_SD), own_sd) + CURRENT_SD * 0.85),
+        float(np.hypot(max(spread, DRIFT_SD), own_sd) + CURRENT_SD * AUXILIARY),
         "A",
         f"{len(resting)} rides at rest: pack less inverter less auxiliary is {apart.mean():+.3f} ± {spread:.3f} "
         f"A, {own.mean():.3f} A of it the inverter's own {p['inverter_loss_constant']:.1f} W",

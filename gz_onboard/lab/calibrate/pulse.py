@@ -22,7 +22,7 @@ from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.ocv import TESTER
 from gz_onboard.lab.calibrate.pulse_mesh import direct, mesh_quality, meshes
 from gz_onboard.lab.calibrate.pulse_rests import rest_shift, rests_over_soc, shift_of_rests
-from gz_onboard.lab.calibrate.pulse_test import Tested, moved_pieces, tested
+from gz_onboard.lab.calibrate.pulse_test import APART, Tested, moved_pieces, nearest_to_bench, tested
 from gz_onboard.lab.calibrate.result import Curve, Found, Panel, PlotLine, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
 
@@ -118,14 +118,19 @@ def _tests(tables: Sequence[Measurements], ocv: Curve, capacity: Found, result: 
     """The tests by temperature; InputError for none, or two at one temperature."""
     if not tables:
         raise InputError("no pulse test is given")
-    tests = sorted(
-        (tested(t, ocv.axes["soc"], ocv.value, capacity, result) for t in tables), key=lambda t: t.temperature
-    )
+    tests = sorted((tested(t, ocv, capacity, result) for t in tables), key=lambda t: t.temperature)
     for cold, warm in pairwise(tests):
         if warm.temperature - cold.temperature < 2:
             raise InputError(
                 f"{cold.test.table.file} and {warm.test.table.file} are both at {warm.temperature:g} degC: one of them"
             )
+    rated = tests[nearest_to_bench(tests)]
+    if abs(rated.capacity / capacity.value - 1) > APART:
+        result.notes.append(
+            f"{rated.test.name}: the rests ask for a capacity of {rated.capacity:.3f} A·h at {rated.temperature:g} "
+            f"degC, cell_capacity is {capacity.value:.3f}: another cell, an aged one, or tests between other ends. "
+            "cell_capacity stays; battery.capacity only says how it depends on temperature"
+        )
     return tests
 
 

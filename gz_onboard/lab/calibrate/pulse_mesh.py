@@ -48,8 +48,8 @@ def direct(
         fit_direct(t.test, t.level, ocv_and_slope(nodes, volts, t.level), f, (start[0][k], start[1][k], start[2][k]), a)
         for k, (t, f, a) in enumerate(zip(tests, fitted, activation, strict=True))
     ]
-    tables = [np.array([d.r0 for d in found]), np.array([d.r1 for d in found]), np.array([d.time for d in found])]
-    return tables, [np.array([d.sd[j] for d in found]) for j in range(4)]
+    tables, sds = (np.array(part).swapaxes(0, 1) for part in zip(*found, strict=True))
+    return list(tables), list(sds)
 
 
 def _pooled(soc: Array, sd: Array, covered: Mask) -> Array:
@@ -103,6 +103,9 @@ def mesh_quality(
             part.append(fit_branches(x, group[np.searchsorted(t.test.block, x.label)] % 2 == odd))
         covered &= np.array([f.covered for f in part])
         halves.append(meshes(part, one)[0])
+    if not covered.any():
+        result.refusals.append("meshes: the pulses are too few to compare half of them with the other half")
+        return
     single = list(np.exp([one.logs(f.resistance) for f in fitted]).transpose(2, 0, 1))
     names = ", ".join(t.test.name for t in tests)
     for name, unit, number in (("R0", "ohm", 0), ("R1", "ohm", 1), ("C1", "F", 2)):

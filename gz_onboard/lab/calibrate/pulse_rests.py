@@ -7,21 +7,20 @@ from scipy.stats import chi2
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cell_fit import Branches, jackknife
-from gz_onboard.lab.calibrate.pulse_test import FULL_WITHIN, Tested
+from gz_onboard.lab.calibrate.ocv import increasing
+from gz_onboard.lab.calibrate.pulse_test import FULL_WITHIN, Tested, nearest_to_bench
 from gz_onboard.lab.calibrate.result import Curve, Result
-from gz_onboard.physics.battery import BENCH_TEMPERATURE
 
 SURE = 0.99  # how surely the rests must show that temperature moves them, before the vehicle file says so
 
 
 def rest_shift(fitted: list[Branches], tests: list[Tested], nodes: Array, ocv: Curve) -> tuple[Array, Array]:
     """(shift, sd) (len(nodes),) [V] from the OCV to where the cell rests after discharging, near 25 degC."""
-    nearest = _nearest(tests)
+    nearest = nearest_to_bench(tests)
     shift = np.interp(nodes, fitted[nearest].soc, fitted[nearest].shift)
     scatter = np.std([np.interp(nodes, f.soc, f.shift) for f in fitted], axis=0) if len(fitted) > 1 else np.abs(shift)
     shift[nodes == 1] = 0.0 if abs(tests[nearest].test.voltage[0] - ocv.value[-1]) < FULL_WITHIN else shift[-1]
-    moved = ocv.value + shift
-    shift = np.maximum.accumulate(moved + 1e-3 * (nodes[-1] - nodes)) - 1e-3 * (nodes[-1] - nodes) - ocv.value
+    shift = increasing(nodes, ocv.value + shift) - ocv.value
     return shift, np.hypot(np.minimum(ocv.sd, np.abs(shift) + 0.003), scatter)
 
 
@@ -33,27 +32,25 @@ def rests_over_soc(fitted: list[Branches], tests: list[Tested], names: str) -> C
     covered = np.array([f.covered for f in fitted])
     return Curve(
         axes,
-        shifts - shifts[_nearest(tests)],
+        shifts - shifts[nearest_to_bench(tests)],
         np.where(covered, sd, np.nan),
         "V",
         f"{names}: rest voltage against that near 25 degC",
     )
 
 
-def shift_of_rests(rests: Curve, tests: list[Tested], names: str, result: Result) -> Array | None:
-    """The shift (temperatures,) [V] of the open-circuit voltage, as ``battery.rest_shift``; None if it is not sure.
+def shift_of_rests(rests: Curve, tests: list[Tested], names: str, result: Result) -> None:
+    """The shift (temperatures,) [V] of the open-circuit voltage, as ``battery.rest_shift``, if it is sure.
 
     The mean over 15 to 95 % SOC; its sd holds how it varies there, since one number is to stand for all of it.
     """
-    reference = _nearest(tests)
+    reference = nearest_to_bench(tests)
     soc = rests.axes["soc"]
     middle = (soc > 0.15) & (soc < 0.95)
-    if len(tests) < 2:
-        return None
     known = [row[middle & np.isfinite(sd)] for row, sd in zip(rests.value, rests.sd, strict=True)]
     within = [sd[middle & np.isfinite(sd)] for sd in rests.sd]
-    if not all(map(len, known)):
-        return None
+    if len(tests) < 2 or not all(map(len, known)):
+        return
     mean = np.array([row.mean() for row in known])
     sd = np.array([np.hypot(row.std(), s.mean()) for row, s in zip(known, within, strict=True)])
     others = np.arange(len(tests)) != reference
@@ -68,7 +65,7 @@ def shift_of_rests(rests: Curve, tests: list[Tested], names: str, result: Result
             f"rests do not move with temperature beyond how they scatter over the state of charge: {moves}; "
             "the open-circuit voltage is one for all temperatures"
         )
-        return None
+        return
     result.notes.append(f"the cell rests {moves} against {tests[reference].temperature:g} degC")
     result.curves["battery.rest_shift"] = Curve(
         {"temperature": rests.axes["temperature"]},
@@ -77,8 +74,3 @@ def shift_of_rests(rests: Curve, tests: list[Tested], names: str, result: Result
         "V",
         f"{names}: mean over 15 to 95 % SOC of the rests against those near 25 degC",
     )
-    return mean
-
-
-def _nearest(tests: list[Tested]) -> int:
-    return min(range(len(tests)), key=lambda k: abs(tests[k].temperature - BENCH_TEMPERATURE))

@@ -9,15 +9,21 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.calibrate.cell_circuit import KELVIN
+from gz_onboard.constants import KELVIN
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
 from gz_onboard.lab.calibrate.cell_fit import Pieces, filtered, fit_branches, pieces
-from gz_onboard.lab.calibrate.result import Fit, Found, Result
+from gz_onboard.lab.calibrate.ocv import FLAT
+from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Result
 from gz_onboard.lab.calibrate.table import Measurements
+from gz_onboard.physics.battery import BENCH_TEMPERATURE
 from gz_onboard.physics.tables import extended_over
 
 FEWEST_PULSES = 6
 FEWEST_LEVELS = 3
+MOST_DRAWN = 1.3  # of the capacity of the slow test: what no cell like that holds
+UNTOLD = 0.03  # relative sd of a capacity that the rests do not tell: they lie where the OCV is flat
+TAKEN = 0.1  # relative sd of the slow test's capacity where it is taken for another temperature
+APART = 0.03  # relative: how far the capacities of a pulse test and a slow test may differ unsaid
 REST = 1200.0  # s without current, after which a voltage is that of rest
 FULL_WITHIN = 0.03  # V: a first voltage so near to the full cell's is that of a full cell
 
@@ -34,13 +40,22 @@ class Tested:
     rests: NDArray[np.int_]  # rows at the ends of rests
 
 
-def tested(table: Measurements, nodes: Array, volts: Array, capacity: Found, result: Result) -> Tested:
+def tested(table: Measurements, ocv: Curve, capacity: Found, result: Result) -> Tested:
     """`table` with its capacity: the one with which its rest voltages lie best on the OCV above 10 % SOC."""
-    test = cell_test(table)
+    test, nodes, volts = cell_test(table), ocv.axes["soc"], ocv.value
+    if not test.rest[0]:
+        raise table.error(
+            f"begins under a current of {test.current[0]:.3g} A: its first voltage must be one at rest", 0
+        )
     rests = _long_rests(test, capacity)
     start = 1.0
     if test.voltage[0] < volts[-1] - FULL_WITHIN:
         start = float(np.interp(test.voltage[0], volts, nodes))
+        if np.interp(start, nodes, ocv.sd / np.gradient(volts, nodes)) > FLAT:
+            raise table.error(
+                f"begins at {test.voltage[0]:.3f} V, not full and where the open-circuit voltage is flat: how much "
+                "charge it holds is not known; let it begin full"
+            )
         result.notes.append(f"{test.name}: begins at {test.voltage[0]:.3f} V, SOC {start:.3f}, not full")
     drawn, at_rest = test.drawn[rests], test.voltage[rests]
 
@@ -50,16 +65,21 @@ def tested(table: Measurements, nodes: Array, volts: Array, capacity: Found, res
         error = at_rest - extended_over(nodes, volts, level)
         weight = np.where(level > 0.12, 1.0, 0.0)
         offset = float(np.sum(weight * error) / (np.sum(weight) + 1.0))  # prior: 5 mV, as one rest counts
-        result: Array = np.sqrt(weight) * (error - offset)
-        return result
+        return np.asarray(np.sqrt(weight) * (error - offset))
 
     best = minimize_scalar(lambda x: float(np.sum(misses(x) ** 2)), bounds=(0.6, 1.15), method="bounded")
     share = float(best.x)
     error = misses(share)
     curvature = (np.sum((misses(share + 1e-3) - error) ** 2)) / 1e-6
     sd = float(np.sqrt(max(np.sum(error**2) / max(len(error) - 2, 1), 1e-6) / max(curvature, 1e-12)))
-    found = share * capacity.value
     temperature = float(np.round(np.median(test.temperature[rests]))) + 0.0  # no -0
+    if sd > UNTOLD:
+        result.refusals.append(
+            f"{test.name}: the rests at {temperature:g} degC lie where the open-circuit voltage is flat and do not "
+            f"tell the capacity (± {100 * sd:.0f} %): that of the slow test is taken, ± {100 * TAKEN:.0f} %"
+        )
+        share, sd = max(1.0, float(drawn.max()) / (start * capacity.value)), TAKEN
+    found = share * capacity.value
     what, rms = f"rest voltage at {temperature:g} degC, SOC above 0.12", float(np.sqrt(np.mean(error**2)))
     result.fits.append(Fit(what, "V", rms, float(np.abs(error).max()), None, len(error), False, test.name))
     found_sd = float(np.hypot(sd * capacity.value, 0.005 * found))
@@ -72,13 +92,17 @@ def _long_rests(test: CellTest, capacity: Found) -> NDArray[np.int_]:
     if pulses < FEWEST_PULSES:
         raise table.error(f"has {pulses} pulses; at least {FEWEST_PULSES} are needed")
     ends = np.flatnonzero(test.rest & ~np.concatenate([test.rest[1:], [False]]))
-    began = np.array([_began(test, int(k)) for k in ends])
-    rests: NDArray[np.int_] = ends[test.time[ends] - test.time[began] >= REST]
+    rests: NDArray[np.int_] = ends[np.array([test.rested(int(k)) >= REST for k in ends])]
     used = float(test.drawn.max() - test.drawn.min())
     levels = np.unique(np.round(test.drawn[rests] / max(used, 1e-9) * 50))
     if len(levels) < FEWEST_LEVELS:
         raise table.error(
             f"rests of {REST / 60:.0f} min at {len(levels)} states of charge; at least {FEWEST_LEVELS} are needed"
+        )
+    if used > MOST_DRAWN * capacity.value:
+        raise table.error(
+            f"draws {used:.3f} of {capacity.value:.3f} A·h: more than the cell holds. Is it the cell of the slow test, "
+            "and the current in A?"
         )
     if used < 0.5 * capacity.value:
         raise table.error(
@@ -87,10 +111,9 @@ def _long_rests(test: CellTest, capacity: Found) -> NDArray[np.int_]:
     return rests
 
 
-def _began(test: CellTest, end: int) -> int:
-    """The first row of the rest that ends at row `end`."""
-    moving = np.flatnonzero(~test.rest[:end])
-    return int(moving[-1]) + 1 if len(moving) else 0
+def nearest_to_bench(tests: list[Tested]) -> int:
+    """Which of the tests is nearest to the temperature at which capacities are given."""
+    return min(range(len(tests)), key=lambda k: abs(tests[k].temperature - BENCH_TEMPERATURE))
 
 
 def moved_pieces(

@@ -113,10 +113,14 @@ def shape(curve: Curve) -> str:
 # --- page ---------------------------------------------------------------------------------------------------------
 
 
-def write_report(file: Path, title: str, results: Sequence[Result]) -> None:
-    """Write the page: of each procedure its values, fits, refusals and a picture. Raises OSError."""
+def write_report(file: Path, title: str, results: Sequence[Result], trouble: Exception | None = None) -> None:
+    """Write the page: of each procedure its values, fits, refusals and a picture. Raises OSError.
+
+    trouble: why there is no more, or no vehicle file.
+    """
     names = [html.escape(result.procedure) for result in results]
     body = [f"<p>{', '.join(f'<a href={chr(34)}#{name}{chr(34)}>{name}</a>' for name in names)}</p>"]
+    body += [f'<p class="no">Not finished: {html.escape(str(trouble))}</p>'] if trouble else []
     body += [_section(result) for result in results]
     if rows := thesis.compare(results):
         body.append(f"<h2>The thesis and ours</h2>{html_table(thesis.HEAD, rows, [1, 2, 3])}")

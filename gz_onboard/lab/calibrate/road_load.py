@@ -21,6 +21,7 @@ from gz_onboard.physics.model import Bound, air_density, all_quantities, total
 from gz_onboard.physics.sensors import road_speed
 from gz_onboard.vehicle import Vehicle
 
+STRONGEST = 8.0  # m/s: a wind in which nobody coasts down
 NAMES = ("rolling_resistance_constant", "rolling_resistance_speed", "drag_area")
 
 
@@ -80,7 +81,7 @@ def own_wind(force: RoadLoad, run: Coast, slope: float) -> float:
     """The constant headwind [m/s] with which `run` is followed best."""
     best = minimize_scalar(
         lambda wind: float(np.sum((roll(force, run, slope, wind, run.time) - run.speed) ** 2)),
-        bounds=(-8.0, 8.0),
+        bounds=(-STRONGEST, STRONGEST),
         method="bounded",
         options={"xatol": 0.01},
     )

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from gz_onboard.arrays import Array
+from gz_onboard.constants import KELVIN
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.simulation.columns import csv_rows
 
@@ -47,7 +48,7 @@ _FACTORS: dict[str, dict[str, float]] = {  # by SI unit (or degC), the units as 
     "rad": {"rad": 1, "deg": math.pi / 180},
     "1": {"pct": 0.01, "1": 1},
 }
-_OFFSETS = {"K": -273.15, "degF": -160 / 9}
+_OFFSETS = {"K": -KELVIN, "degF": -160 / 9}
 # Unit as written -> (unit it is turned into, factor, offset)
 UNITS: dict[str, tuple[str, float, float]] = {
     unit: (si, factor, _OFFSETS.get(unit, 0)) for si, units in _FACTORS.items() for unit, factor in units.items()

@@ -41,7 +41,7 @@ ROWS = (
     Row("R1 over (SOC, T)", ("pulse", "mesh of R1, SOC 0.2 to 0.9, half against half", "", True), "r2", 0.9210),
     Row("C1 over (SOC, T)", ("pulse", "mesh of C1, SOC 0.2 to 0.9, half against half", "", True), "r2", 0.9600),
     Row("cell voltage, road profile, 25 °C", ("pulse", "cell voltage", "25C", True), "largest", 0.02, "V"),
-    Row("cell voltage, road profile, 5 °C", ("pulse", "cell voltage", "5C", True), "largest", 0.02, "V"),
+    Row("cell voltage, road profile, 5 °C", ("pulse", "cell voltage", "_5C", True), "largest", 0.02, "V"),
     Row("motor temperature, calibration", ("cooling", "motor temperature, closed", "", False), "largest", 4, "°C"),
     Row("motor temperature, validation", ("cooling", "motor temperature", "valid", True), "largest", 10, "°C"),
     Row("motor temperature, riding", ("cooling", "motor temperature, riding", "", True), "largest", 10, "°C"),
@@ -55,6 +55,7 @@ ROWS = (
     Row("coast-down speed, wind unknown", ("coastdown", "speed, no wind", "", True), "largest", 2, "m/s"),
 )
 
+WORDS = ("no", "yes")
 HEAD = ("what", "thesis", "ours", "rms", "on", "better")
 
 
@@ -68,41 +69,18 @@ def compare(results: Sequence[Result]) -> list[tuple[str, ...]]:
             for result in results
             if result.procedure == procedure
             for fit in result.fits
-            if fit.what.startswith(what) and _of(fit, data) and fit.held_out == held_out
+            if fit.what.startswith(what) and data in fit.data and fit.held_out == held_out
         ]
         if fits:
             rows.append(_row(row, fits))
     return rows
 
 
-def _of(fit: Fit, data: str) -> bool:
-    if data == "5C":
-        return "_5C" in fit.data
-    return data in fit.data
-
-
 def _row(row: Row, fits: Sequence[Fit]) -> tuple[str, ...]:
     on = "; ".join(dict.fromkeys(fit.data for fit in fits)) + ("" if row.fits[3] else " (fitted)")
     if row.measure == "r2":
         r2 = min(fit.r2 if fit.r2 is not None else 0.0 for fit in fits)
-        return row.what, row.thesis, f"R² {r2:.4f}", "", on, _word(r2 >= row.limit)
+        return row.what, row.thesis, f"R² {r2:.4f}", "", on, WORDS[r2 >= row.limit]
     worst = max(fits, key=lambda fit: fit.largest)
-    rms = max(fit.rms for fit in fits)
-    return (
-        row.what,
-        row.thesis,
-        f"±{worst.largest:.2g} {row.unit}",
-        f"{rms:.2g} {row.unit}",
-        on,
-        _word(worst.largest <= row.limit),
-    )
-
-
-def _word(better: bool) -> str:
-    return "yes" if better else "no"
-
-
-def markdown(rows: Sequence[Sequence[str]]) -> str:
-    """The rows as a table of a page."""
-    lines = [HEAD, ["---"] * len(HEAD), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n"
+    ours, rms = (f"{x:.2g} {row.unit}" for x in (worst.largest, max(fit.rms for fit in fits)))
+    return row.what, row.thesis, f"±{ours}", rms, on, WORDS[worst.largest <= row.limit]

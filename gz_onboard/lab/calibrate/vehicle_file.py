@@ -6,6 +6,7 @@ import os
 import shutil
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,17 +21,35 @@ from gz_onboard.lab.calibrate.result import Curve, Found, Result
 from gz_onboard.lab.calibrate.toml_text import KeyPath, number, spliced, string, with_keys
 from gz_onboard.physics.effect import PACKAGE_EFFECTS, Effect
 from gz_onboard.physics.parameters import declared_parameters
-from gz_onboard.vehicle import read_vehicle
+from gz_onboard.vehicle import Vehicle, read_vehicle
 
 
-def write_vehicle(base: Path, results: Sequence[Result], out: Path) -> None:
-    """Write the vehicle file `base` with what `results` found to `out`, whole or not at all. InputError, OSError."""
+def write_vehicle(base: Path, results: Sequence[Result], out: Path) -> Vehicle:
+    """Write the vehicle file `base` with what `results` found to `out`, as `write_whole`. InputError, OSError."""
     text = merged(base.read_text(encoding="utf-8"), results, base, out)
     if base.resolve().parent != out.resolve().parent:
         text = with_keys(text, copied_effects(read_vehicle(base).model.effects, out), out)
+    return write_whole(out, text)
+
+
+def write_whole(out: Path, text: str) -> Vehicle:
+    """Write the vehicle file `out`, whole or not at all, and give it as read back.
+
+    Raises OSError, and InputError for a text that is no vehicle file: then what stood at `out` stays.
+    """
     temporary = out.with_name(out.name + ".new")
     temporary.write_text(text, encoding="utf-8", errors="replace")
-    temporary.replace(out)
+    try:
+        vehicle = read_vehicle(temporary)
+    except InputError as error:
+        raise InputError(
+            f"{str(error).replace(str(temporary), str(out))}; that was found, so the file is not written"
+        ) from error
+    else:
+        temporary.replace(out)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return replace(vehicle, file=out)
 
 
 def merged(text: str, results: Sequence[Result], base: Path, out: Path) -> str:
@@ -55,6 +74,8 @@ def merged(text: str, results: Sequence[Result], base: Path, out: Path) -> str:
         **{("correlation", name): group for name, group in groups.items()},
     }
     dropped: set[KeyPath] = {("correlation", name) for name in document.get("correlation", {})}
+    if "battery.ocv" in curves:
+        dropped.add(("battery", "rest_shift"))  # which is that of the curve before
     return spliced(text, new, tables, dropped, base)
 
 
@@ -164,14 +185,14 @@ def _correlations(
             groups[name] = ([group["parameters"][i] for i in kept], matrix, group.get("source", ""))
     last = {name: i for i, result in enumerate(results) for name in result.parameters}
     for i, result in enumerate(results):
-        for number_, (names, covariance) in enumerate(result.covariance):
+        for place, (names, covariance) in enumerate(result.covariance):
             for name in names:
                 if name not in last:
                     raise InputError(f"{base}: {result.procedure}: a covariance of {name}, which was not found")
             kept = [k for k, name in enumerate(names) if last[name] <= i]  # a later procedure knows better
             if len(kept) < 2:
                 continue
-            key = result.procedure if number_ == 0 else f"{result.procedure}_{number_ + 1}"
+            key = result.procedure if place == 0 else f"{result.procedure}_{place + 1}"
             matrix = correlation(np.asarray(covariance)[np.ix_(kept, kept)])
             groups[key] = ([names[k] for k in kept], matrix, f"of {result.procedure}")
     return {name: _group(name, *group) for name, group in groups.items()}

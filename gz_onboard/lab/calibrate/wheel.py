@@ -27,7 +27,7 @@ RECEIVER = 0.002  # relative: Doppler speed of a receiver in the open
 def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     """wheel_radius [m] of the rides that have GPS and steady riding; each ride held out once shows how it differs.
 
-    Raises InputError if none of them has.
+    Raises InputError if no ride has both.
     """
     result = Result("wheel")
     radii: list[float] = []
@@ -65,14 +65,8 @@ def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         data = f"each of {', '.join(names)} left out"
         result.fits.append(Fit("wheel radius", "m", rms, largest, None, len(radii), True, data))
     ends = np.array([SLOWEST, max(float(t.x.max()) * radius for t in traces)]) / radius
-    result.panels.append(
-        Panel(
-            "Speed over ground by wheel speed",
-            "speed of the driven wheel [rad/s]",
-            "m",
-            (*traces, PlotLine("radius", ends, np.full(2, radius))),
-        )
-    )
+    lines = *traces, PlotLine("radius", ends, np.full(2, radius))
+    result.panels.append(Panel("Speed over ground by wheel speed", "speed of the driven wheel [rad/s]", "m", lines))
     return result
 
 

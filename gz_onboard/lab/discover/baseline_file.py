@@ -13,7 +13,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.result import Found, Result
 from gz_onboard.lab.calibrate.toml_text import string, with_keys
-from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged
+from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged, write_whole
 from gz_onboard.lab.discover.channels import ChannelNoise
 from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel, initial
 from gz_onboard.vehicle import Vehicle
@@ -44,13 +44,6 @@ def write_baseline(vehicle: Vehicle, base: Path, out: Path) -> None:
         ("healthy", "rides"): str(mixed.healthy),
     }
     write_whole(out, with_keys(text, keys, out))
-
-
-def write_whole(out: Path, text: str) -> None:
-    """Write the file whole or not at all."""
-    temporary = out.with_name(out.name + ".new")
-    temporary.write_text(text, encoding="utf-8", errors="replace")
-    temporary.replace(out)
 
 
 def save(mixed: MixedModel, file: Path) -> None:

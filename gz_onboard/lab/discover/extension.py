@@ -10,8 +10,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.result import Found, Result
 from gz_onboard.lab.calibrate.toml_text import number, string, with_keys
-from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged
-from gz_onboard.lab.discover.baseline_file import write_whole
+from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged, write_whole
 from gz_onboard.lab.discover.energy import energy_share
 from gz_onboard.lab.discover.result import Unknown
 from gz_onboard.lab.discover.verdict import Discovery
