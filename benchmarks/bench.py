@@ -345,7 +345,7 @@ def simulation(repeats: int) -> tuple[float, float]:
     """CPU s of 20 minutes at 100 Hz: of the full scooter on WMTC class 1, and of the energy-only backward form."""
     import numpy as np
 
-    from gz_onboard.simulation.backward import Conditions, backward
+    from benchmarks.backward import Conditions, backward
     from gz_onboard.simulation.cycles import cycle
     from gz_onboard.simulation.run import at_steps, drive, follow
     from gz_onboard.simulation.scooter import STEP, Scooter

@@ -1,4 +1,4 @@
-"""The scooter beside FASTSim 3 on the same drive cycles: python benchmarks/fastsim_compare.py
+"""The scooter beside FASTSim 3 on the same drive cycles: python -m benchmarks.fastsim_compare
 
 Needs a Python that has both the requirements of gz-onboard and PyPI's fastsim (3.1). Two comparisons:
 
@@ -19,9 +19,9 @@ from typing import Any
 import fastsim  # type: ignore[import-not-found, unused-ignore]
 import numpy as np
 
+from benchmarks.backward import Conditions, backward
 from gz_onboard.physics.derating import DeratingCurve
 from gz_onboard.physics.model import Model
-from gz_onboard.simulation.backward import Conditions, backward
 from gz_onboard.simulation.cycles import cycle
 from gz_onboard.simulation.run import at_steps, drive, follow
 from gz_onboard.simulation.scooter import Scooter

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.backward import Conditions, backward
 from gz_onboard.physics.effect import QUANTITIES, load_effect
 from gz_onboard.physics.model import air_density
-from gz_onboard.simulation.backward import Conditions, backward
 from gz_onboard.simulation.cycles import cycle
 from gz_onboard.simulation.run import at_steps, drive, follow
 from gz_onboard.simulation.scooter import Scooter
@@ -60,7 +60,7 @@ def test_blocks_are_one_ride(effects, monkeypatch):
     v, grade = 8 + 4 * np.sin(t / 7), 0.02 * np.sin(t / 5)
     conditions = Conditions(grade=grade, curvature=0.01 * np.cos(t / 3), headwind=2.0)
     whole = backward(vehicle, t, v, conditions)
-    monkeypatch.setattr("gz_onboard.simulation.backward.BLOCK", 700)
+    monkeypatch.setattr("benchmarks.backward.BLOCK", 700)
     parts = backward(vehicle, t, v, conditions)
     assert parts.power == pytest.approx(whole.power, rel=1e-12)
     assert parts.ledger == pytest.approx(whole.ledger, rel=1e-12)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.backward import Conditions, backward
 from gz_onboard.physics.effect import known_effects, load_effect
-from gz_onboard.simulation.backward import Conditions, backward
 from gz_onboard.simulation.cycles import cycle, names
 from gz_onboard.simulation.parts.battery import EffectPack
 from gz_onboard.simulation.parts.road import Dynamometer, straight
@@ -155,7 +155,7 @@ def test_a_motor_loss_with_memory_goes_on_once_each_step(tmp_path):
         speed = (before + scooter.wheel_speed) / 2
         value = 0.99 * value + 0.01 * 40.0 * speed / (speed + 1)
         energy += value * STEP
-    assert scooter.ledger.entries["bearing"] == pytest.approx(energy, rel=1e-9)
+    assert scooter.ledger["bearing"] == pytest.approx(energy, rel=1e-9)
 
 
 def test_hysteresis_stays_at_rest_and_relaxation_does_not():

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.backward import Conditions, backward
 from gz_onboard.cli import main
 from gz_onboard.lab.discover.grid import vibration as of_samples
 from gz_onboard.lab.validate_components import battery_voltage, road_load
 from gz_onboard.lab.validate_ride import per_second
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import MOVING, load_effect
-from gz_onboard.simulation.backward import Conditions, backward
 from gz_onboard.simulation.parts.road import Dynamometer, straight
 from gz_onboard.simulation.recorded import Recorded, read_recorded
 from gz_onboard.simulation.run import drive
