@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gz_onboard.constants import WH
 from gz_onboard.offline.style import (
     BLUE,
@@ -45,8 +47,6 @@ _LEAST_SHARE = 5e-5  # of all energy: less cannot be seen
 
 def overview(run: Run, title: str) -> Figure:
     """The time series of a ride: speed, throttle and brake, pack, state of charge, temperatures, energy."""
-    import numpy as np
-
     s = run.series
     figure, axes = _panels(title, (1.7, 1.0, 1.3, 1.0, 1.0, 1.2))
     x, time = _time(run)
@@ -199,8 +199,6 @@ def sweep_map(
     names: tuple[str, str], values: tuple[Sequence[float], Sequence[float]], variants: Sequence[Variant], title: str
 ) -> Figure:
     """Range and consumption over two parameters, `variants` with the second changing fastest."""
-    import numpy as np
-
     figure = new_figure(12, 5.4)
     for i, (key, text, colours) in enumerate(
         (("range_km", "range [km]", "Blues"), ("consumption_wh_km", "consumption [Wh/km]", "Oranges"))

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gz_onboard.bus.checksum import sae_j1850_tables
 from gz_onboard.bus.export import out_suffix, write_frames_as
 from gz_onboard.bus.layout import raw_range
@@ -21,7 +23,6 @@ from gz_onboard.simulation.trace import Truth
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    import numpy as np
     from cantools.database.can import Message
     from cantools.database.can.signal import Signal
     from numpy.typing import NDArray
@@ -91,8 +92,6 @@ def _can_be_packed(signal: Signal) -> bool:
 
 def batches(sent: list[Sent]) -> Iterator[list[Frame]]:
     """The frames in the order of their times, some thousands at once."""
-    import numpy as np
-
     times = np.concatenate([s.times for s in sent])
     words = np.concatenate([s.words for s in sent])
     identifiers = np.concatenate([np.full(len(s.times), s.identifier, dtype=np.int64) for s in sent])
@@ -123,8 +122,6 @@ def write_frames(out: Path, sent: list[Sent]) -> int:
 def _send(
     vehicle: Vehicle, message: Message, sensors: dict[str, Sensor], truth: Truth, seed: int, losses: Losses
 ) -> Sent:
-    import numpy as np
-
     period_ns = round(vehicle.mapping.periods[message.name] * 1e9)
     rng = np.random.default_rng([seed, message.frame_id, _PHASE])
     phase_us = int(rng.integers(0, period_ns // 1000))  # whole µs: candump has no more
@@ -168,8 +165,6 @@ def _send(
 
 def _values(sensor: Sensor | None, truth: Truth, seconds: Floats, period: float, rng: np.random.Generator) -> Floats:
     """What is read at `seconds`, in the unit of the DBC; not a number where there is no such sensor."""
-    import numpy as np
-
     if sensor is None:
         return np.full(len(seconds), np.nan)
     steps = np.clip(((seconds - latency(sensor, truth.parameters)) / truth.dt + 1e-6).astype(int), 0, truth.count - 1)
@@ -189,8 +184,6 @@ def _values(sensor: Sensor | None, truth: Truth, seconds: Floats, period: float,
 
 
 def _without_fix(signal: str, values: Floats, no_fix: NDArray[np.bool_]) -> Floats:
-    import numpy as np
-
     if not no_fix.any():
         return values
     return np.where(no_fix, 0.0 if signal in ("GPS_Fix", "GPS_Satellites") else np.nan, values)
@@ -198,8 +191,6 @@ def _without_fix(signal: str, values: Floats, no_fix: NDArray[np.bool_]) -> Floa
 
 def _raw(signal: Signal, values: Floats) -> NDArray[np.int64]:
     """The nearest raw values within the limits; the code for not available for what is not a number."""
-    import numpy as np
-
     low, high = raw_range(signal, not_available=True)
     absent = -(2 ** (signal.length - 1)) if signal.is_signed else 2**signal.length - 1
     scale, offset = float(signal.conversion.scale), float(signal.conversion.offset)
@@ -209,8 +200,6 @@ def _raw(signal: Signal, values: Floats) -> NDArray[np.int64]:
 
 def _seal(words: Words) -> Words:
     """`words` with the CRC-8 SAE J1850 of their first seven bytes as the last."""
-    import numpy as np
-
     constant, tables = sae_j1850_tables(7)
     crc = np.full(len(words), constant, dtype=np.uint64)
     for i, table in enumerate(tables):
@@ -220,8 +209,6 @@ def _seal(words: Words) -> Words:
 
 def _gps_gaps(truth: Truth, seed: int, losses: Losses) -> Any:
     """(begin, end) [s] of each time without a fix; on a dynamometer, indoors, all of the ride."""
-    import numpy as np
-
     duration = truth.count * truth.dt
     if truth.on_dynamometer:
         return np.array([(0.0, duration)])

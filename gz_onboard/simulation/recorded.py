@@ -11,8 +11,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import pi
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from gz_onboard.arrays import Array, block_means, held_at
 from gz_onboard.bus.codec import Codec
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
@@ -24,10 +27,6 @@ from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
 from gz_onboard.simulation.run import road_table
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    from gz_onboard.arrays import Array
-
 
 BRAKE_FORCE = 20e-5
 """N of both brakes for each Pa, front and rear pressure added: deceleration on 8 road rides, with 19 N of scatter."""
@@ -104,8 +103,6 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
 
     Raises InputError for a log that cannot be read, or that has no speed.
     """
-    import numpy as np
-
     if vehicle.battery is None:
         raise vehicle.error("has no [battery], which a simulation needs")
     codec = Codec(extended(vehicle.mapping))
@@ -155,9 +152,6 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
 
 def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicle) -> dict[str, Array]:
     """All on one grid of steps: the speeds interpolated, what comes in steps as it was last told."""
-    import numpy as np
-
-    from gz_onboard.arrays import held_at
 
     pace, factor = speed_role(str(log), columns, vehicle.parameters)
     time = columns[pace][0]
@@ -185,8 +179,6 @@ def _over_road(distance: Array, values: Array, period: float | None = None) -> A
 
     period: of an angle, which then goes on over a whole turn.
     """
-    import numpy as np
-
     distance, keep = np.unique(distance, return_index=True)
     found = values[keep] if period is None else np.unwrap(values[keep], period=period)
     return np.interp(np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE), distance, found)
@@ -236,8 +228,6 @@ def _rest_soc(signals: dict[str, Array], vehicle: Vehicle) -> float | None:
 
 def _counted_soc(signals: dict[str, Array], vehicle: Vehicle) -> Array:
     """SOC by counting the measured charge from that at the start."""
-    import numpy as np
-
     start = _rest_soc(signals, vehicle)
     assert start is not None
     temperature = float(signals["cell_temperature"][0]) if "cell_temperature" in signals else AMBIENT
@@ -250,9 +240,6 @@ def fit_dynamometer(recorded: Recorded) -> Dynamometer:
 
     Raises InputError if there was no roller, or it did not move.
     """
-    import numpy as np
-
-    from gz_onboard.arrays import block_means
 
     if not recorded.on_dynamometer:
         raise InputError(f"{recorded.name}: no roller of a dynamometer was recorded")

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from pathlib import Path
 
+import numpy as np
+
 from gz_onboard.errors import InputError
 from gz_onboard.simulation.columns import Columns, read_columns
 
@@ -131,8 +133,6 @@ def _course(
     columns: Columns, positions: list[tuple[float, float]], distance: tuple[float, ...]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Heading [rad] and curvature [1/m] at each point; what is not given follows from what is."""
-    import numpy as np
-
     middles: list[float] = []
     headings: list[float] = []
     last = 0
@@ -175,8 +175,6 @@ def _slopes(x: tuple[float, ...], y: tuple[float, ...], at: tuple[float, ...], l
     At the ends the length is kept and lies to one side, so that noise is smoothed there as elsewhere; where points
     are sparse the nearest on both sides are taken.
     """
-    import numpy as np
-
     xs, ys, where = np.asarray(x), np.asarray(y), np.asarray(at)
     length = min(length, x[-1] - x[0])
     start = np.clip(where - length / 2, x[0], x[-1] - length)

@@ -9,17 +9,16 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import nan
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
+import numpy as np
+
+from gz_onboard.arrays import Array
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.progress import Progress
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.parts.road import RoadProfile
 from gz_onboard.simulation.scooter import Scooter
-
-if TYPE_CHECKING:
-    from gz_onboard.arrays import Array
-
 
 COLUMNS = {
     "time": "s",
@@ -168,8 +167,6 @@ class _Totals(NamedTuple):
 
 def _finished(scooter: Scooter, rows: Sequence[tuple[float, ...]], before: tuple[float, float], totals: _Totals) -> Run:
     """The run of a scooter that has ended it. before: kinetic energy [J] and SOC at its start."""
-    import numpy as np
-
     kinetic, soc_start = before
     series = dict(zip(COLUMNS, np.array(rows, dtype=float).T, strict=True))
     if len(rows) > 1 and not np.isnan(series["wanted_speed"][1]):
@@ -178,7 +175,7 @@ def _finished(scooter: Scooter, rows: Sequence[tuple[float, ...]], before: tuple
     return Run(
         series=series,
         ledger={
-            **scooter.ledger.entries,
+            **scooter.ledger,
             "kinetic_energy": scooter.kinetic_energy() - kinetic,
             "potential_energy": scooter.potential_energy(),
         },
@@ -263,8 +260,6 @@ def along(metres: Sequence[float]) -> Command:
 
 def at_steps(time: Sequence[float], speed: Sequence[float], dt: float) -> list[float]:
     """`speed` at each step of `dt` [s] within `time` [s], the end of the step counting: a rider looks ahead."""
-    import numpy as np
-
     steps = round((time[-1] - time[0]) / dt)
     values: list[float] = np.interp(time[0] + dt * np.arange(1, steps + 1), time, speed).tolist()
     return values
@@ -295,7 +290,6 @@ def road_table(
 
 def shortfalls(series: dict[str, Array]) -> list[Shortfall]:
     """Where the speed stayed below all that was wanted within a second, by more than the tolerance; worst first."""
-    import numpy as np
     from numpy.lib.stride_tricks import sliding_window_view
 
     time, wanted, speed = series["time"], series["wanted_speed"], series["speed"]

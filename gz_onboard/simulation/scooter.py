@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
 from math import sqrt
 from typing import TypedDict, Unpack
 
@@ -36,17 +35,6 @@ WHEEL_ONLY = {"speed", "motor_speed", "time_moving"}
 TRACKED = frozenset({"heading", "time_moving", "soc", "cell_temperature", "cell_current", "vibration"})
 LEAST_LOAD = 0.05  # of the weight, on the rear axle
 VOLTAGE_FILTER = 0.3  # s: the controller's own; without one, current and sag would chase each other each step
-
-
-@dataclass
-class Ledger:
-    """Energy [J] by where it went, since the start."""
-
-    entries: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
-
-    def total(self) -> float:
-        """The sum of all entries."""
-        return sum(self.entries.values())
 
 
 class Options(TypedDict, total=False):
@@ -93,7 +81,7 @@ class Scooter:
         self.current = self.motor_current = 0.0  # A; of the pack, of the motor
         self.throttle = self.brake = 0.0
         self.force = self.rear_load = self.front_load = 0.0  # N; of the driven tyre, on the axles
-        self.ledger = Ledger()
+        self.ledger = defaultdict[str, float](float)  # J by where it went, since the start
         self._q: dict[str, float] = dict.fromkeys(QUANTITIES, 0.0)
         self._begin(options)
         cells = options.get("cell_temperature")
@@ -195,7 +183,7 @@ class Scooter:
 
     def step(self, throttle: float, brake: float) -> None:
         """One step with throttle and brake [0..1]."""
-        dt, q, entries, roller = self.dt, self._q, self.ledger.entries, self.dynamometer
+        dt, q, entries, roller = self.dt, self._q, self.ledger, self.dynamometer
         v, w, gear = self.speed, self.wheel_speed, self._gear
         self.throttle, self.brake = throttle, brake
         normal, turning, radius = self._on_the_road()
@@ -265,7 +253,7 @@ class Scooter:
 
     def _draw(self, mechanical: float, motor_speed: float, current: float) -> None:
         """Every watt from the pack to the shaft (eqs. 2.2-2.6, 2.9, 2.10, 2.16-2.19), and its heat."""
-        dt, q, entries, heat = self.dt, self._q, self.ledger.entries, self._heat
+        dt, q, entries, heat = self.dt, self._q, self.ledger, self._heat
         q["torque"] = self.motor.torque_constant * current
         motor_heat = self.motor.heat(motor_speed, current, self.motor_cooling.stator, dt, entries)
         q["motor_speed"], q["motor_current"] = motor_speed, current

@@ -5,8 +5,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import numpy as np
+
+from gz_onboard.arrays import Array
 from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.offline.results import clock, number, text_rows, times
 from gz_onboard.offline.schema import descriptions
@@ -15,9 +18,6 @@ from gz_onboard.simulation.recorded import Recorded
 from gz_onboard.simulation.run import COLUMNS, Run, range_by_energy
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    from gz_onboard.arrays import Array
 
 SUMMARY_VERSION = 1
 _RANGE_BY = {
@@ -162,8 +162,6 @@ def summarise(vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, resul
 
 def measured_columns(recorded: Recorded, result: Run) -> dict[str, Array]:
     """What was recorded of the columns of a run, at the times of its series."""
-    import numpy as np
-
     at = np.minimum(np.round(result.series["time"] / recorded.dt).astype(int), len(recorded.signals["speed"]) - 1)
     columns = {name: values[at] for name, values in recorded.signals.items() if name in COLUMNS}
     if "soc" in recorded.signals:
@@ -173,8 +171,6 @@ def measured_columns(recorded: Recorded, result: Run) -> dict[str, Array]:
 
 def compare(recorded: Recorded, result: Run) -> MeasuredEntry:
     """The entry ``measured`` of the summary."""
-    import numpy as np
-
     columns = measured_columns(recorded, result)
     energy = recorded.energy()
 

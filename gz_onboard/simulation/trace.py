@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import MOVING, Port
 from gz_onboard.physics.model import Bound, all_quantities, over, total
 from gz_onboard.simulation.run import Command
 from gz_onboard.simulation.scooter import Scooter
-
-if TYPE_CHECKING:
-    from gz_onboard.arrays import Array
 
 LEAN_TIME = 1.0  # s that a rider takes into a bend: the road's pieces change their curvature at once
 _NAMES = (
@@ -82,8 +81,6 @@ class Trace:
 
     def truth(self, scooter: Scooter) -> Truth:
         """What there was to be sensed on the ride of `scooter`; ValueError if nothing was ridden."""
-        import numpy as np
-
         if len(self._rows) < 3 * len(_NAMES):
             raise ValueError("a trace of fewer than three steps")
         columns = np.frombuffer(self._rows).reshape(-1, len(_NAMES)).T
@@ -100,7 +97,6 @@ class Truth:
     """
 
     def __init__(self, columns: Mapping[str, Array], scooter: Scooter) -> None:
-        import numpy as np
 
         from gz_onboard.arrays import running_mean
 
@@ -131,8 +127,6 @@ class Truth:
 
     def _auxiliary(self, scooter: Scooter) -> Array:
         """What all effects at the DC link draw beside the inverter [W]."""
-        import numpy as np
-
         c = self.columns
         q = all_quantities(
             speed=c["way"],
@@ -157,8 +151,6 @@ class Truth:
 
     def constant(self, value: float) -> Array:
         """`value` at every step."""
-        import numpy as np
-
         return np.full(self.count, value)
 
 
@@ -167,8 +159,6 @@ def _lean_of(ideal: Array, p: Mapping[str, float]) -> Array:
 
     A chassis without lean has nobody on it who leans; its sensors are those of one that does.
     """
-    import numpy as np
-
     crown, height = p["tyre_crown_radius"], p["cg_height"]
     lean: Array = ideal + np.arcsin(np.clip(crown * np.sin(ideal) / (height - crown), -1.0, 1.0))
     return lean
