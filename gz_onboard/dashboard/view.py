@@ -160,11 +160,3 @@ class View:
     def complete(self) -> bool:
         """Whether every message has come."""
         return all(entry.received for entry in self.messages.values())
-
-
-def words(name: str) -> str:
-    """The name of a reason or a role in words, such as ``no IMU``, ``GPS altitude``, ``acceleration x``."""
-    return " ".join(_WORDS.get(word, word) for word in name.lower().split("_"))
-
-
-_WORDS = {"imu": "IMU", "gps": "GPS", "soc": "SOC", "bms": "BMS", "accel": "acceleration", "rate": "rate of rotation"}

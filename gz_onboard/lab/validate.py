@@ -12,13 +12,11 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import BAD_INPUT, FAILED, OK, not_an_input, writing
 from gz_onboard.lab.validate_ride import log_size, validate_ride
 from gz_onboard.lab.validate_score import Means, PooledMeans, Ride, SimulationVerdict, pooled
-from gz_onboard.offline.processes import Task, collect, over_rides
-from gz_onboard.offline.results import explain_keys, output_names, write_json
-from gz_onboard.offline.samples import ride_name
+from gz_onboard.offline.processes import Task, collect, over_rides, tasks_of
+from gz_onboard.offline.results import explain_keys, write_json
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
 from gz_onboard.progress import progress_bar
@@ -74,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard validate``: `OK`; `BAD_INPUT` if a ride cannot be judged; `FAILED` if with --gate one fails."""
-    tasks = _tasks(arguments)
+    tasks = tasks_of(arguments, Task, ".validation.png")
     written = [arguments.json, arguments.markdown, arguments.output / PAGE]
     written += [task.output(".validation.png") for task in tasks]
     not_an_input(written, [*(task.path for task in tasks), find_vehicle(arguments.vehicle)])
@@ -106,15 +104,6 @@ def _write_tables(arguments: argparse.Namespace, rides: list[Ride], together: Po
             arguments.markdown.write_text(markdown(rides, together), encoding="utf-8", errors="replace")
     if arguments.json != "-" and written:
         print(f"written: {', '.join(map(str, written))}")
-
-
-def _tasks(arguments: argparse.Namespace) -> list[Task]:
-    logs = list(dict.fromkeys(logs_among(arguments.logs)))
-    names = output_names(logs, [ride_name(log) for log in logs], ".validation.png")
-    return [
-        Task(log, arguments.output / name, arguments.vehicle, arguments.payload, not arguments.no_plot)
-        for log, name in zip(logs, names, strict=True)
-    ]
 
 
 def ride_text(ride: Ride) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gz_onboard.constants import WH
+from gz_onboard.events import words
 from gz_onboard.offline.style import (
     BLUE,
     GREEN,
@@ -130,7 +131,7 @@ def sankey(ledger: Mapping[str, float], effects: Sequence[Effect], title: str) -
     for name, energy, colour in sources:
         thick = energy / total * height
         axis.add_patch(Rectangle((left - 0.025, y - thick), 0.025, thick, color=colour, linewidth=0))
-        text = f"{_words(name)}\n{energy / WH:.1f} Wh"
+        text = f"{words(name)}\n{energy / WH:.1f} Wh"
         axis.text(left - 0.035, y - thick / 2, text, ha="right", va="center", fontsize=10, color=INK)
         y -= thick
     y, low = trunk, 1.0
@@ -139,7 +140,7 @@ def sankey(ledger: Mapping[str, float], effects: Sequence[Effect], title: str) -
         low -= thick
         _band(axis, (left, y), (right, low + thick), thick, colour)
         axis.add_patch(Rectangle((right, low), 0.02, thick, color=colour, linewidth=0))
-        text = f"{_words(name)}   {energy / WH:.2f} Wh   {100 * energy / total:.1f} %"
+        text = f"{words(name)}   {energy / WH:.2f} Wh   {100 * energy / total:.1f} %"
         axis.text(right + 0.03, low + thick / 2, text, va="center", fontsize=10, color=INK)
         y -= thick
         low -= gap
@@ -239,7 +240,3 @@ def _finish(axes: Sequence[Axes], x: Any, text: str, seconds: Mapping[int, Axes]
     for i, axis in enumerate(axes):
         legend(axis, *([seconds[i]] if i in seconds else []))
     close(axes, x, text)
-
-
-def _words(name: str) -> str:
-    return "BMS" if name == "bms" else name.replace("_", " ")
