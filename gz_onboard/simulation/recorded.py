@@ -137,8 +137,6 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     if felt is not None:
         columns["vibration"] = felt[:, 0], felt[:, 2]
     signals = _signals(log, columns, vehicle)
-    if "pack_voltage" in signals and "pack_current" in signals:
-        signals["soc"] = _counted_soc(signals, vehicle)
     way, grade, curvature = (np.array(column) for column in zip(*rows, strict=True))
     vibration = None if felt is None else _over_road(felt[:, 1], felt[:, 2])
     heading = None
@@ -147,12 +145,14 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
         heading = _over_road(course[:, 0], course[:, 1], period=2 * pi)
     stood = way[0] == way[-1]
     slope, bend = (np.zeros(1) if stood else _over_road(way, values) for values in (grade, curvature))
-    return Recorded(ride_name(log), STEP, signals, slope, bend, heading, vibration)
+    recorded = Recorded(ride_name(log), STEP, signals, slope, bend, heading, vibration)
+    if "pack_voltage" in signals and "pack_current" in signals:
+        signals["soc"] = _counted_soc(recorded, vehicle)
+    return recorded
 
 
 def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicle) -> dict[str, Array]:
     """All on one grid of steps: the speeds interpolated, what comes in steps as it was last told."""
-
     pace, factor = speed_role(str(log), columns, vehicle.parameters)
     time = columns[pace][0]
     grid = np.arange(time[0], time[-1], STEP)
@@ -211,24 +211,16 @@ def scooter_at_start(
 
 def rest_soc(recorded: Recorded, vehicle: Vehicle) -> float | None:
     """SOC in the first second, from voltage and current as if the RC pair had been at rest; None if not measured."""
-    return _rest_soc(recorded.signals, vehicle)
-
-
-def _rest_soc(signals: dict[str, Array], vehicle: Vehicle) -> float | None:
     battery = vehicle.battery
-    if battery is None or "pack_voltage" not in signals:
+    if battery is None or "pack_voltage" not in recorded.signals:
         return None
-
-    def first(role: str, default: float) -> float:
-        return float(signals[role][: round(1 / STEP)].mean()) if role in signals else default
-
-    soc = battery.first_soc(first("pack_voltage", 0.0), first("pack_current", 0.0), first("cell_temperature", AMBIENT))
-    return min(max(soc, 0.0), 1.0)
+    voltage, current = recorded.first("pack_voltage", 0.0), recorded.first("pack_current", 0.0)
+    return min(max(battery.first_soc(voltage, current, recorded.first("cell_temperature", AMBIENT)), 0.0), 1.0)
 
 
-def _counted_soc(signals: dict[str, Array], vehicle: Vehicle) -> Array:
+def _counted_soc(recorded: Recorded, vehicle: Vehicle) -> Array:
     """SOC by counting the measured charge from that at the start."""
-    start = _rest_soc(signals, vehicle)
+    signals, start = recorded.signals, rest_soc(recorded, vehicle)
     assert start is not None
     temperature = float(signals["cell_temperature"][0]) if "cell_temperature" in signals else AMBIENT
     soc: Array = start - discharged(np.cumsum(signals["pack_current"]), STEP, vehicle.pack.pack_capacity(temperature))

@@ -15,6 +15,7 @@ from math import sqrt
 from typing import TypedDict, Unpack
 
 from gz_onboard.constants import GRAVITY
+from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.physics.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
 from gz_onboard.physics.elementary import direction
@@ -119,7 +120,7 @@ class Scooter:
         self._series = battery.cells_series
         self._voltage_gain = min(dt / VOLTAGE_FILTER, 1.0)
         self._q["cell_capacity"] = battery.cell_capacity(cells)
-        inside = model.at(Port.CELL_VOLTAGE)
+        inside = CellEffects(model, battery)
         own = EffectPack(battery, soc, inside, self._q) if inside else FirstOrderPack(battery, soc)
         self.pack: Pack = options.get("pack") or own
         self._inverter = Losses(_calls(model.at(Port.INVERTER_LOSS), dt), dt)

@@ -41,28 +41,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = "name of a built-in drive cycle, CSV file of a cycle or a route, or log of a recorded ride to be replayed"
     add("what", metavar="WHAT", help=what)
     add_shared(parser, "--vehicle", "--payload")
-    _number(
-        parser, "--soc", 0.0, 1.0, help="state of charge at the start (default: 1; of a recorded ride, as recorded)"
-    )
-    _number(
-        parser,
-        "--ambient",
-        -40.0,
-        60.0,
-        "degC",
-        metavar="C",
-        help="temperature of air and vehicle at the start (default: 20)",
-    )
-    _number(
-        parser,
-        "--grade",
-        -30.0,
-        30.0,
-        "%",
-        default=0.0,
-        metavar="PERCENT",
-        help="of the road, uphill positive (default: %(default)g)",
-    )
+    charge = "state of charge at the start (default: 1; of a recorded ride, as recorded)"
+    _number(parser, "--soc", 0.0, 1.0, help=charge)
+    air = "temperature of air and vehicle at the start (default: 20)"
+    _number(parser, "--ambient", -40.0, 60.0, "degC", metavar="C", help=air)
+    hill = "of the road, uphill positive (default: %(default)g)"
+    _number(parser, "--grade", -30.0, 30.0, "%", default=0.0, metavar="PERCENT", help=hill)
     _number(parser, "--wind", -40.0, 40.0, "m/s", default=0.0, help="headwind (default: %(default)g)")
     often = parser.add_mutually_exclusive_group()
     repeat = number("--repeat", 1, 1000, kind=int)

@@ -163,10 +163,7 @@ def summarise(vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, resul
 def measured_columns(recorded: Recorded, result: Run) -> dict[str, Array]:
     """What was recorded of the columns of a run, at the times of its series."""
     at = np.minimum(np.round(result.series["time"] / recorded.dt).astype(int), len(recorded.signals["speed"]) - 1)
-    columns = {name: values[at] for name, values in recorded.signals.items() if name in COLUMNS}
-    if "soc" in recorded.signals:
-        columns["soc"] = recorded.signals["soc"][at]
-    return columns
+    return {name: values[at] for name, values in recorded.signals.items() if name in COLUMNS}
 
 
 def compare(recorded: Recorded, result: Run) -> MeasuredEntry:

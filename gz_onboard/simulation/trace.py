@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Mapping
+from operator import attrgetter
 
 import numpy as np
 
@@ -15,28 +16,20 @@ from gz_onboard.simulation.run import Command
 from gz_onboard.simulation.scooter import Scooter
 
 LEAN_TIME = 1.0  # s that a rider takes into a bend: the road's pieces change their curvature at once
-_NAMES = (
-    "time",
-    "speed",
-    "wheel_speed",
-    "distance",
-    "climb",
-    "grade",
-    "curvature",
-    "throttle",
-    "brake",
-    "motor_current",
-    "pack_current",
-    "pack_voltage",
-    "soc",
-    "cell",
-    "motor",
-    "inverter",
-    "bms",
-    "tyre_force",
-    "chassis_lean",
-    "vibration",
-)
+_ALIKE = "time speed wheel_speed distance climb throttle brake motor_current vibration"
+_STATES = {name: name for name in _ALIKE.split()} | {
+    "pack_current": "current",
+    "pack_voltage": "voltage",
+    "tyre_force": "force",
+    "chassis_lean": "lean",
+    "soc": "pack.soc",
+    "cell": "pack_cooling.temperature",
+    "bms": "bms_cooling.temperature",
+    "motor": "motor_cooling.stator",
+    "inverter": "inverter_cooling.board",
+}
+"""What is kept of a scooter, by name: the attribute that has it."""
+_NAMES = ("grade", "curvature", *_STATES)
 
 
 class Trace:
@@ -47,34 +40,11 @@ class Trace:
 
     def watch(self, command: Command) -> Command:
         """`command`, with the state that it is given kept."""
-        extend = self._rows.extend
+        extend, states = self._rows.extend, attrgetter(*_STATES.values())
 
         def watched(s: Scooter) -> tuple[float, float, float]:
             grade, curvature, _ = (0.0, 0.0, 0.0) if s.dynamometer else s.road(s.distance)
-            extend(
-                (
-                    s.time,
-                    s.speed,
-                    s.wheel_speed,
-                    s.distance,
-                    s.climb,
-                    grade,
-                    curvature,
-                    s.throttle,
-                    s.brake,
-                    s.motor_current,
-                    s.current,
-                    s.voltage,
-                    s.pack.soc,
-                    s.pack_cooling.temperature,
-                    s.motor_cooling.stator,
-                    s.inverter_cooling.board,
-                    s.bms_cooling.temperature,
-                    s.force,
-                    s.lean,
-                    s.vibration,
-                )
-            )
+            extend((grade, curvature, *states(s)))
             return command(s)
 
         return watched

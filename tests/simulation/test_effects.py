@@ -43,7 +43,7 @@ def per_metre(run: Run) -> float:
 
 def states(scooter: Scooter) -> dict[str, float]:
     assert isinstance(scooter.pack, EffectPack)
-    return scooter.pack.states
+    return scooter.pack.effects.states
 
 
 def bends(distance: float) -> tuple[float, float, float]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from gz_onboard.simulation.turning.machine import Machine, Rates, Road, State
 
-_NONE = ["lateral_acceleration", "yaw_rate", "lean", "steer", "slip_front", "slip_rear", "side_front", "side_rear"]
+_NONE = "lateral_acceleration yaw_rate lean steer slip_front slip_rear side_front side_rear"
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Straight:
         seen = {"speed": speed, "acceleration": acceleration, "drive": drive, "rolling_radius": m.wheel_radius}
         for load in ("load", "plane_load"):
             seen |= {f"{load}_front": front, f"{load}_rear": weight - front}
-        return Rates((acceleration, speed), power, seen | dict.fromkeys(_NONE, 0.0))
+        return Rates((acceleration, speed), power, seen | dict.fromkeys(_NONE.split(), 0.0))
 
     def handlebar(self, steer: float, lean: float) -> float:
         """Handlebar angle [rad] for a steer angle at the ground: there is no steering."""
