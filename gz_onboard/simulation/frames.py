@@ -37,7 +37,7 @@ _PHASE, _LOSS, _GAPS = 101, 102, 103  # streams of chance that belong to no sign
 
 
 @dataclass(frozen=True)
-class Losses:
+class Dropouts:
     """What the bus and the GPS receiver do not deliver."""
 
     frames: float = 1e-4  # share of the frames of each message
@@ -56,7 +56,7 @@ class Sent:
     dropped: int  # that were lost
 
 
-def simulate_frames(vehicle: Vehicle, truth: Truth, seed: int = 0, losses: Losses | None = None) -> list[Sent]:
+def simulate_frames(vehicle: Vehicle, truth: Truth, seed: int = 0, dropouts: Dropouts | None = None) -> list[Sent]:
     """The messages that the sensors of a ride send, from `START_NS` on.
 
     Raises InputError if the vehicle's DBC files have none of the sensors' signals, or a message that has no
@@ -82,7 +82,7 @@ def simulate_frames(vehicle: Vehicle, truth: Truth, seed: int = 0, losses: Losse
             raise vehicle.error(
                 f"message {message.name}: simulated frames have eight bytes and little-endian integers, not multiplexed"
             )
-        sent.append(_send(vehicle, message, sensors, truth, seed, losses or Losses()))
+        sent.append(_send(vehicle, message, sensors, truth, seed, dropouts or Dropouts()))
     return sent
 
 
@@ -120,7 +120,7 @@ def write_frames(out: Path, sent: list[Sent]) -> int:
 
 
 def _send(
-    vehicle: Vehicle, message: Message, sensors: dict[str, Sensor], truth: Truth, seed: int, losses: Losses
+    vehicle: Vehicle, message: Message, sensors: dict[str, Sensor], truth: Truth, seed: int, dropouts: Dropouts
 ) -> Sent:
     period_ns = round(vehicle.mapping.periods[message.name] * 1e9)
     rng = np.random.default_rng([seed, message.frame_id, _PHASE])
@@ -130,7 +130,7 @@ def _send(
     seconds: Floats = offsets.astype(float) * 1e-9
     no_fix = np.zeros(len(offsets), dtype=bool)
     if message.name in GPS_MESSAGES:
-        for begin, end in _gps_gaps(truth, seed, losses):
+        for begin, end in _gps_gaps(truth, seed, dropouts):
             no_fix |= (seconds >= begin) & (seconds < end)
     protection = vehicle.mapping.protection.get(message.name)
     counter = protection.counter if protection else None
@@ -158,7 +158,7 @@ def _send(
     words |= np.uint64((2**64 - 1) & ~used)  # bits without a signal are ones
     if crc:
         words = _seal(words)
-    kept = np.random.default_rng([seed, message.frame_id, _LOSS]).random(len(offsets)) >= losses.frames
+    kept = np.random.default_rng([seed, message.frame_id, _LOSS]).random(len(offsets)) >= dropouts.frames
     identifier = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
     return Sent(message.name, identifier, START_NS + offsets[kept], words[kept], int((~kept).sum()))
 
@@ -207,7 +207,7 @@ def _seal(words: Words) -> Words:
     return (words & np.uint64(2**56 - 1)) | crc << np.uint64(56)
 
 
-def _gps_gaps(truth: Truth, seed: int, losses: Losses) -> Any:
+def _gps_gaps(truth: Truth, seed: int, dropouts: Dropouts) -> Any:
     """(begin, end) [s] of each time without a fix; on a dynamometer, indoors, all of the ride."""
     duration = truth.count * truth.dt
     if truth.on_dynamometer:
@@ -215,11 +215,11 @@ def _gps_gaps(truth: Truth, seed: int, losses: Losses) -> Any:
     rng = np.random.default_rng([seed, _GAPS])
     gaps = []
     at = 0.0
-    while losses.gps_gap_every > 0:
-        at += rng.exponential(losses.gps_gap_every)
+    while dropouts.gps_gap_every > 0:
+        at += rng.exponential(dropouts.gps_gap_every)
         if at >= duration:
             break
-        end = at + rng.uniform(*losses.gps_gap)
+        end = at + rng.uniform(*dropouts.gps_gap)
         gaps.append((at, end))
         at = end
     return np.array(gaps).reshape(-1, 2)

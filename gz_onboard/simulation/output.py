@@ -12,7 +12,7 @@ from pathlib import Path
 from gz_onboard.errors import writable, writing
 from gz_onboard.offline.page import svg, write_page
 from gz_onboard.offline.style import save
-from gz_onboard.simulation.frames import Losses, simulate_frames, write_frames
+from gz_onboard.simulation.frames import Dropouts, simulate_frames, write_frames
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.run import COLUMNS, Run
 from gz_onboard.simulation.scooter import Scooter
@@ -49,8 +49,8 @@ def write(
 
 def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, scooter: Scooter) -> str:
     """Write the ride's frames; gives the file's name. InputError if it cannot be written."""
-    losses = Losses() if arguments.frame_loss is None else Losses(frames=arguments.frame_loss)
-    sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, losses=losses)
+    dropouts = Dropouts() if arguments.frame_loss is None else Dropouts(frames=arguments.frame_loss)
+    sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, dropouts=dropouts)
     with writing(arguments.frames):
         arguments.frames.parent.mkdir(parents=True, exist_ok=True)
         write_frames(arguments.frames, sent)

@@ -18,7 +18,7 @@ from gz_onboard.errors import OK, InputError, not_an_input
 from gz_onboard.offline.results import explain_keys, times, write_json
 from gz_onboard.options import add_shared, number
 from gz_onboard.progress import Progress, progress_bar
-from gz_onboard.simulation.frames import Losses, check_output
+from gz_onboard.simulation.frames import Dropouts, check_output
 from gz_onboard.simulation.output import FORMATS, write, write_trace
 from gz_onboard.simulation.parts.chassis import MODELS, chassis
 from gz_onboard.simulation.parts.road import Dynamometer
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     frames = "write the ride as CAN frames of the vehicle's sensors: .blf .log .asc .trc .csv .mf4"
     add("--frames", type=Path, metavar="FILE", help=frames)
     add_shared(parser, "--seed", help="seed of the noise and losses of --frames (default: %(default)s)")
-    lost = f"share of the --frames that the bus loses (default: {Losses.frames:g})"
+    lost = f"share of the --frames that the bus loses (default: {Dropouts.frames:g})"
     _number(parser, "--frame-loss", 0.0, 1.0, metavar="SHARE", help=lost)
     add_shared(parser, "--quiet")
 
