@@ -46,7 +46,7 @@ class Dropouts:
 
 
 @dataclass(frozen=True)
-class Sent:
+class Stream:
     """All frames of one message: `words` are its eight bytes as little-endian numbers."""
 
     message: str
@@ -56,7 +56,7 @@ class Sent:
     dropped: int  # that were lost
 
 
-def simulate_frames(vehicle: Vehicle, truth: Truth, seed: int = 0, dropouts: Dropouts | None = None) -> list[Sent]:
+def simulate_frames(vehicle: Vehicle, truth: Truth, seed: int = 0, dropouts: Dropouts = Dropouts()) -> list[Stream]:
     """The messages that the sensors of a ride send, from `START_NS` on.
 
     Raises InputError if the vehicle's DBC files have none of the sensors' signals, or a message that has no
@@ -82,7 +82,7 @@ def simulate_frames(vehicle: Vehicle, truth: Truth, seed: int = 0, dropouts: Dro
             raise vehicle.error(
                 f"message {message.name}: simulated frames have eight bytes and little-endian integers, not multiplexed"
             )
-        sent.append(_send(vehicle, message, sensors, truth, seed, dropouts or Dropouts()))
+        sent.append(_send(vehicle, message, sensors, truth, seed, dropouts))
     return sent
 
 
@@ -90,7 +90,7 @@ def _can_be_packed(signal: Signal) -> bool:
     return signal.byte_order == "little_endian" and not signal.conversion.is_float
 
 
-def batches(sent: list[Sent]) -> Iterator[list[Frame]]:
+def batches(sent: list[Stream]) -> Iterator[list[Frame]]:
     """The frames in the order of their times, some thousands at once."""
     times = np.concatenate([s.times for s in sent])
     words = np.concatenate([s.words for s in sent])
@@ -114,14 +114,14 @@ def check_output(out: Path) -> str:
     return suffix
 
 
-def write_frames(out: Path, sent: list[Sent]) -> int:
+def write_frames(out: Path, sent: list[Stream]) -> int:
     """Write the frames in the format of the suffix of `out`; returns how many. InputError for an unknown suffix."""
     return write_frames_as(out, check_output(out), batches(sent))
 
 
 def _send(
     vehicle: Vehicle, message: Message, sensors: dict[str, Sensor], truth: Truth, seed: int, dropouts: Dropouts
-) -> Sent:
+) -> Stream:
     period_ns = round(vehicle.mapping.periods[message.name] * 1e9)
     rng = np.random.default_rng([seed, message.frame_id, _PHASE])
     phase_us = int(rng.integers(0, period_ns // 1000))  # whole µs: candump has no more
@@ -160,7 +160,7 @@ def _send(
         words = _seal(words)
     kept = np.random.default_rng([seed, message.frame_id, _LOSS]).random(len(offsets)) >= dropouts.frames
     identifier = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
-    return Sent(message.name, identifier, START_NS + offsets[kept], words[kept], int((~kept).sum()))
+    return Stream(message.name, identifier, START_NS + offsets[kept], words[kept], int((~kept).sum()))
 
 
 def _values(sensor: Sensor | None, truth: Truth, seconds: Floats, period: float, rng: np.random.Generator) -> Floats:
