@@ -9,7 +9,7 @@ from math import ceil, sqrt
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effects import aerodynamic_drag, rolling_resistance
 from gz_onboard.physics.model import air_density
-from gz_onboard.simulation.turning.tyre import Tyre
+from gz_onboard.simulation.turning.tyre import LateralTyre
 
 State = tuple[float, ...]
 
@@ -54,8 +54,8 @@ class Machine:
     yaw_inertia: float
     crown: float
     caster: float
-    front: Tyre
-    rear: Tyre
+    front: LateralTyre
+    rear: LateralTyre
     drag_area: float
     rolling_constant: float
     rolling_speed: float
@@ -65,7 +65,7 @@ class Machine:
         """The machine that these parameters describe."""
         p = parameters
         front, rear = (
-            Tyre(
+            LateralTyre(
                 p[f"cornering_stiffness_{axle}"],
                 p[f"camber_stiffness_{axle}"],
                 p["side_friction"],

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from math import cos, sin, sqrt
 
 from gz_onboard.simulation.turning.machine import Machine, Rates, Road, State
-from gz_onboard.simulation.turning.tyre import Tyre
+from gz_onboard.simulation.turning.tyre import LateralTyre
 
 STANDSTILL = 0.1  # m/s: below it what camber does fades, as rolling resistance does
 
@@ -137,7 +137,7 @@ class Planar:
         return Rates(change, power, seen, fastest)
 
     def _wheel(
-        self, tyre: Tyre, slip: float, camber: float, along: float, radius: float
+        self, tyre: LateralTyre, slip: float, camber: float, along: float, radius: float
     ) -> tuple[float, float, float, float, float]:
         rolls = along / sqrt(along * along + STANDSTILL * STANDSTILL)  # a wheel that stands has no camber thrust
         side = tyre.side_force(slip, camber * abs(rolls))
