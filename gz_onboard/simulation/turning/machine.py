@@ -11,7 +11,7 @@ from gz_onboard.physics.effects import aerodynamic_drag, rolling_resistance
 from gz_onboard.physics.model import air_density
 from gz_onboard.simulation.turning.tyre import LateralTyre
 
-State = tuple[float, ...]
+MachineState = tuple[float, ...]
 
 STABLE = 2.0
 """Step times fastest decay that is left to one step: the method is stable up to 2.78, and oscillates beyond 2."""
@@ -35,7 +35,7 @@ class Rates:
     decays by itself.
     """
 
-    change: State
+    change: MachineState
     power: dict[str, float]
     seen: dict[str, float]
     fastest: float = 0.0
@@ -113,7 +113,9 @@ class Machine:
         return self.mass * GRAVITY * sqrt(1 - road.grade * road.grade)
 
 
-def step(rates: Callable[[State], Rates], state: State, dt: float) -> tuple[State, dict[str, float]]:
+def step(
+    rates: Callable[[MachineState], Rates], state: MachineState, dt: float
+) -> tuple[MachineState, dict[str, float]]:
     """A step of the classical Runge-Kutta method: (state after `dt` [s], energy [J] by where it went).
 
     The energies are integrated like the state, so their balance is as exact as the step itself. Where something decays
@@ -129,7 +131,9 @@ def step(rates: Callable[[State], Rates], state: State, dt: float) -> tuple[Stat
     return state, energy
 
 
-def _one_step(rates: Callable[[State], Rates], first: Rates, state: State, dt: float) -> tuple[State, dict[str, float]]:
+def _one_step(
+    rates: Callable[[MachineState], Rates], first: Rates, state: MachineState, dt: float
+) -> tuple[MachineState, dict[str, float]]:
     second = rates(_moved(state, first.change, dt / 2))
     third = rates(_moved(state, second.change, dt / 2))
     fourth = rates(_moved(state, third.change, dt))
@@ -144,5 +148,5 @@ def _one_step(rates: Callable[[State], Rates], first: Rates, state: State, dt: f
     return _moved(state, change, dt), energy
 
 
-def _moved(state: State, change: State, dt: float) -> State:
+def _moved(state: MachineState, change: MachineState, dt: float) -> MachineState:
     return tuple(value + rate * dt for value, rate in zip(state, change, strict=True))

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gz_onboard.simulation.turning.machine import Machine, Rates, Road, State
+from gz_onboard.simulation.turning.machine import Machine, MachineState, Rates, Road
 
 _NONE = "lateral_acceleration yaw_rate lean steer slip_front slip_rear side_front side_rear"
 
 
 @dataclass(frozen=True)
 class Straight:
-    """State: speed [m/s], distance [m]."""
+    """MachineState: speed [m/s], distance [m]."""
 
     machine: Machine
 
-    def start(self, speed: float) -> State:
+    def start(self, speed: float) -> MachineState:
         """The state at `speed` [m/s]."""
         return speed, 0.0
 
-    def energy(self, state: State) -> float:
+    def energy(self, state: MachineState) -> float:
         """Kinetic energy [J], of the turning wheels too."""
         m = self.machine
         return (m.mass + m.spin_inertia / m.wheel_radius**2) * state[0] ** 2 / 2
 
-    def rates(self, state: State, steer: float, drive: float | None, road: Road) -> Rates:
+    def rates(self, state: MachineState, steer: float, drive: float | None, road: Road) -> Rates:
         """With a force `drive` [N] of the driven wheel (None: the one that holds the speed); `steer` does nothing."""
         m = self.machine
         speed = state[0]

@@ -24,7 +24,7 @@ from gz_onboard.constants import GRAVITY
 from gz_onboard.offline.page import markdown_table
 from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, RED, new_figure, rule, save
 from gz_onboard.simulation.turning.leaning import Leaning
-from gz_onboard.simulation.turning.machine import Machine, Rates, Road, State, step
+from gz_onboard.simulation.turning.machine import Machine, MachineState, Rates, Road, step
 from gz_onboard.simulation.turning.planar import Planar
 from gz_onboard.simulation.turning.straight import Straight
 from gz_onboard.simulation.turning.tyre import ideal_of
@@ -57,7 +57,7 @@ class CoastDown:
     distance: list[float]
     lost: list[dict[str, float]]
     kinetic: list[float]
-    states: list[State]
+    states: list[MachineState]
     seen: list[dict[str, float]]
 
     def at_distance(self, distance: float, values: Sequence[float]) -> float:
@@ -86,11 +86,11 @@ class Rider:
         self.turn = -GRAVITY * tan(ideal_of(roll, machine.crown, machine.cg_height))  # m/s²
         self.let_go = False
 
-    def start(self, speed: float) -> State:
+    def start(self, speed: float) -> MachineState:
         """Straight ahead at `speed` [m/s]."""
         return *self.chassis.start(speed), 0.0, 0.0
 
-    def rates(self, state: State) -> Rates:
+    def rates(self, state: MachineState) -> Rates:
         """The rates of chassis and rider."""
         *body, integral, time = state
         speed = max(body[0], 1.0)
