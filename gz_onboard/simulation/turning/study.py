@@ -33,10 +33,10 @@ from gz_onboard.vehicle import read_vehicle
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Chassis = Straight | Planar | Leaning
+ChassisModel = Straight | Planar | Leaning
 
 ROLLS = (0.0, 5.0, 10.0, 20.0, 30.0)  # degrees
-MODELS: dict[str, type[Straight] | type[Planar] | type[Leaning]] = {
+CHASSIS_MODELS: dict[str, type[Straight] | type[Planar] | type[Leaning]] = {
     "straight": Straight,
     "planar": Planar,
     "leaning": Leaning,
@@ -73,14 +73,14 @@ def _at(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
     return float(np.interp(x, xs, ys, left=inf, right=inf))
 
 
-class Rider:
+class Steerer:
     """Steers `chassis` so that it turns as a machine that leans by `roll` [rad, positive right].
 
     A kinematic steer for the wanted yaw rate -g·tan φ_ideal/u, and feedback of the yaw rate with an integral. That
     integral and the time [s] are the last two entries of the state: the rider is integrated with the machine.
     """
 
-    def __init__(self, chassis: Chassis, roll: float, road: Road) -> None:
+    def __init__(self, chassis: ChassisModel, roll: float, road: Road) -> None:
         self.chassis, self.road = chassis, road
         machine = chassis.machine
         self.turn = -GRAVITY * tan(ideal_of(roll, machine.crown, machine.cg_height))  # m/s²
@@ -108,9 +108,9 @@ class Rider:
         return replace(rates, change=(*rates.change, STEER_INTEGRAL * error, 1.0))
 
 
-def coast_down(chassis: Chassis, roll: float, *, slow: float = SLOW, dt: float = STEP) -> CoastDown:
+def coast_down(chassis: ChassisModel, roll: float, *, slow: float = SLOW, dt: float = STEP) -> CoastDown:
     """Lean to `roll` [rad] at `FAST`, let go, and record until `slow` [m/s] (at most 10 minutes)."""
-    rider = Rider(chassis, roll, Road())
+    rider = Steerer(chassis, roll, Road())
     state = rider.start(FAST)
     for _ in range(round(LEAD_IN / dt)):
         state, _ = step(rider.rates, state, dt)
@@ -212,9 +212,9 @@ def _draw_energy(runs: dict[tuple[str, float], CoastDown], grid: Sequence[Axes])
         grid[1].plot([s[3] for s in run.states], [s[4] for s in run.states], STYLES[model], color=COLOURS[roll])
     grid[1].set_aspect("equal", adjustable="datalim")
     grid[1].set_title("Path of the coast-down [m]", fontsize=10, loc="left")
-    keys = [(model, roll) for roll in ROLLS for model in MODELS]
+    keys = [(model, roll) for roll in ROLLS for model in CHASSIS_MODELS]
     rows = [row(model, roll, runs[model, roll]) for model, roll in keys]
-    places = [i + i // len(MODELS) for i in range(len(keys))]
+    places = [i + i // len(CHASSIS_MODELS) for i in range(len(keys))]
     bottoms = np.zeros(len(keys))
     for name, shade in PARTS.items():
         heights = np.array([r["parts"][name] / 1000 for r in rows])
@@ -255,7 +255,7 @@ def _lines(
 def _legend(axes: Axes) -> None:
     for roll in ROLLS:
         axes.plot([], [], color=COLOURS[roll], label=f"{roll:.0f}°")
-    for model in MODELS:
+    for model in CHASSIS_MODELS:
         axes.plot([], [], STYLES[model], color=MUTED, label=model)
     axes.legend(fontsize=8, frameon=False, ncols=2)
 
@@ -267,7 +267,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--vehicle", default="reference", help="vehicle file (default: the reference scooter)")
     arguments = parser.parse_args(argv)
     machine = Machine.of(read_vehicle(arguments.vehicle).parameters)
-    runs = {(name, roll): coast_down(MODELS[name](machine), radians(roll)) for roll in ROLLS for name in MODELS}
+    runs = {
+        (name, roll): coast_down(CHASSIS_MODELS[name](machine), radians(roll))
+        for roll in ROLLS
+        for name in CHASSIS_MODELS
+    }
     rows = [row(model, roll, run) for (model, roll), run in runs.items()]
     arguments.output.mkdir(parents=True, exist_ok=True)
     table = markdown(rows)
