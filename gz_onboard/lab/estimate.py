@@ -13,7 +13,7 @@ from pathlib import Path
 
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
 from gz_onboard.events import words
-from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, Summary, estimate_log, known_vehicle
+from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, RideSummary, estimate_log, known_vehicle
 from gz_onboard.offline.processes import collect, over_rides, tasks_of
 from gz_onboard.offline.results import clock, explain_keys, number, text_rows, write_json
 from gz_onboard.offline.schema import descriptions
@@ -21,7 +21,7 @@ from gz_onboard.options import add_shared
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.vehicle import find_vehicle
 
-KEYS = descriptions(Summary)
+KEYS = descriptions(RideSummary)
 """What the summary of a ride holds."""
 
 
@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _results(
     tasks: Sequence[EstimateTask], jobs: int | None, progress: Progress
-) -> Iterator[tuple[EstimateTask, Summary | InputError]]:
+) -> Iterator[tuple[EstimateTask, RideSummary | InputError]]:
     """Each task with its summary or its error, in order."""
     try:
         yield from over_rides(estimate_log, tasks, jobs, progress)
@@ -86,7 +86,7 @@ def _expected(path: Path) -> int | None:
     return None
 
 
-def summary_text(ride: Summary) -> str:
+def summary_text(ride: RideSummary) -> str:
     """A ride's summary for a terminal."""
     rows = [
         (

@@ -65,7 +65,7 @@ class Variant:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Summary:
+class SimulationSummary:
     """What ``--json`` writes."""
 
     what: Annotated[str, "the cycle, route or ride, as given"]
@@ -114,7 +114,7 @@ class Summary:
     )
 
 
-KEYS = descriptions(Summary)
+KEYS = descriptions(SimulationSummary)
 
 
 def cycle_range(result: Run, scooter: Scooter) -> tuple[float | None, str | None]:
@@ -126,10 +126,12 @@ def cycle_range(result: Run, scooter: Scooter) -> tuple[float | None, str | None
     return metres, None if metres is None else "energy"
 
 
-def summarise(vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, result: Run, scooter: Scooter) -> Summary:
+def summarise(
+    vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, result: Run, scooter: Scooter
+) -> SimulationSummary:
     """The summary, without what only the command knows: its time, sweep and files."""
     metres, by = cycle_range(result, scooter)
-    return Summary(
+    return SimulationSummary(
         what=str(arguments.what),
         kind=plan.kind,
         vehicle=vehicle.name,
@@ -187,7 +189,7 @@ def compare(recorded: Recorded, result: Run) -> MeasuredEntry:
     )
 
 
-def summary_text(summary: Summary) -> str:
+def summary_text(summary: SimulationSummary) -> str:
     """A summary for a terminal."""
     ledger = sorted(summary.ledger_wh.items(), key=lambda item: -item[1])
     ledger = [(name, energy) for name, energy in ledger if abs(energy) >= _LEAST]
@@ -224,7 +226,7 @@ def summary_text(summary: Summary) -> str:
     return "\n".join([text_rows(head, rows), *(["", *_table(summary.sweep)] if summary.sweep else [])])
 
 
-def _shortfall_rows(summary: Summary) -> list[tuple[str, str]]:
+def _shortfall_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
     found = summary.shortfalls
     if not found:
         return []
@@ -236,14 +238,14 @@ def _shortfall_rows(summary: Summary) -> list[tuple[str, str]]:
     return rows
 
 
-def _turning_rows(summary: Summary) -> list[tuple[str, str]]:
+def _turning_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
     seconds = summary.turning_beyond_s
     if not seconds:
         return []
     return [("turning", f"{seconds:.1f} s in bends harder than the {summary.chassis} model goes: taken at its edge")]
 
 
-def _measured_rows(summary: Summary) -> list[tuple[str, str]]:
+def _measured_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
     m = summary.measured
     if not m:
         return []
