@@ -21,9 +21,9 @@ from gz_onboard.lab.validate_score import (
     COMPONENT_GATE,
     GATE,
     LEAST_SECONDS,
-    Ride,
     SimulationVerdict,
     Splits,
+    ValidatedRide,
     Verdict,
     conditions,
     errors,
@@ -67,7 +67,7 @@ def log_size(log: Path) -> int:
         return 1
 
 
-def validate_ride(task: Task, progress: Progress = lambda _: None) -> Ride:
+def validate_ride(task: Task, progress: Progress = lambda _: None) -> ValidatedRide:
     """Compare one ride with its simulation; `progress` counts bytes of the log. Raises InputError."""
     facts = facts_of(task.path)
     kind = facts.get("kind")
@@ -99,7 +99,7 @@ def validate_ride(task: Task, progress: Progress = lambda _: None) -> Ride:
     }
     splits["components"] = {name: split(c.measured, c.modelled, found, c.valid) for name, c in alone.items()}
     picture = task.output(".validation.png") if task.plot else None
-    result = Ride(
+    result = ValidatedRide(
         file=str(task.path),
         name=ride_name(task.path),
         kind=None if kind is None else str(kind),

@@ -50,7 +50,7 @@ CHANNELS = {
 
 
 @dataclass(frozen=True)
-class Errors:
+class ChannelErrors:
     """How far a simulated quantity is from the measured one: see the module's text."""
 
     unit: str
@@ -63,14 +63,14 @@ class Errors:
     passed: bool
 
 
-def errors(measured: Array, simulated: Array, quantity: Quantity, limit: float) -> Errors:
+def errors(measured: Array, simulated: Array, quantity: Quantity, limit: float) -> ChannelErrors:
     """Compare two arrays of shape (n,), n > 0; limit: in percent."""
     error = simulated - measured
     mae, rms = float(np.abs(error).mean()), float(np.sqrt(np.mean(error**2)))
     base = float(max(np.ptp(measured), LEAST_RISE)) if quantity.temperature else float(np.abs(measured).mean())
     percent = 100 * mae / base if base > 0 else None
     spread = float(measured.std())
-    return Errors(
+    return ChannelErrors(
         unit="K" if quantity.temperature else quantity.unit,
         rms=rms,
         max=float(np.abs(error).max()),
@@ -87,7 +87,7 @@ class Verdict:
     """Whether a simulation, or the components, are within the limits."""
 
     channels: Annotated[
-        dict[str, Errors], "by name: unit, rms, max, mean_error, percent, of_spread, limit_percent, passed"
+        dict[str, ChannelErrors], "by name: unit, rms, max, mean_error, percent, of_spread, limit_percent, passed"
     ]
     passed: bool
 
@@ -126,7 +126,7 @@ Splits = dict[str, dict[str, Means]]
 
 
 @dataclass(frozen=True)
-class Ride:
+class ValidatedRide:
     """What was found of a ride."""
 
     file: Annotated[str, "the log"]
