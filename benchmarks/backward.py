@@ -42,7 +42,7 @@ class Energy:
 
 
 @dataclass(frozen=True)
-class Conditions:
+class RideConditions:
     """Where and in what a speed is ridden; quantities of the ride are scalars or of shape (n,)."""
 
     grade: ArrayLike = 0.0  # sine of the road's angle
@@ -59,7 +59,7 @@ def backward(
     vehicle: Vehicle,
     time: ArrayLike,
     speed: ArrayLike,
-    conditions: Conditions = Conditions(),
+    conditions: RideConditions = RideConditions(),
     *,
     smoothing: float = SMOOTHING,
 ) -> Energy:
@@ -91,7 +91,7 @@ def backward(
 
 
 def _quantities(
-    vehicle: Vehicle, middle: Array, acceleration: Array, dt: Array, conditions: Conditions
+    vehicle: Vehicle, middle: Array, acceleration: Array, dt: Array, conditions: RideConditions
 ) -> dict[str, Any]:
     """What effects read, at the middle of each interval of `dt` [s]."""
     c = conditions

@@ -345,7 +345,7 @@ def simulation(repeats: int) -> tuple[float, float]:
     """CPU s of 20 minutes at 100 Hz: of the full scooter on WMTC class 1, and of the energy-only backward form."""
     import numpy as np
 
-    from benchmarks.backward import Conditions, backward
+    from benchmarks.backward import RideConditions, backward
     from gz_onboard.simulation.cycles import cycle
     from gz_onboard.simulation.run import at_steps, drive, follow
     from gz_onboard.simulation.scooter import STEP, Scooter
@@ -363,7 +363,7 @@ def simulation(repeats: int) -> tuple[float, float]:
     v = np.maximum(0, 8 + 4 * np.sin(t / 13))
     for _ in range(10 * repeats):
         begin = time.process_time()
-        backward(vehicle, t, v, Conditions(grade=0.02 * np.sin(t / 50)))
+        backward(vehicle, t, v, RideConditions(grade=0.02 * np.sin(t / 50)))
         backward_times.append(time.process_time() - begin)
     return median(forward_times), median(backward_times)
 

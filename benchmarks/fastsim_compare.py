@@ -19,7 +19,7 @@ from typing import Any
 import fastsim  # type: ignore[import-not-found, unused-ignore]
 import numpy as np
 
-from benchmarks.backward import Conditions, backward
+from benchmarks.backward import RideConditions, backward
 from gz_onboard.physics.derating import DeratingCurve
 from gz_onboard.physics.model import Model
 from gz_onboard.simulation.cycles import cycle
@@ -258,7 +258,7 @@ def main() -> None:
             electric,
             [0.1 * i for i in range(len(fine))],
             fine,
-            Conditions(ambient=AMBIENT, altitude=ALTITUDE, motor_temperature=30.0),
+            RideConditions(ambient=AMBIENT, altitude=ALTITUDE, motor_temperature=30.0),
             smoothing=0.0,
         )
         shares, efficiency = mean_efficiency(vehicle)

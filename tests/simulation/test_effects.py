@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks.backward import Conditions, backward
+from benchmarks.backward import RideConditions, backward
 from gz_onboard.physics.effect import known_effects, load_effect
 from gz_onboard.simulation.cycles import cycle, names
 from gz_onboard.simulation.parts.battery import EffectPack
@@ -197,7 +197,7 @@ def test_backward_agrees_with_forward_with_all_forces():
     curve = 0.004
     scooter = Scooter(vehicle, lambda distance: (0.0, curve, 0.0), soc=0.9)
     run = drive(scooter, follow(speeds, STEP), 300.0)
-    energy = backward(vehicle, run.series["time"], run.series["speed"], Conditions(curvature=curve), smoothing=0.0)
+    energy = backward(vehicle, run.series["time"], run.series["speed"], RideConditions(curvature=curve), smoothing=0.0)
     for name in ("headwind", "dragging_brake", "tyre_warm_up", "drivetrain_drag", "cornering_drag"):
         assert energy.ledger[name] == pytest.approx(run.ledger[name], rel=0.02, abs=200.0), name
 
