@@ -159,7 +159,7 @@ def oval(runs: list[tuple[Array, Array, dict[str, Any]]], file: Path) -> None:
     for (x, e, _), colour, label in zip(runs, (ORANGE, BLUE), ("simulated, before", "simulated, after"), strict=True):
         axis.plot(x / 1e3, e / 3600, color=colour, linewidth=1.6, label=label)
     axis.plot(way / 1e3, drawn / 3600, color=INK, linewidth=1.6, label="measured")
-    axis.set_xlabel("way [km]", fontsize=8.5, color=INK)
+    axis.set_xlabel("distance [km]", fontsize=8.5, color=INK)
     ordinate(axis, "drawn from the pack [Wh]")
     legend(axis)
     headline(figure, 0.07, 0.97, "The oval, which was in no fit", 11)
