@@ -20,7 +20,6 @@ from gz_onboard.simulation.trace import Truth
 
 BMS_DELAY = 0.10  # s behind the inverter
 GPS_DELAY = 0.4  # s
-CABLE = 0.0086  # Ω between pack and inverter
 REPORTED_TORQUE = 0.47  # N·m/A, that the inverter makes torque of its current with, whatever the magnets are
 ODOMETER_RADIUS = 0.245  # m, that the odometer assumes
 LATITUDE, LONGITUDE, ALTITUDE = 45.0, 9.0, 200.0  # deg, deg, m: where a simulated road begins, to the north
@@ -61,6 +60,10 @@ def _temperatures() -> list[Sensor]:
 
 def _delay(signal: str) -> float:
     return BMS_DELAY if signal.startswith("BMS_") else 0.0
+
+
+def _inverter_voltage(t: Truth) -> Array:
+    return t["pack_voltage"] - t.parameters["cable_resistance"] * t["pack_current"]
 
 
 def _inverter_current(t: Truth) -> Array:
@@ -129,7 +132,7 @@ SENSORS: tuple[Sensor, ...] = (
     Sensor("INV_MotorCurrent", _column("motor_current"), sd=0.3),
     Sensor("INV_MotorTorque", _column("motor_current", REPORTED_TORQUE), sd=0.1),
     Sensor("INV_State", _inverter_state),
-    Sensor("INV_DcVoltage", lambda t: t["pack_voltage"] - CABLE * t["pack_current"], sd=0.042),
+    Sensor("INV_DcVoltage", _inverter_voltage, sd=0.042),
     Sensor("INV_DcCurrent", _inverter_current, sd=0.35),
     # battery; gain, offset and noise are the vehicle's, see `spread`
     Sensor("BMS_PackVoltage", lambda t: t["pack_voltage"] + t.parameters["pack_voltage_offset"], delay=BMS_DELAY),

@@ -96,6 +96,13 @@ def test_the_estimate_is_the_truth():
     assert energy == pytest.approx(ride()[0].energy, rel=0.01)
 
 
+def test_the_inverter_is_behind_the_cable_of_the_vehicle_file():
+    truth = ride()[1]
+    (sensor,) = (sensor for sensor in SENSORS if sensor.signal == "INV_DcVoltage")
+    behind = truth["pack_voltage"] - reference().parameters["cable_resistance"] * truth["pack_current"]
+    assert sensor.read(truth) == pytest.approx(behind, abs=1e-12)
+
+
 def test_lean_and_grade_are_found():
     truth = ride()[1]
     run = estimated()
