@@ -223,25 +223,18 @@ def offline_ours(rides: Sequence[Path], *options: str) -> tuple[float, float]:
     """CPU time [s] of the whole process and the length of the rides [s]."""
     with tempfile.TemporaryDirectory() as name:
         before = os.times()
-        text = subprocess.run(
-            [
-                sys.executable,
-                "-m",
-                "gz_onboard",
-                "estimate",
-                *map(str, rides),
-                "--no-plot",
-                "--jobs",
-                "1",
-                "--json=-",
-                "--output",
-                name,
-                *options,
-            ],
-            check=True,
-            stdout=subprocess.PIPE,
-            text=True,
-        ).stdout
+        command = [
+            sys.executable,
+            "-m",
+            "gz_onboard",
+            "estimate",
+            *map(str, rides),
+            "--no-plot",
+            "--jobs=1",
+            "--json=-",
+        ]
+        command += [f"--output={name}", *options]
+        text = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
         after = os.times()
     used = after.children_user + after.children_system - before.children_user - before.children_system
     return used, sum(ride["duration_s"] for ride in json.loads(text)["rides"])

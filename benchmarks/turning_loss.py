@@ -125,22 +125,8 @@ def simulated(vehicle: str, folder: Path) -> tuple[Array, Array, dict[str, Any]]
     out.mkdir()
     summary = out / "summary.json"
     with contextlib.redirect_stdout(io.StringIO()):
-        command(
-            [
-                "simulate",
-                str(OVAL),
-                "--vehicle",
-                vehicle,
-                "--payload",
-                "84",
-                "--predictive",
-                "--no-plot",
-                "--output",
-                str(out),
-                "--json",
-                str(summary),
-            ]
-        )
+        options = [f"--vehicle={vehicle}", "--payload=84", "--predictive", "--no-plot"]
+        command(["simulate", str(OVAL), *options, f"--output={out}", f"--json={summary}"])
     table = parquet.read_table(next(out.glob("*.parquet")))
     way, energy = (np.array(table[name]) for name in ("distance[m]", "energy[J]"))
     return way, energy, json.loads(summary.read_text())

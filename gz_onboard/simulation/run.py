@@ -223,7 +223,7 @@ def follow(speeds: Sequence[float], dt: float, rider: Rider | None = None) -> Co
 
 
 def replay(throttle: Sequence[float], brake: Sequence[float], dt: float) -> Command:
-    """Throttle and brake as given, one of each for each step of `dt` [s]; after the last as there."""
+    """Throttle and brake as given, one of each for each step of `dt` [s]; after them the last."""
     last = min(len(throttle), len(brake)) - 1
 
     def command(scooter: Scooter) -> tuple[float, float, float]:
