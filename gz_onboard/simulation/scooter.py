@@ -52,8 +52,8 @@ class Options(TypedDict, total=False):
     pack: Pack | None
     motor: Motor | None
     chassis: Chassis | None
-    tyre_form: str  # transient; see `Tyre`
-    brake_form: str  # friction; see `Brakes`
+    tyre_form: str  # transient; or steady, as the thesis prints it, see `Tyre`
+    brake_form: str  # friction; or viscous, as the thesis prints it, see `Brakes`
 
 
 class Scooter:
