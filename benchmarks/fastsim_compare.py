@@ -122,7 +122,6 @@ def in_fastsim(
     data["grid"] = [{"v": 1, "dim": [len(shares)], "data": list(shares)}]
     data["values"] = {"v": 1, "dim": [len(shares)], "data": list(efficiency)}
     em["eff_interp_at_max_input"] = None
-    ride = fastsim.Cycle.from_resource("udds.csv").to_dict()
     n = len(t)
     ride = {
         "init_elev_meters": 121.92,
