@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from gz_onboard.arrays import Array
+from gz_onboard.constants import MILD
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import air_density, all_quantities, over
 from gz_onboard.vehicle import Vehicle
@@ -49,7 +50,7 @@ class RideConditions:
     curvature: ArrayLike = 0.0  # 1/m, positive to the left
     heading: ArrayLike | None = None  # rad clockwise from north; None: as the curvature turns it from north
     headwind: ArrayLike = 0.0  # m/s
-    ambient: float = 20.0  # degC
+    ambient: float = MILD  # degC
     altitude: float = 0.0  # m
     motor_temperature: ArrayLike | None = None  # degC; None: ambient
     vibration: ArrayLike | None = None  # m/s²; None: while moving what the vehicle's file expects

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.arrays import Array, block_means, running_mean
-from gz_onboard.constants import GRAVITY, WH
+from gz_onboard.constants import GRAVITY, MILD, WH
 from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.validate_components import Component, components
 from gz_onboard.lab.validate_score import (
@@ -34,7 +34,7 @@ from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.progress import Progress
 from gz_onboard.simulation.parts.road import Dynamometer, Place, RoadProfile
 from gz_onboard.simulation.plan import ridden_road, route_file
-from gz_onboard.simulation.recorded import AMBIENT, Recorded, read_recorded, rest_soc, scooter_at_start
+from gz_onboard.simulation.recorded import Recorded, read_recorded, rest_soc, scooter_at_start
 from gz_onboard.simulation.run import Command, Run, drive, follow, replay
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -85,7 +85,7 @@ def validate_ride(task: Task, progress: Progress = lambda _: None) -> ValidatedR
         for form, command in commands.items()
     }
     verdicts = {form: _judge_ride(measured, series) for form, series in simulated.items()}
-    ambient = recorded.first("ambient_temperature", AMBIENT)
+    ambient = recorded.first("ambient_temperature", MILD)
     roller = ride.road if isinstance(ride.road, Dynamometer) else None
     alone = components(vehicle, measured, ride.soc, ambient, roller)
     judged = _judge_components(alone)

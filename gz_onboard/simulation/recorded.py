@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from gz_onboard.arrays import Array, block_means, held_at
+from gz_onboard.arrays import Array, block_means, held_at, running_mean
 from gz_onboard.bus.codec import Codec
+from gz_onboard.constants import MILD
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Event
@@ -33,8 +34,8 @@ BRAKE_FORCE = 20e-5
 BRAKE_PRESSED = 0.5e5  # Pa: below this the sensors show noise
 BRAKE_MEAN = 90.0  # N: the mean of the same rides while the switch is on, where there are no pressures
 ROAD_PIECE = 5.0  # m
-AMBIENT = 20.0  # degC: of the air, where it was not measured
 SPAN, ROLLING, LEAST_SPANS = 2.0, 1.0, 10  # s, m/s and count: of spans of a roller's run that moves
+SMOOTHED = 0.2  # s: over which the roller's speed at the ends of a span is a mean
 LEAST_HEADINGS = 10  # of a ride whose heading counts as known
 _MOVING = 2.0  # m/s: slower than this, yaw rate over speed is no curvature
 
@@ -201,7 +202,7 @@ def scooter_at_start(
     ambient: air [degC]; None: as measured, or 20 degC. options: of `Scooter`.
     """
     measured = recorded.first if recorded else lambda _, default: default
-    air = measured("ambient_temperature", AMBIENT) if ambient is None else ambient
+    air = measured("ambient_temperature", MILD) if ambient is None else ambient
     cell, speed = measured("cell_temperature", air), measured("speed", 0.0)
     scooter = Scooter(vehicle, road, ambient=air, cell_temperature=cell, speed=speed, **options)
     scooter.motor_cooling.stator = scooter.motor_cooling.rotor = measured("motor_temperature", air)
@@ -215,14 +216,14 @@ def rest_soc(recorded: Recorded, vehicle: Vehicle) -> float | None:
     if battery is None or "pack_voltage" not in recorded.signals:
         return None
     voltage, current = recorded.first("pack_voltage", 0.0), recorded.first("pack_current", 0.0)
-    return min(max(battery.first_soc(voltage, current, recorded.first("cell_temperature", AMBIENT)), 0.0), 1.0)
+    return min(max(battery.first_soc(voltage, current, recorded.first("cell_temperature", MILD)), 0.0), 1.0)
 
 
 def _counted_soc(recorded: Recorded, vehicle: Vehicle) -> Array:
     """SOC by counting the measured charge from that at the start."""
     signals, start = recorded.signals, rest_soc(recorded, vehicle)
     assert start is not None
-    temperature = float(signals["cell_temperature"][0]) if "cell_temperature" in signals else AMBIENT
+    temperature = float(signals["cell_temperature"][0]) if "cell_temperature" in signals else MILD
     soc: Array = start - discharged(np.cumsum(signals["pack_current"]), STEP, vehicle.pack.pack_capacity(temperature))
     return soc
 
@@ -239,8 +240,8 @@ def fit_dynamometer(recorded: Recorded) -> Dynamometer:
     speed, force = recorded.signals["roller_speed"], recorded.signals["roller_force"]
     mean_v, mean_f, square = (block_means(x, n) for x in (speed, force, speed**2))
     spans = len(mean_v)
-    edges = np.interp(np.arange(spans + 1) * n, np.arange(len(speed)), np.convolve(speed, np.ones(21) / 21, "same"))
-    acceleration = np.diff(edges) / (n * recorded.dt)
+    smooth = running_mean(speed, 2 * round(SMOOTHED / recorded.dt / 2) + 1)
+    acceleration = np.diff(smooth[np.minimum(np.arange(spans + 1) * n, len(smooth) - 1)]) / (n * recorded.dt)
     moving = mean_v > ROLLING
     if moving.sum() < LEAST_SPANS:
         raise InputError(f"{recorded.name}: its roller hardly moves; give --dyno KG,A,B,C")

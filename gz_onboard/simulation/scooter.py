@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable
 from math import sqrt
 from typing import TypedDict, Unpack
 
-from gz_onboard.constants import GRAVITY
+from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.physics.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
@@ -74,7 +74,7 @@ class Scooter:
         self.dynamometer = road if isinstance(road, Dynamometer) else None
         self.road: RoadProfile = straight() if road is None or isinstance(road, Dynamometer) else road
         self.dt = options.get("dt", STEP)
-        self.ambient = options.get("ambient", 20.0)
+        self.ambient = options.get("ambient", MILD)
         self.speed = options.get("speed", 0.0)  # m/s
         self.wheel_speed = self.speed / vehicle.parameters["wheel_radius"]  # rad/s
         self.distance = self.climb = 0.0  # m

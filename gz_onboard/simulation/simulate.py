@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.constants import WH_PER_KM
+from gz_onboard.constants import HOUR, WH_PER_KM
 from gz_onboard.errors import OK, InputError, not_an_input
 from gz_onboard.offline.results import explain_keys, times, write_json
 from gz_onboard.options import add_shared, number
@@ -139,7 +139,7 @@ def ride(
         vibration=plan.vibration,
         chassis=chassis(arguments.chassis, vehicle.parameters),
     )
-    seconds = _MOST_HOURS * 3600 if arguments.until_empty else plan.seconds * arguments.repeat
+    seconds = _MOST_HOURS * HOUR if arguments.until_empty else plan.seconds * arguments.repeat
     if plan.length is not None:
         seconds = 3 * plan.seconds + 600  # a weak vehicle takes longer
     command = trace.watch(plan.command()) if trace else plan.command()

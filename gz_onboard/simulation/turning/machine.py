@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import ceil, sqrt
 
-from gz_onboard.constants import GRAVITY
+from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.physics.effects import aerodynamic_drag, rolling_resistance
 from gz_onboard.physics.model import air_density
 from gz_onboard.simulation.turning.tyre import LateralTyre
@@ -23,7 +23,7 @@ class Road:
 
     grade: float = 0.0
     headwind: float = 0.0
-    air_density: float = air_density(20.0)
+    air_density: float = air_density(MILD)
 
 
 @dataclass(frozen=True)
