@@ -141,13 +141,10 @@ def in_fastsim(
     wall = time.perf_counter() - begin
     out = simulation.to_dict()["veh"]
     state, battery = out["state"], out["pt_type"]["BEV"]["res"]["state"]
-    return {
+    vehicles = {"drag": "drag", "rolling": "rr", "brakes": "brake", "auxiliary": "aux"}
+    return {name: state[f"energy_{theirs}_joules"] for name, theirs in vehicles.items()} | {
         "distance": state["dist_meters"],
-        "drag": state["energy_drag_joules"],
-        "rolling": state["energy_rr_joules"],
-        "brakes": state["energy_brake_joules"],
         "motor": out["pt_type"]["BEV"]["em"]["state"]["energy_loss_joules"],
-        "auxiliary": state["energy_aux_joules"],
         "terminals": battery["energy_out_electrical_joules"],
         "cells": battery["energy_out_chemical_joules"],
         "met": float(state["cyc_met_overall"]),

@@ -115,18 +115,9 @@ def _parameters(report: Row, truth: plant.Truth) -> list[Row]:
             healthy = cause["value"] - cause["change"] if name == cause["parameter"] else 0.0
             true = healthy * (1 + change) if truth.relative else healthy + change
             low, high = found["ci95"]
-            rows.append(
-                {
-                    "effect": truth.name,
-                    "parameter": name,
-                    "true": true,
-                    "value": found["value"],
-                    "change": true - healthy,
-                    "ci95": [low, high],
-                    "held": bool(low <= true <= high),
-                    "clear": truth.clear,
-                }
-            )
+            said = {"effect": truth.name, "parameter": name, "true": true, "value": found["value"]}
+            judged = {"ci95": [low, high], "held": bool(low <= true <= high), "clear": truth.clear}
+            rows.append({**said, "change": true - healthy, **judged})
     return rows
 
 

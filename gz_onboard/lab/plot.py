@@ -305,17 +305,9 @@ def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Logged], reasons: Sequ
 
 def _spans(x: Sequence[float], true: Sequence[bool]) -> list[tuple[float, float]]:
     """(begin, length) of the stretches in which something is true; each estimate holds until the next."""
-    spans: list[tuple[float, float]] = []
-    begin: float | None = None
-    for place, now in zip(x, true, strict=True):
-        if now:
-            begin = place if begin is None else begin
-        elif begin is not None:
-            spans.append((begin, place - begin))
-            begin = None
-    if begin is not None:
-        spans.append((begin, x[-1] - begin))
-    return spans
+    from gz_onboard.arrays import stretches
+
+    return [(x[i], x[min(j, len(x) - 1)] - x[i]) for i, j in stretches(true)]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

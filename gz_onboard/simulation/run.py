@@ -12,7 +12,7 @@ from math import nan
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, stretches
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.progress import Progress
 from gz_onboard.simulation.parts.rider import Rider
@@ -286,10 +286,8 @@ def shortfalls(series: dict[str, Array]) -> list[Shortfall]:
     padded = np.pad(np.nan_to_num(wanted, nan=0.0), reach, mode="edge")
     least = sliding_window_view(padded, 2 * reach + 1).min(axis=1)
     missing = least - TOLERANCE - speed
-    short = np.concatenate(([False], missing > 0, [False]))
-    edges = np.flatnonzero(short[1:] != short[:-1])
     found = []
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+    for begin, end in stretches(missing > 0):
         worst = begin + int(np.argmax(missing[begin:end]))
         throttle = float(series["throttle"][begin:end].mean())
         lasts = float(time[min(end, len(time) - 1)] - time[begin])
