@@ -134,8 +134,7 @@ def in_fastsim(
         "temp_amb_air_kelvin": [AMBIENT + KELVIN] * n,
         "pwr_solar_load_watts": [0.0] * n,
     }
-    vehicle_ = fastsim.Vehicle.from_dict(car)
-    simulation = fastsim.SimDrive(vehicle_, fastsim.Cycle.from_dict(ride))
+    simulation = fastsim.SimDrive(fastsim.Vehicle.from_dict(car), fastsim.Cycle.from_dict(ride))
     begin = time.perf_counter()
     simulation.walk()
     wall = time.perf_counter() - begin

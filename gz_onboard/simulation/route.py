@@ -20,13 +20,14 @@ import numpy as np
 
 from gz_onboard.errors import InputError
 from gz_onboard.simulation.columns import Columns, read_columns
+from gz_onboard.simulation.cycles import UNITS
 
 GRADE_LENGTH = 200.0  # [m]
 CURVE_LENGTH = 40.0  # [m]
 _CHORD = 10.0  # [m]: shorter chords have no heading worth the name
 _STEEPEST = 0.5  # sine; no road is steeper, a wrong unit is
 _CLOSEST = 0.01  # [m] between points
-_LIMITS = {"speed_limit_mps": 1.0, "speed_limit_kmh": 1 / 3.6}
+_LIMITS = {f"speed_limit_{unit}": UNITS[unit] for unit in ("mps", "kmh")}
 _KNOWN = ("distance_m", "latitude_deg", "longitude_deg", "altitude_m", "curvature_1pm", *_LIMITS)
 
 
