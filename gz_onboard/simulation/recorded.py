@@ -32,7 +32,7 @@ from gz_onboard.vehicle import Vehicle
 BRAKE_FORCE = 20e-5
 """N of both brakes for each Pa, front and rear pressure added: deceleration on 8 road rides, with 19 N of scatter."""
 BRAKE_PRESSED = 0.5e5  # Pa: below this the sensors show noise
-BRAKE_MEAN = 90.0  # N: the mean of the same rides while the switch is on, where there are no pressures
+BRAKE_MEAN = 0.07835  # of full brake, 90 N: the mean of these rides while the switch is on, where no pressures are
 ROAD_PIECE = 5.0  # m
 SPAN, ROLLING, LEAST_SPANS = 2.0, 1.0, 10  # s, m/s and count: of spans of a roller's run that moves
 SMOOTHED = 0.2  # s: over which the roller's speed at the ends of a span is a mean
@@ -171,7 +171,7 @@ def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicl
             pressure = np.where(pressed > 0.5, np.maximum(pressure, 1.0), 0.0)
         signals["brake"] = np.clip(pressure * BRAKE_FORCE / limit, 0.0, 1.0)
     elif pressed is not None:
-        signals["brake"] = np.where(pressed > 0.5, BRAKE_MEAN / limit, 0.0)
+        signals["brake"] = np.where(pressed > 0.5, BRAKE_MEAN, 0.0)
     return signals
 
 
