@@ -46,7 +46,7 @@ docs: setup .venv/.docs-ready  ## the documentation as a site in build/docs; a d
 	@.ci/setup docs
 
 bench: setup  ## cost per frame, start-up, memory, beside the obvious pipeline of the same libraries
-	$(PYTHON_IN_VENV) benchmarks/bench.py
+	$(PYTHON_IN_VENV) -m benchmarks.bench
 
 trial: setup  ## does discover name hidden effects in rides of a scooter that is not the model's? rewrites docs/trial.md (CASES=n FIRST=seed)
 	$(PYTHON_IN_VENV) -m benchmarks.trial --cases $(CASES) --first $(FIRST)

@@ -98,25 +98,11 @@ def ride(file: Path, payload: float | None) -> tuple[str, list[Sample]]:
             state["next"] = e.time + 1.0
             bms = signals["bms_state_of_charge"].value
             assert pipeline.estimator.filter
-            samples.append(
-                Sample(
-                    e.time,
-                    pipeline.estimator.filter.soc,
-                    e.soc_sd,
-                    state["soc"],
-                    e.innovation or 0.0,
-                    e.distance,
-                    e.range,
-                    e.range_p10 or 0.0,
-                    e.range_p90 or 0.0,
-                    bms,
-                    baseline.range(bms, 0.15),
-                    baseline.range(bms, 0.0),
-                    baseline.energy,
-                    e.energy_left or 0.0,
-                    e.consumption_expected or 0.0,
-                )
-            )
+            soc = pipeline.estimator.filter.soc, e.soc_sd, state["soc"], e.innovation or 0.0
+            reach = e.range, e.range_p10 or 0.0, e.range_p90 or 0.0
+            others = bms, baseline.range(bms, 0.15), baseline.range(bms, 0.0), baseline.energy
+            ours = e.energy_left or 0.0, e.consumption_expected or 0.0
+            samples.append(Sample(e.time, *soc, e.distance, *reach, *others, *ours))
 
     pipeline = Pipeline(vehicle, observer=observe)
     for frames in read_frames(file):

@@ -223,25 +223,18 @@ def offline_ours(rides: Sequence[Path], *options: str) -> tuple[float, float]:
     """CPU time [s] of the whole process and the length of the rides [s]."""
     with tempfile.TemporaryDirectory() as name:
         before = os.times()
-        text = subprocess.run(
-            [
-                sys.executable,
-                "-m",
-                "gz_onboard",
-                "estimate",
-                *map(str, rides),
-                "--no-plot",
-                "--jobs",
-                "1",
-                "--json=-",
-                "--output",
-                name,
-                *options,
-            ],
-            check=True,
-            stdout=subprocess.PIPE,
-            text=True,
-        ).stdout
+        command = [
+            sys.executable,
+            "-m",
+            "gz_onboard",
+            "estimate",
+            *map(str, rides),
+            "--no-plot",
+            "--jobs=1",
+            "--json=-",
+        ]
+        command += [f"--output={name}", *options]
+        text = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
         after = os.times()
     used = after.children_user + after.children_system - before.children_user - before.children_system
     return used, sum(ride["duration_s"] for ride in json.loads(text)["rides"])
@@ -345,7 +338,7 @@ def simulation(repeats: int) -> tuple[float, float]:
     """CPU s of 20 minutes at 100 Hz: of the full scooter on WMTC class 1, and of the energy-only backward form."""
     import numpy as np
 
-    from gz_onboard.simulation.backward import Conditions, backward
+    from benchmarks.backward import RideConditions, backward
     from gz_onboard.simulation.cycles import cycle
     from gz_onboard.simulation.run import at_steps, drive, follow
     from gz_onboard.simulation.scooter import STEP, Scooter
@@ -363,7 +356,7 @@ def simulation(repeats: int) -> tuple[float, float]:
     v = np.maximum(0, 8 + 4 * np.sin(t / 13))
     for _ in range(10 * repeats):
         begin = time.process_time()
-        backward(vehicle, t, v, Conditions(grade=0.02 * np.sin(t / 50)))
+        backward(vehicle, t, v, RideConditions(grade=0.02 * np.sin(t / 50)))
         backward_times.append(time.process_time() - begin)
     return median(forward_times), median(backward_times)
 

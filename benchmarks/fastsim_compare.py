@@ -1,4 +1,4 @@
-"""The scooter beside FASTSim 3 on the same drive cycles: python benchmarks/fastsim_compare.py
+"""The scooter beside FASTSim 3 on the same drive cycles: python -m benchmarks.fastsim_compare
 
 Needs a Python that has both the requirements of gz-onboard and PyPI's fastsim (3.1). Two comparisons:
 
@@ -11,7 +11,6 @@ own losses   the scooter's own losses in watts over speed and current; FASTSim w
 from __future__ import annotations
 
 import time
-from bisect import bisect_right
 from collections.abc import MutableMapping
 from dataclasses import replace
 from typing import Any
@@ -19,9 +18,11 @@ from typing import Any
 import fastsim  # type: ignore[import-not-found, unused-ignore]
 import numpy as np
 
+from benchmarks.backward import RideConditions, backward
+from gz_onboard.constants import KELVIN, WH
 from gz_onboard.physics.derating import DeratingCurve
-from gz_onboard.physics.model import Model
-from gz_onboard.simulation.backward import Conditions, backward
+from gz_onboard.physics.model import BASE_EFFECTS
+from gz_onboard.physics.tables import linear
 from gz_onboard.simulation.cycles import cycle
 from gz_onboard.simulation.run import at_steps, drive, follow
 from gz_onboard.simulation.scooter import Scooter
@@ -33,7 +34,6 @@ POWER = 5000.0  # W, of the motor
 SHARES = (0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0)
 EFFICIENCY = (0.70, 0.72, 0.76, 0.82, 0.87, 0.89, 0.90, 0.89, 0.87, 0.85)
 PACK_EFFICIENCY = 0.96
-WH = 3600.0
 
 
 class EfficiencyMotor:
@@ -51,9 +51,7 @@ class EfficiencyMotor:
     ) -> float:
         power = self.torque_constant * current * speed
         share = min(max(power, 0.0) / POWER, 1.0)
-        i = min(bisect_right(SHARES, share), len(SHARES) - 1) - 1
-        part = (share - SHARES[i]) / (SHARES[i + 1] - SHARES[i])
-        efficiency = EFFICIENCY[i] + part * (EFFICIENCY[i + 1] - EFFICIENCY[i])
+        efficiency = linear(SHARES, EFFICIENCY, share)
         loss = power / efficiency - power if power >= 0 else power * efficiency - power
         ledger["motor"] += loss * dt
         return loss
@@ -77,11 +75,6 @@ class EfficiencyPack:
 
     def chemical_energy_drawn(self) -> float:
         return self.drawn
-
-
-def with_values(vehicle: Vehicle, **values: float) -> Vehicle:
-    parameters = vehicle.parameters.replaced(**values)
-    return replace(vehicle, parameters=parameters, model=Model(vehicle.model.effects, parameters))
 
 
 def cycles() -> dict[str, tuple[tuple[float, ...], tuple[float, ...]]]:
@@ -129,7 +122,6 @@ def in_fastsim(
     data["grid"] = [{"v": 1, "dim": [len(shares)], "data": list(shares)}]
     data["values"] = {"v": 1, "dim": [len(shares)], "data": list(efficiency)}
     em["eff_interp_at_max_input"] = None
-    ride = fastsim.Cycle.from_resource("udds.csv").to_dict()
     n = len(t)
     ride = {
         "init_elev_meters": 121.92,
@@ -139,23 +131,19 @@ def in_fastsim(
         "grade": [0.0] * n,
         "elev_meters": [],
         "pwr_max_chrg_watts": [0.0] * n,
-        "temp_amb_air_kelvin": [AMBIENT + 273.15] * n,
+        "temp_amb_air_kelvin": [AMBIENT + KELVIN] * n,
         "pwr_solar_load_watts": [0.0] * n,
     }
-    vehicle_ = fastsim.Vehicle.from_dict(car)
-    simulation = fastsim.SimDrive(vehicle_, fastsim.Cycle.from_dict(ride))
+    simulation = fastsim.SimDrive(fastsim.Vehicle.from_dict(car), fastsim.Cycle.from_dict(ride))
     begin = time.perf_counter()
     simulation.walk()
     wall = time.perf_counter() - begin
     out = simulation.to_dict()["veh"]
     state, battery = out["state"], out["pt_type"]["BEV"]["res"]["state"]
-    return {
+    vehicles = {"drag": "drag", "rolling": "rr", "brakes": "brake", "auxiliary": "aux"}
+    return {name: state[f"energy_{theirs}_joules"] for name, theirs in vehicles.items()} | {
         "distance": state["dist_meters"],
-        "drag": state["energy_drag_joules"],
-        "rolling": state["energy_rr_joules"],
-        "brakes": state["energy_brake_joules"],
         "motor": out["pt_type"]["BEV"]["em"]["state"]["energy_loss_joules"],
-        "auxiliary": state["energy_aux_joules"],
         "terminals": battery["energy_out_electrical_joules"],
         "cells": battery["energy_out_chemical_joules"],
         "met": float(state["cyc_met_overall"]),
@@ -164,9 +152,7 @@ def in_fastsim(
 
 
 def capacity(vehicle: Vehicle) -> float:
-    battery = vehicle.battery
-    assert battery
-    return battery.pack_capacity(AMBIENT) * 3600 * battery.cells_series * 3.7
+    return vehicle.pack.pack_capacity(AMBIENT) * 3600 * vehicle.pack.cells_series * 3.7
 
 
 def forward(scooter: Scooter, t: Any, v: Any) -> dict[str, float]:
@@ -193,9 +179,8 @@ def forward(scooter: Scooter, t: Any, v: Any) -> dict[str, float]:
 
 def electric_braking(vehicle: Vehicle, **values: float) -> Vehicle:
     """The vehicle with a motor that can do all the braking, as FASTSim has it, and all the driving."""
-    return with_values(
-        vehicle, brake_torque_limit=1.0, regeneration_torque_limit=300.0, motor_current_limit=600.0, **values
-    )
+    all_of_it = {"brake_torque_limit": 1.0, "regeneration_torque_limit": 300.0, "motor_current_limit": 600.0}
+    return vehicle.changed(vehicle.parameters.replaced(**all_of_it, **values))
 
 
 def unlimited(scooter: Scooter) -> Scooter:
@@ -225,19 +210,8 @@ def row(name: str, ours: float, theirs: float) -> str:
 
 
 def main() -> None:
-    effects = (
-        "aerodynamic_drag",
-        "rolling_resistance",
-        "grade_force",
-        "inertia",
-        "motor_copper_loss",
-        "motor_iron_loss",
-        "inverter_loss",
-        "auxiliary_load",
-    )
     vehicle = read_vehicle("reference", 80.0)
-    chosen = tuple(e for e in vehicle.model.effects if e.name in effects)
-    vehicle = replace(vehicle, model=Model(chosen, vehicle.parameters))
+    vehicle = vehicle.changed(vehicle.parameters, [e for e in vehicle.model.effects if e.name in BASE_EFFECTS])
     for name, (t, v) in cycles().items():
         print(f"\n### {name}\n\n| same parts, Wh | gz-onboard | FASTSim | difference |\n| --- | --- | --- | --- |")
         ours = forward(same_parts(vehicle), t, v)
@@ -258,7 +232,7 @@ def main() -> None:
             electric,
             [0.1 * i for i in range(len(fine))],
             fine,
-            Conditions(ambient=AMBIENT, altitude=ALTITUDE, motor_temperature=30.0),
+            RideConditions(ambient=AMBIENT, altitude=ALTITUDE, motor_temperature=30.0),
             smoothing=0.0,
         )
         shares, efficiency = mean_efficiency(vehicle)

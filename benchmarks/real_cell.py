@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from math import exp, sqrt
+from math import exp, nan, sqrt
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,8 @@ from gz_onboard.vehicle import read_vehicle
 TEMPERATURES = (25, 10, 0, -10, -20)
 OFFSET = 0.05  # A of the cell: what the current sensor shows too much
 WRONG = -0.2  # of SOC
+RIGHT, WORST = (0.0, 0.0), (WRONG, OFFSET)
+CASES = {RIGHT: "right", (0.0, OFFSET): "right, offset", (WRONG, 0.0): "wrong", WORST: "wrong, offset"}
 RIGHT_SD = 0.01  # of SOC: how far the right one is believed
 CONVERGED = 0.025  # of SOC: from here on the error counts
 NOMINAL = 2.9  # A·h, for C-rates
@@ -107,21 +109,9 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
         return Mesh(soc, temperature, tuple(tuple(map(float, row)) for row in table))
 
     sd = result.curves["battery.ocv"].sd[(cell.ocv_soc > 0.1) & (cell.ocv_soc < 0.95)]
-    battery = Battery(
-        1,
-        1,
-        capacity_25,
-        temperature,
-        share,
-        2.5,
-        0.0,
-        tuple(map(float, cell.ocv_soc)),
-        tuple(map(float, cell.ocv)),
-        float(np.median(sd)),
-        mesh(cell.r0),
-        mesh(cell.r1),
-        mesh(cell.c1),
-    )
+    ocv_table = tuple(map(float, cell.ocv_soc)), tuple(map(float, cell.ocv)), float(np.median(sd))
+    circuit = mesh(cell.r0), mesh(cell.r1), mesh(cell.c1)
+    battery = Battery(1, 1, capacity_25, temperature, share, 2.5, 0.0, *ocv_table, *circuit)
     if (shift := result.curves.get("battery.rest_shift")) is None:
         return battery
     return replace(
@@ -232,19 +222,10 @@ def run(setting: Setting, cycle: Cycle, wrong: float, offset: float) -> Score:
     known = np.isfinite(soc)
     error, sd = (soc - truth)[known], sd[known]
     near = np.flatnonzero(np.abs(error) < CONVERGED)
-    if not len(near):
-        nan = float("nan")
-        return Score(nan, nan, nan, float(np.mean(np.abs(error) > 3 * sd)), nan, float(np.mean(sd)))
-    e, start = error[near[0] :], int(near[0])
-    outside = float(np.mean(np.abs(error) > 3 * sd))
-    return Score(
-        float(np.sqrt(np.mean(e**2))),
-        float(np.mean(np.abs(e))),
-        float(np.abs(e).max()),
-        outside,
-        float(start),
-        float(np.mean(sd)),
-    )
+    e = error[near[0] :] if len(near) else np.array([nan])
+    sizes = float(np.sqrt(np.mean(e**2))), float(np.mean(np.abs(e))), float(np.abs(e).max())
+    outside, start = float(np.mean(np.abs(error) > 3 * sd)), float(near[0]) if len(near) else nan
+    return Score(*sizes, outside, start, float(np.mean(sd)))
 
 
 def open_loop(cell: Circuit, cycle: Cycle, capacity: float) -> Array:
@@ -307,9 +288,8 @@ def report(folder: Path) -> list[str]:
     every = settings(rest, result)
     work = cycles(folder)
     plain = [c for c in work if "trise" not in c.name]
-    cases = [(0.0, 0.0), (0.0, OFFSET), (WRONG, 0.0), (WRONG, OFFSET)]
-    runs = [(every[0], c, wrong, offset) for c in work for wrong, offset in cases]
-    runs += [(s, c, *case) for s in every[1:] for c in work for case in (cases[0], cases[3])]
+    runs = [(every[0], c, *case) for c in work for case in CASES]
+    runs += [(s, c, *case) for s in every[1:] for c in work for case in (RIGHT, WORST)]
     with ProcessPoolExecutor(2) as pool:
         keys = [(s.name, c, wrong, offset) for s, c, wrong, offset in runs]
         scores = dict(zip(keys, pool.map(jobs, runs, chunksize=4), strict=True))
@@ -318,11 +298,11 @@ def report(folder: Path) -> list[str]:
     lines += _tables(result)
     lines += ["", "## State of charge on the drive cycles, filter as on board", "", *_detail(every[0], work, scores)]
     lines += ["", "Means over the cycles of a temperature, without those of rising temperature:", ""]
-    lines += _summary(every[:1], plain, scores, cases)
+    lines += _summary(every[:1], plain, scores, list(CASES))
     lines += ["", "## What is missing", "", "### In the filter: the same with more in the model", ""]
-    lines += _summary(every, plain, scores, [cases[0], cases[3]])
+    lines += _summary(every, plain, scores, [RIGHT, WORST])
     lines += ["", "The cycles of rising temperature, right start, no offset:", ""]
-    lines += _summary(every, [c for c in work if "trise" in c.name], scores, [cases[0]])
+    lines += _summary(every, [c for c in work if "trise" in c.name], scores, [RIGHT])
     lines += ["", "### In the voltage", "", *_residuals(result, every[0], plain)]
     lines += ["", "### Over current: the pulses themselves", "", *_rates(tables, every[0])]
     return lines
@@ -368,23 +348,17 @@ def _detail(setting: Setting, work: list[Cycle], scores: Scores) -> list[str]:
     ]
     for c in work:
         cells = []
-        for case in ((0.0, 0.0), (0.0, OFFSET), (WRONG, 0.0), (WRONG, OFFSET)):
+        for case in CASES:
             s = scores[setting.name, c, *case]
             cell = f"{percent(s.rms)}, {percent(s.mae)}, {percent(s.largest, 1)}, {percent(s.outside, 0)}"
             cells.append(("never" if np.isnan(s.rms) else cell) + (f", {s.start:.0f}" if s.start > 0 else ""))
         end = 1 - c.drawn[-1] / setting.battery.cell_capacity(c.temperature)
-        sd = scores[setting.name, c, 0.0, 0.0].sd
+        sd = scores[setting.name, c, *RIGHT].sd
         lines.append(f"| {c.temperature} | {c.name} | {100 * end:.0f} | {' | '.join(cells)} | {100 * sd:.1f} |")
     return lines
 
 
 def _summary(every: list[Setting], work: list[Cycle], scores: Scores, cases: list[tuple[float, float]]) -> list[str]:
-    names = {
-        (0.0, 0.0): "right",
-        (0.0, OFFSET): "right, offset",
-        (WRONG, 0.0): "wrong",
-        (WRONG, OFFSET): "wrong, offset",
-    }
     lines = ["| model | start | " + " | ".join(f"{t} °C" for t in TEMPERATURES) + " |", "| --- " * 7 + "|"]
     for setting in every:
         for case in cases:
@@ -398,7 +372,7 @@ def _summary(every: list[Setting], work: list[Cycle], scores: Scores, cases: lis
                     cells.append(f"{percent(rms)} ({percent(worst)}; {percent(max(s.largest for s in good), 1)}){lost}")
                 else:
                     cells.append("–")
-            lines.append(f"| {setting.name} | {names[case]} | {' | '.join(cells)} |")
+            lines.append(f"| {setting.name} | {CASES[case]} | {' | '.join(cells)} |")
     return lines
 
 

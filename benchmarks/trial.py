@@ -30,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from gz_onboard.lab.discover.baseline import baseline
 from gz_onboard.lab.discover.discovery import discover
@@ -88,19 +89,7 @@ def judge_scooter(seeds: Sequence[int], keep: Path | None = None) -> list[Row]:
 
 def judge(base: Vehicle, case: plant.Case) -> Row:
     """What the tool says of one case, beside the truth."""
-    truths = [
-        {
-            "name": t.name,
-            "parameter": t.parameter,
-            "unit": t.unit,
-            "change": list(t.change),
-            "relative": t.relative,
-            "share": t.share,
-            "clear": t.clear,
-        }
-        for t in case.truths
-    ]
-    row: Row = {"seed": case.seed, "kind": case.kind, "truths": truths, "accepted": list(case.accepted)}
+    row: Row = {"seed": case.seed, "kind": case.kind, "truths": to_json(case.truths), "accepted": list(case.accepted)}
     began, wall = time.process_time(), time.monotonic()
     try:
         report = discovered(base, case.rides, case.seed)
@@ -126,18 +115,9 @@ def _parameters(report: Row, truth: plant.Truth) -> list[Row]:
             healthy = cause["value"] - cause["change"] if name == cause["parameter"] else 0.0
             true = healthy * (1 + change) if truth.relative else healthy + change
             low, high = found["ci95"]
-            rows.append(
-                {
-                    "effect": truth.name,
-                    "parameter": name,
-                    "true": true,
-                    "value": found["value"],
-                    "change": true - healthy,
-                    "ci95": [low, high],
-                    "held": bool(low <= true <= high),
-                    "clear": truth.clear,
-                }
-            )
+            said = {"effect": truth.name, "parameter": name, "true": true, "value": found["value"]}
+            judged = {"ci95": [low, high], "held": bool(low <= true <= high), "clear": truth.clear}
+            rows.append({**said, "change": true - healthy, **judged})
     return rows
 
 
@@ -150,16 +130,8 @@ def judge_healthy(seeds: Sequence[int]) -> list[Row]:
     for seed, rides in zip(seeds, sets, strict=True):
         for against, vehicle in known.items():
             report = discovered(vehicle, rides, seed)
-            rows.append(
-                {
-                    "seed": seed,
-                    "against": against,
-                    "verdict": report["verdict"],
-                    "causes": report["causes"],
-                    "ambiguous": report["ambiguous"],
-                    "unknown": report["unknown"],
-                }
-            )
+            said = {key: report[key] for key in ("verdict", "causes", "ambiguous", "unknown")}
+            rows.append({"seed": seed, "against": against, **said})
     return rows
 
 
@@ -233,11 +205,8 @@ def interval(hits: int, count: int) -> tuple[float, float]:
     """Wilson's 95 % interval of a share."""
     if count == 0:
         return 0.0, 1.0
-    z = 1.96
-    p = hits / count
-    middle = (p + z * z / (2 * count)) / (1 + z * z / count)
-    half = z / (1 + z * z / count) * math.sqrt(p * (1 - p) / count + z * z / (4 * count * count))
-    return max(middle - half, 0.0), min(middle + half, 1.0)
+    low, high = binomtest(hits, count).proportion_ci(0.95, "wilson")
+    return low, high
 
 
 def share(hits: Iterable[bool]) -> str:
@@ -257,17 +226,14 @@ def gains(rows: Sequence[Row]) -> list[tuple[str, float, float, float, float]]:
     for row in rows:
         if "floor" not in row or not any(t["clear"] for t in row["truths"]):
             continue
-        best: tuple[float, tuple[str, float, float, float, float]] | None = None
+        spoiled = {}
         for metric, values in (row.get("gain") or {}).items():
             floor = (row["floor"] or {}).get(metric)
-            if not isinstance(values, dict) or not isinstance(floor, dict) or not values.get("before"):
-                continue
-            before, left = values["before"], floor["before"]
-            spoiled = (before - left) / before
-            if best is None or spoiled > best[0]:
-                best = spoiled, (metric, before, values["after"], values["control"], left)
-        if best and best[0] > 0.1:  # else there is nothing to gain
-            out.append(best[1])
+            if isinstance(values, dict) and isinstance(floor, dict) and values.get("before"):
+                before, left = values["before"], floor["before"]
+                spoiled[(before - left) / before] = metric, before, values["after"], values["control"], left
+        if spoiled and max(spoiled) > 0.1:  # else there is nothing to gain
+            out.append(spoiled[max(spoiled)])
     return out
 
 

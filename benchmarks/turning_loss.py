@@ -124,22 +124,8 @@ def simulated(vehicle: str, folder: Path) -> tuple[Array, Array, dict[str, Any]]
     out.mkdir()
     summary = out / "summary.json"
     with contextlib.redirect_stdout(io.StringIO()):
-        command(
-            [
-                "simulate",
-                str(OVAL),
-                "--vehicle",
-                vehicle,
-                "--payload",
-                "84",
-                "--predictive",
-                "--no-plot",
-                "--output",
-                str(out),
-                "--json",
-                str(summary),
-            ]
-        )
+        options = [f"--vehicle={vehicle}", "--payload=84", "--predictive", "--no-plot"]
+        command(["simulate", str(OVAL), *options, f"--output={out}", f"--json={summary}"])
     table = parquet.read_table(next(out.glob("*.parquet")))
     way, energy = (np.array(table[name]) for name in ("distance[m]", "energy[J]"))
     return way, energy, json.loads(summary.read_text())
@@ -158,7 +144,7 @@ def oval(runs: list[tuple[Array, Array, dict[str, Any]]], file: Path) -> None:
     for (x, e, _), colour, label in zip(runs, (ORANGE, BLUE), ("simulated, before", "simulated, after"), strict=True):
         axis.plot(x / 1e3, e / 3600, color=colour, linewidth=1.6, label=label)
     axis.plot(way / 1e3, drawn / 3600, color=INK, linewidth=1.6, label="measured")
-    axis.set_xlabel("way [km]", fontsize=8.5, color=INK)
+    axis.set_xlabel("distance [km]", fontsize=8.5, color=INK)
     ordinate(axis, "drawn from the pack [Wh]")
     legend(axis)
     headline(figure, 0.07, 0.97, "The oval, which was in no fit", 11)

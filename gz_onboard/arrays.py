@@ -1,5 +1,7 @@
 """Types of numpy arrays, for signatures (their docstrings give shape and unit), and what is often done with them."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +31,12 @@ def held_at(at: Array, time: Array, values: Array) -> Array:
 def held_integral(time: Array, values: Array) -> Array:
     """The integral of `values`, each held from its `time` to the next, up to each time; all (n,)."""
     return np.concatenate([[0.0], np.cumsum(np.diff(time) * values[:-1])])
+
+
+def stretches(true: Mask | Sequence[bool]) -> list[tuple[int, int]]:
+    """(first, one beyond the last) index of each stretch of `true` (n,) in which it is."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], np.asarray(true, dtype=int), [0]))))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def bends(nodes: Array) -> Array:

@@ -140,6 +140,14 @@ class Reason(IntFlag):
     SAVE_FAILED = 1 << 19  # the state cannot be saved for the next start
 
 
+_WORDS = {"imu": "IMU", "gps": "GPS", "soc": "SOC", "bms": "BMS", "accel": "acceleration", "rate": "rate of rotation"}
+
+
+def words(name: str) -> str:
+    """The name of a reason, a role or an effect in words, such as ``no IMU``, ``GPS altitude``, ``acceleration x``."""
+    return " ".join(_WORDS.get(word, word) for word in name.lower().split("_"))
+
+
 @dataclass(slots=True)
 class Estimate:
     """What is known at one time. None stands for what is not known; it is never published as a number."""

@@ -79,11 +79,6 @@ def kept_time(clocks: Path = Path("/sys/class/rtc")) -> float:
     return latest
 
 
-def save(file: Path, snapshot: Mapping[str, Any], time: float, uptime: float | None = None) -> None:
-    """Write `snapshot`, taken at `time` [s since the epoch] and `uptime` [s]; `encode` and `write` in one."""
-    write(file, encode(snapshot, time, uptime))
-
-
 def write(file: Path, text: bytes) -> None:
     """Write the text of a state file, so that a power cut leaves the old one or the new one.
 

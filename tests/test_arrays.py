@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.arrays import bends, block_means, held_at, held_integral, running_mean
+from gz_onboard.arrays import bends, block_means, held_at, held_integral, running_mean, stretches
 
 TIME, VALUES = np.array([0.0, 1.0, 3.0]), np.array([2.0, 5.0, 7.0])
 
@@ -22,6 +22,11 @@ def test_a_running_mean_keeps_shape_and_bounds(values, half):
     smooth = running_mean(np.array(values), min(2 * half + 1, len(values) // 2 * 2 + 1))
     assert len(smooth) == len(values)
     assert min(values) - 1e-9 <= min(smooth) <= max(smooth) <= max(values) + 1e-9
+
+
+def test_stretches():
+    assert stretches([True, False, False, True, True]) == [(0, 1), (3, 5)]
+    assert stretches(np.array([], dtype=bool)) == stretches([False]) == []
 
 
 def test_what_is_held():

@@ -282,7 +282,7 @@ def test_a_state_that_does_not_fit_is_refused_whole_said_so_and_set_aside(
     file = tmp_path / "scooter.json"
     snapshot = copy.deepcopy(learned)
     spoil(snapshot)
-    state.save(file, snapshot, time.time())
+    state.write(file, state.encode(snapshot, time.time()))
     text = file.read_bytes()
     daemon = Daemon(reference(), [], None, file)
     daemon.stop()
@@ -298,7 +298,7 @@ def test_whatever_restoring_raises_it_begins_afresh(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, learned: Snapshot, monkeypatch: pytest.MonkeyPatch
 ):
     file = tmp_path / "scooter.json"
-    state.save(file, learned, time.time())
+    state.write(file, state.encode(learned, time.time()))
 
     def half(self: Estimator, *_: object) -> None:
         self.road.bias_x = 7.0
@@ -316,8 +316,8 @@ def test_where_the_latest_state_is_damaged_the_one_before_is_used(
 ):
     caplog.set_level(logging.INFO)
     file = tmp_path / "scooter.json"
-    state.save(file, {**learned, "soc": 0.41}, time.time())
-    state.save(file, {**learned, "soc": 0.42}, time.time())
+    state.write(file, state.encode({**learned, "soc": 0.41}, time.time()))
+    state.write(file, state.encode({**learned, "soc": 0.42}, time.time()))
     unfinished, latest, _ = state.copies(file)
     unfinished.write_bytes(latest.read_bytes()[:100])  # the power was cut while it was written
     data = bytearray(latest.read_bytes())
@@ -339,8 +339,8 @@ def test_where_the_latest_state_is_damaged_the_one_before_is_used(
 def test_a_cut_between_two_names_loses_nothing(tmp_path: Path, learned: Snapshot):
     """The new state is whole, and not yet in the place of the old one."""
     file = tmp_path / "scooter.json"
-    state.save(file, {**learned, "soc": 0.41}, time.time())
-    state.save(tmp_path / "other.json", {**learned, "soc": 0.42}, time.time())
+    state.write(file, state.encode({**learned, "soc": 0.41}, time.time()))
+    state.write(tmp_path / "other.json", state.encode({**learned, "soc": 0.42}, time.time()))
     unfinished, _, before = state.copies(file)
     (tmp_path / "other.json").replace(unfinished)
     file.replace(before)

@@ -34,7 +34,7 @@ JSON = st.recursive(
 @settings(deadline=None)
 def test_what_is_saved_is_loaded(tmp_path_factory: pytest.TempPathFactory, snapshot: dict[str, object]):
     file = tmp_path_factory.mktemp("state") / "scooter.json"
-    state.save(file, snapshot, NOW - 30)
+    state.write(file, state.encode(snapshot, NOW - 30))
     assert state.load(file, NOW) == (snapshot, 30.0)
 
 
@@ -52,7 +52,7 @@ def test_there_is_none(tmp_path: Path):
 )
 def test_age(tmp_path: Path, saved_at: float, age: float | None):
     file = tmp_path / "scooter.json"
-    state.save(file, SNAPSHOT, saved_at)
+    state.write(file, state.encode(SNAPSHOT, saved_at))
     assert state.load(file, NOW) == (SNAPSHOT, age)
 
 
@@ -120,7 +120,7 @@ def test_damaged(tmp_path: Path, text: bytes):
 
 def test_cut_off_at_any_byte_or_with_any_bit_turned_it_is_refused(tmp_path: Path):
     file = tmp_path / "scooter.json"
-    state.save(file, SNAPSHOT, NOW)
+    state.write(file, state.encode(SNAPSHOT, NOW))
     whole = file.read_bytes()
     for length in range(len(whole)):
         with pytest.raises(ValueError, match="is "):
@@ -135,7 +135,7 @@ def test_cut_off_at_any_byte_or_with_any_bit_turned_it_is_refused(tmp_path: Path
 def test_the_one_before_is_kept(tmp_path: Path):
     file = tmp_path / "scooter.json"
     for n in range(3):
-        state.save(file, {"n": n}, NOW)
+        state.write(file, state.encode({"n": n}, NOW))
     _, latest, before = state.copies(file)
     assert state.load(latest, NOW) == ({"n": 2}, 0.0)
     assert state.load(before, NOW) == ({"n": 1}, 0.0)
@@ -161,7 +161,7 @@ def test_a_pipe_in_its_place_is_refused(tmp_path: Path):
 
 def test_not_a_number_is_not_saved(tmp_path: Path):
     with pytest.raises(ValueError, match="JSON"):
-        state.save(tmp_path / "scooter.json", {"soc": float("nan")}, NOW)
+        state.write(tmp_path / "scooter.json", state.encode({"soc": float("nan")}, NOW))
     assert list(tmp_path.iterdir()) == []
 
 
@@ -173,15 +173,15 @@ def test_a_directory_in_its_place_is_refused(tmp_path: Path):
 
 def test_the_directory_is_made(tmp_path: Path):
     file = tmp_path / "var" / "lib" / "scooter.json"
-    state.save(file, SNAPSHOT, NOW)
+    state.write(file, state.encode(SNAPSHOT, NOW))
     assert state.load(file, NOW) == (SNAPSHOT, 0.0)
 
 
 def test_a_save_that_fails_leaves_the_old_one(tmp_path: Path):
     file = tmp_path / "scooter.json"
-    state.save(file, SNAPSHOT, NOW)
+    state.write(file, state.encode(SNAPSHOT, NOW))
     with pytest.raises(TypeError):
-        state.save(file, {"soc": object()}, NOW + 1)
+        state.write(file, state.encode({"soc": object()}, NOW + 1))
     assert state.load(file, NOW) == (SNAPSHOT, 0.0)
 
 
@@ -192,7 +192,7 @@ from gz_onboard import state
 n = 0
 while True:
     n += 1
-    state.save(Path(sys.argv[1]), {"n": n, "row": [n] * 2000}, float(n))
+    state.write(Path(sys.argv[1]), state.encode({"n": n, "row": [n] * 2000}, float(n)))
 """
 
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from functools import partial
 
 from gz_onboard.bus.publisher import reason_signal
-from gz_onboard.dashboard.view import View, words
-from gz_onboard.events import State
+from gz_onboard.dashboard.view import View
+from gz_onboard.events import State, words
 
 
 @dataclass(frozen=True)

@@ -95,23 +95,23 @@ class View:
         entry.counter = counter
         entry.time = now
         entry.received += 1
-        for signal_ in message.signals:
-            value = float(str(raw[signal_.name]))
-            low, high = entry.limits[signal_.name]
-            scale, offset = float(signal_.conversion.scale), float(signal_.conversion.offset)
-            entry.values[signal_.name] = value * scale + offset if low <= value <= high else None
+        for signal in message.signals:
+            value = float(str(raw[signal.name]))
+            low, high = entry.limits[signal.name]
+            scale, offset = float(signal.conversion.scale), float(signal.conversion.offset)
+            entry.values[signal.name] = value * scale + offset if low <= value <= high else None
 
-    def value(self, signal_: str, now: float) -> float | None:
+    def value(self, signal: str, now: float) -> float | None:
         """A signal's value in the units of the DBC; None if it is stale, not available or never came."""
         for entry in self.messages.values():
-            if signal_ in entry.limits:
-                return None if entry.stale(now) else entry.values.get(signal_)
-        raise KeyError(signal_)
+            if signal in entry.limits:
+                return None if entry.stale(now) else entry.values.get(signal)
+        raise KeyError(signal)
 
-    def text(self, signal_: str, now: float) -> str:
+    def text(self, signal: str, now: float) -> str:
         """The value with its unit; a dash if there is none."""
-        value = self.value(signal_, now)
-        form, unit = _NUMBERS[signal_]
+        value = self.value(signal, now)
+        form, unit = _NUMBERS[signal]
         return "–" if value is None else f"{value:{form}} {unit}"
 
     def state(self, now: float) -> State | None:
@@ -127,8 +127,8 @@ class View:
             status = estimate
         return estimate if status is None else status
 
-    def _state(self, signal_: str, now: float) -> State | None:
-        value = self.value(signal_, now)
+    def _state(self, signal: str, now: float) -> State | None:
+        value = self.value(signal, now)
         return State(int(value)) if value is not None and value in tuple(State) else None
 
     def reasons(self, now: float) -> list[Reason]:
@@ -160,11 +160,3 @@ class View:
     def complete(self) -> bool:
         """Whether every message has come."""
         return all(entry.received for entry in self.messages.values())
-
-
-def words(name: str) -> str:
-    """The name of a reason or a role in words, such as ``no IMU``, ``GPS altitude``, ``acceleration x``."""
-    return " ".join(_WORDS.get(word, word) for word in name.lower().split("_"))
-
-
-_WORDS = {"imu": "IMU", "gps": "GPS", "soc": "SOC", "bms": "BMS", "accel": "acceleration", "rate": "rate of rotation"}

@@ -11,19 +11,18 @@ import contextlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from gz_onboard.bus.logs import is_table, logs_among
+from gz_onboard.bus.logs import is_table
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
-from gz_onboard.events import Reason
-from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, Summary, estimate_log, known_vehicle
-from gz_onboard.lab.plot import reason_words
-from gz_onboard.offline.processes import collect, over_rides
-from gz_onboard.offline.results import clock, explain_keys, number, output_names, text_rows, write_json
+from gz_onboard.events import words
+from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, RideSummary, estimate_log, known_vehicle
+from gz_onboard.offline.processes import collect, over_rides, tasks_of
+from gz_onboard.offline.results import clock, explain_keys, number, text_rows, write_json
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.vehicle import find_vehicle
 
-KEYS = descriptions(Summary)
+KEYS = descriptions(RideSummary)
 """What the summary of a ride holds."""
 
 
@@ -40,7 +39,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard estimate``: `OK` if every log could be estimated, else `BAD_INPUT`."""
-    tasks = _tasks(arguments)
+    parts = {"filter_name": arguments.filter, "frames": arguments.frames, "signals": arguments.signals}
+    tasks = tasks_of(arguments, EstimateTask, ".estimate.mcap", **parts)
     written = [arguments.json, *(file for task in tasks for file in (task.log, task.picture))]
     not_an_input(written, [*(task.path for task in tasks), find_vehicle(arguments.vehicle)])
     known_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
@@ -52,36 +52,9 @@ def run(arguments: argparse.Namespace) -> int:
     return BAD_INPUT if failed else OK
 
 
-def _tasks(arguments: argparse.Namespace) -> list[EstimateTask]:
-    logs = list(dict.fromkeys(logs_among(arguments.logs)))
-    names = output_names(logs, [_stem(log) for log in logs], ".estimate.mcap")
-    return [
-        EstimateTask(
-            log,
-            arguments.output / name,
-            arguments.vehicle,
-            arguments.payload,
-            plot=not arguments.no_plot,
-            filter_name=arguments.filter,
-            frames=arguments.frames,
-            signals=arguments.signals,
-        )
-        for log, name in zip(logs, names, strict=True)
-    ]
-
-
-def _stem(path: Path) -> str:
-    """The name without the suffixes of its format."""
-    name = path.name
-    for suffix in (".gz", path.with_suffix("").suffix if path.suffix.lower() == ".gz" else path.suffix):
-        if suffix and name.lower().endswith(suffix.lower()):
-            name = name[: -len(suffix)]
-    return name.removesuffix(".estimate")
-
-
 def _results(
     tasks: Sequence[EstimateTask], jobs: int | None, progress: Progress
-) -> Iterator[tuple[EstimateTask, Summary | InputError]]:
+) -> Iterator[tuple[EstimateTask, RideSummary | InputError]]:
     """Each task with its summary or its error, in order."""
     try:
         yield from over_rides(estimate_log, tasks, jobs, progress)
@@ -116,7 +89,7 @@ def _expected(path: Path) -> int | None:
     return None
 
 
-def summary_text(ride: Summary) -> str:
+def summary_text(ride: RideSummary) -> str:
     """A ride's summary for a terminal."""
     rows = [
         (
@@ -157,7 +130,7 @@ def summary_text(ride: Summary) -> str:
             for reason, places in ride.faults.items()
         ),
         ("state", ", ".join(f"{name.lower()} {duration:.1f} s" for name, duration in ride.states.items())),
-        *(("", f"{reason_words(Reason[name])} {duration:.1f} s") for name, duration in ride.reasons.items()),
+        *(("", f"{words(name)} {duration:.1f} s") for name, duration in ride.reasons.items()),
         (
             "computed",
             f"{ride.cpu_s:.2f} s of processor time, {number(ride.real_time_factor, '.0f')} times as fast as the ride",

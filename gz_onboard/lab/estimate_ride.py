@@ -57,7 +57,7 @@ class EstimateTask(Task):
 
 
 @dataclass(frozen=True)
-class Summary:
+class RideSummary:
     """A ride in the JSON: {"version", "rides": [summaries], "failed": [{file, error}]}."""
 
     file: Annotated[str, "the log"]
@@ -198,7 +198,7 @@ def _without_jumps(batch: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
     yield batch[begin:]
 
 
-def estimate_log(task: EstimateTask, progress: Progress | None = None) -> Summary:
+def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSummary:
     """Estimate one log and write its MCAP and picture; gives its summary. Raises InputError."""
     vehicle = known_vehicle(task.vehicle, task.payload)
     damages: list[LogDamage] = []
@@ -281,7 +281,7 @@ def _summary(
     start_ns: int,
     damages: Sequence[LogDamage],
     took: tuple[float, float],
-) -> Summary:
+) -> RideSummary:
     """The summary of a ride that went through `pipeline`; took: processor and wall time [s]."""
     cpu, wall = took
     last = tally.last or Estimate(0.0)
@@ -293,7 +293,7 @@ def _summary(
         states[state.name] += ticks
         for name in reason_names(Reason(bits)):
             reasons[name] += ticks
-    return Summary(
+    return RideSummary(
         file=str(task.path),
         log=str(task.log),
         plot=str(task.picture) if task.picture else None,

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from gz_onboard.bus.logs import LogDamage, read_metadata, read_samples
 from gz_onboard.constants import WH_PER_KM
 from gz_onboard.errors import OK, InputError, writing
-from gz_onboard.events import Reason, State
+from gz_onboard.events import Reason, State, words
 from gz_onboard.offline.style import (
     BLUE,
     GREEN,
@@ -279,7 +279,7 @@ def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Logged], reasons: Sequ
     for place, reason in enumerate(reasons, 1):
         spans = _spans(x, [reason.name in row["reasons"].split() for row in rows])
         axis.broken_barh(spans, (place - 0.3, 0.6), facecolors=MUTED, linewidth=0)
-        labels.append(reason_words(reason))
+        labels.append(words(str(reason.name)))
     axis.set_ylim(len(labels) - 0.4, -0.6)
     axis.set_yticks(range(len(labels)), labels, fontsize=7)
     legend(axis)
@@ -303,25 +303,11 @@ def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Logged], reasons: Sequ
         )
 
 
-def reason_words(reason: Reason) -> str:
-    """The reason's name in words, such as ``no IMU``."""
-    words = str(reason.name).split("_")
-    return " ".join(word if word in ("IMU", "GPS", "SOC") else word.lower() for word in words)
-
-
 def _spans(x: Sequence[float], true: Sequence[bool]) -> list[tuple[float, float]]:
     """(begin, length) of the stretches in which something is true; each estimate holds until the next."""
-    spans: list[tuple[float, float]] = []
-    begin: float | None = None
-    for place, now in zip(x, true, strict=True):
-        if now:
-            begin = place if begin is None else begin
-        elif begin is not None:
-            spans.append((begin, place - begin))
-            begin = None
-    if begin is not None:
-        spans.append((begin, x[-1] - begin))
-    return spans
+    from gz_onboard.arrays import stretches
+
+    return [(x[i], x[min(j, len(x) - 1)] - x[i]) for i, j in stretches(true)]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -12,13 +12,11 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import BAD_INPUT, FAILED, OK, not_an_input, writing
 from gz_onboard.lab.validate_ride import log_size, validate_ride
-from gz_onboard.lab.validate_score import Means, PooledMeans, Ride, SimulationVerdict, pooled
-from gz_onboard.offline.processes import Task, collect, over_rides
-from gz_onboard.offline.results import explain_keys, output_names, write_json
-from gz_onboard.offline.samples import ride_name
+from gz_onboard.lab.validate_score import Means, PooledMeans, SimulationVerdict, ValidatedRide, pooled
+from gz_onboard.offline.processes import Task, collect, over_rides, tasks_of
+from gz_onboard.offline.results import explain_keys, write_json
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
 from gz_onboard.progress import progress_bar
@@ -26,7 +24,7 @@ from gz_onboard.vehicle import find_vehicle, read_vehicle
 
 SUMMARY_VERSION = 1
 PAGE = "validation.html"
-KEYS = descriptions(SimulationVerdict) | descriptions(Ride)
+KEYS = descriptions(SimulationVerdict) | descriptions(ValidatedRide)
 """What ``--json`` holds of a ride: {"version", "rides", "pooled": splits of all rides, "failed": [{file, error}]}."""
 
 FORMS = {
@@ -43,7 +41,7 @@ Pooled = dict[str, dict[str, dict[str, dict[str, dict[str, PooledMeans]]]]]
 """On the road or the dynamometer: by form, channel, sorting and condition."""
 
 
-def pool(rides: Sequence[Ride]) -> Pooled:
+def pool(rides: Sequence[ValidatedRide]) -> Pooled:
     """The splits of all rides as one, apart for road and dynamometer."""
     result: Pooled = {}
     for where in ("road", "dynamometer"):
@@ -74,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard validate``: `OK`; `BAD_INPUT` if a ride cannot be judged; `FAILED` if with --gate one fails."""
-    tasks = _tasks(arguments)
+    tasks = tasks_of(arguments, Task, ".validation.png")
     written = [arguments.json, arguments.markdown, arguments.output / PAGE]
     written += [task.output(".validation.png") for task in tasks]
     not_an_input(written, [*(task.path for task in tasks), find_vehicle(arguments.vehicle)])
@@ -93,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
     return FAILED if arguments.gate and not all(ride.passed for ride in rides) else OK
 
 
-def _write_tables(arguments: argparse.Namespace, rides: list[Ride], together: Pooled) -> None:
+def _write_tables(arguments: argparse.Namespace, rides: list[ValidatedRide], together: Pooled) -> None:
     from gz_onboard.lab.validate_report import markdown, write_report
 
     written = []
@@ -108,16 +106,7 @@ def _write_tables(arguments: argparse.Namespace, rides: list[Ride], together: Po
         print(f"written: {', '.join(map(str, written))}")
 
 
-def _tasks(arguments: argparse.Namespace) -> list[Task]:
-    logs = list(dict.fromkeys(logs_among(arguments.logs)))
-    names = output_names(logs, [ride_name(log) for log in logs], ".validation.png")
-    return [
-        Task(log, arguments.output / name, arguments.vehicle, arguments.payload, not arguments.no_plot)
-        for log, name in zip(logs, names, strict=True)
-    ]
-
-
-def ride_text(ride: Ride) -> str:
+def ride_text(ride: ValidatedRide) -> str:
     """A ride's entry for a terminal."""
     where = "dynamometer" if ride.on_dynamometer else "road"
     air = "" if ride.ambient_c is None else f", {ride.ambient_c:.0f} degC"

@@ -1,4 +1,4 @@
-"""Each component by itself, with what was measured at its inputs: it shows which part makes the whole wrong.
+"""Each component by itself, with what was measured at its inputs, so that an error of the whole can be traced.
 
     battery voltage     from measured current and cell temperature
     inverter DC power   from measured motor current (torque), motor speed and motor temperature

@@ -11,7 +11,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.validate_components import Component
-from gz_onboard.lab.validate_score import CHANNELS, Ride
+from gz_onboard.lab.validate_score import CHANNELS, ValidatedRide
 from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, new_figure, rule, time_unit
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class _Panel:
 
 def draw_ride(
     file: Path,
-    ride: Ride,
+    ride: ValidatedRide,
     measured: Mapping[str, Array],
     simulated: Mapping[str, Mapping[str, Array]],
     alone: Mapping[str, Component],

@@ -13,17 +13,17 @@ from gz_onboard.lab.validate_score import (
     GATE,
     LABELS,
     ORDER,
-    Errors,
+    ChannelErrors,
     PooledMeans,
-    Ride,
     SimulationVerdict,
+    ValidatedRide,
 )
 from gz_onboard.offline.page import Failed, Subheading, html_table, image, markdown_table, write_page
 from gz_onboard.offline.results import number
 
 Forms = Mapping[str, Mapping[str, Mapping[str, Mapping[str, PooledMeans]]]]
 """Pooled means by form, channel, sorting and condition."""
-Table = tuple[list[str], list[list[str]]]
+HeadedRows = tuple[list[str], list[list[str]]]
 """Heads and rows."""
 
 COLUMNS = (
@@ -36,7 +36,7 @@ COLUMNS = (
 """What the table of failures shows: form, channel, unit, head."""
 
 
-def write_report(file: Path, rides: Sequence[Ride], together: Mapping[str, Forms]) -> None:
+def write_report(file: Path, rides: Sequence[ValidatedRide], together: Mapping[str, Forms]) -> None:
     """The page: the gate's tables, where the model fails, each ride's picture. Raises OSError."""
     passed = sum(ride.passed for ride in rides)
     limits = f"each channel within {GATE:g} %, each component within {COMPONENT_GATE:g} %"
@@ -56,7 +56,7 @@ def write_report(file: Path, rides: Sequence[Ride], together: Mapping[str, Forms
     write_page(file, f"Validation of {rides[0].vehicle}", parts)
 
 
-def markdown(rides: Sequence[Ride], together: Mapping[str, Forms]) -> str:
+def markdown(rides: Sequence[ValidatedRide], together: Mapping[str, Forms]) -> str:
     """The tables of the page as Markdown; what is beyond its limit in bold."""
     parts = [f"### {NAMES[form].capitalize()}, percent\n\n{markdown_table(*_gate(rides, form))}" for form in NAMES]
     parts += [
@@ -66,7 +66,7 @@ def markdown(rides: Sequence[Ride], together: Mapping[str, Forms]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _gate(rides: Sequence[Ride], form: str) -> Table:
+def _gate(rides: Sequence[ValidatedRide], form: str) -> HeadedRows:
     verdicts = [(ride.name, ride.verdicts[form]) for ride in rides if form in ride.verdicts]
     names = list(dict.fromkeys(name for _, verdict in verdicts for name in verdict.channels))
     energy = ["energy"] if form != "components" else []
@@ -79,7 +79,7 @@ def _gate(rides: Sequence[Ride], form: str) -> Table:
     return ["ride", *(name.replace("_", " ") for name in names), *energy], rows
 
 
-def _percent(entry: Errors | None) -> str:
+def _percent(entry: ChannelErrors | None) -> str:
     if entry is None or entry.percent is None:
         return "–"
     text = f"{entry.percent:.1f}"
@@ -98,7 +98,7 @@ def failures(forms: Forms) -> list[tuple[str, str, float, list[tuple[float, floa
     return rows
 
 
-def _failures(forms: Forms) -> Table:
+def _failures(forms: Forms) -> HeadedRows:
     heads = ["condition", "min", *(f"{title}, {unit}" for *_, unit, title in COLUMNS)]
     rows: list[list[str]] = []
     before = ""

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.arrays import Array, block_means, running_mean
-from gz_onboard.constants import GRAVITY, WH
+from gz_onboard.constants import GRAVITY, MILD, WH
 from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.validate_components import Component, components
 from gz_onboard.lab.validate_score import (
@@ -21,9 +21,9 @@ from gz_onboard.lab.validate_score import (
     COMPONENT_GATE,
     GATE,
     LEAST_SECONDS,
-    Ride,
     SimulationVerdict,
     Splits,
+    ValidatedRide,
     Verdict,
     conditions,
     errors,
@@ -33,9 +33,9 @@ from gz_onboard.offline.processes import Task
 from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.progress import Progress
 from gz_onboard.simulation.parts.road import Dynamometer, Place, RoadProfile
-from gz_onboard.simulation.recorded import AMBIENT, Recorded, fit_dynamometer, read_recorded, rest_soc, scooter_at_start
-from gz_onboard.simulation.route import read_route
-from gz_onboard.simulation.run import Command, Run, drive, follow, replay, road_table
+from gz_onboard.simulation.plan import ridden_road, route_file
+from gz_onboard.simulation.recorded import Recorded, read_recorded, rest_soc, scooter_at_start
+from gz_onboard.simulation.run import Command, Run, drive, follow, replay
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -67,7 +67,7 @@ def log_size(log: Path) -> int:
         return 1
 
 
-def validate_ride(task: Task, progress: Progress = lambda _: None) -> Ride:
+def validate_ride(task: Task, progress: Progress = lambda _: None) -> ValidatedRide:
     """Compare one ride with its simulation; `progress` counts bytes of the log. Raises InputError."""
     facts = facts_of(task.path)
     kind = facts.get("kind")
@@ -85,7 +85,7 @@ def validate_ride(task: Task, progress: Progress = lambda _: None) -> Ride:
         for form, command in commands.items()
     }
     verdicts = {form: _judge_ride(measured, series) for form, series in simulated.items()}
-    ambient = recorded.first("ambient_temperature", AMBIENT)
+    ambient = recorded.first("ambient_temperature", MILD)
     roller = ride.road if isinstance(ride.road, Dynamometer) else None
     alone = components(vehicle, measured, ride.soc, ambient, roller)
     judged = _judge_components(alone)
@@ -99,7 +99,7 @@ def validate_ride(task: Task, progress: Progress = lambda _: None) -> Ride:
     }
     splits["components"] = {name: split(c.measured, c.modelled, found, c.valid) for name, c in alone.items()}
     picture = task.output(".validation.png") if task.plot else None
-    result = Ride(
+    result = ValidatedRide(
         file=str(task.path),
         name=ride_name(task.path),
         kind=None if kind is None else str(kind),
@@ -173,21 +173,12 @@ def _averaged_speed(recorded: Recorded) -> Array:
 
 def _road(recorded: Recorded, log: Path) -> tuple[RoadProfile | Dynamometer, Array | None]:
     """(the road by place, or the roller; the grade of each second, None on a roller)."""
-    if recorded.on_dynamometer:
-        return fit_dynamometer(recorded), None
-    beside = _route_file(recorded, log)
-    if beside.is_file():
-        route = read_route(beside)
-        road = road_table(route.distance, route.grade, route.curvature)
-    else:
-        road = recorded.road()
+    road, _ = ridden_road(recorded, log)
+    if isinstance(road, Dynamometer):
+        return road, None
     distance = recorded.signals["distance"]
     at = block_means(distance, round(1 / recorded.dt))
     return road, np.array([road(place)[0] for place in at.tolist()])
-
-
-def _route_file(recorded: Recorded, log: Path) -> Path:
-    return log.with_name(f"{recorded.name}.route.csv")
 
 
 def _commands(recorded: Recorded) -> dict[str, Command]:
@@ -208,7 +199,7 @@ def _not_judged(ride: Measured, log: Path, commands: Mapping[str, Command]) -> l
     missing = [
         f"{channel.label} not judged: not measured" for name, channel in CHANNELS.items() if name not in ride.series
     ]
-    if not recorded.on_dynamometer and not _route_file(recorded, log).is_file():
+    if not recorded.on_dynamometer and not route_file(log).is_file():
         newtons = GRADE_ERROR * GRAVITY * ride.vehicle.model.mass
         missing.append(
             f"grade is the on-board filter's, by accelerometer and altitude: wrong by some {100 * GRADE_ERROR:g} % in "

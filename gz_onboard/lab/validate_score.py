@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -50,7 +50,7 @@ CHANNELS = {
 
 
 @dataclass(frozen=True)
-class Errors:
+class ChannelErrors:
     """How far a simulated quantity is from the measured one: see the module's text."""
 
     unit: str
@@ -63,14 +63,14 @@ class Errors:
     passed: bool
 
 
-def errors(measured: Array, simulated: Array, quantity: Quantity, limit: float) -> Errors:
+def errors(measured: Array, simulated: Array, quantity: Quantity, limit: float) -> ChannelErrors:
     """Compare two arrays of shape (n,), n > 0; limit: in percent."""
     error = simulated - measured
     mae, rms = float(np.abs(error).mean()), float(np.sqrt(np.mean(error**2)))
     base = float(max(np.ptp(measured), LEAST_RISE)) if quantity.temperature else float(np.abs(measured).mean())
     percent = 100 * mae / base if base > 0 else None
     spread = float(measured.std())
-    return Errors(
+    return ChannelErrors(
         unit="K" if quantity.temperature else quantity.unit,
         rms=rms,
         max=float(np.abs(error).max()),
@@ -87,7 +87,7 @@ class Verdict:
     """Whether a simulation, or the components, are within the limits."""
 
     channels: Annotated[
-        dict[str, Errors], "by name: unit, rms, max, mean_error, percent, of_spread, limit_percent, passed"
+        dict[str, ChannelErrors], "by name: unit, rms, max, mean_error, percent, of_spread, limit_percent, passed"
     ]
     passed: bool
 
@@ -126,7 +126,7 @@ Splits = dict[str, dict[str, Means]]
 
 
 @dataclass(frozen=True)
-class Ride:
+class ValidatedRide:
     """What was found of a ride."""
 
     file: Annotated[str, "the log"]
@@ -163,6 +163,39 @@ class Ride:
         return {form: verdict for form, verdict in every.items() if verdict}
 
 
+class Sorting(NamedTuple):
+    """Conditions by a value, one on each side of every edge, in the order of the edges; `label` has these in it."""
+
+    label: str
+    conditions: tuple[str, ...]
+    edges: tuple[float, ...]
+
+    def of(self, values: Array, among: Mask) -> dict[str, Mask]:
+        """The seconds of each condition, of those `among` which there are any."""
+        found = np.digitize(values, self.edges)
+        return {name: among & (found == i) for i, name in enumerate(self.conditions)}
+
+
+_SPEEDS = ("standing", "below 4 m/s", "4 to 8 m/s", "8 to 11 m/s", "above 11 m/s")
+_PACE = "acceleration above {0:g}, {1:g} to {0:g}, within {1:g}, below −{1:g} m/s² without brake; with brake"
+_PACES = ("hard acceleration", "acceleration", "steady", "coasting", "braking")
+_TURNING = "lateral acceleration below {0:g}, {0:g} to {1:g}, above {1:g} m/s²"
+_AIR = "air below {0:g}, {0:g} to {1:g}, above {1:g} °C, straight on"
+_TIMES = ("first 3 min", "3 to 10 min", "later")
+_SORTINGS = {
+    "turning": Sorting(_TURNING, ("straight", "slightly", "turning"), (0.5, 1.5)),
+    "grade": Sorting("above {0:.0%}, within, below −{0:.0%}", ("uphill", "level", "downhill"), (0.01, -0.01)),
+    "temperature": Sorting(_AIR, ("cold", "mild", "warm"), (12.0, 20.0)),
+    "since start": Sorting("time ridden since the start, straight on", _TIMES, (180.0, 600.0)),
+    "speed": Sorting("speed", _SPEEDS, (0.5, 4.0, 8.0, 11.0)),
+    "pace": Sorting(_PACE, _PACES, (1.0, 0.3, -0.3)),
+}
+LABELS = {by: sorting.label.format(*sorting.edges).replace("%", " %") for by, sorting in _SORTINGS.items()}
+"""What the seconds are sorted by."""
+ORDER = tuple(kind for sorting in _SORTINGS.values() for kind in sorting.conditions)
+"""The conditions as tables list them."""
+
+
 def conditions(measured: Mapping[str, Array]) -> tuple[dict[str, dict[str, Mask]], list[str]]:
     """(the seconds of each condition, by what they are sorted by; what could not be sorted by, and why).
 
@@ -170,72 +203,27 @@ def conditions(measured: Mapping[str, Array]) -> tuple[dict[str, dict[str, Mask]
     ``ambient_temperature`` [degC], ``braking`` (share of the second).
     """
     speed = measured["speed"]
-    moving = speed > ROLLING
-    straight = moving.copy()
+    moving = straight = speed > ROLLING
     missing = []
-    found: dict[str, dict[str, Mask]] = {}
+    sorted_by: dict[str, tuple[Array, Mask]] = {}
     if "yaw_rate" in measured:
-        lateral = np.abs(speed * measured["yaw_rate"])
-        straight &= lateral < 0.5
-        found["turning"] = {
-            "straight": straight,
-            "slightly": moving & (lateral >= 0.5) & (lateral < 1.5),
-            "turning": moving & (lateral >= 1.5),
-        }
+        sorted_by["turning"] = np.abs(speed * measured["yaw_rate"]), moving
+        straight = _SORTINGS["turning"].of(*sorted_by["turning"])["straight"]
     else:
         missing.append("not split into straight and turning: the ride has no yaw rate (rate_z), or is on a roller")
     if "grade" in measured:
-        grade = measured["grade"]
-        found["grade"] = {
-            "uphill": moving & (grade > 0.01),
-            "level": moving & (np.abs(grade) <= 0.01),
-            "downhill": moving & (grade < -0.01),
-        }
+        sorted_by["grade"] = measured["grade"], moving
     if "ambient_temperature" in measured:
-        ambient = measured["ambient_temperature"]
-        found["temperature"] = {
-            "cold": straight & (ambient < 12.0),
-            "mild": straight & (ambient >= 12.0) & (ambient < 20.0),
-            "warm": straight & (ambient >= 20.0),
-        }
+        sorted_by["temperature"] = measured["ambient_temperature"], straight
     else:
         missing.append("not split into cold and warm: the ride has no ambient_temperature")
-    begun = np.cumsum(moving)
-    found["since start"] = {
-        "first 3 min": straight & (begun <= 180),
-        "3 to 10 min": straight & (begun > 180) & (begun <= 600),
-        "later": straight & (begun > 600),
-    }
-    edges = (0.0, 0.5, 4.0, 8.0, 11.0, 40.0)
-    found["speed"] = {
-        name: (speed >= a) & (speed < b) for name, a, b in zip(_SPEEDS, edges[:-1], edges[1:], strict=True)
-    }
-    a = measured["acceleration"]
+    sorted_by["since start"] = np.cumsum(moving, dtype=float) - 1, straight
+    sorted_by["speed"] = speed, np.ones(len(speed), dtype=bool)
     braking = measured.get("braking", np.zeros(len(speed))) > 0
-    found["pace"] = {
-        "hard acceleration": moving & (a > 1.0) & ~braking,
-        "acceleration": moving & (a > 0.3) & (a <= 1.0) & ~braking,
-        "steady": moving & (np.abs(a) <= 0.3) & ~braking,
-        "coasting": moving & (a < -0.3) & ~braking,
-        "braking": moving & braking,
-    }
+    sorted_by["pace"] = measured["acceleration"], moving & ~braking
+    found = {by: _SORTINGS[by].of(*values) for by, values in sorted_by.items()}
+    found["pace"]["braking"] = moving & braking
     return found, missing
-
-
-_SPEEDS = ("standing", "below 4 m/s", "4 to 8 m/s", "8 to 11 m/s", "above 11 m/s")
-_PACES = ("hard acceleration", "acceleration", "steady", "coasting", "braking")
-_SORTINGS = {
-    "turning": ("lateral acceleration below 0.5, 0.5 to 1.5, above 1.5 m/s²", ("straight", "slightly", "turning")),
-    "grade": ("above 1 %, within, below −1 %", ("uphill", "level", "downhill")),
-    "temperature": ("air below 12, 12 to 20, above 20 °C, straight on", ("cold", "mild", "warm")),
-    "since start": ("time ridden since the start, straight on", ("first 3 min", "3 to 10 min", "later")),
-    "speed": ("speed", _SPEEDS),
-    "pace": ("acceleration above 1, 0.3 to 1, within 0.3, below −0.3 m/s² without brake; with brake", _PACES),
-}
-LABELS = {by: label for by, (label, _) in _SORTINGS.items()}
-"""What the seconds are sorted by."""
-ORDER = tuple(kind for _, kinds in _SORTINGS.values() for kind in kinds)
-"""The conditions as tables list them."""
 
 
 def split(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import signal
 import sys
@@ -16,8 +17,10 @@ from multiprocessing.context import BaseContext
 from pathlib import Path
 from typing import Any, TypeVar
 
+from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import InputError
-from gz_onboard.offline.results import Failure
+from gz_onboard.offline.results import Failure, output_names
+from gz_onboard.offline.samples import ride_name
 from gz_onboard.progress import Display, Progress
 
 
@@ -38,6 +41,17 @@ class Task:
 
 TaskT = TypeVar("TaskT", bound=Task)
 Answer = TypeVar("Answer")
+
+
+def tasks_of(arguments: argparse.Namespace, kind: type[TaskT], suffix: str, **options: Any) -> list[TaskT]:
+    """A task for each of the logs that a command is given; `options` are those of their `kind` alone.
+
+    suffix: of a file that is written of each, which InputError names if two logs would be written as one.
+    """
+    logs = list(dict.fromkeys(logs_among(arguments.logs)))
+    names = output_names(logs, [ride_name(log).removesuffix(Path(suffix).stem) for log in logs], suffix)
+    given = arguments.vehicle, arguments.payload, not arguments.no_plot
+    return [kind(log, arguments.output / name, *given, **options) for log, name in zip(logs, names, strict=True)]
 
 
 def over_rides(

@@ -137,7 +137,7 @@ def read_facts(file: Path) -> dict[str, dict[str, object]]:
 
 def ride_name(log: Path) -> str:
     """The name of the ride in a log: the file's, without its suffixes."""
-    return Path(log.name.removesuffix(".gz")).stem
+    return (log.with_suffix("") if log.suffix.lower() == ".gz" else log).stem
 
 
 def facts_of(log: Path) -> dict[str, object]:

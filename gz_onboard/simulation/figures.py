@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gz_onboard.constants import WH
+from gz_onboard.events import words
 from gz_onboard.offline.style import (
     BLUE,
     GREEN,
@@ -45,8 +48,6 @@ _LEAST_SHARE = 5e-5  # of all energy: less cannot be seen
 
 def overview(run: Run, title: str) -> Figure:
     """The time series of a ride: speed, throttle and brake, pack, state of charge, temperatures, energy."""
-    import numpy as np
-
     s = run.series
     figure, axes = _panels(title, (1.7, 1.0, 1.3, 1.0, 1.0, 1.2))
     x, time = _time(run)
@@ -130,7 +131,7 @@ def sankey(ledger: Mapping[str, float], effects: Sequence[Effect], title: str) -
     for name, energy, colour in sources:
         thick = energy / total * height
         axis.add_patch(Rectangle((left - 0.025, y - thick), 0.025, thick, color=colour, linewidth=0))
-        text = f"{_words(name)}\n{energy / WH:.1f} Wh"
+        text = f"{words(name)}\n{energy / WH:.1f} Wh"
         axis.text(left - 0.035, y - thick / 2, text, ha="right", va="center", fontsize=10, color=INK)
         y -= thick
     y, low = trunk, 1.0
@@ -139,7 +140,7 @@ def sankey(ledger: Mapping[str, float], effects: Sequence[Effect], title: str) -
         low -= thick
         _band(axis, (left, y), (right, low + thick), thick, colour)
         axis.add_patch(Rectangle((right, low), 0.02, thick, color=colour, linewidth=0))
-        text = f"{_words(name)}   {energy / WH:.2f} Wh   {100 * energy / total:.1f} %"
+        text = f"{words(name)}   {energy / WH:.2f} Wh   {100 * energy / total:.1f} %"
         axis.text(right + 0.03, low + thick / 2, text, va="center", fontsize=10, color=INK)
         y -= thick
         low -= gap
@@ -199,8 +200,6 @@ def sweep_map(
     names: tuple[str, str], values: tuple[Sequence[float], Sequence[float]], variants: Sequence[Variant], title: str
 ) -> Figure:
     """Range and consumption over two parameters, `variants` with the second changing fastest."""
-    import numpy as np
-
     figure = new_figure(12, 5.4)
     for i, (key, text, colours) in enumerate(
         (("range_km", "range [km]", "Blues"), ("consumption_wh_km", "consumption [Wh/km]", "Oranges"))
@@ -241,7 +240,3 @@ def _finish(axes: Sequence[Axes], x: Any, text: str, seconds: Mapping[int, Axes]
     for i, axis in enumerate(axes):
         legend(axis, *([seconds[i]] if i in seconds else []))
     close(axes, x, text)
-
-
-def _words(name: str) -> str:
-    return "BMS" if name == "bms" else name.replace("_", " ")

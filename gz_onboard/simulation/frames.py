@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gz_onboard.bus.checksum import sae_j1850_tables
 from gz_onboard.bus.export import out_suffix, write_frames_as
 from gz_onboard.bus.layout import raw_range
@@ -21,7 +23,6 @@ from gz_onboard.simulation.trace import Truth
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
-    import numpy as np
     from cantools.database.can import Message
     from cantools.database.can.signal import Signal
     from numpy.typing import NDArray
@@ -36,7 +37,7 @@ _PHASE, _LOSS, _GAPS = 101, 102, 103  # streams of chance that belong to no sign
 
 
 @dataclass(frozen=True)
-class Losses:
+class Dropouts:
     """What the bus and the GPS receiver do not deliver."""
 
     frames: float = 1e-4  # share of the frames of each message
@@ -45,7 +46,7 @@ class Losses:
 
 
 @dataclass(frozen=True)
-class Sent:
+class Stream:
     """All frames of one message: `words` are its eight bytes as little-endian numbers."""
 
     message: str
@@ -55,7 +56,7 @@ class Sent:
     dropped: int  # that were lost
 
 
-def simulate_frames(vehicle: Vehicle, truth: Truth, seed: int = 0, losses: Losses | None = None) -> list[Sent]:
+def simulate_frames(vehicle: Vehicle, truth: Truth, seed: int = 0, dropouts: Dropouts = Dropouts()) -> list[Stream]:
     """The messages that the sensors of a ride send, from `START_NS` on.
 
     Raises InputError if the vehicle's DBC files have none of the sensors' signals, or a message that has no
@@ -81,7 +82,7 @@ def simulate_frames(vehicle: Vehicle, truth: Truth, seed: int = 0, losses: Losse
             raise vehicle.error(
                 f"message {message.name}: simulated frames have eight bytes and little-endian integers, not multiplexed"
             )
-        sent.append(_send(vehicle, message, sensors, truth, seed, losses or Losses()))
+        sent.append(_send(vehicle, message, sensors, truth, seed, dropouts))
     return sent
 
 
@@ -89,10 +90,8 @@ def _can_be_packed(signal: Signal) -> bool:
     return signal.byte_order == "little_endian" and not signal.conversion.is_float
 
 
-def batches(sent: list[Sent]) -> Iterator[list[Frame]]:
+def batches(sent: list[Stream]) -> Iterator[list[Frame]]:
     """The frames in the order of their times, some thousands at once."""
-    import numpy as np
-
     times = np.concatenate([s.times for s in sent])
     words = np.concatenate([s.words for s in sent])
     identifiers = np.concatenate([np.full(len(s.times), s.identifier, dtype=np.int64) for s in sent])
@@ -115,16 +114,14 @@ def check_output(out: Path) -> str:
     return suffix
 
 
-def write_frames(out: Path, sent: list[Sent]) -> int:
+def write_frames(out: Path, sent: list[Stream]) -> int:
     """Write the frames in the format of the suffix of `out`; returns how many. InputError for an unknown suffix."""
     return write_frames_as(out, check_output(out), batches(sent))
 
 
 def _send(
-    vehicle: Vehicle, message: Message, sensors: dict[str, Sensor], truth: Truth, seed: int, losses: Losses
-) -> Sent:
-    import numpy as np
-
+    vehicle: Vehicle, message: Message, sensors: dict[str, Sensor], truth: Truth, seed: int, dropouts: Dropouts
+) -> Stream:
     period_ns = round(vehicle.mapping.periods[message.name] * 1e9)
     rng = np.random.default_rng([seed, message.frame_id, _PHASE])
     phase_us = int(rng.integers(0, period_ns // 1000))  # whole µs: candump has no more
@@ -133,7 +130,7 @@ def _send(
     seconds: Floats = offsets.astype(float) * 1e-9
     no_fix = np.zeros(len(offsets), dtype=bool)
     if message.name in GPS_MESSAGES:
-        for begin, end in _gps_gaps(truth, seed, losses):
+        for begin, end in _gps_gaps(truth, seed, dropouts):
             no_fix |= (seconds >= begin) & (seconds < end)
     protection = vehicle.mapping.protection.get(message.name)
     counter = protection.counter if protection else None
@@ -161,15 +158,13 @@ def _send(
     words |= np.uint64((2**64 - 1) & ~used)  # bits without a signal are ones
     if crc:
         words = _seal(words)
-    kept = np.random.default_rng([seed, message.frame_id, _LOSS]).random(len(offsets)) >= losses.frames
+    kept = np.random.default_rng([seed, message.frame_id, _LOSS]).random(len(offsets)) >= dropouts.frames
     identifier = message.frame_id | (EFF_FLAG if message.is_extended_frame else 0)
-    return Sent(message.name, identifier, START_NS + offsets[kept], words[kept], int((~kept).sum()))
+    return Stream(message.name, identifier, START_NS + offsets[kept], words[kept], int((~kept).sum()))
 
 
 def _values(sensor: Sensor | None, truth: Truth, seconds: Floats, period: float, rng: np.random.Generator) -> Floats:
     """What is read at `seconds`, in the unit of the DBC; not a number where there is no such sensor."""
-    import numpy as np
-
     if sensor is None:
         return np.full(len(seconds), np.nan)
     steps = np.clip(((seconds - latency(sensor, truth.parameters)) / truth.dt + 1e-6).astype(int), 0, truth.count - 1)
@@ -189,8 +184,6 @@ def _values(sensor: Sensor | None, truth: Truth, seconds: Floats, period: float,
 
 
 def _without_fix(signal: str, values: Floats, no_fix: NDArray[np.bool_]) -> Floats:
-    import numpy as np
-
     if not no_fix.any():
         return values
     return np.where(no_fix, 0.0 if signal in ("GPS_Fix", "GPS_Satellites") else np.nan, values)
@@ -198,8 +191,6 @@ def _without_fix(signal: str, values: Floats, no_fix: NDArray[np.bool_]) -> Floa
 
 def _raw(signal: Signal, values: Floats) -> NDArray[np.int64]:
     """The nearest raw values within the limits; the code for not available for what is not a number."""
-    import numpy as np
-
     low, high = raw_range(signal, not_available=True)
     absent = -(2 ** (signal.length - 1)) if signal.is_signed else 2**signal.length - 1
     scale, offset = float(signal.conversion.scale), float(signal.conversion.offset)
@@ -209,8 +200,6 @@ def _raw(signal: Signal, values: Floats) -> NDArray[np.int64]:
 
 def _seal(words: Words) -> Words:
     """`words` with the CRC-8 SAE J1850 of their first seven bytes as the last."""
-    import numpy as np
-
     constant, tables = sae_j1850_tables(7)
     crc = np.full(len(words), constant, dtype=np.uint64)
     for i, table in enumerate(tables):
@@ -218,21 +207,19 @@ def _seal(words: Words) -> Words:
     return (words & np.uint64(2**56 - 1)) | crc << np.uint64(56)
 
 
-def _gps_gaps(truth: Truth, seed: int, losses: Losses) -> Any:
+def _gps_gaps(truth: Truth, seed: int, dropouts: Dropouts) -> Any:
     """(begin, end) [s] of each time without a fix; on a dynamometer, indoors, all of the ride."""
-    import numpy as np
-
     duration = truth.count * truth.dt
     if truth.on_dynamometer:
         return np.array([(0.0, duration)])
     rng = np.random.default_rng([seed, _GAPS])
     gaps = []
     at = 0.0
-    while losses.gps_gap_every > 0:
-        at += rng.exponential(losses.gps_gap_every)
+    while dropouts.gps_gap_every > 0:
+        at += rng.exponential(dropouts.gps_gap_every)
         if at >= duration:
             break
-        end = at + rng.uniform(*losses.gps_gap)
+        end = at + rng.uniform(*dropouts.gps_gap)
         gaps.append((at, end))
         at = end
     return np.array(gaps).reshape(-1, 2)

@@ -12,11 +12,11 @@ from pathlib import Path
 from gz_onboard.errors import writable, writing
 from gz_onboard.offline.page import svg, write_page
 from gz_onboard.offline.style import save
-from gz_onboard.simulation.frames import Losses, simulate_frames, write_frames
+from gz_onboard.simulation.frames import Dropouts, simulate_frames, write_frames
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.run import COLUMNS, Run
 from gz_onboard.simulation.scooter import Scooter
-from gz_onboard.simulation.summary import Summary, measured_columns, summary_text
+from gz_onboard.simulation.summary import SimulationSummary, measured_columns, summary_text
 from gz_onboard.simulation.sweep import Sweep
 from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle
@@ -26,7 +26,12 @@ _TOPIC = "simulation"
 
 
 def write(
-    arguments: argparse.Namespace, vehicle: Vehicle, plan: Plan, result: Run, summary: Summary, sweeps: Sequence[Sweep]
+    arguments: argparse.Namespace,
+    vehicle: Vehicle,
+    plan: Plan,
+    result: Run,
+    summary: SimulationSummary,
+    sweeps: Sequence[Sweep],
 ) -> list[str]:
     """The time series and the pictures; gives their names. Raises InputError if they cannot be written."""
     mode = ".predictive" if arguments.predictive else ""
@@ -49,8 +54,8 @@ def write(
 
 def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, scooter: Scooter) -> str:
     """Write the ride's frames; gives the file's name. InputError if it cannot be written."""
-    losses = Losses() if arguments.frame_loss is None else Losses(frames=arguments.frame_loss)
-    sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, losses=losses)
+    dropouts = Dropouts() if arguments.frame_loss is None else Dropouts(frames=arguments.frame_loss)
+    sent = simulate_frames(vehicle, trace.truth(scooter), arguments.seed, dropouts=dropouts)
     with writing(arguments.frames):
         arguments.frames.parent.mkdir(parents=True, exist_ok=True)
         write_frames(arguments.frames, sent)
@@ -58,7 +63,12 @@ def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, s
 
 
 def _draw(
-    file: Callable[[str], Path], vehicle: Vehicle, plan: Plan, result: Run, summary: Summary, sweeps: Sequence[Sweep]
+    file: Callable[[str], Path],
+    vehicle: Vehicle,
+    plan: Plan,
+    result: Run,
+    summary: SimulationSummary,
+    sweeps: Sequence[Sweep],
 ) -> None:
     from gz_onboard.simulation import figures
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.offline.samples import facts_of, rider_mass
+from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.options import LOG_SUFFIXES
 from gz_onboard.simulation.cycles import find_cycle
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile, straight
@@ -22,6 +22,8 @@ from gz_onboard.vehicle import Vehicle
 _LOGS = {*LOG_SUFFIXES, ".gz"} - {".csv"}
 TOP_SPEED = 50 / 3.6
 """m/s: what a rider aims for on a route without limits."""
+Ground = RoadProfile | Dynamometer
+Heading = float | Callable[[float], float]
 
 
 @dataclass(frozen=True)
@@ -31,11 +33,11 @@ class Plan:
     name: str
     kind: str
     seconds: float  # of one repetition, as planned
-    road: RoadProfile | Dynamometer
+    road: Ground
     command: Callable[[], Command]
     length: float | None = None  # m, of one repetition; None if it ends by time
     recorded: Recorded | None = None
-    heading: float | Callable[[float], float] = 0.0  # rad clockwise from north, where it begins or over distance
+    heading: Heading = 0.0  # rad clockwise from north, where it begins or over distance
     vibration: Callable[[float], float] | None = None  # m/s² over distance, as it was recorded
 
 
@@ -43,11 +45,11 @@ def find_plan(arguments: argparse.Namespace, vehicle: Vehicle) -> Plan:
     """The plan that WHAT asks for; InputError for what is neither a file that can be ridden nor a built-in cycle."""
     path = Path(arguments.what)
     kind = _kind(path)
+    roller = dynamometer(arguments.dyno) if arguments.dyno else None
     if kind == "ride":
-        return _ride_plan(path, arguments, vehicle)
+        return _ride_plan(path, arguments, vehicle, roller)
     if arguments.predictive:
         raise InputError(f"--predictive: {path} is a {kind}, whose speed is followed anyway; it is for recorded rides")
-    roller = dynamometer(arguments.dyno) if arguments.dyno else None
     if kind == "route":
         return _route_plan(path, arguments, roller)
     cycle = find_cycle(arguments.what)
@@ -99,23 +101,12 @@ def _route_plan(path: Path, arguments: argparse.Namespace, roller: Dynamometer |
     )
 
 
-def _ride_plan(path: Path, arguments: argparse.Namespace, vehicle: Vehicle) -> Plan:
+def _ride_plan(path: Path, arguments: argparse.Namespace, vehicle: Vehicle, roller: Dynamometer | None) -> Plan:
     if arguments.repeat > 1 or arguments.until_empty:
         raise InputError(f"{path}: a recorded ride is ridden once; --repeat and --until-empty are for cycles")
     recorded = read_recorded(path, vehicle)
     signals = recorded.signals
-    beside = path.with_name(f"{recorded.name}.route.csv")
-    heading: float | Callable[[float], float] = recorded.heading_at
-    if arguments.dyno:
-        road: RoadProfile | Dynamometer = dynamometer(arguments.dyno)
-    elif recorded.on_dynamometer:
-        road = fit_dynamometer(recorded)
-    elif beside.is_file():
-        route = read_route(beside)
-        heading = route.heading[0]
-        road = road_table(route.distance, route.grade, route.curvature, arguments.wind)
-    else:
-        road = recorded.road(arguments.wind)
+    road, heading = ridden_road(recorded, path, arguments.wind, roller)
     if arguments.predictive:
         speeds = signals["speed"].tolist()
         kind, command = "ride (predictive)", lambda: follow(speeds, STEP)
@@ -138,6 +129,23 @@ def _ride_plan(path: Path, arguments: argparse.Namespace, vehicle: Vehicle) -> P
         heading=heading,
         vibration=recorded.vibration_at if rough else None,
     )
+
+
+def route_file(log: Path) -> Path:
+    """Where the route of the ride in `log` would be."""
+    return log.with_name(f"{ride_name(log)}.route.csv")
+
+
+def ridden_road(
+    recorded: Recorded, log: Path, headwind: float = 0.0, roller: Dynamometer | None = None
+) -> tuple[Ground, Heading]:
+    """(what was ridden on, its heading): a roller, the road of the route file beside the log, or of the filter."""
+    if roller or recorded.on_dynamometer:
+        return roller or fit_dynamometer(recorded), recorded.heading_at
+    if not route_file(log).is_file():
+        return recorded.road(headwind), recorded.heading_at
+    route = read_route(route_file(log))
+    return road_table(route.distance, route.grade, route.curvature, headwind), route.heading[0]
 
 
 def dynamometer(text: str) -> Dynamometer:

@@ -11,9 +11,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import pi
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+import numpy as np
+
+from gz_onboard.arrays import Array, block_means, held_at, running_mean
 from gz_onboard.bus.codec import Codec
+from gz_onboard.constants import MILD
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Event
@@ -25,17 +29,13 @@ from gz_onboard.simulation.run import road_table
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.vehicle import Vehicle
 
-if TYPE_CHECKING:
-    from gz_onboard.arrays import Array
-
-
 BRAKE_FORCE = 20e-5
 """N of both brakes for each Pa, front and rear pressure added: deceleration on 8 road rides, with 19 N of scatter."""
 BRAKE_PRESSED = 0.5e5  # Pa: below this the sensors show noise
-BRAKE_MEAN = 90.0  # N: the mean of the same rides while the switch is on, where there are no pressures
+BRAKE_MEAN = 0.07835  # of full brake, 90 N: the mean of these rides while the switch is on, where no pressures are
 ROAD_PIECE = 5.0  # m
-AMBIENT = 20.0  # degC: of the air, where it was not measured
 SPAN, ROLLING, LEAST_SPANS = 2.0, 1.0, 10  # s, m/s and count: of spans of a roller's run that moves
+SMOOTHED = 0.2  # s: over which the roller's speed at the ends of a span is a mean
 LEAST_HEADINGS = 10  # of a ride whose heading counts as known
 _MOVING = 2.0  # m/s: slower than this, yaw rate over speed is no curvature
 
@@ -104,8 +104,6 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
 
     Raises InputError for a log that cannot be read, or that has no speed.
     """
-    import numpy as np
-
     if vehicle.battery is None:
         raise vehicle.error("has no [battery], which a simulation needs")
     mapping, frames = open_ride(log, vehicle)
@@ -141,8 +139,6 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     if felt is not None:
         columns["vibration"] = felt[:, 0], felt[:, 2]
     signals = _signals(log, columns, vehicle)
-    if "pack_voltage" in signals and "pack_current" in signals:
-        signals["soc"] = _counted_soc(signals, vehicle)
     way, grade, curvature = (np.array(column) for column in zip(*rows, strict=True))
     vibration = None if felt is None else _over_road(felt[:, 1], felt[:, 2])
     heading = None
@@ -151,15 +147,14 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
         heading = _over_road(course[:, 0], course[:, 1], period=2 * pi)
     stood = way[0] == way[-1]
     slope, bend = (np.zeros(1) if stood else _over_road(way, values) for values in (grade, curvature))
-    return Recorded(ride_name(log), STEP, signals, slope, bend, heading, vibration)
+    recorded = Recorded(ride_name(log), STEP, signals, slope, bend, heading, vibration)
+    if "pack_voltage" in signals and "pack_current" in signals:
+        signals["soc"] = _counted_soc(recorded, vehicle)
+    return recorded
 
 
 def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicle) -> dict[str, Array]:
     """All on one grid of steps: the speeds interpolated, what comes in steps as it was last told."""
-    import numpy as np
-
-    from gz_onboard.arrays import held_at
-
     pace, factor = speed_role(str(log), columns, vehicle.parameters)
     time = columns[pace][0]
     grid = np.arange(time[0], time[-1], STEP)
@@ -177,7 +172,7 @@ def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicl
             pressure = np.where(pressed > 0.5, np.maximum(pressure, 1.0), 0.0)
         signals["brake"] = np.clip(pressure * BRAKE_FORCE / limit, 0.0, 1.0)
     elif pressed is not None:
-        signals["brake"] = np.where(pressed > 0.5, BRAKE_MEAN / limit, 0.0)
+        signals["brake"] = np.where(pressed > 0.5, BRAKE_MEAN, 0.0)
     return signals
 
 
@@ -186,8 +181,6 @@ def _over_road(distance: Array, values: Array, period: float | None = None) -> A
 
     period: of an angle, which then goes on over a whole turn.
     """
-    import numpy as np
-
     distance, keep = np.unique(distance, return_index=True)
     found = values[keep] if period is None else np.unwrap(values[keep], period=period)
     return np.interp(np.arange(ROAD_PIECE / 2, distance[-1] + ROAD_PIECE, ROAD_PIECE), distance, found)
@@ -210,7 +203,7 @@ def scooter_at_start(
     ambient: air [degC]; None: as measured, or 20 degC. options: of `Scooter`.
     """
     measured = recorded.first if recorded else lambda _, default: default
-    air = measured("ambient_temperature", AMBIENT) if ambient is None else ambient
+    air = measured("ambient_temperature", MILD) if ambient is None else ambient
     cell, speed = measured("cell_temperature", air), measured("speed", 0.0)
     scooter = Scooter(vehicle, road, ambient=air, cell_temperature=cell, speed=speed, **options)
     scooter.motor_cooling.stator = scooter.motor_cooling.rotor = measured("motor_temperature", air)
@@ -220,28 +213,18 @@ def scooter_at_start(
 
 def rest_soc(recorded: Recorded, vehicle: Vehicle) -> float | None:
     """SOC in the first second, from voltage and current as if the RC pair had been at rest; None if not measured."""
-    return _rest_soc(recorded.signals, vehicle)
-
-
-def _rest_soc(signals: dict[str, Array], vehicle: Vehicle) -> float | None:
     battery = vehicle.battery
-    if battery is None or "pack_voltage" not in signals:
+    if battery is None or "pack_voltage" not in recorded.signals:
         return None
-
-    def first(role: str, default: float) -> float:
-        return float(signals[role][: round(1 / STEP)].mean()) if role in signals else default
-
-    soc = battery.first_soc(first("pack_voltage", 0.0), first("pack_current", 0.0), first("cell_temperature", AMBIENT))
-    return min(max(soc, 0.0), 1.0)
+    voltage, current = recorded.first("pack_voltage", 0.0), recorded.first("pack_current", 0.0)
+    return min(max(battery.first_soc(voltage, current, recorded.first("cell_temperature", MILD)), 0.0), 1.0)
 
 
-def _counted_soc(signals: dict[str, Array], vehicle: Vehicle) -> Array:
+def _counted_soc(recorded: Recorded, vehicle: Vehicle) -> Array:
     """SOC by counting the measured charge from that at the start."""
-    import numpy as np
-
-    start = _rest_soc(signals, vehicle)
+    signals, start = recorded.signals, rest_soc(recorded, vehicle)
     assert start is not None
-    temperature = float(signals["cell_temperature"][0]) if "cell_temperature" in signals else AMBIENT
+    temperature = float(signals["cell_temperature"][0]) if "cell_temperature" in signals else MILD
     soc: Array = start - discharged(np.cumsum(signals["pack_current"]), STEP, vehicle.pack.pack_capacity(temperature))
     return soc
 
@@ -251,9 +234,6 @@ def fit_dynamometer(recorded: Recorded) -> Dynamometer:
 
     Raises InputError if there was no roller, or it did not move.
     """
-    import numpy as np
-
-    from gz_onboard.arrays import block_means
 
     if not recorded.on_dynamometer:
         raise InputError(f"{recorded.name}: no roller of a dynamometer was recorded")
@@ -261,8 +241,8 @@ def fit_dynamometer(recorded: Recorded) -> Dynamometer:
     speed, force = recorded.signals["roller_speed"], recorded.signals["roller_force"]
     mean_v, mean_f, square = (block_means(x, n) for x in (speed, force, speed**2))
     spans = len(mean_v)
-    edges = np.interp(np.arange(spans + 1) * n, np.arange(len(speed)), np.convolve(speed, np.ones(21) / 21, "same"))
-    acceleration = np.diff(edges) / (n * recorded.dt)
+    smooth = running_mean(speed, 2 * round(SMOOTHED / recorded.dt / 2) + 1)
+    acceleration = np.diff(smooth[np.minimum(np.arange(spans + 1) * n, len(smooth) - 1)]) / (n * recorded.dt)
     moving = mean_v > ROLLING
     if moving.sum() < LEAST_SPANS:
         raise InputError(f"{recorded.name}: its roller hardly moves; give --dyno KG,A,B,C")

@@ -16,15 +16,18 @@ from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from pathlib import Path
 
+import numpy as np
+
 from gz_onboard.errors import InputError
 from gz_onboard.simulation.columns import Columns, read_columns
+from gz_onboard.simulation.cycles import UNITS
 
 GRADE_LENGTH = 200.0  # [m]
 CURVE_LENGTH = 40.0  # [m]
 _CHORD = 10.0  # [m]: shorter chords have no heading worth the name
 _STEEPEST = 0.5  # sine; no road is steeper, a wrong unit is
 _CLOSEST = 0.01  # [m] between points
-_LIMITS = {"speed_limit_mps": 1.0, "speed_limit_kmh": 1 / 3.6}
+_LIMITS = {f"speed_limit_{unit}": UNITS[unit] for unit in ("mps", "kmh")}
 _KNOWN = ("distance_m", "latitude_deg", "longitude_deg", "altitude_m", "curvature_1pm", *_LIMITS)
 
 
@@ -131,8 +134,6 @@ def _course(
     columns: Columns, positions: list[tuple[float, float]], distance: tuple[float, ...]
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Heading [rad] and curvature [1/m] at each point; what is not given follows from what is."""
-    import numpy as np
-
     middles: list[float] = []
     headings: list[float] = []
     last = 0
@@ -175,8 +176,6 @@ def _slopes(x: tuple[float, ...], y: tuple[float, ...], at: tuple[float, ...], l
     At the ends the length is kept and lies to one side, so that noise is smoothed there as elsewhere; where points
     are sparse the nearest on both sides are taken.
     """
-    import numpy as np
-
     xs, ys, where = np.asarray(x), np.asarray(y), np.asarray(at)
     length = min(length, x[-1] - x[0])
     start = np.clip(where - length / 2, x[0], x[-1] - length)

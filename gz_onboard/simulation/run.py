@@ -9,17 +9,15 @@ from bisect import bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import nan
-from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
+from gz_onboard.arrays import Array, stretches
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.progress import Progress
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.parts.road import RoadProfile
 from gz_onboard.simulation.scooter import Scooter
-
-if TYPE_CHECKING:
-    from gz_onboard.arrays import Array
-
 
 COLUMNS = {
     "time": "s",
@@ -87,10 +85,14 @@ class Run:
     duration: float  # s
     soc_start: float
     soc_end: float
-    mean_power: float  # W, at the terminals
     form_factor_squared: float  # mean square of the pack current over the square of its mean
     empty: bool = False  # the ride ended because the pack was empty
     shortfalls: list[Shortfall] = field(default_factory=list)
+
+    @property
+    def mean_power(self) -> float:
+        """At the terminals [W]."""
+        return self.energy / self.duration if self.duration else 0.0
 
     @property
     def consumption(self) -> float | None:
@@ -119,21 +121,17 @@ def drive(
     """
     dt = scooter.dt
     every = max(round(SAMPLE / dt), 1)
-    battery = scooter.vehicle.battery
-    assert battery  # a Scooter has one
+    battery = scooter.vehicle.pack
     cutoff = battery.cutoff_voltage * battery.cells_series if until_empty else -1.0
     end = finish if finish is not None else float("inf")
-    before = scooter.kinetic_energy(), scooter.pack.soc
+    kinetic, soc_start = scooter.kinetic_energy(), scooter.pack.soc
     energy = recovered = charge = squares = 0.0
-    wanted = nan
     rows = [_row(scooter, nan, 0.0)]
-    steps = round(seconds / dt)
-    done, empty = 0, False
+    done, empty, wanted = 0, False, nan
     step = scooter.step
-    while done < steps:
+    for done in range(1, round(seconds / dt) + 1):
         throttle, brake, wanted = command(scooter)
         step(throttle, brake)
-        done += 1
         current = scooter.current
         part = scooter.voltage * current * dt
         energy += part
@@ -152,48 +150,34 @@ def drive(
             break
     if done % every:
         rows.append(_row(scooter, wanted, energy))
-    form_factor_squared = max(squares * done / (charge * charge), 1.0) if charge else 1.0
-    return _finished(scooter, rows, before, _Totals(energy, recovered, form_factor_squared, done * dt, empty))
+    series = _series(rows)
+    return Run(
+        series=series,
+        ledger=_ledger(scooter, kinetic),
+        chemical=scooter.pack.chemical_energy_drawn(),
+        energy=energy,
+        recovered=recovered,
+        distance=scooter.distance,
+        duration=done * dt,
+        soc_start=soc_start,
+        soc_end=scooter.pack.soc,
+        form_factor_squared=max(squares * done / (charge * charge), 1.0) if charge else 1.0,
+        empty=empty,
+        shortfalls=shortfalls(series),
+    )
 
 
-class _Totals(NamedTuple):
-    """Of a ride, as in `Run`."""
-
-    energy: float
-    recovered: float
-    form_factor_squared: float
-    duration: float
-    empty: bool
-
-
-def _finished(scooter: Scooter, rows: Sequence[tuple[float, ...]], before: tuple[float, float], totals: _Totals) -> Run:
-    """The run of a scooter that has ended it. before: kinetic energy [J] and SOC at its start."""
-    import numpy as np
-
-    kinetic, soc_start = before
+def _series(rows: Sequence[tuple[float, ...]]) -> dict[str, Array]:
     series = dict(zip(COLUMNS, np.array(rows, dtype=float).T, strict=True))
     if len(rows) > 1 and not np.isnan(series["wanted_speed"][1]):
         series["wanted_speed"][0] = series["speed"][0]  # before the first step nothing else can be wanted
-    energy, duration = totals.energy, totals.duration
-    return Run(
-        series=series,
-        ledger={
-            **scooter.ledger.entries,
-            "kinetic_energy": scooter.kinetic_energy() - kinetic,
-            "potential_energy": scooter.potential_energy(),
-        },
-        chemical=scooter.pack.chemical_energy_drawn(),
-        energy=energy,
-        recovered=totals.recovered,
-        distance=scooter.distance,
-        duration=duration,
-        soc_start=soc_start,
-        soc_end=scooter.pack.soc,
-        mean_power=energy / duration if duration else 0.0,
-        form_factor_squared=totals.form_factor_squared,
-        empty=totals.empty,
-        shortfalls=shortfalls(series),
-    )
+    return series
+
+
+def _ledger(scooter: Scooter, kinetic: float) -> dict[str, float]:
+    """Where the energy of a ride went; kinetic: energy [J] at its start."""
+    gained = {"kinetic_energy": scooter.kinetic_energy() - kinetic, "potential_energy": scooter.potential_energy()}
+    return {**scooter.ledger, **gained}
 
 
 def _row(scooter: Scooter, wanted: float, energy: float) -> tuple[float, ...]:
@@ -239,7 +223,7 @@ def follow(speeds: Sequence[float], dt: float, rider: Rider | None = None) -> Co
 
 
 def replay(throttle: Sequence[float], brake: Sequence[float], dt: float) -> Command:
-    """Throttle and brake as given, one of each for each step of `dt` [s]; after the last as there."""
+    """Throttle and brake as given, one of each for each step of `dt` [s]; after them the last."""
     last = min(len(throttle), len(brake)) - 1
 
     def command(scooter: Scooter) -> tuple[float, float, float]:
@@ -263,8 +247,6 @@ def along(metres: Sequence[float]) -> Command:
 
 def at_steps(time: Sequence[float], speed: Sequence[float], dt: float) -> list[float]:
     """`speed` at each step of `dt` [s] within `time` [s], the end of the step counting: a rider looks ahead."""
-    import numpy as np
-
     steps = round((time[-1] - time[0]) / dt)
     values: list[float] = np.interp(time[0] + dt * np.arange(1, steps + 1), time, speed).tolist()
     return values
@@ -295,7 +277,6 @@ def road_table(
 
 def shortfalls(series: dict[str, Array]) -> list[Shortfall]:
     """Where the speed stayed below all that was wanted within a second, by more than the tolerance; worst first."""
-    import numpy as np
     from numpy.lib.stride_tricks import sliding_window_view
 
     time, wanted, speed = series["time"], series["wanted_speed"], series["speed"]
@@ -305,10 +286,8 @@ def shortfalls(series: dict[str, Array]) -> list[Shortfall]:
     padded = np.pad(np.nan_to_num(wanted, nan=0.0), reach, mode="edge")
     least = sliding_window_view(padded, 2 * reach + 1).min(axis=1)
     missing = least - TOLERANCE - speed
-    short = np.concatenate(([False], missing > 0, [False]))
-    edges = np.flatnonzero(short[1:] != short[:-1])
     found = []
-    for begin, end in zip(edges[::2], edges[1::2], strict=True):
+    for begin, end in stretches(missing > 0):
         worst = begin + int(np.argmax(missing[begin:end]))
         throttle = float(series["throttle"][begin:end].mean())
         lasts = float(time[min(end, len(time) - 1)] - time[begin])

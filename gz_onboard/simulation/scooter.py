@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
 from math import sqrt
 from typing import TypedDict, Unpack
 
-from gz_onboard.constants import GRAVITY
+from gz_onboard.constants import GRAVITY, MILD
+from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.physics.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling
 from gz_onboard.physics.effect import MOVING, QUANTITIES, Port
 from gz_onboard.physics.elementary import direction
@@ -38,17 +38,6 @@ LEAST_LOAD = 0.05  # of the weight, on the rear axle
 VOLTAGE_FILTER = 0.3  # s: the controller's own; without one, current and sag would chase each other each step
 
 
-@dataclass
-class Ledger:
-    """Energy [J] by where it went, since the start."""
-
-    entries: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
-
-    def total(self) -> float:
-        """The sum of all entries."""
-        return sum(self.entries.values())
-
-
 class Options(TypedDict, total=False):
     """How a simulation begins, and the parts that stand in for the vehicle's own."""
 
@@ -63,8 +52,8 @@ class Options(TypedDict, total=False):
     pack: Pack | None
     motor: Motor | None
     chassis: Chassis | None
-    tyre_form: str  # transient; see `Tyre`
-    brake_form: str  # friction; see `Brakes`
+    tyre_form: str  # transient; or steady, as the thesis prints it, see `Tyre`
+    brake_form: str  # friction; or viscous, as the thesis prints it, see `Brakes`
 
 
 class Scooter:
@@ -85,7 +74,7 @@ class Scooter:
         self.dynamometer = road if isinstance(road, Dynamometer) else None
         self.road: RoadProfile = straight() if road is None or isinstance(road, Dynamometer) else road
         self.dt = options.get("dt", STEP)
-        self.ambient = options.get("ambient", 20.0)
+        self.ambient = options.get("ambient", MILD)
         self.speed = options.get("speed", 0.0)  # m/s
         self.wheel_speed = self.speed / vehicle.parameters["wheel_radius"]  # rad/s
         self.distance = self.climb = 0.0  # m
@@ -93,7 +82,7 @@ class Scooter:
         self.current = self.motor_current = 0.0  # A; of the pack, of the motor
         self.throttle = self.brake = 0.0
         self.force = self.rear_load = self.front_load = 0.0  # N; of the driven tyre, on the axles
-        self.ledger = Ledger()
+        self.ledger = defaultdict[str, float](float)  # J by where it went, since the start
         self._q: dict[str, float] = dict.fromkeys(QUANTITIES, 0.0)
         self._begin(options)
         cells = options.get("cell_temperature")
@@ -131,7 +120,7 @@ class Scooter:
         self._series = battery.cells_series
         self._voltage_gain = min(dt / VOLTAGE_FILTER, 1.0)
         self._q["cell_capacity"] = battery.cell_capacity(cells)
-        inside = model.at(Port.CELL_VOLTAGE)
+        inside = CellEffects(model, battery)
         own = EffectPack(battery, soc, inside, self._q) if inside else FirstOrderPack(battery, soc)
         self.pack: Pack = options.get("pack") or own
         self._inverter = Losses(_calls(model.at(Port.INVERTER_LOSS), dt), dt)
@@ -195,7 +184,7 @@ class Scooter:
 
     def step(self, throttle: float, brake: float) -> None:
         """One step with throttle and brake [0..1]."""
-        dt, q, entries, roller = self.dt, self._q, self.ledger.entries, self.dynamometer
+        dt, q, entries, roller = self.dt, self._q, self.ledger, self.dynamometer
         v, w, gear = self.speed, self.wheel_speed, self._gear
         self.throttle, self.brake = throttle, brake
         normal, turning, radius = self._on_the_road()
@@ -265,7 +254,7 @@ class Scooter:
 
     def _draw(self, mechanical: float, motor_speed: float, current: float) -> None:
         """Every watt from the pack to the shaft (eqs. 2.2-2.6, 2.9, 2.10, 2.16-2.19), and its heat."""
-        dt, q, entries, heat = self.dt, self._q, self.ledger.entries, self._heat
+        dt, q, entries, heat = self.dt, self._q, self.ledger, self._heat
         q["torque"] = self.motor.torque_constant * current
         motor_heat = self.motor.heat(motor_speed, current, self.motor_cooling.stator, dt, entries)
         q["motor_speed"], q["motor_current"] = motor_speed, current

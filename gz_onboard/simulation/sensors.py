@@ -9,20 +9,17 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import cos, pi
-from typing import TYPE_CHECKING
 
+import numpy as np
+
+from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.vibration import FAST
 from gz_onboard.simulation.recorded import BRAKE_FORCE
 from gz_onboard.simulation.trace import Truth
 
-if TYPE_CHECKING:
-    from gz_onboard.arrays import Array
-
-
 BMS_DELAY = 0.10  # s behind the inverter
 GPS_DELAY = 0.4  # s
-CABLE = 0.0086  # Ω between pack and inverter
 REPORTED_TORQUE = 0.47  # N·m/A, that the inverter makes torque of its current with, whatever the magnets are
 ODOMETER_RADIUS = 0.245  # m, that the odometer assumes
 LATITUDE, LONGITUDE, ALTITUDE = 45.0, 9.0, 200.0  # deg, deg, m: where a simulated road begins, to the north
@@ -65,6 +62,10 @@ def _delay(signal: str) -> float:
     return BMS_DELAY if signal.startswith("BMS_") else 0.0
 
 
+def _inverter_voltage(t: Truth) -> Array:
+    return t["pack_voltage"] - t.parameters["cable_resistance"] * t["pack_current"]
+
+
 def _inverter_current(t: Truth) -> Array:
     """The DC current: no auxiliary load in it, nor the inverter's constant loss, which it does not show."""
     p = t.parameters
@@ -82,39 +83,27 @@ def _pressure(share: Callable[[Mapping[str, float]], float]) -> Callable[[Truth]
 
 
 def _lateral(t: Truth) -> Array:
-    import numpy as np
-
     return GRAVITY * np.cos(t["slope"]) * np.sin(t["lean"]) + t["way"] * t["yaw_rate"] * np.cos(t["lean"])
 
 
 def _vertical(t: Truth) -> Array:
-    import numpy as np
-
     return GRAVITY * np.cos(t["slope"]) * np.cos(t["lean"]) - t["way"] * t["yaw_rate"] * np.sin(t["lean"])
 
 
 def _forward(t: Truth) -> Array:
-    import numpy as np
-
     return t["acceleration"] + GRAVITY * np.sin(t["slope"])
 
 
 def _pitch(t: Truth) -> Array:
-    import numpy as np
-
     return (t["pitch_rate"] * np.cos(t["lean"]) + t["yaw_rate"] * np.sin(t["lean"])) * (180 / pi)
 
 
 def _yaw(t: Truth) -> Array:
-    import numpy as np
-
     return (t["yaw_rate"] * np.cos(t["lean"]) - t["pitch_rate"] * np.sin(t["lean"])) * (180 / pi)
 
 
 def _course(t: Truth) -> Array:
     """Clockwise from north [deg]; not known while standing."""
-    import numpy as np
-
     return np.where(t["way"] > 0.5, t["heading"] * (180 / pi), np.nan)
 
 
@@ -124,8 +113,6 @@ def _longitude(t: Truth) -> Array:
 
 def _inverter_state(t: Truth) -> Array:
     """Ready, Drive or Regen."""
-    import numpy as np
-
     current = t["motor_current"]
     return np.where(current > 0.5, 2.0, np.where(current < -0.5, 3.0, 1.0))
 
@@ -145,7 +132,7 @@ SENSORS: tuple[Sensor, ...] = (
     Sensor("INV_MotorCurrent", _column("motor_current"), sd=0.3),
     Sensor("INV_MotorTorque", _column("motor_current", REPORTED_TORQUE), sd=0.1),
     Sensor("INV_State", _inverter_state),
-    Sensor("INV_DcVoltage", lambda t: t["pack_voltage"] - CABLE * t["pack_current"], sd=0.042),
+    Sensor("INV_DcVoltage", _inverter_voltage, sd=0.042),
     Sensor("INV_DcCurrent", _inverter_current, sd=0.35),
     # battery; gain, offset and noise are the vehicle's, see `spread`
     Sensor("BMS_PackVoltage", lambda t: t["pack_voltage"] + t.parameters["pack_voltage_offset"], delay=BMS_DELAY),
@@ -201,8 +188,6 @@ def shaken(sensor: Sensor, truth: Truth, period: float) -> Array | None:
 
     White, sampled each `period` [s], of the size that `physics.vibration.Vibration` makes the truth's vibration of.
     """
-    import numpy as np
-
     if sensor.signal != "IMU_AccelZ" or not truth["vibration"].any():
         return None
     keep = np.exp(-period / FAST)  # of the slow mean; the variance of what is faster is keep²·(1 + (1-keep)/(1+keep))

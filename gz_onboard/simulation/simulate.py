@@ -13,12 +13,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gz_onboard.constants import WH_PER_KM
+from gz_onboard.constants import HOUR, WH_PER_KM
 from gz_onboard.errors import OK, InputError, not_an_input
 from gz_onboard.offline.results import explain_keys, times, write_json
 from gz_onboard.options import add_shared, number
 from gz_onboard.progress import Progress, progress_bar
-from gz_onboard.simulation.frames import Losses, check_output
+from gz_onboard.simulation.frames import Dropouts, check_output
 from gz_onboard.simulation.output import FORMATS, write, write_trace
 from gz_onboard.simulation.parts.chassis import MODELS, chassis
 from gz_onboard.simulation.parts.road import Dynamometer
@@ -41,28 +41,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = "name of a built-in drive cycle, CSV file of a cycle or a route, or log of a recorded ride to be replayed"
     add("what", metavar="WHAT", help=what)
     add_shared(parser, "--vehicle", "--payload")
-    _number(
-        parser, "--soc", 0.0, 1.0, help="state of charge at the start (default: 1; of a recorded ride, as recorded)"
-    )
-    _number(
-        parser,
-        "--ambient",
-        -40.0,
-        60.0,
-        "degC",
-        metavar="C",
-        help="temperature of air and vehicle at the start (default: 20)",
-    )
-    _number(
-        parser,
-        "--grade",
-        -30.0,
-        30.0,
-        "%",
-        default=0.0,
-        metavar="PERCENT",
-        help="of the road, uphill positive (default: %(default)g)",
-    )
+    charge = "state of charge at the start (default: 1; of a recorded ride, as recorded)"
+    _number(parser, "--soc", 0.0, 1.0, help=charge)
+    air = "temperature of air and vehicle at the start (default: 20)"
+    _number(parser, "--ambient", -40.0, 60.0, "degC", metavar="C", help=air)
+    hill = "of the road, uphill positive (default: %(default)g)"
+    _number(parser, "--grade", -30.0, 30.0, "%", default=0.0, metavar="PERCENT", help=hill)
     _number(parser, "--wind", -40.0, 40.0, "m/s", default=0.0, help="headwind (default: %(default)g)")
     often = parser.add_mutually_exclusive_group()
     repeat = number("--repeat", 1, 1000, kind=int)
@@ -83,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     frames = "write the ride as CAN frames of the vehicle's sensors: .blf .log .asc .trc .csv .mf4"
     add("--frames", type=Path, metavar="FILE", help=frames)
     add_shared(parser, "--seed", help="seed of the noise and losses of --frames (default: %(default)s)")
-    lost = f"share of the --frames that the bus loses (default: {Losses.frames:g})"
+    lost = f"share of the --frames that the bus loses (default: {Dropouts.frames:g})"
     _number(parser, "--frame-loss", 0.0, 1.0, metavar="SHARE", help=lost)
     add_shared(parser, "--quiet")
 
@@ -155,7 +139,7 @@ def ride(
         vibration=plan.vibration,
         chassis=chassis(arguments.chassis, vehicle.parameters),
     )
-    seconds = _MOST_HOURS * 3600 if arguments.until_empty else plan.seconds * arguments.repeat
+    seconds = _MOST_HOURS * HOUR if arguments.until_empty else plan.seconds * arguments.repeat
     if plan.length is not None:
         seconds = 3 * plan.seconds + 600  # a weak vehicle takes longer
     command = trace.watch(plan.command()) if trace else plan.command()

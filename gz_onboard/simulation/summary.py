@@ -5,8 +5,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
+import numpy as np
+
+from gz_onboard.arrays import Array
 from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.offline.results import clock, number, text_rows, times
 from gz_onboard.offline.schema import descriptions
@@ -15,9 +18,6 @@ from gz_onboard.simulation.recorded import Recorded
 from gz_onboard.simulation.run import COLUMNS, Run, range_by_energy
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    from gz_onboard.arrays import Array
 
 SUMMARY_VERSION = 1
 _RANGE_BY = {
@@ -65,7 +65,7 @@ class Variant:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Summary:
+class SimulationSummary:
     """What ``--json`` writes."""
 
     what: Annotated[str, "the cycle, route or ride, as given"]
@@ -114,7 +114,7 @@ class Summary:
     )
 
 
-KEYS = descriptions(Summary)
+KEYS = descriptions(SimulationSummary)
 
 
 def cycle_range(result: Run, scooter: Scooter) -> tuple[float | None, str | None]:
@@ -126,10 +126,12 @@ def cycle_range(result: Run, scooter: Scooter) -> tuple[float | None, str | None
     return metres, None if metres is None else "energy"
 
 
-def summarise(vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, result: Run, scooter: Scooter) -> Summary:
+def summarise(
+    vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, result: Run, scooter: Scooter
+) -> SimulationSummary:
     """The summary, without what only the command knows: its time, sweep and files."""
     metres, by = cycle_range(result, scooter)
-    return Summary(
+    return SimulationSummary(
         what=str(arguments.what),
         kind=plan.kind,
         vehicle=vehicle.name,
@@ -162,19 +164,12 @@ def summarise(vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, resul
 
 def measured_columns(recorded: Recorded, result: Run) -> dict[str, Array]:
     """What was recorded of the columns of a run, at the times of its series."""
-    import numpy as np
-
     at = np.minimum(np.round(result.series["time"] / recorded.dt).astype(int), len(recorded.signals["speed"]) - 1)
-    columns = {name: values[at] for name, values in recorded.signals.items() if name in COLUMNS}
-    if "soc" in recorded.signals:
-        columns["soc"] = recorded.signals["soc"][at]
-    return columns
+    return {name: values[at] for name, values in recorded.signals.items() if name in COLUMNS}
 
 
 def compare(recorded: Recorded, result: Run) -> MeasuredEntry:
     """The entry ``measured`` of the summary."""
-    import numpy as np
-
     columns = measured_columns(recorded, result)
     energy = recorded.energy()
 
@@ -194,7 +189,7 @@ def compare(recorded: Recorded, result: Run) -> MeasuredEntry:
     )
 
 
-def summary_text(summary: Summary) -> str:
+def summary_text(summary: SimulationSummary) -> str:
     """A summary for a terminal."""
     ledger = sorted(summary.ledger_wh.items(), key=lambda item: -item[1])
     ledger = [(name, energy) for name, energy in ledger if abs(energy) >= _LEAST]
@@ -231,7 +226,7 @@ def summary_text(summary: Summary) -> str:
     return "\n".join([text_rows(head, rows), *(["", *_table(summary.sweep)] if summary.sweep else [])])
 
 
-def _shortfall_rows(summary: Summary) -> list[tuple[str, str]]:
+def _shortfall_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
     found = summary.shortfalls
     if not found:
         return []
@@ -243,14 +238,14 @@ def _shortfall_rows(summary: Summary) -> list[tuple[str, str]]:
     return rows
 
 
-def _turning_rows(summary: Summary) -> list[tuple[str, str]]:
+def _turning_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
     seconds = summary.turning_beyond_s
     if not seconds:
         return []
     return [("turning", f"{seconds:.1f} s in bends harder than the {summary.chassis} model goes: taken at its edge")]
 
 
-def _measured_rows(summary: Summary) -> list[tuple[str, str]]:
+def _measured_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
     m = summary.measured
     if not m:
         return []

@@ -4,40 +4,32 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from operator import attrgetter
 
+import numpy as np
+
+from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import MOVING, Port
 from gz_onboard.physics.model import Bound, all_quantities, over, total
 from gz_onboard.simulation.run import Command
 from gz_onboard.simulation.scooter import Scooter
 
-if TYPE_CHECKING:
-    from gz_onboard.arrays import Array
-
 LEAN_TIME = 1.0  # s that a rider takes into a bend: the road's pieces change their curvature at once
-_NAMES = (
-    "time",
-    "speed",
-    "wheel_speed",
-    "distance",
-    "climb",
-    "grade",
-    "curvature",
-    "throttle",
-    "brake",
-    "motor_current",
-    "pack_current",
-    "pack_voltage",
-    "soc",
-    "cell",
-    "motor",
-    "inverter",
-    "bms",
-    "tyre_force",
-    "chassis_lean",
-    "vibration",
-)
+_ALIKE = "time speed wheel_speed distance climb throttle brake motor_current vibration"
+_STATES = {name: name for name in _ALIKE.split()} | {
+    "pack_current": "current",
+    "pack_voltage": "voltage",
+    "tyre_force": "force",
+    "chassis_lean": "lean",
+    "soc": "pack.soc",
+    "cell": "pack_cooling.temperature",
+    "bms": "bms_cooling.temperature",
+    "motor": "motor_cooling.stator",
+    "inverter": "inverter_cooling.board",
+}
+"""What is kept of a scooter, by name: the attribute that has it."""
+_NAMES = ("grade", "curvature", *_STATES)
 
 
 class Trace:
@@ -48,42 +40,17 @@ class Trace:
 
     def watch(self, command: Command) -> Command:
         """`command`, with the state that it is given kept."""
-        extend = self._rows.extend
+        extend, states = self._rows.extend, attrgetter(*_STATES.values())
 
         def watched(s: Scooter) -> tuple[float, float, float]:
             grade, curvature, _ = (0.0, 0.0, 0.0) if s.dynamometer else s.road(s.distance)
-            extend(
-                (
-                    s.time,
-                    s.speed,
-                    s.wheel_speed,
-                    s.distance,
-                    s.climb,
-                    grade,
-                    curvature,
-                    s.throttle,
-                    s.brake,
-                    s.motor_current,
-                    s.current,
-                    s.voltage,
-                    s.pack.soc,
-                    s.pack_cooling.temperature,
-                    s.motor_cooling.stator,
-                    s.inverter_cooling.board,
-                    s.bms_cooling.temperature,
-                    s.force,
-                    s.lean,
-                    s.vibration,
-                )
-            )
+            extend((grade, curvature, *states(s)))
             return command(s)
 
         return watched
 
     def truth(self, scooter: Scooter) -> Truth:
         """What there was to be sensed on the ride of `scooter`; ValueError if nothing was ridden."""
-        import numpy as np
-
         if len(self._rows) < 3 * len(_NAMES):
             raise ValueError("a trace of fewer than three steps")
         columns = np.frombuffer(self._rows).reshape(-1, len(_NAMES)).T
@@ -100,7 +67,6 @@ class Truth:
     """
 
     def __init__(self, columns: Mapping[str, Array], scooter: Scooter) -> None:
-        import numpy as np
 
         from gz_onboard.arrays import running_mean
 
@@ -131,8 +97,6 @@ class Truth:
 
     def _auxiliary(self, scooter: Scooter) -> Array:
         """What all effects at the DC link draw beside the inverter [W]."""
-        import numpy as np
-
         c = self.columns
         q = all_quantities(
             speed=c["way"],
@@ -157,8 +121,6 @@ class Truth:
 
     def constant(self, value: float) -> Array:
         """`value` at every step."""
-        import numpy as np
-
         return np.full(self.count, value)
 
 
@@ -167,8 +129,6 @@ def _lean_of(ideal: Array, p: Mapping[str, float]) -> Array:
 
     A chassis without lean has nobody on it who leans; its sensors are those of one that does.
     """
-    import numpy as np
-
     crown, height = p["tyre_crown_radius"], p["cg_height"]
     lean: Array = ideal + np.arcsin(np.clip(crown * np.sin(ideal) / (height - crown), -1.0, 1.0))
     return lean

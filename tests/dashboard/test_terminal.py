@@ -26,8 +26,8 @@ from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.dashboard import screen
 from gz_onboard.dashboard.screen import Style
-from gz_onboard.dashboard.view import View, words
-from gz_onboard.events import ROLES, Activity, Estimate, Frame, Reason, State
+from gz_onboard.dashboard.view import View
+from gz_onboard.events import ROLES, Activity, Estimate, Frame, Reason, State, words
 
 REASONS = Reason.NO_IMU | Reason.PRIOR_RIDING
 ESTIMATE = Estimate(

@@ -21,7 +21,7 @@ from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.logs import read_attachments, read_frames, read_metadata, read_samples
 from gz_onboard.events import EFF_FLAG, Estimate
 from gz_onboard.lab import estimate
-from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, Summary, Tally, feed
+from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, RideSummary, Tally, feed
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
 from tests.support import HEARS_CTRL_C
@@ -288,7 +288,7 @@ def test_progress_is_told_from_all_processes(tmp_path, frames, monkeypatch):
     for jobs in 1, 2:
         told: list[float] = []
         results = list(estimate._results(tasks, jobs, told.append))
-        assert all(isinstance(result, Summary) for _, result in results)
+        assert all(isinstance(result, RideSummary) for _, result in results)
         assert sum(told) <= 9000
         assert sum(told) >= 3000
 

@@ -14,7 +14,7 @@ from gz_onboard import cli
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import LogDamage
 from gz_onboard.errors import InputError
-from gz_onboard.events import Reason
+from gz_onboard.events import words
 from gz_onboard.lab import plot
 
 LOGS = Path(__file__).resolve().parents[2] / "replay_logs"
@@ -59,7 +59,7 @@ def test_the_panels_show_what_the_log_says(log):
     strip = figure.axes[6]
     shown = [label.get_text() for label in strip.get_yticklabels()]
     assert shown[0] == "state"
-    assert set(shown[1:]) == {plot.reason_words(Reason[name]) for row in rows for name in row["reasons"].split()}
+    assert set(shown[1:]) == {words(name) for row in rows for name in row["reasons"].split()}
     figure.savefig(io.BytesIO(), format="png", dpi=30)
 
 

@@ -212,7 +212,7 @@ def test_everyone_books_the_same_losses_of_motor_and_inverter(ride):
     scooter = Scooter(VEHICLE, soc=SOC, ambient=AMBIENT)
     motor = scooter.motor
     rows = zip(ride["motor_speed"], ride["motor_current"], ride["motor_temperature"], strict=True)
-    booked = [motor.heat(*row, scooter.dt, scooter.ledger.entries) for row in rows]
+    booked = [motor.heat(*row, scooter.dt, scooter.ledger) for row in rows]
     assert booked == pytest.approx(by_model, rel=1e-6, abs=1e-6)
 
 

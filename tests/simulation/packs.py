@@ -1,8 +1,11 @@
-"""A pack of another make, to put in place of the project's own."""
+"""A pack and a motor of another make, to put in place of the project's own."""
 
+from collections.abc import MutableMapping
+from dataclasses import dataclass
 from math import exp
 
 from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.tables import Mesh
 from gz_onboard.simulation.parts.battery import FirstOrderPack
 
 
@@ -21,3 +24,22 @@ class SecondOrderPack(FirstOrderPack):
         slow = exp(-dt / self.tau2)
         self.v2 = slow * self.v2 + (1 - slow) * self.r2 * cell
         return current, voltage, heat, delivered
+
+
+@dataclass
+class MapMotor:
+    """With a measured loss map [W] over current [A] and speed [rad/s]: the one of docs/simulation.md."""
+
+    loss: Mesh
+    torque_constant: float
+    voltage_constant: float
+
+    def heat(
+        self, speed: float, current: float, temperature: float, dt: float, ledger: MutableMapping[str, float]
+    ) -> float:
+        watts = self.loss.at(current, abs(speed))[0]
+        ledger["motor_map_loss"] += watts * dt
+        return watts
+
+    def idle(self, speed: float, temperature: float) -> float:
+        return self.loss.at(0.0, abs(speed))[0]

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.backward import RideConditions, backward
 from gz_onboard.physics.effect import QUANTITIES, load_effect
 from gz_onboard.physics.model import air_density
-from gz_onboard.simulation.backward import Conditions, backward
 from gz_onboard.simulation.cycles import cycle
 from gz_onboard.simulation.run import at_steps, drive, follow
 from gz_onboard.simulation.scooter import Scooter
@@ -20,7 +20,7 @@ def test_is_the_model_summed_up_step_by_step():
     t = np.array([0.0, 1.0, 2.5, 3.0, 5.0])
     v = np.array([0.0, 3.0, 9.0, 8.0, 2.0])
     grade = np.array([0.0, 0.02, 0.02, -0.01, 0.0])
-    conditions = Conditions(grade=grade, headwind=1.5, ambient=12.0, motor_temperature=40.0)
+    conditions = RideConditions(grade=grade, headwind=1.5, ambient=12.0, motor_temperature=40.0)
     energy = backward(VEHICLE, t, v, conditions, smoothing=0.0)
     total = 0.0
     for i in range(4):
@@ -46,7 +46,7 @@ def test_agrees_with_the_forward_simulation_on_a_cycle():
     c = cycle("wmtc_part1_reduced")
     speeds = at_steps(c.time, c.speed, 0.01)
     run = drive(Scooter(VEHICLE, soc=0.8), follow(speeds, 0.01), c.duration)
-    energy = backward(VEHICLE, np.arange(len(speeds)) * 0.01, speeds, Conditions(motor_temperature=25.0))
+    energy = backward(VEHICLE, np.arange(len(speeds)) * 0.01, speeds, RideConditions(motor_temperature=25.0))
     assert energy.total == pytest.approx(run.energy, rel=0.05)
     for name in ("aerodynamic_drag", "rolling_resistance", "auxiliary_load", "motor_iron_loss"):
         assert energy.ledger[name] == pytest.approx(run.ledger[name], rel=0.03), name
@@ -58,9 +58,9 @@ def test_blocks_are_one_ride(effects, monkeypatch):
     vehicle = VEHICLE.changed(VEHICLE.parameters.joined(more), (*VEHICLE.model.effects, *more))
     t = np.arange(0, 60, 0.01)
     v, grade = 8 + 4 * np.sin(t / 7), 0.02 * np.sin(t / 5)
-    conditions = Conditions(grade=grade, curvature=0.01 * np.cos(t / 3), headwind=2.0)
+    conditions = RideConditions(grade=grade, curvature=0.01 * np.cos(t / 3), headwind=2.0)
     whole = backward(vehicle, t, v, conditions)
-    monkeypatch.setattr("gz_onboard.simulation.backward.BLOCK", 700)
+    monkeypatch.setattr("benchmarks.backward.BLOCK", 700)
     parts = backward(vehicle, t, v, conditions)
     assert parts.power == pytest.approx(whole.power, rel=1e-12)
     assert parts.ledger == pytest.approx(whole.ledger, rel=1e-12)
@@ -94,7 +94,7 @@ def test_turning_is_seen_by_effects_that_look_for_it():
     vehicle = replace(VEHICLE, model=Model(tuple(effects.values()), VEHICLE.parameters))
     t = np.arange(0, 60, 0.1)
     v = np.full_like(t, 8.0)
-    bent = backward(vehicle, t, v, Conditions(curvature=1 / 20))
+    bent = backward(vehicle, t, v, RideConditions(curvature=1 / 20))
     straight = backward(vehicle, t, v)
     assert bent.ledger["cornering_drag"] > 0
     assert straight.ledger["cornering_drag"] == 0

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.backward import RideConditions, backward
 from gz_onboard.physics.effect import known_effects, load_effect
-from gz_onboard.simulation.backward import Conditions, backward
 from gz_onboard.simulation.cycles import cycle, names
 from gz_onboard.simulation.parts.battery import EffectPack
 from gz_onboard.simulation.parts.road import Dynamometer, straight
@@ -43,7 +43,7 @@ def per_metre(run: Run) -> float:
 
 def states(scooter: Scooter) -> dict[str, float]:
     assert isinstance(scooter.pack, EffectPack)
-    return scooter.pack.states
+    return scooter.pack.effects.states
 
 
 def bends(distance: float) -> tuple[float, float, float]:
@@ -155,7 +155,7 @@ def test_a_motor_loss_with_memory_goes_on_once_each_step(tmp_path):
         speed = (before + scooter.wheel_speed) / 2
         value = 0.99 * value + 0.01 * 40.0 * speed / (speed + 1)
         energy += value * STEP
-    assert scooter.ledger.entries["bearing"] == pytest.approx(energy, rel=1e-9)
+    assert scooter.ledger["bearing"] == pytest.approx(energy, rel=1e-9)
 
 
 def test_hysteresis_stays_at_rest_and_relaxation_does_not():
@@ -197,7 +197,7 @@ def test_backward_agrees_with_forward_with_all_forces():
     curve = 0.004
     scooter = Scooter(vehicle, lambda distance: (0.0, curve, 0.0), soc=0.9)
     run = drive(scooter, follow(speeds, STEP), 300.0)
-    energy = backward(vehicle, run.series["time"], run.series["speed"], Conditions(curvature=curve), smoothing=0.0)
+    energy = backward(vehicle, run.series["time"], run.series["speed"], RideConditions(curvature=curve), smoothing=0.0)
     for name in ("headwind", "dragging_brake", "tyre_warm_up", "drivetrain_drag", "cornering_drag"):
         assert energy.ledger[name] == pytest.approx(run.ledger[name], rel=0.02, abs=200.0), name
 

@@ -28,10 +28,10 @@ DT = 0.01
 
 def parted(scooter, throttle, brake=0.0):
     """One step; what each entry of the ledger gained in it [W], and the mean speeds of vehicle and wheel."""
-    before = dict(scooter.ledger.entries)
+    before = dict(scooter.ledger)
     speed, wheel = scooter.speed, scooter.wheel_speed
     scooter.step(throttle, brake)
-    watts = {name: (energy - before.get(name, 0.0)) / DT for name, energy in scooter.ledger.entries.items()}
+    watts = {name: (energy - before.get(name, 0.0)) / DT for name, energy in scooter.ledger.items()}
     return watts, (speed + scooter.speed) / 2, (wheel + scooter.wheel_speed) / 2
 
 
@@ -216,7 +216,7 @@ def test_2_24_to_2_31_each_network_takes_its_own_heat():
     scooter = Scooter(VEHICLE, soc=0.7, ambient=20.0)
     for _ in range(100):
         scooter.step(0.5, 0.0)
-    e, motor, box = scooter.ledger.entries, scooter.motor_cooling, scooter.inverter_cooling
+    e, motor, box = scooter.ledger, scooter.motor_cooling, scooter.inverter_cooling
     gained = P["motor_stator_capacity"] * (motor.stator - 20) + P["motor_rotor_capacity"] * (motor.rotor - 20)
     assert gained == pytest.approx(e["motor_copper_loss"] + e["motor_iron_loss"], rel=1e-9)
     gained = P["inverter_board_capacity"] * (box.board - 20) + P["inverter_box_capacity"] * (box.box - 20)
@@ -231,7 +231,7 @@ def test_2_30_the_battery_cools_to_the_air():
     scooter = Scooter(VEHICLE, soc=0.7, ambient=0.0, cell_temperature=30.0)
     for _ in range(100):
         scooter.step(0.0, 0.0)
-    lost = P["pack_heat_capacity"] * (30.0 - scooter.pack_cooling.temperature) + scooter.ledger.entries["battery_heat"]
+    lost = P["pack_heat_capacity"] * (30.0 - scooter.pack_cooling.temperature) + scooter.ledger["battery_heat"]
     assert lost == pytest.approx(P["pack_conductance"] * 30.0, rel=1e-6)
 
 

@@ -16,7 +16,7 @@ from gz_onboard.cli import main
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.events import Reason, State
-from gz_onboard.simulation.frames import START_NS, Losses, batches, simulate_frames, write_frames
+from gz_onboard.simulation.frames import START_NS, Dropouts, batches, simulate_frames, write_frames
 from gz_onboard.simulation.parts.chassis import chassis
 from gz_onboard.simulation.parts.road import Dynamometer
 from gz_onboard.simulation.run import along, drive, road_table
@@ -27,7 +27,7 @@ from gz_onboard.simulation.turning.tyre import lean_of
 from gz_onboard.vehicle import read_vehicle
 from tests.support import ROOT, reference, ridden
 
-NONE = Losses(frames=0.0, gps_gap_every=0.0)
+NONE = Dropouts(frames=0.0, gps_gap_every=0.0)
 SECONDS = 180.0
 
 
@@ -44,8 +44,9 @@ def ride():
     return run, trace.truth(scooter)
 
 
-def frames(seed=1, losses=NONE):
-    return [frame for batch in batches(simulate_frames(reference(), ride()[1], seed, losses=losses)) for frame in batch]
+def frames(seed=1, dropouts=NONE):
+    sent = simulate_frames(reference(), ride()[1], seed, dropouts=dropouts)
+    return [frame for batch in batches(sent) for frame in batch]
 
 
 @cache
@@ -93,6 +94,13 @@ def test_the_estimate_is_the_truth():
     assert last.consumption_factor == pytest.approx(1.0, abs=0.1)
     energy = sum(e.pack_voltage * e.pack_current * 0.1 for e in run.estimates if e.pack_current is not None)
     assert energy == pytest.approx(ride()[0].energy, rel=0.01)
+
+
+def test_the_inverter_is_behind_the_cable_of_the_vehicle_file():
+    truth = ride()[1]
+    (sensor,) = (sensor for sensor in SENSORS if sensor.signal == "INV_DcVoltage")
+    behind = truth["pack_voltage"] - reference().parameters["cable_resistance"] * truth["pack_current"]
+    assert sensor.read(truth) == pytest.approx(behind, abs=1e-12)
 
 
 def test_lean_and_grade_are_found():
@@ -196,9 +204,9 @@ def test_each_sensor_is_in_the_dbc_files():
 
 
 def test_lost_frames_show_in_the_counters_and_change_no_other():
-    losses = Losses(frames=0.01, gps_gap_every=0.0)
-    sent = simulate_frames(reference(), ride()[1], 1, losses=losses)
-    left = frames(1, losses)
+    dropouts = Dropouts(frames=0.01, gps_gap_every=0.0)
+    sent = simulate_frames(reference(), ride()[1], 1, dropouts=dropouts)
+    left = frames(1, dropouts)
     assert set(left) < set(frames(1))
     run = ridden(left)
     dropped = {s.message: s.dropped for s in sent}
@@ -209,13 +217,13 @@ def test_lost_frames_show_in_the_counters_and_change_no_other():
 
 
 def test_gaps_of_the_gps_have_no_fix():
-    losses = Losses(frames=0.0, gps_gap_every=40.0, gps_gap=(10.0, 12.0))
-    run = ridden(frames(3, losses))
+    dropouts = Dropouts(frames=0.0, gps_gap_every=40.0, gps_gap=(10.0, 12.0))
+    run = ridden(frames(3, dropouts))
     without = [e for e in run.estimates if e.reasons & Reason.NO_GPS]
     assert without
-    _, fixes = column("gps_fix", frames(3, losses))
+    _, fixes = column("gps_fix", frames(3, dropouts))
     assert set(fixes) == {0.0, 3.0}
-    assert len(column("latitude", frames(3, losses))[0]) == pytest.approx(
+    assert len(column("latitude", frames(3, dropouts))[0]) == pytest.approx(
         (fixes == 3).sum(), abs=4
     )  # the phases differ
 
@@ -224,7 +232,7 @@ def test_on_a_dynamometer_the_roller_turns_and_the_body_stands():
     scooter = Scooter(reference(), Dynamometer(180.0, 5.0, 0.3, 0.27), soc=0.8)
     trace = Trace()
     drive(scooter, trace.watch(along([10.0] * 500)), 20.0)
-    sent = {s.message: s for s in simulate_frames(reference(), trace.truth(scooter), losses=NONE)}
+    sent = {s.message: s for s in simulate_frames(reference(), trace.truth(scooter), dropouts=NONE)}
     codec = Codec(reference().mapping)
 
     def decoded(name):
@@ -237,7 +245,7 @@ def test_on_a_dynamometer_the_roller_turns_and_the_body_stands():
 
 @pytest.mark.parametrize("suffix", [".blf", ".log", ".asc"])
 def test_a_written_log_reads_back(tmp_path, suffix):
-    sent = simulate_frames(reference(), ride()[1], 1, losses=NONE)
+    sent = simulate_frames(reference(), ride()[1], 1, dropouts=NONE)
     file = tmp_path / f"ride{suffix}"
     assert write_frames(file, sent) == len(frames())
     back = [frame for batch in read_frames(file) for frame in batch]

@@ -11,7 +11,7 @@ import pytest
 
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
-from gz_onboard.simulation.recorded import fit_dynamometer, read_recorded, rest_soc
+from gz_onboard.simulation.recorded import _signals, fit_dynamometer, read_recorded, rest_soc
 from gz_onboard.vehicle import read_vehicle
 
 LOGS = Path(__file__).parents[2] / "replay_logs"
@@ -51,6 +51,14 @@ def test_the_sensors_known_errors_are_taken_off(city):
     drawn = amperes.sum() * ride.dt / 3600 / wrong.pack.pack_capacity(ride.first("cell_temperature", 20.0))
     soc = ride.signals["soc"]
     assert soc[0] - soc[-1] == pytest.approx(drawn, rel=0.01)
+
+
+def test_a_brake_known_by_its_switch_alone_is_pulled_as_far_on_any_vehicle():
+    time = np.arange(0.0, 3.0, 0.1)
+    columns = {"vehicle_speed": (time, 0.0 * time + 5.0), "brake_switch": (time, (time > 1.0).astype(float))}
+    small = VEHICLE.changed(VEHICLE.parameters.replaced(brake_torque_limit=10.0))
+    pulled = [_signals(Path("ride.blf"), columns, vehicle)["brake"] for vehicle in (VEHICLE, small)]
+    assert pulled[0].max() == pulled[1].max() == pytest.approx(90.0 / 1148.6, rel=1e-4)  # N of the reference
 
 
 def test_brake_follows_its_switch(city):

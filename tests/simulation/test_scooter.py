@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.simulation.parts.motor import MapMotor
+from gz_onboard.physics.tables import Mesh
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.parts.road import Dynamometer, straight
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import read_vehicle
-from tests.simulation.packs import SecondOrderPack
+from tests.simulation.packs import MapMotor, SecondOrderPack
 
 VEHICLE = read_vehicle("reference", 75.0)
 BATTERY = VEHICLE.pack
@@ -29,7 +29,7 @@ def follow(scooter, profile, seconds):
 
 def closure(scooter, kinetic):
     """(energy out of the cells, energy accounted for) [J]; the first from the state of charge alone."""
-    accounted = scooter.ledger.total() + scooter.kinetic_energy() - kinetic + scooter.potential_energy()
+    accounted = sum(scooter.ledger.values()) + scooter.kinetic_energy() - kinetic + scooter.potential_energy()
     return scooter.pack.chemical_energy_drawn(), accounted
 
 
@@ -53,7 +53,7 @@ def test_the_ledger_closes_over_any_ride(soc, ambient, grade, wind, form, brakes
         for _ in range(steps):
             scooter.step(throttle if brake < 0.5 else 0.0, brake if brake >= 0.5 else 0.0)
     drawn, accounted = closure(scooter, 0.0)
-    turnover = sum(abs(x) for x in scooter.ledger.entries.values()) + scooter.kinetic_energy()
+    turnover = sum(abs(x) for x in scooter.ledger.values()) + scooter.kinetic_energy()
     assert math.isfinite(scooter.speed)
     assert abs(drawn - accounted) < 1e-4 * turnover
 
@@ -158,8 +158,8 @@ def test_dynamometer_accelerates_its_roller_only():
     scooter = Scooter(VEHICLE, Dynamometer(180.0, a=20.0, c=0.3), soc=0.8)
     for _ in range(2000):
         scooter.step(0.5, 0.0)
-    assert "aerodynamic_drag" not in scooter.ledger.entries
-    assert scooter.ledger.entries["dynamometer"] > 0
+    assert "aerodynamic_drag" not in scooter.ledger
+    assert scooter.ledger["dynamometer"] > 0
     drawn, accounted = closure(scooter, 0.0)
     assert accounted == pytest.approx(drawn, rel=1e-4)
 
@@ -168,7 +168,7 @@ def test_the_battery_can_be_replaced():
     """A two-RC pack sags more in the long run; the rest of the scooter does not know."""
     one = follow(Scooter(VEHICLE, soc=0.8), town, 600)
     two = follow(Scooter(VEHICLE, soc=0.8, pack=SecondOrderPack(BATTERY, 0.8)), town, 600)
-    assert two.ledger.entries["battery_heat"] > 1.005 * one.ledger.entries["battery_heat"]
+    assert two.ledger["battery_heat"] > 1.005 * one.ledger["battery_heat"]
     assert two.distance == pytest.approx(one.distance, rel=1e-3)
     drawn, accounted = closure(two, 0.0)
     assert accounted == pytest.approx(drawn, rel=1e-4)
@@ -176,12 +176,12 @@ def test_the_battery_can_be_replaced():
 
 def test_the_motor_can_be_replaced_by_a_measured_map():
     p = VEHICLE.parameters
-    speeds, currents = [0.0, 20.0, 40.0, 60.0], [-60.0, 0.0, 60.0, 120.0, 220.0]
-    loss = [[0.017 * i * i + 0.9 * w + 0.0154 * w * w for i in currents] for w in speeds]
-    motor = MapMotor(speeds, currents, loss, p["torque_constant"], p["voltage_constant"])
+    speeds, currents = (0.0, 20.0, 40.0, 60.0), (-60.0, 0.0, 60.0, 120.0, 220.0)
+    loss = tuple(tuple(0.017 * i * i + 0.9 * w + 0.0154 * w * w for i in currents) for w in speeds)
+    motor = MapMotor(Mesh(currents, speeds, loss), p["torque_constant"], p["voltage_constant"])
     scooter = follow(Scooter(VEHICLE, soc=0.8, motor=motor), town, 200)
-    assert scooter.ledger.entries["motor_map_loss"] > 0
-    assert "motor_copper_loss" not in scooter.ledger.entries
+    assert scooter.ledger["motor_map_loss"] > 0
+    assert "motor_copper_loss" not in scooter.ledger
     drawn, accounted = closure(scooter, 0.0)
     assert accounted == pytest.approx(drawn, rel=1e-4)
 

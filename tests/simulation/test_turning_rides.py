@@ -53,11 +53,11 @@ def test_the_scooter_rides_the_turn_of_the_model(name, speed, lateral):
     scooter = Scooter(VEHICLE, lambda _: (0.0, lateral / speed**2, 0.0), soc=0.8, speed=speed, chassis=chassis(name, P))
     run = drive(scooter, follow([speed] * 3000, 0.01), 30.0)
     assert scooter.speed == pytest.approx(speed, abs=0.05)
-    before = scooter.ledger.entries["turning"]
+    before = scooter.ledger["turning"]
     way = scooter.distance
     for _ in range(100):
         scooter.step(scooter.throttle, 0.0)
-    force = (scooter.ledger.entries["turning"] - before) / (scooter.distance - way)
+    force = (scooter.ledger["turning"] - before) / (scooter.distance - way)
     assert force == pytest.approx(expected, rel=0.02)
     assert scooter.lean == pytest.approx(-seen["lean"] if lateral < 0 else seen["lean"], rel=0.02, abs=1e-9)
     assert scooter.front_load == pytest.approx(seen["load_front"], abs=6.0)

@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.backward import RideConditions, backward
 from gz_onboard.cli import main
 from gz_onboard.lab.discover.grid import vibration as of_samples
 from gz_onboard.lab.validate_components import battery_voltage, road_load
 from gz_onboard.lab.validate_ride import per_second
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import MOVING, load_effect
-from gz_onboard.simulation.backward import Conditions, backward
 from gz_onboard.simulation.parts.road import Dynamometer, straight
 from gz_onboard.simulation.recorded import Recorded, read_recorded
 from gz_onboard.simulation.run import drive
@@ -92,7 +92,7 @@ def test_backward_agrees_with_forward(folder: Path):
         run, _ = ride(vehicle, vibration=given)
         series = run.series
         told = None if given is None else np.where(series["speed"] > 0.5, given, 0.0)
-        energy = backward(vehicle, series["time"], series["speed"], Conditions(vibration=told), smoothing=0.0)
+        energy = backward(vehicle, series["time"], series["speed"], RideConditions(vibration=told), smoothing=0.0)
         for name in ("rough_road", "rough_power"):
             assert energy.ledger[name] == pytest.approx(run.ledger[name], rel=0.02)
 

@@ -81,7 +81,7 @@ def test_killed_it_goes_on_from_the_saved_state(running: Running, listener: List
     assert snapshot is not None
     folder = running.folder("a")
     uptime = time.clock_gettime(time.CLOCK_BOOTTIME)  # the guest has no clock of its own: without it no age is known
-    state.save(folder / f"{reference().name}.json", snapshot, time.time(), uptime)
+    state.write(folder / f"{reference().name}.json", state.encode(snapshot, time.time(), uptime))
     daemon = running.daemon()
     assert "going on from the state saved" in daemon.journal
     replay = running.replay(city, "--from", "200")

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import MutableMapping, Sequence
+from collections.abc import Mapping
 from itertools import pairwise
 from typing import Protocol
 
 from gz_onboard.constants import HOUR
+from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.physics.battery import Battery, current_of, discharged, heat, terminal_voltage
-from gz_onboard.physics.model import Bound
 from gz_onboard.physics.relaxation import decay_over, relaxed
 
 TABLE_PERIOD = 1.0  # s: R0, R1 and C1 follow SOC and temperature this often; both move slowly
@@ -104,27 +104,19 @@ class EffectPack(FirstOrderPack):
     """The first-order pack with effects of the vehicle's model in its cells: slow relaxation, hysteresis, one's own.
 
     They act on each step with what they were after the one before; what they take from the voltage is heat of the pack.
-    quantities: what the effects read; those of the cells are kept up to date here.
+    quantities: what the effects read, beside those of the cells.
     """
 
-    def __init__(
-        self, battery: Battery, soc: float, effects: Sequence[Bound], quantities: MutableMapping[str, float]
-    ) -> None:
+    def __init__(self, battery: Battery, soc: float, effects: CellEffects, quantities: Mapping[str, float]) -> None:
         super().__init__(battery, soc)
-        self.states = {effect.effect.name: 0.0 for effect in effects}  # V of a cell
-        self._effects = list(effects)
-        self._q = quantities
+        self.effects, self._q = effects, quantities
 
     def draw(self, power: float, dt: float, temperature: float) -> tuple[float, float, float, float]:
         """See `Pack`."""
-        fast, states, q = self.v1, self.states, self._q
-        self.v1 = fast + sum(states.values())
+        fast = self.v1
+        self.v1 += self.effects.overpotential
         drawn = super().draw(power, dt, temperature)
         cell = drawn[0] / self.battery.cells_parallel
         self.v1 = relaxed(fast, self._r1 * cell, self._decay)
-        q["cell_current"], q["soc"], q["cell_temperature"] = cell, self.soc, temperature
-        q["cell_capacity"] = self._capacity / self.battery.cells_parallel
-        for effect in self._effects:
-            name = effect.effect.name
-            states[name] = effect.step(states[name], dt, q)
+        self.effects.step(dt, cell, self.soc, temperature, self._q)
         return drawn

@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.simulation.turning.leaning import LEAN_TIME, Leaning
-from gz_onboard.simulation.turning.machine import Machine, Road, State
+from gz_onboard.simulation.turning.machine import Machine, MachineState, Road
 from gz_onboard.simulation.turning.planar import Planar
 
 MODELS: dict[str, type[Planar] | None] = {"straight": None, "planar": Planar, "leaning": Leaning}
@@ -129,7 +129,7 @@ def _steady_turns(model: Planar, speed: float, limit: float) -> list[Turn]:
     return turns
 
 
-def steady_turn(model: Planar, speed: float, rate: float) -> tuple[State, float]:
+def steady_turn(model: Planar, speed: float, rate: float) -> tuple[MachineState, float]:
     """(state, steer) of the steady turn at `speed` [m/s] and a yaw rate [rad/s].
 
     Newton's method on lateral speed and steer, from the turn of wheels that do not slip. Raises ArithmeticError where
@@ -154,7 +154,7 @@ def steady_turn(model: Planar, speed: float, rate: float) -> tuple[State, float]
     raise ArithmeticError(f"no steady turn at {speed:g} m/s and {rate:g} rad/s")
 
 
-def _drift(model: Planar, state: State, steer: float) -> tuple[float, float]:
+def _drift(model: Planar, state: MachineState, steer: float) -> tuple[float, float]:
     """Rates of lateral speed and yaw rate, whose zero is the steady turn."""
     change = model.rates(state, steer, None, Road()).change
     return change[1], change[2]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Callable, Mapping, MutableMapping, Sequence
 from typing import Protocol
 
@@ -82,40 +81,3 @@ class EffectMotor:
         for term in self._settled:
             total += term(q)
         return total
-
-
-class MapMotor:
-    """A motor with a measured loss map [W] over speed [rad/s] (rows) and current [A] (columns), bilinear, clamped."""
-
-    def __init__(
-        self,
-        speed: Sequence[float],
-        current: Sequence[float],
-        loss: Sequence[Sequence[float]],
-        torque_constant: float,
-        voltage_constant: float,
-    ) -> None:
-        self.torque_constant = torque_constant
-        self.voltage_constant = voltage_constant
-        self._speed, self._current = list(speed), list(current)
-        self._loss = [list(row) for row in loss]
-
-    def heat(self, speed: float, current: float, temperature: float, dt: float, ledger: Ledger) -> float:
-        """See `Motor`; the map was measured at one temperature."""
-        loss = self._at(speed, current)
-        ledger["motor_map_loss"] += loss * dt
-        return loss
-
-    def idle(self, speed: float, temperature: float) -> float:
-        """See `Motor`."""
-        return self._at(speed, 0.0)
-
-    def _at(self, speed: float, current: float) -> float:
-        xs, ys = self._speed, self._current
-        i = min(max(bisect_right(xs, abs(speed)) - 1, 0), len(xs) - 2)
-        j = min(max(bisect_right(ys, current) - 1, 0), len(ys) - 2)
-        a = min(max((abs(speed) - xs[i]) / (xs[i + 1] - xs[i]), 0.0), 1.0)
-        b = min(max((current - ys[j]) / (ys[j + 1] - ys[j]), 0.0), 1.0)
-        low, high = self._loss[i], self._loss[i + 1]
-        one, two = low[j] + b * (low[j + 1] - low[j]), high[j] + b * (high[j + 1] - high[j])
-        return one + a * (two - one)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 from math import atan, cos, sin
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.simulation.turning.machine import Rates, Road, State
+from gz_onboard.simulation.turning.machine import MachineState, Rates, Road
 from gz_onboard.simulation.turning.planar import Planar, Posture
 from gz_onboard.simulation.turning.tyre import front_camber, ground_steer, handlebar_of, lean_of, rolling_radius
 
@@ -27,17 +27,17 @@ LEAN_TIME = 0.2  # s: the machine has no roll dynamics; its lean follows balance
 
 @dataclass(frozen=True)
 class Leaning(Planar):
-    """State: that of `Planar`, and the lean [rad, positive right]. `steer` is the handlebar's angle."""
+    """MachineState: that of `Planar`, and the lean [rad, positive right]. `steer` is the handlebar's angle."""
 
-    def start(self, speed: float) -> State:
+    def start(self, speed: float) -> MachineState:
         """Straight ahead, upright, at `speed` [m/s]."""
         return *super().start(speed), 0.0
 
-    def settled(self, u: float, v: float, r: float, steer: float) -> State:
+    def settled(self, u: float, v: float, r: float, steer: float) -> MachineState:
         """The state at speed, lateral speed [m/s] and yaw rate [rad/s] in which lean and slip have settled."""
         return self._slipped((u, v, r, 0.0, 0.0, 0.0, 0.0, 0.0, self._balance(u, r)), steer)
 
-    def posture(self, state: State, steer: float) -> Posture:
+    def posture(self, state: MachineState, steer: float) -> Posture:
         """Leaning as the state says."""
         m = self.machine
         lean = state[8]
@@ -55,12 +55,12 @@ class Leaning(Planar):
         """Handlebar angle [rad] for a steer angle at the ground."""
         return handlebar_of(steer, lean, self.machine.caster)
 
-    def rates(self, state: State, steer: float, drive: float | None, road: Road) -> Rates:
+    def rates(self, state: MachineState, steer: float, drive: float | None, road: Road) -> Rates:
         """With the handlebar at `steer` [rad] and a force `drive` [N] (None: what holds the speed)."""
         rates = super().rates(state, steer, drive, road)
         return replace(rates, change=(*rates.change, self._lean_rate(state)))
 
-    def _lean_rate(self, state: State) -> float:
+    def _lean_rate(self, state: MachineState) -> float:
         return (self._balance(state[0], state[2]) - state[8]) / LEAN_TIME
 
     def _balance(self, u: float, r: float) -> float:

@@ -6,12 +6,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import ceil, sqrt
 
-from gz_onboard.constants import GRAVITY
+from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.physics.effects import aerodynamic_drag, rolling_resistance
 from gz_onboard.physics.model import air_density
-from gz_onboard.simulation.turning.tyre import Tyre
+from gz_onboard.simulation.turning.tyre import LateralTyre
 
-State = tuple[float, ...]
+MachineState = tuple[float, ...]
 
 STABLE = 2.0
 """Step times fastest decay that is left to one step: the method is stable up to 2.78, and oscillates beyond 2."""
@@ -23,7 +23,7 @@ class Road:
 
     grade: float = 0.0
     headwind: float = 0.0
-    air_density: float = air_density(20.0)
+    air_density: float = air_density(MILD)
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Rates:
     decays by itself.
     """
 
-    change: State
+    change: MachineState
     power: dict[str, float]
     seen: dict[str, float]
     fastest: float = 0.0
@@ -54,8 +54,8 @@ class Machine:
     yaw_inertia: float
     crown: float
     caster: float
-    front: Tyre
-    rear: Tyre
+    front: LateralTyre
+    rear: LateralTyre
     drag_area: float
     rolling_constant: float
     rolling_speed: float
@@ -65,7 +65,7 @@ class Machine:
         """The machine that these parameters describe."""
         p = parameters
         front, rear = (
-            Tyre(
+            LateralTyre(
                 p[f"cornering_stiffness_{axle}"],
                 p[f"camber_stiffness_{axle}"],
                 p["side_friction"],
@@ -113,7 +113,9 @@ class Machine:
         return self.mass * GRAVITY * sqrt(1 - road.grade * road.grade)
 
 
-def step(rates: Callable[[State], Rates], state: State, dt: float) -> tuple[State, dict[str, float]]:
+def step(
+    rates: Callable[[MachineState], Rates], state: MachineState, dt: float
+) -> tuple[MachineState, dict[str, float]]:
     """A step of the classical Runge-Kutta method: (state after `dt` [s], energy [J] by where it went).
 
     The energies are integrated like the state, so their balance is as exact as the step itself. Where something decays
@@ -129,7 +131,9 @@ def step(rates: Callable[[State], Rates], state: State, dt: float) -> tuple[Stat
     return state, energy
 
 
-def _one_step(rates: Callable[[State], Rates], first: Rates, state: State, dt: float) -> tuple[State, dict[str, float]]:
+def _one_step(
+    rates: Callable[[MachineState], Rates], first: Rates, state: MachineState, dt: float
+) -> tuple[MachineState, dict[str, float]]:
     second = rates(_moved(state, first.change, dt / 2))
     third = rates(_moved(state, second.change, dt / 2))
     fourth = rates(_moved(state, third.change, dt))
@@ -144,5 +148,5 @@ def _one_step(rates: Callable[[State], Rates], first: Rates, state: State, dt: f
     return _moved(state, change, dt), energy
 
 
-def _moved(state: State, change: State, dt: float) -> State:
+def _moved(state: MachineState, change: MachineState, dt: float) -> MachineState:
     return tuple(value + rate * dt for value, rate in zip(state, change, strict=True))

@@ -19,8 +19,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import cos, sin, sqrt
 
-from gz_onboard.simulation.turning.machine import Machine, Rates, Road, State
-from gz_onboard.simulation.turning.tyre import Tyre
+from gz_onboard.simulation.turning.machine import Machine, MachineState, Rates, Road
+from gz_onboard.simulation.turning.tyre import LateralTyre
 
 STANDSTILL = 0.1  # m/s: below it what camber does fades, as rolling resistance does
 
@@ -40,19 +40,19 @@ class Posture:
 
 @dataclass(frozen=True)
 class Planar:
-    """State: u, v [m/s], r [rad/s], x, y [m], heading [rad], slip angles front and rear [rad]."""
+    """MachineState: u, v [m/s], r [rad/s], x, y [m], heading [rad], slip angles front and rear [rad]."""
 
     machine: Machine
 
-    def start(self, speed: float) -> State:
+    def start(self, speed: float) -> MachineState:
         """Straight ahead at `speed` [m/s]."""
         return speed, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
 
-    def settled(self, u: float, v: float, r: float, steer: float) -> State:
+    def settled(self, u: float, v: float, r: float, steer: float) -> MachineState:
         """The state at speed, lateral speed [m/s] and yaw rate [rad/s] in which slip has settled."""
         return self._slipped((u, v, r, 0.0, 0.0, 0.0, 0.0, 0.0), steer)
 
-    def _slipped(self, state: State, steer: float) -> State:
+    def _slipped(self, state: MachineState, steer: float) -> MachineState:
         m = self.machine
         u, v, r, x, y, heading, _, _, *rest = state
         delta = self.posture(state, steer).steer
@@ -61,7 +61,7 @@ class Planar:
         front = m.front.settled_slip(along_f, across_f)
         return u, v, r, x, y, heading, front, m.rear.settled_slip(u, v - m.cg_to_rear * r), *rest
 
-    def posture(self, state: State, steer: float) -> Posture:
+    def posture(self, state: MachineState, steer: float) -> Posture:
         """Upright, whatever the turn."""
         m = self.machine
         return Posture(steer, 0.0, 0.0, m.wheel_radius, 0.0, m.cg_height, 0.0)
@@ -70,14 +70,14 @@ class Planar:
         """Steer input [rad] for a steer angle at the ground: the same."""
         return steer
 
-    def energy(self, state: State) -> float:
+    def energy(self, state: MachineState) -> float:
         """Kinetic energy [J], of the turning wheels too."""
         m = self.machine
         u, v, r = state[:3]
         radius = self.posture(state, 0.0).radius
         return (m.mass * (u * u + v * v) + m.yaw_inertia * r * r + m.spin_inertia * (u / radius) ** 2) / 2
 
-    def rates(self, state: State, steer: float, drive: float | None, road: Road) -> Rates:
+    def rates(self, state: MachineState, steer: float, drive: float | None, road: Road) -> Rates:
         """With `steer` [rad] at the ground and a force `drive` [N] of the rear wheel (None: what holds the speed)."""
         m = self.machine
         u, v, r, _, _, heading, slip_f, slip_r = state[:8]
@@ -137,7 +137,7 @@ class Planar:
         return Rates(change, power, seen, fastest)
 
     def _wheel(
-        self, tyre: Tyre, slip: float, camber: float, along: float, radius: float
+        self, tyre: LateralTyre, slip: float, camber: float, along: float, radius: float
     ) -> tuple[float, float, float, float, float]:
         rolls = along / sqrt(along * along + STANDSTILL * STANDSTILL)  # a wheel that stands has no camber thrust
         side = tyre.side_force(slip, camber * abs(rolls))

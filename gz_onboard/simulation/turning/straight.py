@@ -4,25 +4,27 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from gz_onboard.simulation.turning.machine import Machine, Rates, Road, State
+from gz_onboard.simulation.turning.machine import Machine, MachineState, Rates, Road
+
+_NONE = "lateral_acceleration yaw_rate lean steer slip_front slip_rear side_front side_rear"
 
 
 @dataclass(frozen=True)
 class Straight:
-    """State: speed [m/s], distance [m]."""
+    """MachineState: speed [m/s], distance [m]."""
 
     machine: Machine
 
-    def start(self, speed: float) -> State:
+    def start(self, speed: float) -> MachineState:
         """The state at `speed` [m/s]."""
         return speed, 0.0
 
-    def energy(self, state: State) -> float:
+    def energy(self, state: MachineState) -> float:
         """Kinetic energy [J], of the turning wheels too."""
         m = self.machine
         return (m.mass + m.spin_inertia / m.wheel_radius**2) * state[0] ** 2 / 2
 
-    def rates(self, state: State, steer: float, drive: float | None, road: Road) -> Rates:
+    def rates(self, state: MachineState, steer: float, drive: float | None, road: Road) -> Rates:
         """With a force `drive` [N] of the driven wheel (None: the one that holds the speed); `steer` does nothing."""
         m = self.machine
         speed = state[0]
@@ -35,35 +37,12 @@ class Straight:
         acceleration = (drive - against) / (m.mass + m.spin_inertia / m.wheel_radius**2)
         ground = m.mass * acceleration + drag + slope  # what the tyres push the machine with
         front = min(max((weight * m.cg_to_rear - ground * m.cg_height) / m.wheelbase, 0.0), weight)
-        return Rates(
-            (acceleration, speed),
-            {
-                "aerodynamic drag": drag * speed,
-                "rolling": rolling * speed,
-                "sideslip": 0.0,
-                "twisting": 0.0,
-                "grade": slope * speed,
-                "drive": -drive * speed,
-            },
-            {
-                "speed": speed,
-                "acceleration": acceleration,
-                "drive": drive,
-                "lateral_acceleration": 0.0,
-                "yaw_rate": 0.0,
-                "lean": 0.0,
-                "steer": 0.0,
-                "load_front": front,
-                "load_rear": weight - front,
-                "plane_load_front": front,
-                "plane_load_rear": weight - front,
-                "rolling_radius": m.wheel_radius,
-                "slip_front": 0.0,
-                "slip_rear": 0.0,
-                "side_front": 0.0,
-                "side_rear": 0.0,
-            },
-        )
+        power = {"aerodynamic drag": drag * speed, "rolling": rolling * speed, "sideslip": 0.0, "twisting": 0.0}
+        power |= {"grade": slope * speed, "drive": -drive * speed}
+        seen = {"speed": speed, "acceleration": acceleration, "drive": drive, "rolling_radius": m.wheel_radius}
+        for load in ("load", "plane_load"):
+            seen |= {f"{load}_front": front, f"{load}_rear": weight - front}
+        return Rates((acceleration, speed), power, seen | dict.fromkeys(_NONE.split(), 0.0))
 
     def handlebar(self, steer: float, lean: float) -> float:
         """Handlebar angle [rad] for a steer angle at the ground: there is no steering."""

@@ -14,13 +14,17 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from math import atan, cos, degrees, pi, radians, tan
+from math import atan, cos, degrees, inf, pi, radians, tan
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from gz_onboard.constants import GRAVITY
+from gz_onboard.offline.page import markdown_table
+from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, RED, new_figure, rule, save
 from gz_onboard.simulation.turning.leaning import Leaning
-from gz_onboard.simulation.turning.machine import Machine, Rates, Road, State, step
+from gz_onboard.simulation.turning.machine import Machine, MachineState, Rates, Road, step
 from gz_onboard.simulation.turning.planar import Planar
 from gz_onboard.simulation.turning.straight import Straight
 from gz_onboard.simulation.turning.tyre import ideal_of
@@ -29,10 +33,10 @@ from gz_onboard.vehicle import read_vehicle
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Chassis = Straight | Planar | Leaning
+ChassisModel = Straight | Planar | Leaning
 
 ROLLS = (0.0, 5.0, 10.0, 20.0, 30.0)  # degrees
-MODELS: dict[str, type[Straight] | type[Planar] | type[Leaning]] = {
+CHASSIS_MODELS: dict[str, type[Straight] | type[Planar] | type[Leaning]] = {
     "straight": Straight,
     "planar": Planar,
     "leaning": Leaning,
@@ -53,44 +57,40 @@ class CoastDown:
     distance: list[float]
     lost: list[dict[str, float]]
     kinetic: list[float]
-    states: list[State]
+    states: list[MachineState]
     seen: list[dict[str, float]]
 
     def at_distance(self, distance: float, values: Sequence[float]) -> float:
         """`values` where `distance` [m] has been ridden; inf if it never was."""
-        return _interpolate(distance, self.distance, values)
+        return _at(distance, self.distance, values)
 
     def at_speed(self, speed: float, name: str) -> float:
         """What was seen as `name` when the speed [m/s] fell to `speed`; inf if it never did."""
-        return _interpolate(-speed, [-seen["speed"] for seen in self.seen], [seen[name] for seen in self.seen])
+        return _at(-speed, [-seen["speed"] for seen in self.seen], [seen[name] for seen in self.seen])
 
 
-def _interpolate(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
-    for i in range(1, len(xs)):
-        if xs[i - 1] <= x <= xs[i]:
-            share = (x - xs[i - 1]) / (xs[i] - xs[i - 1]) if xs[i] > xs[i - 1] else 0.0
-            return ys[i - 1] + share * (ys[i] - ys[i - 1])
-    return float("inf")
+def _at(x: float, xs: Sequence[float], ys: Sequence[float]) -> float:
+    return float(np.interp(x, xs, ys, left=inf, right=inf))
 
 
-class Rider:
+class Steerer:
     """Steers `chassis` so that it turns as a machine that leans by `roll` [rad, positive right].
 
     A kinematic steer for the wanted yaw rate -g·tan φ_ideal/u, and feedback of the yaw rate with an integral. That
     integral and the time [s] are the last two entries of the state: the rider is integrated with the machine.
     """
 
-    def __init__(self, chassis: Chassis, roll: float, road: Road) -> None:
+    def __init__(self, chassis: ChassisModel, roll: float, road: Road) -> None:
         self.chassis, self.road = chassis, road
         machine = chassis.machine
         self.turn = -GRAVITY * tan(ideal_of(roll, machine.crown, machine.cg_height))  # m/s²
         self.let_go = False
 
-    def start(self, speed: float) -> State:
+    def start(self, speed: float) -> MachineState:
         """Straight ahead at `speed` [m/s]."""
         return *self.chassis.start(speed), 0.0, 0.0
 
-    def rates(self, state: State) -> Rates:
+    def rates(self, state: MachineState) -> Rates:
         """The rates of chassis and rider."""
         *body, integral, time = state
         speed = max(body[0], 1.0)
@@ -108,9 +108,9 @@ class Rider:
         return replace(rates, change=(*rates.change, STEER_INTEGRAL * error, 1.0))
 
 
-def coast_down(chassis: Chassis, roll: float, *, slow: float = SLOW, dt: float = STEP) -> CoastDown:
+def coast_down(chassis: ChassisModel, roll: float, *, slow: float = SLOW, dt: float = STEP) -> CoastDown:
     """Lean to `roll` [rad] at `FAST`, let go, and record until `slow` [m/s] (at most 10 minutes)."""
-    rider = Rider(chassis, roll, Road())
+    rider = Steerer(chassis, roll, Road())
     state = rider.start(FAST)
     for _ in range(round(LEAD_IN / dt)):
         state, _ = step(rider.rates, state, dt)
@@ -166,47 +166,42 @@ def row(model: str, roll: float, run: CoastDown) -> dict[str, Any]:
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:
     """The table of the study."""
+    heads = ["roll", "model", f"lost in {DISTANCE:.0f} m", "air", "rolling", "sideslip", "twisting"]
+    heads += [f"coasts to {SLOW:.0f} m/s in", "load front, rear", "in the wheel's plane", "rolling radius"]
     lines = [
-        f"| roll | model | lost in {DISTANCE:.0f} m | air | rolling | sideslip | twisting "
-        f"| coasts to {SLOW:.0f} m/s in | load front, rear "
-        "| in the wheel's plane | rolling radius | slip front, rear |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |",
+        [
+            f"{r['roll']:.0f}°",
+            r["model"],
+            f"{r['lost']:.0f} J",
+            *(f"{r['parts'][name]:.0f}" for name in PARTS),
+            f"{r['distance']:.0f} m, {r['time']:.1f} s",
+            *(f"{r[f'{load} front']:.0f}, {r[f'{load} rear']:.0f} N" for load in ("load", "plane load")),
+            f"{1000 * r['rolling radius']:.1f} mm",
+            f"{r['slip front']:.2f}°, {r['slip rear']:.2f}°",
+        ]
+        for r in rows
     ]
-    for r in rows:
-        p = r["parts"]
-        lines.append(
-            f"| {r['roll']:.0f}° | {r['model']} | {r['lost']:.0f} J | {p['aerodynamic drag']:.0f} | {p['rolling']:.0f} "
-            f"| {p['sideslip']:.0f} | {p['twisting']:.0f} | {r['distance']:.0f} m, {r['time']:.1f} s "
-            f"| {r['load front']:.0f}, {r['load rear']:.0f} N "
-            f"| {r['plane load front']:.0f}, {r['plane load rear']:.0f} N | {1000 * r['rolling radius']:.1f} mm "
-            f"| {r['slip front']:.2f}°, {r['slip rear']:.2f}° |"
-        )
-    return "\n".join(lines)
+    return markdown_table([*heads, "slip front, rear"], lines)
 
 
-COLOURS = dict(zip(ROLLS, ("#1f2933", "#1667b7", "#2f855a", "#d9730d", "#c53030"), strict=True))
+COLOURS = dict(zip(ROLLS, (INK, BLUE, GREEN, ORANGE, RED), strict=True))
 STYLES = {"straight": ":", "planar": "--", "leaning": "-"}
-PARTS = {"aerodynamic drag": "#9fb3c8", "rolling": "#52606d", "sideslip": "#d9730d", "twisting": "#c53030"}
+PARTS = {"aerodynamic drag": "#9fb3c8", "rolling": "#52606d", "sideslip": ORANGE, "twisting": RED}
 
 
-def plot(runs: dict[tuple[str, float], CoastDown], output: Path) -> list[Path]:
-    """Two pictures of the runs in the folder `output`; their paths."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    paths = []
+def plot(runs: dict[tuple[str, float], CoastDown], output: Path) -> None:
+    """Two pictures of the runs in the folder `output`."""
     for name, draw, panels, size in (
         ("turning_energy.png", _draw_energy, 3, (11.5, 3.8)),
         ("turning_tyres.png", _draw_tyres, 4, (13, 3.6)),
     ):
-        figure, grid = plt.subplots(1, panels, figsize=size, layout="constrained")
+        figure = new_figure(*size)
+        figure.set_layout_engine("constrained")
+        grid = figure.subplots(1, panels)
         draw(runs, grid)
-        paths.append(output / name)
-        figure.savefig(paths[-1], dpi=90)
-    plt.close("all")
-    return paths
+        for axes in grid:
+            rule(axes)
+        save(figure, output / name)
 
 
 def _draw_energy(runs: dict[tuple[str, float], CoastDown], grid: Sequence[Axes]) -> None:
@@ -217,21 +212,19 @@ def _draw_energy(runs: dict[tuple[str, float], CoastDown], grid: Sequence[Axes])
         grid[1].plot([s[3] for s in run.states], [s[4] for s in run.states], STYLES[model], color=COLOURS[roll])
     grid[1].set_aspect("equal", adjustable="datalim")
     grid[1].set_title("Path of the coast-down [m]", fontsize=10, loc="left")
-    grid[1].grid(color="#e4e7eb")
-    bottoms = [0.0] * (len(ROLLS) * len(MODELS))
-    keys = [(model, roll) for roll in ROLLS for model in MODELS]
+    keys = [(model, roll) for roll in ROLLS for model in CHASSIS_MODELS]
     rows = [row(model, roll, runs[model, roll]) for model, roll in keys]
-    places = [i + i // len(MODELS) for i in range(len(keys))]
+    places = [i + i // len(CHASSIS_MODELS) for i in range(len(keys))]
+    bottoms = np.zeros(len(keys))
     for name, shade in PARTS.items():
-        heights = [r["parts"][name] / 1000 for r in rows]
+        heights = np.array([r["parts"][name] / 1000 for r in rows])
         grid[2].bar(places, heights, bottom=bottoms, color=shade, label=name, width=0.85)
-        bottoms = [low + height for low, height in zip(bottoms, heights, strict=True)]
+        bottoms += heights
     labels = [f"{model[0]}\n{roll:.0f}°" if model == "planar" else model[0] for model, roll in keys]
-    grid[2].set_xticks(places, labels, fontsize=8)
-    grid[2].set_ylim(0, max(bottoms) * 1.3)
+    grid[2].set_xticks(places, labels)
+    grid[2].set_ylim(0, bottoms.max() * 1.3)
     grid[2].legend(fontsize=8, frameon=False, ncols=2)
     grid[2].set_title(f"Lost in {DISTANCE:.0f} m [kJ]: straight, planar, leaning", fontsize=10, loc="left")
-    grid[2].spines[["top", "right"]].set_visible(False)
 
 
 def _draw_tyres(runs: dict[tuple[str, float], CoastDown], grid: Sequence[Axes]) -> None:
@@ -257,17 +250,14 @@ def _lines(
         if model != "straight" or roll == 0:
             axes.plot(*value(run), STYLES[model], color=COLOURS[roll], linewidth=1.4)
     axes.set_title(title, fontsize=10, loc="left")
-    axes.grid(color="#e4e7eb")
-    axes.spines[["top", "right"]].set_visible(False)
 
 
 def _legend(axes: Axes) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [Line2D([], [], color=COLOURS[roll], label=f"{roll:.0f}°") for roll in ROLLS]
-    for model in MODELS:
-        handles += axes.plot([], [], STYLES[model], color="#7b8794", label=model)
-    axes.legend(handles=handles, fontsize=8, frameon=False, ncols=2)
+    for roll in ROLLS:
+        axes.plot([], [], color=COLOURS[roll], label=f"{roll:.0f}°")
+    for model in CHASSIS_MODELS:
+        axes.plot([], [], STYLES[model], color=MUTED, label=model)
+    axes.legend(fontsize=8, frameon=False, ncols=2)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -277,7 +267,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--vehicle", default="reference", help="vehicle file (default: the reference scooter)")
     arguments = parser.parse_args(argv)
     machine = Machine.of(read_vehicle(arguments.vehicle).parameters)
-    runs = {(name, roll): coast_down(MODELS[name](machine), radians(roll)) for roll in ROLLS for name in MODELS}
+    runs = {
+        (name, roll): coast_down(CHASSIS_MODELS[name](machine), radians(roll))
+        for roll in ROLLS
+        for name in CHASSIS_MODELS
+    }
     rows = [row(model, roll, run) for (model, roll), run in runs.items()]
     arguments.output.mkdir(parents=True, exist_ok=True)
     table = markdown(rows)

@@ -13,7 +13,7 @@ SLIP_SPEED = 0.5  # m/s: below it slip is relative to this speed, as ε does in 
 
 
 @dataclass(frozen=True)
-class Tyre:
+class LateralTyre:
     """The side of a tyre; stiffness [1/rad], friction [1], twisting arm [m/rad], relaxation length [m]."""
 
     cornering_stiffness: float

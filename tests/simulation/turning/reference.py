@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import root
 
 from gz_onboard.simulation.turning.machine import Rates, Road, step
-from gz_onboard.simulation.turning.study import STEP, Chassis, Rider
+from gz_onboard.simulation.turning.study import STEP, ChassisModel, Steerer
 
 G = 9.80665
 
@@ -112,9 +112,9 @@ def steady_turn(machine, speed: float, lean: float, *, upright: bool = False, fu
     return Turn(r, v, bar, load_f, load_r, drive, slip_f, slip_r, side_f, side_r, sliding + twisting)
 
 
-def held(chassis: Chassis, roll: float, speed: float, *, dt: float = STEP, seconds: float = 12.0) -> Rates:
+def held(chassis: ChassisModel, roll: float, speed: float, *, dt: float = STEP, seconds: float = 12.0) -> Rates:
     """The steady turn at `roll` [rad] and `speed` [m/s], held by the drive: its power and what else is seen."""
-    rider = Rider(chassis, roll, Road())
+    rider = Steerer(chassis, roll, Road())
     state = rider.start(speed)
     for _ in range(round(seconds / dt)):
         state, _ = step(rider.rates, state, dt)

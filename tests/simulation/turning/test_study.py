@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import pytest
 
-from gz_onboard.simulation.turning.study import MODELS, ROLLS, main
+from gz_onboard.simulation.turning.study import CHASSIS_MODELS, ROLLS, main
 
 
 @pytest.fixture(scope="module")
@@ -20,7 +20,7 @@ def output(tmp_path_factory):
 @pytest.fixture(scope="module")
 def rows(output):
     written = json.loads((output / "turning.json").read_text())
-    assert len(written) == len(ROLLS) * len(MODELS)
+    assert len(written) == len(ROLLS) * len(CHASSIS_MODELS)
     return {(row["model"], row["roll"]): row for row in written}
 
 

@@ -1,4 +1,4 @@
-"""Tyre and lean geometry against definitions, rotations and published figures."""
+"""LateralTyre and lean geometry against definitions, rotations and published figures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.simulation.turning.tyre import (
-    Tyre,
+    LateralTyre,
     front_camber,
     ground_steer,
     handlebar_of,
@@ -19,7 +19,7 @@ from gz_onboard.simulation.turning.tyre import (
 )
 from tests.simulation.turning.reference import front_wheel
 
-TYRE = Tyre(cornering_stiffness=15, camber_stiffness=0.85, friction=1.2, twisting_arm=0.02, relaxation_length=0.15)
+TYRE = LateralTyre(15, camber_stiffness=0.85, friction=1.2, twisting_arm=0.02, relaxation_length=0.15)
 angles = st.floats(-0.7, 0.7)
 slips = st.floats(-1.5, 1.5)
 

@@ -10,14 +10,16 @@ from collections import defaultdict
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.constants import MILD
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import air_density, all_quantities, over
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
-
-    from gz_onboard.arrays import Array
 
 
 SMOOTHING = 0.5  # s: a wheel speed sensor's steps of 0.1 r/min at 100 Hz are 0.25 m/s² of acceleration
@@ -41,14 +43,14 @@ class Energy:
 
 
 @dataclass(frozen=True)
-class Conditions:
+class RideConditions:
     """Where and in what a speed is ridden; quantities of the ride are scalars or of shape (n,)."""
 
     grade: ArrayLike = 0.0  # sine of the road's angle
     curvature: ArrayLike = 0.0  # 1/m, positive to the left
     heading: ArrayLike | None = None  # rad clockwise from north; None: as the curvature turns it from north
     headwind: ArrayLike = 0.0  # m/s
-    ambient: float = 20.0  # degC
+    ambient: float = MILD  # degC
     altitude: float = 0.0  # m
     motor_temperature: ArrayLike | None = None  # degC; None: ambient
     vibration: ArrayLike | None = None  # m/s²; None: while moving what the vehicle's file expects
@@ -58,7 +60,7 @@ def backward(
     vehicle: Vehicle,
     time: ArrayLike,
     speed: ArrayLike,
-    conditions: Conditions = Conditions(),
+    conditions: RideConditions = RideConditions(),
     *,
     smoothing: float = SMOOTHING,
 ) -> Energy:
@@ -67,8 +69,6 @@ def backward(
     smoothing: the acceleration is the mean one over so many seconds; 0 for a drive cycle.
     Raises ValueError for shapes that do not fit and time that does not increase.
     """
-    import numpy as np
-
     t, v = np.asarray(time, dtype=float), np.asarray(speed, dtype=float)
     if t.ndim != 1 or t.shape != v.shape or len(t) < 2:
         raise ValueError(f"time and speed must be of one shape (n,), n of 2 or more; are {t.shape} and {v.shape}")
@@ -92,11 +92,9 @@ def backward(
 
 
 def _quantities(
-    vehicle: Vehicle, middle: Array, acceleration: Array, dt: Array, conditions: Conditions
+    vehicle: Vehicle, middle: Array, acceleration: Array, dt: Array, conditions: RideConditions
 ) -> dict[str, Any]:
     """What effects read, at the middle of each interval of `dt` [s]."""
-    import numpy as np
-
     c = conditions
     q = all_quantities(
         speed=middle,
@@ -122,16 +120,12 @@ def _quantities(
 
 def _middle(values: ArrayLike) -> Any:
     """A quantity at the middle of each interval; a scalar as it is."""
-    import numpy as np
-
     array = np.asarray(values, dtype=float)
     return (array[1:] + array[:-1]) / 2 if array.ndim else float(array)
 
 
 def _acceleration(t: Array, v: Array, smoothing: float) -> Array:
     """In each interval [m/s²]: the slope of the speed over `smoothing` [s] around it, or over the interval alone."""
-    import numpy as np
-
     half = round(smoothing / 2 / float(np.median(np.diff(t))))
     if half < 1:
         return np.diff(v) / np.diff(t)
