@@ -18,6 +18,7 @@ from gz_onboard.bus.mapping import pgn
 from gz_onboard.bus.publisher import KNOWN, Counts, Publisher
 from gz_onboard.constants import WH
 from gz_onboard.errors import InputError
+from gz_onboard.estimator import reasons
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
@@ -274,9 +275,14 @@ def _frame_key(vehicle: Vehicle, identifier: int, extended: bool) -> tuple[bool,
     return extended, pgn(identifier) if extended and vehicle.mapping.j1939 else identifier
 
 
-def reason_names(reasons: Reason) -> list[str]:
+def reason_names(found: Reason) -> list[str]:
     """The names of the reasons in a set."""
-    return [str(reason.name) for reason in Reason if reason & reasons]
+    return [str(reason.name) for reason in Reason if reason & found]
+
+
+def lacking(vehicle: Vehicle) -> list[str]:
+    """The reasons that would always be there, were they told: for sensors that the vehicle does not have."""
+    return reason_names(reasons.lacking({source.role for source in vehicle.mapping.sources}))
 
 
 def estimate_row(estimate: Estimate) -> dict[str, object]:

@@ -24,7 +24,7 @@ from gz_onboard.daemon.loop import TICK, Daemon, state_text
 from gz_onboard.errors import FAILED, OK, InputError
 from gz_onboard.options import CHANNEL, add_shared, number
 from gz_onboard.physics.trust import ROOT
-from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts
+from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, lacking
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 LOCK_S = 3.0  # to wait for one that is ending
@@ -96,7 +96,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
         recorder = Recorder(
             arguments.log_dir,
             vehicle.name,
-            metadata={"vehicle_key": vehicle.key},
+            metadata={"vehicle_key": vehicle.key, "lacking": " ".join(lacking(vehicle))},
             attachments=dbc_texts(vehicle),
             limits=Limits(
                 max_file_bytes=round(arguments.log_file_mb * 1e6),
@@ -111,6 +111,8 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
     channels = [CanChannel(arguments.interface, name, index, wanted) for index, name in enumerate(names)]
     for channel in channels:
         channel.open()
+    if never := lacking(vehicle):
+        log.info("%s has no sensors for, and its intervals are wider by: %s", vehicle.name, ", ".join(never))
     daemon = Daemon(vehicle, channels, recorder, state_file, arguments.filter, arguments.tick)
     signal.signal(signal.SIGTERM, daemon.stop)
     signal.signal(signal.SIGINT, daemon.stop)

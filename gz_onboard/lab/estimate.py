@@ -156,6 +156,7 @@ def summary_text(ride: Summary) -> str:
         ),
         ("state", ", ".join(f"{name.lower()} {duration:.1f} s" for name, duration in ride.states.items())),
         *(("", f"{reason_words(Reason[name])} {duration:.1f} s") for name, duration in ride.reasons.items()),
+        *([("never there", ", ".join(reason_words(Reason[name]) for name in ride.lacking))] if ride.lacking else []),
         (
             "computed",
             f"{ride.cpu_s:.2f} s of processor time, {number(ride.real_time_factor, '.0f')} times as fast as the ride",

@@ -20,7 +20,7 @@ from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.plot import plot_log
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.results import times
-from gz_onboard.pipeline import STATUS_TOPIC, TICK_NS, Pipeline, dbc_texts, range_publisher, reason_names
+from gz_onboard.pipeline import STATUS_TOPIC, TICK_NS, Pipeline, dbc_texts, lacking, range_publisher, reason_names
 from gz_onboard.progress import Progress
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -88,6 +88,7 @@ class Summary:
     innovation_max_v: Annotated[float | None, "greatest magnitude of the same"]
     states: Annotated[dict[str, float], "seconds in each state"]
     reasons: Annotated[dict[str, float], "seconds with each reason to distrust the estimate"]
+    lacking: Annotated[list[str], "reasons that hold for ever, as the vehicle has no such sensors: no degradation"]
     frames: Annotated[int, "received"]
     dropped: Annotated[int, "frames that failed a check"]
     implausible: Annotated[int, "signals out of their physical range"]
@@ -254,6 +255,7 @@ def _open_log(task: EstimateTask, vehicle: Vehicle, start_ns: int) -> LogFile:
     metadata = {
         "vehicle": vehicle.name,
         "vehicle_key": vehicle.key,
+        "lacking": " ".join(lacking(vehicle)),
         "source": task.path.name,
         "filter": task.filter_name,
         **({} if task.payload is None else {"payload_kg": f"{task.payload:g}"}),
@@ -315,6 +317,7 @@ def _summary(
         innovation_max_v=tally.innovation_max if tally.innovation_rms is not None else None,
         states={state.name: round(states[state.name] * TICK_S, 1) for state in State if states[state.name]},
         reasons={name: round(ticks * TICK_S, 1) for name, ticks in sorted(reasons.items())},
+        lacking=lacking(pipeline.vehicle),
         frames=pipeline.codec.received,
         dropped=counts.dropped,
         implausible=counts.implausible,
