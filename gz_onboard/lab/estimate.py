@@ -151,6 +151,10 @@ def summary_text(ride: Summary) -> str:
             f"{ride.unknown} unknown identifiers, {ride.error_frames} error frames",
         ),
         *(
+            ("someone else's", f"{count} frames on {identifier}, a range frame's: give another range_identifier")
+            for identifier, count in ride.foreign.items()
+        ),
+        *(
             ("sensor faults", f"{reason}: " + ", ".join(f"{name} {count}" for name, count in places.items()))
             for reason, places in ride.faults.items()
         ),

@@ -94,6 +94,7 @@ class Summary:
     implausible: Annotated[int, "signals out of their physical range"]
     lost: Annotated[int, "frames missing by their counters"]
     unknown: Annotated[int, "different identifiers that the database does not know"]
+    foreign: Annotated[dict[str, int], "frames of someone else on the identifiers of the range frames, by identifier"]
     error_frames: Annotated[int, "error frames of the bus"]
     faults: Annotated[dict[str, dict[str, int]], "what was dropped, by reason and by message or signal"]
     damage: Annotated[str | None, "what of the log could not be read, or null"]
@@ -204,8 +205,8 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> Summar
     damages: list[LogDamage] = []
     cpu, wall = time.process_time(), time.perf_counter()
     batches = read_frames(task.path, on_damage=damages.append)
-    own = range_publisher(vehicle).identifiers
-    ours = ([frame for frame in batch if frame[1] not in own] for batch in batches)  # an earlier run's estimates
+    own = range_publisher(vehicle).may_have_sent
+    ours = ([frame for frame in batch if not own(frame)] for batch in batches)  # without an earlier run's estimates
     batch = next((batch for batch in ours if batch), None)
     if batch is None:
         raise InputError(f"{task.path}: holds no frames of a vehicle" + (f" ({damages[0]})" if damages else ""))
@@ -323,6 +324,7 @@ def _summary(
         implausible=counts.implausible,
         lost=counts.lost,
         unknown=counts.unknown,
+        foreign=cast("dict[str, int]", status["foreign"]),
         error_frames=pipeline.codec.error_frames,
         faults=cast("dict[str, dict[str, int]]", status["faults"]),
         damage=str(damages[0]) if damages else None,
