@@ -1,7 +1,7 @@
 """Parameters of a vehicle: read from its file with value, unit, standard deviation, status and source.
 
     [parameters]
-    drag_area = { value = 0.52, unit = "m^2", sd = 0.03, status = "measured", source = "coast-downs, 8 runs" }
+    drag_area = { value = 0.52, unit = "m²", sd = 0.03, status = "measured", source = "coast-downs, 8 runs" }
 
 ``status`` is measured, data sheet or guess. What the file leaves out takes its prior, as a guess: that of a scooter,
 grown to this vehicle by the parameter's law. What nothing tells is required of a file with a battery.
@@ -252,13 +252,18 @@ def _given(parameters: Table, parameter: Parameter) -> Value:
     name, entry = parameter.name, parameters.table(parameter.name)
     entry.only(["value", "unit", "sd", "status", "source"])
     unit = entry.text("unit")
-    if unit != parameter.unit:
+    if _plain(unit) != _plain(parameter.unit):
         raise entry.error(f"unit {shown(unit)} is wrong: {name} is in {parameter.unit!r}", "unit")
     value = entry.number("value")
     if not parameter.low <= value <= parameter.high:
         raise entry.error(f"{value:g} {unit} is outside {parameter.low:g} to {parameter.high:g} {unit}", "value")
     sd = entry.number("sd", low=0, high=1e9)
-    return Value(value, sd, unit, entry.text("status", choices=STATUS), entry.text("source"))
+    return Value(value, sd, parameter.unit, entry.text("status", choices=STATUS), entry.text("source"))
+
+
+def _plain(unit: str) -> str:
+    """A unit without what not every keyboard has: Ah, A*h and A·h are one, as are m2, m^2 and m²."""
+    return unit.translate(str.maketrans({"·": None, "*": None, " ": None, "^": None, "²": "2", "Ω": "ohm"}))
 
 
 def _check_required(vehicle: Table, given: Collection[str], effects: Iterable[Effect]) -> None:

@@ -101,3 +101,9 @@ def test_key_tells_vehicles_and_models_apart(tmp_path):
     key = read_vehicle("reference").key
     assert vehicle(tmp_path, r'"grade_force", ', "").key != key
     assert vehicle(tmp_path, r"^cells_parallel = 12", "cells_parallel = 11").key != key
+
+
+@pytest.mark.parametrize(("name", "unit"), [("drag_area", "m^2"), ("cell_capacity", "Ah"), ("torque_constant", "Nm/A")])
+def test_units_as_a_plain_keyboard_has_them(tmp_path, name, unit):
+    known = vehicle(tmp_path, rf'^({name} = .*unit = )"[^"]+"', rf'\1"{unit}"').parameters.known[name]
+    assert known == read_vehicle("reference").parameters.known[name]
