@@ -88,27 +88,14 @@ PACKAGE_EFFECTS = Path(__file__).resolve().parent / "effects"
 MOVING = 0.5  # m/s: what counts for time_moving
 
 
-Law = tuple[tuple[str, float], ...]
-
-
-def like(**powers: float) -> Law:
-    """A prior grows with these powers: of parameters, of ``mass`` (payload too), ``cells_series``, ``cells_parallel``.
-
-    Losses, loads and limits are the same share of the power at the same acceleration and speed in any vehicle, and a
-    pack's resistance the same share of its cells'.
-    """
-    return tuple(powers.items())
-
-
 @dataclass(frozen=True)
 class Parameter:
     """A parameter of an effect: what it is and what it can be.
 
-    low, high: of any road vehicle, from a kick scooter to a van of 3.5 t. The prior is that of a scooter of 105 kg;
-    `law` says how it grows with what the file says of another vehicle (see `like`); a parameter of which no law knows
-    is `required` of a file with a battery. ride_sd: by how much what rides show of it scatters from ride to ride
-    [unit], at the prior. healthy_sd: within what a healthy vehicle may show of it where its model lacks the effect.
-    bench: found on one at steady points.
+    low, high: of any road vehicle, from a kick scooter to a van of 3.5 t. The prior is that of a scooter; how it grows
+    with another vehicle is in `physics.similarity`, and what nothing there tells is `required` of a file with a
+    battery. ride_sd: by how much what rides show of it scatters from ride to ride [unit], at the prior. healthy_sd:
+    within what a healthy vehicle may show of it where its model lacks the effect. bench: found on one at steady points.
     """
 
     name: str
@@ -121,7 +108,6 @@ class Parameter:
     ride_sd: float | None = None
     healthy_sd: float | None = None
     bench: bool = False
-    law: Law = ()
     required: bool = False
 
     def __post_init__(self) -> None:
@@ -129,26 +115,18 @@ class Parameter:
             raise ValueError(f"{self.name}: prior {self.prior} is outside {self.low} to {self.high} {self.unit}")
 
 
-LIGHT = like(vehicle_mass=0.8)  # what lights and electronics draw: a car's is not fifteen times a scooter's
-TORQUE = like(mass=1, wheel_radius=1, gear_ratio=1)  # at the motor's shaft
-OF_SPEED = TORQUE  # a loss in W over the motor's speed
-OF_SPEED_SQUARED = like(mass=1, wheel_radius=2, gear_ratio=2)
-OF_CURRENT = like(wheel_radius=-1, gear_ratio=-1, torque_constant=1)  # in W over the motor's current
-OF_CURRENT_SQUARED = like(mass=-1, wheel_radius=-2, gear_ratio=-2, torque_constant=2)
-ROTATING = like(vehicle_mass=1, wheel_radius=2)
-YAWING = like(mass=1, wheelbase=2)
 VEHICLE_PARAMETERS = (
     Parameter("vehicle_mass", "kg", 105, 5, 5, 5000, "GenZe 2.0 data sheet", required=True),
     Parameter("payload_mass", "kg", 80, 12, 0, 3000, "rider and what he carries"),
     Parameter("wheel_radius", "m", 0.245, 0.005, 0.04, 0.6, "effective, of the driven wheel", required=True),
-    Parameter("wheelbase", "m", 1.32, 0.02, 0.3, 6, "GenZe 2.0 data sheet", law=like(vehicle_mass=0.25)),
-    Parameter("cg_to_rear", "m", 0.57, 0.08, 0.05, 4, "rear axle to centre of gravity", law=like(wheelbase=1)),
+    Parameter("wheelbase", "m", 1.32, 0.02, 0.3, 6, "GenZe 2.0 data sheet"),
+    Parameter("cg_to_rear", "m", 0.57, 0.08, 0.05, 4, "rear axle to centre of gravity"),
     Parameter("cg_height", "m", 0.63, 0.08, 0.1, 2, "centre of gravity over the road"),
-    Parameter("wheel_inertia_front", "kg·m²", 0.11, 0.03, 0, 50, "wheel and tyre", law=ROTATING),
-    Parameter("wheel_inertia_rear", "kg·m²", 0.34, 0.08, 0, 50, "wheel, tyre and hub motor", law=ROTATING),
+    Parameter("wheel_inertia_front", "kg·m²", 0.11, 0.03, 0, 50, "wheel and tyre"),
+    Parameter("wheel_inertia_rear", "kg·m²", 0.34, 0.08, 0, 50, "wheel, tyre and hub motor"),
     Parameter("gear_ratio", "1", 1.0, 0.01, 0.02, 5, "wheel speed over motor speed: 0.2 for a reduction of 5"),
     Parameter("torque_constant", "N·m/A", 0.47, 0.02, 0.01, 10, "Lord 2016, table 2.5"),
-    Parameter("yaw_inertia", "kg·m²", 28, 6, 0.1, 20000, "Cossalter 2006, ch. 7: m·(0.39 m)² with rider", law=YAWING),
+    Parameter("yaw_inertia", "kg·m²", 28, 6, 0.1, 20000, "Cossalter 2006, ch. 7: m·(0.39 m)² with rider"),
     Parameter("caster_angle", "rad", 0.46, 0.04, 0.1, 0.8, "26 degrees: Cossalter 2006, sec. 1.3, scooters 24 to 28"),
     Parameter("tyre_crown_radius", "m", 0.05, 0.008, 0.001, 0.15, "half the width of a 100 mm scooter tyre"),
     Parameter("cornering_stiffness_front", "1/rad", 16, 4, 2, 60, "per load: Pacejka 2012, ch. 11: 14 to 19"),
@@ -159,9 +137,7 @@ VEHICLE_PARAMETERS = (
     Parameter("twisting_arm", "m/rad", 0.02, 0.015, 0, 0.2, "brush model, 20 per load, half width 25 mm: C_κ·w²/(3·r)"),
     Parameter("tyre_relaxation_length", "m", 0.15, 0.05, 0.02, 1, "sideways: Cossalter 2006, sec. 2.6, 0.1 to 0.3 m"),
     Parameter("speed_sensor_scale", "1", 1.0, 0.005, 0.5, 2, "what the motor's speed sensor shows over what is"),
-    Parameter(
-        "regeneration_torque_limit", "N·m", 19, 3, 0, 5000, "most braking torque at the motor's shaft", law=TORQUE
-    ),
+    Parameter("regeneration_torque_limit", "N·m", 19, 3, 0, 5000, "most braking torque at the motor's shaft"),
 )
 
 

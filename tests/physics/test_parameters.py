@@ -9,6 +9,7 @@ import pytest
 
 from gz_onboard.errors import InputError
 from gz_onboard.physics.parameters import declared_parameters
+from gz_onboard.physics.similarity import POWERS, USUAL_CELLS
 from gz_onboard.vehicle import OWN, read_vehicle
 
 REFERENCE = (OWN / "reference.toml").read_text()
@@ -101,6 +102,16 @@ def test_key_tells_vehicles_and_models_apart(tmp_path):
     key = read_vehicle("reference").key
     assert vehicle(tmp_path, r'"grade_force", ', "").key != key
     assert vehicle(tmp_path, r"^cells_parallel = 12", "cells_parallel = 11").key != key
+
+
+def test_cells_that_are_no_number(tmp_path):
+    with pytest.raises(InputError, match=r"changed\.toml:\d+: battery\.cells_series: must be a number"):
+        vehicle(tmp_path, r"^cells_series = .*", 'cells_series = "many"')
+
+
+def test_laws_are_of_parameters_and_follow_from_those_before():
+    order = ["mass", *USUAL_CELLS, *declared_parameters()]
+    assert all(order.index(other) < order.index(name) for name, law in POWERS.items() for other in law)
 
 
 @pytest.mark.parametrize(("name", "unit"), [("drag_area", "m^2"), ("cell_capacity", "Ah"), ("torque_constant", "Nm/A")])

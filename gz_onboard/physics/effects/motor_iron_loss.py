@@ -4,25 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from gz_onboard.physics.effect import OF_SPEED, OF_SPEED_SQUARED, Parameter, Port
+from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.MOTOR_LOSS
 HYSTERESIS = "Bertotti 1988: hysteresis loss grows with frequency"
 EDDIES = "Bertotti 1988: eddy loss, its square"
 PARAMETERS = (
-    Parameter("motor_iron_linear", "W·s/rad", 0.5, 0.4, 0.0, 200.0, HYSTERESIS, ride_sd=0.03, bench=True, law=OF_SPEED),
-    Parameter(
-        "motor_iron_quadratic",
-        "W·s²/rad²",
-        0.01,
-        0.01,
-        0.0,
-        20.0,
-        EDDIES,
-        ride_sd=0.001,
-        bench=True,
-        law=OF_SPEED_SQUARED,
-    ),
+    Parameter("motor_iron_linear", "W·s/rad", 0.5, 0.4, 0.0, 200.0, HYSTERESIS, ride_sd=0.03, bench=True),
+    Parameter("motor_iron_quadratic", "W·s²/rad²", 0.01, 0.01, 0.0, 20.0, EDDIES, ride_sd=0.001, bench=True),
 )
 
 

@@ -8,25 +8,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from gz_onboard.physics.effect import Parameter, Port, like
+from gz_onboard.physics.effect import Parameter, Port
 from gz_onboard.physics.elementary import exp
 
 PORT = Port.CELL_VOLTAGE
 RESISTANCE = "18650 NMC at 25 degC: a fifth to half of R0"
 DIFFUSION = "diffusion in 5-10 µm particles: 10 to 40 min"
 PARAMETERS = (
-    Parameter(
-        "slow_resistance",
-        "ohm",
-        0.008,
-        0.006,
-        0.0,
-        10.0,
-        RESISTANCE,
-        ride_sd=0.001,
-        healthy_sd=0.01,
-        law=like(cell_capacity=-1),
-    ),
+    Parameter("slow_resistance", "ohm", 0.008, 0.006, 0.0, 10.0, RESISTANCE, ride_sd=0.001, healthy_sd=0.01),
     Parameter("slow_time", "s", 1200.0, 400.0, 120.0, 7200.0, DIFFUSION),
 )
 SHOWN_BY = (
