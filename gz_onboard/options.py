@@ -13,7 +13,7 @@ LOG_SUFFIXES = (".mcap", ".blf", ".log", ".asc", ".csv", ".trc", ".mf4")
 _LOGS = f"{' '.join(LOG_SUFFIXES)}, each also with .gz"
 MOST_JOBS = 256
 """Processes: each takes some 100 MB and keeps a processor busy."""
-MOST_PAYLOAD = 300.0  # kg
+MOST_PAYLOAD = 3000.0  # kg, of a van
 MOST_SEED = 2**32 - 1
 LONGEST_LOG = 1e9  # s, thirty years
 CHANNEL = "can0"

@@ -9,15 +9,15 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
-from pathlib import Path
 from typing import Any, Protocol
 
 from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE, Codec
+from gz_onboard.bus.layout import identifier_of
 from gz_onboard.bus.logfile import object_schema
 from gz_onboard.bus.mapping import pgn
-from gz_onboard.bus.publisher import KNOWN, Counts, Publisher
+from gz_onboard.bus.publisher import KNOWN, MESSAGES, Counts, Publisher
 from gz_onboard.constants import WH
-from gz_onboard.errors import InputError
+from gz_onboard.estimator import reasons
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
@@ -31,6 +31,12 @@ TICKS_PER_RANGE = 10  # range at 1 Hz
 ESTIMATE_TOPIC = "/estimate"
 STATUS_TOPIC = "/status"
 COUNTS = ("received", "error_frames", "kernel_lost", "overrun", "send_failures", "log_lost", "unknown_others")
+FREE = (
+    *range(0x600, 0x700, 0x10),
+    *range(0x10, 0x600, 0x10),
+    *range(0x18FF_6000 | EFF_FLAG, 0x19FF_6000 | EFF_FLAG, 0x1000),
+)
+"""Where range frames may begin, the first choice first: of 11 bits and low priority, not the diagnosis' above 0x700."""
 DROPPING = (LENGTH, CRC, COUNTER, TIME, UNDECODABLE)  # reasons that drop a frame
 
 ESTIMATE_UNITS = {
@@ -217,6 +223,12 @@ class Pipeline:
                     topic = topics[identifier] = f"/can/{codec.message_name(identifier)}"
                 log.sample(topic, seen_ns, codec.values(identifier, data))
 
+    @property
+    def foreign(self) -> dict[str, int]:
+        """Frames that someone else sent on the identifiers of our own, by identifier: who reads ours may read his."""
+        unknown = self.codec.unknown
+        return {hexadecimal(i): unknown[i] for i in sorted(self.publisher.identifiers) if i in unknown}
+
     def status(self) -> dict[str, object]:
         """What was received, dropped and lost since the start, by message and reason."""
         codec = self.codec
@@ -231,6 +243,7 @@ class Pipeline:
             "send_failures": self.send_failures,
             "log_lost": self.log_lost,
             "unknown_others": codec.unknown_others,
+            "foreign": self.foreign,
             "faults": faults,
             "lost": dict(sorted(codec.lost.items())),
             "unknown": {f"{i & ~EFF_FLAG:X}": n for i, n in sorted(codec.unknown.items())[:32]},
@@ -244,15 +257,15 @@ def range_publisher(vehicle: Vehicle) -> Publisher:
     InputError if its own messages take their identifiers, or if they cannot say what its battery holds, or how far
     that takes it by the prior riding.
     """
-    try:
-        publisher = Publisher(vehicle.range_dbc)
-    except InputError as error:
-        raise vehicle.error(f"range_dbc: {error}") from error
-    known = {_frame_key(vehicle, m.frame_id, m.is_extended_frame) for m in vehicle.mapping.database.messages}
-    clash = [i for i in publisher.identifiers if _frame_key(vehicle, i & ~EFF_FLAG, bool(i & EFF_FLAG)) in known]
-    if clash:
-        names = ", ".join(f"{identifier & ~EFF_FLAG:#x}" for identifier in sorted(clash))
-        raise vehicle.error(f"its DBC files take the identifiers of our own range frames ({publisher.file}): {names}")
+    publisher = vehicle.publisher()
+    known = {_frame_key(vehicle, identifier_of(m)) for m in vehicle.mapping.database.messages}
+    if clash := [i for i in publisher.identifiers if _frame_key(vehicle, i) in known]:
+        free = next(i for i in FREE if not any(_frame_key(vehicle, i + n) in known for n in range(MESSAGES)))
+        raise vehicle.error(
+            f"its DBC files take the identifiers of our own range frames ({publisher.file}): "
+            f"{', '.join(hexadecimal(i) for i in sorted(clash))}; give range_identifier = {free:#x}, "
+            f"from which on {MESSAGES} are free in them"
+        )
     if vehicle.battery:
         full = drawable(vehicle.battery, 1.0, BENCH_TEMPERATURE, 1.0).energy / WH
         forecaster = Forecaster(vehicle.model, vehicle.battery, vehicle.riding)
@@ -269,14 +282,25 @@ def range_publisher(vehicle: Vehicle) -> Publisher:
     return publisher
 
 
-def _frame_key(vehicle: Vehicle, identifier: int, extended: bool) -> tuple[bool, int]:
+def hexadecimal(identifier: int) -> str:
+    """`identifier` without its flag, as it is spoken of."""
+    return f"{identifier & ~EFF_FLAG:#x}"
+
+
+def _frame_key(vehicle: Vehicle, identifier: int) -> tuple[bool, int]:
     """What the vehicle's codec knows a frame by."""
-    return extended, pgn(identifier) if extended and vehicle.mapping.j1939 else identifier
+    extended, plain = bool(identifier & EFF_FLAG), identifier & ~EFF_FLAG
+    return extended, pgn(plain) if extended and vehicle.mapping.j1939 else plain
 
 
-def reason_names(reasons: Reason) -> list[str]:
+def reason_names(found: Reason) -> list[str]:
     """The names of the reasons in a set."""
-    return [str(reason.name) for reason in Reason if reason & reasons]
+    return [str(reason.name) for reason in Reason if reason & found]
+
+
+def lacking(vehicle: Vehicle) -> list[str]:
+    """The reasons that would always be there, were they told: for sensors that the vehicle does not have."""
+    return reason_names(reasons.lacking({source.role for source in vehicle.mapping.sources}))
 
 
 def estimate_row(estimate: Estimate) -> dict[str, object]:
@@ -298,7 +322,7 @@ def _declare(log: Log, codec: Codec, signals: bool) -> None:
     estimate["properties"] |= {name: {"type": "string"} for name in ("state", "reasons", "activity", "distrusted")}
     log.channel(ESTIMATE_TOPIC, estimate)
     counts = {name: {"type": "integer"} for name in COUNTS}
-    maps = {name: {"type": "object"} for name in ("faults", "lost", "unknown")}
+    maps = {name: {"type": "object"} for name in ("foreign", "faults", "lost", "unknown")}
     reasons = {"reasons": {"type": "array", "items": {"type": "string"}}}
     log.channel(STATUS_TOPIC, {"title": "gz_onboard.Status", "type": "object", "properties": counts | maps | reasons})
     for message in codec.mapping.database.messages if signals else ():
@@ -309,5 +333,5 @@ def _declare(log: Log, codec: Codec, signals: bool) -> None:
 
 def dbc_texts(vehicle: Vehicle) -> dict[str, bytes]:
     """The DBC files that a log of this vehicle can be decoded by, by name."""
-    files: list[Path] = [*vehicle.mapping.dbc_files, vehicle.range_dbc]
-    return {file.name: file.read_bytes() for file in files}
+    own = vehicle.range_dbc.read_bytes() if vehicle.range_identifier is None else vehicle.publisher().dbc()
+    return {file.name: file.read_bytes() for file in vehicle.mapping.dbc_files} | {vehicle.range_dbc.name: own}

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.mapping import BusMapping, read_mapping
-from gz_onboard.bus.publisher import RANGE_DBC
+from gz_onboard.bus.publisher import GROUP_STEP, MESSAGES, MOST_EXTENDED, MOST_STANDARD, RANGE_DBC, Publisher
 from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.battery_file import read_battery
@@ -21,7 +21,10 @@ from gz_onboard.physics.riding import PriorRiding, check_riding, read_riding
 from gz_onboard.toml import Table, is_file
 
 OWN = Path(__file__).resolve().parent / "vehicles"
-KEYS = "schema name dbc range_dbc bus roles model parameters correlation battery forecast controller healthy"
+KEYS = (
+    "schema name dbc range_dbc range_identifier bus roles model parameters correlation battery forecast controller "
+    "healthy"
+)
 
 
 @dataclass(frozen=True)
@@ -37,6 +40,7 @@ class Vehicle:
     riding: PriorRiding
     range_dbc: Path  # of the range frames
     derating: Derating = field(default_factory=Derating)
+    range_identifier: int | None = None  # of the first range frame, in place of that in `range_dbc`
     healthy: object = None  # what the discovery learned of it on healthy rides
 
     @property
@@ -51,6 +55,15 @@ class Vehicle:
         if self.battery is None:
             raise self.error("has no [battery]: without one there is no range and nothing to simulate")
         return self.battery
+
+    def publisher(self) -> Publisher:
+        """What sends the vehicle's range frames; InputError if their DBC file does not do."""
+        identifier = self.range_identifier
+        groups = self.mapping.j1939 and identifier is not None and identifier > MOST_STANDARD
+        try:
+            return Publisher(self.range_dbc, identifier, GROUP_STEP if groups else 1)
+        except InputError as error:
+            raise self.error(f"range_dbc: {error}") from error
 
     def changed(self, parameters: Parameters, effects: Iterable[Effect] | None = None) -> Vehicle:
         """The same vehicle with other parameters, and other effects if they are given."""
@@ -118,6 +131,7 @@ def read_vehicle(
         riding=riding,
         derating=read_derating(table),
         range_dbc=_range_dbc(table),
+        range_identifier=_range_identifier(table),
         healthy=_healthy(table.table("healthy")),
     )
 
@@ -129,6 +143,19 @@ def _range_dbc(table: Table) -> Path:
         return find_dbc(name, table.file.parent)
     except InputError as error:
         raise table.error(str(error), "range_dbc") from error
+
+
+def _range_identifier(table: Table) -> int | None:
+    """The identifier of the first range frame, if the file gives one."""
+    if "range_identifier" not in table.values:
+        return None
+    first = table.integer("range_identifier", 0, MOST_EXTENDED - MESSAGES * GROUP_STEP)
+    if first <= MOST_STANDARD < first + MESSAGES - 1:
+        raise table.error(
+            f"the {MESSAGES} frames from {first:#x} on end beyond {MOST_STANDARD:#x}, the last of 11 bits",
+            "range_identifier",
+        )
+    return first
 
 
 def _name(table: Table) -> str:

@@ -7,7 +7,9 @@ stay at their greatest.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -16,13 +18,18 @@ from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.layout import first_bit, identifier_of, raw_range
 from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.events import ROLES, TRANSMITTED, Estimate, Frame, Reason, State
+from gz_onboard.events import EFF_FLAG, ROLES, TRANSMITTED, Estimate, Frame, Reason, State
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
     from cantools.database.can.signal import Signal
 
 RANGE_DBC = "range.dbc"
+MESSAGES = 5  # in it
+LENGTH = 8  # bytes of each
+MOST_STANDARD, MOST_EXTENDED = 0x7FF, 0x1FFF_FFFF  # identifiers of 11 and of 29 bits
+GROUP_STEP = 0x100  # from one parameter group of J1939 to the next
+_NUMBERED = re.compile(rb"\b(BO_|SG_|VAL_|BO_TX_BU_|SIG_GROUP_|SIG_VALTYPE_) (\d+)\b")  # statements on a message
 
 
 @dataclass(frozen=True)
@@ -38,21 +45,35 @@ class Counts:
 class Publisher:
     """Encodes estimates by a DBC file, `dbc/range.dbc` if none is given; its state is the counters of its messages.
 
+    identifier: of the first message, without flags, in place of the file's own; the others follow by `step`.
     InputError if the file does not hold what is to be sent.
     """
 
-    def __init__(self, file: Path | None = None) -> None:
+    def __init__(self, file: Path | None = None, identifier: int | None = None, step: int = 1) -> None:
         self.file = file or find_dbc(RANGE_DBC)
         self.messages = range_messages(self.file)
         self._counters = dict.fromkeys(self.messages, 0)
-        self._layouts = {name: _layout(message) for name, message in self.messages.items()}
+        self._layouts: dict[str, _Layout] = {}
+        for i, (name, message) in enumerate(self.messages.items()):
+            own = identifier_of(message) if identifier is None else with_flag(identifier + i * step)
+            self._layouts[name] = _layout(message, own)
         self._fields = {field.name: field for layout in self._layouts.values() for field in layout.fields}
         self._sensor_signals = [(role, sensor_signal(role)) for role in ROLES if sensor_signal(role) in self._fields]
 
-    @property
-    def identifiers(self) -> set[int]:
+    @cached_property
+    def identifiers(self) -> frozenset[int]:
         """Of the frames that are sent; EFF_FLAG is set in those of 29 bits."""
-        return {layout.identifier for layout in self._layouts.values()}
+        return frozenset(layout.identifier for layout in self._layouts.values())
+
+    def may_have_sent(self, frame: Frame) -> bool:
+        """Whether `frame` is like ours, in identifier and checksum: an earlier run's, if it stands in a log."""
+        _, identifier, data, _ = frame
+        return identifier in self.identifiers and len(data) == LENGTH and crc8_sae_j1850(data[:-1]) == data[-1]
+
+    def dbc(self) -> bytes:
+        """The DBC file of what is sent: `file` with the identifiers that are used."""
+        new = {b"%d" % identifier_of(m): b"%d" % self._layouts[name].identifier for name, m in self.messages.items()}
+        return _NUMBERED.sub(lambda found: found[1] + b" " + new.get(found[2], found[2]), self.file.read_bytes())
 
     def greatest(self, signal: str) -> float:
         """The most that `signal` can say, in the unit of the DBC."""
@@ -132,6 +153,11 @@ class Publisher:
             word |= field.bits(values.get(field.name))  # None: not one of ours
         data = word.to_bytes(7, layout.order)
         return time_ns, layout.identifier, data + bytes((crc8_sae_j1850(data),)), TRANSMITTED
+
+
+def with_flag(identifier: int) -> int:
+    """`identifier` with EFF_FLAG if it has more than 11 bits."""
+    return identifier | EFF_FLAG if identifier > MOST_STANDARD else identifier
 
 
 SOC, SIGMA = "RANGE_StateOfCharge", "RANGE_StateOfChargeSigma"
@@ -266,8 +292,8 @@ def _field(signal: Signal, shift: int) -> _Field:
     return _Field(signal.name, shift, mask, low, high, float(conversion.offset), float(conversion.scale), absent)
 
 
-def _layout(message: Message) -> _Layout:
-    """The places of all signals but the CRC, which is the last of the eight bytes.
+def _layout(message: Message, identifier: int) -> _Layout:
+    """The places of all signals but the CRC, which is the last of the eight bytes, sent as `identifier`.
 
     cantools would take five times as long to encode them.
     """
@@ -283,4 +309,4 @@ def _layout(message: Message) -> _Layout:
             continue
         fields.append(_field(signal, first_bit(signal) if little else 56 - first_bit(signal) - signal.length))
         unused &= ~(fields[-1].mask << fields[-1].shift)
-    return _Layout(identifier_of(message), "little" if little else "big", unused, fields, counter, counts)
+    return _Layout(identifier, "little" if little else "big", unused, fields, counter, counts)

@@ -20,11 +20,11 @@ from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.codec import known_identifiers
 from gz_onboard.bus.recorder import Limits, Recorder
 from gz_onboard.constants import HOUR
-from gz_onboard.daemon.loop import TICK, Daemon, state_text
-from gz_onboard.errors import FAILED, OK, InputError
+from gz_onboard.daemon.loop import TICK, Daemon, foreign_text, state_text
+from gz_onboard.errors import FAILED, OK, InputError, not_an_input, writing
 from gz_onboard.options import CHANNEL, add_shared, number
 from gz_onboard.physics.trust import ROOT
-from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts
+from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, lacking, range_publisher
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 LOCK_S = 3.0  # to wait for one that is ending
@@ -63,6 +63,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for the saved state (default: none)",
     )
+    write_dbc = "write the DBC file of the vehicle's range frames, for whoever reads them, and end"
+    add("--write-dbc", type=Path, metavar="FILE", help=write_dbc)
     add("--all-frames", action="store_true", help="take in, count and log identifiers that the DBC files do not know")
     tick = number("--tick", SHORTEST_TICK, TICK_NS * 1e-9, counted="s")
     add("--tick", type=tick, default=TICK, metavar="S", help="read the bus this often (default: %(default)g)")
@@ -87,6 +89,12 @@ def run(arguments: argparse.Namespace) -> int:
     vehicle = read_vehicle(arguments.vehicle, arguments.payload, arguments.effects, users={ROOT})
     if not vehicle.mapping.dbc_files:
         raise vehicle.error("dbc is missing: the daemon reads frames")
+    if arguments.write_dbc:
+        not_an_input([arguments.write_dbc], [vehicle.file, *vehicle.mapping.dbc_files, vehicle.range_dbc])
+        content = range_publisher(vehicle).dbc()
+        with writing(arguments.write_dbc):
+            arguments.write_dbc.write_bytes(content)
+        return OK
     with ExitStack() as locks:
         _lock(locks, arguments.interface, names, arguments.state_dir)
         return _run(arguments, vehicle, names)
@@ -98,7 +106,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
         recorder = Recorder(
             arguments.log_dir,
             vehicle.name,
-            metadata={"vehicle_key": vehicle.key},
+            metadata={"vehicle_key": vehicle.key, "lacking": " ".join(lacking(vehicle))},
             attachments=dbc_texts(vehicle),
             limits=Limits(
                 max_file_bytes=round(arguments.log_file_mb * 1e6),
@@ -110,9 +118,13 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
     if arguments.state_dir:
         state_file = arguments.state_dir / (re.sub(r"[^\w.+-]+", "-", vehicle.name) + ".json")
     wanted = None if arguments.all_frames else known_identifiers(vehicle.mapping)
+    if wanted is not None:  # who else sends on our own identifiers is to be told
+        wanted += sorted(vehicle.publisher().identifiers)
     channels = [CanChannel(arguments.interface, name, index, wanted) for index, name in enumerate(names)]
     for channel in channels:
         channel.open()
+    if never := lacking(vehicle):
+        log.info("%s has no sensors for, and its intervals are wider by: %s", vehicle.name, ", ".join(never))
     daemon = Daemon(vehicle, channels, recorder, state_file, arguments.filter, arguments.tick)
     signal.signal(signal.SIGTERM, daemon.stop)
     signal.signal(signal.SIGINT, daemon.stop)
@@ -180,6 +192,8 @@ def summary(pipeline: Pipeline) -> list[str]:
         f"received {pipeline.codec.received} frames; dropped {counts.dropped}, lost {counts.lost}, "
         f"implausible {counts.implausible}, unknown identifiers {counts.unknown}"
     ]
+    if pipeline.foreign:
+        lines.append(foreign_text(pipeline))
     if last is None:
         return lines
     ago = ""

@@ -62,6 +62,7 @@ class Daemon:
         self._boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         self._said_at = 0.0
         self._said = ""
+        self._foreign = False  # it was said that someone else sends on our identifiers
         self._log_error = ""
 
     def stop(self, *_: object) -> None:
@@ -188,6 +189,9 @@ class Daemon:
         self._log_error = error
         if self._keeper:
             self._keeper.report()
+        if self.pipeline.foreign and not self._foreign:
+            self._foreign = True
+            log.warning("%s", foreign_text(self.pipeline))
         last = self.pipeline.last
         if last is None:
             return
@@ -200,6 +204,12 @@ class Daemon:
         if remaining is not None and last.soc is not None:
             text = f"{remaining:.1f} km, {100 * last.soc:.0f} %, {text}"
         notify.status(text)
+
+
+def foreign_text(pipeline: Pipeline) -> str:
+    """That someone else sends on the identifiers of our own frames, which does neither any good."""
+    counted = ", ".join(f"{identifier} {count} times" for identifier, count in pipeline.foreign.items())
+    return f"someone else sends on the identifiers of the range frames ({counted}): give others, by range_identifier"
 
 
 def fair_share(frames: list[Frame], most: int) -> list[Frame]:

@@ -232,7 +232,7 @@ class Estimator:
             self._temperatures.cells_sd(now),
             conditions.ambient,
             conditions.altitude,
-            loss_variance(self._reasons(now)),
+            loss_variance(self._reasons(now) | self._missing.lacking),
         )
 
     @property
@@ -265,7 +265,8 @@ class Estimator:
         if self._forecast:
             self._report(estimate, self._forecast)
         estimate.state = State.DEGRADED if estimate.reasons & DEGRADING else State.VALID
-        if (silent and estimate.reasons & NO_PACK == NO_PACK) or estimate.reasons & Reason.SIGNALS_SLOW:
+        missing = estimate.reasons | self._missing.lacking
+        if (silent and missing & NO_PACK == NO_PACK) or estimate.reasons & Reason.SIGNALS_SLOW:
             estimate.state = State.INVALID
         return estimate
 

@@ -1,10 +1,12 @@
-"""Which signals are missing, and what that costs: the reasons of an estimate."""
+"""Which signals are missing, or never were there, and what that costs: the reasons of an estimate."""
 
 from __future__ import annotations
 
+from collections.abc import Container
+
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.signals import FIX_3D, Signals
-from gz_onboard.events import Reason
+from gz_onboard.events import ROLES, Reason
 
 # What is missing makes the consumption to come less certain; relative sd, from the errors on the rides without each.
 LOSS_SD = {
@@ -30,25 +32,43 @@ NEEDED = {
 """The roles of which none may be missing."""
 
 
+POSITION = ("gps_speed", "latitude")
+"""One of which shows that the GPS has a position."""
+
+
+def lacking(roles: Container[str]) -> Reason:
+    """What a vehicle with sensors for `roles` never had: no degradation, but the price is the same."""
+    reasons = Reason(0)
+    for reason, needed in NEEDED.items():
+        if not all(role in roles for role in needed):
+            reasons |= reason
+    for reason, one_of in ((Reason.NO_SPEED, SpeedCheck.ROLES), (Reason.NO_GPS, POSITION)):
+        if not any(role in roles for role in one_of):
+            reasons |= reason
+    return reasons
+
+
 class MissingSignals:
-    """Which of the signals are stale or not trusted."""
+    """Which of the vehicle's signals are stale or not trusted; `lacking`: what it never had."""
 
     def __init__(self, signals: Signals) -> None:
+        mapped = [role for role in ROLES if signals[role].stale_after]
+        self.lacking = lacking(mapped)
         self._signals = signals
-        self._needed = [(reason, signals[role]) for reason, roles in NEEDED.items() for role in roles]
+        self._needed = [(reason, signals[role]) for reason, roles in NEEDED.items() for role in roles if role in mapped]
         self._speeds = [signals[role] for role in SpeedCheck.ROLES]
 
     def reasons(self, now: float) -> Reason:
-        """The reasons for those that are missing at `now` [s]."""
-        signals, reasons = self._signals, Reason(0)
+        """The reasons for those that the vehicle has and that are missing at `now` [s]."""
+        signals, reasons, never = self._signals, Reason(0), self.lacking
         for reason, signal in self._needed:
             if not signal.fresh(now):
                 reasons |= reason
-        if not any(signal.fresh(now) for signal in self._speeds):
+        if not never & Reason.NO_SPEED and not any(signal.fresh(now) for signal in self._speeds):
             reasons |= Reason.NO_SPEED
         position = signals.gps_speed.fresh(now) or signals.latitude.fresh(now)
         altitude = signals.gps_altitude.fresh(now) or not signals.gps_altitude.stale_after
-        if signals.fix_below(now, FIX_3D) or not position or not altitude:
+        if not never & Reason.NO_GPS and (signals.fix_below(now, FIX_3D) or not position or not altitude):
             reasons |= Reason.NO_GPS
         return reasons
 

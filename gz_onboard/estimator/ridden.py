@@ -14,7 +14,7 @@ from gz_onboard.physics.effect import MOVING
 MEMORY = 12000.0  # m: what is further back counts for less than 1/e
 MOST_SEGMENTS = 200  # 50 km: of what is further back nothing counts
 RECENT = 1000.0  # m: what a rider calls his consumption
-FACTOR = 0.3, 3.0  # measured over modelled energy: beyond, parameters are wrong
+FACTOR = 0.1, 10.0  # measured over modelled energy: a heated van in a jam has 5; beyond, parameters are wrong
 # What a saved segment can have at most: m, s, J, W²·s and J; time moving in s.
 MOST_DISTANCE, MOST_DURATION, MOST_ENERGY, MOST_TIME_MOVING = 1e5, 1e6, 1e12, 1e7
 

@@ -126,11 +126,16 @@ def summary_text(ride: RideSummary) -> str:
             f"{ride.unknown} unknown identifiers, {ride.error_frames} error frames",
         ),
         *(
+            ("someone else's", f"{count} frames on {identifier}, a range frame's: give another range_identifier")
+            for identifier, count in ride.foreign.items()
+        ),
+        *(
             ("sensor faults", f"{reason}: " + ", ".join(f"{name} {count}" for name, count in places.items()))
             for reason, places in ride.faults.items()
         ),
         ("state", ", ".join(f"{name.lower()} {duration:.1f} s" for name, duration in ride.states.items())),
         *(("", f"{words(name)} {duration:.1f} s") for name, duration in ride.reasons.items()),
+        *([("never there", ", ".join(words(name) for name in ride.lacking))] if ride.lacking else []),
         (
             "computed",
             f"{ride.cpu_s:.2f} s of processor time, {number(ride.real_time_factor, '.0f')} times as fast as the ride",

@@ -21,7 +21,7 @@ from gz_onboard.lab.plot import plot_log
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.results import times
 from gz_onboard.offline.samples import open_ride
-from gz_onboard.pipeline import STATUS_TOPIC, TICK_NS, Pipeline, dbc_texts, range_publisher, reason_names
+from gz_onboard.pipeline import STATUS_TOPIC, TICK_NS, Pipeline, dbc_texts, lacking, range_publisher, reason_names
 from gz_onboard.progress import Progress
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -89,11 +89,13 @@ class RideSummary:
     innovation_max_v: Annotated[float | None, "greatest magnitude of the same"]
     states: Annotated[dict[str, float], "seconds in each state"]
     reasons: Annotated[dict[str, float], "seconds with each reason to distrust the estimate"]
+    lacking: Annotated[list[str], "reasons that hold for ever, as the vehicle has no such sensors: no degradation"]
     frames: Annotated[int, "received"]
     dropped: Annotated[int, "frames that failed a check"]
     implausible: Annotated[int, "signals out of their physical range"]
     lost: Annotated[int, "frames missing by their counters"]
     unknown: Annotated[int, "different identifiers that the database does not know"]
+    foreign: Annotated[dict[str, int], "frames of someone else on the identifiers of the range frames, by identifier"]
     error_frames: Annotated[int, "error frames of the bus"]
     faults: Annotated[dict[str, dict[str, int]], "what was dropped, by reason and by message or signal"]
     damage: Annotated[str | None, "what of the log could not be read, or null"]
@@ -207,8 +209,8 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSu
     if task.frames and mapping is not vehicle.mapping:
         raise InputError(f"{task.path}: is a table of signals: --frames has nothing to log")
     vehicle = replace(vehicle, mapping=mapping)
-    own = range_publisher(vehicle).identifiers
-    ours = ([frame for frame in batch if frame[1] not in own] for batch in batches)  # an earlier run's estimates
+    own = range_publisher(vehicle).may_have_sent
+    ours = ([frame for frame in batch if not own(frame)] for batch in batches)  # without an earlier run's estimates
     batch = next((batch for batch in ours if batch), None)
     if batch is None:
         raise InputError(f"{task.path}: holds no frames of a vehicle" + (f" ({damages[0]})" if damages else ""))
@@ -258,6 +260,7 @@ def _open_log(task: EstimateTask, vehicle: Vehicle, start_ns: int) -> LogFile:
     metadata = {
         "vehicle": vehicle.name,
         "vehicle_key": vehicle.key,
+        "lacking": " ".join(lacking(vehicle)),
         "source": task.path.name,
         "filter": task.filter_name,
         **({} if task.payload is None else {"payload_kg": f"{task.payload:g}"}),
@@ -319,11 +322,13 @@ def _summary(
         innovation_max_v=tally.innovation_max if tally.innovation_rms is not None else None,
         states={state.name: round(states[state.name] * TICK_S, 1) for state in State if states[state.name]},
         reasons={name: round(ticks * TICK_S, 1) for name, ticks in sorted(reasons.items())},
+        lacking=lacking(pipeline.vehicle),
         frames=pipeline.codec.received,
         dropped=counts.dropped,
         implausible=counts.implausible,
         lost=counts.lost,
         unknown=counts.unknown,
+        foreign=cast("dict[str, int]", status["foreign"]),
         error_frames=pipeline.codec.error_frames,
         faults=cast("dict[str, dict[str, int]]", status["faults"]),
         damage=str(damages[0]) if damages else None,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from gz_onboard.physics.battery import BENCH_TEMPERATURE, Battery
 from gz_onboard.physics.parameters import Parameters
+from gz_onboard.physics.similarity import MOST_CELLS
 from gz_onboard.physics.tables import Mesh, Row, linear
 
 if TYPE_CHECKING:
@@ -47,8 +48,8 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
             raise capacity.error(f"must be within 0.05 to 2 times what it is at {BENCH_TEMPERATURE:g} degC", "value")
     shift_temperatures, shifts, shift_sd = _rest_shift(table)
     battery = Battery(
-        cells_series=table.integer("cells_series", 1, 1000),
-        cells_parallel=table.integer("cells_parallel", 1, 1000),
+        cells_series=table.integer("cells_series", 1, MOST_CELLS),
+        cells_parallel=table.integer("cells_parallel", 1, MOST_CELLS),
         capacity=parameters["cell_capacity"],
         capacity_temperature=temperatures,
         capacity_share=capacities,

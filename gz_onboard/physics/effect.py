@@ -92,8 +92,10 @@ MOVING = 0.5  # m/s: what counts for time_moving
 class Parameter:
     """A parameter of an effect: what it is and what it can be.
 
-    ride_sd: by how much what rides show of it scatters from ride to ride [unit], at the prior. healthy_sd: within what
-    a healthy vehicle may show of it where its model lacks the effect. bench: found on one at steady points.
+    low, high: of any road vehicle, from a kick scooter to a van of 3.5 t. The prior is that of a scooter; how it grows
+    with another vehicle is in `physics.similarity`, and what nothing there tells is `required` of a file with a
+    battery. ride_sd: by how much what rides show of it scatters from ride to ride [unit], at the prior. healthy_sd:
+    within what a healthy vehicle may show of it where its model lacks the effect. bench: found on one at steady points.
     """
 
     name: str
@@ -106,6 +108,7 @@ class Parameter:
     ride_sd: float | None = None
     healthy_sd: float | None = None
     bench: bool = False
+    required: bool = False
 
     def __post_init__(self) -> None:
         if not self.low <= self.prior <= self.high:
@@ -113,17 +116,17 @@ class Parameter:
 
 
 VEHICLE_PARAMETERS = (
-    Parameter("vehicle_mass", "kg", 105, 5, 20, 500, "GenZe 2.0 data sheet"),
-    Parameter("payload_mass", "kg", 80, 12, 0, 300, "rider and what he carries"),
-    Parameter("wheel_radius", "m", 0.245, 0.005, 0.1, 0.5, "effective rolling radius of the driven wheel"),
-    Parameter("wheelbase", "m", 1.32, 0.02, 0.5, 3, "GenZe 2.0 data sheet"),
-    Parameter("cg_to_rear", "m", 0.57, 0.08, 0.1, 2, "rear axle to centre of gravity"),
+    Parameter("vehicle_mass", "kg", 105, 5, 5, 5000, "GenZe 2.0 data sheet", required=True),
+    Parameter("payload_mass", "kg", 80, 12, 0, 3000, "rider and what he carries"),
+    Parameter("wheel_radius", "m", 0.245, 0.005, 0.04, 0.6, "effective, of the driven wheel", required=True),
+    Parameter("wheelbase", "m", 1.32, 0.02, 0.3, 6, "GenZe 2.0 data sheet"),
+    Parameter("cg_to_rear", "m", 0.57, 0.08, 0.05, 4, "rear axle to centre of gravity"),
     Parameter("cg_height", "m", 0.63, 0.08, 0.1, 2, "centre of gravity over the road"),
-    Parameter("wheel_inertia_front", "kg·m²", 0.11, 0.03, 0, 5, "wheel and tyre"),
-    Parameter("wheel_inertia_rear", "kg·m²", 0.34, 0.08, 0, 5, "wheel, tyre and hub motor"),
+    Parameter("wheel_inertia_front", "kg·m²", 0.11, 0.03, 0, 50, "wheel and tyre"),
+    Parameter("wheel_inertia_rear", "kg·m²", 0.34, 0.08, 0, 50, "wheel, tyre and hub motor"),
     Parameter("gear_ratio", "1", 1.0, 0.01, 0.02, 5, "wheel speed over motor speed: 0.2 for a reduction of 5"),
     Parameter("torque_constant", "N·m/A", 0.47, 0.02, 0.01, 10, "Lord 2016, table 2.5"),
-    Parameter("yaw_inertia", "kg·m²", 28, 6, 1, 300, "m·(0.39 m)²: Cossalter 2006, ch. 7, scooter with rider"),
+    Parameter("yaw_inertia", "kg·m²", 28, 6, 0.1, 20000, "Cossalter 2006, ch. 7: m·(0.39 m)² with rider"),
     Parameter("caster_angle", "rad", 0.46, 0.04, 0.1, 0.8, "26 degrees: Cossalter 2006, sec. 1.3, scooters 24 to 28"),
     Parameter("tyre_crown_radius", "m", 0.05, 0.008, 0.001, 0.15, "half the width of a 100 mm scooter tyre"),
     Parameter("cornering_stiffness_front", "1/rad", 16, 4, 2, 60, "per load: Pacejka 2012, ch. 11: 14 to 19"),
@@ -134,7 +137,7 @@ VEHICLE_PARAMETERS = (
     Parameter("twisting_arm", "m/rad", 0.02, 0.015, 0, 0.2, "brush model, 20 per load, half width 25 mm: C_κ·w²/(3·r)"),
     Parameter("tyre_relaxation_length", "m", 0.15, 0.05, 0.02, 1, "sideways: Cossalter 2006, sec. 2.6, 0.1 to 0.3 m"),
     Parameter("speed_sensor_scale", "1", 1.0, 0.005, 0.5, 2, "what the motor's speed sensor shows over what is"),
-    Parameter("regeneration_torque_limit", "N·m", 19, 3, 0, 500, "the most that the motor brakes with, at its shaft"),
+    Parameter("regeneration_torque_limit", "N·m", 19, 3, 0, 5000, "most braking torque at the motor's shaft"),
 )
 
 

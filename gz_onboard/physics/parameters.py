@@ -1,9 +1,10 @@
 """Parameters of a vehicle: read from its file with value, unit, standard deviation, status and source.
 
     [parameters]
-    drag_area = { value = 0.52, unit = "m^2", sd = 0.03, status = "measured", source = "coast-downs, 8 runs" }
+    drag_area = { value = 0.52, unit = "m²", sd = 0.03, status = "measured", source = "coast-downs, 8 runs" }
 
-``status`` is measured, data sheet or guess. What the file leaves out takes the prior of its effect, as a guess.
+``status`` is measured, data sheet or guess. What the file leaves out takes its prior, as a guess: that of a scooter,
+grown to this vehicle (`similarity`). What nothing tells is required of a file with a battery.
 Parameters that were found together are tied:
 
     [correlation.coastdown]
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING
 
 from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.physics.effect import VEHICLE_PARAMETERS, Effect, Parameter, known_effects, load_effect
+from gz_onboard.physics.similarity import MOST_CELLS, USUAL_CELLS, relative_size
 
 if TYPE_CHECKING:
     from gz_onboard.toml import Table
@@ -26,18 +28,18 @@ if TYPE_CHECKING:
 STATUS = ("measured", "data sheet", "guess")
 
 BATTERY_PARAMETERS = (
-    Parameter("cell_capacity", "A·h", 2.8, 0.05, 0.1, 500, "18650 cell, Lord 2016, sec. 2.2"),
+    Parameter("cell_capacity", "A·h", 2.8, 0.05, 0.1, 1000, "18650 cell, Lord 2016, sec. 2.2", required=True),
     Parameter(
         "cell_resistance_factor", "1", 1.0, 0.1, 0.2, 10, "R0 and R1 over their tables': a bench cell's to the pack's"
     ),
-    Parameter("cell_cutoff_voltage", "V", 2.8, 0.05, 2.0, 3.5, "where the vehicle gives up"),
-    Parameter("pack_series_resistance", "ohm", 0.01, 0.005, 0.0, 0.5, "bus bars, fuse and BMS beside the cells"),
-    Parameter("cable_resistance", "ohm", 0.005, 0.005, 0.0, 0.2, "pack to inverter, beyond where the BMS measures"),
-    Parameter("pack_current_offset", "A", 0.0, 0.3, -5, 5, "what the current sensor shows at no current"),
+    Parameter("cell_cutoff_voltage", "V", 2.8, 0.05, 1.0, 4.0, "where the vehicle gives up", required=True),
+    Parameter("pack_series_resistance", "ohm", 0.01, 0.005, 0, 2, "bus bars, fuse and BMS beside the cells"),
+    Parameter("cable_resistance", "ohm", 0.005, 0.005, 0, 2, "pack to inverter, beyond where the BMS measures"),
+    Parameter("pack_current_offset", "A", 0.0, 0.3, -50, 50, "what the current sensor shows at no current"),
     Parameter("pack_current_gain", "1", 1.0, 0.01, 0.5, 2, "what the current sensor shows over what flows"),
-    Parameter("pack_current_noise", "A", 0.1, 0.05, 0, 10, "sd of a sample"),
-    Parameter("pack_voltage_noise", "V", 0.02, 0.01, 0, 1, "sd of a sample"),
-    Parameter("pack_voltage_offset", "V", 0.0, 0.1, -3, 3, "what the voltage sensor shows too much"),
+    Parameter("pack_current_noise", "A", 0.1, 0.05, 0, 100, "sd of a sample"),
+    Parameter("pack_voltage_noise", "V", 0.02, 0.01, 0, 20, "sd of a sample"),
+    Parameter("pack_voltage_offset", "V", 0.0, 0.1, -50, 50, "what the voltage sensor shows too much"),
     Parameter(
         "pack_voltage_latency", "s", 0.0, 0.05, -2, 2, "how far the pack's voltage lags its current; leads if negative"
     ),
@@ -45,18 +47,18 @@ BATTERY_PARAMETERS = (
     Parameter("cell_voltage_error_empty", "V", 0.0, 0.06, 0, 0, "sd: the same at 5 % SOC and below"),
     Parameter("rest_voltage_error", "V", 0.0, 0.008, 0, 0, "sd: rest voltage against OCV: relaxation, hysteresis"),
     Parameter("pack_heat_capacity", "J/K", 9000, 3000, 100, 1e6, "168 cells of 47 g at 0.95 J/(g·K), and the case"),
-    Parameter("pack_conductance", "W/K", 3.0, 1.5, 0.01, 200, "still air to a closed pack"),
+    Parameter("pack_conductance", "W/K", 3.0, 1.5, 0.01, 10000, "still air to a closed pack"),
 )
 
 # Only the simulation reads these.
 SIMULATION_PARAMETERS = (
     Parameter("voltage_constant", "V·s/rad", 0.544, 0.01, 0.001, 20, "Lord 2016, fig. 2.12: 0.057 V per r/min"),
-    Parameter("motor_current_limit", "A", 211, 3, 1, 2000, "the greatest current of the recorded rides"),
+    Parameter("motor_current_limit", "A", 211, 3, 1, 5000, "the greatest current of the recorded rides"),
     Parameter("cell_mass", "kg", 0.047, 0.002, 0.001, 20, "18650 cell: what one more adds to the vehicle"),
     Parameter("gear_efficiency", "1", 1.0, 0.01, 0.5, 1.0, "a hub motor has no gear"),
-    Parameter("brake_torque_limit", "N·m", 280, 60, 1, 5000, "both wheels: 0.6 g with rider"),
+    Parameter("brake_torque_limit", "N·m", 280, 60, 1, 50000, "both wheels: 0.6 g with rider"),
     Parameter("front_brake_share", "1", 0.65, 0.1, 0, 1, "of the braking torque; the rear wheel is unloaded"),
-    Parameter("brake_viscous_constant", "N·s/rad", 60, 20, 0, 5000, "C_b of Lord 2016, eq. 2.13"),
+    Parameter("brake_viscous_constant", "N·s/rad", 60, 20, 0, 50000, "C_b of Lord 2016, eq. 2.13"),
     Parameter("brake_disc_radius", "m", 0.09, 0.02, 0.01, 0.5, "a disc of 200 mm"),
     Parameter("tyre_b", "1", 10.0, 3.0, 1, 40, "Pacejka 2012, ch. 4: with c and d a slip stiffness of 16 per load"),
     Parameter("tyre_c", "1", 1.65, 0.1, 1, 2.5, "Pacejka 2012, ch. 4: longitudinal"),
@@ -67,16 +69,16 @@ SIMULATION_PARAMETERS = (
     ),
     Parameter("bms_heat_capacity", "J/K", 250, 100, 1, 1e5, "board and heat sink of 0.3 kg"),
     Parameter("bms_conductance", "W/K", 0.6, 0.3, 0.001, 100, "to the battery it sits on"),
-    Parameter("inverter_board_capacity", "J/K", 600, 200, 1, 1e5, "board and sink of 0.7 kg"),
-    Parameter("inverter_box_capacity", "J/K", 2200, 700, 1, 1e5, "aluminium box of 2.4 kg"),
-    Parameter("inverter_board_to_air", "W/K", 1.5, 0.8, 0.001, 100, "still air in the box"),
-    Parameter("inverter_box_to_air", "W/K", 3.0, 1.5, 0.001, 100, "still air in the box"),
-    Parameter("inverter_board_to_box", "W/K", 4.0, 2.0, 0.001, 100, "through its mounting"),
-    Parameter("inverter_box_to_ambient", "W/K", 4.0, 2.0, 0.001, 500, "box in moving air"),
+    Parameter("inverter_board_capacity", "J/K", 600, 200, 1, 1e6, "board and sink of 0.7 kg"),
+    Parameter("inverter_box_capacity", "J/K", 2200, 700, 1, 1e6, "aluminium box of 2.4 kg"),
+    Parameter("inverter_board_to_air", "W/K", 1.5, 0.8, 0.001, 5000, "still air in the box"),
+    Parameter("inverter_box_to_air", "W/K", 3.0, 1.5, 0.001, 5000, "still air in the box"),
+    Parameter("inverter_board_to_box", "W/K", 4.0, 2.0, 0.001, 5000, "through its mounting"),
+    Parameter("inverter_box_to_ambient", "W/K", 4.0, 2.0, 0.001, 5000, "box in moving air"),
     Parameter("motor_stator_capacity", "J/K", 3000, 1000, 1, 1e6, "copper and iron of 7 kg"),
     Parameter("motor_rotor_capacity", "J/K", 4000, 1500, 1, 1e6, "rim and magnets of 8 kg"),
-    Parameter("motor_gap_conductance", "W/K", 5.0, 2.0, 0.001, 500, "air gap and bearings of a hub motor"),
-    Parameter("motor_rotor_to_ambient", "W/K", 6.0, 3.0, 0.001, 500, "rim in moving air"),
+    Parameter("motor_gap_conductance", "W/K", 5.0, 2.0, 0.001, 5000, "air gap and bearings of a hub motor"),
+    Parameter("motor_rotor_to_ambient", "W/K", 6.0, 3.0, 0.001, 5000, "rim in moving air"),
     Parameter("cooling_factor", "1", 1.0, 0.1, 0.02, 5, "on what motor, inverter and pack give to the ambient air"),
     Parameter("motor_stator_share", "1", 0.9, 0.1, 0, 1, "copper and iron loss are in the stator"),
 )
@@ -148,8 +150,14 @@ class Parameters(Mapping[str, float]):
     def joined(self, effects: Iterable[Effect]) -> Parameters:
         """The same and the parameters of `effects` that are not yet known, at their priors."""
         new = {p.name: p for effect in effects for p in effect.parameters if p.name not in self.known}
-        values = {name: Value(p.prior, p.prior_sd, p.unit, "guess", f"prior: {p.source}") for name, p in new.items()}
+        values = {name: _prior(p) for name, p in new.items()}
         return Parameters({**self.known, **values}, self.correlations, {**self.declared, **new})
+
+
+def _prior(parameter: Parameter, size: float = 1.0) -> Value:
+    """What `parameter` is guessed to be on a vehicle of this relative `size`."""
+    value = min(max(size * parameter.prior, parameter.low), parameter.high)
+    return Value(value, size * parameter.prior_sd, parameter.unit, "guess", f"prior: {parameter.source}")
 
 
 def declared_parameters(effects: Iterable[Effect] = ()) -> dict[str, Parameter]:
@@ -169,21 +177,55 @@ def read_parameters(vehicle: Table, effects: Iterable[Effect] = ()) -> Parameter
     declared = declared_parameters(effects)
     table = vehicle.table("parameters")
     table.only(declared)
-    known = {p.name: Value(p.prior, p.prior_sd, p.unit, "guess", f"prior: {p.source}") for p in declared.values()}
-    for name in table.values:
-        parameter = declared[name]
-        entry = table.table(name)
-        entry.only(["value", "unit", "sd", "status", "source"])
-        unit = entry.text("unit")
-        if unit != parameter.unit:
-            raise entry.error(f"unit {shown(unit)} is wrong: {name} is in {parameter.unit!r}", "unit")
-        value = entry.number("value")
-        if not parameter.low <= value <= parameter.high:
-            raise entry.error(f"{value:g} {unit} is outside {parameter.low:g} to {parameter.high:g} {unit}", "value")
-        known[name] = Value(
-            value, entry.number("sd", low=0, high=1e9), unit, entry.text("status", choices=STATUS), entry.text("source")
-        )
+    given = {name: _given(table, declared[name]) for name in table.values}
+    if "battery" in vehicle.values:
+        _check_required(vehicle, given, effects)
+    pack = vehicle.table("battery")
+    numbers: dict[str, float] = {
+        name: pack.integer(name, 1, MOST_CELLS) if name in pack.values else usual for name, usual in USUAL_CELLS.items()
+    }
+    usual = {name: parameter.prior for name, parameter in declared.items()}
+    # What an effect would be that the model does not have is for the discovery to say, which has sizes of its own.
+    of_models = {p.name for effect in effects for p in effect.parameters}
+    grows = {p.name for p in (*VEHICLE_PARAMETERS, *BATTERY_PARAMETERS, *SIMULATION_PARAMETERS)} | of_models
+    known: dict[str, Value] = {}
+    for name, parameter in declared.items():
+        size = relative_size(name, numbers, usual) if name in grows else 1.0
+        known[name] = given.get(name) or _prior(parameter, size)
+        numbers[name] = known[name].value
     return Parameters(known, _read_correlations(vehicle, known), declared)
+
+
+def _given(parameters: Table, parameter: Parameter) -> Value:
+    """`parameter` as the file's table of `parameters` has it."""
+    name, entry = parameter.name, parameters.table(parameter.name)
+    entry.only(["value", "unit", "sd", "status", "source"])
+    unit = entry.text("unit")
+    if _plain(unit) != _plain(parameter.unit):
+        raise entry.error(f"unit {shown(unit)} is wrong: {name} is in {parameter.unit!r}", "unit")
+    value = entry.number("value")
+    if not parameter.low <= value <= parameter.high:
+        raise entry.error(f"{value:g} {unit} is outside {parameter.low:g} to {parameter.high:g} {unit}", "value")
+    sd = entry.number("sd", low=0, high=1e9)
+    return Value(value, sd, parameter.unit, entry.text("status", choices=STATUS), entry.text("source"))
+
+
+def _plain(unit: str) -> str:
+    """A unit without what not every keyboard has: Ah, A*h and A·h are one, as are m2, m^2 and m²."""
+    return unit.replace("²", "2").replace("Ω", "ohm").translate(str.maketrans("", "", "·*^ "))
+
+
+def _check_required(vehicle: Table, given: Collection[str], effects: Iterable[Effect]) -> None:
+    """InputError for a parameter that the vehicle's range needs and nothing else tells."""
+    of_effects = (p for effect in effects for p in effect.parameters)
+    needed = [p for p in (*VEHICLE_PARAMETERS, *BATTERY_PARAMETERS, *of_effects) if p.required]
+    if "motor_speed" in vehicle.table("roles").values:
+        needed += [p for p in VEHICLE_PARAMETERS if p.name == "gear_ratio"]
+    if missing := [p for p in needed if p.name not in given]:
+        names = ", ".join(f"{p.name} [{p.unit}]" for p in missing)
+        raise vehicle.table("parameters").error(
+            f'must have {names}: no guess fits every vehicle. Give your own, with status = "guess" and an honest sd'
+        )
 
 
 def _read_correlations(vehicle: Table, known: Collection[str]) -> dict[frozenset[str], float]:

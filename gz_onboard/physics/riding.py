@@ -73,7 +73,7 @@ def read_riding(vehicle: Table) -> PriorRiding:
     return PriorRiding(
         points,
         table.number("unevenness", town.unevenness, 1.0, 2.0),
-        table.number("factor", town.factor, 0.3, 3.0),
+        table.number("factor", town.factor, 0.1, 10.0),
         table.number("factor_sd", town.factor_sd, 0.001, 1.0),
         table.number("lateral_acceleration", town.lateral_acceleration, 0.0, 9.0),
         table.number("vibration", town.vibration, 0.0, 20.0),

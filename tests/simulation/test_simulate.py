@@ -189,7 +189,7 @@ def test_sweep_of_two(short, tmp_path, capsys):
                 ("rolling_resistance", "rolling_resistance_constant"),
             )
         ),
-        (["ece15", "--sweep", "drag_area=0.4..9"], ["9 m²", "0.1 to 1.5 m²"]),
+        (["ece15", "--sweep", "drag_area=0.4..9"], ["9 m²", "0.05 to 8 m²"]),
         (["ece15", "--sweep", "drag_area=0.6..0.4"], ["0.6", "below"]),
         (["ece15", "--sweep", "drag_area"], ["NAME=LOW..HIGH"]),
         (["ece15", "--sweep", "drag_area=a..b"], ["'a' is not a number"]),

@@ -7,6 +7,7 @@ names a folder that holds them (real/tlmoto_motostudent_kiro, real/can_logs).
 from __future__ import annotations
 
 import csv
+import gzip
 import math
 import os
 import struct
@@ -103,7 +104,7 @@ def test_tlmoto_goes_the_whole_way():
         sent += pipeline.advance(frames, frames[-1][0])
     estimate = pipeline.last
     assert estimate is not None and estimate.state is State.DEGRADED
-    assert estimate.reasons & Reason.NO_IMU and not estimate.reasons & Reason.NO_PACK_CURRENT
+    assert not estimate.reasons & (Reason.NO_IMU | Reason.NO_GPS | Reason.NO_PACK_CURRENT)  # what it never had is none
     assert estimate.soc is not None and 0.5 < estimate.soc < 0.9
     assert estimate.range is not None and estimate.range_p10 is not None and estimate.range_p90 is not None
     assert 0 < estimate.range_p10 < estimate.range < estimate.range_p90
@@ -351,3 +352,39 @@ def test_real_frames_with_stamps_of_whole_seconds(tmp_path):
     assert [time for time, _, _ in events] == [(f[0] - frames[0][0]) / 1e9 for f in wanted]
     assert not codec.faults
     assert sum(codec.unknown.values()) == len(frames) - len(wanted)
+
+
+# --- a car whose rides are real and whose frames are made here -------------------------------------------------------
+
+
+@pytest.mark.parametrize("trip", ["TripA01", "TripA05", "TripA08"])
+def test_i3_real_trips_end_where_the_car_says(trip):
+    path = real("ev_bmw_i3_trips", f"{trip}_2hz.csv.gz")
+    i3, drawn, truth = vehicle("i3"), 0.0, 0.0
+    database, pipeline = i3.mapping.database, Pipeline(i3)
+    row: dict[str, float] = {}
+    with gzip.open(path, "rt") as file:
+        for text in csv.DictReader(file):
+            row = {name: float(value or "nan") for name, value in text.items()}
+            if not all(map(math.isfinite, row.values())):
+                continue
+            battery = {"Voltage": row["v_batt_V"], "Current": row["i_batt_A"], "Temperature": row["t_batt_C"]}
+            data = {f"Battery{name}": value for name, value in (battery | {"Charge": row["soc_pct"]}).items()}
+            motion = {"Speed": max(row["v_kmh"], 0.0), "AccelX": row["ax_mps2"], "Torque": row["torque_Nm"]}
+            motion["OutsideTemperature"] = row["t_amb_C"]
+            now = round(row["t_s"] * 1e9)
+            frames: list[Frame] = [
+                (now, 256, database.encode_message("Battery", data, padding=True), 0),
+                (now + MS, 257, database.encode_message("Motion", motion, padding=True), 0),
+            ]
+            pipeline.advance(frames, now + MS)
+            truth -= row["v_batt_V"] * row["i_batt_A"] * 0.5
+            last = pipeline.last
+            if last is not None and last.pack_voltage and last.pack_current is not None:
+                drawn += last.pack_voltage * last.pack_current * 0.5
+    assert pipeline.counts().dropped == pipeline.counts().implausible == 0
+    assert drawn == pytest.approx(truth, rel=0.02)
+    end = pipeline.last
+    assert end is not None and end.soc is not None and end.range is not None
+    assert end.state is State.VALID and not end.distrusted
+    assert end.soc == pytest.approx(row["soc_pct"] / 100, abs=0.03)

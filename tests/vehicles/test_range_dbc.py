@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from gz_onboard.bus.dbc import find_dbc, load_database
-from gz_onboard.errors import InputError
+from gz_onboard.bus.mapping import pgn
+from gz_onboard.bus.publisher import Counts, Publisher
+from gz_onboard.cli import main
+from gz_onboard.daemon.command import summary
+from gz_onboard.errors import BAD_INPUT, InputError
 from gz_onboard.events import EFF_FLAG, State
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.pipeline import Pipeline, dbc_texts
@@ -107,3 +112,76 @@ def test_by_parameter_group_an_own_frame_may_not_be_the_vehicles(tmp_path):
     file.write_text(f'range_dbc = "mine.dbc"\n{REFERENCE.replace(bus, roles)}', encoding="utf-8")
     with pytest.raises(InputError, match=r"take the identifiers of our own range frames .*0x18f00477"):
         Pipeline(read_vehicle(str(file)))
+
+
+# --- identifiers of one's own -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("number", "identifiers"),
+    [("0x6A0", range(0x6A0, 0x6A5)), ("0x18FF6000", range(0x18FF6000 | EFF_FLAG, 0x18FF6005 | EFF_FLAG))],
+)
+def test_identifiers_of_ones_own(number, identifiers, tmp_path):
+    """What is sent, what is said to be sent, and the DBC file that is written and logged agree."""
+    vehicle = van(tmp_path, f"{LARGE}\nrange_identifier = {number}")
+    run = Run(vehicle)
+    feed(run.pipeline, [Scooter().steady(5.0, current=80.0)])
+    assert {frame[1] for frame in run.sent} == run.pipeline.publisher.identifiers == set(identifiers)
+    assert main(["run", "--vehicle", str(vehicle.file), "--write-dbc", str(tmp_path / "written.dbc")]) == 0
+    assert (tmp_path / "written.dbc").read_bytes() == dbc_texts(vehicle)["range_large.dbc"]
+    written = Publisher(tmp_path / "written.dbc")
+    assert written.identifiers == set(identifiers)
+    estimate = run.estimates[-1]
+    assert [frame[1:3] for frame in written.range(estimate, Counts(), 0)] == [
+        frame[1:3] for frame in Publisher(vehicle.range_dbc, identifiers[0] & ~EFF_FLAG).range(estimate, Counts(), 0)
+    ]
+    database = load_database([tmp_path / "written.dbc"])
+    assert {message.cycle_time for message in database.messages} == {100, 1000}
+    assert any(signal.choices for message in database.messages for signal in message.signals)
+    energy = database.decode_message(
+        identifiers[1] & ~EFF_FLAG, next(f[2] for f in reversed(run.sent) if f[1] == identifiers[1])
+    )
+    assert energy["RANGE_EnergyLeft"] == pytest.approx(estimate.energy_left / 3600, rel=0.02)  # type: ignore[call-overload, operator]
+
+
+def test_by_parameter_group_each_own_frame_has_its_own(tmp_path):
+    roles = '[bus]\nidentifiers = "j1939"\n'
+    file = van(tmp_path, "range_identifier = 0x18FF6022", parallel=12).file
+    file.write_text(file.read_text(encoding="utf-8").replace("[bus]\n", roles), encoding="utf-8")
+    publisher = Pipeline(read_vehicle(str(file))).publisher
+    assert {pgn(identifier & ~EFF_FLAG) for identifier in publisher.identifiers} == set(range(0xFF60, 0xFF65))
+
+
+@pytest.mark.parametrize("number", ["-1", "0x7FC", "0x7FF", "0x1FFFFFFD", "1.5", '"0x600"'])
+def test_an_identifier_that_cannot_be_is_refused(number, tmp_path):
+    with pytest.raises(InputError, match=r"van\.toml:1: range_identifier: "):
+        van(tmp_path, f"range_identifier = {number}")
+
+
+def test_one_that_the_vehicle_takes_is_refused_with_one_that_is_free(tmp_path):
+    with pytest.raises(
+        InputError, match=r"take the identifiers .*: 0x200, 0x201, 0x202; .*range_identifier = (0x6\d0), .* free"
+    ) as told:
+        Pipeline(van(tmp_path, f"{LARGE}\nrange_identifier = 0x1FF"))
+    free = re.search(r"range_identifier = (0x6\d0)", str(told.value))
+    assert free
+    Pipeline(van(tmp_path, f"{LARGE}\nrange_identifier = {free[1]}"))
+
+
+def test_someone_else_who_sends_on_ours_is_counted(tmp_path):
+    """A Nissan Leaf sends 0x601 and 0x603."""
+    run = Run(van(tmp_path, LARGE))
+    frames = Scooter().steady(3.0, current=80.0)
+    others = [(frame[0], 0x611, bytes(8), 0) for frame in frames[::100]]
+    feed(run.pipeline, [sorted(frames + others)])
+    assert run.pipeline.foreign == {"0x611": len(others)}
+    assert run.pipeline.status()["foreign"] == {"0x611": len(others)}
+    assert any("0x611" in line and "someone else" in line for line in summary(run.pipeline))
+    ours = run.pipeline.publisher.range(run.estimates[-1], Counts(), 0)
+    assert all(run.pipeline.publisher.may_have_sent(frame) for frame in ours)
+    assert not any(run.pipeline.publisher.may_have_sent(frame) for frame in others)
+
+
+def test_a_file_that_is_read_is_not_written_over(tmp_path):
+    vehicle = van(tmp_path, LARGE)
+    assert main(["run", "--vehicle", str(vehicle.file), "--write-dbc", str(vehicle.file)]) == BAD_INPUT

@@ -8,7 +8,7 @@ from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.DC_POWER
 SOURCE = "LED lamps, dashboard and control of a scooter"
-PARAMETERS = (Parameter("auxiliary_power", "W", 45.0, 15.0, 0.0, 500.0, SOURCE, ride_sd=0.7),)
+PARAMETERS = (Parameter("auxiliary_power", "W", 45.0, 15.0, 0.0, 10000.0, SOURCE, ride_sd=0.7),)
 CAUSE = ("auxiliary_load", "P = P_aux")
 SHOWN_BY = "The auxiliary current sensor, at standstill too; switching lamps one by one splits it from the sensor."
 

@@ -12,7 +12,7 @@ from gz_onboard.physics.elementary import direction
 
 PORT = Port.WHEEL_FORCE
 SOURCE = "a guess: a free disc takes 1 to 3 N at the tyre"
-PARAMETERS = (Parameter("brake_drag_force", "N", 5.0, 5.0, 0.0, 200.0, SOURCE, ride_sd=1.0, healthy_sd=1.5),)
+PARAMETERS = (Parameter("brake_drag_force", "N", 5.0, 5.0, 0.0, 5000.0, SOURCE, ride_sd=1.0, healthy_sd=1.5),)
 SHOWN_BY = (
     "Road load that is the same at all speeds and loads; rides with another payload split it from rolling resistance, "
     "which grows with weight."

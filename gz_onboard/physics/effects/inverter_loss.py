@@ -11,9 +11,9 @@ SUPPLY = "control and gate supply of a 48 V inverter"
 SWITCHING = "switching loss: grows with current"
 CONDUCTION = "conduction: MOSFET on-resistance"
 PARAMETERS = (
-    Parameter("inverter_loss_constant", "W", 10.0, 6.0, 0.0, 100.0, SUPPLY, ride_sd=0.5, bench=True),
-    Parameter("inverter_loss_linear", "W/A", 0.3, 0.2, 0.0, 5.0, SWITCHING, ride_sd=0.02, bench=True),
-    Parameter("inverter_loss_quadratic", "W/A²", 3e-3, 2e-3, 0.0, 0.1, CONDUCTION, ride_sd=1e-4, bench=True),
+    Parameter("inverter_loss_constant", "W", 10.0, 6.0, 0.0, 2000.0, SUPPLY, ride_sd=0.5, bench=True),
+    Parameter("inverter_loss_linear", "W/A", 0.3, 0.2, 0.0, 50.0, SWITCHING, ride_sd=0.02, bench=True),
+    Parameter("inverter_loss_quadratic", "W/A²", 3e-3, 2e-3, 0.0, 5.0, CONDUCTION, ride_sd=1e-4, bench=True),
 )
 CAUSE = ("inverter_loss", "P = c1·|i|")
 STRENGTHS = ("inverter_loss_linear",)

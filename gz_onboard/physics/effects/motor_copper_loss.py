@@ -10,7 +10,7 @@ from gz_onboard.physics.effect import Parameter, Port
 PORT = Port.MOTOR_LOSS
 WINDINGS = "hub motors of 1.5-3 kW at 52 V; at 25 degC"
 PARAMETERS = (
-    Parameter("motor_copper_resistance", "ohm", 0.03, 0.015, 1e-3, 0.5, WINDINGS, ride_sd=3e-4, bench=True),
+    Parameter("motor_copper_resistance", "ohm", 0.03, 0.015, 1e-5, 10.0, WINDINGS, ride_sd=3e-4, bench=True),
     Parameter("motor_copper_temperature_coefficient", "1/K", 0.00393, 1e-4, 0.0, 0.01, "IEC 60034-1"),
 )
 CAUSE = ("winding_resistance", "P = r·(1 + a·(T − 25))·i²")

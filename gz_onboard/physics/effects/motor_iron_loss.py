@@ -10,8 +10,8 @@ PORT = Port.MOTOR_LOSS
 HYSTERESIS = "Bertotti 1988: hysteresis loss grows with frequency"
 EDDIES = "Bertotti 1988: eddy loss, its square"
 PARAMETERS = (
-    Parameter("motor_iron_linear", "W·s/rad", 0.5, 0.4, 0.0, 10.0, HYSTERESIS, ride_sd=0.03, bench=True),
-    Parameter("motor_iron_quadratic", "W·s²/rad²", 0.01, 0.01, 0.0, 0.5, EDDIES, ride_sd=0.001, bench=True),
+    Parameter("motor_iron_linear", "W·s/rad", 0.5, 0.4, 0.0, 200.0, HYSTERESIS, ride_sd=0.03, bench=True),
+    Parameter("motor_iron_quadratic", "W·s²/rad²", 0.01, 0.01, 0.0, 20.0, EDDIES, ride_sd=0.001, bench=True),
 )
 
 

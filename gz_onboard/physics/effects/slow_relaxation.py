@@ -15,7 +15,7 @@ PORT = Port.CELL_VOLTAGE
 RESISTANCE = "18650 NMC at 25 degC: a fifth to half of R0"
 DIFFUSION = "diffusion in 5-10 µm particles: 10 to 40 min"
 PARAMETERS = (
-    Parameter("slow_resistance", "ohm", 0.008, 0.006, 0.0, 0.3, RESISTANCE, ride_sd=0.001, healthy_sd=0.01),
+    Parameter("slow_resistance", "ohm", 0.008, 0.006, 0.0, 10.0, RESISTANCE, ride_sd=0.001, healthy_sd=0.01),
     Parameter("slow_time", "s", 1200.0, 400.0, 120.0, 7200.0, DIFFUSION),
 )
 SHOWN_BY = (
