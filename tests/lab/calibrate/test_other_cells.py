@@ -129,7 +129,7 @@ def test_a_value_out_of_bounds_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(ocv, "calibrate", tiny)
     file, page = as_csv(slow_test()[0], tmp_path / "ocv.csv"), tmp_path / "r.html"
     assert main(["calibrate", "ocv", file, "--output", str(tmp_path / "v.toml"), "--report", str(page)]) == 2
-    assert "cell_capacity: 0.05 A·h was found, outside 0.1 to 500 A·h" in capsys.readouterr().err
+    assert "cell_capacity: 0.05 A·h was found, outside 0.1 to 1000 A·h" in capsys.readouterr().err
     assert page.exists()
 
 
