@@ -99,6 +99,7 @@ def text_reader(suffix: str) -> Reader:
                 if len(message.data) != length and not (message.is_remote_frame or message.is_error_frame):
                     raise ValueError(f"{len(message.data)} bytes of data where there should be {length}")
                 batch.append(frame_of(message, channels))
+            # python-can's readers have no error of their own: these are what a line that is none raises in them.
             except (ValueError, LookupError, TypeError, AttributeError, NotImplementedError) as error:
                 damage.add(f"line {feed.number}", f"{str(error) or type(error).__name__}: {feed.line.strip()[:60]!r}")
                 if not any_frame and damage.count >= BATCH:
