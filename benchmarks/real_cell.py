@@ -27,6 +27,7 @@ from gz_onboard.lab.calibrate.cell_circuit import Circuit, voltage
 from gz_onboard.lab.calibrate.result import Result
 from gz_onboard.lab.calibrate.table import Measurements, Named, read_table
 from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.effects import charge_transfer
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.tables import Mesh
@@ -184,6 +185,9 @@ def estimator_of(setting: Setting) -> Estimator:
         "cell_voltage_error_empty": (0.0, result.parameters["cell_voltage_error_empty"].sd),
         "rest_voltage_error": (0.0, float(np.mean(rests))),
     }
+    for parameter in charge_transfer.PARAMETERS:
+        found = result.parameters[parameter.name]
+        values[parameter.name] = found.value, found.sd
     for name, (value, sd) in values.items():
         known[name] = replace(known[name], value=value, sd=sd)
     model = Model(vehicle.model.effects, Parameters(known))

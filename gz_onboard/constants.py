@@ -3,7 +3,9 @@
 GRAVITY = 9.80665  # m/s², standard acceleration of free fall (CGPM 1901)
 KELVIN = 273.15  # K: 0 degC
 HOUR = 3600.0  # s
+THERMAL_VOLTAGE = 8.617333e-5  # V/K: gas constant over Faraday's
 WH = HOUR  # J
 WH_PER_KM = 3.6  # J/m
 
+BENCH_TEMPERATURE = 25.0  # degC, at which capacities are given
 MILD = 20.0  # degC: of a vehicle and of the air where nothing else is known

@@ -16,13 +16,12 @@ from gz_onboard.bus.layout import identifier_of
 from gz_onboard.bus.logfile import object_schema
 from gz_onboard.bus.mapping import pgn
 from gz_onboard.bus.publisher import KNOWN, MESSAGES, Counts, Publisher
-from gz_onboard.constants import WH
+from gz_onboard.constants import BENCH_TEMPERATURE, WH
 from gz_onboard.estimator import reasons
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
-from gz_onboard.physics.battery import BENCH_TEMPERATURE
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.vehicle import Vehicle
 

@@ -16,6 +16,7 @@ from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Estimate, Frame, Reason, State
 from gz_onboard.lab.estimate_ride import feed
+from gz_onboard.physics.effect import Port
 from gz_onboard.pipeline import TICK_NS, Pipeline
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -31,6 +32,12 @@ HEARS_CTRL_C = ("env", "--default-signal=INT")
 @cache
 def reference() -> Vehicle:
     return read_vehicle("reference")
+
+
+def without_cell_effects(vehicle: Vehicle) -> Vehicle:
+    """The vehicle with R0 and the RC pair only in its cells."""
+    kept = tuple(effect for effect in vehicle.model.effects if effect.port is not Port.CELL_VOLTAGE)
+    return vehicle.changed(vehicle.parameters, kept)
 
 
 @cache

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import QUANTITIES
-from gz_onboard.physics.model import Model
+from gz_onboard.physics.model import BURST, Model
 
 LARGEST = 1.0  # V of a cell, of a saved state
 FOREVER = 1e9  # s: a rest of unknown length
@@ -39,6 +39,19 @@ class CellEffects:
             self.states[name] = effect.step(self.states[name], dt, q)
         self.overpotential = sum(self.states.values())
 
+    def overpotential_at(self, current: float) -> float:
+        """`overpotential` [V] if a cell's `current` [A] had flowed of late, not that of the last step."""
+        q, total = self._quantities, self.overpotential
+        other = {**q, "cell_current": current}
+        for effect in self._effects:
+            total += (effect(other) - effect(q)) * (1 - effect.decay(BURST, q))
+        return float(total)
+
+    def begin(self, current: float, soc: float, temperature: float) -> None:
+        """As for `step`, of a load that has flowed for a while that nobody saw."""
+        if not self.overpotential:
+            self.step(BURST, current, soc, temperature)
+
     def read(self, saved: Mapping[str, float]) -> dict[str, float]:
         """Saved states; KeyError, TypeError or ValueError if they are not of these effects."""
         states = {name: float(saved[name]) for name in self.states}
@@ -50,4 +63,9 @@ class CellEffects:
         """At rest meanwhile; for how long [s] if that is not known: for long."""
         if states:
             self.states = states
-            self.step(FOREVER if age is None else age, 0.0, soc, MILD)
+            self.rest(FOREVER if age is None else age, soc)
+
+    def rest(self, seconds: float, soc: float) -> None:
+        """So much time [s] without a load, at a temperature that is not known."""
+        if self.states:
+            self.step(seconds, 0.0, soc, MILD)

@@ -137,7 +137,10 @@ def first_filter(
     if ridden > room > 0:  # at the middle of what can be: a table beyond its data promises any polarisation
         ridden = room / 2
     v1, v1_sd = (ridden, ridden) if loaded else (0.0, STOPPED_SHARE * ridden)
-    drop_sd, model_sd = RESISTANCE_SD * r0 * cell_current, uncertainty.loaded(soc) if loaded else 0.0
+    drop_sd, model_sd = (
+        RESISTANCE_SD * (r0 * cell_current + at.overpotential),
+        uncertainty.loaded(soc) if loaded else 0.0,
+    )
     voltage_sd = hypot(uncertainty.rest, at.voltage_sd, drop_sd, model_sd, at.unsteady_sd)
     drawn = None
     if saved:

@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Sequence
 from math import hypot, inf, sqrt
 
+from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.ekf import SocFilter
 from gz_onboard.estimator.start import SLOW_TIME, bounded, soc_width, update_soc
 from gz_onboard.estimator.uncertainty import VoltageUncertainty
@@ -104,8 +105,8 @@ def slope(blocks: Sequence[tuple[float, float]]) -> tuple[float, float]:
 class RestUpdate:
     """Follows the rests of a pack, and what of the present one was taken in."""
 
-    def __init__(self, battery: Battery, uncertainty: VoltageUncertainty) -> None:
-        self._battery, self._uncertainty = battery, uncertainty
+    def __init__(self, battery: Battery, uncertainty: VoltageUncertainty, effects: CellEffects) -> None:
+        self._battery, self._uncertainty, self._effects = battery, uncertainty, effects
         self._rest = RestMonitor()
         self._taken = inf  # V² of a cell: variance of what was taken in of this rest
 
@@ -122,7 +123,7 @@ class RestUpdate:
         voltage, current [A] and voltage_sd [V]: of a cell, over `dt` [s] at `temperature` [degC].
         """
         battery, rest = self._battery, self._rest
-        emf = voltage + battery.r0.at(filter_.soc, temperature)[0] * current
+        emf = voltage + battery.r0.at(filter_.soc, temperature)[0] * current + self._effects.overpotential
         fast = battery.r1.at(filter_.soc, temperature)[0] * battery.c1.at(filter_.soc, temperature)[0]
         rest.step(dt, voltage, emf, current / battery.cell_capacity(temperature), fast, self._uncertainty.model)
         if rest.sd is None:

@@ -70,7 +70,7 @@ class StateOfCharge:
         self._sag = sag
         self._charge = ChargeUncertainty(battery, model.parameters)
         self._steady = SteadyVoltage(battery)
-        self._rest = RestUpdate(battery, self.uncertainty)
+        self._rest = RestUpdate(battery, self.uncertainty, self.effects)
         self._odometer: float | None = None  # m, at the last step
         self._own_soc: float | None = None  # the vehicle's own state of charge, at the last step
         self._started = -inf  # s: when there was a first state of charge,
@@ -93,8 +93,11 @@ class StateOfCharge:
         """Measured less predicted voltage of a cell [V] for those of the pack; None before there is a filter."""
         if self.filter is None:
             return None
-        cell = self._battery.cell_voltage(voltage, current) + self.effects.overpotential
-        return self.filter.innovation(cell, current / self._battery.cells_parallel, temperature)[0]
+        cell_current = current / self._battery.cells_parallel
+        cell = self._battery.cell_voltage(voltage, current)
+        if self.effects:
+            cell += self.effects.overpotential_at(cell_current)
+        return self.filter.innovation(cell, cell_current, temperature)[0]
 
     def restarted(self, now: float) -> bool:
         """Whether it was begun anew a short while ago."""
@@ -133,12 +136,13 @@ class StateOfCharge:
     def _wait_again(self) -> None:
         self.filter = self.gate.innovation = None
         self._steady.forget()
-        self._rest = RestUpdate(self._battery, self.uncertainty)
+        self._rest = RestUpdate(self._battery, self.uncertainty, self.effects)
 
     def wait(self, seconds: float) -> None:
         """So much time has passed [s] in which no voltage came: what was restored is older by that."""
         if self.saved and self.saved_age is not None:
             self.saved_age += seconds
+            self.effects.rest(seconds, self.saved.soc)
 
     def snapshot(self, filter_: SocFilter) -> dict[str, object]:
         """What is to be kept over a restart."""
@@ -224,26 +228,29 @@ class StateOfCharge:
         battery, reading, temperature = self._battery, pack.reading, pack.temperature
         voltage, current = measured
         # What effects in the cells take is known: the filter sees the voltage that there would be without them.
-        cell_voltage = battery.cell_voltage(voltage, current) + self.effects.overpotential
+        shown = battery.cell_voltage(voltage, current)
+        cell_voltage = shown + self.effects.overpotential
         cell_current = current / battery.cells_parallel
         r0 = battery.r0.at(filter_.soc, temperature)[0]
+        drop = r0 * cell_current + self.effects.overpotential
         explaining = (
             current if reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else reading.reported_current
         )
         if explaining is not None:
-            self._sag.update(dt, cell_voltage, r0 * explaining / battery.cells_parallel)
+            by_load = r0 * explaining / battery.cells_parallel + self.effects.overpotential
+            self._sag.update(dt, shown, by_load)
         if dt <= self._timing.pause and self._rest.step(
-            filter_, dt, cell_voltage, cell_current, temperature, reading.voltage_sd
+            filter_, dt, shown, cell_current, temperature, reading.voltage_sd
         ):
             return
         by_inverter = not self._signals.pack_voltage.fresh(now)
         voltage_sd = INVERTER_VOLTAGE_SD if by_inverter else reading.voltage_sd
         known = self._signals.cell_temperature.fresh(now)
-        slow = self.uncertainty.variance(filter_.soc, r0, cell_current, reading.source, known, voltage_sd)
+        slow = self.uncertainty.variance(filter_.soc, r0, drop, reading.source, known, voltage_sd)
         error, own = filter_.innovation(cell_voltage, cell_current, temperature)
         variance = self.gate.update(dt, error, own, slow)
         if self.gate.refuted:
-            self._refute(now, filter_, error, r0 * cell_current + filter_.v1)
+            self._refute(now, filter_, error, drop + filter_.v1)
         elif variance is not None:
             # What errs the same way for ERROR_TIME counts as one sample in that time, not one each step.
             variance *= max(2 * ERROR_TIME / max(dt, SHORTEST), 1.0)
@@ -253,7 +260,8 @@ class StateOfCharge:
     def _plausible(self, voltage: float, current: float, temperature: float) -> bool:
         battery = self._battery
         r0 = battery.r0.at(self.filter.soc if self.filter else HALF_FULL, temperature)[0]
-        return plausible(battery, battery.cell_voltage(voltage, current) + r0 * current / battery.cells_parallel)
+        drop = r0 * current / battery.cells_parallel + self.effects.overpotential
+        return plausible(battery, battery.cell_voltage(voltage, current) + drop)
 
     def _refute(self, now: float, filter_: SocFilter, error: float, drop: float) -> None:
         """The voltage of a cell has been off by `error` [V] for long, at a predicted `drop` by its load [V].
@@ -283,10 +291,12 @@ class StateOfCharge:
         if found is None:
             return
         first, unsteady_sd = found
+        if self.effects and first.moving:
+            self.effects.begin(first.current / self._battery.cells_parallel, HALF_FULL, pack.temperature)
         at = Situation(
             now,
             pack.temperature,
-            self.effects.overpotential,  # of before a restart
+            self.effects.overpotential,
             riding.power_of_prior(now),
             pack.reading.voltage_sd,
             unsteady_sd,

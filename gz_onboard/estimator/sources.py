@@ -7,15 +7,16 @@ from dataclasses import dataclass, replace
 from enum import Enum, auto
 from math import hypot, inf, isinf
 
+from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.estimator.redundancy.currents import CellEvidence
 from gz_onboard.estimator.redundancy.electric import Readings
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.signals import Signal, Signals
 from gz_onboard.estimator.timing import SLOW_GAP
-from gz_onboard.physics.battery import BENCH_TEMPERATURE, HALF_FULL, Battery
+from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.parameters import Parameters
 
-MISMATCH = 0.09145416  # 1/h between the two current sensors, over ten seconds or so: 3 A of 32.8 A·h
+MISMATCH = 3 / 32.8  # 1/h between the two current sensors, over ten seconds or so
 MISMATCH_SHARE = 0.01  # of a step: the low pass of that
 APART_TIME = 300.0  # s: over so long the two are compared for the count of charge, which adds up what stays
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.physics.battery import BENCH_TEMPERATURE
 
 COOLING_TIME = 7200.0  # s: how fast the cells' temperature drifts to the ambient's
 WARMER = 3.0  # K: cells over the ambient

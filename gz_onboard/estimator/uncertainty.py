@@ -5,20 +5,21 @@ from __future__ import annotations
 from math import sqrt
 from typing import NamedTuple
 
+from gz_onboard.constants import BENCH_TEMPERATURE, HOUR
 from gz_onboard.estimator.sources import CurrentSource
-from gz_onboard.estimator.start import HOUR, uncounted_sd
+from gz_onboard.estimator.start import uncounted_sd
 from gz_onboard.estimator.timing import SLOW_GAP
-from gz_onboard.physics.battery import BENCH_TEMPERATURE, Battery
+from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.parameters import Parameters
 
 SAMPLING_RATE = 0.15  # 1/h: sd of the mean current over capacity between two samples that are seconds apart
 # Errors of currents are C-rates (1/h: A over the pack's A·h at the bench's temperature), as sensors and loads are sized
-# by the pack; those of voltages are a cell's.
-UNCHECKED_SD = 0.006096944  # 1/h, beside the offset's, while no second sensor confirms the first: 0.2 A of 32.8 A·h
+# by the pack (of 32.8 A·h, where they were found); those of voltages are a cell's (of 14).
+UNCHECKED_SD = 0.2 / 32.8  # 1/h, beside the offset's, while no second sensor confirms the first
 EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
 RESISTANCE_SD = 0.12  # relative: R0 of this pack at this place and temperature
 RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
-INVERTER_VOLTAGE_SD = 0.010714286  # V of a cell: the cable between pack and inverter, 0.15 V of 14 cells
+INVERTER_VOLTAGE_SD = 0.15 / 14  # V of a cell: the cable between pack and inverter
 
 
 class CurrentError(NamedTuple):
@@ -30,10 +31,10 @@ class CurrentError(NamedTuple):
 
 CURRENT_ERRORS = {
     CurrentSource.PACK: CurrentError(0.0, HOUR),
-    CurrentSource.INVERTER: CurrentError(0.01524236, HOUR),  # 0.5 A of 32.8 A·h: the auxiliary load
-    CurrentSource.DISPUTED: CurrentError(0.1829083, HOUR),  # 6 A: the one that is right may be either
-    CurrentSource.MODEL: CurrentError(0.09145416, 600.0),  # 3 A: wind and load, of which some stay for minutes
-    CurrentSource.NONE: CurrentError(0.4572708, 60.0),  # 15 A: any riding
+    CurrentSource.INVERTER: CurrentError(0.5 / 32.8, HOUR),  # the auxiliary load
+    CurrentSource.DISPUTED: CurrentError(6 / 32.8, HOUR),  # the one that is right may be either
+    CurrentSource.MODEL: CurrentError(3 / 32.8, 600.0),  # wind and load, of which some stay for minutes
+    CurrentSource.NONE: CurrentError(15 / 32.8, 60.0),  # any riding
 }
 
 
@@ -88,16 +89,16 @@ class VoltageUncertainty:
         return self.model + empty * (self._empty - self.model)
 
     def variance(
-        self, soc: float, r0: float, current: float, source: CurrentSource, temperature_known: bool, voltage_sd: float
+        self, soc: float, r0: float, drop: float, source: CurrentSource, temperature_known: bool, voltage_sd: float
     ) -> float:
-        """Variance [V²] of the voltage predicted at a cell `current` [A], and measured with `voltage_sd` [V].
+        """Variance [V²] of the voltage predicted at a `drop` [V] by the load, and measured with `voltage_sd` [V].
 
-        r0: [ohm] of a cell.
+        r0: [ohm] of a cell, as all of them.
         """
         resistance_sd = RESISTANCE_SD if temperature_known else RESISTANCE_SD_COLD
         current_sd = CURRENT_ERRORS[source].sd * self._battery.cell_capacity(BENCH_TEMPERATURE)
         model_sd = self.loaded(soc)
         # The pack's cells are not the bench's: where SOC lies on their curve is known to their capacity's scatter.
         axis_sd = self._capacity_scatter * (1 - soc) * self._battery.ocv(soc)[1]
-        resistance = (resistance_sd * r0 * current) ** 2 + (r0 * current_sd) ** 2
+        resistance = (resistance_sd * drop) ** 2 + (r0 * current_sd) ** 2
         return model_sd**2 + voltage_sd**2 + axis_sd**2 + resistance

@@ -105,12 +105,15 @@ def battery_voltage(vehicle: Vehicle, measured: Mapping[str, Array], soc: float)
         v1, decay = battery.relax(0.5, v1, cell, r1, c1)  # to its middle: what is measured is the second's mean
         half = discharged(amperes, 0.5, battery.pack_capacity(celsius))
         soc -= half
+        others = {"vibration": shaken, "time_moving": moving}
+        if effects:
+            effects.step(0.5, cell, soc, celsius, others)
         volts = terminal_voltage(battery.ocv(soc, celsius)[0], r0, cell, v1 + effects.overpotential)
         result[i] = battery.pack_voltage(volts, amperes)
         v1 = relaxed(v1, r1 * cell, decay)
         soc -= half
         if effects:
-            effects.step(1.0, cell, soc, celsius, {"vibration": shaken, "time_moving": moving})
+            effects.step(0.5, cell, soc, celsius, others)
     return result
 
 

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from gz_onboard.arrays import Array
 
 T = TypeVar("T")
-Overpotential = Callable[[float, float, float], float]
-"""What a cell's voltage lacks [V] beside R0 and the RC pair, at a cell's current [A], SOC and temperature [degC]."""
-BENCH_TEMPERATURE = 25.0  # degC, at which capacities are given
+Overpotential = Callable[[float, float, float, float], float]
+"""What a cell's voltage lacks [V] beside R0 and the RC pair, in the mean: of a cell's mean current [A], SOC,
+temperature [degC] and form factor squared, see `Battery.settled_current`."""
 HALF_FULL = 0.5  # SOC that is taken where it is not known
 SOC_ROUNDS = 5  # of the search for a SOC under load: R0 depends on it
 
@@ -139,9 +139,14 @@ class Battery:
             soc = self.soc_at(voltage + self.r0.at(soc, temperature)[0] * current + v1, temperature)
         return soc
 
-    def first_soc(self, pack_voltage: float, pack_current: float, temperature: float) -> float:
-        """`soc_at_load` out of a ride's first pack voltage [V] and current [A], as if it had been at rest before."""
-        cell = self.cell_voltage(pack_voltage, pack_current)
+    def first_soc(
+        self, pack_voltage: float, pack_current: float, temperature: float, overpotential: float = 0.0
+    ) -> float:
+        """`soc_at_load` out of a ride's first pack voltage [V] and current [A], as if it had been at rest before.
+
+        overpotential: of effects in a cell [V], see `physics.model.when_met`.
+        """
+        cell = self.cell_voltage(pack_voltage, pack_current) + overpotential
         return self.soc_at_load(cell, pack_current / self.cells_parallel, temperature)
 
     def circuit(self, soc: float, temperature: float) -> tuple[float, float, float]:
@@ -218,5 +223,7 @@ class Battery:
             return current
         for _ in range(2):  # it moves the current by a percent, and that moves it by a percent of itself
             if current is not None:
-                current = current_of(power, source - n * overpotential(current / m, soc, temperature), resistance)
+                current = current_of(
+                    power, source - n * overpotential(current / m, soc, temperature, form_factor_squared), resistance
+                )
         return current

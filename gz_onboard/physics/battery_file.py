@@ -5,7 +5,8 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from gz_onboard.physics.battery import BENCH_TEMPERATURE, Battery
+from gz_onboard.constants import BENCH_TEMPERATURE
+from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.similarity import MOST_CELLS
 from gz_onboard.physics.tables import Mesh, Row, linear

@@ -44,6 +44,15 @@ def sqrt(x: Any) -> Any:
     return np.sqrt(x)
 
 
+def asinh(x: Any) -> Any:
+    """The inverse hyperbolic sine of `x`."""
+    if isinstance(x, float | int):
+        return math.asinh(x)
+    import numpy as np
+
+    return np.arcsinh(x)
+
+
 def direction(speed: Any) -> Any:
     """The sign of `speed` [m/s or rad/s], smooth around standstill: what friction acts with."""
     return speed / (speed * speed + STANDSTILL * STANDSTILL) ** 0.5

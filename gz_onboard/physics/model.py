@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from gz_onboard.constants import KELVIN
 from gz_onboard.errors import InputError, shown
-from gz_onboard.physics.battery import Battery, Overpotential
+from gz_onboard.physics.battery import HALF_FULL, Battery, Overpotential
 from gz_onboard.physics.effect import QUANTITIES, Effect, Port, effect_file, load_effect
 from gz_onboard.physics.elementary import STANDSTILL, sqrt
 from gz_onboard.physics.parameters import Parameters
@@ -151,6 +151,18 @@ def remembering(effect: Bound, dt: float) -> Callable[[Mapping[str, Any]], float
     return value
 
 
+BURST = 10.0  # s: a load in traffic
+
+
+def when_met(
+    effects: Iterable[Bound], battery: Battery, pack_current: float, temperature: float, seconds: float
+) -> float:
+    """What `effects` in a cell take [V] from its first voltage, at a pack current [A] of some `seconds`."""
+    cell, capacity = pack_current / battery.cells_parallel, battery.cell_capacity(temperature)
+    q = all_quantities(cell_current=cell, soc=HALF_FULL, cell_temperature=temperature, cell_capacity=capacity)
+    return float(sum(effect(q) * (1 - effect.decay(seconds, q)) for effect in effects))
+
+
 def value_of(effect: Bound, quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:
     """The value of `effect`; recall: gives that of one with memory, which without it is what it settles at."""
     return recall(effect, quantities) if recall and effect.effect.decay else effect(quantities)
@@ -240,14 +252,19 @@ class Model:
             return None
         others = dict.fromkeys(QUANTITIES, 0.0) | dict(beside or {})
 
-        def settled(current: float, soc: float, temperature: float) -> float:
+        def settled(current: float, soc: float, temperature: float, form_factor_squared: float) -> float:
             q = others | {
                 "cell_current": current,
                 "soc": soc,
                 "cell_temperature": temperature,
                 "cell_capacity": battery.cell_capacity(temperature),
             }
-            return float(total(self.at(Port.CELL_VOLTAGE), q))
+            lost = 0.0
+            for effect in self.at(Port.CELL_VOLTAGE):
+                # The charge flows in bursts, of which an effect that is fast enough sees the current, not the mean.
+                bursts = 1 + (form_factor_squared - 1) * (1 - effect.decay(BURST, q))
+                lost += effect(q | {"cell_current": bursts * current})
+            return lost
 
         return settled
 

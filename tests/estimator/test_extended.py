@@ -14,8 +14,9 @@ from gz_onboard.estimator.load_model import Conditions, EffectInputs
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import CELLS, GROUPS, MOTOR, PACK, Plant
+from tests.support import without_cell_effects
 
-BASE = read_vehicle("reference", 75.0)
+BASE = without_cell_effects(read_vehicle("reference", 75.0))
 AIR = Conditions(20.0, 0.0)
 
 

@@ -23,9 +23,9 @@ from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import GROUPS, Plant
-from tests.support import ridden
+from tests.support import ridden, without_cell_effects
 
-BASE = read_vehicle("reference", 75.0)
+BASE = without_cell_effects(read_vehicle("reference", 75.0))
 ROUGH = """\"\"\"Drag of a rough road, in proportion to the vibration, made up for a test.\"\"\"
 from gz_onboard.physics.effect import Parameter, Port
 PORT = Port.{port}
@@ -232,7 +232,7 @@ def test_a_contact_that_loses_voltage_on_rough_roads(tmp_path):
         assert e.soc.effects.overpotential == pytest.approx(0.01 * vibration, rel=0.2, abs=1e-4)
     settled = e.forecaster._overpotential
     assert settled is not None
-    assert settled(1.0, 0.5, 20.0) == pytest.approx(0.01 * TYPICAL)
+    assert settled(1.0, 0.5, 20.0, 2.0) == pytest.approx(0.01 * TYPICAL)
 
 
 # --- from frames --------------------------------------------------------------------------------------------------

@@ -193,6 +193,6 @@ def test_a_resistance_beside_equals_one_inside(soc):
     r = 0.01
     flat = replace(BATTERY, r1=Mesh((0.0, 1.0), (25.0,), ((0.02, 0.02),)))
     inside = replace(BATTERY, r1=Mesh((0.0, 1.0), (25.0,), ((0.02 + r, 0.02 + r),)))
-    beside = drawable(flat, soc, 20.0, 800.0, 2.0, lambda current, soc, temperature: r * current)
+    beside = drawable(flat, soc, 20.0, 800.0, 2.0, lambda current, soc, temperature, form: r * current)
     assert beside.energy == pytest.approx(drawable(inside, soc, 20.0, 800.0, 2.0).energy, rel=1e-3)
     assert beside.energy < drawable(flat, soc, 20.0, 800.0, 2.0).energy

@@ -100,7 +100,7 @@ def test_every_parameter_of_the_reference_says_where_it_is_from():
 
 def test_key_tells_vehicles_and_models_apart(tmp_path):
     key = read_vehicle("reference").key
-    assert vehicle(tmp_path, r'"grade_force", ', "").key != key
+    assert vehicle(tmp_path, r'    "grade_force",\n', "").key != key
     assert vehicle(tmp_path, r"^cells_parallel = 12", "cells_parallel = 11").key != key
 
 

@@ -15,8 +15,9 @@ from gz_onboard.simulation.parts.road import Dynamometer, straight
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.vehicle import read_vehicle
 from tests.simulation.packs import MapMotor, SecondOrderPack
+from tests.support import without_cell_effects
 
-VEHICLE = read_vehicle("reference", 75.0)
+VEHICLE = without_cell_effects(read_vehicle("reference", 75.0))
 BATTERY = VEHICLE.pack
 
 

@@ -25,9 +25,9 @@ from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.simulation.sensors import SENSORS
 from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
-from tests.support import LOGS
+from tests.support import LOGS, without_cell_effects
 
-BASE = read_vehicle("reference")
+BASE = without_cell_effects(read_vehicle("reference"))
 RIDE = LOGS / "coastdown.blf"
 NEWTONS = 8.0  # N per m/s²
 EFFECT = """\"\"\"What a rough road takes, in proportion to the vibration, made up for a test.\"\"\"
@@ -166,7 +166,7 @@ def test_the_battery_alone_has_the_measured_and_the_time_moving(folder: Path, re
     vehicle = extended(folder, "loose_contact")
     measured = per_second(recorded)
     fewer = battery_voltage(BASE, measured, 0.8) - battery_voltage(vehicle, measured, 0.8)
-    assert fewer[1:] == pytest.approx(BASE.pack.cells_series * 0.01 * measured["vibration"][:-1], abs=1e-9)
+    assert fewer == pytest.approx(BASE.pack.cells_series * 0.01 * measured["vibration"], abs=1e-9)
     (tmp_path / "wearing.py").write_text(
         EFFECT.format(port="CELL_VOLTAGE", value=0.001, name="wearing")
         .replace("(vibration,", "(time_moving,")
@@ -174,7 +174,7 @@ def test_the_battery_alone_has_the_measured_and_the_time_moving(folder: Path, re
     )
     fewer = battery_voltage(BASE, measured, 0.8) - battery_voltage(extended(tmp_path, "wearing"), measured, 0.8)
     moving = np.cumsum(measured["speed"] > MOVING)
-    assert fewer[1:] == pytest.approx(BASE.pack.cells_series * 0.001 * moving[:-1], abs=1e-6)
+    assert fewer == pytest.approx(BASE.pack.cells_series * 0.001 * moving, abs=1e-6)
 
 
 # --- from a vehicle's file ----------------------------------------------------------------------------------------
@@ -182,7 +182,7 @@ def test_the_battery_alone_has_the_measured_and_the_time_moving(folder: Path, re
 
 def test_a_vehicle_file_says_how_rough_roads_are(tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]):
     text = (OWN / "reference.toml").read_text(encoding="utf-8")
-    listed = text.replace('"auxiliary_load",\n]', '"auxiliary_load", "rough_road",\n]\neffects_folder = "."')
+    listed = text.replace('"charge_transfer",\n]', '"charge_transfer", "rough_road",\n]\neffects_folder = "."')
     shutil.copy(folder / "rough_road.py", tmp_path)
     assert listed.count("[forecast]\n") == listed.count("rough_road") == 1
     cycle, file, summary = tmp_path / "cycle.csv", tmp_path / "rough.toml", tmp_path / "summary.json"

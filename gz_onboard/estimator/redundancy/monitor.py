@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.estimator.redundancy.checks import SensorCheck, StepInputs
 from gz_onboard.estimator.redundancy.currents import CurrentCheck
 from gz_onboard.estimator.redundancy.grades import GradeCheck
@@ -11,7 +12,7 @@ from gz_onboard.estimator.redundancy.odometer import OdometerCheck
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.redundancy.temperatures import TemperatureCheck
 from gz_onboard.estimator.redundancy.voltages import VoltageCheck
-from gz_onboard.physics.battery import BENCH_TEMPERATURE, Battery
+from gz_onboard.physics.battery import Battery
 
 
 class Redundancy:

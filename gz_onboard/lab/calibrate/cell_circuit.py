@@ -1,10 +1,11 @@
 """A cell's equivalent circuit over arrays: filters of the current, tables over SOC and temperature, voltage.
 
-    V = V_oc(SOC) + shift(T) - R0·I - Σ R_k·x_k,    dx_k/dt = (I - x_k)/τ_k
+    V = V_oc(SOC) + shift(T) - R0·I - η - Σ R_k·x_k,    dx_k/dt = (I - x_k)/τ_k
 
-V_k = R_k·x_k (Lord 2016, eqs. 2.22 and 2.23); shift is zero unless the rests show one.
+V_k = R_k·x_k (Lord 2016, eqs. 2.22 and 2.23); shift is zero unless the rests show one, and so is η
+(the effect `charge_transfer`) unless pulses of several currents do.
 
-I is the cell's current [A], positive when discharging. With the time constants given, V is linear in every table.
+I is the cell's current [A], positive when discharging. With the time constants and η given, V is linear in every table.
 """
 
 from __future__ import annotations
@@ -15,8 +16,32 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.physics.battery import terminal_voltage
+from gz_onboard.physics.effects import charge_transfer
 from gz_onboard.physics.relaxation import relaxation_over, relaxed
 from gz_onboard.physics.tables import bilinear_over, extended_over
+
+
+@dataclass(frozen=True)
+class Reaction:
+    """The parameters of the effect `charge_transfer`: resistance [ohm], activation [K] and time [s], with their sds."""
+
+    resistance: float = 0.0
+    activation: float = 0.0
+    time: float = 1.0
+    sd: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def overpotential(self, flowed: Array, dt: Array, temperature: Array) -> Array:
+        """What it takes from the voltage (m,) [V], of a cell that has rested.
+
+        flowed: the mean current [A] over the `dt` [s] before each sample, temperature [degC]; all (m,).
+        """
+        settled = charge_transfer.term(
+            flowed, temperature, charge_transfer_resistance=self.resistance, charge_transfer_activation=self.activation
+        )
+        return follow(settled, dt, self.time)
+
+
+NO_REACTION = Reaction()
 
 
 @dataclass(frozen=True)
@@ -38,6 +63,7 @@ class Circuit:
     slow_resistance: Array | None = None
     slow_time: Array | None = None
     rest_shift: Array | None = None
+    reaction: Reaction = NO_REACTION
 
     def ocv_shift(self, temperature: Array) -> Array:
         """What the open-circuit voltage (m,) [V] is above `ocv` at `temperature` (m,) [degC]."""
@@ -91,6 +117,7 @@ def voltage(cell: Circuit, flowed: Array, current: Array, dt: Array, soc: Array,
         slow = (cell.slow_resistance, cell.slow_time)
         r2, tau = (bilinear_over(cell.soc, cell.temperature, t, soc, temperature) for t in slow)
         pairs = pairs + follow(r2 * flowed, dt, tau)
+    pairs = pairs + cell.reaction.overpotential(flowed, dt, temperature)
     rest = extended_over(cell.ocv_soc, cell.ocv, soc) + cell.ocv_shift(temperature)
     return np.asarray(terminal_voltage(rest, r0, current, pairs))
 

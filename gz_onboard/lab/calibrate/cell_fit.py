@@ -97,15 +97,8 @@ def pieces(
     pairs [K]: R goes as exp(activation/T), which moves samples at other temperatures than the nominal one.
     """
     inverse = 1 / (test.temperature + KELVIN) - 1 / (temperature + KELVIN)
-    weight = 1 / (np.hypot(VOLTAGE_SD, SOC_SD * ocv[1]) * np.sqrt(CORRELATED))
-    columns = np.column_stack(
-        [
-            -test.current * np.exp(activation[0] * inverse),
-            -relaxing * np.exp(activation[1] * inverse)[:, None],
-            np.ones(len(test)),
-        ]
-    )
-    columns *= weight[:, None]
+    warm = np.exp(activation[0] * inverse), np.exp(activation[1] * inverse)
+    columns, weight = weighted_columns(test, ocv, relaxing, warm)
     target = (test.voltage - ocv[0]) * weight
     hat = hats(soc, level)
     labels, first = np.unique(test.block, return_index=True)  # the number of the block never falls
@@ -126,6 +119,21 @@ def pieces(
     return Pieces(soc, temperature, labels, gram, right, samples)
 
 
+def weighted_columns(
+    test: CellTest, ocv: tuple[Array, Array], relaxing: Array, warm: tuple[Array, Array] | None = None
+) -> tuple[Array, Array]:
+    """(what the voltage is of R0, each pair and the shift at every sample, (m, 2 + len(TIMES)); weights (m,)).
+
+    ocv, relaxing: see `pieces`. warm: factors (m,) on R0 and on the pairs.
+    """
+    weight = 1 / (np.hypot(VOLTAGE_SD, SOC_SD * ocv[1]) * np.sqrt(CORRELATED))
+    columns = np.column_stack([-test.current, -relaxing, np.ones(len(test))])
+    if warm:
+        columns[:, 0] *= warm[0]
+        columns[:, 1:-1] *= warm[1][:, None]
+    return columns * weight[:, None], weight
+
+
 def fit_branches(of: Pieces, keep: NDArray[np.bool_] | None = None, leave_out: bool = False) -> Branches:
     """The pairs that fit the pieces best. keep: (pieces,), True for those to use; leave_out: of each left out too."""
     used = np.ones(len(of.label), dtype=bool) if keep is None else keep
@@ -133,7 +141,7 @@ def fit_branches(of: Pieces, keep: NDArray[np.bool_] | None = None, leave_out: b
     gram, right = of.gram[used].sum(axis=0), of.right[used].sum(axis=0)
     scale = np.full(branches, 0.02)  # ohm
     for _ in range(2):  # how far a table may bend is relative to its size, which the first turn gives
-        prior = _smoothness(of.soc, scale, n, branches)
+        prior = smoothness(of.soc, scale, n, branches)
         p = _positive(gram + prior, right, n)
         scale = np.maximum(np.median(p[:-n].reshape(branches, n), axis=1), 2e-3)
     without = [
@@ -193,7 +201,7 @@ def left_out(a: Array, residual: Array, labels: NDArray[Any], normal: Array) -> 
     return total * (len(pieces) - 1) / max(len(pieces), 1)
 
 
-def _smoothness(soc: Array, scale: Array, n: int, branches: int) -> Array:
+def smoothness(soc: Array, scale: Array, n: int, branches: int) -> Array:
     """The normal matrix of the priors: tables bend little from node to node, rest voltages stay near the OCV."""
     total = np.zeros((n * (branches + 1), n * (branches + 1)))
     left, right = np.diff(soc)[:-1], np.diff(soc)[1:]
@@ -301,7 +309,7 @@ def fit_direct(
     resistive = -(test.current * np.exp(activation[0] * inverse))[:, None] * hat
     p = np.concatenate([pairs[0], pairs[1], np.log(pairs[2]), start.shift])
     scale = np.array([np.median(pairs[0]), np.median(pairs[1]), TIME_BEND / BEND_SD])
-    prior = _smoothness(soc, scale, n, 3)
+    prior = smoothness(soc, scale, n, 3)
     for _ in range(TURNS):
         tau = np.exp(hat @ p[2 * n : 3 * n])
         x, slope = follow_slope(test.flowed, test.dt, tau)

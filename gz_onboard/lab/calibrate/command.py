@@ -22,6 +22,7 @@ from gz_onboard.lab.calibrate.vehicle_file import write_vehicle
 from gz_onboard.offline.results import explain_keys, write_json
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.options import add_shared, keep_old_name
+from gz_onboard.physics.effect import load_effect
 from gz_onboard.progress import progress_bar
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
@@ -68,13 +69,14 @@ def is_table(file: Path, kind: str) -> bool:
 
 def for_file(results: Sequence[Result], vehicle: Vehicle) -> list[Result]:
     """`results` with only what a vehicle file holds: the rest is for the report."""
-    kept = []
+    kept, held = [], set(vehicle.parameters)
     for result in results:
-        parameters = {name: f for name, f in result.parameters.items() if name in vehicle.parameters}
+        held |= {p.name for name, seen in result.effects.items() if seen for p in load_effect(name).parameters}
+        parameters = {name: f for name, f in result.parameters.items() if name in held}
         curves = {name: c for name, c in result.curves.items() if name.startswith("battery.")}
         covariance = []
         for names, matrix in result.covariance:
-            inside = [i for i, name in enumerate(names) if name in vehicle.parameters]
+            inside = [i for i, name in enumerate(names) if name in held]
             covariance.append((tuple(names[i] for i in inside), np.asarray(matrix)[np.ix_(inside, inside)]))
         kept.append(replace(result, parameters=parameters, curves=curves, covariance=covariance))
     return kept

@@ -10,13 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from gz_onboard.arrays import Array, held_integral
+from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.battery import BENCH_TEMPERATURE, Battery, dissipation
+from gz_onboard.physics.battery import dissipation
 from gz_onboard.physics.cooling import PERIOD
 from gz_onboard.physics.effect import Port
-from gz_onboard.physics.model import total
+from gz_onboard.physics.model import total, when_met
 from gz_onboard.physics.sensors import road_speed, true_columns
 from gz_onboard.vehicle import Vehicle
 
@@ -112,7 +113,7 @@ def ride_run(ride: Samples, vehicle: Vehicle) -> CoolingRun:
     mean, square = _means(pack_time, amperes, grid), _means(pack_time, amperes**2, grid)
     pack_heat = np.zeros_like(grid)
     if vehicle.battery and "cell_temperature" in measured and "pack_voltage" in columns:
-        pack_heat = _pack_heat(vehicle.battery, mean, square, measured["cell_temperature"], at("pack_voltage"))
+        pack_heat = _pack_heat(vehicle, mean, square, measured["cell_temperature"], at("pack_voltage"))
     return CoolingRun(
         ride.name,
         "roller_speed" in columns,
@@ -148,10 +149,15 @@ def _means(time: Array, value: Array, grid: Array) -> Array:
     return result
 
 
-def _pack_heat(battery: Battery, mean: Array, square: Array, temperature: Array, voltage: Array) -> Array:
+def _pack_heat(vehicle: Vehicle, mean: Array, square: Array, temperature: Array, voltage: Array) -> Array:
     """What the cells turn to heat [W] by mean and mean square of the pack's current; voltage: the pack's, all (n,)."""
+    battery = vehicle.pack
+    lost = vehicle.model.overpotential(battery)
     n, m = battery.cells_series, battery.cells_parallel
-    soc = battery.first_soc(*(float(column[:FIRST].mean()) for column in (voltage, mean, temperature)))
+    first = [float(column[:FIRST].mean()) for column in (voltage, mean, temperature)]
+    inside = vehicle.model.at(Port.CELL_VOLTAGE)
+    begun = when_met(inside, battery, first[1], first[2], FIRST * PERIOD / 2)  # the load, from rest
+    soc = battery.first_soc(first[0], first[1], first[2], begun)
     heat, v1 = np.empty_like(mean), 0.0
     for k, (i, i2, t) in enumerate(
         zip((mean / m).tolist(), (square / m**2).tolist(), temperature.tolist(), strict=True)
@@ -159,4 +165,6 @@ def _pack_heat(battery: Battery, mean: Array, square: Array, temperature: Array,
         r0, r1, _ = battery.circuit(soc, t)
         soc, v1, _ = battery.advanced(PERIOD, soc, v1, i, t)
         heat[k] = n * m * dissipation(r0, r1, i2, v1)
+        if lost and i:
+            heat[k] += n * m * i * lost(i, soc, t, i2 / i**2)
     return heat

@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
+from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.lab.calibrate.fit import Solution, line, linear, score, split
 from gz_onboard.lab.calibrate.result import Fit, Panel, PlotLine, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
-from gz_onboard.physics.battery import BENCH_TEMPERATURE
 from gz_onboard.physics.effects import motor_copper_loss
 
 RIDING_CURRENT = 120.0  # A: larger ones are short, and the constant falls with them

@@ -91,15 +91,20 @@ def _pulse(given: Given) -> Result:
     loads = [_load(ride) for ride in _true(given, "load")]
     method = str(given.options["method"])
     result = pulse.calibrate(given.tables["data"], curve, capacity, loads=loads or None, method=method)
-    cell = pulse.circuit(result)
+    cell, squares = pulse.circuit(result), []
     for table in given.tables.get("held_out", []):
         test = cell_test(table)
         model, measured = pulse.follow_profile(cell, test)
         result.fits.append(score("cell voltage", "V", measured, model, held_out=True, source=table.file.name))
         near = float(np.mean(np.abs(model - measured) <= THESIS_VOLTS))
         result.notes.append(f"{table.file.name}: {100 * near:.0f} % of the samples within ±{THESIS_VOLTS:g} V")
+        squares.append(float(np.mean((model - measured)[test.drawn < 0.9 * capacity.value] ** 2)))
         title = f"{table.file.name}, held out"
         result.panels += compared(title, "time [min]", "cell voltage [V]", test.time / 60, measured, model)
+    error, held_out = result.parameters["cell_voltage_error"], float(np.sqrt(np.mean(squares or [0.0])))
+    if held_out > error.sd:  # what no fit has seen tells better than what it was made of
+        source = f"{', '.join(table.file.name for table in given.tables['held_out'])}: rms, held out"
+        result.parameters["cell_voltage_error"] = replace(error, sd=held_out, source=source)
     return result
 
 

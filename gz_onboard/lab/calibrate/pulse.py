@@ -15,19 +15,22 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.constants import HOUR
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.lab.calibrate.cell_circuit import Circuit, riding_current, voltage
+from gz_onboard.lab.calibrate.cell_circuit import NO_REACTION, Circuit, Reaction, riding_current, voltage
 from gz_onboard.lab.calibrate.cell_data import CellTest
 from gz_onboard.lab.calibrate.cell_fit import TIMES, Reduction, fit_branches
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.ocv import TESTER
 from gz_onboard.lab.calibrate.pulse_mesh import direct, mesh_quality, meshes
+from gz_onboard.lab.calibrate.pulse_reaction import charge_transfer, linear
 from gz_onboard.lab.calibrate.pulse_rests import rest_shift, rests_over_soc, shift_of_rests
 from gz_onboard.lab.calibrate.pulse_test import APART, Tested, moved_pieces, nearest_to_bench, tested
 from gz_onboard.lab.calibrate.result import Curve, Found, Panel, PlotLine, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
+from gz_onboard.physics.effects import charge_transfer as effect
 
 SOC = np.array([0, 0.02, 0.05, 0.1, 0.15, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0])
 METHODS = ("reduced", "direct")
+EFFECT = effect.__name__.rpartition(".")[2]
 
 
 def calibrate(
@@ -54,6 +57,8 @@ def calibrate(
     result = Result("pulse")
     tests = _tests(tables, ocv, capacity, result)
     nodes, volts = ocv.axes["soc"], ocv.value
+    reaction = charge_transfer(tests, nodes, volts, soc, result)
+    measured, tests = tests, [linear(t, reaction) for t in tests]
     split, activation = moved_pieces(tests, nodes, volts, soc)
     fitted = [fit_branches(x, leave_out=True) for x in split]
     rides = [riding_current(seed=k) for k in range(1, 4)] if loads is None else loads
@@ -83,7 +88,12 @@ def calibrate(
                 f"{t.test.name}: no pulses near SOC {', '.join(f'{s:g}' for s in soc[~there])} at "
                 f"{t.temperature:g} degC; the table there only continues its neighbours (no sd)"
             )
-    _voltages(result, tests, names)
+    result.effects[EFFECT] = bool(reaction.resistance)
+    if reaction.resistance:
+        values = (reaction.resistance, reaction.activation, reaction.time)
+        for parameter, value, sd in zip(effect.PARAMETERS, values, reaction.sd, strict=True):
+            result.parameters[parameter.name] = Found(value, sd, parameter.unit, f"{names}: pulses of several currents")
+    _voltages(result, measured, names)
     if method == "reduced":  # the halves are
         mesh_quality(result, tests, fitted, split, reduction, one)
     return result
@@ -144,7 +154,9 @@ def circuit(result: Result, slow: bool = False) -> Circuit:
     if "battery.rest_shift" in c:
         tables["rest_shift"] = c["battery.rest_shift"].value
     capacity = c["battery.capacity"].value
-    return Circuit(ocv.axes["soc"], ocv.value, axes["soc"], axes["temperature"], capacity, **tables)
+    found = [result.parameters[p.name].value for p in effect.PARAMETERS if p.name in result.parameters]
+    reaction = Reaction(found[0], found[1], found[2]) if found else NO_REACTION
+    return Circuit(ocv.axes["soc"], ocv.value, axes["soc"], axes["temperature"], capacity, **tables, reaction=reaction)
 
 
 def follow_profile(cell: Circuit, test: CellTest) -> tuple[Array, Array]:

@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
 from gz_onboard.arrays import Array
-from gz_onboard.constants import KELVIN
+from gz_onboard.constants import BENCH_TEMPERATURE, KELVIN
 from gz_onboard.lab.calibrate.cell_data import CellTest, cell_test
 from gz_onboard.lab.calibrate.cell_fit import Pieces, filtered, fit_branches, pieces
 from gz_onboard.lab.calibrate.ocv import FLAT
 from gz_onboard.lab.calibrate.result import Curve, Fit, Found, Result
 from gz_onboard.lab.calibrate.table import Measurements
-from gz_onboard.physics.battery import BENCH_TEMPERATURE
 from gz_onboard.physics.tables import extended_over
 
 FEWEST_PULSES = 6

@@ -84,6 +84,7 @@ def compared(
 class Result:
     """What one procedure found.
 
+    effects: by name, whether the data show it, where a procedure looked for it: the model then has it, or has it not.
     covariance: groups of parameters that are tied, each with its matrix in the parameters' units.
     refusals: what the data could not show, one sentence each, with the number that says so.
     """
@@ -96,11 +97,13 @@ class Result:
     refusals: list[str] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     panels: list[Panel] = field(default_factory=list)
+    effects: dict[str, bool] = field(default_factory=dict)
 
     def add(self, other: Result) -> None:
         """Put what `other` found into this."""
         self.parameters |= other.parameters
         self.curves |= other.curves
+        self.effects |= other.effects
         self.covariance += other.covariance
         self.fits += other.fits
         self.refusals += other.refusals

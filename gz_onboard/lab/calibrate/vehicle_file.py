@@ -20,6 +20,7 @@ from gz_onboard.lab.calibrate.fit import correlation
 from gz_onboard.lab.calibrate.result import Curve, Found, Result
 from gz_onboard.lab.calibrate.toml_text import KeyPath, number, spliced, string, with_keys
 from gz_onboard.physics.effect import PACKAGE_EFFECTS, Effect
+from gz_onboard.physics.model import BASE_EFFECTS
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -68,6 +69,7 @@ def merged(text: str, results: Sequence[Result], base: Path, out: Path) -> str:
     new: dict[KeyPath, str] = {
         **{("parameters", name): f"{name} = {_parameter(found)}\n" for name, found in parameters.items()},
         **_moved(document, base, out),
+        **_effects(document, results),
     }
     tables: dict[KeyPath, str] = {
         **{tuple(name.split(".")): _curve(name, curve) for name, curve in curves.items()},
@@ -77,6 +79,18 @@ def merged(text: str, results: Sequence[Result], base: Path, out: Path) -> str:
     if "battery.ocv" in curves:
         dropped.add(("battery", "rest_shift"))  # which is that of the curve before
     return spliced(text, new, tables, dropped, base)
+
+
+def _effects(document: Mapping[str, Any], results: Sequence[Result]) -> dict[KeyPath, str]:
+    """The model's effects with those that the data show and without those that they do not; nothing if they stay."""
+    listed = list(document.get("model", {}).get("effects", BASE_EFFECTS))
+    looked_for = {name: seen for result in results for name, seen in result.effects.items()}
+    new = [name for name in listed if looked_for.get(name, True)]
+    new += [name for name, seen in looked_for.items() if seen and name not in new]
+    if new == listed:
+        return {}
+    lines = "".join(f"    {string(name)},\n" for name in new)
+    return {("model", "effects"): f"effects = [\n{lines}]\n"}
 
 
 def copied_effects(effects: Iterable[Effect], out: Path) -> dict[KeyPath, str]:

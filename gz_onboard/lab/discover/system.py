@@ -12,7 +12,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.sizes import USUAL_SIZES, Sizes
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING, Effect, Port
-from gz_onboard.physics.model import Bound, over, value_of
+from gz_onboard.physics.model import Bound, value_of
 from gz_onboard.physics.riding import VIBRATION
 
 Values = Mapping[str, float]
@@ -36,9 +36,13 @@ class System:
         return self.battery
 
     def terms(self, q: Mapping[str, Any], p: Values, dt: float, *ports: Port) -> list[tuple[Effect, Any]]:
-        """The effects at these ports and their values over time, at the beginnings of steps of `dt` [s]; but for those
-        that store energy: the accelerometer measures them."""
-        recall = over(np.full(len(next(iter(q.values()))), dt), before=True)
+        """The effects at these ports and their values over time, the mean of the ends of steps of `dt` [s]; but for
+        those that store energy: the accelerometer measures them."""
+        steps = np.full(len(next(iter(q.values()))), dt)
+
+        def recall(effect: Bound, quantities: Mapping[str, Any]) -> Any:
+            return (effect.series(steps, quantities, before=True) + effect.series(steps, quantities)) / 2
+
         found = []
         for effect in self.effects:
             if effect.port not in ports or effect.stores_energy:

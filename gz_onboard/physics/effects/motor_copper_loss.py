@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from gz_onboard.physics.battery import BENCH_TEMPERATURE
+from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.MOTOR_LOSS

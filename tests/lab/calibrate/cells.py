@@ -32,6 +32,22 @@ class Plant:
     seed: int = 0
     soc: float = 1.0
     state: list[float] = field(default_factory=list)
+    reaction: float = 0.0  # ohm at 25 degC and no current: of charge transfer beside a double layer,
+    activation: float = 4500.0  # K, of it
+    layer: float = 3.0  # s: resistance times the double layer's capacity
+    eta: float = 0.0  # V
+
+    def charged(self, current, dt, temperature):
+        """The double layer's voltage [V] after `dt` [s]: τ·η' = R·I - U·sinh(η/U), U = 2RT/F."""
+        u = 1.7234e-4 * (temperature + 273.15)
+        r = self.reaction * np.exp(self.activation * (1 / (temperature + 273.15) - 1 / 298.15))
+        if dt > 30:
+            self.eta = u * np.arcsinh(r * current / u)
+            return self.eta
+        n = int(np.ceil(dt / 0.05))
+        for _ in range(n):
+            self.eta += dt / n / self.layer * (r * current - u * np.sinh(self.eta / u))
+        return self.eta
 
     def ocv(self, soc):
         return 3.35 + 0.75 * soc + 0.1 * np.exp(-(((soc - 0.95) / 0.08) ** 2)) - 0.5 * np.exp(-soc / 0.03)
@@ -56,7 +72,7 @@ class Plant:
                 for k, (r, tau) in enumerate(self.pairs):
                     a = np.exp(-dt / tau / slower)
                     self.state[k] = a * self.state[k] + (1 - a) * r * factor * current
-                volts = (
+                volts = (-self.charged(current, dt, temperature) if self.reaction else 0.0) + (
                     self.ocv(self.soc) - lower - self.r0 * factor * current - sum(self.state) - side * self.hysteresis
                 )
                 rows.append((now, current, volts))

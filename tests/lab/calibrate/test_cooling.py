@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import asinh, exp
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from gz_onboard.lab.calibrate.cooling import bms_cooling, inverter_cooling, moto
 from gz_onboard.lab.calibrate.cooling_run import CoolingRun, bench_run, ride_run
 from gz_onboard.lab.calibrate.table import read_table
 from gz_onboard.offline.samples import Samples
+from gz_onboard.physics.cooling import PERIOD
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import read_vehicle
 
@@ -212,15 +214,16 @@ def test_ride_run_takes_the_heat_of_the_vehicles_own_losses():
     assert np.allclose(run.iron, iron) and not run.still
     assert np.allclose(run.motor_heat, iron + p["motor_copper_resistance"] * 2500, rtol=1e-6)
     cell = (24 - p["pack_current_offset"]) / p["pack_current_gain"] / 12
-    settled = 168 * cell**2 * (VEHICLE.pack.r0.at(0.5, 25)[0] + VEHICLE.pack.r1.at(0.5, 25)[0])
+    reaction = 0.05138 * asinh(p["charge_transfer_resistance"] * cell / 0.05138)  # 2RT/F [V]
+    settled = 168 * (cell**2 * (VEHICLE.pack.r0.at(0.5, 25)[0] + VEHICLE.pack.r1.at(0.5, 25)[0]) + cell * reaction)
     assert run.pack_heat[-1] == pytest.approx(settled, rel=0.2)
     battery, temperature = VEHICLE.pack, 25.0  # nearly empty and under load, where the resistance depends most on SOC
     r0 = battery.r0.at(0.1, temperature)[0]
-    columns["pack_voltage"] = (
-        fast,
-        np.full(len(fast), battery.pack_voltage(battery.ocv(0.1, temperature)[0] - r0 * cell, 24.0)),
-    )
-    assert ride_run(Samples("low", columns), VEHICLE).pack_heat[0] == pytest.approx(168 * cell**2 * r0, rel=0.02)
+    begun = reaction * (1 - exp(-2.5 * PERIOD / p["charge_transfer_time"]))  # in the middle of what counts as the first
+    volts = battery.pack_voltage(battery.ocv(0.1, temperature)[0] - r0 * cell - begun, 24.0)
+    columns["pack_voltage"] = fast, np.full(len(fast), volts)
+    heat = 168 * cell * (cell * r0 + reaction)
+    assert ride_run(Samples("low", columns), VEHICLE).pack_heat[0] == pytest.approx(heat, rel=0.02)
     with pytest.raises(InputError, match="steady: no motor_current"):
         ride_run(Samples("steady", {k: v for k, v in columns.items() if k != "motor_current"}), VEHICLE)
 

@@ -1,0 +1,39 @@
+"""Charge transfer of a cell: what the reaction takes, U·asinh(R_ct·I/U) with U = 2RT/F, settling in seconds.
+
+Butler's and Volmer's equation of two equal coefficients, solved for the overpotential (Plett 2015, Battery Management
+Systems, vol. 1, sec. 3.11); it settles as the double layer is charged. It grows less than the current, so that a cold
+cell's resistance falls with the current. R_ct, its slope at no current, falls with temperature (Arrhenius).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from gz_onboard.constants import BENCH_TEMPERATURE, KELVIN, THERMAL_VOLTAGE
+from gz_onboard.physics.effect import Parameter, Port
+from gz_onboard.physics.elementary import asinh, exp
+
+PORT = Port.CELL_VOLTAGE
+RESISTANCE = "18650 cells: a third of R0 at 25 degC"
+ACTIVATION = "50 kJ/mol; Li-ion cells: 35 to 110"
+PARAMETERS = (
+    Parameter("charge_transfer_resistance", "ohm", 0.01, 0.01, 0.0, 10.0, RESISTANCE),
+    Parameter("charge_transfer_activation", "K", 6000.0, 2500.0, 0.0, 15000.0, ACTIVATION),
+    Parameter("charge_transfer_time", "s", 1.0, 1.0, 0.01, 60.0, "double layer: tenths of a second to seconds"),
+)
+STRENGTHS = ()  # pulses of several currents show it; a ride shows it as resistance only
+
+
+def term(
+    cell_current: Any, cell_temperature: Any, *, charge_transfer_resistance: float, charge_transfer_activation: float
+) -> Any:
+    """What the terminals lack [V] once settled."""
+    kelvin = cell_temperature + KELVIN
+    thermal = 2 * THERMAL_VOLTAGE * kelvin
+    arrhenius = exp(charge_transfer_activation * (1 / kelvin - 1 / (BENCH_TEMPERATURE + KELVIN)))
+    return thermal * asinh(charge_transfer_resistance * arrhenius * cell_current / thermal)
+
+
+def decay(dt: Any, *, charge_transfer_time: float) -> Any:
+    """The share that is left after `dt` [s]."""
+    return exp(-dt / charge_transfer_time)
