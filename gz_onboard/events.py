@@ -76,6 +76,18 @@ ROLES: dict[str, str] = {
     "brake_switch": "1",
 }
 
+# What instruments beside the vehicle's own measure, for the bench and validation: no estimator needs it on board.
+INSTRUMENTS: dict[str, str] = {
+    "brake_pressure_front": "Pa",
+    "brake_pressure_rear": "Pa",
+    "suspension_front": "m",
+    "suspension_rear": "m",
+    "roller_speed": "m/s",  # of a chassis dynamometer
+    "roller_force": "N",  # positive against the vehicle
+    "bms_temperature": "degC",
+    **{f"pack_temperature_{i}": "degC" for i in range(1, 7)},
+}
+
 # The roles whose sensors are checked against each other: each must have a signal of its own.
 VOLTAGES = ("pack_voltage", "inverter_voltage")
 CURRENTS = ("pack_current", "inverter_current", "auxiliary_current")

@@ -15,6 +15,9 @@ period = 0.01                     # s, where the DBC has no GenMsgCycleTime
 pack_voltage = "BMS_PackVoltage"
 pack_current = { signal = "BMS_Current", scale = -1, unit = "A" }
 motor_speed = { message = "INV_Motion", signal = "INV_MotorSpeed" }
+
+[instruments]                     # of the bench and of measuring rides, not needed on board
+roller_speed = "DYNO_RollerSpeed"
 """
 
 from __future__ import annotations
@@ -24,9 +27,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.dbc import LARGEST, SMALLEST, LeftOut, empty_database, find_dbc, load_database
-from gz_onboard.bus.units import known_units, to_si
+from gz_onboard.bus.units import UNITS, known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown
-from gz_onboard.events import CURRENTS, ROLES, SPEEDS, VOLTAGES
+from gz_onboard.events import CURRENTS, INSTRUMENTS, ROLES, SPEEDS, VOLTAGES
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
@@ -69,6 +72,7 @@ class BusMapping:
     not_available: bool = True
     j1939: bool = False
     delays: dict[str, float] = field(default_factory=dict)  # s, by message: its values are so much older; where stated
+    instruments: tuple[Source, ...] = ()  # of roles that no estimator needs
     columns: Table | None = None  # the roles of a vehicle without DBC files: their signals are columns of a table
 
 
@@ -121,10 +125,13 @@ def read_mapping(vehicle: Table) -> BusMapping:
     roles.only(ROLES)
     sources = tuple(_source(database, left_out, roles, role) for role in roles.values)
     _check_witnesses(sources, roles)
+    instruments = vehicle.table("instruments")
+    instruments.only(INSTRUMENTS)
     return BusMapping(
         database=database,
         dbc_files=tuple(files),
         sources=sources,
+        instruments=tuple(_source(database, left_out, instruments, role) for role in instruments.values),
         protection=protection,
         periods=periods,
         not_available=bus.text("not_available", "all-ones", ["all-ones", "none"]) == "all-ones",
@@ -178,7 +185,7 @@ def _source(database: Database, left_out: LeftOut, roles: Table, role: str) -> S
     si = to_si(unit, role)
     if si is None:
         raise where.error(
-            f"{name!r} has unit {shown(unit)}, from which {role} [{ROLES[role]}] cannot be had; "
+            f"{name!r} has unit {shown(unit)}, from which {role} [{UNITS[role]}] cannot be had; "
             f"give unit = one of {', '.join(known_units(role))}{nearest(unit, known_units(role)) if unit else ''}",
             key,
         )

@@ -5,7 +5,9 @@ from __future__ import annotations
 from math import pi
 
 from gz_onboard.constants import GRAVITY, KELVIN
-from gz_onboard.events import ROLES
+from gz_onboard.events import INSTRUMENTS, ROLES
+
+UNITS = {**ROLES, **INSTRUMENTS}  # of all roles
 
 # (unit in a DBC, SI unit) -> factor, offset
 _CONVERSIONS: dict[tuple[str, str], tuple[float, float]] = {
@@ -20,6 +22,9 @@ _CONVERSIONS: dict[tuple[str, str], tuple[float, float]] = {
     ("km/h", "m/s"): (1 / 3.6, 0.0),
     ("mph", "m/s"): (0.44704, 0.0),
     ("km", "m"): (1e3, 0.0),
+    ("mm", "m"): (1e-3, 0.0),
+    ("bar", "Pa"): (1e5, 0.0),
+    ("kPa", "Pa"): (1e3, 0.0),
     ("g", "m/s^2"): (GRAVITY, 0.0),
     ("%", "1"): (0.01, 0.0),
 }
@@ -35,12 +40,12 @@ _SPELLINGS = {"": "1", "-": "1", "deg C": "degC"} | dict(alias.split("=") for al
 
 def known_units(role: str) -> list[str]:
     """The units from which `role` can be read."""
-    return [ROLES[role], *(unit for unit, si in _CONVERSIONS if si == ROLES[role])]
+    return [UNITS[role], *(unit for unit, si in _CONVERSIONS if si == UNITS[role])]
 
 
 def to_si(unit: str, role: str) -> tuple[float, float] | None:
     """(factor, offset) from `unit` to the SI unit of `role`; None if it cannot be one of the role's units."""
     unit = _SPELLINGS.get(unit, unit)
-    if unit == ROLES[role]:
+    if unit == UNITS[role]:
         return 1.0, 0.0
-    return _CONVERSIONS.get((unit, ROLES[role]))
+    return _CONVERSIONS.get((unit, UNITS[role]))

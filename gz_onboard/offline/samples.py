@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.logs import LogDamage, is_table, read_frames
-from gz_onboard.bus.mapping import BusMapping, Source
+from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.errors import InputError
 from gz_onboard.events import Event, Frame
 from gz_onboard.offline.signal_table import read_signal_table
@@ -23,24 +23,11 @@ if TYPE_CHECKING:
     from gz_onboard.arrays import Array
 
 
-# Signals that no estimator needs, of the reference scooter's instruments: role, message, signal, factor to SI.
-INSTRUMENTS = (
-    ("brake_pressure_front", "HBM_Brakes", "HBM_BrakePressureFront", 1e5),  # Pa
-    ("brake_pressure_rear", "HBM_Brakes", "HBM_BrakePressureRear", 1e5),
-    ("suspension_front", "HBM_Chassis", "HBM_SuspensionFront", 1e-3),  # m
-    ("suspension_rear", "HBM_Chassis", "HBM_SuspensionRear", 1e-3),
-    ("roller_speed", "DYNO_Roller", "DYNO_RollerSpeed", 1.0),  # m/s
-    ("roller_force", "DYNO_Roller", "DYNO_RollerForce", 1.0),  # N
-    ("bms_temperature", "BMS_Cells", "BMS_BoardTemp", 1.0),  # degC
-    *((f"pack_temperature_{i}", "TC_Pack1" if i < 4 else "TC_Pack2", f"TC_Pack{i}", 1.0) for i in range(1, 7)),
-)
-
-
 @dataclass(frozen=True)
 class Samples:
     """One ride as measured.
 
-    columns: by role (names and units of `events.ROLES`, and those of `INSTRUMENTS`) the times [s, of one clock for the
+    columns: by role (names and units of `events.ROLES`, and `events.INSTRUMENTS`) the times [s, of one clock for the
     whole ride, increasing] and values (SI) of every sample that passed the codec, no two roles at the same times.
     facts: what was written down about the ride (``rider_mass_kg``, ``ambient_C``, ``kind``, ``direction``, ...).
     """
@@ -152,12 +139,5 @@ def rider_mass(facts: dict[str, object]) -> float | None:
 
 
 def extended(mapping: BusMapping) -> BusMapping:
-    """`mapping` and those of `INSTRUMENTS` that its database has."""
-    sources = list(mapping.sources)
-    for role, message, signal, factor in INSTRUMENTS:
-        for m in mapping.database.messages:
-            if m.name == message and signal in m.signal_tree:
-                conversion = m.get_signal_by_name(signal).conversion
-                scale, offset = float(conversion.scale) * factor, float(conversion.offset) * factor
-                sources.append(Source(role, message, signal, scale, offset))
-    return replace(mapping, sources=tuple(sources))
+    """`mapping` with its instruments among the sources."""
+    return replace(mapping, sources=mapping.sources + mapping.instruments)

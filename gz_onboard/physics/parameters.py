@@ -56,6 +56,7 @@ SIMULATION_PARAMETERS = (
     Parameter("motor_current_limit", "A", 211, 3, 1, 5000, "the greatest current of the recorded rides"),
     Parameter("cell_mass", "kg", 0.047, 0.002, 0.001, 20, "18650 cell: what one more adds to the vehicle"),
     Parameter("gear_efficiency", "1", 1.0, 0.01, 0.5, 1.0, "a hub motor has no gear"),
+    Parameter("brake_force_per_pressure", "N/Pa", 20e-5, 2e-5, 1e-7, 1.0, "8 road rides: both brakes, pressures added"),
     Parameter("brake_torque_limit", "N·m", 280, 60, 1, 50000, "both wheels: 0.6 g with rider"),
     Parameter("front_brake_share", "1", 0.65, 0.1, 0, 1, "of the braking torque; the rear wheel is unloaded"),
     Parameter("brake_viscous_constant", "N·s/rad", 60, 20, 0, 50000, "C_b of Lord 2016, eq. 2.13"),

@@ -34,6 +34,7 @@ _LAWS: tuple[tuple[dict[str, float], str], ...] = (
     (_CURRENT_SQUARED, "inverter_loss_quadratic motor_copper_resistance"),
     ({"torque_constant": 1.0}, "voltage_constant"),
     ({"mass": 1.0}, "brake_viscous_constant"),
+    ({"mass": 1.0}, "brake_force_per_pressure"),
     ({"mass": 1.0, "wheel_radius": 1.0}, "brake_torque_limit"),
     ({"wheel_radius": 1.0}, "brake_disc_radius"),
     ({"vehicle_mass": 0.25}, "wheelbase"),

@@ -20,8 +20,8 @@ from gz_onboard.bus.codec import Codec
 from gz_onboard.constants import MILD
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
-from gz_onboard.events import Event
-from gz_onboard.offline.samples import INSTRUMENTS, extended, open_ride, read_roles, ride_name
+from gz_onboard.events import INSTRUMENTS, Event
+from gz_onboard.offline.samples import extended, open_ride, read_roles, ride_name
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.sensors import speed_role, true_columns
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
@@ -29,8 +29,6 @@ from gz_onboard.simulation.run import road_table
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.vehicle import Vehicle
 
-BRAKE_FORCE = 20e-5
-"""N of both brakes for each Pa, front and rear pressure added: deceleration on 8 road rides, with 19 N of scatter."""
 BRAKE_PRESSED = 0.5e5  # Pa: below this the sensors show noise
 BRAKE_MEAN = 0.07835  # of full brake, 90 N: the mean of these rides while the switch is on, where no pressures are
 ROAD_PIECE = 5.0  # m
@@ -108,8 +106,7 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
         raise vehicle.error("has no [battery], which a simulation needs")
     mapping, frames = open_ride(log, vehicle)
     codec = Codec(extended(mapping))
-    own = {role for role, *_ in INSTRUMENTS}
-    estimator_groups = [replace(g, roles=()) if own & set(g.roles) else g for g in codec.groups]
+    estimator_groups = [replace(g, roles=()) if set(INSTRUMENTS).intersection(g.roles) else g for g in codec.groups]
     estimator = Estimator(estimator_groups, vehicle.battery, vehicle.model, vehicle.riding)
     known = [bool(group.roles) for group in estimator_groups]
     rows: list[tuple[float, float, float]] = []  # distance, grade, yaw rate over speed
@@ -170,7 +167,7 @@ def _signals(log: Path, columns: dict[str, tuple[Array, Array]], vehicle: Vehicl
         pressure = np.where(pressure > BRAKE_PRESSED, pressure, 0.0)
         if pressed is not None:
             pressure = np.where(pressed > 0.5, np.maximum(pressure, 1.0), 0.0)
-        signals["brake"] = np.clip(pressure * BRAKE_FORCE / limit, 0.0, 1.0)
+        signals["brake"] = np.clip(pressure * vehicle.parameters["brake_force_per_pressure"] / limit, 0.0, 1.0)
     elif pressed is not None:
         signals["brake"] = np.where(pressed > 0.5, BRAKE_MEAN, 0.0)
     return signals

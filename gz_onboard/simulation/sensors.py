@@ -15,9 +15,9 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.vibration import FAST
-from gz_onboard.simulation.recorded import BRAKE_FORCE
 from gz_onboard.simulation.trace import Truth
 
+BAR = 1e5  # Pa
 BMS_DELAY = 0.10  # s behind the inverter
 GPS_DELAY = 0.4  # s
 REPORTED_TORQUE = 0.47  # N·m/A, that the inverter makes torque of its current with, whatever the magnets are
@@ -77,7 +77,9 @@ def _pressure(share: Callable[[Mapping[str, float]], float]) -> Callable[[Truth]
 
     def read(t: Truth) -> Array:
         p = t.parameters
-        return t["brake"] * (share(p) * p["brake_torque_limit"] / p["wheel_radius"] / BRAKE_FORCE * 1e-5)
+        return t["brake"] * (
+            share(p) * p["brake_torque_limit"] / p["wheel_radius"] / p["brake_force_per_pressure"] / BAR
+        )
 
     return read
 

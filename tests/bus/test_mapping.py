@@ -74,6 +74,18 @@ ambient_temperature = { signal = "Heat", scale = 2, offset = 1 }
     }
 
 
+def test_instruments_are_read_like_roles_and_stay_off_the_estimators_bus(tmp_path):
+    dbc = DBC.replace('"K" A', '"bar" A')
+    found = mapping(tmp_path, 'pack_voltage = "Voltage"\n[instruments]\nbrake_pressure_front = "Heat"', dbc=dbc)
+    assert [s.role for s in found.sources] == ["pack_voltage"]
+    (pressure,) = found.instruments
+    assert (pressure.role, pressure.message) == ("brake_pressure_front", "Motor")
+    assert (pressure.factor, pressure.offset) == (1e5, -40e5)
+    assert "did you mean 'roller_speed'" in complaint(tmp_path, roles='[instruments]\nroler_speed = "Speed"')
+    said = complaint(tmp_path, roles='[instruments]\nroller_force = "Voltage"')
+    assert "'Voltage' has unit 'V', from which roller_force [N] cannot be had" in said
+
+
 def test_periods_are_those_of_the_dbc_unless_the_file_says_otherwise(tmp_path):
     assert mapping(tmp_path).periods == {"Pack": 0.1}
     bus = "[bus.messages.Pack]\nperiod = 0.2\n[bus.messages.Motor]\nperiod = 0.02"
