@@ -16,10 +16,11 @@ from gz_onboard.physics.elementary import asinh, exp
 PORT = Port.CELL_VOLTAGE
 RESISTANCE = "18650 cells: a third of R0 at 25 degC"
 ACTIVATION = "50 kJ/mol; Li-ion cells: 35 to 110"
-PARAMETERS = (
-    Parameter("charge_transfer_resistance", "ohm", 0.01, 0.01, 0.0, 10.0, RESISTANCE),
-    Parameter("charge_transfer_activation", "K", 6000.0, 2500.0, 0.0, 15000.0, ACTIVATION),
-    Parameter("charge_transfer_time", "s", 1.0, 1.0, 0.01, 60.0, "double layer: tenths of a second to seconds"),
+DOUBLE_LAYER = "double layer: tenths of a second to seconds"
+PARAMETERS = (  # of the kind of cell: from ride to ride they stay, but for how well its temperature is known
+    Parameter("charge_transfer_resistance", "ohm", 0.01, 0.01, 0.0, 10.0, RESISTANCE, ride_sd=1e-4, bench=True),
+    Parameter("charge_transfer_activation", "K", 6000.0, 2500.0, 0.0, 15000.0, ACTIVATION, ride_sd=20.0, bench=True),
+    Parameter("charge_transfer_time", "s", 1.0, 1.0, 0.01, 60.0, DOUBLE_LAYER, ride_sd=0.02, bench=True),
 )
 STRENGTHS = ()  # pulses of several currents show it; a ride shows it as resistance only
 
