@@ -13,10 +13,10 @@ import argparse
 import json
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from math import atan, cos, degrees, inf, pi, radians, tan
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -136,8 +136,29 @@ def coast_down(chassis: ChassisModel, roll: float, *, slow: float = SLOW, dt: fl
     return record
 
 
-def row(model: str, roll: float, run: CoastDown) -> dict[str, Any]:
-    """The figures of one coast-down at `roll` [degrees]; lengths in m, energies in J, angles in degrees."""
+@dataclass(frozen=True)
+class StudyRow:
+    """One coast-down at `roll` [degrees]: lengths in m, energies in J, forces in N, angles in degrees."""
+
+    roll: float
+    model: str
+    distance: float
+    time: float  # s
+    lost: float  # over `DISTANCE`
+    parts: dict[str, float]
+    speed_after: float  # m/s
+    lateral_acceleration: float  # m/s², as all that follow at `LOOK_AT`
+    load_front: float
+    load_rear: float
+    plane_load_front: float
+    plane_load_rear: float
+    rolling_radius: float
+    slip_front: float
+    slip_rear: float
+
+
+def row(model: str, roll: float, run: CoastDown) -> StudyRow:
+    """The figures of `run`."""
 
     def over(name: str) -> float:
         return run.at_distance(DISTANCE, [lost[name] for lost in run.lost])
@@ -145,39 +166,37 @@ def row(model: str, roll: float, run: CoastDown) -> dict[str, Any]:
     parts = {name: over(name) for name in run.lost[0] if name not in ("grade", "drive")}
     lateral = run.at_speed(LOOK_AT, "lateral_acceleration")
     side = -1.0 if lateral < 0 else 1.0  # slip angles are told as positive into the turn
-    return {
-        "roll": roll,
-        "model": model,
-        "distance": run.distance[-1],
-        "time": run.time[-1],
-        "lost": sum(parts.values()),
-        "parts": parts,
-        "speed after": run.at_distance(DISTANCE, [seen["speed"] for seen in run.seen]),
-        "lateral acceleration": abs(lateral),
-        "load front": run.at_speed(LOOK_AT, "load_front"),
-        "load rear": run.at_speed(LOOK_AT, "load_rear"),
-        "plane load front": run.at_speed(LOOK_AT, "plane_load_front"),
-        "plane load rear": run.at_speed(LOOK_AT, "plane_load_rear"),
-        "rolling radius": run.at_speed(LOOK_AT, "rolling_radius"),
-        "slip front": side * degrees(run.at_speed(LOOK_AT, "slip_front")),
-        "slip rear": side * degrees(run.at_speed(LOOK_AT, "slip_rear")),
-    }
+    seen = ("load_front", "load_rear", "plane_load_front", "plane_load_rear", "rolling_radius")
+    return StudyRow(
+        roll=roll,
+        model=model,
+        distance=run.distance[-1],
+        time=run.time[-1],
+        lost=sum(parts.values()),
+        parts=parts,
+        speed_after=run.at_distance(DISTANCE, [seen["speed"] for seen in run.seen]),
+        lateral_acceleration=abs(lateral),
+        slip_front=side * degrees(run.at_speed(LOOK_AT, "slip_front")),
+        slip_rear=side * degrees(run.at_speed(LOOK_AT, "slip_rear")),
+        **{name: run.at_speed(LOOK_AT, name) for name in seen},
+    )
 
 
-def markdown(rows: Sequence[dict[str, Any]]) -> str:
+def markdown(rows: Sequence[StudyRow]) -> str:
     """The table of the study."""
     heads = ["roll", "model", f"lost in {DISTANCE:.0f} m", "air", "rolling", "sideslip", "twisting"]
     heads += [f"coasts to {SLOW:.0f} m/s in", "load front, rear", "in the wheel's plane", "rolling radius"]
     lines = [
         [
-            f"{r['roll']:.0f}°",
-            r["model"],
-            f"{r['lost']:.0f} J",
-            *(f"{r['parts'][name]:.0f}" for name in PARTS),
-            f"{r['distance']:.0f} m, {r['time']:.1f} s",
-            *(f"{r[f'{load} front']:.0f}, {r[f'{load} rear']:.0f} N" for load in ("load", "plane load")),
-            f"{1000 * r['rolling radius']:.1f} mm",
-            f"{r['slip front']:.2f}°, {r['slip rear']:.2f}°",
+            f"{r.roll:.0f}°",
+            r.model,
+            f"{r.lost:.0f} J",
+            *(f"{r.parts[name]:.0f}" for name in PARTS),
+            f"{r.distance:.0f} m, {r.time:.1f} s",
+            f"{r.load_front:.0f}, {r.load_rear:.0f} N",
+            f"{r.plane_load_front:.0f}, {r.plane_load_rear:.0f} N",
+            f"{1000 * r.rolling_radius:.1f} mm",
+            f"{r.slip_front:.2f}°, {r.slip_rear:.2f}°",
         ]
         for r in rows
     ]
@@ -217,7 +236,7 @@ def _draw_energy(runs: dict[tuple[str, float], CoastDown], grid: Sequence[Axes])
     places = [i + i // len(CHASSIS_MODELS) for i in range(len(keys))]
     bottoms = np.zeros(len(keys))
     for name, shade in PARTS.items():
-        heights = np.array([r["parts"][name] / 1000 for r in rows])
+        heights = np.array([r.parts[name] / 1000 for r in rows])
         grid[2].bar(places, heights, bottom=bottoms, color=shade, label=name, width=0.85)
         bottoms += heights
     labels = [f"{model[0]}\n{roll:.0f}°" if model == "planar" else model[0] for model, roll in keys]
@@ -276,7 +295,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments.output.mkdir(parents=True, exist_ok=True)
     table = markdown(rows)
     (arguments.output / "turning.md").write_text(table + "\n", encoding="utf-8")
-    (arguments.output / "turning.json").write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+    (arguments.output / "turning.json").write_text(
+        json.dumps([asdict(r) for r in rows], indent=1) + "\n", encoding="utf-8"
+    )
     plot(runs, arguments.output)
     print(table)
     return 0

@@ -34,11 +34,11 @@ def test_loss_grows_with_roll(rows, model):
 
 def test_lean_shows_in_loads_radius_and_slip(rows):
     planar, leaning = rows["planar", 30.0], rows["leaning", 30.0]
-    assert planar["rolling radius"] == rows["straight", 0.0]["rolling radius"]
-    assert 0.005 < planar["rolling radius"] - leaning["rolling radius"] < 0.008
-    assert leaning["plane load rear"] > 1.1 * leaning["load rear"]
-    assert leaning["slip rear"] < 0.4 * planar["slip rear"]
-    assert leaning["load front"] + leaning["load rear"] == pytest.approx(planar["load front"] + planar["load rear"])
+    assert planar["rolling_radius"] == rows["straight", 0.0]["rolling_radius"]
+    assert 0.005 < planar["rolling_radius"] - leaning["rolling_radius"] < 0.008
+    assert leaning["plane_load_rear"] > 1.1 * leaning["load_rear"]
+    assert leaning["slip_rear"] < 0.4 * planar["slip_rear"]
+    assert leaning["load_front"] + leaning["load_rear"] == pytest.approx(planar["load_front"] + planar["load_rear"])
 
 
 def test_command_writes_table_and_plots(output, rows):
