@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from gz_onboard.constants import MILD
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import QUANTITIES
 from gz_onboard.physics.model import BURST, Model
 
 LARGEST = 1.0  # V of a cell, of a saved state
 FOREVER = 1e9  # s: a rest of unknown length
-MILD = 20.0  # degC: of cells after a restart
 
 
 class CellEffects:
@@ -42,6 +42,8 @@ class CellEffects:
     def overpotential_at(self, current: float) -> float:
         """`overpotential` [V] if a cell's `current` [A] had flowed of late, not that of the last step."""
         q, total = self._quantities, self.overpotential
+        if not q["cell_capacity"]:  # there was no step yet
+            return total
         other = {**q, "cell_current": current}
         for effect in self._effects:
             total += (effect(other) - effect(q)) * (1 - effect.decay(BURST, q))

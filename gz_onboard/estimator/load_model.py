@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import pi
 
+from gz_onboard.constants import MILD
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.model import Model, air_density, stepping
@@ -27,7 +28,7 @@ WARM_MOTOR = 40.0  # degC: a motor at work, where its temperature is not known
 HEADINGS = tuple(
     pi / 4 * i for i in range(8)
 )  # rad: of a wind slower than the scooter their mean is that of all, exactly
-USUAL_AIR = 20.0, 0.0  # degC, m: of the usual force
+USUAL_AIR = MILD, 0.0  # degC, m: of the usual force
 AMBIENT_DIGITS, ALTITUDE_DIGITS = 0, -2  # the prior riding is modelled anew for each degC and each 100 m
 BASE = {
     "speed",

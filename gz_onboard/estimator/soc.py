@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from math import inf, sqrt
 from typing import Protocol
 
+from gz_onboard.constants import HOUR
 from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.ekf import FilterMaker, SocFilter
 from gz_onboard.estimator.gate import ERROR_TIME, InnovationGate
@@ -14,7 +15,7 @@ from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.rest import RestUpdate
 from gz_onboard.estimator.signals import Signal, Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading, Synchroniser
-from gz_onboard.estimator.start import BRIDGE, HOUR, SOC_UNKNOWN_SD, Saved, bounded, plausible
+from gz_onboard.estimator.start import BRIDGE, SOC_UNKNOWN_SD, Saved, bounded, plausible
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
@@ -237,7 +238,8 @@ class StateOfCharge:
             current if reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else reading.reported_current
         )
         if explaining is not None:
-            by_load = r0 * explaining / battery.cells_parallel + self.effects.overpotential
+            by_load = explaining / battery.cells_parallel
+            by_load = r0 * by_load + (self.effects.overpotential_at(by_load) if self.effects else 0.0)
             self._sag.update(dt, shown, by_load)
         if dt <= self._timing.pause and self._rest.step(
             filter_, dt, shown, cell_current, temperature, reading.voltage_sd

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from math import exp, hypot, sqrt
 
+from gz_onboard.constants import HOUR
 from gz_onboard.estimator.ekf import Covariance, SocFilter
 from gz_onboard.physics.battery import HALF_FULL, Battery
 
@@ -29,7 +30,6 @@ OWN_SOC_GAIN_SD = 0.2  # relative, of the same: its window and its errors
 CONTRADICTS = 3.0  # sd: two that are further apart are not both right
 CURVE = -0.02, 1.02  # SOC to which a first voltage is read off the rest voltage
 ROUNDS = 5  # of the search for a SOC: R0 depends on it
-HOUR = 3600.0  # s
 SLOW_TIME = 1000.0  # s: time constant of slow diffusion in lithium-ion cells, a quarter of an hour or so
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from gz_onboard.constants import BENCH_TEMPERATURE
+from gz_onboard.constants import BENCH_TEMPERATURE, MILD
 from gz_onboard.estimator.signals import Signals
 
 COOLING_TIME = 7200.0  # s: how fast the cells' temperature drifts to the ambient's
 WARMER = 3.0  # K: cells over the ambient
-UNKNOWN = 20.0  # degC: the ambient that no sensor shows
 CELL_SD, CELL_SD_UNKNOWN = 1.0, 8.0  # K: of a sensor, of its replacement
 
 
@@ -34,7 +33,7 @@ class Temperatures:
             return ambient
         if self.cells is not None and self._signals.cell_temperature.fresh(now):
             return self.cells - WARMER
-        return UNKNOWN
+        return MILD
 
     def step(self, now: float, dt: float) -> float:
         """The cells' temperature [degC]: measured; else the last one, drifting to the ambient; else the ambient."""

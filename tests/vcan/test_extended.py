@@ -15,7 +15,7 @@ CITY = LOGS / "city_14C.blf"
 SECONDS = 12.0
 DISCOVERED = ROOT / "tests" / "vehicles" / "discovered.toml"  # see tests/test_turning_loss.py
 MORE = (
-    '"auxiliary_load", "cornering_drag", "headwind", "slow_relaxation", "ocv_hysteresis", "rough_road",\n]\n'
+    '"charge_transfer", "cornering_drag", "headwind", "slow_relaxation", "ocv_hysteresis", "rough_road",\n]\n'
     'effects_folder = "effects"'
 )
 VALUES = """[parameters]
@@ -36,7 +36,7 @@ def extended(folder: Path) -> Path:
     """The reference scooter with more effects, one a file of its own, and a current sensor that shows 2 A more."""
     text = (OWN / "reference.toml").read_text()
     for old, new in (
-        ('"auxiliary_load",\n]', MORE),
+        ('"charge_transfer",\n]', MORE),
         ("[parameters]\n", VALUES),
         ("pack_current_offset = { value = 0.02", "pack_current_offset = { value = 2.02"),
     ):

@@ -17,7 +17,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.coastdown_fit import RoadFit, covariance_with_inputs, fit_road
-from gz_onboard.lab.calibrate.coastdown_run import FASTEST, SLOWEST, SPAN, Coast, coast, directions
+from gz_onboard.lab.calibrate.coastdown_run import SLOWEST, SPAN, Coast, coast, directions
 from gz_onboard.lab.calibrate.fit import correlation, score
 from gz_onboard.lab.calibrate.result import Fit, Found, Panel, PlotLine, Result
 from gz_onboard.lab.calibrate.road_load import NAMES, RoadLoad, own_wind, roll
@@ -173,7 +173,7 @@ def _panels(force: RoadLoad, road: RoadFit, runs: Sequence[Coast], speeds: Seque
         errors.append(PlotLine(run.name, time, run.speed - model, "-"))
         level = run.slowing * (run.mass + force.rotating) - run.direction * slope * run.mass * GRAVITY
         loads.append(PlotLine(run.name, run.middle, level, "."))
-    v = np.linspace(SLOWEST, FASTEST, 50)
+    v = np.linspace(SLOWEST, max(float(run.speed.max()) for run in runs), 50)
     mass, temperature = (
         float(np.mean(column)) for column in zip(*((r.mass, r.temperature) for r in runs), strict=True)
     )

@@ -16,9 +16,9 @@ from gz_onboard.physics.sensors import speed_role, true_columns
 from gz_onboard.vehicle import Vehicle
 
 SPAN = 2.0  # s
-FASTEST, SLOWEST = 12.5, 1.0  # m/s: within these the run is fitted
+SLOWEST = 1.0  # m/s: down to it the run is fitted
 SHORTEST, LEAST_FALL = 10.0, 3.0  # s, m/s: less than this is of no use
-DRIVING = 2.0  # A of the motor beside its offset, mean of a span of coasting
+DRIVING = 0.01  # of the motor's greatest current, beside its offset: mean of a span of coasting
 RISING = 0.2  # m/s from one `RISE_TIME` to the next
 RISE_TIME = 5.0  # s
 CLOSED = 0.02  # of the throttle: below is noise
@@ -86,7 +86,7 @@ def samples(table: Measurements, facts: Mapping[str, object] | None = None) -> S
 
 
 def coast(run: Samples, vehicle: Vehicle, direction: int) -> Coast:
-    """The longest coasting of `run`: throttle closed, no brake, no current, from `FASTEST` down to `SLOWEST`.
+    """The longest coasting of `run`: throttle closed, no brake, no current, down to `SLOWEST`.
 
     Raises InputError for a run that has no speed, is too short, in which the motor drives or the speed rises.
     """
@@ -106,10 +106,9 @@ def coast(run: Samples, vehicle: Vehicle, direction: int) -> Coast:
     time, speed = time[keep], speed[keep]
     if not switched and len(speed):  # nothing but speed: from its greatest on
         time, speed = time[int(np.argmax(speed)) :], speed[int(np.argmax(speed)) :]
-    from_top = int(np.argmax(speed <= FASTEST)) if len(speed) and speed[0] > FASTEST else 0
     slow = np.flatnonzero(speed < SLOWEST)
     until = int(slow[0]) if len(slow) else len(speed)
-    time, speed = time[from_top:until], speed[from_top:until]
+    time, speed = time[:until], speed[:until]
     lasts = float(time[-1] - time[0]) if len(time) > 1 else 0.0
     falls = float(speed[0] - speed[-1]) if len(speed) > 1 else 0.0
     if lasts < SHORTEST or -RISING < falls < LEAST_FALL:
@@ -117,7 +116,7 @@ def coast(run: Samples, vehicle: Vehicle, direction: int) -> Coast:
             f"{run.name}: too short a coast-down: {lasts:.1f} s in which the speed falls by {falls:.1f} m/s; at least "
             f"{SHORTEST:g} s and {LEAST_FALL:g} m/s are needed (throttle below {CLOSED:.0%}, no brake)"
         )
-    _check_current(run, time)
+    _check_current(run, time, DRIVING * p["motor_current_limit"])
     n = max(int(lasts / SPAN), 1)
     ends = time[0] + SPAN * np.arange(n + 1)
     at = _smooth(time, speed, ends)
@@ -160,8 +159,8 @@ def _longest(rolling: Any, time: Array) -> tuple[int, int]:
     return int(best[0]), int(best[1])
 
 
-def _check_current(run: Samples, time: Array) -> None:
-    """Refuse a run in which the motor drives or brakes: current beyond its median, which is the sensor's offset."""
+def _check_current(run: Samples, time: Array, driving: float) -> None:
+    """Refuse a run with a current beyond `driving` [A] over its median, the sensor's offset: the motor works."""
     if "motor_current" not in run.columns:
         return
     t, current = run.columns["motor_current"]
@@ -172,10 +171,10 @@ def _check_current(run: Samples, time: Array) -> None:
     count = max(int((time[-1] - time[0]) / SPAN), 1)
     means = np.array([part.mean() for part in np.array_split(current[inside], count)])
     worst = int(np.argmax(np.abs(means)))
-    if abs(offset) > DRIVING or abs(means[worst]) > DRIVING:
+    if abs(offset) > driving or abs(means[worst]) > driving:
         raise InputError(
             f"{run.name}: the motor {'drives' if means[worst] > 0 else 'brakes'} while it should coast: "
-            f"{means[worst]:.1f} A in mean over {SPAN:g} s, {offset:.1f} A in all; at most {DRIVING:g} A"
+            f"{means[worst]:.1f} A in mean over {SPAN:g} s, {offset:.1f} A in all; at most {driving:.2g} A"
         )
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask, running_mean
-from gz_onboard.constants import GRAVITY
+from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
@@ -35,7 +35,6 @@ SWITCHED, REGENERATING = 0.01, -1.0  # of the brake switch; A of the motor: a br
 TOUCHED = 11  # grid steps: half a second to either side
 ACCELERATING, YAWING, CLIMBING = 0.4, 0.5, 2.0  # s: running means that take noise off acceleration, yaw rate, grade
 STEEPEST_LEAN, STEEPEST = 0.85, 0.5  # sine of the lean, and of the slope: beyond, the sensors err
-USUAL_AIR = 20.0  # degC, of a ride that did not measure it
 SUSPENSION = ("suspension_front", "suspension_rear")
 CRAWL, MOST_STEERING = 1.0, 0.6  # m/s, rad: of slower riding the angle is noise
 ROUGH_PERIOD = 0.034  # s: samples further apart do not show what a road does to a wheel
@@ -222,7 +221,7 @@ def _quantities(ride: Ride, p: Mapping[str, float]) -> dict[str, Array]:
     motor_speed = s["motor_speed"]
     speed = motor_speed * ride.radius
     acceleration: Array = np.gradient(smooth(speed, ACCELERATING), STEP)
-    ambient = s.get("ambient_temperature", np.full(n, USUAL_AIR))
+    ambient = s.get("ambient_temperature", np.full(n, MILD))
     temperature = s.get("cell_temperature", ambient)
     still = np.abs(speed) < STANDSTILL
     yaw = np.zeros(n)

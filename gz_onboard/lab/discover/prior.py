@@ -162,6 +162,8 @@ RIDE_SD = {
     "speed_sensor_scale": 3e-4,
     "pack_voltage_latency": 0.004,
 }
+SIZES = {"pack_current_offset": "current", "pack_voltage_offset": "voltage"}
+"""What those grow with whose prior is 0."""
 RIDE_SD_STEP = 4.0  # in which a scatter grows with a parameter over its prior: known to a factor of two
 RIDE_SD_SHARE = 0.1
 """What a parameter scatters by of which nothing is declared, as a share of its prior's standard deviation."""
@@ -196,9 +198,9 @@ class Prior:
 
 def prior_of(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], value: float, absent: bool) -> Prior:
     """Of the parameter `name`, at `value`. absent: it is of an effect that the model lacks."""
-    on_bench = False
+    on_bench, sizes = False, sizes_of(vehicle)
     if name in NUISANCE:
-        size = sizes_of(vehicle).of(NUISANCE[name].size)
+        size = sizes.of(NUISANCE[name].size)
         scatter, spread = NUISANCE[name].ride_sd * size, NUISANCE[name].sd * size
     else:
         parameter, known = declared[name], vehicle.parameters
@@ -209,7 +211,7 @@ def prior_of(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], val
         if healthy is not None and (absent or not stated or name == "payload_mass"):
             spread = healthy
         own = RIDE_SD.get(name, parameter.ride_sd)
-        size = nearest_step(value / parameter.prior, RIDE_SD_STEP) if parameter.prior else 1.0
+        size = nearest_step(value / parameter.prior, RIDE_SD_STEP) if parameter.prior else sizes.of(SIZES.get(name, ""))
         scatter = RIDE_SD_SHARE * parameter.prior_sd if own is None else own * size
     if name in LOG_SCALED:
         spread, scatter = min(spread / value, MOST_LOG), LOG_RIDE_SD.get(name, LOG_RIDE_SD_ELSE)

@@ -7,9 +7,8 @@ from math import log
 
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.physics.riding import PriorRiding
+from gz_onboard.physics.similarity import USUAL_CELLS
 from gz_onboard.vehicle import Vehicle
-
-CELLS = 14  # in series, of a pack of 52 V
 
 
 @dataclass(frozen=True)
@@ -50,11 +49,11 @@ def sizes_of(vehicle: Vehicle) -> Sizes:
         return p[name] / declared[name].prior
 
     fastest, usual = (max(speed for _, speed, _ in riding.points) for riding in (vehicle.riding, PriorRiding()))
-    cells = vehicle.battery.cells_series if vehicle.battery else CELLS
+    cells = vehicle.battery.cells_series if vehicle.battery else USUAL_CELLS["cells_series"]
     return Sizes(
         power=nearest_step(over("vehicle_mass")),
         current=nearest_step(over("motor_current_limit")),
-        voltage=nearest_step(cells / CELLS),
+        voltage=nearest_step(cells / USUAL_CELLS["cells_series"]),
         auxiliary=nearest_step(over("auxiliary_power")),
         speed=nearest_step(fastest / usual),
         spin=nearest_step(fastest / usual / (over("wheel_radius") * over("gear_ratio"))),
