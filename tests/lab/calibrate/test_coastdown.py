@@ -125,10 +125,11 @@ def test_covariance_is_that_of_the_values(healthy):
 
 
 def test_a_speed_term_that_does_not_show_is_refused_with_its_number():
-    found = calibrate(plant(3, rolling_resistance_speed=0.0)[0][0], VEHICLE, hold_out=False)
-    assert found.parameters["rolling_resistance_speed"].value == 0
-    assert "cannot be told from zero" in found.refusals[0]
-    assert "·10⁻⁵ s/m" in found.refusals[0]
+    every = [calibrate(plant(i, rolling_resistance_speed=0.0)[0][0], VEHICLE, hold_out=False) for i in range(3, 9)]
+    refused = [found for found in every if found.parameters["rolling_resistance_speed"].value == 0]
+    assert len(refused) >= 5  # it is given from 2 sd on: by chance of one in forty
+    assert all("cannot be told from zero" in found.refusals[0] for found in refused)
+    assert all("·10⁻⁵ s/m" in found.refusals[0] for found in refused)
 
 
 def test_a_speed_term_that_shows_is_given():
@@ -154,7 +155,7 @@ def changed(run, **columns):
 def test_refused_runs(healthy):
     runs = list(healthy[0])
     time, speed = runs[0].columns["motor_speed"]
-    with pytest.raises(InputError, match=r"run_0: too short a coast-down: 5\.\d s"):
+    with pytest.raises(InputError, match=r"run_0: too short a coast-down: 7\.\d s"):
         calibrate([changed(runs[0], motor_speed=(time[:80], speed[:80])), *runs[1:]], VEHICLE)
     rising = speed + 12 * np.exp(-(((time - 40) / 4) ** 2))
     with pytest.raises(InputError, match="run_0: the speed rises from"):
