@@ -210,7 +210,10 @@ class Forecaster:
         consumption = expected.consumption
         left, colder = (self._drawable(soc, t, expected) for t in (cell_temperature, cell_temperature - temperature_sd))
         energy_sd = sqrt(
-            (soc_sd * left.slope) ** 2 + (left.energy - colder.energy) ** 2 + (self._capacity_sd * left.energy) ** 2
+            (soc_sd * left.slope) ** 2
+            + (self.battery.window.sd * left.slope) ** 2
+            + (left.energy - colder.energy) ** 2
+            + (self._capacity_sd * left.energy) ** 2
         )
         range_ = left.energy / consumption
         variance = (
