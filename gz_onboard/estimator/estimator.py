@@ -38,7 +38,9 @@ from gz_onboard.physics.model import Model
 from gz_onboard.physics.riding import PriorRiding
 
 PACE = ("pack_voltage", "inverter_voltage", "motor_speed")  # the message of the first that is mapped sets the pace
+SHOWN = "bms_state_of_charge"
 STEP_AT_LEAST = 0.25  # s: without the message that sets the pace, a step is made after so long
+PACE_JITTER = 0.05  # s: so near its time a step is left to that message: speed and current of a step are of one time
 SHORTEST_STEP = 0.02  # s: what comes sooner belongs to the last step
 FORECAST_PERIOD = 1.0  # s
 EARLY = 0.05  # s: by so much a forecast may be made early, rather than a step late
@@ -78,6 +80,7 @@ class Estimator:
         self._vibration = VibrationMonitor() if "vibration" in model.reads else None
         self._shaken = next(iter(_carrying(("accel_z",), groups)), -1) if self._vibration else -1
         self._accel_z = groups[self._shaken].roles.index("accel_z") if self._shaken >= 0 else 0
+        self._shown = next(iter(_carrying((SHOWN,), groups)), -1) if battery.window.given else -1
         self._time: float | None = None  # s, of the last step
         self._deadline = float("-inf")
         self._activities = Activities()
@@ -121,11 +124,22 @@ class Estimator:
                 signal.count += 1
         if group == self._shaken and self._vibration and (accel_z := values[self._accel_z]) is not None:
             self._vibration.update(time, accel_z)
+        if group == self._shown and time == self.signals[SHOWN].time:
+            self.signals[SHOWN].value = self.battery.window.of_cells(self.signals[SHOWN].value)
         if group == self._pace or time >= self._deadline:
-            if self._time is None and group != self._pace and self._deadline < 0:
-                self._deadline = time + STEP_AT_LEAST  # the first step too is for the message that sets the pace
+            if group != self._pace and self._await_pace(time):
                 return
             self._step(time)
+
+    def _await_pace(self, time: float) -> bool:
+        """Whether the message that sets the pace is about to come: the first, or the next by its period."""
+        if self._time is None and self._deadline < 0:
+            self._deadline = time + STEP_AT_LEAST
+            return True
+        if self._pace < 0 or abs(time - self._last_seen[self._pace] - self._timing.periods[self._pace]) >= PACE_JITTER:
+            return False
+        self._deadline = time + PACE_JITTER
+        return True
 
     def _step(self, now: float) -> None:
         dt = 0.0 if self._time is None else now - self._time
@@ -258,7 +272,7 @@ class Estimator:
         if filter_ is None:
             estimate.state = State.INVALID if now > STARTING_FOR else State.STARTING
             return estimate
-        estimate.soc, estimate.soc_sd = min(max(filter_.soc, 0.0), 1.0), sqrt(filter_.covariance[0])
+        estimate.soc, estimate.soc_sd = self.battery.window.shown(filter_.soc, sqrt(filter_.covariance[0]))
         estimate.v1, estimate.innovation_rms = filter_.v1, self.soc.gate.rms
         if estimate.soc_sd > UNCERTAIN:
             estimate.reasons |= Reason.SOC_UNCERTAIN

@@ -32,7 +32,6 @@ from gz_onboard.physics.riding import PriorRiding
 SEGMENT = 250.0  # m
 PRIOR_LENGTH = 3000.0  # m: the prior riding counts like that much of real riding
 ALIKE = 300.0  # m: over such a distance segments are alike; those of the eight commissioning rides are not at 250 m
-DRIFT = 0.055  # relative sd: the rest of the ride is not the ride so far; the eight rides differ by that
 FACTOR_WALK = 0.01  # sd of its change over a segment: wind, tyres, traffic
 SEGMENT_SD = 0.18  # relative: measured against modelled energy of one segment, of the eight commissioning rides
 HEIGHT_WALK = 0.75  # m per sqrt(m): roads climb or fall by 60 m on 6 km; where no sensor showed the grade
@@ -81,7 +80,7 @@ class Forecaster:
 
     def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
         self.load = LoadModel(model, battery, prior)
-        self.battery = battery
+        self.battery, self._drift = battery, prior.drift
         self.riding = Riding(factor=prior.factor, factor_variance=prior.factor_sd**2)
         self._past = Past()
         self._overpotential = model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
@@ -211,13 +210,16 @@ class Forecaster:
         consumption = expected.consumption
         left, colder = (self._drawable(soc, t, expected) for t in (cell_temperature, cell_temperature - temperature_sd))
         energy_sd = sqrt(
-            (soc_sd * left.slope) ** 2 + (left.energy - colder.energy) ** 2 + (self._capacity_sd * left.energy) ** 2
+            (soc_sd * left.slope) ** 2
+            + (self.battery.window.sd * left.slope) ** 2
+            + (left.energy - colder.energy) ** 2
+            + (self._capacity_sd * left.energy) ** 2
         )
         range_ = left.energy / consumption
         variance = (
             loss_variance
             + expected.scatter * ALIKE * (1 / max(range_, ALIKE) + 1 / max(expected.distance, ALIKE))
-            + DRIFT**2
+            + self._drift**2
             + r.factor_variance / r.factor**2
         )
         variance = min(variance, MOST_SD**2)

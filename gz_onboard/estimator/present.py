@@ -46,9 +46,10 @@ class Present:
         return self._load.power(quantities)
 
     def power_of_prior(self, now: float) -> float:
-        """Of the prior riding [W]."""
-        conditions = self.conditions(now)
-        return self._load.prior_ride(conditions.ambient, conditions.altitude)[0]
+        """Of the riding before the first voltage [W]: the prior's, or, where it rides faster, at its speed."""
+        conditions, speed = self.conditions(now), self._road.speed or 0.0
+        power, usual = self._load.prior_ride(conditions.ambient, conditions.altitude)
+        return max(power, self.power_at(now, speed, 0.0)) if speed > usual else power
 
     def effect_inputs(self, now: float) -> EffectInputs | None:
         """What effects beyond the base's may read; None if the model has none."""

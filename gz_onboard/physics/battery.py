@@ -13,7 +13,7 @@ or discovers calls them. The RC pair is `physics.relaxation`.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import sqrt
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -66,6 +66,28 @@ def dissipation(r0: Any, r1: Any, current_squared: Any, v1: Any) -> Any:
 
 
 @dataclass(frozen=True)
+class Window:
+    """The cells' states of charge at which the vehicle shows empty and full: it keeps the rest for itself.
+
+    sd: of each. given: the vehicle file says it; else the cells are used until their cut-off voltage.
+    """
+
+    low: float = 0.0
+    high: float = 1.0
+    sd: float = 0.0
+    given: bool = False
+
+    def shown(self, soc: float, sd: float) -> tuple[float, float]:
+        """(state of charge as the vehicle shows it, its sd) for that of the cells."""
+        width = self.high - self.low
+        return min(max((soc - self.low) / width, 0.0), 1.0), sqrt(sd * sd + self.sd**2) / width
+
+    def of_cells(self, shown: float) -> float:
+        """The cells' state of charge for what the vehicle shows."""
+        return self.low + shown * (self.high - self.low)
+
+
+@dataclass(frozen=True)
 class Battery:
     """A pack of `cells_series` by `cells_parallel` cells."""
 
@@ -86,6 +108,7 @@ class Battery:
     rest_shift_temperature: Row = ()  # degC; none: V_oc does not depend on temperature
     rest_shift_value: Row = ()  # V of a cell
     rest_shift_sd: float = 0.0  # V
+    window: Window = field(default_factory=Window)
 
     def cell_capacity(self, temperature: float) -> float:
         """Capacity of a cell [A·h] at `temperature` [degC]: the charge between SOC 0 and 1."""

@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from gz_onboard.constants import BENCH_TEMPERATURE
-from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery import HALF_FULL, Battery, Window
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.similarity import MOST_CELLS
 from gz_onboard.physics.tables import Mesh, Row, linear
@@ -24,7 +24,7 @@ LARGEST_SHIFT = 0.2  # V: real cells rest tens of mV apart from -20 to 25 degC; 
 def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
     """The battery in the vehicle file; InputError for tables that do not make sense."""
     table = vehicle.table("battery")
-    table.only(["cells_series", "cells_parallel", "ocv", "rest_shift", "capacity", "r0", "r1", "c1"])
+    table.only(["cells_series", "cells_parallel", "ocv", "rest_shift", "capacity", "window", "r0", "r1", "c1"])
     ocv = table.table("ocv")
     ocv.only(["soc", "value", "unit", "sd", "source", "status"])
     ocv.text("unit", choices=["V"])
@@ -65,6 +65,7 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         rest_shift_temperature=shift_temperatures,
         rest_shift_value=shifts,
         rest_shift_sd=shift_sd,
+        window=_window(table),
     )
     return battery.with_parameters(parameters)
 
@@ -81,6 +82,20 @@ def _rest_shift(battery: Table) -> tuple[Row, Row, float]:
         wanted = f"must be {len(temperatures)} numbers within {-LARGEST_SHIFT:g} to {LARGEST_SHIFT:g} V"
         raise table.error(f"{wanted}, one for each temperature", "value")
     return temperatures, shifts, table.number("sd", 0.005, low=0.0, high=LARGEST_SHIFT)
+
+
+def _window(battery: Table) -> Window:
+    """The share of the cells' charge that the vehicle uses; all of it if the file does not say."""
+    if "window" not in battery.values:
+        return Window()
+    table = battery.table("window")
+    table.only(["low", "high", "sd", "source", "status"])
+    return Window(
+        table.number("low", low=0.0, high=HALF_FULL),
+        table.number("high", low=HALF_FULL, high=1.0),
+        table.number("sd", 0.01, low=0.0, high=HALF_FULL),
+        given=True,
+    )
 
 
 def _axis(table: Table, key: str, low: float, high: float, least: int = 2) -> Row:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from gz_onboard.constants import HOUR
 from gz_onboard.physics.battery import Battery, Overpotential
 
+BELOW_EMPTY = -0.05  # SOC down to which the cut-off is sought
+
 
 @dataclass(frozen=True)
 class Drawable:
@@ -29,18 +31,20 @@ def drawable(
     form_factor_squared: float = 1.0,
     overpotential: Overpotential | None = None,
 ) -> Drawable:
-    """What a pack at `soc` and `temperature` [degC] delivers at a mean `power` [W] until the cut-off.
+    """What a pack at `soc` and `temperature` [degC] delivers at a mean `power` [W] until the cut-off, or until the end
+    of the charge that the vehicle uses.
 
     At constant power P the charge Q·dSOC passes in dt = Q·dSOC/I, so the energy is P·Q·∫ dSOC/I(SOC), from the
     SOC at which the terminal voltage at the mean load meets the cut-off: bursts are held back by the vehicle before.
     form_factor_squared, overpotential: see `Battery.settled_current`. The RC pair is taken as settled (V1 = R1·I):
     discharging takes an hour, its time constant is a minute.
     """
-    low, high = -0.05, soc
+    least = battery.window.low if battery.window.given else BELOW_EMPTY
+    low, high = least, soc
     charge = battery.pack_capacity(temperature) * HOUR
     cutoff = battery.cutoff_voltage * battery.cells_series
     current = battery.settled_current(power, soc, temperature, overpotential=overpotential)
-    if current is None or power < cutoff * current:
+    if current is None or power < cutoff * current or soc <= least:
         return Drawable(0.0, charge * cutoff)
     slope = charge * power / current
     for _ in range(14):  # to 6e-5 of SOC

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 
 LATERAL = 1.1  # m/s², of the eight commissioning rides; each alone 0.26 (suburban) to 1.7 (oval)
+DRIFT = 0.055  # of the eight commissioning rides, which stay in town or on one road
 VIBRATION = 1.3  # m/s², RMS while moving, of the median of the eight commissioning rides; each alone 1.14 to 1.43
 
 
@@ -25,8 +26,8 @@ class PriorRiding:
 
     points: (share of time, speed [m/s], acceleration [m/s²]). unevenness: what hills and what lies between the
     points add to the energy modelled. factor, factor_sd: energy measured over modelled, and how that differs from
-    ride to ride. lateral_acceleration, vibration: the root mean square while moving [m/s²]; only a model that reads it
-    asks.
+    ride to ride. drift: relative sd of what the rest of a ride consumes per metre, expected from the ride so far.
+    lateral_acceleration, vibration: the root mean square while moving [m/s²]; only a model that reads it asks.
     """
 
     points: tuple[tuple[float, float, float], ...] = (
@@ -41,6 +42,7 @@ class PriorRiding:
     unevenness: float = 1.1
     factor: float = 1.0
     factor_sd: float = 0.15
+    drift: float = DRIFT
     lateral_acceleration: float = LATERAL
     vibration: float = VIBRATION
 
@@ -56,7 +58,7 @@ def read_riding(vehicle: Table) -> PriorRiding:
     ``riding`` has rows of share of time, speed [m/s], acceleration [m/s²].
     """
     table = vehicle.table("forecast")
-    table.only(["riding", "unevenness", "factor", "factor_sd", "lateral_acceleration", "vibration", "source"])
+    table.only(["riding", "unevenness", "factor", "factor_sd", "drift", "lateral_acceleration", "vibration", "source"])
     town = PriorRiding()
     if "riding" not in table.values:
         points = town.points
@@ -75,6 +77,7 @@ def read_riding(vehicle: Table) -> PriorRiding:
         table.number("unevenness", town.unevenness, 1.0, 2.0),
         table.number("factor", town.factor, 0.1, 10.0),
         table.number("factor_sd", town.factor_sd, 0.001, 1.0),
+        table.number("drift", town.drift, 0.0, 1.0),
         table.number("lateral_acceleration", town.lateral_acceleration, 0.0, 9.0),
         table.number("vibration", town.vibration, 0.0, 20.0),
     )

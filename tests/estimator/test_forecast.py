@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -207,3 +208,12 @@ def test_nothing_from_before_a_restart_is_unlearned():
     ride(again, 0.6)
     again.forget(2000.0)
     assert len(again.riding.segments) == segments
+
+
+def test_a_vehicle_whose_rides_change_has_a_wide_interval():
+    """Known to the same: only that the rest of a ride is less like its begin."""
+    town, far = (Forecaster(VEHICLE.model, VEHICLE.pack, replace(VEHICLE.riding, drift=d)) for d in (0.055, 0.25))
+    for f in (town, far):
+        f.riding.factor_variance = 1e-6
+    assert forecast(town).range == forecast(far).range
+    assert 1.2 < forecast(town).p90 / forecast(town).p10 < 1.5 < 1.7 < forecast(far).p90 / forecast(far).p10
