@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import repeat
 
 import numpy as np
 
@@ -71,7 +70,7 @@ def components(
             force = (constant * current - drag_torque(idle, speed)) / road_speed(1.0, vehicle.parameters)
             needed = road_load(vehicle, measured, ambient, roller)
             found["road_load"] = Component(Quantity("N", "road load"), force, needed, moving)
-        found |= _temperatures(vehicle, measured, soc, ambient, copper + idle, inverter, every)
+        found |= _temperatures(vehicle, measured, soc, ambient, (copper + idle, idle, inverter))
     return found
 
 
@@ -160,25 +159,29 @@ def _temperatures(
     measured: Mapping[str, Array],
     soc: float | None,
     ambient: float,
-    motor_heat: Array,
-    inverter_heat: Array,
-    every: Mask,
+    losses: tuple[Array, Array, Array],
 ) -> dict[str, Component]:
-    """The cooling networks with the heat of the measured currents and the measured ambient temperature."""
-    air = measured.get("ambient_temperature", np.full(len(every), ambient))
+    """The cooling networks with the heat of the measured currents, the measured ambient temperature and speed.
+
+    losses: of the motor, of it without current, of the inverter [W]. A roller has a fan that follows it.
+    """
+    speed = np.abs(measured["speed"])
+    every = np.ones(len(speed), dtype=bool)
     p, battery = vehicle.parameters, vehicle.battery
+    air = measured.get("ambient_temperature", np.full(len(every), ambient))
+    outside = air, speed, np.full(len(every), p["cooling_factor"])
+    motor_heat, idle, inverter_heat = losses
     found: dict[str, Component] = {}
 
-    def add(sensor: str, network: Network, heat: Array) -> None:
-        flow = repeat(p["cooling_factor"], len(heat))
-        modelled = np.array(temperatures(network, 1.0, heat.tolist(), air.tolist(), flow))
+    def add(sensor: str, network: Network, heat: Array, *more: Array) -> None:
+        modelled = np.array(temperatures(network, 1.0, heat, *outside, *more))
         found[sensor] = Component(CHANNELS[sensor], measured[sensor], modelled, every)
 
     def start(sensor: str) -> float:
         return float(measured[sensor][0])
 
     if "motor_temperature" in measured:
-        add("motor_temperature", MotorCooling.of(p, start("motor_temperature")), motor_heat)
+        add("motor_temperature", MotorCooling.of(p, start("motor_temperature")), motor_heat, idle)
     if "inverter_temperature" in measured:
         network = InverterCooling.of(p, start("inverter_temperature"))
         add("inverter_temperature", network, inverter_heat)
@@ -186,7 +189,7 @@ def _temperatures(
         cells, current = measured["cell_temperature"], measured["pack_current"]
         levels = soc - np.cumsum(discharged(current, 1.0, battery.pack_capacity(start("cell_temperature"))))
         rest = battery.ocv_over(levels, cells) * battery.cells_series
-        generated = heat(rest, measured["pack_voltage"], current)
+        generated = heat(rest, measured["pack_voltage"], current) + battery.reversible_heat(current, levels, cells)
         pack = LumpedCooling.of(p, "pack", start("cell_temperature"))
         add("cell_temperature", pack, generated)
     return found
