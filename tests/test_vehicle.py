@@ -36,6 +36,23 @@ def test_the_packages_own_vehicles_are_whole(name):
     assert vehicle.name in vehicle.key
 
 
+ENTROPY = r"(\[battery.entropy\]\nsoc = .*\nvalue = \[)[-\d.e]+, "
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (r'unit = "V/K"', 'unit = "mV/K"', "battery.entropy.unit: 'mV/K' is not one of V/K"),
+        (ENTROPY, r"\g<1>-0.4, ", "battery.entropy.value: -0.4 is outside -0.005 to 0.005"),
+        (ENTROPY, r"\g<1>", "battery.entropy.value: must be 7 numbers, one for each soc"),
+    ],
+)
+def test_an_entropy_that_cannot_be_is_named_with_its_line(tmp_path, old, new, message):
+    file, _ = changed(tmp_path, old, new)
+    with pytest.raises(InputError, match=rf"mine.toml:\d+: {re.escape(message)}"):
+        read_vehicle(str(file))
+
+
 def test_the_key_tells_what_a_saved_state_belongs_to(tmp_path):
     ours = read_vehicle("reference").key
     for old, new in [('"grade_force", ', ""), ("cells_series = 14", "cells_series = 13"), ("-scooter", "-2")]:

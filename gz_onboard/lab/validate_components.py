@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import repeat
 
 import numpy as np
 
@@ -44,8 +43,10 @@ class Component:
 def components(
     vehicle: Vehicle, measured: Mapping[str, Array], soc: float | None, ambient: float, roller: Dynamometer | None
 ) -> dict[str, Component]:
-    """Those whose inputs were measured. measured: by role, per second, all of one length, and ``acceleration``,
-    ``grade``, ``yaw_rate``, ``braking`` where known. soc, ambient: at the start.
+    """Those whose inputs were measured.
+
+    measured: by role, per second, all of one length, and ``acceleration``, ``grade``, ``yaw_rate``, ``braking``,
+    ``pack_power`` and the heats of `validate_ride.losses_per_second` where known. soc, ambient: at the start.
     """
     found: dict[str, Component] = {}
     has = measured.keys()
@@ -71,7 +72,8 @@ def components(
             force = (constant * current - drag_torque(idle, speed)) / road_speed(1.0, vehicle.parameters)
             needed = road_load(vehicle, measured, ambient, roller)
             found["road_load"] = Component(Quantity("N", "road load"), force, needed, moving)
-        found |= _temperatures(vehicle, measured, soc, ambient, copper + idle, inverter, every)
+        warm = {"motor_heat": copper + idle, "idle_heat": idle, "inverter_heat": inverter} | dict(measured)
+        found |= _temperatures(vehicle, warm, soc, ambient)
     return found
 
 
@@ -156,37 +158,38 @@ def road_load(vehicle: Vehicle, measured: Mapping[str, Array], ambient: float, r
 
 
 def _temperatures(
-    vehicle: Vehicle,
-    measured: Mapping[str, Array],
-    soc: float | None,
-    ambient: float,
-    motor_heat: Array,
-    inverter_heat: Array,
-    every: Mask,
+    vehicle: Vehicle, measured: Mapping[str, Array], soc: float | None, ambient: float
 ) -> dict[str, Component]:
-    """The cooling networks with the heat of the measured currents and the measured ambient temperature."""
-    air = measured.get("ambient_temperature", np.full(len(every), ambient))
+    """The cooling networks with the heat of the measured currents, the measured ambient temperature and speed.
+
+    measured: with motor_heat, idle_heat (of it without current) and inverter_heat [W]. A roller's fan follows it.
+    """
+    speed = np.abs(measured["speed"])
+    every = np.ones(len(speed), dtype=bool)
     p, battery = vehicle.parameters, vehicle.battery
+    air = measured.get("ambient_temperature", np.full(len(every), ambient))
+    outside = air, speed, np.full(len(every), p["cooling_factor"])
     found: dict[str, Component] = {}
 
-    def add(sensor: str, network: Network, heat: Array) -> None:
-        flow = repeat(p["cooling_factor"], len(heat))
-        modelled = np.array(temperatures(network, 1.0, heat.tolist(), air.tolist(), flow))
+    def add(sensor: str, network: Network, heat: Array, *more: Array) -> None:
+        modelled = np.array(temperatures(network, 1.0, heat, *outside, *more))
         found[sensor] = Component(CHANNELS[sensor], measured[sensor], modelled, every)
 
     def start(sensor: str) -> float:
         return float(measured[sensor][0])
 
     if "motor_temperature" in measured:
-        add("motor_temperature", MotorCooling.of(p, start("motor_temperature")), motor_heat)
+        heats = measured["motor_heat"], measured["idle_heat"]
+        add("motor_temperature", MotorCooling.of(p, start("motor_temperature")), *heats)
     if "inverter_temperature" in measured:
         network = InverterCooling.of(p, start("inverter_temperature"))
-        add("inverter_temperature", network, inverter_heat)
+        add("inverter_temperature", network, measured["inverter_heat"])
     if battery and measured.keys() >= {"cell_temperature", "pack_current", "pack_voltage"} and soc is not None:
         cells, current = measured["cell_temperature"], measured["pack_current"]
         levels = soc - np.cumsum(discharged(current, 1.0, battery.pack_capacity(start("cell_temperature"))))
         rest = battery.ocv_over(levels, cells) * battery.cells_series
-        generated = heat(rest, measured["pack_voltage"], current)
+        delivered = measured.get("pack_power", measured["pack_voltage"] * current)
+        generated = heat(rest, 0.0, current) - delivered + battery.reversible_heat(current, levels, cells)
         pack = LumpedCooling.of(p, "pack", start("cell_temperature"))
         add("cell_temperature", pack, generated)
     return found

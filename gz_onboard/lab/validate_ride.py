@@ -15,7 +15,7 @@ import numpy as np
 from gz_onboard.arrays import Array, block_means, running_mean
 from gz_onboard.constants import GRAVITY, MILD, WH
 from gz_onboard.errors import InputError, writing
-from gz_onboard.lab.validate_components import Component, components
+from gz_onboard.lab.validate_components import Component, components, losses
 from gz_onboard.lab.validate_score import (
     CHANNELS,
     COMPONENT_GATE,
@@ -146,6 +146,7 @@ def _measured(log: Path, vehicle: Vehicle, size: int, progress: Progress) -> Mea
     road, grade = _road(recorded, log)
     if grade is not None:
         measured["grade"] = grade
+    measured |= losses_per_second(recorded, vehicle)
     return Measured(recorded, vehicle, measured, road, rest_soc(recorded, vehicle))
 
 
@@ -162,8 +163,20 @@ def per_second(recorded: Recorded) -> dict[str, Array]:
     if "brake" in measured:
         measured["braking"] = (measured["brake"] > 0).astype(float)
     if {"pack_current", "pack_voltage"} <= measured.keys():
-        measured["pack_power"] = measured["pack_voltage"] * measured["pack_current"]
+        power = recorded.signals["pack_voltage"] * recorded.signals["pack_current"]
+        measured["pack_power"] = block_means(power, rate)  # of bursts within a second too
     return measured
+
+
+def losses_per_second(recorded: Recorded, vehicle: Vehicle) -> dict[str, Array]:
+    """The motor_heat, idle_heat and inverter_heat [W] of `validate_components`, of bursts within a second too."""
+    signals = recorded.signals
+    inputs = [signals.get(role) for role in ("motor_current", "motor_speed", "motor_temperature")]
+    if any(column is None for column in inputs):
+        return {}
+    copper, idle, inverter = losses(vehicle, *(column for column in inputs if column is not None))
+    heats = {"motor_heat": copper + idle, "idle_heat": idle, "inverter_heat": inverter}
+    return {name: block_means(watts, round(1 / recorded.dt)) for name, watts in heats.items()}
 
 
 def _averaged_speed(recorded: Recorded) -> Array:

@@ -4,7 +4,8 @@
 
 with I the cell's current, positive when discharging. R0, R1 and C1 are tables over SOC and temperature; V_oc goes on
 beyond full and empty along its last slope, so that an estimate that strays there is still shown its way back. A cold
-cell rests lower: with `rest_shift` V_oc(SOC, T) = V_oc(SOC) + shift(T).
+cell rests lower: with `rest_shift` V_oc(SOC, T) = V_oc(SOC) + shift(T). Its heat is what it loses (eq. 2.24) and, with
+`entropy` over SOC, what the reaction gives or takes as heat without loss.
 
 The functions are the equations, of floats and of numpy arrays alike; who simulates, estimates, calibrates, validates
 or discovers calls them. The RC pair is `physics.relaxation`.
@@ -17,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from math import sqrt
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from gz_onboard.constants import HOUR
+from gz_onboard.constants import HOUR, KELVIN
 from gz_onboard.physics.relaxation import decay_over, relaxed
 from gz_onboard.physics.tables import Mesh, Row, extended, extended_over, linear
 
@@ -54,6 +55,15 @@ def heat(rest: Any, terminal: Any, current: Any) -> Any:
     It counts what the RC pair's capacitor stores for a minute as heat, as the printed form does.
     """
     return (rest - terminal) * current
+
+
+def reversible_heat(entropy: Any, current: Any, temperature: Any) -> Any:
+    """Heat [W] of the change of order in the electrodes, -I·T·dU/dT (Bernardi 1985); cold if it is negative.
+
+    entropy: dU/dT of the open-circuit voltage [V/K]; temperature in degC. It changes its sign with the current's, and
+    is in no voltage: what a cell delivers it takes from its surroundings.
+    """
+    return -entropy * current * (temperature + KELVIN)
 
 
 def dissipation(r0: Any, r1: Any, current_squared: Any, v1: Any) -> Any:
@@ -109,6 +119,8 @@ class Battery:
     rest_shift_value: Row = ()  # V of a cell
     rest_shift_sd: float = 0.0  # V
     window: Window = field(default_factory=Window)
+    entropy_soc: Row = ()  # none: no reversible heat
+    entropy_value: Row = ()  # V/K of a cell
 
     def cell_capacity(self, temperature: float) -> float:
         """Capacity of a cell [A·h] at `temperature` [degC]: the charge between SOC 0 and 1."""
@@ -145,6 +157,18 @@ class Battery:
         if self.rest_shift_value:
             volts = volts + np.interp(temperature, self.rest_shift_temperature, self.rest_shift_value)
         return volts
+
+    def reversible_heat(self, current: Any, soc: Any, temperature: Any) -> Any:
+        """`reversible_heat` of the pack [W] at its `current` [A] and `temperature` [degC]; all floats, or all (n,)."""
+        if not self.entropy_soc:
+            return 0.0 * current
+        if isinstance(soc, float):
+            entropy: Any = linear(self.entropy_soc, self.entropy_value, soc)
+        else:
+            import numpy as np
+
+            entropy = np.interp(soc, self.entropy_soc, self.entropy_value)
+        return reversible_heat(self.cells_series * entropy, current, temperature)
 
     def soc_at(self, ocv: float, temperature: float | None = None) -> float:
         """The SOC at which the open-circuit voltage of a cell is `ocv` [V]; `temperature` as for `ocv`."""

@@ -18,13 +18,14 @@ TEMPERATURE = (-60.0, 100.0)  # degC, of a cell
 RESISTANCE = (1e-6, 10.0)  # ohm, of a cell: from the largest to a frozen one of a watch
 CAPACITANCE = (1e-3, 1e8)  # F, of a cell's RC pair
 SMALLEST_STEP = 1e-6  # of SOC, V or degC, from point to point: a slope must stay a number
+LARGEST_ENTROPY = 5e-3  # V/K: of intercalation cells 1e-3 at most; more is mV/K
 LARGEST_SHIFT = 0.2  # V: real cells rest tens of mV apart from -20 to 25 degC; more is a mistyped unit
 
 
 def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
     """The battery in the vehicle file; InputError for tables that do not make sense."""
     table = vehicle.table("battery")
-    table.only(["cells_series", "cells_parallel", "ocv", "rest_shift", "capacity", "window", "r0", "r1", "c1"])
+    table.only("cells_series cells_parallel ocv rest_shift voltage_error entropy capacity window r0 r1 c1".split())
     ocv = table.table("ocv")
     ocv.only(["soc", "value", "unit", "sd", "source", "status"])
     ocv.text("unit", choices=["V"])
@@ -48,6 +49,7 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         if min(capacities) < 0.05 or max(capacities) > 2:
             raise capacity.error(f"must be within 0.05 to 2 times what it is at {BENCH_TEMPERATURE:g} degC", "value")
     shift_temperatures, shifts, shift_sd = _rest_shift(table)
+    entropy_soc, entropy = _entropy(table)
     battery = Battery(
         cells_series=table.integer("cells_series", 1, MOST_CELLS),
         cells_parallel=table.integer("cells_parallel", 1, MOST_CELLS),
@@ -66,6 +68,8 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         rest_shift_value=shifts,
         rest_shift_sd=shift_sd,
         window=_window(table),
+        entropy_soc=entropy_soc,
+        entropy_value=entropy,
     )
     return battery.with_parameters(parameters)
 
@@ -96,6 +100,20 @@ def _window(battery: Table) -> Window:
         table.number("sd", 0.01, low=0.0, high=HALF_FULL),
         given=True,
     )
+
+
+def _entropy(battery: Table) -> tuple[Row, Row]:
+    """(SOC, dU/dT [V/K]); nothing if the file does not have the table."""
+    if "entropy" not in battery.values:
+        return (), ()
+    table = battery.table("entropy")
+    table.only(["soc", "value", "unit", "sd", "source", "status"])
+    table.text("unit", choices=["V/K"])
+    soc = _axis(table, "soc", -0.01, 1.01, least=1)
+    value = table.numbers("value", -LARGEST_ENTROPY, LARGEST_ENTROPY)
+    if len(value) != len(soc):
+        raise table.error(f"must be {len(soc)} numbers, one for each soc", "value")
+    return soc, value
 
 
 def _axis(table: Table, key: str, low: float, high: float, least: int = 2) -> Row:

@@ -76,12 +76,14 @@ SIMULATION_PARAMETERS = (
     Parameter("inverter_box_to_air", "W/K", 3.0, 1.5, 0.001, 5000, "still air in the box"),
     Parameter("inverter_board_to_box", "W/K", 4.0, 2.0, 0.001, 5000, "through its mounting"),
     Parameter("inverter_box_to_ambient", "W/K", 4.0, 2.0, 0.001, 5000, "box in moving air"),
+    Parameter("inverter_box_per_speed", "W·s/(K·m)", 0.0, 0.2, 0, 500, "what moving air adds to the one before"),
     Parameter("motor_stator_capacity", "J/K", 3000, 1000, 1, 1e6, "copper and iron of 7 kg"),
     Parameter("motor_rotor_capacity", "J/K", 4000, 1500, 1, 1e6, "rim and magnets of 8 kg"),
     Parameter("motor_gap_conductance", "W/K", 5.0, 2.0, 0.001, 5000, "air gap and bearings of a hub motor"),
     Parameter("motor_rotor_to_ambient", "W/K", 6.0, 3.0, 0.001, 5000, "rim in moving air"),
+    Parameter("motor_rotor_per_speed", "W·s/(K·m)", 0.0, 0.3, 0, 500, "what moving air adds to the one before"),
     Parameter("cooling_factor", "1", 1.0, 0.1, 0.02, 5, "on what motor, inverter and pack give to the ambient air"),
-    Parameter("motor_stator_share", "1", 0.9, 0.1, 0, 1, "copper and iron loss are in the stator"),
+    Parameter("motor_iron_share", "1", 0.7, 0.2, 0, 1, "of iron and drag, in the stator; magnets and bearings beside"),
 )
 
 

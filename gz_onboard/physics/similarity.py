@@ -23,6 +23,7 @@ _PACK_RESISTANCE = {"cells_series": 1.0, "cells_parallel": -1.0, "cell_capacity"
 
 _LAWS: tuple[tuple[dict[str, float], str], ...] = (
     (_MASS, "brake_drag_force motor_stator_capacity motor_rotor_capacity motor_gap_conductance motor_rotor_to_ambient"),
+    (_MASS, "motor_rotor_per_speed inverter_box_per_speed"),
     (_MASS, "inverter_board_capacity inverter_box_capacity inverter_board_to_air inverter_box_to_air"),
     (_MASS, "inverter_board_to_box inverter_box_to_ambient"),
     (_LIGHT, "auxiliary_power inverter_loss_constant"),
@@ -30,6 +31,7 @@ _LAWS: tuple[tuple[dict[str, float], str], ...] = (
     (_TORQUE, "regeneration_torque_limit motor_iron_linear"),
     (_TORQUE | {"torque_constant": -1.0}, "motor_current_limit"),
     ({"mass": 1.0, "wheel_radius": 2.0, "gear_ratio": 2.0}, "motor_iron_quadratic"),
+    ({"wheel_radius": 2.0, "gear_ratio": 2.0}, "motor_copper_frequency"),
     ({"wheel_radius": -1.0, "gear_ratio": -1.0, "torque_constant": 1.0}, "inverter_loss_linear"),
     (_CURRENT_SQUARED, "inverter_loss_quadratic motor_copper_resistance"),
     ({"torque_constant": 1.0}, "voltage_constant"),

@@ -135,9 +135,11 @@ class Scooter:
         self.motor_cooling = MotorCooling.of(p, self.ambient)
         self.pack_cooling = LumpedCooling.of(p, "pack", cells)
         self.bms_cooling = LumpedCooling.of(p, "bms", cells)
-        self._air = p["cooling_factor"]
+        self._cooling_factor = p["cooling_factor"]
         self._bms_resistance = p["bms_resistance"]
-        self._heat = {"inverter": 0.0, "motor": 0.0, "pack": 0.0, "bms": 0.0}  # J in the current cooling period
+        # J in the current cooling period; idle: the motor's part that comes without current
+        self._heat = {"inverter": 0.0, "motor": 0.0, "idle": 0.0, "pack": 0.0, "bms": 0.0}
+        self._charge = 0.0  # A·s out of the pack in that period
         self._since_cooling = 0.0
 
     def _build_mechanic(self, options: Options) -> None:
@@ -227,6 +229,7 @@ class Scooter:
         entries["brakes"] += (braking * w_mean + front_braking * v_mean) * dt
         mechanical = torque * w_mean / gear
         entries["gearing"] += (mechanical - drive * w_mean) * dt
+        self._heat["idle"] += idle * dt
         self._draw(mechanical, w_mean / gear, current)
 
     def _on_the_road(self) -> tuple[float, float, float]:
@@ -271,6 +274,7 @@ class Scooter:
         heat["inverter"] += inverter_heat * dt
         heat["pack"] += pack_heat * dt
         heat["bms"] += bms_heat * dt
+        self._charge += self.current * dt
         self._since_cooling += dt
         if self._since_cooling >= PERIOD - 1e-9:
             self._cool(self._since_cooling)
@@ -293,15 +297,17 @@ class Scooter:
         q["cell_current"] = self.current / self.vehicle.pack.cells_parallel
 
     def _cool(self, dt: float) -> None:
-        """The cooling networks, with the mean heat of the period (eqs. 2.25-2.31)."""
-        heat = self._heat
-        self.inverter_cooling.step(dt, heat["inverter"] / dt, self.ambient, self._air)
-        self.motor_cooling.step(dt, heat["motor"] / dt, self.ambient, self._air)
-        self.pack_cooling.step(dt, heat["pack"] / dt, self.ambient, self._air)
+        """The cooling networks, with the mean heat of the period (eqs. 2.25-2.31); a roller's fan follows it."""
+        heat, outside = self._heat, (self.ambient, abs(self.speed), self._cooling_factor)
+        self.inverter_cooling.step(dt, heat["inverter"] / dt, *outside)
+        self.motor_cooling.step(dt, heat["motor"] / dt, *outside, heat["idle"] / dt)
+        cells, battery = self.pack_cooling.temperature, self.vehicle.pack
+        reversible = battery.reversible_heat(self._charge / dt, self.pack.soc, cells)
+        self.pack_cooling.step(dt, heat["pack"] / dt + reversible, *outside)
         self.bms_cooling.step(dt, heat["bms"] / dt, self.pack_cooling.temperature)
         for name in heat:
             heat[name] = 0.0
-        self._since_cooling = 0.0
+        self._since_cooling = self._charge = 0.0
         self._q["motor_temperature"] = self.motor_cooling.stator
         self._watch()
 

@@ -53,6 +53,7 @@ def test_ledger_against_the_equations_written_out(q):
     iron = P["motor_iron_linear"] * speed + P["motor_iron_quadratic"] * speed**2
     current = (torque + iron * speed / (speed**2 + 0.01)) / P["torque_constant"]  # in the air gap
     copper = P["motor_copper_resistance"] * (1 + 0.00393 * (q["motor_temperature"] - 25)) * current**2
+    copper *= 1 + P["motor_copper_frequency"] * speed**2
     inverter = (
         P["inverter_loss_constant"]
         + P["inverter_loss_linear"] * abs(current)

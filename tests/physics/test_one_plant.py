@@ -15,7 +15,7 @@ from gz_onboard.estimator.ekf import ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, Reaction, voltage
 from gz_onboard.lab.calibrate.coastdown_run import Coast
-from gz_onboard.lab.calibrate.cooling_network import motor_temperatures, pack_temperatures
+from gz_onboard.lab.calibrate.cooling_network import ENTROPY, ENTROPY_SOC, motor_temperatures, pack_temperatures
 from gz_onboard.lab.calibrate.cooling_run import CoolingRun
 from gz_onboard.lab.calibrate.road_load import RoadLoad
 from gz_onboard.lab.discover import residuals
@@ -182,8 +182,11 @@ def test_validation_and_calibration_warm_the_cells_alike(ride):
     modelled = components(VEHICLE, ride, SOC, AMBIENT, None)["cell_temperature"].modelled
     count = SOC - np.cumsum(ride["pack_current"] / (3600 * PACK.pack_capacity(float(ride["cell_temperature"][0]))))
     rest = PACK.cells_series * PACK.ocv_over(count, ride["cell_temperature"])
-    run = calibration_run(ride, pack_heat=(rest - ride["pack_voltage"]) * ride["pack_current"])
-    exposed = dict(P) | {"pack_conductance": P["pack_conductance"] * P["cooling_factor"]}
+    series = PACK.cells_series * ride["pack_current"]
+    lost = (rest - ride["pack_voltage"]) * ride["pack_current"]
+    run = calibration_run(ride, pack_heat=lost, series_current=series, soc=count)
+    disorder = dict(zip(ENTROPY, np.interp(ENTROPY_SOC, PACK.entropy_soc, PACK.entropy_value), strict=True))
+    exposed = dict(P) | {"pack_conductance": P["pack_conductance"] * P["cooling_factor"]} | disorder
     start = float(ride["cell_temperature"][0]) - pack_temperatures(exposed, run)["cell_temperature"][0]
     by_calibration = pack_temperatures(exposed | {"start:ride:cell_temperature": start}, run)["cell_temperature"]
     assert modelled == pytest.approx(by_calibration, abs=1e-6)
@@ -191,15 +194,16 @@ def test_validation_and_calibration_warm_the_cells_alike(ride):
 
 def calibration_run(ride, **heats):
     nothing = np.zeros(len(ride["speed"]))
-    parts = {"motor_heat": nothing, "iron": nothing, "inverter_heat": nothing, "pack_heat": nothing} | heats
+    names = ("motor_heat", "iron", "inverter_heat", "pack_heat", "series_current", "soc")
+    parts = dict.fromkeys(names, nothing) | heats
     measured = {name: ride[name] for name in ("motor_temperature", "cell_temperature")}
     time = np.arange(len(nothing), dtype=float)
     return CoolingRun(
         name="ride",
-        still=False,
+        bench=False,
         time=time,
         ambient=ride["ambient_temperature"],
-        speed=ride["speed"],
+        air=ride["speed"],
         pack_square=nothing,
         measured=measured,
         **parts,
@@ -233,11 +237,52 @@ def test_calibration_and_discovery_warm_the_motor_alike(ride):
     grid = on_grid(ride)
     still = values | {"motor_start": 0.0, "rotor_start": 0.0, "motor_airflow": 0.0}
     modelled = block_means(grid.signals["motor_temperature"], 5) - residuals.motor_temperature(grid, still, system)
-    heat = residuals._heat(grid, values, system)[0]
-    run = calibration_run(ride, motor_heat=block_means(heat, 2))
+    heat, idle = (block_means(watts, 2) for watts in residuals._heat(grid, values, system)[:2])
+    run = calibration_run(ride, motor_heat=heat, iron=idle)
     start = modelled[0] - motor_temperatures(P, run)["motor_temperature"][0]
     by_calibration = motor_temperatures(dict(P) | {"start:ride:motor_temperature": start}, run)["motor_temperature"]
     assert modelled[::2] == pytest.approx(by_calibration, abs=0.05)  # steps of half a second and of a second
+
+
+NO_NUISANCE = {
+    "inverter_start": 0.0,
+    "box_start": 0.0,
+    "inverter_airflow": 0.0,
+    "cells_start": 0.0,
+    "pack_airflow": 0.0,
+}
+"""Of the discovery, which so begins and cools as the vehicle file says."""
+
+
+def test_validation_discovery_and_simulation_warm_the_inverter_alike(ride):
+    values, system = healthy()
+    ride["inverter_temperature"] = np.full(len(ride["speed"]), AMBIENT)
+    grid = on_grid(ride)
+    left = residuals.inverter_temperature(grid, values | NO_NUISANCE, system)
+    by_discovery = AMBIENT - left
+    by_validation = components(VEHICLE, ride, SOC, AMBIENT, None)["inverter_temperature"].modelled
+    assert by_discovery[::2] == pytest.approx(by_validation, abs=0.05)  # steps of half a second and of a second
+    cooling = Scooter(VEHICLE, soc=SOC, ambient=AMBIENT).inverter_cooling
+    heat = losses(VEHICLE, ride["motor_current"], ride["motor_speed"], ride["motor_temperature"])[2]
+    for watts, speed in zip(heat[:-1], ride["speed"][:-1], strict=True):
+        cooling.step(1.0, watts, AMBIENT, speed, P["cooling_factor"])
+    assert cooling.board == pytest.approx(by_validation[-1], abs=1e-6)
+
+
+def test_everyone_has_the_same_heat_of_the_reaction(ride):
+    """What the cells are warmer by with the file's entropy than with one that is 1 mV/K lower: I·T·1 mV/K."""
+    values, system = healthy()
+    lower = replace(PACK, entropy_value=tuple(x - 1e-3 for x in PACK.entropy_value))
+    kelvin = ride["cell_temperature"] + 273.15
+    expected = 1e-3 * PACK.cells_series * np.cumsum(ride["pack_current"] * kelvin) / P["pack_heat_capacity"]
+    grid, other = on_grid(ride), replace(VEHICLE, battery=lower)
+    by_validation = [components(v, ride, SOC, AMBIENT, None)["cell_temperature"].modelled for v in (VEHICLE, other)]
+    without, with_less = (
+        residuals.cell_temperature(grid, values | NO_NUISANCE, s) for s in (system, replace(system, battery=lower))
+    )
+    tolerance = 0.08 * np.abs(expected).max() + 1e-3  # what is warmer cools more
+    assert (by_validation[1] - by_validation[0])[1:] == pytest.approx(expected[:-1], abs=tolerance)
+    assert (without - with_less)[2::2] == pytest.approx(expected[:-1], abs=tolerance)
 
 
 def test_everyone_has_the_same_road_load(ride):

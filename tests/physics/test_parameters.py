@@ -78,7 +78,7 @@ def test_priors_grow_with_the_vehicle(tmp_path):
         re.sub(r"(?m)^wheel_radius = { value = [\d.]+", "wheel_radius = { value = 0.245", text)
     )
     big, usual = read_vehicle(str(tmp_path / "big.toml")).parameters, declared_parameters()
-    torque = 0.45246 / usual["torque_constant"].prior
+    torque = read_vehicle("reference").parameters["torque_constant"] / usual["torque_constant"].prior
     expected = {"motor_copper_resistance": torque**2 / 2 / 0.1**2, "motor_iron_quadratic": 2 * 0.1**2}
     expected |= {"pack_current_noise": 10.0, "regeneration_torque_limit": 2 * 0.1}
     for name, size in expected.items():

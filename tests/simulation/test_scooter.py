@@ -200,7 +200,7 @@ def test_heat_balance_of_the_cooling_networks():
             network.step(step, 50.0, 15.0)
     c = scooter.motor_cooling
     assert c.rotor_to_ambient * (c.rotor - 15.0) == pytest.approx(50.0, rel=1e-6)
-    assert c.gap * (c.stator - c.rotor) == pytest.approx(c.stator_share * 50.0, rel=1e-6)
+    assert c.gap * (c.stator - c.rotor) == pytest.approx(50.0, rel=1e-6)
     i = scooter.inverter_cooling
     assert i.box_to_ambient * (i.box - 15.0) == pytest.approx(50.0, rel=1e-6)
     b = scooter.pack_cooling

@@ -127,8 +127,13 @@ def _help(name: str, procedure: Procedure) -> Iterator[str]:
     for slot, s in procedure.slots.items():
         key = "DATA" if slot == "data" else f"--with {slot}=FILE"
         yield f"  {'':<12}   {key}: {s.what}{'' if s.least else ' (may be left out)'}"
-    if procedure.options:
-        yield f"  {'':<12}   --set {', '.join(f'{k}={v}' for k, v in procedure.options.items())}"
+    if plain := _plain(procedure):
+        yield f"  {'':<12}   --set {', '.join(f'{k}={v}' for k, v in plain.items())}"
+
+
+def _plain(procedure: Procedure) -> dict[str, float | str]:
+    """The options that a command line may give; one for each file is for a manifest."""
+    return {name: default for name, default in procedure.options.items() if isinstance(default, float | str)}
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -224,12 +229,13 @@ def _asked(arguments: argparse.Namespace) -> tuple[Path, list[Step]]:
 
 def _options(texts: Sequence[str], procedure: Procedure) -> dict[str, Option]:
     found: dict[str, Option] = {}
+    options = _plain(procedure)
     for text in texts:
         name, _, value = text.partition("=")
-        if name not in procedure.options:
-            known = ", ".join(procedure.options) or "none"
-            raise InputError(f"--set {text}: no option {name!r}{nearest(name, procedure.options)}; there are {known}")
-        if isinstance(procedure.options[name], str):
+        if name not in options:
+            known = ", ".join(options) or "none"
+            raise InputError(f"--set {text}: no option {name!r}{nearest(name, options)}; there are {known}")
+        if isinstance(options[name], str):
             found[name] = value
             continue
         try:

@@ -1,6 +1,7 @@
 """The temperatures of the model's own cooling networks over a run, stepped at its period.
 
-Parameters go by their names in the vehicle file, and ``room`` for the conductance of a closed room.
+Parameters go by their names in the vehicle file, and ``entropy_SOC`` for the change of a cell's open-circuit voltage
+with temperature at each of `ENTROPY_SOC`.
 """
 
 from __future__ import annotations
@@ -11,32 +12,22 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.cooling_run import CoolingRun
+from gz_onboard.physics.battery import reversible_heat
 from gz_onboard.physics.cooling import PERIOD, InverterCooling, LumpedCooling, MotorCooling, temperatures
 
 Values = Mapping[str, float]
 Model = Callable[[Values, CoolingRun], dict[str, Array]]
 """The temperatures [degC] of a network over a run, by sensor, each of shape (n,)."""
+ENTROPY_SOC = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
+"""Where the entropy is sought: as fine as rides of a tenth of the charge tell; it is held below and above."""
+ENTROPY = tuple(f"entropy_{soc:g}" for soc in ENTROPY_SOC)
 
 
 def motor_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
-    """Of the stator. The rotor has no sensor and starts as warm as the stator.
-
-    ``iron_share``: of the iron loss in the stator, if it has one of its own.
-    """
-    stator = _first(p, run, "motor_temperature")
-    share, iron_share = p["motor_stator_share"], p.get("iron_share")
-    network = MotorCooling.of({**p, "motor_rotor_to_ambient": 1.0}, stator)
-    shares = np.full_like(run.time, share)
-    if iron_share is not None:
-        fraction = run.iron / np.where(np.abs(run.motor_heat) > 1.0, run.motor_heat, np.inf)
-        shares = share + (iron_share - share) * fraction
-    outside = _outside(p, run, "motor_rotor_to_ambient")
-    result = np.empty_like(run.time)
-    rows = zip(run.motor_heat.tolist(), run.ambient.tolist(), shares.tolist(), outside.tolist(), strict=True)
-    for k, (heat, ambient, network.stator_share, conductance) in enumerate(rows):
-        result[k] = network.stator
-        network.step(PERIOD, heat, ambient, conductance)
-    return {"motor_temperature": result}
+    """Of the stator. The rotor has no sensor and starts as warm as the stator."""
+    network = MotorCooling.of(p, _first(p, run, "motor_temperature"))
+    columns = run.motor_heat, run.ambient, run.air, np.ones_like(run.air), run.iron
+    return {"motor_temperature": np.array(temperatures(network, PERIOD, *columns))}
 
 
 def inverter_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
@@ -45,27 +36,29 @@ def inverter_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     box = _first(
         p, run, "inverter_box_temperature" if "inverter_box_temperature" in run.measured else "inverter_temperature"
     )
-    network = InverterCooling.of({**p, "inverter_box_to_ambient": 1.0}, board, box)
-    outside = _outside(p, run, "inverter_box_to_ambient")
+    network = InverterCooling.of(p, board, box)
     result = np.empty((2, len(run.time)))
-    rows = zip(run.inverter_heat.tolist(), run.ambient.tolist(), outside.tolist(), strict=True)
-    for k, (heat, ambient, conductance) in enumerate(rows):
+    rows = zip(run.inverter_heat.tolist(), run.ambient.tolist(), run.air.tolist(), strict=True)
+    for k, (heat, ambient, air) in enumerate(rows):
         result[:, k] = network.board, network.box
-        network.step(PERIOD, heat, ambient, conductance)
+        network.step(PERIOD, heat, ambient, air)
     return {"inverter_temperature": result[0], "inverter_box_temperature": result[1]}
 
 
 def pack_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     """Of the cells."""
-    start = _first(p, run, "cell_temperature")
-    return {"cell_temperature": _lumped(LumpedCooling.of(p, "pack", start), run.pack_heat, run.ambient)}
+    entropy = np.interp(run.soc, ENTROPY_SOC, [p.get(name, 0.0) for name in ENTROPY])
+    cells = run.measured["cell_temperature"]
+    heat = run.pack_heat + reversible_heat(entropy, run.series_current, cells)
+    network = LumpedCooling.of(p, "pack", _first(p, run, "cell_temperature"))
+    return {"cell_temperature": np.array(temperatures(network, PERIOD, heat, run.ambient))}
 
 
 def bms_temperatures(p: Values, run: CoolingRun) -> dict[str, Array]:
     """Of the BMS, over the pack's temperature as measured."""
-    start = _first(p, run, "bms_temperature")
+    network = LumpedCooling.of(p, "bms", _first(p, run, "bms_temperature"))
     heat, cells = p["bms_resistance"] * run.pack_square, run.measured["cell_temperature"]
-    return {"bms_temperature": _lumped(LumpedCooling.of(p, "bms", start), heat, cells)}
+    return {"bms_temperature": np.array(temperatures(network, PERIOD, heat, cells))}
 
 
 def _first(p: Values, run: CoolingRun, sensor: str) -> float:
@@ -74,14 +67,3 @@ def _first(p: Values, run: CoolingRun, sensor: str) -> float:
     first = run.measured[sensor][:10]
     line = np.polyfit(np.arange(len(first)) * PERIOD, first, 1)
     return float(line[1]) + p.get(f"start:{run.name}:{sensor}", 0.0)
-
-
-def _lumped(network: LumpedCooling, heat: Array, ambient: Array) -> Array:
-    return np.array(temperatures(network, PERIOD, heat.tolist(), ambient.tolist()))
-
-
-def _outside(p: Values, run: CoolingRun, name: str) -> Array:
-    """The conductance to the ambient [W/K], shape (n,)."""
-    if run.still and "room" in p:
-        return np.full_like(run.time, p["room"])
-    return np.asarray(np.full_like(run.time, p[name]) + p.get("per_speed", 0.0) * run.speed)

@@ -12,6 +12,7 @@ import numpy as np
 from gz_onboard.arrays import Array, held_integral
 from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.errors import InputError
+from gz_onboard.lab.calibrate.manifest import AIRFLOWS
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.battery import dissipation
@@ -21,7 +22,7 @@ from gz_onboard.physics.model import total, when_met
 from gz_onboard.physics.sensors import road_speed, true_columns
 from gz_onboard.vehicle import Vehicle
 
-FIRST = 5  # periods whose mean voltage and current tell the state of charge at the start
+FIRST = 1.0  # s: whose mean voltage and current tell the state of charge at the start, before the load has grown
 SHORTEST = 300.0  # s: less says nothing of time constants of minutes
 
 
@@ -29,26 +30,42 @@ SHORTEST = 300.0  # s: less says nothing of time constants of minutes
 class CoolingRun:
     """One run at `PERIOD` spacing, every array of shape (n,); powers in W, temperatures in degC.
 
-    still: on a bench or a roller, without the airflow of riding. iron: the part of the motor's heat that grows with
-    speed. measured: the temperatures there are, by ``motor_temperature``, ``inverter_temperature``,
-    ``inverter_box_temperature``, ``cell_temperature``, ``bms_temperature``.
+    bench: a table with measured heat. air: past the vehicle. iron: the part of the motor's
+    heat that comes without current. pack_heat: without the reversible part, for which series_current is the pack's
+    current times its cells in series. measured: the temperatures there are, by ``motor_temperature``,
+    ``inverter_temperature``, ``inverter_box_temperature``, ``cell_temperature``, ``bms_temperature``.
     """
 
     name: str
-    still: bool
+    bench: bool
     time: Array
     ambient: Array
-    speed: Array  # m/s, of the wheel
+    air: Array  # m/s
     motor_heat: Array
     iron: Array
     inverter_heat: Array
     pack_heat: Array
     pack_square: Array  # A²: mean square of the pack's current
+    series_current: Array  # A
+    soc: Array
     measured: dict[str, Array]
 
 
-def bench_run(table: Measurements, vehicle: Vehicle) -> CoolingRun:
-    """A run of motor and inverter in a closed room with their losses measured. InputError naming what is missing."""
+def _air(airflow: float | str, motor_speed: Array, vehicle: Vehicle) -> Array:
+    """The speed of the air [m/s] past a vehicle whose motor turns by `motor_speed` (n,) [rad/s], shape (n,).
+
+    airflow: of the whole run [m/s], or one of `AIRFLOWS`.
+    """
+    if isinstance(airflow, str):
+        return np.asarray(AIRFLOWS[airflow] * road_speed(np.abs(motor_speed), vehicle.parameters))
+    return np.full_like(motor_speed, airflow)
+
+
+def bench_run(table: Measurements, vehicle: Vehicle, airflow: float | str = "none") -> CoolingRun:
+    """A run of motor and inverter with their losses measured, in a closed room if `airflow` does not say otherwise.
+
+    InputError naming what is missing.
+    """
     time = table["time"]
     grid = _grid(time, table.file.name)
 
@@ -71,17 +88,19 @@ def bench_run(table: Measurements, vehicle: Vehicle) -> CoolingRun:
         True,
         grid,
         np.interp(grid, time, table["ambient_temperature"]),
-        road_speed(speed, vehicle.parameters),
+        _air(airflow, turning, vehicle),
         motor_heat,
         iron,
         inverter_heat,
+        nothing,
+        nothing,
         nothing,
         nothing,
         measured,
     )
 
 
-def ride_run(ride: Samples, vehicle: Vehicle) -> CoolingRun:
+def ride_run(ride: Samples, vehicle: Vehicle, airflow: float | str = "wheel") -> CoolingRun:
     """A ride or dynamometer run with the heat that the vehicle's own losses give. InputError for signals it lacks."""
     for role in ("motor_speed", "motor_current", "motor_temperature", "ambient_temperature", "pack_current"):
         if role not in ride.columns:
@@ -111,20 +130,23 @@ def ride_run(ride: Samples, vehicle: Vehicle) -> CoolingRun:
     if inside:  # the mean of thermocouples is finer than the BMS's whole degrees
         measured["cell_temperature"] = np.mean(inside, axis=0)
     mean, square = _means(pack_time, amperes, grid), _means(pack_time, amperes**2, grid)
-    pack_heat = np.zeros_like(grid)
+    pack_heat = soc = np.zeros_like(grid)
     if vehicle.battery and "cell_temperature" in measured and "pack_voltage" in columns:
-        pack_heat = _pack_heat(vehicle, mean, square, measured["cell_temperature"], at("pack_voltage"))
+        begin = [float(v[t < t[0] + FIRST].mean()) for t, v in (columns["pack_voltage"], columns["pack_current"])]
+        pack_heat, soc = _pack_heat(vehicle, mean, square, measured["cell_temperature"], (begin[0], begin[1]))
     return CoolingRun(
         ride.name,
-        "roller_speed" in columns,
+        False,
         grid,
         at("ambient_temperature"),
-        road_speed(np.abs(_means(*columns["motor_speed"], grid)), vehicle.parameters),
+        _air(airflow, _means(*columns["motor_speed"], grid), vehicle),
         _means(time, motor_heat, grid),
         _means(time, np.zeros_like(time) + vehicle.model.idle_loss(quantities), grid),
         _means(time, inverter_heat, grid),
         pack_heat,
         square,
+        (vehicle.battery.cells_series if vehicle.battery else 0) * mean,
+        soc,
         measured,
     )
 
@@ -149,22 +171,27 @@ def _means(time: Array, value: Array, grid: Array) -> Array:
     return result
 
 
-def _pack_heat(vehicle: Vehicle, mean: Array, square: Array, temperature: Array, voltage: Array) -> Array:
-    """What the cells turn to heat [W] by mean and mean square of the pack's current; voltage: the pack's, all (n,)."""
+def _pack_heat(
+    vehicle: Vehicle, mean: Array, square: Array, temperature: Array, first: tuple[float, float]
+) -> tuple[Array, Array]:
+    """(what the pack turns to heat [W], its SOC) by mean and mean square of its current, all (n,).
+
+    first: mean voltage and current of the pack in its first moments, from rest.
+    """
     battery = vehicle.pack
     lost = vehicle.model.overpotential(battery)
     n, m = battery.cells_series, battery.cells_parallel
-    first = [float(column[:FIRST].mean()) for column in (voltage, mean, temperature)]
-    inside = vehicle.model.at(Port.CELL_VOLTAGE)
-    begun = when_met(inside, battery, first[1], first[2], FIRST * PERIOD / 2)  # the load, from rest
-    soc = battery.first_soc(first[0], first[1], first[2], begun)
-    heat, v1 = np.empty_like(mean), 0.0
+    volts, amperes, celsius = *first, float(temperature[0])
+    begun = when_met(vehicle.model.at(Port.CELL_VOLTAGE), battery, amperes, celsius, FIRST / 2)
+    soc = battery.first_soc(volts, amperes, celsius, begun)
+    heat, socs, v1 = battery.series_resistance * square, np.empty_like(mean), 0.0
     for k, (i, i2, t) in enumerate(
         zip((mean / m).tolist(), (square / m**2).tolist(), temperature.tolist(), strict=True)
     ):
         r0, r1, _ = battery.circuit(soc, t)
         soc, v1, _ = battery.advanced(PERIOD, soc, v1, i, t)
-        heat[k] = n * m * dissipation(r0, r1, i2, v1)
+        socs[k] = soc
+        heat[k] += n * m * dissipation(r0, r1, i2, v1)
         if lost and i:
             heat[k] += n * m * i * lost(i, soc, t, i2 / i**2)
-    return heat
+    return heat, socs

@@ -17,9 +17,10 @@ from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.physics.effects import inverter_loss, motor_iron_loss
 
 CURRENT = "motor current, RMS [A]"
-TIED = ("torque_constant", "motor_copper_resistance", "motor_iron_linear", "motor_iron_quadratic")
+TIED = ("torque_constant", "motor_copper_resistance", "motor_iron_linear", "motor_iron_quadratic", motor.FREQUENCY)
 UNITS = {
     "motor_copper_resistance": "ohm",
+    motor.FREQUENCY: "s²/rad²",
     "motor_iron_linear": "W·s/rad",
     "motor_iron_quadratic": "W·s²/rad²",
     "inverter_loss_constant": "W",
@@ -29,7 +30,7 @@ UNITS = {
 
 
 def motor_losses(dyno: Measurements, largest_current: float = RIDING_CURRENT) -> Result:
-    """motor_copper_resistance [ohm], motor_iron_linear [W·s/rad], motor_iron_quadratic [W·s²/rad²] of steady points.
+    """motor_copper_resistance [ohm], its motor_copper_frequency [s²/rad²] and both iron terms of steady points.
 
     They are tied to the torque_constant of `motor.torque_constant`, which comes out of the same fit.
     """
@@ -76,17 +77,14 @@ def motor_loss(solution: Solution, bench: Bench) -> Array:
 
 
 def _copper_with_speed(result: Result, found: Solution, bench: Bench) -> None:
-    """A note if the copper loss grows with speed (skin and proximity effect), which the effect does not know."""
-    copper = motor.copper(found, bench)
-    w = np.abs(bench.speed)
-    columns = {"copper": copper, "with_speed": copper * w**2, "linear": w, "quadratic": w**2}
-    more = linear(columns, bench.loss, np.hypot(2.0, 0.3 * w))
-    if more["with_speed"] > 3 * more.sd("with_speed"):
-        top = float(w.max())
-        grown = 100 * more["with_speed"] * top**2 / more["copper"]
-        result.notes.append(
-            f"copper loss grows with speed, by {grown:.0f} % at {top:.0f} rad/s: the iron terms take it up"
-        )
+    """A note by how much the copper loss grows with speed."""
+    top = float(np.abs(bench.speed).max())
+    share, sd = (100 * x * top**2 for x in (found[motor.FREQUENCY], found.sd(motor.FREQUENCY)))
+    result.notes.append(
+        f"copper loss grows with speed, by {share:.0f} ± {sd:.0f} % at {top:.0f} rad/s"
+        if share
+        else f"copper loss does not grow with speed: within {sd:.0f} % (sd) at {top:.0f} rad/s"
+    )
 
 
 def inverter_losses(dyno: Measurements, largest_current: float = RIDING_CURRENT) -> Result:

@@ -11,12 +11,16 @@
     held_out = ["cell_road_profile_25C.csv"]
     columns = { time = "t_s", voltage = "v_V", current = { column = "i_A", scale = -1 } }
 
+    [cooling]
+    data = ["closed_room.csv", "dyno.blf"]
+    airflow = { "dyno.blf" = "none" }      # it had no fan; "wheel": as fast as the wheel turns; or m/s
+
 Paths are from the manifest's folder. ``SLOT_columns`` is for the tables of one key only, such as ``held_out_columns``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -29,7 +33,13 @@ NAME = "calibration.toml"
 LEAST, MOST = 1e-6, 1e6  # a number that is an option of a procedure
 _OWN = ("schema", "vehicle", "source")
 
-Option = float | str
+ByFile = Mapping[str, float | str]
+"""Of each file of a procedure, by its name: a number, or one of a few words."""
+Option = float | str | ByFile
+AIRFLOWS = {"none": 0.0, "wheel": 1.0}
+"""What moves past the vehicle, over the wheel's speed: no air in a closed room; air when riding or with a fan that
+follows the roller."""
+FASTEST_AIR = 100.0  # m/s
 
 
 @dataclass(frozen=True)
@@ -94,7 +104,9 @@ def _step(table: Table, name: str, slots: Mapping[str, Slot], options: Mapping[s
         own = f"{slot}_columns"
         if named := read_columns(table.table(own if own in table.values else "columns")):
             columns[slot] = named
-    return Step(name, files, columns, _options(table, options))
+    return Step(
+        name, files, columns, _options(table, options, [file.name for group in files.values() for file in group])
+    )
 
 
 def check_count(procedure: str, slot: str, needed: Slot, count: int) -> None:
@@ -123,9 +135,24 @@ def _files(table: Table, slot: str) -> tuple[Path, ...]:
     return tuple(folder / name for name in names)
 
 
-def _options(table: Table, options: Mapping[str, Option]) -> dict[str, Option]:
+def _options(table: Table, options: Mapping[str, Option], files: Sequence[str]) -> dict[str, Option]:
     found: dict[str, Option] = {}
     for key, default in options.items():
-        if key in table.values:
-            found[key] = table.text(key) if isinstance(default, str) else table.number(key, low=LEAST, high=MOST)
+        if key not in table.values:
+            continue
+        if isinstance(default, str):
+            found[key] = table.text(key)
+        elif isinstance(default, Mapping):
+            found[key] = _airflows(table.table(key), files)
+        else:
+            found[key] = table.number(key, low=LEAST, high=MOST)
     return found
+
+
+def _airflows(table: Table, files: Sequence[str]) -> ByFile:
+    """Of the `files` that the table names, one of `AIRFLOWS` or a speed [m/s]."""
+    table.only(files)
+    return {
+        name: table.text(name, choices=AIRFLOWS) if isinstance(value, str) else table.number(name, None, 0, FASTEST_AIR)
+        for name, value in table.values.items()
+    }

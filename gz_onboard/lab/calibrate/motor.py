@@ -4,12 +4,13 @@ The shaft gives what the air gap does less the drag of iron and bearings, so tha
 
     torque = torque_constant·i_m − motor_iron_linear·sign(ω) − motor_iron_quadratic·ω
 
-The drag is that of the effect motor_iron_loss; `losses.motor_losses` gives it from the same fit.
+The drag is that of the effect motor_iron_loss; `losses.motor_losses` gives it from the same fit, with how the copper
+loss grows with speed if the points are sure of it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,6 +23,8 @@ from gz_onboard.physics.effects import motor_copper_loss
 
 RIDING_CURRENT = 120.0  # A: larger ones are short, and the constant falls with them
 COPPER = 0.00393  # 1/K (IEC 60034-1)
+FREQUENCY = "motor_copper_frequency"
+SURE = 3.0  # sd, of a copper loss that grows with speed
 ROUGH = 0.02  # a point's torque sd is not known better than to this share of the greatest torque
 
 
@@ -95,9 +98,27 @@ def read_bench(dyno: Measurements) -> Bench:
 
 
 def solve(bench: Bench, use: Mask) -> Solution:
-    """torque_constant, motor_copper_resistance and both iron terms from loss and torque of the points `use`, together.
+    """torque_constant, motor_copper_resistance, both iron terms and `FREQUENCY` of the points `use`, together.
 
-    Both equations are linear in the four. Errors of torque grow into the loss by the speed, so a point's loss counts
+    The last is held at 0 where it is not distinguishable from it; its sd is what it would have free.
+    """
+    free, plain = _solve(bench, use, True), _solve(bench, use, False)
+    resistance, product = free["motor_copper_resistance"], free[FREQUENCY]
+    turn = np.eye(len(free.names))  # from resistance times frequency, in which the loss is linear, to the frequency
+    turn[-1] /= resistance
+    turn[-1, free.names.index("motor_copper_resistance")] = -product / resistance**2
+    covariance = turn @ free.covariance @ turn.T
+    if product > SURE * free.sd(FREQUENCY):
+        return replace(free, value=np.append(free.value[:-1], product / resistance), covariance=covariance)
+    alone = np.zeros_like(covariance)
+    alone[:-1, :-1], alone[-1, -1] = plain.covariance, covariance[-1, -1]
+    return replace(plain, names=free.names, value=np.append(plain.value, 0.0), covariance=alone)
+
+
+def _solve(bench: Bench, use: Mask, with_speed: bool) -> Solution:
+    """The four, and resistance times `FREQUENCY` as the last if `with_speed`.
+
+    Both equations are linear in them. Errors of torque grow into the loss by the speed, so a point's loss counts
     with that sd; what its two equations share makes the covariance that of whole points.
     """
     w, i = bench.speed[use], bench.current[use]
@@ -109,6 +130,8 @@ def solve(bench: Bench, use: Mask) -> Solution:
         "motor_iron_linear": np.concatenate([-sign, np.abs(w)]),
         "motor_iron_quadratic": np.concatenate([-w, w**2]),
     }
+    if with_speed:
+        columns[FREQUENCY] = np.concatenate([nothing, copper * w**2])
     y = np.concatenate([bench.torque[use], bench.loss[use]])
     point = np.tile(np.arange(len(w)), 2)
     torque_sd, floor = ROUGH * float(np.max(np.abs(bench.torque))), 2.0
@@ -223,7 +246,9 @@ def copper(solution: Solution, bench: Bench) -> Array:
     result: Array = motor_copper_loss.term(
         bench.current,
         bench.temperature,
+        bench.speed,
         motor_copper_resistance=solution["motor_copper_resistance"],
         motor_copper_temperature_coefficient=COPPER,
+        motor_copper_frequency=solution[FREQUENCY],
     )
     return result

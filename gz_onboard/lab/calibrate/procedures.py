@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -28,7 +29,7 @@ from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.manifest import Option, Slot
 from gz_onboard.lab.calibrate.result import Curve, Found, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
-from gz_onboard.offline.samples import Samples
+from gz_onboard.offline.samples import Samples, ride_name
 from gz_onboard.physics.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
@@ -45,7 +46,9 @@ class Given:
 
     def number(self, name: str) -> float:
         """The option `name`, a number."""
-        return float(self.options[name])
+        value = self.options[name]
+        assert isinstance(value, float | int)
+        return float(value)
 
     def one(self, slot: str) -> Measurements | None:
         """The one table of a slot that may be left out."""
@@ -164,8 +167,16 @@ def _cooling(given: Given) -> Result:
 
 
 def _cooling_runs(given: Given, slot: str) -> list[cooling_run.CoolingRun]:
-    bench = [cooling_run.bench_run(table, given.vehicle) for table in given.tables.get(slot, [])]
-    return bench + [cooling_run.ride_run(ride, given.vehicle) for ride in given.rides.get(slot, [])]
+    """Those with no airflow stated: tables from a closed room, rides and rollers with air as fast as the wheel."""
+    airflow = given.options["airflow"]
+    assert isinstance(airflow, Mapping)
+    of_log = {ride_name(Path(name)): value for name, value in airflow.items()}
+    return [
+        cooling_run.bench_run(table, given.vehicle, airflow.get(table.file.name, "none"))
+        for table in given.tables.get(slot, [])
+    ] + [
+        cooling_run.ride_run(ride, given.vehicle, of_log.get(ride.name, "wheel")) for ride in given.rides.get(slot, [])
+    ]
 
 
 def _coastdown(given: Given) -> Result:
@@ -235,6 +246,7 @@ PROCEDURES: dict[str, Procedure] = {
         "the four cooling networks from warming up and cooling down, on a bench (tables) and on the vehicle (rides)",
         {"data": Slot("any", "runs of 5 min or longer", 1), "held_out": Slot("any", "further runs, to validate", 0)},
         _cooling,
+        {"airflow": {}},
     ),
     "coastdown": Procedure(
         "rolling resistance and drag area from coast-downs in both directions",

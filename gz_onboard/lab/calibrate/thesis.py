@@ -42,12 +42,10 @@ ROWS = (
     Row("C1 over (SOC, T)", ("pulse", "mesh of C1, SOC 0.2 to 0.9, half against half", "", True), "r2", 0.9600),
     Row("cell voltage, road profile, 25 °C", ("pulse", "cell voltage", "25C", True), "largest", 0.02, "V"),
     Row("cell voltage, road profile, 5 °C", ("pulse", "cell voltage", "_5C", True), "largest", 0.02, "V"),
-    Row("motor temperature, calibration", ("cooling", "motor temperature, closed", "", False), "largest", 4, "°C"),
-    Row("motor temperature, validation", ("cooling", "motor temperature", "valid", True), "largest", 10, "°C"),
+    Row("motor temperature, calibration", ("cooling", "motor temperature, bench", "", False), "largest", 4, "°C"),
+    Row("motor temperature, validation", ("cooling", "motor temperature, bench", "valid", True), "largest", 10, "°C"),
     Row("motor temperature, riding", ("cooling", "motor temperature, riding", "", True), "largest", 10, "°C"),
-    Row(
-        "inverter temperature, calibration", ("cooling", "inverter temperature, closed", "", False), "largest", 1, "°C"
-    ),
+    Row("inverter temperature, calibration", ("cooling", "inverter temperature, bench", "", False), "largest", 1, "°C"),
     Row("inverter temperature, validation", ("cooling", "inverter temperature", "valid", True), "largest", 6, "°C"),
     Row("inverter temperature, riding", ("cooling", "inverter temperature, riding", "", True), "largest", 6, "°C"),
     Row("cell temperature", ("cooling", "cell temperature", "", True), "largest", 1, "°C"),

@@ -151,7 +151,7 @@ def _curve(name: str, curve: Curve) -> str:
         lines += ["value = [", *(f"  {toml_text.row(row)}," for row in curve.value), "]"]
     lines.append(f"unit = {string(curve.unit)}")
     known = np.isfinite(curve.sd)
-    if known.any() and curve.unit == "V":
+    if known.any() and curve.unit in ("V", "V/K"):
         lines.append(f"sd = {number(float(np.median(curve.sd[known])))}")
     elif known.any():
         lines.append(f"sd_relative = {number(float(np.median(curve.sd[known] / np.abs(curve.value[known]))))}")

@@ -252,7 +252,7 @@ CHANNELS = (
         parameters=(
             "motor_start",
             "rotor_start",
-            "motor_stator_share",
+            "motor_iron_share",
             "motor_gap_conductance",
             "motor_stator_capacity",
             "motor_rotor_capacity",

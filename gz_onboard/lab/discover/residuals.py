@@ -7,7 +7,7 @@ the linear model is its difference.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -261,21 +261,28 @@ def front_speed(ride: Ride, p: Values, system: System) -> Array:
     return np.asarray((front - speed) * ride.radius + p["wheel_lag"] * q["acceleration"])
 
 
-def _heat(ride: Ride, p: Values, system: System) -> tuple[Array, Array]:
-    """(motor's, inverter's) loss [W] at steps of `DT`."""
+def _heat(ride: Ride, p: Values, system: System) -> tuple[Array, Array, Array]:
+    """Loss [W] at steps of `DT`: (the motor's, of it what comes without current, the inverter's)."""
     q = moving(ride, p, system)
     electric, drag = motor_losses(ride, q, p, system)
     inverter = summed(system.terms(q, p, STEP, Port.INVERTER_LOSS))
     n = len(ride.time)
-    return block_means(np.broadcast_to(electric + drag, n), SLOW), block_means(np.broadcast_to(inverter, n), SLOW)
+    motor, idle, inverter = (block_means(np.broadcast_to(x, n), SLOW) for x in (electric + drag, drag, inverter))
+    return motor, idle, inverter
 
 
-def _warmed(ride: Ride, p: Values, sensor: str, network: Network, watts: Array, airflow: str) -> Array:
-    """What `network`, heated by `watts`, leaves [K] of its `sensor`; airflow: how much more moving air cools."""
-    flow = 1 + p[airflow] * np.abs(block_means(ride.quantities["speed"], SLOW)) / WIND
-    air = p.get("cooling_factor", 1.0) * np.maximum(flow, LEAST_COOLING)
-    ambient = block_means(ride.quantities["ambient_temperature"], SLOW)
-    modelled: Array = np.array(temperatures(network, DT, watts.tolist(), ambient.tolist(), air.tolist()))
+def _warmed(
+    ride: Ride, p: Values, channel: tuple[str, str], network: Network, watts: Array, idle: Sequence[Array] = ()
+) -> Array:
+    """What `network`, heated by `watts`, `idle` of it without current, leaves [K] of a sensor.
+
+    channel: (sensor, how much more moving air cools than the network says).
+    """
+    sensor, airflow = channel
+    speed, ambient = (block_means(ride.quantities[name], SLOW) for name in ("speed", "ambient_temperature"))
+    speed = np.abs(speed)
+    factor = p.get("cooling_factor", 1.0) * np.maximum(1 + p[airflow] * speed / WIND, LEAST_COOLING)
+    modelled: Array = np.array(temperatures(network, DT, watts, ambient, speed, factor, *idle))
     return block_means(ride.signals[sensor], SLOW) - modelled
 
 
@@ -288,19 +295,22 @@ def motor_temperature(ride: Ride, p: Values, system: System) -> Array:
     stator = _first(ride, "motor_temperature") + p["motor_start"]
     ambient = float(block_means(ride.quantities["ambient_temperature"], SLOW)[0])
     network = MotorCooling.of(p, stator, stator + p["rotor_start"] * (stator - ambient) / WARMER)
-    return _warmed(ride, p, "motor_temperature", network, _heat(ride, p, system)[0], "motor_airflow")
+    watts, *idle, _ = _heat(ride, p, system)
+    return _warmed(ride, p, ("motor_temperature", "motor_airflow"), network, watts, idle)
 
 
 def inverter_temperature(ride: Ride, p: Values, system: System) -> Array:
     """The board's temperature [K] less that of the cooling network at the modelled loss, at steps of `DT`."""
     board = _first(ride, "inverter_temperature") + p["inverter_start"]
     network = InverterCooling.of(p, board, board + p["box_start"])
-    return _warmed(ride, p, "inverter_temperature", network, _heat(ride, p, system)[1], "inverter_airflow")
+    return _warmed(ride, p, ("inverter_temperature", "inverter_airflow"), network, _heat(ride, p, system)[2])
 
 
 def cell_temperature(ride: Ride, p: Values, system: System) -> Array:
     """The cells' temperature [K] less that of the lump at the circuit's heat, at steps of `DT`."""
     cell = cell_circuit(ride, p, system)
+    celsius = block_means(ride.quantities["cell_temperature"], SLOW)
     watts = system.pack.cells_series * heat(cell.rest, cell.voltage, cell.current)
+    watts = watts + system.pack.reversible_heat(cell.current, cell.soc, celsius)
     network = LumpedCooling.of(p, "pack", _first(ride, "cell_temperature") + p["cells_start"])
-    return _warmed(ride, p, "cell_temperature", network, watts, "pack_airflow")
+    return _warmed(ride, p, ("cell_temperature", "pack_airflow"), network, watts)

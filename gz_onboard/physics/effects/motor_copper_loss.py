@@ -1,4 +1,8 @@
-"""Copper loss of the motor, P = r(T)·i_m², r(T) = r_25·(1 + 0.00393·(T − 25)), i_m on the inverter's own scale."""
+"""Copper loss of the motor, P = r(T)·(1 + f·ω²)·i_m², r(T) = r_25·(1 + 0.00393·(T − 25)), i_m on the inverter's scale.
+
+The share f·ω² is that of eddy currents in the winding, which grow with the square of the frequency (skin and proximity
+effect while the wire is thinner than the skin: Sullivan 2001).
+"""
 
 from __future__ import annotations
 
@@ -9,9 +13,11 @@ from gz_onboard.physics.effect import Parameter, Port
 
 PORT = Port.MOTOR_LOSS
 WINDINGS = "hub motors of 1.5-3 kW at 52 V; at 25 degC"
+EDDIES = "windings of thin wire: none; of bars: tens of percent at full speed"
 PARAMETERS = (
     Parameter("motor_copper_resistance", "ohm", 0.03, 0.015, 1e-5, 10.0, WINDINGS, ride_sd=3e-4, bench=True),
     Parameter("motor_copper_temperature_coefficient", "1/K", 0.00393, 1e-4, 0.0, 0.01, "IEC 60034-1"),
+    Parameter("motor_copper_frequency", "s²/rad²", 0.0, 5e-5, 0.0, 0.01, EDDIES, ride_sd=1e-6, bench=True),
 )
 CAUSE = ("winding_resistance", "P = r·(1 + a·(T − 25))·i²")
 SHOWN_BY = (
@@ -23,13 +29,16 @@ SHOWN_BY = (
 def term(
     motor_current: Any,
     motor_temperature: Any,
+    motor_speed: Any,
     *,
     motor_copper_resistance: float,
     motor_copper_temperature_coefficient: float,
+    motor_copper_frequency: float,
 ) -> Any:
     """Heat [W]."""
     return (
         motor_copper_resistance
+        * (1 + motor_copper_frequency * motor_speed * motor_speed)
         * (1 + motor_copper_temperature_coefficient * (motor_temperature - BENCH_TEMPERATURE))
         * motor_current
         * motor_current

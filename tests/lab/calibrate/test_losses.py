@@ -44,11 +44,15 @@ def test_tied_parameters_have_the_covariance_of_one_fit():
     assert covariance[2, 3] < 0  # more of one iron term is less of the other
 
 
-def test_copper_loss_that_grows_with_speed_is_told():
+def test_copper_loss_that_grows_with_speed_is_found_and_held_at_zero_where_it_does_not():
     run = dyno(0)
     more = 0.2 * 0.017 * run["motor_current"] ** 2 * (run["motor_speed"] / 57) ** 2
-    note = [n for n in motor_losses(changed(run, ac_power=run["ac_power"] + more)).notes if "grows with speed" in n]
-    assert note and not any("grows with speed" in n for n in motor_losses(run).notes)
+    result = motor_losses(changed(run, ac_power=run["ac_power"] + more))
+    found = result.parameters["motor_copper_frequency"]
+    assert abs(found.value - 0.2 / 57**2 / (1 + 0.00393 * 30)) < 3 * found.sd  # of a winding at 55 degC on average
+    assert found.sd < 0.15 * found.value and any("copper loss grows with speed" in note for note in result.notes)
+    plain = motor_losses(run).parameters["motor_copper_frequency"]
+    assert plain.value == 0.0 and 0 < plain.sd < 1e-5
 
 
 def test_a_narrow_range_of_temperature_is_told():

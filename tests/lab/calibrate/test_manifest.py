@@ -15,7 +15,7 @@ SLOTS = {
     "one": {"data": Slot("table", "a table", 1, 1), "held_out": Slot("table", "another")},
     "two": {"data": Slot("ride", "rides", 2)},
 }
-OPTIONS: dict[str, dict[str, Option]] = {"two": {"limit": 3.0, "method": "a"}}
+OPTIONS: dict[str, dict[str, Option]] = {"two": {"limit": 3.0, "method": "a", "airflow": {}}}
 GOOD = """schema = 1
 [two]
 data = ["b.blf", "c.blf"]
@@ -55,6 +55,11 @@ def test_steps_come_in_the_order_of_the_procedures(folder):
     assert read(folder, 'vehicle = "scooter.toml"\n' + GOOD)[0] == folder / "scooter.toml"
 
 
+def test_the_airflow_is_stated_by_file(folder):
+    text = GOOD.replace("limit = 4", 'airflow = { "b.blf" = "none", "c.blf" = 3 }')
+    assert read(folder, text)[1][1].options["airflow"] == {"b.blf": "none", "c.blf": 3.0}
+
+
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
@@ -67,6 +72,9 @@ def test_steps_come_in_the_order_of_the_procedures(folder):
         ('"a.csv"', "3", "must be the name of a file, or a list of them"),
         ('data = "a.csv"\n', "", r"calibration.toml:6: one: one needs a table"),
         ("limit = 4", 'limit = "x"', r"calibration.toml:4: two.limit: must be a number"),
+        ("limit = 4", 'airflow = { "b.blf" = "fan" }', r"two.airflow.b.blf: 'fan' is not one of none, wheel"),
+        ("limit = 4", 'airflow = { "b.blf" = 400 }', r"two.airflow.b.blf: 400 is outside 0 to 100"),
+        ("limit = 4", 'airflow = { "d.blf" = "none" }', r"calibration.toml:4: two.airflow.d.blf: unknown key"),
         ("schema = 1", "schema = 2", "calibration.toml:1: schema: is 2.0|calibration.toml:1: schema: is 2"),
         (
             "schema = 1",
