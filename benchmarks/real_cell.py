@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.estimator.ekf import Covariance, ScalarFilter, SocFilter
+from gz_onboard.estimator.ekf import Covariance, Noise, ScalarFilter, SocFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Group
 from gz_onboard.lab.calibrate import ocv, pulse
@@ -113,6 +113,12 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
     ocv_table = tuple(map(float, cell.ocv_soc)), tuple(map(float, cell.ocv)), float(np.median(sd))
     circuit = mesh(cell.r0), mesh(cell.r1), mesh(cell.c1)
     battery = Battery(1, 1, capacity_25, temperature, share, 2.5, 0.0, *ocv_table, *circuit)
+    error = result.curves["battery.voltage_error"]
+    battery = replace(
+        battery,
+        voltage_error_temperature=tuple(map(float, error.axes["temperature"])),
+        voltage_error_value=tuple(map(float, error.value)),
+    )
     if (shift := result.curves.get("battery.rest_shift")) is None:
         return battery
     return replace(
@@ -130,7 +136,7 @@ class Extended(ScalarFilter):
     slow_time: Mesh | None = None
     v2 = 0.0
 
-    def predict(self, dt: float, current: float, temperature: float, noise: tuple[float, float]) -> None:
+    def predict(self, dt: float, current: float, temperature: float, noise: Noise) -> None:
         if self.slow_resistance and self.slow_time:
             decay = exp(-dt / self.slow_time.at(self.soc, temperature)[0])
             r2 = self.slow_resistance.at(self.soc, temperature)[0]
@@ -183,6 +189,7 @@ def estimator_of(setting: Setting) -> Estimator:
         "cell_capacity": (battery.capacity, result.parameters["cell_capacity"].sd),
         "cell_voltage_error": (0.0, result.parameters["cell_voltage_error"].sd),
         "cell_voltage_error_empty": (0.0, result.parameters["cell_voltage_error_empty"].sd),
+        "cell_voltage_error_time": (result.parameters["cell_voltage_error_time"].value, 0.0),
         "rest_voltage_error": (0.0, float(np.mean(rests))),
     }
     for parameter in charge_transfer.PARAMETERS:

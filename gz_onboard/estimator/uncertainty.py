@@ -81,24 +81,32 @@ class VoltageUncertainty:
         self.model = p.sd("cell_voltage_error")
         self.rest = sqrt(p.sd("rest_voltage_error") ** 2 + battery.ocv_sd**2 + battery.rest_shift_sd**2)
         self._empty = p.sd("cell_voltage_error_empty")
+        self.error_time = p["cell_voltage_error_time"]
+        self._sensor = (p.sd("pack_voltage_offset") / battery.cells_series) ** 2  # V²
+        # What depends on the cell's history and no test after a full charge shows, hysteresis before all.
+        self._constant = self._sensor + p.sd("rest_voltage_error") ** 2 + battery.rest_shift_sd**2  # V²
         self._capacity_scatter = p.sd("cell_capacity") / p["cell_capacity"]
 
-    def loaded(self, soc: float) -> float:
-        """Sd of the cell model under load [V]: it errs more near empty."""
-        empty = min(max((EMPTY_BELOW - soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
-        return self.model + empty * (self._empty - self.model)
+    def loaded(self, soc: float, temperature: float) -> float:
+        """Sd of the cell model under load [V]: it errs more near empty, and in the cold."""
+        model, empty = self._battery.voltage_error(temperature, self.model), self._empty
+        share = min(max((EMPTY_BELOW - soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
+        return model + share * max(empty - model, 0.0)
 
-    def variance(
-        self, soc: float, r0: float, drop: float, source: CurrentSource, temperature_known: bool, voltage_sd: float
+    def slow(self, soc: float, temperature: float) -> float:
+        """Variance [V²] of what errs the same way for `error_time`: the cell model, the tables' place, the sensor."""
+        # The pack's cells are not the bench's: where SOC lies on their curve is known to their capacity's scatter.
+        axis_sd = self._capacity_scatter * (1 - soc) * self._battery.ocv(soc)[1]
+        return self.loaded(soc, temperature) ** 2 + axis_sd**2 + self._constant
+
+    def load(
+        self, r0: float, drops: tuple[float, float], source: CurrentSource, temperature_known: bool, voltage_sd: float
     ) -> float:
-        """Variance [V²] of the voltage predicted at a `drop` [V] by the load, and measured with `voltage_sd` [V].
+        """Variance [V²] of what changes with the load, of a voltage measured with `voltage_sd` [V].
 
-        r0: [ohm] of a cell, as all of them.
+        drops: by R0 and the effects, and by the RC pair [V]; r0: [ohm]; of a cell, as all of them.
         """
         resistance_sd = RESISTANCE_SD if temperature_known else RESISTANCE_SD_COLD
         current_sd = CURRENT_ERRORS[source].sd * self._battery.cell_capacity(BENCH_TEMPERATURE)
-        model_sd = self.loaded(soc)
-        # The pack's cells are not the bench's: where SOC lies on their curve is known to their capacity's scatter.
-        axis_sd = self._capacity_scatter * (1 - soc) * self._battery.ocv(soc)[1]
-        resistance = (resistance_sd * drop) ** 2 + (r0 * current_sd) ** 2
-        return model_sd**2 + voltage_sd**2 + axis_sd**2 + resistance
+        doubted = max(voltage_sd**2 - self._sensor, 0.0)
+        return resistance_sd**2 * (drops[0] ** 2 + drops[1] ** 2) + (r0 * current_sd) ** 2 + doubted

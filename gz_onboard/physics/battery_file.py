@@ -24,7 +24,7 @@ LARGEST_SHIFT = 0.2  # V: real cells rest tens of mV apart from -20 to 25 degC; 
 def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
     """The battery in the vehicle file; InputError for tables that do not make sense."""
     table = vehicle.table("battery")
-    table.only(["cells_series", "cells_parallel", "ocv", "rest_shift", "capacity", "r0", "r1", "c1"])
+    table.only(["cells_series", "cells_parallel", "ocv", "rest_shift", "voltage_error", "capacity", "r0", "r1", "c1"])
     ocv = table.table("ocv")
     ocv.only(["soc", "value", "unit", "sd", "source", "status"])
     ocv.text("unit", choices=["V"])
@@ -47,7 +47,8 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         capacities = tuple(value / rated for value in capacities)
         if min(capacities) < 0.05 or max(capacities) > 2:
             raise capacity.error(f"must be within 0.05 to 2 times what it is at {BENCH_TEMPERATURE:g} degC", "value")
-    shift_temperatures, shifts, shift_sd = _rest_shift(table)
+    shift_temperatures, shifts, shift_sd = _over_temperature(table, "rest_shift", -LARGEST_SHIFT)
+    error_temperatures, errors, _ = _over_temperature(table, "voltage_error", 0.0)
     battery = Battery(
         cells_series=table.integer("cells_series", 1, MOST_CELLS),
         cells_parallel=table.integer("cells_parallel", 1, MOST_CELLS),
@@ -65,22 +66,24 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         rest_shift_temperature=shift_temperatures,
         rest_shift_value=shifts,
         rest_shift_sd=shift_sd,
+        voltage_error_temperature=error_temperatures,
+        voltage_error_value=errors,
     )
     return battery.with_parameters(parameters)
 
 
-def _rest_shift(battery: Table) -> tuple[Row, Row, float]:
-    """(temperatures [degC], shifts [V], their sd [V]); nothing if the file does not have the table."""
-    if "rest_shift" not in battery.values:
+def _over_temperature(battery: Table, name: str, least: float) -> tuple[Row, Row, float]:
+    """(temperatures [degC], voltages [V], their sd [V]) of a table; nothing if the file does not have it."""
+    if name not in battery.values:
         return (), (), 0.0
-    table = battery.table("rest_shift")
+    table = battery.table(name)
     table.only(["temperature", "value", "unit", "sd", "source", "status"])
     table.text("unit", choices=["V"])
-    temperatures, shifts = _axis(table, "temperature", *TEMPERATURE), table.numbers("value")
-    if len(shifts) != len(temperatures) or max(map(abs, shifts)) > LARGEST_SHIFT:
-        wanted = f"must be {len(temperatures)} numbers within {-LARGEST_SHIFT:g} to {LARGEST_SHIFT:g} V"
+    temperatures, volts = _axis(table, "temperature", *TEMPERATURE, least=1), table.numbers("value")
+    if len(volts) != len(temperatures) or min(volts) < least or max(volts) > LARGEST_SHIFT:
+        wanted = f"must be {len(temperatures)} numbers within {least:g} to {LARGEST_SHIFT:g} V"
         raise table.error(f"{wanted}, one for each temperature", "value")
-    return temperatures, shifts, table.number("sd", 0.005, low=0.0, high=LARGEST_SHIFT)
+    return temperatures, volts, table.number("sd", 0.005, low=0.0, high=LARGEST_SHIFT)
 
 
 def _axis(table: Table, key: str, low: float, high: float, least: int = 2) -> Row:

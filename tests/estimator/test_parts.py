@@ -20,6 +20,7 @@ from gz_onboard.vehicle import read_vehicle
 VEHICLE = read_vehicle("reference")
 BATTERY = VEHICLE.pack
 SLOW = 1e-4  # V²
+LOAD = 0.005**2  # V²
 
 
 def everything(now: float = 0.0) -> Signals:
@@ -42,8 +43,8 @@ def test_past_segments_count_less_the_further_back_they_are():
 
 def test_a_glitch_is_not_used_and_what_persists_is():
     gate = InnovationGate()
-    assert gate.update(0.1, 0.01, 0.0, SLOW) == SLOW
-    used = [gate.update(0.1, 0.3, 0.0, SLOW) is not None for _ in range(GATE_COUNT)]
+    assert gate.update(0.1, 0.01, 0.0, SLOW, LOAD) == pytest.approx(LOAD)
+    used = [gate.update(0.1, 0.3, 0.0, SLOW, LOAD) is not None for _ in range(GATE_COUNT)]
     assert used == [False] * (GATE_COUNT - 1) + [True]
     assert gate.mismatch
     assert not gate.refuted
@@ -52,9 +53,9 @@ def test_a_glitch_is_not_used_and_what_persists_is():
 def test_a_voltage_that_is_off_for_long_refutes_the_state():
     gate = InnovationGate()
     for _ in range(round(CONTRADICTED) - 1):
-        gate.update(1.0, 0.3, 0.0, SLOW)
+        gate.update(1.0, 0.3, 0.0, SLOW, LOAD)
     assert not gate.refuted
-    assert gate.update(1.0, 0.3, 0.0, SLOW) is None
+    assert gate.update(1.0, 0.3, 0.0, SLOW, LOAD) is None
     assert gate.refuted
 
 

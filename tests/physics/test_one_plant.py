@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.arrays import block_means
 from gz_onboard.estimator.cell_effects import CellEffects
-from gz_onboard.estimator.ekf import ScalarFilter
+from gz_onboard.estimator.ekf import Noise, ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, Reaction, voltage
 from gz_onboard.lab.calibrate.coastdown_run import Coast
@@ -119,9 +119,9 @@ def test_the_filter_predicts_the_voltage_of_a_cell(ride, backend):
     filter_, predicted = backend(PACK, SOC, 0.0, (1e-4, 0.0, 1e-6)), []
     for amperes, celsius in zip(ride["pack_current"], ride["cell_temperature"], strict=True):
         i = amperes / PACK.cells_parallel
-        filter_.predict(0.5, i, celsius, (0.0, 0.0))
+        filter_.predict(0.5, i, celsius, Noise(0.0, 1e-6, 600.0))
         predicted.append(-filter_.innovation(0.0, i, celsius)[0])
-        filter_.predict(0.5, i, celsius, (0.0, 0.0))
+        filter_.predict(0.5, i, celsius, Noise(0.0, 1e-6, 600.0))
     assert predicted == pytest.approx(written_out(ride, reaction=0.0)[0], abs=0.1 * MILLIVOLT)
 
 
