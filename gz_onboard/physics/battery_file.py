@@ -106,4 +106,4 @@ def _mesh(table: Table, unit: str, low: float, high: float) -> Mesh:
     rows = table.rows("value", len(soc), f"in {unit}, one for each soc", low, high)
     if len(rows) != len(temperature):
         raise table.error(f"must be {len(temperature)} rows, one for each temperature", "value")
-    return Mesh(soc, temperature, rows)
+    return Mesh(soc, temperature, rows, geometric=True)
