@@ -9,7 +9,7 @@ from gz_onboard.estimator.ekf import FilterMaker, SocFilter
 from gz_onboard.estimator.rest import REST_RATE
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.start import Saved, bounded, from_voltage, parked, uncounted, update_soc
-from gz_onboard.estimator.uncertainty import RESISTANCE_SD, VoltageUncertainty
+from gz_onboard.estimator.uncertainty import VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.effect import MOVING
 
@@ -138,7 +138,7 @@ def first_filter(
     v1, v1_sd = (ridden, ridden) if loaded else (0.0, STOPPED_SHARE * ridden)
     model_sd = uncertainty.loaded(soc, temperature) if loaded else 0.0
     slow_sd = hypot(uncertainty.rest, at.voltage_sd, model_sd)
-    once_sd = hypot(RESISTANCE_SD * (r0 * cell_current + at.overpotential), at.unsteady_sd)
+    once_sd = hypot(uncertainty.resistance * (r0 * cell_current + at.overpotential), at.unsteady_sd)
     drawn = None
     if saved:
         own_soc, odometer = signals.bms_state_of_charge.get(at.now), signals.odometer.get(at.now)

@@ -255,7 +255,7 @@ class StateOfCharge:
         variance = self.gate.update(dt, error, own, slow, load)
         if self.gate.refuted:
             self._refute(now, filter_, error, drop + filter_.v1)
-        elif variance is not None:
+        elif variance is not None and self.uncertainty.tells_more(filter_.soc, filter_.covariance[0]):
             # What errs the same way for a time counts as one sample in that time, not one each step.
             variance *= max(2 * self.uncertainty.error_time / max(dt, SHORTEST), 1.0)
             filter_.update(cell_voltage, cell_current, temperature, variance)

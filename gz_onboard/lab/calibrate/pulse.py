@@ -45,8 +45,7 @@ def calibrate(
 ) -> Result:
     """``battery.r0``, ``r1``, ``c1``, ``capacity``, ``ocv``, and beside them a slow pair.
 
-    Also ``battery.voltage_error`` and ``cell_voltage_error_time`` (see `pulse_error`), and ``battery.rest_shift``, if
-    the rests show that temperature moves the open-circuit voltage (see `pulse_rests`).
+    Also what they err by (see `pulse_error`), and ``battery.rest_shift``, if the rests show one (see `pulse_rests`).
 
     tables: one for each temperature. ocv, capacity: from `ocv.calibrate`. loads: currents [any unit, one value a
     second, each from rest] that the pair is to follow; synthetic rides if None. Raises InputError for tables that are
