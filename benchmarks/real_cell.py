@@ -1,6 +1,6 @@
 """State of charge of a real cell: the on-board filter on a Panasonic NCR18650PF, -20 to 25 degC.
 
-    OMP_NUM_THREADS=1 python benchmarks/real_cell.py DATA_FOLDER [--write docs/real-cell.md]
+    OMP_NUM_THREADS=1 python benchmarks/real_cell.py DATA_FOLDER [--only Cycle_1] [--board] [--write docs/real-cell.md]
 
 Data: Kollmeyer, "Panasonic 18650PF Li-ion Battery Data", Mendeley Data 2018, doi:10.17632/wykht8y7tg.1, as Parquet and
 1 Hz CSV. The tables come from the pulse (HPPC) tests and the C/20 discharge alone, by `gz_onboard.lab.calibrate`; the
@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.estimator.ekf import Covariance, ScalarFilter, SocFilter
+from gz_onboard.estimator.ekf import Covariance, Noise, ScalarFilter, SocFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Group
 from gz_onboard.lab.calibrate import ocv, pulse
@@ -35,13 +35,16 @@ from gz_onboard.vehicle import read_vehicle
 
 TEMPERATURES = (25, 10, 0, -10, -20)
 OFFSET = 0.05  # A of the cell: what the current sensor shows too much
+TESTER_OFFSET = 0.005  # A: sd of the tester's own current, of which the reference is made
 WRONG = -0.2  # of SOC
 RIGHT, WORST = (0.0, 0.0), (WRONG, OFFSET)
 CASES = {RIGHT: "right", (0.0, OFFSET): "right, offset", (WRONG, 0.0): "wrong", WORST: "wrong, offset"}
 RIGHT_SD = 0.01  # of SOC: how far the right one is believed
 CONVERGED = 0.025  # of SOC: from here on the error counts
+NEAR = 0.03  # of SOC: a wrong start is left when it is first as near as this
+INTERVAL = 1.96  # sd: of 95 %
 NOMINAL = 2.9  # A·h, for C-rates
-SENSOR = {"pack_current_offset": (0.0, OFFSET), "pack_current_gain": (1.0, 0.005), "pack_voltage_offset": (0.0, 0.002)}
+SENSOR = {"pack_current_gain": (1.0, 0.005), "pack_voltage_offset": (0.0, 0.002)}
 COLUMNS = {
     "time": Named("t_s", "s"),
     "current": Named("i_A", "A", -1),
@@ -107,12 +110,18 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
     soc, temperature, share = rows
 
     def mesh(table: Array) -> Mesh:
-        return Mesh(soc, temperature, tuple(tuple(map(float, row)) for row in table))
+        return Mesh(soc, temperature, tuple(tuple(map(float, row)) for row in table), geometric=True)
 
     sd = result.curves["battery.ocv"].sd[(cell.ocv_soc > 0.1) & (cell.ocv_soc < 0.95)]
     ocv_table = tuple(map(float, cell.ocv_soc)), tuple(map(float, cell.ocv)), float(np.median(sd))
     circuit = mesh(cell.r0), mesh(cell.r1), mesh(cell.c1)
     battery = Battery(1, 1, capacity_25, temperature, share, 2.5, 0.0, *ocv_table, *circuit)
+    error = result.curves["battery.voltage_error"]
+    battery = replace(
+        battery,
+        voltage_error_temperature=tuple(map(float, error.axes["temperature"])),
+        voltage_error_value=tuple(map(float, error.value)),
+    )
     if (shift := result.curves.get("battery.rest_shift")) is None:
         return battery
     return replace(
@@ -130,7 +139,7 @@ class Extended(ScalarFilter):
     slow_time: Mesh | None = None
     v2 = 0.0
 
-    def predict(self, dt: float, current: float, temperature: float, noise: tuple[float, float]) -> None:
+    def predict(self, dt: float, current: float, temperature: float, noise: Noise) -> None:
         if self.slow_resistance and self.slow_time:
             decay = exp(-dt / self.slow_time.at(self.soc, temperature)[0])
             r2 = self.slow_resistance.at(self.soc, temperature)[0]
@@ -163,26 +172,30 @@ class Setting:
 
 @dataclass(frozen=True)
 class Score:
-    """Errors of SOC, once converged; `start`: s until then, nan if never; sd: mean of the filter's own."""
+    """Errors of SOC, once converged, and of all samples how well the filter's own sd tells them."""
 
     rms: float
-    mae: float
     largest: float
-    outside: float
-    start: float
-    sd: float
+    start: float  # s until converged, nan if never
+    near: float  # s until within `NEAR`, nan if never
+    inside: float  # share of all samples within the interval of 95 %
+    nees: float  # mean of the squared error over its variance
+    sd: float  # mean
 
 
-def estimator_of(setting: Setting) -> Estimator:
+def estimator_of(setting: Setting, offset: float) -> Estimator:
+    """The estimator on board of the cell, with a current sensor that is known to be off by up to `offset` [A]."""
     battery, result = setting.battery, setting.result
     vehicle = read_vehicle("reference")
     known = dict(vehicle.parameters.known)
     rests = [f.rms for f in result.fits if f.what.startswith("rest voltage")]
     values = {
         **SENSOR,
+        "pack_current_offset": (0.0, offset or TESTER_OFFSET),
         "cell_capacity": (battery.capacity, result.parameters["cell_capacity"].sd),
         "cell_voltage_error": (0.0, result.parameters["cell_voltage_error"].sd),
         "cell_voltage_error_empty": (0.0, result.parameters["cell_voltage_error_empty"].sd),
+        "cell_voltage_error_time": (result.parameters["cell_voltage_error_time"].value, 0.0),
         "rest_voltage_error": (0.0, float(np.mean(rests))),
     }
     for parameter in charge_transfer.PARAMETERS:
@@ -208,7 +221,7 @@ def estimator_of(setting: Setting) -> Estimator:
 
 def run(setting: Setting, cycle: Cycle, wrong: float, offset: float) -> Score:
     """One cycle through the on-board estimator, which is told the SOC, or one that is `wrong`, after its first step."""
-    estimator = estimator_of(setting)
+    estimator = estimator_of(setting, offset)
     truth = 1 - cycle.drawn / setting.battery.cell_capacity(cycle.temperature)
     soc, sd = np.full(len(truth), np.nan), np.full(len(truth), np.nan)
     told = False
@@ -220,16 +233,24 @@ def run(setting: Setting, cycle: Cycle, wrong: float, offset: float) -> Score:
             continue
         if not told:
             told = True
-            f.soc, f.v1 = float(truth[k]) + wrong, 0.0
+            f.soc, f.v1, f.error = float(truth[k]) + wrong, 0.0, 0.0
             f.covariance = (max(abs(wrong), RIGHT_SD) ** 2, 0.0, f.covariance[2])
         soc[k], sd[k] = f.soc, sqrt(f.covariance[0])
     known = np.isfinite(soc)
     error, sd = (soc - truth)[known], sd[known]
-    near = np.flatnonzero(np.abs(error) < CONVERGED)
-    e = error[near[0] :] if len(near) else np.array([nan])
-    sizes = float(np.sqrt(np.mean(e**2))), float(np.mean(np.abs(e))), float(np.abs(e).max())
-    outside, start = float(np.mean(np.abs(error) > 3 * sd)), float(near[0]) if len(near) else nan
-    return Score(*sizes, outside, start, float(np.mean(sd)))
+    first = [np.flatnonzero(np.abs(error) < limit) for limit in (CONVERGED, NEAR)]
+    start, near = (float(x[0]) if len(x) else nan for x in first)
+    e = error[int(start) :] if np.isfinite(start) else np.array([nan])
+    own = np.abs(error) / sd
+    return Score(
+        float(np.sqrt(np.mean(e**2))),
+        float(np.abs(e).max()),
+        start,
+        near,
+        float(np.mean(own < INTERVAL)),
+        float(np.mean(own**2)),
+        float(np.mean(sd)),
+    )
 
 
 def open_loop(cell: Circuit, cycle: Cycle, capacity: float) -> Array:
@@ -263,7 +284,9 @@ def settings(rest: Result, result: Result) -> list[Setting]:
     assert two.slow_resistance is not None
     assert two.slow_time is not None
     axes = double.r0.soc, double.r0.temperature
-    slow = tuple(Mesh(*axes, tuple(map(tuple, t.tolist()))) for t in (two.slow_resistance, two.slow_time))
+    slow = tuple(
+        Mesh(*axes, tuple(map(tuple, t.tolist())), geometric=True) for t in (two.slow_resistance, two.slow_time)
+    )
     return [
         Setting("on board: one RC pair", single, result),
         Setting("rest voltage one for all temperatures", _unshifted(single), result),
@@ -284,13 +307,16 @@ def percent(value: float | np.floating[Any], digits: int = 2) -> str:
     return "never" if np.isnan(value) else f"{100 * value:.{digits}f}"
 
 
-def report(folder: Path) -> list[str]:
-    """The tables of docs/real-cell.md, as lines of Markdown."""
+def report(folder: Path, only: str = "", board: bool = False) -> list[str]:
+    """The tables of docs/real-cell.md, as lines of Markdown.
+
+    only: of cycles whose name holds this; board: of the filter on board alone.
+    """
     rest = ocv.calibrate(read_table(folder / "25C_c20_ocv.parquet", COLUMNS))
     tables = {t: pulse_test(folder, t) for t in TEMPERATURES}
     result = pulse.calibrate(list(tables.values()), rest.curves["battery.ocv"], rest.parameters["cell_capacity"])
-    every = settings(rest, result)
-    work = cycles(folder)
+    every = settings(rest, result)[: 1 if board else None]
+    work = [c for c in cycles(folder) if only in c.name]
     plain = [c for c in work if "trise" not in c.name]
     runs = [(every[0], c, *case) for c in work for case in CASES]
     runs += [(s, c, *case) for s in every[1:] for c in work for case in (RIGHT, WORST)]
@@ -303,12 +329,15 @@ def report(folder: Path) -> list[str]:
     lines += ["", "## State of charge on the drive cycles, filter as on board", "", *_detail(every[0], work, scores)]
     lines += ["", "Means over the cycles of a temperature, without those of rising temperature:", ""]
     lines += _summary(every[:1], plain, scores, list(CASES))
-    lines += ["", "## What is missing", "", "### In the filter: the same with more in the model", ""]
-    lines += _summary(every, plain, scores, [RIGHT, WORST])
-    lines += ["", "The cycles of rising temperature, right start, no offset:", ""]
-    lines += _summary(every, [c for c in work if "trise" in c.name], scores, [RIGHT])
-    lines += ["", "### In the voltage", "", *_residuals(result, every[0], plain)]
-    lines += ["", "### Over current: the pulses themselves", "", *_rates(tables, every[0])]
+    lines += ["", "The filter's own interval of 95 %, and how fast a wrong start is left:", ""]
+    lines += _intervals(every[0], work, scores)
+    if not board:
+        lines += ["", "## What is missing", "", "### In the filter: the same with more in the model", ""]
+        lines += _summary(every, plain, scores, [RIGHT, WORST])
+        lines += ["", "The cycles of rising temperature, right start, no offset:", ""]
+        lines += _summary(every, [c for c in work if "trise" in c.name], scores, [RIGHT])
+        lines += ["", "### In the voltage", "", *_residuals(result, every[0], plain)]
+        lines += ["", "### Over current: the pulses themselves", "", *_rates(tables, every[0])]
     return lines
 
 
@@ -346,7 +375,7 @@ Scores = dict[tuple[str, Cycle, float, float], Score]
 
 def _detail(setting: Setting, work: list[Cycle], scores: Scores) -> list[str]:
     lines = [
-        "| °C | cycle | to SOC, % | right: RMS, MAE, max, >3σ | right, offset | 20 % wrong: RMS, MAE, max, >3σ, s "
+        "| °C | cycle | to SOC, % | right: RMS, max, in 95 % | right, offset | 20 % wrong: RMS, max, in 95 %, s "
         "| 20 % wrong, offset | σ |",
         "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
@@ -354,11 +383,32 @@ def _detail(setting: Setting, work: list[Cycle], scores: Scores) -> list[str]:
         cells = []
         for case in CASES:
             s = scores[setting.name, c, *case]
-            cell = f"{percent(s.rms)}, {percent(s.mae)}, {percent(s.largest, 1)}, {percent(s.outside, 0)}"
+            cell = f"{percent(s.rms)}, {percent(s.largest, 1)}, {percent(s.inside, 0)}"
             cells.append(("never" if np.isnan(s.rms) else cell) + (f", {s.start:.0f}" if s.start > 0 else ""))
         end = 1 - c.drawn[-1] / setting.battery.cell_capacity(c.temperature)
         sd = scores[setting.name, c, *RIGHT].sd
         lines.append(f"| {c.temperature} | {c.name} | {100 * end:.0f} | {' | '.join(cells)} | {100 * sd:.1f} |")
+    return lines
+
+
+def _intervals(setting: Setting, work: list[Cycle], scores: Scores) -> list[str]:
+    lines = [
+        "| °C | start | σ, % | samples within 95 %, least of a cycle | NEES | s to within 3 %, most of a cycle |",
+        "| --- " * 6 + "|",
+    ]
+    groups = {f"{t}": [c for c in work if c.temperature == t and "trise" not in c.name] for t in TEMPERATURES}
+    groups["rising"] = [c for c in work if "trise" in c.name]
+    for name, group in groups.items():
+        for case in CASES if group else ():
+            mine = [scores[setting.name, c, *case] for c in group]
+            near = np.array([s.near for s in mine])
+            never = f", {np.count_nonzero(np.isnan(near))} never" if np.any(np.isnan(near)) else ""
+            inside = [s.inside for s in mine]
+            lines.append(
+                f"| {name} | {CASES[case]} | {percent(np.mean([s.sd for s in mine]))} | "
+                f"{percent(np.mean(inside), 0)}, {percent(min(inside), 0)} | {np.mean([s.nees for s in mine]):.2f} | "
+                f"{np.nanmean(near):.0f}, {np.nanmax(near):.0f}{never} |"
+            )
     return lines
 
 
@@ -371,9 +421,10 @@ def _summary(every: list[Setting], work: list[Cycle], scores: Scores, cases: lis
                 mine = [scores[setting.name, c, *case] for c in work if c.temperature == t]
                 if mine:
                     good = [s for s in mine if np.isfinite(s.rms)]
-                    rms, worst = np.mean([s.rms for s in good]), max(s.rms for s in good)
+                    rms = np.mean([s.rms for s in good])
+                    worst, most = (max((getattr(s, name) for s in good), default=nan) for name in ("rms", "largest"))
                     lost = f", {len(mine) - len(good)} never" if len(good) < len(mine) else ""
-                    cells.append(f"{percent(rms)} ({percent(worst)}; {percent(max(s.largest for s in good), 1)}){lost}")
+                    cells.append(f"{percent(rms)} ({percent(worst)}; {percent(most, 1)}){lost}")
                 else:
                     cells.append("–")
             lines.append(f"| {setting.name} | {CASES[case]} | {' | '.join(cells)} |")
@@ -424,8 +475,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("data", type=Path, help="folder of the cell's files")
     parser.add_argument("--write", type=Path, help="replace what stands in this file after its mark")
+    parser.add_argument("--only", default="", help="cycles whose name holds this")
+    parser.add_argument("--board", action="store_true", help="the filter on board alone")
     arguments = parser.parse_args()
-    lines = report(arguments.data)
+    lines = report(arguments.data, arguments.only, arguments.board)
     if arguments.write:
         head = arguments.write.read_text(encoding="utf-8").partition(MARK)[0]
         arguments.write.write_text("\n".join([head + MARK, "", *lines]) + "\n", encoding="utf-8")

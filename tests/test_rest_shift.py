@@ -1,4 +1,4 @@
-"""A cell that rests lower when cold: `[battery.rest_shift]` in the vehicle file, and everything that goes by it."""
+"""What depends on temperature beside resistance: `[battery.rest_shift]` and `[battery.voltage_error]`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
-from gz_onboard.estimator.ekf import ScalarFilter
+from gz_onboard.estimator.ekf import Noise, ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Group
@@ -102,7 +102,7 @@ def test_the_filter_reckons_with_it(backend):
         f = backend(battery, 0.6, 0.0, (0.05**2, 0.0, 1e-6))
         volts = COLD.ocv(0.6, 0.0)[0]
         for _ in range(200):
-            f.predict(1.0, 0.0, 0.0, (1e-9, 1e-8))
+            f.predict(1.0, 0.0, 0.0, Noise(1e-9, 1e-6, 100.0))
             f.update(volts, 0.0, 0.0, 0.01**2)
         soc[battery is COLD] = f.soc
     assert soc[True] == pytest.approx(0.6, abs=1e-6)
@@ -154,3 +154,20 @@ def test_less_can_be_drawn_from_cells_that_rest_lower(soc, temperature, power):
     assert less <= more + 1e-6
     if more > 1e5:
         assert less < more
+
+
+ERRORS = """
+[battery.voltage_error]
+temperature = [-10.0, 25.0]
+value = [0.020, 0.006]
+unit = "V"
+"""
+
+
+def test_what_the_circuit_errs_by_is_read_over_temperature(tmp_path):
+    battery = read(tmp_path, ERRORS)
+    assert battery.voltage_error(-20.0, 0.01) == pytest.approx(0.020)
+    assert battery.voltage_error(7.5, 0.01) == pytest.approx(0.013)
+    assert PLAIN.voltage_error(7.5, 0.01) == 0.01
+    with pytest.raises(InputError, match=r"voltage_error.* 2 numbers within 0 to 0\.2 V"):
+        read(tmp_path, ERRORS.replace("0.020", "-0.020"))

@@ -20,6 +20,7 @@ class CellEffects:
         self._battery = battery
         self._effects = [effect for _, effect in model.cell_voltage]
         self._quantities = dict.fromkeys(QUANTITIES, 0.0)
+        self._quantities["cell_capacity"] = battery.cell_capacity(MILD)  # until the first step
         self.states = {effect.effect.name: 0.0 for effect in self._effects}  # V of a cell
         self.overpotential = 0.0  # V of a cell: their sum
 

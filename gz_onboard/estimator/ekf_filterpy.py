@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from math import exp
+
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 from numpy.typing import NDArray
 
-from gz_onboard.estimator.ekf import Covariance
+from gz_onboard.estimator.ekf import NEAR, TURNS, Covariance, Noise
 from gz_onboard.physics.battery import Battery
 
 
@@ -24,8 +26,9 @@ class FilterpyFilter:
 
     def __init__(self, battery: Battery, soc: float, v1: float, covariance: Covariance) -> None:
         self.battery = battery
+        self.v1 = v1
         self._ekf = _Ekf(dim_x=2, dim_z=1)
-        self._ekf.x = np.array([[soc], [v1]])
+        self._ekf.x = np.array([[soc], [0.0]])
         self.covariance = covariance
 
     @property
@@ -38,17 +41,17 @@ class FilterpyFilter:
         self._ekf.x[0, 0] = value
 
     @property
-    def v1(self) -> float:
-        """Voltage over the RC pair [V]."""
+    def error(self) -> float:
+        """What the circuit errs by [V]."""
         return float(self._ekf.x[1, 0])
 
-    @v1.setter
-    def v1(self, value: float) -> None:
+    @error.setter
+    def error(self, value: float) -> None:
         self._ekf.x[1, 0] = value
 
     @property
     def covariance(self) -> Covariance:
-        """var(SOC), cov(SOC, V1) [V], var(V1) [V²]."""
+        """var(SOC), cov(SOC, e) [V], var(e) [V²]."""
         p = self._ekf.P
         return float(p[0, 0]), float(p[0, 1]), float(p[1, 1])
 
@@ -56,30 +59,37 @@ class FilterpyFilter:
     def covariance(self, value: Covariance) -> None:
         self._ekf.P = np.array([[value[0], value[1]], [value[1], value[2]]])
 
-    def predict(self, dt: float, current: float, temperature: float, noise: tuple[float, float]) -> None:
+    def predict(self, dt: float, current: float, temperature: float, noise: Noise) -> None:
         """See `SocFilter`."""
-        x = self._ekf.x
-        soc, v1, decay = self.battery.advanced(dt, float(x[0, 0]), float(x[1, 0]), current, temperature)
-        self._ekf.F, self._ekf.Q = np.diag([1.0, decay]), np.diag(noise)
-        self._ekf.advanced = np.array([[soc], [v1]])
+        soc, self.v1, fading = self.battery.advanced(dt, self.soc, self.v1, current, temperature)
+        left = fading if self.covariance[2] > noise.error else exp(-dt / noise.time)
+        self._ekf.F, self._ekf.Q = np.diag([1.0, left]), np.diag([noise.soc, noise.error * (1 - left**2)])
+        self._ekf.advanced = np.array([[soc], [left * self.error]])
         self._ekf.predict()
 
     def _predicted(self, x: NDArray[np.float64], current: float, temperature: float) -> NDArray[np.float64]:
-        voltage, _ = self.battery.terminal_voltage(float(x[0, 0]), float(x[1, 0]), current, temperature)
-        return np.array([[voltage]])  # (1, 1): a scalar would turn x into 2×2
+        voltage, _ = self.battery.terminal_voltage(float(x[0, 0]), self.v1, current, temperature)
+        return np.array([[voltage - float(x[1, 0])]])  # (1, 1): a scalar would turn x into 2×2
 
     def _jacobian(self, x: NDArray[np.float64], current: float, temperature: float) -> NDArray[np.float64]:
-        _, slope = self.battery.terminal_voltage(float(x[0, 0]), float(x[1, 0]), current, temperature)
+        _, slope = self.battery.terminal_voltage(float(x[0, 0]), self.v1, current, temperature)
         return np.array([[slope, -1.0]])
 
     def innovation(self, voltage: float, current: float, temperature: float) -> tuple[float, float]:
         """See `SocFilter`."""
         h = self._jacobian(self._ekf.x, current, temperature)
-        predicted = float(self._predicted(self._ekf.x, current, temperature)[0, 0])
+        predicted = float(self._predicted(self._ekf.x, current, temperature)[0, 0]) + self.error
         return voltage - predicted, float((h @ self._ekf.P @ h.T)[0, 0])
 
     def update(self, voltage: float, current: float, temperature: float, variance: float) -> None:
         """See `SocFilter`."""
-        arguments = (current, temperature)
-        z, r = np.array([[voltage]]), np.array([[variance]])
-        self._ekf.update(z, self._jacobian, self._predicted, R=r, args=arguments, hx_args=arguments)
+        z, r, before, p = np.array([[voltage]]), np.array([[variance]]), self._ekf.x, self._ekf.P
+        at = before
+        for _ in range(TURNS):
+            h = self._jacobian(at, current, temperature)
+            line = self._predicted(at, current, temperature) + h @ (before - at)
+            after = before + p @ h.T @ np.linalg.inv(h @ p @ h.T + r) @ (z - line)
+            last, at = at, after
+            if abs(after[0, 0] - last[0, 0]) < NEAR:
+                break
+        self._ekf.update(z, lambda x: h, lambda x: line, R=r)

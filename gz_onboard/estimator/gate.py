@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import sqrt
 
-ERROR_TIME = 600.0  # s: over so long the cell model errs the same way; its error does not average out faster
+MATCHING_TIME = 600.0  # s over which it is seen whether the cell model errs by more than is known of it
 INNOVATION_TIME = 10.0  # s: low pass of the innovation that is shown
 GATE = 5.0  # sd: a voltage further off is a glitch, unless it persists
 GATE_COUNT = 20  # so many in a row are no glitch
@@ -18,8 +18,10 @@ class InnovationGate:
     def __init__(self) -> None:
         self.innovation: float | None = None
         self.off = 0  # voltages in a row
-        self._square = self._error_square = 0.0  # V², over `INNOVATION_TIME` and `ERROR_TIME`
+        self._square = 0.0  # V², over `INNOVATION_TIME`
+        self._ratio = 0.0  # of the error's square over its variance, over `MATCHING_TIME`
         self._contradicted = 0.0  # s
+        self._known = 1.0  # V²: variance of the last error by what is known of the cell model
 
     @property
     def rms(self) -> float:
@@ -38,21 +40,25 @@ class InnovationGate:
 
     def blame_both(self) -> None:
         """The last error may be the cell model's as well: it is believed to no better than that."""
-        self._error_square = (self.innovation or 0.0) ** 2
+        self._ratio = (self.innovation or 0.0) ** 2 / self._known
         self._contradicted = 0.0
 
-    def update(self, dt: float, error: float, own: float, slow: float) -> float | None:
-        """The variance [V²] with which a voltage is to be taken in, of which `error` [V] is off; None: not at all.
+    def update(self, dt: float, error: float, own: float, slow: float, load: float) -> float | None:
+        """The variance [V²] of what in a voltage that is `error` [V] off is not the slow error; None: take in none.
 
-        dt: [s] that it represents; own: variance of the prediction by the state, slow: by everything else [V²].
+        dt: [s] that it represents; own: variance of the prediction by the state, slow: by what stays for minutes,
+        load: by what changes with the load [V²].
         """
-        self.innovation, square = error, error * error
+        self.innovation, square, known = error, error * error, slow + load
         # A model with larger errors than in the vehicle file gets a larger variance (Mehra 1970: covariance matching).
-        believed = max(slow, self._error_square)
-        self._error_square += (square - self._error_square) * min(dt / ERROR_TIME, 1.0)
+        believed = known * max(self._ratio, 1.0)
+        self._ratio += (square / (own + known) - self._ratio) * min(dt / MATCHING_TIME, 1.0)
+        self._known = known
         self._square += (square - self._square) * min(dt / INNOVATION_TIME, 1.0)
-        self._contradicted = self._contradicted + dt if square > GATE * GATE * (own + slow) else 0.0
+        self._contradicted = self._contradicted + dt if square > GATE * GATE * (own + known) else 0.0
         if self.refuted:
             return None
         self.off = self.off + 1 if square > GATE * GATE * (own + believed) else 0
-        return None if 0 < self.off < GATE_COUNT else believed
+        if self.off:  # what is no slow error of the model is not to become one
+            return None if self.off < GATE_COUNT else believed
+        return believed - slow

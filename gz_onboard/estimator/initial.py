@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from math import exp, hypot, inf, sqrt
 
 from gz_onboard.estimator.ekf import FilterMaker, SocFilter
-from gz_onboard.estimator.gate import ERROR_TIME
 from gz_onboard.estimator.rest import REST_RATE
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.start import Saved, bounded, from_voltage, parked, uncounted, update_soc
-from gz_onboard.estimator.uncertainty import RESISTANCE_SD, VoltageUncertainty
+from gz_onboard.estimator.uncertainty import VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.effect import MOVING
 
@@ -137,11 +136,9 @@ def first_filter(
     if ridden > room > 0:  # at the middle of what can be: a table beyond its data promises any polarisation
         ridden = room / 2
     v1, v1_sd = (ridden, ridden) if loaded else (0.0, STOPPED_SHARE * ridden)
-    drop_sd, model_sd = (
-        RESISTANCE_SD * (r0 * cell_current + at.overpotential),
-        uncertainty.loaded(soc) if loaded else 0.0,
-    )
-    voltage_sd = hypot(uncertainty.rest, at.voltage_sd, drop_sd, model_sd, at.unsteady_sd)
+    model_sd = uncertainty.loaded(soc, temperature) if loaded else 0.0
+    slow_sd = hypot(uncertainty.rest, at.voltage_sd, model_sd)
+    once_sd = hypot(uncertainty.resistance * (r0 * cell_current + at.overpotential), at.unsteady_sd)
     drawn = None
     if saved:
         own_soc, odometer = signals.bms_state_of_charge.get(at.now), signals.odometer.get(at.now)
@@ -152,10 +149,12 @@ def first_filter(
             decay = exp(-age / (r1 * battery.c1.at(soc, temperature)[0]))
             v1 += (saved.v1 - v1) * decay
             v1_sd = sqrt(saved.covariance[2] * decay**2 + v1_sd**2 * (1 - decay**2))
-        # The cell model errs the same way for ERROR_TIME: after a shorter gap the voltage adds no information.
+        # The cell model errs the same way for a time: after a shorter gap the voltage adds no information.
         if age is not None:
-            voltage_sd *= sqrt(max(2 * ERROR_TIME / max(age, SHORTEST_AGE), 1.0))
-    soc, covariance = from_voltage(battery, cell_voltage, cell_current, temperature, v1, v1_sd, voltage_sd)
+            factor = sqrt(max(2 * uncertainty.error_time / max(age, SHORTEST_AGE), 1.0))
+            slow_sd, once_sd = factor * slow_sd, factor * once_sd
+    error_sd = hypot(v1_sd, slow_sd)
+    soc, covariance = from_voltage(battery, cell_voltage, cell_current, temperature, v1, error_sd, once_sd)
     filter_ = make(battery, soc, v1, covariance)
     if saved and drawn:
         before, variance = saved.soc - drawn[0], saved.covariance[0] + drawn[1] ** 2

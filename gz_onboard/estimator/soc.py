@@ -8,9 +8,9 @@ from typing import Protocol
 
 from gz_onboard.constants import HOUR
 from gz_onboard.estimator.cell_effects import CellEffects
-from gz_onboard.estimator.ekf import FilterMaker, SocFilter
-from gz_onboard.estimator.gate import ERROR_TIME, InnovationGate
-from gz_onboard.estimator.initial import DROP_FACTOR, RELAXED, Situation, SteadyVoltage, first_filter
+from gz_onboard.estimator.ekf import FilterMaker, Noise, SocFilter
+from gz_onboard.estimator.gate import InnovationGate
+from gz_onboard.estimator.initial import DROP_FACTOR, Situation, SteadyVoltage, first_filter
 from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.rest import RestUpdate
 from gz_onboard.estimator.signals import Signal, Signals
@@ -23,8 +23,7 @@ from gz_onboard.physics.model import Model
 
 DOUBTED_START = 30.0  # s: a voltage that is doubted so soon has misled the first state of charge
 RESTARTED_FOR = 600.0  # s: for so long it is reported
-V1_WALK = 1e-8  # V²/s: variance that V1 gains, as the RC pair is a mixture of several
-STEADY_NOISE = 1e-9, 1e-7  # variance of SOC and V1 [V²] from the first voltage to the end of the wait
+STEADY_NOISE = 1e-9  # variance of SOC from the first voltage to the end of the wait
 SHORTEST = 0.02  # s: a step, to divide by
 
 
@@ -214,13 +213,17 @@ class StateOfCharge:
         if dt > pause or (counted is CurrentSource.NONE and unmeasured(pack.reading)):
             q += self._charge.of_pause(dt, sqrt(filter_.covariance[0]))
             self._rest.interrupt()
-        filter_.predict(dt, mean / battery.cells_parallel, temperature, (q, V1_WALK * min(dt, RELAXED)))
+        filter_.predict(dt, mean / battery.cells_parallel, temperature, self._noise(q, filter_, temperature))
         p00, p01, p11 = filter_.covariance
         if p00 > SOC_UNKNOWN_SD**2:
             filter_.covariance = SOC_UNKNOWN_SD**2, p01 * SOC_UNKNOWN_SD / sqrt(p00), p11
         if self.effects:
             self.effects.step(dt, mean / battery.cells_parallel, filter_.soc, temperature, riding.cell_inputs(now))
         filter_.soc = bounded(filter_.soc)
+
+    def _noise(self, counted: float, filter_: SocFilter, temperature: float) -> Noise:
+        """`counted`: variance of SOC."""
+        return Noise(counted, self.uncertainty.slow(filter_.soc, temperature), self.uncertainty.error_time)
 
     def _update(
         self, filter_: SocFilter, now: float, dt: float, measured: tuple[float, float], pack: PackState
@@ -248,14 +251,15 @@ class StateOfCharge:
         by_inverter = not self._signals.pack_voltage.fresh(now)
         voltage_sd = INVERTER_VOLTAGE_SD if by_inverter else reading.voltage_sd
         known = self._signals.cell_temperature.fresh(now)
-        slow = self.uncertainty.variance(filter_.soc, r0, drop, reading.source, known, voltage_sd)
+        slow = self.uncertainty.slow(filter_.soc, temperature)
+        load = self.uncertainty.load(r0, (drop, filter_.v1), reading.source, known, voltage_sd)
         error, own = filter_.innovation(cell_voltage, cell_current, temperature)
-        variance = self.gate.update(dt, error, own, slow)
+        variance = self.gate.update(dt, error, own, slow, load)
         if self.gate.refuted:
             self._refute(now, filter_, error, drop + filter_.v1)
-        elif variance is not None:
-            # What errs the same way for ERROR_TIME counts as one sample in that time, not one each step.
-            variance *= max(2 * ERROR_TIME / max(dt, SHORTEST), 1.0)
+        elif variance is not None and self.uncertainty.tells_more(filter_.soc, filter_.covariance[0]):
+            # What errs the same way for a time counts as one sample in that time, not one each step.
+            variance *= max(2 * self.uncertainty.error_time / max(dt, SHORTEST), 1.0)
             filter_.update(cell_voltage, cell_current, temperature, variance)
             filter_.soc = bounded(filter_.soc)
 
@@ -307,7 +311,8 @@ class StateOfCharge:
         self.saved, self._started, self._started_from = None, now, restored
         self.filter = first_filter(self._battery, self._make, self.uncertainty, first, at, self._signals, restored)
         mean = (first.current + current) / 2 / self._battery.cells_parallel
-        self.filter.predict(now - first.time, mean, pack.temperature, STEADY_NOISE)
+        noise = self._noise(STEADY_NOISE, self.filter, pack.temperature)
+        self.filter.predict(now - first.time, mean, pack.temperature, noise)
 
 
 def unmeasured(reading: PackReading) -> bool:

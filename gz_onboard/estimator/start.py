@@ -86,7 +86,7 @@ def update_soc(filter_: SocFilter, soc: float, variance: float) -> None:
     total = p00 + variance
     difference = soc - filter_.soc
     filter_.soc += p00 / total * difference
-    filter_.v1 += p01 / total * difference
+    filter_.error += p01 / total * difference
     share = variance / total
     filter_.covariance = p00 * share, p01 * share, p11 - p01 * p01 / total
 

@@ -17,7 +17,7 @@ SAMPLING_RATE = 0.15  # 1/h: sd of the mean current over capacity between two sa
 # by the pack (of 32.8 A·h, where they were found); those of voltages are a cell's (of 14).
 UNCHECKED_SD = 0.2 / 32.8  # 1/h, beside the offset's, while no second sensor confirms the first
 EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
-RESISTANCE_SD = 0.12  # relative: R0 of this pack at this place and temperature
+RESISTANCE_SD = 0.12  # relative: measured tables of R0 and R1, for this pack at this place and temperature
 RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
 INVERTER_VOLTAGE_SD = 0.15 / 14  # V of a cell: the cable between pack and inverter
 
@@ -80,25 +80,42 @@ class VoltageUncertainty:
         self._battery = battery
         self.model = p.sd("cell_voltage_error")
         self.rest = sqrt(p.sd("rest_voltage_error") ** 2 + battery.ocv_sd**2 + battery.rest_shift_sd**2)
+        self.resistance = max(RESISTANCE_SD, p.sd("cell_resistance_factor"))  # relative
         self._empty = p.sd("cell_voltage_error_empty")
+        self.error_time = p["cell_voltage_error_time"]
+        self._sensor = (p.sd("pack_voltage_offset") / battery.cells_series) ** 2  # V²
+        # What depends on the cell's history, hysteresis before all: it lasts as long as the history does.
+        self._history = p.sd("rest_voltage_error") ** 2 + battery.rest_shift_sd**2  # V²
         self._capacity_scatter = p.sd("cell_capacity") / p["cell_capacity"]
 
-    def loaded(self, soc: float) -> float:
-        """Sd of the cell model under load [V]: it errs more near empty."""
-        empty = min(max((EMPTY_BELOW - soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
-        return self.model + empty * (self._empty - self.model)
+    def loaded(self, soc: float, temperature: float) -> float:
+        """Sd of the cell model under load [V]: it errs more near empty, and in the cold."""
+        model, empty = self._battery.voltage_error(temperature, self.model), self._empty
+        share = min(max((EMPTY_BELOW - soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
+        return model + share * max(empty - model, 0.0)
 
-    def variance(
-        self, soc: float, r0: float, drop: float, source: CurrentSource, temperature_known: bool, voltage_sd: float
-    ) -> float:
-        """Variance [V²] of the voltage predicted at a `drop` [V] by the load, and measured with `voltage_sd` [V].
-
-        r0: [ohm] of a cell, as all of them.
-        """
-        resistance_sd = RESISTANCE_SD if temperature_known else RESISTANCE_SD_COLD
-        current_sd = CURRENT_ERRORS[source].sd * self._battery.cell_capacity(BENCH_TEMPERATURE)
-        model_sd = self.loaded(soc)
+    def slow(self, soc: float, temperature: float) -> float:
+        """Variance [V²] of what errs the same way for `error_time`: the cell model, the tables' place, the sensor."""
         # The pack's cells are not the bench's: where SOC lies on their curve is known to their capacity's scatter.
         axis_sd = self._capacity_scatter * (1 - soc) * self._battery.ocv(soc)[1]
-        resistance = (resistance_sd * drop) ** 2 + (r0 * current_sd) ** 2
-        return model_sd**2 + voltage_sd**2 + axis_sd**2 + resistance
+        return self.loaded(soc, temperature) ** 2 + axis_sd**2 + self._history + self._sensor
+
+    def tells_more(self, soc: float, variance: float) -> bool:
+        """Whether a voltage can tell more than a state of charge that is known to `variance`.
+
+        What stays for hours does not average out, however many voltages there are: so little do they tell on a flat
+        curve with hysteresis.
+        """
+        return bool(self._battery.ocv(soc)[1] ** 2 * variance > self._history)
+
+    def load(
+        self, r0: float, drops: tuple[float, float], source: CurrentSource, temperature_known: bool, voltage_sd: float
+    ) -> float:
+        """Variance [V²] of what changes with the load, of a voltage measured with `voltage_sd` [V].
+
+        drops: by R0 and the effects, and by the RC pair [V]; r0: [ohm]; of a cell, as all of them.
+        """
+        resistance_sd = self.resistance if temperature_known else max(self.resistance, RESISTANCE_SD_COLD)
+        current_sd = CURRENT_ERRORS[source].sd * self._battery.cell_capacity(BENCH_TEMPERATURE)
+        doubted = max(voltage_sd**2 - self._sensor, 0.0)
+        return resistance_sd**2 * (drops[0] ** 2 + drops[1] ** 2) + (r0 * current_sd) ** 2 + doubted

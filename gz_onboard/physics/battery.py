@@ -121,6 +121,8 @@ class Battery:
     window: Window = field(default_factory=Window)
     entropy_soc: Row = ()  # none: no reversible heat
     entropy_value: Row = ()  # V/K of a cell
+    voltage_error_temperature: Row = ()  # degC; none: one error of the circuit for all temperatures
+    voltage_error_value: Row = ()  # V of a cell, sd
 
     def cell_capacity(self, temperature: float) -> float:
         """Capacity of a cell [A·h] at `temperature` [degC]: the charge between SOC 0 and 1."""
@@ -141,6 +143,12 @@ class Battery:
         if not self.rest_shift_value:
             return 0.0
         return linear(self.rest_shift_temperature, self.rest_shift_value, temperature)
+
+    def voltage_error(self, temperature: float, usual: float) -> float:
+        """By how much [V] the circuit errs at `temperature` [degC], one sd; `usual` [V] if that is not known."""
+        if not self.voltage_error_value:
+            return usual
+        return linear(self.voltage_error_temperature, self.voltage_error_value, temperature)
 
     def ocv(self, soc: float, temperature: float | None = None) -> tuple[float, float]:
         """(open-circuit voltage of a cell [V], its slope [V]) at `temperature` [degC]; None: as tabulated over SOC."""

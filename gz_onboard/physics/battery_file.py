@@ -14,6 +14,19 @@ from gz_onboard.physics.tables import Mesh, Row, linear
 if TYPE_CHECKING:
     from gz_onboard.toml import Table
 
+KEYS = (
+    "cells_series",
+    "cells_parallel",
+    "ocv",
+    "rest_shift",
+    "voltage_error",
+    "entropy",
+    "capacity",
+    "window",
+    "r0",
+    "r1",
+    "c1",
+)
 TEMPERATURE = (-60.0, 100.0)  # degC, of a cell
 RESISTANCE = (1e-6, 10.0)  # ohm, of a cell: from the largest to a frozen one of a watch
 CAPACITANCE = (1e-3, 1e8)  # F, of a cell's RC pair
@@ -25,7 +38,21 @@ LARGEST_SHIFT = 0.2  # V: real cells rest tens of mV apart from -20 to 25 degC; 
 def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
     """The battery in the vehicle file; InputError for tables that do not make sense."""
     table = vehicle.table("battery")
-    table.only("cells_series cells_parallel ocv rest_shift voltage_error entropy capacity window r0 r1 c1".split())
+    table.only(
+        [
+            "cells_series",
+            "cells_parallel",
+            "ocv",
+            "rest_shift",
+            "voltage_error",
+            "entropy",
+            "capacity",
+            "window",
+            "r0",
+            "r1",
+            "c1",
+        ]
+    )
     ocv = table.table("ocv")
     ocv.only(["soc", "value", "unit", "sd", "source", "status"])
     ocv.text("unit", choices=["V"])
@@ -48,8 +75,9 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         capacities = tuple(value / rated for value in capacities)
         if min(capacities) < 0.05 or max(capacities) > 2:
             raise capacity.error(f"must be within 0.05 to 2 times what it is at {BENCH_TEMPERATURE:g} degC", "value")
-    shift_temperatures, shifts, shift_sd = _rest_shift(table)
     entropy_soc, entropy = _entropy(table)
+    shift_temperatures, shifts, shift_sd = _over_temperature(table, "rest_shift", -LARGEST_SHIFT)
+    error_temperatures, errors, _ = _over_temperature(table, "voltage_error", 0.0)
     battery = Battery(
         cells_series=table.integer("cells_series", 1, MOST_CELLS),
         cells_parallel=table.integer("cells_parallel", 1, MOST_CELLS),
@@ -70,22 +98,24 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         window=_window(table),
         entropy_soc=entropy_soc,
         entropy_value=entropy,
+        voltage_error_temperature=error_temperatures,
+        voltage_error_value=errors,
     )
     return battery.with_parameters(parameters)
 
 
-def _rest_shift(battery: Table) -> tuple[Row, Row, float]:
-    """(temperatures [degC], shifts [V], their sd [V]); nothing if the file does not have the table."""
-    if "rest_shift" not in battery.values:
+def _over_temperature(battery: Table, name: str, least: float) -> tuple[Row, Row, float]:
+    """(temperatures [degC], voltages [V], their sd [V]) of a table; nothing if the file does not have it."""
+    if name not in battery.values:
         return (), (), 0.0
-    table = battery.table("rest_shift")
+    table = battery.table(name)
     table.only(["temperature", "value", "unit", "sd", "source", "status"])
     table.text("unit", choices=["V"])
-    temperatures, shifts = _axis(table, "temperature", *TEMPERATURE), table.numbers("value")
-    if len(shifts) != len(temperatures) or max(map(abs, shifts)) > LARGEST_SHIFT:
-        wanted = f"must be {len(temperatures)} numbers within {-LARGEST_SHIFT:g} to {LARGEST_SHIFT:g} V"
+    temperatures, volts = _axis(table, "temperature", *TEMPERATURE, least=1), table.numbers("value")
+    if len(volts) != len(temperatures) or min(volts) < least or max(volts) > LARGEST_SHIFT:
+        wanted = f"must be {len(temperatures)} numbers within {least:g} to {LARGEST_SHIFT:g} V"
         raise table.error(f"{wanted}, one for each temperature", "value")
-    return temperatures, shifts, table.number("sd", 0.005, low=0.0, high=LARGEST_SHIFT)
+    return temperatures, volts, table.number("sd", 0.005, low=0.0, high=LARGEST_SHIFT)
 
 
 def _window(battery: Table) -> Window:
@@ -136,4 +166,4 @@ def _mesh(table: Table, unit: str, low: float, high: float) -> Mesh:
     rows = table.rows("value", len(soc), f"in {unit}, one for each soc", low, high)
     if len(rows) != len(temperature):
         raise table.error(f"must be {len(temperature)} rows, one for each temperature", "value")
-    return Mesh(soc, temperature, rows)
+    return Mesh(soc, temperature, rows, geometric=True)

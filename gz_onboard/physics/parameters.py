@@ -45,6 +45,7 @@ BATTERY_PARAMETERS = (
     ),
     Parameter("cell_voltage_error", "V", 0.0, 0.012, 0, 0, "sd: what one RC pair cannot follow, slow as minutes"),
     Parameter("cell_voltage_error_empty", "V", 0.0, 0.06, 0, 0, "sd: the same at 5 % SOC and below"),
+    Parameter("cell_voltage_error_time", "s", 600.0, 300.0, 10, 36000, "for so long it errs the same way"),
     Parameter("rest_voltage_error", "V", 0.0, 0.008, 0, 0, "sd: rest voltage against OCV: relaxation, hysteresis"),
     Parameter("pack_heat_capacity", "J/K", 9000, 3000, 100, 1e6, "168 cells of 47 g at 0.95 J/(g·K), and the case"),
     Parameter("pack_conductance", "W/K", 3.0, 1.5, 0.01, 10000, "still air to a closed pack"),

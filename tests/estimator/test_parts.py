@@ -13,13 +13,15 @@ from gz_onboard.estimator.reasons import LOSS_SD, MissingSignals, loss_variance
 from gz_onboard.estimator.ridden import MEMORY, Past, Segment
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.estimator.sources import CurrentSource, Synchroniser
-from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, ChargeUncertainty
+from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.events import ROLES, Reason
+from gz_onboard.physics.parameters import Parameters
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference")
 BATTERY = VEHICLE.pack
 SLOW = 1e-4  # V²
+LOAD = 0.005**2  # V²
 
 
 def everything(now: float = 0.0) -> Signals:
@@ -42,8 +44,8 @@ def test_past_segments_count_less_the_further_back_they_are():
 
 def test_a_glitch_is_not_used_and_what_persists_is():
     gate = InnovationGate()
-    assert gate.update(0.1, 0.01, 0.0, SLOW) == SLOW
-    used = [gate.update(0.1, 0.3, 0.0, SLOW) is not None for _ in range(GATE_COUNT)]
+    assert gate.update(0.1, 0.01, 0.0, SLOW, LOAD) == pytest.approx(LOAD)
+    used = [gate.update(0.1, 0.3, 0.0, SLOW, LOAD) is not None for _ in range(GATE_COUNT)]
     assert used == [False] * (GATE_COUNT - 1) + [True]
     assert gate.mismatch
     assert not gate.refuted
@@ -52,9 +54,9 @@ def test_a_glitch_is_not_used_and_what_persists_is():
 def test_a_voltage_that_is_off_for_long_refutes_the_state():
     gate = InnovationGate()
     for _ in range(round(CONTRADICTED) - 1):
-        gate.update(1.0, 0.3, 0.0, SLOW)
+        gate.update(1.0, 0.3, 0.0, SLOW, LOAD)
     assert not gate.refuted
-    assert gate.update(1.0, 0.3, 0.0, SLOW) is None
+    assert gate.update(1.0, 0.3, 0.0, SLOW, LOAD) is None
     assert gate.refuted
 
 
@@ -139,3 +141,21 @@ def test_the_first_voltage_is_waited_for():
     now, (_, sd) = wait(SteadyVoltage(BATTERY), lambda t: 50.0 + 2 * (t * 10 % 2), 100.0)
     assert now == STEADY_WAIT
     assert sd == pytest.approx(BATTERY.ocv(1.0)[0] - BATTERY.ocv(0.0)[0])
+
+
+def test_a_voltage_on_a_flat_curve_tells_no_more_than_hysteresis_allows():
+    """6 mV that stay are worth 5 % of charge where the curve rises by 0.1 V over 80 %, however often they are seen."""
+    flat = replace(VEHICLE.pack, ocv_soc=(0.0, 0.1, 0.9, 1.0), ocv_value=(2.5, 3.2, 3.3, 3.6))
+    uncertainty = VoltageUncertainty(flat, VEHICLE.parameters)
+    assert not uncertainty.tells_more(0.5, 0.03**2)
+    assert uncertainty.tells_more(0.5, 0.10**2)
+    assert uncertainty.tells_more(0.05, 0.03**2)
+
+
+def test_resistances_that_are_guessed_make_a_loaded_voltage_worth_less():
+    parameters = VEHICLE.parameters
+    known = {**parameters.known}
+    known["cell_resistance_factor"] = replace(known["cell_resistance_factor"], sd=0.5)
+    measured, guessed = (VoltageUncertainty(VEHICLE.pack, p) for p in (parameters, Parameters(known)))
+    load = (0.04, (0.05, 0.03), CurrentSource.PACK, True, 0.0)
+    assert guessed.load(*load) > 10 * measured.load(*load)

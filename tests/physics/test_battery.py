@@ -23,8 +23,9 @@ PARAMETERS = VEHICLE.parameters
 @given(st.floats(-0.2, 1.2), st.floats(-30, 60))
 def test_mesh_equals_numpy_interpolation(soc, temperature):
     mesh = BATTERY.r0
-    columns = [np.interp(soc, mesh.soc, row) for row in mesh.value]
-    assert mesh.at(soc, temperature)[0] == pytest.approx(np.interp(temperature, mesh.temperature, columns), rel=1e-9)
+    columns = np.log(mesh.value).T
+    row = [np.exp(np.interp(temperature, mesh.temperature, column)) for column in columns]
+    assert mesh.at(soc, temperature)[0] == pytest.approx(np.interp(soc, mesh.soc, row), rel=1e-9)
 
 
 @given(st.floats(0.001, 0.999), st.floats(-20, 50))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.arrays import block_means
 from gz_onboard.estimator.cell_effects import CellEffects
-from gz_onboard.estimator.ekf import ScalarFilter
+from gz_onboard.estimator.ekf import Noise, ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, Reaction, voltage
 from gz_onboard.lab.calibrate.coastdown_run import Coast
@@ -119,9 +119,9 @@ def test_the_filter_predicts_the_voltage_of_a_cell(ride, backend):
     filter_, predicted = backend(PACK, SOC, 0.0, (1e-4, 0.0, 1e-6)), []
     for amperes, celsius in zip(ride["pack_current"], ride["cell_temperature"], strict=True):
         i = amperes / PACK.cells_parallel
-        filter_.predict(0.5, i, celsius, (0.0, 0.0))
+        filter_.predict(0.5, i, celsius, Noise(0.0, 1e-6, 600.0))
         predicted.append(-filter_.innovation(0.0, i, celsius)[0])
-        filter_.predict(0.5, i, celsius, (0.0, 0.0))
+        filter_.predict(0.5, i, celsius, Noise(0.0, 1e-6, 600.0))
     assert predicted == pytest.approx(written_out(ride, reaction=0.0)[0], abs=0.1 * MILLIVOLT)
 
 
@@ -321,6 +321,13 @@ def test_a_coast_down_is_held_back_as_the_model_says(speed, slope):
     assert force == pytest.approx(expected)
 
 
+def test_resistances_are_geometric_over_temperature():
+    mesh = Mesh((0.0, 1.0), (0.0, 20.0), ((0.09, 0.16), (0.01, 0.04)), geometric=True)
+    assert mesh.at(0.0, 10.0)[0] == pytest.approx(0.03)
+    assert mesh.at(1.0, 10.0)[0] == pytest.approx(0.08)
+    assert mesh.scaled(2.0).at(1.0, 10.0)[0] == pytest.approx(0.16)
+
+
 AXIS = st.lists(st.floats(-1, 2), min_size=2, max_size=6, unique_by=lambda x: round(x, 2)).map(sorted)
 
 
@@ -333,6 +340,9 @@ def test_a_table_is_read_alike_one_value_or_many_at_a_time(data, xs, ys):
     mesh = Mesh(tuple(xs), tuple(ys), table)
     assert mesh.over(x, y) == pytest.approx([mesh.at(*point)[0] for point in points], rel=1e-9, abs=1e-9)
     assert bilinear_over(np.array(xs), np.array(ys), np.array(table), x, y) == pytest.approx(mesh.over(x, y))
+    positive = tuple(tuple(np.exp(0.3 * v) for v in values) for values in table)
+    falling = Mesh(tuple(xs), tuple(ys), positive, geometric=True)
+    assert falling.over(x, y) == pytest.approx([falling.at(*point)[0] for point in points], rel=1e-9)
     assert extended_over(mesh.soc, table[0], x) == pytest.approx(
         [extended(mesh.soc, table[0], a)[0] for a in x], rel=1e-9, abs=1e-9
     )

@@ -110,12 +110,12 @@ def voltage(cell: Circuit, flowed: Array, current: Array, dt: Array, soc: Array,
     flowed: the mean current over the `dt` before each sample; current: at the sample. The cell has rested: all
     RC pairs start at zero.
     """
-    tables = (cell.r0, cell.r1, cell.c1)
-    r0, r1, c1 = (bilinear_over(cell.soc, cell.temperature, t, soc, temperature) for t in tables)
+    tables, over = (cell.r0, cell.r1, cell.c1), (cell.soc, cell.temperature)
+    r0, r1, c1 = (bilinear_over(*over, t, soc, temperature, geometric=True) for t in tables)
     pairs = follow(r1 * flowed, dt, r1 * c1)
     if cell.slow_resistance is not None and cell.slow_time is not None:
         slow = (cell.slow_resistance, cell.slow_time)
-        r2, tau = (bilinear_over(cell.soc, cell.temperature, t, soc, temperature) for t in slow)
+        r2, tau = (bilinear_over(*over, t, soc, temperature, geometric=True) for t in slow)
         pairs = pairs + follow(r2 * flowed, dt, tau)
     pairs = pairs + cell.reaction.overpotential(flowed, dt, temperature)
     rest = extended_over(cell.ocv_soc, cell.ocv, soc) + cell.ocv_shift(temperature)

@@ -20,6 +20,7 @@ from gz_onboard.lab.calibrate.cell_data import CellTest
 from gz_onboard.lab.calibrate.cell_fit import TIMES, Reduction, fit_branches
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.ocv import TESTER
+from gz_onboard.lab.calibrate.pulse_error import Residual, voltage_errors
 from gz_onboard.lab.calibrate.pulse_mesh import direct, mesh_quality, meshes
 from gz_onboard.lab.calibrate.pulse_reaction import charge_transfer, linear
 from gz_onboard.lab.calibrate.pulse_rests import rest_shift, rests_over_soc, shift_of_rests
@@ -44,7 +45,7 @@ def calibrate(
 ) -> Result:
     """``battery.r0``, ``r1``, ``c1``, ``capacity``, ``ocv``, and beside them a slow pair.
 
-    Also ``battery.rest_shift``, if the rests show that temperature moves the open-circuit voltage (see `pulse_rests`).
+    Also what they err by (see `pulse_error`), and ``battery.rest_shift``, if the rests show one (see `pulse_rests`).
 
     tables: one for each temperature. ocv, capacity: from `ocv.calibrate`. loads: currents [any unit, one value a
     second, each from rest] that the pair is to follow; synthetic rides if None. Raises InputError for tables that are
@@ -173,6 +174,7 @@ def _voltages(result: Result, tests: Sequence[Tested], names: str) -> None:
     """How well the tables follow the tests that they came from: voltage, and what is left over time."""
     pairs = {"one pair": circuit(result), "two pairs": circuit(result, slow=True)}
     rms: dict[str, list[float]] = {"above": [], "below": []}  # 0.1 of SOC, of one pair
+    left = []
     for t in tests:
         test, at = t.test, f"{t.temperature:g}"
         models = {
@@ -186,8 +188,10 @@ def _voltages(result: Result, tests: Sequence[Tested], names: str) -> None:
                     result.fits.append(fit)
                     if what == "one pair":
                         rms[name].append(fit.rms)
+        left.append(Residual(t.temperature, test.time, test.voltage - models["one pair"], t.level))
         hours, model, title = test.time / HOUR, models["one pair"], f"Pulse test at {at} °C"
         result.panels += compared(title, "time [h]", "voltage [V]", hours, test.voltage, model)
+    voltage_errors(left, names, result)
     for key, unit, factor in (("r0", "mΩ", 1e3), ("r1", "mΩ", 1e3), ("c1", "F", 1.0)):
         mesh = result.curves[f"battery.{key}"]
         rows = zip(mesh.axes["temperature"], mesh.value, strict=True)

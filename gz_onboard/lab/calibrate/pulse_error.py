@@ -1,0 +1,66 @@
+"""How far the circuit that was found is off the pulse tests, by temperature, and for how long it errs the same way.
+
+Of the residual over time, not over samples, of which most are in the pulses: on board a second at rest counts as much
+as one under load. What changes with the load the filter reckons with beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.lab.calibrate.result import Curve, Found, Result
+
+GRID = 10.0  # s: between the values whose square and correlation are taken
+EMPTY = 0.1  # SOC up to which `cell_voltage_error_empty` counts
+LONGEST = 3600.0  # s: beyond, two residuals have nothing to do with each other
+LEAST_TIME = 2 * GRID  # s: no shorter time can be told
+
+
+class Residual(NamedTuple):
+    """What a pulse test is off the circuit; arrays (m,)."""
+
+    temperature: float  # degC, nominal
+    time: Array  # s
+    voltage: Array  # V, measured less the circuit's
+    level: Array  # state of charge
+
+
+def voltage_errors(residuals: Sequence[Residual], names: str, result: Result) -> None:
+    """``battery.voltage_error`` and ``cell_voltage_error_time`` into `result`."""
+    even = [_evenly(r) for r in residuals]
+    known = [k for k, x in enumerate(even) if len(x) > LONGEST / GRID]
+    if not known:
+        return
+    sizes = np.array([np.sqrt(np.mean(even[k] ** 2)) for k in known])
+    times = np.array([_correlation_time(even[k]) for k in known])
+    result.curves["battery.voltage_error"] = Curve(
+        {"temperature": np.array([residuals[k].temperature for k in known])},
+        sizes,
+        sizes * np.sqrt(times / np.array([GRID * len(even[k]) for k in known])),
+        "V",
+        f"{names}: rms over time of one RC pair above 10 % SOC",
+    )
+    middle = float(np.exp(np.mean(np.log(times))))
+    spread = middle * float(np.std(np.log(times))) if len(known) > 1 else middle
+    source = f"{names}: correlation of what one RC pair leaves falls to 1/e"
+    result.parameters["cell_voltage_error_time"] = Found(middle, spread, "s", source)
+
+
+def _evenly(residual: Residual) -> Array:
+    """The residual each `GRID` seconds, above `EMPTY`."""
+    at = np.arange(residual.time[0], residual.time[-1], GRID)
+    values: Array = np.interp(at, residual.time, residual.voltage)
+    return values[np.interp(at, residual.time, residual.level) > EMPTY]
+
+
+def _correlation_time(values: Array) -> float:
+    """The lag [s] at which the correlation of `values`, one each `GRID` seconds, falls to 1/e."""
+    lags = np.arange(1, int(LONGEST / GRID))
+    square = float(np.mean(values**2))
+    correlation = np.array([np.mean(values[:-k] * values[k:]) for k in lags]) / square
+    below = np.flatnonzero(correlation < np.exp(-1))
+    return float(max(GRID * lags[below[0]], LEAST_TIME)) if len(below) else LONGEST

@@ -1,0 +1,42 @@
+"""By how much, and for how long in the same way, a circuit errs: given back from errors of known size and time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gz_onboard.lab.calibrate.pulse_error import Residual, voltage_errors
+from gz_onboard.lab.calibrate.result import Result
+
+
+def wandering(seed, sd, tau, hours=60.0):
+    """A Gauss-Markov process, at uneven times as a tester writes them."""
+    rng = np.random.default_rng(seed)
+    time = np.cumsum(rng.choice([0.1, 1.0, 10.0], size=int(hours * 3600 / 3.7)))
+    values = np.empty(len(time))
+    values[0] = sd * rng.standard_normal()
+    for k, left in enumerate(np.exp(-np.diff(time) / tau)):
+        values[k + 1] = left * values[k] + sd * np.sqrt(1 - left**2) * rng.standard_normal()
+    return time, values
+
+
+def test_size_and_time_come_back():
+    residuals = []
+    for seed, (temperature, sd) in enumerate(((-10.0, 0.02), (25.0, 0.005))):
+        time, values = wandering(seed, sd, 400.0)
+        residuals.append(Residual(temperature, time, values, np.full(len(time), 0.5)))
+    result = Result("pulse")
+    voltage_errors(residuals, "t", result)
+    curve, time = result.curves["battery.voltage_error"], result.parameters["cell_voltage_error_time"]
+    assert list(curve.axes["temperature"]) == [-10, 25]
+    assert curve.value == pytest.approx([0.02, 0.005], rel=0.15)
+    assert time.value == pytest.approx(400, rel=0.35)
+
+
+def test_what_is_near_empty_is_left_out():
+    time, values = wandering(3, 0.005, 300.0)
+    level = np.linspace(1.0, 0.0, len(time))
+    spoilt = np.where(level < 0.1, 0.3, values)
+    result = Result("pulse")
+    voltage_errors([Residual(25.0, time, spoilt, level)], "t", result)
+    assert result.curves["battery.voltage_error"].value == pytest.approx([0.005], rel=0.15)
