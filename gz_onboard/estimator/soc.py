@@ -241,9 +241,10 @@ class StateOfCharge:
             current if reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else reading.reported_current
         )
         if explaining is not None:
-            by_load = explaining / battery.cells_parallel
-            by_load = r0 * by_load + (self.effects.overpotential_at(by_load) if self.effects else 0.0)
-            self._sag.update(dt, shown, by_load)
+            # Both with what lies beside the cells: of a pack of which little is known, r0 may hold it already.
+            cell, beside = explaining / battery.cells_parallel, battery.series_resistance / battery.cells_series
+            by_load = r0 * cell + beside * explaining + (self.effects.overpotential_at(cell) if self.effects else 0.0)
+            self._sag.update(dt, voltage / battery.cells_series, by_load)
         if dt <= self._timing.pause and self._rest.step(
             filter_, dt, shown, cell_current, temperature, reading.voltage_sd
         ):
