@@ -8,6 +8,7 @@ differ in the air that moves past it, which each run states.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -113,6 +114,13 @@ _UNITS = {
 }
 
 
+def _with_source(result: Result, names: Sequence[str], more: str) -> None:
+    """Put what is known of them together to the source of parameters."""
+    for name in names:
+        found = result.parameters[name]
+        result.parameters[name] = replace(found, source=f"{found.source}; {more}")
+
+
 def _source(runs: Sequence[CoolingRun]) -> str:
     names = [run.name for run in runs]
     listed = ", ".join(names if len(names) < 4 else [names[0], "...", names[-1]])
@@ -189,9 +197,11 @@ def inverter_cooling(
     further_sd, free = {names[2]: series_sd}, (*names, speed)
     job = Job(network.inverter_temperatures, _starts(vehicle, free), held, _priors(vehicle, free), speed, further_sd)
     found = _solve(result, job, runs, validation, hold_out)
+    acts = f"only board_to_box + b·c/(b + c) = {found[names[2]] + series:.2f} ± {found.sd(names[2]):.2f} W/K acts"
+    _with_source(result, names[2:3], f"{acts}, of which the air's part is held")
     result.refusals.append(
-        f"inverter_board_to_air, inverter_box_to_air: only board_to_box + b·c/(b + c) = {found[names[2]] + series:.2f} "
-        f"± {found.sd(names[2]):.2f} W/K acts between board and box; the two are held at {b:g} and {c:g} W/K"
+        f"inverter_board_to_air, inverter_box_to_air: {acts} between board and box; the two are held at {b:g} and "
+        f"{c:g} W/K"
     )
     if not any("inverter_box_temperature" in run.measured for run in runs):
         result.refusals.append(f"{names[1]}, {names[2]}: no sensor on the box, so that both lean on their priors")
@@ -257,9 +267,9 @@ def bms_cooling(runs: Sequence[CoolingRun], vehicle: Vehicle, validation: Sequen
     job = Job(network.bms_temperatures, {name: p[name] for name in names}, {}, prior)
     found = _solve(result, job, runs, validation)
     r, c, g = (found[name] for name in names)
-    result.refusals.append(
-        f"bms_resistance, bms_heat_capacity, bms_conductance: the data tell resistance/conductance = {1e3 * r / g:.2f} "
-        f"mohm·K/W and capacity/conductance = {c / g:.0f} s only; their scale is that of the priors, "
-        f"{1e3 * prior[names[0]][0]:.1f} ± {1e3 * prior[names[0]][1]:.1f} mohm for the resistance"
-    )
+    known = f"resistance/conductance = {1e3 * r / g:.2f} mohm·K/W and capacity/conductance = {c / g:.0f} s only"
+    value, sd = (1e3 * x for x in prior[names[0]])
+    scale = f"the scale is that of the priors, {value:.1f} ± {sd:.1f} mohm for the resistance"
+    _with_source(result, names, f"tells {known}; {scale}")
+    result.refusals.append(f"{', '.join(names)}: the data tell {known}; {scale}")
     return result
