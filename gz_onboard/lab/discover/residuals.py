@@ -56,15 +56,27 @@ def colder(temperature: Array) -> Array:
 def moving(ride: Ride, p: Values, system: System) -> dict[str, Array]:
     """The quantities with the parameters' own radius, sensor scale and mass."""
     q = dict(ride.quantities)
-    scale = 1 / p.get("speed_sensor_scale", 1.0)
-    radius = p["wheel_radius"] * p["gear_ratio"] * scale / ride.radius
-    q["motor_speed"] = q["motor_speed"] * scale
+    radius = wheel_ratio(ride, p)
+    q["motor_speed"] = q["motor_speed"] * (1 / p.get("speed_sensor_scale", 1.0))
     q["speed"] = q["speed"] * radius
     q["acceleration"] = q["acceleration"] * radius
     q["lateral_acceleration"] = q["lateral_acceleration"] * radius
     q["mass"] = np.full(len(ride.time), mass(ride, p, system))
+    if "current_per_watt" in q:  # the rest of the pack's power
+        more = auxiliary_power(ride, p, system) - auxiliary_power(ride, {**p, **system.healthy}, system)
+        q["motor_current"] = q["motor_current"] - q["current_per_watt"] * more
     q["torque"] = torque_constant(ride, p, system) * q["motor_current"]
     return q
+
+
+def wheel_ratio(ride: Ride, p: Values) -> float:
+    """Speed over the one in the ride's quantities."""
+    return p["wheel_radius"] * p["gear_ratio"] * (1 / p.get("speed_sensor_scale", 1.0)) / ride.radius
+
+
+def rotating(p: Values) -> dict[str, float]:
+    """The parameters of the wheels' inertia."""
+    return {name: p[name] for name in ("wheel_inertia_front", "wheel_inertia_rear", "wheel_radius")}
 
 
 def mass(ride: Ride, p: Values, system: System) -> float:
@@ -98,8 +110,7 @@ def road_force(ride: Ride, p: Values, system: System) -> Array:
     shaft = q["torque"] - drag_torque(motor_losses(ride, q, p, system)[1], q["motor_speed"])
     entered, m = float(ride.quantities["mass"][0]), mass(ride, p, system)
     specific = ride.signals["accel_x"] - p["accel_bias"] - p["pitch_gain"] * q["acceleration"]
-    rotating = {name: p[name] for name in ("wheel_inertia_front", "wheel_inertia_rear", "wheel_radius")}
-    force = inertia.term(q["acceleration"], 0.0, **rotating) + summed(system.terms(q, p, STEP, *ROAD_LOAD))
+    force = inertia.term(q["acceleration"], 0.0, **rotating(p)) + summed(system.terms(q, p, STEP, *ROAD_LOAD))
     push = shaft / (p["wheel_radius"] * p["gear_ratio"]) - force
     # what is noisy stands alone: were the accelerometer multiplied with the mass that is sought, the least noise would
     # be had with the least mass, and all that it is weighed with would shrink along
@@ -115,19 +126,62 @@ def altitude(ride: Ride, p: Values, system: System) -> Array:
     return np.asarray(ride.signals["gps_altitude"] - height - ride.signals["gps_altitude"][0] - p["altitude_start"])
 
 
-def inverter_power(ride: Ride, p: Values, system: System) -> Array:
-    """The inverter's power [W] on the DC side, less air-gap power and losses."""
-    q = moving(ride, p, system)
+def electric_power(ride: Ride, q: Mapping[str, Array], shaft: Array, p: Values, system: System) -> Array:
+    """What motor and inverter take [W] on the DC side for the power of the air gap `shaft` [W], (n,)."""
     electric, _ = motor_losses(ride, q, p, system)
-    power = q["torque"] * q["motor_speed"] + electric
+    power = shaft + electric
     power = power + summed(system.terms(q, p, STEP, Port.INVERTER_LOSS))
     spin = np.abs(q["motor_speed"]) / (SPIN * system.sizes.spin)
     cross = p["loss_cross"] * np.abs(q["motor_current"]) / (AMPERES * system.sizes.current)
     power = power + (p["loss_speed"] + cross) * spin
-    power = power - p["torque_lag"] * np.gradient(running_mean(np.broadcast_to(power, len(ride.time)), LAGGED), STEP)
+    return np.asarray(
+        power - p["torque_lag"] * np.gradient(running_mean(np.broadcast_to(power, len(ride.time)), LAGGED), STEP)
+    )
+
+
+def inverter_power(ride: Ride, p: Values, system: System) -> Array:
+    """The inverter's power [W] on the DC side, less air-gap power and losses."""
+    q = moving(ride, p, system)
+    power = electric_power(ride, q, q["torque"] * q["motor_speed"], p, system)
     volts = ride.signals["inverter_voltage"]
     shown = p["inverter_current_gain"] * power + p["inverter_current_offset"] * volts
     return np.asarray(ride.signals["inverter_current"] * volts - shown)
+
+
+def road_power(ride: Ride, q: Mapping[str, Array], p: Values, system: System) -> Array:
+    """The air-gap power [W] of a motor that moves the vehicle as it moves: against road load and its own drag."""
+    if "accel_x" in ride.signals:
+        specific = ride.signals["accel_x"] - p["accel_bias"] - p["pitch_gain"] * q["acceleration"]
+    else:
+        specific = q["acceleration"] + GRAVITY * q["grade"]
+    force = q["mass"] * specific + inertia.term(q["acceleration"], 0.0, **rotating(p))
+    force = force + summed(system.terms(q, p, STEP, *ROAD_LOAD))
+    return np.asarray(force * q["speed"] + motor_losses(ride, q, p, system)[1])
+
+
+def pack_power(ride: Ride, p: Values, system: System) -> Array:
+    """The pack's power [W] less the drive's and the auxiliaries', each as measured, or by its model where it was not.
+
+    Without the motor's current the drive is that of the road load, its losses at the current that the pack's power
+    points to. So the noise of acceleration stands alone: losses that grow with it could be sought to take it off. For
+    the same reason the residual is that of the mass entered and the radius of the file, as in `road_force`.
+    """
+    s = ride.signals
+    volts = true_voltage(s["pack_voltage"], p)
+    power = volts * true_current(s["pack_current"], p) - ride.loads
+    if "auxiliary_current" in s:
+        power = power - volts * (s["auxiliary_current"] + p["idle_current"])
+    else:
+        power = power - auxiliary_power(ride, p, system)
+    q = moving(ride, p, system)
+    if "motor_current" not in s:
+        drive = electric_power(ride, q, road_power(ride, q, p, system), p, system)
+        larger = q["mass"] / ride.quantities["mass"] * wheel_ratio(ride, p)
+        return np.asarray((power - drive) / larger)
+    if "inverter_voltage" in s and "inverter_current" in s:
+        inverter = (s["inverter_current"] - p["inverter_current_offset"]) / p["inverter_current_gain"]
+        return np.asarray(power - volts * p["idle_current"] - s["inverter_voltage"] * inverter)
+    return np.asarray(power - electric_power(ride, q, q["torque"] * q["motor_speed"], p, system))
 
 
 def pack_balance(ride: Ride, p: Values, system: System) -> Array:
@@ -136,7 +190,7 @@ def pack_balance(ride: Ride, p: Values, system: System) -> Array:
     true = true_current(s["pack_current"], p)
     true = true + p["pack_inverter_lag"] * np.gradient(running_mean(true, LAGGED), STEP)
     # beside the auxiliary load there is what is drawn when nothing is: the inverter's own supply
-    inverter = true - s["auxiliary_current"] - p["idle_current"]
+    inverter = true - s["auxiliary_current"] - p["idle_current"] - ride.loads / s["pack_voltage"]
     shown = p["inverter_current_offset"] + p["inverter_current_gain"] * inverter
     return np.asarray(shown - s["inverter_current"])
 
@@ -144,10 +198,15 @@ def pack_balance(ride: Ride, p: Values, system: System) -> Array:
 def auxiliary(ride: Ride, p: Values, system: System) -> Array:
     """The auxiliaries' power [W] less that of the vehicle file and the brake light."""
     s = ride.signals
+    return np.asarray(s["auxiliary_current"] * s["pack_voltage"] - auxiliary_power(ride, p, system))
+
+
+def auxiliary_power(ride: Ride, p: Values, system: System) -> Any:
+    """That of the vehicle file and the brake light [W]."""
     power = summed(system.terms(ride.quantities, p, STEP, Port.DC_POWER))
-    if "brake_switch" in s:
-        power = power + p["brake_light"] * (s["brake_switch"] > BRAKING)
-    return np.asarray(s["auxiliary_current"] * s["pack_voltage"] - power)
+    if "brake_switch" in ride.signals:
+        power = power + p["brake_light"] * (ride.signals["brake_switch"] > BRAKING)
+    return power
 
 
 def voltage_balance(ride: Ride, p: Values, system: System) -> Array:
