@@ -29,10 +29,15 @@ def usable(channel: Channel, ride: Ride, system: System) -> bool:
     """Whether the ride has what `channel` needs."""
     if not {*channel.roles, *channel.fed_by} <= ride.have or (channel.battery and system.battery is None):
         return False
-    if any(ride.periods.get(role, 0.0) > channel.apart for role in channel.roles):
+    if slow(channel, ride):
         return False
     parts = [CHANNEL[name] for name in channel.unless if "motor_current" in ride.have]
     return not parts or not all(usable(part, ride, system) for part in parts)
+
+
+def slow(channel: Channel, ride: Ride) -> bool:
+    """Whether samples of what `channel` needs are too far apart to show it."""
+    return any(ride.periods.get(role, 0.0) > channel.apart for role in channel.roles)
 
 
 def support(channel: Channel, ride: Ride) -> Mask:

@@ -25,6 +25,14 @@ from gz_onboard.physics.model import drag_torque
 from gz_onboard.physics.relaxation import decay_over, relaxation_over, relaxed
 from gz_onboard.physics.sensors import true_current, true_voltage
 
+PROPORTIONS = (
+    "pack_current_gain",
+    "wheel_radius",
+    "speed_sensor_scale",
+    "torque_constant",
+    "torque_constant_slope",
+    "torque_saturation",
+)
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
 DT = SLOW * STEP
 MID = 200.0  # s: between the pair of the vehicle file and slow relaxation
@@ -56,8 +64,9 @@ def colder(temperature: Array) -> Array:
 def moving(ride: Ride, p: Values, system: System) -> dict[str, Array]:
     """The quantities with the parameters' own radius, sensor scale and mass."""
     q = dict(ride.quantities)
-    radius = wheel_ratio(ride, p)
-    q["motor_speed"] = q["motor_speed"] * (1 / p.get("speed_sensor_scale", 1.0))
+    scale = 1 / p.get("speed_sensor_scale", 1.0)
+    radius = p["wheel_radius"] * p["gear_ratio"] * scale / ride.radius
+    q["motor_speed"] = q["motor_speed"] * scale
     q["speed"] = q["speed"] * radius
     q["acceleration"] = q["acceleration"] * radius
     q["lateral_acceleration"] = q["lateral_acceleration"] * radius
@@ -67,11 +76,6 @@ def moving(ride: Ride, p: Values, system: System) -> dict[str, Array]:
         q["motor_current"] = q["motor_current"] - q["current_per_watt"] * more
     q["torque"] = torque_constant(ride, p, system) * q["motor_current"]
     return q
-
-
-def wheel_ratio(ride: Ride, p: Values) -> float:
-    """Speed over the one in the ride's quantities."""
-    return p["wheel_radius"] * p["gear_ratio"] * (1 / p.get("speed_sensor_scale", 1.0)) / ride.radius
 
 
 def rotating(p: Values) -> dict[str, float]:
@@ -164,9 +168,12 @@ def pack_power(ride: Ride, p: Values, system: System) -> Array:
 
     Without the motor's current the drive is that of the road load, its losses at the current that the pack's power
     points to. So the noise of acceleration stands alone: losses that grow with it could be sought to take it off. For
-    the same reason the residual is that of the mass entered and the radius of the file, as in `road_force`.
+    the same reason the residual is that of the mass entered, as in `road_force`. And what the whole drive is in
+    proportion to is the file's (`PROPORTIONS`): hills that nothing shows would be taken off by it.
     """
     s = ride.signals
+    if "motor_current" not in s:
+        p = {**p, **{name: system.healthy.get(name, 0.0) for name in PROPORTIONS}}
     volts = true_voltage(s["pack_voltage"], p)
     power = volts * true_current(s["pack_current"], p) - ride.loads
     if "auxiliary_current" in s:
@@ -176,8 +183,7 @@ def pack_power(ride: Ride, p: Values, system: System) -> Array:
     q = moving(ride, p, system)
     if "motor_current" not in s:
         drive = electric_power(ride, q, road_power(ride, q, p, system), p, system)
-        larger = q["mass"] / ride.quantities["mass"] * wheel_ratio(ride, p)
-        return np.asarray((power - drive) / larger)
+        return np.asarray((power - drive) * (ride.quantities["mass"] / q["mass"] if "accel_x" in s else 1.0))
     if "inverter_voltage" in s and "inverter_current" in s:
         inverter = (s["inverter_current"] - p["inverter_current_offset"]) / p["inverter_current_gain"]
         return np.asarray(power - volts * p["idle_current"] - s["inverter_voltage"] * inverter)

@@ -15,6 +15,7 @@ from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.lab.discover.grid import grade_by_altitude
 from gz_onboard.lab.discover.mixed_model import initial
 from gz_onboard.lab.discover.residuals import pack_power
+from gz_onboard.lab.discover.verdict import needs
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.plant.cases import draw_many
@@ -119,3 +120,11 @@ def test_the_grade_by_altitude_is_that_of_the_hill():
     grade = grade_by_altitude(height, speed)
     assert grade[300:-300] == pytest.approx((20.0 / 300.0) * np.cos(way / 300.0)[300:-300], abs=0.003)
     assert not grade_by_altitude(height, np.zeros(4000)).any()
+
+
+def test_every_candidate_says_what_it_needs(scooter: Vehicle):
+    mixed = initial(scooter)
+    by_name = {cause.name: needs(mixed, cause) for cause in mixed.causes}
+    assert all(by_name.values())
+    assert "pack_voltage and pack_current" in by_name["auxiliary_load"]
+    assert any("motor_temperature" in text for text in by_name["cooling_blocked"])
