@@ -47,6 +47,8 @@ ROLES: dict[str, str] = {
     "inverter_voltage": "V",
     "inverter_current": "A",  # DC side, positive when driving
     "auxiliary_current": "A",  # at pack voltage, positive when consuming
+    "heater_power": "W",  # electric, out of the pack, beside the auxiliary current
+    "air_conditioner_power": "W",  # likewise
     "cell_temperature": "degC",
     "ambient_temperature": "degC",
     "motor_temperature": "degC",
@@ -100,6 +102,7 @@ PLAUSIBLE: dict[str, tuple[float, float]] = {
     "degC": (-80.0, 400.0),
     "rad/s": (-10_000.0, 10_000.0),
     "N·m": (-20_000.0, 20_000.0),
+    "W": (-1e6, 1e6),
     "m": (-1000.0, 1e10),
     "m/s": (-150.0, 150.0),
     "m/s^2": (-2000.0, 2000.0),

@@ -53,9 +53,20 @@ STAGES = {
     "read": ["sizes", "grid"],
     "residuals": ["system", "residuals", "channels", "blocks"],
     "linear model": ["prior", "candidates", "linear", "mixed_model", "uncalibrated", "baseline_file"],
-    "search": ["search", "curve_forms", "curves", "baseline", "selection"],
+    "search": ["search", "curve_forms", "curves", "selection"],
     "judgement": ["constancy", "cross_validation", "acceptance", "winds", "energy", "unexplained", "verdict"],
-    "report": ["gain", "detectability", "discovery", "breakdown", "summary", "plots", "page", "extension"],
+    "report": [
+        "gain",
+        "baseline_check",
+        "baseline",
+        "detectability",
+        "discovery",
+        "breakdown",
+        "summary",
+        "plots",
+        "page",
+        "extension",
+    ],
     "command": ["command"],
 }
 STAGE = {module: place for place, module in enumerate(module for modules in STAGES.values() for module in modules)}

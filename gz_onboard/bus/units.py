@@ -13,6 +13,7 @@ UNITS = {**ROLES, **INSTRUMENTS}  # of all roles
 _CONVERSIONS: dict[tuple[str, str], tuple[float, float]] = {
     ("mV", "V"): (1e-3, 0.0),
     ("mA", "A"): (1e-3, 0.0),
+    ("kW", "W"): (1e3, 0.0),
     ("K", "degC"): (1.0, -KELVIN),
     ("degF", "degC"): (5 / 9, -160 / 9),
     ("rpm", "rad/s"): (2 * pi / 60, 0.0),

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.errors import InputError
+from gz_onboard.lab.discover.baseline_check import Learned, check_against_file, check_held_out
 from gz_onboard.lab.discover.curves import with_inflation
 from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.linear import LinearRide, Noise, Normal, Posterior, learn_noise
@@ -26,6 +27,7 @@ ROUNDS = 3
 SCATTER_ROUNDS = 120  # of expectation and maximisation
 LEAST = 0.6  # of an inflation
 LEAST_RIDES = 3
+HARDLY = 0.8  # of the standard deviation that was known: a guess that is no surer was not measured
 
 
 def baseline(
@@ -37,17 +39,21 @@ def baseline(
 ) -> Vehicle:
     """`vehicle` as `healthy` rides show it: parameters refitted within their calibration, and the null statistics.
 
-    Needs three rides. Raises InputError for rides that cannot be used.
+    Needs three rides. Raises InputError for rides that cannot be used, that contradict the file, or that foretell each
+    other's energy worse than it does (`baseline_check`).
     """
     if len(healthy) < LEAST_RIDES:
         raise InputError(f"{len(healthy)} healthy rides: three are the least that tell how rides differ")
     mixed = initial(vehicle, folder)
-    mixed = learn(mixed, [mixed.ride(samples) for samples in healthy], progress or (lambda _: None), workers)
-    return adopted(vehicle, mixed)
+    learned = learn(mixed, [mixed.ride(samples) for samples in healthy], progress or (lambda _: None), workers)
+    check_against_file(learned)
+    return adopted(vehicle, replace(learned.after, checked=check_held_out(learned)), mixed)
 
 
-def adopted(vehicle: Vehicle, mixed: MixedModel) -> Vehicle:
-    """`vehicle` with the values and standard deviations of its own parameters that `mixed` has learned."""
+def adopted(vehicle: Vehicle, mixed: MixedModel, before: MixedModel) -> Vehicle:
+    """`vehicle` with the values and standard deviations of its own parameters that `mixed` has learned. A guess of
+    which the rides say hardly more than was known `before` stays one.
+    """
     known = dict(vehicle.parameters.known)
     sd = np.sqrt(np.diag(mixed.prior)) * mixed.scale
     at = mixed.values_at(mixed.mean)
@@ -56,6 +62,9 @@ def adopted(vehicle: Vehicle, mixed: MixedModel) -> Vehicle:
     for name, s in zip(mixed.names, sd, strict=True):
         if name in known and (name in model or not known[name].source.startswith("prior:")):
             old = known[name]
+            i = mixed.names.index(name)
+            if old.status == "guess" and s > HARDLY * float(np.sqrt(before.prior[i, i]) * before.scale[i]):
+                continue
             wide = float(s * (old.value if name in LOG_SCALED else 1.0))
             source = f"{old.source}; refitted on {mixed.healthy} healthy rides"
             bounds = declared[name]
@@ -64,7 +73,7 @@ def adopted(vehicle: Vehicle, mixed: MixedModel) -> Vehicle:
     return replace(learned, healthy=replace(mixed, vehicle=learned))
 
 
-def learn(mixed: MixedModel, rides: Sequence[Ride], progress: Say, workers: int = 1) -> MixedModel:
+def learn(mixed: MixedModel, rides: Sequence[Ride], progress: Say, workers: int = 1) -> Learned:
     """`mixed` as `rides` of the healthy vehicle teach it: common part and noise first, then the scatter of rides.
 
     In this order, for a scatter that is free while the noise is learned takes what is noise for its own.
@@ -87,7 +96,8 @@ def learn(mixed: MixedModel, rides: Sequence[Ride], progress: Say, workers: int 
     before = replace(now, scatter=post.scatter, healthy=len(rides))
     after = replace(before, mean=post.mean, prior=post.covariance)
     folds = left_out(before, normals)
-    return replace(after, inflation=inflation(folds, normals), shapes=with_inflation(after, folds, lines, normals))
+    after = replace(after, inflation=inflation(folds, normals), shapes=with_inflation(after, folds, lines, normals))
+    return Learned(before, after, lines, folds, mixed.scatter)
 
 
 def learned_noise(lines: Sequence[LinearRide], post: Posterior, now: MixedModel) -> Noise:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask, block_means
-from gz_onboard.lab.discover.channels import Channel
+from gz_onboard.lab.discover.channels import CHANNEL, Channel
 from gz_onboard.lab.discover.grid import STEP, Ride
 from gz_onboard.lab.discover.system import System, Values
 from gz_onboard.physics.effect import Effect
@@ -27,7 +27,17 @@ def depends(channel: Channel, effects: Sequence[Effect]) -> set[str]:
 
 def usable(channel: Channel, ride: Ride, system: System) -> bool:
     """Whether the ride has what `channel` needs."""
-    return set(channel.roles) <= ride.have and (system.battery is not None or not channel.battery)
+    if not {*channel.roles, *channel.fed_by} <= ride.have or (channel.battery and system.battery is None):
+        return False
+    if slow(channel, ride):
+        return False
+    parts = [CHANNEL[name] for name in channel.unless if "motor_current" in ride.have]
+    return not parts or not all(usable(part, ride, system) for part in parts)
+
+
+def slow(channel: Channel, ride: Ride) -> bool:
+    """Whether samples of what `channel` needs are too far apart to show it."""
+    return any(ride.periods.get(role, 0.0) > channel.apart for role in channel.roles)
 
 
 def support(channel: Channel, ride: Ride) -> Mask:
@@ -50,16 +60,18 @@ def blocks(channel: Channel, ride: Ride, p: Values, system: System) -> Array:
 
 def roughness(channel: Channel, ride: Ride, system: System) -> Array:
     """By how much more a block's residual scatters, shape (blocks,): where the current changes within it, small errors
-    of timing and of dynamics weigh more; on a rough road the accelerometer is noisy.
+    of timing and of dynamics weigh more; on a rough road the accelerometer is noisy; a force's noise is power by speed.
     """
     doubling = channel.rough * system.sizes.current
     n = round(channel.block / STEP)
     shaken = np.ones(len(ride.time) // n)
     if channel.shaken > 0 and "vibration" in ride.quantities:
         shaken = shaken + block_means(ride.quantities["vibration"] ** 2, n) / channel.shaken**2
+    if channel.fast > 0 and "motor_current" not in ride.have:
+        shaken = shaken * (1 + block_means(ride.quantities["speed"] ** 2, n) / channel.fast**2)
     if doubling <= 0:
         return np.asarray(np.sqrt(shaken))
-    amperes = ride.signals["motor_current"]
+    amperes = ride.quantities["motor_current"]
     level = block_means(np.abs(amperes), n)
     swing = np.sqrt(np.maximum(block_means(amperes**2, n) - block_means(amperes, n) ** 2, 0.0))
     return np.asarray(np.sqrt(shaken * (1 + ((swing + STEADY * level) / doubling) ** 2)))

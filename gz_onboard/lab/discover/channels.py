@@ -8,6 +8,7 @@ channels, and causes that look alike in the energy drawn (a heavier rider, a wea
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -20,7 +21,7 @@ from gz_onboard.lab.discover import residuals
 from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.residuals import SLOW
 from gz_onboard.lab.discover.system import System, Values
-from gz_onboard.physics.effect import Port
+from gz_onboard.physics.effect import ROAD_LOAD, Port
 
 ROLLING, COASTING, FAST = 2.0, 3.0, 4.0  # m/s: above these the wheel rolls freely, coasts, GPS shows its speed well
 FIX = 2.5  # quality of a GPS fix, between that of two dimensions and of three
@@ -37,6 +38,11 @@ def _unbraked(faster: float, ride: Ride) -> Mask:
 def _fast(ride: Ride) -> Mask:
     fix = ride.signals["gps_fix"] > FIX if "gps_fix" in ride.signals else np.ones(len(ride.time), dtype=bool)
     return np.asarray((np.abs(ride.quantities["speed"]) > FAST) & fix)
+
+
+def _known_drive(ride: Ride) -> Mask:
+    """Where what drives it is known: all of the ride with a motor current, else where no brake takes a part of it."""
+    return _always(ride) if "motor_current" in ride.signals else np.asarray(~ride.braking | ride.standing)
 
 
 class ChannelNoise(NamedTuple):
@@ -79,6 +85,10 @@ class Channel:
     slow: float = 0.0  # s: the shortest correlation that its noise can have; what its model lacks is slow
     rough: float = 0.0  # A of motor current, in a vehicle of size 1, that double a block's variance; 0: none do
     shaken: float = 0.0  # m/s² of vibration that do; 0: none
+    fast: float = 0.0  # m/s that do, of a power: of what noise in a force makes at that speed; 0: none
+    fed_by: tuple[str, ...] = ()  # roles that it needs too, though not at each instant
+    apart: float = math.inf  # s between samples of its roles, beyond which they do not show it
+    unless: tuple[str, ...] = ()  # channels that together show it in parts, where the motor's current was measured
 
 
 _TORQUE = ("torque_constant", "torque_constant_slope", "torque_saturation")
@@ -159,6 +169,37 @@ CHANNELS = (
         rough=30.0,
     ),
     Channel(
+        "pack_power",
+        "W",
+        block=4.0,
+        roles=("pack_voltage", "pack_current"),
+        residual=residuals.pack_power,
+        holds=_known_drive,
+        parameters=(
+            *_TORQUE,
+            *_SPEED,
+            *_LOSSES,
+            *_PACK_CURRENT,
+            *_INVERTER_CURRENT,
+            "idle_current",
+            "pack_voltage_offset",
+            "brake_light",
+            "payload_mass",
+            "payload_error",
+            "accel_bias",
+            "pitch_gain",
+            "rolling_cold",
+        ),
+        ports=(*ROAD_LOAD, Port.MOTOR_LOSS, Port.INVERTER_LOSS, Port.DC_POWER),
+        noise=ChannelNoise(white=4.0, slow=2.0, time=60.0),
+        size="power",
+        rough=7.0,
+        shaken=0.85,
+        fast=0.8,
+        slow=60.0,
+        unless=("inverter_power", "pack_balance"),
+    ),
+    Channel(
         "auxiliary",
         "W",
         block=4.0,
@@ -211,6 +252,7 @@ CHANNELS = (
         battery=True,
         correlated=False,
         rough=3.0,
+        apart=0.15,
     ),
     Channel(
         "gps_speed",
@@ -248,6 +290,7 @@ CHANNELS = (
         block=10.0,
         steps=SLOW,
         roles=("motor_temperature", "ambient_temperature"),
+        fed_by=("motor_current",),
         residual=residuals.motor_temperature,
         parameters=(
             "motor_start",
@@ -271,6 +314,7 @@ CHANNELS = (
         block=10.0,
         steps=SLOW,
         roles=("inverter_temperature", "ambient_temperature"),
+        fed_by=("motor_current",),
         residual=residuals.inverter_temperature,
         parameters=(
             "inverter_start",

@@ -17,6 +17,7 @@ from gz_onboard.lab.discover.candidates import candidates
 from gz_onboard.lab.discover.detectability import implausible_rides, missing_residuals, remaining_range_error
 from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.lab.discover.extension import write_model
+from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.result import VERSION, Report
 from gz_onboard.lab.discover.summary import listing, summary
 from gz_onboard.lab.discover.verdict import Discovery
@@ -112,6 +113,8 @@ def run_baseline(arguments: argparse.Namespace, vehicle: Vehicle, rides: list[Sa
         f"{arguments.baseline}: {vehicle.name} as {len(healthy)} healthy rides show it; what healthy rides look like "
         f"is in {arguments.baseline.with_suffix('.healthy.npz').name} beside it"
     )
+    if isinstance(found.healthy, MixedModel):
+        print(found.healthy.checked)
     if left:
         print(f"left out, as no rides on a road: {', '.join(left)}")
     for text in refused:

@@ -102,8 +102,8 @@ def improves(held: Iterator[Squares], shares: Mapping[str, float]) -> bool:
 
 
 def start_equations(mixed: MixedModel, line: LinearRide) -> Normal:
-    """What shows how a ride began: not the road force, whose mean would be taken for the accelerometer's bias."""
-    return normal(line, mixed.noise, [name for name in line.tables if name != "road_force"])
+    """What shows how a ride began: not force and power, whose mean would be taken for the accelerometer's bias."""
+    return normal(line, mixed.noise, [name for name in line.tables if name not in ("road_force", "pack_power")])
 
 
 def with_own_start(mixed: MixedModel, ride: Normal, theta: Array) -> Array:

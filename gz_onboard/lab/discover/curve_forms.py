@@ -35,13 +35,21 @@ KNOTS: dict[str, tuple[tuple[float, ...], str]] = {
 PAIRS: tuple[tuple[str, tuple[str, ...]], ...] = (
     ("road_force", tuple(name for name in KNOTS if name not in ("pack_current", "soc"))),
     ("inverter_power", ("speed", "motor_current", "motor_temperature", "time", "current_change")),
+    ("pack_power", ("speed", "acceleration", "lateral_acceleration", "grade", "heading", "time", "vibration")),
     ("auxiliary", ("speed", "motor_temperature", "time", "pack_current", "vibration")),
     ("pack_balance", ("speed", "pack_current", "motor_temperature", "time")),
     ("cell_voltage", ("pack_current", "soc", "time", "current_change", "vibration")),
 )
 
 
-UNITS = {"road_force": 5.0, "inverter_power": 10.0, "auxiliary": 2.0, "pack_balance": 0.1, "cell_voltage": 0.005}
+UNITS = {
+    "road_force": 5.0,
+    "inverter_power": 10.0,
+    "pack_power": 40.0,
+    "auxiliary": 2.0,
+    "pack_balance": 0.1,
+    "cell_voltage": 0.005,
+}
 """Of a curve's coefficients, in the channel's, of a vehicle of size 1; they grow as the channel's noise does, and
 `SCATTER` of them is taken to differ between rides."""
 SCATTER = 0.3
@@ -107,6 +115,8 @@ def quantity(ride: Ride, name: str, table: LinearChannel) -> Array | None:
     """The quantity over the blocks of `table`, (m,); None if the ride has it not."""
     channel = table.channel
     values = ride.quantities.get(name)
+    if name in ("current_change", "motor_current") and "motor_current" not in ride.have:
+        return None
     if name == "current_change":
         n = round(channel.block / STEP)
         mean = over_blocks(channel, ride.signals["motor_current"])

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from gz_onboard.lab.discover.blocks import slow
 from gz_onboard.lab.discover.channels import CHANNELS
 from gz_onboard.lab.discover.energy import energy_share
 from gz_onboard.lab.discover.linear import LinearRide
 from gz_onboard.lab.discover.prior import LOG_SCALED
 from gz_onboard.lab.discover.result import Limit, Report
 from gz_onboard.lab.discover.search import evidence
-from gz_onboard.lab.discover.verdict import Discovery
+from gz_onboard.lab.discover.verdict import Discovery, needs
 from gz_onboard.lab.discover.wording import readable
 
 RIDING = 5.0  # m/s
 MISSED = 0.05  # of the range
+INSTEAD = (
+    "instead, the pack's power (voltage times current) is held against the drive and the auxiliaries, as measured or "
+    "by their models: what acts alike in it is told apart by how it goes with speed, acceleration and grade alone"
+)
 FAR = 1.1  # no tyre changes its radius by as much
 
 
@@ -31,7 +37,7 @@ def limits(found: Discovery) -> dict[str, Limit]:
         parameter = cause.parameters[0]
         place = mixed.names.index(parameter.name) if parameter.name in mixed.names else None
         if place is None or cause.name not in order or information[place] <= 0:
-            result[cause.name] = Limit(parameter.name, parameter.unit, None, None)
+            result[cause.name] = Limit(parameter.name, parameter.unit, None, None, needs(mixed, cause))
             continue
         steps = float(np.sqrt(report.threshold * mixed.inflation.get(cause.name, 1.0) / float(information[place])))
         change = np.zeros(len(mixed.mean))
@@ -40,7 +46,7 @@ def limits(found: Discovery) -> dict[str, Limit]:
             mixed.healthy_value(parameter.name) if parameter.name in LOG_SCALED else 1.0
         )
         share = abs(energy_share(found.lines, change))
-        result[cause.name] = Limit(parameter.name, parameter.unit, steps * step, share)
+        result[cause.name] = Limit(parameter.name, parameter.unit, steps * step, share, needs(mixed, cause))
     return result
 
 
@@ -62,6 +68,15 @@ def missing_residuals(found: Discovery) -> list[str]:
         without = [line.ride.name for line in found.lines if not set(roles) <= line.ride.have]
         rides = "no ride has" if len(without) == len(found.lines) else f"{', '.join(without)}: without"
         sentences.append(f"{rides} {' and '.join(roles)}: no {', no '.join(readable(name) for name in names)} there")
+    sentences += dict.fromkeys(words for line in found.lines for words in line.ride.stand_ins)
+    for channel in (c for c in CHANNELS if c.apart < math.inf):
+        if any(set(channel.roles) <= line.ride.have and slow(channel, line.ride) for line in found.lines):
+            sentences.append(
+                f"samples of {' and '.join(channel.roles)} are further apart than {channel.apart:g} s: no "
+                f"{readable(channel.name)} there"
+            )
+    if any("pack_power" in line.tables for line in found.lines):
+        sentences.append(INSTEAD)
     return sentences
 
 

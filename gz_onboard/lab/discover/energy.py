@@ -21,7 +21,7 @@ def pack_power(table_name: str, line: LinearRide, values: Array) -> Array | None
     real = values * table.unit
     if table_name == "road_force":
         return np.asarray(real * over_blocks(table.channel, line.ride.quantities["speed"])[table.used])
-    if table_name in ("inverter_power", "auxiliary"):
+    if table_name in ("inverter_power", "pack_power", "auxiliary"):
         return np.asarray(real)
     if table_name == "pack_balance" and "pack_voltage" in line.ride.signals:
         return np.asarray(real * over_blocks(table.channel, line.ride.signals["pack_voltage"])[table.used])

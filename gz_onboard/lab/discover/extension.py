@@ -21,11 +21,12 @@ from gz_onboard.vehicle import Vehicle
 PORTS = {
     "road_force": ("WHEEL_FORCE", "N", 1.0),
     "inverter_power": ("INVERTER_LOSS", "W", 1.0),
+    "pack_power": ("DC_POWER", "W", 1.0),
     "auxiliary": ("DC_POWER", "W", 1.0),
     "cell_voltage": ("CELL_VOLTAGE", "V", -1.0),
 }
 READS = {"time": "time_moving", "pack_current": "cell_current"}
-MODELLED = ("road_force", "inverter_power", "auxiliary")
+MODELLED = ("road_force", "inverter_power", "pack_power", "auxiliary")
 """The channels whose residual is energy that the model lacks; elsewhere it is a sensor's."""
 
 

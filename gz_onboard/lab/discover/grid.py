@@ -7,7 +7,7 @@ longer than three of its periods (and 0.3 s), the grid says so: nothing is made 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,9 +16,9 @@ from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.effect import MOVING
-from gz_onboard.physics.model import air_density
-from gz_onboard.physics.sensors import true_current, true_voltage
+from gz_onboard.physics.effect import MOVING, Port
+from gz_onboard.physics.model import air_density, total
+from gz_onboard.physics.sensors import speed_role, true_current, true_voltage
 from gz_onboard.physics.vibration import Vibration
 from gz_onboard.vehicle import Vehicle
 
@@ -26,7 +26,7 @@ STEP = 0.1  # s
 USUAL_DELAYS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}
 """By how much later than the inverter's a value is sent [s], where no message states its `delay`; what is left of it
 is fitted (see `channels`)."""
-NEEDED = ("motor_speed", "motor_current")
+PACK = ("pack_voltage", "pack_current")
 BRAKE_PRESSURE = 0.8e5  # Pa: above what the sensors show at rest
 STANDSTILL, STANDING = 0.05, 30  # m/s, grid steps: below it, for more of them the median of a rate is its bias
 LEAST_GAP, GAP = 0.3, 3.0  # s, periods of a signal: it is missing for more than both
@@ -35,11 +35,15 @@ SWITCHED, REGENERATING = 0.01, -1.0  # of the brake switch; A of the motor: a br
 TOUCHED = 11  # grid steps: half a second to either side
 ACCELERATING, YAWING, CLIMBING = 0.4, 0.5, 2.0  # s: running means that take noise off acceleration, yaw rate, grade
 STEEPEST_LEAN, STEEPEST = 0.85, 0.5  # sine of the lean, and of the slope: beyond, the sensors err
+LOADS = ("heater_power", "air_conditioner_power")
 SUSPENSION = ("suspension_front", "suspension_rear")
 CRAWL, MOST_STEERING = 1.0, 0.6  # m/s, rad: of slower riding the angle is noise
 ROUGH_PERIOD = 0.034  # s: samples further apart do not show what a road does to a wheel
 SHAKING = 2.0  # s, over which the suspension is as fast as the road is rough
 JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
+HALVINGS = 20  # of the span of motor currents
+BRAKED = -0.6  # m/s²: what slows a vehicle more, its road load apart, may be more than its motor
+CLIMB, FEWEST = 60.0, 5.0  # m of way that an altitude's steps average out over; m from one point of it to the next
 LONGEST = 60.0  # s since a brake was touched, or a current changed: what was longer ago is as good as never
 
 
@@ -49,7 +53,8 @@ class Ride:
 
     time: shape (n,) [s from the start]. signals: by role, shape (n,); valid: likewise, where it was measured.
     quantities: what effects read (names of `physics.effect.QUANTITIES`) and residuals are looked at over, shape (n,),
-    with the vehicle's nominal mass and radius. energy: see `energy_drawn`. have: the roles that are there.
+    with the vehicle's nominal mass and radius. energy: see `energy_drawn`. have: the roles that are there. periods: of
+    their samples [s]. stand_ins: what was taken for a role that is not there, and for another why it is lacking.
     """
 
     name: str
@@ -60,6 +65,8 @@ class Ride:
     payload: float | None
     quantities: dict[str, Array] = field(default_factory=dict)
     energy: float = 0.0
+    periods: dict[str, float] = field(default_factory=dict)
+    stand_ins: tuple[str, ...] = ()
 
     @property
     def have(self) -> set[str]:
@@ -72,6 +79,16 @@ class Ride:
         for role in roles:
             result &= self.valid[role]
         return result
+
+    @property
+    def loads(self) -> Array | float:
+        """What heater and air conditioner take [W], where they are measured, shape (n,); else 0."""
+        return sum((self.signals[role] for role in LOADS if role in self.signals), 0.0)
+
+    @property
+    def standing(self) -> Mask:
+        """Where the vehicle does not move, shape (n,)."""
+        return np.asarray(np.abs(self.quantities["speed"]) < STANDSTILL)
 
     @property
     def distance(self) -> float:
@@ -88,7 +105,10 @@ class Ride:
             if role in self.signals:
                 result |= self.signals[role] > BRAKE_PRESSURE
         if not {"brake_switch", "brake_pressure_rear"} & self.have:  # only regeneration shows it
-            result |= self.signals["motor_current"] < REGENERATING
+            if "motor_current" in self.signals:
+                result |= self.signals["motor_current"] < REGENERATING
+            else:
+                result |= self.quantities["acceleration"] + GRAVITY * self.quantities["grade"] < BRAKED
         wide = np.convolve(result, np.ones(TOUCHED), mode="same") > 0
         return np.asarray(wide, dtype=bool)
 
@@ -118,44 +138,116 @@ def measured(times: Array, grid: Array) -> Mask:
     return np.asarray((gap < limit) & (grid > times[0] - limit) & (grid < times[-1] + limit))
 
 
+def stand_ins(samples: Samples, vehicle: Vehicle) -> tuple[Samples, tuple[str, ...]]:
+    """(`samples` with what can be taken for a motor's speed and current that were not measured, which that is).
+
+    Another speed is the motor's by the radius of the file: if the tyre's is another, the vehicle errs as it shows. What
+    stands in is in no channel by itself. Raises InputError for a ride without any speed, or without any measure of what
+    drives it.
+    """
+    p, columns, words = vehicle.parameters, dict(samples.columns), []
+    if "motor_speed" not in columns:
+        role, factor = speed_role(f"ride {samples.name}", columns, p)
+        times, values = columns.pop(role)
+        factor /= p["wheel_radius"] * p["gear_ratio"]
+        columns["motor_speed"] = times - USUAL_DELAYS.get(role, 0.0), values * factor
+        words.append(f"motor_speed: {role} stands in, by wheel radius and gear ratio of the vehicle file")
+    if "motor_current" not in columns and "motor_torque" in columns:
+        times, values = columns["motor_torque"]
+        columns["motor_current"] = times, values / p["torque_constant"]
+        words.append("motor_current: motor_torque stands in, over the torque constant of the vehicle file")
+    if "motor_current" not in columns and not set(PACK) <= columns.keys():
+        raise InputError(
+            f"ride {samples.name}: has no motor_current, no motor_torque and not both of {' and '.join(PACK)}: what "
+            "drives it is not known, and nothing can be compared"
+        )
+    return replace(samples, columns=columns), tuple(words)
+
+
 def read_ride(samples: Samples, vehicle: Vehicle) -> Ride:
     """`samples` on the grid, of `vehicle`.
 
-    Raises InputError for a ride without motor speed or current, or shorter than a minute.
+    Raises InputError for a ride without any speed, without motor current, torque, or voltage and current of the pack,
+    or shorter than a minute.
     """
-    for role in NEEDED:
-        if role not in samples.columns:
-            raise InputError(f"ride {samples.name}: has no {role}, without which nothing can be compared")
-    start = max(samples.columns[role][0][0] for role in NEEDED)
-    end = min(samples.columns[role][0][-1] for role in NEEDED)
+    seen = {role: column for role, column in samples.columns.items() if len(column[0]) >= LEAST_SAMPLES}
+    samples, words = stand_ins(replace(samples, columns=seen), vehicle)
+    needed = ("motor_speed", *(("motor_current",) if "motor_current" in samples.columns else PACK))
+    start = max(samples.columns[role][0][0] for role in needed)
+    end = min(samples.columns[role][0][-1] for role in needed)
     if end - start < SHORTEST:
-        raise InputError(f"ride {samples.name}: {end - start:.0f} s of motor speed and current; a minute is the least")
+        raise InputError(
+            f"ride {samples.name}: {end - start:.0f} s of {', '.join(needed)} together; a minute is the least"
+        )
     grid = np.arange(start, end, STEP)
     stated = vehicle.mapping
     delays = USUAL_DELAYS | {s.role: stated.delays[s.message] for s in stated.sources if s.message in stated.delays}
     signals: dict[str, Array] = {}
     valid: dict[str, Mask] = {}
     for role, (times, values) in samples.columns.items():
-        if len(times) < LEAST_SAMPLES:
-            continue
         at = grid + delays.get(role, 0.0)
         turned = np.unwrap(values) if role == "gps_course" else values
         signals[role] = averaged(times, turned, at)
         valid[role] = measured(times, at)
     p = vehicle.parameters
     ride = Ride(samples.name, grid - start, signals, valid, p["wheel_radius"] * p["gear_ratio"], samples.rider_mass)
+    ride.periods = {role: float(np.median(np.diff(times))) for role, (times, _) in samples.columns.items()}
+    ride.stand_ins = words
     ride.quantities = _quantities(ride, p)
+    if "motor_current" not in signals:
+        ride.quantities |= driven_by_pack(ride, vehicle)
     ride.energy = energy_drawn(ride, p)
     if "pack_current" in signals:
         ride.quantities["pack_current"] = true_current(signals["pack_current"], p)
     ride.quantities["since_braking"] = since(ride.braking)
-    ride.quantities["since_change"] = since_change(signals["motor_current"] / sizes_of(vehicle).current)
+    ride.quantities["since_change"] = since_change(ride.quantities["motor_current"] / sizes_of(vehicle).current)
     wheels = [samples.columns[role] for role in SUSPENSION if role in samples.columns]
     if wheels and all(np.median(np.diff(times)) < ROUGH_PERIOD for times, _ in wheels):
         ride.quantities["suspension_speed"] = suspension_speed(wheels, grid)
     if "accel_z" in samples.columns and np.median(np.diff(samples.columns["accel_z"][0])) < ROUGH_PERIOD:
         ride.quantities["vibration"] = vibration(*samples.columns["accel_z"], grid)
     return ride
+
+
+def driven_by_pack(ride: Ride, vehicle: Vehicle) -> dict[str, Array]:
+    """Current [A] and torque [N·m] of the motor, (n,), that the pack's power points to by the vehicle file, none at
+    standstill; and how much less of the current a watt more of another load leaves (``current_per_watt`` [A/W]).
+    """
+    p, model, q, s = vehicle.parameters, vehicle.model, ride.quantities, ride.signals
+    power = true_voltage(s["pack_voltage"], p) * true_current(s["pack_current"], p) - ride.loads
+    power = power - total(model.at(Port.DC_POWER), q)
+    constant, spin = p["torque_constant"], np.maximum(np.abs(q["motor_speed"]), CRAWL / ride.radius)
+
+    def drive(current: Array) -> Array:
+        """What the drive takes at this current [W]."""
+        now = {**q, "motor_current": current, "torque": constant * current}
+        return np.asarray(now["torque"] * q["motor_speed"] + total(model.at(Port.MOTOR_LOSS, Port.INVERTER_LOSS), now))
+
+    low, high = np.zeros_like(power), np.full_like(power, 2 * p["motor_current_limit"])
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        over = drive(middle) > power
+        low, high = np.where(over, low, middle), np.where(over, middle, high)
+    # recovering, losses are small beside what the shaft gives
+    recovered = np.minimum((power - drive(np.zeros_like(power))) / (constant * spin), 0.0)
+    current = np.where(ride.standing, 0.0, np.where(recovered < 0, recovered, (low + high) / 2))
+    steep = np.maximum(drive(current + 1.0) - drive(current), constant * spin)  # W/A
+    return {
+        "motor_current": current,
+        "torque": constant * current,
+        "current_per_watt": np.where(ride.standing, 0.0, 1 / steep),
+    }
+
+
+def grade_by_altitude(altitude: Array, speed: Array) -> Array:
+    """Sine of the slope (n,) from `altitude` (n,) [m] at `speed` (n,) [m/s], a mean over `CLIMB` of the way."""
+    way = np.cumsum(np.abs(speed)) * STEP
+    if way[-1] < CLIMB:
+        return np.zeros_like(way)
+    points = np.arange(way[0], way[-1], FEWEST)
+    first = np.flatnonzero(np.diff(way, prepend=-1.0) > 0)  # standing, there are many at one place
+    height = running_mean(np.interp(points, way[first], altitude[first]), round(CLIMB / FEWEST / 2) * 2 + 1)
+    return np.clip(np.interp(way, points, np.gradient(height, FEWEST)), -STEEPEST, STEEPEST)
 
 
 def energy_drawn(ride: Ride, p: Mapping[str, float]) -> float:
@@ -219,6 +311,7 @@ def _quantities(ride: Ride, p: Mapping[str, float]) -> dict[str, Array]:
     s = ride.signals
     n = len(ride.time)
     motor_speed = s["motor_speed"]
+    motor_current = s.get("motor_current", np.zeros(n))
     speed = motor_speed * ride.radius
     acceleration: Array = np.gradient(smooth(speed, ACCELERATING), STEP)
     ambient = s.get("ambient_temperature", np.full(n, MILD))
@@ -234,6 +327,8 @@ def _quantities(ride: Ride, p: Mapping[str, float]) -> dict[str, Array]:
     grade = np.zeros(n)
     if "accel_x" in s:
         grade = smooth((s["accel_x"] - acceleration) / GRAVITY, CLIMBING)
+    elif "gps_altitude" in s:
+        grade = grade_by_altitude(s["gps_altitude"], speed)
     moved = np.cumsum(np.abs(speed) > MOVING) * STEP
     course = s.get("gps_course", np.zeros(n))
     altitude = float(np.median(s["gps_altitude"])) if "gps_altitude" in s else 0.0
@@ -249,12 +344,12 @@ def _quantities(ride: Ride, p: Mapping[str, float]) -> dict[str, Array]:
         "lateral_acceleration": lateral,
         "steering": steering(speed, lateral, p["wheelbase"]),
         "motor_speed": motor_speed,
-        "motor_current": s["motor_current"],
+        "motor_current": motor_current,
         "motor_temperature": s.get("motor_temperature", ambient),
         "ambient_temperature": ambient,
         "cell_temperature": temperature,
         "heading": np.asarray(np.mod(course, 2 * np.pi), dtype=np.float64),
         "time": ride.time,
         "time_moving": np.asarray(moved, dtype=np.float64),
-        "torque": p["torque_constant"] * s["motor_current"],
+        "torque": p["torque_constant"] * motor_current,
     }

@@ -65,6 +65,7 @@ class MixedModel(Population):
     differences from `values`.
 
     inflation: of a cause's score on healthy rides left out, 1 if right. shapes: what these show over quantities.
+    checked: in words, how the energy of healthy rides held out is known.
     """
 
     vehicle: Vehicle
@@ -78,6 +79,7 @@ class MixedModel(Population):
     free: Mask  # whose scatter between rides is learned, (p,)
     inflation: dict[str, float] = field(default_factory=dict)
     shapes: dict[str, HealthyCurve] = field(default_factory=dict)
+    checked: str = ""
 
     @property
     def freedom(self) -> float:

@@ -25,6 +25,14 @@ from gz_onboard.physics.model import drag_torque
 from gz_onboard.physics.relaxation import decay_over, relaxation_over, relaxed
 from gz_onboard.physics.sensors import true_current, true_voltage
 
+PROPORTIONS = (
+    "pack_current_gain",
+    "wheel_radius",
+    "speed_sensor_scale",
+    "torque_constant",
+    "torque_constant_slope",
+    "torque_saturation",
+)
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
 DT = SLOW * STEP
 MID = 200.0  # s: between the pair of the vehicle file and slow relaxation
@@ -63,8 +71,16 @@ def moving(ride: Ride, p: Values, system: System) -> dict[str, Array]:
     q["acceleration"] = q["acceleration"] * radius
     q["lateral_acceleration"] = q["lateral_acceleration"] * radius
     q["mass"] = np.full(len(ride.time), mass(ride, p, system))
+    if "current_per_watt" in q:  # the rest of the pack's power
+        more = auxiliary_power(ride, p, system) - auxiliary_power(ride, {**p, **system.healthy}, system)
+        q["motor_current"] = q["motor_current"] - q["current_per_watt"] * more
     q["torque"] = torque_constant(ride, p, system) * q["motor_current"]
     return q
+
+
+def rotating(p: Values) -> dict[str, float]:
+    """The parameters of the wheels' inertia."""
+    return {name: p[name] for name in ("wheel_inertia_front", "wheel_inertia_rear", "wheel_radius")}
 
 
 def mass(ride: Ride, p: Values, system: System) -> float:
@@ -98,8 +114,7 @@ def road_force(ride: Ride, p: Values, system: System) -> Array:
     shaft = q["torque"] - drag_torque(motor_losses(ride, q, p, system)[1], q["motor_speed"])
     entered, m = float(ride.quantities["mass"][0]), mass(ride, p, system)
     specific = ride.signals["accel_x"] - p["accel_bias"] - p["pitch_gain"] * q["acceleration"]
-    rotating = {name: p[name] for name in ("wheel_inertia_front", "wheel_inertia_rear", "wheel_radius")}
-    force = inertia.term(q["acceleration"], 0.0, **rotating) + summed(system.terms(q, p, STEP, *ROAD_LOAD))
+    force = inertia.term(q["acceleration"], 0.0, **rotating(p)) + summed(system.terms(q, p, STEP, *ROAD_LOAD))
     push = shaft / (p["wheel_radius"] * p["gear_ratio"]) - force
     # what is noisy stands alone: were the accelerometer multiplied with the mass that is sought, the least noise would
     # be had with the least mass, and all that it is weighed with would shrink along
@@ -115,19 +130,64 @@ def altitude(ride: Ride, p: Values, system: System) -> Array:
     return np.asarray(ride.signals["gps_altitude"] - height - ride.signals["gps_altitude"][0] - p["altitude_start"])
 
 
-def inverter_power(ride: Ride, p: Values, system: System) -> Array:
-    """The inverter's power [W] on the DC side, less air-gap power and losses."""
-    q = moving(ride, p, system)
+def electric_power(ride: Ride, q: Mapping[str, Array], shaft: Array, p: Values, system: System) -> Array:
+    """What motor and inverter take [W] on the DC side for the power of the air gap `shaft` [W], (n,)."""
     electric, _ = motor_losses(ride, q, p, system)
-    power = q["torque"] * q["motor_speed"] + electric
+    power = shaft + electric
     power = power + summed(system.terms(q, p, STEP, Port.INVERTER_LOSS))
     spin = np.abs(q["motor_speed"]) / (SPIN * system.sizes.spin)
     cross = p["loss_cross"] * np.abs(q["motor_current"]) / (AMPERES * system.sizes.current)
     power = power + (p["loss_speed"] + cross) * spin
-    power = power - p["torque_lag"] * np.gradient(running_mean(np.broadcast_to(power, len(ride.time)), LAGGED), STEP)
+    return np.asarray(
+        power - p["torque_lag"] * np.gradient(running_mean(np.broadcast_to(power, len(ride.time)), LAGGED), STEP)
+    )
+
+
+def inverter_power(ride: Ride, p: Values, system: System) -> Array:
+    """The inverter's power [W] on the DC side, less air-gap power and losses."""
+    q = moving(ride, p, system)
+    power = electric_power(ride, q, q["torque"] * q["motor_speed"], p, system)
     volts = ride.signals["inverter_voltage"]
     shown = p["inverter_current_gain"] * power + p["inverter_current_offset"] * volts
     return np.asarray(ride.signals["inverter_current"] * volts - shown)
+
+
+def road_power(ride: Ride, q: Mapping[str, Array], p: Values, system: System) -> Array:
+    """The air-gap power [W] of a motor that moves the vehicle as it moves: against road load and its own drag."""
+    if "accel_x" in ride.signals:
+        specific = ride.signals["accel_x"] - p["accel_bias"] - p["pitch_gain"] * q["acceleration"]
+    else:
+        specific = q["acceleration"] + GRAVITY * q["grade"]
+    force = q["mass"] * specific + inertia.term(q["acceleration"], 0.0, **rotating(p))
+    force = force + summed(system.terms(q, p, STEP, *ROAD_LOAD))
+    return np.asarray(force * q["speed"] + motor_losses(ride, q, p, system)[1])
+
+
+def pack_power(ride: Ride, p: Values, system: System) -> Array:
+    """The pack's power [W] less the drive's and the auxiliaries', each as measured, or by its model where it was not.
+
+    Without the motor's current the drive is that of the road load, its losses at the current that the pack's power
+    points to. So the noise of acceleration stands alone: losses that grow with it could be sought to take it off. For
+    the same reason the residual is that of the mass entered, as in `road_force`. And what the whole drive is in
+    proportion to is the file's (`PROPORTIONS`): hills that nothing shows would be taken off by it.
+    """
+    s = ride.signals
+    if "motor_current" not in s:
+        p = {**p, **{name: system.healthy.get(name, 0.0) for name in PROPORTIONS}}
+    volts = true_voltage(s["pack_voltage"], p)
+    power = volts * true_current(s["pack_current"], p) - ride.loads
+    if "auxiliary_current" in s:
+        power = power - volts * (s["auxiliary_current"] + p["idle_current"])
+    else:
+        power = power - auxiliary_power(ride, p, system)
+    q = moving(ride, p, system)
+    if "motor_current" not in s:
+        drive = electric_power(ride, q, road_power(ride, q, p, system), p, system)
+        return np.asarray((power - drive) * (ride.quantities["mass"] / q["mass"] if "accel_x" in s else 1.0))
+    if "inverter_voltage" in s and "inverter_current" in s:
+        inverter = (s["inverter_current"] - p["inverter_current_offset"]) / p["inverter_current_gain"]
+        return np.asarray(power - volts * p["idle_current"] - s["inverter_voltage"] * inverter)
+    return np.asarray(power - electric_power(ride, q, q["torque"] * q["motor_speed"], p, system))
 
 
 def pack_balance(ride: Ride, p: Values, system: System) -> Array:
@@ -136,7 +196,7 @@ def pack_balance(ride: Ride, p: Values, system: System) -> Array:
     true = true_current(s["pack_current"], p)
     true = true + p["pack_inverter_lag"] * np.gradient(running_mean(true, LAGGED), STEP)
     # beside the auxiliary load there is what is drawn when nothing is: the inverter's own supply
-    inverter = true - s["auxiliary_current"] - p["idle_current"]
+    inverter = true - s["auxiliary_current"] - p["idle_current"] - ride.loads / s["pack_voltage"]
     shown = p["inverter_current_offset"] + p["inverter_current_gain"] * inverter
     return np.asarray(shown - s["inverter_current"])
 
@@ -144,10 +204,15 @@ def pack_balance(ride: Ride, p: Values, system: System) -> Array:
 def auxiliary(ride: Ride, p: Values, system: System) -> Array:
     """The auxiliaries' power [W] less that of the vehicle file and the brake light."""
     s = ride.signals
+    return np.asarray(s["auxiliary_current"] * s["pack_voltage"] - auxiliary_power(ride, p, system))
+
+
+def auxiliary_power(ride: Ride, p: Values, system: System) -> Any:
+    """That of the vehicle file and the brake light [W]."""
     power = summed(system.terms(ride.quantities, p, STEP, Port.DC_POWER))
-    if "brake_switch" in s:
-        power = power + p["brake_light"] * (s["brake_switch"] > BRAKING)
-    return np.asarray(s["auxiliary_current"] * s["pack_voltage"] - power)
+    if "brake_switch" in ride.signals:
+        power = power + p["brake_light"] * (ride.signals["brake_switch"] > BRAKING)
+    return power
 
 
 def voltage_balance(ride: Ride, p: Values, system: System) -> Array:

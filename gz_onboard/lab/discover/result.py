@@ -163,13 +163,14 @@ class Limit:
     """The smallest change of a cause that these rides would show, half the time, were it alone.
 
     change: of its first parameter [unit]; energy_share: as a magnitude, 0 for one that takes none. Both None if the
-    rides say nothing of it.
+    rides say nothing of it. needs: what shows it, each a set of roles.
     """
 
     parameter: str
     unit: str
     change: float | None
     energy_share: float | None
+    needs: tuple[str, ...] = ()
 
 
 @dataclass
@@ -215,5 +216,6 @@ class Report:
     ] = field(default_factory=list)
     limits: Annotated[
         dict[str, Limit],
-        "per candidate: parameter, change, unit, energy_share: the least that would be found half the time",
+        "per candidate: parameter, change, unit, energy_share: the least that would be found half the time; needs: the "
+        "roles that show it, any set of them",
     ] = field(default_factory=dict)

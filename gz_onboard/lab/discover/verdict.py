@@ -9,6 +9,9 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.acceptance import within_bounds
+from gz_onboard.lab.discover.blocks import depends
+from gz_onboard.lab.discover.candidates import Candidate
+from gz_onboard.lab.discover.channels import CHANNELS, Channel
 from gz_onboard.lab.discover.constancy import splits
 from gz_onboard.lab.discover.energy import energy_share, residual_sizes
 from gz_onboard.lab.discover.linear import LinearRide, Normal
@@ -93,9 +96,25 @@ def verdict_of(found: Sequence[Cause], sets: Sequence[Sequence[str]], unknown: U
 
 
 def unseen(problem: SearchProblem) -> list[str]:
-    """A note on the candidates that these rides say nothing of."""
-    blind = [cause.name for cause in problem.mixed.causes if cause not in problem.causes]
-    return ["these rides say nothing of " + ", ".join(blind)] if blind else []
+    """A note on the candidates that these rides say nothing of, and one on each that no ride has the sensors for."""
+    mixed = problem.mixed
+    blind = [cause for cause in mixed.causes if cause not in problem.causes]
+    there = {name for line in problem.lines for name in line.tables}
+    lacking = [cause for cause in blind if not there & {c.name for c in showing(mixed, cause)}]
+    notes = [f"{c.name} was not looked for: it needs {', or '.join(needs(mixed, c)) or 'a battery'}" for c in lacking]
+    rest = [cause.name for cause in blind if cause not in lacking]
+    return [*(["these rides say nothing of " + ", ".join(rest)] if rest else []), *notes]
+
+
+def showing(mixed: MixedModel, cause: Candidate) -> list[Channel]:
+    """The channels that depend on `cause`."""
+    return [channel for channel in CHANNELS if set(cause.names) & depends(channel, mixed.system.effects)]
+
+
+def needs(mixed: MixedModel, cause: Candidate) -> tuple[str, ...]:
+    """What would show `cause`: of each channel its roles, the shortest first."""
+    sets = {" and ".join((*channel.roles, *channel.fed_by)) for channel in showing(mixed, cause)}
+    return tuple(sorted(sets, key=lambda text: (text.count(" and "), text)))
 
 
 def causes_of(search: Search, chosen: Sequence[str], lines: Sequence[LinearRide]) -> list[Cause]:

@@ -223,7 +223,7 @@ def learned(mixed: MixedModel) -> MixedModel:
 
 def test_a_baseline_is_read_as_it_was_written(learned: MixedModel, tmp_path: Path):
     out = tmp_path / "base.toml"
-    vehicle = adopted(learned.vehicle, learned)
+    vehicle = adopted(learned.vehicle, learned, learned)
     write_baseline(vehicle, REFERENCE, out)
     again = read_vehicle(str(out))
     assert again.healthy == tmp_path / "base.healthy.npz"
@@ -245,15 +245,15 @@ def test_a_baseline_is_read_as_it_was_written(learned: MixedModel, tmp_path: Pat
 
 def test_once_more_gives_one_healthy_table(learned: MixedModel, tmp_path: Path):
     first, second = tmp_path / "one.toml", tmp_path / "two.toml"
-    write_baseline(adopted(learned.vehicle, learned), REFERENCE, first)
+    write_baseline(adopted(learned.vehicle, learned, learned), REFERENCE, first)
     again = read_vehicle(str(first))
-    write_baseline(adopted(again, replace(learned, vehicle=again, healthy=9)), first, second)
+    write_baseline(adopted(again, replace(learned, vehicle=again, healthy=9), learned), first, second)
     assert tomllib.loads(second.read_text())["healthy"] == {"file": "two.healthy.npz", "rides": 9}
 
 
 def test_the_extended_model_has_no_statistics_of_before(learned: MixedModel, lines, tmp_path: Path):
     base, out = tmp_path / "base.toml", tmp_path / "new.toml"
-    write_baseline(adopted(learned.vehicle, learned), REFERENCE, base)
+    write_baseline(adopted(learned.vehicle, learned, learned), REFERENCE, base)
     vehicle = read_vehicle(str(base))
     write_model(report(learned, lines, cornering()), vehicle, base, out)
     assert read_vehicle(str(out)).healthy is None
@@ -261,7 +261,7 @@ def test_the_extended_model_has_no_statistics_of_before(learned: MixedModel, lin
 
 def test_statistics_that_cannot_be_read_are_refused(learned: MixedModel, mixed: MixedModel, tmp_path: Path):
     base = tmp_path / "base.toml"
-    write_baseline(adopted(learned.vehicle, learned), REFERENCE, base)
+    write_baseline(adopted(learned.vehicle, learned, learned), REFERENCE, base)
     beside = tmp_path / "base.healthy.npz"
     fewer = replace(mixed, names=mixed.names[:-3])
     with pytest.raises(InputError, match="another model"):

@@ -1,0 +1,103 @@
+"""Whether a baseline may be believed: no parameter far from what was known, no energy worse on rides held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.errors import InputError
+from gz_onboard.lab.discover.channels import CHANNEL
+from gz_onboard.lab.discover.cross_validation import start_equations, with_own_start
+from gz_onboard.lab.discover.gain import errors
+from gz_onboard.lab.discover.linear import LinearRide, normal
+from gz_onboard.lab.discover.mixed_model import MixedModel
+from gz_onboard.lab.discover.prior import LOG_SCALED
+from gz_onboard.physics.parameters import declared_parameters
+
+FAR = 4.0  # standard deviations of what was known, beyond which rides contradict it
+LEAST_RIDES = 5  # to hold two out at a time and learn from the others
+WATT_HOURS = 3.6  # J/m of 1 Wh/km
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What healthy rides taught. before: at the values that they led to, with what was known without them; after: with
+    them. lines: the rides there. folds: what is learned without some of them, and which these are. usual_scatter (p,):
+    between rides, as a variance in scales, before any.
+    """
+
+    before: MixedModel
+    after: MixedModel
+    lines: Sequence[LinearRide]
+    folds: Sequence[tuple[MixedModel, list[int]]]
+    usual_scatter: Array
+
+
+def check_against_file(learned: Learned) -> None:
+    """InputError if a parameter of the vehicle file is led beyond `FAR` from where the file has it, in its sd and in
+    what differs between rides, naming the channel that leads it there.
+
+    Terms of a loss curve from a bench are not judged one by one: they stand in for each other.
+    """
+    before, after = learned.before, learned.after
+    known, declared = before.vehicle.parameters.known, declared_parameters(before.vehicle.model.effects)
+    sd = np.sqrt(np.diag(before.prior) + learned.usual_scatter)
+    far = np.abs(after.mean - before.mean) / sd
+    of_file = [i for i, name in enumerate(before.names) if name in known and not declared[name].bench]
+    found = [i for i in sorted(of_file, key=lambda i: -far[i]) if far[i] > FAR]
+    if not found:
+        return
+    rows = []
+    for i in found:
+        name, old = before.names[i], known[before.names[i]]
+        new = after.values_at(after.mean)[name]
+        wide = float(np.sqrt(after.prior[i, i]) * after.scale[i]) * (new if name in LOG_SCALED else 1.0)
+        channel, without = pulling(learned, i)
+        rows.append(
+            f"{name} is {old.value:.4g} ± {old.sd:.2g} {old.unit} ({old.status}) by the file and {new:.4g} ± "
+            f"{wide:.2g} {old.unit} by these rides, {far[i]:.0f} standard deviations apart; {channel} "
+            f"({', '.join(CHANNEL[channel].roles)}) pulls it there, without which it is {without:.4g}"
+        )
+    raise InputError(
+        "; ".join(rows) + ". Nothing is written. If these signals are poor, leave them out of [roles]; if the file "
+        "only guesses, give it a larger sd"
+    )
+
+
+def pulling(learned: Learned, i: int) -> tuple[str, float]:
+    """(the channel without which the parameter at `i` is nearest to the file's, its value without it)."""
+    before, file = learned.before, learned.before.mean[i]
+    channels = sorted({name for line in learned.lines for name in line.tables})
+    without = {}
+    for channel in channels:
+        rest = [normal(line, before.noise, [n for n in line.tables if n != channel]) for line in learned.lines]
+        without[channel] = before.fit(rest).mean
+    best = min(channels, key=lambda channel: abs(without[channel][i] - file))
+    return best, before.values_at(without[best])[before.names[i]]
+
+
+def check_held_out(learned: Learned) -> str:
+    """How well the energy of rides is known that were held out, two at a time, by the file before and by what the
+    others taught, in words; InputError if it is worse, by more than the standard error of the difference.
+    """
+    rows = []
+    if len(learned.lines) >= LEAST_RIDES:
+        for fold, held in learned.folds:
+            for line in (learned.lines[i] for i in held):
+                start = start_equations(fold, line)
+                models = (learned.before, fold)
+                rows.append([errors(line, with_own_start(m, start, m.mean))["consumption"] for m in models])
+    if not rows or not np.any(rows):
+        return f"not checked on rides held out: {len(learned.lines)} rides, {LEAST_RIDES} with their energy are needed"
+    old, new = np.array(rows).T / WATT_HOURS
+    more = new - old
+    text = (
+        f"energy of rides held out: {old.mean():.2f} Wh/km missed by the file before, {new.mean():.2f} by what the "
+        f"others taught ({len(rows)} rides)"
+    )
+    if more.mean() > more.std(ddof=1) / np.sqrt(len(more)):
+        raise InputError(f"{text}: worse. Nothing is written; are these rides of this vehicle, and its signals right?")
+    return text
