@@ -43,7 +43,8 @@ def test_a_series_resistance_that_r0_holds_already_does_not_hide_what_the_curren
     r0 = cells.r0.at(0.6, 20.0)[0]
     guessed = guess * r0 * cells.cells_series / cells.cells_parallel
     groups = [Group("Pack", ("pack_current", "pack_voltage"), 0.1), Group("Cells", ("cell_temperature",), 1.0)]
-    model = Model([x for x in vehicle.model.effects if x.port is not Port.CELL_VOLTAGE], vehicle.model.parameters)
+    effects = tuple(x for x in vehicle.model.effects if x.port is not Port.CELL_VOLTAGE)
+    model = Model(effects, vehicle.model.parameters)
     e = Estimator(groups, replace(cells, series_resistance=guessed), model, vehicle.riding)
     for i in range(300):
         current = 40.0 if i // 20 % 2 else 5.0
