@@ -19,6 +19,7 @@ from gz_onboard.lab.discover.wording import readable
 
 FINEST = 25  # bins of the least width that are the span of a quantity
 OUTSTANDING = 3.5  # standard deviations of what differs between healthy rides
+LOADED = 2.0  # standard deviations of the auxiliary power of the file, beyond which its median is another
 
 COVARIATES: dict[str, tuple[str, str, str]] = {
     "speed": ("speed", "m/s", "motor_speed"),
@@ -76,6 +77,25 @@ def outlying_rides(found: Discovery) -> list[str]:
             most = ", ".join(f"{readable(name)} {z:+.1f}" for _, name, z in sorted(rows, reverse=True)[:3])
             sentences.append(f"{line.ride.name} alone differs by more than rides do: {most} standard deviations")
     return sentences
+
+
+def loads_by_ride(found: Discovery) -> list[str]:
+    """What the rides that only show it in the pack's power ask for as auxiliary power, where most ask for other than
+    the file says: a heater or an air conditioner that differs from ride to ride is no cause, but it is there.
+    """
+    mixed, name = found.mixed, "auxiliary_power"
+    if name not in mixed.names or not any("pack_power" in line.tables for line in found.lines):
+        return []
+    _, post = fitted(found)
+    (i,), known = mixed.index([name]), mixed.vehicle.parameters.known[name]
+    values = mixed.values[name] + float(mixed.scale[i]) * (post.mean[i] + post.own[:, i])
+    if abs(float(np.median(values)) - known.value) < LOADED * known.sd:
+        return []
+    return [
+        f"beside the drive these rides ask for {np.median(values):.0f} W, {values.min():.0f} to {values.max():.0f} W "
+        f"from ride to ride; the file has {known.value:.0f} ± {known.sd:.0f} W of auxiliary power. A heater or an air "
+        "conditioner would do that; with its power in [roles] it is taken off"
+    ]
 
 
 def over(line: LinearRide, name: str, table: LinearChannel) -> Array | None:

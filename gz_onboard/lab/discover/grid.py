@@ -14,6 +14,7 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask, running_mean
 from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
+from gz_onboard.events import LOADS
 from gz_onboard.lab.discover.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import MOVING, Port
@@ -36,7 +37,6 @@ TOUCHED = 11  # grid steps: half a second to either side
 ACCELERATING, YAWING, CLIMBING = 0.4, 0.5, 2.0  # s: running means that take noise off acceleration, yaw rate, grade
 STEEPEST_LEAN, STEEPEST = 0.85, 0.5  # sine of the lean, and of the slope: beyond, the sensors err
 USUAL_AIR = 20.0  # degC, of a ride that did not measure it
-LOADS = ("heater_power", "air_conditioner_power")
 SUSPENSION = ("suspension_front", "suspension_rear")
 CRAWL, MOST_STEERING = 1.0, 0.6  # m/s, rad: of slower riding the angle is noise
 ROUGH_PERIOD = 0.034  # s: samples further apart do not show what a road does to a wheel

@@ -25,8 +25,10 @@ from gz_onboard.physics.model import drag_torque
 from gz_onboard.physics.relaxation import decay_over, relaxation_over, relaxed
 from gz_onboard.physics.sensors import true_current, true_voltage
 
-PROPORTIONS = (
+AS_IN_FILE = (
     "pack_current_gain",
+    "pack_current_offset",
+    "pack_voltage_offset",
     "wheel_radius",
     "speed_sensor_scale",
     "torque_constant",
@@ -168,12 +170,13 @@ def pack_power(ride: Ride, p: Values, system: System) -> Array:
 
     Without the motor's current the drive is that of the road load, its losses at the current that the pack's power
     points to. So the noise of acceleration stands alone: losses that grow with it could be sought to take it off. For
-    the same reason the residual is that of the mass entered, as in `road_force`. And what the whole drive is in
-    proportion to is the file's (`PROPORTIONS`): hills that nothing shows would be taken off by it.
+    the same reason the residual is that of the mass entered, as in `road_force`. And errors of sensors, and what the
+    whole drive is in proportion to, are the file's (`AS_IN_FILE`): other channels show them, and here they would take
+    off hills that nothing shows, and stand for loads.
     """
     s = ride.signals
     if "motor_current" not in s:
-        p = {**p, **{name: system.healthy.get(name, 0.0) for name in PROPORTIONS}}
+        p = {**p, **{name: system.healthy.get(name, 0.0) for name in AS_IN_FILE}}
     volts = true_voltage(s["pack_voltage"], p)
     power = volts * true_current(s["pack_current"], p) - ride.loads
     if "auxiliary_current" in s:
