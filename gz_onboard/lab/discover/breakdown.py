@@ -94,9 +94,9 @@ def loads_by_ride(found: Discovery) -> list[str]:
     if not rows or abs(float(np.median(rows)) - known.value) < LOADED * known.sd:
         return []
     return [
-        f"at standstill these rides take {np.median(rows):.0f} W, {min(rows):.0f} to {max(rows):.0f} W from ride to ride; "
-        f"the file has {known.value:.0f} ± {known.sd:.0f} W of auxiliary power. A heater or an air conditioner would do "
-        "that; with its power in [roles] it is taken off"
+        f"at standstill these rides take {np.median(rows):.0f} W, {min(rows):.0f} to {max(rows):.0f} W from ride to "
+        f"ride; the file has {known.value:.0f} ± {known.sd:.0f} W of auxiliary power. A heater or an air conditioner "
+        "would do that; with its power in [roles] it is taken off"
     ]
 
 
