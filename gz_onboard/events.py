@@ -93,6 +93,7 @@ INSTRUMENTS: dict[str, str] = {
 # The roles whose sensors are checked against each other: each must have a signal of its own.
 VOLTAGES = ("pack_voltage", "inverter_voltage")
 CURRENTS = ("pack_current", "inverter_current", "auxiliary_current")
+LOADS = ("heater_power", "air_conditioner_power")  # beside the auxiliaries
 SPEEDS = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "vehicle_speed", "gps_speed")
 
 # What a road vehicle can have at most, by unit, whatever its DBC allows: many give no limits.

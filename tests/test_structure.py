@@ -50,8 +50,8 @@ ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py"}
 # that stand before it.
 STAGES = {
     "plain data": ["result", "wording"],
-    "read": ["sizes", "grid"],
-    "residuals": ["system", "residuals", "channels", "blocks"],
+    "read": ["sizes", "stand_ins", "grid"],
+    "residuals": ["system", "residuals", "pack_power", "channels", "blocks"],
     "linear model": ["prior", "candidates", "linear", "mixed_model", "uncalibrated", "baseline_file"],
     "search": ["search", "curve_forms", "curves", "selection"],
     "judgement": ["constancy", "cross_validation", "acceptance", "winds", "energy", "unexplained", "verdict"],

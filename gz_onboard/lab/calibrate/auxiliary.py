@@ -8,15 +8,64 @@ import numpy as np
 
 from gz_onboard.arrays import Array, Mask, held_at
 from gz_onboard.errors import InputError
+from gz_onboard.events import LOADS
 from gz_onboard.lab.calibrate.fit import score
-from gz_onboard.lab.calibrate.result import Found, Panel, PlotLine, Result
+from gz_onboard.lab.calibrate.result import Found, LackingError, Panel, PlotLine, Result
 from gz_onboard.offline.samples import Samples
+from gz_onboard.physics.sensors import speed_role
+from gz_onboard.vehicle import Vehicle
 
 NEEDED = ("auxiliary_current", "pack_voltage")
+PACK = ("pack_voltage", "pack_current")
+STANDING, LEAST_STANDING = 0.05, 20  # m/s; samples at rest of a ride
 CURRENT_SD = 0.01  # of the current, relative: a shunt's calibration
 
 
-def auxiliary_power(rides: Sequence[Samples]) -> Result:
+def auxiliary_power(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
+    """auxiliary_power [W] by the auxiliary current; of rides that lack it, by the pack's power at standstill.
+
+    Raises InputError if no ride has either.
+    """
+    if any(set(NEEDED) <= ride.columns.keys() for ride in rides):
+        return by_auxiliary_current(rides)
+    return at_standstill(rides, vehicle)
+
+
+def at_standstill(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
+    """auxiliary_power [W] as the pack's power while the vehicle stands, less the inverter's own and what a heater and
+    an air conditioner take. Its sd is of a ride to come, with that of the inverter's own. LackingError without one.
+    """
+    result, p = Result("auxiliary"), vehicle.parameters
+    result.notes.append("no ride has auxiliary_current: taken from the pack's power at standstill instead")
+    means = []
+    for ride in rides:
+        columns = ride.columns
+        if missing := [role for role in PACK if role not in columns]:
+            result.notes.append(f"{ride.name}: no {missing[0]}, left out")
+            continue
+        role, factor = speed_role(ride.name, columns, p)
+        time, current = columns["pack_current"]
+        still = np.abs(np.interp(time, *columns[role])) * factor < STANDING
+        power = current * np.interp(time, *columns["pack_voltage"]) - p["inverter_loss_constant"]
+        for load in LOADS:
+            if load in columns:
+                power = power - np.interp(time, *columns[load])
+        if still.sum() >= LEAST_STANDING:
+            means.append(float(np.median(power[still])))
+    if not means:
+        raise LackingError("no ride has auxiliary_current, and none stands still with pack_voltage and pack_current")
+    mean = float(np.mean(means))
+    if mean <= 0:
+        raise InputError(f"the pack gives {mean:.3g} W at standstill: its current must be positive when discharging")
+    spread = float(np.std(means, ddof=1)) if len(means) > 1 else 0.2 * mean
+    sd = float(np.hypot(spread, p.sd("inverter_loss_constant")))
+    span = f"{min(means):.0f} to {max(means):.0f} W"
+    source = f"pack power at standstill of {len(means)} rides, {span}, less the inverter's own"
+    result.parameters["auxiliary_power"] = Found(mean, sd, "W", source)
+    return result
+
+
+def by_auxiliary_current(rides: Sequence[Samples]) -> Result:
     """auxiliary_power [W]: its mean over the rides, each counting once.
 
     The brake light makes it one of two values; the mean holds it as often as these riders braked. The sd is that of one

@@ -16,7 +16,7 @@ from gz_onboard.errors import OK, InputError, nearest, not_an_input, writing
 from gz_onboard.lab.calibrate import manifest, report
 from gz_onboard.lab.calibrate.manifest import Option, Step, check_count
 from gz_onboard.lab.calibrate.procedures import PROCEDURES, Given, Procedure
-from gz_onboard.lab.calibrate.result import Result
+from gz_onboard.lab.calibrate.result import LackingError, Result
 from gz_onboard.lab.calibrate.table import read_table
 from gz_onboard.lab.calibrate.vehicle_file import write_vehicle
 from gz_onboard.offline.results import explain_keys, write_json
@@ -33,7 +33,7 @@ def calibrate(
     """(what it found, seconds that it took) of each of the `steps`, with what those before it found put into `base`.
 
     begin: is called with the name of each part of the work that begins. Raises InputError for data that cannot be
-    used, naming the procedure.
+    used, naming the procedure; one of several that no ride has the sensors for is refused, and the others go on.
     """
     read: dict[Path, Samples] = {}
     results: list[Result] = []
@@ -56,6 +56,10 @@ def calibrate(
             try:
                 results.append(procedure.run(given))
             except InputError as error:
+                if isinstance(error, LackingError) and len(steps) > 1:
+                    results.append(Result(step.procedure, refusals=[f"{error}; what the file says stays"]))
+                    yield results[-1], time.perf_counter() - start
+                    continue
                 raise InputError(f"{step.procedure}: {error}") from error
             yield results[-1], time.perf_counter() - start
 

@@ -16,7 +16,7 @@ from gz_onboard.arrays import Array, Mask, block_means
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD
 from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, score
-from gz_onboard.lab.calibrate.result import Found, Panel, PlotLine, Result
+from gz_onboard.lab.calibrate.result import Found, LackingError, Panel, PlotLine, Result
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
@@ -48,7 +48,7 @@ def read_pair(ride: Samples, vehicle: Vehicle) -> Pair:
     """The readings of pack and inverter at the same times, their lag taken off. InputError for what is missing."""
     for role in NEEDED.split():
         if role not in ride.columns:
-            raise InputError(f"{ride.name}: no {role}, which sensor offsets and resistances need")
+            raise LackingError(f"{ride.name}: no {role}, which sensor offsets and resistances need")
     time, pack = ride.columns["pack_current"]
 
     def at(role: str, lag: float = 0.0) -> Array:

@@ -140,8 +140,15 @@ def _load(ride: Samples) -> Array:
 
 
 def _resistance(given: Given) -> Result:
-    result = resistance.cable_resistance(given.rides["data"], given.vehicle)
-    result.procedure = "resistance"
+    rides, needed = given.rides["data"], set(offsets.NEEDED.split())
+    result = Result("resistance")
+    if with_inverter := [ride for ride in rides if needed <= ride.columns.keys()]:
+        result.add(resistance.cable_resistance(with_inverter, given.vehicle))
+    else:
+        lacking = sorted(needed.difference(*(ride.columns for ride in rides)))
+        result.refusals.append(
+            f"cable_resistance: needs {', '.join(lacking)}, which no ride has; the value of the file stays"
+        )
     result.add(resistance.pack_series_resistance(given.rides["data"], given.vehicle, given.tables.get("pulses", [])))
     return result
 
@@ -226,8 +233,8 @@ PROCEDURES: dict[str, Procedure] = {
     ),
     "auxiliary": Procedure(
         "power of lamps, dashboard and control",
-        {"data": Slot("ride", "rides with auxiliary current", 1)},
-        lambda given: auxiliary.auxiliary_power(_true(given, "data")),
+        {"data": Slot("ride", "rides with auxiliary current, or standing still with pack current", 1)},
+        lambda given: auxiliary.auxiliary_power(_true(given, "data"), given.vehicle),
     ),
     "offsets": Procedure(
         "offset, gain and noise of the pack's sensors",

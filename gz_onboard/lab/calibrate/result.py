@@ -7,6 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gz_onboard.arrays import Array
+from gz_onboard.errors import InputError
+
+
+class LackingError(InputError):
+    """No ride has the sensors that a procedure needs; the others of a calibration go on."""
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.result import Fit, Found, Panel, PlotLine, Result
+from gz_onboard.lab.calibrate.result import Fit, Found, LackingError, Panel, PlotLine, Result
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
@@ -50,7 +49,7 @@ def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         count += len(wheel)
         traces.append(PlotLine(ride.name, wheel, ratio, "."))
     if not radii:
-        raise InputError(f"no ride tells the wheel's radius: {'; '.join(result.refusals) or 'none given'}")
+        raise LackingError(f"no ride tells the wheel's radius: {'; '.join(result.refusals) or 'none given'}")
     radius = float(np.mean(radii))
     spread = float(np.std(radii, ddof=1)) if len(radii) > 1 else 3 * RECEIVER * radius
     sd = float(np.hypot(spread / np.sqrt(len(radii)), RECEIVER * radius))

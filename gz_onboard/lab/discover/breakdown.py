@@ -19,6 +19,8 @@ from gz_onboard.lab.discover.wording import readable
 
 FINEST = 25  # bins of the least width that are the span of a quantity
 OUTSTANDING = 3.5  # standard deviations of what differs between healthy rides
+STILL = 0.99  # of a block
+LOADED = 2.0  # standard deviations of the auxiliary power of the file, beyond which its median is another
 
 COVARIATES: dict[str, tuple[str, str, str]] = {
     "speed": ("speed", "m/s", "motor_speed"),
@@ -76,6 +78,26 @@ def outlying_rides(found: Discovery) -> list[str]:
             most = ", ".join(f"{readable(name)} {z:+.1f}" for _, name, z in sorted(rows, reverse=True)[:3])
             sentences.append(f"{line.ride.name} alone differs by more than rides do: {most} standard deviations")
     return sentences
+
+
+def loads_by_ride(found: Discovery) -> list[str]:
+    """What the pack gives at standstill, of rides that show loads by its power only, where most give other than the
+    file says: a heater or an air conditioner that differs from ride to ride is no cause, but it is there.
+    """
+    known, rows = found.mixed.vehicle.parameters.known["auxiliary_power"], []
+    for line in found.lines:
+        if (table := line.tables.get("pack_power")) is None:
+            continue
+        still = over_blocks(table.channel, line.ride.standing.astype(float))[table.used] > STILL
+        if still.any() and "auxiliary_current" not in line.ride.have:
+            rows.append(known.value + float(np.mean((table.y * table.unit)[still])))
+    if not rows or abs(float(np.median(rows)) - known.value) < LOADED * known.sd:
+        return []
+    return [
+        f"at standstill these rides take {np.median(rows):.0f} W, {min(rows):.0f} to {max(rows):.0f} W from ride to "
+        f"ride; the file has {known.value:.0f} ± {known.sd:.0f} W of auxiliary power. A heater or an air conditioner "
+        "would do that; with its power in [roles] it is taken off"
+    ]
 
 
 def over(line: LinearRide, name: str, table: LinearChannel) -> Array | None:

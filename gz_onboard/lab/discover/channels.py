@@ -19,6 +19,7 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.discover import residuals
 from gz_onboard.lab.discover.grid import Ride
+from gz_onboard.lab.discover.pack_power import pack_power
 from gz_onboard.lab.discover.residuals import SLOW
 from gz_onboard.lab.discover.system import System, Values
 from gz_onboard.physics.effect import ROAD_LOAD, Port
@@ -94,6 +95,8 @@ class Channel:
 _TORQUE = ("torque_constant", "torque_constant_slope", "torque_saturation")
 _SPEED = ("wheel_radius", "speed_sensor_scale")
 _PACK_CURRENT = ("pack_current_offset", "pack_current_gain")
+_PACK = (*_PACK_CURRENT, "pack_voltage_offset")
+_ROAD = ("payload_mass", "payload_error", "accel_bias", "pitch_gain", "rolling_cold")
 _INVERTER_CURRENT = ("inverter_current_offset", "inverter_current_gain")
 _LOSSES = ("copper_speed", "loss_speed", "loss_cross", "torque_lag")
 _CELL = (
@@ -129,7 +132,7 @@ CHANNELS = (
         roles=("motor_speed", "motor_current", "accel_x"),
         residual=residuals.road_force,
         holds=partial(_unbraked, ROLLING),
-        parameters=(*_TORQUE, *_SPEED, "payload_mass", "payload_error", "accel_bias", "pitch_gain", "rolling_cold"),
+        parameters=(*_TORQUE, *_SPEED, *_ROAD),
         ports=(Port.WHEEL_FORCE, Port.TYRE, Port.MOTOR_LOSS),
         noise=ChannelNoise(white=5.0, slow=2.0, time=60.0),
         size="power",
@@ -173,23 +176,9 @@ CHANNELS = (
         "W",
         block=4.0,
         roles=("pack_voltage", "pack_current"),
-        residual=residuals.pack_power,
+        residual=pack_power,
         holds=_known_drive,
-        parameters=(
-            *_TORQUE,
-            *_SPEED,
-            *_LOSSES,
-            *_PACK_CURRENT,
-            *_INVERTER_CURRENT,
-            "idle_current",
-            "pack_voltage_offset",
-            "brake_light",
-            "payload_mass",
-            "payload_error",
-            "accel_bias",
-            "pitch_gain",
-            "rolling_cold",
-        ),
+        parameters=(*_TORQUE, *_SPEED, *_LOSSES, *_PACK, *_INVERTER_CURRENT, *_ROAD, "idle_current", "brake_light"),
         ports=(*ROAD_LOAD, Port.MOTOR_LOSS, Port.INVERTER_LOSS, Port.DC_POWER),
         noise=ChannelNoise(white=4.0, slow=2.0, time=60.0),
         size="power",

@@ -12,7 +12,7 @@ from gz_onboard.bus.logs import log_suffix, logs_among
 from gz_onboard.errors import InputError, nearest, not_an_input, writing
 from gz_onboard.lab.discover.baseline import baseline
 from gz_onboard.lab.discover.baseline_file import write_baseline
-from gz_onboard.lab.discover.breakdown import outlying_rides
+from gz_onboard.lab.discover.breakdown import loads_by_ride, outlying_rides
 from gz_onboard.lab.discover.candidates import candidates
 from gz_onboard.lab.discover.detectability import implausible_rides, missing_residuals, remaining_range_error
 from gz_onboard.lab.discover.discovery import discover
@@ -83,6 +83,7 @@ def run(arguments: argparse.Namespace) -> int:
     report.notes[:0] = refused
     report.notes += [
         *remaining_range_error(report),
+        *loads_by_ride(found),
         *outlying_rides(found),
         *implausible_rides(found.lines),
         *missing_residuals(found),

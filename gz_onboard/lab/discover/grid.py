@@ -14,19 +14,17 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask, running_mean
 from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.errors import InputError
+from gz_onboard.events import LOADS
 from gz_onboard.lab.discover.sizes import sizes_of
+from gz_onboard.lab.discover.stand_ins import PACK, USUAL_DELAYS, stand_ins
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import MOVING, Port
 from gz_onboard.physics.model import air_density, total
-from gz_onboard.physics.sensors import speed_role, true_current, true_voltage
+from gz_onboard.physics.sensors import true_current, true_voltage
 from gz_onboard.physics.vibration import Vibration
 from gz_onboard.vehicle import Vehicle
 
 STEP = 0.1  # s
-USUAL_DELAYS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}
-"""By how much later than the inverter's a value is sent [s], where no message states its `delay`; what is left of it
-is fitted (see `channels`)."""
-PACK = ("pack_voltage", "pack_current")
 BRAKE_PRESSURE = 0.8e5  # Pa: above what the sensors show at rest
 STANDSTILL, STANDING = 0.05, 30  # m/s, grid steps: below it, for more of them the median of a rate is its bias
 LEAST_GAP, GAP = 0.3, 3.0  # s, periods of a signal: it is missing for more than both
@@ -35,7 +33,6 @@ SWITCHED, REGENERATING = 0.01, -1.0  # of the brake switch; A of the motor: a br
 TOUCHED = 11  # grid steps: half a second to either side
 ACCELERATING, YAWING, CLIMBING = 0.4, 0.5, 2.0  # s: running means that take noise off acceleration, yaw rate, grade
 STEEPEST_LEAN, STEEPEST = 0.85, 0.5  # sine of the lean, and of the slope: beyond, the sensors err
-LOADS = ("heater_power", "air_conditioner_power")
 SUSPENSION = ("suspension_front", "suspension_rear")
 CRAWL, MOST_STEERING = 1.0, 0.6  # m/s, rad: of slower riding the angle is noise
 ROUGH_PERIOD = 0.034  # s: samples further apart do not show what a road does to a wheel
@@ -136,32 +133,6 @@ def measured(times: Array, grid: Array) -> Mask:
     i = np.clip(np.searchsorted(times, grid), 1, len(times) - 1)
     gap = times[i] - times[i - 1]
     return np.asarray((gap < limit) & (grid > times[0] - limit) & (grid < times[-1] + limit))
-
-
-def stand_ins(samples: Samples, vehicle: Vehicle) -> tuple[Samples, tuple[str, ...]]:
-    """(`samples` with what can be taken for a motor's speed and current that were not measured, which that is).
-
-    Another speed is the motor's by the radius of the file: if the tyre's is another, the vehicle errs as it shows. What
-    stands in is in no channel by itself. Raises InputError for a ride without any speed, or without any measure of what
-    drives it.
-    """
-    p, columns, words = vehicle.parameters, dict(samples.columns), []
-    if "motor_speed" not in columns:
-        role, factor = speed_role(f"ride {samples.name}", columns, p)
-        times, values = columns.pop(role)
-        factor /= p["wheel_radius"] * p["gear_ratio"]
-        columns["motor_speed"] = times - USUAL_DELAYS.get(role, 0.0), values * factor
-        words.append(f"motor_speed: {role} stands in, by wheel radius and gear ratio of the vehicle file")
-    if "motor_current" not in columns and "motor_torque" in columns:
-        times, values = columns["motor_torque"]
-        columns["motor_current"] = times, values / p["torque_constant"]
-        words.append("motor_current: motor_torque stands in, over the torque constant of the vehicle file")
-    if "motor_current" not in columns and not set(PACK) <= columns.keys():
-        raise InputError(
-            f"ride {samples.name}: has no motor_current, no motor_torque and not both of {' and '.join(PACK)}: what "
-            "drives it is not known, and nothing can be compared"
-        )
-    return replace(samples, columns=columns), tuple(words)
 
 
 def read_ride(samples: Samples, vehicle: Vehicle) -> Ride:

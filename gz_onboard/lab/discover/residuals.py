@@ -25,14 +25,6 @@ from gz_onboard.physics.model import drag_torque
 from gz_onboard.physics.relaxation import decay_over, relaxation_over, relaxed
 from gz_onboard.physics.sensors import true_current, true_voltage
 
-PROPORTIONS = (
-    "pack_current_gain",
-    "wheel_radius",
-    "speed_sensor_scale",
-    "torque_constant",
-    "torque_constant_slope",
-    "torque_saturation",
-)
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
 DT = SLOW * STEP
 MID = 200.0  # s: between the pair of the vehicle file and slow relaxation
@@ -150,44 +142,6 @@ def inverter_power(ride: Ride, p: Values, system: System) -> Array:
     volts = ride.signals["inverter_voltage"]
     shown = p["inverter_current_gain"] * power + p["inverter_current_offset"] * volts
     return np.asarray(ride.signals["inverter_current"] * volts - shown)
-
-
-def road_power(ride: Ride, q: Mapping[str, Array], p: Values, system: System) -> Array:
-    """The air-gap power [W] of a motor that moves the vehicle as it moves: against road load and its own drag."""
-    if "accel_x" in ride.signals:
-        specific = ride.signals["accel_x"] - p["accel_bias"] - p["pitch_gain"] * q["acceleration"]
-    else:
-        specific = q["acceleration"] + GRAVITY * q["grade"]
-    force = q["mass"] * specific + inertia.term(q["acceleration"], 0.0, **rotating(p))
-    force = force + summed(system.terms(q, p, STEP, *ROAD_LOAD))
-    return np.asarray(force * q["speed"] + motor_losses(ride, q, p, system)[1])
-
-
-def pack_power(ride: Ride, p: Values, system: System) -> Array:
-    """The pack's power [W] less the drive's and the auxiliaries', each as measured, or by its model where it was not.
-
-    Without the motor's current the drive is that of the road load, its losses at the current that the pack's power
-    points to. So the noise of acceleration stands alone: losses that grow with it could be sought to take it off. For
-    the same reason the residual is that of the mass entered, as in `road_force`. And what the whole drive is in
-    proportion to is the file's (`PROPORTIONS`): hills that nothing shows would be taken off by it.
-    """
-    s = ride.signals
-    if "motor_current" not in s:
-        p = {**p, **{name: system.healthy.get(name, 0.0) for name in PROPORTIONS}}
-    volts = true_voltage(s["pack_voltage"], p)
-    power = volts * true_current(s["pack_current"], p) - ride.loads
-    if "auxiliary_current" in s:
-        power = power - volts * (s["auxiliary_current"] + p["idle_current"])
-    else:
-        power = power - auxiliary_power(ride, p, system)
-    q = moving(ride, p, system)
-    if "motor_current" not in s:
-        drive = electric_power(ride, q, road_power(ride, q, p, system), p, system)
-        return np.asarray((power - drive) * (ride.quantities["mass"] / q["mass"] if "accel_x" in s else 1.0))
-    if "inverter_voltage" in s and "inverter_current" in s:
-        inverter = (s["inverter_current"] - p["inverter_current_offset"]) / p["inverter_current_gain"]
-        return np.asarray(power - volts * p["idle_current"] - s["inverter_voltage"] * inverter)
-    return np.asarray(power - electric_power(ride, q, q["torque"] * q["motor_speed"], p, system))
 
 
 def pack_balance(ride: Ride, p: Values, system: System) -> Array:

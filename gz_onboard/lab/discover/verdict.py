@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -113,7 +114,11 @@ def showing(mixed: MixedModel, cause: Candidate) -> list[Channel]:
 
 def needs(mixed: MixedModel, cause: Candidate) -> tuple[str, ...]:
     """What would show `cause`: of each channel its roles, the shortest first."""
-    sets = {" and ".join((*channel.roles, *channel.fed_by)) for channel in showing(mixed, cause)}
+    sets = {
+        " and ".join((*channel.roles, *channel.fed_by))
+        + (f" each {channel.apart:g} s or more often" if channel.apart < math.inf else "")
+        for channel in showing(mixed, cause)
+    }
     return tuple(sorted(sets, key=lambda text: (text.count(" and "), text)))
 
 

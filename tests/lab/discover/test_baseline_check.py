@@ -39,9 +39,11 @@ def ride(mixed: MixedModel, channel: str, name: str, value: float) -> LinearRide
     a[:, i] = 5 * mixed.noise[channel].sd
     y = a @ at(mixed, name, value)
     quantities = {"speed": np.full(4 * BLOCKS * 10, 8.0)}
-    made = Ride("made up", np.arange(4 * BLOCKS * 10) * 0.1, {}, {}, 0.25, None, quantities, 1e5)
+    made = Ride("made up", np.linspace(0.0, 4.0 * BLOCKS, 4 * BLOCKS * 10), {}, {}, 0.25, None, quantities, 1e5)
     used = np.ones(BLOCKS, dtype=bool)
-    table = LinearChannel(CHANNEL[channel], y, a, 4.0 * np.arange(BLOCKS), used, roughness=np.ones(BLOCKS))
+    table = LinearChannel(
+        CHANNEL[channel], y, a, np.linspace(0.0, 4.0 * BLOCKS, BLOCKS), used, roughness=np.ones(BLOCKS)
+    )
     return LinearRide(made, {channel: table})
 
 

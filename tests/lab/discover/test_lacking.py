@@ -14,7 +14,7 @@ from gz_onboard.lab.discover.channels import CHANNEL, CHANNELS
 from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.lab.discover.grid import grade_by_altitude
 from gz_onboard.lab.discover.mixed_model import initial
-from gz_onboard.lab.discover.residuals import pack_power
+from gz_onboard.lab.discover.pack_power import pack_power
 from gz_onboard.lab.discover.verdict import needs
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle, read_vehicle
