@@ -144,10 +144,10 @@ def test_after_a_load_a_short_stop_proves_nothing():
 
 def test_a_voltage_that_never_changes_proves_no_rest():
     stuck, moving = estimator(), estimator()
-    for i in range(3000):
+    for i in range(1000):
         stuck.handle((0.1 * i, PACK, (52.0, 0.9, 0.5)))
         moving.handle((0.1 * i, PACK, (52.0 + 0.01 * (i % 2), 0.9, 0.5)))
-    assert stuck.estimate(300.0).soc_sd > 1.3 * moving.estimate(300.0).soc_sd
+    assert stuck.estimate(100.0).soc_sd > 1.3 * moving.estimate(100.0).soc_sd
 
 
 @pytest.mark.parametrize("time_constant", [0.3, 2.0, 5.0])
