@@ -55,7 +55,7 @@ def test_an_entropy_that_cannot_be_is_named_with_its_line(tmp_path, old, new, me
 
 def test_the_key_tells_what_a_saved_state_belongs_to(tmp_path):
     ours = read_vehicle("reference").key
-    for old, new in [('"grade_force", ', ""), ("cells_series = 14", "cells_series = 13"), ("-scooter", "-2")]:
+    for old, new in [(r'"grade_force",\s+', ""), ("cells_series = 14", "cells_series = 13"), ("-scooter", "-2")]:
         assert read_vehicle(str(changed(tmp_path, old, new)[0])).key != ours
     assert read_vehicle(str(changed(tmp_path, DRAG, r"\g<1>0.4567")[0])).key == ours
 
