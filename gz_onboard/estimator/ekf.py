@@ -4,10 +4,10 @@ Prediction (Lord 2016, eqs. 2.21 and 2.22, exact for a current that is constant 
 
     SOC' = SOC - I·dt/(3600·Ah)         V1' = a·V1 + R1·(1 - a)·I,  a = exp(-dt/(R1·C1))         e' = b·e
 
-V1(I) follows the current alone; x holds SOC and e. What the circuit errs by, e, is a Gauss-Markov process,
-b = exp(-dt/τ_e), of a variance that e returns to (Gelb 1974, sec. 3.8): the first voltage tells as much as the circuit is good for, the next ones only
-what is new since, so that a wrong start is left at once and a right one is not lost to an error that stays. What e is
-uncertain by beyond that is a polarisation of before, and fades as V1 does, b = a.
+V1(I) follows the current alone; x holds SOC and e. What the circuit errs by, e, is a Gauss-Markov process, b =
+exp(-dt/τ_e), of a variance that e returns to (Gelb 1974, sec. 3.8): the first voltage tells as much as the circuit is
+good for, the next ones only what is new since, so that a wrong start is left at once and a right one is not lost to
+an error that stays. What e is uncertain by beyond that is a polarisation of before, and fades as V1 does, b = a.
 
 Measurement (eq. 2.23): V = V_oc(SOC, T) - R0·I - V1 - e, so H = [dV_oc/dSOC - I·dR0/dSOC, -1].
 
