@@ -154,7 +154,7 @@ def test_a_gap(seconds: float, live: bool):
     end, true = numbers(run.at(RIDE)), numbers(unspoilt().at(RIDE))
     assert abs(end[0] - true[0]) <= end[1]
     if seconds == 20.0:
-        assert end[1] > 0.99 * true[1]  # no surer, but for where each stopped at what hysteresis allows
+        assert end[1] > 0.97 * true[1]  # no surer, but for where each stopped at what hysteresis allows
     assert run.at(RIDE).state is State.VALID
 
 
