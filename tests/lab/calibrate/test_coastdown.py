@@ -279,7 +279,8 @@ def test_tables_give_what_the_same_runs_give_as_rides(tmp_path, healthy):
     same = calibrate(runs, VEHICLE, hold_out=False)
     for name in ("rolling_resistance_constant", "drag_area"):
         value = found["parameters"][name]["value"]
-        assert value == pytest.approx(same.parameters[name].value, abs=0.5 * same.parameters[name].sd)
+        # A table begins at its greatest speed, a ride where the throttle closes.
+        assert value == pytest.approx(same.parameters[name].value, abs=0.7 * same.parameters[name].sd)
         assert abs(value - truth[name]) < 3 * found["parameters"][name]["sd"]
 
 
