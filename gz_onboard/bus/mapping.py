@@ -22,6 +22,7 @@ roller_speed = "DYNO_RollerSpeed"
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -121,17 +122,13 @@ def read_mapping(vehicle: Table) -> BusMapping:
     j1939 = bus.text("identifiers", "exact", ["exact", "j1939"]) == "j1939"
     if j1939:
         _check_groups(database, bus)
-    roles = vehicle.table("roles")
-    roles.only(ROLES)
-    sources = tuple(_source(database, left_out, roles, role) for role in roles.values)
-    _check_witnesses(sources, roles)
-    instruments = vehicle.table("instruments")
-    instruments.only(INSTRUMENTS)
+    sources = _sources(database, left_out, vehicle.table("roles"), ROLES)
+    _check_witnesses(sources, vehicle.table("roles"))
     return BusMapping(
         database=database,
         dbc_files=tuple(files),
         sources=sources,
-        instruments=tuple(_source(database, left_out, instruments, role) for role in instruments.values),
+        instruments=_sources(database, left_out, vehicle.table("instruments"), INSTRUMENTS),
         protection=protection,
         periods=periods,
         not_available=bus.text("not_available", "all-ones", ["all-ones", "none"]) == "all-ones",
@@ -151,6 +148,12 @@ def _dbc_files(vehicle: Table) -> list[Path]:
         return [find_dbc(name, vehicle.file.parent) for name in names]
     except InputError as error:
         raise vehicle.error(str(error), "dbc") from error
+
+
+def _sources(database: Database, left_out: LeftOut, roles: Table, known: Collection[str]) -> tuple[Source, ...]:
+    """Of all in the table `roles`, which has `known` ones only."""
+    roles.only(known)
+    return tuple(_source(database, left_out, roles, role) for role in roles.values)
 
 
 def _source(database: Database, left_out: LeftOut, roles: Table, role: str) -> Source:

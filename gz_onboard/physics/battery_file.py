@@ -38,21 +38,7 @@ LARGEST_SHIFT = 0.2  # V: real cells rest tens of mV apart from -20 to 25 degC; 
 def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
     """The battery in the vehicle file; InputError for tables that do not make sense."""
     table = vehicle.table("battery")
-    table.only(
-        [
-            "cells_series",
-            "cells_parallel",
-            "ocv",
-            "rest_shift",
-            "voltage_error",
-            "entropy",
-            "capacity",
-            "window",
-            "r0",
-            "r1",
-            "c1",
-        ]
-    )
+    table.only(KEYS)
     ocv = table.table("ocv")
     ocv.only(["soc", "value", "unit", "sd", "source", "status"])
     ocv.text("unit", choices=["V"])
@@ -61,20 +47,7 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         raise ocv.error(f"must reach from 0.1 or less to 0.9 or more, is {soc[0]:g} to {soc[-1]:g}", "soc")
     if len(soc) != len(volts):
         raise ocv.error(f"has {len(volts)} numbers for {len(soc)} of soc", "value")
-    temperatures: Row = (BENCH_TEMPERATURE,)
-    capacities: Row = (1.0,)
-    if "capacity" in table.values:
-        capacity = table.table("capacity")
-        capacity.only(["temperature", "value", "unit", "sd_relative", "source", "status"])
-        capacity.text("unit", choices=["A·h"])
-        temperatures = _axis(capacity, "temperature", *TEMPERATURE, least=1)
-        capacities = capacity.numbers("value", 0.01, 1000)
-        if len(temperatures) != len(capacities):
-            raise capacity.error(f"must be {len(temperatures)} positive numbers, one for each temperature", "value")
-        rated = linear(temperatures, capacities, BENCH_TEMPERATURE)
-        capacities = tuple(value / rated for value in capacities)
-        if min(capacities) < 0.05 or max(capacities) > 2:
-            raise capacity.error(f"must be within 0.05 to 2 times what it is at {BENCH_TEMPERATURE:g} degC", "value")
+    temperatures, capacities = _capacity(table)
     entropy_soc, entropy = _entropy(table)
     shift_temperatures, shifts, shift_sd = _over_temperature(table, "rest_shift", -LARGEST_SHIFT)
     error_temperatures, errors, _ = _over_temperature(table, "voltage_error", 0.0)
@@ -102,6 +75,24 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         voltage_error_value=errors,
     )
     return battery.with_parameters(parameters)
+
+
+def _capacity(battery: Table) -> tuple[Row, Row]:
+    """(temperatures [degC], capacity over that at the bench's); one and 1 if the file does not have the table."""
+    if "capacity" not in battery.values:
+        return (BENCH_TEMPERATURE,), (1.0,)
+    table = battery.table("capacity")
+    table.only(["temperature", "value", "unit", "sd_relative", "source", "status"])
+    table.text("unit", choices=["A·h"])
+    temperatures = _axis(table, "temperature", *TEMPERATURE, least=1)
+    capacities = table.numbers("value", 0.01, 1000)
+    if len(temperatures) != len(capacities):
+        raise table.error(f"must be {len(temperatures)} positive numbers, one for each temperature", "value")
+    rated = linear(temperatures, capacities, BENCH_TEMPERATURE)
+    shares = tuple(value / rated for value in capacities)
+    if min(shares) < 0.05 or max(shares) > 2:
+        raise table.error(f"must be within 0.05 to 2 times what it is at {BENCH_TEMPERATURE:g} degC", "value")
+    return temperatures, shares
 
 
 def _over_temperature(battery: Table, name: str, least: float) -> tuple[Row, Row, float]:

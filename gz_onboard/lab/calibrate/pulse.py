@@ -89,15 +89,20 @@ def calibrate(
                 f"{t.test.name}: no pulses near SOC {', '.join(f'{s:g}' for s in soc[~there])} at "
                 f"{t.temperature:g} degC; the table there only continues its neighbours (no sd)"
             )
+    _reaction(result, reaction, names)
+    _voltages(result, measured, names)
+    if method == "reduced":  # the halves are
+        mesh_quality(result, tests, fitted, split, reduction, one)
+    return result
+
+
+def _reaction(result: Result, reaction: Reaction, names: str) -> None:
+    """The effect and its parameters; without them if there is none."""
     result.effects[EFFECT] = bool(reaction.resistance)
     if reaction.resistance:
         values = (reaction.resistance, reaction.activation, reaction.time)
         for parameter, value, sd in zip(effect.PARAMETERS, values, reaction.sd, strict=True):
             result.parameters[parameter.name] = Found(value, sd, parameter.unit, f"{names}: pulses of several currents")
-    _voltages(result, measured, names)
-    if method == "reduced":  # the halves are
-        mesh_quality(result, tests, fitted, split, reduction, one)
-    return result
 
 
 def _tables(
