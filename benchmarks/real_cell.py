@@ -199,8 +199,8 @@ def estimator_of(setting: Setting, offset: float) -> Estimator:
         "rest_voltage_error": (0.0, float(np.mean(rests))),
     }
     for parameter in charge_transfer.PARAMETERS:
-        found = result.parameters[parameter.name]
-        values[parameter.name] = found.value, found.sd
+        if found := result.parameters.get(parameter.name):
+            values[parameter.name] = found.value, found.sd
     for name, (value, sd) in values.items():
         known[name] = replace(known[name], value=value, sd=sd)
     model = Model(vehicle.model.effects, Parameters(known))

@@ -84,12 +84,15 @@ class Machine:
     capacity: float = 2.735
     capacity_temperature: float = 0.0018  # 1/K below 25 degC
     ohmic: float = 0.0215
-    transfer: float = 0.0185
-    diffusion_a: float = 0.0085  # 6 s
+    film: float = 0.0185
+    diffusion_a: float = 0.0035  # 6 s
     diffusion_b: float = 0.0150  # 45 s
     diffusion_c: float = 0.0055  # 300 s
     diffusion_d: float = 0.0070  # 1800 s
-    exchange_current: float = 9.0  # A at 25 degC
+    cathode_exchange: float = 2.0  # A at 25 degC
+    anode_exchange: float = 8.0
+    cathode_layer: float = 2.8  # s, until its double layer is charged
+    anode_layer: float = 0.5
     hysteresis: float = 0.003  # V
     ocv_shift: float = 0.0
     ocv_wave: float = 0.0  # V, its own shape
@@ -146,7 +149,7 @@ SPREAD = {
     "auxiliary": 0.03,
     "capacity": 0.01,
     "ohmic": 0.05,
-    "transfer": 0.06,
+    "film": 0.06,
     "diffusion_a": 0.08,
     "diffusion_b": 0.08,
     "diffusion_c": 0.15,
@@ -181,6 +184,10 @@ SPREAD_ABSOLUTE = {
     "ocv_wave": 0.0015,
     "ocv_phase": 3.0,
     "cell_probe_bias": 0.3,
+    "cathode_exchange": 0.12,
+    "anode_exchange": 1.2,
+    "cathode_layer": 0.25,
+    "anode_layer": 0.1,
 }
 
 

@@ -1,8 +1,8 @@
 """The plant's equations: many rides ridden at once, a step of 20 ms, one array element for each ride.
 
 Written apart from the package: slip of the driven wheel, leaning with a crown radius, wind as a vector with gusts,
-tyres that warm up, a cell with four diffusion branches and asinh kinetics, a motor whose copper loss grows with
-frequency and whose torque falls with temperature, a rider with delay and an unsteady hand.
+tyres that warm up, a cell with four diffusion branches and two electrodes of Butler's and Volmer's kinetics, a motor
+whose copper loss grows with frequency and whose torque falls with temperature, a rider with delay and an unsteady hand.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ STEP = 0.02  # s
 DELAY = 10  # steps that a rider takes to react
 REST = 12.0  # s of standing before the start and, at most, after the end
 KELVIN = 273.15
+GAS_OVER_FARADAY = 8.31446 / 96485.3  # V/K
 GAS = 8.314
 SPEED_LIMIT = (50.5, 54.0)  # rad/s: where the controller begins to take the torque away, and where none is left
 COLUMNS = (
@@ -187,6 +188,7 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
     taus = np.array([6.0, 45.0, 300.0, 1800.0])[:, None]
     keep = np.exp(-STEP / taus)
     slow_keep = np.exp(-STEP / h.slow_time)
+    layer = np.exp(-STEP / np.stack([m.cathode_layer, m.anode_layer]))
     warm = h.cooling_factor
 
     # state
@@ -198,6 +200,7 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
     waiting, wait_left, next_stop = np.ones(n, bool), np.full(n, REST), np.zeros(n, int)
     tyre, moved = p.ambient.copy(), np.zeros(n)
     soc = p.soc.copy()
+    reaction = np.zeros((2, n))
     branch, slow, memory, hidden_memory = np.zeros((4, n)), np.zeros(n), m.hysteresis * 0.5, np.zeros(n)
     core = shell = p.ambient + p.pack_warmer
     stator = rotor = p.ambient + p.motor_warmer
@@ -326,17 +329,15 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
         cold_factor = 1 / kelvin - 1 / 298.15
         ends = 1 + 0.22 * np.exp(-np.maximum(soc, 0) / 0.06) + 0.35 * (soc - 0.45) ** 2
         ohmic = m.ohmic * np.exp(1100 * cold_factor) * ends
-        exchange = m.exchange_current * np.exp(-2200 * cold_factor)
         cell_current = pack_current / PARALLEL
-        relative = np.abs(cell_current) / (2 * exchange) + 1e-6
-        transfer = m.transfer * np.exp(4300 * cold_factor) * ends * np.arcsinh(relative) / relative
+        film = m.film * np.exp(4300 * cold_factor) * ends
         source_soc = np.clip(soc, 0, 1) * ocv_count
         low = np.minimum(source_soc.astype(int), ocv_count - 1)
         rest = ocv_table[low] + (source_soc - low) * (ocv_table[low + 1] - ocv_table[low]) + m.ocv_shift
         rest = rest + m.ocv_wave * np.sin(9 * soc + m.ocv_phase) + 2.0 * np.minimum(soc, 0)
         window = h.window_resistance * np.exp(-0.5 * ((soc - h.window_soc) / 0.03) ** 2)
-        instant = (ohmic + transfer) * h.resistance_factor + window
-        lag_voltage = branch.sum(axis=0) + slow + memory + hidden_memory
+        instant = (ohmic + film) * h.resistance_factor + window
+        lag_voltage = branch.sum(axis=0) + reaction.sum(axis=0) + slow + memory + hidden_memory
         emf = SERIES * (rest - lag_voltage)
         inside = SERIES * instant / PARALLEL + m.series_resistance
         inverter_now = pack_current - auxiliary / pack_voltage
@@ -357,6 +358,12 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
             * cell_current
         )
         branch = keep * branch + (1 - keep) * settle
+        # each electrode's own reaction (Butler and Volmer), behind its own double layer
+        exchange = np.stack(
+            [m.cathode_exchange * np.exp(-5200 * cold_factor), m.anode_exchange * np.exp(-4000 * cold_factor)]
+        )
+        wanted = h.resistance_factor * 2 * GAS_OVER_FARADAY * kelvin * np.arcsinh(cell_current / (2 * exchange / ends))
+        reaction = layer * reaction + (1 - layer) * wanted
         slow = slow_keep * slow + (1 - slow_keep) * h.slow_resistance * cell_current
         capacity = m.capacity * (1 - m.capacity_temperature * np.maximum(25 - core, 0)) * h.capacity_factor
         passed = cell_current * STEP / 3600 / capacity

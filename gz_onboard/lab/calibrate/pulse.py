@@ -15,7 +15,7 @@ import numpy as np
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.constants import HOUR
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.lab.calibrate.cell_circuit import NO_REACTION, Circuit, Reaction, riding_current, voltage
+from gz_onboard.lab.calibrate.cell_circuit import FOUND, NO_REACTION, Circuit, Reaction, riding_current, voltage
 from gz_onboard.lab.calibrate.cell_data import CellTest
 from gz_onboard.lab.calibrate.cell_fit import TIMES, Reduction, fit_branches
 from gz_onboard.lab.calibrate.fit import score
@@ -101,7 +101,7 @@ def _reaction(result: Result, reaction: Reaction, names: str) -> None:
     result.effects[EFFECT] = bool(reaction.resistance)
     if reaction.resistance:
         values = (reaction.resistance, reaction.activation, reaction.time)
-        for parameter, value, sd in zip(effect.PARAMETERS, values, reaction.sd, strict=True):
+        for parameter, value, sd in zip(FOUND, values, reaction.sd, strict=True):
             result.parameters[parameter.name] = Found(value, sd, parameter.unit, f"{names}: pulses of several currents")
 
 
@@ -160,7 +160,7 @@ def circuit(result: Result, slow: bool = False) -> Circuit:
     if "battery.rest_shift" in c:
         tables["rest_shift"] = c["battery.rest_shift"].value
     capacity = c["battery.capacity"].value
-    found = [result.parameters[p.name].value for p in effect.PARAMETERS if p.name in result.parameters]
+    found = [result.parameters[p.name].value for p in FOUND if p.name in result.parameters]
     reaction = Reaction(found[0], found[1], found[2]) if found else NO_REACTION
     return Circuit(ocv.axes["soc"], ocv.value, axes["soc"], axes["temperature"], capacity, **tables, reaction=reaction)
 

@@ -16,13 +16,11 @@ from scipy.sparse import csr_matrix, diags, hstack
 from scipy.stats import f as f_distribution
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.calibrate.cell_circuit import NO_REACTION, Reaction, hats
+from gz_onboard.lab.calibrate.cell_circuit import FOUND, NO_REACTION, Reaction, hats
 from gz_onboard.lab.calibrate.cell_fit import CORRELATED, TIMES, filtered, fit_branches, smoothness, weighted_columns
 from gz_onboard.lab.calibrate.pulse_test import Tested, moved_pieces, ocv_and_slope
 from gz_onboard.lab.calibrate.result import Result
-from gz_onboard.physics.effects import charge_transfer as effect
 
-NAMES = tuple(parameter.name for parameter in effect.PARAMETERS)
 START_SHARE = 0.3  # of R0 in the warmest test: where the search begins
 STEPS = np.array([0.05, 200.0, 0.05])  # of ln resistance, activation [K] and ln time: for the curvature
 TIME_SD = 1.5  # of ln time, before the pulses
@@ -54,7 +52,7 @@ def charge_transfer(tests: Sequence[Tested], nodes: Array, volts: Array, soc: Ar
     split, _ = moved_pieces(list(tests), nodes, volts, soc)
     first = [fit_branches(x).resistance for x in split]
     problems = [_problem(t, nodes, volts, soc, r) for t, r in zip(tests, first, strict=True)]
-    known = effect.PARAMETERS
+    known = FOUND
 
     def reaction(x: Array) -> Reaction:
         values = (float(np.exp(x[0])), float(x[1]), float(np.exp(x[2])))

@@ -60,10 +60,13 @@ def prior_of_file(mixed: MixedModel) -> Array:
     """
     known = mixed.vehicle.parameters
     prior = mixed.prior.copy()
-    losses = {p.name for effect in mixed.vehicle.model.effects for p in effect.parameters if p.bench}
-    for name in losses & set(mixed.names):
-        (i,) = mixed.index([name])
-        prior[i, i] += (MAKE_SPREAD * known[name] / float(mixed.scale[i])) ** 2
+    for effect in mixed.vehicle.model.effects:
+        for parameter in (p for p in effect.parameters if p.bench and p.name in mixed.names):
+            (i,) = mixed.index([parameter.name])
+            # losses are alike within a make; how a cell's reaction slows is its own, and its bench had another cell
+            reaction = effect.port is Port.CELL_VOLTAGE
+            own = parameter.prior_sd if reaction else MAKE_SPREAD * known[parameter.name]
+            prior[i, i] += (own / float(mixed.scale[i])) ** 2
     for name in set(BENCH_FACTORS) & set(mixed.names):
         (i,) = mixed.index([name])
         prior[i, i] = (known.sd(name) / float(mixed.scale[i])) ** 2

@@ -1,8 +1,9 @@
-"""Charge transfer of a cell: what the reaction takes, U·asinh(R_ct·I/U) with U = 2RT/F, settling in seconds.
+"""Charge transfer of a cell: what the reaction takes, U·asinh(R_ct·I/U) with U = n·2RT/F, settling in seconds.
 
 Butler's and Volmer's equation of two equal coefficients, solved for the overpotential (Plett 2015, Battery Management
 Systems, vol. 1, sec. 3.11); it settles as the double layer is charged. It grows less than the current, so that a cold
-cell's resistance falls with the current. R_ct, its slope at no current, falls with temperature (Arrhenius).
+cell's resistance falls with the current. R_ct, its slope at no current, falls with temperature (Arrhenius). n is 1
+where one electrode is by far the slower and 2 where both are alike: the more, the less it bends.
 """
 
 from __future__ import annotations
@@ -16,21 +17,28 @@ from gz_onboard.physics.elementary import asinh, exp
 PORT = Port.CELL_VOLTAGE
 RESISTANCE = "18650 cells: a third of R0 at 25 degC"
 ACTIVATION = "50 kJ/mol; Li-ion cells: 35 to 110"
+REACTIONS = "2 where both electrodes are alike slow, 1 where one is"
 DOUBLE_LAYER = "double layer: tenths of a second to seconds"
 PARAMETERS = (  # of the kind of cell: from ride to ride they stay, but for how well its temperature is known
     Parameter("charge_transfer_resistance", "ohm", 0.01, 0.01, 0.0, 10.0, RESISTANCE, ride_sd=1e-4, bench=True),
     Parameter("charge_transfer_activation", "K", 6000.0, 2500.0, 0.0, 15000.0, ACTIVATION, ride_sd=20.0, bench=True),
     Parameter("charge_transfer_time", "s", 1.0, 1.0, 0.01, 60.0, DOUBLE_LAYER, ride_sd=0.02, bench=True),
+    Parameter("charge_transfer_reactions", "1", 1.0, 0.5, 0.5, 4.0, REACTIONS, ride_sd=0.02, bench=True),
 )
 STRENGTHS = ()  # pulses of several currents show it; a ride shows it as resistance only
 
 
 def term(
-    cell_current: Any, cell_temperature: Any, *, charge_transfer_resistance: float, charge_transfer_activation: float
+    cell_current: Any,
+    cell_temperature: Any,
+    *,
+    charge_transfer_resistance: float,
+    charge_transfer_activation: float,
+    charge_transfer_reactions: float,
 ) -> Any:
     """What the terminals lack [V] once settled."""
     kelvin = cell_temperature + KELVIN
-    thermal = 2 * THERMAL_VOLTAGE * kelvin
+    thermal = charge_transfer_reactions * 2 * THERMAL_VOLTAGE * kelvin
     arrhenius = exp(charge_transfer_activation * (1 / kelvin - 1 / (BENCH_TEMPERATURE + KELVIN)))
     return thermal * asinh(charge_transfer_resistance * arrhenius * cell_current / thermal)
 
