@@ -27,6 +27,7 @@ from gz_onboard.lab.calibrate.cell_data import cell_test
 from gz_onboard.lab.calibrate.coastdown_run import samples as coastdown_samples
 from gz_onboard.lab.calibrate.fit import score
 from gz_onboard.lab.calibrate.manifest import Option, Slot
+from gz_onboard.lab.calibrate.pulse_error import slow_pair
 from gz_onboard.lab.calibrate.result import Curve, Found, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.offline.samples import Samples, ride_name
@@ -101,6 +102,8 @@ def _pulse(given: Given) -> Result:
         result.fits.append(score("cell voltage", "V", measured, model, held_out=True, source=table.file.name))
         near = float(np.mean(np.abs(model - measured) <= THESIS_VOLTS))
         result.notes.append(f"{table.file.name}: {100 * near:.0f} % of the samples within ±{THESIS_VOLTS:g} V")
+        slow = slow_pair(test.flowed, test.dt, measured - model)
+        result.notes.append(f"{table.file.name}: {slow.words()}")
         squares.append(float(np.mean((model - measured)[test.drawn < 0.9 * capacity.value] ** 2)))
         title = f"{table.file.name}, held out"
         result.panels += compared(title, "time [min]", "cell voltage [V]", test.time / 60, measured, model)

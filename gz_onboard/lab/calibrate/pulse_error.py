@@ -13,10 +13,13 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.result import Curve, Found, Result
+from gz_onboard.physics.relaxation import relaxation_over
 
 GRID = 10.0  # s: between the values whose square and correlation are taken
 EMPTY = 0.1  # SOC up to which `cell_voltage_error_empty` counts
 LONGEST = 3600.0  # s: beyond, two residuals have nothing to do with each other
+SLOW_TIMES = 600.0 * 2.0 ** np.arange(0, 4.5, 0.5)
+"""From what pulse tests with rests of tens of minutes still show, to over two hours [s]."""
 LEAST_TIME = 2 * GRID  # s: no shorter time can be told
 
 
@@ -48,6 +51,38 @@ def voltage_errors(residuals: Sequence[Residual], names: str, result: Result) ->
     spread = middle * float(np.std(np.log(times))) if len(known) > 1 else middle
     source = f"{names}: correlation of what one RC pair leaves falls to 1/e"
     result.parameters["cell_voltage_error_time"] = Found(middle, spread, "s", source)
+
+
+class SlowPair(NamedTuple):
+    """What a pair slower than those of the circuit would explain of a profile, found on its first half."""
+
+    resistance: float  # ohm
+    time: float  # s
+    without: float  # V, the largest residual of the second half
+    largest: float  # V, with the pair
+
+    def words(self) -> str:
+        """As a note says it."""
+        return (
+            f"a further pair of {1e3 * self.resistance:.0f} mΩ and {self.time / 60:.0f} min, found on the first half, "
+            f"leaves {1e3 * self.largest:.0f} mV at most on the second; without it {1e3 * self.without:.0f} mV"
+        )
+
+
+def slow_pair(flowed: Array, dt: Array, left: Array) -> SlowPair:
+    """Of the residual `left` [V] (measured less the circuit's) under the mean currents `flowed` [A] over `dt` [s]."""
+    half = len(left) // 2
+    best: tuple[float, SlowPair] | None = None
+    for time in SLOW_TIMES:
+        columns = np.column_stack([-relaxation_over(flowed, np.exp(-dt / time), before=False), np.ones(len(left))])
+        found, *_ = np.linalg.lstsq(columns[:half], left[:half], rcond=None)
+        rest = left - columns @ found
+        sizes = float(np.max(np.abs(left[half:]))), float(np.max(np.abs(rest[half:])))
+        cost = float(np.sum(rest[:half] ** 2))
+        if best is None or cost < best[0]:
+            best = cost, SlowPair(float(found[0]), time, *sizes)
+    assert best
+    return best[1]
 
 
 def _evenly(residual: Residual) -> Array:
