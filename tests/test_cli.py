@@ -280,3 +280,9 @@ def test_help_as_it_is_asked_for(capsys: pytest.CaptureFixture[str]):
         assert status(name, "--help") == 0
         assert capsys.readouterr().out == HELP[f"gz-onboard {name}"]()
     assert status("--version") == 0
+
+
+def test_a_folder_of_tables_says_how_to_give_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "ride.csv").write_text("time,speed\n0,5\n")
+    said = refused(capsys, "estimate", str(tmp_path))
+    assert "this folder holds no log; its tables must be given one by one, such as ride.csv" in said

@@ -24,6 +24,7 @@ GUIDE = {
     "quick-start",
     "commands",
     "another-vehicle",
+    "vehicle-file",
     "own-effect",
     "range-frames",
     "log-format",

@@ -295,6 +295,13 @@ def test_a_file_that_does_not_fit(tmp_path, old, new, line, parts):
         assert told and int(told[1]) == number + line, message
 
 
+@pytest.mark.parametrize("table", ["ocv", "r0", "r1", "c1"])
+def test_a_table_of_the_battery_that_is_not_there_is_missing_as_a_whole(tmp_path, table):
+    file, _ = changed(tmp_path, rf"(?s)\[battery\.{table}\].*?(?=\n\[)", "")
+    with pytest.raises(InputError, match=rf"mine\.toml:\d+: battery\.{table}: is missing"):
+        read_vehicle(str(file))
+
+
 CORRELATION = """
 [correlation.coastdown]
 parameters = ["drag_area", "rolling_resistance_constant"]

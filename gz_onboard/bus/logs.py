@@ -155,7 +155,9 @@ def logs_among(paths: Iterable[Path]) -> list[Path]:
     for path in paths:
         found = [path] if not path.is_dir() else sorted(file for file in path.iterdir() if _is_log(file))
         if not found:
-            raise InputError(f"{path}: this folder holds no log")
+            table = next((file.name for file in sorted(path.iterdir()) if file.is_file() and is_table(file)), None)
+            hint = f"; its tables must be given one by one, such as {table}" if table else ""
+            raise InputError(f"{path}: this folder holds no log{hint}")
         logs += found
     return logs
 

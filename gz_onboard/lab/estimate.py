@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from gz_onboard.bus.logs import is_table
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
-from gz_onboard.events import words
+from gz_onboard.events import Reason, words
 from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, RideSummary, estimate_log, known_vehicle
 from gz_onboard.offline.processes import collect, over_rides, tasks_of
 from gz_onboard.offline.results import clock, explain_keys, number, text_rows, write_json
@@ -108,13 +108,7 @@ def summary_text(ride: RideSummary) -> str:
             f"{_percent(ride.soc_start, ride.soc_start_sd)} at the start, "
             f"{_percent(ride.soc_end, ride.soc_end_sd)} at the end",
         ),
-        (
-            "range at the end",
-            f"{number(ride.range_end_km, '.1f', 'km')} "
-            f"({number(ride.range_end_p10_km, '.1f')} to "
-            f"{number(ride.range_end_p90_km, '.1f')}, 80 % interval), "
-            f"{number(ride.energy_left_wh, '.0f', 'Wh')} left",
-        ),
+        ("range at the end", _range(ride)),
         (
             "innovation",
             f"{number(ride.innovation_rms_v, '.1f', 'mV', 1000)} RMS, "
@@ -135,6 +129,7 @@ def summary_text(ride: RideSummary) -> str:
         ),
         ("state", ", ".join(f"{name.lower()} {duration:.1f} s" for name, duration in ride.states.items())),
         *(("", f"{words(name)} {duration:.1f} s") for name, duration in ride.reasons.items()),
+        *([("left out", _durations(ride.distrusted))] if ride.distrusted else []),
         *([("never there", ", ".join(words(name) for name in ride.lacking))] if ride.lacking else []),
         (
             "computed",
@@ -143,6 +138,22 @@ def summary_text(ride: RideSummary) -> str:
         ("written", f"{ride.log}{' and .png' if ride.plot else ''}"),
     ]
     return text_rows(ride.file, rows)
+
+
+def _range(ride: RideSummary) -> str:
+    if ride.soc_start is None and Reason.NO_PACK_VOLTAGE.name in ride.lacking:
+        return "none: no voltage of the pack or the inverter came"
+    return (
+        f"{number(ride.range_end_km, '.1f', 'km')} "
+        f"({number(ride.range_end_p10_km, '.1f')} to "
+        f"{number(ride.range_end_p90_km, '.1f')}, 80 % interval), "
+        f"{number(ride.energy_left_wh, '.0f', 'Wh')} left"
+    )
+
+
+def _durations(seconds: Mapping[str, float]) -> str:
+    """Each role with its time [s]."""
+    return ", ".join(f"{words(role)} {duration:.1f} s" for role, duration in seconds.items())
 
 
 def _percent(value: float | None, sd: float | None) -> str:

@@ -89,6 +89,7 @@ class RideSummary:
     innovation_max_v: Annotated[float | None, "greatest magnitude of the same"]
     states: Annotated[dict[str, float], "seconds in each state"]
     reasons: Annotated[dict[str, float], "seconds with each reason to distrust the estimate"]
+    distrusted: Annotated[dict[str, float], "seconds by role of a sensor that contradicted the others and was left out"]
     lacking: Annotated[list[str], "reasons that hold for ever, as the vehicle has no such sensors: no degradation"]
     frames: Annotated[int, "received"]
     dropped: Annotated[int, "frames that failed a check"]
@@ -117,6 +118,7 @@ class Tally:
     speed_max: float | None = None  # m/s
     innovation_max: float = 0.0  # V
     ticks: Counter[tuple[State, int]] = field(default_factory=Counter)
+    distrusted: Counter[str] = field(default_factory=Counter)  # ticks by role
     _squares: float = 0.0
     _innovations: int = 0
     _before: float = 0.0
@@ -128,6 +130,7 @@ class Tally:
         dt, self._before = e.time - self._before, e.time
         self.last = e
         self.ticks[e.state, int(e.reasons)] += 1
+        self.distrusted.update(e.distrusted)
         if e.pack_voltage is not None and e.pack_current is not None and 0 <= dt <= 1:
             energy = e.pack_voltage * e.pack_current * dt
             self.drawn = (self.drawn or 0.0) + energy
@@ -322,6 +325,7 @@ def _summary(
         innovation_max_v=tally.innovation_max if tally.innovation_rms is not None else None,
         states={state.name: round(states[state.name] * TICK_S, 1) for state in State if states[state.name]},
         reasons={name: round(ticks * TICK_S, 1) for name, ticks in sorted(reasons.items())},
+        distrusted={role: round(ticks * TICK_S, 1) for role, ticks in sorted(tally.distrusted.items())},
         lacking=lacking(pipeline.vehicle),
         frames=pipeline.codec.received,
         dropped=counts.dropped,

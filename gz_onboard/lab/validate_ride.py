@@ -89,6 +89,9 @@ def validate_ride(task: Task, progress: Progress = lambda _: None) -> ValidatedR
     roller = ride.road if isinstance(ride.road, Dynamometer) else None
     alone = components(vehicle, measured, ride.soc, ambient, roller)
     judged = _judge_components(alone)
+    if not judged and not any(verdict.channels for verdict in verdicts.values()):
+        channels = ", ".join(channel.label for channel in CHANNELS.values())
+        raise InputError(f"{task.path}: nothing in it can be compared with its simulation: it has none of {channels}")
     splits: dict[str, dict[str, Splits]] = {
         form: {
             name: split(measured[name], series[name], found)

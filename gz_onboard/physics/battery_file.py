@@ -39,7 +39,7 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
     """The battery in the vehicle file; InputError for tables that do not make sense."""
     table = vehicle.table("battery")
     table.only(KEYS)
-    ocv = table.table("ocv")
+    ocv = _needed(table, "ocv")
     ocv.only(["soc", "value", "unit", "sd", "source", "status"])
     ocv.text("unit", choices=["V"])
     soc, volts = _axis(ocv, "soc", -0.01, 1.01), _axis(ocv, "value", 0.5, 5.0)
@@ -62,9 +62,9 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         ocv_soc=soc,
         ocv_value=volts,
         ocv_sd=ocv.number("sd", 0.005, low=1e-4, high=0.5),
-        r0=_mesh(table.table("r0"), "ohm", *RESISTANCE),
-        r1=_mesh(table.table("r1"), "ohm", *RESISTANCE),
-        c1=_mesh(table.table("c1"), "F", *CAPACITANCE),
+        r0=_mesh(_needed(table, "r0"), "ohm", *RESISTANCE),
+        r1=_mesh(_needed(table, "r1"), "ohm", *RESISTANCE),
+        c1=_mesh(_needed(table, "c1"), "F", *CAPACITANCE),
         rest_shift_temperature=shift_temperatures,
         rest_shift_value=shifts,
         rest_shift_sd=shift_sd,
@@ -75,6 +75,13 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         voltage_error_value=errors,
     )
     return battery.with_parameters(parameters)
+
+
+def _needed(battery: Table, name: str) -> Table:
+    """A table that every battery must have: without it, the table is what is missing, not the first of its keys."""
+    if name not in battery.values:
+        raise battery.error("is missing", name)
+    return battery.table(name)
 
 
 def _capacity(battery: Table) -> tuple[Row, Row]:

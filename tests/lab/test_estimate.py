@@ -3,6 +3,7 @@ from __future__ import annotations
 import gzip
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -238,6 +239,26 @@ def test_a_slow_bus_is_estimated_ten_times_a_second(vehicle, frames):
     pipeline = Pipeline(vehicle, observer=tally)
     feed(pipeline, [slow[:1000], slow[1000:]])
     assert sum(tally.ticks.values()) == pytest.approx((slow[-1][0] - slow[0][0]) / 1e8, abs=2)
+
+
+def test_a_summary_names_the_sensors_that_were_left_out(tmp_path, capsys):
+    rows = "".join(f"{t / 2},361,14,{36 + t % 4},{0 if t > 60 else 36}\n" for t in range(241))
+    (tmp_path / "ride.csv").write_text(
+        "time,pack_voltage [V],pack_current [A],vehicle_speed [km/h],gps_speed [km/h]\n" + rows
+    )
+    i3 = LOGS.parent / "tests" / "vehicles" / "i3" / "i3.toml"
+    arguments = ["--vehicle", i3, "--no-plot", "--output", tmp_path]
+    assert run(tmp_path / "ride.csv", *arguments) == 0
+    assert re.search(r"(?m)^  left out +GPS speed \d+\.\d s", capsys.readouterr().out)
+    assert run(tmp_path / "ride.csv", *arguments, "--json") == 0
+    (ride,) = json.loads(capsys.readouterr().out)["rides"]
+    assert 0 < ride["distrusted"]["gps_speed"] <= ride["reasons"]["SENSOR_DISTRUSTED"] < 120
+
+
+def test_without_a_voltage_a_summary_says_why_there_is_no_range(tmp_path, capsys):
+    (tmp_path / "ride.csv").write_text("time,speed [m/s]\n" + "".join(f"{t},5\n" for t in range(40)))
+    assert run(tmp_path / "ride.csv", "--no-plot", "--output", tmp_path) == 0
+    assert "range at the end  none: no voltage of the pack or the inverter came" in capsys.readouterr().out
 
 
 def test_a_gap_is_ridden_through_and_a_pause_is_not(vehicle, frames):
