@@ -112,6 +112,9 @@ PLAUSIBLE: dict[str, tuple[float, float]] = {
     "1": (-10.0, 1000.0),
 }
 
+# Likewise of a role whose unit allows more: 65 is a state of charge in percent whose unit the DBC does not tell.
+PLAUSIBLE_OF: dict[str, tuple[float, float]] = {"bms_state_of_charge": (-0.1, 1.1)}
+
 
 class State(IntEnum):
     """How far the published range can be trusted."""

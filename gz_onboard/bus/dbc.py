@@ -251,6 +251,8 @@ def _signal_problem(signal: Signal) -> str | None:
     """What of a signal's place and scale is no number that could be calculated with."""
     if signal.start < 0 or signal.length < 1:
         return f"signal {signal.name} has {signal.length} bits from bit {signal.start} on"
+    if signal.conversion.is_float and signal.length not in (32, 64):
+        return f"signal {signal.name} is a float of {signal.length} bits"
     scale, offset = signal.conversion.scale, signal.conversion.offset
     if not SMALLEST <= abs(scale) <= LARGEST:
         return f"signal {signal.name} has a scale of {shown(scale)}"

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
 from gz_onboard.bus.mapping import Protection, Source
-from gz_onboard.events import EFF_FLAG, PLAUSIBLE, ROLES, STALE_PERIODS
+from gz_onboard.events import EFF_FLAG, PLAUSIBLE, PLAUSIBLE_OF, ROLES, STALE_PERIODS
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -53,7 +53,8 @@ def plausible_range(source: Source, low: float, high: float) -> tuple[float, flo
     """The raw values from `low` to `high` that a road vehicle can have, too."""
     if source.role not in ROLES:  # of an instrument that is not on board
         return low, high
-    ends = sorted((value - source.offset) / source.factor for value in PLAUSIBLE[ROLES[source.role]])
+    limits = PLAUSIBLE_OF.get(source.role, PLAUSIBLE[ROLES[source.role]])
+    ends = sorted((value - source.offset) / source.factor for value in limits)
     return (low if low >= ends[0] else ends[0]), (high if high <= ends[1] else ends[1])
 
 

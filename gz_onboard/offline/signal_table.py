@@ -23,7 +23,7 @@ from struct import Struct
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from gz_onboard.bus.mapping import BusMapping, Source, column_sources
-from gz_onboard.bus.readers.common import BATCH, Damage, unpacked
+from gz_onboard.bus.readers.common import BATCH, TIME_LIMIT_NS, Damage, unpacked
 from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.events import EFF_FLAG, ROLES, Frame
@@ -60,7 +60,11 @@ def read_signal_table(file: Path, mapping: BusMapping) -> tuple[BusMapping, Iter
     if len(header) < 2:
         raise InputError(f"{file}:1: a table of signals has a column of times and one for each signal")
     times = _times(file, header[0], rows)
-    columns = [_column(text, at) for at, text in enumerate(header) if at]
+    columns = [
+        _column(text, at)
+        for at, text in enumerate(header)
+        if at and (text.strip() or not all(_is_missing(row[at]) for _, row in rows))  # a separator at each line's end
+    ]
     database = _database(file, columns)
     sources = column_sources(database, mapping.columns, file) if mapping.columns else _by_role(file, columns)
     played = {source.signal: source.role for source in sources}
@@ -112,11 +116,11 @@ def _parquet(file: Path) -> tuple[list[str], Rows]:
     except ImportError as error:
         raise InputError(f"{file}: Parquet needs pyarrow: pip install pyarrow; or give the table as CSV") from error
     try:
-        table = pyarrow.parquet.read_table(file)
+        table = pyarrow.parquet.ParquetFile(file).read()  # `read_table` chokes on two columns of one name
     except (OSError, pyarrow.ArrowException) as error:
         raise InputError(f"{file}: not a Parquet file: {error}") from error
     columns = [
-        column.cast(pyarrow.timestamp("us", column.type.tz), safe=False)  # of ns, datetime has none
+        column.cast(pyarrow.timestamp("us", "UTC"), safe=False)  # datetime has no ns, and may not know the zone
         if pyarrow.types.is_timestamp(column.type)
         else column
         for column in table.columns
@@ -140,10 +144,17 @@ def _times(file: Path, name: str, rows: Rows) -> list[int]:
             raise InputError(
                 f"{file}:{line}: {name}: {shown(row[0])} is neither a number nor a time of ISO 8601"
             ) from None
+        if not -TIME_LIMIT_NS < times[-1] < TIME_LIMIT_NS:
+            raise InputError(
+                f"{file}:{line}: {name}: {shown(row[0])} {header['unit'] or 's'} is no time of this age; if it is in "
+                "ms, call the column 'time [ms]'"
+            )
         if len(times) > 1 and times[-1] < times[-2]:
             raise InputError(f"{file}:{line}: {name}: {shown(row[0])} is before the time of the row above")
     if len(times) < 2:
         raise InputError(f"{file}: {len(times)} rows are no ride")
+    if times[0] == times[-1]:
+        raise InputError(f"{file}: {name}: all rows have the same time, {shown(rows[0][1][0])}, which is no ride")
     return [time - times[0] for time in times] if times[0] < 0 else times
 
 
@@ -168,12 +179,16 @@ def _column(text: str, at: int) -> _Column:
     return _Column(header["name"], header["unit"] or "", at) if header else _Column(text, "", at)
 
 
+def _is_missing(cell: object) -> bool:
+    return cell is None or (isinstance(cell, str) and cell.strip().lower() in _MISSING)
+
+
 def _values(file: Path, rows: Rows, column: _Column) -> list[float | None]:
     """The values of a column, None for an empty cell."""
     values: list[float | None] = []
     for line, row in rows:
         cell = row[column.at]
-        if cell is None or (isinstance(cell, str) and cell.strip().lower() in _MISSING):
+        if _is_missing(cell):
             values.append(None)
             continue
         try:

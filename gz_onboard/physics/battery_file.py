@@ -32,6 +32,7 @@ RESISTANCE = (1e-6, 10.0)  # ohm, of a cell: from the largest to a frozen one of
 CAPACITANCE = (1e-3, 1e8)  # F, of a cell's RC pair
 SMALLEST_STEP = 1e-6  # of SOC, V or degC, from point to point: a slope must stay a number
 LARGEST_ENTROPY = 5e-3  # V/K: of intercalation cells 1e-3 at most; more is mV/K
+NARROWEST_WINDOW = 0.1  # of the cells' charge: no vehicle carries ten times the cells that it uses
 LARGEST_SHIFT = 0.2  # V: real cells rest tens of mV apart from -20 to 25 degC; more is a mistyped unit
 
 
@@ -122,12 +123,10 @@ def _window(battery: Table) -> Window:
         return Window()
     table = battery.table("window")
     table.only(["low", "high", "sd", "source", "status"])
-    return Window(
-        table.number("low", low=0.0, high=HALF_FULL),
-        table.number("high", low=HALF_FULL, high=1.0),
-        table.number("sd", 0.01, low=0.0, high=HALF_FULL),
-        given=True,
-    )
+    low, high = table.number("low", low=0.0, high=HALF_FULL), table.number("high", low=HALF_FULL, high=1.0)
+    if high - low < NARROWEST_WINDOW:
+        raise table.error(f"must be {NARROWEST_WINDOW:g} or more above low, is {high:g} over {low:g}", "high")
+    return Window(low, high, table.number("sd", 0.01, low=0.0, high=HALF_FULL), given=True)
 
 
 def _entropy(battery: Table) -> tuple[Row, Row]:

@@ -382,7 +382,7 @@ def test_broken_lines_of_python_cans_formats_are_skipped_too(tmp_path: Path, suf
         ("a.log", b"hello\n1,2\n", "line 1"),
         ("a.log", b"time,speed\n1,2\n", "a table of signals"),
         ("a.csv", b"time,speed\n1,2\n3,4\n", "a table of signals"),
-        ("a.csv", b"moment,speed\n1,2\n3,4\n", "line 2.*SavvyCAN"),
+        ("a.csv", b"moment,speed\n1,2\n3,4\n", ":1: neither.*SavvyCAN"),
         ("a.txt", b"hello\nworld\n", "'hello'"),
         ("a.trc", b"hello\n", "line 1"),
         ("a.asc", b"hello\nworld\n", "line 1"),

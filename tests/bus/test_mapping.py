@@ -329,6 +329,11 @@ def test_a_broken_dbc(tmp_path, change, parts):
         (("16|16@1- (0.1", "8|16@1- (0.1"), {"Pack.Voltage", "Pack.Current"}, "line 5: The signals .* overlapping"),
         (("24|8@1+ (1,-40)", "28|8@1+ (1,-40)"), {"Motor.Heat"}, "line 12: The signal Heat does not fit"),
         (("16|16@1- (0.1,0)", "16|16@1- (0,0)"), {"Pack.Current"}, "line 5: signal Current has a scale of 0"),
+        (
+            ("BA_DEF_ BO_", "SIG_VALTYPE_ 256 Current : 2;\nBA_DEF_ BO_"),
+            {"Pack.Current"},
+            "line 5: signal Current is a float of 16",
+        ),
         (("BO_ 256 Pack", "BO_ 4096 Pack"), {"Pack.*"}, "line 5: Standard frame id 0x1000 is more than 11 bits"),
         (("BO_ 256 Pack", "BO_ 256 2Pack"), {"2Pack.*"}, "line 5: Invalid syntax"),
         (("0|16@1- (1", "100000|16@1- (1"), {"Motor.Speed"}, "line 13: .*beyond the longest frame"),

@@ -46,6 +46,20 @@ def test_savvycan_without_the_direction_and_its_zeros_behind_the_data(tmp_path):
     assert frames_of(tmp_path, text) == [(5336724_000, 0x0F1, b"\x00\x02", 1)]
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"{SAVVYCAN}1700000000000000,120,false,Rx,0,1,90,\n",
+        "1700000000.0 1R11 120 90\n",
+        "(1700000000.0) can0 120#90\n",
+        "base dec timestamps absolute\n 1700000000.0 1 288 Rx d 1 144\n",
+    ],
+)
+def test_a_byte_order_mark_costs_no_line(tmp_path, text):
+    ((time, identifier, data, _),) = frames_of(tmp_path, f"\xef\xbb\xbf{text}")
+    assert (time, identifier, data) == (1_700_000_000 * S, 0x120, b"\x90")
+
+
 def test_savvycan_times_before_its_clock_was_set_begin_at_zero(tmp_path, caplog):
     text = f"{SAVVYCAN}-1621841258567223,1D0,false,Rx,0,1,6C,\n-1621841258567009,2C4,false,Rx,0,1,FF,\n"
     assert [frame[0] for frame in frames_of(tmp_path, text, "r.csv")] == [0, 214_000]

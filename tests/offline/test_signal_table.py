@@ -54,6 +54,12 @@ def test_columns_play_the_roles_of_their_names_in_si_and_empty_cells_are_missing
     assert plain(samples_of(tmp_path, RIDE)) == EXPECTED
 
 
+def test_columns_of_nothing_behind_the_last_are_passed_over(tmp_path):
+    assert plain(samples_of(tmp_path, RIDE.replace("\n", ",, \n"))) == EXPECTED
+    with pytest.raises(InputError, match=r"ride\.csv:1: column '' is no role"):
+        samples_of(tmp_path, RIDE.replace("\n", ",7\n").replace("plug,7", "plug,"))
+
+
 def test_semicolons_with_decimal_commas_and_other_encodings_and_packed(tmp_path):
     text = RIDE.replace(",", ";").replace(".", ",")
     file = tmp_path / "ride.csv.gz"
@@ -97,6 +103,14 @@ def test_parquet(tmp_path, monkeypatch):
     assert plain(read_samples(file, REFERENCE)) == EXPECTED
     with pytest.raises(InputError, match="a table of signals"):
         list(read_frames(file))
+    for zone in ("Europe/Berlin", "Mars/Olympus"):  # a zone is how the time is written, not what it is
+        columns["time"] = columns["time"].cast(pa.timestamp("us", zone), safe=False)
+        pq.write_table(pa.table(columns), file)
+        _, frames = open_ride(file, REFERENCE)
+        assert next(frames)[0][0] == 10 * 10**9
+    pq.write_table(pa.Table.from_arrays([*columns.values(), pa.array([1, 2, 3])], [*columns, "pack_voltage[V]"]), file)
+    with pytest.raises(InputError, match=r"ride\.parquet:1: two columns are called 'pack_voltage'"):
+        read_samples(file, REFERENCE)
     monkeypatch.setitem(sys.modules, "pyarrow", None)
     with pytest.raises(InputError, match=r"ride\.parquet: Parquet needs pyarrow"):
         read_samples(file, REFERENCE)
@@ -116,6 +130,8 @@ def test_parquet(tmp_path, monkeypatch):
         ("3500", "much", [":3: column 'pack_current' [mA]: 'much' is not a finite number"]),
         ("3500", "inf", [":3: column", "'inf' is not"]),
         ("3500,", "", [":3: 5 cells for 6 columns"]),
+        ("11.0,", "1714557600000,", [":4: time [s]: '1714557600000' s is no time", "call the column 'time [ms]'"]),
+        ("10.5,,3500,39.6,nan,0\n11.0,", "10.0,", ["time [s]: all rows have the same time, '10.0'"]),
     ],
 )
 def test_what_is_wrong_is_said_with_its_line(tmp_path, old, new, parts):
@@ -224,6 +240,13 @@ def test_a_table_of_a_ride_gives_the_estimate_of_its_frames(tmp_path):
     for key in ("soc_end", "soc_end_sd", "distance_km", "energy_wh", "range_end_km", "innovation_rms_v"):
         assert ours[key] == pytest.approx(theirs[key], rel=2e-3), key
     assert np.isfinite(ours["range_end_km"])
+
+
+@pytest.mark.parametrize("text", [RIDE.replace(",", "\t"), RIDE.encode("utf-16").decode("latin-1"), f"0{RIDE}"])
+def test_a_csv_that_is_neither_is_told_how_a_table_begins(tmp_path, text):
+    (tmp_path / "ride.csv").write_text(text, encoding="latin-1")
+    with pytest.raises(InputError, match=r"ride\.csv:1: neither .* nor a table .*'time \[s\],.*UTF-8.*begins with '"):
+        list(open_ride(tmp_path / "ride.csv", REFERENCE)[1])
 
 
 def test_logs_of_frames_and_tables_are_told_apart_in_the_errors_of_replay(tmp_path, capsys):

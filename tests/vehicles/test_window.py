@@ -69,6 +69,7 @@ def test_the_vehicles_own_state_of_charge_is_that_of_the_window(tmp_path):
         ("low = 0.1\nhigh = 85", "high: 85 is outside 0.5 to 1"),
         ("low = 0.1\nhigh = 0.85\nmiddle = 0.5", "unknown key"),
         ("low = 0.1", "high: is missing"),
+        ("low = 0.5\nhigh = 0.5", "high: must be 0.1 or more above low, is 0.5 over 0.5"),
     ],
 )
 def test_a_window_that_is_none_is_refused(wrong, message, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import mmap
 import re
 import zlib
+from codecs import BOM_UTF8
 from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -135,8 +136,8 @@ def unpacked(path: Path, data: Contents, damage: Damage) -> Contents:
 
 
 def text_pieces(data: Contents) -> Iterator[str]:
-    """The text in pieces of whole lines; bytes that are not ASCII do no harm."""
-    position = 0
+    """The text in pieces of whole lines, without a byte order mark; bytes that are not ASCII do no harm."""
+    position = len(BOM_UTF8) if data[: len(BOM_UTF8)] == BOM_UTF8 else 0
     while position < len(data):
         end = position + _PIECE
         if end < len(data):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from gz_onboard.bus.readers.common import BATCH, ChannelNumbers, Clock, Contents, Damage, Reader, text_pieces
-from gz_onboard.errors import InputError
+from gz_onboard.errors import InputError, shown
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 
 if TYPE_CHECKING:
@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 ASC_BASE = re.compile(r"^\s*base\s+(?P<base>hex|dec)(?:\s+timestamps\s+(?P<times>absolute|relative))?", re.I | re.M)
 _ASC_HEAD = 4000  # characters within which the base stands
+_BEGINNING = 100  # characters that show a reader what a file is
 _ASC_STAMP = re.compile(r"\s*(\d+\.\d+)(?=\s)")
 _ASC_LINE = re.compile(
     r"\s*(?:\d+\.\d+\s|//|date\b|base\b|(?:begin|end)\s+trigger|(?:no\s+)?internal\s+events|$)", re.I
@@ -81,7 +82,7 @@ def text_reader(suffix: str) -> Reader:
         feed, clock = _LineFeed(data), Clock(damage)
         reader: can.io.generic.MessageReader
         if suffix == ".asc":
-            base = ASC_BASE.search(str(data[:_ASC_HEAD], "latin-1"))
+            base = ASC_BASE.search(str(data[:_ASC_HEAD], "utf-8-sig", "replace"))
             feed.asc(damage, relative=bool(base and (base["times"] or "").lower() == "relative"))
             reader = can.ASCReader(cast("TextIO", feed), base["base"].lower() if base else "hex")
         else:
@@ -112,9 +113,14 @@ def text_reader(suffix: str) -> Reader:
                 yield clock.timed(batch)
                 batch = []
         if not any_frame and feed.number:
+            if damage.count and suffix == ".csv":
+                raise InputError(
+                    f"{path}:1: neither a log of frames (SavvyCAN's or python-can's CSV) nor a table of signals, which "
+                    "begins with 'time [s],' or 'time [s];' and is in UTF-8; it begins with "
+                    f"{shown(str(data[:_BEGINNING], 'latin-1').partition(chr(10))[0])}"
+                )
             if damage.count:
-                other = ", and the first line is no header of SavvyCAN's or of a table" if suffix == ".csv" else ""
-                raise InputError(f"{path}, {damage.place}: not a line of the format {suffix}: {damage.reason}{other}")
+                raise InputError(f"{path}, {damage.place}: not a line of the format {suffix}: {damage.reason}")
             if not _looks_like(suffix, data):
                 raise InputError(f"{path}, line 1: not a log in the format {suffix}: it has no header of that format")
         if batch:

@@ -94,6 +94,10 @@ def read_manifest(
 def _step(table: Table, name: str, slots: Mapping[str, Slot], options: Mapping[str, Option]) -> Step:
     table.only([*slots, *options, "columns", *(f"{slot}_columns" for slot in slots)])
     files = {slot: _files(table, slot) for slot in slots if slot in table.values}
+    fitted, held = ({file.resolve() for file in files.get(slot, ())} for slot in ("data", "held_out"))
+    if both := fitted & held:
+        name_of = min(file.name for file in both)
+        raise table.error(f"names {name_of}, which is in data too: what was fitted is not held out", "held_out")
     for slot, needed in slots.items():
         try:
             check_count(name, slot, needed, len(files.get(slot, ())))

@@ -34,6 +34,8 @@ from gz_onboard.offline.samples import Samples, ride_name
 from gz_onboard.physics.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
+ABOVE_CUTOFF = 0.2  # V: at C/8 or slower a nearly empty cell is that near its open-circuit voltage
+
 
 @dataclass
 class Given:
@@ -65,6 +67,17 @@ class Procedure:
     slots: Mapping[str, Slot]
     run: Callable[[Given], Result]
     options: Mapping[str, Option] = field(default_factory=dict)
+
+
+def _ocv(given: Given) -> Result:
+    result = ocv.calibrate(given.tables["data"][0])
+    cutoff, empty = given.vehicle.parameters["cell_cutoff_voltage"], float(result.curves["battery.ocv"].value[0])
+    if empty > cutoff + ABOVE_CUTOFF:
+        result.refusals.append(
+            f"the discharge ends at an open-circuit voltage of {empty:.2f} V, {empty - cutoff:.2f} V above "
+            f"cell_cutoff_voltage ({cutoff:g} V): what the cell holds in between is not in its capacity"
+        )
+    return result
 
 
 def _motor(given: Given) -> Result:
@@ -222,7 +235,7 @@ PROCEDURES: dict[str, Procedure] = {
     "ocv": Procedure(
         "open-circuit voltage and capacity of a cell from a slow discharge and charge",
         {"data": Slot("table", "a discharge (and charge) of C/8 or slower", 1, 1)},
-        lambda given: ocv.calibrate(given.tables["data"][0]),
+        _ocv,
     ),
     "pulse": Procedure(
         "R0, R1, C1 over state of charge and temperature from pulse tests of a cell",

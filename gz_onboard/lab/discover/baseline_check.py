@@ -19,6 +19,7 @@ from gz_onboard.physics.parameters import declared_parameters
 
 FAR = 4.0  # standard deviations of what was known, beyond which rides contradict it
 LEAST_RIDES = 5  # to hold two out at a time and learn from the others
+MOST_SAID = 3  # parameters: one bad signal may pull dozens
 WATT_HOURS = 3.6  # J/m of 1 Wh/km
 
 
@@ -51,7 +52,7 @@ def check_against_file(learned: Learned) -> None:
     if not found:
         return
     rows = []
-    for i in found:
+    for i in found[:MOST_SAID]:
         name, old = before.names[i], known[before.names[i]]
         new = after.values_at(after.mean)[name]
         wide = float(np.sqrt(after.prior[i, i]) * after.scale[i]) * (new if name in LOG_SCALED else 1.0)
@@ -61,6 +62,8 @@ def check_against_file(learned: Learned) -> None:
             f"{wide:.2g} {old.unit} by these rides, {far[i]:.0f} standard deviations apart; {channel} "
             f"({', '.join(CHANNEL[channel].roles)}) pulls it there, without which it is {without:.4g}"
         )
+    if more := len(found) - len(rows):
+        rows.append(f"and {more} more parameters are as far")
     raise InputError(
         "; ".join(rows) + ". Nothing is written. If these signals are poor, leave them out of [roles]; if the file "
         "only guesses, give it a larger sd"

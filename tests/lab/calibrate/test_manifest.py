@@ -67,6 +67,11 @@ def test_the_airflow_is_stated_by_file(folder):
         ('data = "a.csv"', 'dta = "a.csv"', r"calibration.toml:7: one.dta: unknown key \(did you mean 'data'\?\)"),
         ("a.csv", "aa.csv", r"calibration.toml:7: one.data: no file .*aa.csv \(did you mean 'a.csv'\?\)"),
         ('"c.blf"', '"b.blf"', r"calibration.toml:3: two.data: names b.blf twice"),
+        (
+            'data = "a.csv"',
+            'data = "a.csv"\nheld_out = ["./a.csv"]',
+            r"calibration.toml:8: one.held_out: names a.csv, which is in data too: what was fitted is not held out",
+        ),
         (', "c.blf"', "", r"calibration.toml:3: two.data: two needs rides \(data: 2 or more\), has 1"),
         ('"a.csv"', '["a.csv", "b.blf"]', r"one.data: one takes 1 for data \(a table\), has 2"),
         ('"a.csv"', "3", "must be the name of a file, or a list of them"),

@@ -106,6 +106,17 @@ def test_a_file_that_could_not_be_read_leaves_the_old_one_and_a_report(tmp_path,
     assert {f.name for f in tmp_path.iterdir()} == {"v.toml", "r.html", "ocv.csv"}
 
 
+def test_a_discharge_that_ends_far_above_the_cut_off_is_told(tmp_path, capsys):
+    table, _ = slow_test(charge=0)
+    half = np.arange(len(table)) < 620  # a little over half of it
+    cut = replace(table, columns={name: values[half] for name, values in table.columns.items()})
+    for some, told in ((cut, True), (table, False)):
+        arguments = ["calibrate", "ocv", as_csv(some, tmp_path / "ocv.csv"), "--output", str(tmp_path / "v.toml")]
+        assert main([*arguments, "--quiet"]) == 0
+        said = "above cell_cutoff_voltage (2.8 V)" in capsys.readouterr().out
+        assert said == told
+
+
 def test_a_step_that_fails_leaves_the_report_of_those_before(tmp_path, capsys):
     as_csv(slow_test()[0], tmp_path / "ocv.csv")
     (tmp_path / "calibration.toml").write_text('schema = 1\n[ocv]\ndata = "ocv.csv"\n[pulse]\ndata = "ocv.csv"\n')

@@ -91,3 +91,12 @@ def test_what_foretells_rides_held_out_worse_than_the_file_is_refused(mixed: Mix
 def test_too_few_rides_are_not_checked_and_it_is_said(mixed: MixedModel):
     few = learned(mixed, "road_force", "rolling_resistance_constant", 0.012, 0.012)
     assert "not checked on rides held out: 3 rides" in check_held_out(replace(few, lines=few.lines[:3]))
+
+
+def test_of_many_parameters_the_farthest_are_named_and_the_others_counted(mixed: MixedModel):
+    it = learned(mixed, "altitude", "wheel_radius", mixed.values["wheel_radius"] - 0.03, 0.0)
+    names = ["wheel_radius", "auxiliary_power", "drag_area", "cell_capacity", "payload_mass"]
+    mean = it.before.mean + np.isin(mixed.names, names) * 100.0
+    with pytest.raises(InputError, match=r"standard deviations apart.*; and 2 more parameters are as far") as error:
+        check_against_file(replace(it, after=replace(it.after, mean=mean)))
+    assert str(error.value).count("pulls it there") == 3
