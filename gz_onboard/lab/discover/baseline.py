@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.errors import InputError
-from gz_onboard.lab.discover.baseline_check import Learned, check_against_file, check_held_out
+from gz_onboard.lab.discover.baseline_check import Learned, check_against_file, check_held_out, rides_apart
 from gz_onboard.lab.discover.curves import with_inflation
 from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.linear import LinearRide, Noise, Normal, Posterior, learn_noise
@@ -47,7 +47,8 @@ def baseline(
     mixed = initial(vehicle, folder)
     learned = learn(mixed, [mixed.ride(samples) for samples in healthy], progress or (lambda _: None), workers)
     check_against_file(learned)
-    return adopted(vehicle, replace(learned.after, checked=check_held_out(learned)), mixed)
+    checked = "\nnote: ".join([check_held_out(learned), *rides_apart(learned)])
+    return adopted(vehicle, replace(learned.after, checked=checked), mixed)
 
 
 def adopted(vehicle: Vehicle, mixed: MixedModel, before: MixedModel) -> Vehicle:

@@ -18,6 +18,7 @@ from gz_onboard.lab.discover.prior import LOG_SCALED
 from gz_onboard.physics.parameters import declared_parameters
 
 FAR = 4.0  # standard deviations of what was known, beyond which rides contradict it
+APART = 12.0  # times what differs between rides: of eight healthy rides 5 at most, of a current 30 % wrong in one 61
 LEAST_RIDES = 5  # to hold two out at a time and learn from the others
 MOST_SAID = 3  # parameters: one bad signal may pull dozens
 WATT_HOURS = 3.6  # J/m of 1 Wh/km
@@ -44,11 +45,10 @@ def check_against_file(learned: Learned) -> None:
     Terms of a loss curve from a bench are not judged one by one: they stand in for each other.
     """
     before, after = learned.before, learned.after
-    known, declared = before.vehicle.parameters.known, declared_parameters(before.vehicle.model.effects)
+    known = before.vehicle.parameters.known
     sd = np.sqrt(np.diag(before.prior) + learned.usual_scatter)
     far = np.abs(after.mean - before.mean) / sd
-    of_file = [i for i, name in enumerate(before.names) if name in known and not declared[name].bench]
-    found = [i for i in sorted(of_file, key=lambda i: -far[i]) if far[i] > FAR]
+    found = [i for i in sorted(_judged(before), key=lambda i: -far[i]) if far[i] > FAR]
     if not found:
         return
     rows = []
@@ -68,6 +68,30 @@ def check_against_file(learned: Learned) -> None:
         "; ".join(rows) + ". Nothing is written. If these signals are poor, leave them out of [roles]; if the file "
         "only guesses, give it a larger sd"
     )
+
+
+def _judged(before: MixedModel) -> list[int]:
+    """Where the parameters of the file are that are no terms of a loss curve from a bench."""
+    known, declared = before.vehicle.parameters.known, declared_parameters(before.vehicle.model.effects)
+    return [i for i, name in enumerate(before.names) if name in known and not declared[name].bench]
+
+
+def rides_apart(learned: Learned) -> list[str]:
+    """Rides in which a parameter of the file is more than `APART` usual scatters from the others, a sentence each."""
+    before = learned.before
+    own = before.fit(before.normals(learned.lines)).own
+    own = own - np.median(own, axis=0)  # the mean has moved towards a ride that is far
+    sd = np.sqrt(learned.usual_scatter)
+    judged = [i for i in _judged(before) if sd[i] > 0]
+    found = []
+    for line, row in zip(learned.lines, own, strict=True):
+        i = max(judged, key=lambda i: abs(row[i] / sd[i]))
+        if (far := abs(row[i] / sd[i])) > APART:
+            found.append(
+                f"{line.ride.name} alone differs in {before.names[i]} by {far:.0f} times what rides do; is it healthy, "
+                "and are its signals right?"
+            )
+    return found
 
 
 def pulling(learned: Learned, i: int) -> tuple[str, float]:

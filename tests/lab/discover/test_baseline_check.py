@@ -10,7 +10,7 @@ import pytest
 from gz_onboard.arrays import Array
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.baseline import adopted
-from gz_onboard.lab.discover.baseline_check import Learned, check_against_file, check_held_out
+from gz_onboard.lab.discover.baseline_check import Learned, check_against_file, check_held_out, rides_apart
 from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.grid import Ride
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide
@@ -100,3 +100,13 @@ def test_of_many_parameters_the_farthest_are_named_and_the_others_counted(mixed:
     with pytest.raises(InputError, match=r"standard deviations apart.*; and 2 more parameters are as far") as error:
         check_against_file(replace(it, after=replace(it.after, mean=mean)))
     assert str(error.value).count("pulls it there") == 3
+
+
+def test_a_ride_whose_sensor_lies_is_named(mixed: MixedModel):
+    rolling = mixed.values["rolling_resistance_constant"]
+    alike = learned(mixed, "road_force", "rolling_resistance_constant", rolling, rolling)
+    assert rides_apart(alike) == []
+    odd = ride(mixed, "road_force", "rolling_resistance_constant", 3 * rolling)
+    lines = [*alike.lines[1:], replace(odd, ride=replace(odd.ride, name="ride_7"))]
+    (said,) = rides_apart(replace(alike, lines=lines))
+    assert said.startswith("ride_7 alone differs in rolling_resistance_constant by ")
