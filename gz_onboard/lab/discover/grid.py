@@ -15,8 +15,8 @@ from gz_onboard.arrays import Array, Mask, running_mean
 from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.errors import InputError
 from gz_onboard.events import LOADS
-from gz_onboard.lab.discover.sizes import sizes_of
 from gz_onboard.lab.discover.stand_ins import PACK, USUAL_DELAYS, stand_ins
+from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import MOVING, Port
 from gz_onboard.physics.model import air_density, total

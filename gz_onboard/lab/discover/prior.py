@@ -16,7 +16,7 @@ from math import exp
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.sizes import nearest_step, sizes_of
+from gz_onboard.lab.sizes import nearest_step, sizes_of
 from gz_onboard.physics.effect import Parameter
 from gz_onboard.vehicle import Vehicle
 

@@ -14,7 +14,7 @@ from gz_onboard.lab.discover.curve_forms import KNOTS, CurveForm
 from gz_onboard.lab.discover.grid import MOST_STEERING, steering
 from gz_onboard.lab.discover.mixed_model import initial
 from gz_onboard.lab.discover.prior import NUISANCE
-from gz_onboard.lab.discover.sizes import USUAL_SIZES, nearest_step, sizes_of
+from gz_onboard.lab.sizes import USUAL_SIZES, nearest_step, sizes_of
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import known_effects, load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
