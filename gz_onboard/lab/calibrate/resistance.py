@@ -123,7 +123,8 @@ def _ride_steps(
 ) -> tuple[Array, Array, Array] | None:
     """(steps of current [A], falls of voltage [V], the cells' part of the resistance [ohm]) of a ride, each (m,).
 
-    None for a ride without steps above `least` [A], or at a temperature at which the cells' part is too large or not known.
+    None for a ride without steps above `least` [A], or at a temperature at which the cells' part is too large or not
+    known.
     """
     battery = vehicle.pack
     temperature = _mean_of(ride, "cell_temperature")
