@@ -9,6 +9,7 @@ from gz_onboard.estimator.redundancy.checks import MOVING, NO_SENSOR, STUCK_AFTE
 from gz_onboard.estimator.road import accelerated
 from gz_onboard.estimator.signals import FIX_2D, Signals
 from gz_onboard.events import SPEEDS
+from gz_onboard.physics.sensors import speed_factors
 
 REVERSE = 4.0  # m/s: no road vehicle goes back faster; slower, wheels and GPS do not show the direction
 SPEED_APART, SPEED_APART_RELATIVE = 1.0, 0.12  # m/s and 1: two speeds that differ by more contradict each other
@@ -88,7 +89,7 @@ class SpeedCheck:
     ROLES = SPEEDS
 
     def __init__(self, radius: float, gear: float) -> None:
-        self._scale = {"motor_speed": radius * gear, "wheel_speed_rear": radius, "wheel_speed_front": radius}
+        self._scale = speed_factors(radius, gear)
         self.counters = counters(self.ROLES)
         self._last = dict.fromkeys(self.ROLES, 0.0)  # m/s
         self.still = dict.fromkeys(self.ROLES, 0.0)  # s without a change
@@ -167,7 +168,7 @@ class SpeedCheck:
                 signal.trusted = step.signals.gps_course.trusted = not step.signals.fix_below(step.now, FIX_2D)
             if reported is None or (role == "gps_speed" and not signal.trusted):
                 continue
-            speed = reported * self._scale.get(role, 1.0)
+            speed = reported * self._scale[role]
             speeds[role] = speed if speed < -REVERSE else abs(speed)
             apart[role] = SPEED_APART + SPEED_APART_RELATIVE * abs(speed) + BRAKING * max(step.now - signal.time, 0.0)
             self.still[role] = 0.0 if speed != self._last[role] else self.still[role] + step.observed

@@ -20,7 +20,7 @@ from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import MOVING, Port
 from gz_onboard.physics.model import air_density, total
-from gz_onboard.physics.sensors import true_current, true_voltage
+from gz_onboard.physics.sensors import grade_shown, road_speed, true_current, true_voltage
 from gz_onboard.physics.vibration import Vibration
 from gz_onboard.vehicle import Vehicle
 
@@ -162,7 +162,7 @@ def read_ride(samples: Samples, vehicle: Vehicle) -> Ride:
         signals[role] = averaged(times, turned, at)
         valid[role] = measured(times, at)
     p = vehicle.parameters
-    ride = Ride(samples.name, grid - start, signals, valid, p["wheel_radius"] * p["gear_ratio"], samples.rider_mass)
+    ride = Ride(samples.name, grid - start, signals, valid, road_speed(1.0, p), samples.rider_mass)
     ride.periods = {role: float(np.median(np.diff(times))) for role, (times, _) in samples.columns.items()}
     ride.stand_ins, ride.current_size = words, sizes_of(vehicle).current
     ride.quantities = _quantities(ride, p)
@@ -298,7 +298,7 @@ def _quantities(ride: Ride, p: Mapping[str, float]) -> dict[str, Array]:
     lateral = GRAVITY * sine / np.sqrt(1 - sine**2)
     grade = np.zeros(n)
     if "accel_x" in s:
-        grade = smooth((s["accel_x"] - acceleration) / GRAVITY, CLIMBING)
+        grade = smooth(grade_shown(s["accel_x"], acceleration), CLIMBING)
     elif "gps_altitude" in s:
         grade = grade_by_altitude(s["gps_altitude"], speed)
     moved = np.cumsum(np.abs(speed) > MOVING) * STEP

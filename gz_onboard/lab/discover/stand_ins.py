@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from gz_onboard.errors import InputError
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.sensors import speed_role
+from gz_onboard.physics.sensors import road_speed, speed_role
 from gz_onboard.vehicle import Vehicle
 
 USUAL_DELAYS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}
@@ -32,7 +32,7 @@ def stand_ins(samples: Samples, vehicle: Vehicle) -> tuple[Samples, tuple[str, .
     if "motor_speed" not in columns:
         role, factor = speed_role(f"ride {samples.name}", columns, p)
         times, values = columns.pop(role)
-        factor /= p["wheel_radius"] * p["gear_ratio"]
+        factor /= road_speed(1.0, p)
         columns["motor_speed"] = times - delays(vehicle).get(role, 0.0), values * factor
         words.append(f"motor_speed: {role} stands in, by wheel radius and gear ratio of the vehicle file")
     if "motor_current" not in columns and "motor_torque" in columns:
