@@ -16,14 +16,11 @@ SPEED_APART, SPEED_APART_RELATIVE = 1.0, 0.12  # m/s and 1: two speeds that diff
 BRAKING = 5.0  # m/s²: how fast a speed can have changed since its sensor last reported
 DRIFT_TIME = 20.0  # s, low pass
 DRIFT_APART, DRIFT_APART_RELATIVE = 0.2, 0.08  # the same for the low-passed: tyres and scales err by a few percent
-AXLE = frozenset(
-    {"motor_speed", "wheel_speed_rear"}
-)  # what turns on a roller bench or spins while the vehicle does not move
+# What turns on a roller bench or spins while the vehicle does not move.
+AXLE = frozenset({"motor_speed", "wheel_speed_rear"})
 GROUND = "wheel_speed_front", "gps_speed"
-SPIN_TIME, SPIN_MOST = (
-    20.0,
-    30.0,
-)  # s: wheels hold no ratio to the ground they spin on for so long; most that is counted
+# s: wheels hold no ratio to the ground they spin on for so long; most that is counted
+SPIN_TIME, SPIN_MOST = 20.0, 30.0
 RATIO_APART = 0.15  # ratios that differ by less are the same: speeds are late by a second while the vehicle accelerates
 ODOMETRY = frozenset({"motor_speed", "wheel_speed_rear", "wheel_speed_front"})  # what a vehicle speed is made from
 
