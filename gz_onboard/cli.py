@@ -69,9 +69,8 @@ def command_line(called: Collection[str]) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"gz-onboard {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
     for name, (module, text) in COMMANDS.items():
-        command = commands.add_parser(
-            name, help=text.replace("%", "%%"), description=text, allow_abbrev=False
-        )  # argparse expands % in the former only
+        help_ = text.replace("%", "%%")  # argparse expands % in it, and not in the description
+        command = commands.add_parser(name, help=help_, description=text, allow_abbrev=False)
         if name in called:
             importlib.import_module(module).add_arguments(command)
     return parser

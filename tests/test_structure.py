@@ -50,7 +50,7 @@ ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py"}
 # that stand before it.
 STAGES = {
     "plain data": ["result", "wording"],
-    "read": ["sizes", "stand_ins", "grid"],
+    "read": ["stand_ins", "grid"],
     "residuals": ["system", "residuals", "pack_power", "channels", "blocks"],
     "linear model": ["prior", "candidates", "linear", "mixed_model", "uncalibrated", "baseline_file"],
     "search": ["search", "curve_forms", "curves", "selection"],

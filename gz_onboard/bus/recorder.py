@@ -239,9 +239,8 @@ class Recorder:
         room = free - keep + total  # that all of ours may take together
         if room < _LEAST_ROOM:
             raise OSError(errno.ENOSPC, f"no room for a log: {max(free, 0) >> 10} kB are free", str(self._directory))
-        self._file_bytes = min(
-            self._limits.max_file_bytes, room // 4
-        )  # on a small disk small ones: the oldest goes whole
+        # on a small disk small ones: the oldest goes whole
+        self._file_bytes = min(self._limits.max_file_bytes, room // 4)
         allowed = min(self._limits.max_total_bytes, room) - self._file_bytes
         for path, size in sizes.items():
             if total <= allowed:

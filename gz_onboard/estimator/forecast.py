@@ -26,6 +26,7 @@ from gz_onboard.estimator.load_model import AHEAD, Conditions, EffectInputs, Loa
 from gz_onboard.estimator.ridden import FACTOR, MEMORY, Past, Riding, Second, Segment, restored, restored_states
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.drawable import Drawable, drawable
+from gz_onboard.physics.effects.inertia import rotating_mass
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.riding import PriorRiding
 
@@ -84,6 +85,8 @@ class Forecaster:
         self.riding = Riding(factor=prior.factor, factor_variance=prior.factor_sd**2)
         self._past = Past()
         self._overpotential = model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
+        self._weight = model.mass * GRAVITY  # N
+        self._moving_mass = model.mass + rotating_mass(model.parameters)  # kg, with what rotates
         self._capacity_sd = model.parameters.sd("cell_capacity") / model.parameters["cell_capacity"]
 
     # --- learning ---------------------------------------------------------------------------------------------
@@ -119,8 +122,8 @@ class Forecaster:
         segment.measured += r.second.energy
         segment.squares += r.second.squares
         segment.modelled += modelled
-        stored = GRAVITY * r.second.climb + (speed * speed - before * before) / 2
-        segment.level += to_come - self.load.model.mass * stored
+        stored = self._weight * r.second.climb + self._moving_mass * (speed * speed - before * before) / 2
+        segment.level += to_come - stored
         r.second, r.speed_before = Second(), speed
         if segment.distance < SEGMENT:
             return False
@@ -178,7 +181,7 @@ class Forecaster:
         r.factor_variance += FACTOR_WALK**2
         if segment.modelled > 0:
             noise = SEGMENT_SD * self._past.level / self._past.distance * segment.distance
-            height = self.load.model.mass * GRAVITY * HEIGHT_WALK * sqrt(segment.unseen)
+            height = self._weight * HEIGHT_WALK * sqrt(segment.unseen)
             variance = (noise * noise + height * height) / segment.modelled**2
             gain = r.factor_variance / (r.factor_variance + variance)
             r.factor += gain * (segment.measured / segment.modelled - r.factor)

@@ -25,9 +25,8 @@ Quantities = dict[str, float]
 """By name what effects read: see `physics.effect.QUANTITIES`."""
 AHEAD = 1800.0  # s: half of what a range lasts
 WARM_MOTOR = 40.0  # degC: a motor at work, where its temperature is not known
-HEADINGS = tuple(
-    pi / 4 * i for i in range(8)
-)  # rad: of a wind slower than the scooter their mean is that of all, exactly
+# rad: of a wind slower than the vehicle their mean is that of all, exactly
+HEADINGS = tuple(pi / 4 * i for i in range(8))
 USUAL_AIR = MILD, 0.0  # degC, m: of the usual force
 AMBIENT_DIGITS, ALTITUDE_DIGITS = 0, -2  # the prior riding is modelled anew for each degC and each 100 m
 BASE = {

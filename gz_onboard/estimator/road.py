@@ -13,6 +13,7 @@ from math import asin, atan, atan2, cos, pi, sin
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.signals import FIX_3D, Signals
+from gz_onboard.physics.sensors import grade_shown, speed_factors
 
 SPEED_TIME = 0.3  # s: the speed's low pass, whose lag gives the acceleration
 LEAN_TIME = 2.0  # s: how fast the lean is drawn to that of the steady turn
@@ -77,20 +78,12 @@ class RoadState:
             self.altitude = None
 
     def _update_speed(self, now: float, dt: float, signals: Signals, radius: float, gear: float) -> None:
-        motor = signals.motor_speed.mean(now)
-        rear, front = signals.wheel_speed_rear.mean(now), signals.wheel_speed_front.mean(now)
-        speed: float | None = None
-        if motor is not None:
-            speed = motor * gear * radius
-        elif rear is not None:
-            speed = rear * radius
-        elif front is not None:
-            speed = front * radius
+        for role, factor in speed_factors(radius, gear).items():
+            shown = signals[role].mean(now)
+            if shown is not None:
+                speed = shown * factor
+                break
         else:
-            speed = signals.vehicle_speed.mean(now)
-            if speed is None:
-                speed = signals.gps_speed.get(now)
-        if speed is None:
             self.speed = self.acceleration = None
             return
         if self.speed is None:
@@ -145,7 +138,7 @@ class RoadState:
             self.grade = None
             return
         if forward is not None and self.acceleration is not None:
-            sine = min(max((forward - self.acceleration) / GRAVITY, -1.0), 1.0)
+            sine = min(max(grade_shown(forward, self.acceleration), -1.0), 1.0)
             self.accelerometer_grade += (sine - self.accelerometer_grade) * min(dt / GRADE_TIME, 1.0)
         else:
             self.accelerometer_grade = 0.0

@@ -15,6 +15,7 @@ from gz_onboard.estimator.signals import Signal, Signals
 from gz_onboard.estimator.timing import SLOW_GAP
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.parameters import Parameters
+from gz_onboard.physics.sensors import true_current, true_voltage
 
 MISMATCH = 3 / 32.8  # 1/h between the two current sensors, over ten seconds or so
 MISMATCH_SHARE = 0.01  # of a step: the low pass of that
@@ -50,8 +51,7 @@ class PackSources:
     def __init__(self, signals: Signals, redundancy: Redundancy, battery: Battery, parameters: Parameters) -> None:
         p = parameters
         self._signals, self._currents, self._voltages = signals, redundancy.currents, redundancy.voltages
-        self._offset, self._gain = p["pack_current_offset"], p["pack_current_gain"]
-        self._voltage_offset, self._cable = p["pack_voltage_offset"], p["cable_resistance"]
+        self._parameters, self._cable = dict(p), p["cable_resistance"]
         self._voltage_sd = p.sd("pack_voltage_offset") / battery.cells_series
         self._auxiliary_power = p["auxiliary_power"]
         self._usual_voltage = battery.ocv(HALF_FULL)[0] * battery.cells_series
@@ -72,7 +72,7 @@ class PackSources:
         pack = signals.pack_current.reported(now)
         any_voltage = voltage if voltage is not None else inverter_voltage
         readings = Readings(
-            None if pack is None else (pack - self._offset) / self._gain,
+            None if pack is None else true_current(pack, self._parameters),
             signals.inverter_current.reported(now),
             signals.auxiliary_current.reported(now),
             self._auxiliary_power / (any_voltage or self._usual_voltage),
@@ -82,7 +82,7 @@ class PackSources:
         )
         current, source = self._current(dt, readings, evidence)
         if voltage is not None:
-            voltage -= self._voltage_offset
+            voltage = true_voltage(voltage, self._parameters)
         if inverter_voltage is not None:
             inverter_voltage += self._cable * (current or 0.0)
         together = _together(signals.pack_voltage, signals.inverter_voltage)

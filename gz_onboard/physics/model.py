@@ -19,6 +19,7 @@ from gz_onboard.physics.effect import QUANTITIES, Effect, Port, effect_file, loa
 from gz_onboard.physics.elementary import STANDSTILL, sqrt
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.relaxation import relaxation_over, relaxed
+from gz_onboard.physics.sensors import road_speed
 from gz_onboard.physics.trust import changeable, trusted_users
 
 if TYPE_CHECKING:
@@ -202,7 +203,7 @@ class Model:
         self.reads: frozenset[str] = frozenset(name for effect in effects for name in effect.reads)
         self.cell_voltage = self._at[Port.CELL_VOLTAGE]
         self.mass = parameters["vehicle_mass"] + parameters["payload_mass"]
-        self._motor_per_speed = 1 / (parameters["wheel_radius"] * parameters["gear_ratio"])
+        self._motor_per_speed = 1 / road_speed(1.0, parameters)
 
     def at(self, *ports: Port) -> list[Bound]:
         """The effects at these ports."""

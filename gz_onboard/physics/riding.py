@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
 
-from gz_onboard.constants import MILD
+from gz_onboard.constants import MILD, WH_PER_KM
 from gz_onboard.physics.effect import QUANTITIES, failed
 from gz_onboard.physics.model import Bound, air_density
 
@@ -112,8 +112,9 @@ def check_riding(vehicle: Table, riding: PriorRiding, model: Model) -> None:
     if power > 0:
         return
     acceleration = sum(share * acceleration for share, _, acceleration in riding.points)
+    costs = power / riding.speed / WH_PER_KM
     raise vehicle.table("forecast").error(
-        f"by the model this riding costs {power / riding.speed / 3.6:.3g} Wh/km on a level road: it must cost energy. "
+        f"by the model this riding costs {costs:.3g} Wh/km on a level road: it must cost energy. "
         f"Its mean acceleration is {acceleration:.2g} m/s² (of a whole ride 0); see [parameters] too",
         "riding",
     )

@@ -8,7 +8,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
+from gz_onboard.events import SPEEDS
 
 if TYPE_CHECKING:
     from gz_onboard.arrays import Array
@@ -45,16 +47,22 @@ def road_speed(motor_speed: Any, parameters: Mapping[str, float]) -> Any:
     return motor_speed * (parameters["wheel_radius"] * parameters["gear_ratio"])
 
 
+def grade_shown(forward: Any, acceleration: Any) -> Any:
+    """Sine of the road's angle by a forward accelerometer, which shows gravity too; both [m/s²]."""
+    return (forward - acceleration) / GRAVITY
+
+
+def speed_factors(radius: float, gear: float) -> dict[str, float]:
+    """What makes m/s of a true speed, by role, the best first. radius of the wheel [m]; gear: wheel over motor."""
+    return dict(zip(SPEEDS, (radius * gear, radius, radius, 1.0, 1.0), strict=True))
+
+
 def speed_role(name: str, columns: Columns, parameters: Mapping[str, float]) -> tuple[str, float]:
     """(the best speed among the true `columns` of ride `name`, the factor that makes m/s of it): motor or wheel, before
     what is told of the vehicle. InputError if there is none.
     """
-    factors = {
-        "motor_speed": road_speed(1.0, parameters),
-        "wheel_speed_rear": parameters["wheel_radius"],
-        "vehicle_speed": 1.0,
-        "gps_speed": 1.0,
-    }
+    factors = speed_factors(parameters["wheel_radius"], parameters["gear_ratio"])
+    del factors["wheel_speed_front"]  # the discovery compares it with that of the driven wheel
     for role, factor in factors.items():
         if role in columns:
             return role, factor

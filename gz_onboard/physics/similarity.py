@@ -47,7 +47,7 @@ _LAWS: tuple[tuple[dict[str, float], str], ...] = (
     (_PACK_RESISTANCE, "pack_series_resistance cable_resistance bms_resistance"),
     (_CELLS, "pack_heat_capacity pack_conductance bms_heat_capacity bms_conductance"),
     ({"cell_capacity": 1.0}, "cell_mass"),
-    ({"cell_capacity": -1.0}, "slow_resistance"),
+    ({"cell_capacity": -1.0}, "slow_resistance charge_transfer_resistance"),
 )
 POWERS = {name: law for law, names in _LAWS for name in names.split()}
 """By parameter, the powers it grows with: of other parameters, of ``mass`` (with payload) and of the cells' numbers."""

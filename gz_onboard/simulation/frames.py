@@ -147,9 +147,8 @@ def _send(
             low, high = raw_range(signal, not_available=True)
             raw = np.arange(len(offsets), dtype=np.int64) % int(high - low + 1) + int(low)
         elif signal.name.startswith("IMU_") and signal.name.endswith("Counter"):
-            raw = np.minimum(
-                np.arange(len(offsets), dtype=np.int64) % 256, 254
-            )  # as the real one: never the code for no value
+            # as the real one: never the code for no value
+            raw = np.minimum(np.arange(len(offsets), dtype=np.int64) % 256, 254)
         else:
             rng = np.random.default_rng([seed, message.frame_id, index])
             values = _values(sensors.get(signal.name), truth, seconds, period_ns * 1e-9, rng)

@@ -231,7 +231,6 @@ def fit_dynamometer(recorded: Recorded) -> Dynamometer:
 
     Raises InputError if there was no roller, or it did not move.
     """
-
     if not recorded.on_dynamometer:
         raise InputError(f"{recorded.name}: no roller of a dynamometer was recorded")
     n = round(SPAN / recorded.dt)

@@ -8,12 +8,13 @@ from operator import attrgetter
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, running_mean
 from gz_onboard.constants import GRAVITY
 from gz_onboard.physics.effect import MOVING, Port
 from gz_onboard.physics.model import Bound, all_quantities, over, total
 from gz_onboard.simulation.run import Command
 from gz_onboard.simulation.scooter import Scooter
+from gz_onboard.simulation.turning.tyre import lean_of
 
 LEAN_TIME = 1.0  # s that a rider takes into a bend: the road's pieces change their curvature at once
 _ALIKE = "time speed wheel_speed distance climb throttle brake motor_current vibration"
@@ -61,15 +62,12 @@ class Truth:
     """Everything that the sensors read, as arrays over the steps; SI units, temperatures in degC, angles in rad.
 
     Those of `Trace`, and: ``acceleration`` and ``way`` (of the body over the ground: none on a dynamometer),
-    ``yaw_rate`` (left), ``lean`` (right; of a leaning chassis its own, else `_lean_of`), ``lean_rate``, ``pitch_rate``
+    ``yaw_rate`` (left), ``lean`` (right; of a leaning chassis its own, else `lean_of`), ``lean_rate``, ``pitch_rate``
     (nose down), ``heading`` (from north), ``north`` and ``east`` [m], ``auxiliary_power`` (of all effects at the DC
     link), ``auxiliary_current``. ``vibration`` is 0 unless the model reads it.
     """
 
     def __init__(self, columns: Mapping[str, Array], scooter: Scooter) -> None:
-
-        from gz_onboard.arrays import running_mean
-
         self.parameters = scooter.vehicle.parameters
         self.ambient = scooter.ambient
         self.on_dynamometer = scooter.dynamometer is not None
@@ -85,7 +83,10 @@ class Truth:
         if scooter.chassis.name == "leaning":
             c["lean"] = running_mean(c["chassis_lean"], width)
         else:
-            c["lean"] = _lean_of(-np.arctan(c["way"] ** 2 * curvature / GRAVITY), self.parameters)
+            # Nobody leans on a chassis without lean; its sensors are those of one that does.
+            crown, height = self.parameters["tyre_crown_radius"], self.parameters["cg_height"]
+            ideal = -np.arctan(c["way"] ** 2 * curvature / GRAVITY)
+            c["lean"] = np.array([lean_of(x, crown, height) for x in ideal.tolist()])
         c["lean_rate"] = np.gradient(c["lean"], dt)
         c["slope"] = np.arcsin(running_mean(c["grade"], width))
         c["pitch_rate"] = -np.gradient(c["slope"], dt)
@@ -122,13 +123,3 @@ class Truth:
     def constant(self, value: float) -> Array:
         """`value` at every step."""
         return np.full(self.count, value)
-
-
-def _lean_of(ideal: Array, p: Mapping[str, float]) -> Array:
-    """Lean [rad] of a machine on round tyres where a thin disc leans by `ideal`, as `turning.tyre.lean_of`.
-
-    A chassis without lean has nobody on it who leans; its sensors are those of one that does.
-    """
-    crown, height = p["tyre_crown_radius"], p["cg_height"]
-    lean: Array = ideal + np.arcsin(np.clip(crown * np.sin(ideal) / (height - crown), -1.0, 1.0))
-    return lean

@@ -10,6 +10,8 @@ import pytest
 
 from gz_onboard.estimator.forecast import PRIOR_LENGTH, Forecaster
 from gz_onboard.estimator.load_model import Conditions
+from gz_onboard.physics.effect import load_effect
+from gz_onboard.physics.model import Model
 from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference", 75.0)
@@ -69,6 +71,19 @@ def test_the_interval_narrows_with_riding():
     ride(f, 15)
     after = forecast(f)
     assert (after.p90 - after.p10) / after.range < 0.8 * (before.p90 - before.p10) / before.range
+
+
+def test_what_speed_stores_is_no_consumption():
+    """Neither is what the wheels store: in a vehicle without losses, all of an acceleration can be had again."""
+    model = Model((load_effect("inertia"),), VEHICLE.parameters)
+    f = Forecaster(model, VEHICLE.pack, VEHICLE.riding)
+    dt, spent = 0.02, 0.0
+    for step in range(1, 501):
+        v = 1.0 * step * dt
+        power = sum(model.power(f.load.quantities(v, 1.0, AIR)).values())
+        spent += power * dt
+        f.ride(dt, v, 0.0, power, AIR)
+    assert f.riding.current.level == pytest.approx(0.0, abs=0.003 * spent)
 
 
 def test_a_climb_is_not_taken_for_consumption():

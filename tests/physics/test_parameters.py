@@ -70,7 +70,8 @@ def test_what_no_guess_fits_is_asked_for(tmp_path, name):
 
 def test_priors_grow_with_the_vehicle(tmp_path):
     """Twice the reference scooter with its rider, with a gear: the same share of the power is lost."""
-    left_out = ("motor_copper_resistance", "motor_iron_quadratic", "pack_current_noise", "regeneration_torque_limit")
+    left_out = ["motor_copper_resistance", "motor_iron_quadratic", "pack_current_noise", "regeneration_torque_limit"]
+    left_out.append("charge_transfer_resistance")
     text = re.sub(rf"(?m)^({'|'.join(left_out)}) = .*\n", "", REFERENCE)
     for name, value in (("vehicle_mass", 290.0), ("gear_ratio", 0.1), ("cell_capacity", 28.0)):
         text = re.sub(rf"(?m)^{name} = {{ value = [\d.]+", f"{name} = {{ value = {value}", text)
@@ -80,7 +81,7 @@ def test_priors_grow_with_the_vehicle(tmp_path):
     big, usual = read_vehicle(str(tmp_path / "big.toml")).parameters, declared_parameters()
     torque = read_vehicle("reference").parameters["torque_constant"] / usual["torque_constant"].prior
     expected = {"motor_copper_resistance": torque**2 / 2 / 0.1**2, "motor_iron_quadratic": 2 * 0.1**2}
-    expected |= {"pack_current_noise": 10.0, "regeneration_torque_limit": 2 * 0.1}
+    expected |= {"pack_current_noise": 10.0, "regeneration_torque_limit": 2 * 0.1, "charge_transfer_resistance": 0.1}
     for name, size in expected.items():
         assert big[name] == pytest.approx(size * usual[name].prior), name
         assert big.sd(name) == pytest.approx(size * usual[name].prior_sd), name

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from gz_onboard.constants import GRAVITY
 from gz_onboard.errors import InputError
-from gz_onboard.physics.sensors import road_speed, speed_role, true_columns
+from gz_onboard.physics.sensors import grade_shown, road_speed, speed_factors, speed_role, true_columns
 
 P = {
     "pack_current_offset": 0.5,
@@ -16,6 +17,17 @@ P = {
     "wheel_radius": 0.25,
     "gear_ratio": 0.2,
 }
+
+
+def test_an_accelerometer_shows_the_hill_beside_the_wheels():
+    assert grade_shown(GRAVITY * 0.03 + 0.7, 0.7) == pytest.approx(0.03)
+
+
+def test_all_speeds_of_a_vehicle_are_one():
+    speed, (radius, gear) = 7.0, (P["wheel_radius"], P["gear_ratio"])
+    factors = speed_factors(radius, gear)
+    assert factors["motor_speed"] == road_speed(1.0, P) and factors["gps_speed"] == 1.0
+    assert factors["wheel_speed_front"] * speed / radius == pytest.approx(speed)
 
 
 def test_the_errors_of_the_sensors_are_taken_off():

@@ -16,6 +16,7 @@ from gz_onboard.estimator.redundancy.checks import faulty as faulty_roles
 from gz_onboard.estimator.redundancy.grade_difference import NEAR, DistanceMean, GradeDifference, Limits
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.signals import FIX_3D, Signals
+from gz_onboard.physics.sensors import grade_shown
 
 APART = Limits(0.05, 0.022, 0.08)
 APART_FROM_ENERGY = Limits(0.09, 0.06, 0.10)  # of a single witness against the energy
@@ -98,7 +99,7 @@ class GradeCheck:
         if forward is None:
             self._climb = None
         elif self._climb is not None:
-            self._climb += (forward - speeds.acceleration) / GRAVITY * distance
+            self._climb += grade_shown(forward, speeds.acceleration) * distance
             if self.gain.contradicts(dt, forward, speed, speeds.acceleration, speeds.on_road):
                 self.counters["accel_x"].update(dt, True)
         self._work = None if self._work is None or power is None else self._work + power * dt

@@ -9,20 +9,18 @@ from gz_onboard.estimator.redundancy.checks import MOVING, NO_SENSOR, STUCK_AFTE
 from gz_onboard.estimator.road import accelerated
 from gz_onboard.estimator.signals import FIX_2D, Signals
 from gz_onboard.events import SPEEDS
+from gz_onboard.physics.sensors import speed_factors
 
 REVERSE = 4.0  # m/s: no road vehicle goes back faster; slower, wheels and GPS do not show the direction
 SPEED_APART, SPEED_APART_RELATIVE = 1.0, 0.12  # m/s and 1: two speeds that differ by more contradict each other
 BRAKING = 5.0  # m/s²: how fast a speed can have changed since its sensor last reported
 DRIFT_TIME = 20.0  # s, low pass
 DRIFT_APART, DRIFT_APART_RELATIVE = 0.2, 0.08  # the same for the low-passed: tyres and scales err by a few percent
-AXLE = frozenset(
-    {"motor_speed", "wheel_speed_rear"}
-)  # what turns on a roller bench or spins while the vehicle does not move
+# What turns on a roller bench or spins while the vehicle does not move.
+AXLE = frozenset({"motor_speed", "wheel_speed_rear"})
 GROUND = "wheel_speed_front", "gps_speed"
-SPIN_TIME, SPIN_MOST = (
-    20.0,
-    30.0,
-)  # s: wheels hold no ratio to the ground they spin on for so long; most that is counted
+# s: wheels hold no ratio to the ground they spin on for so long; most that is counted
+SPIN_TIME, SPIN_MOST = 20.0, 30.0
 RATIO_APART = 0.15  # ratios that differ by less are the same: speeds are late by a second while the vehicle accelerates
 ODOMETRY = frozenset({"motor_speed", "wheel_speed_rear", "wheel_speed_front"})  # what a vehicle speed is made from
 
@@ -88,7 +86,7 @@ class SpeedCheck:
     ROLES = SPEEDS
 
     def __init__(self, radius: float, gear: float) -> None:
-        self._scale = {"motor_speed": radius * gear, "wheel_speed_rear": radius, "wheel_speed_front": radius}
+        self._scale = speed_factors(radius, gear)
         self.counters = counters(self.ROLES)
         self._last = dict.fromkeys(self.ROLES, 0.0)  # m/s
         self.still = dict.fromkeys(self.ROLES, 0.0)  # s without a change
@@ -167,7 +165,7 @@ class SpeedCheck:
                 signal.trusted = step.signals.gps_course.trusted = not step.signals.fix_below(step.now, FIX_2D)
             if reported is None or (role == "gps_speed" and not signal.trusted):
                 continue
-            speed = reported * self._scale.get(role, 1.0)
+            speed = reported * self._scale[role]
             speeds[role] = speed if speed < -REVERSE else abs(speed)
             apart[role] = SPEED_APART + SPEED_APART_RELATIVE * abs(speed) + BRAKING * max(step.now - signal.time, 0.0)
             self.still[role] = 0.0 if speed != self._last[role] else self.still[role] + step.observed

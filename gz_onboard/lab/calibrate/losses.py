@@ -49,7 +49,8 @@ def motor_losses(dyno: Measurements, largest_current: float = RIDING_CURRENT) ->
     )
     for parameter in TIED[1:]:
         result.parameters[parameter] = found.found(parameter, UNITS[parameter], source)
-    result.parameters["motor_copper_temperature_coefficient"] = Found(motor.COPPER, 1e-4, "1/K", "copper, IEC 60034-1")
+    copper = motor.COPPER
+    result.parameters[copper.name] = Found(copper.prior, copper.prior_sd, copper.unit, f"copper, {copper.source}")
     result.covariance.append((TIED, found.part(TIED)))
     _copper_with_speed(result, found, bench)
     spread = float(np.ptp(bench.temperature))
@@ -73,7 +74,7 @@ def motor_loss(solution: Solution, bench: Bench) -> Array:
         motor_iron_linear=solution["motor_iron_linear"],
         motor_iron_quadratic=solution["motor_iron_quadratic"],
     )
-    return motor.copper(solution, bench) + iron
+    return motor.copper_loss(bench, solution["motor_copper_resistance"], solution[motor.FREQUENCY]) + iron
 
 
 def _copper_with_speed(result: Result, found: Solution, bench: Bench) -> None:

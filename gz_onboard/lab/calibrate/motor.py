@@ -22,7 +22,7 @@ from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.physics.effects import motor_copper_loss
 
 RIDING_CURRENT = 120.0  # A: larger ones are short, and the constant falls with them
-COPPER = 0.00393  # 1/K (IEC 60034-1)
+COPPER = next(p for p in motor_copper_loss.PARAMETERS if p.unit == "1/K")  # how its resistance grows
 FREQUENCY = "motor_copper_frequency"
 SURE = 3.0  # sd, of a copper loss that grows with speed
 ROUGH = 0.02  # a point's torque sd is not known better than to this share of the greatest torque
@@ -122,7 +122,7 @@ def _solve(bench: Bench, use: Mask, with_speed: bool) -> Solution:
     with that sd; what its two equations share makes the covariance that of whole points.
     """
     w, i = bench.speed[use], bench.current[use]
-    copper = i**2 * (1 + COPPER * (bench.temperature[use] - BENCH_TEMPERATURE))
+    copper = copper_loss(bench, 1.0)[use]
     nothing, sign = np.zeros_like(w), np.sign(w)
     columns = {
         "torque_constant": np.concatenate([i, nothing]),
@@ -233,7 +233,7 @@ def _temperature_note(warming: Measurements) -> str:
     current, hot = warming["motor_current"], warming["motor_temperature"]
     on = np.abs(current - np.median(current[np.abs(current) > 1.0])) < 0.05 * np.max(np.abs(current))
     ratio = warming["shaft_torque"][on] / current[on]
-    slope = linear({"fall": hot[on] - 25, "at25": np.ones(int(on.sum()))}, ratio)
+    slope = linear({"fall": hot[on] - BENCH_TEMPERATURE, "at25": np.ones(int(on.sum()))}, ratio)
     percent = 100 * slope["fall"] / slope["at25"]
     return (
         f"{warming.file.name}: torque over current changes by {percent:+.3f} %/K of the winding's temperature, "
@@ -241,14 +241,14 @@ def _temperature_note(warming: Measurements) -> str:
     )
 
 
-def copper(solution: Solution, bench: Bench) -> Array:
-    """Copper loss [W] at all points."""
+def copper_loss(bench: Bench, resistance: float, frequency: float = 0.0) -> Array:
+    """Copper loss [W] at all points, of a `resistance` [ohm] that grows with `frequency` [s²/rad²]."""
     result: Array = motor_copper_loss.term(
         bench.current,
         bench.temperature,
         bench.speed,
-        motor_copper_resistance=solution["motor_copper_resistance"],
-        motor_copper_temperature_coefficient=COPPER,
-        motor_copper_frequency=solution[FREQUENCY],
+        motor_copper_resistance=resistance,
+        motor_copper_temperature_coefficient=COPPER.prior,
+        motor_copper_frequency=frequency,
     )
     return result

@@ -17,16 +17,20 @@ from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD
 from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, score
 from gz_onboard.lab.calibrate.result import Found, LackingError, Panel, PlotLine, Result
+from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle
 
 NEEDED = "pack_current pack_voltage inverter_current inverter_voltage motor_speed motor_current"
 LAGS = np.arange(-0.3, 0.31, 0.05)  # s: what one set of sensors may lag the other
-MOVING, DRIVING = 0.3, 3.0  # rad/s and A of the motor: below is rest
+# Of a vehicle of size 1, as all currents here:
+MOVING, DRIVING, FED = 0.3, 3.0, 2.0  # rad/s and A of the motor, A of the inverter: below is rest
+LEAST_SPAN = 5.0  # A, for a gain
 LEAST_REST = 20  # samples
+LEAST_APART = 0.01  # V, that two voltage sensors of a pack may differ by, however alike they read
 WINDOW = 2.0  # s: means over that separate gains from timing
-DRIFT_SD = 0.02  # A: of a current sensor's zero from day to day, the least that is believed
-AUXILIARY = 0.85  # A: of lamps and control, by which the auxiliary sensor's class counts
+DRIFT_SD, FIRST_SPREAD = 0.02, 0.05  # A of a current sensor's zero from day to day: the least believed; of one ride
+AUXILIARY = 0.85  # A of lamps and control, by which the auxiliary sensor's class counts
 GAIN_SD = 0.007  # of a current sensor of 1 % class
 
 
@@ -60,8 +64,9 @@ def read_pair(ride: Samples, vehicle: Vehicle) -> Pair:
         auxiliary = vehicle.parameters["auxiliary_power"] / np.maximum(at("pack_voltage"), 1.0)
     lag = float(min(LAGS, key=lambda x: float(np.std(pack - auxiliary - at("inverter_current", x)))))
     speed, current = np.abs(at("motor_speed")), np.abs(at("motor_current"))
-    rest = (speed < MOVING) & (current < DRIVING) & (np.abs(at("inverter_current", lag)) < 2.0)
     inverter, inverter_voltage = at("inverter_current", lag), at("inverter_voltage", lag)
+    size = sizes_of(vehicle).current
+    rest = (speed < MOVING) & (current < DRIVING * size) & (np.abs(inverter) < FED * size)
     return Pair(ride.name, time, pack, inverter, auxiliary, at("pack_voltage"), inverter_voltage, rest, lag)
 
 
@@ -76,21 +81,21 @@ def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     resting = [pair for pair in pairs if pair.rest.sum() >= LEAST_REST]
     if not resting:
         raise InputError(f"{pairs[0].name}: no ride stands without load for {LEAST_REST} samples; offsets show at rest")
-    p, result = vehicle.parameters, Result("offsets")
+    p, sizes, result = vehicle.parameters, sizes_of(vehicle), Result("offsets")
     own = np.array([p["inverter_loss_constant"] / pair.pack_voltage[pair.rest].mean() for pair in resting])
     apart = np.array([(pair.pack - pair.inverter - pair.auxiliary)[pair.rest].mean() for pair in resting])
     # of a ride to come: what differs from ride to ride, the inverter's own loss, and the auxiliary sensor's share
     own_sd = p.sd("inverter_loss_constant") / float(resting[0].pack_voltage.mean())
-    spread = float(np.std(apart - own, ddof=1)) if len(apart) > 1 else 0.05
-    offset = float(np.mean(apart - own))
+    spread = float(np.std(apart - own, ddof=1)) if len(apart) > 1 else FIRST_SPREAD * sizes.current
+    offset, auxiliary = float(np.mean(apart - own)), AUXILIARY * sizes.auxiliary / sizes.voltage
     result.parameters["pack_current_offset"] = Found(
         offset,
-        float(np.hypot(max(spread, DRIFT_SD), own_sd) + CURRENT_SD * AUXILIARY),
+        float(np.hypot(max(spread, DRIFT_SD * sizes.current), own_sd) + CURRENT_SD * auxiliary),
         "A",
         f"{len(resting)} rides at rest: pack less inverter less auxiliary is {apart.mean():+.3f} ± {spread:.3f} "
         f"A, {own.mean():.3f} A of it the inverter's own {p['inverter_loss_constant']:.1f} W",
     )
-    _gain(result, pairs)
+    _gain(result, pairs, LEAST_SPAN * sizes.current)
     noises = np.array([(_noise(pair.pack, pair.rest), _noise(pair.pack_voltage, pair.rest)) for pair in resting])
     for (name, unit), column in zip((("pack_current_noise", "A"), ("pack_voltage_noise", "V")), noises.T, strict=True):
         sd = float(column.std(ddof=1)) if len(column) > 1 else 0.2 * float(column.mean())
@@ -100,7 +105,7 @@ def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     volts = np.array([(pair.pack_voltage - pair.inverter_voltage)[pair.rest].mean() for pair in resting])
     result.parameters["pack_voltage_offset"] = Found(
         0.0,
-        float(max(abs(volts.mean()), 0.01)),
+        float(max(abs(volts.mean()), LEAST_APART * sizes.voltage)),
         "V",
         f"reads {volts.mean():+.3f} V over the inverter's at rest, {len(resting)} rides; which one errs is unknown",
     )
@@ -121,13 +126,13 @@ def window_means(pair: Pair, values: Array, seconds: float) -> Array:
     return block_means(values, count)
 
 
-def _gain(result: Result, pairs: Sequence[Pair]) -> None:
-    """The pack's current over inverter's and auxiliary together, by ride."""
+def _gain(result: Result, pairs: Sequence[Pair], least: float) -> None:
+    """The pack's current over inverter's and auxiliary together, by ride, if they span `least` [A]."""
     total = [window_means(pair, pair.inverter + pair.auxiliary, WINDOW) for pair in pairs]
     pack = [window_means(pair, pair.pack, WINDOW) for pair in pairs]
     x, y = np.concatenate(total), np.concatenate(pack)
     labels = np.concatenate([np.full(len(column), k) for k, column in enumerate(total)])
-    if np.ptp(x) < 5.0:
+    if np.ptp(x) < least:
         result.refusals.append(f"pack_current_gain: currents of {x.min():.1f} to {x.max():.1f} A only tell no gain")
         return
     fitted = every_second(labels)

@@ -16,6 +16,7 @@ from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, linear, 
 from gz_onboard.lab.calibrate.offsets import read_pair, window_means
 from gz_onboard.lab.calibrate.result import Found, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
+from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.relaxation import decay_over
@@ -23,10 +24,10 @@ from gz_onboard.physics.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
 
 STEP_TIME = 0.2  # s
-LEAST_STEP = 15.0  # A
+LEAST_STEP = 15.0  # A, in a vehicle of size 1
 LEAST_STEPS = 20
 FIRST = 5  # readings whose medians tell the state of charge at the start
-LEAST_SPAN = 10.0  # A: of current, for a line
+LEAST_SPAN = 10.0  # A, in a vehicle of size 1: of current, for a line
 MEAN_OF = 1.0  # s: timing counts less then
 WARM = 20.0  # degC: below the cells' resistance is many times that of bars and fuse
 VOLTAGE_GAIN_SD = 1e-3  # of each voltage sensor: a volt of either's gain over the sag of the pack looks like resistance
@@ -45,10 +46,11 @@ def cable_resistance(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     if not rows:
         raise InputError("no ride, which cable_resistance comes from")
     (i, v, pack), label = (np.concatenate(column) for column in zip(*rows, strict=True)), np.concatenate(labels)
-    if np.ptp(i) < LEAST_SPAN:
+    span = LEAST_SPAN * sizes_of(vehicle).current
+    if np.ptp(i) < span:
         raise InputError(
             f"{rides[0].name}: inverter_current of {i.min():.1f} to {i.max():.1f} A spans too little for a resistance; "
-            f"{LEAST_SPAN:g} A are needed"
+            f"{span:g} A are needed"
         )
     fitted = every_second(label)
     found, model, outside = line("cable_resistance", i, v, fitted, as_groups(label))
@@ -83,13 +85,13 @@ def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: S
     the cells' own doubt is greater than what is left.
     """
     result = Result("pack_series_resistance")
-    by_temperature = cell_steps(pulses) if pulses else None
-    of_rides = [_ride_steps(ride, vehicle, by_temperature, result) for ride in rides]
+    by_temperature, least = cell_steps(pulses) if pulses else None, LEAST_STEP * sizes_of(vehicle).current
+    of_rides = [_ride_steps(ride, vehicle, by_temperature, least, result) for ride in rides]
     steps = [columns for columns in of_rides if columns is not None]
     count = sum(len(di) for di, _, _ in steps)
     if count < LEAST_STEPS:
         raise InputError(
-            f"{count} steps of more than {LEAST_STEP:g} A within {STEP_TIME:g} s above {WARM:g} degC are "
+            f"{count} steps of more than {least:g} A within {STEP_TIME:g} s above {WARM:g} degC are "
             f"too few for pack_series_resistance; {LEAST_STEPS} are needed"
         )
     di, dv, cell = (np.concatenate(column) for column in zip(*steps, strict=True))
@@ -100,7 +102,7 @@ def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: S
     whole = linear({"whole": di}, dv)["whole"]
     origin = "the pulse tests' steps" if pulses else "the cell tables"
     source = (
-        f"{len(di)} steps above {LEAST_STEP:g} A within {STEP_TIME:g} s of {len(steps)} rides above {WARM:g} degC: "
+        f"{len(di)} steps above {least:g} A within {STEP_TIME:g} s of {len(steps)} rides above {WARM:g} degC: "
         f"{1e3 * whole:.1f} mohm, less {1e3 * cell.mean():.1f} mohm of {origin}"
     )
     model = (cell + found["series"]) * di
@@ -117,11 +119,12 @@ def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: S
 
 
 def _ride_steps(
-    ride: Samples, vehicle: Vehicle, by_temperature: tuple[Array, Array] | None, result: Result
+    ride: Samples, vehicle: Vehicle, by_temperature: tuple[Array, Array] | None, least: float, result: Result
 ) -> tuple[Array, Array, Array] | None:
     """(steps of current [A], falls of voltage [V], the cells' part of the resistance [ohm]) of a ride, each (m,).
 
-    None for a ride without large steps, or at a temperature at which the cells' part is too large or not known.
+    None for a ride without steps above `least` [A], or at a temperature at which the cells' part is too large or not
+    known.
     """
     battery = vehicle.pack
     temperature = _mean_of(ride, "cell_temperature")
@@ -133,7 +136,7 @@ def _ride_steps(
     voltage = np.interp(time, *columns["pack_voltage"])
     stride = max(round(STEP_TIME / float(np.median(np.diff(time)))), 1)
     step, drop = current[stride:] - current[:-stride], -(voltage[stride:] - voltage[:-stride])
-    big = np.abs(step) > LEAST_STEP
+    big = np.abs(step) > least
     if not big.any():
         return None
     if by_temperature is None:

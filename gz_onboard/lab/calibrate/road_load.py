@@ -17,6 +17,7 @@ from scipy.optimize import minimize_scalar
 from gz_onboard.arrays import Array
 from gz_onboard.lab.calibrate.coastdown_run import Coast
 from gz_onboard.physics.effect import ROAD_LOAD, Port
+from gz_onboard.physics.effects.inertia import rotating_mass
 from gz_onboard.physics.model import Bound, air_density, all_quantities, total
 from gz_onboard.physics.sensors import road_speed
 from gz_onboard.vehicle import Vehicle
@@ -35,7 +36,7 @@ class RoadLoad:
         self._road = [e for e in effects if e.effect.port in ROAD_LOAD and "acceleration" not in e.effect.quantities]
         self._motor = [e for e in effects if e.effect.port is Port.MOTOR_LOSS]
         self._vibration = vehicle.riding.vibration  # a coast-down shows no road that is rougher than others
-        self.rotating = (p["wheel_inertia_front"] + p["wheel_inertia_rear"]) / p["wheel_radius"] ** 2
+        self.rotating = rotating_mass(p)
 
     def __call__(self, speed: Any, run: Coast, slope: float, wind: float, density: float = 1.0) -> Any:
         """Force [N] at `speed` [m/s] (above zero). slope: sine, uphill in direction +1. wind [m/s]: against it.

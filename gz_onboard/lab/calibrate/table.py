@@ -118,12 +118,12 @@ class Measurements:
         return InputError(f"{self.file}{'' if row is None else f':{self.line(row)}'}: {message}")
 
 
-def read_table(file: Path, columns: Mapping[str, Named] | None = None, needed: Sequence[str] = ()) -> Measurements:
+def read_table(file: Path, columns: Mapping[str, Named] | None = None) -> Measurements:
     """The table in `file`.
 
-    columns: for a file with names of its own, the column of each quantity; all others are left out. needed: quantities
-    without which the file is of no use. Raises InputError naming file, line, column and value for a file that cannot be
-    read, for a missing column or unit, for what is not a finite number, and for a time that goes back.
+    columns: for a file with names of its own, the column of each quantity; all others are left out. Raises InputError
+    naming file, line, column and value for a file that cannot be read, for a missing column or unit, for what is not a
+    finite number, and for a time that goes back.
     """
     names, raw, lines = _read_parquet(file) if file.suffix in (".parquet", ".pq") else _read_csv(file)
     found: dict[str, Array] = {}
@@ -137,8 +137,6 @@ def read_table(file: Path, columns: Mapping[str, Named] | None = None, needed: S
         else:
             found[quantity] = array
     table = Measurements(file, found, lines, trouble)
-    for quantity in needed:
-        table[quantity]
     if columns and trouble:  # what somebody has named must be of use
         raise InputError(f"{file}: {next(iter(trouble.values()))}")
     if "time" in found:

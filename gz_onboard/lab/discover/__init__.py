@@ -2,7 +2,7 @@
 
 A pipeline, each stage with one thing in and one out. A module imports from the stages before its own only.
 
-    read          samples -> `Ride`: a ride on one grid of time                          sizes, grid
+    read          samples -> `Ride`: a ride on one grid of time                          grid
     residuals     `Ride` -> each channel, measured less model                            system, residuals, channels,
                                                                                          blocks
     linear model  `Ride` -> `LinearRide` about a `MixedModel`                            prior, candidates, linear,

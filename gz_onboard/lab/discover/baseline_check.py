@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gz_onboard.arrays import Array
+from gz_onboard.constants import WH_PER_KM
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.cross_validation import start_equations, with_own_start
@@ -21,7 +22,6 @@ FAR = 4.0  # standard deviations of what was known, beyond which rides contradic
 APART = 12.0  # times what differs between rides: of eight healthy rides 5 at most, of a current 30 % wrong in one 61
 LEAST_RIDES = 5  # to hold two out at a time and learn from the others
 MOST_SAID = 3  # parameters: one bad signal may pull dozens
-WATT_HOURS = 3.6  # J/m of 1 Wh/km
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def check_held_out(learned: Learned) -> str:
                 rows.append([errors(line, with_own_start(m, start, m.mean))["consumption"] for m in models])
     if not rows or not np.any(rows):
         return f"not checked on rides held out: {len(learned.lines)} rides, {LEAST_RIDES} with their energy are needed"
-    old, new = np.array(rows).T / WATT_HOURS
+    old, new = np.array(rows).T / WH_PER_KM
     more = new - old
     text = (
         f"energy of rides held out: {old.mean():.2f} Wh/km missed by the file before, {new.mean():.2f} by what the "

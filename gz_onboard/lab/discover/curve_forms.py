@@ -12,7 +12,7 @@ from gz_onboard.lab.discover.blocks import over_blocks
 from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.grid import STEP, Ride, smooth
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide
-from gz_onboard.lab.discover.sizes import USUAL_SIZES, Sizes
+from gz_onboard.lab.sizes import USUAL_SIZES, Sizes
 
 # knots of the hat functions, of a vehicle of size 1 (see `KNOT_SIZES`); unit
 KNOTS: dict[str, tuple[tuple[float, ...], str]] = {

@@ -15,12 +15,12 @@ from gz_onboard.arrays import Array, Mask, running_mean
 from gz_onboard.constants import GRAVITY, MILD
 from gz_onboard.errors import InputError
 from gz_onboard.events import LOADS
-from gz_onboard.lab.discover.sizes import sizes_of
-from gz_onboard.lab.discover.stand_ins import PACK, USUAL_DELAYS, stand_ins
+from gz_onboard.lab.discover.stand_ins import PACK, delays, stand_ins
+from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import MOVING, Port
 from gz_onboard.physics.model import air_density, total
-from gz_onboard.physics.sensors import true_current, true_voltage
+from gz_onboard.physics.sensors import grade_shown, road_speed, true_current, true_voltage
 from gz_onboard.physics.vibration import Vibration
 from gz_onboard.vehicle import Vehicle
 
@@ -29,7 +29,7 @@ BRAKE_PRESSURE = 0.8e5  # Pa: above what the sensors show at rest
 STANDSTILL, STANDING = 0.05, 30  # m/s, grid steps: below it, for more of them the median of a rate is its bias
 LEAST_GAP, GAP = 0.3, 3.0  # s, periods of a signal: it is missing for more than both
 SHORTEST, LEAST_SAMPLES = 60.0, 20  # s of a ride; samples of a role
-SWITCHED, REGENERATING = 0.01, -1.0  # of the brake switch; A of the motor: a brake is touched
+SWITCHED, REGENERATING = 0.01, -1.0  # of the brake switch; A of a motor of size 1: a brake is touched
 TOUCHED = 11  # grid steps: half a second to either side
 ACCELERATING, YAWING, CLIMBING = 0.4, 0.5, 2.0  # s: running means that take noise off acceleration, yaw rate, grade
 STEEPEST_LEAN, STEEPEST = 0.85, 0.5  # sine of the lean, and of the slope: beyond, the sensors err
@@ -52,6 +52,7 @@ class Ride:
     quantities: what effects read (names of `physics.effect.QUANTITIES`) and residuals are looked at over, shape (n,),
     with the vehicle's nominal mass and radius. energy: see `energy_drawn`. have: the roles that are there. periods: of
     their samples [s]. stand_ins: what was taken for a role that is not there, and for another why it is lacking.
+    current_size: of the vehicle's currents (`Sizes`).
     """
 
     name: str
@@ -64,6 +65,7 @@ class Ride:
     energy: float = 0.0
     periods: dict[str, float] = field(default_factory=dict)
     stand_ins: tuple[str, ...] = ()
+    current_size: float = 1.0
 
     @property
     def have(self) -> set[str]:
@@ -103,7 +105,7 @@ class Ride:
                 result |= self.signals[role] > BRAKE_PRESSURE
         if not {"brake_switch", "brake_pressure_rear"} & self.have:  # only regeneration shows it
             if "motor_current" in self.signals:
-                result |= self.signals["motor_current"] < REGENERATING
+                result |= self.signals["motor_current"] < REGENERATING * self.current_size
             else:
                 result |= self.quantities["acceleration"] + GRAVITY * self.quantities["grade"] < BRAKED
         wide = np.convolve(result, np.ones(TOUCHED), mode="same") > 0
@@ -151,19 +153,18 @@ def read_ride(samples: Samples, vehicle: Vehicle) -> Ride:
             f"ride {samples.name}: {end - start:.0f} s of {', '.join(needed)} together; a minute is the least"
         )
     grid = np.arange(start, end, STEP)
-    stated = vehicle.mapping
-    delays = USUAL_DELAYS | {s.role: stated.delays[s.message] for s in stated.sources if s.message in stated.delays}
+    late = delays(vehicle)
     signals: dict[str, Array] = {}
     valid: dict[str, Mask] = {}
     for role, (times, values) in samples.columns.items():
-        at = grid + delays.get(role, 0.0)
+        at = grid + late.get(role, 0.0)
         turned = np.unwrap(values) if role == "gps_course" else values
         signals[role] = averaged(times, turned, at)
         valid[role] = measured(times, at)
     p = vehicle.parameters
-    ride = Ride(samples.name, grid - start, signals, valid, p["wheel_radius"] * p["gear_ratio"], samples.rider_mass)
+    ride = Ride(samples.name, grid - start, signals, valid, road_speed(1.0, p), samples.rider_mass)
     ride.periods = {role: float(np.median(np.diff(times))) for role, (times, _) in samples.columns.items()}
-    ride.stand_ins = words
+    ride.stand_ins, ride.current_size = words, sizes_of(vehicle).current
     ride.quantities = _quantities(ride, p)
     if "motor_current" not in signals:
         ride.quantities |= driven_by_pack(ride, vehicle)
@@ -171,7 +172,7 @@ def read_ride(samples: Samples, vehicle: Vehicle) -> Ride:
     if "pack_current" in signals:
         ride.quantities["pack_current"] = true_current(signals["pack_current"], p)
     ride.quantities["since_braking"] = since(ride.braking)
-    ride.quantities["since_change"] = since_change(ride.quantities["motor_current"] / sizes_of(vehicle).current)
+    ride.quantities["since_change"] = since_change(ride.quantities["motor_current"] / ride.current_size)
     wheels = [samples.columns[role] for role in SUSPENSION if role in samples.columns]
     if wheels and all(np.median(np.diff(times)) < ROUGH_PERIOD for times, _ in wheels):
         ride.quantities["suspension_speed"] = suspension_speed(wheels, grid)
@@ -297,7 +298,7 @@ def _quantities(ride: Ride, p: Mapping[str, float]) -> dict[str, Array]:
     lateral = GRAVITY * sine / np.sqrt(1 - sine**2)
     grade = np.zeros(n)
     if "accel_x" in s:
-        grade = smooth((s["accel_x"] - acceleration) / GRAVITY, CLIMBING)
+        grade = smooth(grade_shown(s["accel_x"], acceleration), CLIMBING)
     elif "gps_altitude" in s:
         grade = grade_by_altitude(s["gps_altitude"], speed)
     moved = np.cumsum(np.abs(speed) > MOVING) * STEP

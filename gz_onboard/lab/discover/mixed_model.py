@@ -36,8 +36,8 @@ from gz_onboard.lab.discover.prior import (
     stepped,
 )
 from gz_onboard.lab.discover.residuals import counted_soc
-from gz_onboard.lab.discover.sizes import Sizes, sizes_of
 from gz_onboard.lab.discover.system import System
+from gz_onboard.lab.sizes import Sizes, sizes_of
 from gz_onboard.offline.processes import worker_pool
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.effect import Effect

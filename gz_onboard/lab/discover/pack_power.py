@@ -9,10 +9,10 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.constants import GRAVITY
 from gz_onboard.lab.discover.grid import STEP, Ride
-from gz_onboard.lab.discover.residuals import auxiliary_power, electric_power, motor_losses, moving, rotating
+from gz_onboard.lab.discover.residuals import auxiliary_power, electric_power, motor_losses, moving
 from gz_onboard.lab.discover.system import System, Values, summed
 from gz_onboard.physics.effect import ROAD_LOAD
-from gz_onboard.physics.effects import inertia
+from gz_onboard.physics.effects.inertia import rotating_mass
 from gz_onboard.physics.sensors import true_current, true_voltage
 
 AS_IN_FILE = (
@@ -31,7 +31,7 @@ def road_power(ride: Ride, q: Mapping[str, Array], p: Values, system: System) ->
         specific = ride.signals["accel_x"] - p["accel_bias"] - p["pitch_gain"] * q["acceleration"]
     else:
         specific = q["acceleration"] + GRAVITY * q["grade"]
-    force = q["mass"] * specific + inertia.term(q["acceleration"], 0.0, **rotating(p))
+    force = q["mass"] * specific + rotating_mass(p) * q["acceleration"]
     force = force + summed(system.terms(q, p, STEP, *ROAD_LOAD))
     return np.asarray(force * q["speed"] + motor_losses(ride, q, p, system)[1])
 

@@ -16,7 +16,7 @@ from math import exp
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.sizes import nearest_step, sizes_of
+from gz_onboard.lab.sizes import nearest_step, sizes_of
 from gz_onboard.physics.effect import Parameter
 from gz_onboard.vehicle import Vehicle
 
@@ -24,7 +24,7 @@ from gz_onboard.vehicle import Vehicle
 @dataclass(frozen=True)
 class Nuisance:
     """A parameter that no vehicle file has: sd is of its mean, ride_sd of its scatter from ride to ride, both in a
-    vehicle of size 1; size: the one of `Sizes` that they grow with.
+    vehicle of size 1; size, per: those of `Sizes` that they grow with, and fall with.
     """
 
     name: str
@@ -34,6 +34,7 @@ class Nuisance:
     ride_sd: float
     text: str
     size: str = ""
+    per: str = ""
 
 
 NUISANCES = (
@@ -44,7 +45,7 @@ NUISANCES = (
     Nuisance("rolling_cold", "1/(20 K)", 0.0, 0.3, 0.05, "rolling resistance below 20 degC, as a share"),
     Nuisance("torque_constant_slope", "1/K", 0.0, 7e-4, 1e-4, "magnets weaken when warm"),
     Nuisance("torque_saturation", "1/(100 A)", 0.0, 0.03, 0.005, "torque per current falls at high current"),
-    Nuisance("copper_speed", "s/(50 rad)", 0.0, 0.25, 0.02, "copper loss grows with frequency"),
+    Nuisance("copper_speed", "s/(50 rad)", 0.0, 0.25, 0.02, "copper loss grows with frequency", per="spin"),
     Nuisance("inverter_current_gain", "1", 1.0, 0.007, 0.002, "gain of the inverter's current measurement"),
     Nuisance("inverter_current_offset", "A", 0.0, 0.2, 0.03, "its offset", "current"),
     Nuisance("idle_current", "A", 0.0, 0.2, 0.01, "drawn beside inverter and auxiliary current sensors", "current"),
@@ -200,7 +201,7 @@ def prior_of(name: str, vehicle: Vehicle, declared: Mapping[str, Parameter], val
     """Of the parameter `name`, at `value`. absent: it is of an effect that the model lacks."""
     on_bench, sizes = False, sizes_of(vehicle)
     if name in NUISANCE:
-        size = sizes.of(NUISANCE[name].size)
+        size = sizes.of(NUISANCE[name].size) / sizes.of(NUISANCE[name].per)
         scatter, spread = NUISANCE[name].ride_sd * size, NUISANCE[name].sd * size
     else:
         parameter, known = declared[name], vehicle.parameters

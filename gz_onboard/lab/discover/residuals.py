@@ -20,10 +20,10 @@ from gz_onboard.lab.discover.system import System, Values, summed
 from gz_onboard.physics.battery import discharged, heat, terminal_voltage
 from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.physics.effect import ROAD_LOAD, Port
-from gz_onboard.physics.effects import inertia
+from gz_onboard.physics.effects.inertia import rotating_mass
 from gz_onboard.physics.model import drag_torque
 from gz_onboard.physics.relaxation import decay_over, relaxation_over, relaxed
-from gz_onboard.physics.sensors import true_current, true_voltage
+from gz_onboard.physics.sensors import grade_shown, true_current, true_voltage
 
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
 DT = SLOW * STEP
@@ -70,11 +70,6 @@ def moving(ride: Ride, p: Values, system: System) -> dict[str, Array]:
     return q
 
 
-def rotating(p: Values) -> dict[str, float]:
-    """The parameters of the wheels' inertia."""
-    return {name: p[name] for name in ("wheel_inertia_front", "wheel_inertia_rear", "wheel_radius")}
-
-
 def mass(ride: Ride, p: Values, system: System) -> float:
     """Vehicle and payload [kg]: the payload entered, and by how much it is wrong."""
     usual = system.healthy["payload_mass"]
@@ -106,7 +101,7 @@ def road_force(ride: Ride, p: Values, system: System) -> Array:
     shaft = q["torque"] - drag_torque(motor_losses(ride, q, p, system)[1], q["motor_speed"])
     entered, m = float(ride.quantities["mass"][0]), mass(ride, p, system)
     specific = ride.signals["accel_x"] - p["accel_bias"] - p["pitch_gain"] * q["acceleration"]
-    force = inertia.term(q["acceleration"], 0.0, **rotating(p)) + summed(system.terms(q, p, STEP, *ROAD_LOAD))
+    force = rotating_mass(p) * q["acceleration"] + summed(system.terms(q, p, STEP, *ROAD_LOAD))
     push = shaft / (p["wheel_radius"] * p["gear_ratio"]) - force
     # what is noisy stands alone: were the accelerometer multiplied with the mass that is sought, the least noise would
     # be had with the least mass, and all that it is weighed with would shrink along
@@ -117,7 +112,7 @@ def altitude(ride: Ride, p: Values, system: System) -> Array:
     """GPS altitude [m] above the start, less the way times the grade that the accelerometer shows."""
     q = moving(ride, p, system)
     acceleration = q["acceleration"]
-    sine = (ride.signals["accel_x"] - p["accel_bias"] - (1 + p["pitch_gain"]) * acceleration) / GRAVITY
+    sine = grade_shown(ride.signals["accel_x"] - p["accel_bias"], (1 + p["pitch_gain"]) * acceleration)
     height = np.cumsum(sine * q["speed"]) * STEP
     return np.asarray(ride.signals["gps_altitude"] - height - ride.signals["gps_altitude"][0] - p["altitude_start"])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from gz_onboard.constants import WH_PER_KM
 from gz_onboard.offline.schema import OPTIONAL
 
 VERSION = 2  # of the keys: 1 had energy_per_way for consumption
@@ -16,7 +17,7 @@ VERDICTS = {
 }
 METRICS = {
     "power": ("power, rms", 1.0, "W"),
-    "consumption": ("consumption", 1 / 3.6, "Wh/km"),
+    "consumption": ("consumption", 1 / WH_PER_KM, "Wh/km"),
     "range": ("range", 100.0, "%"),
     "voltage": ("voltage of a cell", 1e3, "mV"),
 }

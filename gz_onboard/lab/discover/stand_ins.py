@@ -6,13 +6,19 @@ from dataclasses import replace
 
 from gz_onboard.errors import InputError
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.sensors import speed_role
+from gz_onboard.physics.sensors import road_speed, speed_role
 from gz_onboard.vehicle import Vehicle
 
 USUAL_DELAYS = {"gps_speed": 0.4, "gps_course": 0.4, "gps_altitude": 0.4, "pack_voltage": 0.1, "pack_current": 0.1}
 """By how much later than the inverter's a value is sent [s], where no message states its `delay`; what is left of it
-is fitted (see `channels`)."""
+is fitted (see `channels`); by `delays` of a vehicle."""
 PACK = ("pack_voltage", "pack_current")
+
+
+def delays(vehicle: Vehicle) -> dict[str, float]:
+    """By role how old a value is when it comes [s]: as its message states, or as usual; none of what is not there."""
+    stated = vehicle.mapping
+    return USUAL_DELAYS | {s.role: stated.delays[s.message] for s in stated.sources if s.message in stated.delays}
 
 
 def stand_ins(samples: Samples, vehicle: Vehicle) -> tuple[Samples, tuple[str, ...]]:
@@ -26,8 +32,8 @@ def stand_ins(samples: Samples, vehicle: Vehicle) -> tuple[Samples, tuple[str, .
     if "motor_speed" not in columns:
         role, factor = speed_role(f"ride {samples.name}", columns, p)
         times, values = columns.pop(role)
-        factor /= p["wheel_radius"] * p["gear_ratio"]
-        columns["motor_speed"] = times - USUAL_DELAYS.get(role, 0.0), values * factor
+        factor /= road_speed(1.0, p)
+        columns["motor_speed"] = times - delays(vehicle).get(role, 0.0), values * factor
         words.append(f"motor_speed: {role} stands in, by wheel radius and gear ratio of the vehicle file")
     if "motor_current" not in columns and "motor_torque" in columns:
         times, values = columns["motor_torque"]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.errors import InputError
-from gz_onboard.lab.discover.sizes import USUAL_SIZES, Sizes
+from gz_onboard.lab.sizes import USUAL_SIZES, Sizes
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING, Effect, Port
 from gz_onboard.physics.model import Bound, value_of

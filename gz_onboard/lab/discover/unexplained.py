@@ -17,7 +17,7 @@ from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.result import RIDE_TO_RIDE, Split, Unknown
 from gz_onboard.lab.discover.search import one_degree
 from gz_onboard.lab.discover.selection import Selection
-from gz_onboard.lab.discover.sizes import Sizes
+from gz_onboard.lab.sizes import Sizes
 
 LEFT = 0.1  # of what causes explain: a curve beside them that takes less is the bend of a large effect
 CURVE = 1.5  # a curve's evidence over that of a cause: their knots are chosen by eye; lines count as tries instead

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from gz_onboard.physics.effect import Parameter, Port
@@ -15,5 +16,10 @@ def term(
     acceleration: Any, mass: Any, *, wheel_inertia_front: float, wheel_inertia_rear: float, wheel_radius: float
 ) -> Any:
     """Force [N] against the motion."""
-    rotating = (wheel_inertia_front + wheel_inertia_rear) / wheel_radius**2
-    return (mass + rotating) * acceleration
+    return (mass + (wheel_inertia_front + wheel_inertia_rear) / wheel_radius**2) * acceleration
+
+
+def rotating_mass(parameters: Mapping[str, float]) -> float:
+    """What rotates, as mass at the wheel [kg]."""
+    names = ("wheel_inertia_front", "wheel_inertia_rear", "wheel_radius")
+    return float(term(1.0, 0.0, **{name: parameters[name] for name in names}))

@@ -20,6 +20,7 @@ PARAMETERS = (
     Parameter("motor_copper_frequency", "s²/rad²", 0.0, 5e-5, 0.0, 0.01, EDDIES, ride_sd=1e-6, bench=True),
 )
 CAUSE = ("winding_resistance", "P = r·(1 + a·(T − 25))·i²")
+SCALE = 50.0  # rad/s, at which copper_speed is the share
 SHOWN_BY = (
     "DC power over air-gap power grows with the square of the current, and the motor warms; full-throttle starts "
     "split it from inverter loss."
@@ -48,6 +49,6 @@ def term(
 def variation(
     motor_speed: Any, *, copper_speed: float, motor_copper_resistance: float, healthy_motor_copper_resistance: float
 ) -> Any:
-    """Eddy currents grow with frequency in the healthy winding, not in what a fault adds; copper_speed: at 50 rad/s."""
+    """Eddy currents grow with frequency in the healthy winding, not in what a fault adds; copper_speed: at `SCALE`."""
     own = healthy_motor_copper_resistance / motor_copper_resistance
-    return 1 + own * copper_speed * abs(motor_speed) / 50
+    return 1 + own * copper_speed * abs(motor_speed) / SCALE

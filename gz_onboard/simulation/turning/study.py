@@ -41,7 +41,7 @@ CHASSIS_MODELS: dict[str, type[Straight] | type[Planar] | type[Leaning]] = {
     "planar": Planar,
     "leaning": Leaning,
 }
-FAST, SLOW = 12.5, 5.0  # m/s: the scooter's top speed; below 5 m/s a turn at 30 degrees has less than 4.5 m
+FAST, SLOW = 12.5, 5.0  # m/s: as in town; below 5 m/s a turn at 30 degrees has less than 4.5 m
 LEAD_IN, LEAN_IN = 8.0, 3.0  # s: until the rider lets go; in which he leans
 DISTANCE = 60.0  # m: over which energy is compared, for all models lose the same from one speed to another
 LOOK_AT = 8.0  # m/s: speed at which loads, slip and radius are compared

@@ -56,6 +56,19 @@ def test_series_resistance_is_what_the_cells_do_not_explain():
     assert abs(series.value - SERIES) < 1.96 * series.sd and "pulse tests" in series.source
 
 
+def test_a_vehicle_of_small_currents_needs_small_steps():
+    p = VEHICLE.parameters
+    small = VEHICLE.changed(p.replaced(motor_current_limit=p["motor_current_limit"] / 8))
+    rides = [ride(seed) for seed in range(4)]
+    for columns in (one.columns for one in rides):
+        columns |= {role: (t, x / 8) for role, (t, x) in columns.items() if role.endswith("current")}
+    found = pack_series_resistance(rides, small, [pulse(10.0, 8 * CELL_STEP), pulse(40.0, 8 * CELL_STEP)])
+    series = found.parameters["pack_series_resistance"]
+    assert abs(series.value - 8 * SERIES) < 1.96 * series.sd and "above 1.875 A" in series.source
+    cable = cable_resistance(rides, small).parameters["cable_resistance"]
+    assert abs(cable.value - 8 * CABLE) < 1.96 * cable.sd
+
+
 def test_series_intervals_hold_cells_that_differ():
     """Over packs whose cells are not those of the pulse test, by what cells scatter."""
     pulses, rng = [pulse(10.0, CELL_STEP), pulse(40.0, CELL_STEP)], np.random.default_rng(0)

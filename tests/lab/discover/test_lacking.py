@@ -15,6 +15,7 @@ from gz_onboard.lab.discover.discovery import discover
 from gz_onboard.lab.discover.grid import grade_by_altitude
 from gz_onboard.lab.discover.mixed_model import initial
 from gz_onboard.lab.discover.pack_power import pack_power
+from gz_onboard.lab.discover.stand_ins import stand_ins
 from gz_onboard.lab.discover.verdict import needs
 from gz_onboard.offline.samples import Samples
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -97,6 +98,15 @@ def test_another_speed_and_torque_stand_in(scooter: Vehicle, loaded: tuple[list[
     assert other.quantities["speed"][:n] == pytest.approx(ride.quantities["speed"][:n], abs=0.1)
     (rear,) = without([plain], "motor_speed", "vehicle_speed")
     assert "wheel_speed_rear" not in initial(scooter).ride(rear).have  # not compared with itself
+
+
+def test_what_stands_in_is_as_old_as_its_message_states(scooter: Vehicle, loaded: tuple[list[Samples], float]):
+    (message,) = {s.message for s in scooter.mapping.sources if s.role == "gps_speed"}
+    late = replace(scooter, mapping=replace(scooter.mapping, delays={message: 0.9}))
+    (plain,) = without(loaded[0][:1], "motor_speed", "wheel_speed_rear", "vehicle_speed")
+    times = plain.columns["gps_speed"][0]
+    assert stand_ins(plain, scooter)[0].columns["motor_speed"][0] == pytest.approx(times - 0.4)
+    assert stand_ins(plain, late)[0].columns["motor_speed"][0] == pytest.approx(times - 0.9)
 
 
 def test_without_any_measure_of_what_drives_it_a_ride_is_refused(scooter: Vehicle, loaded):

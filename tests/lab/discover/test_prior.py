@@ -14,7 +14,7 @@ from gz_onboard.lab.discover.curve_forms import KNOTS, CurveForm
 from gz_onboard.lab.discover.grid import MOST_STEERING, steering
 from gz_onboard.lab.discover.mixed_model import initial
 from gz_onboard.lab.discover.prior import NUISANCE
-from gz_onboard.lab.discover.sizes import USUAL_SIZES, nearest_step, sizes_of
+from gz_onboard.lab.sizes import USUAL_SIZES, nearest_step, sizes_of
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import known_effects, load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -48,6 +48,9 @@ def test_absolute_numbers_grow_with_the_vehicle(scooter: Vehicle):
     assert large.scale[place] == pytest.approx(4 * small.scale[place])
     geared = sizes_of(scooter.changed(p.replaced(gear_ratio=p["gear_ratio"] / 4, cell_capacity=4 * p["cell_capacity"])))
     assert (geared.spin, geared.resistance) == pytest.approx((4.0, 1 / 4))
+    spun = initial(scooter.changed(p.replaced(gear_ratio=p["gear_ratio"] / 4)))
+    place = small.names.index("copper_speed")
+    assert spun.scale[place] == pytest.approx(small.scale[place] / 4)
     assert large.noise["road_force"].white == pytest.approx(4 * small.noise["road_force"].white)
     form = CurveForm("road_force", "motor_current", sizes=sizes)
     assert form.knots == pytest.approx(4 * np.array(KNOTS["motor_current"][0]))

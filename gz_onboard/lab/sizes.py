@@ -1,4 +1,4 @@
-"""How large a vehicle is over the one that the absolute numbers of the discovery are for."""
+"""How large a vehicle is over the one that the absolute numbers of calibration and discovery are for."""
 
 from __future__ import annotations
 
