@@ -170,8 +170,8 @@ class Estimator:
             known = self.road.speed is not None and self._timing.sampled <= SLOW_GAP
             return self._present.power(now) if known else None
 
-        def error(voltage: float, current: float) -> float | None:
-            return self.soc.cell_error(voltage, current, cells)
+        def error(voltage: float, current: float, sensor: str) -> float | None:
+            return self.soc.cell_error(now, (voltage, current), sensor, cells)
 
         evidence = CellEvidence(error, road_power, self.soc.gate.rms)
         reading = self._sources.read(now, dt, self.road.speed, evidence)

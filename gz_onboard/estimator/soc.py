@@ -89,14 +89,18 @@ class StateOfCharge:
         soc = self.filter.soc if self.filter else HALF_FULL
         return self._battery.ocv(soc)[0] * self._battery.cells_series
 
-    def cell_error(self, voltage: float, current: float, temperature: float) -> float | None:
-        """Measured less predicted voltage of a cell [V] for those of the pack; None before there is a filter."""
+    def cell_error(self, now: float, shown: tuple[float, float], sensor: str, temperature: float) -> float | None:
+        """Measured less predicted voltage of a cell [V] for those of the pack; None before there is a filter.
+
+        shown: voltage [V] and current [A] of the pack; sensor: whose current it is, see `CellEffects.supposed`.
+        """
         if self.filter is None:
             return None
+        voltage, current = shown
         cell_current = current / self._battery.cells_parallel
         cell = self._battery.cell_voltage(voltage, current)
         if self.effects:
-            cell += self.effects.overpotential_at(cell_current)
+            cell += self.effects.supposed(sensor, now, cell_current)
         return self.filter.innovation(cell, cell_current, temperature)[0]
 
     def restarted(self, now: float) -> bool:
@@ -237,14 +241,16 @@ class StateOfCharge:
         cell_current = current / battery.cells_parallel
         r0 = battery.r0.at(filter_.soc, temperature)[0]
         drop = r0 * cell_current + self.effects.overpotential
-        explaining = (
-            current if reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else reading.reported_current
-        )
+        explaining: float | None = current
+        lost = self.effects.overpotential
+        if reading.source not in (CurrentSource.PACK, CurrentSource.INVERTER):
+            explaining = reading.reported_current
+            if explaining is not None and self.effects:
+                lost = self.effects.supposed("reported", now, explaining / battery.cells_parallel)
         if explaining is not None:
             # Both with what lies beside the cells: of a pack of which little is known, r0 may hold it already.
             cell, beside = explaining / battery.cells_parallel, battery.series_resistance / battery.cells_series
-            by_load = r0 * cell + beside * explaining + (self.effects.overpotential_at(cell) if self.effects else 0.0)
-            self._sag.update(dt, voltage / battery.cells_series, by_load)
+            self._sag.update(dt, voltage / battery.cells_series, r0 * cell + beside * explaining + lost)
         if dt <= self._timing.pause and self._rest.step(
             filter_, dt, shown, cell_current, temperature, reading.voltage_sd
         ):
