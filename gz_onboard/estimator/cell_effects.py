@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from gz_onboard.constants import MILD
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import QUANTITIES
-from gz_onboard.physics.model import BURST, Model
+from gz_onboard.physics.model import Model
 
 LARGEST = 1.0  # V of a cell, of a saved state
 FOREVER = 1e9  # s: a rest of unknown length
@@ -57,11 +57,6 @@ class CellEffects:
         states = {e.effect.name: e.step(states[e.effect.name], now - then, q) for e in self._effects}
         self._supposed[sensor] = now, current, states
         return sum(states.values())
-
-    def begin(self, current: float, soc: float, temperature: float) -> None:
-        """As for `step`, of a load that has flowed for a while that nobody saw."""
-        if not self.overpotential:
-            self.step(BURST, current, soc, temperature)
 
     def read(self, saved: Mapping[str, float]) -> dict[str, float]:
         """Saved states; KeyError, TypeError or ValueError if they are not of these effects."""

@@ -19,7 +19,7 @@ from gz_onboard.estimator.start import BRIDGE, SOC_UNKNOWN_SD, Saved, bounded, p
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
-from gz_onboard.physics.model import Model
+from gz_onboard.physics.model import STOOD, Model
 
 DOUBTED_START = 30.0  # s: a voltage that is doubted so soon has misled the first state of charge
 RESTARTED_FOR = 600.0  # s: for so long it is reported
@@ -66,6 +66,7 @@ class StateOfCharge:
         self.saved: Saved | None = None
         self.saved_age: float | None = None  # s
         self.current: float | None = None  # A of the pack, at the last step
+        self._unseen = STOOD  # s: for so long, and not longer, its load was not seen
         self._battery, self._make, self._signals, self._timing = battery, make, signals, timing
         self._sag = sag
         self._charge = ChargeUncertainty(battery, model.parameters)
@@ -132,7 +133,7 @@ class StateOfCharge:
         began, saved = self._gap
         self._gap = None
         if now - began > BRIDGE:
-            self.saved, self.saved_age = saved, now - began
+            self.saved, self.saved_age, self._unseen = saved, now - began, STOOD
             if self.effects and dt > BRIDGE:
                 self.effects.step(dt, 0.0, filter_.soc, temperature)
             self._wait_again()
@@ -146,6 +147,7 @@ class StateOfCharge:
         """So much time has passed [s] in which no voltage came: what was restored is older by that."""
         if self.saved and self.saved_age is not None:
             self.saved_age += seconds
+            self._unseen = min(self._unseen + seconds, STOOD)
             self.effects.rest(seconds, self.saved.soc)
 
     def snapshot(self, filter_: SocFilter) -> dict[str, object]:
@@ -163,6 +165,7 @@ class StateOfCharge:
     def restore(self, saved: Saved, age: float | None, effects: dict[str, float]) -> None:
         """Go on from what is `age` [s] old; effects: their states [V of a cell]."""
         self.saved, self.saved_age = saved, age
+        self._unseen = STOOD if age is None else min(age, STOOD)
         self.effects.restore(effects, age, saved.soc)
 
     # --- step by step -----------------------------------------------------------------------------------------
@@ -300,12 +303,14 @@ class StateOfCharge:
         if self.saved:
             awaited += [self._signals.odometer, self._signals.bms_state_of_charge]
         missing = any(signal.stale_after and not signal.fresh(now) for signal in awaited)
+        battery = self._battery
         found = self._steady.step(now, voltage, current, pack.temperature, pack.speed, self._timing.pause, missing)
         if found is None:
             return
         first, unsteady_sd = found
-        if self.effects and first.moving:
-            self.effects.begin(first.current / self._battery.cells_parallel, HALF_FULL, pack.temperature)
+        if self.effects and self._unseen:
+            self.effects.step(self._unseen, first.current / battery.cells_parallel, HALF_FULL, pack.temperature)
+            self._unseen = 0.0
         at = Situation(
             now,
             pack.temperature,
@@ -316,8 +321,8 @@ class StateOfCharge:
         )
         restored = self.saved, self.saved_age
         self.saved, self._started, self._started_from = None, now, restored
-        self.filter = first_filter(self._battery, self._make, self.uncertainty, first, at, self._signals, restored)
-        mean = (first.current + current) / 2 / self._battery.cells_parallel
+        self.filter = first_filter(battery, self._make, self.uncertainty, first, at, self._signals, restored)
+        mean = (first.current + current) / 2 / battery.cells_parallel
         noise = self._noise(STEADY_NOISE, self.filter, pack.temperature)
         self.filter.predict(now - first.time, mean, pack.temperature, noise)
 

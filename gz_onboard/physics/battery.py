@@ -194,16 +194,6 @@ class Battery:
             soc = self.soc_at(voltage + self.r0.at(soc, temperature)[0] * current + v1, temperature)
         return soc
 
-    def first_soc(
-        self, pack_voltage: float, pack_current: float, temperature: float, overpotential: float = 0.0
-    ) -> float:
-        """`soc_at_load` out of a ride's first pack voltage [V] and current [A], as if it had been at rest before.
-
-        overpotential: of effects in a cell [V], see `physics.model.when_met`.
-        """
-        cell = self.cell_voltage(pack_voltage, pack_current) + overpotential
-        return self.soc_at_load(cell, pack_current / self.cells_parallel, temperature)
-
     def circuit(self, soc: float, temperature: float) -> tuple[float, float, float]:
         """(R0 [ohm], R1 [ohm], C1 [F]) of a cell at `temperature` [degC]."""
         return self.r0.at(soc, temperature)[0], self.r1.at(soc, temperature)[0], self.c1.at(soc, temperature)[0]

@@ -18,7 +18,7 @@ from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.battery import dissipation
 from gz_onboard.physics.cooling import PERIOD
 from gz_onboard.physics.effect import Port
-from gz_onboard.physics.model import total, when_met
+from gz_onboard.physics.model import first_soc, total
 from gz_onboard.physics.sensors import road_speed, true_columns
 from gz_onboard.vehicle import Vehicle
 
@@ -182,8 +182,7 @@ def _pack_heat(
     lost = vehicle.model.overpotential(battery)
     n, m = battery.cells_series, battery.cells_parallel
     volts, amperes, celsius = *first, float(temperature[0])
-    begun = when_met(vehicle.model.at(Port.CELL_VOLTAGE), battery, amperes, celsius, FIRST / 2)
-    soc = battery.first_soc(volts, amperes, celsius, begun)
+    soc = first_soc(vehicle.model.at(Port.CELL_VOLTAGE), battery, volts, amperes, celsius)
     heat, socs, v1 = battery.series_resistance * square, np.empty_like(mean), 0.0
     for k, (i, i2, t) in enumerate(
         zip((mean / m).tolist(), (square / m**2).tolist(), temperature.tolist(), strict=True)
