@@ -104,6 +104,13 @@ class StateOfCharge:
             cell += self.effects.supposed(sensor, now, cell_current)
         return self.filter.innovation(cell, cell_current, temperature)[0]
 
+    def heat(self, temperature: float) -> float:
+        """Of the pack [W] at the last step's current and `temperature` [degC]; 0 before there is a filter."""
+        filter_ = self.filter
+        if filter_ is None or not self.current:
+            return 0.0
+        return self._battery.pack_heat(self.current, filter_.soc, temperature, filter_.v1 + self.effects.overpotential)
+
     def restarted(self, now: float) -> bool:
         """Whether it was begun anew a short while ago."""
         return now - self._restarted_at < RESTARTED_FOR

@@ -178,6 +178,17 @@ class Battery:
             entropy = np.interp(soc, self.entropy_soc, self.entropy_value)
         return reversible_heat(self.cells_series * entropy, current, temperature)
 
+    def pack_heat(self, current: float, soc: float, temperature: float, overpotential: float) -> float:
+        """Heat of the pack [W] at its `current` [A] and `temperature` [degC], with the reversible part.
+
+        overpotential: of a cell [V], of the RC pair and whatever else relaxes.
+        """
+        cell = current / self.cells_parallel
+        volts = self.terminal_voltage(soc, overpotential, cell, temperature)[0]
+        rest = self.cells_series * self.ocv(soc, temperature)[0]
+        lost = heat(rest, self.pack_voltage(volts, current), current)
+        return float(lost + self.reversible_heat(current, soc, temperature))
+
     def soc_at(self, ocv: float, temperature: float | None = None) -> float:
         """The SOC at which the open-circuit voltage of a cell is `ocv` [V]; `temperature` as for `ocv`."""
         if temperature is not None:
