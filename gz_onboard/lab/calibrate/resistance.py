@@ -69,6 +69,7 @@ def cable_resistance(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         float(np.hypot(found.sd("cable_resistance"), gains)),
         "ohm",
         f"{source}; {found['offset']:+.3f} V at no current",
+        "pack_voltage less inverter_voltage over inverter_current",
     )
     y_label = "pack less inverter voltage [V]"
     result.panels += compared("Voltage between pack and inverter", "current [A]", y_label, i, v, model)
@@ -114,7 +115,9 @@ def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: S
             f"mohm ({100 * CELL_SHARE_SD:.0f} % of the cells' own in doubt): the value of the vehicle file stays"
         )
     else:
-        result.parameters["pack_series_resistance"] = Found(found["series"], sd, "ohm", source)
+        result.parameters["pack_series_resistance"] = Found(
+            found["series"], sd, "ohm", source, "steps of pack_voltage over those of pack_current"
+        )
     return result
 
 

@@ -15,9 +15,9 @@ from gz_onboard.lab.discover.gain import errors
 from gz_onboard.lab.discover.linear import LinearRide, normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.prior import LOG_SCALED
+from gz_onboard.lab.overrun import FAR, overrun, stop_at
 from gz_onboard.physics.parameters import declared_parameters
 
-FAR = 4.0  # standard deviations of what was known, beyond which rides contradict it
 LEAST_RIDES = 5  # to hold two out at a time and learn from the others
 WATT_HOURS = 3.6  # J/m of 1 Wh/km
 
@@ -48,23 +48,15 @@ def check_against_file(learned: Learned) -> None:
     far = np.abs(after.mean - before.mean) / sd
     of_file = [i for i, name in enumerate(before.names) if name in known and not declared[name].bench]
     found = [i for i in sorted(of_file, key=lambda i: -far[i]) if far[i] > FAR]
-    if not found:
-        return
     rows = []
     for i in found:
         name, old = before.names[i], known[before.names[i]]
         new = after.values_at(after.mean)[name]
         wide = float(np.sqrt(after.prior[i, i]) * after.scale[i]) * (new if name in LOG_SCALED else 1.0)
         channel, without = pulling(learned, i)
-        rows.append(
-            f"{name} is {old.value:.4g} ± {old.sd:.2g} {old.unit} ({old.status}) by the file and {new:.4g} ± "
-            f"{wide:.2g} {old.unit} by these rides, {far[i]:.0f} standard deviations apart; {channel} "
-            f"({', '.join(CHANNEL[channel].roles)}) pulls it there, without which it is {without:.4g}"
-        )
-    raise InputError(
-        "; ".join(rows) + ". Nothing is written. If these signals are poor, leave them out of [roles]; if the file "
-        "only guesses, give it a larger sd"
-    )
+        pulled = f"{channel} ({', '.join(CHANNEL[channel].roles)}) pulls it there, without which it is {without:.4g}"
+        rows.append(overrun(name, old, (new, wide), float(far[i]), pulled))
+    stop_at(rows)
 
 
 def pulling(learned: Learned, i: int) -> tuple[str, float]:
