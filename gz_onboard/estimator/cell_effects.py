@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from gz_onboard.constants import MILD
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import QUANTITIES
-from gz_onboard.physics.model import BURST, Model
+from gz_onboard.physics.model import Model
 
 LARGEST = 1.0  # V of a cell, of a saved state
 FOREVER = 1e9  # s: a rest of unknown length
+FORGOTTEN = 10.0  # s: a current that nobody asked for in so long is followed anew
 
 
 class CellEffects:
@@ -23,6 +24,9 @@ class CellEffects:
         self._quantities["cell_capacity"] = battery.cell_capacity(MILD)  # until the first step
         self.states = {effect.effect.name: 0.0 for effect in self._effects}  # V of a cell
         self.overpotential = 0.0  # V of a cell: their sum
+        self._supposed: dict[
+            str, tuple[float, float, dict[str, float]]
+        ] = {}  # by sensor: when [s], current [A], states
 
     def __bool__(self) -> bool:
         return bool(self._effects)
@@ -40,20 +44,19 @@ class CellEffects:
             self.states[name] = effect.step(self.states[name], dt, q)
         self.overpotential = sum(self.states.values())
 
-    def overpotential_at(self, current: float) -> float:
-        """`overpotential` [V] if a cell's `current` [A] had flowed of late, not that of the last step."""
-        q, total = self._quantities, self.overpotential
-        if not q["cell_capacity"]:  # there was no step yet
-            return total
-        other = {**q, "cell_current": current}
-        for effect in self._effects:
-            total += (effect(other) - effect(q)) * (1 - effect.decay(BURST, q))
-        return float(total)
+    def supposed(self, sensor: str, now: float, current: float) -> float:
+        """`overpotential` [V] at `now` [s] if the cell's `current` [A] by `sensor` flows, not the one that is followed.
 
-    def begin(self, current: float, soc: float, temperature: float) -> None:
-        """As for `step`, of a load that has flowed for a while that nobody saw."""
-        if not self.overpotential:
-            self.step(BURST, current, soc, temperature)
+        It has its own memory from when it is first asked for: what has just begun has not built up yet, and what has
+        long been another is settled.
+        """
+        then, before, states = self._supposed.get(sensor, (now, current, self.states))
+        if not 0 <= now - then < FORGOTTEN:
+            then, before, states = now, current, self.states
+        q = {**self._quantities, "cell_current": (before + current) / 2}
+        states = {e.effect.name: e.step(states[e.effect.name], now - then, q) for e in self._effects}
+        self._supposed[sensor] = now, current, states
+        return sum(states.values())
 
     def read(self, saved: Mapping[str, float]) -> dict[str, float]:
         """Saved states; KeyError, TypeError or ValueError if they are not of these effects."""

@@ -28,7 +28,7 @@ from gz_onboard.estimator.road import RoadState
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.soc import PackState, StateOfCharge
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources
-from gz_onboard.estimator.temperatures import Temperatures
+from gz_onboard.estimator.temperatures import Temperatures, at_rest
 from gz_onboard.estimator.timing import SLOW_GAP, SLOWEST, MessageTiming
 from gz_onboard.estimator.vibration import VibrationMonitor
 from gz_onboard.events import STALE_PERIODS, Activity, Estimate, Event, Group, Reason, State
@@ -93,7 +93,7 @@ class Estimator:
         load = self.forecaster.load
         self.redundancy = Redundancy(self._radius, self._gear, model.mass, load.usual_force(), battery)
         self._sources = PackSources(self.signals, self.redundancy, battery, p)
-        self._temperatures = Temperatures(self.signals)
+        self._temperatures = Temperatures(self.signals, p)
         sag = self.redundancy.currents.sag
         self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, sag)
         self._present = Present(self.forecaster, self.road, self._temperatures, self.soc, self._vibration)
@@ -153,7 +153,7 @@ class Estimator:
         road.step(now, elapsed, signals, self._radius, self._gear)
         self._reading = self._read_pack(now, elapsed)
         self._compare_grades(now, elapsed)
-        temperature = self._temperatures.step(now, dt)
+        temperature = self._temperatures.step(now, dt, self.soc.heat if dt <= self._timing.pause else at_rest)
         self.soc.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self._expected_consumption)
         self.soc.step(now, dt, PackState(self._reading, temperature, road.speed), self._present)
         self._follow_activity(now, dt)
@@ -170,8 +170,8 @@ class Estimator:
             known = self.road.speed is not None and self._timing.sampled <= SLOW_GAP
             return self._present.power(now) if known else None
 
-        def error(voltage: float, current: float) -> float | None:
-            return self.soc.cell_error(voltage, current, cells)
+        def error(voltage: float, current: float, sensor: str) -> float | None:
+            return self.soc.cell_error(now, (voltage, current), sensor, cells)
 
         evidence = CellEvidence(error, road_power, self.soc.gate.rms)
         reading = self._sources.read(now, dt, self.road.speed, evidence)

@@ -19,9 +19,10 @@ from gz_onboard.estimator.start import BRIDGE, SOC_UNKNOWN_SD, Saved, bounded, p
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
-from gz_onboard.physics.model import Model
+from gz_onboard.physics.model import STOOD, Model
 
 DOUBTED_START = 30.0  # s: a voltage that is doubted so soon has misled the first state of charge
+STANDING_LOADS = 1.5  # times the auxiliary power: the most that is believed to have flowed before it was seen
 RESTARTED_FOR = 600.0  # s: for so long it is reported
 STEADY_NOISE = 1e-9  # variance of SOC from the first voltage to the end of the wait
 SHORTEST = 0.02  # s: a step, to divide by
@@ -66,9 +67,11 @@ class StateOfCharge:
         self.saved: Saved | None = None
         self.saved_age: float | None = None  # s
         self.current: float | None = None  # A of the pack, at the last step
+        self._unseen = STOOD  # s: for so long, and not longer, its load was not seen
         self._battery, self._make, self._signals, self._timing = battery, make, signals, timing
         self._sag = sag
         self._charge = ChargeUncertainty(battery, model.parameters)
+        self._auxiliary_power = model.parameters["auxiliary_power"]
         self._steady = SteadyVoltage(battery)
         self._rest = RestUpdate(battery, self.uncertainty, self.effects)
         self._odometer: float | None = None  # m, at the last step
@@ -89,15 +92,26 @@ class StateOfCharge:
         soc = self.filter.soc if self.filter else HALF_FULL
         return self._battery.ocv(soc)[0] * self._battery.cells_series
 
-    def cell_error(self, voltage: float, current: float, temperature: float) -> float | None:
-        """Measured less predicted voltage of a cell [V] for those of the pack; None before there is a filter."""
+    def cell_error(self, now: float, shown: tuple[float, float], sensor: str, temperature: float) -> float | None:
+        """Measured less predicted voltage of a cell [V] for those of the pack; None before there is a filter.
+
+        shown: voltage [V] and current [A] of the pack; sensor: whose current it is, see `CellEffects.supposed`.
+        """
         if self.filter is None:
             return None
+        voltage, current = shown
         cell_current = current / self._battery.cells_parallel
         cell = self._battery.cell_voltage(voltage, current)
         if self.effects:
-            cell += self.effects.overpotential_at(cell_current)
+            cell += self.effects.supposed(sensor, now, cell_current)
         return self.filter.innovation(cell, cell_current, temperature)[0]
+
+    def heat(self, temperature: float) -> float:
+        """Of the pack [W] at the last step's current and `temperature` [degC]; 0 before there is a filter."""
+        filter_ = self.filter
+        if filter_ is None or not self.current:
+            return 0.0
+        return self._battery.pack_heat(self.current, filter_.soc, temperature, filter_.v1 + self.effects.overpotential)
 
     def restarted(self, now: float) -> bool:
         """Whether it was begun anew a short while ago."""
@@ -128,7 +142,7 @@ class StateOfCharge:
         began, saved = self._gap
         self._gap = None
         if now - began > BRIDGE:
-            self.saved, self.saved_age = saved, now - began
+            self.saved, self.saved_age, self._unseen = saved, now - began, STOOD
             if self.effects and dt > BRIDGE:
                 self.effects.step(dt, 0.0, filter_.soc, temperature)
             self._wait_again()
@@ -142,6 +156,7 @@ class StateOfCharge:
         """So much time has passed [s] in which no voltage came: what was restored is older by that."""
         if self.saved and self.saved_age is not None:
             self.saved_age += seconds
+            self._unseen = min(self._unseen + seconds, STOOD)
             self.effects.rest(seconds, self.saved.soc)
 
     def snapshot(self, filter_: SocFilter) -> dict[str, object]:
@@ -159,6 +174,7 @@ class StateOfCharge:
     def restore(self, saved: Saved, age: float | None, effects: dict[str, float]) -> None:
         """Go on from what is `age` [s] old; effects: their states [V of a cell]."""
         self.saved, self.saved_age = saved, age
+        self._unseen = STOOD if age is None else min(age, STOOD)
         self.effects.restore(effects, age, saved.soc)
 
     # --- step by step -----------------------------------------------------------------------------------------
@@ -237,14 +253,16 @@ class StateOfCharge:
         cell_current = current / battery.cells_parallel
         r0 = battery.r0.at(filter_.soc, temperature)[0]
         drop = r0 * cell_current + self.effects.overpotential
-        explaining = (
-            current if reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else reading.reported_current
-        )
+        explaining: float | None = current
+        lost = self.effects.overpotential
+        if reading.source not in (CurrentSource.PACK, CurrentSource.INVERTER):
+            explaining = reading.reported_current
+            if explaining is not None and self.effects:
+                lost = self.effects.supposed("reported", now, explaining / battery.cells_parallel)
         if explaining is not None:
             # Both with what lies beside the cells: of a pack of which little is known, r0 may hold it already.
             cell, beside = explaining / battery.cells_parallel, battery.series_resistance / battery.cells_series
-            by_load = r0 * cell + beside * explaining + (self.effects.overpotential_at(cell) if self.effects else 0.0)
-            self._sag.update(dt, voltage / battery.cells_series, by_load)
+            self._sag.update(dt, voltage / battery.cells_series, r0 * cell + beside * explaining + lost)
         if dt <= self._timing.pause and self._rest.step(
             filter_, dt, shown, cell_current, temperature, reading.voltage_sd
         ):
@@ -294,12 +312,18 @@ class StateOfCharge:
         if self.saved:
             awaited += [self._signals.odometer, self._signals.bms_state_of_charge]
         missing = any(signal.stale_after and not signal.fresh(now) for signal in awaited)
+        battery = self._battery
         found = self._steady.step(now, voltage, current, pack.temperature, pack.speed, self._timing.pause, missing)
         if found is None:
             return
         first, unsteady_sd = found
-        if self.effects and first.moving:
-            self.effects.begin(first.current / self._battery.cells_parallel, HALF_FULL, pack.temperature)
+        if self.effects and self._unseen:
+            load = first.current
+            if not first.moving:  # more than a standing vehicle draws is a sensor's error as likely as a load
+                most = STANDING_LOADS * self._auxiliary_power / first.voltage
+                load = min(max(load, -most), most)
+            self.effects.step(self._unseen, load / battery.cells_parallel, HALF_FULL, pack.temperature)
+            self._unseen = 0.0
         at = Situation(
             now,
             pack.temperature,
@@ -310,8 +334,8 @@ class StateOfCharge:
         )
         restored = self.saved, self.saved_age
         self.saved, self._started, self._started_from = None, now, restored
-        self.filter = first_filter(self._battery, self._make, self.uncertainty, first, at, self._signals, restored)
-        mean = (first.current + current) / 2 / self._battery.cells_parallel
+        self.filter = first_filter(battery, self._make, self.uncertainty, first, at, self._signals, restored)
+        mean = (first.current + current) / 2 / battery.cells_parallel
         noise = self._noise(STEADY_NOISE, self.filter, pack.temperature)
         self.filter.predict(now - first.time, mean, pack.temperature, noise)
 

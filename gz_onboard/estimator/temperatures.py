@@ -2,20 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from gz_onboard.constants import BENCH_TEMPERATURE, MILD
 from gz_onboard.estimator.signals import Signals
+from gz_onboard.physics.parameters import Parameters
+from gz_onboard.physics.relaxation import decay_over, relaxed
 
-COOLING_TIME = 7200.0  # s: how fast the cells' temperature drifts to the ambient's
-WARMER = 3.0  # K: cells over the ambient
 CELL_SD, CELL_SD_UNKNOWN = 1.0, 8.0  # K: of a sensor, of its replacement
 
 
-class Temperatures:
-    """Remembers the cells' temperature."""
+def at_rest(temperature: float) -> float:
+    """The heat [W] of a pack without a load."""
+    return 0.0
 
-    def __init__(self, signals: Signals) -> None:
+
+class Temperatures:
+    """Remembers the cells' temperature, and by how much their heat has made them warmer than the air.
+
+    What is not measured follows the pack's cooling network (`physics.cooling.LumpedCooling`, exact over any step).
+    """
+
+    def __init__(self, signals: Signals, parameters: Parameters) -> None:
         self._signals = signals
+        self._conductance = parameters["pack_conductance"] * parameters["cooling_factor"]  # W/K
+        self._cooling_time = parameters["pack_heat_capacity"] / self._conductance  # s
         self.cells: float | None = None  # degC, the last known
+        self._over = 0.0  # K: over the ambient; parked for long they are as cold
 
     @property
     def cells_or_bench(self) -> float:
@@ -32,17 +45,28 @@ class Temperatures:
         if ambient is not None:
             return ambient
         if self.cells is not None and self._signals.cell_temperature.fresh(now):
-            return self.cells - WARMER
+            return self.cells - self._over
         return MILD
 
-    def step(self, now: float, dt: float) -> float:
-        """The cells' temperature [degC]: measured; else the last one, drifting to the ambient; else the ambient."""
-        measured = self._signals.cell_temperature.get(now)
+    def step(self, now: float, dt: float, heat: Callable[[float], float]) -> float:
+        """The cells' temperature [degC]: measured; else the last one; else the ambient; from there on by their heat.
+
+        heat: of the pack [W] over `dt` [s] by its temperature [degC].
+        """
+        measured, air = self._signals.cell_temperature.get(now), self._signals.ambient_temperature.get(now)
         if measured is not None:
             self.cells = measured
+            self._over = self._over_after(self._over, dt, heat(measured)) if air is None else measured - air
             return measured
         ambient = self.ambient(now)
+        cells = ambient + self._over if self.cells is None else self.cells
+        warm = self._over_after(cells - ambient, dt, heat(cells))
         if self.cells is None:
-            return ambient
-        self.cells += (ambient - self.cells) * min(dt / COOLING_TIME, 1.0)
-        return self.cells
+            self._over = warm
+        else:
+            self.cells = ambient + warm
+        return ambient + warm
+
+    def _over_after(self, over: float, dt: float, watts: float) -> float:
+        """`over` [K] the ambient, after `dt` [s] with so many `watts`."""
+        return relaxed(over, watts / self._conductance, decay_over(dt, self._cooling_time))

@@ -178,6 +178,17 @@ class Battery:
             entropy = np.interp(soc, self.entropy_soc, self.entropy_value)
         return reversible_heat(self.cells_series * entropy, current, temperature)
 
+    def pack_heat(self, current: float, soc: float, temperature: float, overpotential: float) -> float:
+        """Heat of the pack [W] at its `current` [A] and `temperature` [degC], with the reversible part.
+
+        overpotential: of a cell [V], of the RC pair and whatever else relaxes.
+        """
+        cell = current / self.cells_parallel
+        volts = self.terminal_voltage(soc, overpotential, cell, temperature)[0]
+        rest = self.cells_series * self.ocv(soc, temperature)[0]
+        lost = heat(rest, self.pack_voltage(volts, current), current)
+        return float(lost + self.reversible_heat(current, soc, temperature))
+
     def soc_at(self, ocv: float, temperature: float | None = None) -> float:
         """The SOC at which the open-circuit voltage of a cell is `ocv` [V]; `temperature` as for `ocv`."""
         if temperature is not None:
@@ -193,16 +204,6 @@ class Battery:
         for _ in range(SOC_ROUNDS):
             soc = self.soc_at(voltage + self.r0.at(soc, temperature)[0] * current + v1, temperature)
         return soc
-
-    def first_soc(
-        self, pack_voltage: float, pack_current: float, temperature: float, overpotential: float = 0.0
-    ) -> float:
-        """`soc_at_load` out of a ride's first pack voltage [V] and current [A], as if it had been at rest before.
-
-        overpotential: of effects in a cell [V], see `physics.model.when_met`.
-        """
-        cell = self.cell_voltage(pack_voltage, pack_current) + overpotential
-        return self.soc_at_load(cell, pack_current / self.cells_parallel, temperature)
 
     def circuit(self, soc: float, temperature: float) -> tuple[float, float, float]:
         """(R0 [ohm], R1 [ohm], C1 [F]) of a cell at `temperature` [degC]."""

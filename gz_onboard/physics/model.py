@@ -153,15 +153,21 @@ def remembering(effect: Bound, dt: float) -> Callable[[Mapping[str, Any]], float
 
 
 BURST = 10.0  # s: a load in traffic
+STOOD = 60.0  # s: for so long the load of a ride's first voltages has flowed: lights, heater, charger
 
 
-def when_met(
-    effects: Iterable[Bound], battery: Battery, pack_current: float, temperature: float, seconds: float
+def first_soc(
+    effects: Iterable[Bound], battery: Battery, pack_voltage: float, pack_current: float, temperature: float
 ) -> float:
-    """What `effects` in a cell take [V] from its first voltage, at a pack current [A] of some `seconds`."""
+    """The SOC out of a ride's first pack voltage [V] and current [A]: as if that had flowed for `STOOD`, from rest.
+
+    effects: in the cells; temperature in degC. The RC pair, slower than most of them, is taken to be at rest still. It
+    may be below 0 or above 1, see `Battery.soc_at_load`.
+    """
     cell, capacity = pack_current / battery.cells_parallel, battery.cell_capacity(temperature)
     q = all_quantities(cell_current=cell, soc=HALF_FULL, cell_temperature=temperature, cell_capacity=capacity)
-    return float(sum(effect(q) * (1 - effect.decay(seconds, q)) for effect in effects))
+    lost = float(sum(effect(q) * (1 - effect.decay(STOOD, q)) for effect in effects))
+    return battery.soc_at_load(battery.cell_voltage(pack_voltage, pack_current) + lost, cell, temperature)
 
 
 def value_of(effect: Bound, quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:

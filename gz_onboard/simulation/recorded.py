@@ -23,6 +23,8 @@ from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import INSTRUMENTS, Event
 from gz_onboard.offline.samples import extended, open_ride, read_roles, ride_name
 from gz_onboard.physics.battery import discharged
+from gz_onboard.physics.effect import Port
+from gz_onboard.physics.model import first_soc
 from gz_onboard.physics.sensors import speed_role, true_columns
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
 from gz_onboard.simulation.run import road_table
@@ -209,12 +211,13 @@ def scooter_at_start(
 
 
 def rest_soc(recorded: Recorded, vehicle: Vehicle) -> float | None:
-    """SOC in the first second, from voltage and current as if the RC pair had been at rest; None if not measured."""
+    """SOC in the first second, from voltage and current, see `first_soc`; None if not measured."""
     battery = vehicle.battery
     if battery is None or "pack_voltage" not in recorded.signals:
         return None
     voltage, current = recorded.first("pack_voltage", 0.0), recorded.first("pack_current", 0.0)
-    return min(max(battery.first_soc(voltage, current, recorded.first("cell_temperature", MILD)), 0.0), 1.0)
+    cells = vehicle.model.at(Port.CELL_VOLTAGE)
+    return min(max(first_soc(cells, battery, voltage, current, recorded.first("cell_temperature", MILD)), 0.0), 1.0)
 
 
 def _counted_soc(recorded: Recorded, vehicle: Vehicle) -> Array:

@@ -136,7 +136,7 @@ class Scooter:
         self.pack_cooling = LumpedCooling.of(p, "pack", cells)
         self.bms_cooling = LumpedCooling.of(p, "bms", cells)
         self._cooling_factor = p["cooling_factor"]
-        self._bms_resistance = p["bms_resistance"]
+        self._bms_resistance = min(p["bms_resistance"], battery.series_resistance)  # its part of it
         # J in the current cooling period; idle: the motor's part that comes without current
         self._heat = {"inverter": 0.0, "motor": 0.0, "idle": 0.0, "pack": 0.0, "bms": 0.0}
         self._charge = 0.0  # A·s out of the pack in that period
@@ -262,17 +262,17 @@ class Scooter:
         motor_heat = self.motor.heat(motor_speed, current, self.motor_cooling.stator, dt, entries)
         q["motor_speed"], q["motor_current"] = motor_speed, current
         inverter_heat = self._inverter.total(q, entries)
-        bms_heat = self._bms_resistance * self.current * self.current
-        entries["bms"] += bms_heat * dt
-        power = mechanical + motor_heat + inverter_heat + self._dc.total(q, entries) + bms_heat
+        power = mechanical + motor_heat + inverter_heat + self._dc.total(q, entries)
         self.current, self.voltage, pack_heat, delivered = self.pack.draw(power, dt, self.pack_cooling.temperature)
-        entries["battery_heat"] += pack_heat * dt
+        bms_heat = self._bms_resistance * self.current * self.current  # in the pack's: the board lies in its current
+        entries["bms"] += bms_heat * dt
+        entries["battery_heat"] += (pack_heat - bms_heat) * dt
         if power - delivered > 1e-6 * abs(power):
             entries["not_delivered"] -= (power - delivered) * dt
         self.motor_current = current
         heat["motor"] += motor_heat * dt
         heat["inverter"] += inverter_heat * dt
-        heat["pack"] += pack_heat * dt
+        heat["pack"] += pack_heat * dt  # the board's too, which stands on it: so its network was calibrated
         heat["bms"] += bms_heat * dt
         self._charge += self.current * dt
         self._since_cooling += dt

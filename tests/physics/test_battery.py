@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.physics.battery import current_of, dissipation, heat, terminal_voltage
 from gz_onboard.physics.drawable import drawable
+from gz_onboard.physics.model import first_soc
 from gz_onboard.physics.tables import Mesh
 from gz_onboard.vehicle import read_vehicle
 
@@ -50,7 +51,7 @@ def test_soc_at_load_inverts_terminal_voltage(soc, current, temperature, v1):
     assert BATTERY.soc_at_load(voltage, current, temperature, v1) == pytest.approx(soc, abs=2e-3)
     voltage = BATTERY.terminal_voltage(soc, 0.0, current, temperature)[0]
     amperes = BATTERY.cells_parallel * current
-    first = BATTERY.first_soc(BATTERY.pack_voltage(voltage, amperes), amperes, temperature)
+    first = first_soc([], BATTERY, BATTERY.pack_voltage(voltage, amperes), amperes, temperature)
     assert first == pytest.approx(BATTERY.soc_at_load(voltage, current, temperature), abs=1e-9)
 
 

@@ -61,14 +61,13 @@ def test_2_1_motor_current_is_its_command(riding):
 @pytest.mark.parametrize(("throttle", "brake"), [(0.5, 0.0), (0.0, 0.3)])
 def test_2_2_to_2_6_direct_current_carries_mechanical_power_and_losses(riding, throttle, brake):
     for _ in range(3):
-        before, start = riding.current, riding.wheel_speed
+        start = riding.wheel_speed
         watts, _, wheel = parted(riding, throttle, brake)
     mechanical = (P["torque_constant"] * riding.motor_current - motor_drag(start)) * wheel
     assert (mechanical > 0) is (throttle > 0)
     losses = watts["motor_copper_loss"] + watts["motor_iron_loss"] + watts["inverter_loss"]
     assert watts["inverter_loss"] > 0
-    bms = P["bms_resistance"] * before**2
-    terminal = mechanical + losses + watts["auxiliary_load"] + bms
+    terminal = mechanical + losses + watts["auxiliary_load"]
     assert riding.voltage * riding.current == pytest.approx(terminal, rel=1e-4)
 
 
@@ -132,9 +131,20 @@ def test_2_13_default_brake_is_friction():
 
 
 def test_2_16_and_2_17_bms(riding):
-    before = riding.current
     watts, _, _ = parted(riding, 0.5)
-    assert watts["bms"] == pytest.approx(P["bms_resistance"] * before**2, rel=1e-9)
+    assert watts["bms"] == pytest.approx(P["bms_resistance"] * riding.current**2, rel=1e-9)
+
+
+def test_2_17_and_2_23_the_board_is_a_part_of_the_packs_resistance(riding):
+    """From the cells' source to the loads the voltage drops by what calibration measured, the board in it."""
+    pack, soc, lost = riding.pack, riding.pack.soc, riding.pack.v1 + riding.pack.effects.overpotential
+    celsius, start = riding.pack_cooling.temperature, riding.wheel_speed
+    watts, _, wheel = parted(riding, 0.6)
+    taken = (P["torque_constant"] * riding.motor_current - motor_drag(start)) * wheel
+    taken += sum(watts[name] for name in ("motor_copper_loss", "motor_iron_loss", "inverter_loss", "auxiliary_load"))
+    cells = BATTERY.cells_series * (BATTERY.ocv(soc, celsius)[0] - lost) - taken / riding.current
+    measured = BATTERY.cells_series / BATTERY.cells_parallel * pack._r0 + P["pack_series_resistance"]
+    assert cells / riding.current == pytest.approx(measured, abs=2e-4)
 
 
 def test_2_18_and_2_23_pack_voltage():
@@ -230,7 +240,7 @@ def test_2_24_to_2_31_each_network_takes_its_own_heat():
     gained = P["inverter_board_capacity"] * (box.board - 20) + P["inverter_box_capacity"] * (box.box - 20)
     assert gained == pytest.approx(e["inverter_loss"], rel=1e-9)
     warmed = P["pack_heat_capacity"] * (scooter.pack_cooling.temperature - 20)
-    assert warmed == pytest.approx(e["battery_heat"] + reaction_heat(scooter, 20.0), rel=1e-3)
+    assert warmed == pytest.approx(e["battery_heat"] + e["bms"] + reaction_heat(scooter, 20.0), rel=1e-3)
     from_pack = P["bms_conductance"] * (scooter.pack_cooling.temperature - 20)  # which is warmed before
     assert P["bms_heat_capacity"] * (scooter.bms_cooling.temperature - 20) == pytest.approx(e["bms"] + from_pack)
     assert min(e[name] for name in ("motor_copper_loss", "inverter_loss", "battery_heat", "bms")) > 0.1
@@ -240,7 +250,8 @@ def test_2_30_the_battery_cools_to_the_air():
     scooter = Scooter(VEHICLE, soc=0.7, ambient=0.0, cell_temperature=30.0)
     for _ in range(100):
         scooter.step(0.0, 0.0)
-    lost = P["pack_heat_capacity"] * (30.0 - scooter.pack_cooling.temperature) + scooter.ledger["battery_heat"]
+    heat = scooter.ledger["battery_heat"] + scooter.ledger["bms"]
+    lost = P["pack_heat_capacity"] * (30.0 - scooter.pack_cooling.temperature) + heat
     assert lost + reaction_heat(scooter, 30.0) == pytest.approx(P["pack_conductance"] * 30.0, rel=1e-4)
 
 

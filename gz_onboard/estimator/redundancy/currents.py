@@ -95,7 +95,7 @@ class CurrentCheck:
             allowed = apart + APART_RELATIVE * self._load
             if self._without < min(allowed**2, self._square * EXPLAINS):
                 return AUXILIARY, None
-        errors = (error(voltage, pack), error(voltage, inverter)) if voltage else (None, None)
+        errors = (error(voltage, pack, "pack"), error(voltage, inverter, "inverter")) if voltage else (None, None)
         wrong = self._residuals.update(dt, *errors) or self._wrong_at_rest(readings, pack, inverter)
         if wrong:
             return (PACK, INVERTER)[wrong - 1], None
@@ -119,7 +119,7 @@ class CurrentCheck:
         pack, inverter = (self.counters[role].faulty for role in self.ROLES[:2])
         instead = readings.pack is None or (pack and not inverter)
         used = readings.through_inverter if instead else readings.pack
-        first = None if used is None else evidence.error(voltage, used)
+        first = None if used is None else evidence.error(voltage, used, "inverter" if instead else "pack")
         if used is None or first is None:
             return False
         gross, explained = abs(first) > GROSS_ERROR, self.sag.explained
@@ -130,7 +130,7 @@ class CurrentCheck:
             return False
         shown, power = readings.pack_voltage or readings.inverter_voltage, evidence.road_power()
         expected = power / shown if shown and power is not None else None
-        second = None if expected is None else evidence.error(voltage, expected)
+        second = None if expected is None else evidence.error(voltage, expected, "road")
         if expected is None or second is None:
             return False
         far = abs(used - expected) > OFF_ROAD * self._capacity + TWICE * min(abs(used), abs(expected))

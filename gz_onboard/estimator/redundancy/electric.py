@@ -14,8 +14,8 @@ from gz_onboard.estimator.road import STANDSTILL
 ERROR_TIME, ERROR_LEAST = 10.0, 0.04  # s, V: what the cell model leaves, low-passed
 CLEARLY = 2.5  # of two mean squares: the greater one's reading is wrong
 
-CellError = Callable[[float, float], float | None]
-"""Measured less predicted voltage of a cell [V], for a voltage [V] and a current [A] of the pack."""
+CellError = Callable[[float, float, str], float | None]
+"""Measured less predicted voltage of a cell [V], for a voltage [V] and a current [A] of the pack; and whose current."""
 
 
 @dataclass(frozen=True, slots=True)

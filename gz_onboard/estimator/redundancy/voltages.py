@@ -85,7 +85,7 @@ class VoltageCheck:
         """Which of two that differ is wrong; nothing while that is not known."""
         wrong = 0
         if current is not None and self._agreed > AGREED_BEFORE:
-            wrong = self._residuals.update(dt, error(pack, current), error(inverter, current))
+            wrong = self._residuals.update(dt, error(pack, current, "chosen"), error(inverter, current, "chosen"))
         known = faulty(self.counters)
         return frozenset({self.ROLES[wrong - 1]}) if wrong else known if len(known) == 1 else frozenset()
 

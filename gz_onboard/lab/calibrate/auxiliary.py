@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -43,13 +43,7 @@ def at_standstill(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         if missing := [role for role in PACK if role not in columns]:
             result.notes.append(f"{ride.name}: no {missing[0]}, left out")
             continue
-        role, factor = speed_role(ride.name, columns, p)
-        time, current = columns["pack_current"]
-        still = np.abs(np.interp(time, *columns[role])) * factor < STANDING
-        power = current * np.interp(time, *columns["pack_voltage"]) - p["inverter_loss_constant"]
-        for load in LOADS:
-            if load in columns:
-                power = power - np.interp(time, *columns[load])
+        still, power = standing(ride, p)
         if still.sum() >= LEAST_STANDING:
             means.append(float(np.median(power[still])))
     if not means:
@@ -61,8 +55,22 @@ def at_standstill(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     sd = float(np.hypot(spread, p.sd("inverter_loss_constant")))
     span = f"{min(means):.0f} to {max(means):.0f} W"
     source = f"pack power at standstill of {len(means)} rides, {span}, less the inverter's own"
-    result.parameters["auxiliary_power"] = Found(mean, sd, "W", source)
+    result.parameters["auxiliary_power"] = Found(mean, sd, "W", source, "pack_voltage times pack_current")
     return result
+
+
+def standing(ride: Samples, p: Mapping[str, float]) -> tuple[Mask, Array]:
+    """(whether the vehicle stands; the pack's power [W] less the inverter's own, a heater's and an air conditioner's).
+
+    At the times of the pack's current, (n,). InputError for a ride without a speed.
+    """
+    role, factor = speed_role(ride.name, ride.columns, p)
+    time, current = ride.columns["pack_current"]
+    power = current * np.interp(time, *ride.columns["pack_voltage"]) - p["inverter_loss_constant"]
+    for load in LOADS:
+        if load in ride.columns:
+            power = power - np.interp(time, *ride.columns[load])
+    return np.abs(np.interp(time, *ride.columns[role])) * factor < STANDING, power
 
 
 def by_auxiliary_current(rides: Sequence[Samples]) -> Result:
@@ -100,7 +108,7 @@ def by_auxiliary_current(rides: Sequence[Samples]) -> Result:
         source += f"; {off:.1f} W, {on:.1f} W with brake light"
     else:
         result.refusals.append("auxiliary power of the brake light: no ride has brake_switch with the brake on")
-    result.parameters["auxiliary_power"] = Found(value, sd, "W", source)
+    result.parameters["auxiliary_power"] = Found(value, sd, "W", source, "auxiliary_current times pack_voltage")
     if len(mean) > 1:
         others = np.array([np.delete(mean, k).mean() for k in range(len(mean))])
         by = f"each of {len(mean)} rides by the others"

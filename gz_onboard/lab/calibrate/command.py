@@ -15,6 +15,7 @@ from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import OK, InputError, nearest, not_an_input, writing
 from gz_onboard.lab.calibrate import manifest, report
 from gz_onboard.lab.calibrate.manifest import Option, Step, check_count
+from gz_onboard.lab.calibrate.prior_check import check_against_file
 from gz_onboard.lab.calibrate.procedures import PROCEDURES, Given, Procedure
 from gz_onboard.lab.calibrate.result import LackingError, Result
 from gz_onboard.lab.calibrate.table import read_table
@@ -54,7 +55,9 @@ def calibrate(
                     given.rides.setdefault(slot, []).append(read[file])
             begin(f"{step.procedure}: fitting")
             try:
-                results.append(procedure.run(given))
+                result = procedure.run(given)
+                check_against_file(result, vehicle)
+                results.append(result)
             except InputError as error:
                 if isinstance(error, LackingError) and len(steps) > 1:
                     results.append(Result(step.procedure, refusals=[f"{error}; what the file says stays"]))

@@ -18,7 +18,7 @@ from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.battery import dissipation
 from gz_onboard.physics.cooling import PERIOD
 from gz_onboard.physics.effect import Port
-from gz_onboard.physics.model import total, when_met
+from gz_onboard.physics.model import STOOD, all_quantities, first_soc, stepping, total
 from gz_onboard.physics.sensors import road_speed, true_columns
 from gz_onboard.vehicle import Vehicle
 
@@ -176,14 +176,17 @@ def _pack_heat(
 ) -> tuple[Array, Array]:
     """(what the pack turns to heat [W], its SOC) by mean and mean square of its current, all (n,).
 
-    first: mean voltage and current of the pack in its first moments, from rest.
+    first: mean voltage and current of the pack in its first moments, at a standing load.
     """
     battery = vehicle.pack
-    lost = vehicle.model.overpotential(battery)
+    cells = vehicle.model.at(Port.CELL_VOLTAGE)
     n, m = battery.cells_series, battery.cells_parallel
     volts, amperes, celsius = *first, float(temperature[0])
-    begun = when_met(vehicle.model.at(Port.CELL_VOLTAGE), battery, amperes, celsius, FIRST / 2)
-    soc = battery.first_soc(volts, amperes, celsius, begun)
+    soc = first_soc(cells, battery, volts, amperes, celsius)
+    states: dict[str, float] = {}
+    q = all_quantities(cell_current=amperes / m, soc=soc, cell_temperature=celsius)
+    q["cell_capacity"] = battery.cell_capacity(celsius)
+    total(cells, q, stepping(states, STOOD))  # as the first state of charge has it
     heat, socs, v1 = battery.series_resistance * square, np.empty_like(mean), 0.0
     for k, (i, i2, t) in enumerate(
         zip((mean / m).tolist(), (square / m**2).tolist(), temperature.tolist(), strict=True)
@@ -192,6 +195,6 @@ def _pack_heat(
         soc, v1, _ = battery.advanced(PERIOD, soc, v1, i, t)
         socs[k] = soc
         heat[k] += n * m * dissipation(r0, r1, i2, v1)
-        if lost and i:
-            heat[k] += n * m * i * lost(i, soc, t, i2 / i**2)
+        q |= {"cell_current": i, "soc": soc, "cell_temperature": t, "cell_capacity": battery.cell_capacity(t)}
+        heat[k] += n * m * i * total(cells, q, stepping(states, PERIOD))
     return heat, socs

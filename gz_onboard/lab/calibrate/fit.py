@@ -50,9 +50,9 @@ class Solution:
         i = [self.names.index(name) for name in names]
         return self.covariance[np.ix_(i, i)]
 
-    def found(self, name: str, unit: str, source: str, sd_more: float = 0.0) -> Found:
+    def found(self, name: str, unit: str, source: str, sd_more: float = 0.0, channel: str = "") -> Found:
         """`name` as a result. sd_more: a further standard deviation that no sample shows, such as of the sensor."""
-        return Found(self[name], float(np.hypot(self.sd(name), sd_more)), unit, source)
+        return Found(self[name], float(np.hypot(self.sd(name), sd_more)), unit, source, channel)
 
 
 def correlation(covariance: Array) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array, Mask, block_means
 from gz_onboard.errors import InputError
-from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD
+from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD, PACK, standing
 from gz_onboard.lab.calibrate.fit import as_groups, every_second, line, score
 from gz_onboard.lab.calibrate.result import Found, LackingError, Panel, PlotLine, Result
 from gz_onboard.lab.sizes import sizes_of
@@ -73,15 +73,20 @@ def read_pair(ride: Samples, vehicle: Vehicle) -> Pair:
 def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     """pack_current_offset, pack_current_gain, both noises and pack_voltage_offset of the pack's sensors.
 
-    Raises InputError if no ride has readings of both, or none stands still for `LEAST_REST` samples.
+    Of rides that all lack the inverter's, see `at_standstill`. Raises InputError if none stands still for `LEAST_REST`
+    samples.
     """
-    pairs = [read_pair(ride, vehicle) for ride in rides]
-    if not pairs:
+    if not rides:
         raise InputError("no ride, which sensor offsets come from")
+    pairs = [read_pair(ride, vehicle) for ride in rides if set(NEEDED.split()) <= ride.columns.keys()]
+    if not pairs:
+        return at_standstill(rides, vehicle)
     resting = [pair for pair in pairs if pair.rest.sum() >= LEAST_REST]
     if not resting:
         raise InputError(f"{pairs[0].name}: no ride stands without load for {LEAST_REST} samples; offsets show at rest")
     p, sizes, result = vehicle.parameters, sizes_of(vehicle), Result("offsets")
+    if left_out := [ride.name for ride in rides if ride.name not in {pair.name for pair in pairs}]:
+        result.notes.append(f"{', '.join(left_out)}: left out; needed are {NEEDED.replace(' ', ', ')}")
     own = np.array([p["inverter_loss_constant"] / pair.pack_voltage[pair.rest].mean() for pair in resting])
     apart = np.array([(pair.pack - pair.inverter - pair.auxiliary)[pair.rest].mean() for pair in resting])
     # of a ride to come: what differs from ride to ride, the inverter's own loss, and the auxiliary sensor's share
@@ -94,14 +99,10 @@ def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         "A",
         f"{len(resting)} rides at rest: pack less inverter less auxiliary is {apart.mean():+.3f} ± {spread:.3f} "
         f"A, {own.mean():.3f} A of it the inverter's own {p['inverter_loss_constant']:.1f} W",
+        "pack_current less inverter_current and auxiliary_current at rest",
     )
     _gain(result, pairs, LEAST_SPAN * sizes.current)
-    noises = np.array([(_noise(pair.pack, pair.rest), _noise(pair.pack_voltage, pair.rest)) for pair in resting])
-    for (name, unit), column in zip((("pack_current_noise", "A"), ("pack_voltage_noise", "V")), noises.T, strict=True):
-        sd = float(column.std(ddof=1)) if len(column) > 1 else 0.2 * float(column.mean())
-        result.parameters[name] = Found(
-            float(np.median(column)), max(sd, 1e-4), unit, f"first differences at rest, {len(resting)} rides, white"
-        )
+    _noises(result, [(_noise(pair.pack, pair.rest), _noise(pair.pack_voltage, pair.rest)) for pair in resting])
     volts = np.array([(pair.pack_voltage - pair.inverter_voltage)[pair.rest].mean() for pair in resting])
     result.parameters["pack_voltage_offset"] = Found(
         0.0,
@@ -118,6 +119,59 @@ def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         f"pack's sensors lag the inverter's by {np.median(lags):.2f} s ({min(lags):.2f} to {max(lags):.2f})"
     )
     return result
+
+
+def at_standstill(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
+    """Both noises and, of rides with auxiliary_current, pack_current_offset, while the vehicle stands.
+
+    Raises LackingError if no ride has pack_voltage and pack_current and stands for `LEAST_REST` samples.
+    """
+    result, p = Result("offsets"), vehicle.parameters
+    lacking = sorted(set(NEEDED.split()).difference(*(ride.columns for ride in rides)))
+    missing = f"no ride has all of {', '.join(NEEDED.split())}" + (
+        f" (none has {', '.join(lacking)})" if lacking else ""
+    )
+    noises, apart, volts = [], [], 1.0
+    for ride in rides:
+        if not set(PACK) <= ride.columns.keys():
+            continue
+        (still, power), (time, current) = standing(ride, p), ride.columns["pack_current"]
+        if still.sum() < LEAST_REST:
+            continue
+        voltage = np.interp(time, *ride.columns["pack_voltage"])
+        noises.append((_noise(current, still), _noise(voltage, still)))
+        if "auxiliary_current" in ride.columns:
+            volts = float(voltage[still].mean())
+            over = power / voltage - np.interp(time, *ride.columns["auxiliary_current"])
+            apart.append(float(over[still].mean()))
+    if not noises:
+        raise LackingError(f"{missing}, nor stands for {LEAST_REST} samples with {' and '.join(PACK)}")
+    result.notes.append(f"{missing}: taken from the pack's sensors at standstill instead")
+    _noises(result, noises)
+    if apart:
+        spread = float(np.std(apart, ddof=1)) if len(apart) > 1 else 0.05
+        sd = float(np.hypot(max(spread, DRIFT_SD), p.sd("inverter_loss_constant") / volts) + CURRENT_SD * AUXILIARY)
+        source = f"{len(apart)} rides at standstill: pack less auxiliary current and the inverter's own"
+        channel = "pack_current less auxiliary_current at standstill"
+        result.parameters["pack_current_offset"] = Found(float(np.mean(apart)), sd, "A", source, channel)
+    else:
+        result.refusals.append(
+            "pack_current_offset: needs inverter_current, or auxiliary_current at standstill; what the file says stays"
+        )
+    result.refusals.append(
+        "pack_current_gain, pack_voltage_offset: need inverter_current and inverter_voltage; what the file says stays"
+    )
+    return result
+
+
+def _noises(result: Result, noises: Sequence[tuple[float, float]]) -> None:
+    """pack_current_noise [A] and pack_voltage_noise [V] out of those of each ride."""
+    columns = np.array(noises).T
+    for (name, unit), column in zip((("pack_current_noise", "A"), ("pack_voltage_noise", "V")), columns, strict=True):
+        sd = float(column.std(ddof=1)) if len(column) > 1 else 0.2 * float(column.mean())
+        result.parameters[name] = Found(
+            float(np.median(column)), max(sd, 1e-4), unit, f"first differences at rest, {len(column)} rides, white"
+        )
 
 
 def window_means(pair: Pair, values: Array, seconds: float) -> Array:
@@ -138,7 +192,9 @@ def _gain(result: Result, pairs: Sequence[Pair], least: float) -> None:
     fitted = every_second(labels)
     found, model, outside = line("pack_current_gain", x, y, fitted, as_groups(labels))
     source = f"{len(pairs)} rides, {len(x)} means of {WINDOW:g} s, against inverter and auxiliary current"
-    result.parameters["pack_current_gain"] = found.found("pack_current_gain", "1", source, GAIN_SD)
+    result.parameters["pack_current_gain"] = found.found(
+        "pack_current_gain", "1", source, GAIN_SD, "pack_current over inverter_current"
+    )
     result.refusals.append(
         f"pack_current_gain: {found['pack_current_gain']:.4f} ± {found.sd('pack_current_gain'):.4f} is the ratio of "
         f"two sensors; which one errs is unknown, so that its sd holds a sensor's class of {100 * GAIN_SD:.1f} %"

@@ -19,6 +19,8 @@ from gz_onboard.lab.calibrate.table import Measurements
 from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.battery import discharged
+from gz_onboard.physics.effect import Port
+from gz_onboard.physics.model import first_soc
 from gz_onboard.physics.relaxation import decay_over
 from gz_onboard.physics.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
@@ -69,6 +71,7 @@ def cable_resistance(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         float(np.hypot(found.sd("cable_resistance"), gains)),
         "ohm",
         f"{source}; {found['offset']:+.3f} V at no current",
+        "pack_voltage less inverter_voltage over inverter_current",
     )
     y_label = "pack less inverter voltage [V]"
     result.panels += compared("Voltage between pack and inverter", "current [A]", y_label, i, v, model)
@@ -114,7 +117,9 @@ def pack_series_resistance(rides: Sequence[Samples], vehicle: Vehicle, pulses: S
             f"mohm ({100 * CELL_SHARE_SD:.0f} % of the cells' own in doubt): the value of the vehicle file stays"
         )
     else:
-        result.parameters["pack_series_resistance"] = Found(found["series"], sd, "ohm", source)
+        result.parameters["pack_series_resistance"] = Found(
+            found["series"], sd, "ohm", source, "steps of pack_voltage over those of pack_current"
+        )
     return result
 
 
@@ -140,7 +145,8 @@ def _ride_steps(
     if not big.any():
         return None
     if by_temperature is None:
-        start = battery.first_soc(float(np.median(voltage[:FIRST])), float(np.median(current[:FIRST])), temperature)
+        volts, amperes = float(np.median(voltage[:FIRST])), float(np.median(current[:FIRST]))
+        start = first_soc(vehicle.model.at(Port.CELL_VOLTAGE), battery, volts, amperes, temperature)
         charge = float(np.trapezoid(current, time))  # A·s; what half of it takes is the middle of the ride
         soc = start - discharged(charge, 0.5, battery.pack_capacity(temperature))
         r0, r1, c1 = battery.circuit(soc, temperature)

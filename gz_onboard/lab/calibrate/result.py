@@ -22,6 +22,7 @@ class Found:
     sd: float
     unit: str
     source: str  # data, number of points, residual, conditions
+    channel: str = ""  # the signals of a ride that tell it, by their roles; none: a bench
 
 
 @dataclass(frozen=True)

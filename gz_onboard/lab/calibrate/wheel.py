@@ -20,24 +20,29 @@ SLOWEST = 5.0  # m/s: below, a receiver's speed is poor
 STEADY = 0.15  # m/s²
 LONGEST = 2.0  # s either side, over which it must be steady
 FEWEST = 60  # fixes of a ride
+TURNING = ("motor_speed", "wheel_speed_rear")  # rad/s: what turns with the driven wheel, the first that there is
 RECEIVER = 0.002  # relative: Doppler speed of a receiver in the open
 
 
 def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     """wheel_radius [m] of the rides that have GPS and steady riding; each ride held out once shows how it differs.
 
-    Raises InputError if no ride has both.
+    By motor_speed, of rides without it by wheel_speed_rear. Raises LackingError if no ride has both.
     """
     result = Result("wheel")
     radii: list[float] = []
     names: list[str] = []
     traces: list[PlotLine] = []
-    count = 0
+    count, turning = 0, set()
     for ride in rides:
-        if "gps_speed" not in ride.columns or "motor_speed" not in ride.columns:
-            result.refusals.append(f"{ride.name}: has no gps_speed or no motor_speed")
+        role = next((role for role in TURNING if role in ride.columns), None)
+        if "gps_speed" not in ride.columns or role is None:
+            result.refusals.append(f"{ride.name}: has no gps_speed or no motor_speed, nor a {TURNING[1]} instead")
             continue
-        over_ground, wheel = _steady(true_columns(ride.columns, vehicle.parameters), vehicle.parameters["gear_ratio"])
+        if role != TURNING[0]:
+            result.notes.append(f"{ride.name}: no {TURNING[0]}, taken by {role} instead")
+        gear = vehicle.parameters["gear_ratio"] if role == TURNING[0] else 1.0
+        over_ground, wheel = _steady(true_columns(ride.columns, vehicle.parameters), role, gear)
         if len(wheel) < FEWEST:
             result.refusals.append(
                 f"{ride.name}: {len(wheel)} fixes at steady speed above {SLOWEST:g} m/s; {FEWEST} needed"
@@ -46,6 +51,7 @@ def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         ratio = over_ground / wheel
         radii.append(float(np.median(ratio)))
         names.append(ride.name)
+        turning.add(role)
         count += len(wheel)
         traces.append(PlotLine(ride.name, wheel, ratio, "."))
     if not radii:
@@ -53,11 +59,12 @@ def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     radius = float(np.mean(radii))
     spread = float(np.std(radii, ddof=1)) if len(radii) > 1 else 3 * RECEIVER * radius
     sd = float(np.hypot(spread / np.sqrt(len(radii)), RECEIVER * radius))
+    channel = f"gps_speed over {' and '.join(sorted(turning))}"
     source = (
-        f"{', '.join(names)}: GPS speed over motor speed, {count} fixes at steady speed, {min(radii):.4f} to "
+        f"{', '.join(names)}: {channel}, {count} fixes at steady speed, {min(radii):.4f} to "
         f"{max(radii):.4f} m; slip of the driven wheel included"
     )
-    result.parameters["wheel_radius"] = Found(radius, sd, "m", source)
+    result.parameters["wheel_radius"] = Found(radius, sd, "m", source, channel)
     if len(radii) > 1:
         left = np.array([r - (radius * len(radii) - r) / (len(radii) - 1) for r in radii])
         rms, largest = float(np.sqrt(np.mean(left**2))), float(np.abs(left).max())
@@ -69,10 +76,10 @@ def calibrate(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     return result
 
 
-def _steady(columns: Mapping[str, tuple[Array, Array]], gear: float) -> tuple[Array, Array]:
-    """(GPS speed [m/s], speed of the driven wheel [rad/s]) at fixes within steady riding."""
+def _steady(columns: Mapping[str, tuple[Array, Array]], role: str, gear: float) -> tuple[Array, Array]:
+    """(GPS speed [m/s], speed of the driven wheel [rad/s]) at fixes within steady riding, by `gear` times `role`."""
     time, speed = columns["gps_speed"]
-    at, motor = columns["motor_speed"]
+    at, motor = columns[role]
     good = (speed > SLOWEST) & (time > at[0] + LONGEST) & (time < at[-1] - LONGEST)
     if "gps_fix" in columns:
         good &= np.interp(time, *columns["gps_fix"]) > 1.5

@@ -16,9 +16,9 @@ from gz_onboard.lab.discover.gain import errors
 from gz_onboard.lab.discover.linear import LinearRide, normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.prior import LOG_SCALED
+from gz_onboard.lab.overrun import FAR, overrun, stop_at
 from gz_onboard.physics.parameters import declared_parameters
 
-FAR = 4.0  # standard deviations of what was known, beyond which rides contradict it
 APART = 12.0  # times what differs between rides: of eight healthy rides 5 at most, of a current 30 % wrong in one 61
 LEAST_RIDES = 5  # to hold two out at a time and learn from the others
 MOST_SAID = 3  # parameters: one bad signal may pull dozens
@@ -49,25 +49,17 @@ def check_against_file(learned: Learned) -> None:
     sd = np.sqrt(np.diag(before.prior) + learned.usual_scatter)
     far = np.abs(after.mean - before.mean) / sd
     found = [i for i in sorted(_judged(before), key=lambda i: -far[i]) if far[i] > FAR]
-    if not found:
-        return
     rows = []
     for i in found[:MOST_SAID]:
         name, old = before.names[i], known[before.names[i]]
         new = after.values_at(after.mean)[name]
         wide = float(np.sqrt(after.prior[i, i]) * after.scale[i]) * (new if name in LOG_SCALED else 1.0)
         channel, without = pulling(learned, i)
-        rows.append(
-            f"{name} is {old.value:.4g} ± {old.sd:.2g} {old.unit} ({old.status}) by the file and {new:.4g} ± "
-            f"{wide:.2g} {old.unit} by these rides, {far[i]:.0f} standard deviations apart; {channel} "
-            f"({', '.join(CHANNEL[channel].roles)}) pulls it there, without which it is {without:.4g}"
-        )
+        pulled = f"{channel} ({', '.join(CHANNEL[channel].roles)}) pulls it there, without which it is {without:.4g}"
+        rows.append(overrun(name, old, (new, wide), float(far[i]), pulled))
     if more := len(found) - len(rows):
         rows.append(f"and {more} more parameters are as far")
-    raise InputError(
-        "; ".join(rows) + ". Nothing is written. If these signals are poor, leave them out of [roles]; if the file "
-        "only guesses, give it a larger sd"
-    )
+    stop_at(rows)
 
 
 def _judged(before: MixedModel) -> list[int]:

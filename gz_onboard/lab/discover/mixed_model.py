@@ -40,7 +40,7 @@ from gz_onboard.lab.discover.system import System
 from gz_onboard.lab.sizes import Sizes, sizes_of
 from gz_onboard.offline.processes import worker_pool
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.effect import Effect
+from gz_onboard.physics.effect import Effect, Port
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import Vehicle
 
@@ -172,7 +172,8 @@ def initial(vehicle: Vehicle, folder: Path | None = None) -> MixedModel:
     effects: tuple[Effect, ...] = (*vehicle.model.effects, *more)
     p = vehicle.parameters
     sizes = sizes_of(vehicle)
-    system = System(effects, vehicle.battery, dict(p), vehicle.riding.vibration, sizes)
+    cells = tuple(vehicle.model.at(Port.CELL_VOLTAGE))
+    system = System(effects, vehicle.battery, dict(p), cells, vehicle.riding.vibration, sizes)
     values = {name: x.prior for name, x in declared_parameters(effects).items()} | dict(p)
     values |= {nuisance.name: nuisance.value for nuisance in NUISANCES} | dict.fromkeys(absent, 0.0)
     names = _names(vehicle, causes, more, values)

@@ -26,6 +26,7 @@ class System:
     effects: tuple[Effect, ...]
     battery: Battery | None
     healthy: Values  # parameters of the vehicle file
+    cells: tuple[Bound, ...] = ()  # the effects in its cells by the vehicle file
     vibration: float = VIBRATION  # m/s², of the vehicle file's prior riding: for rides that did not measure it
     sizes: Sizes = USUAL_SIZES
 

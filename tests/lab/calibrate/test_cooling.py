@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import asinh, exp
+from math import asinh
 
 import numpy as np
 import pytest
 
 from gz_onboard.errors import InputError
+from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.lab.calibrate import cooling_network
 from gz_onboard.lab.calibrate.cooling import (
     bms_cooling,
@@ -20,6 +21,7 @@ from gz_onboard.lab.calibrate.table import read_table
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import read_vehicle
+from tests.support import without_cell_effects
 
 from .bench import bench_file, changed, needs_data, table, without
 
@@ -251,8 +253,7 @@ def test_ride_run_takes_the_heat_of_the_vehicles_own_losses():
     assert run.pack_heat[-1] == pytest.approx(settled, rel=0.2)
     battery, temperature = VEHICLE.pack, 25.0  # nearly empty and under load, where the resistance depends most on SOC
     r0 = battery.r0.at(0.1, temperature)[0]
-    begun = reaction * (1 - exp(-0.5 / p["charge_transfer_time"]))  # in the middle of what counts as the first
-    volts = battery.pack_voltage(battery.ocv(0.1, temperature)[0] - r0 * cell - begun, 24.0)
+    volts = battery.pack_voltage(battery.ocv(0.1, temperature)[0] - r0 * cell - reaction, 24.0)
     columns["pack_voltage"] = fast, np.full(len(fast), volts)
     heat = bars + 168 * cell * (cell * r0 + reaction)
     assert ride_run(Samples("low", columns), VEHICLE).pack_heat[0] == pytest.approx(heat, rel=0.02)
@@ -267,3 +268,27 @@ def test_reference_bench_against_the_thesis():
         fits = procedure([step], VEHICLE, [validation]).fits
         assert max(fit.largest for fit in fits if not fit.held_out) < calibrated
         assert max(fit.largest for fit in fits if fit.held_out) < validated
+
+
+def test_bursts_heat_the_cells_by_what_their_reaction_has_built_up():
+    """Two seconds in four, of a reaction that takes three: settled in each second it would heat by a third more."""
+    time = np.arange(0, 600, 0.1)
+    slow, amperes = time[::10], np.where(time % 4 < 2, 60.0, 0.0)
+    p = VEHICLE.parameters
+    values = {
+        "pack_current": p["pack_current_gain"] * amperes + p["pack_current_offset"],
+        "pack_voltage": 50 + 0 * time,
+    }
+    values |= dict.fromkeys(("motor_speed", "motor_current"), 0 * time)
+    columns = {role: (time, value) for role, value in values.items()}
+    steady = ("motor_temperature", "ambient_temperature", "cell_temperature")
+    columns |= {role: (slow, np.full(len(slow), 15.0)) for role in steady}
+    with_it, without_it = (
+        ride_run(Samples("bursts", columns), vehicle) for vehicle in (VEHICLE, without_cell_effects(VEHICLE))
+    )
+    effects, joules = CellEffects(VEHICLE.model, VEHICLE.pack), 0.0
+    for cell in (amperes / 12).tolist():
+        effects.step(0.1, cell, 0.5, 15.0)
+        joules += 168 * cell * effects.overpotential * 0.1
+    found = with_it.pack_heat.sum() - without_it.pack_heat.sum()
+    assert found == pytest.approx(joules, rel=0.1)

@@ -6,6 +6,7 @@ import pytest
 from gz_onboard.errors import InputError
 from gz_onboard.lab.calibrate.auxiliary import CURRENT_SD
 from gz_onboard.lab.calibrate.offsets import DRIFT_SD, GAIN_SD, offsets, read_pair, window_means
+from gz_onboard.lab.calibrate.result import LackingError
 
 from .rides import CURRENT_NOISE, GAIN, OFFSET, VEHICLE, VOLTAGE_NOISE, VOLTS_APART, ride
 
@@ -63,8 +64,10 @@ def test_no_gain_without_current():
 
 
 def test_bad_rides_are_refused():
-    with pytest.raises(InputError, match="ride_0: no inverter_current"):
-        offsets([ride(0, drop=["inverter_current"])], VEHICLE)
+    with pytest.raises(
+        LackingError, match=r"none has inverter_current, pack_current\), nor stands .* with pack_voltage"
+    ):
+        offsets([ride(0, drop=["inverter_current", "pack_current"])], VEHICLE)
     moving = ride(0)
     moving.columns["motor_speed"][1][:] = 30.0
     with pytest.raises(InputError, match="no ride stands without load"):
@@ -80,3 +83,27 @@ def test_means_are_over_whole_windows():
     means = window_means(pair, np.arange(len(pair.time), dtype=float), 2.0)
     assert len(means) == len(pair.time) // count
     assert means[:2] == pytest.approx([(count - 1) / 2, (3 * count - 1) / 2])
+
+
+INVERTER = ["inverter_current", "inverter_voltage", "motor_current"]
+
+
+def test_without_the_inverters_sensors_the_pack_at_standstill_tells_and_it_is_said():
+    result = offsets([ride(seed, drop=INVERTER) for seed in range(3)], VEHICLE)
+    found = result.parameters
+    assert set(found) == {"pack_current_offset", "pack_current_noise", "pack_voltage_noise"}
+    assert abs(found["pack_current_offset"].value - OFFSET) < 2 * found["pack_current_offset"].sd
+    assert found["pack_current_noise"].value == pytest.approx(CURRENT_NOISE, rel=0.1)
+    assert "none has inverter_current, inverter_voltage, motor_current): taken from the pack's" in result.notes[0]
+    assert "pack_current_gain, pack_voltage_offset: need inverter_current" in result.refusals[-1]
+
+
+def test_without_any_other_current_there_is_no_offset():
+    result = offsets([ride(0, drop=[*INVERTER, "auxiliary_current"])], VEHICLE)
+    assert set(result.parameters) == {"pack_current_noise", "pack_voltage_noise"}
+    assert "pack_current_offset: needs inverter_current, or auxiliary_current" in result.refusals[0]
+
+
+def test_a_ride_without_the_inverters_sensors_beside_others_is_left_out_and_named():
+    result = offsets([ride(0), ride(1), ride(2, drop=INVERTER)], VEHICLE)
+    assert any(note.startswith("ride_2: left out") for note in result.notes)

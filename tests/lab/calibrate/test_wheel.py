@@ -54,8 +54,19 @@ def test_what_does_not_tell_is_refused():
     blind = Samples("blind", {"motor_speed": good.columns["motor_speed"]})
     slow = ride(0.24, 2, top=4.0)
     result = calibrate([good, blind, slow], VEHICLE)
-    assert result.refusals[0] == "blind: has no gps_speed or no motor_speed"
+    assert result.refusals[0] == "blind: has no gps_speed or no motor_speed, nor a wheel_speed_rear instead"
     assert "ride_2: 0 fixes at steady speed" in result.refusals[1]
     assert "ride_1" in result.parameters["wheel_radius"].source
     with pytest.raises(InputError, match="no ride tells the wheel's radius: blind"):
         calibrate([blind], VEHICLE)
+
+
+def test_without_a_motor_speed_it_is_that_of_the_rear_wheel_and_says_so():
+    with_motor = ride(0.24, 1)
+    time, turned = with_motor.columns["motor_speed"]
+    columns = {"gps_speed": with_motor.columns["gps_speed"], "wheel_speed_rear": (time, turned)}
+    geared = VEHICLE.changed(VEHICLE.parameters.replaced(gear_ratio=0.2))
+    result = calibrate([Samples("car", columns)], geared)
+    assert result.parameters["wheel_radius"].value == pytest.approx(0.24, rel=0.003)
+    assert "car: no motor_speed, taken by wheel_speed_rear instead" in result.notes
+    assert "gps_speed over wheel_speed_rear" in result.parameters["wheel_radius"].source

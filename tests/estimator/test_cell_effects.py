@@ -1,0 +1,90 @@
+"""Effects in the cells as the estimator follows them: through steps of the current, and for currents in dispute."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from gz_onboard.estimator.cell_effects import CellEffects
+from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.events import Group
+from gz_onboard.vehicle import read_vehicle
+
+VEHICLE = read_vehicle("reference", 75.0)
+PACK, MODEL = VEHICLE.pack, VEHICLE.model
+COLD, SOC, DT = -5.0, 0.7, 0.1  # degC, 1, s
+HARD = 5.0  # A of a cell: pulling away
+GROUPS = [
+    Group("Pack", ("pack_voltage", "pack_current"), DT),
+    Group("Motor", ("motor_speed",), DT),
+    Group("Cells", ("cell_temperature", "ambient_temperature"), 1.0),
+]
+
+
+def followed(currents, temperature=COLD):
+    """The effects after cell `currents` [A], `DT` each, and their overpotential [V] at each."""
+    effects, volts = CellEffects(MODEL, PACK), []
+    for before, current in zip([currents[0], *currents[:-1]], currents, strict=True):
+        effects.step(DT, (before + current) / 2, SOC, temperature)
+        volts.append(effects.overpotential)
+    return effects, volts
+
+
+def test_a_current_that_has_just_begun_takes_no_more_than_has_built_up():
+    """A step to 5 A: the charge transfer of 3 s has hardly begun, whoever reports the current."""
+    _, volts = followed([0.1] * 100 + [HARD] * 3)
+    effects, _ = followed([0.1] * 100)
+    effects.supposed("pack", 0.0, 0.1)
+    for k, truth in enumerate(volts[-3:]):
+        assert effects.supposed("pack", DT * (k + 1), HARD) == pytest.approx(truth, abs=2e-3)
+
+
+def test_a_current_that_is_long_another_than_the_one_followed_has_its_own_overpotential():
+    """The pack's sensor is stuck at nothing for half a minute, the inverter's shows what flows."""
+    effects, _ = followed([0.0] * 10)
+    for k in range(300):
+        effects.step(DT, 0.0, SOC, COLD)
+        shown = effects.supposed("inverter", DT * k, HARD)
+    assert effects.overpotential == pytest.approx(0.0, abs=1e-9)
+    assert shown == pytest.approx(followed([HARD] * 400)[1][-1], rel=0.01)
+
+
+def test_a_current_that_nobody_asked_for_in_a_while_is_followed_anew():
+    effects, _ = followed([0.0] * 10)
+    for k in range(300):
+        effects.supposed("inverter", DT * k, HARD)
+    assert effects.supposed("inverter", 3600.0, HARD) == effects.overpotential
+
+
+def bursts(seconds):
+    """Events of a cold pack of the vehicle's own model: 4 s at 60 A in every 12 s."""
+    p, soc, v1, effects, before = VEHICLE.parameters, SOC, 0.0, CellEffects(MODEL, PACK), 2.0
+    effects.step(60.0, before / PACK.cells_parallel, soc, COLD)  # it has stood with its lights on
+    for step in range(round(seconds / DT)):
+        t = step * DT
+        current = 2.0 if t < 10 or t % 12 > 4 else 60.0
+        cell = current / PACK.cells_parallel
+        effects.step(DT, (before + current) / 2 / PACK.cells_parallel, soc, COLD)
+        soc, v1, _ = PACK.advanced(DT, soc, v1, (before + current) / 2 / PACK.cells_parallel, COLD)
+        before = current
+        volts = PACK.pack_voltage(PACK.terminal_voltage(soc, v1, cell, COLD)[0] - effects.overpotential, current)
+        yield t, 0, (volts + p["pack_voltage_offset"], p["pack_current_gain"] * current + p["pack_current_offset"])
+        yield t + 0.01, 1, (0.0 if t < 10 else 20.0,)
+        if step % 10 == 0:
+            yield t + 0.02, 2, (COLD, COLD)
+
+
+def test_steps_of_the_current_leave_no_error_and_the_sag_that_there_is(monkeypatch):
+    e = Estimator(GROUPS, PACK, MODEL, VEHICLE.riding)
+    errors, cell_error = [], e.soc.cell_error
+
+    def kept(*arguments):
+        errors.append(cell_error(*arguments))
+        return errors[-1]
+
+    monkeypatch.setattr(e.soc, "cell_error", kept)
+    for event in bursts(120.0):
+        e.handle(event)
+    late = np.array([x for x in errors if x is not None][300:])
+    assert np.abs(late).max() < 0.003
+    assert e.redundancy.currents.sag.ratio == pytest.approx(1.0, abs=0.03)
