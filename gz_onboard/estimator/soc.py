@@ -19,10 +19,9 @@ from gz_onboard.estimator.start import BRIDGE, SOC_UNKNOWN_SD, Saved, bounded, p
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.physics.battery import HALF_FULL, Battery
-from gz_onboard.physics.model import STOOD, Model
+from gz_onboard.physics.model import STOOD, Model, standing_load
 
 DOUBTED_START = 30.0  # s: a voltage that is doubted so soon has misled the first state of charge
-STANDING_LOADS = 1.5  # times the auxiliary power: the most that is believed to have flowed before it was seen
 RESTARTED_FOR = 600.0  # s: for so long it is reported
 STEADY_NOISE = 1e-9  # variance of SOC from the first voltage to the end of the wait
 SHORTEST = 0.02  # s: a step, to divide by
@@ -319,9 +318,8 @@ class StateOfCharge:
         first, unsteady_sd = found
         if self.effects and self._unseen:
             load = first.current
-            if not first.moving:  # more than a standing vehicle draws is a sensor's error as likely as a load
-                most = STANDING_LOADS * self._auxiliary_power / first.voltage
-                load = min(max(load, -most), most)
+            if not first.moving:
+                load = standing_load(load, first.voltage, self._auxiliary_power)
             self.effects.step(self._unseen, load / battery.cells_parallel, HALF_FULL, pack.temperature)
             self._unseen = 0.0
         at = Situation(

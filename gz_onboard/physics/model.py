@@ -153,21 +153,35 @@ def remembering(effect: Bound, dt: float) -> Callable[[Mapping[str, Any]], float
 
 
 BURST = 10.0  # s: a load in traffic
-STOOD = 60.0  # s: for so long the load of a ride's first voltages has flowed: lights, heater, charger
+STOOD = 60.0  # s: for so long the load of a ride's first voltages has flowed: lights, a heater
+STANDING_LOADS = 1.5  # times the auxiliary power: the most that is believed to have flowed before it was seen
+
+
+def standing_load(current: float, voltage: float, auxiliary_power: float) -> float:
+    """How much of a pack's first `current` [A] at `voltage` [V] has flowed for a while already.
+
+    More than a standing vehicle draws is a rider who pulls away, or a sensor's error, as likely as a load.
+    """
+    most = STANDING_LOADS * auxiliary_power / voltage if voltage > 0 else 0.0
+    return min(max(current, -most), most)
 
 
 def first_soc(
-    effects: Iterable[Bound], battery: Battery, pack_voltage: float, pack_current: float, temperature: float
+    effects: Iterable[Bound], battery: Battery, first: tuple[float, float], temperature: float, load: float
 ) -> float:
-    """The SOC out of a ride's first pack voltage [V] and current [A]: as if that had flowed for `STOOD`, from rest.
+    """The SOC out of the pack's first voltage [V] and current [A] of a ride.
 
-    effects: in the cells; temperature in degC. The RC pair, slower than most of them, is taken to be at rest still. It
+    effects: in the cells; temperature in degC; load: the current [A] that has flowed for `STOOD`, from rest, see
+    `standing_load`. The RC pair, slower than most of them, is taken to be at rest still. It
     may be below 0 or above 1, see `Battery.soc_at_load`.
     """
-    cell, capacity = pack_current / battery.cells_parallel, battery.cell_capacity(temperature)
-    q = all_quantities(cell_current=cell, soc=HALF_FULL, cell_temperature=temperature, cell_capacity=capacity)
+    voltage, current = first
+    cell, capacity = current / battery.cells_parallel, battery.cell_capacity(temperature)
+    q = all_quantities(
+        cell_current=load / battery.cells_parallel, soc=HALF_FULL, cell_temperature=temperature, cell_capacity=capacity
+    )
     lost = float(sum(effect(q) * (1 - effect.decay(STOOD, q)) for effect in effects))
-    return battery.soc_at_load(battery.cell_voltage(pack_voltage, pack_current) + lost, cell, temperature)
+    return battery.soc_at_load(battery.cell_voltage(voltage, current) + lost, cell, temperature)
 
 
 def value_of(effect: Bound, quantities: Mapping[str, Any], recall: Recall | None = None) -> Any:

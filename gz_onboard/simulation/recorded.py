@@ -24,7 +24,7 @@ from gz_onboard.events import INSTRUMENTS, Event
 from gz_onboard.offline.samples import extended, open_ride, read_roles, ride_name
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import Port
-from gz_onboard.physics.model import first_soc
+from gz_onboard.physics.model import first_soc, standing_load
 from gz_onboard.physics.sensors import speed_role, true_columns
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile
 from gz_onboard.simulation.run import road_table
@@ -216,8 +216,9 @@ def rest_soc(recorded: Recorded, vehicle: Vehicle) -> float | None:
     if battery is None or "pack_voltage" not in recorded.signals:
         return None
     voltage, current = recorded.first("pack_voltage", 0.0), recorded.first("pack_current", 0.0)
-    cells = vehicle.model.at(Port.CELL_VOLTAGE)
-    return min(max(first_soc(cells, battery, voltage, current, recorded.first("cell_temperature", MILD)), 0.0), 1.0)
+    load = standing_load(current, voltage, vehicle.parameters["auxiliary_power"])
+    cells, celsius = vehicle.model.at(Port.CELL_VOLTAGE), recorded.first("cell_temperature", MILD)
+    return min(max(first_soc(cells, battery, (voltage, current), celsius, load), 0.0), 1.0)
 
 
 def _counted_soc(recorded: Recorded, vehicle: Vehicle) -> Array:

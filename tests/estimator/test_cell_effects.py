@@ -58,11 +58,11 @@ def test_a_current_that_nobody_asked_for_in_a_while_is_followed_anew():
 
 def bursts(seconds):
     """Events of a cold pack of the vehicle's own model: 4 s at 60 A in every 12 s."""
-    p, soc, v1, effects, before = VEHICLE.parameters, SOC, 0.0, CellEffects(MODEL, PACK), 2.0
+    p, soc, v1, effects, before = VEHICLE.parameters, SOC, 0.0, CellEffects(MODEL, PACK), 1.2
     effects.step(60.0, before / PACK.cells_parallel, soc, COLD)  # it has stood with its lights on
     for step in range(round(seconds / DT)):
         t = step * DT
-        current = 2.0 if t < 10 or t % 12 > 4 else 60.0
+        current = 1.2 if t < 10 or t % 12 > 4 else 60.0
         cell = current / PACK.cells_parallel
         effects.step(DT, (before + current) / 2 / PACK.cells_parallel, soc, COLD)
         soc, v1, _ = PACK.advanced(DT, soc, v1, (before + current) / 2 / PACK.cells_parallel, COLD)

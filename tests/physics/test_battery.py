@@ -51,7 +51,7 @@ def test_soc_at_load_inverts_terminal_voltage(soc, current, temperature, v1):
     assert BATTERY.soc_at_load(voltage, current, temperature, v1) == pytest.approx(soc, abs=2e-3)
     voltage = BATTERY.terminal_voltage(soc, 0.0, current, temperature)[0]
     amperes = BATTERY.cells_parallel * current
-    first = first_soc([], BATTERY, BATTERY.pack_voltage(voltage, amperes), amperes, temperature)
+    first = first_soc([], BATTERY, (BATTERY.pack_voltage(voltage, amperes), amperes), temperature, 0.0)
     assert first == pytest.approx(BATTERY.soc_at_load(voltage, current, temperature), abs=1e-9)
 
 

@@ -427,7 +427,7 @@ def commissioning(number: int) -> list[Samples]:
 RIDES_OF_A_SET = 5
 
 
-def _stranger(rng: np.random.Generator) -> Rider:
+def stranger(rng: np.random.Generator) -> Rider:
     """Somebody who did not ride when the scooter was commissioned: lighter or heavier, gentler or harsher than they."""
     return Rider(
         "S",
@@ -452,7 +452,7 @@ def _strange_runs(number: int, seed: int) -> list[Run]:
             plan(
                 2_000_000_000 + seed * 64 + i,
                 str(rng.choice(sorted(ROADS))),
-                _stranger(rng),
+                stranger(rng),
                 float(rng.uniform(-5, 35)),
                 float(rng.uniform(0.2, 1.0)),
                 hilly=float(rng.uniform(0.2, 1.7)),

@@ -35,8 +35,8 @@ STEP = 0.02  # s
 DELAY = 10  # steps that a rider takes to react
 REST = 12.0  # s of standing before the start and, at most, after the end
 KELVIN = 273.15
-GAS_OVER_FARADAY = 8.31446 / 96485.3  # V/K
-GAS = 8.314
+EMPTIEST = -0.02  # SOC down to which the voltage falls on
+GAS, FARADAY = 8.314, 96485.0
 SPEED_LIMIT = (50.5, 54.0)  # rad/s: where the controller begins to take the torque away, and where none is left
 COLUMNS = (
     "speed",
@@ -137,8 +137,10 @@ def _curve() -> tuple[Array, int]:
     return PchipInterpolator(soc, volts)(np.linspace(0, 1, count + 1)), count
 
 
-def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[Hidden]) -> list[Ridden]:
-    """Ride them all; one array element for each."""
+def ride(
+    plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[Hidden], gives_up: float = 0.0
+) -> list[Ridden]:
+    """Ride them all; one array element for each. A ride ends with a second below `gives_up` [V] at the terminals."""
     n = len(plans)
     m = SimpleNamespace(**{f.name: np.array([getattr(x, f.name) for x in machines]) for f in fields(Machine)})
     h = SimpleNamespace(**{f.name: np.array([float(getattr(x, f.name)) for x in hiddens]) for f in fields(Hidden)})
@@ -210,7 +212,10 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
     roll_work, drag_work, load_way, drag_way = (np.zeros(n) for _ in range(4))
     energy, energy_way = np.zeros(n), np.zeros(n)
 
+    last, low_for = np.array([int(x.duration / STEP) for x in plans]), np.zeros(n)
     for step in range(steps):
+        if np.all(step >= last):
+            break
         time = step * STEP
         noise = noises[int(time / NOISE_STEP)]
         # --- road under the wheels, and where the rider looks
@@ -334,7 +339,7 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
         source_soc = np.clip(soc, 0, 1) * ocv_count
         low = np.minimum(source_soc.astype(int), ocv_count - 1)
         rest = ocv_table[low] + (source_soc - low) * (ocv_table[low + 1] - ocv_table[low]) + m.ocv_shift
-        rest = rest + m.ocv_wave * np.sin(9 * soc + m.ocv_phase) + 2.0 * np.minimum(soc, 0)
+        rest = rest + m.ocv_wave * np.sin(9 * soc + m.ocv_phase) + 2.0 * np.clip(soc, EMPTIEST, 0)
         window = h.window_resistance * np.exp(-0.5 * ((soc - h.window_soc) / 0.03) ** 2)
         instant = (ohmic + film) * h.resistance_factor + window
         lag_voltage = branch.sum(axis=0) + reaction.sum(axis=0) + slow + memory + hidden_memory
@@ -362,7 +367,7 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
         exchange = np.stack(
             [m.cathode_exchange * np.exp(-5200 * cold_factor), m.anode_exchange * np.exp(-4000 * cold_factor)]
         )
-        wanted = h.resistance_factor * 2 * GAS_OVER_FARADAY * kelvin * np.arcsinh(cell_current / (2 * exchange / ends))
+        wanted = h.resistance_factor * 2 * GAS / FARADAY * kelvin * np.arcsinh(cell_current / (2 * exchange / ends))
         reaction = layer * reaction + (1 - layer) * wanted
         slow = slow_keep * slow + (1 - slow_keep) * h.slow_resistance * cell_current
         capacity = m.capacity * (1 - m.capacity_temperature * np.maximum(25 - core, 0)) * h.capacity_factor
@@ -454,10 +459,12 @@ def ride(plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[H
         )
         for name, value in zip(COLUMNS, now, strict=True):
             record[name][step] = value
+        low_for = np.where(pack_voltage < gives_up, low_for + STEP, 0.0)
+        last = np.where(low_for >= 1.0, np.minimum(last, step + 1), last)
 
     out = []
     for i in range(n):
-        count = int(plans[i].duration / STEP)
+        count = int(last[i])
         columns = {name: np.ascontiguousarray(record[name][:count, i]) for name in COLUMNS}
         out.append(
             Ridden(

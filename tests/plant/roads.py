@@ -90,11 +90,13 @@ def plan(
     soc: float,
     wind: tuple[float, float] | None = None,
     hilly: float = 1.0,
+    duration: float | None = None,
 ) -> Plan:
-    """A ride; `wind` [m/s] from north and east, drawn with 1 m/s standard deviation if not given."""
+    """A ride; `wind` [m/s] from north and east, drawn with 1 m/s standard deviation if not given; duration [s], too."""
     rng = np.random.default_rng([seed, 19])
     person = make_rider(rng, rider) if isinstance(rider, str) else rider
-    duration = float(rng.uniform(*DURATION))
+    drawn = float(rng.uniform(*DURATION))
+    duration = drawn if duration is None else duration
     curvature, speed, stops = _way(rng, kind, person, 14.0 * duration)
     own_wind = rng.normal(0, 1.0, 2)
     north, east = own_wind if wind is None else wind

@@ -182,7 +182,7 @@ def _pack_heat(
     cells = vehicle.model.at(Port.CELL_VOLTAGE)
     n, m = battery.cells_series, battery.cells_parallel
     volts, amperes, celsius = *first, float(temperature[0])
-    soc = first_soc(cells, battery, volts, amperes, celsius)
+    soc = first_soc(cells, battery, (volts, amperes), celsius, amperes)
     states: dict[str, float] = {}
     q = all_quantities(cell_current=amperes / m, soc=soc, cell_temperature=celsius)
     q["cell_capacity"] = battery.cell_capacity(celsius)

@@ -20,7 +20,7 @@ from gz_onboard.lab.sizes import sizes_of
 from gz_onboard.offline.samples import Samples
 from gz_onboard.physics.battery import discharged
 from gz_onboard.physics.effect import Port
-from gz_onboard.physics.model import first_soc
+from gz_onboard.physics.model import first_soc, standing_load
 from gz_onboard.physics.relaxation import decay_over
 from gz_onboard.physics.sensors import true_columns
 from gz_onboard.vehicle import Vehicle
@@ -146,7 +146,8 @@ def _ride_steps(
         return None
     if by_temperature is None:
         volts, amperes = float(np.median(voltage[:FIRST])), float(np.median(current[:FIRST]))
-        start = first_soc(vehicle.model.at(Port.CELL_VOLTAGE), battery, volts, amperes, temperature)
+        load = standing_load(amperes, volts, vehicle.parameters["auxiliary_power"])
+        start = first_soc(vehicle.model.at(Port.CELL_VOLTAGE), battery, (volts, amperes), temperature, load)
         charge = float(np.trapezoid(current, time))  # A·s; what half of it takes is the middle of the ride
         soc = start - discharged(charge, 0.5, battery.pack_capacity(temperature))
         r0, r1, c1 = battery.circuit(soc, temperature)

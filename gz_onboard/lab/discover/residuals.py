@@ -21,7 +21,7 @@ from gz_onboard.physics.battery import discharged, heat, terminal_voltage
 from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCooling, Network, temperatures
 from gz_onboard.physics.effect import ROAD_LOAD, Port
 from gz_onboard.physics.effects.inertia import rotating_mass
-from gz_onboard.physics.model import drag_torque, first_soc
+from gz_onboard.physics.model import drag_torque, first_soc, standing_load
 from gz_onboard.physics.relaxation import decay_over, relaxation_over, relaxed
 from gz_onboard.physics.sensors import grade_shown, true_current, true_voltage
 
@@ -214,7 +214,8 @@ def start_soc(ride: Ride, system: System) -> float:
     volts = true_voltage(float(np.mean(ride.signals["pack_voltage"][:FIRST])), system.healthy)
     amperes = true_current(float(np.mean(ride.signals["pack_current"][:FIRST])), system.healthy)
     celsius = float(ride.quantities["cell_temperature"][0])
-    return first_soc(system.cells, system.pack, volts, amperes, celsius)
+    load = standing_load(amperes, volts, system.healthy["auxiliary_power"])
+    return first_soc(system.cells, system.pack, (volts, amperes), celsius, load)
 
 
 def counted_soc(ride: Ride, system: System) -> Array:

@@ -11,7 +11,7 @@ from gz_onboard.lab.discover.grid import STEP, Ride
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial
 from gz_onboard.lab.discover.residuals import cell_temperature, counted_soc, start_soc
 from gz_onboard.offline.samples import Samples
-from gz_onboard.physics.model import all_quantities, total
+from gz_onboard.physics.model import all_quantities, standing_load, total
 from gz_onboard.vehicle import read_vehicle
 
 SECONDS, COLD, AMPERES, SOC = 120, 5.0, 30.0, 0.15
@@ -26,11 +26,11 @@ def mixed() -> MixedModel:
 
 @pytest.fixture(scope="module")
 def ride(mixed: MixedModel) -> Ride:
-    """Steady, on a cold and nearly empty pack whose reaction has settled; as its sensors show it."""
+    """Steady, on a cold and nearly empty pack with its lights on before; as its sensors show it."""
     battery, p = mixed.system.pack, mixed.vehicle.parameters
-    amperes = AMPERES / battery.cells_parallel
-    reaction = total(mixed.system.cells, all_quantities(cell_current=amperes, cell_temperature=COLD))
-    cell = battery.terminal_voltage(SOC, 0.0, amperes, COLD)[0] - reaction
+    cell, _ = battery.terminal_voltage(SOC, 0.0, AMPERES / battery.cells_parallel, COLD)
+    load = standing_load(AMPERES, battery.pack_voltage(cell, AMPERES), p["auxiliary_power"]) / battery.cells_parallel
+    cell -= total(mixed.system.cells, all_quantities(cell_current=load, cell_temperature=COLD))
     time = np.arange(0.0, SECONDS, 0.05)
     shown = {
         "motor_speed": 30.0,
