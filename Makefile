@@ -8,7 +8,7 @@ FIRST ?= 100240
 PYTHON_IN_VENV := .venv/bin/python
 DEMO = replay_logs/demo.py "$(RIDE)" --speed $(SPEED) --seconds $(SECONDS)
 
-.PHONY: help setup run test lint format docs bench trial hardening clean
+.PHONY: help setup run test lint format docs bench trial range-benchmark hardening clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -50,6 +50,9 @@ bench: setup  ## cost per frame, start-up, memory, beside the obvious pipeline o
 
 trial: setup  ## does discover name hidden effects in rides of a scooter that is not the model's? rewrites docs/trial.md (CASES=n FIRST=seed)
 	$(PYTHON_IN_VENV) -m benchmarks.trial --cases $(CASES) --first $(FIRST)
+
+range-benchmark: setup  ## how good is the range on full discharges of scooters that are not the model's? rewrites docs/range-benchmark.md
+	$(PYTHON_IN_VENV) -m benchmarks.range_benchmark
 
 hardening: setup  ## hostile frames, sensors that lie, power cuts, damaged states, malformed files by the thousand; rewrites docs/reliability.md
 	$(PYTHON_IN_VENV) -m tests.hardening
