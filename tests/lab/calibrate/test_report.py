@@ -69,7 +69,8 @@ def test_json_holds_no_nan(capsys):
     read = json.loads(written)
     (procedure,) = read["procedures"]
     assert read["version"] == 1
-    assert procedure["parameters"]["drag_area"] == {"value": 0.5, "sd": 0.03, "unit": "m²", "source": "runs <1> & 2"}
+    said = {"value": 0.5, "sd": 0.03, "unit": "m²", "source": "runs <1> & 2", "channel": ""}
+    assert procedure["parameters"]["drag_area"] == said
     assert procedure["curves"]["battery.r0"]["sd"] == [None, 0.1]
     assert procedure["correlation"] == [{"parameters": ["drag_area", "mass"], "value": [[1, 0.5], [0.5, 1]]}]
     assert [fit["held_out"] for fit in procedure["fits"]] == [True, False]
