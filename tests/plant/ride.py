@@ -264,6 +264,7 @@ def ride(
         limit = m.current_limit * np.clip((SPEED_LIMIT[1] - rear) / (SPEED_LIMIT[1] - SPEED_LIMIT[0]), 0, 1)
         limit = np.minimum(limit, limit_pack * pack_voltage / (0.456 * rear + 6.0))
         command = np.where(braking, -m.regeneration_current * np.clip(rear / 7.5, 0, 1), throttle * m.current_limit)
+        command = np.where(step < last, command, 0.0)  # a pack that gave up
         motor_current = motor_current + STEP / 0.06 * (np.minimum(command, limit) - motor_current)
         # --- brakes
         regen_brake = 0.456 * m.regeneration_current / radius / inertia * np.clip(rear / 7.5, 0, 1)
