@@ -12,9 +12,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.simulation.columns import read_columns
-
-UNITS = {"mps": 1.0, "kmh": 1 / 3.6, "mph": 0.44704}  # [m/s] in one of each
+from gz_onboard.routes.columns import UNITS, read_columns
 
 _GTR2 = "UN GTR No. 2, Annex 5 (the same in Regulation (EU) No 134/2014, Annex II, Appendix 6)"
 _TITLES = {

@@ -11,10 +11,11 @@ from pathlib import Path
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.options import LOG_SUFFIXES
+from gz_onboard.routes.profile import speed_profile
+from gz_onboard.routes.route import read_route
 from gz_onboard.simulation.cycles import find_cycle
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile, straight
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded
-from gz_onboard.simulation.route import read_route, speed_profile
 from gz_onboard.simulation.run import Command, along, at_steps, follow, replay, road_table
 from gz_onboard.simulation.scooter import STEP
 from gz_onboard.vehicle import Vehicle

@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.errors import InputError
-from gz_onboard.simulation.route import Route, read_route, speed_profile
+from gz_onboard.routes.profile import speed_profile
+from gz_onboard.routes.route import Route, read_route
 
 METRES_NORTH = 111_035.0  # of a degree at 40.3° on WGS 84, and of one east:
 METRES_EAST = 85_010.0

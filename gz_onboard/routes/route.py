@@ -1,4 +1,4 @@
-"""A route as distance, altitude, curvature and speed limit, and the speed that a rider would ride it with.
+"""A route as distance, altitude, curvature, speed limit, and what else is known of the road.
 
 Altitude of a map or a receiver is off by a metre or so from point to point, and a bare difference over 20 m would
 turn that into grades of 5 %. Grade is therefore the slope of the straight line fitted (least squares) to the altitudes
@@ -11,16 +11,12 @@ between points shows as a longer and gentler one.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from pathlib import Path
 
-import numpy as np
-
 from gz_onboard.errors import InputError
-from gz_onboard.simulation.columns import Columns, read_columns
-from gz_onboard.simulation.cycles import UNITS
+from gz_onboard.routes.columns import UNITS, Columns, read_columns
 
 GRADE_LENGTH = 200.0  # [m]
 CURVE_LENGTH = 40.0  # [m]
@@ -29,6 +25,11 @@ _STEEPEST = 0.5  # sine; no road is steeper, a wrong unit is
 _CLOSEST = 0.01  # [m] between points
 _LIMITS = {f"speed_limit_{unit}": UNITS[unit] for unit in ("mps", "kmh")}
 _KNOWN = ("distance_m", "latitude_deg", "longitude_deg", "altitude_m", "curvature_1pm", *_LIMITS)
+_AHEAD = {"stop_s": (0.0, 3600.0, "s"), "headwind_mps": (-40.0, 40.0, "m/s"), "temperature_degc": (-50.0, 60.0, "degC")}
+KNOWN_AHEAD = (*_KNOWN, *_AHEAD)
+"""Columns of a route that is still to be ridden."""
+MOST_POINTS = 50_000  # of a route on board: 1000 km at 20 m
+LONGEST_HOLE = 5000.0  # m: what is farther apart are places on the way, not the road
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,12 @@ class Route:
     curvature: tuple[float, ...]  # 1/m, positive to the left
     heading: tuple[float, ...]  # rad clockwise from north
     speed_limit: tuple[float, ...]  # m/s, infinite if none is given
+    latitude: tuple[float, ...] = ()  # deg; nothing if the file has no positions
+    longitude: tuple[float, ...] = ()
+    stop: tuple[float, ...] = ()  # s of standing at a point, 0 where none is expected; nothing if not given
+    headwind: tuple[float, ...] = ()  # m/s along the route, positive from ahead; nothing if not given
+    temperature: tuple[float, ...] = ()  # degC of the air; nothing if not given
+    grade_known: bool = True  # False: without altitudes, all is taken as level
 
     @property
     def length(self) -> float:
@@ -62,11 +69,36 @@ def read_route(file: Path | str) -> Route:
     not increase, positions that do not move or do not fit the distance, and values that no road has.
     """
     file = Path(file)
-    columns = read_columns(file, _KNOWN)
+    return route_of(read_columns(file, _KNOWN), file.name.removesuffix(".csv").removesuffix(".route"))
+
+
+def route_ahead_of(columns: Columns, name: str) -> Route:
+    """The route in `columns` (of `KNOWN_AHEAD`) for the road ahead: altitude may be missing.
+
+    Raises InputError as `read_route`, and for more than `MOST_POINTS`, or points over `LONGEST_HOLE` apart.
+    """
+    if len(columns) > MOST_POINTS:
+        raise InputError(
+            f"{columns.file}: has {len(columns)} points, must have at most {MOST_POINTS}; one each 20 m is enough"
+        )
+    route = route_of(columns, name, altitude_needed=False)
+    for row, (before, after) in enumerate(pairwise(route.distance), start=1):
+        if after - before > LONGEST_HOLE:
+            raise columns.error(row, f"is {(after - before) / 1000:.1f} km from the point before: that is no road")
+    for extra, (low, high, unit) in _AHEAD.items():
+        if extra in columns.values:
+            columns.check(extra, low, high, unit)
+    stop, headwind, temperature = (columns.values.get(extra, ()) for extra in _AHEAD)
+    return replace(route, stop=stop, headwind=headwind, temperature=temperature)
+
+
+def route_of(columns: Columns, name: str, altitude_needed: bool = True) -> Route:
+    """The route in `columns`, as `read_route`; without altitudes it is level, if they are not needed."""
     values = columns.values
-    if "altitude_m" not in values:
-        raise InputError(f"{file}: column altitude_m is missing")
-    columns.check("altitude_m", -500.0, 9000.0, "m")
+    if "altitude_m" in values:
+        columns.check("altitude_m", -500.0, 9000.0, "m")
+    elif altitude_needed:
+        raise InputError(f"{columns.file}: column altitude_m is missing")
     positions = _positions(columns)
     if "distance_m" in values:
         columns.increasing("distance_m", "m")
@@ -74,21 +106,25 @@ def read_route(file: Path | str) -> Route:
     elif positions:
         distance = _lengths(positions)
     else:
-        raise InputError(f"{file}: needs column distance_m, or latitude_deg and longitude_deg")
+        raise InputError(f"{columns.file}: needs column distance_m, or latitude_deg and longitude_deg")
     if positions:
         _check_moving(columns, positions, distance)
     heading, curvature = _course(columns, positions, distance)
-    grade = _slopes(distance, values["altitude_m"], distance, GRADE_LENGTH)
+    level = (0.0,) * len(distance)
+    grade = _slopes(distance, values["altitude_m"], distance, GRADE_LENGTH) if "altitude_m" in values else level
     for row, sine in enumerate(grade):
         if abs(sine) > _STEEPEST:
             raise columns.error(row, f"altitude_m: a grade of {100 * sine:.0f} % is no road's; are distances in m?")
     return Route(
-        file.name.removesuffix(".csv").removesuffix(".route"),
+        name,
         distance,
         grade,
         curvature,
         heading,
         _speed_limits(columns),
+        values.get("latitude_deg", ()),
+        values.get("longitude_deg", ()),
+        grade_known="altitude_m" in values,
     )
 
 
@@ -154,6 +190,8 @@ def _course(
     else:
         curvature = (0.0,) * len(distance)
     if middles:
+        import numpy as np
+
         return tuple(np.interp(distance, middles, headings).tolist()), curvature
     turns = ((d1 - d0) * (k0 + k1) / 2 for (d0, k0), (d1, k1) in pairwise(zip(distance, curvature, strict=True)))
     return tuple(-turn for turn in accumulate(turns, initial=0.0)), curvature
@@ -176,6 +214,8 @@ def _slopes(x: tuple[float, ...], y: tuple[float, ...], at: tuple[float, ...], l
     At the ends the length is kept and lies to one side, so that noise is smoothed there as elsewhere; where points
     are sparse the nearest on both sides are taken.
     """
+    import numpy as np
+
     xs, ys, where = np.asarray(x), np.asarray(y), np.asarray(at)
     length = min(length, x[-1] - x[0])
     start = np.clip(where - length / 2, x[0], x[-1] - length)
@@ -189,72 +229,3 @@ def _slopes(x: tuple[float, ...], y: tuple[float, ...], at: tuple[float, ...], l
         dx = xs[i:j] - xs[i:j].mean()
         slopes.append(float(dx @ ys[i:j] / (dx @ dx)))
     return tuple(slopes)
-
-
-@dataclass(frozen=True)
-class SpeedProfile:
-    """Target `speed` [m/s] over `distance` [m] and the `time` [s] at which it is reached; tuples of one length.
-
-    Acceleration is constant between points. The ride begins and ends at standstill: a rider who follows speed over
-    distance must look a little ahead, or follow speed over time.
-    """
-
-    distance: tuple[float, ...]
-    speed: tuple[float, ...]
-    time: tuple[float, ...]
-
-    def speed_at(self, distance: float) -> float:
-        """Target speed [m/s] at `distance` [m]; 0 before the begin and past the end."""
-        if not 0.0 <= distance <= self.distance[-1]:
-            return 0.0
-        i = min(bisect_right(self.distance, distance), len(self.distance) - 1) - 1
-        part = (distance - self.distance[i]) / (self.distance[i + 1] - self.distance[i])
-        v0, v1 = self.speed[i], self.speed[i + 1]
-        return math.sqrt(v0 * v0 + part * (v1 * v1 - v0 * v0))
-
-
-def speed_profile(
-    route: Route,
-    *,
-    lateral_acceleration: float = 2.5,
-    acceleration: float = 1.2,
-    deceleration: float = 1.5,
-    top_speed: float = math.inf,
-    step: float = 5.0,
-) -> SpeedProfile:
-    """The fastest ride of `route`, from standstill to standstill, within its limits and the rider's.
-
-    Speed stays within the speed limit, `top_speed` [m/s] and √(lateral_acceleration/|curvature|), everywhere and
-    not only at points; it rises and falls with at most `acceleration` and `deceleration` (all in m/s²). Points are
-    the route's and others between them, at most `step` [m] apart. Raises InputError for a value that is not above 0.
-    """
-    for name, value, unit in (
-        ("lateral_acceleration", lateral_acceleration, "m/s²"),
-        ("acceleration", acceleration, "m/s²"),
-        ("deceleration", deceleration, "m/s²"),
-        ("top_speed", top_speed, "m/s"),
-        ("step", step, "m"),
-    ):
-        if not value > 0:
-            raise InputError(f"{name}: {value:g} {unit}, must be above 0 {unit}")
-    distance = [0.0]
-    curve: list[float] = [abs(route.curvature[0])]
-    limit: list[float] = []  # square of the speed allowed in each interval
-    for i, (d0, d1) in enumerate(pairwise(route.distance)):
-        pieces = max(2, math.ceil((d1 - d0) / step))  # two at least: one interval would be standstill throughout
-        fixed = min(route.speed_limit[i], top_speed) ** 2
-        for k in range(1, pieces + 1):
-            part = k / pieces
-            distance.append(d0 + part * (d1 - d0) if k < pieces else d1)
-            curve.append(abs(route.curvature[i] + part * (route.curvature[i + 1] - route.curvature[i])))
-            sharpest = max(curve[-2:])
-            limit.append(min(fixed, lateral_acceleration / sharpest if sharpest > 0 else math.inf))
-    square = [0.0, *(min(pair) for pair in pairwise(limit)), 0.0]
-    lengths = [d1 - d0 for d0, d1 in pairwise(distance)]
-    for i, length in enumerate(lengths):
-        square[i + 1] = min(square[i + 1], square[i] + 2 * acceleration * length)
-    for i, length in reversed(list(enumerate(lengths))):
-        square[i] = min(square[i], square[i + 1] + 2 * deceleration * length)
-    speed = [math.sqrt(v2) for v2 in square]
-    durations = (2 * length / (v0 + v1) for length, (v0, v1) in zip(lengths, pairwise(speed), strict=True))
-    return SpeedProfile(tuple(distance), tuple(speed), tuple(accumulate(durations, initial=0.0)))

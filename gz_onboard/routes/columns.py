@@ -14,6 +14,7 @@ from pathlib import Path
 from gz_onboard.errors import InputError, nearest
 
 LEAST_ROWS = 2
+UNITS = {"mps": 1.0, "kmh": 1 / 3.6, "mph": 0.44704}  # [m/s] in one of each
 _KMH = re.compile(r"km?/h|km?ph", re.I)
 
 

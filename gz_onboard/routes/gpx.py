@@ -1,0 +1,87 @@
+"""GPX files: the track or, without one, the route in it, as columns."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.parsers import expat
+
+from gz_onboard.errors import InputError, shown
+from gz_onboard.routes.columns import LEAST_ROWS, Columns
+
+POINTS = ("trkpt", "rtept")  # a track is the road; a route may be the places on the way only
+Point = tuple[int, str, str, str]
+"""(line, latitude, longitude, altitude) as they stand in the file; an altitude may be empty."""
+
+
+class _Reader:
+    """Gathers the points while the parser goes through the file."""
+
+    def __init__(self) -> None:
+        self.points: dict[str, list[Point]] = {kind: [] for kind in POINTS}
+        self._parser = expat.ParserCreate(namespace_separator=" ")
+        self._parser.StartElementHandler = self._start
+        self._parser.EndElementHandler = self._end
+        self._parser.CharacterDataHandler = self._text
+        self._parser.StartDoctypeDeclHandler = self._refuse
+        self._at: Point | None = None
+        self._altitude: list[str] | None = None
+
+    def parse(self, content: bytes) -> None:
+        """Raises expat.ExpatError for what is not XML, and InputError for a document type."""
+        self._parser.Parse(content, True)
+
+    def _refuse(self, *_: object) -> None:
+        raise InputError("has a document type, which no GPX has")  # and whose entities can be of any size
+
+    def _start(self, name: str, attributes: dict[str, str]) -> None:
+        kind = name.rpartition(" ")[2]
+        if kind in POINTS:
+            self._at = self._parser.CurrentLineNumber, attributes.get("lat", ""), attributes.get("lon", ""), ""
+        elif kind == "ele" and self._at:
+            self._altitude = []
+
+    def _text(self, text: str) -> None:
+        if self._altitude is not None:
+            self._altitude.append(text)
+
+    def _end(self, name: str) -> None:
+        kind = name.rpartition(" ")[2]
+        if kind == "ele" and self._at and self._altitude is not None:
+            self._at, self._altitude = (*self._at[:3], "".join(self._altitude).strip()), None
+        elif kind in POINTS and self._at:
+            self.points[kind].append(self._at)
+            self._at = None
+
+
+def read_gpx(file: Path) -> Columns:
+    """Latitude, longitude and, if all points have it, altitude of the track in a GPX `file`.
+
+    A point at the place of the one before it is passed over. Raises InputError naming file and line.
+    """
+    reader = _Reader()
+    try:
+        reader.parse(file.read_bytes())
+    except expat.ExpatError as error:
+        raise InputError(f"{file}:{error.lineno}: not a GPX file: {expat.ErrorString(error.code)}") from error
+    except OSError as error:
+        raise InputError(f"{file}: {error.strerror or error}") from error
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+    points: list[Point] = next(filter(None, reader.points.values()), [])
+    points = [p for i, p in enumerate(points) if i == 0 or p[1:3] != points[i - 1][1:3]]
+    if len(points) < LEAST_ROWS:
+        raise InputError(f"{file}: has {len(points)} points of a track or a route, must have at least {LEAST_ROWS}")
+    lines = tuple(point[0] for point in points)
+    columns = {"latitude_deg": 1, "longitude_deg": 2} | ({"altitude_m": 3} if all(p[3] for p in points) else {})
+    values = {name: tuple(_number(file, p, p[field], name) for p in points) for name, field in columns.items()}
+    return Columns(file, lines, values)
+
+
+def _number(file: Path, point: Point, text: str | int, name: str) -> float:
+    try:
+        value = float(text)
+        if abs(value) < float("inf"):
+            return value
+    except ValueError:
+        pass
+    raise InputError(f"{file}:{point[0]}: {name}: {shown(text)} is not a number")

@@ -1,0 +1,109 @@
+"""Files of the road ahead: GPX and CSV, and what of them is refused."""
+
+from __future__ import annotations
+
+import pytest
+
+from gz_onboard.errors import InputError
+from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.routes.profile import speed_profile
+from gz_onboard.routes.route import MOST_POINTS
+
+HEAD = '<?xml version="1.0"?>\n<gpx xmlns="http://www.topografix.com/GPX/1/1">\n'
+
+
+def gpx(folder, points, kind="trkpt"):
+    """A GPX of (latitude, longitude, altitude or None), a point each line from the third on."""
+    around = ("<trk><trkseg>", "</trkseg></trk>") if kind == "trkpt" else ("<rte>", "</rte>")
+    lines = [f'<{kind} lat="{y}" lon="{x}">{"" if z is None else f"<ele> {z} </ele>"}</{kind}>' for y, x, z in points]
+    file = folder / "way.gpx"
+    file.write_text(HEAD + around[0] + "\n".join(lines) + around[1] + "</gpx>\n", encoding="utf-8")
+    return file
+
+
+@pytest.mark.parametrize("kind", ["trkpt", "rtept"])
+def test_a_gpx_is_read(tmp_path, kind):
+    points = [(47.0 + 0.0002 * i, 8.0, 400.0 + 0.5 * i) for i in range(40)]
+    route = read_ahead(gpx(tmp_path, points, kind))[1]
+    assert (route.name, route.grade_known) == ("way", True)
+    assert route.length == pytest.approx(39 * 22.236, rel=1e-3)
+    assert route.grade == pytest.approx([0.5 / 22.236] * 40, rel=1e-2)
+    assert route.latitude[5] == pytest.approx(47.001)
+
+
+def test_without_all_altitudes_it_is_level_and_says_so(tmp_path):
+    points = [(47.0 + 0.0002 * i, 8.0, None if i == 7 else 400.0 + i) for i in range(40)]
+    route = read_ahead(gpx(tmp_path, points))[1]
+    assert not route.grade_known
+    assert set(route.grade) == {0.0}
+
+
+def test_a_track_that_stood_is_passed_over(tmp_path):
+    points = [(47.0 + 0.0002 * max(i - 5, 0), 8.0, 400.0) for i in range(12)]
+    assert len(read_ahead(gpx(tmp_path, points))[1].distance) == 7
+
+
+def test_stops_winds_and_temperatures_of_a_csv(tmp_path):
+    rows = "".join(f"{20 * i},{30 if i == 10 else 0},3,-5\n" for i in range(20))
+    file = tmp_path / "way.route.csv"
+    file.write_text("distance_m,stop_s,headwind_mps,temperature_degc\n" + rows)
+    route = read_ahead(file)[1]
+    assert (route.stop[10], route.headwind[3], route.temperature[4]) == (30.0, 3.0, -5.0)
+    profile = speed_profile(route, top_speed=12.0)
+    assert profile.speed_at(200.0) == 0.0
+    assert profile.speed_at(190.0) > 3.0
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        ([], r"way\.gpx: has 0 points"),
+        ([(47.0, 8.0, 1.0)], r"way\.gpx: has 1 points"),
+        ([(47.0, 8.0, 1.0), (48.0, 8.0, 1.0)], r"way\.gpx:4: is 111\.2 km from the point before: that is no road"),
+        ([(47.0, 8.0, 1.0), (97.0, 8.0, 1.0)], r"way\.gpx:4: latitude_deg: 97 deg is outside"),
+        ([(47.0, 8.0, 1.0), ("x", 8.0, 1.0)], r"way\.gpx:4: latitude_deg: 'x' is not a number"),
+        ([(47.0, 8.0, 1.0), (47.001, "nan", 1.0)], r"way\.gpx:4: longitude_deg: 'nan' is not a number"),
+        ([(47.0, 8.0, 1.0), (47.001, 8.0, 90000.0)], r"way\.gpx:4: altitude_m: 90000 m is outside"),
+        ([(47.0, 8.0, 1.0), (47.001, 8.0, 900.0)], r"way\.gpx:3: altitude_m: a grade of 809 %"),
+    ],
+)
+def test_gpx_refused(tmp_path, points, message):
+    with pytest.raises(InputError, match=message):
+        read_ahead(gpx(tmp_path, points))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("nonsense", r"way\.gpx:1: not a GPX file: syntax error"),
+        (HEAD + "<trk>", r"way\.gpx:3: not a GPX file"),
+        ('<!DOCTYPE x [<!ENTITY a "aaaa">]>' + HEAD[22:] + "</gpx>", r"way\.gpx: has a document type"),
+    ],
+)
+def test_what_is_no_gpx_is_refused(tmp_path, text, message):
+    file = tmp_path / "way.gpx"
+    file.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_ahead(file)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("distance_m,speed_limit_kmh\n0,50\n20,500\n", r":3: speed_limit_kmh: 500 kmh is outside"),
+        ("distance_m,temperature_degc\n0,20\n20,293\n", r":3: temperature_degc: 293 degC is outside"),
+        ("distance_m,stop\n0,20\n20,293\n", r":1: unknown column 'stop' \(did you mean 'stop_s'\?\)"),
+        ("distance_m\n0\n20000\n", r":3: is 20\.0 km from the point before"),
+        ("distance_m\n" + "".join(f"{i}\n" for i in range(MOST_POINTS + 1)), rf"has {MOST_POINTS + 1} points, must"),
+    ],
+)
+def test_csv_refused(tmp_path, text, message):
+    file = tmp_path / "way.route.csv"
+    file.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_ahead(file)
+
+
+def test_a_file_that_is_not_there(tmp_path):
+    with pytest.raises(InputError, match=r"gone\.gpx: No such file"):
+        read_ahead(tmp_path / "gone.gpx")
