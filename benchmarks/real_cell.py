@@ -10,21 +10,23 @@ filter is that of the on-board estimator, fed with events once a second; the dri
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from math import exp, nan, sqrt
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.estimator.ekf import Covariance, Noise, ScalarFilter, SocFilter
 from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.estimator.uncertainty import UNCHECKED_SD
 from gz_onboard.events import Group
 from gz_onboard.lab.calibrate import ocv, pulse
 from gz_onboard.lab.calibrate.cell_circuit import Circuit, voltage
-from gz_onboard.lab.calibrate.result import Result
+from gz_onboard.lab.calibrate.result import Found, Result
 from gz_onboard.lab.calibrate.table import Measurements, Named, read_table
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effects import charge_transfer
@@ -37,13 +39,12 @@ TEMPERATURES = (25, 10, 0, -10, -20)
 OFFSET = 0.05  # A of the cell: what the current sensor shows too much
 TESTER_OFFSET = 0.005  # A: sd of the tester's own current, of which the reference is made
 WRONG = -0.2  # of SOC
-RIGHT, WORST = (0.0, 0.0), (WRONG, OFFSET)
-CASES = {RIGHT: "right", (0.0, OFFSET): "right, offset", (WRONG, 0.0): "wrong", WORST: "wrong, offset"}
 RIGHT_SD = 0.01  # of SOC: how far the right one is believed
 CONVERGED = 0.025  # of SOC: from here on the error counts
 NEAR = 0.03  # of SOC: a wrong start is left when it is first as near as this
 INTERVAL = 1.96  # sd: of 95 %
 NOMINAL = 2.9  # A·h, for C-rates
+SEED = 1  # of what is drawn
 SENSOR = {"pack_current_gain": (1.0, 0.005), "pack_voltage_offset": (0.0, 0.002)}
 COLUMNS = {
     "time": Named("t_s", "s"),
@@ -52,6 +53,39 @@ COLUMNS = {
     "cell_temperature": Named("t_cell_C", "degC"),
     "charge": Named("q_Ah", "Ah", -1),
 }
+
+
+class Case(NamedTuple):
+    """What the filter is told wrong: SOC, offset [A] and relative error of the current; and the sd it is told."""
+
+    wrong: float = 0.0
+    offset: float = 0.0
+    gain: float = 0.0
+    sd: float = RIGHT_SD
+    declared: float = TESTER_OFFSET  # A: sd of the offset
+
+
+OFF = {"offset": OFFSET, "declared": OFFSET}
+RIGHT, WORST = Case(), Case(WRONG, sd=-WRONG, **OFF)
+CASES = {RIGHT: "right", Case(**OFF): "right, offset", Case(WRONG, sd=-WRONG): "wrong", WORST: "wrong, offset"}
+DRAWN = {"right": RIGHT_SD, "wrong": -WRONG}
+
+
+def drawn(work: Sequence[Cycle], capacity: Found) -> dict[tuple[str, Cycle], Case]:
+    """Cases whose errors are drawn from what the filter is told of them; a full cell is never told to be fuller.
+
+    In the others the start, the count and the capacity are right, which no interval can know.
+    """
+    rng = np.random.default_rng(SEED)
+    unchecked = UNCHECKED_SD * capacity.value
+    share = float(np.hypot(capacity.sd / capacity.value, SENSOR["pack_current_gain"][1]))
+    found = {}
+    for name, sd in DRAWN.items():
+        for c in work:
+            start, offset, gain = rng.standard_normal(3)
+            error = (-abs(start) * sd, offset * float(np.hypot(TESTER_OFFSET, unchecked)), gain * share)
+            found[name, c] = Case(*error, sd=sd)
+    return found
 
 
 def pulse_test(folder: Path, temperature: int) -> Measurements:
@@ -184,14 +218,14 @@ class Score:
 
 
 def estimator_of(setting: Setting, offset: float) -> Estimator:
-    """The estimator on board of the cell, with a current sensor that is known to be off by up to `offset` [A]."""
+    """The estimator on board of the cell, with a current sensor whose offset has the sd `offset` [A]."""
     battery, result = setting.battery, setting.result
     vehicle = read_vehicle("reference")
     known = dict(vehicle.parameters.known)
     rests = [f.rms for f in result.fits if f.what.startswith("rest voltage")]
     values = {
         **SENSOR,
-        "pack_current_offset": (0.0, offset or TESTER_OFFSET),
+        "pack_current_offset": (0.0, offset),
         "cell_capacity": (battery.capacity, result.parameters["cell_capacity"].sd),
         "cell_voltage_error": (0.0, result.parameters["cell_voltage_error"].sd),
         "cell_voltage_error_empty": (0.0, result.parameters["cell_voltage_error_empty"].sd),
@@ -206,7 +240,7 @@ def estimator_of(setting: Setting, offset: float) -> Estimator:
     model = Model(vehicle.model.effects, Parameters(known))
     groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
     estimator = Estimator(groups, battery, model, vehicle.riding, setting.make)
-    estimator._forecast_time = float("inf")  # no range is asked for
+    estimator._outlook._time = float("inf")  # no range is asked for
     # A scooter's riding, of which the first state of charge expects a polarisation, is one cell's share of it here.
     cells, load = vehicle.pack.cells_series * vehicle.pack.cells_parallel, estimator.forecaster.load
     prior_ride = load.prior_ride
@@ -219,13 +253,14 @@ def estimator_of(setting: Setting, offset: float) -> Estimator:
     return estimator
 
 
-def run(setting: Setting, cycle: Cycle, wrong: float, offset: float) -> Score:
-    """One cycle through the on-board estimator, which is told the SOC, or one that is `wrong`, after its first step."""
-    estimator = estimator_of(setting, offset)
+def run(setting: Setting, cycle: Cycle, case: Case) -> Score:
+    """One cycle through the on-board estimator, which is told the SOC as of the `case` after its first step."""
+    estimator = estimator_of(setting, case.declared)
+    current = (1 + case.gain) * cycle.current + case.offset
     truth = 1 - cycle.drawn / setting.battery.cell_capacity(cycle.temperature)
     soc, sd = np.full(len(truth), np.nan), np.full(len(truth), np.nan)
     told = False
-    for k, (v, i, t) in enumerate(zip(cycle.voltage, cycle.current + offset, cycle.cell, strict=True)):
+    for k, (v, i, t) in enumerate(zip(cycle.voltage, current, cycle.cell, strict=True)):
         estimator.handle((1.0 + k, 0, (t,)))
         estimator.handle((1.0 + k, 1, (v, i)))
         f = estimator.filter
@@ -233,8 +268,8 @@ def run(setting: Setting, cycle: Cycle, wrong: float, offset: float) -> Score:
             continue
         if not told:
             told = True
-            f.soc, f.v1, f.error = float(truth[k]) + wrong, 0.0, 0.0
-            f.covariance = (max(abs(wrong), RIGHT_SD) ** 2, 0.0, f.covariance[2])
+            f.soc, f.v1, f.error = float(truth[k]) + case.wrong, 0.0, 0.0
+            f.covariance = (case.sd**2, 0.0, f.covariance[2])
         soc[k], sd[k] = f.soc, sqrt(f.covariance[0])
     known = np.isfinite(soc)
     error, sd = (soc - truth)[known], sd[known]
@@ -299,7 +334,7 @@ def _unshifted(battery: Battery) -> Battery:
     return replace(battery, rest_shift_temperature=(), rest_shift_value=(), rest_shift_sd=0.0)
 
 
-def jobs(work: tuple[Setting, Cycle, float, float]) -> Score:
+def jobs(work: tuple[Setting, Cycle, Case]) -> Score:
     return run(*work)
 
 
@@ -318,10 +353,12 @@ def report(folder: Path, only: str = "", board: bool = False) -> list[str]:
     every = settings(rest, result)[: 1 if board else None]
     work = [c for c in cycles(folder) if only in c.name]
     plain = [c for c in work if "trise" not in c.name]
-    runs = [(every[0], c, *case) for c in work for case in CASES]
-    runs += [(s, c, *case) for s in every[1:] for c in work for case in (RIGHT, WORST)]
+    random = drawn(work, result.parameters["cell_capacity"])
+    runs = [(every[0], c, case) for c in work for case in CASES]
+    runs += [(every[0], c, case) for (_, c), case in random.items()]
+    runs += [(s, c, case) for s in every[1:] for c in work for case in (RIGHT, WORST)]
     with ProcessPoolExecutor(2) as pool:
-        keys = [(s.name, c, wrong, offset) for s, c, wrong, offset in runs]
+        keys = [(s.name, c, case) for s, c, case in runs]
         scores = dict(zip(keys, pool.map(jobs, runs, chunksize=4), strict=True))
     lines = ["## What the calibration found", ""]
     lines += [f"- {text}" for r in (rest, result) for text in (*r.refusals, *r.notes)]
@@ -330,7 +367,7 @@ def report(folder: Path, only: str = "", board: bool = False) -> list[str]:
     lines += ["", "Means over the cycles of a temperature, without those of rising temperature:", ""]
     lines += _summary(every[:1], plain, scores, list(CASES))
     lines += ["", "The filter's own interval of 95 %, and how fast a wrong start is left:", ""]
-    lines += _intervals(every[0], work, scores)
+    lines += _intervals(every[0], work, scores, random)
     if not board:
         lines += ["", "## What is missing", "", "### In the filter: the same with more in the model", ""]
         lines += _summary(every, plain, scores, [RIGHT, WORST])
@@ -370,7 +407,7 @@ def _tables(result: Result) -> list[str]:
     return lines
 
 
-Scores = dict[tuple[str, Cycle, float, float], Score]
+Scores = dict[tuple[str, Cycle, Case], Score]
 
 
 def _detail(setting: Setting, work: list[Cycle], scores: Scores) -> list[str]:
@@ -382,16 +419,16 @@ def _detail(setting: Setting, work: list[Cycle], scores: Scores) -> list[str]:
     for c in work:
         cells = []
         for case in CASES:
-            s = scores[setting.name, c, *case]
+            s = scores[setting.name, c, case]
             cell = f"{percent(s.rms)}, {percent(s.largest, 1)}, {percent(s.inside, 0)}"
             cells.append(("never" if np.isnan(s.rms) else cell) + (f", {s.start:.0f}" if s.start > 0 else ""))
         end = 1 - c.drawn[-1] / setting.battery.cell_capacity(c.temperature)
-        sd = scores[setting.name, c, *RIGHT].sd
+        sd = scores[setting.name, c, RIGHT].sd
         lines.append(f"| {c.temperature} | {c.name} | {100 * end:.0f} | {' | '.join(cells)} | {100 * sd:.1f} |")
     return lines
 
 
-def _intervals(setting: Setting, work: list[Cycle], scores: Scores) -> list[str]:
+def _intervals(setting: Setting, work: list[Cycle], scores: Scores, random: dict[tuple[str, Cycle], Case]) -> list[str]:
     lines = [
         "| °C | start | σ, % | samples within 95 %, least of a cycle | NEES | s to within 3 %, most of a cycle |",
         "| --- " * 6 + "|",
@@ -399,26 +436,27 @@ def _intervals(setting: Setting, work: list[Cycle], scores: Scores) -> list[str]
     groups = {f"{t}": [c for c in work if c.temperature == t and "trise" not in c.name] for t in TEMPERATURES}
     groups["rising"] = [c for c in work if "trise" in c.name]
     for name, group in groups.items():
-        for case in CASES if group else ():
-            mine = [scores[setting.name, c, *case] for c in group]
+        found = {text: [scores[setting.name, c, case] for c in group] for case, text in CASES.items()}
+        found |= {f"{text}, drawn": [scores[setting.name, c, random[text, c]] for c in group] for text in DRAWN}
+        for text, mine in found.items() if group else ():
             near = np.array([s.near for s in mine])
             never = f", {np.count_nonzero(np.isnan(near))} never" if np.any(np.isnan(near)) else ""
             inside = [s.inside for s in mine]
             lines.append(
-                f"| {name} | {CASES[case]} | {percent(np.mean([s.sd for s in mine]))} | "
+                f"| {name} | {text} | {percent(np.mean([s.sd for s in mine]))} | "
                 f"{percent(np.mean(inside), 0)}, {percent(min(inside), 0)} | {np.mean([s.nees for s in mine]):.2f} | "
                 f"{np.nanmean(near):.0f}, {np.nanmax(near):.0f}{never} |"
             )
     return lines
 
 
-def _summary(every: list[Setting], work: list[Cycle], scores: Scores, cases: list[tuple[float, float]]) -> list[str]:
+def _summary(every: list[Setting], work: list[Cycle], scores: Scores, cases: list[Case]) -> list[str]:
     lines = ["| model | start | " + " | ".join(f"{t} °C" for t in TEMPERATURES) + " |", "| --- " * 7 + "|"]
     for setting in every:
         for case in cases:
             cells = []
             for t in TEMPERATURES:
-                mine = [scores[setting.name, c, *case] for c in work if c.temperature == t]
+                mine = [scores[setting.name, c, case] for c in work if c.temperature == t]
                 if mine:
                     good = [s for s in mine if np.isfinite(s.rms)]
                     rms = np.mean([s.rms for s in good])

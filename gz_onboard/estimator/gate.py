@@ -22,6 +22,7 @@ class InnovationGate:
         self._ratio = 0.0  # of the error's square over its variance, over `MATCHING_TIME`
         self._contradicted = 0.0  # s
         self._known = 1.0  # V²: variance of the last error by what is known of the cell model
+        self._blamed = False  # the cell model as well, and it has not followed the voltage since
 
     @property
     def rms(self) -> float:
@@ -39,9 +40,12 @@ class InnovationGate:
         return self._contradicted >= CONTRADICTED
 
     def blame_both(self) -> None:
-        """The last error may be the cell model's as well: it is believed to no better than that."""
+        """The last error may be the cell model's as well: it is believed to no better than that.
+
+        What the state of charge is uncertain by from here on is that same error, and explains nothing of it.
+        """
         self._ratio = (self.innovation or 0.0) ** 2 / self._known
-        self._contradicted = 0.0
+        self._contradicted, self._blamed = 0.0, True
 
     def update(self, dt: float, error: float, own: float, slow: float, load: float) -> float | None:
         """The variance [V²] of what in a voltage that is `error` [V] off is not the slow error; None: take in none.
@@ -52,7 +56,9 @@ class InnovationGate:
         self.innovation, square, known = error, error * error, slow + load
         # A model with larger errors than in the vehicle file gets a larger variance (Mehra 1970: covariance matching).
         believed = known * max(self._ratio, 1.0)
-        self._ratio += (square / (own + known) - self._ratio) * min(dt / MATCHING_TIME, 1.0)
+        expected = known if self._blamed else own + known
+        self._ratio += (square / expected - self._ratio) * min(dt / MATCHING_TIME, 1.0)
+        self._blamed = self._blamed and self._ratio > 1
         self._known = known
         self._square += (square - self._square) * min(dt / INNOVATION_TIME, 1.0)
         self._contradicted = self._contradicted + dt if square > GATE * GATE * (own + known) else 0.0

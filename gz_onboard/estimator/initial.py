@@ -117,10 +117,10 @@ def first_filter(
     at: Situation,
     signals: Signals,
     restored: tuple[Saved | None, float | None],
-) -> SocFilter:
+) -> tuple[SocFilter, tuple[float, float] | None]:
     """The first SOC: from the voltage, and from what was saved before, each with what is not known about it.
 
-    restored: what was saved, and how long before [s].
+    restored: what was saved, and how long before [s]. Gives also (SOC, its variance) of the latter, if the two agree.
     """
     temperature, (saved, age) = at.temperature, restored
     cell_current = first.current / battery.cells_parallel
@@ -156,12 +156,15 @@ def first_filter(
     error_sd = hypot(v1_sd, slow_sd)
     soc, covariance = from_voltage(battery, cell_voltage, cell_current, temperature, v1, error_sd, once_sd)
     filter_ = make(battery, soc, v1, covariance)
+    counted = None
     if saved and drawn:
         before, variance = saved.soc - drawn[0], saved.covariance[0] + drawn[1] ** 2
         apart = (before - soc) ** 2
         if apart > CONFLICT**2 * (variance + covariance[0]):  # either may be wrong
             variance += apart
             filter_.covariance = covariance[0] + apart, covariance[1], covariance[2]
+        else:
+            counted = before, variance
         update_soc(filter_, before, variance)
     filter_.soc = bounded(filter_.soc)
-    return filter_
+    return filter_, counted

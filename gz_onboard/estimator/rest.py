@@ -109,6 +109,7 @@ class RestUpdate:
         self._battery, self._uncertainty, self._effects = battery, uncertainty, effects
         self._rest = RestMonitor()
         self._taken = inf  # V² of a cell: variance of what was taken in of this rest
+        self.shown = False  # whether a rest has shown the state of charge yet
 
     def interrupt(self) -> None:
         """A pause in the data."""
@@ -130,6 +131,7 @@ class RestUpdate:
             self._taken = inf
             return False
         variance = rest.sd**2 + self._uncertainty.rest**2 + voltage_sd**2
+        self.shown = True
         if not rest.fresh or variance > REST_NEWS * self._taken:
             return False
         emf += rest.coming

@@ -97,6 +97,14 @@ class Window:
         return self.low + shown * (self.high - self.low)
 
 
+@dataclass(slots=True)
+class Health:
+    """How a pack has aged, as factors on what its file says; every equation of `Battery` has them in it."""
+
+    capacity: float = 1.0
+    resistance: float = 1.0  # of R0, R1 and what effects in the cells take
+
+
 @dataclass(frozen=True)
 class Battery:
     """A pack of `cells_series` by `cells_parallel` cells."""
@@ -123,10 +131,12 @@ class Battery:
     entropy_value: Row = ()  # V/K of a cell
     voltage_error_temperature: Row = ()  # degC; none: one error of the circuit for all temperatures
     voltage_error_value: Row = ()  # V of a cell, sd
+    health: Health = field(default_factory=Health)  # changed by `age` only
 
     def cell_capacity(self, temperature: float) -> float:
         """Capacity of a cell [A·h] at `temperature` [degC]: the charge between SOC 0 and 1."""
-        return self.capacity * linear(self.capacity_temperature, self.capacity_share, temperature)
+        fresh = self.capacity * linear(self.capacity_temperature, self.capacity_share, temperature)
+        return self.health.capacity * fresh
 
     def capacity_share_over(self, temperature: Array) -> Array:
         """The share of the capacity at 25 degC that there is at `temperature` (m,) [degC]."""
@@ -255,6 +265,21 @@ class Battery:
             c1=self.c1.scaled(1 / more),  # the time constant stays
             resistance_factor=factor,
         )
+
+    def own(self) -> Battery:
+        """A copy that may `age` by itself; it is as new."""
+        r0, r1, c1 = (table.scaled(1.0) for table in (self.r0, self.r1, self.c1))
+        return replace(self, r0=r0, r1=r1, c1=c1, health=Health())
+
+    def age(self, capacity: float, resistance: float) -> None:
+        """From now on the pack has so many times the capacity and the resistance that its file says.
+
+        In place: who holds the battery sees it. Call it for a copy of one's `own` only.
+        """
+        self.health.capacity, self.health.resistance = capacity, resistance
+        self.r0.rescale(resistance)
+        self.r1.rescale(resistance)
+        self.c1.rescale(1 / resistance)  # the time constant stays
 
     def settled_current(
         self,

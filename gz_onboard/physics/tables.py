@@ -71,6 +71,7 @@ class Mesh:
     temperature: Row
     value: tuple[Row, ...]
     geometric: bool = False  # over temperature; all values are positive then
+    _scale: list[float] = field(default_factory=lambda: [1.0], init=False, repr=False)  # one factor, see `rescale`
     _rows: dict[float, Row] = field(default_factory=dict, init=False, repr=False)  # by temperature, the last few
 
     def at(self, soc: float, temperature: float) -> tuple[float, float]:
@@ -90,7 +91,12 @@ class Mesh:
         import numpy as np
 
         nodes = np.array(self.soc), np.array(self.temperature), np.array(self.value)
-        return bilinear_over(*nodes, soc, temperature, self.geometric)
+        return self._scale[0] * bilinear_over(*nodes, soc, temperature, self.geometric)
+
+    def rescale(self, factor: float) -> None:
+        """From now on the table's values are read times `factor`."""
+        self._scale[0] = factor
+        self._rows.clear()
 
     def scaled(self, factor: float) -> Mesh:
         """The same mesh times `factor`."""
@@ -110,6 +116,7 @@ class Mesh:
                 row = tuple(cold * (warm / cold) ** w for cold, warm in pairs)
             else:
                 row = tuple(cold + w * (warm - cold) for cold, warm in pairs)
+        row = tuple(self._scale[0] * value for value in row)
         if len(self._rows) >= KEPT_ROWS:
             self._rows.clear()
         self._rows[temperature] = row

@@ -176,7 +176,8 @@ def _pack_heat(
 ) -> tuple[Array, Array]:
     """(what the pack turns to heat [W], its SOC) by mean and mean square of its current, all (n,).
 
-    first: mean voltage and current of the pack in its first moments, at a standing load.
+    first: mean voltage and current of the pack in its first moments. These runs begin under way, so the whole current
+    is taken to have flowed for a while, not only what lamps and control draw.
     """
     battery = vehicle.pack
     cells = vehicle.model.at(Port.CELL_VOLTAGE)

@@ -89,13 +89,10 @@ def offsets(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         result.notes.append(f"{', '.join(left_out)}: left out; needed are {NEEDED.replace(' ', ', ')}")
     own = np.array([p["inverter_loss_constant"] / pair.pack_voltage[pair.rest].mean() for pair in resting])
     apart = np.array([(pair.pack - pair.inverter - pair.auxiliary)[pair.rest].mean() for pair in resting])
-    # of a ride to come: what differs from ride to ride, the inverter's own loss, and the auxiliary sensor's share
-    own_sd = p.sd("inverter_loss_constant") / float(resting[0].pack_voltage.mean())
-    spread = float(np.std(apart - own, ddof=1)) if len(apart) > 1 else FIRST_SPREAD * sizes.current
-    offset, auxiliary = float(np.mean(apart - own)), AUXILIARY * sizes.auxiliary / sizes.voltage
+    spread, sd = _offset_sd(apart - own, vehicle, float(resting[0].pack_voltage.mean()))
     result.parameters["pack_current_offset"] = Found(
-        offset,
-        float(np.hypot(max(spread, DRIFT_SD * sizes.current), own_sd) + CURRENT_SD * auxiliary),
+        float(np.mean(apart - own)),
+        sd,
         "A",
         f"{len(resting)} rides at rest: pack less inverter less auxiliary is {apart.mean():+.3f} ± {spread:.3f} "
         f"A, {own.mean():.3f} A of it the inverter's own {p['inverter_loss_constant']:.1f} W",
@@ -149,8 +146,7 @@ def at_standstill(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
     result.notes.append(f"{missing}: taken from the pack's sensors at standstill instead")
     _noises(result, noises)
     if apart:
-        spread = float(np.std(apart, ddof=1)) if len(apart) > 1 else 0.05
-        sd = float(np.hypot(max(spread, DRIFT_SD), p.sd("inverter_loss_constant") / volts) + CURRENT_SD * AUXILIARY)
+        sd = _offset_sd(np.array(apart), vehicle, volts)[1]
         source = f"{len(apart)} rides at standstill: pack less auxiliary current and the inverter's own"
         channel = "pack_current less auxiliary_current at standstill"
         result.parameters["pack_current_offset"] = Found(float(np.mean(apart)), sd, "A", source, channel)
@@ -162,6 +158,18 @@ def at_standstill(rides: Sequence[Samples], vehicle: Vehicle) -> Result:
         "pack_current_gain, pack_voltage_offset: need inverter_current and inverter_voltage; what the file says stays"
     )
     return result
+
+
+def _offset_sd(offsets: Array, vehicle: Vehicle, volts: float) -> tuple[float, float]:
+    """(scatter of those of the rides (n,), sd of that of a ride to come) [A], of a pack at `volts`.
+
+    Beside the scatter from ride to ride, the inverter's own loss and the auxiliary sensor's class are in the sd.
+    """
+    sizes = sizes_of(vehicle)
+    spread = float(np.std(offsets, ddof=1)) if len(offsets) > 1 else FIRST_SPREAD * sizes.current
+    own = vehicle.parameters.sd("inverter_loss_constant") / volts
+    auxiliary = AUXILIARY * sizes.auxiliary / sizes.voltage
+    return spread, float(np.hypot(max(spread, DRIFT_SD * sizes.current), own) + CURRENT_SD * auxiliary)
 
 
 def _noises(result: Result, noises: Sequence[tuple[float, float]]) -> None:

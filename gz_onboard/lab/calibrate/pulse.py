@@ -193,7 +193,7 @@ def _voltages(result: Result, tests: Sequence[Tested], names: str) -> None:
                     result.fits.append(fit)
                     if what == "one pair":
                         rms[name].append(fit.rms)
-        left.append(Residual(t.temperature, test.time, test.voltage - models["one pair"], t.level))
+        left.append(Residual(t.temperature, test.time, test.voltage - models["one pair"], t.level, test.rest))
         hours, model, title = test.time / HOUR, models["one pair"], f"Pulse test at {at} °C"
         result.panels += compared(title, "time [h]", "voltage [V]", hours, test.voltage, model)
     voltage_errors(left, names, result)

@@ -1,7 +1,8 @@
 """How far the circuit that was found is off the pulse tests, by temperature, and for how long it errs the same way.
 
-Of the residual over time, not over samples, of which most are in the pulses: on board a second at rest counts as much
-as one under load. What changes with the load the filter reckons with beside it.
+Of the residual over time, not over samples, of which most are in the pulses. Rest and load count the same: a test rests
+nine tenths of its time, a ride does not, and under a load that stays the circuit errs several times as much. What
+changes with the load the filter reckons with beside it.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gz_onboard.arrays import Array
+from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.calibrate.result import Curve, Found, Result
 from gz_onboard.physics.relaxation import relaxation_over
 
@@ -30,22 +31,23 @@ class Residual(NamedTuple):
     time: Array  # s
     voltage: Array  # V, measured less the circuit's
     level: Array  # state of charge
+    rest: Mask  # where no current flows
 
 
 def voltage_errors(residuals: Sequence[Residual], names: str, result: Result) -> None:
     """``battery.voltage_error`` and ``cell_voltage_error_time`` into `result`."""
-    even = [_evenly(r) for r in residuals]
-    known = [k for k, x in enumerate(even) if len(x) > LONGEST / GRID]
+    found = [(r.temperature, *_evenly(r)) for r in residuals]
+    known = [(at, left, rest) for at, left, rest in found if len(left) > LONGEST / GRID]
     if not known:
         return
-    sizes = np.array([np.sqrt(np.mean(even[k] ** 2)) for k in known])
-    times = np.array([_correlation_time(even[k]) for k in known])
+    sizes = np.array([_size(left, rest) for _, left, rest in known])
+    times = np.array([_correlation_time(left) for _, left, _ in known])
     result.curves["battery.voltage_error"] = Curve(
-        {"temperature": np.array([residuals[k].temperature for k in known])},
+        {"temperature": np.array([at for at, _, _ in known])},
         sizes,
-        sizes * np.sqrt(times / np.array([GRID * len(even[k]) for k in known])),
+        sizes * np.sqrt(times / np.array([GRID * len(left) for _, left, _ in known])),
         "V",
-        f"{names}: rms over time of one RC pair above 10 % SOC",
+        f"{names}: rms of one RC pair above 10 % SOC, rest and load alike",
     )
     middle = float(np.exp(np.mean(np.log(times))))
     spread = middle * float(np.std(np.log(times))) if len(known) > 1 else middle
@@ -85,11 +87,17 @@ def slow_pair(flowed: Array, dt: Array, left: Array) -> SlowPair:
     return best[1]
 
 
-def _evenly(residual: Residual) -> Array:
-    """The residual each `GRID` seconds, above `EMPTY`."""
+def _evenly(residual: Residual) -> tuple[Array, Mask]:
+    """The residual each `GRID` seconds, above `EMPTY`, and where the cell rests."""
     at = np.arange(residual.time[0], residual.time[-1], GRID)
-    values: Array = np.interp(at, residual.time, residual.voltage)
-    return values[np.interp(at, residual.time, residual.level) > EMPTY]
+    values, level = (np.interp(at, residual.time, x) for x in (residual.voltage, residual.level))
+    rest = residual.rest[np.searchsorted(residual.time, at)]
+    return values[level > EMPTY], rest[level > EMPTY]
+
+
+def _size(values: Array, rest: Mask) -> float:
+    """The rms of `values`, those at rest and those under load counted alike."""
+    return float(np.sqrt(np.mean([np.mean(values[part] ** 2) for part in (rest, ~rest) if np.any(part)])))
 
 
 def _correlation_time(values: Array) -> float:

@@ -22,7 +22,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.constants import KELVIN
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.simulation.columns import csv_rows
+from gz_onboard.routes.columns import csv_rows
 
 if TYPE_CHECKING:
     from gz_onboard.toml import Table

@@ -20,11 +20,16 @@ def wandering(seed, sd, tau, hours=60.0):
     return time, values
 
 
+def resting(time):
+    """True but for the last tenth of each hour."""
+    return time % 3600 < 3240
+
+
 def test_size_and_time_come_back():
     residuals = []
     for seed, (temperature, sd) in enumerate(((-10.0, 0.02), (25.0, 0.005))):
         time, values = wandering(seed, sd, 400.0)
-        residuals.append(Residual(temperature, time, values, np.full(len(time), 0.5)))
+        residuals.append(Residual(temperature, time, values, np.full(len(time), 0.5), resting(time)))
     result = Result("pulse")
     voltage_errors(residuals, "t", result)
     curve, time = result.curves["battery.voltage_error"], result.parameters["cell_voltage_error_time"]
@@ -38,8 +43,17 @@ def test_what_is_near_empty_is_left_out():
     level = np.linspace(1.0, 0.0, len(time))
     spoilt = np.where(level < 0.1, 0.3, values)
     result = Result("pulse")
-    voltage_errors([Residual(25.0, time, spoilt, level)], "t", result)
+    voltage_errors([Residual(25.0, time, spoilt, level, resting(time))], "t", result)
     assert result.curves["battery.voltage_error"].value == pytest.approx([0.005], rel=0.15)
+
+
+def test_load_counts_as_much_as_rest_though_a_test_has_little_of_it():
+    time = np.arange(0.0, 36000.0, 5.0)
+    rest = resting(time)
+    values = np.where(rest, 0.005, 0.04)
+    result = Result("pulse")
+    voltage_errors([Residual(-10.0, time, values, np.full(len(time), 0.5), rest)], "t", result)
+    assert result.curves["battery.voltage_error"].value == pytest.approx([np.hypot(0.005, 0.04) / np.sqrt(2)])
 
 
 @pytest.mark.parametrize(("resistance", "time"), [(0.04, 2400.0), (0.0, 2400.0)])
