@@ -60,3 +60,18 @@ def drawable(
         current = battery.settled_current(power, high + width * node, temperature, form_factor_squared, overpotential)
         total += weight / current if current else 0.0
     return Drawable(power * charge * width * total, slope)
+
+
+NEWTON_STEPS = 3  # to 1e-4 of SOC: the energy is nearly linear in it
+
+
+def soc_left(battery: Battery, soc: float, temperature: float, share: float, power: float = 1.0) -> float:
+    """The SOC at which `share` (0 to 1) is left of the energy that a pack at `soc` still delivers.
+
+    temperature in degC, power in W.
+    """
+    left = share * drawable(battery, soc, temperature, power).energy
+    for _ in range(NEWTON_STEPS):
+        now = drawable(battery, soc, temperature, power)
+        soc -= (now.energy - left) / now.slope
+    return soc

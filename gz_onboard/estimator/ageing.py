@@ -1,0 +1,304 @@
+"""How the pack has aged: its capacity and its resistance, as factors on what its file says.
+
+**Capacity.** The inverse of the factor, ψ, is a third state beside SOC and e of the filter: SOC' = SOC - ψ·dq with the
+charge dq over the file's capacity. What a voltage or a rest says of SOC says of ψ what the covariance of the two has
+gathered, dq·var(ψ) with the charge that has passed (joint estimation: Plett 2004, part 3). Two rests with charge
+between them are a fit through two points with errors in both (total least squares: Plett 2011), by the variances of
+the two and of the count. Filter and ψ are kept apart: given SOC and e, what is expected of ψ is a plane over them, and
+an update of the filter moves ψ along it, however the filter makes it.
+
+**Resistance.** Least squares with forgetting of the voltage's quick changes over what the circuit makes of the
+current. The tables err by `RESISTANCE_SD` at their place for minutes, whatever the number of samples.
+
+A pack of unknown age holds anything from all of what its file says down to little more than half. Half of the packs
+are taken to be as new, which the voltages of a healthy pack confirm soon, so that it is not made wrong; those of an
+aged pack refute it within some tens of per cent of charge. The interval of the range is wider on the lower side only:
+no pack is better than new. Nothing is learned while a sensor is doubted, or where SOC is not known by itself to
+`TRUSTED`: an age would explain what is none. With one current sensor its gain and the capacity cannot be told apart,
+and the factor is that of what the sensor counts; with two that differ nothing is learned.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import exp, isfinite, sqrt
+
+from gz_onboard.constants import BENCH_TEMPERATURE
+from gz_onboard.estimator.ekf import Covariance, SocFilter
+from gz_onboard.estimator.signals import Signals
+from gz_onboard.estimator.sources import CurrentSource, PackReading
+from gz_onboard.estimator.uncertainty import RESISTANCE_SD
+from gz_onboard.physics.battery import Battery
+
+CAPACITY, RESISTANCE = (0.5, 1.1), (0.5, 4.0)  # factors that a pack at work has
+CAPACITY_SD, UNKNOWN_RESISTANCE_SD = 0.16, 0.3  # of a pack of unknown age
+AS_NEW, AS_NEW_SD = 0.5, 0.02  # share of packs that still hold what their file says, and how closely
+LEAST_VARIANCE = 0.01**2  # of ψ: the curve's place, and what of an ageing cell is not capacity
+CAPACITY_DRIFT = 0.02**2  # of ψ: variance that it gains over as much charge as a pack holds a hundred times
+CYCLES = 100.0  # see above
+LEAST_SOC = 0.001**2  # variance
+MOST_COUNTED = 1.0  # of SOC in one step: a pause of years is no charge
+TRUSTED = 0.03  # of SOC: sd by itself from which the charge that passes tells of the capacity
+QUICK = 60.0  # s: changes of the voltage that are slower may be the charge's
+PLACE_TIME = 600.0  # s for which the tables' place errs the same way
+RESISTANCE_MEMORY = 3600.0  # s of load: the mean over a ride's charge and temperature is what lasts
+EXCITED = 0.01  # V of a cell: a load that changes its voltage by less shows no resistance
+FIRST = 10.0  # s of load before the resistance is more than a guess
+PRIOR_WEIGHT = 0.02  # V²·s: what the guess counts beside the load
+AGREEING_RATE = 0.01  # 1/h: two currents that differ by more in the mean, over capacity, show no capacity
+APPLIED_EVERY = 10.0  # s
+SAME = 1e-6  # relative: the vehicle file says the same as when it was learned
+
+Numbers = list[float] | None
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A factor on what the vehicle file says."""
+
+    value: float
+    sd: float
+    share: float  # 0 nothing is learned, 1 as much as can be
+
+
+@dataclass(frozen=True, slots=True)
+class Belief:
+    """What of ψ is used: its mean and variance, and what it makes of the filter's SOC."""
+
+    inverse: float = 1.0
+    variance: float = CAPACITY_SD**2
+    soc_shift: float = 0.0
+    soc_variance: float = 0.0  # beside the filter's; may be negative
+
+
+class Ageing:
+    """Learns the factors of one pack, and gives them to its `Battery`."""
+
+    def __init__(self, battery: Battery) -> None:
+        self._battery = battery
+        self.inverse, self.variance = 1.0, CAPACITY_SD**2  # ψ
+        self._with_soc = self._with_error = 0.0  # covariances of ψ with SOC and e
+        self.belief = Belief()
+        self._learning = False
+        self._agreeing = AGREEING_RATE * battery.pack_capacity(BENCH_TEMPERATURE)  # A
+        self._resistance, self._weight, self._load_time = 1.0, PRIOR_WEIGHT, 0.0  # 1, V²·s, s
+        self._slow = 0.0, 0.0  # V: low-passed drop at a factor of 1, and measured
+        self._since = 0.0  # s
+
+    # --- what others ask --------------------------------------------------------------------------------------
+
+    @property
+    def capacity(self) -> Learned:
+        """What the pack holds over what its file says."""
+        factor, sd = 1 / self.belief.inverse, sqrt(self.belief.variance)
+        return Learned(factor, sd * factor * factor, max(1 - sqrt(self.variance) / CAPACITY_SD, 0.0))
+
+    def energy_sd(self, energy: float, slope: float, soc_sd: float) -> tuple[float, float]:
+        """(sd of the energy that is left [J] downwards, upwards), by SOC and capacity, which err together.
+
+        slope: how much more `energy` [J] there would be for more SOC [J].
+        """
+        belief = self.belief
+        sd = sqrt(belief.variance)
+        by_capacity = energy / belief.inverse
+        together = self._with_soc / self.variance  # of SOC, for ψ
+        found = []
+        for age_sd in (sd, min(sd, max(belief.inverse - 1, 0.0) + AS_NEW_SD)):
+            by_itself = max(soc_sd * soc_sd - (together * sd) ** 2, 0.0)
+            found.append(sqrt(slope * slope * by_itself + (age_sd * (by_capacity - slope * together)) ** 2))
+        return found[0], found[1]
+
+    @property
+    def resistance(self) -> Learned:
+        """Of R0, R1 and what effects in the cells take."""
+        seen = self._load_time / (self._load_time + FIRST)
+        places = seen * (1 + self._load_time / PLACE_TIME)
+        sd = 1 / sqrt(1 / UNKNOWN_RESISTANCE_SD**2 + places / RESISTANCE_SD**2)
+        return Learned(self._resistance_factor, sd, 1 - sd / UNKNOWN_RESISTANCE_SD)
+
+    @property
+    def _resistance_factor(self) -> float:
+        """What is believed: a change that is small beside the tables' own error is mostly that (a Wiener filter)."""
+        change = self._resistance - 1
+        return 1 + change**3 / (change**2 + RESISTANCE_SD**2)
+
+    def learned(self) -> dict[str, Learned]:
+        """Both, by the names of `snapshot`."""
+        return {"capacity": self.capacity, "resistance": self.resistance}
+
+    def state_of_charge(self, filter_: SocFilter) -> tuple[float, float]:
+        """(SOC, its sd) with what is believed of the capacity."""
+        belief = self.belief
+        return filter_.soc + belief.soc_shift, sqrt(max(filter_.covariance[0] + belief.soc_variance, LEAST_SOC))
+
+    # --- learning ---------------------------------------------------------------------------------------------
+
+    def part(self, filter_: SocFilter | None = None) -> None:
+        """What SOC errs by is no longer that of the charge counted: begin anew, with what is believed of SOC now."""
+        if filter_:
+            soc, sd = self.state_of_charge(filter_)
+            filter_.soc, filter_.covariance = soc, (sd * sd, *filter_.covariance[1:])
+        self._with_soc = self._with_error = 0.0
+        self.belief = self._believe()
+
+    def resume(self, filter_: SocFilter, counted: tuple[float, float] | None) -> None:
+        """A filter was begun after a pause; counted: (SOC, its variance) from before, if that is in it and fits.
+
+        What a rest tells beside it is of the charge until then: a pair of trusted points and the charge between them.
+        """
+        if counted is None or counted[1] - self._with_soc**2 / self.variance > TRUSTED**2:
+            self.part()
+            return
+        soc, variance = counted
+        self._with_error, self._learning = 0.0, True
+        self.corrected(filter_, (soc, filter_.error, (variance, 0.0, filter_.covariance[2])))
+        self.belief = self._believe()
+
+    def count(self, filter_: SocFilter, before: Covariance, flowed: float) -> None:
+        """The filter has counted a share `flowed` of the capacity; `before`: its covariance before."""
+        p00, p01, p11 = filter_.covariance
+        share = min(max(flowed * self._battery.health.capacity, -MOST_COUNTED), MOST_COUNTED)
+        filter_.soc -= (self.inverse - 1 / self._battery.health.capacity) * share
+        fade = min(max(p01 / before[1], 0.0), 1.0) if before[1] else 1.0
+        with_soc = self._with_soc
+        self._with_soc = with_soc - share * self.variance
+        self._with_error *= fade
+        p00 = max(p00 + share * (share * self.variance - 2 * with_soc), LEAST_SOC)
+        filter_.covariance = p00, p01 - share * self._with_error, p11
+        self.variance = min(self.variance + CAPACITY_DRIFT / CYCLES * abs(share), CAPACITY_SD**2)
+
+    def corrected(self, filter_: SocFilter, before: tuple[float, float, Covariance]) -> None:
+        """The filter has taken in a voltage; `before`: its SOC, e and covariance until then."""
+        soc, error, (p00, p01, p11) = before
+        n00, n01, n11 = filter_.covariance
+        determinant = p00 * p11 - p01 * p01
+        if determinant <= 0:
+            return
+        c0, c1 = self._with_soc, self._with_error
+        g0, g1 = (p11 * c0 - p01 * c1) / determinant, (p00 * c1 - p01 * c0) / determinant
+        self._with_soc, self._with_error = n00 * g0 + n01 * g1, n01 * g0 + n11 * g1
+        if not self._learning:
+            return
+        inverse = self.inverse + g0 * (filter_.soc - soc) + g1 * (filter_.error - error)
+        self.inverse = min(max(inverse, 1 / CAPACITY[1]), 1 / CAPACITY[0])
+        less = g0 * g0 * (p00 - n00) + 2 * g0 * g1 * (p01 - n01) + g1 * g1 * (p11 - n11)
+        self.variance = max(self.variance - less, LEAST_VARIANCE)
+
+    def permit(self, now: float, reading: PackReading, signals: Signals, filter_: SocFilter) -> None:
+        """Whether all that the learning depends on is beyond doubt at `now` [s]; else a sensor's fault may be learned.
+
+        What was counted before is not gone on from.
+        """
+        by_itself = filter_.covariance[0] - self._with_soc**2 / self.variance
+        if by_itself <= 0:  # SOC was made known from elsewhere
+            self.part()
+            by_itself = filter_.covariance[0]
+        sound = reading.source is CurrentSource.PACK and not reading.voltage_doubted
+        known = signals.cell_temperature.fresh(now) and signals.pack_voltage.fresh(now)
+        agree = reading.current_apart is None or abs(reading.current_apart) < self._agreeing
+        permitted = sound and known and agree and by_itself < TRUSTED**2
+        if permitted != self._learning:
+            self._learning = permitted
+            self.part(filter_)
+
+    def load(self, dt: float, drop: float, error: float) -> None:
+        """A cell's voltage [V] over `dt` [s]: `drop` by the load as predicted, `error` measured less predicted."""
+        unit, measured = drop / self._battery.health.resistance, drop - error
+        share = min(dt / QUICK, 1.0)
+        slow, slow_measured = self._slow
+        self._slow = slow + share * (unit - slow), slow_measured + share * (measured - slow_measured)
+        quick, quick_measured = unit - slow, measured - slow_measured
+        if not self._learning or abs(quick) < EXCITED:
+            return
+        self._load_time = min(self._load_time + dt, RESISTANCE_MEMORY)
+        self._weight += quick * quick * dt - self._weight * dt / RESISTANCE_MEMORY
+        factor = self._resistance + quick * (quick_measured - self._resistance * quick) * dt / self._weight
+        self._resistance = min(max(factor, RESISTANCE[0]), RESISTANCE[1])
+
+    def apply(self, dt: float) -> bool:
+        """Give the battery what was learned, every now and then; gives whether it did."""
+        self._since += dt
+        if self._since < APPLIED_EVERY:
+            return False
+        self._since = 0.0
+        self.belief = self._believe()
+        self._battery.age(1 / self.belief.inverse, self._resistance_factor)
+        return True
+
+    def _believe(self) -> Belief:
+        """Two kinds of pack, as new and of unknown age, each by how well it explains what was seen (Bayes).
+
+        The filter's ψ is that of a pack of unknown age. Where the other kind's is elsewhere, SOC is so too.
+        """
+        told = 1 / self.variance - 1 / CAPACITY_SD**2  # information beyond the prior's
+        off = (self.inverse - 1) / self.variance
+        narrow, wide = 1 + AS_NEW_SD**2 * told, 1 + CAPACITY_SD**2 * told
+        odds = AS_NEW / (1 - AS_NEW)
+        if told > 0:
+            odds *= sqrt(wide / narrow) * exp(-off * off / told * (1 / narrow - 1 / wide) / 2)
+        as_new = odds / (1 + odds)
+        new_variance = AS_NEW_SD**2 / narrow
+        new = 1 + off * new_variance
+        inverse = as_new * new + (1 - as_new) * self.inverse
+        variance = as_new * (new_variance + (new - inverse) ** 2)
+        variance += (1 - as_new) * (self.variance + (self.inverse - inverse) ** 2)
+        moves = self._with_soc / self.variance
+        return Belief(inverse, variance, moves * (inverse - self.inverse), moves * moves * (variance - self.variance))
+
+    # --- saving -----------------------------------------------------------------------------------------------
+
+    def snapshot(self) -> dict[str, dict[str, float]]:
+        """What is to be kept over a restart, by the name of what was learned; of: what the vehicle file says."""
+        return {
+            "capacity": {
+                "of": self._battery.capacity,
+                "inverse": self.inverse,
+                "variance": self.variance,
+                "with_soc": self._with_soc,
+            },
+            "resistance": {
+                "of": self._battery.resistance_factor,
+                "factor": self._resistance,
+                "weight": self._weight,
+                "time": self._load_time,
+            },
+        }
+
+    def read(self, saved: Mapping[str, Mapping[str, float]]) -> tuple[Numbers, Numbers]:
+        """The numbers of a snapshot, of capacity and resistance; None for what it lacks, or is of another pack.
+
+        KeyError, TypeError or ValueError if it holds what cannot be.
+        """
+        capacity = _numbers(saved.get("capacity"), "inverse", "variance", "with_soc", of=self._battery.capacity)
+        resistance = _numbers(saved.get("resistance"), "factor", "weight", "time", of=self._battery.resistance_factor)
+        if capacity:
+            inverse, variance, with_soc = capacity
+            possible = 1 / CAPACITY[1] <= inverse <= 1 / CAPACITY[0] and 0 < variance <= CAPACITY_SD**2
+            if not (possible and with_soc**2 < variance):
+                raise ValueError("holds an implausible capacity")
+        if resistance:
+            factor, weight, time = resistance
+            if not (RESISTANCE[0] <= factor <= RESISTANCE[1] and weight > 0 and 0 <= time <= RESISTANCE_MEMORY):
+                raise ValueError("holds an implausible resistance")
+        return capacity, resistance
+
+    def restore(self, saved: Mapping[str, Mapping[str, float]]) -> None:
+        """Go on from a snapshot; what `read` gives no numbers of is as new. Raises as `read` does, all or nothing."""
+        capacity, resistance = self.read(saved)
+        if capacity:
+            self.inverse, self.variance, self._with_soc = capacity
+        if resistance:
+            self._resistance, self._weight, self._load_time = resistance
+        self.belief = self._believe()
+        self._battery.age(1 / self.belief.inverse, self._resistance_factor)
+
+
+def _numbers(saved: Mapping[str, float] | None, *names: str, of: float) -> Numbers:
+    """The saved numbers `names`; None if there are none, or if they are factors on something else than `of`."""
+    if saved is None or abs(float(saved["of"]) / of - 1) > SAME:
+        return None
+    found = [float(saved[name]) for name in names]
+    if not all(isfinite(x) for x in found):
+        raise ValueError("holds numbers that are none")
+    return found
