@@ -38,7 +38,7 @@ from gz_onboard.options import add_shared
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
 
-ESTIMATE_TOPIC = "/estimate"  # as in gz_onboard.pipeline, which a part of bus may not import
+ESTIMATE_TOPIC = "/estimate"  # as in gz_onboard.log_rows, which a part of bus may not import
 _TEXT_FORMATS = (".log", ".asc", ".trc", ".csv")
 _FORMATS = (*_TEXT_FORMATS, ".blf", ".mf4", ".parquet", ".mcap")
 

@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Literal
 from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.layout import first_bit, identifier_of, raw_range
-from gz_onboard.constants import WH, WH_PER_KM
+from gz_onboard.constants import MINUTE, WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.events import EFF_FLAG, ROLES, TRANSMITTED, Estimate, Frame, Reason, State
+from gz_onboard.events import EFF_FLAG, ROLES, TRANSMITTED, Cause, Estimate, Explanation, Frame, Reason, State
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
     from cantools.database.can.signal import Signal
 
 RANGE_DBC = "range.dbc"
-MESSAGES = 5  # in it
+MESSAGES = 8  # in it
 LENGTH = 8  # bytes of each
 MOST_STANDARD, MOST_EXTENDED = 0x7FF, 0x1FFF_FFFF  # identifiers of 11 and of 29 bits
 GROUP_STEP = 0x100  # from one parameter group of J1939 to the next
@@ -101,7 +101,20 @@ class Publisher:
                 signal: min(count, self.greatest(signal))
                 for signal, count in ((f"RANGE_Count{name.capitalize()}", n) for name, n in vars(counts).items())
             },
+            "RANGE_Charge": {
+                "RANGE_TimeToFull": _scaled(e.time_to_full, 1 / MINUTE) if known else None,
+                "RANGE_RemainingFull": _scaled(e.range_full, 1e-3) if known else None,
+                "RANGE_ChargePower": e.charge_power if known else None,
+            },
             "RANGE_Sensors": {signal: role in e.distrusted for role, signal in self._sensor_signals},
+            "RANGE_Why": _why(e.why if known else None),
+            "RANGE_Route": {
+                "RANGE_ArrivalStateOfCharge": _scaled(e.arrival_soc, 100) if known else None,
+                "RANGE_ArrivalStateOfChargeP10": _scaled(e.arrival_soc_p10, 100) if known else None,
+                "RANGE_RouteLeft": _scaled(e.route_left, 1e-3) if known else None,
+                "RANGE_BatteryEndsAfter": _scaled(e.battery_ends_after, 1e-3) if known else None,
+                "RANGE_RouteState": e.route_state,
+            },
         }
         return [self._frame(name, values, time_ns) for name, values in frames.items()]
 
@@ -176,6 +189,15 @@ def reason_signal(reason: Reason) -> str:
 
 
 _REASON_SIGNALS = [(int(reason), reason_signal(reason)) for reason in Reason]
+
+
+def _why(why: Explanation | None) -> dict[str, float | None]:
+    """The rated range and the two largest causes; none for what is not known."""
+    nothing: tuple[Cause, float | None] = Cause.NONE, None
+    values: dict[str, float | None] = {"RANGE_WhyRated": why.reference * 1e-3 if why else None}
+    for i, (cause, size) in enumerate([*(why.largest() if why else ()), nothing, nothing][:2], 1):
+        values |= {f"RANGE_WhyCause{i}": cause, f"RANGE_WhyDistance{i}": _scaled(size, 1e-3)}
+    return values
 
 
 def _scaled(value: float | None, factor: float) -> float | None:

@@ -7,7 +7,6 @@ import errno
 import fcntl
 import logging
 import os
-import re
 import signal
 import socket
 import sys
@@ -20,11 +19,15 @@ from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.codec import known_identifiers
 from gz_onboard.bus.recorder import Limits, Recorder
 from gz_onboard.constants import HOUR
+from gz_onboard.daemon.control import Control
+from gz_onboard.daemon.keeper import state_file
 from gz_onboard.daemon.loop import TICK, Daemon, foreign_text, state_text
+from gz_onboard.daemon.route import SOCKET
 from gz_onboard.errors import FAILED, OK, InputError, not_an_input, writing
 from gz_onboard.options import CHANNEL, add_shared, number
 from gz_onboard.physics.trust import ROOT
 from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, lacking, range_publisher
+from gz_onboard.routes.ahead import read_ahead
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 LOCK_S = 3.0  # to wait for one that is ending
@@ -41,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     channel = f"channel (default: {CHANNEL}), the vehicle's bus; twice, for a second bus"
     add_shared(parser, "--channel", action="append", default=None, help=channel)
     add_shared(parser, "--payload", help="mass of rider and luggage (default: from the vehicle file)")
-    add_shared(parser, "--effects", "--filter")
+    add_shared(parser, "--effects", "--filter", "--route")
     add(
         "--log-dir",
         type=Path,
@@ -62,6 +65,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=_directory("STATE_DIRECTORY"),
         metavar="DIR",
         help="folder for the saved state (default: none)",
+    )
+    runtime = _directory("RUNTIME_DIRECTORY")
+    add(
+        "--control-socket",
+        type=Path,
+        default=runtime / SOCKET.name if runtime else None,
+        metavar="PATH",
+        help="where `gz-onboard route` gives a route (default: none)",
     )
     write_dbc = "write the DBC file of the vehicle's range frames, for whoever reads them, and end"
     add("--write-dbc", type=Path, metavar="FILE", help=write_dbc)
@@ -101,6 +112,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> int:
+    route = read_ahead(arguments.route)[1] if arguments.route else None
     recorder = None
     if arguments.log_dir:
         recorder = Recorder(
@@ -114,9 +126,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
                 max_total_bytes=round(arguments.log_total_mb * 1e6),
             ),
         )
-    state_file = None
-    if arguments.state_dir:
-        state_file = arguments.state_dir / (re.sub(r"[^\w.+-]+", "-", vehicle.name) + ".json")
+    saved = state_file(arguments.state_dir, vehicle.name) if arguments.state_dir else None
     wanted = None if arguments.all_frames else known_identifiers(vehicle.mapping)
     if wanted is not None:  # who else sends on our own identifiers is to be told
         wanted += sorted(vehicle.publisher().identifiers)
@@ -125,7 +135,11 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
         channel.open()
     if never := lacking(vehicle):
         log.info("%s has no sensors for, and its intervals are wider by: %s", vehicle.name, ", ".join(never))
-    daemon = Daemon(vehicle, channels, recorder, state_file, arguments.filter, arguments.tick)
+    daemon = Daemon(vehicle, channels, recorder, saved, arguments.filter, arguments.tick)
+    daemon.control = Control(arguments.control_socket, lambda: daemon.pipeline)
+    daemon.control.start()
+    if route:
+        daemon.control.give(route)
     signal.signal(signal.SIGTERM, daemon.stop)
     signal.signal(signal.SIGINT, daemon.stop)
     daemon.run()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,11 @@ SAVE_SOC = 0.001  # a change that is saved before the period is over: what a pow
 STATE_STUCK_S = 10.0
 
 log = logging.getLogger("gz-onboard")
+
+
+def state_file(directory: Path, vehicle: str) -> Path:
+    """Where the state of the vehicle of this name is saved."""
+    return directory / (re.sub(r"[^\w.+-]+", "-", vehicle) + ".json")
 
 
 class StateKeeper:

@@ -19,9 +19,11 @@ from gz_onboard import notify
 from gz_onboard.bus.background_recorder import BackgroundRecorder
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.recorder import Recorder
+from gz_onboard.daemon.control import Control
 from gz_onboard.daemon.keeper import StateKeeper
 from gz_onboard.events import Frame, Reason, State
-from gz_onboard.pipeline import Pipeline, reason_names
+from gz_onboard.log_rows import reason_names
+from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle
 
 TICK = 0.1  # s: as often as a status is sent; each wake-up costs as much as ten frames
@@ -48,6 +50,7 @@ class Daemon:
     ) -> None:
         self.channels = channels
         self.recorder = recorder
+        self.control: Control | None = None
         self.finished = True  # whether log and state were written to their end
         self._log = BackgroundRecorder(recorder) if recorder else None
         self._make_pipeline: Callable[[], Pipeline] = lambda: Pipeline(vehicle, filter_name=filter_name, log=self._log)
@@ -105,6 +108,8 @@ class Daemon:
     def close(self) -> None:
         """Save the state, write the log to its end as far as the disks allow it in time, and close the channels."""
         until = time.monotonic() + STOP_S
+        if self.control:
+            self.control.close()
         if self._keeper:
             self._keeper.save(self.pipeline, time.time_ns())
         if self._log and not self._log.close(until - time.monotonic()):
@@ -171,6 +176,8 @@ class Daemon:
         if self._keeper and self._keeper.failing:
             reasons |= Reason.SAVE_FAILED
         pipeline.extra_reasons = reasons
+        if self.control:
+            self.control.take()
         for frame in pipeline.advance(frames, now_ns):
             self.channels[0].send(frame)
         if self._log:

@@ -15,6 +15,7 @@ from gz_onboard.bus.logs import is_table
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
 from gz_onboard.events import Reason, words
 from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, RideSummary, estimate_log, known_vehicle
+from gz_onboard.lab.estimate_route import route_text
 from gz_onboard.offline.processes import collect, over_rides, tasks_of
 from gz_onboard.offline.results import clock, explain_keys, number, text_rows, write_json
 from gz_onboard.offline.schema import descriptions
@@ -31,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     explain_keys(parser, "a ride", SUMMARY_VERSION, KEYS)
     add_shared(parser, "logs", "--vehicle")
     add_shared(parser, "--payload", help="mass of rider and luggage (default: unknown)")
+    add_shared(parser, "--route")
     add_shared(parser, "--filter", "--output", "--json", "--no-plot")
     parser.add_argument("--signals", action="store_true", help="also log the signals of each message, once a second")
     parser.add_argument("--frames", action="store_true", help="also log the raw frames and the range frames")
@@ -40,9 +42,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard estimate``: `OK` if every log could be estimated, else `BAD_INPUT`."""
     parts = {"filter_name": arguments.filter, "frames": arguments.frames, "signals": arguments.signals}
+    parts["route"] = arguments.route
     tasks = tasks_of(arguments, EstimateTask, ".estimate.mcap", **parts)
     written = [arguments.json, *(file for task in tasks for file in (task.log, task.picture))]
-    not_an_input(written, [*(task.path for task in tasks), find_vehicle(arguments.vehicle)])
+    not_an_input(
+        written, [*(task.path for task in tasks), *filter(None, [arguments.route]), find_vehicle(arguments.vehicle)]
+    )
     known_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
     with progress_bar(lambda: _frames(tasks), "frames", quiet=arguments.quiet) as display:
         results = _results(tasks, arguments.jobs, display.update)
@@ -109,6 +114,7 @@ def summary_text(ride: RideSummary) -> str:
             f"{_percent(ride.soc_end, ride.soc_end_sd)} at the end",
         ),
         ("range at the end", _range(ride)),
+        *([("route", route_text(ride.route))] if ride.route else []),
         (
             "innovation",
             f"{number(ride.innovation_rms_v, '.1f', 'mV', 1000)} RMS, "

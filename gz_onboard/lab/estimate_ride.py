@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import functools
 import time
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from math import sqrt
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -16,13 +14,19 @@ from gz_onboard.bus.logs import LogDamage
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.errors import InputError, writing
-from gz_onboard.events import Estimate, Frame, Reason, State
+from gz_onboard.events import Estimate, Frame, State
+from gz_onboard.lab.estimate_route import RouteSummary, route_summary
+from gz_onboard.lab.estimate_tally import Tally
 from gz_onboard.lab.plot import plot_log
+from gz_onboard.lab.why import Why, why_of
+from gz_onboard.log_rows import STATUS_TOPIC
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.results import times
 from gz_onboard.offline.samples import open_ride
-from gz_onboard.pipeline import STATUS_TOPIC, TICK_NS, Pipeline, dbc_texts, lacking, range_publisher, reason_names
+from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, lacking, range_publisher
 from gz_onboard.progress import Progress
+from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.routes.route import Route
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 SUMMARY_VERSION = 1
@@ -39,6 +43,7 @@ class EstimateTask(Task):
     filter_name: str = "scalar"
     frames: bool = False
     signals: bool = False
+    route: Path | None = None
 
     @property
     def log(self) -> Path:
@@ -85,6 +90,13 @@ class RideSummary:
     range_end_p10_km: Annotated[float | None, "exceeded with 90 % probability"]
     range_end_p90_km: Annotated[float | None, "exceeded with 10 % probability"]
     energy_left_wh: Annotated[float | None, "to be drawn before the cut-off, at the end"]
+    why: Annotated[Why | None, "why the last range that was explained is not the rated one, or null"]
+    changes: Annotated[list[Why], "each change of the range by 1 km more or less than was ridden, and why"]
+    route: Annotated[
+        RouteSummary | None,
+        "of the route given: state at the end (ON, OFF); and of the last estimate on it km along and left, energy to "
+        "its end and state of charge there, km from its start and position where the battery ends before; or null",
+    ]
     innovation_rms_v: Annotated[float | None, "root mean square of measured less predicted voltage of a cell [V]"]
     innovation_max_v: Annotated[float | None, "greatest magnitude of the same"]
     states: Annotated[dict[str, float], "seconds in each state"]
@@ -102,56 +114,6 @@ class RideSummary:
     damage: Annotated[str | None, "what of the log could not be read, or null"]
     cpu_s: Annotated[float, "processor time taken, without drawing"]
     real_time_factor: Annotated[float | None, "duration of the ride over the time taken, without drawing"]
-
-
-@dataclass
-class Tally:
-    """Sums over a ride's estimates; pass it to the pipeline as its observer."""
-
-    first: Estimate | None = None
-    last: Estimate | None = None
-    soc_start: tuple[float, float] | None = None
-    soc_end: tuple[float, float] | None = None
-    range_start: float | None = None  # m
-    drawn: float | None = None  # J, net
-    recovered: float = 0.0  # J
-    speed_max: float | None = None  # m/s
-    innovation_max: float = 0.0  # V
-    ticks: Counter[tuple[State, int]] = field(default_factory=Counter)
-    distrusted: Counter[str] = field(default_factory=Counter)  # ticks by role
-    _squares: float = 0.0
-    _innovations: int = 0
-    _before: float = 0.0
-
-    def __call__(self, e: Estimate) -> None:
-        """Take in the next estimate."""
-        if self.first is None:
-            self.first, self._before = e, e.time
-        dt, self._before = e.time - self._before, e.time
-        self.last = e
-        self.ticks[e.state, int(e.reasons)] += 1
-        self.distrusted.update(e.distrusted)
-        if e.pack_voltage is not None and e.pack_current is not None and 0 <= dt <= 1:
-            energy = e.pack_voltage * e.pack_current * dt
-            self.drawn = (self.drawn or 0.0) + energy
-            self.recovered -= min(energy, 0.0)
-        if e.innovation is not None:
-            self._squares += e.innovation * e.innovation
-            self._innovations += 1
-            self.innovation_max = max(self.innovation_max, abs(e.innovation))
-        if e.speed is not None and (self.speed_max is None or e.speed > self.speed_max):
-            self.speed_max = e.speed
-        if e.soc is not None and e.soc_sd is not None:
-            self.soc_end = e.soc, e.soc_sd
-            if self.soc_start is None:
-                self.soc_start = self.soc_end
-        if self.range_start is None:
-            self.range_start = e.range
-
-    @property
-    def innovation_rms(self) -> float | None:
-        """[V] of a cell, or None if there was no innovation."""
-        return sqrt(self._squares / self._innovations) if self._innovations else None
 
 
 class _Mute(Publisher):
@@ -206,6 +168,7 @@ def _without_jumps(batch: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
 def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSummary:
     """Estimate one log and write its MCAP and picture; gives its summary. Raises InputError."""
     vehicle = known_vehicle(task.vehicle, task.payload)
+    route = read_ahead(task.route)[1] if task.route else None
     damages: list[LogDamage] = []
     cpu, wall = time.process_time(), time.perf_counter()
     mapping, batches = open_ride(task.path, vehicle, damages.append)
@@ -217,7 +180,7 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSu
     batch = next((batch for batch in ours if batch), None)
     if batch is None:
         raise InputError(f"{task.path}: holds no frames of a vehicle" + (f" ({damages[0]})" if damages else ""))
-    tally = Tally()
+    tally = Tally(batch[0][0])
     with writing(task.log):
         log = _open_log(task, vehicle, batch[0][0])
         try:
@@ -229,6 +192,8 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSu
                 log_signals=task.signals,
                 observer=tally,
             )
+            if route:
+                pipeline.estimator.ahead.follow(pipeline.estimator.ahead.ready(route))
             if not task.frames:
                 pipeline.publisher = _Mute()
             feed(pipeline, _chained(batch, ours), progress)
@@ -244,7 +209,7 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSu
         took = time.process_time() - cpu, time.perf_counter() - wall
         if task.picture:
             plot_log(task.log, task.picture)
-    return _summary(task, pipeline, tally, batch[0][0], damages, took)
+    return _summary(task, pipeline, tally, route, damages, took)
 
 
 @functools.lru_cache(maxsize=1)
@@ -284,28 +249,22 @@ def _summary(
     task: EstimateTask,
     pipeline: Pipeline,
     tally: Tally,
-    start_ns: int,
+    route: Route | None,
     damages: Sequence[LogDamage],
     took: tuple[float, float],
 ) -> RideSummary:
     """The summary of a ride that went through `pipeline`; took: processor and wall time [s]."""
-    cpu, wall = took
-    last = tally.last or Estimate(0.0)
+    last, changes = tally.last or Estimate(0.0), pipeline.estimator.attribution.changes
     soc_start, soc_end = tally.soc_start or (None, None), tally.soc_end or (None, None)
     counts, status = pipeline.counts(), pipeline.status()
-    states: Counter[str] = Counter()
-    reasons: Counter[str] = Counter()
-    for (state, bits), ticks in tally.ticks.items():
-        states[state.name] += ticks
-        for name in reason_names(Reason(bits)):
-            reasons[name] += ticks
+    states, reasons = tally.by_name()
     return RideSummary(
         file=str(task.path),
         log=str(task.log),
         plot=str(task.picture) if task.picture else None,
         vehicle=pipeline.vehicle.name,
         filter=task.filter_name,
-        start_ns=start_ns,
+        start_ns=tally.start_ns,
         duration_s=last.time,
         distance_km=last.distance * 1e-3,
         speed_max_km_h=times(tally.speed_max, 3.6),
@@ -321,6 +280,9 @@ def _summary(
         range_end_p10_km=times(last.range_p10, 1e-3),
         range_end_p90_km=times(last.range_p90, 1e-3),
         energy_left_wh=times(last.energy_left, 1 / WH),
+        why=why_of(last.why) if last.why else None,
+        changes=list(map(why_of, changes)),
+        route=route_summary(last, tally.on_route or last, route.grade_known) if route else None,
         innovation_rms_v=tally.innovation_rms,
         innovation_max_v=tally.innovation_max if tally.innovation_rms is not None else None,
         states={state.name: round(states[state.name] * TICK_S, 1) for state in State if states[state.name]},
@@ -336,6 +298,6 @@ def _summary(
         error_frames=pipeline.codec.error_frames,
         faults=cast("dict[str, dict[str, int]]", status["faults"]),
         damage=str(damages[0]) if damages else None,
-        cpu_s=cpu,
-        real_time_factor=tally.last.time / wall if tally.last else None,
+        cpu_s=took[0],
+        real_time_factor=tally.last.time / took[1] if tally.last else None,
     )

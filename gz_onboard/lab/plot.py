@@ -7,6 +7,7 @@ import sys
 from collections import deque
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
+from functools import partial
 from itertools import pairwise
 from math import degrees, isfinite
 from pathlib import Path
@@ -16,6 +17,8 @@ from gz_onboard.bus.logs import LogDamage, read_metadata, read_samples
 from gz_onboard.constants import WH_PER_KM
 from gz_onboard.errors import OK, InputError, writing
 from gz_onboard.events import Reason, State, words
+from gz_onboard.lab.why import plot_why
+from gz_onboard.log_rows import ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
 from gz_onboard.offline.style import (
     BLUE,
     GREEN,
@@ -33,7 +36,7 @@ from gz_onboard.offline.style import (
     time_unit,
 )
 from gz_onboard.options import add_shared
-from gz_onboard.pipeline import DROPPING, ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
+from gz_onboard.pipeline import DROPPING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -316,16 +319,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "picture", type=Path, nargs="?", metavar="PNG", help="file to write (default: the name of the log, with .png)"
     )
+    parser.add_argument("--why", action="store_true", help="instead, why the range at the end is not the rated one")
     parser.add_argument("--over", choices=("time", "distance"), default="time", help="abscissa (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard plot``."""
-    picture = arguments.picture or arguments.log.with_suffix(".png")
+    picture = arguments.picture or arguments.log.with_suffix(".why.png" if arguments.why else ".png")
     if picture.suffix.lower() != ".png":
         raise InputError(f"{picture}: the picture's name has to end in .png")
     with writing(picture):
-        for damage in plot_log(arguments.log, picture, arguments.over):
+        plot = plot_why if arguments.why else partial(plot_log, over=arguments.over)
+        for damage in plot(arguments.log, picture):
             print(f"gz-onboard plot: {damage}", file=sys.stderr)
     print(picture)
     return OK

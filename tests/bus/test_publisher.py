@@ -18,7 +18,7 @@ from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.mapping import read_mapping
 from gz_onboard.bus.publisher import SIGMA, SOC, Counts, Publisher, reason_signal, sensor_signal
 from gz_onboard.errors import InputError
-from gz_onboard.events import EFF_FLAG, ROLES, TRANSMITTED, Activity, Estimate, Reason, State
+from gz_onboard.events import EFF_FLAG, ROLES, TRANSMITTED, Activity, Cause, Estimate, Explanation, Reason, State
 from gz_onboard.toml import Table
 
 DATABASES = {name: load_database([find_dbc(name)]) for name in ("range.dbc", "range_large.dbc")}
@@ -34,6 +34,10 @@ QUANTITIES = {
     "RANGE_ConsumptionExpected": ("consumption_expected", 3.6),
     SOC: ("soc", 0.01),
     SIGMA: ("soc_sd", 0.01),
+    "RANGE_ArrivalStateOfCharge": ("arrival_soc", 0.01),
+    "RANGE_ArrivalStateOfChargeP10": ("arrival_soc_p10", 0.01),
+    "RANGE_RouteLeft": ("route_left", 1000.0),
+    "RANGE_BatteryEndsAfter": ("battery_ends_after", 1000.0),
 }
 COUNTS = {
     "RANGE_CountDropped": "dropped",
@@ -114,6 +118,10 @@ def check_what_is_sent(file: str, given_values: dict[str, float | None], state: 
         "RANGE_ConsumptionRecent": True,
         SOC: told and sayable(SIGMA, values[SIGMA], file),
         SIGMA: told and sayable(SOC, values[SOC], file),
+        "RANGE_ArrivalStateOfCharge": told,
+        "RANGE_ArrivalStateOfChargeP10": told,
+        "RANGE_RouteLeft": told,
+        "RANGE_BatteryEndsAfter": told,
     }
     for name, value in values.items():
         if there[name] and sayable(name, value, file):
@@ -172,6 +180,10 @@ def test_a_car_by_the_large_file():
             "RANGE_ConsumptionExpected": 136,
             SOC: 80,
             SIGMA: 2,
+            "RANGE_ArrivalStateOfCharge": None,
+            "RANGE_ArrivalStateOfChargeP10": None,
+            "RANGE_RouteLeft": None,
+            "RANGE_BatteryEndsAfter": None,
         }
     )
     assert got["RANGE_EstimateState"] == State.VALID
@@ -287,7 +299,7 @@ def test_an_owners_file(text, tmp_path):
         ('(0.1,0) [0|6553.4] "Wh"', '(0.1,0) [0|6553.4] "kWh"', "RANGE_EnergyLeft has unit 'kWh', must have 'Wh'"),
         ('(0.1,0) [0|6553.4] "Wh"', '(0.1,9) [9|6553.4] "Wh"', "RANGE_EnergyLeft must be able to say 0 Wh"),
         ('(0.01,0) [0|100] "%"', '(0.01,0) [0|99] "%"', "RANGE_StateOfCharge must be able to say 100 %"),
-        ("RANGE_Activity : 44|4", "RANGE_Activity : 44|1", "RANGE_Activity must hold the whole numbers from 0 to 3"),
+        ("RANGE_Activity : 44|4", "RANGE_Activity : 44|1", "RANGE_Activity must hold the whole numbers from 0 to 6"),
         ("RANGE_Activity : 44|4@1+ (1,0)", "RANGE_Activity : 44|4@1+ (2,0)", "RANGE_Activity must hold .*scale 1"),
         ("RANGE_NoImu : 29|1@1+", "RANGE_NoImu : 29|1@1-", "RANGE_NoImu must hold the whole numbers from 0 to 1"),
         ("RANGE_StatusCounter : 52|4", "RANGE_StatusCounter : 52|1", "RANGE_StatusCounter must hold .*0 to 2"),
@@ -363,6 +375,28 @@ def test_states_are_named_in_the_dbc_as_in_the_code():
         assert choices == {state.value: state.name for state in State}
     choices = {int(value): str(text).upper() for value, text in signal_of("RANGE_Activity").choices.items()}
     assert choices == {activity.value: activity.name for activity in Activity}
+    for name in ("RANGE_WhyCause1", "RANGE_WhyCause2"):
+        choices = {int(value): str(text).upper() for value, text in signal_of(name).choices.items()}
+        assert choices == {cause.value: cause.name for cause in Cause}
+
+
+def test_the_two_largest_causes_are_sent_without_the_charge():
+    causes = {Cause.CHARGE: -20e3, Cause.SPEED: 1200.0, Cause.TEMPERATURE: -3420.0, Cause.UNEXPLAINED: -40.0}
+    why = Explanation(0.0, 56e3, 33.74e3, causes)
+    for file, scale in (("range.dbc", 0.1), ("range_large.dbc", 1.0)):
+        got = sent(Publisher(find_dbc(file)), replace(SCOOTER, why=why))
+        assert (got["RANGE_WhyCause1"], got["RANGE_WhyCause2"]) == (Cause.TEMPERATURE, Cause.SPEED)
+        assert (got["RANGE_WhyDistance1"], got["RANGE_WhyDistance2"]) == pytest.approx((-3.4, 1.2), abs=0.5 * scale)
+        assert got["RANGE_WhyRated"] == pytest.approx(56, abs=0.5 * scale)
+
+
+@pytest.mark.parametrize("causes", [None, {}, {Cause.WIND: 0.0, Cause.CHARGE: -5e3}, {Cause.WIND: math.nan}])
+def test_no_cause_is_sent_of_what_is_not_known(causes):
+    why = None if causes is None else Explanation(0.0, 1e6, 35e3, causes)
+    for estimate in (replace(SCOOTER, why=why), replace(SCOOTER, why=why, state=State.INVALID)):
+        got = sent(Publisher(), estimate)
+        assert (got["RANGE_WhyDistance1"], got["RANGE_WhyDistance2"], got["RANGE_WhyRated"]) == (None, None, None)
+        assert got["RANGE_WhyCause2"] == Cause.NONE
 
 
 def test_counters_and_checksums_as_a_receiver_checks_them():
@@ -371,7 +405,7 @@ def test_counters_and_checksums_as_a_receiver_checks_them():
     counters: dict[int, list[int]] = {}
     for i in range(40):
         frames = publisher.range(estimate, Counts(), i) + publisher.status(estimate, i)
-        assert [f[3] for f in frames] == [TRANSMITTED] * 5
+        assert [f[3] for f in frames] == [TRANSMITTED] * 8
         for time_ns, identifier, data, _ in frames:
             assert time_ns == i
             assert len(data) == 8

@@ -58,7 +58,7 @@ def check_against_file(learned: Learned) -> None:
         pulled = f"{channel} ({', '.join(CHANNEL[channel].roles)}) pulls it there, without which it is {without:.4g}"
         rows.append(overrun(name, old, (new, wide), float(far[i]), pulled))
     if more := len(found) - len(rows):
-        rows.append(f"and {more} more parameters are as far")
+        rows.append(f"and {more} more")
     stop_at(rows)
 
 

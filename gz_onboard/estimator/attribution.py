@@ -1,0 +1,279 @@
+"""Why the range is what it is: its difference to another range, split among causes, so that they add up to it.
+
+The range is E/c, the energy that can be drawn over the consumption expected. Each is a function of causes that the
+forward model already is (`physics.drawable`, `composition`), evaluated with some causes as they are and the others as
+they were. A cause counts with what it changes in an order of the causes and in the reverse order, in the mean. That is
+its Shapley value as far as causes act alone or in pairs, and adds up to the difference whatever they do.
+
+The rated range, which the present one is compared with: the vehicle file's prior riding in mild air, without hills and
+wind, with its payload, its consumption factor, and a full battery as new, at the same temperature.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from math import exp
+from typing import NamedTuple
+
+from gz_onboard.constants import MILD
+from gz_onboard.estimator.composition import PARTS, Composition, Parts
+from gz_onboard.estimator.forecast import PRIOR_FORM_FACTOR_SQUARED, Forecast, Forecaster
+from gz_onboard.estimator.load_model import AHEAD, ALTITUDE_DIGITS, AMBIENT_DIGITS, USUAL_AIR, Conditions
+from gz_onboard.estimator.pattern import Point
+from gz_onboard.estimator.ridden import MEMORY
+from gz_onboard.estimator.signals import Signals
+from gz_onboard.events import LOADS, Cause, Explanation
+from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.drawable import drawable
+from gz_onboard.physics.warming import cells_ahead
+
+EVERY = 180.0  # s: a split takes as long as four forecasts, and all are to take a hundredth of the whole
+LEAST_MOVED = 100.0  # m: nothing new is to be said of a range that has not moved
+MOVED = 1000.0  # m: so much more or less than the distance ridden, and a change is explained
+SETTLED = 60.0  # s: what goes back within is no change
+MOST_CHANGES = 100
+
+
+class Draw(NamedTuple):
+    """What the energy that can be drawn follows from; cells in degC, power in W."""
+
+    soc: float
+    cells: float
+    battery: Battery
+    power: float
+    form_factor_squared: float
+
+
+@dataclass(frozen=True)
+class State:
+    """One range, and all that it follows from; SI units, temperatures in degC."""
+
+    time: float
+    ridden: float  # m, since the start
+    range: float
+    energy: float
+    consumption: float
+    draw: Draw
+    air: Conditions
+    mass: float
+    factor: float
+    auxiliaries: float  # of the factor, what auxiliaries beyond the model's make
+    points: tuple[Point, ...]  # lately ridden
+    known: float = 0.0  # how much of the price expected is theirs, and not the prior riding's: 0 to 1
+    rated: bool = False  # the prior riding without hills and wind, nothing ridden
+    parts: dict[tuple[Conditions, float], Parts] = field(default_factory=dict)  # as far as they were asked for
+
+
+class Attribution:
+    """Explains the range of one vehicle. `latest`: against the rated range; `changes`: what moved it, the last few."""
+
+    def __init__(self, forecaster: Forecaster, signals: Signals) -> None:
+        self._forecaster, self._signals, load = forecaster, signals, forecaster.load
+        modelled = any(p.name == "auxiliary_power" for effect in load.model.effects for p in effect.parameters)
+        self._usual_load = load.model.parameters["auxiliary_power"] if modelled else 0.0  # W
+        self._more = self._known = 0.0  # W beyond that, weighted by the way; sum of the weights
+        self._ridden = 0.0  # m
+        self._composition = Composition(load)
+        self._new = forecaster.battery.own()
+        self._rated: State | None = None
+        self._since: State | None = None
+        self.latest: Explanation | None = None
+        self.changes: deque[Explanation] = deque(maxlen=MOST_CHANGES)
+        self._news: deque[tuple[bool, Explanation]] = deque(maxlen=MOST_CHANGES)
+
+    def take(self, now: float, forecast: Forecast, soc: float, air: Conditions, ridden: float) -> None:
+        """A new `forecast`, of this state of charge in this air, after `ridden` [m]."""
+        self._measure_auxiliaries(now, ridden)
+        last, since = self.latest, self._since
+        due = last is None or (now - last.time >= EVERY and abs(forecast.range - last.range) > LEAST_MOVED)
+        moved = since and abs(forecast.range + ridden - since.range - since.ridden) > MOVED
+        if since and moved and now - since.time >= SETTLED:
+            self._since = self._state(now, forecast, soc, air, ridden)
+            self.changes.append(self.explained(since, self._since))
+            self._news.append((True, self.changes[-1]))
+        if due:
+            state = self._state(now, forecast, soc, air, ridden)
+            self._since = self._since or state
+            self.latest = self.explained(self.rated, state)
+            self._news.append((False, self.latest))
+
+    def news(self) -> list[tuple[bool, Explanation]]:
+        """What was explained since it was last asked for: (whether it is a change, explanation)."""
+        news = list(self._news)
+        self._news.clear()
+        return news
+
+    def _state(self, now: float, forecast: Forecast, soc: float, air: Conditions, ridden: float) -> State:
+        load, riding = self._forecaster.load, self._forecaster.riding
+        known = forecast.range > 0 and forecast.energy > 0
+        return State(
+            time=now,
+            ridden=ridden,
+            range=forecast.range,
+            energy=forecast.energy,
+            consumption=forecast.energy / forecast.range if known else forecast.consumption,
+            draw=Draw(soc, forecast.cells, self._pack(), forecast.power, forecast.form_factor_squared),
+            air=Conditions(round(air.ambient, AMBIENT_DIGITS), round(air.altitude, ALTITUDE_DIGITS)),
+            mass=load.model.mass,
+            factor=riding.factor,
+            auxiliaries=self._auxiliaries(forecast.power),
+            points=self._forecaster.pattern.points(),
+            known=min(max(1 - riding.usual.price.variance / self._forecaster.prior.price.variance, 0.0), 1.0),
+        )
+
+    def _measure_auxiliaries(self, now: float, ridden: float) -> None:
+        """What they take beyond the model's, in the mean over the way lately ridden."""
+        way, self._ridden = ridden - self._ridden, ridden
+        signals = self._signals
+        voltage, current = signals.pack_voltage.get(now), signals.auxiliary_current.get(now)
+        beside = [signals[role].get(now) for role in LOADS]
+        known = [power for power in beside if power is not None]
+        if voltage is not None and current is not None:
+            known.append(voltage * current - self._usual_load)
+        if way > 0 and known:
+            fade = exp(-way / MEMORY)
+            self._more = fade * self._more + (1 - fade) * sum(known)
+            self._known = fade * self._known + 1 - fade
+
+    def _auxiliaries(self, power: float) -> float:
+        """The part of the consumption factor that they make, as far as it is learned; `power` [W]: expected."""
+        riding = self._forecaster.riding
+        if not self._known or power <= 0:
+            return 0.0
+        learned = min(max(1 - riding.factor_variance / self._forecaster.load.prior.factor_sd**2, 0.0), 1.0)
+        return learned * riding.factor * self._more / self._known / power
+
+    @property
+    def rated(self) -> State:
+        """What the range is compared with: see above."""
+        if self._rated is None:
+            load = self._forecaster.load
+            parameters = load.model.parameters
+            mass = parameters["vehicle_mass"] + parameters.filed("payload_mass")
+            air, prior = Conditions(*USUAL_AIR), load.prior
+            calm = _without_hills_and_wind(self._composition.prior(air, mass))
+            consumption = prior.factor * sum(calm.values())
+            full, power = self._new.window.of_cells(1.0), consumption * prior.speed
+            load_ahead = power, PRIOR_FORM_FACTOR_SQUARED
+            cells = cells_ahead(self._new, self._forecaster.cooling, (full, MILD), MILD, load_ahead)
+            draw = Draw(full, cells, self._new, *load_ahead)
+            energy = self._energy(draw)
+            self._rated = State(
+                time=0.0,
+                ridden=0.0,
+                range=energy / consumption,
+                energy=energy,
+                consumption=consumption,
+                draw=draw,
+                air=air,
+                mass=mass,
+                factor=prior.factor,
+                auxiliaries=0.0,
+                points=(),
+                rated=True,
+            )
+        return self._rated
+
+    # --- splitting --------------------------------------------------------------------------------------------
+
+    def explained(self, a: State, b: State) -> Explanation:
+        """The range of `b` against that of `a`; if not `a` is the rated one, the distance ridden between is added."""
+        energy = self._energy(a.draw._replace(soc=b.draw.soc))
+        ridden = 0.0 if a.rated else b.ridden - a.ridden
+        causes = dict.fromkeys((cause for cause in Cause if cause), 0.0)
+        causes[Cause.CHARGE] = (energy - a.energy) / a.consumption + ridden
+        costs = self._costs(a, b)
+        for cause, change in self._energies(a, b, energy, costs).items():
+            causes[cause] += change * (1 / a.consumption + 1 / b.consumption) / 2
+        for cause, cost in costs.items():
+            causes[cause] -= cost * (energy + b.energy) / 2 / (a.consumption * b.consumption)
+        return Explanation(b.time, a.range, b.range + ridden, causes)
+
+    def _costs(self, a: State, b: State) -> Parts:
+        """The difference of the consumptions [J/m]: factor times what is left open times the model's."""
+        modelled = self._modelled(a, b)
+        f0, m0, f1, m1 = a.factor, self._total(a, a.air, a.mass), b.factor, self._total(b, b.air, b.mass)
+        g0, g1 = a.consumption / (f0 * m0), b.consumption / (f1 * m1)
+        of_model, of_factor = _worth(f0, g0, f1, g1), _worth(g0, m0, g1, m1)
+        costs = {cause: of_model * part for cause, part in modelled.items()}
+        auxiliaries = b.auxiliaries - a.auxiliaries
+        return costs | {
+            Cause.AUXILIARIES: of_factor * auxiliaries,
+            Cause.UNEXPLAINED: of_factor * (f1 - f0 - auxiliaries),
+            Cause.RIDING: _worth(f0, m0, f1, m1) * (g1 - g0),
+        }
+
+    def _modelled(self, a: State, b: State) -> Parts:
+        """The difference of the modelled consumptions [J/m]."""
+        parts: Parts = dict.fromkeys(PARTS, 0.0)
+        for at in (a, b):
+            before, after = self._parts(a, at.air, at.mass), self._parts(b, at.air, at.mass)
+            for part in PARTS:
+                parts[part] += (after[part] - before[part]) / 2
+        # The air, then the mass, of the riding as it is; the mass, then the air, of the riding as it was.
+        warm, light = self._total(b, b.air, a.mass), self._total(a, a.air, b.mass)
+        air = warm - self._total(b, a.air, a.mass) + self._total(a, b.air, b.mass) - light
+        mass = self._total(b, b.air, b.mass) - warm + light - self._total(a, a.air, a.mass)
+        return parts | {Cause.TEMPERATURE: air / 2, Cause.PAYLOAD: mass / 2}
+
+    def _total(self, state: State, air: Conditions, mass: float) -> float:
+        return sum(self._parts(state, air, mass).values())
+
+    def _parts(self, state: State, air: Conditions, mass: float) -> Parts:
+        """The modelled consumption [J/m] of the riding of `state` in another air, with another mass."""
+        at = air, mass
+        if at not in state.parts:
+            prior = self._composition.prior(air, mass)
+            distance = sum(p.distance for p in state.points)
+            if state.rated:
+                state.parts[at] = _without_hills_and_wind(prior)
+            elif not distance:
+                state.parts[at] = prior
+            else:
+                ridden, share = self._composition.of(state.points, air, mass), state.known
+                state.parts[at] = {part: share * ridden[part] + (1 - share) * prior[part] for part in PARTS}
+        return state.parts[at]
+
+    def _energies(self, a: State, b: State, energy: float, costs: Parts) -> Parts:
+        """The difference of the energies [J] beside that of the charge; `energy`: of `a` with the charge of `b`."""
+        names = "cells", "battery", "power", "form_factor_squared"
+        steps = dict.fromkeys(names, 0.0)
+        for order in (names, names[::-1]):
+            draw, before = a.draw._replace(soc=b.draw.soc), energy
+            for name in order:
+                changed = draw._replace(**{name: getattr(b.draw, name)})
+                after = b.energy if changed == b.draw else before if changed == draw else self._energy(changed)
+                steps[name] += (after - before) / 2
+                draw, before = changed, after
+        energies = {Cause.TEMPERATURE: steps["cells"], Cause.AGE: steps["battery"], Cause.SPEED: steps["power"]}
+        energies[Cause.STOPS] = steps["form_factor_squared"]
+        # The power is consumption times mean speed: each cause of the one has its share, the other is the speed's.
+        speed = (a.draw.power / a.consumption + b.draw.power / b.consumption) / 2
+        more = b.draw.power - a.draw.power
+        for cause, cost in costs.items():
+            share = steps["power"] * speed * cost / more if more else 0.0
+            energies[cause] = energies.get(cause, 0.0) + share
+            energies[Cause.SPEED] -= share
+        return energies
+
+    def _pack(self) -> Battery:
+        """The battery as it is now: what is learned of it later is another state's."""
+        pack, health = self._new.own(), self._forecaster.battery.health
+        pack.age(health.capacity, health.resistance)
+        return pack
+
+    def _energy(self, draw: Draw) -> float:
+        load = self._forecaster.load
+        usual = {"vibration": load.prior.vibration, "time_moving": AHEAD}
+        lost = load.model.overpotential(draw.battery, usual)
+        return drawable(draw.battery, draw.soc, draw.cells, draw.power, draw.form_factor_squared, lost).energy
+
+
+def _without_hills_and_wind(parts: Parts) -> Parts:
+    return parts | {Cause.CLIMB: 0.0, Cause.WIND: 0.0}
+
+
+def _worth(x0: float, y0: float, x1: float, y1: float) -> float:
+    """What the change of a factor is worth beside two others, x and y: its Shapley value per change."""
+    return (x0 * y0 + x1 * y1) / 3 + (x0 * y1 + x1 * y0) / 6

@@ -1,0 +1,244 @@
+"""The road ahead: what the rest of a route costs, what is left at its end, or where the battery ends before.
+
+The model is ridden along the route once, and again when air or pace have changed. What was ridden of it corrects it:
+the cost, measured over modelled energy of the level road, and the pace, see `route_rider`.
+
+The range is the distance along the route that the energy left goes, beyond the end of the route at the consumption that
+is expected without one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from math import exp, sqrt
+from typing import Any
+
+from gz_onboard.estimator.forecast import DECILE, Forecast, Forecaster
+from gz_onboard.estimator.load_model import Conditions
+from gz_onboard.estimator.road import RoadState
+from gz_onboard.estimator.route_energy import Costs, RouteEnergy
+from gz_onboard.estimator.route_position import RoutePosition
+from gz_onboard.estimator.route_rider import SEGMENT_SD, RouteRider, restored
+from gz_onboard.estimator.signals import FIX_2D, Signals
+from gz_onboard.events import Estimate, RouteState
+from gz_onboard.physics.drawable import soc_left
+from gz_onboard.physics.effect import MOVING
+from gz_onboard.physics.effects.inertia import rotating_mass
+from gz_onboard.routes.route import Route
+
+SEGMENT = 250.0  # m of the route from which the cost is learned
+AHEAD_SD = 0.03  # relative, of the cost of what is left, beyond what its segments scatter
+UNLIKE = 0.1  # of a segment: what was ridden is not what is modelled
+COURSE_FROM = 3.0  # m/s: slower, the heading is noise
+STEADY = 0.3  # m/s², and m/s within a second of the profile: there the pace shows
+CHANGED = Conditions(2.0, 200.0), 0.02  # degC, m; of the pace: by so much and the route is modelled anew
+
+
+@dataclass(frozen=True, slots=True)
+class Road:
+    """A route made ready for the estimator; that takes up to some seconds."""
+
+    route: Route
+    energy: RouteEnergy
+    position: RoutePosition
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What is known of the route; SI units. None: not known, or the battery does not end on the route."""
+
+    state: RouteState = RouteState.NONE
+    along: float | None = None
+    left: float | None = None
+    energy: float | None = None  # to the end of the route
+    energy_sd: float | None = None
+    soc: float | None = None  # at the end of the route, with P10 and P90; 0 if the battery ends before
+    soc_p10: float | None = None
+    soc_p90: float | None = None
+    ends_after: float | None = None  # from here
+    ends_at: tuple[float, float] | None = None  # latitude, longitude [deg]
+
+
+class RoadAhead:
+    """Follows the vehicle along a route and forecasts on it. Without a route it costs nothing."""
+
+    def __init__(self, forecaster: Forecaster, motion: RoadState, signals: Signals) -> None:
+        model = forecaster.load.model
+        self.rider, self.answer = RouteRider(), Answer()
+        self._forecaster, self._motion, self._signals = forecaster, motion, signals
+        self._moving_mass = model.mass + rotating_mass(model.parameters)
+        self._road: Road | None = None
+        self._costs: Costs | None = None
+        self._modelling: Iterator[Costs | None] | None = None
+        self._modelled: tuple[Conditions, float] | None = None
+        self._segment: tuple[float, float] | None = None  # m along the route, m/s: its start
+        self._energy = self._ridden = self._distance = 0.0  # J, m of the segment; m of the vehicle at the last forecast
+
+    def ready(self, route: Route) -> Road:
+        """`route` made ready, in any thread. The fastest of the prior riding stands in for limits."""
+        top_speed = max(speed for _, speed, _ in self._forecaster.load.prior.points)
+        return Road(route, RouteEnergy(route, top_speed), RoutePosition(route))
+
+    def follow(self, road: Road | None) -> None:
+        """Have `road` from now on, or none."""
+        self._road, self._costs, self._modelling, self._segment = road, None, None, None
+        self._distance = self._motion.distance
+        self.answer = Answer(RouteState.OFF if road else RouteState.NONE)
+
+    # --- learning ---------------------------------------------------------------------------------------------
+
+    def ride(self, dt: float, speed: float, power: float) -> None:
+        """Take in `dt` [s] of riding at `speed` [m/s] and `power` [W] of the pack."""
+        if self._segment:
+            self._ridden += abs(speed) * dt
+            self._energy += power * dt
+
+    def _learn(self, road: Road, costs: Costs) -> None:
+        """Learn the cost if a segment ends here."""
+        speed, along = self._motion.speed or 0.0, road.position.along
+        self._learn_pace(road, along, speed)
+        start, before = self._segment or (along, speed)
+        way = along - start
+        if self._segment and 0 <= way < SEGMENT:
+            return
+        self._segment, energy, ridden = (along, speed), self._energy, self._ridden
+        self._energy = self._ridden = 0.0
+        if way < SEGMENT or abs(ridden - way) > UNLIKE * way:
+            return
+        energies = road.energy
+        level, height, allowed = (
+            energies.between(x, start, along) for x in (costs.level, costs.height, energies.speed**2)
+        )
+        usual = way * float(costs.level[-1]) / energies.length
+        if usual > 0:
+            level -= self._moving_mass * self.rider.pace**2 * allowed / 2
+            energy -= height + self._moving_mass * (speed**2 - before**2) / 2
+            self.rider.learn_cost(energy / usual, level / usual, self._cost)
+
+    def _learn_pace(self, road: Road, along: float, speed: float) -> None:
+        if speed > MOVING and abs(self._motion.acceleration or 0.0) < STEADY:
+            allowed, before = road.energy.allowed(along), road.energy.allowed(along - speed)
+            if allowed >= 0.98 * road.energy.limit(along) and abs(allowed - before) < STEADY:
+                self.rider.learn_pace(speed / allowed)
+
+    @property
+    def _cost(self) -> tuple[float, float]:
+        riding = self._forecaster.riding
+        return self.rider.expected_cost(riding.factor, riding.factor_variance)
+
+    # --- forecasting ------------------------------------------------------------------------------------------
+
+    def forecast(self, now: float, free: Forecast, pack: tuple[float, float], conditions: Conditions) -> Forecast:
+        """The forecast with the route out of `free`, that without; to be made each second or so. Time in s.
+
+        pack: state of charge, and the variance that missing sensors add to the consumption.
+        """
+        road = self._road
+        if road is None:
+            return free
+        self._move(now, road)
+        self._model(road, conditions)
+        if not road.position.on or self._costs is None:
+            self._segment, self.answer = None, Answer(RouteState.OFF)
+            return free
+        self._learn(road, self._costs)
+        return self._ahead(road, self._costs, free, pack)
+
+    def _move(self, now: float, road: Road) -> None:
+        signals, motion = self._signals, self._motion
+        moved, self._distance = motion.distance - self._distance, motion.distance
+        latitude, longitude = signals.latitude.get(now), signals.longitude.get(now)
+        fix = None
+        if latitude is not None and longitude is not None and not signals.fix_below(now, FIX_2D):
+            fix = latitude, longitude
+        road.position.update(moved, fix, motion.heading if (motion.speed or 0.0) > COURSE_FROM else None)
+
+    def _model(self, road: Road, conditions: Conditions) -> None:
+        """Model a part of the route if that is due."""
+        pace = self.rider.pace
+        if self._modelling is None:
+            (change, of_pace), then = CHANGED, self._modelled
+            if (
+                then
+                and self._costs
+                and (
+                    abs(conditions.ambient - then[0].ambient) < change.ambient
+                    and abs(conditions.altitude - then[0].altitude) < change.altitude
+                    and abs(pace - then[1]) < of_pace
+                )
+            ):
+                return
+            moving = self._forecaster.riding.time_moving
+            self._modelling = road.energy.modelled(self._forecaster.load, conditions, pace, moving)
+            self._modelled = conditions, pace
+        costs = next(self._modelling)
+        if costs:
+            self._costs, self._modelling = costs, None
+
+    def _ahead(self, road: Road, costs: Costs, free: Forecast, pack: tuple[float, float]) -> Forecast:
+        here, end = road.position.along, road.energy.length
+        cost, variance = self._cost
+        variance = variance / cost**2 + AHEAD_SD**2 + pack[1]
+        level = cost * road.energy.between(costs.level, here, end)
+        needed = level + road.energy.between(costs.height, here, end)
+
+        def reach(energy: float) -> float:
+            found = road.energy.reach(cost * costs.level + costs.height, here, max(energy, 0.0))
+            return end - here + (energy - needed) / free.consumption if found is None else found
+
+        def sd(way: float) -> float:
+            return sqrt(variance + SEGMENT_SD**2 * SEGMENT / max(way, SEGMENT))
+
+        range_ = reach(free.energy)
+        on_route = min(1.0, (end - here) / range_) if range_ > 0 else 1.0
+        spread = on_route * sd(range_) + (1 - on_route) * free.consumption_sd / free.consumption
+        if free.energy > free.energy_sd:
+            whole = DECILE * sqrt(spread**2 + (free.energy_sd / free.energy) ** 2)
+            p10, p90 = reach(free.energy * exp(-whole)), reach(free.energy * exp(whole))
+        else:  # near empty the energy's error rules, and that is not relative
+            p10, p90 = 0.0, reach((free.energy + DECILE * free.energy_sd) * exp(DECILE * spread))
+        arrival = self._arrival(free, pack, needed, level * sd(end - here))
+        ends = range_ if range_ < end - here else None
+        self.answer = Answer(
+            RouteState.ON,
+            here,
+            end - here,
+            needed,
+            level * sd(end - here),
+            *arrival,
+            ends,
+            None if ends is None else road.position.at(here + ends),
+        )
+        expected = free.energy / range_ if range_ > 0 and free.energy > 0 else free.consumption
+        return replace(free, range=range_, p10=p10, p90=p90, consumption=expected, consumption_sd=expected * spread)
+
+    def _arrival(
+        self, free: Forecast, pack: tuple[float, float], needed: float, needed_sd: float
+    ) -> tuple[float, float, float]:
+        """State of charge at the end of the route, P10 and P90, as shown; 0 where it is not reached."""
+        if free.energy <= 0:
+            return 0.0, 0.0, 0.0
+        window, soc, share = self._forecaster.battery.window, pack[0], max(1 - needed / free.energy, 0.0)
+        arrival = soc_left(self._forecaster.battery, soc, free.cells, share)
+        spread = DECILE * sqrt(needed_sd**2 + free.energy_sd**2) * soc / free.energy
+        beyond = soc * (needed / free.energy - 1)  # how much the battery lacks, if it does
+        if share <= 0:
+            return 0.0, 0.0, max(window.shown(arrival + spread - beyond, 0.0)[0], 0.0)
+        median, p10, p90 = (window.shown(arrival + x * spread, 0.0)[0] for x in (0, -1, 1))
+        return max(median, 0.0), max(p10, 0.0), min(p90, 1.0)
+
+    # --- results ----------------------------------------------------------------------------------------------
+
+    def report(self, estimate: Estimate) -> None:
+        """Put what is known of the route into `estimate`."""
+        a = self.answer
+        estimate.route_state, estimate.route_along, estimate.route_left = a.state, a.along, a.left
+        estimate.route_energy, estimate.route_energy_sd = a.energy, a.energy_sd
+        estimate.arrival_soc, estimate.arrival_soc_p10, estimate.arrival_soc_p90 = a.soc, a.soc_p10, a.soc_p90
+        estimate.battery_ends_after = a.ends_after
+        estimate.battery_ends_latitude, estimate.battery_ends_longitude = a.ends_at or (None, None)
+
+    def restore(self, saved: Any) -> None:
+        """Take what `rider.snapshot` gave, or begin anew."""
+        self.rider = restored(saved)

@@ -1,0 +1,74 @@
+"""Sums over the estimates of one ride."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from math import sqrt
+
+from gz_onboard.events import Estimate, Reason, RouteState, State
+from gz_onboard.log_rows import reason_names
+
+
+@dataclass
+class Tally:
+    """Sums over a ride's estimates; pass it to the pipeline as its observer."""
+
+    start_ns: int  # of the first frame
+    first: Estimate | None = None
+    last: Estimate | None = None
+    soc_start: tuple[float, float] | None = None
+    soc_end: tuple[float, float] | None = None
+    range_start: float | None = None  # m
+    on_route: Estimate | None = None  # the last
+    drawn: float | None = None  # J, net
+    recovered: float = 0.0  # J
+    speed_max: float | None = None  # m/s
+    innovation_max: float = 0.0  # V
+    ticks: Counter[tuple[State, int]] = field(default_factory=Counter)
+    distrusted: Counter[str] = field(default_factory=Counter)  # ticks by role
+    _squares: float = 0.0
+    _innovations: int = 0
+    _before: float = 0.0
+
+    def __call__(self, e: Estimate) -> None:
+        """Take in the next estimate."""
+        if self.first is None:
+            self.first, self._before = e, e.time
+        dt, self._before = e.time - self._before, e.time
+        self.last = e
+        self.ticks[e.state, int(e.reasons)] += 1
+        self.distrusted.update(e.distrusted)
+        if e.pack_voltage is not None and e.pack_current is not None and 0 <= dt <= 1:
+            energy = e.pack_voltage * e.pack_current * dt
+            self.drawn = (self.drawn or 0.0) + energy
+            self.recovered -= min(energy, 0.0)
+        if e.innovation is not None:
+            self._squares += e.innovation * e.innovation
+            self._innovations += 1
+            self.innovation_max = max(self.innovation_max, abs(e.innovation))
+        if e.speed is not None and (self.speed_max is None or e.speed > self.speed_max):
+            self.speed_max = e.speed
+        if e.soc is not None and e.soc_sd is not None:
+            self.soc_end = e.soc, e.soc_sd
+            if self.soc_start is None:
+                self.soc_start = self.soc_end
+        if self.range_start is None:
+            self.range_start = e.range
+        if e.route_state == RouteState.ON:
+            self.on_route = e
+
+    @property
+    def innovation_rms(self) -> float | None:
+        """[V] of a cell, or None if there was no innovation."""
+        return sqrt(self._squares / self._innovations) if self._innovations else None
+
+    def by_name(self) -> tuple[Counter[str], Counter[str]]:
+        """(ticks in each state, ticks with each reason)."""
+        states: Counter[str] = Counter()
+        reasons: Counter[str] = Counter()
+        for (state, bits), ticks in self.ticks.items():
+            states[state.name] += ticks
+            for name in reason_names(Reason(bits)):
+                reasons[name] += ticks
+        return states, reasons

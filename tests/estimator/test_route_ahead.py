@@ -1,0 +1,221 @@
+"""The road ahead: hills, arrival, where the battery ends, what is learned, and leaving the route."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gz_onboard.estimator.forecast import Forecast, Forecaster
+from gz_onboard.estimator.load_model import Conditions
+from gz_onboard.estimator.road import RoadState
+from gz_onboard.estimator.route_ahead import RoadAhead
+from gz_onboard.estimator.route_energy import RouteEnergy
+from gz_onboard.estimator.route_rider import RouteRider, restored
+from gz_onboard.estimator.signals import Signals
+from gz_onboard.events import Estimate, RouteState
+from gz_onboard.physics.drawable import drawable, soc_left
+from gz_onboard.routes.route import Route
+from tests.support import reference
+
+AIR = Conditions(20.0, 300.0)
+FREE = Forecast(
+    range=40e3, p10=34e3, p90=47e3, energy=4e6, energy_sd=8e4, consumption=100.0, consumption_sd=12.0,
+    recent=None, mostly_prior=False, power=800.0, form_factor_squared=2.5, cells=25.0,
+)  # fmt: skip
+
+
+def way(length=20e3, grade=lambda x: 0.0, limit=lambda x: 11.0, **more):
+    """A straight road northward with a point each 20 m."""
+    at = [20.0 * i for i in range(int(length / 20) + 1)]
+    zero = (0.0,) * len(at)
+    route = Route(
+        "way", tuple(at), tuple(map(grade, at)), zero, zero, tuple(map(limit, at)),
+        tuple(47 + x / 111_200 for x in at), (8.0,) * len(at),
+    )  # fmt: skip
+    return replace(route, **more)
+
+
+class Rider:
+    """Rides along a route by the second, without a receiver, and asks for forecasts."""
+
+    def __init__(self, route=None):
+        vehicle = reference()
+        self.road, self.signals = RoadState(altitude=300.0), Signals([])
+        self.forecaster = Forecaster(vehicle.model, vehicle.pack, vehicle.riding)
+        self.ahead = RoadAhead(self.forecaster, self.road, self.signals)
+        self.now = 0.0
+        if route:
+            self.ahead.follow(self.ahead.ready(route))
+
+    def ask(self, free=FREE, soc=0.7):
+        return self.ahead.forecast(self.now, free, (soc, 0.0), AIR)
+
+    def ride(self, seconds, power, speed=11.0):
+        self.road.speed, self.road.acceleration = speed, 0.0
+        for _ in range(seconds):
+            self.now += 1
+            self.road.distance += speed
+            self.ahead.ride(1.0, speed, power)
+            self.ask()
+
+    def settled(self, free=FREE, soc=0.7):
+        """The forecast and the answer once the route is modelled."""
+        for _ in range(50):
+            found = self.ask(free, soc)
+        return found, self.ahead.answer
+
+
+def test_without_a_route_nothing_changes():
+    rider = Rider()
+    assert rider.ask() is FREE
+    assert rider.ahead.answer.state == RouteState.NONE
+    estimate = Estimate(0.0)
+    rider.ahead.report(estimate)
+    assert estimate == Estimate(0.0)
+
+
+def test_arrival_and_range_on_a_short_route():
+    found, answer = Rider(way(5e3)).settled()
+    assert answer.state == RouteState.ON
+    assert answer.left == pytest.approx(5e3)
+    assert answer.ends_after is answer.ends_at is None
+    assert 5e3 * 60 < answer.energy < 5e3 * 130
+    assert found.range == pytest.approx(5e3 + (FREE.energy - answer.energy) / FREE.consumption)
+    assert found.p10 < found.range < found.p90
+    assert 0.7 - answer.soc == pytest.approx(0.7 * answer.energy / FREE.energy, rel=0.15)
+    assert answer.soc_p10 < answer.soc < answer.soc_p90 < 0.7
+
+
+def test_where_the_battery_ends():
+    found, answer = Rider(way(60e3)).settled()
+    assert found.range == answer.ends_after < 60e3
+    assert answer.ends_at == pytest.approx((47 + answer.ends_after / 111_200, 8.0))
+    assert answer.soc == 0.0
+
+
+def test_a_climb_costs_its_height_and_a_fall_gives_less_back():
+    level, up, down = (Rider(way(20e3, lambda x, g=g: g)).settled()[1].energy for g in (0.0, 0.02, -0.02))
+    weight = 185.0 * 9.80665 * 400.0
+    assert weight < up - level < 1.5 * weight
+    assert 0.5 * weight < level - down < up - level  # the motor loses more, the more it gives
+
+
+def test_the_hill_that_is_past_counts_no_more():
+    rider = Rider(way(10e3, lambda x: 0.05 if x < 2e3 else 0.0))
+    before = rider.settled()[1].energy
+    rider.ride(200, 0.0)
+    assert rider.ahead.answer.left == pytest.approx(7.8e3)
+    assert before - rider.ahead.answer.energy > 185 * 9.8 * 100
+
+
+def test_faster_roads_stops_and_headwind_cost_more():
+    slow = Rider(way(limit=lambda x: 8.0)).settled()[1].energy
+    assert Rider(way(limit=lambda x: 14.0)).settled()[1].energy > 1.2 * slow
+    stops = tuple(20.0 if i % 20 == 10 else 0.0 for i in range(1001))
+    assert Rider(way(limit=lambda x: 8.0, stop=stops)).settled()[1].energy > 1.05 * slow
+    assert Rider(way(limit=lambda x: 8.0, headwind=(4.0,) * 1001)).settled()[1].energy > 1.15 * slow
+    assert Rider(way(limit=lambda x: 8.0, temperature=(-15.0,) * 1001)).settled()[1].energy > 1.02 * slow
+
+
+def test_the_cost_is_learned_and_kept():
+    rider = Rider(way(30e3))
+    rider.settled()
+    costs = rider.ahead._costs
+    assert costs
+    usual = costs.level[-1] / 30e3 * 11.0  # W
+    rider.ride(700, 1.4 * usual)
+    assert rider.ahead.rider.cost == pytest.approx(1.4, abs=0.1)
+    assert restored(rider.ahead.rider.snapshot()) == rider.ahead.rider
+
+
+def test_the_pace_is_learned_where_it_shows():
+    rider = Rider(way(30e3, limit=lambda x: 12.0))
+    rider.settled()
+    rider.ride(300, 1000.0, speed=9.6)
+    assert rider.ahead.rider.pace == pytest.approx(0.8, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    "saved", [None, 3, [], [1, 2], ["x", 0, 1, 1], [1.0, 0.01, 9.0, 0.1], [99.0, 0.01, 1.0, 0.1], [1.0, None, 1.0, 1.0]]
+)
+def test_what_is_saved_wrongly_is_learned_anew(saved):
+    assert restored(saved) == RouteRider()
+
+
+def test_off_the_route_it_is_as_without_one_and_comes_back():
+    rider = Rider(way(5e3))
+    rider.signals = rider.ahead._signals = Signals([("latitude", 2.0), ("longitude", 2.0)])
+    rider.settled()
+
+    def at(east, north):
+        rider.now += 1
+        rider.road.distance += 10.0
+        rider.road.speed, rider.road.heading = 10.0, 0.0
+        for role, value in (("latitude", 47 + north / 111_200), ("longitude", 8 + east / 75_800)):
+            rider.signals[role].value, rider.signals[role].time = value, rider.now
+        return rider.ask()
+
+    for k in range(1, 50):
+        assert at(0.0, 10.0 * k) is not FREE
+    assert [at(200.0, 500 + 10.0 * k) is FREE for k in range(20)][-1]
+    assert rider.ahead.answer.state == RouteState.OFF
+    assert rider.ahead.answer.energy is None
+    assert [at(0.0, 700 + 10.0 * k) is FREE for k in range(20)][-1] is False
+    assert rider.ahead.answer.along == pytest.approx(890, abs=5)
+
+
+def test_its_end_is_the_end_of_it():
+    rider = Rider(way(1e3))
+    rider.ride(120, 1000.0)
+    assert rider.ahead.answer.state == RouteState.OFF
+    assert rider.ask() is FREE
+
+
+def test_an_empty_battery_has_no_range():
+    found, answer = Rider(way(5e3)).settled(replace(FREE, energy=0.0, energy_sd=3e4), soc=0.02)
+    assert found.range == found.p10 == 0.0 < found.p90 < 2e3
+    assert (answer.soc, answer.ends_after) == (0.0, 0.0)
+
+
+@given(
+    costs=st.lists(st.floats(-5e3, 2e4).map(round), min_size=2, max_size=30),
+    start=st.floats(0, 0.99),
+    given_=st.floats(1, 1e5),
+)
+def test_reach_is_where_the_energy_is_first_used_up(costs, start, given_):
+    energy = object.__new__(RouteEnergy)
+    energy._np, energy.distance = np, np.arange(len(costs) + 1) * 20.0
+    total = np.concatenate(([0.0], np.cumsum(costs)))
+    begin = start * energy.distance[-1]
+    found = energy.reach(total, begin, given_)
+    fine = np.linspace(begin, energy.distance[-1], 4000)
+    used = np.interp(fine, energy.distance, total) - np.interp(begin, energy.distance, total)
+    over = np.flatnonzero(used >= given_ - 1e-6)
+    if found is None:
+        assert used[-1] <= given_ + 1e-6
+    else:
+        assert begin + found == pytest.approx(fine[over[0]], abs=2 * (fine[1] - fine[0]) + 1e-6)
+
+
+@given(soc=st.floats(0.1, 1.0), share=st.floats(0.0, 1.0), temperature=st.floats(-10, 40))
+def test_soc_left_is_where_that_share_is_left(soc, share, temperature):
+    pack = reference().pack
+    whole = drawable(pack, soc, temperature, 1.0).energy
+    left = drawable(pack, soc_left(pack, soc, temperature, share), temperature, 1.0).energy
+    assert left == pytest.approx(share * whole, abs=2e-3 * whole)
+
+
+def test_a_long_route_is_modelled_in_parts():
+    rider = Rider(way(200e3))
+    asked = 0
+    while rider.ask() is FREE:
+        asked += 1
+    assert 5 < asked < 60
+    assert rider.ahead._costs
+    assert all(b >= a for a, b in pairwise(rider.ahead._costs.time.tolist()))
+    assert rider.ahead.answer.energy == pytest.approx(200e3 * 95, rel=0.3)
