@@ -2,7 +2,7 @@
 
 GRAVITY = 9.80665  # m/s², standard acceleration of free fall (CGPM 1901)
 KELVIN = 273.15  # K: 0 degC
-HOUR = 3600.0  # s
+MINUTE, HOUR = 60.0, 3600.0  # s
 THERMAL_VOLTAGE = 8.617333e-5  # V/K: gas constant over Faraday's
 WH = HOUR  # J
 WH_PER_KM = 3.6  # J/m

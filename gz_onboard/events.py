@@ -6,6 +6,7 @@ fifth of building a dataclass.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 from typing import TypeAlias
@@ -74,6 +75,8 @@ ROLES: dict[str, str] = {
     "longitude": "deg",
     "bms_state_of_charge": "1",
     "charge_plug": "1",
+    "key": "1",  # 0: off
+    "contactor": "1",  # of the pack, 0: open
     "throttle": "1",
     "brake_switch": "1",
 }
@@ -130,8 +133,19 @@ class Activity(IntEnum):
 
     UNKNOWN = 0  # neither speed nor charge plug
     RIDING = 1
-    STANDING = 2
+    STANDING = 2  # a short stop, as at a traffic light
     CHARGING = 3
+    PARKED = 4  # a longer one, or the key is off or the contactor open
+    ASLEEP = 5  # nothing comes from the bus since it stood
+    JOINED = 6  # riding, and so since before the first message: no rest has shown the state of charge yet
+
+
+class RouteState(IntEnum):
+    """Whether the vehicle is on the route that it was given."""
+
+    NONE = 0  # none was given
+    ON = 1
+    OFF = 2  # not on it, or not yet known to be, or beyond its end
 
 
 class Reason(IntFlag):
@@ -157,6 +171,42 @@ class Reason(IntFlag):
     SIGNALS_SLOW = 1 << 17  # pack current or voltage comes too slowly to be integrated
     SOC_RESTARTED = 1 << 18  # the state of charge was contradicted for long and was begun anew from the voltage
     SAVE_FAILED = 1 << 19  # the state cannot be saved for the next start
+
+
+TOLD = 50.0  # m: RANGE_Why counts tenths of a kilometre
+
+
+class Cause(IntEnum):
+    """Why a range is not another. RANGE_Why in dbc/range.dbc has these numbers and names."""
+
+    NONE = 0
+    TEMPERATURE = 1  # of cells and air
+    SPEED = 2
+    STOPS = 3  # accelerating, braking, standing
+    WIND = 4  # that the model knows of
+    CLIMB = 5  # of roads like those ridden
+    TURNING = 6
+    AUXILIARIES = 7  # measured, beyond what the vehicle file says
+    PAYLOAD = 8  # as entered, against that of the vehicle file
+    AGE = 9  # capacity and resistance of the cells against new ones
+    CHARGE = 10  # state of charge; of a change, beyond the distance ridden
+    RIDING = 11  # what is expected of the riding to come beyond that of the last kilometres
+    UNEXPLAINED = 12  # measured over modelled consumption, as learned: wind, tyres, a dragging brake
+
+
+@dataclass(frozen=True, slots=True)
+class Explanation:
+    """A range against another, split among causes; the causes add up to the difference."""
+
+    time: float  # s, of the range that is explained
+    reference: float  # m: the vehicle's rated range; of a change, the range before
+    range: float  # m; of a change, with the distance ridden since
+    causes: Mapping[Cause, float]  # m, by cause
+
+    def largest(self) -> list[tuple[Cause, float]]:
+        """The causes that are worth telling, the largest first, but for the charge, which is shown elsewhere."""
+        told = [each for each in self.causes.items() if each[0] is not Cause.CHARGE and abs(each[1]) >= TOLD]
+        return sorted(told, key=lambda each: -abs(each[1]))
 
 
 _WORDS = {"imu": "IMU", "gps": "GPS", "soc": "SOC", "bms": "BMS", "accel": "acceleration", "rate": "rate of rotation"}
@@ -199,5 +249,20 @@ class Estimate:
     consumption_recent: float | None = None  # J/m, measured
     consumption_expected: float | None = None  # J/m
     consumption_expected_sd: float | None = None  # J/m
+    charge_power: float | None = None  # W into the pack, while it is charged
+    time_to_full: float | None = None  # s, likewise
+    range_full: float | None = None  # m, likewise: when it is full
     consumption_factor: float | None = None  # learned: measured over modelled
     consumption_factor_sd: float | None = None
+    why: Explanation | None = None  # the range against the rated one, at most a minute or so old
+    route_state: RouteState = RouteState.NONE
+    route_along: float | None = None  # m from the start of the route
+    route_left: float | None = None  # m to its end
+    route_energy: float | None = None  # J, needed to its end
+    route_energy_sd: float | None = None  # J
+    arrival_soc: float | None = None  # 0..1, at the end of the route; 0 if the battery ends before
+    arrival_soc_p10: float | None = None
+    arrival_soc_p90: float | None = None
+    battery_ends_after: float | None = None  # m from here; None if not on the route
+    battery_ends_latitude: float | None = None  # deg
+    battery_ends_longitude: float | None = None  # deg

@@ -62,6 +62,10 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
         "mass of rider and luggage (default: from rides.json beside the log, or the vehicle file)",
         {"type": number("--payload", 0.0, MOST_PAYLOAD, "kg"), "metavar": "KG"},
     ),
+    "--route": (
+        "the road that is to be ridden: GPX, or CSV as for `simulate`, altitudes not needed",
+        {"type": Path, "metavar": "FILE"},
+    ),
     "--effects": ("folder with effects of your own: Python code you trust", {"type": Path, "metavar": "DIR"}),
     "--filter": (
         "implementation of the SOC filter (default: %(default)s)",

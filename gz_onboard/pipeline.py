@@ -7,13 +7,10 @@ portions the frames arrive.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
-from math import isfinite
-from typing import Any, Protocol
+from collections.abc import Callable, Sequence
 
 from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE, Codec
 from gz_onboard.bus.layout import identifier_of
-from gz_onboard.bus.logfile import object_schema
 from gz_onboard.bus.mapping import pgn
 from gz_onboard.bus.publisher import KNOWN, MESSAGES, Counts, Publisher
 from gz_onboard.constants import BENCH_TEMPERATURE, WH
@@ -22,14 +19,22 @@ from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
+from gz_onboard.log_rows import (
+    CHANGE_TOPIC,
+    ESTIMATE_TOPIC,
+    STATUS_TOPIC,
+    WHY_TOPIC,
+    Log,
+    declare,
+    estimate_row,
+    explanation_row,
+    reason_names,
+)
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.vehicle import Vehicle
 
 TICK_NS = 100_000_000  # status at 10 Hz
 TICKS_PER_RANGE = 10  # range at 1 Hz
-ESTIMATE_TOPIC = "/estimate"
-STATUS_TOPIC = "/status"
-COUNTS = ("received", "error_frames", "kernel_lost", "overrun", "send_failures", "log_lost", "unknown_others")
 FREE = (
     *range(0x600, 0x700, 0x10),
     *range(0x10, 0x600, 0x10),
@@ -37,48 +42,6 @@ FREE = (
 )
 """Where range frames may begin, the first choice first: of 11 bits and low priority, not the diagnosis' above 0x700."""
 DROPPING = (LENGTH, CRC, COUNTER, TIME, UNDECODABLE)  # reasons that drop a frame
-
-ESTIMATE_UNITS = {
-    "time": "s since the first frame",
-    "soc": "1",
-    "soc_sd": "1",
-    "v1": "V of a cell",
-    "innovation": "V of a cell",
-    "innovation_rms": "V of a cell",
-    "pack_voltage": "V",
-    "pack_current": "A, positive discharging",
-    "cell_temperature": "degC",
-    "speed": "m/s",
-    "acceleration": "m/s^2",
-    "grade": "sine, positive uphill",
-    "lean": "rad, positive right",
-    "yaw_rate": "rad/s, positive left",
-    "heading": "rad, clockwise from north",
-    "distance": "m",
-    "range": "m",
-    "range_p10": "m",
-    "range_p90": "m",
-    "energy_left": "J",
-    "energy_left_sd": "J",
-    "consumption_recent": "J/m",
-    "consumption_expected": "J/m",
-    "consumption_expected_sd": "J/m",
-    "consumption_factor": "1, measured over modelled",
-    "consumption_factor_sd": "1",
-}
-
-
-class Log(Protocol):
-    """What the pipeline writes to; `gz_onboard.bus.logfile` and `recorder` have them."""
-
-    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
-        """Declare a topic of JSON objects."""
-
-    def frames(self, batch: Sequence[Frame]) -> None:
-        """Log raw frames."""
-
-    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
-        """Log one JSON object."""
 
 
 def filter_maker(name: str) -> FilterMaker:
@@ -130,7 +93,7 @@ class Pipeline:
         self._recent = Reason(0)
         self._topics: dict[int, str] = {}
         if log:
-            _declare(log, self.codec, log_signals)
+            declare(log, self.codec.mapping.database.messages if log_signals else ())
 
     def advance(self, frames: Sequence[Frame], until_ns: int) -> list[Frame]:
         """Take in `frames`, in the order of their times, up to `until_ns`; gives the frames to be sent."""
@@ -212,6 +175,8 @@ class Pipeline:
     def _sample(self, log: Log, time_ns: int, estimate: Estimate) -> None:
         log.sample(ESTIMATE_TOPIC, time_ns, estimate_row(estimate))
         log.sample(STATUS_TOPIC, time_ns, self.status())
+        for change, why in self.estimator.attribution.news():
+            log.sample(CHANGE_TOPIC if change else WHY_TOPIC, time_ns, explanation_row(why))
         if not self._log_signals:
             return
         codec, topics = self.codec, self._topics
@@ -292,42 +257,9 @@ def _frame_key(vehicle: Vehicle, identifier: int) -> tuple[bool, int]:
     return extended, pgn(plain) if extended and vehicle.mapping.j1939 else plain
 
 
-def reason_names(found: Reason) -> list[str]:
-    """The names of the reasons in a set."""
-    return [str(reason.name) for reason in Reason if reason & found]
-
-
 def lacking(vehicle: Vehicle) -> list[str]:
     """The reasons that would always be there, were they told: for sensors that the vehicle does not have."""
     return reason_names(reasons.lacking({source.role for source in vehicle.mapping.sources}))
-
-
-def estimate_row(estimate: Estimate) -> dict[str, object]:
-    """An estimate as it stands in logs: SI units, state and reasons by name, None for what is not known."""
-    row: dict[str, object] = {}
-    for name in ESTIMATE_UNITS:
-        value = getattr(estimate, name)
-        # Seven digits are more than any sensor gives, and compress to half the size of seventeen.
-        row[name] = float(f"{value:.7g}") if value is not None and isfinite(value) else None
-    row["state"] = estimate.state.name
-    row["reasons"] = " ".join(reason_names(estimate.reasons))
-    row["activity"] = estimate.activity.name
-    row["distrusted"] = " ".join(estimate.distrusted)
-    return row
-
-
-def _declare(log: Log, codec: Codec, signals: bool) -> None:
-    estimate = object_schema("gz_onboard.Estimate", ESTIMATE_UNITS)
-    estimate["properties"] |= {name: {"type": "string"} for name in ("state", "reasons", "activity", "distrusted")}
-    log.channel(ESTIMATE_TOPIC, estimate)
-    counts = {name: {"type": "integer"} for name in COUNTS}
-    maps = {name: {"type": "object"} for name in ("foreign", "faults", "lost", "unknown")}
-    reasons = {"reasons": {"type": "array", "items": {"type": "string"}}}
-    log.channel(STATUS_TOPIC, {"title": "gz_onboard.Status", "type": "object", "properties": counts | maps | reasons})
-    for message in codec.mapping.database.messages if signals else ():
-        log.channel(
-            f"/can/{message.name}", object_schema(message.name, {s.name: s.unit or "" for s in message.signals})
-        )
 
 
 def dbc_texts(vehicle: Vehicle) -> dict[str, bytes]:

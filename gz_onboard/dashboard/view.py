@@ -11,7 +11,7 @@ from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.layout import identifier_of, raw_range
 from gz_onboard.bus.publisher import KNOWN, RANGE_DBC, range_messages, reason_signal, sensor_signal
-from gz_onboard.events import ROLES, STALE_PERIODS, Activity, Frame, Reason, State
+from gz_onboard.events import ROLES, STALE_PERIODS, Activity, Cause, Frame, Reason, State
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -25,8 +25,11 @@ _NUMBERS = {  # how each is written: format, unit
     "RANGE_EnergyLeft": (".0f", "Wh"),
     "RANGE_ConsumptionRecent": (".1f", "Wh/km"),
     "RANGE_ConsumptionExpected": (".1f", "Wh/km"),
+    "RANGE_WhyRated": (".1f", "km"),
     "RANGE_StateOfCharge": (".1f", "%"),
     "RANGE_StateOfChargeSigma": (".1f", "%"),
+    "RANGE_RemainingFull": (".1f", "km"),
+    "RANGE_ChargePower": (".0f", "W"),
 }
 
 
@@ -139,6 +142,20 @@ class View:
         """What the vehicle does, in a word; nothing if it is not known, or before there is an estimate."""
         value = None if self.state(now) is State.STARTING else self.value("RANGE_Activity", now)
         return Activity(int(value)).name.lower() if value and value in tuple(Activity) else ""
+
+    def charge(self, now: float) -> str:
+        """Power, time to full and the range then; nothing while nothing is charged."""
+        minutes = self.value("RANGE_TimeToFull", now)
+        if minutes is None:
+            return ""
+        hours, rest = divmod(round(minutes), 60)
+        time = f"{hours} h {rest:02d} min" if hours else f"{rest} min"
+        return f"{self.text('RANGE_ChargePower', now)}, full in {time}, {self.text('RANGE_RemainingFull', now)} then"
+
+    def why(self, now: float) -> list[tuple[Cause, float]]:
+        """The largest causes of what the range is beside the rated one, with what each makes of it [km]."""
+        pairs = [[self.value(f"RANGE_Why{what}{i}", now) for what in ("Cause", "Distance")] for i in (1, 2)]
+        return [(Cause(int(cause)), size) for cause, size in pairs if cause and cause in tuple(Cause) and size]
 
     def distrusted(self, now: float) -> list[str]:
         """The roles whose sensors contradict the others and are left out."""

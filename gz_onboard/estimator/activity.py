@@ -1,6 +1,7 @@
-"""What the vehicle does: riding, standing or charging. Only riding teaches what a kilometre costs.
+"""What the vehicle does: riding, standing, parked, charging, asleep. Only riding teaches what a kilometre costs.
 
-A charge plug that is in means charging, unless the vehicle moves. Without a plug signal, or with one that is out, a
+A stop is short until it has lasted `STOP_TIME`, or the key is turned off or the contactor opens: then it is parked. A
+charge plug that is in means charging, unless the vehicle moves. Without a plug signal, or with one that is out, a
 charging current that lasts means it too, where it cannot be a brake's: at standstill, or while the inverter is silent.
 """
 
@@ -33,12 +34,19 @@ class Activities:
         self._drawing = 0.0  # s of a drive's current without motion, less those without it
 
     def step(
-        self, dt: float, speed: float | None, c_rate: float | None, plug: float | None, inverter_silent: bool
+        self,
+        dt: float,
+        speed: float | None,
+        c_rate: float | None,
+        plug: float | None,
+        inverter_silent: bool,
+        off: bool = False,
     ) -> None:
         """Go `dt` [s] on.
 
         speed: [m/s]. c_rate: current over capacity [1/h], positive discharging. plug: whether the charge plug is in.
-        Each None where it is not known. inverter_silent: the vehicle has signals of its inverter and none comes.
+        Each None where it is not known. inverter_silent: the vehicle has signals of its inverter and none comes. off:
+        the key is off, or the contactor is open.
         """
         moving = speed is not None and abs(speed) > MOVING
         self._moving = self._moving + dt if moving else 0.0
@@ -57,7 +65,13 @@ class Activities:
         elif moving or self._still < STANDING_AFTER:
             self.now = Activity.RIDING
         else:
-            self.now = Activity.STANDING
+            self.now = Activity.PARKED if off or self._still > STOP_TIME else Activity.STANDING
+
+    def shown(self, silent: bool, joined: bool) -> Activity:
+        """The activity; silent: nothing comes from the bus; joined: no rest has shown the state of charge yet."""
+        if silent:
+            return Activity.UNKNOWN if self.now in (Activity.UNKNOWN, Activity.RIDING) else Activity.ASLEEP
+        return Activity.JOINED if joined and self.now is Activity.RIDING else self.now
 
     @property
     def teaches(self) -> bool:

@@ -14,6 +14,10 @@ FOREVER = 1e9  # s: a rest of unknown length
 FORGOTTEN = 10.0  # s: a current that nobody asked for in so long is followed anew
 
 
+Supposed = tuple[float, float, dict[str, float]]
+"""When [s], the cell's current [A] then, and the states of the effects."""
+
+
 class CellEffects:
     """The states of the effects. False if the model has none."""
 
@@ -24,9 +28,7 @@ class CellEffects:
         self._quantities["cell_capacity"] = battery.cell_capacity(MILD)  # until the first step
         self.states = {effect.effect.name: 0.0 for effect in self._effects}  # V of a cell
         self.overpotential = 0.0  # V of a cell: their sum
-        self._supposed: dict[
-            str, tuple[float, float, dict[str, float]]
-        ] = {}  # by sensor: when [s], current [A], states
+        self._supposed: dict[str, Supposed] = {}  # by sensor
 
     def __bool__(self) -> bool:
         return bool(self._effects)
@@ -37,7 +39,8 @@ class CellEffects:
         """`dt` [s] on at a mean cell `current` [A], `temperature` in degC; others: what else has changed, by name."""
         q = self._quantities
         q.update(others or {})
-        q["cell_current"], q["soc"], q["cell_temperature"] = current, soc, temperature
+        q["soc"], q["cell_temperature"] = soc, temperature
+        q["cell_current"] = self._battery.health.resistance * current  # of what has aged less is left to carry it
         q["cell_capacity"] = self._battery.cell_capacity(temperature)
         for effect in self._effects:
             name = effect.effect.name
@@ -53,7 +56,7 @@ class CellEffects:
         then, before, states = self._supposed.get(sensor, (now, current, self.states))
         if not 0 <= now - then < FORGOTTEN:
             then, before, states = now, current, self.states
-        q = {**self._quantities, "cell_current": (before + current) / 2}
+        q = {**self._quantities, "cell_current": self._battery.health.resistance * (before + current) / 2}
         states = {e.effect.name: e.step(states[e.effect.name], now - then, q) for e in self._effects}
         self._supposed[sensor] = now, current, states
         return sum(states.values())

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from math import sqrt
 from typing import Any
 
 from gz_onboard.estimator import snapshot
 from gz_onboard.estimator.activity import Activities
+from gz_onboard.estimator.attribution import Attribution
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
-from gz_onboard.estimator.forecast import Forecast, Forecaster
+from gz_onboard.estimator.forecast import Forecaster
+from gz_onboard.estimator.outlook import Now, Outlook
 from gz_onboard.estimator.present import Present
 from gz_onboard.estimator.reasons import DEGRADING, NO_PACK, MissingSignals, loss_variance
 from gz_onboard.estimator.redundancy.checks import StepInputs
@@ -25,9 +26,10 @@ from gz_onboard.estimator.redundancy.currents import CellEvidence
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.road import RoadState
+from gz_onboard.estimator.route_ahead import RoadAhead
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
-from gz_onboard.estimator.soc import PackState, StateOfCharge
-from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources
+from gz_onboard.estimator.soc import StateOfCharge
+from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources, PackState
 from gz_onboard.estimator.temperatures import Temperatures, at_rest
 from gz_onboard.estimator.timing import SLOW_GAP, SLOWEST, MessageTiming
 from gz_onboard.estimator.vibration import VibrationMonitor
@@ -42,8 +44,6 @@ SHOWN = "bms_state_of_charge"
 STEP_AT_LEAST = 0.25  # s: without the message that sets the pace, a step is made after so long
 PACE_JITTER = 0.05  # s: so near its time a step is left to that message: speed and current of a step are of one time
 SHORTEST_STEP = 0.02  # s: what comes sooner belongs to the last step
-FORECAST_PERIOD = 1.0  # s
-EARLY = 0.05  # s: by so much a forecast may be made early, rather than a step late
 SILENT_AFTER = 2.0  # s without a step: what was measured is no longer reported
 STARTING_FOR = 10.0  # s: without a state of charge by then, no range is to be expected soon
 UNCERTAIN = 0.05  # of SOC: a larger sd is reported
@@ -62,7 +62,7 @@ class Estimator:
         riding: PriorRiding,
         make: FilterMaker = ScalarFilter,
     ) -> None:
-        self.battery = battery
+        self.battery = battery = battery.own()  # what is learned of its age is of this one
         self.road = RoadState()
         self.forecaster = Forecaster(model, battery, riding)
         self.signals = Signals(
@@ -70,6 +70,8 @@ class Estimator:
             for group in groups
             for role in group.roles
         )
+        self.attribution = Attribution(self.forecaster, self.signals)
+        self.ahead = RoadAhead(self.forecaster, self.road, self.signals)
         self._missing = MissingSignals(self.signals)
         self._slots = [[self.signals[role] for role in group.roles] for group in groups]
         self._timing = MessageTiming(groups, self._slots)
@@ -85,8 +87,7 @@ class Estimator:
         self._deadline = float("-inf")
         self._activities = Activities()
         self._reading = PackReading()
-        self._forecast: Forecast | None = None
-        self._forecast_time = float("-inf")
+        self._outlook = Outlook(self.forecaster, battery, self.ahead)
         self._distrusted: tuple[str, ...] = ()
         p = model.parameters
         self._radius, self._gear = p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"]
@@ -96,6 +97,7 @@ class Estimator:
         self._temperatures = Temperatures(self.signals, p)
         sag = self.redundancy.currents.sag
         self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, sag)
+        self.forecaster.ageing = self.soc.ageing
         self._present = Present(self.forecaster, self.road, self._temperatures, self.soc, self._vibration)
 
     @property
@@ -154,13 +156,13 @@ class Estimator:
         self._reading = self._read_pack(now, elapsed)
         self._compare_grades(now, elapsed)
         temperature = self._temperatures.step(now, dt, self.soc.heat if dt <= self._timing.pause else at_rest)
-        self.soc.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self._expected_consumption)
+        self.soc.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self._outlook.consumption)
         self.soc.step(now, dt, PackState(self._reading, temperature, road.speed), self._present)
         self._follow_activity(now, dt)
         self._ride(now, dt)
         signals.next_step()
-        if now - self._forecast_time >= FORECAST_PERIOD - EARLY:
-            self._make_forecast(now, temperature)
+        if self._outlook.due(now):
+            self._look_ahead(now, temperature)
 
     def _read_pack(self, now: float, dt: float) -> PackReading:
         """What the pack gives by the sensors, else by the model."""
@@ -211,7 +213,8 @@ class Estimator:
         inverter = (signals.inverter_current, signals.inverter_voltage, signals.motor_speed)
         mapped = [signal for signal in inverter if signal.stale_after]
         silent = bool(mapped) and not any(signal.fresh(now) for signal in mapped)
-        self._activities.step(dt, self.road.speed, rate, signals.charge_plug.get(now), silent)
+        off = any(signal.get(now) == 0 for signal in (signals.key, signals.contactor))
+        self._activities.step(dt, self.road.speed, rate, signals.charge_plug.get(now), silent, off)
 
     def _ride(self, now: float, dt: float) -> None:
         """Learn from the riding, where its consumption is known."""
@@ -219,8 +222,9 @@ class Estimator:
         unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.redundancy.speeds.unsettled
         known = 0 < dt <= self._timing.pause and not unsure and self._activities.teaches
         if speed is None or reading.voltage is None or reading.current is None or not known:
-            self.forecaster.pause()
+            self.forecaster.pause(dt if dt > self._timing.pause or self._activities.now is not Activity.RIDING else 0.0)
             return
+        self.ahead.ride(dt, speed, reading.voltage * reading.current)
         learned = self.forecaster.ride(
             dt,
             speed,
@@ -233,36 +237,25 @@ class Estimator:
         if learned and self.signals.cell_temperature.fresh(now):  # R0 is known only with it
             self.redundancy.currents.compare_consumption(self.forecaster.recent_factor)
 
-    def _make_forecast(self, now: float, temperature: float) -> None:
-        filter_ = self.filter
-        if filter_ is None:
+    def _look_ahead(self, now: float, temperature: float) -> None:
+        if self.filter is None:
             return
-        self._forecast_time = now
+        cells = temperature, self._temperatures.cells_sd(now)
+        lost = loss_variance(self._reasons(now) | self._missing.lacking)
         conditions = self._present.conditions(now)
-        self._forecast = self.forecaster.forecast(
-            filter_.soc,
-            sqrt(filter_.covariance[0]),
-            temperature,
-            self._temperatures.cells_sd(now),
-            conditions.ambient,
-            conditions.altitude,
-            loss_variance(self._reasons(now) | self._missing.lacking),
-        )
-
-    @property
-    def _expected_consumption(self) -> float | None:
-        """[J/m]."""
-        return self._forecast.consumption if self._forecast else None
+        soc = self.soc.ageing.state_of_charge(self.filter)
+        self._outlook.step(Now(now, *soc, *cells, conditions, lost, self._reading, self._activities.now))
+        if self._outlook.forecast:
+            self.attribution.take(now, self._outlook.forecast, soc[0], conditions, self.road.distance)
 
     # --- results ----------------------------------------------------------------------------------------------
 
     def estimate(self, now: float) -> Estimate:
         """What is known at `now` [s]; cheap, and changes nothing."""
-        estimate = Estimate(time=now, reasons=self._reasons(now), distrusted=self._distrusted)
         road, filter_ = self.road, self.filter
-        estimate.distance = road.distance
-        estimate.activity = Activity.UNKNOWN if self._time is None else self._activities.now
+        estimate = Estimate(time=now, reasons=self._reasons(now), distrusted=self._distrusted, distance=road.distance)
         silent = self._time is None or now - self._time > max(SILENT_AFTER, self._timing.pause)
+        estimate.activity = self._activities.shown(silent, self.soc.joined)
         if not silent:
             estimate.speed, estimate.acceleration, estimate.grade = road.speed, road.acceleration, road.grade
             estimate.lean, estimate.yaw_rate, estimate.heading = road.lean, road.yaw_rate, road.heading
@@ -272,28 +265,17 @@ class Estimator:
         if filter_ is None:
             estimate.state = State.INVALID if now > STARTING_FOR else State.STARTING
             return estimate
-        estimate.soc, estimate.soc_sd = self.battery.window.shown(filter_.soc, sqrt(filter_.covariance[0]))
+        estimate.soc, estimate.soc_sd = self.battery.window.shown(*self.soc.ageing.state_of_charge(filter_))
         estimate.v1, estimate.innovation_rms = filter_.v1, self.soc.gate.rms
         if estimate.soc_sd > UNCERTAIN:
             estimate.reasons |= Reason.SOC_UNCERTAIN
-        if self._forecast:
-            self._report(estimate, self._forecast)
+        self._outlook.report(estimate)
+        estimate.why = self.attribution.latest if self._outlook.forecast else None
         estimate.state = State.DEGRADED if estimate.reasons & DEGRADING else State.VALID
         missing = estimate.reasons | self._missing.lacking
         if (silent and missing & NO_PACK == NO_PACK) or estimate.reasons & Reason.SIGNALS_SLOW:
             estimate.state = State.INVALID
         return estimate
-
-    def _report(self, estimate: Estimate, forecast: Forecast) -> None:
-        estimate.range, estimate.range_p10, estimate.range_p90 = forecast.range, forecast.p10, forecast.p90
-        estimate.energy_left, estimate.energy_left_sd = forecast.energy, forecast.energy_sd
-        estimate.consumption_expected = forecast.consumption
-        estimate.consumption_expected_sd = forecast.consumption_sd
-        estimate.consumption_recent = forecast.recent
-        riding = self.forecaster.riding
-        estimate.consumption_factor, estimate.consumption_factor_sd = riding.factor, sqrt(riding.factor_variance)
-        if forecast.mostly_prior:
-            estimate.reasons |= Reason.PRIOR_RIDING
 
     def _reasons(self, now: float) -> Reason:
         s, reasons = self.signals, self._missing.reasons(now)
@@ -319,10 +301,10 @@ class Estimator:
         return self.soc.snapshot(self.filter) | {
             "version": snapshot.VERSION,
             "key": key,
-            "consumption": self._expected_consumption,
+            "consumption": self._outlook.consumption,
             "cell_temperature": self._temperatures.cells,
             "gyro_bias": [self.road.bias_x, self.road.bias_z],
-            "riding": self.forecaster.snapshot(),
+            "riding": self.forecaster.snapshot() | {"on_routes": self.ahead.rider.snapshot()},
         }
 
     def wait(self, seconds: float) -> None:
@@ -331,11 +313,13 @@ class Estimator:
 
     def restore(self, saved: Mapping[str, Any], key: str, age: float | None) -> None:
         """Go on from a snapshot that is `age` [s] old (None: not known). ValueError if it does not fit, whole."""
-        restored = snapshot.read(saved, key, age, self.soc.effects, self.forecaster.restore)
+        restored = snapshot.read(saved, key, age, self.soc.effects, self.soc.ageing, self.forecaster.restore)
+        self.ahead.restore(saved["riding"].get("on_routes"))
         self.road.bias_x, self.road.bias_z = restored.gyro_bias
         if restored.cell_temperature is not None:
             self._temperatures.cells = restored.cell_temperature
         self.soc.restore(restored.battery, restored.age, restored.cell_effects)
+        self.forecaster.pause(restored.age or 0.0)
 
 
 def _carrying(roles: Sequence[str], groups: Sequence[Group]) -> list[int]:

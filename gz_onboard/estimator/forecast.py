@@ -1,52 +1,54 @@
 """How far the energy that is left will go.
 
-What is known of the riding is kept in segments of `SEGMENT` metres: what the pack delivered, and what the forward
-model gives for the same riding, as it was and less what height and speed have stored. From them:
+What is known of the riding is kept in segments of `SEGMENT` metres: what the pack delivered in motion and at stops, and
+what the forward model gives for the same motion, as it was and less what height and speed have stored. From them is
+learned, by segment, what is usual and how the present ride differs from it (`usual`):
 
-- the consumption factor, measured over modelled, learned slowly: one number that carries what the parameters have
-  wrong for this vehicle, rider and season;
-- the consumption to be expected: the model's on the riding of the last kilometres, on its hills but back at the
-  height where it began, times that factor. Before anything is ridden, the model's on a prior riding; it counts like
-  `PRIOR_LENGTH` metres;
-- its spread: how unlike each other segments are, how long they stay alike, and how much riding drifts.
+- the price of a metre in motion: measured, less what height and speed have stored, over the model's of the prior
+  riding in the same air;
+- what stops add to it, as it is usual. Standing for longer than a stop takes energy, but teaches nothing;
+- the time that a metre takes, and with it the power to be expected;
+- the consumption factor, measured over modelled: what the parameters have wrong for this vehicle and season.
 
-The range is the energy that can be drawn before the cut-off at the power to be expected, over that consumption,
-with a log-normal distribution.
+The range is the energy that can be drawn before the cut-off at the power to be expected, over the price to be expected
+on the way that it lasts, with a log-normal distribution. What is shown of it moves calmly (`calm`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp, sqrt
 from typing import Any
 
-from gz_onboard.constants import GRAVITY
-from gz_onboard.estimator.load_model import AHEAD, Conditions, EffectInputs, LoadModel
-from gz_onboard.estimator.ridden import FACTOR, MEMORY, Past, Riding, Second, Segment, restored, restored_states
-from gz_onboard.physics.battery import Battery
+from gz_onboard.constants import GRAVITY, HOUR
+from gz_onboard.estimator.activity import STOP_TIME
+from gz_onboard.estimator.ageing import Ageing
+from gz_onboard.estimator.calm import Calm, restored_ratio
+from gz_onboard.estimator.load_model import AHEAD, USUAL_AIR, Conditions, EffectInputs, LoadModel
+from gz_onboard.estimator.pattern import STEEPEST, Pattern, restored_pattern
+from gz_onboard.estimator.ridden import Past, Riding, Second, Segment, learned, restored, restored_states
+from gz_onboard.estimator.usual import SEGMENT, Usual
+from gz_onboard.physics.battery import HALF_FULL, Battery
+from gz_onboard.physics.cooling import LumpedCooling
 from gz_onboard.physics.drawable import Drawable, drawable
+from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.effects.inertia import rotating_mass
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.riding import PriorRiding
+from gz_onboard.physics.warming import cells_ahead
 
-SEGMENT = 250.0  # m
-PRIOR_LENGTH = 3000.0  # m: the prior riding counts like that much of real riding
-ALIKE = 300.0  # m: over such a distance segments are alike; those of the eight commissioning rides are not at 250 m
-FACTOR_WALK = 0.01  # sd of its change over a segment: wind, tyres, traffic
-SEGMENT_SD = 0.18  # relative: measured against modelled energy of one segment, of the eight commissioning rides
+PRIOR_LENGTH = 3000.0  # m: before, a forecast is said to stand on the prior; it counts so much for the form factor
 HEIGHT_WALK = 0.75  # m per sqrt(m): roads climb or fall by 60 m on 6 km; where no sensor showed the grade
 PRIOR_FORM_FACTOR_SQUARED = 2.5  # mean square of the power over its mean squared, of the eight commissioning rides
 FORM_FACTOR_SQUARED = 1.0, 6.0  # the same, of any riding
-PRIOR_SCATTER = 0.25  # relative sd of segments of a riding not yet known
-LEAST_SCATTER = 0.1  # the same, of any riding
 ACCELERATION = 15.0  # m/s²: no road gives more; a second that shows more is left out
 SPEEDS = -5.0, 70.0  # m/s: the same
-STEEPEST = 0.3  # sine: the same
 LEAST_DISTANCE = 0.1  # m: over less a climb shows no grade
 LEAST = 0.2  # of the prior's consumption: no riding of any length consumes less
 MOST_SD = 3.0  # of the logarithm of the range: beyond, it is not known at all
 SHOWN_FROM = 500.0  # m: over less the recent consumption is that of one traffic light
+WARM_CELLS = 25.0  # degC, of a cooling that is only asked for its constants
 DECILE = 1.2815515655446004  # sd of a normal distribution: 10 % are beyond
 
 
@@ -63,6 +65,9 @@ class Forecast:
     consumption_sd: float
     recent: float | None  # J/m, measured over the last kilometre or so
     mostly_prior: bool
+    power: float  # W, mean of the riding expected
+    form_factor_squared: float
+    cells: float  # degC, their mean on the way that is left
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,8 +77,12 @@ class Expected:
     consumption: float  # J/m
     power: float  # W, mean
     form_factor_squared: float  # mean square of the power over the square of its mean
-    scatter: float  # relative variance of the consumption of segments
-    distance: float  # m of riding that this is known from
+    variance: float  # of the consumption over the way to come, relative
+
+    @property
+    def load(self) -> tuple[float, float]:
+        """Mean power [W] and the square of its form factor."""
+        return self.power, self.form_factor_squared
 
 
 class Forecaster:
@@ -81,12 +90,17 @@ class Forecaster:
 
     def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
         self.load = LoadModel(model, battery, prior)
-        self.battery, self._drift = battery, prior.drift
-        self.riding = Riding(factor=prior.factor, factor_variance=prior.factor_sd**2)
+        self.battery = battery
+        price, stops = self.load.prior_prices(*USUAL_AIR)
+        self.prior, self._usual_price = Usual.of(prior, stops / price), price + stops
+        self.riding = Riding(self.prior)
+        self.calm, self.pattern = Calm(), Pattern()
+        self.ageing: Ageing | None = None  # None: the pack is known to be as its file says
         self._past = Past()
         self._overpotential = model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
         self._weight = model.mass * GRAVITY  # N
         self._moving_mass = model.mass + rotating_mass(model.parameters)  # kg, with what rotates
+        self.cooling = LumpedCooling.of(model.parameters, "pack", WARM_CELLS)
         self._capacity_sd = model.parameters.sd("cell_capacity") / model.parameters["cell_capacity"]
 
     # --- learning ---------------------------------------------------------------------------------------------
@@ -108,6 +122,7 @@ class Forecaster:
         """
         r = self.riding
         r.add(dt, speed, grade, power, inputs)
+        self.calm.ride(abs(speed) * dt)
         if r.second.seconds < max(1.0, period):
             return False
         before = speed if r.speed_before is None else r.speed_before
@@ -118,16 +133,24 @@ class Forecaster:
         segment = r.current
         modelled, to_come = self._modelled(mean, acceleration, conditions, inputs)
         segment.distance += abs(r.second.distance)
-        segment.duration += r.second.seconds
-        segment.measured += r.second.energy
-        segment.squares += r.second.squares
-        segment.modelled += modelled
+        if abs(mean) > MOVING:
+            r.still = 0.0
+            segment.measured += r.second.energy
+            segment.modelled += modelled
+            segment.level += to_come
+        else:
+            r.stand(r.second.seconds)
+            segment.standing += r.second.energy if r.still <= STOP_TIME else 0.0
+        if r.still <= STOP_TIME:
+            segment.duration += r.second.seconds
+            segment.squares += r.second.squares
         stored = self._weight * r.second.climb + self._moving_mass * (speed * speed - before * before) / 2
-        segment.level += to_come - stored
+        segment.level -= stored
+        self.pattern.add(r.second, mean, acceleration)
         r.second, r.speed_before = Second(), speed
         if segment.distance < SEGMENT:
             return False
-        self._close(segment)
+        self._close(segment, conditions)
         return True
 
     def _modelled(
@@ -149,6 +172,12 @@ class Forecaster:
         then, to_come = load.power_with_memory(q, inputs.heading is not None, second.seconds)
         return then * second.seconds, to_come * second.seconds
 
+    def shown(self, forecast: Forecast) -> Forecast:
+        """`forecast` as it is to be shown: its range and interval moved together; to be asked once for each."""
+        way = self.calm.follow(forecast.range, forecast.energy, self.riding.usual.price.known_from)
+        move = way / forecast.range if forecast.range > 0 else 1.0
+        return replace(forecast, range=way, p10=move * forecast.p10, p90=move * forecast.p90)
+
     @property
     def recent_factor(self) -> float:
         """Measured over modelled energy of the last kilometre or so; 1 while that is not known."""
@@ -162,31 +191,23 @@ class Forecaster:
         r.current = Segment()
         while distance > 0 and r.segments and (before := r.segments[-1].learned):
             distance -= r.segments.pop().distance
-            r.factor, r.factor_variance = before
+            r.usual = before
         self._sum_past()
 
-    def pause(self) -> None:
-        """Something was not known for a while: leave the second that was being gathered."""
+    def pause(self, dt: float = 0.0) -> None:
+        """`dt` [s] that teach nothing: parked, or something is not known. Leave the second that was being gathered."""
         self.riding.second, self.riding.speed_before = Second(), None
+        self.riding.stand(dt)
 
-    def _close(self, segment: Segment) -> None:
-        """Learn the factor: a Kalman filter. Its error is one of energy (a hill or a gust not seen), so a segment of
-        little energy has a large variance.
-        """
+    def _close(self, segment: Segment, conditions: Conditions) -> None:
         r = self.riding
-        segment.learned = r.factor, r.factor_variance
+        segment.learned = r.usual
         r.segments.append(segment)
         r.current = Segment()
         self._sum_past()
-        r.factor_variance += FACTOR_WALK**2
-        if segment.modelled > 0:
-            noise = SEGMENT_SD * self._past.level / self._past.distance * segment.distance
-            height = self._weight * HEIGHT_WALK * sqrt(segment.unseen)
-            variance = (noise * noise + height * height) / segment.modelled**2
-            gain = r.factor_variance / (r.factor_variance + variance)
-            r.factor += gain * (segment.measured / segment.modelled - r.factor)
-            r.factor = min(max(r.factor, FACTOR[0]), FACTOR[1])
-            r.factor_variance *= 1 - gain
+        price, _ = self.load.prior_prices(conditions.ambient, conditions.altitude)
+        height = self._weight * HEIGHT_WALK * sqrt(segment.unseen)
+        r.usual = learned(r.usual, segment, price, self.load.prior.speed, height)
 
     def _sum_past(self) -> None:
         self._past = Past.of(reversed(self.riding.segments))
@@ -208,30 +229,28 @@ class Forecaster:
         Temperatures and their sd in degC, altitude in m; `loss_variance`: relative variance that missing sensors
         add to the consumption.
         """
-        r, past, now = self.riding, self._past, self.riding.current
-        expected = self._expected(ambient, altitude)
+        past, now = self._past, self.riding.current
+        expected = self._expected(self._rough_way(soc, cell_temperature), ambient, altitude)
         consumption = expected.consumption
-        left, colder = (self._drawable(soc, t, expected) for t in (cell_temperature, cell_temperature - temperature_sd))
-        energy_sd = sqrt(
-            (soc_sd * left.slope) ** 2
-            + (self.battery.window.sd * left.slope) ** 2
+        ahead = cells_ahead(self.battery, self.cooling, (soc, cell_temperature), ambient, expected.load)
+        left, colder = (self._drawable(soc, t, expected) for t in (ahead, ahead - temperature_sd))
+        beside = (
+            (self.battery.window.sd * left.slope) ** 2
             + (left.energy - colder.energy) ** 2
             + (self._capacity_sd * left.energy) ** 2
         )
+        by_soc = soc_sd * left.slope
+        of_pack = self.ageing.energy_sd(left.energy, left.slope, soc_sd) if self.ageing else (by_soc, by_soc)
+        energy_sd, upwards = (sqrt(beside + sd * sd) for sd in of_pack)
         range_ = left.energy / consumption
-        variance = (
-            loss_variance
-            + expected.scatter * ALIKE * (1 / max(range_, ALIKE) + 1 / max(expected.distance, ALIKE))
-            + self._drift**2
-            + r.factor_variance / r.factor**2
-        )
+        variance = loss_variance + expected.variance
         variance = min(variance, MOST_SD**2)
         sd = sqrt(variance)
         if left.energy > energy_sd:
-            spread = sqrt(variance + (energy_sd / left.energy) ** 2)
-            p10, p90 = range_ * exp(-DECILE * spread), range_ * exp(DECILE * spread)
+            down, up = (sqrt(variance + (sd / left.energy) ** 2) for sd in (energy_sd, upwards))
+            p10, p90 = range_ * exp(-DECILE * down), range_ * exp(DECILE * up)
         else:  # near empty the energy's error rules, and that is not relative
-            p10, p90 = 0.0, (left.energy + DECILE * energy_sd) * exp(DECILE * sd) / consumption
+            p10, p90 = 0.0, (left.energy + DECILE * upwards) * exp(DECILE * sd) / consumption
         recent_distance = past.recent_distance + now.distance
         return Forecast(
             range=range_,
@@ -241,8 +260,13 @@ class Forecaster:
             energy_sd=energy_sd,
             consumption=consumption,
             consumption_sd=consumption * sd,
-            recent=(past.recent + now.measured) / recent_distance if recent_distance >= SHOWN_FROM else None,
+            recent=(past.recent + past.recent_standing + now.measured + now.standing) / recent_distance
+            if recent_distance >= SHOWN_FROM
+            else None,
             mostly_prior=past.whole + now.distance < PRIOR_LENGTH,
+            power=expected.power,
+            form_factor_squared=expected.form_factor_squared,
+            cells=ahead,
         )
 
     def _drawable(self, soc: float, temperature: float, expected: Expected) -> Drawable:
@@ -250,39 +274,48 @@ class Forecaster:
             self.battery, soc, temperature, expected.power, expected.form_factor_squared, self._overpotential
         )
 
-    def _expected(self, ambient: float, altitude: float) -> Expected:
-        r, past, now = self.riding, self._past, self.riding.current
-        prior_power, prior_speed = self.load.prior_ride(ambient, altitude)
-        prior, prior_time = prior_power / prior_speed, PRIOR_LENGTH / prior_speed
-        fade = exp(-now.distance / MEMORY)
-        distance = PRIOR_LENGTH + fade * past.distance + now.distance
-        modelled = max((PRIOR_LENGTH * prior + fade * past.level + now.level) / distance, LEAST * prior)
-        speed = distance / (prior_time + fade * past.duration + now.duration)
-        consumption = r.factor * modelled
+    def _rough_way(self, soc: float, temperature: float) -> float:
+        """How long the charge will last [m], roughly: by the battery's nominal energy and the prior's price."""
+        charge = soc * self.battery.pack_capacity(temperature) * HOUR
+        energy = charge * self.battery.ocv(HALF_FULL)[0] * self.battery.cells_series
+        return max(energy / self._usual_price, SEGMENT)
+
+    def _expected(self, way: float, ambient: float, altitude: float) -> Expected:
+        """The riding on the next `way` [m]."""
+        usual, past = self.riding.usual, self._past
+        moving, stops = self.load.prior_prices(ambient, altitude)
+        price, variance = usual.price.ahead(way)
+        price = max(price, LEAST)
+        standing, standing_variance = usual.standing.ahead(way)
+        # What was ridden without a grade has the model's price times the factor, whose error is the same all the way.
+        variance += (past.blind * price / self.riding.factor) ** 2 * self.riding.factor_variance
+        pace, _ = usual.pace.ahead(way)
+        consumption = moving * (price + max(standing, 0.0))
+        speed = self.load.prior.speed / max(pace, LEAST)
+        prior_power, prior_time = (moving + stops) * self.load.prior.speed, PRIOR_LENGTH / self.load.prior.speed
         # Downhill next to nothing is drawn in the mean; what is to come is not all downhill.
-        energy = prior_power * prior_time + max(past.measured, r.factor * past.level)
+        energy = prior_power * prior_time + max(past.measured, self.riding.factor * past.level)
         energy = max(energy, LEAST * prior_power * prior_time)
         squares = PRIOR_FORM_FACTOR_SQUARED * prior_power**2 * prior_time + past.power_squares
         form_factor_squared = squares * (prior_time + past.duration) / energy**2
-        closed = PRIOR_LENGTH + fade * past.distance
-        squares = (PRIOR_LENGTH * prior**2 * (1 + PRIOR_SCATTER**2) + fade * past.squares) / closed
-        mean = max((PRIOR_LENGTH * prior + fade * past.level) / closed, LEAST * prior)
         return Expected(
             consumption,
             consumption * speed,
             form_factor_squared=min(max(form_factor_squared, FORM_FACTOR_SQUARED[0]), FORM_FACTOR_SQUARED[1]),
-            scatter=max(squares / mean**2 - 1, LEAST_SCATTER**2),
-            distance=distance,
+            variance=(variance + standing_variance) * (moving / consumption) ** 2,
         )
 
     # --- saving -----------------------------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, object]:
         """What is to be kept over a restart."""
-        return self.riding.snapshot() | {"states": dict(self.load.states)}
+        kept = {"states": dict(self.load.states), "shown": self.calm.ratio, "pattern": self.pattern.snapshot()}
+        return self.riding.snapshot() | kept
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Take what `snapshot` gave; raises KeyError, TypeError or ValueError if it is not that."""
-        riding, states = restored(saved), restored_states(saved["states"])
-        self.riding, self.load.states = riding, states
+        riding, states = restored(saved, self.prior), restored_states(saved["states"])
+        pattern = restored_pattern(saved.get("pattern", ()))
+        self.calm = Calm(restored_ratio(saved))
+        self.riding, self.load.states, self.pattern = riding, states, pattern
         self._sum_past()

@@ -76,7 +76,7 @@ class LoadModel:
         self.extended = not model.reads <= BASE or any(e.decay for e in model.effects)
         self._battery = battery
         self._by_heading = "heading" in model.reads
-        self._prior_at: tuple[tuple[float, float], float] = (float("nan"), 0.0), 0.0
+        self._prior_at: tuple[tuple[float, float], tuple[float, float]] = (float("nan"), 0.0), (0.0, 0.0)
 
     def quantities(self, speed: float, acceleration: float, conditions: Conditions) -> Quantities:
         """What the base model reads, on a level road without wind; speed [m/s], acceleration [m/s²]."""
@@ -97,7 +97,7 @@ class LoadModel:
         lateral = inputs.lateral_acceleration
         q["lateral_acceleration"] = self._typical_lateral(q["speed"]) if lateral is None else lateral
         q["vibration"] = self.typical_vibration(q["speed"]) if inputs.vibration is None else inputs.vibration
-        q["heading"] = inputs.heading or 0.0
+        q["heading"] = 0.0 if inputs.heading is None else inputs.heading
         q["time_moving"] = time_moving
         self._add_cells(q, inputs.soc, inputs.cell_temperature, inputs.current, ambient)
 
@@ -137,22 +137,30 @@ class LoadModel:
 
     def prior_ride(self, ambient: float, altitude: float) -> tuple[float, float]:
         """(power [W], speed [m/s]) of the prior riding at `ambient` [degC] and `altitude` [m]."""
-        return self._prior(round(ambient, AMBIENT_DIGITS), round(altitude, ALTITUDE_DIGITS)), self.prior.speed
+        return sum(self._prior(ambient, altitude)), self.prior.speed
+
+    def prior_prices(self, ambient: float, altitude: float) -> tuple[float, float]:
+        """What a metre of the prior riding costs in motion and by its stops [J/m]; see `prior_ride`."""
+        moving, standing = self._prior(ambient, altitude)
+        return moving / self.prior.speed, standing / self.prior.speed
 
     def usual_force(self) -> float:
         """Mean force [N] of the prior riding: its energy at the pack over its distance."""
-        return self.prior.factor * self._prior(*USUAL_AIR) / self.prior.speed
+        return self.prior.factor * sum(self._prior(*USUAL_AIR)) / self.prior.speed
 
-    def _prior(self, ambient: float, altitude: float) -> float:
-        if self._prior_at[0] != (ambient, altitude):
-            power = 0.0
+    def _prior(self, ambient: float, altitude: float) -> tuple[float, float]:
+        """The mean power [W] of its motion and of its stops."""
+        at = round(ambient, AMBIENT_DIGITS), round(altitude, ALTITUDE_DIGITS)
+        if self._prior_at[0] != at:
+            powers = [0.0, 0.0]
             for share, speed, acceleration in self.prior.points:
-                q = self.quantities(speed, acceleration, Conditions(ambient, altitude))
+                q = self.quantities(speed, acceleration, Conditions(*at))
                 if self.extended:
-                    settled = EffectInputs(None, None, HALF_FULL, ambient, 0.0)
-                    self.extend(q, settled, ambient, AHEAD)
-                    power += share * self._over_headings(q)
+                    settled = EffectInputs(None, None, HALF_FULL, at[0], 0.0)
+                    self.extend(q, settled, at[0], AHEAD)
+                    power = self._over_headings(q)
                 else:
-                    power += share * self.power(q)
-            self._prior_at = (ambient, altitude), power * self.prior.unevenness
+                    power = self.power(q)
+                powers[speed <= MOVING] += share * power * self.prior.unevenness
+            self._prior_at = at, (powers[0], powers[1])
         return self._prior_at[1]

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
-from math import exp, isfinite
+from dataclasses import dataclass, field, replace
+from math import exp, inf, isfinite
 from typing import Any
 
 from gz_onboard.estimator.load_model import EffectInputs
+from gz_onboard.estimator.usual import Usual, restored_usual
 from gz_onboard.physics.effect import MOVING
 
 MEMORY = 12000.0  # m: what is further back counts for less than 1/e
 MOST_SEGMENTS = 200  # 50 km: of what is further back nothing counts
 RECENT = 1000.0  # m: what a rider calls his consumption
+LEAST_PRICE = 0.2  # of the prior riding: the price that a factor is weighted by
+RIDE_ENDS = 600.0  # s without motion: what comes then is another ride
 FACTOR = 0.1, 10.0  # measured over modelled energy: a heated van in a jam has 5; beyond, parameters are wrong
 # What a saved segment can have at most: m, s, J, W²·s and J; time moving in s.
 MOST_DISTANCE, MOST_DURATION, MOST_ENERGY, MOST_TIME_MOVING = 1e5, 1e6, 1e12, 1e7
@@ -25,12 +28,18 @@ class Segment:
 
     distance: float = 0.0  # m
     duration: float = 0.0  # s
-    measured: float = 0.0
+    measured: float = 0.0  # in motion
     squares: float = 0.0  # W²·s, of the measured power
-    modelled: float = 0.0
-    level: float = 0.0  # modelled, less what height and speed have stored: its hills and stops, but back where it began
+    modelled: float = 0.0  # in motion
+    level: float = 0.0  # modelled, less what height and speed have stored: its hills, but back where it began
+    standing: float = 0.0  # measured, at stops
     unseen: float = 0.0  # m of which no sensor showed the grade
-    learned: tuple[float, float] | None = None  # the factor and its variance before it; None after a restart
+    learned: Usual | None = None  # what was usual before it; None after a restart
+
+
+KEPT = "distance", "duration", "measured", "squares", "modelled", "level", "standing", "unseen"
+KEPT_ONCE = 6
+"""What of a segment is saved; older versions have so many of them, the first."""
 
 
 @dataclass(slots=True)
@@ -61,13 +70,29 @@ class Second:
 class Riding:
     """What is known of the riding: state of the forecast."""
 
-    factor: float  # measured over modelled energy
-    factor_variance: float
+    usual: Usual
     segments: deque[Segment] = field(default_factory=lambda: deque(maxlen=MOST_SEGMENTS))
     current: Segment = field(default_factory=Segment)
     second: Second = field(default_factory=Second)
     time_moving: float = 0.0  # s since the start
     speed_before: float | None = None  # m/s, at the start of the second
+    still: float = 0.0  # s since the last motion
+
+    @property
+    def factor(self) -> float:
+        """Measured over modelled energy of the present riding."""
+        return min(max(self.usual.factor.now, FACTOR[0]), FACTOR[1])
+
+    @property
+    def factor_variance(self) -> float:
+        """Of `factor`."""
+        return self.usual.factor.variance
+
+    def stand(self, dt: float) -> None:
+        """`dt` [s] without motion; after long enough what follows is another ride."""
+        riding, self.still = self.still < RIDE_ENDS, self.still + dt
+        if riding and self.still >= RIDE_ENDS:
+            self.usual = self.usual.rested()
 
     def add(self, dt: float, speed: float, grade: float | None, power: float, inputs: EffectInputs | None) -> None:
         """`dt` [s] at `speed` [m/s], `grade` (sine) and `power` [W]."""
@@ -87,26 +112,37 @@ class Riding:
 
     def snapshot(self) -> dict[str, object]:
         """What is to be kept over a restart."""
-        rows = [[s.distance, s.duration, s.measured, s.squares, s.modelled, s.level] for s in self.segments]
-        return {
-            "segments": rows,
-            "factor": self.factor,
-            "factor_variance": self.factor_variance,
-            "time_moving": self.time_moving,
-        }
+        rows = [[getattr(segment, name) for name in KEPT] for segment in self.segments]
+        return {"segments": rows, "usual": self.usual.snapshot(), "still": self.still, "time_moving": self.time_moving}
 
 
-def restored(saved: Mapping[str, Any]) -> Riding:
-    """What `Riding.snapshot` gave; KeyError, TypeError or ValueError if it is not that."""
-    segments = [Segment(a, b, c, d, e, f) for a, b, c, d, e, f in (map(float, row) for row in saved["segments"])]
-    riding = Riding(factor=float(saved["factor"]), factor_variance=float(saved["factor_variance"]))
+def restored(saved: Mapping[str, Any], prior: Usual) -> Riding:
+    """What `Riding.snapshot` gave; KeyError, TypeError or ValueError if it is not that.
+
+    What older versions saved has stops within the rest of a segment, and of what is usual only the factor: the rest is
+    taken from `prior`.
+    """
+    rows = [[float(x) for x in row] for row in saved["segments"]]
+    if not all(KEPT_ONCE <= len(row) <= len(KEPT) for row in rows):
+        raise ValueError("segments of another form")
+    segments = []
+    for row in rows:
+        segments.append(Segment())
+        for name, value in zip(KEPT, row, strict=False):
+            setattr(segments[-1], name, value)
+    if "usual" in saved:
+        usual = restored_usual(saved["usual"])
+    else:
+        factor = replace(prior.factor, usual=float(saved["factor"]), usual_variance=float(saved["factor_variance"]))
+        usual = restored_usual(replace(prior, factor=factor).snapshot())
+    riding = Riding(usual, still=float(saved.get("still", 0.0)))
     riding.segments.extend(segments)
     riding.time_moving = float(saved["time_moving"])
-    numbers = [x for s in segments for x in (s.measured, s.squares, s.modelled, s.level)]
+    numbers = [getattr(segment, name) for segment in segments for name in KEPT[2:]]
     good = all(0 < s.distance < MOST_DISTANCE and 0 < s.duration < MOST_DURATION for s in segments) and all(
         abs(x) < MOST_ENERGY for x in numbers
     )
-    if not good or not (FACTOR[0] <= riding.factor <= FACTOR[1] and 0 < riding.factor_variance < 1):
+    if not good or not 0 <= riding.still < inf:
         raise ValueError("implausible riding")
     if not (0 <= riding.time_moving < MOST_TIME_MOVING):
         raise ValueError("implausible time moving")
@@ -121,6 +157,25 @@ def restored_states(saved: Mapping[str, Any]) -> dict[str, float]:
     return states
 
 
+def learned(usual: Usual, segment: Segment, price: float, speed: float, height: float) -> Usual:
+    """What is usual after `segment`. The prior riding costs `price` [J/m] in motion, at `speed` [m/s] with its stops.
+
+    `height`: sd [J] of what hills that no sensor showed have stored; there the price is the model's, times the factor.
+    The factor's residual is weighted by the energy that is to be expected, not by the segment's modelled: whose errors
+    (of the grade) would draw the factor to 0.
+    """
+    way, unit, unseen = segment.distance, price * segment.distance, segment.unseen / segment.distance
+    factor, likely = usual.factor.now, max(usual.price.now, LEAST_PRICE)
+    paid = (1 - unseen) * (segment.measured - segment.modelled) + ((1 - unseen) + unseen * factor) * segment.level
+    excess = factor * (segment.measured - factor * segment.modelled) / (likely * unit)
+    return Usual(
+        usual.price.learned(paid / unit - usual.price.now, way, unseen * unseen * usual.factor.variance),
+        usual.standing.learned(segment.standing / unit - usual.standing.now, way),
+        usual.pace.learned(segment.duration * speed / way - usual.pace.now, way),
+        usual.factor.learned(excess, way, (height * factor / (likely * unit)) ** 2),
+    )
+
+
 @dataclass(slots=True)
 class Past:
     """Sums over the closed segments, each weighted by how far back it is."""
@@ -128,10 +183,11 @@ class Past:
     level: float = 0.0  # J
     duration: float = 0.0  # s
     distance: float = 0.0  # m
-    squares: float = 0.0  # J²/m: of the consumptions, by distance
-    measured: float = 0.0  # J
+    unseen: float = 0.0  # m of which no sensor showed the grade
+    measured: float = 0.0  # J, stops included
     power_squares: float = 0.0  # W²·s
-    recent: float = 0.0  # J, measured over the last kilometre
+    recent: float = 0.0  # J, measured over the last kilometre, in motion
+    recent_standing: float = 0.0  # J, the same, at stops
     recent_modelled: float = 0.0  # J
     recent_distance: float = 0.0  # m
     whole: float = 0.0  # m, unweighted
@@ -145,15 +201,21 @@ class Past:
             past.whole += segment.distance
             past.level += share * segment.level
             past.duration += share * segment.duration
-            past.measured += share * segment.measured
-            past.power_squares += share * segment.squares
             past.distance += share * segment.distance
-            past.squares += share * segment.level**2 / segment.distance
+            past.unseen += share * segment.unseen
+            past.measured += share * (segment.measured + segment.standing)
+            past.power_squares += share * segment.squares
             if past.recent_distance < RECENT:
                 past.recent += segment.measured
+                past.recent_standing += segment.standing
                 past.recent_modelled += segment.modelled
                 past.recent_distance += segment.distance
         return past
+
+    @property
+    def blind(self) -> float:
+        """The share of the way whose hills no sensor showed."""
+        return self.unseen / self.distance if self.distance else 0.0
 
     @property
     def recent_factor(self) -> float:

@@ -32,6 +32,11 @@ class Signal:
         """Its last value, or None if that is stale or not trusted."""
         return self.value if self.trusted and now - self.time <= self.stale_after else None
 
+    @property
+    def last(self) -> float | None:
+        """The last value that ever came."""
+        return self.value if self.time > float("-inf") else None
+
     def mean(self, now: float) -> float | None:
         """Its mean since the last step; if nothing came, its last value; None if that is stale or not trusted."""
         return self.reported(now) if self.trusted else None

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from math import inf
 from typing import Any
 
+from gz_onboard.estimator.ageing import Ageing
 from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.road import MOST_BIAS
 from gz_onboard.estimator.start import Saved
@@ -37,9 +38,11 @@ def read(
     key: str,
     age: float | None,
     effects: CellEffects,
+    ageing: Ageing,
     restore_riding: Callable[[Mapping[str, Any]], None],
 ) -> Restored:
-    """The snapshot `saved`, `age` [s] old, of the vehicle `key`; the riding is restored if the rest fits.
+    """The snapshot `saved`, `age` [s] old, of the vehicle `key`; the riding, and what was learned of the
+    pack's age, are restored if the rest fits.
 
     ValueError if it does not fit, whole.
     """
@@ -55,7 +58,10 @@ def read(
         if not (abs(bias_x) < MOST_BIAS and abs(bias_z) < MOST_BIAS):
             raise ValueError("holds implausible numbers")
         states = effects.read(saved["cell_effects"])
+        learned = saved.get("learned", {})  # states from before there was any have none
+        ageing.read(learned)
         restore_riding(saved["riding"])
+        ageing.restore(learned)
     except (KeyError, TypeError, AttributeError, OverflowError) as error:
         raise ValueError(f"is damaged: {error!r}") from error
     cells = saved.get("cell_temperature")

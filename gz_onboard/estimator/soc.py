@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import inf, sqrt
 from typing import Protocol
 
 from gz_onboard.constants import HOUR
+from gz_onboard.estimator.ageing import Ageing
 from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.ekf import FilterMaker, Noise, SocFilter
 from gz_onboard.estimator.gate import InnovationGate
 from gz_onboard.estimator.initial import DROP_FACTOR, Situation, SteadyVoltage, first_filter
 from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.rest import RestUpdate
-from gz_onboard.estimator.signals import Signal, Signals
-from gz_onboard.estimator.sources import CurrentSource, PackReading, Synchroniser
+from gz_onboard.estimator.signals import Signals
+from gz_onboard.estimator.sources import CurrentSource, PackReading, PackState, Synchroniser
 from gz_onboard.estimator.start import BRIDGE, SOC_UNKNOWN_SD, Saved, bounded, plausible
 from gz_onboard.estimator.timing import SLOWEST, MessageTiming
 from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, INVERTER_VOLTAGE_SD, ChargeUncertainty, VoltageUncertainty
@@ -25,15 +25,6 @@ DOUBTED_START = 30.0  # s: a voltage that is doubted so soon has misled the firs
 RESTARTED_FOR = 600.0  # s: for so long it is reported
 STEADY_NOISE = 1e-9  # variance of SOC from the first voltage to the end of the wait
 SHORTEST = 0.02  # s: a step, to divide by
-
-
-@dataclass(frozen=True, slots=True)
-class PackState:
-    """What is known of the pack at one step, beside the signals."""
-
-    reading: PackReading
-    temperature: float  # degC, of the cells
-    speed: float | None  # m/s
 
 
 class RidingModel(Protocol):
@@ -60,6 +51,7 @@ class StateOfCharge:
     ) -> None:
         self.filter: SocFilter | None = None
         self.gate = InnovationGate()
+        self.ageing = Ageing(battery)
         self.effects = CellEffects(model, battery)
         self.uncertainty = VoltageUncertainty(battery, model.parameters)
         self.synchroniser = Synchroniser(model.parameters["pack_voltage_latency"])
@@ -69,6 +61,7 @@ class StateOfCharge:
         self._unseen = STOOD  # s: for so long, and not longer, its load was not seen
         self._battery, self._make, self._signals, self._timing = battery, make, signals, timing
         self._sag = sag
+        self._resistance_sd = self.uncertainty.resistance
         self._charge = ChargeUncertainty(battery, model.parameters)
         self._auxiliary_power = model.parameters["auxiliary_power"]
         self._steady = SteadyVoltage(battery)
@@ -79,6 +72,7 @@ class StateOfCharge:
         self._started_from: tuple[Saved | None, float | None] = (None, None)  # and what it was made from, how old
         self._doubted = False  # a voltage
         self._restarted_at = -inf  # s
+        self._joined = False
         self._gap: tuple[float, Saved] | None = None  # when the pack was last measured [s], and what was known then
         self._voltage_time: float | None = None  # s, of the message whose voltage was taken in last
         self._voltage_taken = -inf  # s: when
@@ -112,6 +106,11 @@ class StateOfCharge:
             return 0.0
         return self._battery.pack_heat(self.current, filter_.soc, temperature, filter_.v1 + self.effects.overpotential)
 
+    @property
+    def joined(self) -> bool:
+        """Whether it was begun on the move, from nothing saved, and no rest has shown it yet."""
+        return self._joined and not self._rest.shown
+
     def restarted(self, now: float) -> bool:
         """Whether it was begun anew a short while ago."""
         return now - self._restarted_at < RESTARTED_FOR
@@ -121,6 +120,7 @@ class StateOfCharge:
         if doubted and not self._doubted and now - self._started < DOUBTED_START:
             self.saved, self.saved_age = self._started_from
             self._wait_again()
+            self.ageing.part()
         self._doubted = doubted
 
     def follow_gap(self, now: float, dt: float, reading: PackReading, temperature: float, price: float | None) -> None:
@@ -129,7 +129,7 @@ class StateOfCharge:
         A gap of all messages, or of the pack's: it may have been charged meanwhile. dt: of this step [s]; temperature:
         of the cells [degC]; price: the consumption that is expected [J/m].
         """
-        filter_, blind = self.filter, unmeasured(reading)
+        filter_, blind = self.filter, reading.unmeasured
         if filter_ is None:
             self._gap = None
             return
@@ -165,9 +165,10 @@ class StateOfCharge:
             "v1": filter_.v1,
             "covariance": list(filter_.covariance),
             "current": self.current,
-            "odometer": last(self._signals.odometer),
-            "own_soc": last(self._signals.bms_state_of_charge),
+            "odometer": self._signals.odometer.last,
+            "own_soc": self._signals.bms_state_of_charge.last,
             "cell_effects": dict(self.effects.states),
+            "learned": self.ageing.snapshot(),
         }
 
     def restore(self, saved: Saved, age: float | None, effects: dict[str, float]) -> None:
@@ -193,7 +194,7 @@ class StateOfCharge:
         if dt > 0:
             self._predict(filter_, now, dt, pack, riding)
         self.current = current
-        self._odometer, self._own_soc = last(self._signals.odometer), last(self._signals.bms_state_of_charge)
+        self._odometer, self._own_soc = self._signals.odometer.last, self._signals.bms_state_of_charge.last
         if voltage is None or current is None:
             self.gate.innovation = None
             return
@@ -215,20 +216,21 @@ class StateOfCharge:
     def _predict(self, filter_: SocFilter, now: float, dt: float, pack: PackState, riding: RidingModel) -> None:
         """Count the charge of `dt` [s] up to `now` [s]."""
         battery, temperature, current = self._battery, pack.temperature, pack.reading.current
-        before = self.current if self.current is not None else current
-        mean = ((before or 0.0) + (current or 0.0)) / 2
+        last = self.current if self.current is not None else current
+        mean = ((last or 0.0) + (current or 0.0)) / 2
         charge = HOUR * battery.pack_capacity(temperature)
         sampled, pause = self._timing.sampled, self._timing.pause
-        counted = (
-            pack.reading.source if sampled <= SLOWEST else CurrentSource.NONE
-        )  # beyond, most that flows is not seen
+        # Beyond, most that flows is not seen.
+        counted = pack.reading.source if sampled <= SLOWEST else CurrentSource.NONE
         error, apart = CURRENT_ERRORS[counted], pack.reading.current_apart
         q = self._charge.counted(min(dt, pause), mean * dt / charge, charge, error, apart)
         q += self._charge.between_samples(dt, sampled)
-        if dt > pause or (counted is CurrentSource.NONE and unmeasured(pack.reading)):
+        if dt > pause or (counted is CurrentSource.NONE and pack.reading.unmeasured):
             q += self._charge.of_pause(dt, sqrt(filter_.covariance[0]))
             self._rest.interrupt()
+        before = filter_.covariance
         filter_.predict(dt, mean / battery.cells_parallel, temperature, self._noise(q, filter_, temperature))
+        self.ageing.count(filter_, before, mean * dt / charge)
         p00, p01, p11 = filter_.covariance
         if p00 > SOC_UNKNOWN_SD**2:
             filter_.covariance = SOC_UNKNOWN_SD**2, p01 * SOC_UNKNOWN_SD / sqrt(p00), p11
@@ -240,11 +242,9 @@ class StateOfCharge:
         """`counted`: variance of SOC."""
         return Noise(counted, self.uncertainty.slow(filter_.soc, temperature), self.uncertainty.error_time)
 
-    def _update(
-        self, filter_: SocFilter, now: float, dt: float, measured: tuple[float, float], pack: PackState
-    ) -> None:
+    def _update(self, filter_: SocFilter, now: float, dt: float, measured: tuple[float, float], at: PackState) -> None:
         """Update with the voltage [V] at a current [A], both of the pack, that represents `dt` [s]."""
-        battery, reading, temperature = self._battery, pack.reading, pack.temperature
+        battery, reading, temperature = self._battery, at.reading, at.temperature
         voltage, current = measured
         # What effects in the cells take is known: the filter sees the voltage that there would be without them.
         shown = battery.cell_voltage(voltage, current)
@@ -262,9 +262,12 @@ class StateOfCharge:
             # Both with what lies beside the cells: of a pack of which little is known, r0 may hold it already.
             cell, beside = explaining / battery.cells_parallel, battery.series_resistance / battery.cells_series
             self._sag.update(dt, voltage / battery.cells_series, r0 * cell + beside * explaining + lost)
+        before = filter_.soc, filter_.error, filter_.covariance
+        self.ageing.permit(now, reading, self._signals, filter_)
         if dt <= self._timing.pause and self._rest.step(
             filter_, dt, shown, cell_current, temperature, reading.voltage_sd
         ):
+            self.ageing.corrected(filter_, before)
             return
         by_inverter = not self._signals.pack_voltage.fresh(now)
         voltage_sd = INVERTER_VOLTAGE_SD if by_inverter else reading.voltage_sd
@@ -280,6 +283,11 @@ class StateOfCharge:
             variance *= max(2 * self.uncertainty.error_time / max(dt, SHORTEST), 1.0)
             filter_.update(cell_voltage, cell_current, temperature, variance)
             filter_.soc = bounded(filter_.soc)
+            self.ageing.corrected(filter_, before)
+        if not self.gate.off:
+            self.ageing.load(min(dt, self._timing.pause), drop + filter_.v1, error)
+        if self.ageing.apply(dt):
+            self.uncertainty.resistance = max(self._resistance_sd, self.ageing.resistance.sd)
 
     def _plausible(self, voltage: float, current: float, temperature: float) -> bool:
         battery = self._battery
@@ -301,6 +309,7 @@ class StateOfCharge:
             self.gate.blame_both()
             return
         self._wait_again()
+        self.ageing.part()
         self.gate = InnovationGate()
         self.saved = None
         self._restarted_at = now
@@ -331,18 +340,10 @@ class StateOfCharge:
             unsteady_sd,
         )
         restored = self.saved, self.saved_age
+        self._joined = bool(first.moving) and not self.saved
         self.saved, self._started, self._started_from = None, now, restored
-        self.filter = first_filter(battery, self._make, self.uncertainty, first, at, self._signals, restored)
+        self.filter, counted = first_filter(battery, self._make, self.uncertainty, first, at, self._signals, restored)
+        self.ageing.resume(self.filter, counted)
         mean = (first.current + current) / 2 / battery.cells_parallel
         noise = self._noise(STEADY_NOISE, self.filter, pack.temperature)
         self.filter.predict(now - first.time, mean, pack.temperature, noise)
-
-
-def unmeasured(reading: PackReading) -> bool:
-    """Whether no sensor shows anything of the pack."""
-    return reading.voltage is None and reading.source in (CurrentSource.MODEL, CurrentSource.NONE)
-
-
-def last(signal: Signal) -> float | None:
-    """The last value that ever came."""
-    return signal.value if signal.time > -inf else None

@@ -44,6 +44,20 @@ class PackReading:
     current_apart: float | None = None  # A: by so much the two currents differ in the mean; None: only one is known
     voltage_doubted: bool = False  # the two voltages differ, or one of them is faulty
 
+    @property
+    def unmeasured(self) -> bool:
+        """Whether no sensor shows anything of the pack."""
+        return self.voltage is None and self.source in (CurrentSource.MODEL, CurrentSource.NONE)
+
+
+@dataclass(frozen=True, slots=True)
+class PackState:
+    """What is known of the pack at one step, beside the signals."""
+
+    reading: PackReading
+    temperature: float  # degC, of the cells
+    speed: float | None  # m/s
+
 
 class PackSources:
     """Corrects, compares and chooses the electric sensors."""

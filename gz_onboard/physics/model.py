@@ -172,8 +172,8 @@ def first_soc(
     """The SOC out of the pack's first voltage [V] and current [A] of a ride.
 
     effects: in the cells; temperature in degC; load: the current [A] that has flowed for `STOOD`, from rest, see
-    `standing_load`. The RC pair, slower than most of them, is taken to be at rest still. It
-    may be below 0 or above 1, see `Battery.soc_at_load`.
+    `standing_load`. The RC pair, slower than most of them, is taken to be at rest still. It may be below 0 or above 1,
+    see `Battery.soc_at_load`.
     """
     voltage, current = first
     cell, capacity = current / battery.cells_parallel, battery.cell_capacity(temperature)
@@ -275,7 +275,7 @@ class Model:
 
         def settled(current: float, soc: float, temperature: float, form_factor_squared: float) -> float:
             q = others | {
-                "cell_current": current,
+                "cell_current": battery.health.resistance * current,
                 "soc": soc,
                 "cell_temperature": temperature,
                 "cell_capacity": battery.cell_capacity(temperature),
@@ -284,7 +284,7 @@ class Model:
             for effect in self.at(Port.CELL_VOLTAGE):
                 # The charge flows in bursts, of which an effect that is fast enough sees the current, not the mean.
                 bursts = 1 + (form_factor_squared - 1) * (1 - effect.decay(BURST, q))
-                lost += effect(q | {"cell_current": bursts * current})
+                lost += effect(q | {"cell_current": bursts * q["cell_current"]})
             return lost
 
         return settled

@@ -107,8 +107,10 @@ class Parameters(Mapping[str, float]):
         known: Mapping[str, Value],
         correlations: Mapping[frozenset[str], float] | None = None,
         declared: Mapping[str, Parameter] | None = None,
+        replaced: Mapping[str, float] | None = None,
     ) -> None:
         self.known = dict(known)
+        self._replaced = dict(replaced or {})
         self.correlations = dict(correlations or {})
         self.declared = dict(declared or declared_parameters())  # with those of the user's own effects
 
@@ -124,6 +126,10 @@ class Parameters(Mapping[str, float]):
     def sd(self, name: str) -> float:
         """The standard deviation of `name`, in its unit."""
         return self.known[name].sd
+
+    def filed(self, name: str) -> float:
+        """The value of `name` before others were entered: that of the vehicle file."""
+        return self._replaced.get(name, self[name])
 
     def covariance(self, names: Sequence[str]) -> list[list[float]]:
         """The covariance of the parameters `names`, in the products of their units."""
@@ -149,13 +155,14 @@ class Parameters(Mapping[str, float]):
             name: Value(value, 0.1 * self.known[name].sd, self.known[name].unit, "data sheet", "as entered")
             for name, value in values.items()
         }
-        return Parameters({**self.known, **changed}, self.correlations, self.declared)
+        filed = {name: self.known[name].value for name in values} | self._replaced
+        return Parameters({**self.known, **changed}, self.correlations, self.declared, filed)
 
     def joined(self, effects: Iterable[Effect]) -> Parameters:
         """The same and the parameters of `effects` that are not yet known, at their priors."""
         new = {p.name: p for effect in effects for p in effect.parameters if p.name not in self.known}
         values = {name: _prior(p) for name, p in new.items()}
-        return Parameters({**self.known, **values}, self.correlations, {**self.declared, **new})
+        return Parameters({**self.known, **values}, self.correlations, {**self.declared, **new}, self._replaced)
 
 
 def _prior(parameter: Parameter, size: float = 1.0) -> Value:

@@ -26,7 +26,7 @@ class PriorRiding:
 
     points: (share of time, speed [m/s], acceleration [m/s²]). unevenness: what hills and what lies between the
     points add to the energy modelled. factor, factor_sd: energy measured over modelled, and how that differs from
-    ride to ride. drift: relative sd of what the rest of a ride consumes per metre, expected from the ride so far.
+    ride to ride. drift: relative sd of what rides consume per metre, from ride to ride, before that is learned.
     lateral_acceleration, vibration: the root mean square while moving [m/s²]; only a model that reads it asks.
     """
 

@@ -27,7 +27,7 @@ from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.dashboard import screen
 from gz_onboard.dashboard.screen import Style
 from gz_onboard.dashboard.view import View
-from gz_onboard.events import ROLES, Activity, Estimate, Frame, Reason, State, words
+from gz_onboard.events import ROLES, Activity, Cause, Estimate, Explanation, Frame, Reason, State, words
 
 REASONS = Reason.NO_IMU | Reason.PRIOR_RIDING
 ESTIMATE = Estimate(
@@ -43,6 +43,9 @@ ESTIMATE = Estimate(
     energy_left=895 * 3600.0,
     consumption_recent=24.6 * 3.6,
     consumption_expected=26.2 * 3.6,
+    why=Explanation(
+        1.0, 56_000.0, 34_210.0, {Cause.CHARGE: -20_000.0, Cause.TEMPERATURE: -3_420.0, Cause.STOPS: 1_630.0}
+    ),
 )
 COUNTS = Counts(dropped=7, implausible=3, lost=24, unknown=2)
 PLAIN = Style(colour=False, unicode=True)
@@ -81,10 +84,11 @@ def test_it_shows_what_the_daemon_sends():
         "895 Wh",
         "26.2 Wh/km expected",
         "24.6 Wh/km over",
+        "Why               temperature -3.4 km, stops +1.6 km (rated 56.0 km)",
         "degraded",
         "no IMU: No lean",
         "prior riding",
-        "0.0 s old, 14 received, 0 lost, 0 bad",
+        "0.0 s old, 17 received, 0 lost, 0 bad",
         "Activity          riding",
         "7 dropped, 3 implausible, 24 lost, 2 unknown",
     ):
@@ -93,7 +97,7 @@ def test_it_shows_what_the_daemon_sends():
     line = screen.summary_line(seen(), 100.0)
     assert line == (
         "range 34.2 km (26.5 km to 44.3 km); SOC 62.4 % ± 1.2 %; 895 Wh left; 24.6 Wh/km recent, "
-        "26.2 Wh/km expected; degraded; riding; because: no IMU, prior riding"
+        "26.2 Wh/km expected; degraded; riding; why: temperature -3.4 km, stops +1.6 km; because: no IMU, prior riding"
     )
 
 
@@ -284,7 +288,7 @@ def test_counters():
 @given(
     st.lists(
         st.tuples(
-            st.one_of(st.integers(0x5FE, 0x605), st.integers(0, 2**32 - 1)), st.binary(max_size=12), st.floats(0, 20)
+            st.one_of(st.integers(0x5FE, 0x606), st.integers(0, 2**32 - 1)), st.binary(max_size=12), st.floats(0, 20)
         ),
         max_size=40,
     ),

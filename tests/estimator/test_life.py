@@ -418,3 +418,63 @@ def test_a_sensor_that_twitches_at_standstill_is_no_motion():
     twitching = ((t, g, (4.0,) if g == MOTOR and t % 60 < 0.1 else v) for t, g, v in scooter.live(1200))
     follow(e, twitching, scooter)
     assert e.forecaster.riding.current.duration == duration
+
+
+@pytest.mark.parametrize("start", [0.2, 0.6])
+def test_a_charge_says_when_it_will_be_full_and_how_far_that_goes(start):
+    """Against the truth of a charger that holds 10 A and then the voltage of a full cell."""
+    scooter, e = Scooter(soc=start), estimator()
+    follow(e, scooter.live(20), scooter)
+    follow(e, scooter.live(600, 10.0), scooter)
+    _, ridden = follow(e, scooter.live(60), scooter)[-1]
+    begin = scooter.soc
+    _, row = follow(e, scooter.live(300, charge=10.9), scooter)[-1]
+    assert row.activity is Activity.CHARGING
+    assert row.charge_power == pytest.approx(10.0 * row.pack_voltage, rel=0.03)
+    constant = (1 - scooter.soc) * scooter.capacity / 10.0 * 3600
+    assert constant < row.time_to_full < constant + 3600  # the voltage of a full cell holds it up at the end
+    assert begin < scooter.soc
+    scooter.soc = 1.0
+    knows(e, scooter)
+    _, after = follow(e, scooter.live(60, 8.0), scooter)[-1]
+    assert row.range_full == pytest.approx(after.range, rel=0.03)
+    assert (after.charge_power, after.time_to_full, after.range_full) == (None, None, None)
+    assert ridden.range_full is None
+
+
+def test_a_long_stop_is_parking_and_a_bus_that_falls_silent_then_is_asleep():
+    scooter, e = Scooter(), estimator()
+    follow(e, scooter.live(20), scooter)
+    follow(e, scooter.live(200, 10.0), scooter)
+    scooter.speed = 0.0
+    rows = follow(e, scooter.live(180), scooter)
+    assert rows[30][1].activity is Activity.STANDING
+    assert rows[-1][1].activity is Activity.PARKED
+    assert e.estimate(scooter.time + 30).activity is Activity.ASLEEP
+    follow(e, scooter.live(60, 10.0), scooter)
+    assert e.estimate(scooter.time + 30).activity is Activity.UNKNOWN  # the bus broke on the ride
+
+
+@pytest.mark.parametrize("role", ["key", "contactor"])
+def test_without_key_or_contactor_a_stop_is_parking_at_once(role):
+    groups = [*GROUPS, Group("Switch", (role,), 1.0)]
+    scooter, e = Scooter(), estimator(groups)
+    follow(e, scooter.live(60, 10.0), scooter)
+    scooter.speed = 0.0
+    for t, group, values in scooter.live(10):
+        e.handle((t, group, values))
+        if group == OTHERS:
+            e.handle((t + 0.001, len(GROUPS), (0.0,)))
+    assert e.estimate(scooter.time).activity is Activity.PARKED
+
+
+def test_joined_mid_ride_it_says_so_until_a_rest_shows_the_state_of_charge():
+    scooter, e = Scooter(seed=7), estimator()
+    scooter.away(700, 11.0)
+    scooter.speed = 11.0
+    rows = follow(e, scooter.live(120, 11.0), scooter)
+    assert {row.activity for _, row in rows[10:30]} == {Activity.JOINED}
+    scooter.speed = 0.0
+    follow(e, scooter.live(3600), scooter)
+    rows = follow(e, scooter.live(20, 11.0), scooter)
+    assert rows[-1][1].activity is Activity.RIDING

@@ -60,6 +60,18 @@ def test_a_voltage_that_is_off_for_long_refutes_the_state():
     assert gate.refuted
 
 
+def test_a_model_that_is_blamed_is_believed_again_only_once_it_follows():
+    """However uncertain the state of charge is made by the same error."""
+    gate, uncertain = InnovationGate(), 0.3**2
+    for _ in range(round(CONTRADICTED)):
+        gate.update(1.0, 0.3, 0.0, SLOW, LOAD)
+    gate.blame_both()
+    blamed = [gate.update(1.0, 0.3, uncertain, SLOW, LOAD) for _ in range(1800)]
+    assert blamed[-1] == pytest.approx(0.3**2, rel=0.1)
+    followed = [gate.update(1.0, 0.01, uncertain, SLOW, LOAD) for _ in range(7200)]
+    assert followed[-1] == pytest.approx(LOAD)
+
+
 @pytest.mark.parametrize("latency", [0.2, -0.2])
 def test_voltage_and_current_are_of_one_time(latency):
     late, early = (lambda t: 50.0 + t), (lambda t: 10.0 * t)

@@ -22,7 +22,8 @@ from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.logs import read_attachments, read_frames, read_metadata, read_samples
 from gz_onboard.events import EFF_FLAG, Estimate
 from gz_onboard.lab import estimate
-from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, RideSummary, Tally, feed
+from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, RideSummary, feed
+from gz_onboard.lab.estimate_tally import Tally
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
 from tests.support import HEARS_CTRL_C
@@ -97,6 +98,17 @@ def test_the_summary_of_a_ride_agrees_with_its_frames(tmp_path, capsys):
     assert ride["soc_end"] == pytest.approx(logged[-1]["soc"], abs=0.002)
     assert ride["distance_km"] == pytest.approx(logged[-1]["distance"] / 1000, abs=0.02)
     assert ride["range_end_p10_km"] < ride["range_end_km"] < ride["range_end_p90_km"]
+    why = ride["why"]
+    assert sum(why["causes_km"].values()) == pytest.approx(why["range_km"] - why["reference_km"], abs=1e-6)
+    assert ride["duration_s"] - 200 < why["time_s"] <= ride["duration_s"]
+    told = [(topic, v) for topic, _, v in read_samples(Path(ride["log"])) if topic in ("/why", "/range_change")]
+    assert [v["range"] / 1000 for topic, v in told if topic == "/range_change"] == pytest.approx(
+        [change["range_km"] for change in ride["changes"]], abs=1e-4
+    )
+    assert told[-1][1]["range"] / 1000 == pytest.approx(why["range_km"], abs=1e-4)
+    for _, v in told:
+        causes = sum(size for name, size in v.items() if name not in ("time", "reference", "range"))
+        assert causes == pytest.approx(v["range"] - v["reference"], abs=0.1)
     assert 0 < ride["innovation_rms_v"] < ride["innovation_max_v"] < 0.2
 
 
@@ -127,7 +139,7 @@ def test_what_goes_into_the_log(tmp_path, frames):
     candump(tmp_path / "a.log", frames[:6000])
     assert run(tmp_path / "a.log", "--output", tmp_path, "--no-plot", "--payload", 75) == 0
     log = tmp_path / "a.estimate.mcap"
-    assert {topic for topic, _, _ in read_samples(log)} == {"/estimate", "/status"}
+    assert {topic for topic, _, _ in read_samples(log)} == {"/estimate", "/status", "/why"}
     assert not list(chain.from_iterable(read_frames(log)))
     metadata = read_metadata(log)
     assert (metadata["source"], metadata["filter"], metadata["payload_kg"]) == ("a.log", "scalar", "75")
@@ -136,7 +148,7 @@ def test_what_goes_into_the_log(tmp_path, frames):
     assert run(tmp_path / "a.log", "--output", tmp_path, "--no-plot", "--frames", "--signals") == 0
     topics = {topic for topic, _, _ in read_samples(log)}
     assert {"/can/BMS_Pack", "/can/INV_Motion"} <= topics
-    written = [(t, i, d) for t, i, d, _ in chain.from_iterable(read_frames(log)) if not 0x600 <= i <= 0x604]
+    written = [(t, i, d) for t, i, d, _ in chain.from_iterable(read_frames(log)) if not 0x600 <= i <= 0x607]
     read = [(t, i, d) for t, i, d, _ in chain.from_iterable(read_frames(tmp_path / "a.log"))]
     assert sorted(written) == sorted(read)
 
@@ -235,7 +247,7 @@ def test_what_cannot_be_done_is_told(tmp_path, monkeypatch, capsys, frames, argu
 
 def test_a_slow_bus_is_estimated_ten_times_a_second(vehicle, frames):
     slow = frames[::12]  # 45 frames/s: a reader's batch takes 20 s
-    tally = Tally()
+    tally = Tally(0)
     pipeline = Pipeline(vehicle, observer=tally)
     feed(pipeline, [slow[:1000], slow[1000:]])
     assert sum(tally.ticks.values()) == pytest.approx((slow[-1][0] - slow[0][0]) / 1e8, abs=2)

@@ -14,8 +14,9 @@ from gz_onboard import cli
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import LogDamage
 from gz_onboard.errors import InputError
-from gz_onboard.events import words
+from gz_onboard.events import Cause, Explanation, words
 from gz_onboard.lab import plot
+from gz_onboard.lab.why import draw_why
 
 LOGS = Path(__file__).resolve().parents[2] / "replay_logs"
 
@@ -41,6 +42,23 @@ def test_the_overview(log, tmp_path, over):
     assert image.shape[0] > 900
     assert image.shape[1] > 1000
     assert 0.02 < (image[..., :3].min(axis=2) < 0.9).mean() < 0.6  # neither empty nor black
+
+
+def test_why_the_range_is_what_it_is(log, tmp_path, capsys):
+    assert cli.main(["plot", str(log), "--why"]) == 0
+    file = log.with_suffix(".why.png")
+    assert capsys.readouterr().out == f"{file}\n"
+    assert 0.02 < (pixels(file)[..., :3].min(axis=2) < 0.9).mean() < 0.6
+    causes = {Cause.CHARGE: -20e3, Cause.SPEED: 1200.0, Cause.TEMPERATURE: -3000.0, Cause.WIND: 0.0}
+    axis = draw_why(Explanation(60.0, 50e3, 28.2e3, causes), "ride").axes[0]
+    assert [t.get_text() for t in axis.get_yticklabels()] == ["rated range", "charge", "temperature", "speed", "range"]
+    bars: list[Any] = list(axis.patches)
+    ends = [(bar.get_x(), bar.get_x() + bar.get_width()) for bar in bars]
+    assert ends == [pytest.approx(pair) for pair in ((0, 50), (50, 30), (30, 27), (27, 28.2), (0, 28.2))]
+    with (tmp_path / "empty.mcap").open("wb") as stream:
+        LogFile(stream, 0).close()
+    assert cli.main(["plot", str(tmp_path / "empty.mcap"), "--why"]) == 2
+    assert "says nothing of why" in capsys.readouterr().err
 
 
 def test_the_panels_show_what_the_log_says(log):

@@ -18,7 +18,8 @@ from pathlib import Path
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import Estimate, Frame
 from gz_onboard.lab.estimate_ride import feed
-from gz_onboard.pipeline import Pipeline, estimate_row
+from gz_onboard.log_rows import estimate_row
+from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
 
 LOGS = Path(__file__).resolve().parents[2] / "replay_logs"
@@ -57,9 +58,24 @@ TOLERANCE = {
     "consumption_expected_sd": 1e-3,
     "consumption_factor": 1e-5,
     "consumption_factor_sd": 1e-5,
+    "why": 0.0,
+    "charge_power": 1.0,
+    "time_to_full": 10.0,
+    "range_full": 1.0,
+    "route_along": 0.01,
+    "route_left": 0.01,
+    "route_energy": 20.0,
+    "route_energy_sd": 20.0,
+    "arrival_soc": 1e-6,
+    "arrival_soc_p10": 1e-6,
+    "arrival_soc_p90": 1e-6,
+    "battery_ends_after": 0.5,
+    "battery_ends_latitude": 1e-6,
+    "battery_ends_longitude": 1e-6,
     "state": 0.0,
     "reasons": 0.0,
     "activity": 0.0,
+    "route_state": 0.0,
     "distrusted": 0.0,
 }
 

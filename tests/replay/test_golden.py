@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import Estimate
-from gz_onboard.pipeline import estimate_row
+from gz_onboard.log_rows import estimate_row
 from tests.replay import golden, regenerate
 
 LOGS = golden.logs()

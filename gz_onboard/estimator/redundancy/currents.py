@@ -122,7 +122,7 @@ class CurrentCheck:
         first = None if used is None else evidence.error(voltage, used, "inverter" if instead else "pack")
         if used is None or first is None:
             return False
-        gross, explained = abs(first) > GROSS_ERROR, self.sag.explained
+        gross, explained = abs(first) > GROSS_ERROR, self.sag.explained or readings.charging  # no road charges a pack
         suspicious = gross or pack or inverter or evidence.innovation_rms > ERROR_LEAST  # seldom
         if not suspicious or (explained and not gross):
             self._from_road.forget()

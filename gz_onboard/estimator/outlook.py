@@ -1,0 +1,86 @@
+"""What lies ahead: the range, on a route where one is given, and while the pack is charged, when it is full."""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+from typing import NamedTuple
+
+from gz_onboard.estimator.charging import Charging
+from gz_onboard.estimator.forecast import Forecast, Forecaster
+from gz_onboard.estimator.load_model import Conditions
+from gz_onboard.estimator.route_ahead import RoadAhead
+from gz_onboard.estimator.sources import PackReading
+from gz_onboard.events import Activity, Estimate, Reason
+from gz_onboard.physics.battery import Battery
+
+PERIOD = 1.0  # s
+EARLY = 0.05  # s: by so much a forecast may be made early, rather than a step late
+LONGEST = 60.0  # s: more is not taken in of a pause
+
+
+class Now(NamedTuple):
+    """What a forecast is made from."""
+
+    time: float  # s
+    soc: float
+    soc_sd: float
+    temperature: float  # degC, of the cells
+    temperature_sd: float
+    conditions: Conditions
+    loss_variance: float  # see `Forecaster.forecast`
+    reading: PackReading
+    activity: Activity
+
+
+class Outlook:
+    """Makes a forecast each second, and keeps it."""
+
+    def __init__(self, forecaster: Forecaster, battery: Battery, road: RoadAhead) -> None:
+        self.forecast: Forecast | None = None
+        self._forecaster, self._battery, self._road = forecaster, battery, road
+        self._charging = Charging()
+        self._full: Forecast | None = None  # while it is charged
+        self._time = -inf
+
+    def due(self, now: float) -> bool:
+        """Whether the next forecast is to be made at `now` [s]."""
+        return now - self._time >= PERIOD - EARLY
+
+    @property
+    def consumption(self) -> float | None:
+        """That is to be expected [J/m]."""
+        return self.forecast.consumption if self.forecast else None
+
+    def step(self, now: Now) -> None:
+        """Make the forecast of `now`."""
+        elapsed, self._time = min(now.time - self._time, LONGEST), now.time
+        known = now.temperature, now.temperature_sd, now.conditions.ambient, now.conditions.altitude
+        free = self._forecaster.forecast(now.soc, now.soc_sd, *known, now.loss_variance)
+        pack = now.soc, now.loss_variance
+        self.forecast = self._forecaster.shown(self._road.forecast(now.time, free, pack, now.conditions))
+        voltage, current = now.reading.voltage, now.reading.current
+        if now.activity is Activity.CHARGING and voltage and current is not None:
+            self._charging.step(elapsed, self._battery, (voltage, current), now.soc, now.temperature)
+            self._full = self._forecaster.forecast(self._battery.window.high, 0.0, *known)
+        else:
+            self._charging.end()
+            self._full = None
+
+    def report(self, estimate: Estimate) -> None:
+        """Write into `estimate` what was forecast."""
+        self._road.report(estimate)
+        forecast = self.forecast
+        if forecast is None:
+            return
+        estimate.range, estimate.range_p10, estimate.range_p90 = forecast.range, forecast.p10, forecast.p90
+        estimate.energy_left, estimate.energy_left_sd = forecast.energy, forecast.energy_sd
+        estimate.consumption_expected = forecast.consumption
+        estimate.consumption_expected_sd = forecast.consumption_sd
+        estimate.consumption_recent = forecast.recent
+        riding = self._forecaster.riding
+        estimate.consumption_factor, estimate.consumption_factor_sd = riding.factor, sqrt(riding.factor_variance)
+        if forecast.mostly_prior:
+            estimate.reasons |= Reason.PRIOR_RIDING
+        if estimate.activity is Activity.CHARGING:  # not of a bus that fell silent
+            estimate.charge_power, estimate.time_to_full = self._charging.power, self._charging.to_full
+            estimate.range_full = self._full.range * self._forecaster.calm.ratio if self._full else None

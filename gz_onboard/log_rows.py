@@ -1,0 +1,119 @@
+"""What stands in logs: topics, their schemas, and estimates and explanations as rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import isfinite
+from typing import TYPE_CHECKING, Any, Protocol
+
+from gz_onboard.bus.logfile import object_schema
+from gz_onboard.events import Cause, Estimate, Explanation, Frame, Reason
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message
+
+ESTIMATE_TOPIC = "/estimate"
+STATUS_TOPIC = "/status"
+WHY_TOPIC, CHANGE_TOPIC = "/why", "/range_change"
+COUNTS = ("received", "error_frames", "kernel_lost", "overrun", "send_failures", "log_lost", "unknown_others")
+ESTIMATE_UNITS = {
+    "time": "s since the first frame",
+    "soc": "1",
+    "soc_sd": "1",
+    "v1": "V of a cell",
+    "innovation": "V of a cell",
+    "innovation_rms": "V of a cell",
+    "pack_voltage": "V",
+    "pack_current": "A, positive discharging",
+    "cell_temperature": "degC",
+    "speed": "m/s",
+    "acceleration": "m/s^2",
+    "grade": "sine, positive uphill",
+    "lean": "rad, positive right",
+    "yaw_rate": "rad/s, positive left",
+    "heading": "rad, clockwise from north",
+    "distance": "m",
+    "range": "m",
+    "range_p10": "m",
+    "range_p90": "m",
+    "energy_left": "J",
+    "energy_left_sd": "J",
+    "consumption_recent": "J/m",
+    "consumption_expected": "J/m",
+    "consumption_expected_sd": "J/m",
+    "charge_power": "W into the pack, while it is charged",
+    "time_to_full": "s, likewise",
+    "range_full": "m, likewise: when it is full",
+    "consumption_factor": "1, measured over modelled",
+    "consumption_factor_sd": "1",
+    "route_along": "m",
+    "route_left": "m",
+    "route_energy": "J",
+    "route_energy_sd": "J",
+    "arrival_soc": "1",
+    "arrival_soc_p10": "1",
+    "arrival_soc_p90": "1",
+    "battery_ends_after": "m",
+    "battery_ends_latitude": "deg",
+    "battery_ends_longitude": "deg",
+}
+
+TEXTS = ("state", "reasons", "activity", "route_state", "distrusted")
+
+
+class Log(Protocol):
+    """What the pipeline writes to; `gz_onboard.bus.logfile` and `recorder` have them."""
+
+    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
+        """Declare a topic of JSON objects."""
+
+    def frames(self, batch: Sequence[Frame]) -> None:
+        """Log raw frames."""
+
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
+        """Log one JSON object."""
+
+
+def reason_names(found: Reason) -> list[str]:
+    """The names of the reasons in a set."""
+    return [str(reason.name) for reason in Reason if reason & found]
+
+
+def estimate_row(estimate: Estimate) -> dict[str, object]:
+    """An estimate as it stands in logs: SI units, state and reasons by name, None for what is not known."""
+    row: dict[str, object] = {}
+    for name in ESTIMATE_UNITS:
+        value = getattr(estimate, name)
+        # Seven digits are more than any sensor gives, and compress to half the size of seventeen.
+        row[name] = float(f"{value:.7g}") if value is not None and isfinite(value) else None
+    row["state"] = estimate.state.name
+    row["reasons"] = " ".join(reason_names(estimate.reasons))
+    row["activity"] = estimate.activity.name
+    row["route_state"] = estimate.route_state.name
+    row["distrusted"] = " ".join(estimate.distrusted)
+    return row
+
+
+def explanation_row(why: Explanation) -> dict[str, object]:
+    """An explanation as it stands in logs: causes by name."""
+    causes = {cause.name.lower(): size for cause, size in why.causes.items()}
+    numbers = {"time": why.time, "reference": why.reference, "range": why.range} | causes
+    return {name: round(value, 2) for name, value in numbers.items()}
+
+
+def declare(log: Log, messages: Sequence[Message]) -> None:
+    """Declare the topics of a log; messages: those whose decoded signals are logged, too."""
+    estimate = object_schema("gz_onboard.Estimate", ESTIMATE_UNITS)
+    estimate["properties"] |= {name: {"type": "string"} for name in TEXTS}
+    log.channel(ESTIMATE_TOPIC, estimate)
+    units = dict.fromkeys(("reference", "range", *(cause.name.lower() for cause in Cause if cause)), "m")
+    for topic, title in ((WHY_TOPIC, "gz_onboard.Why"), (CHANGE_TOPIC, "gz_onboard.RangeChange")):
+        log.channel(topic, object_schema(title, {"time": ESTIMATE_UNITS["time"]} | units))
+    counts = {name: {"type": "integer"} for name in COUNTS}
+    maps = {name: {"type": "object"} for name in ("foreign", "faults", "lost", "unknown")}
+    reasons = {"reasons": {"type": "array", "items": {"type": "string"}}}
+    log.channel(STATUS_TOPIC, {"title": "gz_onboard.Status", "type": "object", "properties": counts | maps | reasons})
+    for message in messages:
+        log.channel(
+            f"/can/{message.name}", object_schema(message.name, {s.name: s.unit or "" for s in message.signals})
+        )

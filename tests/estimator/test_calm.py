@@ -1,0 +1,175 @@
+"""The range that is shown: calm, and near the forecast."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gz_onboard.estimator.calm import CALM, Calm, restored_ratio
+from gz_onboard.estimator.usual import Habit, Usual, restored_usual
+from gz_onboard.physics.riding import PriorRiding
+
+KNOWN = 1e6  # m: much was ridden
+
+
+def shown(raw, ridden, known=KNOWN, calm=None):
+    """What is shown of the forecasts `raw` [m], `ridden` [m] before each."""
+    calm = calm or Calm()
+    found = []
+    for forecast, way in zip(raw, ridden, strict=True):
+        calm.ride(way)
+        found.append(calm.follow(forecast, 90.0 * forecast, known))
+    return np.array(found)
+
+
+def test_a_forecast_that_holds_is_shown_as_it_is():
+    ridden = np.full(3000, 10.0)
+    raw = 50_000 - np.cumsum(ridden)
+    assert shown(raw, ridden) == pytest.approx(raw, abs=1e-6)
+
+
+def test_noise_of_the_forecast_hardly_shows():
+    """Errors of 3 % that stay alike over a kilometre: of them less than a third of a km remains per km."""
+    rng = np.random.default_rng(0)
+    ridden = np.full(3000, 10.0)
+    error = np.interp(np.arange(3000), np.arange(0, 3001, 100), rng.normal(0, 0.03, 31))
+    left = 50_000 - np.cumsum(ridden)
+    total = (shown(left * (1 + error), ridden) + np.cumsum(ridden))[::100]
+    assert np.percentile(np.abs(np.diff(total)), 90) < 300
+
+
+def test_a_real_change_is_followed_within_three_lengths():
+    ridden = np.full(4000, 10.0)
+    at = np.cumsum(ridden)
+    raw = np.where(at < 5000, 60_000 - at, 58_000 - at)  # 2 km are lost at 5 km
+    error = (shown(raw, ridden) - raw)[1:]
+    assert error[at[1:] >= 5000 + CALM][0] < 2000 * 0.37
+    assert np.all(error[at[1:] > 5000 + 3 * CALM] < 100)
+
+
+def test_a_step_that_no_riding_makes_is_shown_at_once():
+    ridden = np.full(100, 10.0)
+    raw = np.where(np.arange(100) < 50, 40_000.0, 30_000.0) - np.cumsum(ridden)
+    assert shown(raw, ridden)[50] == pytest.approx(raw[50], rel=1e-3)
+
+
+def test_what_is_drawn_or_charged_at_standstill_shows_at_once():
+    calm = Calm(0.95)
+    assert shown([40_000.0, 38_000.0, 60_000.0], np.zeros(3), calm=calm) == pytest.approx([38_000, 36_100, 57_000])
+
+
+def test_a_restart_keeps_what_was_shown():
+    calm = Calm()
+    ridden = np.full(500, 10.0)
+    before = shown(42_000 + 800 * np.sin(np.arange(500) / 50) - np.cumsum(ridden), ridden, calm=calm)[-1]
+    raw = 42_000 + 800 * np.sin(499 / 50) - 5000
+    assert Calm(calm.ratio).follow(raw, 90.0 * raw, KNOWN) == pytest.approx(before)
+
+
+def test_it_is_right_when_empty():
+    ridden = np.full(2000, 10.0)
+    left = 20_000 - np.cumsum(ridden)
+    found = shown(left, ridden, calm=Calm(1.2))
+    assert np.all(np.abs(found - left)[left < 1000] < 50)
+    assert found[-1] < 1
+
+
+def test_nothing_known_is_followed_at_once():
+    ridden = np.full(200, 10.0)
+    raw = np.where(np.arange(200) < 50, 50_000.0, 48_000.0) - np.cumsum(ridden)
+    assert shown(raw, ridden, known=0.0)[150] == pytest.approx(raw[150], rel=0.002)
+
+
+@pytest.mark.parametrize("saved", [{"shown": 0.0}, {"shown": float("nan")}, {"shown": "x"}, {"shown": None}])
+def test_an_implausible_ratio_is_refused(saved):
+    with pytest.raises((TypeError, ValueError)):
+        restored_ratio(saved)
+
+
+def test_a_habit_knows_how_well_it_knows():
+    """Rides drawn from its own model: the errors of what it expects have the variance that it states."""
+    rng = np.random.default_rng(1)
+    normalised = []
+    for _ in range(150):
+        usual = rng.normal(1.0, 0.15)
+        habit = Habit(1.0, 0.15**2, 0.06**2, 0.2**2)
+        for _ in range(6):
+            level = usual + rng.normal(0, 0.06)
+            for _ in range(20):
+                habit = habit.learned(level + rng.normal(0, 0.2) - habit.now, 250.0)
+            habit = habit.rested()
+        normalised.append((habit.usual - usual) / np.sqrt(habit.usual_variance))
+    assert 0.8 < np.std(normalised) < 1.25
+    assert abs(np.mean(normalised)) < 0.25
+
+
+def test_a_habit_learns_its_scatter_and_how_unlike_rides_are():
+    rng = np.random.default_rng(2)
+    habit = Habit(1.0, 0.15**2, 0.05**2, 0.2**2)
+    for _ in range(60):
+        level = 0.9 + rng.normal(0, 0.12)
+        for _ in range(24):
+            habit = habit.learned(level + rng.normal(0, 0.1) - habit.now, 250.0)
+        habit = habit.rested()
+    assert habit.usual == pytest.approx(0.9, abs=0.06)
+    assert np.sqrt(habit.scatter) == pytest.approx(0.1, rel=0.2)
+    assert np.sqrt(habit.between) == pytest.approx(0.12, rel=0.35)
+
+
+def test_far_ahead_the_usual_counts_and_near_the_present():
+    habit = Habit(1.0, 0.001, 0.01, 0.01, present=0.2, present_variance=0.001)
+    near, far = habit.ahead(1000.0), habit.ahead(1e7)
+    assert near[0] == pytest.approx(1.2, abs=0.01)
+    assert far[0] == pytest.approx(1.0, abs=0.01)
+    assert far[1] == pytest.approx(0.001, rel=0.5)
+
+
+@pytest.mark.parametrize(("before", "most"), [(5, 12.0), (20, 12.0), (40, 12.0)])
+def test_a_fifth_more_consumption_is_followed_within_the_stated_distance(before, most):
+    """A headwind that stays: 63 % of it is in the range shown after at most so many km, in the mean over rides."""
+    rng = np.random.default_rng(3)
+    found = []
+    for _ in range(20):
+        habit, calm = Habit(1.0, 0.17**2, 0.055**2, 0.2**2), Calm()
+        for k in range(4 * 70):
+            habit = habit.learned((1.0 if k < 4 * before else 1.2) + rng.normal(0, 0.17) - habit.now, 250.0)
+            left = 100_000 - 250.0 * k  # as though it lasted for long
+            calm.ride(250.0 if k else 0.0)
+            found.append(calm.follow(left / habit.ahead(left)[0], 90.0 * left, habit.known_from) / left)
+    price = 1 / np.mean(np.reshape(found, (20, -1)), axis=0)
+    late = price[4 * before :]
+    reached = np.argmax(late > 1 + 0.63 * 0.2) / 4
+    assert 0 < reached < most
+
+
+def test_scatter_raises_no_alarm():
+    """Of 100 rides of 50 km that do not change few are taken to have changed."""
+    rng = np.random.default_rng(4)
+    alarms = 0
+    for _ in range(100):
+        habit = Habit(1.0, 0.05**2, 0.055**2, 0.17**2)
+        for _ in range(200):
+            before = habit.variance
+            habit = habit.learned(1.0 + rng.normal(0, 0.17) - habit.now, 250.0)
+            alarms += habit.variance > 1.5 * before
+    assert alarms < 8
+
+
+ANY = st.floats(-1e9, 1e9)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(ANY, st.floats(1.0, 1e5), st.floats(0.0, 1e12)), min_size=1, max_size=60), st.integers(1, 40))
+def test_whatever_was_learned_can_be_restored(segments, repeats):
+    habit = Habit(1.0, 0.15**2, 0.055**2, 0.2**2)
+    for i, (residual, distance, noise) in enumerate(segments * repeats):
+        habit = habit.learned(residual, distance, noise)
+        if i % 7 == 6:
+            habit = habit.rested()
+    prior = Usual.of(PriorRiding(), 0.02)
+    usual = Usual(habit, prior.standing, prior.pace, habit)
+    assert restored_usual(usual.snapshot()) == usual
+    assert habit.ahead(10_000.0)[1] >= 0
+    assert habit.variance >= 0
