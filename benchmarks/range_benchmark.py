@@ -1,11 +1,16 @@
-"""How good the range is on full discharges that nothing was set on, beside the usual estimators.
+"""How good the range is on full discharges and weeks that nothing was set on, beside the usual estimators.
 
 Scooters of the tests' plant, whose physics, integrator and sensors are not the package's, are ridden by seed until they
-give up: riders of 48 to 118 kg whom nobody enters, towns and arterial roads, -5 to 35 degC, hills. Their CAN frames go
-as logs through the pipeline of the daemon, which knows the reference scooter's file and starts without a saved state.
-Every other ride is of an aged pack: 20 % less capacity, 50 % more resistance.
+give up: near empty the controller takes the current away, and a ride ends with a second below 2.8 V a cell or when it
+has only been creeping for ten. Riders of 48 to 118 kg whom nobody enters, towns and arterial roads, -5 to 35 degC,
+hills. Their CAN frames go as logs through the pipeline of the daemon, which knows the reference scooter's file and
+starts without a saved state: once without the road ahead, once with it (altitude as a map has it, bends and limits, no
+stops). Every other pack is aged: 20 % less capacity, 50 % more resistance; it is discharged a second time, by another
+rider on another road, with what was learned of it kept.
 
-Seeds 0 to 999 are for development; 1000 and up for the table.
+A week has fifteen rides of 4 to 9 km, three a day, with rests and charges between; the state is kept.
+
+Seeds 0 to 999 are for development; 1000 and up for the tables.
 """
 
 from __future__ import annotations
@@ -13,60 +18,82 @@ from __future__ import annotations
 import argparse
 import json
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.range_rides import Drawn, Truth, draw, ride_until_empty
-from benchmarks.range_yardstick import NAMES, Usual, crps, jumps
+from benchmarks.range_rides import Drawn, Truth, again, draw, ride_until_empty, road_of, route_of
+from benchmarks.range_week import NIGHT, RIDES, Ride, ride_weeks
+from benchmarks.range_yardstick import NAMES, OURS, Usual, crps, jumps
 from benchmarks.trial import commit
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import Estimate
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.progress import progress_bar
+from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import read_vehicle
 
 PAGE = Path(__file__).parents[1] / "docs" / "range-benchmark.md"
 FIRST = 1000
 TOGETHER = 4  # rides that are ridden at once, for memory
 LEVELS = tuple(x / 10 for x in range(9, 0, -1))  # SOC, at which estimates are judged
+JUDGED_FROM = 0.2  # SOC: below, an error is of little use in per cent
 RATED = 33.6 * 51.8 * 3600  # J of the pack's data sheet
 RATED_RANGE = RATED / (26.0 * 3.6)  # m: at the consumption of its commissioning rides without hills
 SOME_WAY = 0.05  # of the ride, before which jumps do not count
+LEARNED_FROM = 2  # day of a week, from 0, from which something must have been learned
+KEY = "range benchmark"  # of the vehicle, in its saved states
+ADVANCED = 20.0  # m between two looks at the interval
+State = dict[str, Any] | None
+
+
+class Interval(NamedTuple):
+    """P10 and P90 [m]."""
+
+    low: float
+    high: float
 
 
 @dataclass(frozen=True)
 class Row:
     """One ride at one state of charge; distances in m."""
 
-    seed: int
-    aged: bool
-    ambient: float
     level: float
     true: float
     ranges: dict[str, float]
-    p10: float
-    p90: float
+    intervals: dict[str, Interval]
     soc_error: float
     soc_sd: float
 
 
 @dataclass(frozen=True)
 class Judged:
-    """What one ride gave."""
+    """What one ride gave; held, jumps: by estimator, see `Followed`."""
 
     drawn: Drawn
+    second: bool  # of the same pack
     length: float  # m
+    rows: list[Row]
+    held: dict[str, float]
+    jumps: dict[str, list[float]]
+
+
+@dataclass(frozen=True)
+class Followed:
+    """One log through the pipeline once."""
+
     rows: list[Row]
     held: float  # share of the way on which P10 to P90 holds the truth
     jumps: list[float]  # m, of each km
+    state: State  # at its end
 
 
-def judge(drawn: Drawn, log: Path, truth: Truth) -> Judged:
-    """The log through the pipeline, against its truth."""
+def follow(name: str, log: Path, truth: Truth, state: State = None, route: Path | None = None) -> Followed:
+    """The log through the pipeline against its truth, with a state that was kept and a route; ours is called `name`."""
     usual, waiting = Usual(RATED, RATED_RANGE), list(LEVELS)
     rows: list[Row] = []
     way: list[tuple[float, float, float, float]] = []  # distance, range, P10, P90
@@ -79,115 +106,235 @@ def judge(drawn: Drawn, log: Path, truth: Truth) -> Judged:
         usual.ride(e.pack_voltage * e.pack_current, e.speed or 0.0, e.time - before if before else 0.0)
         before = e.time
         distance, soc = (float(np.interp(e.time, truth.time, x)) for x in (truth.distance, truth.soc))
-        low, high = e.range_p10 or 0.0, e.range_p90 or 0.0
-        if not way or distance - way[-1][0] > 20:
-            way.append((distance, e.range, low, high))
+        held = Interval(e.range_p10 or 0.0, e.range_p90 or 0.0)
+        if not way or distance - way[-1][0] > ADVANCED:
+            way.append((distance, e.range, *held))
         if waiting and soc <= waiting[0]:
             shown = pipeline.estimator.signals["bms_state_of_charge"].value
-            ranges = {"ours": e.range, **usual.ranges(shown)}
-            left, (error, sd) = truth.distance[-1] - distance, ((e.soc or 0.0) - soc, e.soc_sd or 0.0)
-            fields = (drawn.seed, drawn.aged, drawn.ambient, waiting.pop(0), left, ranges, low, high, error, sd)
-            rows.append(Row(*fields))
+            left, error = truth.distance[-1] - distance, (e.soc or 0.0) - soc
+            ranges = {name: e.range, **usual.ranges(shown)}
+            rows.append(Row(waiting.pop(0), left, ranges, {name: held}, error, e.soc_sd or 0.0))
 
     pipeline = Pipeline(read_vehicle("reference"), observer=observe)
+    if state:
+        pipeline.estimator.restore(state, KEY, NIGHT)
+    if route:
+        ahead = pipeline.estimator.ahead
+        ahead.follow(ahead.ready(read_route(route)))
     for frames in read_frames(log):
         pipeline.advance(frames, frames[-1][0])
     at = np.array(way)
     left = truth.distance[-1] - at[:, 0]
-    held = float(np.mean((at[:, 2] <= left) & (left <= at[:, 3])))
     later = at[:, 0] > SOME_WAY * truth.distance[-1]
-    return Judged(drawn, float(truth.distance[-1]), rows, held, list(jumps(at[later, 0], at[later, 1])))
+    held = float(np.mean((at[:, 2] <= left) & (left <= at[:, 3])))
+    return Followed(rows, held, list(jumps(at[later, 0], at[later, 1])), pipeline.estimator.snapshot(KEY))
 
 
-def _judged(given: tuple[Drawn, Path, Truth]) -> Judged:
-    return judge(*given)
+def judge(drawn: Drawn, log: Path, truth: Truth, state: State, *, second: bool) -> tuple[Judged, State]:
+    """One discharge, without a route and with it, each from the `state` kept; and the state kept at its end."""
+    route = log.with_suffix(".route.csv")
+    route.write_text(route_of(road_of(drawn), positions=False), encoding="utf-8")
+    free, ahead = follow("ours", log, truth, state), follow("route", log, truth, state, route)
+    rows = [
+        Row(a.level, a.true, a.ranges | b.ranges, a.intervals | b.intervals, a.soc_error, a.soc_sd)
+        for a, b in zip(free.rows, ahead.rows, strict=True)
+    ]
+    held, moved = ({"ours": getattr(free, x), "route": getattr(ahead, x)} for x in ("held", "jumps"))
+    return Judged(drawn, second, float(truth.distance[-1]), rows, held, moved), free.state
+
+
+def _judged(given: tuple[Drawn, Path, Truth, State, bool]) -> tuple[Judged, State]:
+    return judge(*given[:4], second=given[4])
 
 
 def run(drawn: Sequence[Drawn], jobs: int, *, quiet: bool = False) -> list[Judged]:
-    """All rides, a few at a time."""
+    """All discharges, a few at a time; those of aged packs twice."""
     found: list[Judged] = []
+    number = len(drawn) + sum(x.aged for x in drawn)
     with (
-        progress_bar(lambda: float(len(drawn)), "ride", quiet=quiet) as bar,
+        progress_bar(lambda: float(number), "discharge", quiet=quiet) as bar,
         tempfile.TemporaryDirectory() as folder,
         ProcessPoolExecutor(jobs) as pool,
     ):
         for k in range(0, len(drawn), TOGETHER):
-            part = drawn[k : k + TOGETHER]
-            ridden = ride_until_empty(part, Path(folder))
-            given = [(x, log, truth) for x, (log, truth) in zip(part, ridden, strict=True)]
-            for judged in pool.map(_judged, given):
-                found.append(judged)
-                bar.update(1.0)
-            for log, _ in ridden:
-                log.unlink()
+            part = list(drawn[k : k + TOGETHER])
+            states: list[State] = [None] * len(part)
+            for second in (False, True):
+                ridden = ride_until_empty(part, Path(folder)) if part else []
+                given = [(x, *way, state, second) for x, way, state in zip(part, ridden, states, strict=True)]
+                kept = []
+                for judged, state in pool.map(_judged, given):
+                    found.append(judged)
+                    bar.update(1.0)
+                    kept += [(again(judged.drawn), state)] if judged.drawn.aged else []
+                for log, _ in ridden:
+                    log.unlink()
+                part, states = [x for x, _ in kept], [x for _, x in kept]
     return found
 
 
+# --- weeks -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Day:
+    """One ride of a week."""
+
+    week: int
+    number: int
+    day: int
+    length: float  # m
+    expected: float  # J/m at its start
+    ridden: float  # J/m
+    soc_error: float  # at its end
+
+
+def follow_ride(ride: Ride, state: State) -> tuple[Day, State]:
+    """A ride of a week, from the state that the one before left."""
+    expected: list[float] = []
+    last: list[float] = []
+
+    def observe(e: Estimate) -> None:
+        if e.consumption_expected is not None:
+            expected.append(e.consumption_expected)
+        if e.soc is not None:
+            last[:] = [e.soc - float(np.interp(e.time, ride.truth.time, ride.truth.soc))]
+
+    pipeline = Pipeline(read_vehicle("reference"), observer=observe)
+    if state:
+        pipeline.estimator.restore(state, KEY, ride.away)
+    for frames in read_frames(ride.log):
+        pipeline.advance(frames, frames[-1][0])
+    length = float(ride.truth.distance[-1])
+    day = Day(ride.week, ride.number, ride.day, length, expected[0], ride.energy, last[0])
+    return day, pipeline.estimator.snapshot(KEY)
+
+
+def run_weeks(seeds: Sequence[int], jobs: int, *, quiet: bool = False) -> list[Day]:
+    """All weeks side by side."""
+    days: list[Day] = []
+    states: dict[int, State] = dict.fromkeys(seeds)
+    with (
+        progress_bar(lambda: float(RIDES * len(seeds)), "ride", quiet=quiet) as bar,
+        tempfile.TemporaryDirectory() as folder,
+        ProcessPoolExecutor(jobs) as pool,
+    ):
+        for rides in ride_weeks(seeds, Path(folder)) if seeds else ():
+            for day, state in pool.map(follow_ride, rides, [states[ride.week] for ride in rides]):
+                days.append(day)
+                states[day.week] = state
+                bar.update(1.0)
+            for ride in rides:
+                ride.log.unlink()
+    return days
+
+
+# --- tables ----------------------------------------------------------------------------------------------------------
+
+
 def table(judged: Sequence[Judged]) -> list[str]:
-    """Errors of the remaining distance above 20 % of charge."""
-    rows = [row for x in judged for row in x.rows if row.level >= 0.2]
+    """Errors of the remaining distance above 20 % of charge, each ride at each tenth of it."""
+    rows = [row for x in judged for row in x.rows if row.level >= JUDGED_FROM]
     lines = [
-        "| estimator | median error, % | 90th percentile, % | bias, % | in P10 to P90, % | width, % | CRPS, km |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        "| estimator | median error, % | 90th percentile, % | bias, % | P10 to P90 holds the truth, % of the way | "
+        "width, % | CRPS, km | jumps per km: 90th percentile, largest, km |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for name, words in NAMES.items():
         error = np.array([100 * (row.ranges[name] / row.true - 1) for row in rows])
-        cells = [np.median(np.abs(error)), np.percentile(np.abs(error), 90), np.mean(error)]
-        line = [words, *(f"{x:.1f}" for x in cells)]
-        if name == "ours":
-            held = 100 * np.mean([row.p10 <= row.true <= row.p90 for row in rows])
-            width = 100 * np.mean([(row.p90 - row.p10) / row.true for row in rows])
-            line += [f"{held:.0f}", f"{width:.0f}"]
-            score = np.mean([crps(row.ranges[name], row.p10, row.p90, row.true) for row in rows])
+        cells = [f"{x:.1f}" for x in (np.median(np.abs(error)), np.percentile(np.abs(error), 90), np.mean(error))]
+        if name in OURS:
+            width = 100 * np.mean([(row.intervals[name].high - row.intervals[name].low) / row.true for row in rows])
+            score = np.mean([crps(row.ranges[name], *row.intervals[name], row.true) for row in rows])
+            moved = np.concatenate([x.jumps[name] for x in judged]) / 1000
+            jumped = f"{np.percentile(moved, 90):.2f}, {moved.max():.1f}"
+            held = 100 * np.mean([x.held[name] for x in judged])
+            cells += [f"{held:.0f}", f"{width:.0f}", f"{score / 1000:.2f}", jumped]
         else:  # of a number without an interval its error is the score
-            line += ["", ""]
             score = np.mean([abs(row.ranges[name] - row.true) for row in rows])
-        lines.append("| " + " | ".join([*line, f"{score / 1000:.2f}"]) + " |")
+            cells += ["", "", f"{score / 1000:.2f}", ""]
+        lines.append("| " + " | ".join([words, *cells]) + " |")
     return lines
 
 
 def ride_table(judged: Sequence[Judged]) -> list[str]:
-    """Ride by ride."""
+    """Ride by ride, without a route."""
     lines = [
-        "| seed | road | °C | rider, kg | ridden, km | error at 80, 50, 20 %, % | in P10 to P90, % of the way | "
-        "jumps per km: 90th percentile, largest, km |",
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+        "| seed | road | °C | rider, kg | ridden, km | error at 80, 50, 20 %, % | SOC error there, points | "
+        "in P10 to P90, % of the way | jumps per km: 90th percentile, largest, km |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- | --- |",
     ]
     for x in judged:
-        at = {row.level: 100 * (row.ranges["ours"] / row.true - 1) for row in x.rows}
-        errors = ", ".join(f"{at[level]:+.0f}" if level in at else "" for level in (0.8, 0.5, 0.2))
-        moved = f"{np.percentile(x.jumps, 90) / 1000:.1f}, {max(x.jumps) / 1000:.1f}"
+        at = {row.level: row for row in x.rows}
+        there = [at[level] for level in (0.8, 0.5, 0.2) if level in at]
+        errors = ", ".join(f"{100 * (row.ranges['ours'] / row.true - 1):+.0f}" for row in there)
+        socs = ", ".join(f"{100 * row.soc_error:+.1f}" for row in there)
+        moved = f"{np.percentile(x.jumps['ours'], 90) / 1000:.2f}, {max(x.jumps['ours']) / 1000:.1f}"
         facts = f"{x.drawn.seed} | {x.drawn.kind} | {x.drawn.ambient:.0f} | {x.drawn.mass:.0f} | {x.length / 1000:.1f}"
-        lines.append(f"| {facts} | {errors} | {100 * x.held:.0f} | {moved} |")
+        lines.append(f"| {facts} | {errors} | {socs} | {100 * x.held['ours']:.0f} | {moved} |")
     return lines
 
 
-def page(judged: Sequence[Judged], command: str, version: str) -> str:
+def week_table(days: Sequence[Day]) -> list[str]:
+    """Consumption expected at the start of rides against that of the whole week, from the third day on."""
+    lines = [
+        "| week | ridden, km | ridden, Wh/km | from the third day on expected, Wh/km | median error of that, % | "
+        "largest SOC error, points |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for week in sorted({x.week for x in days}):
+        some = [x for x in days if x.week == week]
+        mean = sum(x.ridden * x.length for x in some) / sum(x.length for x in some)
+        later = [x.expected for x in some if x.day >= LEARNED_FROM]
+        error = np.median([abs(x / mean - 1) for x in later])
+        span = f"{min(later) / 3.6:.1f} to {max(later) / 3.6:.1f}"
+        soc = max(abs(x.soc_error) for x in some)
+        way = sum(x.length for x in some) / 1000
+        lines.append(f"| {week} | {way:.0f} | {mean / 3.6:.1f} | {span} | {100 * error:.1f} | {100 * soc:.1f} |")
+    return lines
+
+
+def page(judged: Sequence[Judged], days: Sequence[Day], command: str, version: str) -> str:
     """docs/range-benchmark.md."""
     lines = ["# Range benchmark", "", *(__doc__ or "").partition("\n\n")[2].strip().split("\n"), ""]
-    lines += [f"Made by `{command}` on commit {version}.", ""]
-    for title, aged in (("Healthy packs", False), ("Aged packs", True)):
-        some = [x for x in judged if x.drawn.aged == aged]
+    lines += [
+        f"Made by `{command}` on commit {version}. Rows are each ride at each tenth of charge from 90 to 20 %.",
+        "",
+    ]
+    for title, some in (
+        ("Healthy packs", [x for x in judged if not x.drawn.aged]),
+        ("Aged packs, first discharge", [x for x in judged if x.drawn.aged and not x.second]),
+        ("Aged packs, second discharge", [x for x in judged if x.second]),
+    ):
         if some:
             lines += [f"## {title}", "", *table(some), "", *ride_table(some), ""]
+    if days:
+        lines += ["## Weeks", "", *week_table(days), ""]
     return "\n".join(lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--rides", type=int, default=16, metavar="N", help="so many full discharges (default: 16)")
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--rides", type=int, default=8, metavar="N", help="so many full discharges (default: 8)")
+    parser.add_argument("--weeks", type=int, default=2, metavar="N", help="so many weeks (default: 2)")
     parser.add_argument("--first", type=int, default=FIRST, metavar="SEED", help="of the first (default: %(default)s)")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="rides at a time (default: 2)")
     parser.add_argument("--output", type=Path, default=PAGE, metavar="FILE", help="page to write (default: the docs')")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all rows as JSON, too")
     parser.add_argument("--quiet", action="store_true", help="no progress")
     arguments = parser.parse_args()
-    seeds = range(arguments.first, arguments.first + arguments.rides)
-    judged = run([draw(seed, aged=seed % 2 == 1) for seed in seeds], arguments.jobs, quiet=arguments.quiet)
-    command = f"python -m benchmarks.range_benchmark --rides {arguments.rides} --first {arguments.first}"
-    arguments.output.write_text(page(judged, command, commit()), encoding="utf-8")
+    first, rides, weeks = arguments.first, arguments.rides, arguments.weeks
+    drawn = [draw(seed, aged=seed % 2 == 1) for seed in range(first, first + rides)]
+    judged = run(drawn, arguments.jobs, quiet=arguments.quiet)
+    days = run_weeks(range(first, first + weeks), arguments.jobs, quiet=arguments.quiet)
+    command = f"python -m benchmarks.range_benchmark --rides {rides} --weeks {weeks} --first {first}"
+    arguments.output.write_text(page(judged, days, command, commit()), encoding="utf-8")
     if arguments.json:
-        arguments.json.write_text(json.dumps([asdict(x) for x in judged]), encoding="utf-8")
+        found: Mapping[str, list[dict[str, Any]]] = {
+            "discharges": [asdict(x) for x in judged],
+            "weeks": [asdict(x) for x in days],
+        }
+        arguments.json.write_text(json.dumps(found), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -14,8 +14,9 @@ FALLBACK = 45 * 3.6  # J/m: of an estimator that has nothing to go by yet
 ROLLING = 25_000.0  # m, over which consumption is averaged
 RESERVE = 0.15  # of the charge that a telematics module keeps back
 SOME_WAY = 1000.0  # m, before which no mean is taken
+OURS = {"ours": "gz_onboard", "route": "gz_onboard, with the route"}
 NAMES = {
-    "ours": "gz_onboard",
+    **OURS,
     "rolling": "mean of 25 km, to 0 %",
     "rolling_reserve": "mean of 25 km, 15 % kept",
     "trip": "mean of the trip (VESC)",

@@ -27,11 +27,13 @@ GUIDE = {
     "vehicle-file",
     "own-effect",
     "range-frames",
+    "why",
+    "road-ahead",
     "log-format",
     "service",
     "limits",
 }
-METHOD = {"architecture", "simulation", "cycles", "discovery", "turning"}
+METHOD = {"architecture", "simulation", "cycles", "discovery", "forecast", "turning"}
 MEASURED_BY = re.compile(
     r"`[^`]*?(?:python (?:-m )?([\w./]+)|make (\w+)|gz-onboard (\w+))[^`]*`|python (benchmarks/\w+\.py)"
 )

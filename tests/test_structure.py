@@ -19,10 +19,11 @@ PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 LAYERS = [
     ["__init__", "arrays", "background", "constants", "errors", "events", "notify", "progress", "state"],
     ["options"],
-    ["toml"],
+    ["toml", "routes"],
     ["bus", "physics"],
     ["vehicle"],
     ["estimator"],
+    ["log_rows"],
     ["pipeline"],
     ["offline"],
     ["simulation"],

@@ -212,7 +212,7 @@ def test_estimate_of_a_trip_of_a_vehicle_without_dbc(tmp_path, without_dbc, caps
     assert ride["energy_wh"] == pytest.approx(109 * 11 * 119.5 / 3600, rel=0.02)
     assert ride["frames"] == 3 * 240
     topics = {topic for topic, _, _ in logged_samples(tmp_path / "trip.estimate.mcap")}
-    assert topics == {"/estimate", "/status", "/can/v_kmh", "/can/U", "/can/i"}
+    assert topics == {"/estimate", "/status", "/why", "/range_change", "/can/v_kmh", "/can/U", "/can/i"}
     arguments = ["estimate", "--vehicle", str(without_dbc), "--frames", "--output", str(tmp_path)]
     assert cli.main([*arguments, str(tmp_path / "trip.csv")]) == 2
     assert "--frames has nothing to log" in capsys.readouterr().err

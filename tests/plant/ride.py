@@ -37,6 +37,13 @@ REST = 12.0  # s of standing before the start and, at most, after the end
 KELVIN = 273.15
 EMPTIEST = -0.02  # SOC down to which the voltage falls on
 GAS, FARADAY = 8.314, 96485.0
+DERATED = 0.3  # V of a cell above where it gives up: from there on the controller takes the current away
+LEFT_AT_LEAST, TOO_SLOW, PATIENCE = (
+    0.1,
+    0.25,
+    10.0,
+)  # share of the current that stays; s below a share until the rider ends
+FELT_TIME = 0.3  # s, of the controller's voltage
 SPEED_LIMIT = (50.5, 54.0)  # rad/s: where the controller begins to take the torque away, and where none is left
 COLUMNS = (
     "speed",
@@ -140,7 +147,11 @@ def _curve() -> tuple[Array, int]:
 def ride(
     plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[Hidden], gives_up: float = 0.0
 ) -> list[Ridden]:
-    """Ride them all; one array element for each. A ride ends with a second below `gives_up` [V] at the terminals."""
+    """Ride them all; one array element for each.
+
+    With `gives_up` [V at the terminals] the controller takes current away above it, and a ride ends with a second below
+    it, or when the rider has had enough of creeping along.
+    """
     n = len(plans)
     m = SimpleNamespace(**{f.name: np.array([getattr(x, f.name) for x in machines]) for f in fields(Machine)})
     h = SimpleNamespace(**{f.name: np.array([float(getattr(x, f.name)) for x in hiddens]) for f in fields(Hidden)})
@@ -212,7 +223,8 @@ def ride(
     roll_work, drag_work, load_way, drag_way = (np.zeros(n) for _ in range(4))
     energy, energy_way = np.zeros(n), np.zeros(n)
 
-    last, low_for = np.array([int(x.duration / STEP) for x in plans]), np.zeros(n)
+    last, low_for, creeps_for = np.array([int(x.duration / STEP) for x in plans]), np.zeros(n), np.zeros(n)
+    felt, share = np.full(n, 60.0), np.ones(n)
     for step in range(steps):
         if np.all(step >= last):
             break
@@ -264,6 +276,10 @@ def ride(
         limit = m.current_limit * np.clip((SPEED_LIMIT[1] - rear) / (SPEED_LIMIT[1] - SPEED_LIMIT[0]), 0, 1)
         limit = np.minimum(limit, limit_pack * pack_voltage / (0.456 * rear + 6.0))
         command = np.where(braking, -m.regeneration_current * np.clip(rear / 7.5, 0, 1), throttle * m.current_limit)
+        if gives_up:
+            felt = felt + STEP / FELT_TIME * (pack_voltage - felt)
+            share = np.clip((felt - gives_up) / (DERATED * SERIES), LEFT_AT_LEAST, 1.0)
+            limit = limit * share
         command = np.where(step < last, command, 0.0)  # a pack that gave up
         motor_current = motor_current + STEP / 0.06 * (np.minimum(command, limit) - motor_current)
         # --- brakes
@@ -461,7 +477,8 @@ def ride(
         for name, value in zip(COLUMNS, now, strict=True):
             record[name][step] = value
         low_for = np.where(pack_voltage < gives_up, low_for + STEP, 0.0)
-        last = np.where(low_for >= 1.0, np.minimum(last, step + 1), last)
+        creeps_for = np.where(share < TOO_SLOW, creeps_for + STEP, 0.0)
+        last = np.where((low_for >= 1.0) | (creeps_for >= PATIENCE), np.minimum(last, step + 1), last)
 
     out = []
     for i in range(n):

@@ -82,6 +82,7 @@ def measure(ridden: Ridden, name: str) -> Samples:
     counted = np.cumsum(np.concatenate(([0.0], amperes[:-1] * np.diff(t)))) / 3600
     start = float(c["soc"][0]) + 0.015 * rng.normal()
     put("bms_state_of_charge", t, np.clip(start - counted / (12 * 2.735), 0.0, 1.0), 0.005)
+    put("contactor", t, np.ones(len(t)), 1.0)
     t = message(1.0, 1.0, 0.0)
     put("cell_temperature", t, at(c["shell"], t) + m.cell_probe_bias, 1.0, 0.05)
     put("ambient_temperature", message(1.0, 1.0, 0.0), np.zeros(0), 0.1)
