@@ -8,7 +8,9 @@ the two and of the count. Filter and ψ are kept apart: given SOC and e, what is
 an update of the filter moves ψ along it, however the filter makes it.
 
 **Resistance.** Least squares with forgetting of the voltage's quick changes over what the circuit makes of the
-current. The tables err by `RESISTANCE_SD` at their place for minutes, whatever the number of samples.
+current. The tables err by `RESISTANCE_SD` at their place for minutes, whatever the number of samples. It is used once
+it has stood for `PROVEN` of load: a current that is doubled looks like half the resistance, and the voltages that would
+refute that current must not have been explained by then.
 
 A pack of unknown age holds anything from all of what its file says down to little more than half. Half of the packs
 are taken to be as new, which the voltages of a healthy pack confirm soon, so that it is not made wrong; those of an
@@ -20,6 +22,7 @@ and the factor is that of what the sensor counts; with two that differ nothing i
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import exp, isfinite, sqrt
@@ -44,6 +47,7 @@ QUICK = 60.0  # s: changes of the voltage that are slower may be the charge's
 PLACE_TIME = 600.0  # s for which the tables' place errs the same way
 RESISTANCE_MEMORY = 3600.0  # s of load: the mean over a ride's charge and temperature is what lasts
 EXCITED = 0.01  # V of a cell: a load that changes its voltage by less shows no resistance
+PROVEN, KEPT = 150.0, 5  # s of load; so many times in it what was learned is kept
 FIRST = 10.0  # s of load before the resistance is more than a guess
 PRIOR_WEIGHT = 0.02  # V²·s: what the guess counts beside the load
 AGREEING_RATE = 0.01  # 1/h: two currents that differ by more in the mean, over capacity, show no capacity
@@ -60,6 +64,15 @@ class Learned:
     value: float
     sd: float
     share: float  # 0 nothing is learned, 1 as much as can be
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """Of the resistance: its factor, what it is from [V²·s], and the time of load [s]."""
+
+    factor: float = 1.0
+    weight: float = PRIOR_WEIGHT
+    time: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,7 +95,9 @@ class Ageing:
         self.belief = Belief()
         self._learning = False
         self._agreeing = AGREEING_RATE * battery.pack_capacity(BENCH_TEMPERATURE)  # A
-        self._resistance, self._weight, self._load_time = 1.0, PRIOR_WEIGHT, 0.0  # 1, V²·s, s
+        self._fit = Fit()
+        self._proven = deque([self._fit], KEPT + 1)  # the first is used
+        self._unproven = 0.0  # s of load since it was kept
         self._slow = 0.0, 0.0  # V: low-passed drop at a factor of 1, and measured
         self._since = 0.0  # s
 
@@ -112,16 +127,16 @@ class Ageing:
     @property
     def resistance(self) -> Learned:
         """Of R0, R1 and what effects in the cells take."""
-        seen = self._load_time / (self._load_time + FIRST)
-        places = seen * (1 + self._load_time / PLACE_TIME)
+        time = self._fit.time
+        seen = time / (time + FIRST)
+        places = seen * (1 + time / PLACE_TIME)
         sd = 1 / sqrt(1 / UNKNOWN_RESISTANCE_SD**2 + places / RESISTANCE_SD**2)
-        return Learned(self._resistance_factor, sd, 1 - sd / UNKNOWN_RESISTANCE_SD)
+        unproven = believed(self._fit.factor) - self._resistance_factor
+        return Learned(self._resistance_factor, sqrt(sd * sd + unproven * unproven), 1 - sd / UNKNOWN_RESISTANCE_SD)
 
     @property
     def _resistance_factor(self) -> float:
-        """What is believed: a change that is small beside the tables' own error is mostly that (a Wiener filter)."""
-        change = self._resistance - 1
-        return 1 + change**3 / (change**2 + RESISTANCE_SD**2)
+        return believed(self._proven[0].factor)
 
     def learned(self) -> dict[str, Learned]:
         """Both, by the names of `snapshot`."""
@@ -211,10 +226,22 @@ class Ageing:
         quick, quick_measured = unit - slow, measured - slow_measured
         if not self._learning or abs(quick) < EXCITED:
             return
-        self._load_time = min(self._load_time + dt, RESISTANCE_MEMORY)
-        self._weight += quick * quick * dt - self._weight * dt / RESISTANCE_MEMORY
-        factor = self._resistance + quick * (quick_measured - self._resistance * quick) * dt / self._weight
-        self._resistance = min(max(factor, RESISTANCE[0]), RESISTANCE[1])
+        fit = self._fit
+        weight = fit.weight + quick * quick * dt - fit.weight * dt / RESISTANCE_MEMORY
+        factor = fit.factor + quick * (quick_measured - fit.factor * quick) * dt / weight
+        factor = min(max(factor, RESISTANCE[0]), RESISTANCE[1])
+        self._fit = Fit(factor, weight, min(fit.time + dt, RESISTANCE_MEMORY))
+        self._unproven += dt
+        if self._unproven >= PROVEN / KEPT:
+            self._unproven = 0.0
+            self._proven.append(self._fit)
+
+    def unlearn(self) -> None:
+        """A sensor was found faulty: the resistance is what it was before, unless that was confirmed."""
+        if abs(self._fit.factor - self._proven[0].factor) < RESISTANCE_SD:
+            return
+        self._fit, self._unproven = self._proven[0], 0.0
+        self._proven = deque([self._fit], KEPT + 1)
 
     def apply(self, dt: float) -> bool:
         """Give the battery what was learned, every now and then; gives whether it did."""
@@ -259,9 +286,9 @@ class Ageing:
             },
             "resistance": {
                 "of": self._battery.resistance_factor,
-                "factor": self._resistance,
-                "weight": self._weight,
-                "time": self._load_time,
+                "factor": self._proven[0].factor,
+                "weight": self._proven[0].weight,
+                "time": self._proven[0].time,
             },
         }
 
@@ -289,9 +316,16 @@ class Ageing:
         if capacity:
             self.inverse, self.variance, self._with_soc = capacity
         if resistance:
-            self._resistance, self._weight, self._load_time = resistance
+            self._fit = Fit(*resistance)
+            self._proven = deque([self._fit], KEPT + 1)
         self.belief = self._believe()
         self._battery.age(1 / self.belief.inverse, self._resistance_factor)
+
+
+def believed(factor: float) -> float:
+    """A resistance's factor: a change that is small beside the tables' own error is mostly that (a Wiener filter)."""
+    change = factor - 1
+    return 1 + change**3 / (change**2 + RESISTANCE_SD**2)
 
 
 def _numbers(saved: Mapping[str, float] | None, *names: str, of: float) -> Numbers:

@@ -48,6 +48,7 @@ SILENT_AFTER = 2.0  # s without a step: what was measured is no longer reported
 STARTING_FOR = 10.0  # s: without a state of charge by then, no range is to be expected soon
 UNCERTAIN = 0.05  # of SOC: a larger sd is reported
 LEARNED_FROM = {"motor_speed", "accel_x", "gps_altitude", "pack_current", "pack_voltage"}
+AGED_FROM = {"pack_current", "pack_voltage", "cell_temperature"}
 UNLEARNED = 1500.0  # m: so far a sensor can have been faulty before it is found out
 
 
@@ -202,6 +203,8 @@ class Estimator:
         learned = LEARNED_FROM if self.road.speed is not None else LEARNED_FROM.union(SpeedCheck.ROLES)
         if any(role in learned and role not in self._distrusted for role in distrusted):
             self.forecaster.forget(max(UNLEARNED, self.redundancy.odometer.compared))
+        if any(role in AGED_FROM and role not in self._distrusted for role in distrusted):
+            self.soc.ageing.unlearn()
         self._distrusted = distrusted
 
     # --- riding and range -------------------------------------------------------------------------------------

@@ -189,6 +189,7 @@ class Forecaster:
         self.pause()
         distance -= r.current.distance
         r.current = Segment()
+        self.calm = Calm()  # what was shown came from that sensor too
         while distance > 0 and r.segments and (before := r.segments[-1].learned):
             distance -= r.segments.pop().distance
             r.usual = before

@@ -12,7 +12,8 @@ from gz_onboard.estimator.redundancy.checks import share_of_new
 from gz_onboard.estimator.road import STANDSTILL
 
 ERROR_TIME, ERROR_LEAST = 10.0, 0.04  # s, V: what the cell model leaves, low-passed
-CLEARLY = 2.5  # of two mean squares: the greater one's reading is wrong
+CLEARLY = 2.5  # of two mean squares: the greater one's reading is wrong,
+DECIDES = 0.031  # V: where they differ by the square of so much
 
 CellError = Callable[[float, float, str], float | None]
 """Measured less predicted voltage of a cell [V], for a voltage [V] and a current [A] of the pack; and whose current."""
@@ -69,6 +70,6 @@ class ResidualComparison:
         share = share_of_new(dt, self._time)
         self._first += (first * first - self._first) * share
         self._second += (second * second - self._second) * share
-        if max(self._first, self._second) < ERROR_LEAST**2:
+        if abs(self._first - self._second) < DECIDES**2:
             return 0
         return 1 if self._first > CLEARLY * self._second else 2 if self._second > CLEARLY * self._first else 0
