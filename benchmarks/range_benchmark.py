@@ -38,6 +38,7 @@ from gz_onboard.routes.route import read_route
 from gz_onboard.vehicle import read_vehicle
 
 PAGE = Path(__file__).parents[1] / "docs" / "range-benchmark.md"
+PICTURE = "images/range-benchmark.png"  # beside the page
 FIRST = 1000
 TOGETHER = 4  # rides that are ridden at once, for memory
 LEVELS = tuple(x / 10 for x in range(9, 0, -1))  # SOC, at which estimates are judged
@@ -48,6 +49,8 @@ SOME_WAY = 0.05  # of the ride, before which jumps do not count
 LEARNED_FROM = 2  # day of a week, from 0, from which something must have been learned
 KEY = "range benchmark"  # of the vehicle, in its saved states
 ADVANCED = 20.0  # m between two looks at the interval
+COLUMNS = "ridden", "ours", "P10", "P90", "rival"
+RIVAL = "rolling"  # of the usual estimators, the one in the picture
 State = dict[str, Any] | None
 
 
@@ -80,6 +83,7 @@ class Judged:
     rows: list[Row]
     held: dict[str, float]
     jumps: dict[str, list[float]]
+    way: list[tuple[float, ...]]  # along it, without a route: see `COLUMNS` [m]
 
 
 @dataclass(frozen=True)
@@ -89,6 +93,7 @@ class Followed:
     rows: list[Row]
     held: float  # share of the way on which P10 to P90 holds the truth
     jumps: list[float]  # m, of each km
+    way: list[tuple[float, ...]]  # see `COLUMNS`
     state: State  # at its end
 
 
@@ -96,7 +101,7 @@ def follow(name: str, log: Path, truth: Truth, state: State = None, route: Path 
     """The log through the pipeline against its truth, with a state that was kept and a route; ours is called `name`."""
     usual, waiting = Usual(RATED, RATED_RANGE), list(LEVELS)
     rows: list[Row] = []
-    way: list[tuple[float, float, float, float]] = []  # distance, range, P10, P90
+    way: list[tuple[float, ...]] = []
     before = 0.0
 
     def observe(e: Estimate) -> None:
@@ -108,7 +113,8 @@ def follow(name: str, log: Path, truth: Truth, state: State = None, route: Path 
         distance, soc = (float(np.interp(e.time, truth.time, x)) for x in (truth.distance, truth.soc))
         held = Interval(e.range_p10 or 0.0, e.range_p90 or 0.0)
         if not way or distance - way[-1][0] > ADVANCED:
-            way.append((distance, e.range, *held))
+            shown = pipeline.estimator.signals["bms_state_of_charge"].value
+            way.append((distance, e.range, *held, usual.ranges(shown)[RIVAL]))
         if waiting and soc <= waiting[0]:
             shown = pipeline.estimator.signals["bms_state_of_charge"].value
             left, error = truth.distance[-1] - distance, (e.soc or 0.0) - soc
@@ -127,7 +133,7 @@ def follow(name: str, log: Path, truth: Truth, state: State = None, route: Path 
     left = truth.distance[-1] - at[:, 0]
     later = at[:, 0] > SOME_WAY * truth.distance[-1]
     held = float(np.mean((at[:, 2] <= left) & (left <= at[:, 3])))
-    return Followed(rows, held, list(jumps(at[later, 0], at[later, 1])), pipeline.estimator.snapshot(KEY))
+    return Followed(rows, held, list(jumps(at[later, 0], at[later, 1])), way, pipeline.estimator.snapshot(KEY))
 
 
 def judge(drawn: Drawn, log: Path, truth: Truth, state: State, *, second: bool) -> tuple[Judged, State]:
@@ -140,7 +146,7 @@ def judge(drawn: Drawn, log: Path, truth: Truth, state: State, *, second: bool) 
         for a, b in zip(free.rows, ahead.rows, strict=True)
     ]
     held, moved = ({"ours": getattr(free, x), "route": getattr(ahead, x)} for x in ("held", "jumps"))
-    return Judged(drawn, second, float(truth.distance[-1]), rows, held, moved), free.state
+    return Judged(drawn, second, float(truth.distance[-1]), rows, held, moved, free.way), free.state
 
 
 def _judged(given: tuple[Drawn, Path, Truth, State, bool]) -> tuple[Judged, State]:
@@ -294,6 +300,24 @@ def week_table(days: Sequence[Day]) -> list[str]:
     return lines
 
 
+def picture(judged: Judged, file: Path) -> None:
+    """One ride as its rider sees it: what was shown over what was ridden, and what was really left."""
+    from matplotlib.figure import Figure
+
+    ridden, ours, p10, p90, rival = np.array(judged.way).T / 1000
+    figure = Figure(figsize=(8, 4.5), layout="constrained")
+    axes = figure.subplots()
+    axes.fill_between(ridden, p10, p90, color="#0072b2", alpha=0.25, linewidth=0, label="80 % interval")
+    axes.plot(ridden, ours, color="#0072b2", label="gz_onboard")
+    axes.plot(ridden, rival, color="#d55e00", linewidth=1, label=NAMES[RIVAL])
+    axes.plot(ridden, judged.length / 1000 - ridden, "k--", linewidth=1.5, label="really left")
+    axes.set(xlabel="ridden, km", ylabel="remaining range shown, km", xlim=(0, judged.length / 1000), ylim=(0, None))
+    axes.set_title(f"Ride {judged.drawn.seed}: {judged.drawn.kind}, {judged.drawn.ambient:.0f} °C")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(file, dpi=120)
+
+
 def page(judged: Sequence[Judged], days: Sequence[Day], command: str, version: str) -> str:
     """docs/range-benchmark.md."""
     lines = ["# Range benchmark", "", *(__doc__ or "").partition("\n\n")[2].strip().split("\n"), ""]
@@ -301,6 +325,8 @@ def page(judged: Sequence[Judged], days: Sequence[Day], command: str, version: s
         f"Made by `{command}` on commit {version}. Rows are each ride at each tenth of charge from 90 to 20 %.",
         "",
     ]
+    if judged:
+        lines += [f"![One ride: what was shown, and what was really left]({PICTURE})", ""]
     for title, some in (
         ("Healthy packs", [x for x in judged if not x.drawn.aged]),
         ("Aged packs, first discharge", [x for x in judged if x.drawn.aged and not x.second]),
@@ -328,6 +354,9 @@ def main() -> None:
     judged = run(drawn, arguments.jobs, quiet=arguments.quiet)
     days = run_weeks(range(first, first + weeks), arguments.jobs, quiet=arguments.quiet)
     command = f"python -m benchmarks.range_benchmark --rides {rides} --weeks {weeks} --first {first}"
+    if judged:
+        (file := arguments.output.parent / PICTURE).parent.mkdir(exist_ok=True)
+        picture(judged[0], file)
     arguments.output.write_text(page(judged, days, command, commit()), encoding="utf-8")
     if arguments.json:
         found: Mapping[str, list[dict[str, Any]]] = {

@@ -13,7 +13,7 @@ import argparse
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from math import exp, nan, sqrt
+from math import exp, nan
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -155,6 +155,7 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
         battery,
         voltage_error_temperature=tuple(map(float, error.axes["temperature"])),
         voltage_error_value=tuple(map(float, error.value)),
+        as_new=float(__import__("os").environ.get("ASNEW", "0.98")),
     )
     if (shift := result.curves.get("battery.rest_shift")) is None:
         return battery
@@ -270,7 +271,8 @@ def run(setting: Setting, cycle: Cycle, case: Case) -> Score:
             told = True
             f.soc, f.v1, f.error = float(truth[k]) + case.wrong, 0.0, 0.0
             f.covariance = (case.sd**2, 0.0, f.covariance[2])
-        soc[k], sd[k] = f.soc, sqrt(f.covariance[0])
+            estimator.soc.ageing.part()
+        soc[k], sd[k] = estimator.soc.ageing.state_of_charge(f)
     known = np.isfinite(soc)
     error, sd = (soc - truth)[known], sd[known]
     first = [np.flatnonzero(np.abs(error) < limit) for limit in (CONVERGED, NEAR)]

@@ -77,6 +77,7 @@ ROLES: dict[str, str] = {
     "charge_plug": "1",
     "key": "1",  # 0: off
     "contactor": "1",  # of the pack, 0: open
+    "rider": "1",  # a number for each who rides, such as that of the key
     "throttle": "1",
     "brake_switch": "1",
 }

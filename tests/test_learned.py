@@ -6,6 +6,7 @@ import fcntl
 import json
 import os
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -40,7 +41,7 @@ def saved(tmp_path: Path) -> Path:
 def shown(file: Path, capsys: pytest.CaptureFixture[str], *options: str) -> dict[str, dict[str, float]]:
     assert main(["learned", "--state", str(file), "--json", *options]) == OK
     document = json.loads(capsys.readouterr().out)
-    assert document["version"] == 1
+    assert document["version"] == 2
     learned: dict[str, dict[str, float]] = document["learned"]
     return learned
 
@@ -53,6 +54,33 @@ def test_it_shows_what_was_learned(saved: Path, capsys: pytest.CaptureFixture[st
     text = capsys.readouterr().out
     assert "capacity     0.800 ± 0.0" in text
     assert "94 % learned" in text
+
+
+def test_it_shows_each_rider_and_draws_it(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    vehicle = read_vehicle("reference")
+    snapshot, _ = state.load(saved, time.time()) or ({}, None)
+    estimator = Pipeline(vehicle).estimator
+    estimator.restore(snapshot, vehicle.key, 0.0)
+    usual = estimator.forecaster.riding.usual
+    estimator.forecaster.riding.usual = replace(usual, price=replace(usual.price, usual=1.2, usual_variance=0.01**2))
+    estimator.forecaster.ridden_by("anna")
+    estimator.soc.filter = ScalarFilter(estimator.battery, 0.6, 0.0, (1e-4, 0.0, 1e-4))
+    changed = estimator.snapshot(vehicle.key)
+    assert changed
+    state.write(saved, state.encode(changed, time.time()))
+    picture = tmp_path / "learned.png"
+    assert main(["learned", "--state", str(saved), "--plot", str(picture), "--json"]) == OK
+    riders = json.loads(capsys.readouterr().out)["riders"]
+    assert list(riders) == ["anna", ""]
+    assert riders[""]["price"]["factor"] == pytest.approx(1.2 / vehicle.riding.factor)
+    assert riders[""]["price"]["percent_learned"] > 80
+    assert riders["anna"]["price"]["percent_learned"] < 30
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert main(["learned", "--state", str(saved), "--reset", "riding"]) == OK
+    text = capsys.readouterr().out
+    assert "anna" not in text
+    assert "price        1.000 ± 0.1" in text
+    assert "nothing learned: energy of a kilometre" in text
 
 
 def test_it_forgets_one_and_keeps_the_rest(saved: Path, capsys: pytest.CaptureFixture[str]):

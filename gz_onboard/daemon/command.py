@@ -23,7 +23,8 @@ from gz_onboard.daemon.control import Control
 from gz_onboard.daemon.keeper import state_file
 from gz_onboard.daemon.loop import TICK, Daemon, foreign_text, state_text
 from gz_onboard.daemon.route import SOCKET
-from gz_onboard.errors import FAILED, OK, InputError, not_an_input, writing
+from gz_onboard.errors import FAILED, OK, InputError, not_an_input, shown, writing
+from gz_onboard.estimator.riders import LONGEST_NAME
 from gz_onboard.options import CHANNEL, add_shared, number
 from gz_onboard.physics.trust import ROOT
 from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, lacking, range_publisher
@@ -66,6 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder for the saved state (default: none)",
     )
+    rider = "who rides: what is usual is learned of each rider (default: whoever rode last, or a signal of the bus)"
+    add("--rider", type=_rider, default="", metavar="NAME", help=rider)
     runtime = _directory("RUNTIME_DIRECTORY")
     add(
         "--control-socket",
@@ -79,6 +82,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--all-frames", action="store_true", help="take in, count and log identifiers that the DBC files do not know")
     tick = number("--tick", SHORTEST_TICK, TICK_NS * 1e-9, counted="s")
     add("--tick", type=tick, default=TICK, metavar="S", help="read the bus this often (default: %(default)g)")
+
+
+def _rider(text: str) -> str:
+    if not text or len(text) > LONGEST_NAME:
+        raise argparse.ArgumentTypeError(f"must be a name of 1 to {LONGEST_NAME} letters, is {shown(text)}")
+    return text
 
 
 def _directory(variable: str) -> Path | None:
@@ -136,6 +145,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
     if never := lacking(vehicle):
         log.info("%s has no sensors for, and its intervals are wider by: %s", vehicle.name, ", ".join(never))
     daemon = Daemon(vehicle, channels, recorder, saved, arguments.filter, arguments.tick)
+    daemon.rider = arguments.rider
     daemon.control = Control(arguments.control_socket, lambda: daemon.pipeline)
     daemon.control.start()
     if route:

@@ -1,6 +1,6 @@
-"""``gz-onboard learned``: what the daemon has learned of a vehicle and keeps in its state file; forget it on request.
+"""``gz-onboard learned``: what the daemon has learned of a vehicle and its riders, and keeps in its state file.
 
-The state holds it under ``learned``, by name. Whoever learns more adds a name there and to `read_learned`.
+Shown as a text, as JSON and as a picture; forgotten on request.
 """
 
 from __future__ import annotations
@@ -10,7 +10,10 @@ import fcntl
 import json
 import os
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields
+from math import sqrt
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +21,23 @@ from gz_onboard import state
 from gz_onboard.daemon.keeper import state_file
 from gz_onboard.errors import OK, InputError, writing
 from gz_onboard.estimator.ageing import Ageing, Learned
+from gz_onboard.estimator.forecast import Forecaster
+from gz_onboard.estimator.usual import Habit, Usual
 from gz_onboard.options import add_shared
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
-VERSION = 1  # of the JSON keys
+VERSION = 2  # of the JSON keys
+SOME = 0.05  # of what can be learned: less is drawn as unknown
 USUAL_FOLDER = Path("/var/lib/gz-onboard")
 MEANING = {  # by name: what its factor is on
     "capacity": "of the pack, over cell_capacity in the vehicle file, as the pack's current sensor counts it",
     "resistance": "of the cells, over the vehicle file's R0, R1 and effects in the cells",
+    "price": "energy of a kilometre in motion, over the prior riding's in the vehicle file",
+    "standing": "energy at stops, likewise",
+    "pace": "time of a kilometre, likewise",
+    "factor": "measured over modelled energy of the same motion",
 }
+BATTERY, RIDING = ("capacity", "resistance"), "riding"  # what can be forgotten
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,8 +47,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--state", type=Path, metavar="FILE", help=f"saved state (default: the vehicle's in {USUAL_FOLDER})"
     )
     parser.add_argument(
-        "--reset", choices=(*MEANING, "all"), help="forget this, as after a new battery; the daemon must not run"
+        "--reset",
+        choices=(*BATTERY, RIDING, "all"),
+        help="forget this, as after a new battery; the daemon must not run",
     )
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="write a picture of it: PNG, SVG or PDF")
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -46,39 +60,112 @@ def run(arguments: argparse.Namespace) -> int:
     file = arguments.state or state_file(USUAL_FOLDER, vehicle.name)
     snapshot, age = _load(file, vehicle)
     if arguments.reset:
-        names = tuple(MEANING) if arguments.reset == "all" else (arguments.reset,)
-        snapshot = _forget(file, snapshot, age, names)
-    learned = read_learned(vehicle, snapshot)
+        names = (*BATTERY, RIDING) if arguments.reset == "all" else (arguments.reset,)
+        snapshot = _forget(file, snapshot, age, names, _fresh(vehicle))
+    learned, riders = read_learned(vehicle, snapshot), read_riders(vehicle, snapshot)
+    if arguments.plot:
+        with writing(arguments.plot):
+            _plot(arguments.plot, vehicle.name, learned, riders)
     if arguments.json:
-        document = {
-            "version": VERSION,
-            "vehicle": vehicle.key,
-            "age_s": age,
-            "learned": {
-                name: {"factor": x.value, "sd": x.sd, "percent_learned": round(100 * x.share), "of": MEANING[name]}
-                for name, x in learned.items()
-            },
-        }
-        text = json.dumps(document, indent=1)
+        rows = {"learned": _rows(learned), "riders": {name: _rows(x) for name, x in riders.items()}}
+        text = json.dumps({"version": VERSION, "vehicle": vehicle.key, "age_s": age, **rows}, indent=1)
         if arguments.json == "-":
             print(text)
             return OK
         with writing(arguments.json):
             Path(arguments.json).write_text(text + "\n", encoding="utf-8")
     for name, x in learned.items():
-        known = f"{100 * x.share:3.0f} % learned" if x.share else "nothing learned"
-        print(f"{name:12} {x.value:5.3f} ± {x.sd:5.3f}  {known}: {MEANING[name]}")
+        print(_line(name, x))
+    for rider, found in riders.items():
+        if len(riders) > 1:
+            print(f"rider {rider or 'not known'}:")
+        for name, x in found.items():
+            print(_line(name, x))
     return OK
 
 
 def read_learned(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Learned]:
-    """What a saved state holds, by name. InputError if it cannot be."""
+    """What a saved state holds of the battery, by name. InputError if it cannot be."""
     ageing = Ageing(vehicle.pack.own())
-    try:
+    with _sound():
         ageing.restore(snapshot.get("learned", {}))
+    return ageing.learned()
+
+
+def read_riders(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, dict[str, Learned]]:
+    """What a saved state holds of the riding, by rider and name; who rode last comes first. InputError likewise."""
+    forecaster = _fresh(vehicle)
+    prior = forecaster.prior
+    with _sound():
+        forecaster.restore(snapshot["riding"])
+    riders = {forecaster.riders.now: forecaster.riding.usual, **forecaster.riders.others}
+    return {name: _of_usual(usual, prior) for name, usual in riders.items()}
+
+
+def _of_usual(usual: Usual, prior: Usual) -> dict[str, Learned]:
+    names = [field.name for field in fields(Usual)]
+    return {name: _of_habit(getattr(usual, name), getattr(prior, name)) for name in names}
+
+
+def _of_habit(habit: Habit, prior: Habit) -> Learned:
+    sd, unknown = sqrt(habit.usual_variance), sqrt(prior.usual_variance)
+    return Learned(habit.usual / prior.usual, sd / prior.usual, max(1 - sd / unknown, 0.0))
+
+
+def _fresh(vehicle: Vehicle) -> Forecaster:
+    """That has learned nothing."""
+    return Forecaster(vehicle.model, vehicle.pack, vehicle.riding)
+
+
+@contextmanager
+def _sound() -> Iterator[None]:
+    try:
+        yield
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"the saved state is damaged: {error!r}") from error
-    return ageing.learned()
+
+
+def _rows(learned: Mapping[str, Learned]) -> dict[str, dict[str, object]]:
+    return {
+        name: {"factor": x.value, "sd": x.sd, "percent_learned": round(100 * x.share), "of": MEANING[name]}
+        for name, x in learned.items()
+    }
+
+
+def _line(name: str, x: Learned) -> str:
+    known = f"{100 * x.share:3.0f} % learned" if x.share else "nothing learned"
+    return f"{name:12} {x.value:5.3f} ± {x.sd:5.3f}  {known}: {MEANING[name]}"
+
+
+def _plot(
+    file: Path, vehicle: str, learned: Mapping[str, Learned], riders: Mapping[str, Mapping[str, Learned]]
+) -> None:
+    """A picture: each factor with two standard deviations, beside what the vehicle file says."""
+    from matplotlib.figure import Figure
+
+    rows = [(name, x) for name, x in learned.items()]
+    for rider, found in riders.items():
+        rows += [(f"{name}, {rider or 'rider not known'}" if len(riders) > 1 else name, x) for name, x in found.items()]
+    figure = Figure(figsize=(7, 1 + 0.4 * len(rows)), layout="constrained")
+    axes = figure.subplots()
+    for place, (_, x) in enumerate(rows):
+        colour = "#0072b2" if x.share > SOME else "#999999"
+        axes.errorbar(x.value, place, xerr=2 * x.sd, fmt="o", color=colour, capsize=3)
+        axes.annotate(
+            f"{100 * x.share:.0f} % learned",
+            (1.0, place),
+            (5, 0),
+            xycoords=("axes fraction", "data"),
+            textcoords="offset points",
+            va="center",
+            fontsize=8,
+        )
+    axes.axvline(1.0, color="black", linewidth=0.8)
+    axes.set_yticks(range(len(rows)), [name for name, _ in rows])
+    axes.invert_yaxis()
+    axes.set(title=f"What was learned of {vehicle}", xlabel="over what the vehicle file says; bars: 2 sd")
+    axes.grid(axis="x", alpha=0.3)
+    figure.savefig(file, dpi=120)
 
 
 def _load(file: Path, vehicle: Vehicle) -> tuple[Mapping[str, Any], float | None]:
@@ -94,10 +181,14 @@ def _load(file: Path, vehicle: Vehicle) -> tuple[Mapping[str, Any], float | None
     return found
 
 
-def _forget(file: Path, snapshot: Mapping[str, Any], age: float | None, names: Collection[str]) -> Mapping[str, Any]:
+def _forget(
+    file: Path, snapshot: Mapping[str, Any], age: float | None, names: Collection[str], fresh: Forecaster
+) -> Mapping[str, Any]:
     """The state without what was learned under `names`, as it is saved from now on, no younger than it was."""
     kept = {name: x for name, x in snapshot.get("learned", {}).items() if name not in names}
     changed = {**snapshot, "learned": kept}
+    if RIDING in names:
+        changed["riding"] = fresh.snapshot()
     text = state.encode(changed, 0.0 if age is None else time.time() - age)
     with writing(file):
         descriptor = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY)

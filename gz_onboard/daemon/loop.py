@@ -51,6 +51,7 @@ class Daemon:
         self.channels = channels
         self.recorder = recorder
         self.control: Control | None = None
+        self.rider = ""  # if that is known
         self.finished = True  # whether log and state were written to their end
         self._log = BackgroundRecorder(recorder) if recorder else None
         self._make_pipeline: Callable[[], Pipeline] = lambda: Pipeline(vehicle, filter_name=filter_name, log=self._log)
@@ -123,9 +124,11 @@ class Daemon:
 
     def restore(self) -> dict[str, Any] | None:
         """Go on from the latest saved state that can be used; gives it."""
-        if self._keeper is None:
-            return None
-        self.pipeline, snapshot = self._keeper.restore(self.pipeline, self._make_pipeline)
+        snapshot = None
+        if self._keeper:
+            self.pipeline, snapshot = self._keeper.restore(self.pipeline, self._make_pipeline)
+        if self.rider:  # whoever rode when it was saved
+            self.pipeline.estimator.forecaster.ridden_by(self.rider)
         return snapshot
 
     def round(self) -> int:

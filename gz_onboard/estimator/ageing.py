@@ -12,12 +12,13 @@ current. The tables err by `RESISTANCE_SD` at their place for minutes, whatever 
 it has stood for `PROVEN` of load: a current that is doubled looks like half the resistance, and the voltages that would
 refute that current must not have been explained by then.
 
-A pack of unknown age holds anything from all of what its file says down to little more than half. Half of the packs
-are taken to be as new, which the voltages of a healthy pack confirm soon, so that it is not made wrong; those of an
-aged pack refute it within some tens of per cent of charge. The interval of the range is wider on the lower side only:
-no pack is better than new. Nothing is learned while a sensor is doubted, or where SOC is not known by itself to
-`TRUSTED`: an age would explain what is none. With one current sensor its gain and the capacity cannot be told apart,
-and the factor is that of what the sensor counts; with two that differ nothing is learned.
+A pack of unknown age holds anything from all of what its file says down to little more than half. A share of the packs
+(`Battery.as_new`, half if the file does not say) is taken to be as new, which the voltages of a healthy pack confirm
+soon, so that it is not made wrong; those of an aged pack refute it within some tens of per cent of charge. The interval
+of the range is wider on the lower side only: no pack is better than new. Nothing is learned while a sensor is doubted,
+or where SOC is not known by itself to `TRUSTED`: an age would explain what is none. With one current sensor its gain
+and the capacity cannot be told apart, and the factor is that of what the sensor counts; with two that differ nothing is
+learned.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ from gz_onboard.estimator.uncertainty import RESISTANCE_SD
 from gz_onboard.physics.battery import Battery
 
 CAPACITY, RESISTANCE = (0.5, 1.1), (0.5, 4.0)  # factors that a pack at work has
-CAPACITY_SD, UNKNOWN_RESISTANCE_SD = 0.16, 0.3  # of a pack of unknown age
-AS_NEW, AS_NEW_SD = 0.5, 0.02  # share of packs that still hold what their file says, and how closely
+CAPACITY_SD, RESISTANCE_AGED_SD = 0.16, 0.42  # of packs that are not as new
+AS_NEW_SD = 0.01  # how closely new packs hold the same; how well the file knows that is beside it
 LEAST_VARIANCE = 0.01**2  # of ψ: the curve's place, and what of an ageing cell is not capacity
 CAPACITY_DRIFT = 0.02**2  # of ψ: variance that it gains over as much charge as a pack holds a hundred times
 CYCLES = 100.0  # see above
@@ -95,6 +96,7 @@ class Ageing:
         self.belief = Belief()
         self._learning = False
         self._agreeing = AGREEING_RATE * battery.pack_capacity(BENCH_TEMPERATURE)  # A
+        self._unknown_resistance = RESISTANCE_AGED_SD * sqrt(1 - battery.as_new)  # sd of it before anything is learned
         self._fit = Fit()
         self._proven = deque([self._fit], KEPT + 1)  # the first is used
         self._unproven = 0.0  # s of load since it was kept
@@ -130,9 +132,9 @@ class Ageing:
         time = self._fit.time
         seen = time / (time + FIRST)
         places = seen * (1 + time / PLACE_TIME)
-        sd = 1 / sqrt(1 / UNKNOWN_RESISTANCE_SD**2 + places / RESISTANCE_SD**2)
+        sd = 1 / sqrt(1 / self._unknown_resistance**2 + places / RESISTANCE_SD**2)
         unproven = believed(self._fit.factor) - self._resistance_factor
-        return Learned(self._resistance_factor, sqrt(sd * sd + unproven * unproven), 1 - sd / UNKNOWN_RESISTANCE_SD)
+        return Learned(self._resistance_factor, sqrt(sd * sd + unproven * unproven), 1 - sd / self._unknown_resistance)
 
     @property
     def _resistance_factor(self) -> float:
@@ -261,7 +263,7 @@ class Ageing:
         told = 1 / self.variance - 1 / CAPACITY_SD**2  # information beyond the prior's
         off = (self.inverse - 1) / self.variance
         narrow, wide = 1 + AS_NEW_SD**2 * told, 1 + CAPACITY_SD**2 * told
-        odds = AS_NEW / (1 - AS_NEW)
+        odds = self._battery.as_new / (1 - self._battery.as_new)
         if told > 0:
             odds *= sqrt(wide / narrow) * exp(-off * off / told * (1 / narrow - 1 / wide) / 2)
         as_new = odds / (1 + odds)

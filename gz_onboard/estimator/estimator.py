@@ -25,7 +25,7 @@ from gz_onboard.estimator.redundancy.checks import StepInputs
 from gz_onboard.estimator.redundancy.currents import CellEvidence
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
-from gz_onboard.estimator.road import RoadState
+from gz_onboard.estimator.road import STANDSTILL, RoadState
 from gz_onboard.estimator.route_ahead import RoadAhead
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.soc import StateOfCharge
@@ -217,6 +217,9 @@ class Estimator:
         mapped = [signal for signal in inverter if signal.stale_after]
         silent = bool(mapped) and not any(signal.fresh(now) for signal in mapped)
         off = any(signal.get(now) == 0 for signal in (signals.key, signals.contactor))
+        rider = signals.rider.get(now)
+        if rider is not None and abs(self.road.speed or 0.0) < STANDSTILL:
+            self.forecaster.ridden_by(f"{rider:g}")
         self._activities.step(dt, self.road.speed, rate, signals.charge_plug.get(now), silent, off)
 
     def _ride(self, now: float, dt: float) -> None:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from math import exp, sqrt
+from math import exp, hypot, sqrt
 from typing import Any
 
 from gz_onboard.constants import GRAVITY, HOUR
@@ -28,6 +28,7 @@ from gz_onboard.estimator.calm import Calm, restored_ratio
 from gz_onboard.estimator.load_model import AHEAD, USUAL_AIR, Conditions, EffectInputs, LoadModel
 from gz_onboard.estimator.pattern import STEEPEST, Pattern, restored_pattern
 from gz_onboard.estimator.ridden import Past, Riding, Second, Segment, learned, restored, restored_states
+from gz_onboard.estimator.riders import Riders, restored_riders
 from gz_onboard.estimator.usual import SEGMENT, Usual
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.cooling import LumpedCooling
@@ -94,14 +95,16 @@ class Forecaster:
         price, stops = self.load.prior_prices(*USUAL_AIR)
         self.prior, self._usual_price = Usual.of(prior, stops / price), price + stops
         self.riding = Riding(self.prior)
-        self.calm, self.pattern = Calm(), Pattern()
+        self.calm, self.pattern, self.riders = Calm(), Pattern(), Riders()
         self.ageing: Ageing | None = None  # None: the pack is known to be as its file says
         self._past = Past()
         self._overpotential = model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
         self._weight = model.mass * GRAVITY  # N
         self._moving_mass = model.mass + rotating_mass(model.parameters)  # kg, with what rotates
         self.cooling = LumpedCooling.of(model.parameters, "pack", WARM_CELLS)
-        self._capacity_sd = model.parameters.sd("cell_capacity") / model.parameters["cell_capacity"]
+        p = model.parameters
+        self._cutoff_sd = hypot(p.sd("cell_cutoff_voltage"), p.sd("cell_voltage_error_empty"))  # V
+        self._capacity_sd = p.sd("cell_capacity") / p["cell_capacity"]
 
     # --- learning ---------------------------------------------------------------------------------------------
 
@@ -195,6 +198,18 @@ class Forecaster:
             r.usual = before
         self._sum_past()
 
+    def ridden_by(self, rider: str) -> None:
+        """`rider` rides from now on."""
+        if rider == self.riders.now:
+            return
+        r = self.riding
+        self.pause()
+        r.usual = self.riders.change(rider, r.usual.rested())
+        r.segments.clear()
+        r.current = Segment()
+        self.calm, self.pattern = Calm(), Pattern()
+        self._sum_past()
+
     def pause(self, dt: float = 0.0) -> None:
         """`dt` [s] that teach nothing: parked, or something is not known. Leave the second that was being gathered."""
         self.riding.second, self.riding.speed_before = Second(), None
@@ -239,6 +254,7 @@ class Forecaster:
             (self.battery.window.sd * left.slope) ** 2
             + (left.energy - colder.energy) ** 2
             + (self._capacity_sd * left.energy) ** 2
+            + (self._cutoff_sd * left.by_cutoff) ** 2
         )
         by_soc = soc_sd * left.slope
         of_pack = self.ageing.energy_sd(left.energy, left.slope, soc_sd) if self.ageing else (by_soc, by_soc)
@@ -311,12 +327,12 @@ class Forecaster:
     def snapshot(self) -> dict[str, object]:
         """What is to be kept over a restart."""
         kept = {"states": dict(self.load.states), "shown": self.calm.ratio, "pattern": self.pattern.snapshot()}
-        return self.riding.snapshot() | kept
+        return self.riding.snapshot() | self.riders.snapshot() | kept
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Take what `snapshot` gave; raises KeyError, TypeError or ValueError if it is not that."""
         riding, states = restored(saved, self.prior), restored_states(saved["states"])
-        pattern = restored_pattern(saved.get("pattern", ()))
+        pattern, riders = restored_pattern(saved.get("pattern", ())), restored_riders(saved)
         self.calm = Calm(restored_ratio(saved))
-        self.riding, self.load.states, self.pattern = riding, states, pattern
+        self.riding, self.load.states, self.pattern, self.riders = riding, states, pattern, riders
         self._sum_past()

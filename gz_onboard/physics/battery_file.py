@@ -23,6 +23,7 @@ KEYS = (
     "entropy",
     "capacity",
     "window",
+    "as_new",
     "r0",
     "r1",
     "c1",
@@ -33,6 +34,7 @@ CAPACITANCE = (1e-3, 1e8)  # F, of a cell's RC pair
 SMALLEST_STEP = 1e-6  # of SOC, V or degC, from point to point: a slope must stay a number
 LARGEST_ENTROPY = 5e-3  # V/K: of intercalation cells 1e-3 at most; more is mV/K
 NARROWEST_WINDOW = 0.1  # of the cells' charge: no vehicle carries ten times the cells that it uses
+LEAST_AS_NEW = 0.01  # and so much is the least chance that it is not: nothing could be learned
 LARGEST_SHIFT = 0.2  # V: real cells rest tens of mV apart from -20 to 25 degC; more is a mistyped unit
 
 
@@ -74,6 +76,7 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         entropy_value=entropy,
         voltage_error_temperature=error_temperatures,
         voltage_error_value=errors,
+        as_new=table.number("as_new", Battery.as_new, low=LEAST_AS_NEW, high=1 - LEAST_AS_NEW),
     )
     return battery.with_parameters(parameters)
 

@@ -8,6 +8,7 @@ from gz_onboard.constants import HOUR
 from gz_onboard.physics.battery import Battery, Overpotential
 
 BELOW_EMPTY = -0.05  # SOC down to which the cut-off is sought
+LEAST_WIDTH = 1e-3  # SOC: an end found nearer to the last one allowed is that
 
 
 @dataclass(frozen=True)
@@ -16,6 +17,7 @@ class Drawable:
 
     energy: float  # J, at the pack's terminals
     slope: float  # J: how much more energy there would be for more SOC
+    by_cutoff: float = 0.0  # J/V: how much less there would be for a higher cut-off voltage of a cell
 
 
 # Gauss-Legendre nodes and weights on [0, 1], of order 8
@@ -59,7 +61,9 @@ def drawable(
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
         current = battery.settled_current(power, high + width * node, temperature, form_factor_squared, overpotential)
         total += weight / current if current else 0.0
-    return Drawable(power * charge * width * total, slope)
+    # Where the vehicle ends before the voltage does, the cut-off does not count.
+    ends = charge * cutoff / battery.ocv(high, temperature)[1] if high - least > LEAST_WIDTH else 0.0
+    return Drawable(power * charge * width * total, slope, ends)
 
 
 NEWTON_STEPS = 3  # to 1e-4 of SOC: the energy is nearly linear in it

@@ -112,7 +112,7 @@ def test_a_log_of_it_reads_back_as_it_is(tmp_path, healthy):
     read = read_samples(file, read_vehicle("reference"))
     assert read.facts == sent.facts
     assert set(read.columns) == set(sent.columns)
-    assert set(sent.columns) >= set(ROLES) - {"vehicle_speed", "heater_power", "air_conditioner_power", "key"}
+    assert set(sent.columns) >= set(ROLES) - {"vehicle_speed", "heater_power", "air_conditioner_power", "key", "rider"}
     for role, (times, values) in sent.columns.items():
         np.testing.assert_allclose(read.columns[role][1], values, atol=1e-9, err_msg=role)
         np.testing.assert_allclose(np.diff(read.columns[role][0]), np.diff(times), atol=2e-6, err_msg=role)
