@@ -39,6 +39,7 @@ TEMPERATURES = (25, 10, 0, -10, -20)
 OFFSET = 0.05  # A of the cell: what the current sensor shows too much
 TESTER_OFFSET = 0.005  # A: sd of the tester's own current, of which the reference is made
 WRONG = -0.2  # of SOC
+AS_NEW = 0.98  # the cell is the one that the tables were measured on
 RIGHT_SD = 0.01  # of SOC: how far the right one is believed
 CONVERGED = 0.025  # of SOC: from here on the error counts
 NEAR = 0.03  # of SOC: a wrong start is left when it is first as near as this
@@ -155,7 +156,8 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
         battery,
         voltage_error_temperature=tuple(map(float, error.axes["temperature"])),
         voltage_error_value=tuple(map(float, error.value)),
-        as_new=float(__import__("os").environ.get("ASNEW", "0.98")),
+        as_new=AS_NEW,
+        capacity_sd=result.parameters["cell_capacity"].sd / capacity_25,
     )
     if (shift := result.curves.get("battery.rest_shift")) is None:
         return battery

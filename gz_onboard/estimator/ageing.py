@@ -37,7 +37,7 @@ from gz_onboard.physics.battery import Battery
 
 CAPACITY, RESISTANCE = (0.5, 1.1), (0.5, 4.0)  # factors that a pack at work has
 CAPACITY_SD, RESISTANCE_AGED_SD = 0.16, 0.42  # of packs that are not as new
-AS_NEW_SD = 0.01  # how closely new packs hold the same; how well the file knows that is beside it
+NEW_SD = 0.003, CAPACITY_SD / 2  # of a pack that is as new: whatever the file says, no capacity is known more closely
 LEAST_VARIANCE = 0.01**2  # of ψ: the curve's place, and what of an ageing cell is not capacity
 CAPACITY_DRIFT = 0.02**2  # of ψ: variance that it gains over as much charge as a pack holds a hundred times
 CYCLES = 100.0  # see above
@@ -96,6 +96,7 @@ class Ageing:
         self.belief = Belief()
         self._learning = False
         self._agreeing = AGREEING_RATE * battery.pack_capacity(BENCH_TEMPERATURE)  # A
+        self._new_sd = min(max(battery.capacity_sd, NEW_SD[0]), NEW_SD[1])  # of ψ, of a pack that is as new
         self._unknown_resistance = RESISTANCE_AGED_SD * sqrt(1 - battery.as_new)  # sd of it before anything is learned
         self._fit = Fit()
         self._proven = deque([self._fit], KEPT + 1)  # the first is used
@@ -121,7 +122,7 @@ class Ageing:
         by_capacity = energy / belief.inverse
         together = self._with_soc / self.variance  # of SOC, for ψ
         found = []
-        for age_sd in (sd, min(sd, max(belief.inverse - 1, 0.0) + AS_NEW_SD)):
+        for age_sd in (sd, min(sd, max(belief.inverse - 1, 0.0) + self._new_sd)):
             by_itself = max(soc_sd * soc_sd - (together * sd) ** 2, 0.0)
             found.append(sqrt(slope * slope * by_itself + (age_sd * (by_capacity - slope * together)) ** 2))
         return found[0], found[1]
@@ -262,12 +263,12 @@ class Ageing:
         """
         told = 1 / self.variance - 1 / CAPACITY_SD**2  # information beyond the prior's
         off = (self.inverse - 1) / self.variance
-        narrow, wide = 1 + AS_NEW_SD**2 * told, 1 + CAPACITY_SD**2 * told
+        narrow, wide = 1 + self._new_sd**2 * told, 1 + CAPACITY_SD**2 * told
         odds = self._battery.as_new / (1 - self._battery.as_new)
         if told > 0:
             odds *= sqrt(wide / narrow) * exp(-off * off / told * (1 / narrow - 1 / wide) / 2)
         as_new = odds / (1 + odds)
-        new_variance = AS_NEW_SD**2 / narrow
+        new_variance = self._new_sd**2 / narrow
         new = 1 + off * new_variance
         inverse = as_new * new + (1 - as_new) * self.inverse
         variance = as_new * (new_variance + (new - inverse) ** 2)

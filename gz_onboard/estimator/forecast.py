@@ -104,7 +104,6 @@ class Forecaster:
         self.cooling = LumpedCooling.of(model.parameters, "pack", WARM_CELLS)
         p = model.parameters
         self._cutoff_sd = hypot(p.sd("cell_cutoff_voltage"), p.sd("cell_voltage_error_empty"))  # V
-        self._capacity_sd = p.sd("cell_capacity") / p["cell_capacity"]
 
     # --- learning ---------------------------------------------------------------------------------------------
 
@@ -253,11 +252,10 @@ class Forecaster:
         beside = (
             (self.battery.window.sd * left.slope) ** 2
             + (left.energy - colder.energy) ** 2
-            + (self._capacity_sd * left.energy) ** 2
             + (self._cutoff_sd * left.by_cutoff) ** 2
         )
-        by_soc = soc_sd * left.slope
-        of_pack = self.ageing.energy_sd(left.energy, left.slope, soc_sd) if self.ageing else (by_soc, by_soc)
+        fresh = hypot(soc_sd * left.slope, self.battery.capacity_sd * left.energy)
+        of_pack = self.ageing.energy_sd(left.energy, left.slope, soc_sd) if self.ageing else (fresh, fresh)
         energy_sd, upwards = (sqrt(beside + sd * sd) for sd in of_pack)
         range_ = left.energy / consumption
         variance = loss_variance + expected.variance

@@ -132,6 +132,7 @@ class Battery:
     voltage_error_temperature: Row = ()  # degC; none: one error of the circuit for all temperatures
     voltage_error_value: Row = ()  # V of a cell, sd
     as_new: float = 0.5  # probability that the pack is as its file says, before anything is learned of its age
+    capacity_sd: float = 0.01  # relative: how closely a pack that is as new holds `capacity`
     health: Health = field(default_factory=Health)  # changed by `age` only
 
     def cell_capacity(self, temperature: float) -> float:

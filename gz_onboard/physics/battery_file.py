@@ -76,6 +76,7 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         entropy_value=entropy,
         voltage_error_temperature=error_temperatures,
         voltage_error_value=errors,
+        capacity_sd=parameters.sd("cell_capacity") / parameters["cell_capacity"],
         as_new=table.number("as_new", Battery.as_new, low=LEAST_AS_NEW, high=1 - LEAST_AS_NEW),
     )
     return battery.with_parameters(parameters)
