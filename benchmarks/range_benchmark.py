@@ -5,8 +5,10 @@ give up: near empty the controller takes the current away, and a ride ends with 
 has only been creeping for ten. Riders of 48 to 118 kg whom nobody enters, towns and arterial roads, -5 to 35 degC,
 hills. Their CAN frames go as logs through the pipeline of the daemon, which knows the reference scooter's file and
 starts without a saved state: once without the road ahead, once with it (altitude as a map has it, bends and limits, no
-stops). Every other pack is aged: 20 % less capacity, 50 % more resistance; it is discharged a second time, by another
-rider on another road, with what was learned of it kept.
+stops). Of four rides two are of healthy scooters. On one the pack is aged: 20 % less capacity, 50 % more resistance; it
+is discharged a second time, by another rider on another road, with what was learned of it kept. On one a tyre has lost
+its air after 40 minutes. The logs of the healthy ones are also read from the middle on, as by a daemon that starts
+late.
 
 A week has fifteen rides of 4 to 9 km, three a day, with rests and charges between; the state is kept.
 
@@ -47,6 +49,14 @@ RATED = 33.6 * 51.8 * 3600  # J of the pack's data sheet
 RATED_RANGE = RATED / (26.0 * 3.6)  # m: at the consumption of its commissioning rides without hills
 SOME_WAY = 0.05  # of the ride, before which jumps do not count
 LEARNED_FROM = 2  # day of a week, from 0, from which something must have been learned
+JOINED = 0.6  # SOC from which a late daemon listens
+TITLES = {
+    "healthy": "Healthy scooters",
+    "aged": "Aged packs, first discharge",
+    "second": "Aged packs, second discharge",
+    "punctured": "A tyre loses its air after 40 minutes",
+    "joined": "Joined at 60 % of charge",
+}
 KEY = "range benchmark"  # of the vehicle, in its saved states
 ADVANCED = 20.0  # m between two looks at the interval
 COLUMNS = "ridden", "ours", "P10", "P90", "rival"
@@ -78,7 +88,7 @@ class Judged:
     """What one ride gave; held, jumps: by estimator, see `Followed`."""
 
     drawn: Drawn
-    second: bool  # of the same pack
+    kind: str  # see `TITLES`
     length: float  # m
     rows: list[Row]
     held: dict[str, float]
@@ -97,9 +107,14 @@ class Followed:
     state: State  # at its end
 
 
-def follow(name: str, log: Path, truth: Truth, state: State = None, route: Path | None = None) -> Followed:
-    """The log through the pipeline against its truth, with a state that was kept and a route; ours is called `name`."""
-    usual, waiting = Usual(RATED, RATED_RANGE), list(LEVELS)
+def follow(
+    name: str, log: Path, truth: Truth, state: State = None, route: Path | None = None, since: float = 0.0
+) -> Followed:
+    """The log through the pipeline against its truth, with a state that was kept and a route; ours is called `name`.
+
+    since: the time [s] before which nobody listens.
+    """
+    usual, waiting = Usual(RATED, RATED_RANGE), [x for x in LEVELS if x < np.interp(since, truth.time, truth.soc)]
     rows: list[Row] = []
     way: list[tuple[float, ...]] = []
     before = 0.0
@@ -127,36 +142,41 @@ def follow(name: str, log: Path, truth: Truth, state: State = None, route: Path 
     if route:
         ahead = pipeline.estimator.ahead
         ahead.follow(ahead.ready(read_route(route)))
+    first: int | None = None  # ns
     for frames in read_frames(log):
-        pipeline.advance(frames, frames[-1][0])
+        first = frames[0][0] if first is None else first
+        if frames[-1][0] - first >= since * 1e9:
+            pipeline.advance(frames, frames[-1][0])
     at = np.array(way)
     left = truth.distance[-1] - at[:, 0]
-    later = at[:, 0] > SOME_WAY * truth.distance[-1]
+    later = at[:, 0] > at[0, 0] + SOME_WAY * truth.distance[-1]
     held = float(np.mean((at[:, 2] <= left) & (left <= at[:, 3])))
     return Followed(rows, held, list(jumps(at[later, 0], at[later, 1])), way, pipeline.estimator.snapshot(KEY))
 
 
-def judge(drawn: Drawn, log: Path, truth: Truth, state: State, *, second: bool) -> tuple[Judged, State]:
+def judge(drawn: Drawn, log: Path, truth: Truth, state: State, kind: str) -> tuple[Judged, State]:
     """One discharge, without a route and with it, each from the `state` kept; and the state kept at its end."""
     route = log.with_suffix(".route.csv")
     route.write_text(route_of(road_of(drawn), positions=False), encoding="utf-8")
-    free, ahead = follow("ours", log, truth, state), follow("route", log, truth, state, route)
+    since = truth.time[np.searchsorted(-truth.soc, -JOINED)] if kind == "joined" else 0.0
+    free = follow("ours", log, truth, state, since=since)
+    ahead = follow("route", log, truth, state, route, since)
     rows = [
         Row(a.level, a.true, a.ranges | b.ranges, a.intervals | b.intervals, a.soc_error, a.soc_sd)
         for a, b in zip(free.rows, ahead.rows, strict=True)
     ]
     held, moved = ({"ours": getattr(free, x), "route": getattr(ahead, x)} for x in ("held", "jumps"))
-    return Judged(drawn, second, float(truth.distance[-1]), rows, held, moved, free.way), free.state
+    return Judged(drawn, kind, float(truth.distance[-1]), rows, held, moved, free.way), free.state
 
 
-def _judged(given: tuple[Drawn, Path, Truth, State, bool]) -> tuple[Judged, State]:
-    return judge(*given[:4], second=given[4])
+def _judged(given: tuple[Drawn, Path, Truth, State, str]) -> tuple[Judged, State]:
+    return judge(*given)
 
 
 def run(drawn: Sequence[Drawn], jobs: int, *, quiet: bool = False) -> list[Judged]:
-    """All discharges, a few at a time; those of aged packs twice."""
+    """All discharges, a few at a time; those of aged packs twice, those of healthy ones also joined midway."""
     found: list[Judged] = []
-    number = len(drawn) + sum(x.aged for x in drawn)
+    number = len(drawn) + sum(x.condition in ("aged", "healthy") for x in drawn)
     with (
         progress_bar(lambda: float(number), "discharge", quiet=quiet) as bar,
         tempfile.TemporaryDirectory() as folder,
@@ -167,12 +187,15 @@ def run(drawn: Sequence[Drawn], jobs: int, *, quiet: bool = False) -> list[Judge
             states: list[State] = [None] * len(part)
             for second in (False, True):
                 ridden = ride_until_empty(part, Path(folder)) if part else []
-                given = [(x, *way, state, second) for x, way, state in zip(part, ridden, states, strict=True)]
+                given = []
+                for x, way, state in zip(part, ridden, states, strict=True):
+                    given.append((x, *way, state, "second" if second else x.condition))
+                    given += [(x, *way, None, "joined")] if x.condition == "healthy" else []
                 kept = []
                 for judged, state in pool.map(_judged, given):
                     found.append(judged)
                     bar.update(1.0)
-                    kept += [(again(judged.drawn), state)] if judged.drawn.aged else []
+                    kept += [(again(judged.drawn), state)] if judged.kind == "aged" else []
                 for log, _ in ridden:
                     log.unlink()
                 part, states = [x for x, _ in kept], [x for _, x in kept]
@@ -327,12 +350,8 @@ def page(judged: Sequence[Judged], days: Sequence[Day], command: str, version: s
     ]
     if judged:
         lines += [f"![One ride: what was shown, and what was really left]({PICTURE})", ""]
-    for title, some in (
-        ("Healthy packs", [x for x in judged if not x.drawn.aged]),
-        ("Aged packs, first discharge", [x for x in judged if x.drawn.aged and not x.second]),
-        ("Aged packs, second discharge", [x for x in judged if x.second]),
-    ):
-        if some:
+    for kind, title in TITLES.items():
+        if some := [x for x in judged if x.kind == kind]:
             lines += [f"## {title}", "", *table(some), "", *ride_table(some), ""]
     if days:
         lines += ["## Weeks", "", *week_table(days), ""]
@@ -350,7 +369,7 @@ def main() -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress")
     arguments = parser.parse_args()
     first, rides, weeks = arguments.first, arguments.rides, arguments.weeks
-    drawn = [draw(seed, aged=seed % 2 == 1) for seed in range(first, first + rides)]
+    drawn = [draw(seed) for seed in range(first, first + rides)]
     judged = run(drawn, arguments.jobs, quiet=arguments.quiet)
     days = run_weeks(range(first, first + weeks), arguments.jobs, quiet=arguments.quiet)
     command = f"python -m benchmarks.range_benchmark --rides {rides} --weeks {weeks} --first {first}"

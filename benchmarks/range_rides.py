@@ -22,7 +22,12 @@ EMPTY = 0.1  # SOC: no ride ends above it
 GIVES_UP = 2.8 * SERIES  # V at the terminals
 EVERY = 50  # steps of the plant between truths that are kept: each second
 ANOTHER_DAY = 1_000_000  # from a seed to that of a second discharge of the same scooter
-AGED = Hidden(capacity_factor=0.8, resistance_factor=1.5)
+HIDDEN = {
+    "healthy": Hidden(),
+    "aged": Hidden(capacity_factor=0.8, resistance_factor=1.5),
+    "punctured": Hidden(late_force=15.0, late_time=2400.0),  # N: a soft tyre rolls with nearly twice the resistance
+}
+CONDITIONS = "healthy", "aged", "healthy", "punctured"  # by seed
 ROUTE_GRID = 20.0  # m between points of a route
 BEFORE_BEND = 30.0  # m around a point, whose fastest is its limit: within, riders brake for bends
 MAP_ERROR, MAP_LENGTH = 0.3, 400.0  # m of sd of a map's altitude, m over which its errors are alike
@@ -47,25 +52,26 @@ class Drawn:
     kind: str
     ambient: float  # degC
     mass: float  # kg, of rider and luggage, which nobody enters
-    aged: bool
+    condition: str  # see `HIDDEN`
 
 
-def draw(seed: int, *, aged: bool = False) -> Drawn:
+def draw(seed: int) -> Drawn:
     """The ride `seed`, before it is ridden."""
     rng = np.random.default_rng([seed, 29])
     kind, ambient = str(rng.choice(sorted(set(KINDS) - {"oval"}))), float(rng.uniform(-5, 35))
-    return Drawn(seed, seed, kind, ambient, stranger(np.random.default_rng([seed, 31])).mass, aged)
+    mass, condition = stranger(np.random.default_rng([seed, 31])).mass, CONDITIONS[seed % len(CONDITIONS)]
+    return Drawn(seed, seed, kind, ambient, mass, condition)
 
 
 def again(drawn: Drawn) -> Drawn:
     """The same scooter on another day: another rider, road and weather."""
-    return replace(draw(drawn.seed + ANOTHER_DAY, aged=drawn.aged), machine=drawn.machine)
+    return replace(draw(drawn.seed + ANOTHER_DAY), machine=drawn.machine, condition=drawn.condition)
 
 
 def ride_until_empty(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, Truth]]:
     """Ride them together, write the frames of each into `folder`, and give log and truth of each."""
     roads = [road_of(x) for x in drawn]
-    ridden = ride(roads, [scooter(x.machine) for x in drawn], [AGED if x.aged else Hidden() for x in drawn], GIVES_UP)
+    ridden = ride(roads, [scooter(x.machine) for x in drawn], [HIDDEN[x.condition] for x in drawn], GIVES_UP)
     found = []
     for x, way in zip(drawn, ridden, strict=True):
         if (left := way.columns["soc"][-1]) > EMPTY:
