@@ -125,7 +125,7 @@ def follow(
             return
         usual.ride(e.pack_voltage * e.pack_current, e.speed or 0.0, e.time - before if before else 0.0)
         before = e.time
-        distance, soc = (float(np.interp(e.time, truth.time, x)) for x in (truth.distance, truth.soc))
+        distance, soc = (float(np.interp(since + e.time, truth.time, x)) for x in (truth.distance, truth.soc))
         held = Interval(e.range_p10 or 0.0, e.range_p90 or 0.0)
         if not way or distance - way[-1][0] > ADVANCED:
             shown = pipeline.estimator.signals["bms_state_of_charge"].value
