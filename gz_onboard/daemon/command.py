@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="folder for the saved state (default: none)",
     )
     rider = "who rides: what is usual is learned of each rider (default: whoever rode last, or a signal of the bus)"
-    add("--rider", type=_rider, default="", metavar="NAME", help=rider)
+    add("--rider", type=_rider, metavar="NAME", help=rider)
     runtime = _directory("RUNTIME_DIRECTORY")
     add(
         "--control-socket",
@@ -145,7 +145,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
     if never := lacking(vehicle):
         log.info("%s has no sensors for, and its intervals are wider by: %s", vehicle.name, ", ".join(never))
     daemon = Daemon(vehicle, channels, recorder, saved, arguments.filter, arguments.tick)
-    daemon.rider = arguments.rider
+    daemon.rider = arguments.rider or ""
     daemon.control = Control(arguments.control_socket, lambda: daemon.pipeline)
     daemon.control.start()
     if route:

@@ -150,6 +150,13 @@ class Ageing:
         belief = self.belief
         return filter_.soc + belief.soc_shift, sqrt(max(filter_.covariance[0] + belief.soc_variance, LEAST_SOC))
 
+    def as_believed(self, error: float, own: float, slope: float) -> tuple[float, float]:
+        """A voltage's error [V] and the variance of what the filter expects [V²], as the capacity is believed to be.
+
+        slope: of the voltage over SOC [V].
+        """
+        return error - slope * self.belief.soc_shift, max(own + slope * slope * self.belief.soc_variance, 0.0)
+
     # --- learning ---------------------------------------------------------------------------------------------
 
     def part(self, filter_: SocFilter | None = None) -> None:

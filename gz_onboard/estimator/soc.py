@@ -275,7 +275,8 @@ class StateOfCharge:
         slow = self.uncertainty.slow(filter_.soc, temperature)
         load = self.uncertainty.load(r0, (drop, filter_.v1), reading.source, known, voltage_sd)
         error, own = filter_.innovation(cell_voltage, cell_current, temperature)
-        variance = self.gate.update(dt, error, own, slow, load)
+        slope = battery.ocv(filter_.soc, temperature)[1]
+        variance = self.gate.update(dt, *self.ageing.as_believed(error, own, slope), slow, load)
         if self.gate.refuted:
             self._refute(now, filter_, error, drop + filter_.v1)
         elif variance is not None and self.uncertainty.tells_more(filter_.soc, filter_.covariance[0]):
