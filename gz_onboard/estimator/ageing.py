@@ -80,10 +80,10 @@ class Fit:
 class Belief:
     """What of ψ is used: its mean and variance, and what it makes of the filter's SOC."""
 
-    inverse: float = 1.0
-    variance: float = CAPACITY_SD**2
-    soc_shift: float = 0.0
-    soc_variance: float = 0.0  # beside the filter's; may be negative
+    inverse: float
+    variance: float
+    soc_shift: float
+    soc_variance: float  # beside the filter's; may be negative
 
 
 class Ageing:
@@ -91,12 +91,13 @@ class Ageing:
 
     def __init__(self, battery: Battery) -> None:
         self._battery = battery
-        self.inverse, self.variance = 1.0, CAPACITY_SD**2  # ψ
+        self._new_sd = min(max(battery.capacity_sd, NEW_SD[0]), NEW_SD[1])  # of ψ, of a pack that is as new
+        self._unknown = battery.as_new * self._new_sd**2 + (1 - battery.as_new) * CAPACITY_SD**2
+        self.inverse, self.variance = 1.0, self._unknown  # ψ
         self._with_soc = self._with_error = 0.0  # covariances of ψ with SOC and e
-        self.belief = Belief()
+        self.belief = self._believe()
         self._learning = False
         self._agreeing = AGREEING_RATE * battery.pack_capacity(BENCH_TEMPERATURE)  # A
-        self._new_sd = min(max(battery.capacity_sd, NEW_SD[0]), NEW_SD[1])  # of ψ, of a pack that is as new
         self._unknown_resistance = RESISTANCE_AGED_SD * sqrt(1 - battery.as_new)  # sd of it before anything is learned
         self._fit = Fit()
         self._proven = deque([self._fit], KEPT + 1)  # the first is used
@@ -110,7 +111,7 @@ class Ageing:
     def capacity(self) -> Learned:
         """What the pack holds over what its file says."""
         factor, sd = 1 / self.belief.inverse, sqrt(self.belief.variance)
-        return Learned(factor, sd * factor * factor, max(1 - sqrt(self.variance) / CAPACITY_SD, 0.0))
+        return Learned(factor, sd * factor * factor, max(1 - sqrt(self.variance / self._unknown), 0.0))
 
     def energy_sd(self, energy: float, slope: float, soc_sd: float) -> tuple[float, float]:
         """(sd of the energy that is left [J] downwards, upwards), by SOC and capacity, which err together.
@@ -191,7 +192,7 @@ class Ageing:
         self._with_error *= fade
         p00 = max(p00 + share * (share * self.variance - 2 * with_soc), LEAST_SOC)
         filter_.covariance = p00, p01 - share * self._with_error, p11
-        self.variance = min(self.variance + CAPACITY_DRIFT / CYCLES * abs(share), CAPACITY_SD**2)
+        self.variance = min(self.variance + CAPACITY_DRIFT / CYCLES * abs(share), self._unknown)
 
     def corrected(self, filter_: SocFilter, before: tuple[float, float, Covariance]) -> None:
         """The filter has taken in a voltage; `before`: its SOC, e and covariance until then."""
@@ -266,20 +267,19 @@ class Ageing:
     def _believe(self) -> Belief:
         """Two kinds of pack, as new and of unknown age, each by how well it explains what was seen (Bayes).
 
-        The filter's ψ is that of a pack of unknown age. Where the other kind's is elsewhere, SOC is so too.
+        The filter's ψ began with mean and variance of both. Where that of a kind is elsewhere, SOC is so too.
         """
-        told = 1 / self.variance - 1 / CAPACITY_SD**2  # information beyond the prior's
+        told = max(1 / self.variance - 1 / self._unknown, 0.0)  # information beyond the prior's
         off = (self.inverse - 1) / self.variance
         narrow, wide = 1 + self._new_sd**2 * told, 1 + CAPACITY_SD**2 * told
         odds = self._battery.as_new / (1 - self._battery.as_new)
         if told > 0:
             odds *= sqrt(wide / narrow) * exp(-off * off / told * (1 / narrow - 1 / wide) / 2)
         as_new = odds / (1 + odds)
-        new_variance = self._new_sd**2 / narrow
-        new = 1 + off * new_variance
-        inverse = as_new * new + (1 - as_new) * self.inverse
-        variance = as_new * (new_variance + (new - inverse) ** 2)
-        variance += (1 - as_new) * (self.variance + (self.inverse - inverse) ** 2)
+        new_variance, old_variance = self._new_sd**2 / narrow, CAPACITY_SD**2 / wide
+        new, old = 1 + off * new_variance, 1 + off * old_variance
+        inverse = as_new * new + (1 - as_new) * old
+        variance = as_new * (new_variance + (new - inverse) ** 2) + (1 - as_new) * (old_variance + (old - inverse) ** 2)
         moves = self._with_soc / self.variance
         return Belief(inverse, variance, moves * (inverse - self.inverse), moves * moves * (variance - self.variance))
 
