@@ -65,6 +65,11 @@ class Feed:
             self.closed = True
             self.changed.notify_all()
 
+    def before(self) -> int:
+        """The number after which a new reader begins: it gets the newest picture only if that is of now."""
+        with self.changed:
+            return self.number - 1 if self._fresh() else self.number
+
     def after(self, number: int) -> tuple[int, bytes] | None:
         """The newest picture, with its number, once it is newer than `number`; None if there will be none."""
         with self.changed:
@@ -74,8 +79,10 @@ class Feed:
     def latest(self) -> bytes | None:
         """The newest picture; None if it is no longer of now."""
         with self.changed:
-            fresh = self.number and not self.closed and time.monotonic() - self.time <= OLDEST
-            return self.data if fresh else None
+            return self.data if self._fresh() else None
+
+    def _fresh(self) -> bool:
+        return self.number > 0 and not self.closed and time.monotonic() - self.time <= OLDEST
 
 
 @dataclass(frozen=True)
@@ -98,6 +105,11 @@ def static_files() -> dict[str, Static]:
     return files
 
 
+def build_of(files: dict[str, Static]) -> str:
+    """What tells this page from another one."""
+    return hashlib.sha256("".join(file.tag for file in files.values()).encode()).hexdigest()[:16]
+
+
 class Server(ThreadingHTTPServer):
     """Serves `feed` at `host` and `port`; OSError if that cannot be had."""
 
@@ -111,7 +123,7 @@ class Server(ThreadingHTTPServer):
         self.address_family = family
         self.feed = feed
         self.files = static_files()
-        self.build = hashlib.sha256("".join(file.tag for file in self.files.values()).encode()).hexdigest()[:16]
+        self.build = build_of(self.files)
         self._free = threading.Semaphore(MOST_CONNECTIONS)
         super().__init__((str(address[0]), port), Handler)
         self.local = ipaddress.ip_address(str(self.server_address[0]).partition("%")[0]).is_loopback
@@ -213,7 +225,7 @@ class Handler(BaseHTTPRequestHandler):
             return
         with contextlib.suppress(OSError):
             self.wfile.write(f"retry: {RETRY_MS}\nevent: build\ndata: {self.server.build}\n\n".encode())
-            number = 0
+            number = self.server.feed.before()
             while found := self.server.feed.after(number):
                 number, data = found
                 self.wfile.write(b"data: " + data + b"\n\n")

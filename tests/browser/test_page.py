@@ -1,0 +1,345 @@
+"""The page in a real browser: what it shows of which frames, and what it does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+from gz_onboard.dashboard.server import Feed
+from gz_onboard.dashboard.web import served
+from gz_onboard.events import Estimate, Reason, State
+from tests.browser.support import alerts, numbers, shows, texts, wait_for
+from tests.dashboard.served import Sender, dashboard
+from tests.dashboard.test_picture import CHARGING, HEALTHY, ON_ROUTE
+from tests.dashboard.test_terminal import ESTIMATE
+
+SIZES = [(320, 240), (390, 844), (800, 480), (1280, 800)]
+UNREACHABLE = replace(
+    ON_ROUTE,
+    state=State.DEGRADED,
+    reasons=Reason.NO_GPS | Reason.SENSOR_DISTRUSTED,
+    distrusted=("pack_current",),
+    soc=0.12,
+    range=8200.0,
+    range_p10=6100.0,
+    range_p90=9900.0,
+    arrival_soc=0.0,
+    arrival_soc_p10=0.0,
+    battery_ends_after=8300.0,
+)
+
+
+def test_everything_that_the_frames_say(page):
+    with dashboard("all") as address, Sender("all", ESTIMATE):
+        page.goto(address)
+        shows(
+            page,
+            range_value="34",
+            interval="27 to 44 km",
+            soc_value="62",
+            soc_sigma="± 1.2",
+            energy="895 Wh left",
+            recent="25",
+            expected="26",
+            compared="6 % less than expected",
+            causes="temperature −3.4 km\nstops +1.6 km",
+            rated="against the rated 56 km",
+            trust_word="degraded",
+            activity="Riding",
+            reasons="because:\nno inertial unit\ntoo little ridden to know this rider",
+            alerts="A sensor is lost: no inertial unit.",
+            charge="",
+            route="",
+        )
+        assert page.title() == "34 km · gz-onboard"
+        assert (
+            page.get_attribute("#band", "aria-label") == "Range 34 km, between 27 km and 44 km with 80 % probability."
+        )
+        scale = page.inner_text("#band .ticks").split("\n")
+        assert scale[0] == "0"
+        assert scale[-1] == "50"
+        left, width, middle = page.evaluate(
+            """() => [...document.querySelectorAll("#band .between, #band .middle")].flatMap(
+                 (e) => [parseFloat(e.style.left), parseFloat(e.style.width)]).slice(0, 3)"""
+        )
+        assert left / 2 == pytest.approx(26.54, abs=0.01)
+        assert (left + width) / 2 == pytest.approx(44.34, abs=0.01)
+        assert middle / 2 == pytest.approx(34.21, abs=0.01)
+
+
+def test_a_charge(page):
+    with dashboard("charge") as address, Sender("charge", CHARGING):
+        page.goto(address)
+        shows(page, charge_power="620 W", charge_full="full in 2 h 05 min", charge_range="then 54 km", alerts="")
+
+
+def test_a_destination(page):
+    with dashboard("route") as address, Sender("route", ON_ROUTE) as sender:
+        page.goto(address)
+        shows(page, route_left="18 km to go", route_arrival="31 % left there, 22 % at least", alerts="")
+        assert float(page.evaluate("parseFloat(document.querySelector('#band .goal').style.left)")) == pytest.approx(
+            18.3 / 50 * 100, abs=0.1
+        )
+        sender.estimate = UNREACHABLE
+        shows(page, route_arrival="battery ends after 8.3 km", range_value="8.2", interval="6.1 to 9.9 km")
+        assert alerts(page) == [
+            "The destination cannot be reached: the battery ends after 8.3 km.",
+            "The battery is nearly empty: 12 %.",
+            "A sensor is lost: no GPS, pack current.",
+        ]
+        shows(page, distrusted="sensors left out:\npack current")
+
+
+@pytest.mark.parametrize("state", [State.STARTING, State.INVALID])
+def test_without_an_estimate_there_is_no_number(page, state):
+    with dashboard(f"no-{state}") as address, Sender(f"no-{state}", Estimate(time=0.0, state=state)):
+        page.goto(address)
+        shows(page, trust_word=state.name.lower())
+        assert numbers(page) == []
+        assert (alerts(page) == ["The range cannot be told."]) == (state is State.INVALID)
+
+
+def test_a_silent_bus_and_a_daemon_that_is_started_anew(page):
+    with dashboard("quiet") as address:
+        page.goto(address)
+        shows(page, alerts="Nothing has come yet from the range estimator on quiet (range.dbc).")
+        assert numbers(page) == []
+        with Sender("quiet", HEALTHY):
+            shows(page, range_value="34", soc_value="62", alerts="")
+        shows(page, soc_value="–", range_value="34", alerts="Some values are no longer renewed.")
+        assert "nothing new of:" in texts(page)["missing"]
+        shows(page, range_value="–", alerts="Nothing comes from the range estimator any more.")
+        assert numbers(page) == []
+        assert page.is_hidden("#band .between")
+        with Sender("quiet", replace(HEALTHY, range=31_000.0)):
+            shows(page, range_value="31", soc_value="62", alerts="", missing="")
+
+
+def test_the_server_gone_and_started_anew(page):
+    with Sender("gone", HEALTHY):
+        with dashboard("gone") as address:
+            page.goto(address)
+            shows(page, range_value="34")
+            page.evaluate("window.same = true")
+        shows(page, range_value="–", trust_word="not known", alerts="The dashboard does not answer. Trying again.")
+        assert numbers(page) == []
+        with dashboard("gone", urlsplit(address).netloc):
+            shows(page, range_value="34", trust_word="valid", alerts="")
+            assert page.evaluate("window.same")  # by itself, not by loading the page anew
+
+
+def test_a_server_with_another_page_is_loaded_anew(page, monkeypatch):
+    with Sender("new", HEALTHY):
+        with dashboard("new") as address:
+            page.goto(address)
+            shows(page, range_value="34")
+            page.evaluate("window.same = true")
+        monkeypatch.setattr("gz_onboard.dashboard.server.build_of", lambda files: "another")
+        with dashboard("new", urlsplit(address).netloc):
+            wait_for(lambda: not page.evaluate("window.same"), "the page loaded anew")
+            shows(page, range_value="34")
+
+
+def test_a_server_that_hangs(page):
+    """Its connection stands, and nothing comes: the last numbers do not stay."""
+    feed = Feed()
+    with dashboard("hang") as other, Sender("hang", HEALTHY), served(feed, "127.0.0.1:0") as address:
+        page.goto(other)
+        shows(page, range_value="34")
+        data = page.evaluate("fetch('api/latest').then((r) => r.text())")
+        page.goto(address)
+        feed.publish(data.encode())
+        shows(page, range_value="34")
+        shows(page, range_value="–", alerts="The dashboard sends nothing. Trying again.")
+        assert numbers(page) == []
+
+        # It is asked again, and what it sends then is shown.
+        def back() -> bool:
+            feed.publish(data.encode())
+            return texts(page)["range-value"] == "34"
+
+        wait_for(back, "the range back")
+
+
+def test_a_reload(page):
+    with dashboard("reload") as address, Sender("reload", HEALTHY):
+        page.goto(address)
+        for _ in range(5):
+            shows(page, range_value="34", soc_value="62")
+            page.reload()
+        shows(page, range_value="34", soc_value="62")
+
+
+def test_a_page_that_nobody_looks_at_shows_nothing_old(page):
+    with dashboard("hidden") as address, Sender("hidden", HEALTHY):
+        page.goto(address)
+        shows(page, range_value="34")
+        hide = "(on) => { Object.defineProperty(document, 'hidden', {value: on, configurable: true});"
+        page.evaluate(f"{hide} document.dispatchEvent(new Event('visibilitychange')); }}", True)
+        shows(page, range_value="–")
+        assert numbers(page) == []
+        page.evaluate(f"{hide} document.dispatchEvent(new Event('visibilitychange')); }}", False)
+        shows(page, range_value="34")
+
+
+# --- how it is shown ------------------------------------------------------------------------------------------------
+
+
+def test_miles_and_german_are_kept(page):
+    with dashboard("mi") as address, Sender("mi", replace(ESTIMATE, state=State.VALID)):
+        page.goto(address)
+        shows(page, range_value="34")
+        page.click("#unit")
+        shows(page, range_value="21", interval="16 to 28 mi", recent="40", rated="against the rated 35 mi")
+        page.click("#language")
+        shows(page, interval="16 bis 28 mi", compared="6 % weniger als erwartet", trust_word="gültig")
+        shows(page, soc_sigma="± 1,2", causes="Temperatur −2,1 mi\nStopps +1,0 mi")
+        assert page.get_attribute("html", "lang") == "de"
+        page.reload()
+        shows(page, interval="16 bis 28 mi", activity="Fährt")
+
+
+def ground(page: Any) -> str:
+    return str(page.evaluate("getComputedStyle(document.body).backgroundColor"))
+
+
+def test_day_and_night(page):
+    white, black = "rgb(255, 255, 255)", "rgb(0, 0, 0)"
+    with dashboard("night") as address:
+        page.goto(address)
+        assert ground(page) == white
+        page.emulate_media(color_scheme="dark")  # as the system says, at once
+        assert wait_for(lambda: ground(page) == black, "night")
+        page.click("#theme")  # the switch, against the system
+        assert texts(page)["theme"] == "Day"
+        assert ground(page) == white
+        page.reload()
+        assert ground(page) == white
+        page.click("#theme")
+        page.emulate_media(color_scheme="light")
+        assert ground(page) == black
+        page.goto(f"{address}?theme=day")  # for this page alone
+        assert ground(page) == white
+        page.goto(address)
+        assert ground(page) == black
+
+
+def test_it_works_where_storage_is_forbidden(page):
+    page.add_init_script("Object.defineProperty(window, 'localStorage', {get() { throw new Error('forbidden'); }});")
+    with dashboard("stored") as address, Sender("stored", HEALTHY):
+        page.goto(address)
+        shows(page, range_value="34")
+        page.click("#unit")
+        shows(page, range_value="21")
+
+
+@pytest.mark.parametrize("language", ["en", "de"])
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_it_fits(page, width, height, language):
+    """Nothing wider than the screen, whatever stands on it; the range and the charge without scrolling."""
+    page.set_viewport_size({"width": width, "height": height})
+    name = f"fit-{width}-{language}"
+    with dashboard(name) as address, Sender(name, UNREACHABLE) as sender:
+        page.goto(f"{address}?language={language}")
+        far = replace(HEALTHY, range=412e3, range_p10=365e3, range_p90=466e3)
+        for estimate, km in (UNREACHABLE, ("8.2", "8,2")), (CHARGING, ("34",)), (far, ("412",)):
+            sender.estimate = estimate
+            wait_for(lambda km=km: texts(page)["range-value"] in km, f"{km} km")  # type: ignore[misc]
+            assert page.evaluate("document.documentElement.scrollWidth") == width
+            outside = page.evaluate(
+                """() => [...document.querySelectorAll("main *, header *, footer *")].filter((e) => {
+                     const box = e.getBoundingClientRect(), card = e.closest("section, header, footer");
+                     return box.width > 1 && box.right > card.getBoundingClientRect().right + 1;
+                   }).map((e) => e.id || e.className)"""
+            )
+            assert outside == []
+            for place in "#range-value", "#band", "#soc-value", "#trust":
+                box = page.locator(place).bounding_box()
+                assert box["y"] >= 0
+                assert box["y"] + box["height"] <= height + (18 if place == "#band" else 0), place
+            assert page.locator("#range-value").bounding_box()["height"] >= min(width, height) / 5
+
+
+CONTRASTS = """() => {
+  const luminance = (c) => c.slice(0, 3).map((v) => v / 255)
+    .map((v) => v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, v, i) => sum + v * [0.2126, 0.7152, 0.0722][i], 0);
+  const colour = (text) => text.match(/[\\d.]+/g).map(Number);
+  const ground = (e) => { for (; e; e = e.parentElement) { const c = colour(getComputedStyle(e).backgroundColor);
+    if (c.length < 4 || c[3] > 0) return c; } return [255, 255, 255]; };
+  return [...document.querySelectorAll("body *")].filter((e) => e.checkVisibility() &&
+      [...e.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim())).map((e) => {
+    const [a, b] = [luminance(colour(getComputedStyle(e).color)), luminance(ground(e))].sort((x, y) => y - x);
+    return [e.id || e.className || e.tagName, (a + 0.05) / (b + 0.05)];
+  });
+}"""
+
+
+@pytest.mark.parametrize("theme", ["day", "night"])
+def test_all_can_be_read_in_the_sun(page, theme):
+    """Contrast of 4.5 at least, as WCAG AA asks, of all texts; 12 of the numbers."""
+    with dashboard(theme) as address, Sender(theme, UNREACHABLE) as sender:
+        page.goto(f"{address}?theme={theme}")
+        for estimate in UNREACHABLE, HEALTHY, replace(HEALTHY, state=State.INVALID):
+            sender.estimate = estimate
+            shows(page, trust_word=estimate.state.name.lower())
+            found = dict(page.evaluate(CONTRASTS))
+            assert len(found) > 20
+            assert {name: value for name, value in found.items() if value < 4.5} == {}
+            assert min(found[name] for name in ("range-value", "interval", "soc-value", "recent")) > 12
+
+
+# --- keyboard and screen reader -------------------------------------------------------------------------------------
+
+
+def test_by_keyboard(page):
+    with dashboard("keys") as address, Sender("keys", HEALTHY):
+        page.goto(address)
+        shows(page, range_value="34")
+        reached = []
+        for _ in range(3):
+            page.keyboard.press("Tab")
+            reached.append(page.evaluate("document.activeElement.id"))
+            outline = page.evaluate("getComputedStyle(document.activeElement).outlineStyle")
+            assert outline == "solid"
+        assert reached == ["theme", "unit", "language"]
+        page.keyboard.press("Shift+Tab")
+        page.keyboard.press("Enter")
+        shows(page, range_value="21")
+
+
+def test_a_screen_reader_hears_changes_of_state_and_not_every_tick(page):
+    with dashboard("reader") as address, Sender("reader", HEALTHY) as sender:
+        page.goto(address)
+        shows(page, announcer="Range valid. riding.")
+        page.evaluate(
+            """() => { window.said = []; new MutationObserver(() => said.push(announcer.textContent)).observe(
+                 announcer, {childList: true, characterData: true, subtree: true}); }"""
+        )
+        assert page.locator("[aria-live]").count() == 1
+        assert page.get_attribute("#announcer", "aria-live") == "polite"
+        for km in 33, 32, 31:
+            sender.estimate = replace(HEALTHY, range=km * 1000.0)
+            shows(page, range_value=str(km))
+        assert page.evaluate("said") == []
+        sender.estimate = replace(HEALTHY, state=State.DEGRADED, reasons=Reason.NO_GPS)
+        shows(page, announcer="Range degraded. A sensor is lost: no GPS.")
+        assert page.evaluate("said.length") == 1
+
+
+def test_names_for_those_who_do_not_see(page):
+    with dashboard("names") as address, Sender("names", ON_ROUTE):
+        page.goto(address)
+        shows(page, route_left="18 km to go")
+        tree = page.locator("body").aria_snapshot()
+        for shown in (
+            'region "Range"',
+            'region "Battery"',
+            'img "Range 34 km, between',
+            "The destination is 18 km away",
+        ):
+            assert shown in tree
+        assert 'list "Alerts"' in tree or page.is_hidden("#alerts")
