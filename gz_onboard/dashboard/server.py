@@ -77,8 +77,9 @@ class Feed:
             return None if self.closed else (self.number, self.data)
 
     def latest(self) -> bytes | None:
-        """The newest picture; None if it is no longer of now."""
+        """The newest picture, waiting for the first one; None if it is no longer of now."""
         with self.changed:
+            self.changed.wait_for(lambda: self.closed or self.number > 0, OLDEST)
             return self.data if self._fresh() else None
 
     def _fresh(self) -> bool:
