@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 from urllib.parse import urlsplit
@@ -23,6 +24,8 @@ UNREACHABLE = replace(
     reasons=Reason.NO_GPS | Reason.SENSOR_DISTRUSTED,
     distrusted=("pack_current",),
     soc=0.12,
+    energy_left=208 * 3600.0,
+    consumption_recent=31.4 * 3.6,
     range=8200.0,
     range_p10=6100.0,
     range_p90=9900.0,
@@ -79,7 +82,7 @@ def test_a_charge(page):
 def test_a_destination(page):
     with dashboard("route") as address, Sender("route", ON_ROUTE) as sender:
         page.goto(address)
-        shows(page, route_left="18 km to go", route_arrival="31 % left there, 22 % at least", alerts="")
+        shows(page, route_left="18 km to go", route_arrival="31 % left there, 22 % if it goes badly", alerts="")
         assert float(page.evaluate("parseFloat(document.querySelector('#band .goal').style.left)")) == pytest.approx(
             18.3 / 50 * 100, abs=0.1
         )
@@ -138,9 +141,11 @@ def test_a_server_with_another_page_is_loaded_anew(page, monkeypatch):
             shows(page, range_value="34")
             page.evaluate("window.same = true")
         monkeypatch.setattr("gz_onboard.dashboard.server.build_of", lambda files: "another")
-        with dashboard("new", urlsplit(address).netloc):
-            wait_for(lambda: not page.evaluate("window.same"), "the page loaded anew")
+        with ExitStack() as stack:
+            with page.expect_event("load"):
+                stack.enter_context(dashboard("new", urlsplit(address).netloc))
             shows(page, range_value="34")
+            assert not page.evaluate("window.same")
 
 
 def test_a_server_that_hangs(page):
