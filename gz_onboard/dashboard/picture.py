@@ -49,7 +49,7 @@ class Range:
 
 
 @dataclass(frozen=True, slots=True)
-class Battery:
+class BatteryLevel:
     """State of charge and remaining energy."""
 
     soc_percent: float | None
@@ -94,7 +94,7 @@ class CauseOfRange:
 
 
 @dataclass(frozen=True, slots=True)
-class Counts:
+class FrameCounts:
     """Of the range frames as they were received here."""
 
     received: int
@@ -114,7 +114,7 @@ class Picture:
     state: str | None
     activity: str | None
     range: Range
-    battery: Battery
+    battery: BatteryLevel
     consumption: Consumption
     charge: Charge | None
     route: Destination | None
@@ -126,7 +126,7 @@ class Picture:
     stale: tuple[str, ...]  # messages whose numbers are no longer given
     alerts: tuple[str, ...]
     age_s: float | None = field(compare=False)  # since the last good frame
-    counts: Counts = field(compare=False)
+    counts: FrameCounts = field(compare=False)
 
     def encoded(self) -> bytes:
         """As one line of JSON."""
@@ -140,7 +140,7 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
     """
     value = partial(view.value, now=now)
     state, activity, age = view.state(now), _activity(view, now), view.age(now)
-    battery = Battery(
+    battery = BatteryLevel(
         *(_rounded(value(f"RANGE_{name}")) for name in ("StateOfCharge", "StateOfChargeSigma", "EnergyLeft"))
     )
     route, reasons = _route(view, now), view.reasons(now)
@@ -179,7 +179,7 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
         stale=stale,
         alerts=tuple(alert for alert in ALERTS if said[alert]),
         age_s=None if math.isinf(age) else round(age, 3),
-        counts=Counts(
+        counts=FrameCounts(
             sum(entry.received for entry in view.messages.values()),
             sum(entry.lost for entry in view.messages.values()),
             view.bad(),
