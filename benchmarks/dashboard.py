@@ -39,8 +39,9 @@ ESTIMATE = Estimate(
     consumption_recent=88.0,
     consumption_expected=94.0,
 )
-WATCH = """() => { window.drawn = []; new MutationObserver(() => drawn.push([energy.textContent, Date.now()])).observe(
-  energy, {childList: true, characterData: true, subtree: true}); }"""
+WATCH = """() => { window.drawn = []; new MutationObserver(
+  () => drawn.push([energy.textContent.replaceAll("\\u00a0", " "), Date.now()])
+).observe(energy, {childList: true, characterData: true, subtree: true}); }"""
 
 
 def child(seconds: float) -> None:

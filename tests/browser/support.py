@@ -55,8 +55,12 @@ TEXTS = """() => Object.fromEntries([...document.querySelectorAll("[id]")].map(
 
 def texts(page: Page) -> dict[str, str]:
     """What stands on the page at one moment, by the id of its place."""
-    found: dict[str, str] = page.evaluate(TEXTS)
-    return found
+    return {place: plain(text) for place, text in page.evaluate(TEXTS).items()}
+
+
+def plain(text: str) -> str:
+    """With spaces where the page has such as end no line."""
+    return text.replace("\u00a0", " ")
 
 
 def shows(page: Page, **wanted: str) -> None:

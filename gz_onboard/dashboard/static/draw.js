@@ -70,7 +70,8 @@ function drawConsumption({ consumption: used }) {
   put("expected", consumption(expected));
   const most = Math.max(recent ?? 0, expected ?? 0);
   for (const [id, value] of [["recent-bar", recent], ["expected-bar", expected]]) {
-    byId(id).style.width = `${most > 0 ? (100 * Math.max(value ?? 0, 0)) / most : 0}%`;
+    byId(id).hidden = !(value > 0);
+    byId(id).style.width = `${value > 0 ? (100 * value) / most : 0}%`;
   }
   if (!known(recent) || !known(expected) || expected <= 0) return put("compared", DASH);
   const share = recent / expected - 1;

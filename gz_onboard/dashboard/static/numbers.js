@@ -2,6 +2,7 @@
 import { settings } from "./settings.js";
 
 export const DASH = "–";
+const GAP = "\u00a0";  // no line ends between a number and its unit
 const KM_PER_MI = 1.609344;
 
 export const perUnit = () => (settings.unit === "mi" ? KM_PER_MI : 1);
@@ -21,26 +22,26 @@ export function distanceOnly(km) {
   return number(value, value < 9.95 ? 1 : 0);
 }
 
-export const distance = (km) => (known(km) ? `${distanceOnly(km)} ${settings.unit}` : DASH);
-export const change = (km) => `${number(km / perUnit(), 1, true)} ${settings.unit}`;
+export const distance = (km) => (known(km) ? `${distanceOnly(km)}${GAP}${settings.unit}` : DASH);
+export const change = (km) => `${number(km / perUnit(), 1, true)}${GAP}${settings.unit}`;
 export const consumption = (whPerKm) => number(known(whPerKm) ? whPerKm * perUnit() : null);
-export const percent = (value, digits = 0) => (known(value) ? `${number(value, digits)} %` : DASH);
+export const percent = (value, digits = 0) => (known(value) ? `${number(value, digits)}${GAP}%` : DASH);
 
 // Watts below a kilowatt, then kilowatts.
 export function power(watts) {
   if (!known(watts)) return DASH;
-  return watts < 1000 ? `${number(watts)} W` : `${number(watts / 1000, 1)} kW`;
+  return watts < 1000 ? `${number(watts)}${GAP}W` : `${number(watts / 1000, 1)}${GAP}kW`;
 }
 
 export function energy(wh) {
   if (!known(wh)) return DASH;
-  return wh < 10000 ? `${number(wh)} Wh` : `${number(wh / 1000, 1)} kWh`;
+  return wh < 10000 ? `${number(wh)}${GAP}Wh` : `${number(wh / 1000, 1)}${GAP}kWh`;
 }
 
 export function duration(minutes) {
   if (!known(minutes)) return DASH;
   const whole = Math.round(minutes);
-  return whole < 60 ? `${whole} min` : `${Math.floor(whole / 60)} h ${String(whole % 60).padStart(2, "0")} min`;
+  return whole < 60 ? `${whole}${GAP}min` : `${Math.floor(whole / 60)}${GAP}h${GAP}${String(whole % 60).padStart(2, "0")}${GAP}min`;
 }
 
 // The next round number from `value` on.
