@@ -1,4 +1,4 @@
-"""One browser for all tests of a worker, one page for each."""
+"""One browser for the tests of a worker, one page for each."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from playwright.sync_api import BrowserContext, Page
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")  # not longer: its event loop runs in this thread
 def browser() -> Iterator[BrowserContext]:
     pytest.importorskip("playwright", reason="no Playwright: .ci/setup venv")
     if not CHROMIUM:
