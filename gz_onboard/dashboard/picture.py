@@ -139,7 +139,9 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
     source: (channel, interface); up: whether that bus is; before: the alerts of the last picture.
     """
     value = partial(view.value, now=now)
-    state, activity, age = view.state(now), _activity(view, now), view.age(now)
+    # The range's own state lives ten times as long as the status: of a status that is gone it says too much.
+    state = None if view.messages["RANGE_Status"].stale(now) else view.state(now)
+    activity, age = _activity(view, now), view.age(now)
     battery = BatteryLevel(
         *(_rounded(value(f"RANGE_{name}")) for name in ("StateOfCharge", "StateOfChargeSigma", "EnergyLeft"))
     )

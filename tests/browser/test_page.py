@@ -113,6 +113,10 @@ def test_a_silent_bus_and_a_daemon_that_is_started_anew(page):
             shows(page, range_value="34", soc_value="62", alerts="")
         shows(page, soc_value="–", range_value="34", alerts="Some values are no longer renewed.")
         assert "nothing new of:" in texts(page)["missing"]
+        late = "[...document.querySelectorAll('.late')].map((e) => e.id)"
+        wait_for(lambda: set(page.evaluate(late)) >= {"range", "energy", "consumption", "why"}, "what is late, as such")
+        assert page.evaluate("getComputedStyle(document.querySelector('#range .figure')).fontStyle") == "italic"
+        shows(page, trust_word="not known", energy="895 Wh left", range_value="34")
         shows(page, range_value="–", alerts="Nothing comes from the range estimator any more.")
         assert numbers(page) == []
         assert page.is_hidden("#band .between")

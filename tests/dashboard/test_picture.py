@@ -102,6 +102,11 @@ def test_an_old_number_is_not_given(after, gone, stay):
     assert all(has[name] for name in stay)
 
 
+def test_a_state_is_not_older_than_the_status():
+    assert of(HEALTHY, 100.9).state == "valid"
+    assert of(HEALTHY, 101.1).state is None
+
+
 def test_what_is_late_is_said():
     assert of(ESTIMATE, 100.2).late == ()
     assert of(ESTIMATE, 100.4).late == ("RANGE_Status",)

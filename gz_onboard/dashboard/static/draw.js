@@ -11,9 +11,9 @@ const NOTHING = {
   consumption: { recent_wh_per_km: null, expected_wh_per_km: null }, charge: null, route: null, rated_km: null,
   causes: [], reasons: [], distrusted: [], late: [], stale: [], alerts: [], counts: null,
 };
-const SHOWN_BY = {  // the section that a message fills
-  RANGE_Estimate: "range", RANGE_Status: "battery", RANGE_Energy: "consumption", RANGE_Charge: "charge",
-  RANGE_Route: "route", RANGE_Why: "why",
+const SHOWN_BY = {  // the places that a message fills
+  RANGE_Estimate: ["range"], RANGE_Status: ["charge-level", "state"], RANGE_Energy: ["energy", "consumption"],
+  RANGE_Charge: ["charge"], RANGE_Route: ["route"], RANGE_Why: ["why"],
 };
 const SIGNS = { valid: "✓", degraded: "!", invalid: "✕", starting: "…", none: "?" };
 const SAME = 0.03;  // a consumption so near to the expected is as expected
@@ -115,7 +115,9 @@ function drawState(picture, problem) {
   const late = picture.late.filter((name) => !picture.stale.includes(name));
   bullets("missing", picture.stale.length ? words().stale : words().late, named(picture.stale.length ? picture.stale : late));
   put("frames", picture.counts ? said(words().frames, picture.counts) : DASH);
-  for (const [message, section] of Object.entries(SHOWN_BY)) byId(section).classList.toggle("late", late.includes(message));
+  for (const [message, places] of Object.entries(SHOWN_BY)) {
+    for (const place of places) byId(place).classList.toggle("late", late.includes(message));
+  }
   document.body.classList.toggle("gone", Boolean(problem));
 }
 
