@@ -1,7 +1,8 @@
 """A recorded ride through the daemon, on a bus: what `make run` shows.
 
 On a vcan the daemon, the replay and the dashboard are three processes that share nothing but the bus. On
-python-can's `virtual` interface, which ends where the process ends, they are three threads of this one.
+python-can's `virtual` interface, which ends where the process ends, they are three threads of this one. A second
+dashboard serves the page for a browser, but not in a guest, whose network no browser reaches.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from gz_onboard.vehicle import read_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]
 BIN = Path(sys.executable).parent
+GUEST = Path("/run/vcan-guest")
 READY_WITHIN = 30.0  # s
 STOPPED_WITHIN = 15.0  # s
 
@@ -57,13 +59,14 @@ def main() -> int:
     replay = ["replay", str(args.ride), *bus, "--speed", str(args.speed)]
     dbc = read_vehicle(args.vehicle).range_dbc
     dashboard = ["dashboard", *bus, "--dbc", str(dbc)]
+    pages = [] if GUEST.is_dir() else [[*dashboard, "--web", "--listen", "127.0.0.1:0"]]
 
     where = "in-process virtual bus" if args.interface == "virtual" else f"{args.channel} of Linux {os.uname().release}"
     print(f"=== {args.ride.name} on the {where}, for at most {args.seconds:g} s")
     frames = directory / "range.log"
     play = play_in_threads if args.interface == "virtual" else play_in_processes
     with recording(args.interface, args.channel, frames, dbc), listening_for_ready() as wait_until_ready:
-        status = play(daemon, replay, dashboard, wait_until_ready, args.seconds)
+        status = play(daemon, replay, dashboard, pages, wait_until_ready, args.seconds)
     if status:
         print(f"demo: ended with status {status}", file=sys.stderr)
         return status
@@ -113,15 +116,22 @@ def listening_for_ready() -> Iterator[Callable[[], bool]]:
 
 
 def play_in_processes(
-    daemon: list[str], replay: list[str], dashboard: list[str], wait_until_ready: Callable[[], bool], seconds: float
+    daemon: list[str],
+    replay: list[str],
+    dashboard: list[str],
+    pages: list[list[str]],
+    wait_until_ready: Callable[[], bool],
+    seconds: float,
 ) -> int:
-    """Run the three commands as processes; the daemon's exit status."""
+    """Run the commands as processes; the daemon's exit status."""
     command = str(BIN / "gz-onboard")
     with contextlib.ExitStack() as stack:
         daemon_process = stack.enter_context(subprocess.Popen([command, *daemon]))
         stack.callback(daemon_process.terminate)
         if not wait_until_ready():
             return daemon_process.poll() or 1
+        for page in pages:
+            stack.callback(stack.enter_context(subprocess.Popen([command, *page])).terminate)
         dashboard_process = stack.enter_context(subprocess.Popen([command, *dashboard]))
         stack.callback(dashboard_process.terminate)
         with contextlib.suppress(subprocess.TimeoutExpired):  # a ride may be longer than the demonstration
@@ -136,14 +146,20 @@ def play_in_processes(
 
 
 def play_in_threads(
-    daemon: list[str], replay: list[str], dashboard: list[str], wait_until_ready: Callable[[], bool], seconds: float
+    daemon: list[str],
+    replay: list[str],
+    dashboard: list[str],
+    pages: list[list[str]],
+    wait_until_ready: Callable[[], bool],
+    seconds: float,
 ) -> int:
-    """Run the three commands in this process, the daemon in the main thread, where signals arrive."""
+    """Run the commands in this process, the daemon in the main thread, where signals arrive."""
     from gz_onboard import cli
 
     def the_rest() -> None:
         if wait_until_ready():
-            threading.Thread(target=cli.main, args=(replay,), daemon=True).start()
+            for command in [*pages, replay]:
+                threading.Thread(target=cli.main, args=(command,), daemon=True).start()
             cli.main([*dashboard, "--duration", str(seconds)])  # no signal can end it in a thread
         os.kill(os.getpid(), signal.SIGTERM)
 

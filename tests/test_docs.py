@@ -29,6 +29,7 @@ GUIDE = {
     "range-frames",
     "why",
     "road-ahead",
+    "dashboard",
     "log-format",
     "service",
     "limits",

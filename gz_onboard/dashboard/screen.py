@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from gz_onboard.bus.publisher import reason_signal
-from gz_onboard.dashboard.view import View
+from gz_onboard.dashboard.view import NEARLY_EMPTY, View
 from gz_onboard.events import Cause, State, words
 
 
@@ -158,7 +158,7 @@ def _soc(view: View, now: float, width: int) -> Line:
     cells = min(width - 38, 36)
     if soc is not None and cells >= 10:
         full = min(max(round(soc / 100 * cells), 0), cells)
-        line += [("█" * full, _DIM if late else "32" if soc > 15 else "31"), ("░" * (cells - full), _DIM)]
+        line += [("█" * full, _DIM if late else "32" if soc > NEARLY_EMPTY else "31"), ("░" * (cells - full), _DIM)]
     return line
 
 

@@ -1,4 +1,4 @@
-"""``gz-onboard dashboard``: the range in a terminal, from nothing but the range frames on the bus.
+"""The range in a terminal, from nothing but the range frames on the bus.
 
 What is shown is always of now: a message that has not come for ten of its periods is shown as stale, and its
 numbers as dashes. On a terminal a screen that is drawn anew five times a second; anywhere else a line a second.
@@ -6,64 +6,43 @@ numbers as dashes. On a terminal a screen that is drawn anew five times a second
 
 from __future__ import annotations
 
-import argparse
 import errno
 import math
 import os
 import shutil
-import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import IO, TextIO
 
 from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.dbc import find_dbc
-from gz_onboard.bus.publisher import RANGE_DBC
 from gz_onboard.dashboard.screen import Style, rendered, screen, summary_line
+from gz_onboard.dashboard.stopping import until_signalled
 from gz_onboard.dashboard.view import View
 from gz_onboard.errors import FAILED, OK, InputError
-from gz_onboard.options import add_shared, number
 
 POLL = 0.05  # s
 REDRAW = 0.2  # s
 ONCE_WITHIN = 5.0  # s: how long --once waits for every message
-DURATIONS = 1e-3, 1e9  # s
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The options of ``gz-onboard dashboard``."""
-    add = parser.add_argument
-    add_shared(parser, "--interface", "--channel")
-    add(
-        "--dbc",
-        default=RANGE_DBC,
-        metavar="FILE",
-        help="DBC file of the range frames, the vehicle's range_dbc (default: %(default)s)",
-    )
-    add("--once", action="store_true", help="print one picture as soon as every message has come, and end")
-    add("--duration", type=number("--duration", *DURATIONS, "s"), metavar="S", help="end after this long")
+def show(view: View, channel: CanChannel, once: bool, duration: float | None) -> int:
+    """Show `view` of the open `channel` for `duration` [s], or for ever.
 
-
-def run(arguments: argparse.Namespace) -> int:
-    """``gz-onboard dashboard``: 0, also when ended by Ctrl-C; 1 if --once found no range frames."""
+    once: one picture as soon as every message has come. The exit status: 1 if `once` found no range frames.
+    """
     out: TextIO | None = sys.stdout
     if out is None:  # closed by who called us
         raise InputError("there is no standard output to show anything on")
-    view = View(find_dbc(arguments.dbc, Path.cwd()))
-    channel = CanChannel(arguments.interface, arguments.channel, identifiers=view.identifiers)
-    channel.open()
-    source = f"{arguments.channel} ({arguments.interface})"
-    duration = arguments.duration or (ONCE_WITHIN if arguments.once else math.inf)
+    source = f"{channel.name} ({channel.interface})"
+    duration = duration or (ONCE_WITHIN if once else math.inf)
     style = Style(
         colour=_is_screen(out) and "NO_COLOR" not in os.environ, unicode="utf" in (out.encoding or "").lower()
     )
     try:
-        with _until_signalled() as stopped:
-            if arguments.once:
+        with until_signalled() as stopped:
+            if once:
                 for _ in _polled(view, channel, duration, lambda: stopped() or view.complete()):
                     pass
                 _print(view, source, style, out)
@@ -77,31 +56,13 @@ def run(arguments: argparse.Namespace) -> int:
         if isinstance(error, BrokenPipeError):
             raise
         raise InputError(f"standard output: {error.strerror}") from error
-    finally:
-        channel.close()
-    return FAILED if arguments.once and math.isinf(view.age(time.monotonic())) else OK
+    return FAILED if once and math.isinf(view.age(time.monotonic())) else OK
 
 
 def _is_screen(out: IO[str]) -> bool:
     """Whether `out` is a terminal that this process may take over."""
     in_front = threading.current_thread() is threading.main_thread()
     return in_front and out.isatty() and os.environ.get("TERM", "dumb") != "dumb"
-
-
-@contextmanager
-def _until_signalled() -> Iterator[Callable[[], bool]]:
-    """Whether to stop: SIGINT and SIGTERM ask for it, so that the terminal is left as it was found."""
-    if threading.current_thread() is not threading.main_thread():
-        yield lambda: False
-        return
-    stopping = threading.Event()
-    wanted = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, lambda *_: stopping.set()) for number in wanted}
-    try:
-        yield stopping.is_set
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 def _polled(view: View, channel: CanChannel, duration: float, stopped: Callable[[], bool]) -> Iterator[float]:

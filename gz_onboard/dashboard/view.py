@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from cantools.database.can import Message
 
 LATE_PERIODS = 3  # after so many the numbers are shown in grey, after STALE_PERIODS not at all
+NEARLY_EMPTY = 15.0  # %: a state of charge that the rider is told of
 PERIODS = {"RANGE_Status": 100}  # ms, where the DBC does not say; of the others 1000
 _NUMBERS = {  # how each is written: format, unit
     "RANGE_Remaining": (".1f", "km"),

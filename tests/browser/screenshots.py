@@ -1,0 +1,50 @@
+"""The pictures of docs/dashboard.md, of frames as a daemon sends them: ``python -m tests.browser.screenshots``."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+
+from gz_onboard.events import Estimate
+from tests.browser.support import opened_browser, shows
+from tests.browser.test_page import UNREACHABLE
+from tests.dashboard.served import Sender, dashboard
+from tests.dashboard.test_picture import CHARGING, HEALTHY, ON_ROUTE
+from tests.dashboard.test_terminal import ESTIMATE
+from tests.support import ROOT
+
+COLOURS = 48  # the pictures have few
+PICTURES: list[tuple[int, int, str, Estimate, str]] = [
+    (320, 240, "day", HEALTHY, "en"),
+    (320, 240, "night", UNREACHABLE, "en"),
+    (390, 844, "day", ON_ROUTE, "en"),
+    (390, 844, "night", replace(CHARGING, soc=0.624), "de"),
+    (800, 480, "day", ESTIMATE, "en"),
+    (800, 480, "night", HEALTHY, "en"),
+    (1280, 800, "day", UNREACHABLE, "en"),
+    (1280, 800, "night", ON_ROUTE, "en"),
+]
+
+
+def main() -> None:
+    """Write them all."""
+    from PIL import Image
+
+    with opened_browser() as context:
+        for width, height, theme, estimate, language in PICTURES:
+            name = f"{width}x{height}-{theme}"
+            page = context.new_page()
+            page.set_viewport_size({"width": width, "height": height})
+            with dashboard("can0") as address, Sender("can0", estimate):
+                page.goto(f"{address}?theme={theme}&language={language}")
+                shows(page, range_value="8.2" if estimate is UNREACHABLE else "34")
+                page.wait_for_timeout(500)
+                picture = Image.open(io.BytesIO(page.screenshot()))
+            page.close()
+            file = ROOT / "docs" / "images" / f"dashboard-{name}.png"
+            picture.convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(file, optimize=True)
+            print(f"{file.name} {file.stat().st_size // 1000} kB")
+
+
+if __name__ == "__main__":
+    main()

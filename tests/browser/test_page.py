@@ -1,0 +1,191 @@
+"""The page in a real browser: what it shows of which frames, and what it does not."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import replace
+from urllib.parse import urlsplit
+
+import pytest
+
+from gz_onboard.dashboard.server import Feed
+from gz_onboard.dashboard.web import served
+from gz_onboard.events import Estimate, Reason, State
+from tests.browser.support import alerts, numbers, plain, shows, texts, wait_for
+from tests.dashboard.served import Sender, dashboard
+from tests.dashboard.test_picture import CHARGING, HEALTHY, ON_ROUTE
+from tests.dashboard.test_terminal import ESTIMATE
+
+UNREACHABLE = replace(
+    ON_ROUTE,
+    state=State.DEGRADED,
+    reasons=Reason.NO_GPS | Reason.SENSOR_DISTRUSTED,
+    distrusted=("pack_current",),
+    soc=0.12,
+    energy_left=208 * 3600.0,
+    consumption_recent=31.4 * 3.6,
+    range=8200.0,
+    range_p10=6100.0,
+    range_p90=9900.0,
+    arrival_soc=0.0,
+    arrival_soc_p10=0.0,
+    battery_ends_after=8300.0,
+)
+
+
+def test_everything_that_the_frames_say(page):
+    with dashboard("all") as address, Sender("all", ESTIMATE):
+        page.goto(address)
+        shows(
+            page,
+            range_value="34",
+            interval="27 to 44 km",
+            soc_value="62",
+            soc_sigma="± 1.2",
+            energy="895 Wh left",
+            recent="25",
+            expected="26",
+            compared="6 % less than expected",
+            causes="temperature −3.4 km\nstops +1.6 km",
+            rated="against the rated 56 km",
+            trust_word="degraded",
+            activity="Riding",
+            reasons="because:\nno inertial unit\ntoo little ridden to know this rider",
+            alerts="A sensor is lost: no inertial unit.",
+            charge="",
+            route="",
+        )
+        assert plain(page.title()) == "34 km · gz-onboard"
+        label = page.get_attribute("#band", "aria-label")
+        assert plain(label) == "Range 34 km, between 27 km and 44 km with 80 % probability."
+        scale = page.inner_text("#band .ticks").split("\n")
+        assert scale[0] == "0"
+        assert scale[-1] == "50"
+        left, width, middle = page.evaluate(
+            """() => [...document.querySelectorAll("#band .between, #band .middle")].flatMap(
+                 (e) => [parseFloat(e.style.left), parseFloat(e.style.width)]).slice(0, 3)"""
+        )
+        assert left / 2 == pytest.approx(26.54, abs=0.01)
+        assert (left + width) / 2 == pytest.approx(44.34, abs=0.01)
+        assert middle / 2 == pytest.approx(34.21, abs=0.01)
+
+
+def test_a_charge(page):
+    with dashboard("charge") as address, Sender("charge", CHARGING):
+        page.goto(address)
+        shows(page, charge_power="620 W", charge_full="full in 2 h 05 min", charge_range="then 54 km", alerts="")
+
+
+def test_a_destination(page):
+    with dashboard("route") as address, Sender("route", ON_ROUTE) as sender:
+        page.goto(address)
+        shows(page, route_left="18 km to go", route_arrival="31 % left there, 22 % if it goes badly", alerts="")
+        assert float(page.evaluate("parseFloat(document.querySelector('#band .goal').style.left)")) == pytest.approx(
+            18.3 / 50 * 100, abs=0.1
+        )
+        sender.estimate = UNREACHABLE
+        shows(page, route_arrival="battery ends after 8.3 km", range_value="8.2", interval="6.1 to 9.9 km")
+        assert alerts(page) == [
+            "The destination cannot be reached: the battery ends after 8.3 km.",
+            "The battery is nearly empty: 12 %.",
+            "A sensor is lost: no GPS, pack current.",
+        ]
+        shows(page, distrusted="sensors left out:\npack current")
+
+
+@pytest.mark.parametrize("state", [State.STARTING, State.INVALID])
+def test_without_an_estimate_there_is_no_number(page, state):
+    with dashboard(f"no-{state}") as address, Sender(f"no-{state}", Estimate(time=0.0, state=state)):
+        page.goto(address)
+        shows(page, trust_word=state.name.lower())
+        assert numbers(page) == []
+        assert (alerts(page) == ["The range cannot be told."]) == (state is State.INVALID)
+
+
+def test_a_silent_bus_and_a_daemon_that_is_started_anew(page):
+    with dashboard("quiet") as address:
+        page.goto(address)
+        shows(page, alerts="Nothing has come yet from the range estimator on quiet (range.dbc).")
+        assert numbers(page) == []
+        with Sender("quiet", HEALTHY):
+            shows(page, range_value="34", soc_value="62", alerts="")
+        shows(page, soc_value="–", range_value="34", alerts="Some values are no longer renewed.")
+        assert "nothing new of:" in texts(page)["missing"]
+        late = "[...document.querySelectorAll('.late')].map((e) => e.id)"
+        wait_for(lambda: set(page.evaluate(late)) >= {"range", "energy", "consumption", "why"}, "what is late, as such")
+        assert page.evaluate("getComputedStyle(document.querySelector('#range .figure')).fontStyle") == "italic"
+        shows(page, trust_word="not known", energy="895 Wh left", range_value="34")
+        shows(page, range_value="–", alerts="Nothing comes from the range estimator any more.")
+        assert numbers(page) == []
+        assert page.is_hidden("#band .between")
+        with Sender("quiet", replace(HEALTHY, range=31_000.0)):
+            shows(page, range_value="31", soc_value="62", alerts="", missing="")
+
+
+def test_the_server_gone_and_started_anew(page):
+    with Sender("gone", HEALTHY):
+        with dashboard("gone") as address:
+            page.goto(address)
+            shows(page, range_value="34")
+            page.evaluate("window.same = true")
+        shows(page, range_value="–", trust_word="not known", alerts="The dashboard does not answer. Trying again.")
+        assert numbers(page) == []
+        with dashboard("gone", urlsplit(address).netloc):
+            shows(page, range_value="34", trust_word="valid", alerts="")
+            assert page.evaluate("window.same")  # by itself, not by loading the page anew
+
+
+def test_a_server_with_another_page_is_loaded_anew(page, monkeypatch):
+    with Sender("new", HEALTHY):
+        with dashboard("new") as address:
+            page.goto(address)
+            shows(page, range_value="34")
+            page.evaluate("window.same = true")
+        monkeypatch.setattr("gz_onboard.dashboard.server.build_of", lambda files: "another")
+        with ExitStack() as stack:
+            with page.expect_event("load"):
+                stack.enter_context(dashboard("new", urlsplit(address).netloc))
+            shows(page, range_value="34")
+            assert not page.evaluate("window.same")
+
+
+def test_a_server_that_hangs(page):
+    """Its connection stands, and nothing comes: the last numbers do not stay."""
+    feed = Feed()
+    with dashboard("hang") as other, Sender("hang", HEALTHY), served(feed, "127.0.0.1:0") as address:
+        page.goto(other)
+        shows(page, range_value="34")
+        data = page.evaluate("fetch('api/latest').then((r) => r.text())")
+        page.goto(address)
+        feed.publish(data.encode())
+        shows(page, range_value="34")
+        shows(page, range_value="–", alerts="The dashboard sends nothing. Trying again.")
+        assert numbers(page) == []
+
+        # It is asked again, and what it sends then is shown.
+        def back() -> bool:
+            feed.publish(data.encode())
+            return texts(page)["range-value"] == "34"
+
+        wait_for(back, "the range back")
+
+
+def test_a_reload(page):
+    with dashboard("reload") as address, Sender("reload", HEALTHY):
+        page.goto(address)
+        for _ in range(5):
+            shows(page, range_value="34", soc_value="62")
+            page.reload()
+        shows(page, range_value="34", soc_value="62")
+
+
+def test_a_page_that_nobody_looks_at_shows_nothing_old(page):
+    with dashboard("hidden") as address, Sender("hidden", HEALTHY):
+        page.goto(address)
+        shows(page, range_value="34")
+        hide = "(on) => { Object.defineProperty(document, 'hidden', {value: on, configurable: true});"
+        page.evaluate(f"{hide} document.dispatchEvent(new Event('visibilitychange')); }}", True)
+        shows(page, range_value="–")
+        assert numbers(page) == []
+        page.evaluate(f"{hide} document.dispatchEvent(new Event('visibilitychange')); }}", False)
+        shows(page, range_value="34")

@@ -1,0 +1,76 @@
+"""The page's service beside the daemon: what systemd/README.md promises of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import pytest
+
+from tests.service.support import ROOT, UNIT, output, systemctl, wait_for
+
+PAGE = "gz-onboard-dashboard.service"
+ADDRESS = "http://127.0.0.1:8000"
+
+
+def latest() -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(urlopen(f"{ADDRESS}/api/latest", timeout=30).read())
+    return found
+
+
+def pid() -> int:
+    return int(systemctl("show", PAGE, "--value", "-p", "MainPID"))
+
+
+def active() -> bool:
+    return systemctl("show", PAGE, "--value", "-p", "ActiveState") == "active"
+
+
+@pytest.fixture
+def page(installed: None) -> Iterator[None]:
+    shutil.copy(ROOT / "systemd" / PAGE, "/etc/systemd/system/")
+    places = Path(f"/etc/systemd/system/{PAGE}.d")
+    places.mkdir(exist_ok=True)
+    shutil.copy(f"/etc/systemd/system/{UNIT}.d/checkout.conf", places)
+    settings = Path("/etc/default/gz-onboard")
+    if "vcan0 --listen" not in settings.read_text():
+        with settings.open("a") as file:
+            file.write('DASHBOARD="--channel vcan0 --listen 127.0.0.1:8000"\n')
+    systemctl("daemon-reload")
+    systemctl("start", PAGE)
+    yield
+    systemctl("stop", PAGE)
+
+
+def test_unit_is_valid_and_closed(page):
+    assert output("systemd-analyze", "verify", f"/etc/systemd/system/{PAGE}") == ""
+    report = output("systemd-analyze", "security", "--no-pager", PAGE)
+    level = re.search(r"Overall exposure level for \S+: ([\d.]+)", report)
+    assert level, report
+    assert float(level[1]) <= 1.5, report
+
+
+def test_it_shows_the_daemon_and_outlives_it(page, service, ride):
+    assert urlopen(f"{ADDRESS}/", timeout=30).read().startswith(b"<!doctype html>")
+    wait_for(lambda: latest()["range"]["km"] is not None, 30, "a range")
+    before = pid()
+    systemctl("stop", UNIT)
+    wait_for(lambda: latest()["alerts"] == ["silent"], 30, "silence is told")
+    systemctl("start", UNIT)
+    wait_for(lambda: latest()["range"]["km"] is not None, 60, "the range again")
+    assert pid() == before
+
+
+def test_killed_or_hung_it_is_started_again(page):
+    for number in signal.SIGKILL, signal.SIGSTOP:
+        before = pid()
+        os.kill(before, number)
+        wait_for(lambda old=before: active() and pid() not in (0, old), 60, "started again")  # type: ignore[misc]
+        assert latest()["alerts"] == ["silent"]
