@@ -1,3 +1,61 @@
-"""Real-time remaining range, with its uncertainty, on an electric scooter's CAN bus."""
+"""Real-time remaining range, with its uncertainty, on an electric scooter's CAN bus.
+
+The names of the Python API (`gz_onboard.api`) are here too, imported when first asked for: the daemon loads none.
+"""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gz_onboard.api import (
+        Calibration,
+        Discovered,
+        DiscoveryOptions,
+        EstimatedRide,
+        InputError,
+        Samples,
+        SimulatedRide,
+        SimulationOptions,
+        Vehicle,
+        calibrate,
+        discover,
+        estimate,
+        read_ride,
+        read_vehicle,
+        simulate,
+    )
 
 __version__ = "0.1.0"
+__all__ = [
+    "Calibration",
+    "Discovered",
+    "DiscoveryOptions",
+    "EstimatedRide",
+    "InputError",
+    "Samples",
+    "SimulatedRide",
+    "SimulationOptions",
+    "Vehicle",
+    "__version__",
+    "calibrate",
+    "discover",
+    "estimate",
+    "read_ride",
+    "read_vehicle",
+    "simulate",
+]
+
+
+if not TYPE_CHECKING:  # to which a name that is none is a mistake
+
+    def __getattr__(name: str) -> object:
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        from gz_onboard import api
+
+        value: object = getattr(api, name)
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
