@@ -12,6 +12,7 @@ if TYPE_CHECKING:
         DiscoveryOptions,
         EstimatedRide,
         InputError,
+        LoggedEstimates,
         Samples,
         SimulatedRide,
         SimulationOptions,
@@ -19,9 +20,11 @@ if TYPE_CHECKING:
         calibrate,
         discover,
         estimate,
+        read_estimates,
         read_ride,
         read_vehicle,
         simulate,
+        summary_table,
     )
 
 __version__ = "0.1.0"
@@ -31,6 +34,7 @@ __all__ = [
     "DiscoveryOptions",
     "EstimatedRide",
     "InputError",
+    "LoggedEstimates",
     "Samples",
     "SimulatedRide",
     "SimulationOptions",
@@ -39,9 +43,11 @@ __all__ = [
     "calibrate",
     "discover",
     "estimate",
+    "read_estimates",
     "read_ride",
     "read_vehicle",
     "simulate",
+    "summary_table",
 ]
 
 

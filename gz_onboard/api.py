@@ -16,6 +16,7 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 
 from gz_onboard.errors import InputError, writing
+from gz_onboard.lab import estimate_table, export_tables
 from gz_onboard.lab.calibrate import command as calibration
 from gz_onboard.lab.calibrate.report import write_report as write_calibration_report
 from gz_onboard.lab.calibrate.result import Result
@@ -30,7 +31,7 @@ from gz_onboard.lab.estimate_ride import How, RideSummary, open_estimate, ride_t
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TEXTS, WHY_TOPIC, table_columns
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.offline.signal_table import SignalTable
-from gz_onboard.offline.table import Columns, Tabular, columns_of, signal_table
+from gz_onboard.offline.table import Columns, Tabular, array_of, columns_of, signal_table
 from gz_onboard.progress import Progress
 from gz_onboard.routes.ahead import read_ahead
 from gz_onboard.simulation.output import series_table
@@ -46,6 +47,7 @@ __all__ = [
     "DiscoveryOptions",
     "EstimatedRide",
     "InputError",
+    "LoggedEstimates",
     "Samples",
     "SimulatedRide",
     "SimulationOptions",
@@ -53,9 +55,11 @@ __all__ = [
     "calibrate",
     "discover",
     "estimate",
+    "read_estimates",
     "read_ride",
     "read_vehicle",
     "simulate",
+    "summary_table",
 ]
 
 PathLike: TypeAlias = str | os.PathLike[str]
@@ -100,19 +104,30 @@ def read_ride(
 
 
 @dataclass(frozen=True)
-class EstimatedRide(Tabular):
-    """The estimates of a ride. times: of each of the `rows` [ns since the epoch]; whys: rows of the range explained."""
+class LoggedEstimates(Tabular):
+    """The estimates in a log. columns: of each field of the `rows` the column; times: [ns since the epoch]."""
 
-    summary: RideSummary
+    columns: Mapping[str, str]
     times: Sequence[int]
     rows: Sequence[Mapping[str, object]]
+
+    def to_table(self) -> Columns:
+        """A row for each estimate, with the columns that ``gz-onboard export --estimates`` writes."""
+        return {"time": np.array(self.times, dtype="datetime64[ns]"), **columns_of(self.rows, self.columns)}
+
+
+@dataclass(frozen=True)
+class EstimatedRide(Tabular):
+    """The estimates of a ride. whys: of why the range is what it is, changes: of why it changed, a row each."""
+
+    summary: RideSummary
+    estimates: LoggedEstimates
     whys: Sequence[Mapping[str, object]]
     changes: Sequence[Mapping[str, object]]
 
     def to_table(self) -> Columns:
         """A row each second, with the columns that ``gz-onboard export --estimates`` writes."""
-        columns = columns_of(self.rows, table_columns({**ESTIMATE_UNITS, **dict.fromkeys(TEXTS, "")}))
-        return {"time": np.array(self.times, dtype="datetime64[ns]"), **columns}
+        return self.estimates.to_table()
 
 
 class _Kept:
@@ -155,7 +170,23 @@ def estimate(
     ride = open_estimate(_source(source), _vehicle(vehicle))
     ridden = ride_through(ride, How(filter_name, route=road), log, progress)
     times = [time_ns for time_ns, _ in log.rows[ESTIMATE_TOPIC]]
-    return EstimatedRide(summary_of(ridden), times, log.of(ESTIMATE_TOPIC), log.of(WHY_TOPIC), log.of(CHANGE_TOPIC))
+    columns = table_columns({**ESTIMATE_UNITS, **dict.fromkeys(TEXTS, "")})
+    estimates = LoggedEstimates(columns, times, log.of(ESTIMATE_TOPIC))
+    return EstimatedRide(summary_of(ridden), estimates, log.of(WHY_TOPIC), log.of(CHANGE_TOPIC))
+
+
+def summary_table(rides: Iterable[EstimatedRide]) -> Columns:
+    """The summaries of rides, a row each, with the columns that ``gz-onboard estimate --table`` writes."""
+    table = estimate_table.summary_table([ride.summary for ride in rides])
+    return {name: array_of(column) for name, column in table.items()}
+
+
+def read_estimates(log: PathLike) -> LoggedEstimates:
+    """The estimates that the daemon or ``gz-onboard estimate`` wrote into an MCAP log. InputError if it has none."""
+    source = export_tables.Source(Path(log))
+    rows = export_tables.estimate_rows(source)
+    columns = export_tables.topic_columns(source.log, ESTIMATE_TOPIC)
+    return LoggedEstimates(columns, [time_ns for time_ns, _ in rows], [values for _, values in rows])
 
 
 # --- simulate -----------------------------------------------------------------------------------------------------

@@ -29,7 +29,7 @@ COMMANDS = {
         "gz_onboard.lab.discover.command",
         "find what the model gets wrong on rides, name the cause, extend the model",
     ),
-    "export": ("gz_onboard.bus.export", "convert a log to candump, BLF, ASC, Parquet, CSV, ..."),
+    "export": ("gz_onboard.lab.export", "convert a log to candump, BLF, ASC, or what it holds to Parquet, CSV, ..."),
     "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride as PNG"),
 }
 

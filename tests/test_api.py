@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import re
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -88,6 +88,25 @@ def test_an_estimate_is_that_of_the_command(tmp_path, capsys):
             assert values.tolist() == column
         else:
             np.testing.assert_array_equal(values, np.array([np.nan if x is None else x for x in column]))
+
+
+def test_estimates_in_a_log_are_those_that_were_made(tmp_path):
+    assert cli.main(["estimate", str(COASTDOWN), "--no-plot", "--output", str(tmp_path)]) == 0
+    logged = gz.read_estimates(tmp_path / "coastdown.estimate.mcap").to_table()
+    made = gz.estimate(COASTDOWN).to_table()
+    assert list(logged) == list(made)
+    for name, values in made.items():
+        np.testing.assert_array_equal(logged[name], values, name)
+    with pytest.raises(gz.InputError, match=r"holds no estimates.*gz-onboard estimate coastdown\.blf"):
+        gz.read_estimates(COASTDOWN)
+
+
+def test_a_table_of_many_rides_has_a_row_each():
+    rides = [gz.estimate(COASTDOWN), gz.estimate(signals())]
+    table = gz.summary_table(rides)
+    assert table["file"].tolist() == [str(COASTDOWN), "table"]
+    assert table["distance_km"].tolist() == [ride.summary.distance_km for ride in rides]
+    assert {len(column) for column in table.values()} == {2}
 
 
 class Arrow:
@@ -259,7 +278,6 @@ def test_facts_of_a_ride_are_those_given_or_noted():
 
 
 def test_a_type_checker_knows_the_api(tmp_path):
-    """Of one who uses the package, as installed: ``py.typed`` is there."""
     assert (ROOT / "gz_onboard/py.typed").is_file()
     (tmp_path / "use.py").write_text(
         "import gz_onboard as gz\n"
@@ -271,10 +289,10 @@ def test_a_type_checker_knows_the_api(tmp_path):
     run = subprocess.run(
         [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path), "use.py"],
         cwd=tmp_path,
+        env={**os.environ, "MYPYPATH": str(ROOT)},
         capture_output=True,
         text=True,
         check=False,
     )
     assert 'Revealed type is "float | None"' in run.stdout.replace("Union[float, None]", "float | None"), run.stdout
     assert re.search(r"use\.py:4: error: Argument 1 to \"estimate\" has incompatible type \"int\"", run.stdout)
-    assert Path(ROOT / "gz_onboard/api.py").is_file()

@@ -100,10 +100,11 @@ class Tabular(ABC):
 
 def columns_of(rows: Sequence[Mapping[str, object]], names: Mapping[str, str]) -> Columns:
     """The columns of `rows`; names: of each key that becomes a column the column's."""
-    return {column: _array([row.get(key) for row in rows]) for key, column in names.items()}
+    return {column: array_of([row.get(key) for row in rows]) for key, column in names.items()}
 
 
-def _array(values: Sequence[object]) -> NDArray[Any]:
+def array_of(values: Sequence[object]) -> NDArray[Any]:
+    """Texts, truth values, or numbers with nan for None."""
     if any(isinstance(value, str) for value in values):
         return np.array(["" if value is None else str(value) for value in values], dtype=object)
     if values and all(isinstance(value, bool) for value in values):
