@@ -56,7 +56,14 @@ if not TYPE_CHECKING:  # to which a name that is none is a mistake
     def __getattr__(name: str) -> object:
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        from gz_onboard import api
+        try:
+            from gz_onboard import api
+        except ModuleNotFoundError as error:
+            from gz_onboard.errors import lacking_extra
+
+            if not (missing := lacking_extra(error)):
+                raise
+            raise ImportError(f"gz_onboard.{name} {missing}", name=error.name) from error
 
         value: object = getattr(api, name)
         globals()[name] = value

@@ -13,7 +13,7 @@ from contextlib import suppress
 from typing import NoReturn
 
 from gz_onboard import __version__
-from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, InputError, nearest
+from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, InputError, lacking_extra, nearest
 
 COMMANDS = {
     "run": ("gz_onboard.daemon.command", "estimate the range from a live bus and publish it (the daemon)"),
@@ -94,6 +94,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"gz-onboard {called}: {error}", file=sys.stderr)
         _let_go()
+        return BAD_INPUT
+    except ModuleNotFoundError as error:
+        if not (missing := lacking_extra(error)):
+            raise
+        print(f"gz-onboard {called}: {missing}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
         return INTERRUPTED

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from gz_onboard.bus.logs import is_table
-from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
+from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, require
 from gz_onboard.events import Reason, words
 from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, RideSummary, estimate_log, known_vehicle
 from gz_onboard.lab.estimate_route import route_text
@@ -48,6 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     parts = {"filter_name": arguments.filter, "frames": arguments.frames, "signals": arguments.signals}
     parts["route"] = arguments.route
     tasks = tasks_of(arguments, EstimateTask, ".estimate.mcap", **parts)
+    require("matplotlib", not arguments.no_plot)
     if arguments.table:
         check_table(arguments.table)
     written = [arguments.json, arguments.table, *(file for task in tasks for file in (task.log, task.picture))]

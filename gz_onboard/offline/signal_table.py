@@ -133,7 +133,9 @@ def _parquet(file: Path) -> tuple[list[str], Rows]:
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
-        raise InputError(f"{file}: Parquet needs pyarrow: pip install pyarrow; or give the table as CSV") from error
+        raise InputError(
+            f"{file}: Parquet needs pyarrow: pip install 'gz-onboard[lab]'; or give the table as CSV"
+        ) from error
     try:
         table = pyarrow.parquet.ParquetFile(file).read()  # `read_table` chokes on two columns of one name
     except (OSError, pyarrow.ArrowException) as error:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard.constants import HOUR, WH_PER_KM
-from gz_onboard.errors import OK, InputError, not_an_input
+from gz_onboard.errors import OK, InputError, not_an_input, require
 from gz_onboard.offline.results import explain_keys, times, write_json
 from gz_onboard.options import add_shared, number
 from gz_onboard.progress import Progress, progress_bar
@@ -80,6 +80,8 @@ def _number(
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard simulate``."""
+    require("matplotlib", not arguments.no_plot)
+    require("pyarrow", arguments.format == "parquet" and not arguments.no_series)
     vehicle, payload_from = vehicle_on(arguments.what, arguments.vehicle, arguments.payload)
     options = SimulationOptions(**{field.name: getattr(arguments, field.name) for field in fields(SimulationOptions)})
     sweeps = [read_sweep(text, vehicle) for text in arguments.sweep]
