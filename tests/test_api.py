@@ -35,6 +35,18 @@ def signals() -> dict[str, Any]:
     }
 
 
+def test_a_result_prints_as_its_command_and_is_short_otherwise(tmp_path, capsys):
+    assert cli.main(["estimate", str(COASTDOWN), "--no-plot", "--output", str(tmp_path)]) == 0
+    told = capsys.readouterr().out.splitlines()
+    ride = gz.estimate(COASTDOWN)
+    own = [line for line in str(ride).splitlines() if not line.startswith("  computed")]
+    assert own == [line for line in told if not line.startswith(("  computed", "  written"))]
+    assert len(repr(ride)) < 5000
+    simulated = gz.simulate("ece15")
+    assert "rolling resistance" in str(simulated)
+    assert len(repr(simulated)) < 5000
+
+
 def test_the_names_are_those_of_the_api():
     assert sorted(set(gz.__all__) - {"__version__"}) == sorted(api.__all__)
     assert set(gz.__all__) <= set(dir(gz))

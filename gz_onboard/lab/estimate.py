@@ -150,7 +150,7 @@ def summary_text(ride: RideSummary) -> str:
             "computed",
             f"{ride.cpu_s:.2f} s of processor time, {number(ride.real_time_factor, '.0f')} times as fast as the ride",
         ),
-        ("written", f"{ride.log}{' and .png' if ride.plot else ''}"),
+        *([("written", f"{ride.log}{' and .png' if ride.plot else ''}")] if ride.log else []),
     ]
     return text_rows(ride.file, rows)
 
