@@ -18,6 +18,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from tests.support import LOGS, ROOT
+from tests.test_structure import OFFLINE, ON_REQUEST
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 INSTALL = r"pip install 'gz-onboard\[lab\]'"
@@ -73,8 +74,9 @@ def test_the_wheel_has_the_package_and_its_data_and_nothing_else(built):
         names = {name for name in file.namelist() if ".dist-info/" not in name}
     assert {"gz_onboard/py.typed", "gz_onboard/vehicles/reference.toml", "gz_onboard/dbc/vehicle.dbc"} <= names
     assert {name.split("/")[0] for name in names} == {"gz_onboard"}
-    there = {path.relative_to(ROOT).as_posix() for path in (ROOT / "gz_onboard").rglob("*.py")}
-    assert {name for name in names if name.endswith(".py")} == there
+    there = {path.relative_to(ROOT) for path in (ROOT / "gz_onboard").rglob("*") if path.is_file()}
+    own = {path.as_posix() for path in there if "__pycache__" not in path.parts}
+    assert {name for name in names if not name.startswith("gz_onboard/dbc/")} == own
 
 
 def test_the_sdist_is_small_and_builds_the_same_wheel(built, tmp_path):
@@ -147,6 +149,15 @@ def test_the_board_has_nothing_of_the_lab(board):
 @pytest.mark.parametrize("command", [[], ["run"], ["dashboard"], ["replay"], ["learned"], ["route"], ["export"]])
 def test_the_boards_commands_have_their_help(board, command):
     assert run(board / "gz-onboard", *command, "--help").stdout.startswith("usage: gz-onboard")
+
+
+def test_every_module_of_the_board_can_be_imported_there(board):
+    """All but the offline ones, and the reference filter behind ``--filter filterpy``."""
+    modules = [path.relative_to(ROOT).with_suffix("") for path in (ROOT / "gz_onboard").rglob("*.py")]
+    names = {".".join(m.parts) for m in modules if m.parts[1] not in (*OFFLINE, "__main__") and m.stem != "__init__"}
+    names -= {".".join(("gz_onboard", *Path(one).with_suffix("").parts)) for one in ON_REQUEST}
+    assert "gz_onboard.estimator.estimator" in names
+    run(board / "python", "-c", f"import importlib\nfor name in {sorted(names)}:\n  importlib.import_module(name)")
 
 
 RIDE = """
