@@ -8,7 +8,7 @@ FIRST ?= 100240
 PYTHON_IN_VENV := .venv/bin/python
 DEMO = replay_logs/demo.py "$(RIDE)" --speed $(SPEED) --seconds $(SECONDS)
 
-.PHONY: help setup run test lint format docs bench trial range-benchmark hardening clean
+.PHONY: help setup run test lint format docs man bench trial range-benchmark hardening clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -41,6 +41,9 @@ format: setup  ## let ruff format the code
 
 docs: setup .venv/.docs-ready  ## the documentation as a site in build/docs; a dead link or any other warning is an error
 	$(PYTHON_IN_VENV) -m sphinx --builder html --fresh-env --fail-on-warning --keep-going --quiet docs build/docs
+
+man: setup  ## the manual page and the completions of bash and zsh, in build/shell
+	$(PYTHON_IN_VENV) docs/shell.py build/shell
 
 .venv/.docs-ready: .venv/.ready .ci/requirements-docs.txt
 	@.ci/setup docs

@@ -19,9 +19,9 @@ import numpy as np
 
 from gz_onboard.offline.style import save
 from gz_onboard.simulation.figures import comparison
-from gz_onboard.simulation.plan import find_plan
+from gz_onboard.simulation.plan import SimulationOptions, find_plan
 from gz_onboard.simulation.run import follow
-from gz_onboard.simulation.simulate import add_arguments, ride
+from gz_onboard.simulation.simulate import ride
 from gz_onboard.simulation.summary import compare, measured_columns
 from gz_onboard.vehicle import read_vehicle
 
@@ -44,18 +44,16 @@ def group(folder: str, name: str) -> str:
 
 def both(log: Path, payload: float, chassis: str, figures: Path | None) -> dict[str, dict[str, Any]]:
     """The errors of one ride by form, simulated less measured."""
-    parser = argparse.ArgumentParser()
-    add_arguments(parser)
-    arguments = parser.parse_args([str(log), "--chassis", chassis])
+    options = SimulationOptions(chassis=chassis)
     vehicle = read_vehicle("reference", payload)
-    plan = find_plan(arguments, vehicle)
+    plan = find_plan(str(log), options, vehicle)
     recorded = plan.recorded
     assert recorded
     speeds = recorded.signals["speed"].tolist()
     rider = replace(plan, kind="ride (predictive)", command=lambda: follow(speeds, recorded.dt))
     found = {}
     for form, planned in (("open loop", plan), ("predictive", rider)):
-        run, _ = ride(vehicle, planned, arguments, None)
+        run, _ = ride(vehicle, planned, options, None)
         measured = measured_columns(recorded, run)
         errors = compare(recorded, run)
 

@@ -31,7 +31,7 @@ html_show_copyright = False
 
 myst_heading_anchors = 4  # a link to a heading that is not there is a warning
 nitpicky = True  # so is a type in a signature that is nowhere; see `exists`
-autodoc_default_options = {"members": True, "member-order": "bysource"}
+autodoc_default_options = {"members": True, "member-order": "bysource", "ignore-module-all": True}
 autodoc_typehints = "signature"
 LONGEST_VALUE = 120  # characters of a constant that are shown
 ALIASES = {  # what signatures spell out, and how the code says it

@@ -1,3 +1,74 @@
-"""Real-time remaining range, with its uncertainty, on an electric scooter's CAN bus."""
+"""Real-time remaining range, with its uncertainty, on an electric scooter's CAN bus.
+
+The names of the Python API (`gz_onboard.api`) are here too, imported when first asked for: the daemon loads none.
+"""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from gz_onboard.api import (
+        Calibration,
+        Discovered,
+        DiscoveryOptions,
+        EstimatedRide,
+        InputError,
+        LoggedEstimates,
+        Samples,
+        SimulatedRide,
+        SimulationOptions,
+        Vehicle,
+        calibrate,
+        discover,
+        estimate,
+        read_estimates,
+        read_ride,
+        read_vehicle,
+        simulate,
+        summary_table,
+    )
 
 __version__ = "0.1.0"
+__all__ = [
+    "Calibration",
+    "Discovered",
+    "DiscoveryOptions",
+    "EstimatedRide",
+    "InputError",
+    "LoggedEstimates",
+    "Samples",
+    "SimulatedRide",
+    "SimulationOptions",
+    "Vehicle",
+    "__version__",
+    "calibrate",
+    "discover",
+    "estimate",
+    "read_estimates",
+    "read_ride",
+    "read_vehicle",
+    "simulate",
+    "summary_table",
+]
+
+
+if not TYPE_CHECKING:  # to which a name that is none is a mistake
+
+    def __getattr__(name: str) -> object:
+        if name not in __all__:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        try:
+            from gz_onboard import api
+        except ModuleNotFoundError as error:
+            from gz_onboard.errors import lacking_extra
+
+            if not (missing := lacking_extra(error)):
+                raise
+            raise ImportError(f"gz_onboard.{name} {missing}", name=error.name) from error
+
+        value: object = getattr(api, name)
+        globals()[name] = value
+        return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -13,7 +13,7 @@ from contextlib import suppress
 from typing import NoReturn
 
 from gz_onboard import __version__
-from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, InputError, nearest
+from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, InputError, lacking_extra, nearest
 
 COMMANDS = {
     "run": ("gz_onboard.daemon.command", "estimate the range from a live bus and publish it (the daemon)"),
@@ -29,7 +29,7 @@ COMMANDS = {
         "gz_onboard.lab.discover.command",
         "find what the model gets wrong on rides, name the cause, extend the model",
     ),
-    "export": ("gz_onboard.bus.export", "convert a log to candump, BLF, ASC, Parquet, CSV, ..."),
+    "export": ("gz_onboard.lab.export", "convert a log to candump, BLF, ASC, or what it holds to Parquet, CSV, ..."),
     "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride as PNG"),
 }
 
@@ -94,6 +94,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"gz-onboard {called}: {error}", file=sys.stderr)
         _let_go()
+        return BAD_INPUT
+    except ModuleNotFoundError as error:
+        if not (missing := lacking_extra(error)):
+            raise
+        print(f"gz-onboard {called}: {missing}", file=sys.stderr)
         return BAD_INPUT
     except KeyboardInterrupt:
         return INTERRUPTED

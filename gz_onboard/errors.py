@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import errno
+import re
 import reprlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -30,6 +31,30 @@ class InputError(Exception):
     The message names the place (file, line, key), the value and its unit where it has one, and what would
     be right. The command line prints it without a traceback and exits with status `BAD_INPUT`.
     """
+
+
+def require(module: str, wanted: bool = True) -> None:
+    """ModuleNotFoundError for a `module` of an extra that is not installed, before the work that would end in it."""
+    from importlib.util import find_spec
+
+    if wanted and find_spec(module) is None:
+        raise ModuleNotFoundError(f"no module named {module!r}", name=module)
+
+
+def lacking_extra(error: ModuleNotFoundError) -> str | None:
+    """What to install for a module that is missing, if it is of an extra of this package; None if of none."""
+    from importlib.metadata import PackageNotFoundError, requires
+
+    module = (error.name or "").partition(".")[0]
+    try:
+        needed = requires("gz-onboard") or []
+    except PackageNotFoundError:
+        return None
+    for requirement in needed:
+        found = re.fullmatch(r"([\w-]+).*;.*\bextra == ['\"](\w+)['\"].*", requirement)
+        if found and found[1].replace("-", "_").lower() == module.lower():
+            return f"needs {module}, which is not installed: pip install 'gz-onboard[{found[2]}]'"
+    return None
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

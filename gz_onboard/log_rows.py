@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from math import isfinite
 from typing import TYPE_CHECKING, Any, Protocol
@@ -92,6 +93,18 @@ def estimate_row(estimate: Estimate) -> dict[str, object]:
     row["route_state"] = estimate.route_state.name
     row["distrusted"] = " ".join(estimate.distrusted)
     return row
+
+
+def table_columns(descriptions: Mapping[str, str]) -> dict[str, str]:
+    """Of each field of a row its column in a table, ``name[unit]``: the unit is the description's first word.
+
+    The field ``time``, since the first frame, is ``elapsed``: a table's first column is the time of the log.
+    """
+    columns = {}
+    for name, text in descriptions.items():
+        unit = re.split(r"[ ,]", text)[0]
+        columns[name] = ("elapsed" if name == "time" else name) + (f"[{unit}]" if unit not in ("", "1") else "")
+    return columns
 
 
 def explanation_row(why: Explanation) -> dict[str, object]:

@@ -23,6 +23,7 @@ GUIDE = {
     "index",
     "quick-start",
     "commands",
+    "python",
     "another-vehicle",
     "vehicle-file",
     "own-effect",

@@ -17,7 +17,7 @@ PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 
 # The parts of the package, lowest first. A part imports itself and those in the lines above its own.
 LAYERS = [
-    ["__init__", "arrays", "background", "constants", "errors", "events", "notify", "progress", "state"],
+    ["arrays", "background", "constants", "errors", "events", "notify", "progress", "state"],
     ["options"],
     ["toml", "routes"],
     ["bus", "physics"],
@@ -28,8 +28,8 @@ LAYERS = [
     ["offline"],
     ["simulation"],
     ["lab", "dashboard"],
-    ["daemon"],
-    ["cli"],
+    ["daemon", "api"],
+    ["cli", "__init__"],  # the latter has the names of the API, imported when first asked for
     ["__main__"],
 ]
 LEVEL = {part: level for level, parts in enumerate(LAYERS) for part in parts}
@@ -42,7 +42,7 @@ FORBIDDEN = {
     ("daemon", "offline"): "the daemon carries no offline tools",
 }
 
-OFFLINE = ("offline", "simulation", "lab")
+OFFLINE = ("offline", "simulation", "lab", "api")
 HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow"}
 # Imported only when asked for, or for types: the reference filter behind --filter filterpy, the types of arrays.
 ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py"}
@@ -134,7 +134,7 @@ def test_on_board_modules_import_nothing_heavy(module):
 
 
 # `gz-onboard run` starts by way of the cli.
-@pytest.mark.parametrize("name", ["gz_onboard.daemon.command", "gz_onboard.cli"])
+@pytest.mark.parametrize("name", ["gz_onboard", "gz_onboard.daemon.command", "gz_onboard.cli"])
 def test_the_daemon_loads_nothing_heavy(name):
     # None in sys.modules keeps a module out; nothing of it is loaded.
     code = f"import sys, {name}; print(*{{m.partition('.')[0] for m, loaded in sys.modules.items() if loaded}})"
@@ -142,6 +142,15 @@ def test_the_daemon_loads_nothing_heavy(name):
     loaded = set(run.stdout.split())
     assert "gz_onboard" in loaded
     assert not HEAVY & loaded
+
+
+def test_the_api_is_loaded_only_when_asked_for():
+    code = (
+        "import sys, gz_onboard.daemon.command as command, gz_onboard as gz; own = 'gz_onboard.api';"
+        "before = own in sys.modules; gz.estimate; print(before, own in sys.modules)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert run.stdout.split() == ["False", "True"]
 
 
 def graph() -> dict[str, set[str]]:

@@ -1,9 +1,10 @@
-"""Tables of signals or estimates, as CSV and Parquet: a row for each frame, or for each value."""
+"""Tables of frames, signals or estimates, as CSV, Parquet and JSON lines: a row for each frame, or for each value."""
 
 from __future__ import annotations
 
 import csv
 import gzip
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import IO, Any, Protocol, cast
 
 from gz_onboard.bus.signals import Decoded, Values
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 
 ROWS = 20_000  # of a message, which are written at once
 
@@ -71,11 +73,33 @@ class ParquetTables(_Tables):
         """As of `Sink`."""
         import pyarrow.parquet as pq
 
-        table = _arrow_table(times, {name: [row[name] for row in rows] for name in self.columns[message]})
+        table = _arrow_table(times, {name: [row[name] for row in rows] for name in self.columns[message]}, {})
         if message not in self.writers:
             path = self.directory / f"{message}.parquet"
             self.writers[message] = self.stack.enter_context(pq.ParquetWriter(path, table.schema))
         self.writers[message].write_table(table)
+
+
+class JsonTables(_Tables):
+    """``MESSAGE.jsonl``."""
+
+    def write(self, message: str, times: list[int], rows: list[Values]) -> None:
+        """As of `Sink`."""
+        if message not in self.writers:
+            self.writers[message] = self.stack.enter_context((self.directory / f"{message}.jsonl").open("w"))
+        self.writers[message].writelines(_json_line(t, row) for t, row in zip(times, rows, strict=True))
+
+
+class JsonLong:
+    """One file, a line for each frame: ``{"time[s]": ..., "message": ..., SIGNAL: ..., ...}``."""
+
+    def __init__(self, stream: IO[str]) -> None:
+        self._stream = stream
+
+    def write(self, message: str, times: list[int], rows: list[Values]) -> None:
+        """As of `Sink`."""
+        lines = (_json_line(t, {"message": message, **row}) for t, row in zip(times, rows, strict=True))
+        self._stream.writelines(lines)
 
 
 class CsvLong:
@@ -114,22 +138,84 @@ class ParquetLong:
             pa.array(repeated, self._schema.field("time").type),
             pa.array([message] * len(repeated)).dictionary_encode(),
             pa.array(names * len(rows)).dictionary_encode(),
-            pa.array([None if v is None else float(v) for row in rows for v in row.values()], pa.float64()),
+            pa.array([_number(v) for row in rows for v in row.values()], pa.float64()),
         ]
         self._writer.write_table(pa.table(arrays, schema=self._schema))
 
 
-def write_table(out: Path, times: Sequence[int], columns: Mapping[str, Sequence[object]]) -> None:
-    """Write one row for each of `times` [ns] to a .csv or .parquet file."""
-    if out.suffix.lower() != ".parquet":
-        with open_text(out) as stream:
-            writer = csv.writer(stream)
-            writer.writerow(["time[s]", *columns])
-            writer.writerows([_seconds(t), *row] for t, *row in zip(times, *columns.values(), strict=True))
-        return
-    import pyarrow.parquet as pq
+FRAME = ("channel", "identifier", "extended", "remote", "error", "sent", "data")
+"""What a table of frames has beside the time."""
 
-    pq.write_table(_arrow_table(times, columns), out)
+
+def write_frame_table(out: Path, batches: Iterable[list[Frame]]) -> int:
+    """Write a row for each frame to a .parquet or .jsonl file; gives how many it were.
+
+    identifier: without its flags, which are columns. sent: by ourselves. data: hexadecimal.
+    """
+    count = 0
+    with ExitStack() as stack:
+        writer = None
+        stream = None if out.suffix.lower() == ".parquet" else stack.enter_context(open_text(out))
+        for batch in batches:
+            count += len(batch)
+            rows = [_frame_row(frame) for frame in batch]
+            if stream:
+                stream.writelines(
+                    _json_line(frame[0], dict(zip(FRAME, row, strict=True)))
+                    for frame, row in zip(batch, rows, strict=True)
+                )
+                continue
+            import pyarrow as pa
+            import pyarrow.parquet as pq
+
+            columns = dict(zip(FRAME, zip(*rows, strict=True), strict=True))
+            times = pa.array([frame[0] for frame in batch], pa.timestamp("ns", "UTC"))
+            table = pa.table({"time": times, **{name: pa.array(column) for name, column in columns.items()}})
+            writer = writer or stack.enter_context(pq.ParquetWriter(out, table.schema))
+            writer.write_table(table)
+    return count
+
+
+def _frame_row(frame: Frame) -> tuple[object, ...]:
+    """The values of `FRAME`."""
+    _, identifier, data, channel = frame
+    flags = (bool(identifier & flag) for flag in (EFF_FLAG, RTR_FLAG, ERR_FLAG))
+    plain = identifier & ~(EFF_FLAG | RTR_FLAG | ERR_FLAG)
+    return channel & ~TRANSMITTED, plain, *flags, bool(channel & TRANSMITTED), data.hex()
+
+
+def write_table(
+    out: Path,
+    columns: Mapping[str, Sequence[object]],
+    times: Sequence[int] | None = None,
+    kinds: Mapping[str, type] | None = None,
+) -> None:
+    """Write a table to a .csv, .parquet or .jsonl file, its first column the `times` [ns], if there are any.
+
+    kinds: str, int or float of a column in Parquet; of others str if it has a text, else float.
+    """
+    suffix = out.with_suffix("").suffix if out.suffix.lower() == ".gz" else out.suffix
+    if suffix.lower() == ".parquet":
+        import pyarrow.parquet as pq
+
+        pq.write_table(_arrow_table(times, columns, kinds or {}), out)
+        return
+    rows = zip(*columns.values(), strict=True)
+    with open_text(out) as stream:
+        if suffix.lower() == ".jsonl":
+            named = (dict(zip(columns, row, strict=True)) for row in rows)
+            if times is None:
+                stream.writelines(json.dumps(row, ensure_ascii=False) + "\n" for row in named)
+            else:
+                stream.writelines(_json_line(t, row) for t, row in zip(times, named, strict=True))
+            return
+        writer = csv.writer(stream)
+        if times is None:
+            writer.writerow(columns)
+            writer.writerows(rows)
+        else:
+            writer.writerow(["time[s]", *columns])
+            writer.writerows([_seconds(t), *row] for t, row in zip(times, rows, strict=True))
 
 
 def open_text(out: Path) -> IO[str]:
@@ -139,18 +225,33 @@ def open_text(out: Path) -> IO[str]:
     return out.open("w", newline="")
 
 
-def _arrow_table(times: Sequence[int], columns: Mapping[str, Sequence[object]]) -> Any:
-    """A pyarrow table of `columns` over ``time``: text where any value is, else floating point; None stays null."""
+def _arrow_table(
+    times: Sequence[int] | None, columns: Mapping[str, Sequence[object]], kinds: Mapping[str, type]
+) -> Any:
+    """A pyarrow table of `columns` over ``time``; None stays null. kinds: as of `write_table`."""
     import pyarrow as pa
 
-    arrays = {"time": pa.array(times, pa.timestamp("ns", "UTC"))}
+    arrays = {} if times is None else {"time": pa.array(times, pa.timestamp("ns", "UTC"))}
     for name, values in columns.items():
-        if any(isinstance(value, str) for value in values):
+        kind = kinds.get(name) or (str if any(isinstance(value, str) for value in values) else float)
+        if kind is int:
+            arrays[name] = pa.array(values, pa.int64())
+        elif kind is str:
             arrays[name] = pa.array([None if value is None else str(value) for value in values], pa.string())
         else:
-            numbers = [float(value) if isinstance(value, int | float) else None for value in values]
-            arrays[name] = pa.array(numbers, pa.float64())
+            arrays[name] = pa.array([_number(value) for value in values], pa.float64())
     return pa.table(arrays)
+
+
+def _number(value: object) -> float | None:
+    return float(value) if isinstance(value, int | float) else None
+
+
+def _json_line(time_ns: int, row: Mapping[str, object]) -> str:
+    """A line of JSON, the time in seconds to the nanosecond, which no float has."""
+    rest = {name: _decimal(value) if isinstance(value, float) else value for name, value in row.items()}
+    text = json.dumps(rest, ensure_ascii=False)
+    return f'{{"time[s]": {_seconds(time_ns)}{", " if rest else ""}{text[1:]}\n'
 
 
 def _decimal(value: float | None) -> float | None:

@@ -12,10 +12,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from gz_onboard.bus.logs import is_table
-from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
+from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, require
 from gz_onboard.events import Reason, words
 from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, RideSummary, estimate_log, known_vehicle
 from gz_onboard.lab.estimate_route import route_text
+from gz_onboard.lab.estimate_table import FORMATS, check_table, write_summaries
 from gz_onboard.offline.processes import collect, over_rides, tasks_of
 from gz_onboard.offline.results import clock, explain_keys, number, text_rows, write_json
 from gz_onboard.offline.schema import descriptions
@@ -33,7 +34,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "logs", "--vehicle")
     add_shared(parser, "--payload", help="mass of rider and luggage (default: unknown)")
     add_shared(parser, "--route")
-    add_shared(parser, "--filter", "--output", "--json", "--no-plot")
+    add_shared(parser, "--filter", "--output", "--json")
+    table = f"also write the summaries as a table, a row for each log: {' '.join(FORMATS)}"
+    parser.add_argument("--table", type=Path, metavar="FILE", help=table)
+    add_shared(parser, "--no-plot")
     parser.add_argument("--signals", action="store_true", help="also log the signals of each message, once a second")
     parser.add_argument("--frames", action="store_true", help="also log the raw frames and the range frames")
     add_shared(parser, "--jobs", "--quiet")
@@ -44,7 +48,10 @@ def run(arguments: argparse.Namespace) -> int:
     parts = {"filter_name": arguments.filter, "frames": arguments.frames, "signals": arguments.signals}
     parts["route"] = arguments.route
     tasks = tasks_of(arguments, EstimateTask, ".estimate.mcap", **parts)
-    written = [arguments.json, *(file for task in tasks for file in (task.log, task.picture))]
+    require("matplotlib", not arguments.no_plot)
+    if arguments.table:
+        check_table(arguments.table)
+    written = [arguments.json, arguments.table, *(file for task in tasks for file in (task.log, task.picture))]
     not_an_input(
         written, [*(task.path for task in tasks), *filter(None, [arguments.route]), find_vehicle(arguments.vehicle)]
     )
@@ -54,6 +61,8 @@ def run(arguments: argparse.Namespace) -> int:
         text = None if arguments.json == "-" else summary_text
         rides, failed = collect("estimate", results, display, text, lambda ride: ride.damage)
     write_json(arguments.json, SUMMARY_VERSION, {"rides": rides, "failed": failed})
+    if arguments.table:
+        write_summaries(arguments.table, rides, failed)
     return BAD_INPUT if failed else OK
 
 
@@ -141,7 +150,7 @@ def summary_text(ride: RideSummary) -> str:
             "computed",
             f"{ride.cpu_s:.2f} s of processor time, {number(ride.real_time_factor, '.0f')} times as fast as the ride",
         ),
-        ("written", f"{ride.log}{' and .png' if ride.plot else ''}"),
+        *([("written", f"{ride.log}{' and .png' if ride.plot else ''}")] if ride.log else []),
     ]
     return text_rows(ride.file, rows)
 

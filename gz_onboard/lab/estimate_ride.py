@@ -6,6 +6,7 @@ import functools
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -19,10 +20,11 @@ from gz_onboard.lab.estimate_route import RouteSummary, route_summary
 from gz_onboard.lab.estimate_tally import Tally
 from gz_onboard.lab.plot import plot_log
 from gz_onboard.lab.why import Why, why_of
-from gz_onboard.log_rows import STATUS_TOPIC
+from gz_onboard.log_rows import STATUS_TOPIC, Log
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.results import times
 from gz_onboard.offline.samples import open_ride
+from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.pipeline import TICK_NS, Pipeline, dbc_texts, lacking, range_publisher
 from gz_onboard.progress import Progress
 from gz_onboard.routes.ahead import read_ahead
@@ -66,7 +68,7 @@ class RideSummary:
     """A ride in the JSON: {"version", "rides": [summaries], "failed": [{file, error}]}."""
 
     file: Annotated[str, "the log"]
-    log: Annotated[str, "the MCAP written"]
+    log: Annotated[str | None, "the MCAP written, or null"]
     plot: Annotated[str | None, "the PNG written, or null"]
     vehicle: Annotated[str, "name of the vehicle"]
     filter: Annotated[str, "backend of the filter"]
@@ -165,62 +167,103 @@ def _without_jumps(batch: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
     yield batch[begin:]
 
 
+@dataclass(frozen=True)
+class OpenRide:
+    """A ride that is to be estimated. batches: its frames, without an earlier run's estimates."""
+
+    source: Path  # its log, or what its table is called
+    vehicle: Vehicle  # with the mapping of the ride
+    start_ns: int
+    batches: Iterable[list[Frame]]
+    damages: list[LogDamage]  # complete once the frames were read
+
+
+@dataclass(frozen=True)
+class How:
+    """How a ride is estimated, and what is logged beside the estimates."""
+
+    filter_name: str = "scalar"
+    frames: bool = False
+    signals: bool = False
+    route: Route | None = None
+
+
+@dataclass(frozen=True)
+class Ridden:
+    """A ride that went through the pipeline. took: processor and wall time [s]."""
+
+    source: Path
+    pipeline: Pipeline
+    tally: Tally
+    how: How
+    damages: Sequence[LogDamage]
+    took: tuple[float, float]
+
+
 def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSummary:
     """Estimate one log and write its MCAP and picture; gives its summary. Raises InputError."""
     vehicle = known_vehicle(task.vehicle, task.payload)
     route = read_ahead(task.route)[1] if task.route else None
-    damages: list[LogDamage] = []
-    cpu, wall = time.process_time(), time.perf_counter()
-    mapping, batches = open_ride(task.path, vehicle, damages.append)
-    if task.frames and mapping is not vehicle.mapping:
+    ride = open_estimate(task.path, vehicle)
+    if task.frames and ride.vehicle.mapping is not vehicle.mapping:
         raise InputError(f"{task.path}: is a table of signals: --frames has nothing to log")
-    vehicle = replace(vehicle, mapping=mapping)
-    own = range_publisher(vehicle).may_have_sent
-    ours = ([frame for frame in batch if not own(frame)] for batch in batches)  # without an earlier run's estimates
-    batch = next((batch for batch in ours if batch), None)
-    if batch is None:
-        raise InputError(f"{task.path}: holds no frames of a vehicle" + (f" ({damages[0]})" if damages else ""))
-    tally = Tally(batch[0][0])
     with writing(task.log):
-        log = _open_log(task, vehicle, batch[0][0])
+        log = _open_log(task, ride.vehicle, ride.start_ns)
         try:
-            pipeline = Pipeline(
-                vehicle,
-                filter_name=task.filter_name,
-                log=log,
-                log_frames=task.frames,
-                log_signals=task.signals,
-                observer=tally,
-            )
-            if route:
-                pipeline.estimator.ahead.follow(pipeline.estimator.ahead.ready(route))
-            if not task.frames:
-                pipeline.publisher = _Mute()
-            feed(pipeline, _chained(batch, ours), progress)
-            if not pipeline.codec.latest:
-                raise _unknown(task, vehicle, pipeline)
-            if tally.last:  # what came after the last whole second counts too
-                log.sample(STATUS_TOPIC, batch[0][0] + round(tally.last.time * 1e9), pipeline.status())
+            ridden = ride_through(ride, How(task.filter_name, task.frames, task.signals, route), log, progress)
             log.close()
             task.part.replace(task.log)
         finally:
             log.abandon()
             task.part.unlink(missing_ok=True)
-        took = time.process_time() - cpu, time.perf_counter() - wall
         if task.picture:
             plot_log(task.log, task.picture)
-    return _summary(task, pipeline, tally, route, damages, took)
+    return summary_of(ridden, task.log, task.picture)
+
+
+def open_estimate(source: Path | SignalTable, vehicle: Vehicle) -> OpenRide:
+    """The ride of `vehicle` in a log or a table of signals; InputError if there is none."""
+    damages: list[LogDamage] = []
+    name = source.name if isinstance(source, SignalTable) else source
+    mapping, batches = open_ride(source, vehicle, damages.append)
+    vehicle = replace(vehicle, mapping=mapping)
+    own = range_publisher(vehicle).may_have_sent
+    ours = ([frame for frame in batch if not own(frame)] for batch in batches)
+    first = next((batch for batch in ours if batch), None)
+    if first is None:
+        raise InputError(f"{name}: holds no frames of a vehicle" + (f" ({damages[0]})" if damages else ""))
+    return OpenRide(name, vehicle, first[0][0], chain([first], ours), damages)
+
+
+def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None = None) -> Ridden:
+    """Take all frames of `ride` through the pipeline, which writes to `log`. InputError if not one is the vehicle's."""
+    cpu, wall = time.process_time(), time.perf_counter()
+    tally = Tally(ride.start_ns)
+    pipeline = Pipeline(
+        ride.vehicle,
+        filter_name=how.filter_name,
+        log=log,
+        log_frames=how.frames,
+        log_signals=how.signals,
+        observer=tally,
+    )
+    if how.route:
+        pipeline.estimator.ahead.follow(pipeline.estimator.ahead.ready(how.route))
+    if not how.frames:
+        pipeline.publisher = _Mute()
+    feed(pipeline, ride.batches, progress)
+    if not pipeline.codec.latest:
+        raise _unknown(ride, pipeline)
+    if tally.last:  # what came after the last whole second counts too
+        log.sample(STATUS_TOPIC, ride.start_ns + round(tally.last.time * 1e9), pipeline.status())
+    took = time.process_time() - cpu, time.perf_counter() - wall
+    return Ridden(ride.source, pipeline, tally, how, ride.damages, took)
 
 
 @functools.lru_cache(maxsize=1)
 def known_vehicle(name: str, payload: float | None) -> Vehicle:
     """The vehicle, read once for all logs of a process."""
     return read_vehicle(name, payload)
-
-
-def _chained(first: list[Frame], rest: Iterable[list[Frame]]) -> Iterator[list[Frame]]:
-    yield first
-    yield from rest
 
 
 def _open_log(task: EstimateTask, vehicle: Vehicle, start_ns: int) -> LogFile:
@@ -236,34 +279,28 @@ def _open_log(task: EstimateTask, vehicle: Vehicle, start_ns: int) -> LogFile:
     return LogFile(task.part.open("wb"), start_ns, metadata, dbc_texts(vehicle))
 
 
-def _unknown(task: EstimateTask, vehicle: Vehicle, pipeline: Pipeline) -> InputError:
+def _unknown(ride: OpenRide, pipeline: Pipeline) -> InputError:
     unknown = sorted(pipeline.codec.unknown)[:5]
     names = ", ".join(f"{identifier & 0x1FFFFFFF:X}" for identifier in unknown)
     return InputError(
-        f"{task.path}: vehicle {vehicle.name!r} knows none of its {pipeline.codec.received} frames"
+        f"{ride.source}: vehicle {ride.vehicle.name!r} knows none of its {pipeline.codec.received} frames"
         f"{f' (identifiers {names}, ...)' if names else ''}; name its vehicle with --vehicle"
     )
 
 
-def _summary(
-    task: EstimateTask,
-    pipeline: Pipeline,
-    tally: Tally,
-    route: Route | None,
-    damages: Sequence[LogDamage],
-    took: tuple[float, float],
-) -> RideSummary:
-    """The summary of a ride that went through `pipeline`; took: processor and wall time [s]."""
+def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = None) -> RideSummary:
+    """The summary of a ride; log, picture: where its estimates were written and drawn."""
+    pipeline, tally, route = ridden.pipeline, ridden.tally, ridden.how.route
     last, changes = tally.last or Estimate(0.0), pipeline.estimator.attribution.changes
     soc_start, soc_end = tally.soc_start or (None, None), tally.soc_end or (None, None)
     counts, status = pipeline.counts(), pipeline.status()
     states, reasons = tally.by_name()
     return RideSummary(
-        file=str(task.path),
-        log=str(task.log),
-        plot=str(task.picture) if task.picture else None,
+        file=str(ridden.source),
+        log=str(log) if log else None,
+        plot=str(picture) if picture else None,
         vehicle=pipeline.vehicle.name,
-        filter=task.filter_name,
+        filter=ridden.how.filter_name,
         start_ns=tally.start_ns,
         duration_s=last.time,
         distance_km=last.distance * 1e-3,
@@ -297,7 +334,7 @@ def _summary(
         foreign=cast("dict[str, int]", status["foreign"]),
         error_frames=pipeline.codec.error_frames,
         faults=cast("dict[str, dict[str, int]]", status["faults"]),
-        damage=str(damages[0]) if damages else None,
-        cpu_s=took[0],
-        real_time_factor=tally.last.time / took[1] if tally.last else None,
+        damage=str(ridden.damages[0]) if ridden.damages else None,
+        cpu_s=ridden.took[0],
+        real_time_factor=tally.last.time / ridden.took[1] if tally.last else None,
     )

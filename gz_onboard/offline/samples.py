@@ -16,7 +16,7 @@ from gz_onboard.bus.logs import LogDamage, is_table, read_frames
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.errors import InputError
 from gz_onboard.events import Event, Frame
-from gz_onboard.offline.signal_table import read_signal_table
+from gz_onboard.offline.signal_table import SignalTable, read_table, signal_frames
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
@@ -42,27 +42,28 @@ class Samples:
         return rider_mass(self.facts)
 
 
-def read_samples(log: Path, vehicle: Vehicle, progress: Callable[[int], None] | None = None) -> Samples:
+def read_samples(log: Path | SignalTable, vehicle: Vehicle, progress: Callable[[int], None] | None = None) -> Samples:
     """The samples in the log of a ride of `vehicle`, with its facts from a ``rides.json`` beside it, if there is one.
 
     progress: called with the number of frames read. Raises InputError for a log that cannot be read or is not of the
     vehicle.
     """
     mapping, frames = open_ride(log, vehicle)
-    columns = read_roles(log, vehicle, (Codec(extended(mapping)), frames), progress)
-    return Samples(ride_name(log), columns, facts_of(log))
+    file = log.name if isinstance(log, SignalTable) else log
+    columns = read_roles(file, vehicle, (Codec(extended(mapping)), frames), progress)
+    return Samples(ride_name(file), columns, {} if isinstance(log, SignalTable) else facts_of(log))
 
 
 def open_ride(
-    log: Path, vehicle: Vehicle, on_damage: Callable[[LogDamage], None] | None = None
+    log: Path | SignalTable, vehicle: Vehicle, on_damage: Callable[[LogDamage], None] | None = None
 ) -> tuple[BusMapping, Iterator[list[Frame]]]:
     """The mapping that the ride in `log` is decoded by, and its frames: those of a log, or of a table of signals.
 
     on_damage: as of `read_frames`. Raises InputError for what is neither, for frames without times, and for a log of a
     vehicle without DBC files.
     """
-    if is_table(log):
-        return read_signal_table(log, vehicle.mapping)
+    if isinstance(log, SignalTable) or is_table(log):
+        return signal_frames(log if isinstance(log, SignalTable) else read_table(log), vehicle.mapping)
     frames = read_frames(log, on_damage=on_damage)
     if not vehicle.mapping.dbc_files:
         raise vehicle.error(f"dbc is missing: without it a table of signals can be read, but no frames as in {log}")

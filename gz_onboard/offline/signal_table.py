@@ -14,7 +14,7 @@ import csv
 import math
 import re
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
@@ -49,14 +49,32 @@ class _Column(NamedTuple):
     at: int
 
 
-def read_signal_table(file: Path, mapping: BusMapping) -> tuple[BusMapping, Iterator[list[Frame]]]:
+Rows = Sequence[tuple[int, Sequence[Any]]]
+"""(line, or row from 1 of a table that has no lines, and its cells), one for each row."""
+
+
+@dataclass(frozen=True)
+class SignalTable:
+    """A ride as a table: its header, with a unit behind each name, and its rows. name: what errors call it."""
+
+    name: Path
+    header: list[str]
+    rows: Rows
+
+
+def read_table(file: Path) -> SignalTable:
+    """The table in a CSV or Parquet file; InputError if there is none."""
+    return SignalTable(file, *(_parquet(file) if _is_parquet(file) else _csv(file)))
+
+
+def signal_frames(table: SignalTable, mapping: BusMapping) -> tuple[BusMapping, Iterator[list[Frame]]]:
     """The mapping that the ride in a table is decoded by, and its frames, for a vehicle with `mapping`.
 
     The columns have the names of roles; or, for a vehicle without DBC files, those that its roles name. Raises
     InputError naming file, line, column, value and unit for what is neither a time nor a number nor an empty cell, for
     a time that decreases, and for a column that is no role or has a unit that is none of its role's.
     """
-    header, rows = _parquet(file) if _is_parquet(file) else _csv(file)
+    file, header, rows = table.name, table.header, table.rows
     if len(header) < 2:
         raise InputError(f"{file}:1: a table of signals has a column of times and one for each signal")
     times = _times(file, header[0], rows)
@@ -77,13 +95,14 @@ def read_signal_table(file: Path, mapping: BusMapping) -> tuple[BusMapping, Iter
     return made, _frames(times, [(numbers[name], found) for name, found in values.items()])
 
 
+def is_time(name: str) -> bool:
+    """Whether a column of that name is the time."""
+    return _TIME.fullmatch(name) is not None
+
+
 def _is_parquet(file: Path) -> bool:
     with file.open("rb") as stream:
         return stream.read(4) == b"PAR1"
-
-
-Rows = Sequence[tuple[int, Sequence[Any]]]
-"""(line, or row from 1 of a Parquet file, and its cells), one for each row."""
 
 
 def _csv(file: Path) -> tuple[list[str], Rows]:
@@ -114,11 +133,20 @@ def _parquet(file: Path) -> tuple[list[str], Rows]:
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
-        raise InputError(f"{file}: Parquet needs pyarrow: pip install pyarrow; or give the table as CSV") from error
+        raise InputError(
+            f"{file}: Parquet needs pyarrow: pip install 'gz-onboard[lab]'; or give the table as CSV"
+        ) from error
     try:
         table = pyarrow.parquet.ParquetFile(file).read()  # `read_table` chokes on two columns of one name
     except (OSError, pyarrow.ArrowException) as error:
         raise InputError(f"{file}: not a Parquet file: {error}") from error
+    return arrow_rows(table)
+
+
+def arrow_rows(table: Any) -> tuple[list[str], Rows]:
+    """(header, rows) of a table of pyarrow."""
+    import pyarrow
+
     columns = [
         column.cast(pyarrow.timestamp("us", "UTC"), safe=False)  # datetime has no ns, and may not know the zone
         if pyarrow.types.is_timestamp(column.type)

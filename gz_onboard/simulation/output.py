@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from gz_onboard.arrays import Array
 from gz_onboard.errors import writable, writing
 from gz_onboard.offline.page import svg, write_page
 from gz_onboard.offline.style import save
@@ -91,20 +92,26 @@ def _draw(
     write_page(file(".html"), title, [text, *(f"<figure>{svg(figure)}</figure>" for _, figure in drawn)])
 
 
+def series_table(result: Run) -> dict[str, Array]:
+    """The time series by column, ``name[unit]``."""
+    return {f"{name}[{unit}]": result.series[name] for name, unit in COLUMNS.items()}
+
+
 def write_series(result: Run, file: Path, metadata: dict[str, str]) -> None:
     """The time series as MCAP, Parquet or CSV by the file's name; columns as ``name[unit]``, not a number as null."""
-    names = [f"{name}[{unit}]" for name, unit in COLUMNS.items()]
+    table = series_table(result)
+    names = list(table)
     if file.suffix == ".parquet":
         import pyarrow as pa
         import pyarrow.parquet as pq
 
-        columns = [pa.array(column, from_pandas=True) for column in result.series.values()]
-        table = pa.table(columns, names=names)
+        columns = [pa.array(column, from_pandas=True) for column in table.values()]
+        arrow = pa.table(columns, names=names)
         named = {key: writable(text) for key, text in metadata.items()}
         with file.open("wb") as binary:  # pyarrow opens no name that is not UTF-8
-            pq.write_table(table.replace_schema_metadata(named), binary)
+            pq.write_table(arrow.replace_schema_metadata(named), binary)
         return
-    rows = zip(*(column.tolist() for column in result.series.values()), strict=True)
+    rows = zip(*(column.tolist() for column in table.values()), strict=True)
     if file.suffix == ".csv":
         with file.open("w", newline="", encoding="utf-8") as stream:
             writer = csv.writer(stream)

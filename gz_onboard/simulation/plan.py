@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,17 +13,57 @@ from gz_onboard.options import LOG_SUFFIXES
 from gz_onboard.routes.profile import speed_profile
 from gz_onboard.routes.route import read_route
 from gz_onboard.simulation.cycles import find_cycle
+from gz_onboard.simulation.parts.chassis import MODELS
 from gz_onboard.simulation.parts.road import Dynamometer, RoadProfile, straight
 from gz_onboard.simulation.recorded import Recorded, fit_dynamometer, read_recorded
 from gz_onboard.simulation.run import Command, along, at_steps, follow, replay, road_table
 from gz_onboard.simulation.scooter import STEP
-from gz_onboard.vehicle import Vehicle
+from gz_onboard.vehicle import Vehicle, read_vehicle
 
 _LOGS = {*LOG_SUFFIXES, ".gz"} - {".csv"}
 TOP_SPEED = 50 / 3.6
 """m/s: what a rider aims for on a route without limits."""
 Ground = RoadProfile | Dynamometer
 Heading = float | Callable[[float], float]
+
+
+RANGES: dict[str, tuple[float, float, str]] = {
+    "soc": (0.0, 1.0, ""),
+    "ambient": (-40.0, 60.0, "degC"),
+    "grade": (-30.0, 30.0, "%"),
+    "wind": (-40.0, 40.0, "m/s"),
+    "repeat": (1, 1000, ""),
+}
+"""What of `SimulationOptions` is a number: the least, the greatest, the unit."""
+
+
+@dataclass(frozen=True)
+class SimulationOptions:
+    """How a cycle, a route or a recorded ride is to be ridden; what is None is as recorded, or usual.
+
+    soc: state of charge at the start, 0 to 1. ambient: of air and vehicle at the start [degC]. grade: of the road [%,
+    uphill positive]. wind: against the rider [m/s]. repeat: times that a cycle is ridden, or until_empty: until the
+    pack is. dyno: ``KG[,A[,B[,C]]]``, on a chassis dynamometer. chassis: straight, planar or leaning. predictive: a
+    rider follows the speed of a recorded ride. Raises InputError for a number out of its range.
+    """
+
+    soc: float | None = None
+    ambient: float | None = None
+    grade: float = 0.0
+    wind: float = 0.0
+    repeat: int = 1
+    until_empty: bool = False
+    dyno: str | None = None
+    chassis: str = "straight"
+    predictive: bool = False
+
+    def __post_init__(self) -> None:
+        for name, (low, high, unit) in RANGES.items():
+            value = getattr(self, name)
+            if value is not None and not low <= value <= high:
+                raise InputError(f"{name} {value:.10g}: must be {low:g} to {high:g} {unit}".rstrip())
+        if self.chassis not in MODELS:
+            raise InputError(f"chassis {self.chassis!r}: must be {', '.join(MODELS)}{nearest(self.chassis, MODELS)}")
 
 
 @dataclass(frozen=True)
@@ -42,30 +81,40 @@ class Plan:
     vibration: Callable[[float], float] | None = None  # m/s² over distance, as it was recorded
 
 
-def find_plan(arguments: argparse.Namespace, vehicle: Vehicle) -> Plan:
-    """The plan that WHAT asks for; InputError for what is neither a file that can be ridden nor a built-in cycle."""
-    path = Path(arguments.what)
+def find_plan(what: str, options: SimulationOptions, vehicle: Vehicle) -> Plan:
+    """The plan for `what`; InputError for what is neither a file that can be ridden nor a built-in cycle."""
+    plan = _plan(what, options, vehicle)
+    if options.chassis != "straight" and (plan.kind == "cycle" or isinstance(plan.road, Dynamometer)):
+        where = "on a dynamometer" if isinstance(plan.road, Dynamometer) else "in a drive cycle"
+        raise InputError(f"--chassis {options.chassis}: there are no bends {where}; it is for routes and rides")
+    return plan
+
+
+def _plan(what: str, options: SimulationOptions, vehicle: Vehicle) -> Plan:
+    path = Path(what)
     kind = _kind(path)
-    roller = dynamometer(arguments.dyno) if arguments.dyno else None
+    roller = dynamometer(options.dyno) if options.dyno else None
     if kind == "ride":
-        return _ride_plan(path, arguments, vehicle, roller)
-    if arguments.predictive:
+        return _ride_plan(path, options, vehicle, roller)
+    if options.predictive:
         raise InputError(f"--predictive: {path} is a {kind}, whose speed is followed anyway; it is for recorded rides")
     if kind == "route":
-        return _route_plan(path, arguments, roller)
-    cycle = find_cycle(arguments.what)
-    if arguments.repeat > 1 or arguments.until_empty:
+        return _route_plan(path, options, roller)
+    cycle = find_cycle(what)
+    if options.repeat > 1 or options.until_empty:
         cycle.repeated(2)  # its error if it ends at another speed than it begins with
     speeds = at_steps(cycle.time, cycle.speed, STEP)
-    road = roller or straight(math.sin(math.atan(arguments.grade / 100)), arguments.wind)
+    road = roller or straight(math.sin(math.atan(options.grade / 100)), options.wind)
     return Plan(cycle.name, "cycle", cycle.duration, road, lambda: follow(speeds, STEP))
 
 
-def noted_payload(what: Path) -> float | None:
-    """The mass [kg] that ``rides.json`` beside it says of the recorded ride `what`; None of anything else."""
-    if _kind(what) != "ride":
-        return None
-    return rider_mass(facts_of(what))
+def vehicle_on(what: str, vehicle: str | Path, payload: float | None = None) -> tuple[Vehicle, str]:
+    """(vehicle, source of its payload): that given [kg], or of a recorded ride what ``rides.json`` beside it says."""
+    source = "--payload"
+    if payload is None:
+        payload = rider_mass(facts_of(Path(what))) if _kind(Path(what)) == "ride" else None
+        source = "the vehicle file" if payload is None else "rides.json"
+    return read_vehicle(vehicle, payload), source
 
 
 def _kind(path: Path) -> str:
@@ -90,25 +139,25 @@ def _kind(path: Path) -> str:
     )
 
 
-def _route_plan(path: Path, arguments: argparse.Namespace, roller: Dynamometer | None) -> Plan:
-    if arguments.repeat > 1 or arguments.until_empty:
+def _route_plan(path: Path, options: SimulationOptions, roller: Dynamometer | None) -> Plan:
+    if options.repeat > 1 or options.until_empty:
         raise InputError(f"{path}: a route is ridden once, as it does not end where it starts; --repeat is for cycles")
     route = read_route(path)
     profile = speed_profile(route, top_speed=TOP_SPEED)
     metres = [profile.speed_at(float(i)) for i in range(int(route.length) + 1)]
-    road = roller or road_table(route.distance, route.grade, route.curvature, arguments.wind)
+    road = roller or road_table(route.distance, route.grade, route.curvature, options.wind)
     return Plan(
         route.name, "route", profile.time[-1], road, lambda: along(metres), route.length, heading=route.heading[0]
     )
 
 
-def _ride_plan(path: Path, arguments: argparse.Namespace, vehicle: Vehicle, roller: Dynamometer | None) -> Plan:
-    if arguments.repeat > 1 or arguments.until_empty:
+def _ride_plan(path: Path, options: SimulationOptions, vehicle: Vehicle, roller: Dynamometer | None) -> Plan:
+    if options.repeat > 1 or options.until_empty:
         raise InputError(f"{path}: a recorded ride is ridden once; --repeat and --until-empty are for cycles")
     recorded = read_recorded(path, vehicle)
     signals = recorded.signals
-    road, heading = ridden_road(recorded, path, arguments.wind, roller)
-    if arguments.predictive:
+    road, heading = ridden_road(recorded, path, options.wind, roller)
+    if options.predictive:
         speeds = signals["speed"].tolist()
         kind, command = "ride (predictive)", lambda: follow(speeds, STEP)
     else:

@@ -9,27 +9,26 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from gz_onboard.constants import HOUR, WH_PER_KM
-from gz_onboard.errors import OK, InputError, not_an_input
+from gz_onboard.errors import OK, InputError, not_an_input, require
 from gz_onboard.offline.results import explain_keys, times, write_json
 from gz_onboard.options import add_shared, number
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.simulation.frames import Dropouts, check_output
 from gz_onboard.simulation.output import FORMATS, write, write_trace
 from gz_onboard.simulation.parts.chassis import MODELS, chassis
-from gz_onboard.simulation.parts.road import Dynamometer
-from gz_onboard.simulation.plan import Plan, find_plan, noted_payload
+from gz_onboard.simulation.plan import RANGES, Plan, SimulationOptions, find_plan, vehicle_on
 from gz_onboard.simulation.recorded import rest_soc, scooter_at_start
 from gz_onboard.simulation.run import Run, drive
 from gz_onboard.simulation.scooter import Scooter
 from gz_onboard.simulation.summary import KEYS, SUMMARY_VERSION, Variant, cycle_range, summarise, summary_text
 from gz_onboard.simulation.sweep import Sweep, grid, read_sweep, redesigned
 from gz_onboard.simulation.trace import Trace
-from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
+from gz_onboard.vehicle import Vehicle, find_vehicle
 
 _MOST_HOURS = 48.0  # of riding until empty
 
@@ -42,14 +41,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("what", metavar="WHAT", help=what)
     add_shared(parser, "--vehicle", "--payload")
     charge = "state of charge at the start (default: 1; of a recorded ride, as recorded)"
-    _number(parser, "--soc", 0.0, 1.0, help=charge)
+    _number(parser, "--soc", *RANGES["soc"], help=charge)
     air = "temperature of air and vehicle at the start (default: 20)"
-    _number(parser, "--ambient", -40.0, 60.0, "degC", metavar="C", help=air)
+    _number(parser, "--ambient", *RANGES["ambient"], metavar="C", help=air)
     hill = "of the road, uphill positive (default: %(default)g)"
-    _number(parser, "--grade", -30.0, 30.0, "%", default=0.0, metavar="PERCENT", help=hill)
-    _number(parser, "--wind", -40.0, 40.0, "m/s", default=0.0, help="headwind (default: %(default)g)")
+    _number(parser, "--grade", *RANGES["grade"], default=0.0, metavar="PERCENT", help=hill)
+    _number(parser, "--wind", *RANGES["wind"], default=0.0, help="headwind (default: %(default)g)")
     often = parser.add_mutually_exclusive_group()
-    repeat = number("--repeat", 1, 1000, kind=int)
+    repeat = number("--repeat", *RANGES["repeat"], kind=int)
     often.add_argument("--repeat", type=repeat, default=1, metavar="N", help="ride it N times (default: %(default)s)")
     often.add_argument("--until-empty", action="store_true", help="repeat it until the pack is empty")
     dyno = "on a chassis dynamometer: inertia of the roller [kg], force A + B·V + C·V² [N] at a speed V [m/s]"
@@ -81,11 +80,10 @@ def _number(
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard simulate``."""
-    payload, payload_from = arguments.payload, "--payload"
-    if payload is None:
-        payload = noted_payload(Path(arguments.what))
-        payload_from = "the vehicle file" if payload is None else "rides.json"
-    vehicle = read_vehicle(arguments.vehicle, payload)
+    require("matplotlib", not arguments.no_plot)
+    require("pyarrow", arguments.format == "parquet" and not arguments.no_series)
+    vehicle, payload_from = vehicle_on(arguments.what, arguments.vehicle, arguments.payload)
+    options = SimulationOptions(**{field.name: getattr(arguments, field.name) for field in fields(SimulationOptions)})
     sweeps = [read_sweep(text, vehicle) for text in arguments.sweep]
     if len(sweeps) > 2:
         raise InputError(f"--sweep {arguments.sweep[2]}: at most two parameters can be swept")
@@ -96,20 +94,17 @@ def run(arguments: argparse.Namespace) -> int:
     elif arguments.frame_loss is not None:
         raise InputError(f"--frame-loss {arguments.frame_loss:g}: is for --frames FILE")
     not_an_input((arguments.frames, arguments.json), [Path(arguments.what), find_vehicle(arguments.vehicle)])
-    plan = find_plan(arguments, vehicle)
-    if arguments.chassis != "straight" and (plan.kind == "cycle" or isinstance(plan.road, Dynamometer)):
-        where = "on a dynamometer" if isinstance(plan.road, Dynamometer) else "in a drive cycle"
-        raise InputError(f"--chassis {arguments.chassis}: there are no bends {where}; it is for routes and rides")
+    plan = find_plan(arguments.what, options, vehicle)
     trace = Trace() if arguments.frames else None
     begin = time.perf_counter()
-    expected = _expected_seconds(arguments, plan, sweeps)
+    expected = _expected_seconds(options, plan, sweeps)
     with progress_bar(lambda: expected, "s ridden", quiet=arguments.quiet) as display:
-        result, scooter = ride(vehicle, plan, arguments, display.update, trace)
+        result, scooter = ride(vehicle, plan, options, display.update, trace)
         wall = time.perf_counter() - begin
         variants = (
-            [_variant(vehicle, values, plan, arguments, display.update) for values in grid(sweeps)] if sweeps else None
+            [_variant(vehicle, values, plan, options, display.update) for values in grid(sweeps)] if sweeps else None
         )
-    found = summarise(vehicle, plan, arguments, result, scooter)
+    found = summarise(vehicle, plan, arguments.what, result, scooter)
     found = replace(found, payload_from=payload_from, wall_s=wall, sweep=variants)
     files = write(arguments, vehicle, plan, result, found, sweeps)
     if trace:
@@ -122,10 +117,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def ride(
-    vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, progress: Progress | None, trace: Trace | None = None
+    vehicle: Vehicle, plan: Plan, options: SimulationOptions, progress: Progress | None, trace: Trace | None = None
 ) -> tuple[Run, Scooter]:
-    """Ride `plan` with the options of the command line; what these do not say of the start is as it was recorded."""
-    recorded, soc = plan.recorded, arguments.soc
+    """Ride `plan` with `options`; what these do not say of the start is as it was recorded."""
+    recorded, soc = plan.recorded, options.soc
     if soc is None:
         measured = rest_soc(recorded, vehicle) if recorded else None
         soc = 1.0 if measured is None else measured
@@ -133,31 +128,31 @@ def ride(
         recorded,
         vehicle,
         plan.road,
-        arguments.ambient,
+        options.ambient,
         soc=soc,
         heading=plan.heading,
         vibration=plan.vibration,
-        chassis=chassis(arguments.chassis, vehicle.parameters),
+        chassis=chassis(options.chassis, vehicle.parameters),
     )
-    seconds = _MOST_HOURS * HOUR if arguments.until_empty else plan.seconds * arguments.repeat
+    seconds = _MOST_HOURS * HOUR if options.until_empty else plan.seconds * options.repeat
     if plan.length is not None:
         seconds = 3 * plan.seconds + 600  # a weak vehicle takes longer
     command = trace.watch(plan.command()) if trace else plan.command()
-    result = drive(scooter, command, seconds, until_empty=arguments.until_empty, finish=plan.length, progress=progress)
+    result = drive(scooter, command, seconds, until_empty=options.until_empty, finish=plan.length, progress=progress)
     return result, scooter
 
 
-def _expected_seconds(arguments: argparse.Namespace, plan: Plan, sweeps: Sequence[Sweep]) -> float | None:
-    if arguments.until_empty:
+def _expected_seconds(options: SimulationOptions, plan: Plan, sweeps: Sequence[Sweep]) -> float | None:
+    if options.until_empty:
         return None
     rides = 1 + (len(grid(sweeps)) if sweeps else 0)
-    return plan.seconds * float(arguments.repeat) * rides
+    return plan.seconds * float(options.repeat) * rides
 
 
 def _variant(
-    vehicle: Vehicle, values: dict[str, float], plan: Plan, arguments: argparse.Namespace, progress: Progress | None
+    vehicle: Vehicle, values: dict[str, float], plan: Plan, options: SimulationOptions, progress: Progress | None
 ) -> Variant:
-    result, scooter = ride(redesigned(vehicle, values), plan, arguments, progress)
+    result, scooter = ride(redesigned(vehicle, values), plan, options, progress)
     metres, _ = cycle_range(result, scooter)
     shortfall = sum(s.duration for s in result.shortfalls)
     return Variant(values, times(result.consumption, 1 / WH_PER_KM), times(metres, 1e-3), shortfall)

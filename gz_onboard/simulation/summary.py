@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -126,13 +125,11 @@ def cycle_range(result: Run, scooter: Scooter) -> tuple[float | None, str | None
     return metres, None if metres is None else "energy"
 
 
-def summarise(
-    vehicle: Vehicle, plan: Plan, arguments: argparse.Namespace, result: Run, scooter: Scooter
-) -> SimulationSummary:
+def summarise(vehicle: Vehicle, plan: Plan, what: str, result: Run, scooter: Scooter) -> SimulationSummary:
     """The summary, without what only the command knows: its time, sweep and files."""
     metres, by = cycle_range(result, scooter)
     return SimulationSummary(
-        what=str(arguments.what),
+        what=what,
         kind=plan.kind,
         vehicle=vehicle.name,
         payload_kg=vehicle.parameters["payload_mass"],

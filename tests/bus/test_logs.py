@@ -17,7 +17,7 @@ import zstandard
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.bus import export, logs
+from gz_onboard.bus import logs
 from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import LogDamage, json_channels, read_attachments, read_frames, read_metadata, read_samples
@@ -26,6 +26,7 @@ from gz_onboard.bus.readers.pycan import frame_of
 from gz_onboard.bus.writers import write_blf, write_candump
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
+from gz_onboard.lab import export
 
 START_S = 1_750_000_000
 

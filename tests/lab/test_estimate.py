@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import csv
 import gzip
 import json
 import os
@@ -216,6 +217,45 @@ def test_a_folder_of_logs_is_its_logs(tmp_path, frames, capsys):
     assert run(tmp_path, tmp_path / "b.log", "--output", tmp_path, "--no-plot", "--json") == 0
     rides = json.loads(capsys.readouterr().out)["rides"]
     assert [Path(ride["file"]).name for ride in rides] == ["a.log.gz", "b.log"]
+
+
+@pytest.mark.parametrize("name", ["rides.csv", "rides.parquet", "rides.jsonl", "rides.csv.gz"])
+def test_a_folder_of_rides_makes_a_table_of_summaries(tmp_path, frames, name):
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    for ride in ("a.log", "b.log"):
+        candump(folder / ride, frames[:3000])
+    (folder / "c.blf").write_text("noise")
+    out, told = tmp_path / name, tmp_path / "s.json"
+    assert run(folder, "--output", tmp_path, "--no-plot", "--jobs", 1, "--table", out, "--json", told) == 2
+    summary = json.loads(told.read_text())
+    if name.endswith("parquet"):
+        import pyarrow.parquet as pq
+
+        rows = pq.read_table(out).to_pylist()
+    elif name.endswith("jsonl"):
+        rows = [json.loads(line) for line in out.read_text().splitlines()]
+    else:
+        text = gzip.decompress(out.read_bytes()).decode() if name.endswith("gz") else out.read_text()
+        rows = [{key: cell or None for key, cell in row.items()} for row in csv.DictReader(text.splitlines())]
+    assert [row["file"] for row in rows] == [str(folder / ride) for ride in ("a.log", "b.log", "c.blf")]
+    for row, ride in zip(rows, summary["rides"], strict=False):
+        assert {key: str(row[key]) for key in ("start_ns", "vehicle", "frames")} == {
+            key: str(ride[key]) for key in ("start_ns", "vehicle", "frames")
+        }
+        assert float(row["distance_km"]) == ride["distance_km"]
+        assert float(row["valid_s"]) == ride["states"].get("VALID", 0.0)
+        assert row["range_end_km"] == ride["range_end_km"] or float(row["range_end_km"]) == ride["range_end_km"]
+        assert row["reasons"].split() == list(ride["reasons"])
+        assert row["plot"] is row["error"] is None
+    assert rows[2]["error"] == summary["failed"][0]["error"]
+    assert rows[2]["distance_km"] is None
+
+
+def test_a_table_of_summaries_has_a_format(tmp_path, capsys):
+    assert run(COASTDOWN, "--output", tmp_path, "--table", tmp_path / "rides.xls") == 2
+    assert "rides.xls: a table is written as .csv, .parquet, .jsonl" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_rides_of_the_same_name_in_several_folders(tmp_path, frames):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -145,11 +145,7 @@ def _plain(procedure: Procedure) -> dict[str, float | str]:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run ``gz-onboard calibrate``; `OK` if all was found, also where something was refused with its reason."""
-    if arguments.what != "all" and arguments.what not in PROCEDURES:
-        known = ["all", *PROCEDURES]
-        raise InputError(
-            f"no procedure is called {arguments.what!r}{nearest(arguments.what, known)}; there are {', '.join(known)}"
-        )
+    known_procedure(arguments.what)
     base, steps = _asked(arguments)
     for file in (arguments.output, arguments.report, arguments.json):
         if file is not None and str(file) != "-" and not Path(file).parent.is_dir():
@@ -202,41 +198,60 @@ def _found(steps: Sequence[Step], base: Path, quiet: bool) -> tuple[list[Result]
 def _asked(arguments: argparse.Namespace) -> tuple[Path, list[Step]]:
     """(vehicle file to start from, steps) of a command line."""
     if arguments.what == "all":
-        if len(arguments.data) > 1:
-            raise InputError("all takes one folder (or its manifest), which names the files in it")
         if arguments.more or arguments.held_out or arguments.set:
             raise InputError("all takes its data and options from the manifest, not from --with, --held-out or --set")
-        slots = {name: p.slots for name, p in PROCEDURES.items()}
-        base, steps = manifest.read_manifest(
-            arguments.data[0], slots, {name: p.options for name, p in PROCEDURES.items()}
-        )
-        return (find_vehicle(arguments.vehicle) if arguments.vehicle else base), steps
-    name, procedure = arguments.what, PROCEDURES[arguments.what]
+        return asked_of_manifest(arguments.data, arguments.vehicle)
+    procedure = PROCEDURES[arguments.what]
     files: dict[str, list[Path]] = {"data": list(arguments.data)}
     for text in [*arguments.more, *(f"held_out={file}" for file in arguments.held_out)]:
         slot, equals, file = text.partition("=")
-        if not equals or slot not in procedure.slots:
+        if not equals:
+            raise InputError(f"--with {text}: must be NAME=FILE, with one of {', '.join(procedure.slots)}")
+        files.setdefault(slot, []).append(Path(file))
+    base = find_vehicle(arguments.vehicle or "reference")
+    return base, [step_of(arguments.what, files, options_of(arguments.set, arguments.what))]
+
+
+def asked_of_manifest(data: Sequence[Path], vehicle: str | Path | None) -> tuple[Path, list[Step]]:
+    """(vehicle file to start from, steps) of a folder's manifest; vehicle: another than the manifest's."""
+    if len(data) != 1:
+        raise InputError("all takes one folder (or its manifest), which names the files in it")
+    slots = {name: p.slots for name, p in PROCEDURES.items()}
+    base, steps = manifest.read_manifest(data[0], slots, {name: p.options for name, p in PROCEDURES.items()})
+    return (find_vehicle(vehicle) if vehicle else base), steps
+
+
+def step_of(name: str, files: Mapping[str, Sequence[Path]], options: Mapping[str, Option]) -> Step:
+    """The procedure `name` with its data by slot: files, or for rides folders of logs. InputError for what it lacks."""
+    procedure, found = PROCEDURES[name], {slot: list(group) for slot, group in files.items()}
+    for slot, group in found.items():
+        if slot not in procedure.slots:
             raise InputError(
-                f"--with {text}: {name} has no data {slot!r}{nearest(slot, procedure.slots)}; "
+                f"--with {slot}={group[0]}: {name} has no data {slot!r}{nearest(slot, procedure.slots)}; "
                 f"there are {', '.join(procedure.slots)}"
             )
-        files.setdefault(slot, []).append(Path(file))
-    for slot, group in files.items():
         if procedure.slots[slot].kind != "table":
-            files[slot] = logs_among(group)
+            found[slot] = logs_among(group)
     for slot, needed in procedure.slots.items():
-        check_count(name, slot, needed, len(files.get(slot, ())))
-    for file in (file for group in files.values() for file in group):
+        check_count(name, slot, needed, len(found.get(slot, ())))
+    for file in (file for group in found.values() for file in group):
         if not file.is_file():
             there = [p.name for p in file.parent.glob("*")] if file.parent.is_dir() else []
             raise InputError(f"{file}: no such file{nearest(file.name, there)}")
-    step = Step(name, {slot: tuple(group) for slot, group in files.items()}, {}, _options(arguments.set, procedure))
-    return find_vehicle(arguments.vehicle or "reference"), [step]
+    return Step(name, {slot: tuple(group) for slot, group in found.items()}, {}, dict(options))
 
 
-def _options(texts: Sequence[str], procedure: Procedure) -> dict[str, Option]:
+def known_procedure(name: str) -> None:
+    """InputError if no procedure has that name, nor all of them."""
+    if name != "all" and name not in PROCEDURES:
+        known = ["all", *PROCEDURES]
+        raise InputError(f"no procedure is called {name!r}{nearest(name, known)}; there are {', '.join(known)}")
+
+
+def options_of(texts: Sequence[str], procedure: str) -> dict[str, Option]:
+    """The options of a procedure, each given as NAME=VALUE. InputError for one that it has not, or a wrong value."""
     found: dict[str, Option] = {}
-    options = _plain(procedure)
+    options = _plain(PROCEDURES[procedure])
     for text in texts:
         name, _, value = text.partition("=")
         if name not in options:

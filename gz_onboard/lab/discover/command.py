@@ -21,6 +21,7 @@ from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.result import VERSION, Report
 from gz_onboard.lab.discover.summary import listing, summary
 from gz_onboard.lab.discover.verdict import Discovery
+from gz_onboard.lab.discover.wording import Say
 from gz_onboard.offline.processes import Task, over_rides
 from gz_onboard.offline.results import explain_keys, write_json
 from gz_onboard.offline.samples import Samples, read_samples, ride_name
@@ -72,25 +73,13 @@ def run(arguments: argparse.Namespace) -> int:
     rides, refused = read_rides(logs, arguments)
     if arguments.baseline:
         return run_baseline(arguments, vehicle, rides, refused)
-    refused += [f"{ride.name}: is a ride on a roller; left out" for ride in rides if "roller_speed" in ride.columns]
-    rides = [ride for ride in rides if "roller_speed" not in ride.columns]
-    if not rides:
-        raise InputError("; ".join(refused))
     holdout = [name.strip() for name in arguments.holdout.split(",")] if arguments.holdout else None
+    options = DiscoveryOptions(arguments.seed, arguments.effects, arguments.jobs, holdout)
     with progress_bar(lambda: None, quiet=arguments.quiet) as display:
-        found = discover(vehicle, rides, arguments.seed, arguments.effects, display.step, arguments.jobs, holdout)
-    report = found.report
-    report.notes[:0] = refused
-    report.notes += [
-        *remaining_range_error(report),
-        *loads_by_ride(found),
-        *outlying_rides(found),
-        *implausible_rides(found.lines),
-        *missing_residuals(found),
-    ]
-    written = write_extended(found, vehicle, arguments) if arguments.write_model else []
+        found = explain(vehicle, rides, options, refused, display.step)
+    written = write_extended(found, vehicle, arguments.write_model) if arguments.write_model else []
     if arguments.json:
-        write_json(arguments.json, None, report)
+        write_json(arguments.json, None, found.report)
     if arguments.report:
         from gz_onboard.lab.discover.page import write_report
 
@@ -101,6 +90,44 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.report:
             print(f"report       {arguments.report}")
     return 0
+
+
+@dataclass(frozen=True)
+class DiscoveryOptions:
+    """How is searched, as of `discover`."""
+
+    seed: int = 0
+    effects: Path | None = None  # folder of the user's own
+    jobs: int = 1
+    holdout: Sequence[str] | None = None
+
+
+def explain(
+    vehicle: Vehicle,
+    rides: Sequence[Samples],
+    options: DiscoveryOptions,
+    refused: Sequence[str] = (),
+    say: Say | None = None,
+) -> Discovery:
+    """What `rides` show that `vehicle` does not, with notes on what could not be used; refused: why others are none.
+
+    Raises InputError where no ride can be used.
+    """
+    left = [*refused, *(f"{r.name}: is a ride on a roller; left out" for r in rides if "roller_speed" in r.columns)]
+    rides = [ride for ride in rides if "roller_speed" not in ride.columns]
+    if not rides:
+        raise InputError("; ".join(left) or "no ride is given")
+    found = discover(vehicle, rides, options.seed, options.effects, say, options.jobs, options.holdout)
+    report = found.report
+    report.notes[:0] = left
+    report.notes += [
+        *remaining_range_error(report),
+        *loads_by_ride(found),
+        *outlying_rides(found),
+        *implausible_rides(found.lines),
+        *missing_residuals(found),
+    ]
+    return found
 
 
 def run_baseline(arguments: argparse.Namespace, vehicle: Vehicle, rides: list[Samples], refused: list[str]) -> int:
@@ -141,13 +168,18 @@ def _check(arguments: argparse.Namespace, logs: Sequence[Path]) -> None:
             raise InputError(f"--{option.replace('_', '-')} {file}: no folder {Path(file).parent}")
     not_an_input((getattr(arguments, option) for option in ("baseline", "write_model", "report", "json")), [own, *logs])
     names = [ride_name(log) for log in logs]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise InputError(f"two rides are called {twice[0]}: rides are told apart by their names; rename one")
+    told_apart(names)
     for name in filter(None, (part.strip() for part in (arguments.holdout or "").split(","))):
         if name not in names:
             raise InputError(f"--holdout: no ride is called {name!r}{nearest(name, names)}")
     if arguments.holdout and len(logs) < 2:
         raise InputError("--holdout: one ride alone cannot be held out of the fit")
+
+
+def told_apart(names: Sequence[str]) -> None:
+    """InputError if two rides have the same name."""
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"two rides are called {twice[0]}: rides are told apart by their names; rename one")
 
 
 # --- rides --------------------------------------------------------------------------------------------------------
@@ -204,14 +236,14 @@ def on_road(ride: Samples) -> bool:
 # --- the extended model -------------------------------------------------------------------------------------------
 
 
-def write_extended(found: Discovery, vehicle: Vehicle, arguments: argparse.Namespace) -> list[str]:
+def write_extended(found: Discovery, vehicle: Vehicle, out: Path) -> list[str]:
     """Write the extended model if there is anything to extend it with; what was done, in words."""
     report = found.report
     if all(cause.varies for cause in report.causes) and report.unknown is None:
         return ["not written: there is nothing to extend it with"]
-    with writing(f"--write-model {arguments.write_model}"):
-        added = write_model(found, vehicle, find_vehicle(arguments.vehicle), arguments.write_model)
-    written = [str(arguments.write_model), *added] if report.extended_model else ["not written", *added]
+    with writing(f"--write-model {out}"):
+        added = write_model(found, vehicle, vehicle.file, out)
+    written = [str(out), *added] if report.extended_model else ["not written", *added]
     if report.ambiguous:
         written.append(
             "of causes that cannot be told apart it has the likeliest: right for these rides, perhaps not for others"

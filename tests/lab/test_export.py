@@ -4,6 +4,7 @@ import argparse
 import csv
 import gzip
 import json
+import re
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import cantools
 import pytest
 from mcap.reader import make_reader
 
-from gz_onboard.bus import export as command
+from gz_onboard import cli
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.logfile import LogFile, object_schema
 from gz_onboard.bus.logs import read_frames, read_samples
@@ -20,7 +21,9 @@ from gz_onboard.bus.signals import Decoder, column_name
 from gz_onboard.bus.writers import write_candump
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame
+from gz_onboard.lab import export as command
 from gz_onboard.vehicle import read_vehicle
+from tests.support import LOGS
 
 START = 1_750_000_000_000_000_000
 
@@ -148,7 +151,11 @@ def test_tables_have_a_row_for_each_frame_and_null_for_what_was_not_available(tm
         assert table.column("time").cast("int64").to_pylist() == [t for t, _ in rows]
         for name in rows[0][1]:
             assert table.column(name).to_pylist() == [values[name] for _, values in rows]
-    assert sorted(p.name for p in (tmp_path / "tables").iterdir()) == ["Muxed.parquet", "Pack.parquet"]
+    assert sorted(p.name for p in (tmp_path / "tables").iterdir()) == [
+        "Muxed.parquet",
+        "Pack.parquet",
+        "estimate.parquet",
+    ]
 
 
 def test_what_is_beyond_the_range_of_the_dbc_is_null_as_on_board(tmp_path: Path) -> None:
@@ -398,3 +405,150 @@ def test_nothing_half_written_has_the_name(
 def test_a_missing_directory_is_named(tmp_path: Path, log: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere.*cannot be written"):
         run(log, tmp_path / "nowhere" / "out.blf")
+
+
+# --- what a log holds ------------------------------------------------------------------------------------------
+
+
+def lines(path: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in text_of(path).splitlines()]
+
+
+def text_of(path: Path) -> str:
+    data = path.read_bytes()
+    return (gzip.decompress(data) if path.suffix == ".gz" else data).decode()
+
+
+@pytest.mark.parametrize("name", ["out.jsonl", "out.jsonl.gz"])
+def test_signals_as_lines_of_json(tmp_path: Path, log: Path, name: str) -> None:
+    assert run(log, tmp_path / name) == 0
+    there = lines(tmp_path / name)
+    for message, rows in expected().items():
+        mine = [{k: v for k, v in line.items() if k != "message"} for line in there if line["message"] == message]
+        assert [line.pop("time[s]") for line in mine] == [_near(t / 1e9) for t, _ in rows]
+        assert mine == [{name: _near(value) for name, value in values.items()} for _, values in rows]
+    assert f'{{"time[s]": {START // 10**9}.000000000, ' in text_of(
+        tmp_path / name
+    )  # to the nanosecond, which no float has
+
+
+@pytest.mark.parametrize("name", ["out.parquet", "out.jsonl"])
+def test_frames_as_a_table(tmp_path: Path, log: Path, name: str) -> None:
+    assert run(log, tmp_path / name, "--frames") == 0
+    if name == "out.parquet":
+        import pyarrow.parquet as pq
+
+        rows = pq.read_table(tmp_path / name).to_pylist()
+        assert [row.pop("time").value for row in rows] == [frame[0] for frame in recorded()]
+    else:
+        rows = lines(tmp_path / name)
+        assert [row.pop("time[s]") for row in rows] == [_near(frame[0] / 1e9) for frame in recorded()]
+    assert [
+        (row["identifier"] | (EFF_FLAG if row["extended"] else 0), bytes.fromhex(row["data"]), row["channel"])
+        for row in rows
+    ] == [(i, d, c & ~TRANSMITTED) for _, i, d, c in recorded()]
+    assert [row["sent"] for row in rows] == [bool(c & TRANSMITTED) for *_, c in recorded()]
+    assert not any(row["error"] or row["remote"] for row in rows)
+
+
+def test_columns_are_chosen_by_name_with_or_without_unit(tmp_path: Path, estimated: Path, log: Path) -> None:
+    assert run(estimated, tmp_path / "out.csv", "--columns", "range,soc") == 0
+    assert (tmp_path / "out.csv").read_text().splitlines()[0] == "time[s],soc,range[m]"
+    assert run(log, tmp_path / "out.jsonl", "--columns", "Voltage[V],Second") == 0
+    assert {frozenset(line) - {"time[s]", "message"} for line in lines(tmp_path / "out.jsonl")} == {
+        frozenset({"Voltage[V]"}),
+        frozenset({"Second[V]"}),
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (
+            ["out.csv", "--estimates", "--columns", "rnge"],
+            r"has no column 'rnge' \(did you mean 'range'\?\); there are",
+        ),
+        (["out.parquet", "--columns", "Voltag"], r"has no column 'Voltag' \(did you mean 'Voltage'\?\); there are"),
+        (["out.blf", "--columns", "Voltage"], "--columns: are of estimates or signals"),
+        (["out.mcap", "--columns", "Voltage"], "--columns: an .mcap has all"),
+        (["tables", "--frames"], "--frames: can be written into"),
+        (["out.blf", "--estimates"], "estimates can be written into .csv"),
+        (["out.blf", "--signals"], "signals can be written into .csv"),
+        (["out.csv", "--estimates", "--from", "1e6"], "no estimates in the chosen part"),
+    ],
+)
+def test_what_cannot_be_had_is_said(tmp_path: Path, log: Path, arguments: list[str], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        run(log, tmp_path / arguments[0], *arguments[1:])
+    assert not (tmp_path / arguments[0]).is_file()
+
+
+def test_a_log_of_frames_says_how_to_get_estimates(tmp_path: Path) -> None:
+    path = tmp_path / "a.log"
+    with path.open("w") as stream:
+        write_candump(stream, [recorded()])
+    with pytest.raises(InputError, match=r"holds no estimates.*it holds frames.*gz-onboard estimate a\.log"):
+        run(path, tmp_path / "out.csv", "--estimates")
+
+
+def test_the_vehicle_decodes_without_dbc_files(tmp_path: Path) -> None:
+    out = tmp_path / "out.jsonl"
+    with pytest.raises(InputError, match="--vehicle"):
+        run(LOGS / "coastdown.blf", out, "--to", "2")
+    assert run(LOGS / "coastdown.blf", out, "--to", "2", "--vehicle", "reference", "--columns", "BMS_PackVoltage") == 0
+    assert [50 < line["BMS_PackVoltage[V]"] < 60 for line in lines(out)] == [True] * 20
+    with pytest.raises(InputError, match="leave out --dbc"):
+        run(LOGS / "coastdown.blf", out, "--vehicle", "reference", "--dbc", "x.dbc")
+
+
+def test_the_vehicle_that_a_log_names_decodes_it(tmp_path: Path) -> None:
+    path = tmp_path / "ride.mcap"
+    file = LogFile(path.open("wb"), START, {"vehicle": read_vehicle("reference").name})
+    for batch in read_frames(LOGS / "coastdown.blf"):
+        file.frames(batch)
+    file.close()
+    assert run(path, tmp_path / "out.jsonl", "--to", "2", "--columns", "BMS_PackVoltage") == 0
+    assert len(lines(tmp_path / "out.jsonl")) == 20
+
+
+@pytest.fixture(scope="module")
+def own(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What ``gz-onboard estimate --signals`` makes of a recorded ride."""
+    folder = tmp_path_factory.mktemp("own")
+    ride = ["estimate", str(LOGS / "coastdown.blf"), "--signals", "--no-plot", "--output", str(folder)]
+    assert cli.main(ride) == 0
+    return folder / "coastdown.estimate.mcap"
+
+
+def test_signals_that_a_log_has_decoded_are_found_without_frames(tmp_path: Path, own: Path) -> None:
+    assert run(own, tmp_path / "out.jsonl", "--signals", "--columns", "BMS_PackVoltage,BMS_PackCurrent") == 0
+    there = lines(tmp_path / "out.jsonl")
+    logged = [(t, v) for topic, t, v in read_samples(own) if topic == "/can/BMS_Pack"]
+    assert [line["BMS_PackVoltage[V]"] for line in there] == [_near(v["BMS_PackVoltage"]) for _, v in logged]
+    assert len(there) > 50
+    assert run(own, tmp_path / "part.jsonl", "--signals", "--from", "10", "--to", "20") == 0
+    part = [line for line in lines(tmp_path / "part.jsonl") if line["message"] == "BMS_Pack"]
+    assert len(part) == 10
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet", "jsonl"])
+def test_a_folder_has_all_that_the_log_holds(tmp_path: Path, own: Path, form: str) -> None:
+    assert run(own, tmp_path / "all", "--table-format", form) == 0
+    assert {file.name for file in (tmp_path / "all").iterdir()} == {f"estimate.{form}", f"why.{form}"}
+    assert run(own, tmp_path / "signals", "--table-format", form, "--signals") == 0
+    there = {file.stem for file in (tmp_path / "signals").iterdir()}
+    assert {"BMS_Pack", "INV_Motion"} <= there
+    assert not {"estimate", "why"} & there
+
+
+def test_without_an_output_it_says_what_the_log_holds(log: Path, own: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(log) == 0
+    told = capsys.readouterr().out
+    assert f"frames            {len(recorded())}" in told
+    assert "estimate" in told
+    assert "a.dbc" in told
+    assert run(own) == 0
+    told = capsys.readouterr().out
+    assert re.search(r"vehicle +reference-scooter\n", told)
+    assert re.search(r"frames +none\n +estimate +61 rows\n", told)
+    assert "BMS_Pack" in told

@@ -1,0 +1,87 @@
+"""What a shell has of the command line, made out of it: a manual page, and completions for bash and zsh.
+
+make man    # build/shell/gz-onboard.1, build/shell/gz-onboard.bash, build/shell/_gz-onboard
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import shtab
+
+from gz_onboard import __version__
+from gz_onboard.cli import COMMANDS, command_line
+
+ABOUT = "the remaining range of an electric scooter, estimated from its CAN bus"
+
+
+def actions_of(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
+    """The arguments of a command line and of its commands."""
+    for action in parser._actions:
+        yield action
+        if isinstance(action, argparse._SubParsersAction):
+            for command in action.choices.values():
+                yield from actions_of(command)
+
+
+def completion(shell: str) -> str:
+    """The script that completes the command line in ``bash`` or ``zsh``; where a file is wanted, by files."""
+    parser = command_line(COMMANDS)
+    for action in actions_of(parser):
+        if action.type is Path or "TOML" in str(action.metavar) or action.metavar in ("FILE|-", "WHAT"):
+            action.complete = shtab.FILE  # type: ignore[attr-defined]
+    return shtab.complete(parser, shell)
+
+
+def manual() -> str:
+    """The manual page, as troff."""
+    os.environ["COLUMNS"] = "80"  # which argparse breaks its lines at
+    parser = command_line(COMMANDS)
+    lines = [f'.TH GZ\\-ONBOARD 1 "" "gz\\-onboard {__version__}" ""']
+    lines += [".SH NAME", f"gz\\-onboard \\- {plain(ABOUT)}", ".SH SYNOPSIS", ".B gz\\-onboard", "COMMAND [OPTION ...]"]
+    lines += [".SH COMMANDS"]
+    (commands,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    for name, command in commands.choices.items():
+        lines += [f".SS {name}", plain(command.description or ""), ".PP", *literal(command.format_usage())]
+        formatter = command._get_formatter()
+        for action in command._actions:
+            if action.help and action.help != argparse.SUPPRESS and action.dest != "help":
+                lines += [".TP", f".B {plain(formatter._format_action_invocation(action))}"]
+                lines += [plain(formatter._expand_help(action))]
+        lines += literal(command.epilog) if command.epilog else []
+    title, _, statuses = (parser.epilog or "").partition(":\n")
+    return "\n".join([*lines, f".SH {title.upper()}", *literal(statuses)])
+
+
+def plain(text: str) -> str:
+    """A paragraph as troff has it: no character is markup."""
+    return escaped(" ".join(text.split()))
+
+
+def escaped(line: str) -> str:
+    """A line as troff has it: no character is markup, and it is no request."""
+    line = line.replace("\\", "\\e").replace("-", "\\-")
+    return f"\\&{line}" if line.startswith((".", "'")) else line
+
+
+def literal(text: str) -> list[str]:
+    """Lines that stay as they are."""
+    return [".PP", ".nf", *map(escaped, text.strip("\n").splitlines()), ".fi"]
+
+
+def main() -> None:
+    """Write the files to the folder that is named."""
+    folder = Path(sys.argv[1])
+    folder.mkdir(parents=True, exist_ok=True)
+    files = {"gz-onboard.1": manual(), "gz-onboard.bash": completion("bash"), "_gz-onboard": completion("zsh")}
+    for name, text in files.items():
+        (folder / name).write_text(text.rstrip() + "\n", encoding="utf-8")
+        print(folder / name)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""The Python API: ``import gz_onboard as gz``. Each function does what the command of its name does, without printing.
+
+Results are dataclasses; those with a table have ``to_table()`` (a dict of numpy arrays), ``to_arrow()`` and
+``to_pandas()``. A mistake of the user raises `InputError`. Examples: docs/python.md.
+"""
+
+from gz_onboard.api.calibrations import Calibration, calibrate
+from gz_onboard.api.discoveries import Discovered, discover
+from gz_onboard.api.estimates import EstimatedRide, LoggedEstimates, estimate, read_estimates, summary_table
+from gz_onboard.api.given import read_ride
+from gz_onboard.api.simulations import SimulatedRide, simulate
+from gz_onboard.errors import InputError
+from gz_onboard.lab.discover.command import DiscoveryOptions
+from gz_onboard.offline.samples import Samples
+from gz_onboard.simulation.plan import SimulationOptions
+from gz_onboard.vehicle import Vehicle, read_vehicle
+
+__all__ = [
+    "Calibration",
+    "Discovered",
+    "DiscoveryOptions",
+    "EstimatedRide",
+    "InputError",
+    "LoggedEstimates",
+    "Samples",
+    "SimulatedRide",
+    "SimulationOptions",
+    "Vehicle",
+    "calibrate",
+    "discover",
+    "estimate",
+    "read_estimates",
+    "read_ride",
+    "read_vehicle",
+    "simulate",
+    "summary_table",
+]

@@ -1,0 +1,109 @@
+"""Estimates, made and read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gz_onboard.api.given import PathLike, Signals, source_of, vehicle_of
+from gz_onboard.lab import estimate_table, export_tables
+from gz_onboard.lab.estimate import summary_text
+from gz_onboard.lab.estimate_ride import How, RideSummary, open_estimate, ride_through, summary_of
+from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TEXTS, WHY_TOPIC, table_columns
+from gz_onboard.offline.table import Columns, Tabular, array_of, columns_of
+from gz_onboard.progress import Progress
+from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.vehicle import Vehicle
+
+
+@dataclass(frozen=True)
+class LoggedEstimates(Tabular):
+    """The estimates in a log. columns: of each field of the `rows` the column; times: [ns since the epoch]."""
+
+    columns: Mapping[str, str] = field(repr=False)
+    times: Sequence[int] = field(repr=False)
+    rows: Sequence[Mapping[str, object]] = field(repr=False)
+
+    def to_table(self) -> Columns:
+        """A row for each estimate, with the columns that ``gz-onboard export --estimates`` writes."""
+        return {"time": np.array(self.times, dtype="datetime64[ns]"), **columns_of(self.rows, self.columns)}
+
+
+@dataclass(frozen=True)
+class EstimatedRide(Tabular):
+    """The estimates of a ride. whys: of why the range is what it is, changes: of why it changed, a row each."""
+
+    summary: RideSummary
+    estimates: LoggedEstimates = field(repr=False)
+    whys: Sequence[Mapping[str, object]] = field(repr=False)
+    changes: Sequence[Mapping[str, object]] = field(repr=False)
+
+    def __str__(self) -> str:
+        return summary_text(self.summary)
+
+    def to_table(self) -> Columns:
+        """A row each second, with the columns that ``gz-onboard export --estimates`` writes."""
+        return self.estimates.to_table()
+
+
+class _Kept:
+    """A log in memory, of rows by topic."""
+
+    def __init__(self) -> None:
+        self.rows: dict[str, list[tuple[int, Mapping[str, object]]]] = {}
+
+    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
+        """As of `log_rows.Log`."""
+        self.rows[topic] = []
+
+    def frames(self, batch: Sequence[Any]) -> None:
+        """As of `log_rows.Log`."""
+
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
+        """As of `log_rows.Log`."""
+        self.rows[topic].append((time_ns, values))
+
+    def of(self, topic: str) -> list[Mapping[str, object]]:
+        """The rows of a topic."""
+        return [values for _, values in self.rows[topic]]
+
+
+def estimate(
+    source: PathLike | Signals,
+    vehicle: Vehicle | str | Path = "reference",
+    *,
+    route: PathLike | None = None,
+    filter_name: str = "scalar",
+    progress: Progress | None = None,
+) -> EstimatedRide:
+    """Estimate state of charge and range over a log or a table of signals, as the daemon would.
+
+    route: file of the road that is to be ridden. filter_name: scalar or filterpy. progress: takes numbers of frames.
+    Raises InputError.
+    """
+    road = read_ahead(Path(route))[1] if route else None
+    log = _Kept()
+    ride = open_estimate(source_of(source), vehicle_of(vehicle))
+    ridden = ride_through(ride, How(filter_name, route=road), log, progress)
+    times = [time_ns for time_ns, _ in log.rows[ESTIMATE_TOPIC]]
+    columns = table_columns({**ESTIMATE_UNITS, **dict.fromkeys(TEXTS, "")})
+    estimates = LoggedEstimates(columns, times, log.of(ESTIMATE_TOPIC))
+    return EstimatedRide(summary_of(ridden), estimates, log.of(WHY_TOPIC), log.of(CHANGE_TOPIC))
+
+
+def summary_table(rides: Iterable[EstimatedRide]) -> Columns:
+    """The summaries of rides, a row each, with the columns that ``gz-onboard estimate --table`` writes."""
+    table = estimate_table.summary_table([ride.summary for ride in rides])
+    return {name: array_of(column) for name, column in table.items()}
+
+
+def read_estimates(log: PathLike) -> LoggedEstimates:
+    """The estimates that the daemon or ``gz-onboard estimate`` wrote into an MCAP log. InputError if it has none."""
+    source = export_tables.Source(Path(log))
+    rows = export_tables.estimate_rows(source)
+    columns = export_tables.topic_columns(source.log, ESTIMATE_TOPIC)
+    return LoggedEstimates(columns, [time_ns for time_ns, _ in rows], [values for _, values in rows])

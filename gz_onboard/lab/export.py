@@ -1,0 +1,161 @@
+"""``gz-onboard export``: turns a log into other formats of frames, tables of what it holds, or an MCAP of signals.
+
+The name of the output says what is written:
+- .log .blf .asc .trc .csv .mf4: the frames, in the format of candump, Vector, PEAK, python-can or ASAM;
+- .parquet or .jsonl, or .csv with --signals: one table of all signals, a row for each value (.jsonl: for each frame);
+- a directory (a name without a suffix): a table for each message and of the estimates, a column for each signal;
+- .mcap: everything that is in the log, and besides one JSON channel for each message at its full rate.
+
+With --estimates, and of a log that holds no frames (that of ``gz-onboard estimate``), the estimates: .csv, .parquet,
+.jsonl or a directory, a row for each estimate. With --frames the frames as a table, .parquet or .jsonl. Without an
+output it says what the log holds.
+
+Signals have the units of the DBC files, in their names: ``BMS_PackVoltage[V]``. What was not available, or is out of
+the DBC's range, is null.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from gz_onboard.bus import logs
+from gz_onboard.bus.export import out_suffix, whole, write_frames_as, write_mcap
+from gz_onboard.bus.replay import log_section
+from gz_onboard.bus.tables import write_frame_table
+from gz_onboard.errors import OK, InputError, not_an_input
+from gz_onboard.events import Frame
+from gz_onboard.lab.export_contents import contents_text, log_contents
+from gz_onboard.lab.export_tables import (
+    ESTIMATES,
+    Source,
+    decoder_of,
+    recorded_messages,
+    recorded_signals,
+    write_estimates,
+    write_explanations,
+    write_signals,
+)
+from gz_onboard.options import add_shared
+
+_TABLES = (".csv", ".parquet", ".jsonl")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of ``gz-onboard export``."""
+    add_shared(parser, "log")
+    out = (
+        "frames: .log .blf .asc .trc .csv .mf4; signals: .parquet or .jsonl (one long table), .mcap (for Foxglove), or "
+        "a name without suffix (a folder with a table per message and one of the estimates); without it: what LOG holds"
+    )
+    parser.add_argument("out", type=Path, metavar="OUT", nargs="?", help=out)
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--estimates", action="store_true", help="write the estimates, one row each")
+    what.add_argument("--signals", action="store_true", help="write signals, also to .csv and of a log without frames")
+    what.add_argument("--frames", action="store_true", help="write the frames, also to .parquet and .jsonl")
+    names = "only these columns of estimates or signals, with or without their units"
+    parser.add_argument("--columns", type=_names, metavar="NAME,...", help=names)
+    kinds = "format of the tables in a folder (default: parquet)"
+    parser.add_argument("--table-format", choices=[suffix[1:] for suffix in _TABLES], help=kinds)
+    vehicle = "decode the signals by the DBC files of this vehicle (default: those attached to the log)"
+    add_shared(parser, "--vehicle", default=None, help=vehicle)
+    parser.add_argument("--dbc", type=Path, nargs="+", metavar="FILE", help="DBC files to decode the signals by")
+    add_shared(parser, "--from", "--to")
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",") if name.strip()]
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Run ``gz-onboard export``; raises InputError for what cannot be used."""
+    log, out = arguments.log, arguments.out
+    if out is None:
+        print(contents_text(log_contents(log)))
+        return OK
+    suffix = out_suffix(out)
+    if suffix and arguments.table_format:
+        raise InputError(f"--table-format {arguments.table_format}: is for a folder of tables, and {out} is a file")
+    if arguments.dbc and arguments.vehicle:
+        raise InputError(f"--vehicle {arguments.vehicle}: has DBC files of its own; leave out --dbc")
+    not_an_input([out], [log, *(arguments.dbc or [])])
+    source = Source(log, arguments.start, arguments.end, arguments.columns)
+    with whole(out, suffix) as part:
+        told = _write(arguments, source, part, suffix)
+    for damage in dict.fromkeys(map(str, source.damages)):
+        print(f"damaged log: {damage}")
+    print(f"wrote {out}: {told}")
+    return OK
+
+
+def _write(arguments: argparse.Namespace, source: Source, part: Path, suffix: str) -> str:
+    """Write what is asked for to `part`, in the format of `suffix`, none for a folder; gives what it was."""
+    kind = suffix or f"/.{arguments.table_format or 'parquet'}"
+    has_frames, topics = _holds_frames(source.log), logs.json_channels(source.log)
+    if arguments.estimates:
+        return _estimates(arguments, source, part, kind, ["estimate"])
+    told = [name for name, topic in ESTIMATES.items() if topic in topics]
+    if not has_frames and told and not arguments.signals and not arguments.frames:
+        return _estimates(arguments, source, part, kind, told)
+    if arguments.frames or not (arguments.signals or suffix in (".parquet", ".jsonl", ".mcap", "")):
+        return _frames(source, part, suffix)
+    texts = [_signals(arguments, source, part, kind, has_frames)]
+    if not suffix and not arguments.signals and told:
+        texts.append(_estimates(arguments, source, part, kind, told))
+    return "; ".join(texts)
+
+
+def _holds_frames(log: Path) -> bool:
+    """Whether a log holds a frame; of one in another format than ours it is taken for granted."""
+    return logs.log_suffix(log) != ".mcap" or next(logs.read_frames(log, on_damage=lambda _: None), None) is not None
+
+
+def _estimates(arguments: argparse.Namespace, source: Source, part: Path, kind: str, names: Sequence[str]) -> str:
+    """Of a folder the tables `names` of `ESTIMATES`, else the estimates."""
+    if not kind.startswith("/"):
+        if kind not in _TABLES:
+            raise InputError(f"{arguments.out}: estimates can be written into {', '.join(_TABLES)} or a directory")
+        return f"{write_estimates(source, part)} estimates"
+    part.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        if name != "estimate":
+            write_explanations(source, part / f"{name}{kind[1:]}", ESTIMATES[name])
+    return f"{write_estimates(source, part / f'estimate{kind[1:]}')} estimates"
+
+
+def _batches(source: Source) -> tuple[tuple[int | None, int | None], Iterator[list[Frame]]]:
+    """(the part that is wanted [ns], its frames); InputError if there are none."""
+    section = log_section(source.log, source.start, source.end)
+    batches = source.frames(section)
+    if batches is None:
+        where = "this log" if section == (None, None) else "the chosen part"
+        why = "".join(f"; damaged at {damage.place}: {damage.reason}" for damage in source.damages)
+        raise InputError(f"{source.log}: no frames in {where}{why}")
+    return section, batches
+
+
+def _frames(source: Source, part: Path, suffix: str) -> str:
+    if source.columns is not None:
+        raise InputError("--columns: are of estimates or signals, with --estimates or --signals")
+    _, batches = _batches(source)
+    if suffix in (".parquet", ".jsonl"):
+        return f"{write_frame_table(part, batches)} frames"
+    if suffix in ("", ".mcap"):
+        raise InputError("--frames: can be written into .log .blf .asc .trc .csv .mf4 .parquet .jsonl")
+    return f"{write_frames_as(part, suffix, batches)} frames"
+
+
+def _signals(arguments: argparse.Namespace, source: Source, part: Path, kind: str, has_frames: bool) -> str:
+    if not has_frames and recorded_messages(source.log):
+        count = write_signals(source, part, kind, *recorded_signals(source))
+        return f"{count} rows of signals, as they were logged once a second"
+    section, batches = _batches(source)
+    decoder = decoder_of(source.log, arguments.dbc, arguments.vehicle)
+    if kind == ".mcap":
+        if source.columns is not None:
+            raise InputError("--columns: an .mcap has all that is in the log")
+        count, what = write_mcap(source.log, part, decoder, batches, section), "samples"
+    else:
+        count, what = write_signals(source, part, kind, decoder.columns, decoder.decode(batches)), "frames"
+    return f"{count} {what}; {decoder.unknown} frames are in no DBC file, {decoder.undecodable} do not fit theirs"

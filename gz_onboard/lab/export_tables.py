@@ -1,0 +1,223 @@
+"""What a log holds, as tables: estimates, explanations, signals, frames. It prints nothing."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from gz_onboard.bus import logs, tables
+from gz_onboard.bus.signals import Decoded, Decoder
+from gz_onboard.errors import InputError, nearest
+from gz_onboard.events import Frame
+from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, WHY_TOPIC, table_columns
+from gz_onboard.vehicle import OWN, read_vehicle
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
+
+ESTIMATES = {"estimate": ESTIMATE_TOPIC, "why": WHY_TOPIC, "range_change": CHANGE_TOPIC}
+"""The topics that a folder of tables has beside the messages, by the name of the table."""
+_FOLDERS: dict[str, Callable[[Path, Mapping[str, Mapping[str, str]], ExitStack], tables.Sink]] = {
+    "/.parquet": tables.ParquetTables,
+    "/.csv": tables.CsvTables,
+    "/.jsonl": tables.JsonTables,
+}
+_FORMATS = (".csv", ".parquet", ".jsonl", *_FOLDERS)
+_MESSAGE = "/can/"  # begins the topic of a message's signals
+
+
+@dataclass
+class Source:
+    """A log, and what part of it is wanted: of time, [s] since its beginning, and of the columns (None: all)."""
+
+    log: Path
+    start: float = 0.0
+    end: float | None = None
+    columns: Sequence[str] | None = None
+    damages: list[logs.LogDamage] = field(default_factory=list)
+
+    def frames(self, section: tuple[int | None, int | None]) -> Iterator[list[Frame]] | None:
+        """The frames in a part [ns since the epoch]; None if there are none."""
+        batches = logs.read_frames(self.log, *section, self.damages.append)
+        first = next(batches, None)
+        return None if first is None else chain([first], batches)
+
+    def rows(self, topic: str) -> list[tuple[int, dict[str, Any]]]:
+        """(time [ns], values) of the samples of a topic, in the part that is wanted."""
+        found = [sample[1:] for sample in self._samples() if sample[0] == topic]
+        if not found:
+            return []
+        low = found[0][0] + round(self.start * 1e9)
+        high = math.inf if self.end is None else found[0][0] + round(self.end * 1e9)
+        return [(time_ns, values) for time_ns, values in found if low <= time_ns < high]
+
+    def _samples(self) -> Iterator[tuple[str, int, dict[str, Any]]]:
+        return logs.read_samples(self.log, on_damage=self.damages.append)
+
+
+# --- columns ------------------------------------------------------------------------------------------------------
+
+
+def chosen(source: Source, known: Iterable[str]) -> set[str]:
+    """The columns that are wanted of those `known`, by names with or without unit. InputError for one not there."""
+    names = list(dict.fromkeys(known))
+    if source.columns is None:
+        return set(names)
+    plain = {name.partition("[")[0]: name for name in names} | {name: name for name in names}
+    for name in source.columns:
+        if name not in plain:
+            raise InputError(
+                f"{source.log}: has no column {name!r}{nearest(name, plain)}; there are {', '.join(names) or 'none'}"
+            )
+    return {plain[name] for name in source.columns}
+
+
+def topic_columns(log: Path, topic: str) -> dict[str, str]:
+    """Of each field of a topic's samples its column, ``name[unit]``."""
+    try:
+        properties = json.loads(logs.json_channels(log)[topic][0])["properties"]
+        return table_columns({name: str(about.get("description", "")) for name, about in properties.items()})
+    except (ValueError, LookupError, AttributeError, TypeError) as error:
+        raise InputError(f"{log}: the schema of {topic} is not one of ours: {error!r}") from None
+
+
+# --- estimates ----------------------------------------------------------------------------------------------------
+
+
+def estimate_rows(source: Source) -> list[tuple[int, dict[str, Any]]]:
+    """(time [ns], values) of the estimates. InputError if there are none, which says what else the log holds."""
+    if rows := source.rows(ESTIMATE_TOPIC):
+        return rows
+    if ESTIMATE_TOPIC in logs.json_channels(source.log) and (source.start or source.end is not None):
+        raise InputError(f"{source.log}: no estimates in the chosen part")
+    raise InputError(f"{source.log}: holds no estimates ({ESTIMATE_TOPIC}){_other(source.log)}")
+
+
+def write_estimates(source: Source, out: Path) -> int:
+    """Write the estimates, a row each; gives how many. InputError if there are none."""
+    return _write_rows(source, out, ESTIMATE_TOPIC, estimate_rows(source))
+
+
+def write_explanations(source: Source, out: Path, topic: str) -> int:
+    """Write the explanations of a topic, a row each; gives how many. Without any, nothing is written."""
+    rows = source.rows(topic)
+    return _write_rows(source, out, topic, rows) if rows else 0
+
+
+def _write_rows(source: Source, out: Path, topic: str, rows: Sequence[tuple[int, Mapping[str, Any]]]) -> int:
+    """A column for each field of the topic, with its unit."""
+    columns = topic_columns(source.log, topic)
+    wanted = chosen(source, columns.values())
+    table = {c: [values.get(name) for _, values in rows] for name, c in columns.items() if c in wanted}
+    tables.write_table(out, table, [time_ns for time_ns, _ in rows])
+    return len(rows)
+
+
+def _other(log: Path) -> str:
+    if next(logs.read_frames(log, on_damage=lambda _: None), None) is not None:
+        return f"; it holds frames, of which `gz-onboard estimate {log.name}` makes them"
+    return ""
+
+
+# --- signals ------------------------------------------------------------------------------------------------------
+
+
+def recorded_messages(log: Path) -> list[str]:
+    """The messages whose signals are in a log as they were decoded, once a second."""
+    return [topic.removeprefix(_MESSAGE) for topic in logs.json_channels(log) if topic.startswith(_MESSAGE)]
+
+
+def recorded_signals(source: Source) -> tuple[dict[str, dict[str, str]], Iterator[Decoded]]:
+    """(column -> unit of each message, the signals), as they stand in a log that has no frames."""
+    named = {name: _signal_columns(source.log, name) for name in recorded_messages(source.log)}
+    first = min((rows[0][0] for name in named if (rows := source.rows(_MESSAGE + name))), default=0)
+    low = first + round(source.start * 1e9)
+    high = math.inf if source.end is None else first + round(source.end * 1e9)
+
+    def decoded() -> Iterator[Decoded]:
+        for topic, time_ns, values in logs.read_samples(source.log):
+            columns = named.get(topic.removeprefix(_MESSAGE)) if topic.startswith(_MESSAGE) else None
+            if columns is not None and low <= time_ns < high:
+                yield time_ns, topic.removeprefix(_MESSAGE), {c: values.get(n) for n, c in columns.items()}
+
+    return {name: dict.fromkeys(columns.values(), "") for name, columns in named.items()}, decoded()
+
+
+def _signal_columns(log: Path, message: str) -> dict[str, str]:
+    """Signal -> column; one that has its unit in its name keeps it."""
+    columns = topic_columns(log, _MESSAGE + message)
+    return {name: name if name.endswith("]") else column for name, column in columns.items()}
+
+
+def write_signals(
+    source: Source, out: Path, suffix: str, columns: Mapping[str, Mapping[str, str]], decoded: Iterable[Decoded]
+) -> int:
+    """Signals as one long table, or a table for each message in the folder `out`; gives the number of frames.
+
+    suffix: of `out`; of a folder, that of its tables with a slash before. columns: the units by column, by message.
+    """
+    if suffix not in _FORMATS:
+        raise InputError(f"{out.name}: signals can be written into .csv, .parquet, .jsonl, .mcap or a directory")
+    wanted = chosen(source, (column for of in columns.values() for column in of))
+    kept = {message: {c: unit for c, unit in of.items() if c in wanted} for message, of in columns.items()}
+    if source.columns is not None:
+        decoded = ((t, m, {c: v for c, v in values.items() if c in wanted}) for t, m, values in decoded if kept[m])
+    with ExitStack() as stack:
+        sink: tables.Sink
+        if suffix == ".parquet":
+            sink = tables.ParquetLong(out, stack)
+        elif suffix == ".csv":
+            sink = tables.CsvLong(stack.enter_context(tables.open_text(out)))
+        elif suffix == ".jsonl":
+            sink = tables.JsonLong(stack.enter_context(tables.open_text(out)))
+        else:
+            out.mkdir(parents=True, exist_ok=True)
+            sink = _FOLDERS[suffix](out, kept, stack)
+        return tables.write_signals(decoded, sink)
+
+
+def decoder_of(log: Path, files: list[Path] | None, vehicle: str | None) -> Decoder:
+    """What decodes the frames of `log`: DBC files; else those of a vehicle; else those attached to the log; else those
+    of the vehicle that the log names, if it is one of the package's own. InputError if none is known.
+    """
+    return Decoder(_database(log, files, vehicle))
+
+
+def _database(log: Path, files: list[Path] | None, vehicle: str | None) -> Database:
+    from gz_onboard.bus.dbc import database_of, load_database
+
+    if files:
+        return load_database(files, {})
+    if vehicle:
+        return _database_of(vehicle)
+    attached = {name: data for name, data in logs.read_attachments(log).items() if name.lower().endswith(".dbc")}
+    named = logs.read_metadata(log).get("vehicle", "")
+    for own in () if attached else sorted(file.stem for file in OWN.glob("*.toml")):
+        if named in (own, read_vehicle(own).name):
+            return _database_of(own)
+    if not attached:
+        raise InputError(
+            f"{log}: no DBC file is attached to this log; say what to decode it by, with --vehicle NAME|TOML or "
+            "--dbc FILE"
+        )
+    texts = [(Path(f"{log}, attached {name}"), data.decode("utf-8", "replace")) for name, data in attached.items()]
+    try:
+        return database_of(texts, {})
+    except InputError as error:
+        raise InputError(f"{error}; give the right one with --dbc FILE") from error
+
+
+def _database_of(name: str) -> Database:
+    """Of the vehicle's bus, its own range frames beside."""
+    from gz_onboard.bus.dbc import load_database
+
+    vehicle = read_vehicle(name)
+    if not vehicle.mapping.dbc_files:
+        raise vehicle.error("dbc is missing: without it no frame can be decoded")
+    return load_database([*vehicle.mapping.dbc_files, vehicle.range_dbc], {})

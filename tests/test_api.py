@@ -1,0 +1,310 @@
+"""The Python API does what the commands do, of any table, and its documentation runs."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import re
+import subprocess
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gz_onboard as gz
+from gz_onboard import api, cli
+from tests.support import LOGS, ROOT
+
+PAGE = ROOT / "docs/python.md"
+COASTDOWN = LOGS / "coastdown.blf"
+BLOCK = re.compile(r"^```python\n(.*?)^```(?:\n\n```text\n(.*?)^```)?", re.M | re.S)
+
+
+def signals() -> dict[str, Any]:
+    """Five minutes at 36 km/h."""
+    seconds = np.arange(0, 300, 0.5)
+    steady = np.ones(len(seconds))
+    return {
+        "speed [km/h]": 36 * steady,
+        "time [s]": seconds,
+        "pack_voltage [V]": 52 * steady,
+        "pack_current [A]": 14 + np.sin(seconds),
+    }
+
+
+def test_a_result_prints_as_its_command_and_is_short_otherwise(tmp_path, capsys):
+    assert cli.main(["estimate", str(COASTDOWN), "--no-plot", "--output", str(tmp_path)]) == 0
+    told = capsys.readouterr().out.splitlines()
+    ride = gz.estimate(COASTDOWN)
+    own = [line for line in str(ride).splitlines() if not line.startswith("  computed")]
+    assert own == [line for line in told if not line.startswith(("  computed", "  written"))]
+    assert len(repr(ride)) < 5000
+    simulated = gz.simulate("ece15")
+    assert "rolling resistance" in str(simulated)
+    assert len(repr(simulated)) < 5000
+
+
+def test_the_names_are_those_of_the_api():
+    assert sorted(set(gz.__all__) - {"__version__"}) == sorted(api.__all__)
+    assert set(gz.__all__) <= set(dir(gz))
+    for name in api.__all__:
+        assert getattr(gz, name) is getattr(api, name)
+    with pytest.raises(AttributeError, match="no attribute 'estimat'"):
+        gz.estimat  # type: ignore[attr-defined]  # noqa: B018
+
+
+def test_every_page_of_the_documentation_runs(tmp_path, monkeypatch):
+    (tmp_path / "replay_logs").symlink_to(LOGS)
+    monkeypatch.chdir(tmp_path)
+    blocks = BLOCK.findall(PAGE.read_text(encoding="utf-8"))
+    assert len(blocks) > 5
+    shown = 0
+    names: dict[str, Any] = {}
+    for code, said in blocks:
+        out = io.StringIO()
+        with contextlib.redirect_stdout(out):
+            exec(compile(code, str(PAGE), "exec"), names)
+        assert out.getvalue() == said
+        shown += bool(said)
+    assert shown > 4
+    assert (tmp_path / "new.toml").is_file()
+
+
+# --- estimate -----------------------------------------------------------------------------------------------------
+
+
+def test_an_estimate_is_that_of_the_command(tmp_path, capsys):
+    assert cli.main(["estimate", str(COASTDOWN), "--no-plot", "--output", str(tmp_path), "--json"]) == 0
+    (told,) = json.loads(capsys.readouterr().out)["rides"]
+    assert cli.main(["export", str(tmp_path / "coastdown.estimate.mcap"), str(tmp_path / "told.parquet")]) == 0
+    capsys.readouterr()
+    ride = gz.estimate(COASTDOWN)
+    assert capsys.readouterr() == ("", "")
+    differ = {"log", "cpu_s", "real_time_factor"}
+    assert {key: getattr(ride.summary, key) for key in told.keys() - differ - {"why", "changes"}} == {
+        key: value for key, value in told.items() if key not in differ | {"why", "changes"}
+    }
+    import pyarrow.parquet
+
+    exported = pyarrow.parquet.read_table(tmp_path / "told.parquet")
+    table = ride.to_table()
+    assert list(table) == exported.column_names
+    for name, values in table.items():
+        column = exported[name].to_pylist()
+        if name == "time":
+            assert values.astype("int64").tolist() == exported[name].cast("int64").to_pylist()
+        elif values.dtype.kind == "O":
+            assert values.tolist() == column
+        else:
+            np.testing.assert_array_equal(values, np.array([np.nan if x is None else x for x in column]))
+
+
+def test_estimates_in_a_log_are_those_that_were_made(tmp_path):
+    assert cli.main(["estimate", str(COASTDOWN), "--no-plot", "--output", str(tmp_path)]) == 0
+    logged = gz.read_estimates(tmp_path / "coastdown.estimate.mcap").to_table()
+    made = gz.estimate(COASTDOWN).to_table()
+    assert list(logged) == list(made)
+    for name, values in made.items():
+        np.testing.assert_array_equal(logged[name], values, name)
+    with pytest.raises(gz.InputError, match=r"holds no estimates.*gz-onboard estimate coastdown\.blf"):
+        gz.read_estimates(COASTDOWN)
+
+
+def test_a_table_of_many_rides_has_a_row_each():
+    rides = [gz.estimate(COASTDOWN), gz.estimate(signals())]
+    table = gz.summary_table(rides)
+    assert table["file"].tolist() == [str(COASTDOWN), "table"]
+    assert table["distance_km"].tolist() == [ride.summary.distance_km for ride in rides]
+    assert {len(column) for column in table.values()} == {2}
+
+
+class Arrow:
+    """A table that speaks Arrow and nothing else, as those of polars."""
+
+    def __init__(self, table: Any) -> None:
+        self._table = table
+
+    def __arrow_c_stream__(self, requested_schema: object | None = None) -> object:
+        return self._table.__arrow_c_stream__(requested_schema)
+
+
+def tables() -> dict[str, Any]:
+    import pyarrow
+
+    data = signals()
+    return {
+        "lists": {name: list(values) for name, values in data.items()},
+        "dates": {**data, "time [s]": np.array(data["time [s]"] * 1e9, "datetime64[ns]")},
+        "arrow": pyarrow.table(data),
+        "stream": Arrow(pyarrow.table(data)),
+    }
+
+
+@pytest.mark.parametrize("kind", ["lists", "dates", "arrow", "stream"])
+def test_a_table_of_any_kind_is_the_same_ride(kind):
+    ride = gz.estimate(tables()[kind])
+    assert ride.summary.distance_km == pytest.approx(3.0, rel=0.01)
+    same = gz.estimate(signals())
+    np.testing.assert_array_equal(ride.to_table()["range[m]"], same.to_table()["range[m]"])
+    assert same.summary.range_end_km is not None
+
+
+def test_a_data_frame_is_the_same_ride_with_its_time_as_a_column_or_as_the_index():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame(signals())
+    same = gz.estimate(signals()).to_table()["range[m]"]
+    indexed = frame.set_index(pandas.to_datetime(frame.pop("time [s]"), unit="s").rename("time"))
+    for one in (pandas.DataFrame(signals()), indexed):
+        ride = gz.estimate(one)
+        np.testing.assert_array_equal(ride.to_table()["range[m]"], same)
+    assert list(ride.to_pandas().columns) == list(ride.to_table()) == ride.to_arrow().column_names
+    assert ride.to_arrow()["arrival_soc"].null_count == len(same)
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        ({"time [s]": [0, 1], "sped [km/h]": [1, 2]}, "'sped' is no role.*did you mean"),
+        ({"time [s]": [0, 1], "speed": [1, 2]}, "'speed' has no unit"),
+        ({"time [s]": [0, 1], "speed [km/h]": [1, 2, 3]}, r"unlike lengths: time \[s\] 2, speed \[km/h\] 3"),
+        ({"speed [km/h]": [1, 2], "soc": [1, 2]}, "the first column must be the time"),
+        ({"time [s]": [1, 0], "speed [km/h]": [1, 2]}, "table:2: time.*before the time of the row above"),
+        ({"time [s]": [0, 1], "speed [km/h]": [1, "fast"]}, "'fast' is not a finite number"),
+        ({}, "a column of times and one for each signal"),
+        (7, "int is no table of signals"),
+        ("nowhere.blf", "nowhere.blf"),
+    ],
+)
+def test_what_is_no_ride_is_an_input_error(data, said):
+    with pytest.raises(gz.InputError, match=said):
+        gz.estimate(data)
+
+
+def test_a_ride_of_another_vehicle_is_refused():
+    with pytest.raises(gz.InputError, match="knows none of its"):
+        gz.estimate(COASTDOWN, ROOT / "tests/vehicles/tlmoto/tlmoto.toml")
+
+
+# --- the others ---------------------------------------------------------------------------------------------------
+
+
+def test_a_simulation_is_that_of_the_command(tmp_path, capsys):
+    arguments = ["simulate", "ece15", "--soc", "0.8", "--grade", "2", "--no-plot", "--output", str(tmp_path), "--json"]
+    assert cli.main(arguments) == 0
+    told = json.loads(capsys.readouterr().out)
+    ride = gz.simulate("ece15", options=gz.SimulationOptions(soc=0.8, grade=2.0))
+    assert capsys.readouterr() == ("", "")
+    for key in ("consumption_wh_km", "range_km", "soc_end", "ledger_wh", "payload_kg", "payload_from"):
+        assert getattr(ride.summary, key) == told[key], key
+    import pyarrow.parquet
+
+    exported = pyarrow.parquet.read_table(told["files"][0])
+    table = ride.to_table()
+    assert list(table) == exported.column_names
+    np.testing.assert_array_equal(table["soc[1]"], exported["soc[1]"].to_numpy())
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"soc": 1.2}, "soc 1.2: must be 0 to 1"),
+        ({"soc": float("nan")}, "soc nan"),
+        ({"ambient": 300.0}, "ambient 300: must be -40 to 60 degC"),
+        ({"repeat": 0}, "repeat 0: must be 1 to 1000"),
+        ({"chassis": "plannar"}, "did you mean 'planar'"),
+    ],
+)
+def test_options_of_a_simulation_are_checked(options, said):
+    with pytest.raises(gz.InputError, match=said):
+        gz.SimulationOptions(**options)
+
+
+def test_a_calibration_is_that_of_the_command(tmp_path, capsys):
+    folder = LOGS / "calibration"
+    dyno, ramp = folder / "motor_dyno.csv.gz", folder / "motor_emf_ramp.csv.gz"
+    out = tmp_path / "told.toml"
+    arguments = ["calibrate", "motor", str(dyno), "--with", f"emf={ramp}", "--output", str(out), "--json"]
+    assert cli.main(arguments) == 0
+    (told,) = json.loads(capsys.readouterr().out)["procedures"]
+    found = gz.calibrate({"data": [dyno], "emf": [ramp]}, procedure="motor")
+    table = found.to_table()
+    assert dict(zip(table["parameter"], table["value"], strict=True)) == {
+        name: one["value"] for name, one in told["parameters"].items()
+    }
+    vehicle = found.write(tmp_path / "own.toml")
+    assert (tmp_path / "own.toml").read_text() == out.read_text()
+    assert vehicle.parameters["torque_constant"] == pytest.approx(found.results[0].parameters["torque_constant"].value)
+    found.write_report(tmp_path / "report.html")
+    assert "torque_constant" in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "said"),
+    [
+        ("x.csv", {"procedure": "motr"}, "did you mean 'motor'"),
+        ("nowhere", {}, "nowhere"),
+        (["a", "b"], {}, "one folder"),
+        ({"dta": ["x.csv"]}, {"procedure": "motor"}, "no data 'dta'.*did you mean 'data'"),
+        (["x.csv"], {"procedure": "motor"}, "x.csv: no such file"),
+        (["x.csv"], {"procedure": "motor", "options": {"nothing": 1}}, "no option 'nothing'"),
+    ],
+)
+def test_a_calibration_says_what_it_lacks(data, options, said):
+    with pytest.raises(gz.InputError, match=said):
+        gz.calibrate(data, **options)
+
+
+def test_a_discovery_is_that_of_the_command(tmp_path, capsys):
+    log = LOGS / "city_34C.blf"
+    assert cli.main(["discover", str(log), "--jobs", "1", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    found = gz.discover(log)
+    assert capsys.readouterr() == ("", "")
+    assert found.report.verdict == told["verdict"]
+    assert found.to_table()["value"].tolist() == [cause["value"] for cause in told["causes"]]
+    assert found.report.notes == told["notes"]
+    assert told["verdict"].upper() in str(found).upper()
+    found.write_model(tmp_path / "extended.toml")
+    assert (tmp_path / "extended.toml").is_file() == bool(told["causes"])
+
+
+def test_rides_of_one_name_are_refused():
+    ride = gz.read_ride(COASTDOWN)
+    with pytest.raises(gz.InputError, match="two rides are called coastdown"):
+        gz.discover([ride, ride])
+
+
+def test_facts_of_a_ride_are_those_given_or_noted():
+    assert gz.read_ride(COASTDOWN).rider_mass == 75.0
+    ride = gz.read_ride(COASTDOWN, name="first", facts={"rider_mass_kg": 80.0})
+    assert (ride.name, ride.rider_mass, ride.facts["ambient_C"]) == ("first", 80.0, 12.5)
+    table = gz.read_ride(signals(), name="mine")
+    assert table.name == "mine"
+    assert set(table.columns) == {"vehicle_speed", "pack_voltage", "pack_current"}
+
+
+# --- types --------------------------------------------------------------------------------------------------------
+
+
+def test_a_type_checker_knows_the_api(tmp_path):
+    assert (ROOT / "gz_onboard/py.typed").is_file()
+    (tmp_path / "use.py").write_text(
+        "import gz_onboard as gz\n"
+        "ride = gz.estimate('x.blf', gz.read_vehicle('reference'))\n"
+        "reveal_type(ride.summary.range_end_km)\n"
+        "gz.estimate(7)\n",
+        encoding="utf-8",
+    )
+    run = subprocess.run(
+        [sys.executable, "-m", "mypy", "--strict", "--cache-dir", str(tmp_path), "use.py"],
+        cwd=tmp_path,
+        env={**os.environ, "MYPYPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert 'Revealed type is "float | None"' in run.stdout.replace("Union[float, None]", "float | None"), run.stdout
+    assert re.search(r"use\.py:4: error: Argument 1 to \"estimate\" has incompatible type \"int\"", run.stdout)
