@@ -95,6 +95,8 @@ class Mesh:
 
     def rescale(self, factor: float) -> None:
         """From now on the table's values are read times `factor`."""
+        if factor == self._scale[0]:
+            return
         self._scale[0] = factor
         self._rows.clear()
 
