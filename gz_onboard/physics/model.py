@@ -273,13 +273,15 @@ class Model:
             return None
         others = dict.fromkeys(QUANTITIES, 0.0) | dict(beside or {})
         effects = self.at(Port.CELL_VOLTAGE)
+        by_capacity = "cell_capacity" in self.reads
 
         def settled(current: float, soc: float, temperature: float, form_factor_squared: float) -> float:
             # A forecast calls it a hundred times: one dictionary for all effects, and no bursts where there are none.
             load = battery.health.resistance * current
             q = others.copy()
             q["cell_current"], q["soc"], q["cell_temperature"] = load, soc, temperature
-            q["cell_capacity"] = battery.cell_capacity(temperature)
+            if by_capacity:
+                q["cell_capacity"] = battery.cell_capacity(temperature)
             lost = 0.0
             for effect in effects:
                 if form_factor_squared != 1:
