@@ -71,6 +71,8 @@ class Estimator:
             for group in groups
             for role in group.roles
         )
+        inverter = self.signals.inverter_current, self.signals.inverter_voltage, self.signals.motor_speed
+        self._inverter = [signal for signal in inverter if signal.stale_after]  # those that the vehicle has
         self.attribution = Attribution(self.forecaster, self.signals)
         self.ahead = RoadAhead(self.forecaster, self.road, self.signals)
         self._missing = MissingSignals(self.signals)
@@ -213,10 +215,8 @@ class Estimator:
         signals, current = self.signals, self._reading.current
         known = current if self._reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else None
         rate = None if known is None else known / self.battery.pack_capacity(self._temperatures.cells_or_bench)
-        inverter = (signals.inverter_current, signals.inverter_voltage, signals.motor_speed)
-        mapped = [signal for signal in inverter if signal.stale_after]
-        silent = bool(mapped) and not any(signal.fresh(now) for signal in mapped)
-        off = any(signal.get(now) == 0 for signal in (signals.key, signals.contactor))
+        silent = bool(self._inverter) and not any(signal.fresh(now) for signal in self._inverter)
+        off = signals.key.get(now) == 0 or signals.contactor.get(now) == 0
         rider = signals.rider.get(now)
         if rider is not None and abs(self.road.speed or 0.0) < STANDSTILL:
             self.forecaster.ridden_by(f"{rider:g}")

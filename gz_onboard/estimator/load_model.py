@@ -29,6 +29,7 @@ WARM_MOTOR = 40.0  # degC: a motor at work, where its temperature is not known
 HEADINGS = tuple(pi / 4 * i for i in range(8))
 USUAL_AIR = MILD, 0.0  # degC, m: of the usual force
 AMBIENT_DIGITS, ALTITUDE_DIGITS = 0, -2  # the prior riding is modelled anew for each degC and each 100 m
+KEPT_AIRS = 8  # and kept: a sensor at the edge of two goes to and fro
 BASE = {
     "speed",
     "acceleration",
@@ -76,7 +77,7 @@ class LoadModel:
         self.extended = not model.reads <= BASE or any(e.decay for e in model.effects)
         self._battery = battery
         self._by_heading = "heading" in model.reads
-        self._prior_at: tuple[tuple[float, float], tuple[float, float]] = (float("nan"), 0.0), (0.0, 0.0)
+        self._prior_in: dict[tuple[float, float], tuple[float, float]] = {}  # by the air, the last few
 
     def quantities(self, speed: float, acceleration: float, conditions: Conditions) -> Quantities:
         """What the base model reads, on a level road without wind; speed [m/s], acceleration [m/s²]."""
@@ -151,7 +152,8 @@ class LoadModel:
     def _prior(self, ambient: float, altitude: float) -> tuple[float, float]:
         """The mean power [W] of its motion and of its stops."""
         at = round(ambient, AMBIENT_DIGITS), round(altitude, ALTITUDE_DIGITS)
-        if self._prior_at[0] != at:
+        found = self._prior_in.get(at)
+        if found is None:
             powers = [0.0, 0.0]
             for share, speed, acceleration in self.prior.points:
                 q = self.quantities(speed, acceleration, Conditions(*at))
@@ -162,5 +164,7 @@ class LoadModel:
                 else:
                     power = self.power(q)
                 powers[speed <= MOVING] += share * power * self.prior.unevenness
-            self._prior_at = at, (powers[0], powers[1])
-        return self._prior_at[1]
+            if len(self._prior_in) >= KEPT_AIRS:
+                self._prior_in.clear()
+            found = self._prior_in[at] = powers[0], powers[1]
+        return found

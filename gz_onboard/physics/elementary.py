@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
+NUMBER = float, int  # a union in its place is made anew at each call, which takes longer than the function
 STANDSTILL = 0.1  # m/s, or rad/s of a shaft: below it friction fades, so that nothing jumps where the sign changes
 
 
 def exp(x: Any) -> Any:
     """e to the power of `x`."""
-    if isinstance(x, float | int):
+    if isinstance(x, NUMBER):
         return math.exp(x)
     import numpy as np
 
@@ -19,7 +20,7 @@ def exp(x: Any) -> Any:
 
 def sin(x: Any) -> Any:
     """The sine of `x` [rad]."""
-    if isinstance(x, float | int):
+    if isinstance(x, NUMBER):
         return math.sin(x)
     import numpy as np
 
@@ -28,7 +29,7 @@ def sin(x: Any) -> Any:
 
 def cos(x: Any) -> Any:
     """The cosine of `x` [rad]."""
-    if isinstance(x, float | int):
+    if isinstance(x, NUMBER):
         return math.cos(x)
     import numpy as np
 
@@ -37,7 +38,7 @@ def cos(x: Any) -> Any:
 
 def sqrt(x: Any) -> Any:
     """The square root of `x`."""
-    if isinstance(x, float | int):
+    if isinstance(x, NUMBER):
         return math.sqrt(x)
     import numpy as np
 
@@ -46,7 +47,7 @@ def sqrt(x: Any) -> Any:
 
 def asinh(x: Any) -> Any:
     """The inverse hyperbolic sine of `x`."""
-    if isinstance(x, float | int):
+    if isinstance(x, NUMBER):
         return math.asinh(x)
     import numpy as np
 

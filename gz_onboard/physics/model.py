@@ -272,19 +272,24 @@ class Model:
         if not self.cell_voltage:
             return None
         others = dict.fromkeys(QUANTITIES, 0.0) | dict(beside or {})
+        effects = self.at(Port.CELL_VOLTAGE)
+        by_capacity = "cell_capacity" in self.reads
 
         def settled(current: float, soc: float, temperature: float, form_factor_squared: float) -> float:
-            q = others | {
-                "cell_current": battery.health.resistance * current,
-                "soc": soc,
-                "cell_temperature": temperature,
-                "cell_capacity": battery.cell_capacity(temperature),
-            }
+            # A forecast calls it a hundred times: one dictionary for all effects, and no bursts where there are none.
+            load = battery.health.resistance * current
+            q = others.copy()
+            q["cell_current"], q["soc"], q["cell_temperature"] = load, soc, temperature
+            if by_capacity:
+                q["cell_capacity"] = battery.cell_capacity(temperature)
             lost = 0.0
-            for effect in self.at(Port.CELL_VOLTAGE):
-                # The charge flows in bursts, of which an effect that is fast enough sees the current, not the mean.
-                bursts = 1 + (form_factor_squared - 1) * (1 - effect.decay(BURST, q))
-                lost += effect(q | {"cell_current": bursts * q["cell_current"]})
+            for effect in effects:
+                if form_factor_squared != 1:
+                    # The charge flows in bursts, of which an effect that is fast enough sees the current, not the mean.
+                    q["cell_current"] = load
+                    bursts = 1 + (form_factor_squared - 1) * (1 - effect.decay(BURST, q))
+                    q["cell_current"] = bursts * load
+                lost += effect(q)
             return lost
 
         return settled

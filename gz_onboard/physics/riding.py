@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -46,7 +47,7 @@ class PriorRiding:
     lateral_acceleration: float = LATERAL
     vibration: float = VIBRATION
 
-    @property
+    @cached_property
     def speed(self) -> float:
         """Mean speed [m/s], stops included."""
         return sum(share * speed for share, speed, _ in self.points)

@@ -95,6 +95,8 @@ class Mesh:
 
     def rescale(self, factor: float) -> None:
         """From now on the table's values are read times `factor`."""
+        if factor == self._scale[0]:
+            return
         self._scale[0] = factor
         self._rows.clear()
 
@@ -106,17 +108,17 @@ class Mesh:
 
     def _row(self, temperature: float) -> Row:
         """The values over SOC at `temperature`, kept: it changes far more slowly than SOC."""
-        ts = self.temperature
-        row = self.value[0]
+        ts, scale = self.temperature, self._scale[0]
         if len(ts) > 1:
             j = min(max(bisect_right(ts, temperature) - 1, 0), len(ts) - 2)
             w = min(max((temperature - ts[j]) / (ts[j + 1] - ts[j]), 0.0), 1.0)
             pairs = zip(self.value[j], self.value[j + 1], strict=True)
             if self.geometric:
-                row = tuple(cold * (warm / cold) ** w for cold, warm in pairs)
+                row = tuple([scale * (cold * (warm / cold) ** w) for cold, warm in pairs])
             else:
-                row = tuple(cold + w * (warm - cold) for cold, warm in pairs)
-        row = tuple(self._scale[0] * value for value in row)
+                row = tuple([scale * (cold + w * (warm - cold)) for cold, warm in pairs])
+        else:
+            row = tuple([scale * value for value in self.value[0]])
         if len(self._rows) >= KEPT_ROWS:
             self._rows.clear()
         self._rows[temperature] = row

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -99,12 +99,22 @@ class Running:
         folder.mkdir(exist_ok=True)
         return folder
 
-    def daemon(self, *options: str, channels: tuple[str, ...] = ("vcan0",), name: str = "a") -> Daemon:
-        """A daemon that is ready. The same `name` means the same directory for logs and state."""
+    def daemon(
+        self,
+        *options: str,
+        channels: tuple[str, ...] = ("vcan0",),
+        name: str = "a",
+        program: Sequence[str] = ("gz_onboard",),
+        files: Sequence[int] = (),
+    ) -> Daemon:
+        """A daemon that is ready. The same `name` means the same directory for logs and state.
+
+        program: the module that is run, and what stands before its command; files: those open that it is given.
+        """
         folder = self.folder(name)
         errors = folder / "stderr"
         address = folder / f"notify{len(self._processes)}"
-        command = [sys.executable, "-m", "gz_onboard", "run", "--log-dir", str(folder), "--state-dir", str(folder)]
+        command = [sys.executable, "-m", *program, "run", "--log-dir", str(folder), "--state-dir", str(folder)]
         for channel in channels:
             command += ["--channel", channel]
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as server, errors.open("a") as stream:
@@ -116,6 +126,7 @@ class Running:
                 stderr=stream,
                 text=True,
                 env={**os.environ, "NOTIFY_SOCKET": str(address)},
+                pass_fds=files,
             )
             self._processes.append(process)
             assert server.recv(4096).startswith(b"READY=1"), errors.read_text()
