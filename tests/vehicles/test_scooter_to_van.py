@@ -65,6 +65,7 @@ cell_cutoff_voltage = {{ value = 3.0, unit = "V", sd = 0.05, status = "data shee
 [battery]
 cells_series = {series}
 cells_parallel = {parallel}
+as_new = 0.9
 [battery.ocv]
 soc = {socs}
 value = {volts}
