@@ -7,21 +7,23 @@ faster
 - at first, while the forecast itself follows each kilometre: over as much riding as the forecast is known from;
 - near empty, where the forecast's error goes as its range does: over a third of that.
 
-At standstill, and over a restart, the shown range keeps its ratio to the forecast. So energy that is drawn or charged,
-and a state of charge that was corrected, show at once. While riding only a step of the energy by more than `STEP` from
-one forecast to the next does, which no riding makes: a state of charge that was begun anew.
+At standstill nothing is ridden that the gap could close over: what is drawn is taken off, and what else changes the
+forecast, as a rest does that shows the state of charge, waits for the riding to come; at most `STEP` of it. The rest of
+it shows at once. So does a step of the energy by more than `STEP` from one forecast to the next, at standstill or not,
+which nothing makes but a state of charge that was begun anew. While the pack is charged, and over a restart, the shown
+range keeps its ratio to the forecast.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import exp
+from math import exp, log
 from typing import Any
 
 CALM = 6000.0  # m
 NEAR_EMPTY = 3.0  # the gap closes over the range over this
 FIRST = 250.0  # m, over which it closes at first
-STEP = 0.05  # of the energy that is left
+STEP = 0.05  # of the energy that is left, or of the range
 RATIO = 0.2, 5.0  # shown over forecast: beyond, it is not kept
 
 
@@ -32,21 +34,37 @@ class Calm:
         self.ratio = ratio  # shown over forecast
         self._before: tuple[float, float] | None = None  # the last forecast's range [m] and energy [J]
         self._ridden = 0.0  # m since
+        self._waiting = 0.0  # logarithm of the part of the ratio that waits for riding
 
     def ride(self, distance: float) -> None:
         """`distance` [m] was ridden."""
         self._ridden += distance
 
-    def follow(self, raw: float, energy: float, known: float) -> float:
-        """The range to show [m] for a forecast of `raw` [m] with `energy` [J], from so much riding `known` [m]."""
+    def follow(self, raw: float, energy: float, known: float, drawn: float | None = None) -> float:
+        """The range to show [m] for a forecast of `raw` [m] with `energy` [J], from so much riding `known` [m].
+
+        drawn: what was taken from the pack since the last one [J]; None: not known, or it is charged.
+        """
         before, ridden = self._before, self._ridden
         self._before, self._ridden = (raw, energy), 0.0
-        if before is None or ridden == 0 or min(raw, *before) <= 0 or abs(energy - before[1]) > STEP * before[1]:
+        if before is None or min(raw, energy, *before) <= 0 or abs(energy - before[1]) > STEP * before[1]:
+            return raw * self.ratio
+        if ridden == 0:
+            if drawn is not None and drawn < before[1]:
+                self._wait(log(before[0] / raw * (1 - drawn / before[1])))
             return raw * self.ratio
         length = max(min(known, CALM, raw / NEAR_EMPTY), FIRST)
-        gap = (before[0] * self.ratio - ridden - raw) * exp(-ridden / length)
+        fading = exp(-ridden / length)
+        gap = (before[0] * self.ratio - ridden - raw) * fading
         self.ratio = min(max(1 + gap / raw, RATIO[0]), RATIO[1])
+        self._waiting *= fading
         return raw * self.ratio
+
+    def _wait(self, change: float) -> None:
+        """The forecast has changed by the factor exp(-`change`) at standstill, and nothing drawn explains it."""
+        before = self._waiting
+        self._waiting = min(max(before + change, -STEP), STEP)
+        self.ratio = min(max(self.ratio * exp(self._waiting - before), RATIO[0]), RATIO[1])
 
 
 def restored_ratio(saved: Mapping[str, Any]) -> float:

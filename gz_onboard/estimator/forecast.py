@@ -174,9 +174,12 @@ class Forecaster:
         then, to_come = load.power_with_memory(q, inputs.heading is not None, second.seconds)
         return then * second.seconds, to_come * second.seconds
 
-    def shown(self, forecast: Forecast) -> Forecast:
-        """`forecast` as it is to be shown: its range and interval moved together; to be asked once for each."""
-        way = self.calm.follow(forecast.range, forecast.energy, self.riding.usual.price.known_from)
+    def shown(self, forecast: Forecast, drawn: float | None = None) -> Forecast:
+        """`forecast` as it is to be shown: its range and interval moved together; to be asked once for each.
+
+        drawn: see `Calm.follow`.
+        """
+        way = self.calm.follow(forecast.range, forecast.energy, self.riding.usual.price.known_from, drawn)
         move = way / forecast.range if forecast.range > 0 else 1.0
         return replace(forecast, range=way, p10=move * forecast.p10, p90=move * forecast.p90)
 

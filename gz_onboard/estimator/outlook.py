@@ -57,9 +57,11 @@ class Outlook:
         known = now.temperature, now.temperature_sd, now.conditions.ambient, now.conditions.altitude
         free = self._forecaster.forecast(now.soc, now.soc_sd, *known, now.loss_variance)
         pack = now.soc, now.loss_variance
-        self.forecast = self._forecaster.shown(self._road.forecast(now.time, free, pack, now.conditions))
         voltage, current = now.reading.voltage, now.reading.current
-        if now.activity is Activity.CHARGING and voltage and current is not None:
+        charging = now.activity is Activity.CHARGING
+        drawn = None if charging or voltage is None or current is None else voltage * current * elapsed
+        self.forecast = self._forecaster.shown(self._road.forecast(now.time, free, pack, now.conditions), drawn)
+        if charging and voltage and current is not None:
             self._charging.step(elapsed, self._battery, (voltage, current), now.soc, now.temperature)
             self._full = self._forecaster.forecast(self._battery.window.high, 0.0, *known)
         else:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.calm import CALM, Calm, restored_ratio
+from gz_onboard.estimator.calm import CALM, STEP, Calm, restored_ratio
 from gz_onboard.estimator.usual import Habit, Usual, restored_usual
 from gz_onboard.physics.riding import PriorRiding
 
@@ -58,6 +58,31 @@ def test_a_step_that_no_riding_makes_is_shown_at_once():
 def test_what_is_drawn_or_charged_at_standstill_shows_at_once():
     calm = Calm(0.95)
     assert shown([40_000.0, 38_000.0, 60_000.0], np.zeros(3), calm=calm) == pytest.approx([38_000, 36_100, 57_000])
+
+
+def standing(raws, drawn=0.0):
+    """What is shown at standstill of the forecasts `raws` [m], with `drawn` of the energy taken before each."""
+    calm, energy, found = Calm(), 1e6, []
+    for raw in raws:
+        calm.ride(0.0)
+        found.append(calm.follow(raw, energy, KNOWN, drawn * energy))
+        energy *= 1 - drawn
+    return found, calm
+
+
+def test_what_a_rest_shows_waits_for_the_riding_to_come():
+    """Of a forecast that falls by 4 % at standstill only what was drawn shows; riding closes the gap."""
+    found, calm = standing(np.linspace(40_000, 38_400, 100), 1e-4)
+    assert found[-1] == pytest.approx(40_000 * (1 - 1e-4) ** 99)
+    later = shown(38_400 - np.arange(10.0, 12_010, 10), np.full(1200, 10.0), calm=calm)
+    assert later[-1] == pytest.approx(38_400 - 12_000, rel=0.01)
+    assert np.abs(np.diff(later)).max() < 15
+
+
+def test_a_rest_that_shows_much_is_followed_at_once():
+    found, calm = standing(np.linspace(40_000, 25_000, 100))
+    assert found[-1] == pytest.approx(25_000 * np.exp(STEP))
+    assert calm.follow(40_000.0, 1e6, KNOWN, 0.0) == pytest.approx(40_000 * np.exp(-STEP))
 
 
 def test_a_restart_keeps_what_was_shown():

@@ -44,14 +44,17 @@ def heard(events, *, odometer=True, own_soc=True):
 # --- standing and charging ------------------------------------------------------------------------------------------
 
 
-def test_an_hour_of_standing_costs_its_energy_and_no_more():
+@pytest.mark.parametrize("new", [False, True], ids=["known", "new"])
+def test_an_hour_of_standing_costs_its_energy_and_no_more(new):
+    """Of a new vehicle the rest teaches state of charge and capacity: that waits for the riding to come."""
     scooter, e = Scooter(), estimator()
     follow(e, scooter.live(20), scooter)
     follow(e, scooter.live(540, 11.0), scooter)
-    follow(e, scooter.live(60), scooter)
-    knows(e, scooter)
+    if not new:
+        follow(e, scooter.live(60), scooter)
+        knows(e, scooter)
     _, before = follow(e, scooter.live(2), scooter)[-1]
-    energy = scooter.energy
+    energy, scooter.period = scooter.energy, 0.5
     rows = follow(e, scooter.live(3600), scooter)
     _, after = rows[-1]
     standing = (scooter.energy - energy) / before.consumption_expected  # m
