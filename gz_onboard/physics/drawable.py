@@ -18,6 +18,7 @@ class Drawable:
     energy: float  # J, at the pack's terminals
     slope: float  # J: how much more energy there would be for more SOC
     by_cutoff: float = 0.0  # J/V: how much less there would be for a higher cut-off voltage of a cell
+    end_drop: float = 0.0  # V of a cell: what the mean load takes from its rest voltage at the end
 
 
 # Gauss-Legendre nodes and weights on [0, 1], of order 8
@@ -61,9 +62,11 @@ def drawable(
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
         current = battery.settled_current(power, high + width * node, temperature, form_factor_squared, overpotential)
         total += weight / current if current else 0.0
-    # Where the vehicle ends before the voltage does, the cut-off does not count.
-    ends = charge * cutoff / battery.ocv(high, temperature)[1] if high - least > LEAST_WIDTH else 0.0
-    return Drawable(power * charge * width * total, slope, ends)
+    energy = power * charge * width * total
+    if high - least <= LEAST_WIDTH:  # where the vehicle ends before the voltage does, the cut-off does not count
+        return Drawable(energy, slope)
+    rest, rise = battery.ocv(high, temperature)
+    return Drawable(energy, slope, charge * cutoff / rise, max(rest - battery.cutoff_voltage, 0.0))
 
 
 NEWTON_STEPS = 3  # to 1e-4 of SOC: the energy is nearly linear in it

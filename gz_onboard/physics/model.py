@@ -18,7 +18,7 @@ from gz_onboard.physics.battery import HALF_FULL, Battery, Overpotential
 from gz_onboard.physics.effect import QUANTITIES, Effect, Port, effect_file, load_effect
 from gz_onboard.physics.elementary import STANDSTILL, sqrt
 from gz_onboard.physics.parameters import Parameters
-from gz_onboard.physics.relaxation import relaxation_over, relaxed
+from gz_onboard.physics.relaxation import mean_response, relaxation_over, relaxed
 from gz_onboard.physics.sensors import road_speed
 from gz_onboard.physics.trust import changeable, trusted_users
 
@@ -153,6 +153,7 @@ def remembering(effect: Bound, dt: float) -> Callable[[Mapping[str, Any]], float
 
 
 BURST = 10.0  # s: a load in traffic
+
 STOOD = 60.0  # s: for so long the load of a ride's first voltages has flowed: lights, a heater
 STANDING_LOADS = 1.5  # times the auxiliary power: the most that is believed to have flowed before it was seen
 
@@ -284,12 +285,18 @@ class Model:
                 q["cell_capacity"] = battery.cell_capacity(temperature)
             lost = 0.0
             for effect in effects:
-                if form_factor_squared != 1:
-                    # The charge flows in bursts, of which an effect that is fast enough sees the current, not the mean.
-                    q["cell_current"] = load
-                    bursts = 1 + (form_factor_squared - 1) * (1 - effect.decay(BURST, q))
-                    q["cell_current"] = bursts * load
-                lost += effect(q)
+                if form_factor_squared == 1:
+                    lost += effect(q)
+                    continue
+                # The charge flows in bursts, of which an effect that is fast enough sees the current, not the mean.
+                q["cell_current"] = load
+                bursts = 1 + (form_factor_squared - 1) * mean_response(effect.decay(BURST, q))
+                # A gamma distribution of currents of this form factor, as the charge sees it: its mean and its sd are
+                # those of two currents, which tell what an effect loses that does not grow with the current.
+                apart = sqrt((bursts - 1) / bursts)
+                for part in (1 - apart, 1 + apart):
+                    q["cell_current"] = part * bursts * load
+                    lost += effect(q) / 2
             return lost
 
         return settled

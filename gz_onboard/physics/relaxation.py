@@ -7,7 +7,7 @@ floats, or numpy arrays of one shape.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from math import exp
+from math import exp, log
 from typing import TYPE_CHECKING, TypeVar
 
 if TYPE_CHECKING:
@@ -41,3 +41,13 @@ def relaxation_over(targets: Array, decays: Array, start: float = 0.0, before: b
 
     ends = relaxation(targets.tolist(), decays.tolist(), start)
     return np.array([start, *ends[:-1]] if before else ends)
+
+
+def mean_response(left: float) -> float:
+    """What of a load a first-order lag shows in the mean over it: 1 - τ/T·(1 - left), with left = exp(-T/τ).
+
+    left: the share of what relaxes that is left after the load, of duration T.
+    """
+    if left >= 1:
+        return 0.0
+    return 1 + (1 - left) / log(left) if left > 0 else 1.0

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.physics.battery import current_of, dissipation, heat, terminal_voltage
 from gz_onboard.physics.drawable import drawable
+from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import first_soc
 from gz_onboard.physics.tables import Mesh
 from gz_onboard.vehicle import read_vehicle
@@ -165,6 +166,28 @@ def test_bursts_cost_energy_as_a_step_by_step_discharge_says():
     assert abs(bursts.energy - real) < 0.3 * abs(steady.energy - real)
 
 
+@pytest.mark.parametrize("temperature", [-10.0, 25.0])
+@pytest.mark.parametrize("form_factor_squared", [1.5, 3.0])
+def test_bursts_cost_the_reaction_what_a_step_by_step_discharge_says(temperature, form_factor_squared):
+    """Currents drawn at random, 10 s each, through a reaction that bends and lags: what the charge meets in the mean."""
+    settled = VEHICLE.model.overpotential(BATTERY)
+    (reaction,) = VEHICLE.model.at(Port.CELL_VOLTAGE)
+    shape = 1 / (form_factor_squared - 1)
+    currents = np.random.default_rng(0).gamma(shape, 1.5 / shape, 4000)  # A of a cell
+    real, lost, step = 0.0, 0.0, 0.1
+    for current in currents:
+        q = {"cell_current": float(current), "cell_temperature": temperature}
+        target, left = reaction(q), reaction.decay(step, q)
+        for _ in range(100):
+            lost = left * lost + (1 - left) * target
+            real += lost * current / 100
+    mean, square = currents.mean(), (currents**2).mean()
+    assert settled is not None
+    expected = settled(mean, 0.5, temperature, square / mean**2)
+    assert expected == pytest.approx(real / currents.sum(), rel=0.06)
+    assert settled(mean, 0.5, temperature, 1.0) < 0.95 * expected
+
+
 @given(st.floats(0.05, 1.0), st.floats(-10, 45), st.floats(50, 2500))
 def test_drawable_is_sane(soc, temperature, power):
     now = drawable(BATTERY, soc, temperature, power)
@@ -174,6 +197,8 @@ def test_drawable_is_sane(soc, temperature, power):
     assert drawable(BATTERY, soc, temperature, 1.5 * power).energy <= now.energy * (1 + 1e-9)
     full = BATTERY.pack_capacity(temperature) * 3600 * BATTERY.cells_series * BATTERY.ocv(soc)[0]
     assert now.energy < full * (soc + 0.06)
+    assert 0 <= now.end_drop < BATTERY.ocv(soc)[0]
+    assert now.by_cutoff >= 0
 
 
 @given(st.floats(0.3, 3.0), st.floats(0.02, 1.0), st.floats(-10, 45))

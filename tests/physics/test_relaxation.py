@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.physics.relaxation import decay_over, relaxation, relaxed
+from gz_onboard.physics.relaxation import decay_over, mean_response, relaxation, relaxed
 
 steps = st.lists(st.tuples(st.floats(-5, 5), st.floats(0, 1)), min_size=1, max_size=30)
 
@@ -36,3 +36,15 @@ def test_two_half_steps_are_one(dt, time_constant, x, target):
 def test_it_is_the_solution_of_the_equation():
     assert relaxed(1.0, 0.0, decay_over(30.0, 60.0)) == pytest.approx(exp(-0.5))
     assert relaxation([2.0] * 600, [decay_over(1.0, 60.0)] * 600)[-1] == pytest.approx(2.0 * (1 - exp(-10)))
+
+
+@given(st.floats(0.01, 50.0))
+def test_the_mean_over_a_load_is_that_of_its_steps(time_constant):
+    fine = decay_over(10.0 / 2000, time_constant)
+    values = relaxation([1.0] * 2000, [fine] * 2000)
+    assert mean_response(decay_over(10.0, time_constant)) == pytest.approx(np.mean(values), abs=2e-3 + 0.3 * (1 - fine))
+
+
+def test_the_mean_over_a_load_at_its_limits():
+    assert mean_response(0.0) == 1.0
+    assert mean_response(1.0) == 0.0
