@@ -169,7 +169,7 @@ def test_bursts_cost_energy_as_a_step_by_step_discharge_says():
 @pytest.mark.parametrize("temperature", [-10.0, 25.0])
 @pytest.mark.parametrize("form_factor_squared", [1.5, 3.0])
 def test_bursts_cost_the_reaction_what_a_step_by_step_discharge_says(temperature, form_factor_squared):
-    """Currents drawn at random, 10 s each, through a reaction that bends and lags: what the charge meets in the mean."""
+    """Currents drawn at random, 10 s each, through a reaction that bends and lags: as the charge meets it."""
     settled = VEHICLE.model.overpotential(BATTERY)
     (reaction,) = VEHICLE.model.at(Port.CELL_VOLTAGE)
     shape = 1 / (form_factor_squared - 1)
