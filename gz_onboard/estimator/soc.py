@@ -240,7 +240,7 @@ class StateOfCharge:
 
     def _noise(self, counted: float, filter_: SocFilter, temperature: float) -> Noise:
         """`counted`: variance of SOC."""
-        return Noise(counted, self.uncertainty.slow(filter_.soc, temperature), self.uncertainty.error_time)
+        return Noise(counted, *self.uncertainty.slow(filter_.soc, temperature))
 
     def _update(self, filter_: SocFilter, now: float, dt: float, measured: tuple[float, float], at: PackState) -> None:
         """Update with the voltage [V] at a current [A], both of the pack, that represents `dt` [s]."""
@@ -276,12 +276,12 @@ class StateOfCharge:
         load = self.uncertainty.load(r0, (drop, filter_.v1), reading.source, known, voltage_sd)
         error, own = filter_.innovation(cell_voltage, cell_current, temperature)
         slope = battery.ocv(filter_.soc, temperature)[1]
-        variance = self.gate.update(dt, *self.ageing.as_believed(error, own, slope), slow, load)
+        variance = self.gate.update(dt, *self.ageing.as_believed(error, own, slope), slow.variance, load)
         if self.gate.refuted:
             self._refute(now, filter_, error, drop + filter_.v1)
         elif variance is not None and self.uncertainty.tells_more(filter_.soc, filter_.covariance[0]):
             # What errs the same way for a time counts as one sample in that time, not one each step.
-            variance *= max(2 * self.uncertainty.error_time / max(dt, SHORTEST), 1.0)
+            variance *= max(2 * slow.time / max(dt, SHORTEST), 1.0)
             filter_.update(cell_voltage, cell_current, temperature, variance)
             filter_.soc = bounded(filter_.soc)
             self.ageing.corrected(filter_, before)

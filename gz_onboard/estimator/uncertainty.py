@@ -19,6 +19,7 @@ UNCHECKED_SD = 0.2 / 32.8  # 1/h, beside the offset's, while no second sensor co
 EMPTY_BELOW, EMPTY_FROM = 0.15, 0.05  # SOC between which the model's error grows to that of an empty cell
 RESISTANCE_SD = 0.12  # relative: measured tables of R0 and R1, for this pack at this place and temperature
 RESISTANCE_SD_COLD = 0.4  # the same where the cell temperature is not known
+HISTORY_TIME = HOUR  # s that stays what depends on the cell's history, on its place on the curve and on the sensor
 INVERTER_VOLTAGE_SD = 0.15 / 14  # V of a cell: the cable between pack and inverter
 
 
@@ -27,6 +28,13 @@ class CurrentError(NamedTuple):
 
     sd: float  # 1/h
     time: float  # s that such an error stays the same
+
+
+class SlowError(NamedTuple):
+    """Of a cell's voltage by the model, what stays the same for long."""
+
+    variance: float  # V²
+    time: float  # s that it stays, in the mean over what it is made of
 
 
 CURRENT_ERRORS = {
@@ -84,7 +92,7 @@ class VoltageUncertainty:
         self._empty = p.sd("cell_voltage_error_empty")
         self.error_time = p["cell_voltage_error_time"]
         self._sensor = (p.sd("pack_voltage_offset") / battery.cells_series) ** 2  # V²
-        # What depends on the cell's history, hysteresis before all: it lasts as long as the history does.
+        # What depends on the cell's history, hysteresis before all.
         self._history = p.sd("rest_voltage_error") ** 2 + battery.rest_shift_sd**2  # V²
         self._capacity_scatter = p.sd("cell_capacity") / p["cell_capacity"]
 
@@ -94,11 +102,13 @@ class VoltageUncertainty:
         share = min(max((EMPTY_BELOW - soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
         return model + share * max(empty - model, 0.0)
 
-    def slow(self, soc: float, temperature: float) -> float:
-        """Variance [V²] of what errs the same way for `error_time`: the cell model, the tables' place, the sensor."""
+    def slow(self, soc: float, temperature: float) -> SlowError:
+        """What errs the same way for a time: the circuit, the tables' place, the sensor."""
         # The pack's cells are not the bench's: where SOC lies on their curve is known to their capacity's scatter.
         axis_sd = self._capacity_scatter * (1 - soc) * self._battery.ocv(soc)[1]
-        return self.loaded(soc, temperature) ** 2 + axis_sd**2 + self._history + self._sensor
+        circuit, stays = self.loaded(soc, temperature) ** 2, axis_sd**2 + self._history + self._sensor
+        variance = circuit + stays
+        return SlowError(variance, (circuit * self.error_time + stays * HISTORY_TIME) / variance)
 
     def tells_more(self, soc: float, variance: float) -> bool:
         """Whether a voltage can tell more than a state of charge that is known to `variance`.

@@ -13,7 +13,7 @@ from gz_onboard.estimator.reasons import LOSS_SD, MissingSignals, loss_variance
 from gz_onboard.estimator.ridden import MEMORY, Past, Segment
 from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.estimator.sources import CurrentSource, Synchroniser
-from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, ChargeUncertainty, VoltageUncertainty
+from gz_onboard.estimator.uncertainty import CURRENT_ERRORS, HISTORY_TIME, ChargeUncertainty, VoltageUncertainty
 from gz_onboard.events import ROLES, Reason
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.vehicle import read_vehicle
@@ -162,6 +162,15 @@ def test_a_voltage_on_a_flat_curve_tells_no_more_than_hysteresis_allows():
     assert not uncertainty.tells_more(0.5, 0.03**2)
     assert uncertainty.tells_more(0.5, 0.10**2)
     assert uncertainty.tells_more(0.05, 0.03**2)
+
+
+def test_what_stays_for_hours_does_not_fade_with_the_error_of_the_circuit():
+    """History, place on the curve and sensor stay: the less the circuit errs, the more of the error does."""
+    uncertainty = VoltageUncertainty(VEHICLE.pack, VEHICLE.parameters)
+    known, worse = (uncertainty.slow(0.6, temperature) for temperature in (25.0, 10.0))
+    assert uncertainty.loaded(0.6, 10.0) > 1.5 * uncertainty.loaded(0.6, 25.0)
+    assert known.variance < worse.variance
+    assert uncertainty.error_time < worse.time < known.time < HISTORY_TIME
 
 
 def test_resistances_that_are_guessed_make_a_loaded_voltage_worth_less():
