@@ -22,7 +22,9 @@ from tests.service.test_dashboard import PAGE, active, latest
 OPT = Path("/opt/gz-onboard")
 SETTINGS = Path("/etc/default/gz-onboard")
 NETWORK = Path("/etc/systemd/network/80-can0.network")
+OWN = ("/var/lib/private", "/var/log/private", "/var/lib", "/var/log")  # the service's folders, and the links to them
 BY_HAND = [OPT, SETTINGS, *(Path("/etc/systemd/system") / name for name in (UNIT, f"{UNIT}.d", PAGE, f"{PAGE}.d"))]
+BY_HAND += [Path(folder) / "gz-onboard" for folder in OWN]
 WRITTEN = ["/etc", "/etc/default", "/etc/systemd", "/etc/systemd/network", "/etc/systemd/system", "/opt", "/usr/bin"]
 WRITTEN += ["/usr/lib/systemd/system", "/usr/lib/sysusers.d", "/usr/share/doc", "/usr/share/man/man1"]
 WRITTEN += ["/usr/share/bash-completion/completions", "/usr/share/zsh/vendor-completions", "/var/lib/dpkg/info"]
@@ -47,10 +49,10 @@ def package(guest: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def board(guest: None, tmp_path: Path) -> Iterator[None]:
-    """Without what the other tests install by hand; it is put back afterwards."""
+    """Without what the other tests install by hand, and their state; it is put back afterwards."""
     systemctl("stop", UNIT, PAGE) if OPT.exists() else None
     for number, path in enumerate(BY_HAND):
-        if path.exists() or path.is_symlink():
+        if os.path.lexists(path):
             shutil.move(path, tmp_path / str(number))
     for lock in "lock", "lock-frontend", "triggers/Lock":  # what only the host's root may open
         if not os.access(Path("/var/lib/dpkg") / lock, os.W_OK):
@@ -61,7 +63,7 @@ def board(guest: None, tmp_path: Path) -> Iterator[None]:
     yield
     output("dpkg", "--purge", "gz-onboard", check=False)
     for number, path in enumerate(BY_HAND):
-        if (tmp_path / str(number)).exists():
+        if os.path.lexists(tmp_path / str(number)):
             shutil.move(tmp_path / str(number), path)
     systemctl("daemon-reload")
 
