@@ -26,6 +26,7 @@ PREFIX = "opt/gz-onboard"
 DOC = "usr/share/doc/gz-onboard"
 PINNED = ROOT / ".ci" / "requirements-board.txt"
 HOLDER = re.compile(r"^\W*copyright .*(\d{4}|\(c\) \w)|\d{4}.*\(c\)", re.I)
+LEFT_OUT = {".pyi", ".c", ".h", ".a"}
 SCRIPTS = ("preinst", "postinst", "prerm", "postrm")
 FILES = {
     "systemd/gz-onboard.service": "usr/lib/systemd/system/gz-onboard.service",
@@ -118,7 +119,7 @@ def copy_installed(site: Path, python: str) -> None:
 
 
 def settle(stage: Path, python: Path) -> None:
-    """Make the environment that of /opt/gz-onboard: no path of this build, no tests of others, all compiled."""
+    """Make the environment that of /opt/gz-onboard: no path of this build, nothing for developers, all compiled."""
     prefix = stage / PREFIX
     home = f"home = {python.parent}\ninclude-system-site-packages = false\nversion = {run(python, '-V').split()[1]}\n"
     (prefix / "pyvenv.cfg").write_text(home, encoding="utf-8")
@@ -130,10 +131,10 @@ def settle(stage: Path, python: Path) -> None:
         elif not file.name.startswith("python"):
             file.unlink()
     shutil.rmtree(prefix / "include", ignore_errors=True)
-    for origin in prefix.rglob("direct_url.json"):
-        origin.unlink()
     for tests in [path for path in prefix.rglob("tests") if path.is_dir()]:
         shutil.rmtree(tests)
+    for file in [path for path in prefix.rglob("*") if path.suffix in LEFT_OUT or path.name == "direct_url.json"]:
+        file.unlink()
     # By the content of the sources, never by their times; the service may not write, and root shall not need to.
     run(
         python,
