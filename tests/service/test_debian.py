@@ -175,10 +175,11 @@ def check_upgrade(newer: Path, listener: Listener) -> None:
     assert output("dpkg-query", "-W", "-f", "${Version}", "gz-onboard") == "9.0"
     wait_for(lambda: show("ActiveState") == "active" and main_pid() not in (0, pid), 60, "the new one runs")
     assert active()
-    assert "going on from the state saved" in output("journalctl", "--no-pager", "-u", UNIT, f"_PID={main_pid()}")
+    told = ["journalctl", "--no-pager", "-u", UNIT, f"_PID={main_pid()}"]
+    wait_for(lambda: "going on from the state saved" in output(*told), 60, "that it goes on from its state")
     assert "Of version 9" not in SETTINGS.read_text()
     assert "250K" in NETWORK.read_text()
-    listener.next(SOC)
+    listener.next(SOC, 60)
     systemctl("disable", "--now", UNIT)
     output("/var/lib/dpkg/info/gz-onboard.postinst", "configure", "9.0")  # what the next upgrade calls
     assert output("systemctl", "is-enabled", UNIT, check=False) == "disabled"
