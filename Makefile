@@ -8,7 +8,7 @@ FIRST ?= 100240
 PYTHON_IN_VENV := .venv/bin/python
 DEMO = replay_logs/demo.py "$(RIDE)" --speed $(SPEED) --seconds $(SECONDS)
 
-.PHONY: help setup run test lint format docs man bench trial range-benchmark hardening clean
+.PHONY: help setup run test lint format docs man deb bench trial range-benchmark hardening clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
@@ -44,6 +44,9 @@ docs: setup .venv/.docs-ready  ## the documentation as a site in build/docs; a d
 
 man: setup  ## the manual page and the completions of bash and zsh, in build/shell
 	$(PYTHON_IN_VENV) docs/shell.py build/shell
+
+deb: setup  ## a Debian package of the daemon for machines like this one, in dist/
+	$(PYTHON_IN_VENV) packaging/debian/build.py dist
 
 .venv/.docs-ready: .venv/.ready .ci/requirements-docs.txt
 	@.ci/setup docs

@@ -2,7 +2,8 @@
 
 On a vcan the daemon, the replay and the dashboard are three processes that share nothing but the bus. On
 python-can's `virtual` interface, which ends where the process ends, they are three threads of this one. A second
-dashboard serves the page for a browser, but not in a guest, whose network no browser reaches.
+dashboard serves the page for a browser; where Chromium is, it is photographed. In a guest, whose network no browser
+outside reaches, that is done inside.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import contextlib
 import io
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -34,6 +36,7 @@ BIN = Path(sys.executable).parent
 GUEST = Path("/run/vcan-guest")
 READY_WITHIN = 30.0  # s
 STOPPED_WITHIN = 15.0  # s
+PORT = 8000  # of the page, if it is free
 
 
 def main() -> int:
@@ -45,13 +48,14 @@ def main() -> int:
     parser.add_argument("--vehicle", default="reference")
     parser.add_argument("--speed", type=float, default=1.0, help="of the replay; 1 is the ride's own timing")
     parser.add_argument("--seconds", type=float, default=60.0, help="end the replay after this long")
+    parser.add_argument("--output", type=Path, help="the folder for what it leaves behind (default: one in runs/)")
     args = parser.parse_args()
     if not args.ride.is_file():
         parser.error(f"no such ride: {args.ride}")
 
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)  # in the order of what the other processes write
-    directory = ROOT / "runs" / time.strftime("%Y%m%dT%H%M%S")
+    directory = args.output or ROOT / "runs" / time.strftime("%Y%m%dT%H%M%S")
     directory.mkdir(parents=True)
     bus = ["--interface", args.interface, "--channel", args.channel]
     own_directories = ["--log-dir", str(directory), "--state-dir", str(directory)]
@@ -59,14 +63,20 @@ def main() -> int:
     replay = ["replay", str(args.ride), *bus, "--speed", str(args.speed)]
     dbc = read_vehicle(args.vehicle).range_dbc
     dashboard = ["dashboard", *bus, "--dbc", str(dbc)]
-    pages = [] if GUEST.is_dir() else [[*dashboard, "--web", "--listen", "127.0.0.1:0"]]
+    listen = f"127.0.0.1:{free_port()}"
+    page = [*dashboard, "--web", "--listen", listen]
 
     where = "in-process virtual bus" if args.interface == "virtual" else f"{args.channel} of Linux {os.uname().release}"
     print(f"=== {args.ride.name} on the {where}, for at most {args.seconds:g} s")
-    frames = directory / "range.log"
+    print(f"=== The dashboard's page{' (inside the guest)' if GUEST.is_dir() else ''}: http://{listen}/")
+    frames, picture = directory / "range.log", directory / "page.png"
     play = play_in_threads if args.interface == "virtual" else play_in_processes
-    with recording(args.interface, args.channel, frames, dbc), listening_for_ready() as wait_until_ready:
-        status = play(daemon, replay, dashboard, pages, wait_until_ready, args.seconds)
+    with (
+        recording(args.interface, args.channel, frames, dbc),
+        photographing(f"http://{listen}/", picture),
+        listening_for_ready() as wait_until_ready,
+    ):
+        status = play(daemon, replay, dashboard, page, wait_until_ready, args.seconds)
     if status:
         print(f"demo: ended with status {status}", file=sys.stderr)
         return status
@@ -76,8 +86,11 @@ def main() -> int:
     overview = directory / "overview.png"
     subprocess.run([BIN / "gz-onboard", "plot", log, overview], check=True)
     print("\n=== What the ride left behind")
-    for what, path in ("log", log), ("overview", overview), ("range frames", frames):
-        print(f"{what:13} {path.relative_to(ROOT)}")
+    for what, path in ("log", log), ("overview", overview), ("range frames", frames), ("page", picture):
+        if path.exists():
+            print(f"{what:13} {path.relative_to(ROOT) if path.is_relative_to(ROOT) else path}")
+    if not picture.exists():
+        print(f"{'page':13} was at http://{listen}/; no picture of it, which takes Chromium (.ci/setup browser)")
     return 0
 
 
@@ -96,6 +109,30 @@ def recording(interface: str, channel: str, file: Path, dbc: Path) -> Iterator[N
         finally:
             notifier.stop()
             writer.stop()
+
+
+def free_port() -> int:
+    """`PORT`, or another one if it is taken."""
+    for port in PORT, 0:
+        with contextlib.suppress(OSError), socket.socket() as trial:
+            trial.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            trial.bind(("127.0.0.1", port))
+            return int(trial.getsockname()[1])
+    raise OSError("no free port on 127.0.0.1")
+
+
+@contextlib.contextmanager
+def photographing(address: str, picture: Path) -> Iterator[None]:
+    """Meanwhile have a browser make a picture of the page as soon as it shows a range, if there is one."""
+    if not shutil.which("chromium"):
+        yield
+        return
+    camera = [sys.executable, "-m", "tests.browser.photograph", address, str(picture.resolve())]
+    with subprocess.Popen(camera, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            yield
+        finally:
+            process.terminate()
 
 
 @contextlib.contextmanager
@@ -119,7 +156,7 @@ def play_in_processes(
     daemon: list[str],
     replay: list[str],
     dashboard: list[str],
-    pages: list[list[str]],
+    page: list[str],
     wait_until_ready: Callable[[], bool],
     seconds: float,
 ) -> int:
@@ -130,8 +167,7 @@ def play_in_processes(
         stack.callback(daemon_process.terminate)
         if not wait_until_ready():
             return daemon_process.poll() or 1
-        for page in pages:
-            stack.callback(stack.enter_context(subprocess.Popen([command, *page])).terminate)
+        stack.callback(stack.enter_context(subprocess.Popen([command, *page])).terminate)
         dashboard_process = stack.enter_context(subprocess.Popen([command, *dashboard]))
         stack.callback(dashboard_process.terminate)
         with contextlib.suppress(subprocess.TimeoutExpired):  # a ride may be longer than the demonstration
@@ -149,7 +185,7 @@ def play_in_threads(
     daemon: list[str],
     replay: list[str],
     dashboard: list[str],
-    pages: list[list[str]],
+    page: list[str],
     wait_until_ready: Callable[[], bool],
     seconds: float,
 ) -> int:
@@ -158,7 +194,7 @@ def play_in_threads(
 
     def the_rest() -> None:
         if wait_until_ready():
-            for command in [*pages, replay]:
+            for command in [page, replay]:
                 threading.Thread(target=cli.main, args=(command,), daemon=True).start()
             cli.main([*dashboard, "--duration", str(seconds)])  # no signal can end it in a thread
         os.kill(os.getpid(), signal.SIGTERM)

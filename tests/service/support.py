@@ -15,6 +15,7 @@ from cantools.database import Database, load_file
 
 ROOT = Path(__file__).resolve().parents[2]
 UNIT = "gz-onboard.service"
+SOC = "RANGE_StateOfCharge"
 
 
 def output(*command: str, check: bool = True) -> str:

@@ -13,6 +13,7 @@ import pytest
 
 from tests.service.support import (
     ROOT,
+    SOC,
     UNIT,
     Listener,
     bus_down,
@@ -27,7 +28,6 @@ from tests.service.support import (
 )
 
 README = ROOT / "systemd" / "README.md"
-SOC = "RANGE_StateOfCharge"
 SIGMA = "RANGE_StateOfChargeSigma"
 
 
