@@ -115,11 +115,16 @@ def explanation_row(why: Explanation) -> dict[str, object]:
     return {name: round(value, 2) for name, value in numbers.items()}
 
 
+def estimate_schema() -> dict[str, Any]:
+    """The JSON schema of `estimate_row`."""
+    schema = object_schema("gz_onboard.Estimate", ESTIMATE_UNITS)
+    schema["properties"] |= {name: {"type": "string"} for name in TEXTS}
+    return schema
+
+
 def declare(log: Log, messages: Sequence[Message]) -> None:
     """Declare the topics of a log; messages: those whose decoded signals are logged, too."""
-    estimate = object_schema("gz_onboard.Estimate", ESTIMATE_UNITS)
-    estimate["properties"] |= {name: {"type": "string"} for name in TEXTS}
-    log.channel(ESTIMATE_TOPIC, estimate)
+    log.channel(ESTIMATE_TOPIC, estimate_schema())
     units = dict.fromkeys(("reference", "range", *(cause.name.lower() for cause in Cause if cause)), "m")
     for topic, title in ((WHY_TOPIC, "gz_onboard.Why"), (CHANGE_TOPIC, "gz_onboard.RangeChange")):
         log.channel(topic, object_schema(title, {"time": ESTIMATE_UNITS["time"]} | units))
