@@ -18,6 +18,7 @@ EXIT_STATUSES = {
     INTERRUPTED: "interrupted by Ctrl-C",
 }
 """What the exit status of a command means."""
+_PACKAGES = {"paho": "paho-mqtt", "foxglove": "foxglove-sdk"}  # that are not named as their modules
 _DISK_FAILED = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 LONGEST_NAME = 100  # beyond it no near name is looked for, which takes the square of the length
 _SHORT = reprlib.Repr()
@@ -46,14 +47,15 @@ def lacking_extra(error: ModuleNotFoundError) -> str | None:
     from importlib.metadata import PackageNotFoundError, requires
 
     module = (error.name or "").partition(".")[0]
+    package = _PACKAGES.get(module, module)
     try:
         needed = requires("gz-onboard") or []
     except PackageNotFoundError:
         return None
     for requirement in needed:
         found = re.fullmatch(r"([\w-]+).*;.*\bextra == ['\"](\w+)['\"].*", requirement)
-        if found and found[1].replace("-", "_").lower() == module.lower():
-            return f"needs {module}, which is not installed: pip install 'gz-onboard[{found[2]}]'"
+        if found and found[1].replace("-", "_").lower() == package.replace("-", "_").lower():
+            return f"needs {package}, which is not installed: pip install 'gz-onboard[{found[2]}]'"
     return None
 
 

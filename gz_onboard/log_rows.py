@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from gz_onboard.bus.logfile import object_schema
 from gz_onboard.events import Cause, Estimate, Explanation, Frame, Reason
+from gz_onboard.location_rows import BATTERY_ENDS_TOPIC, LOCATION_SCHEMA, LOCATION_TOPIC
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -71,8 +72,8 @@ class Log(Protocol):
     def frames(self, batch: Sequence[Frame]) -> None:
         """Log raw frames."""
 
-    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
-        """Log one JSON object."""
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object], seen_ns: int | None = None) -> None:
+        """Log one JSON object; seen_ns: when it was so, if not at `time_ns`."""
 
 
 def reason_names(found: Reason) -> list[str]:
@@ -114,11 +115,16 @@ def explanation_row(why: Explanation) -> dict[str, object]:
     return {name: round(value, 2) for name, value in numbers.items()}
 
 
+def estimate_schema() -> dict[str, Any]:
+    """The JSON schema of `estimate_row`."""
+    schema = object_schema("gz_onboard.Estimate", ESTIMATE_UNITS)
+    schema["properties"] |= {name: {"type": "string"} for name in TEXTS}
+    return schema
+
+
 def declare(log: Log, messages: Sequence[Message]) -> None:
     """Declare the topics of a log; messages: those whose decoded signals are logged, too."""
-    estimate = object_schema("gz_onboard.Estimate", ESTIMATE_UNITS)
-    estimate["properties"] |= {name: {"type": "string"} for name in TEXTS}
-    log.channel(ESTIMATE_TOPIC, estimate)
+    log.channel(ESTIMATE_TOPIC, estimate_schema())
     units = dict.fromkeys(("reference", "range", *(cause.name.lower() for cause in Cause if cause)), "m")
     for topic, title in ((WHY_TOPIC, "gz_onboard.Why"), (CHANGE_TOPIC, "gz_onboard.RangeChange")):
         log.channel(topic, object_schema(title, {"time": ESTIMATE_UNITS["time"]} | units))
@@ -126,6 +132,9 @@ def declare(log: Log, messages: Sequence[Message]) -> None:
     maps = {name: {"type": "object"} for name in ("foreign", "faults", "lost", "unknown")}
     reasons = {"reasons": {"type": "array", "items": {"type": "string"}}}
     log.channel(STATUS_TOPIC, {"title": "gz_onboard.Status", "type": "object", "properties": counts | maps | reasons})
+    log.channel(BATTERY_ENDS_TOPIC, LOCATION_SCHEMA)
+    if messages:
+        log.channel(LOCATION_TOPIC, LOCATION_SCHEMA)
     for message in messages:
         log.channel(
             f"/can/{message.name}", object_schema(message.name, {s.name: s.unit or "" for s in message.signals})

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
+from math import inf
 
 from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE, Codec
 from gz_onboard.bus.layout import identifier_of
@@ -18,7 +19,9 @@ from gz_onboard.estimator import reasons
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
+from gz_onboard.estimator.signals import FIX_2D, FIX_3D
 from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
+from gz_onboard.location_rows import BATTERY_ENDS_TOPIC, LOCATION_TOPIC, location_row
 from gz_onboard.log_rows import (
     CHANGE_TOPIC,
     ESTIMATE_TOPIC,
@@ -92,6 +95,7 @@ class Pipeline:
         self._dropped_before = self._lost_before = 0
         self._recent = Reason(0)
         self._topics: dict[int, str] = {}
+        self._located = -inf  # s, of the last position logged
         if log:
             declare(log, self.codec.mapping.database.messages if log_signals else ())
 
@@ -177,15 +181,30 @@ class Pipeline:
         log.sample(STATUS_TOPIC, time_ns, self.status())
         for change, why in self.estimator.attribution.news():
             log.sample(CHANGE_TOPIC if change else WHY_TOPIC, time_ns, explanation_row(why))
-        if not self._log_signals:
-            return
+        if estimate.battery_ends_latitude is not None and estimate.battery_ends_longitude is not None:
+            there = estimate.battery_ends_latitude, estimate.battery_ends_longitude
+            log.sample(BATTERY_ENDS_TOPIC, time_ns, location_row(time_ns, "battery_ends", *there, None))
+        if self._log_signals:
+            self._sample_signals(log, time_ns)
+
+    def _sample_signals(self, log: Log, time_ns: int) -> None:
+        """The latest signals of each message, at the time that they were seen, and the position."""
         codec, topics = self.codec, self._topics
         for identifier, (seen_ns, data) in codec.latest.items():
             if time_ns - seen_ns < TICKS_PER_RANGE * TICK_NS:  # not again what was logged before
                 topic = topics.get(identifier)
                 if topic is None:
                     topic = topics[identifier] = f"/can/{codec.message_name(identifier)}"
-                log.sample(topic, seen_ns, codec.values(identifier, data))
+                log.sample(topic, time_ns, codec.values(identifier, data), seen_ns)
+        signals, now = self.estimator.signals, codec.seconds(time_ns)
+        latitude, longitude = signals.latitude.get(now), signals.longitude.get(now)
+        if latitude is None or longitude is None or signals.longitude.time <= self._located:
+            return
+        self._located = signals.longitude.time
+        if not signals.fix_below(now, FIX_2D):
+            altitude = None if signals.fix_below(now, FIX_3D) else signals.gps_altitude.get(now)
+            seen_ns = time_ns - round((now - self._located) * 1e9)
+            log.sample(LOCATION_TOPIC, time_ns, location_row(seen_ns, "gps", latitude, longitude, altitude), seen_ns)
 
     @property
     def foreign(self) -> dict[str, int]:

@@ -170,7 +170,7 @@ class Run:
         """Keep raw frames."""
         self.logged += batch
 
-    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object], seen_ns: int | None = None) -> None:
         """Keep one JSON object."""
         self.samples.append((topic, time_ns, values))
 

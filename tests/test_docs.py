@@ -31,6 +31,7 @@ GUIDE = {
     "why",
     "road-ahead",
     "dashboard",
+    "home-assistant",
     "log-format",
     "service",
     "limits",

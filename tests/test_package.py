@@ -22,7 +22,7 @@ from tests.test_structure import OFFLINE, ON_REQUEST
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 INSTALL = r"pip install 'gz-onboard\[lab\]'"
-HEAVY = {"scipy", "matplotlib", "pyarrow", "filterpy", "pandas", "asammdf"}
+HEAVY = {"scipy", "matplotlib", "pyarrow", "filterpy", "pandas", "asammdf", "paho", "foxglove"}
 
 
 def run(*command: object, cwd: Path | None = None, status: int = 0) -> subprocess.CompletedProcess[str]:
@@ -157,7 +157,9 @@ def test_the_board_has_nothing_of_the_lab(board):
     assert str(board.parent) in told
 
 
-@pytest.mark.parametrize("command", [[], ["run"], ["dashboard"], ["replay"], ["learned"], ["route"], ["export"]])
+@pytest.mark.parametrize(
+    "command", [[], ["run"], ["dashboard"], ["mqtt"], ["foxglove"], ["replay"], ["learned"], ["route"], ["export"]]
+)
 def test_the_boards_commands_have_their_help(board, command):
     assert run(board / "gz-onboard", *command, "--help").stdout.startswith("usage: gz-onboard")
 
@@ -246,6 +248,14 @@ def test_a_command_of_the_lab_says_what_to_install(board, estimated, tmp_path, c
     assert re.fullmatch(said, line)
     assert told.stdout == ""
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("command", "package"), [(["mqtt", "localhost"], "paho-mqtt"), (["foxglove"], "foxglove-sdk")])
+def test_a_bridge_says_what_to_install(board, command, package):
+    (line,) = run(board / "gz-onboard", *command, status=2).stderr.splitlines()
+    extra = command[0]
+    said = f"needs {package}, which is not installed: pip install 'gz-onboard[{extra}]'"
+    assert line == f"gz-onboard {extra}: {said}"
 
 
 def test_a_format_of_the_lab_says_what_to_install(board, tmp_path):

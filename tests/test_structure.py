@@ -17,7 +17,7 @@ PACKAGE = Path(__file__).parents[1] / "gz_onboard"
 
 # The parts of the package, lowest first. A part imports itself and those in the lines above its own.
 LAYERS = [
-    ["arrays", "background", "constants", "errors", "events", "notify", "progress", "state"],
+    ["arrays", "background", "constants", "errors", "events", "location_rows", "notify", "progress", "state"],
     ["options"],
     ["toml", "routes"],
     ["bus", "physics"],
@@ -28,6 +28,7 @@ LAYERS = [
     ["offline"],
     ["simulation"],
     ["lab", "dashboard"],
+    ["bridges"],
     ["daemon", "api"],
     ["cli", "__init__"],  # the latter has the names of the API, imported when first asked for
     ["__main__"],
@@ -43,7 +44,7 @@ FORBIDDEN = {
 }
 
 OFFLINE = ("offline", "simulation", "lab", "api")
-HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow"}
+HEAVY = {"numpy", "scipy", "matplotlib", "pandas", "filterpy", "asammdf", "pyarrow", "paho", "foxglove"}
 # Imported only when asked for, or for types: the reference filter behind --filter filterpy, the types of arrays.
 ON_REQUEST = {"estimator/ekf_filterpy.py", "arrays.py"}
 

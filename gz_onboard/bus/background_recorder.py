@@ -54,9 +54,9 @@ class BackgroundRecorder:
             self._left_out += len(batch)
             self._full = True
 
-    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object], seen_ns: int | None = None) -> None:
         """As that of `Recorder`; `values` may not be changed afterwards."""
-        if not self._thread.call(self._recorder.sample, topic, time_ns, values, weight=len(values)):
+        if not self._thread.call(self._recorder.sample, topic, time_ns, values, seen_ns, weight=len(values)):
             self._full = True
 
     def sync(self, now_ns: int) -> None:

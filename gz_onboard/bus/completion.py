@@ -106,9 +106,12 @@ class _Found:
                 elif opcode == Opcode.MESSAGE_INDEX:
                     if chunk is None:
                         continue  # of a chunk that is broken
-                    chunk.message_index_offsets[int.from_bytes(data[start : start + 2], "little")] = begin
+                    index, known = MessageIndex.read(_stream(data[start:end])), self._last_index
+                    if index.records != next((i.records for i in known if i.channel_id == index.channel_id), []):
+                        continue  # what a cut has left of it
+                    chunk.message_index_offsets[index.channel_id] = begin
                     chunk.message_index_length += end - begin
-                    if len(chunk.message_index_offsets) < len(self._last_index):
+                    if {i.channel_id for i in known} - chunk.message_index_offsets.keys():
                         continue  # cut off here, all are written again
                 else:
                     self._other(opcode, data[start:end], begin, end - begin)

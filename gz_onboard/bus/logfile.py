@@ -7,8 +7,9 @@ import json
 import math
 import os
 from collections.abc import Mapping, Sequence
+from operator import itemgetter
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeAlias
 
 from mcap.writer import CompressionType, Writer
 
@@ -22,6 +23,7 @@ BLOCK_NS = 1_000_000_000
 """A block holds at most this many frames and this much time: a reader that looks for a time relies on it."""
 
 _CHUNK_BYTES = 256 * 1024
+_Sample: TypeAlias = tuple[int, int, bytes, int]  # log time [ns], channel, data, time of publishing [ns]
 
 
 class LogFile:
@@ -44,6 +46,7 @@ class LogFile:
         self.flushed = False
         self._stream = stream
         self._pending: list[Frame] = []
+        self._held: list[_Sample] = []  # younger than the first of the pending frames
         self._channels: dict[str, int] = {}
         self._writer = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library=f"gz-onboard {__version__}")
@@ -70,13 +73,22 @@ class LogFile:
         while pending and (len(pending) >= BLOCK_FRAMES or abs(pending[-1][0] - pending[0][0]) >= BLOCK_NS):
             self._write_block(_block_length(pending))
 
-    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
-        """Log one JSON object on a declared topic; not-a-number and infinities become null."""
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object], seen_ns: int | None = None) -> None:
+        """Log one JSON object on a declared topic; not-a-number and infinities become null.
+
+        seen_ns: when it was so, if not at `time_ns`: the time of publishing, which may go back within a log. The time
+        of the log does not, as long as the clock is not set: what is younger than the first of the pending frames
+        waits for them.
+        """
         try:
             text = json.dumps(values, allow_nan=False, separators=(",", ":"))
         except ValueError:
             text = json.dumps(_without_nan(values), separators=(",", ":"))
-        self._writer.add_message(self._channels[topic], time_ns, text.encode(), time_ns)
+        sample = time_ns, self._channels[topic], text.encode(), time_ns if seen_ns is None else seen_ns
+        if self._pending and time_ns > self._pending[0][0]:
+            self._held.append(sample)
+        else:
+            self._write_sample(sample)
 
     def flush(self, *, to_disk: bool = False) -> None:
         """Write all that there is, so that it can be read though the file is cut off; to_disk: fsync as well."""
@@ -121,6 +133,16 @@ class LogFile:
             self._frames_channel, block[0][0], framelog.encode_block(block), publish_time=block[-1][0]
         )
         del self._pending[:count]
+        held, self._held = sorted(self._held, key=itemgetter(0)), []
+        for sample in held:
+            if self._pending and sample[0] > self._pending[0][0]:
+                self._held.append(sample)
+            else:
+                self._write_sample(sample)
+
+    def _write_sample(self, sample: _Sample) -> None:
+        time_ns, channel, data, seen_ns = sample
+        self._writer.add_message(channel, time_ns, data, seen_ns)
 
 
 def object_schema(title: str, units: Mapping[str, str]) -> dict[str, Any]:

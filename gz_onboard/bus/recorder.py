@@ -117,14 +117,17 @@ class Recorder:
         except Exception as error:  # of the disk; whatever else it may be, it costs this file and nothing more
             self._fail(error, now_ns)
 
-    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
-        """Log one JSON object on a topic declared by `channel`; raises KeyError for any other topic."""
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object], seen_ns: int | None = None) -> None:
+        """Log one JSON object on a topic declared by `channel`; raises KeyError for any other topic.
+
+        seen_ns: when it was so, if not at `time_ns`.
+        """
         self._channels[topic]
         file = self._open_file(time_ns)
         if file is None:
             return
         try:
-            file.sample(topic, time_ns, values)
+            file.sample(topic, time_ns, values, seen_ns)
         except Exception as error:
             self._fail(error, time_ns)
 

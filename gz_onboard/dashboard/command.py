@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from gz_onboard.bus.channel import CanChannel
@@ -20,17 +22,31 @@ LISTEN = "127.0.0.1:8000"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard dashboard``."""
     add = parser.add_argument
-    add_shared(parser, "--interface", "--channel")
-    add(
-        "--dbc",
-        default=RANGE_DBC,
-        metavar="FILE",
-        help="DBC file of the range frames, the vehicle's range_dbc (default: %(default)s)",
-    )
+    add_source(parser)
     add("--once", action="store_true", help="print one picture as soon as every message has come, and end")
-    add("--duration", type=number("--duration", *DURATIONS, "s"), metavar="S", help="end after this long")
     add("--web", action="store_true", help="serve a page for a browser instead of writing to the terminal")
     add("--listen", metavar="ADDRESS:PORT", help=f"where --web serves it (default: {LISTEN}; port 0: any free one)")
+
+
+def add_source(parser: argparse.ArgumentParser) -> None:
+    """The options of every command that shows range frames: where they come from, and for how long."""
+    add_shared(parser, "--interface", "--channel")
+    dbc = "DBC file of the range frames, the vehicle's range_dbc (default: %(default)s)"
+    parser.add_argument("--dbc", default=RANGE_DBC, metavar="FILE", help=dbc)
+    duration = number("--duration", *DURATIONS, "s")
+    parser.add_argument("--duration", type=duration, metavar="S", help="end after this long")
+
+
+@contextmanager
+def source_of(arguments: argparse.Namespace, others: Sequence[int] = ()) -> Iterator[tuple[View, CanChannel]]:
+    """The view, and the open channel of its frames and of those with the identifiers `others`."""
+    view = View(find_dbc(arguments.dbc, Path.cwd()))
+    channel = CanChannel(arguments.interface, arguments.channel, identifiers=[*view.identifiers, *others])
+    channel.open()
+    try:
+        yield view, channel
+    finally:
+        channel.close()
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -39,14 +55,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("--once and --web: use one of them; http://ADDRESS:PORT/api/latest is one picture as JSON")
     if arguments.listen and not arguments.web:
         raise InputError(f"--listen {arguments.listen}: only with --web")
-    view = View(find_dbc(arguments.dbc, Path.cwd()))
-    channel = CanChannel(arguments.interface, arguments.channel, identifiers=view.identifiers)
-    channel.open()
-    try:
+    with source_of(arguments) as (view, channel):
         if arguments.web:
             from gz_onboard.dashboard import web  # not for the terminal: a server is 2 MB
 
             return web.serve(view, channel, arguments.listen or LISTEN, arguments.duration)
         return terminal.show(view, channel, arguments.once, arguments.duration)
-    finally:
-        channel.close()

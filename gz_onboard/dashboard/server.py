@@ -249,21 +249,27 @@ class Handler(BaseHTTPRequestHandler):
         """Nothing: the journal is for what goes wrong."""
 
 
-def opened(listen: str, feed: Feed) -> Server:
-    """The server at `listen`, as ``127.0.0.1:8000`` or ``[::1]:8000``; InputError if that cannot be had."""
+def host_and_port(listen: str) -> tuple[str, int]:
+    """Of ``127.0.0.1:8000`` or ``[::1]:8000``; InputError for what is none."""
     host, _, port = listen.rpartition(":")
     bare = host[1:-1] if host.startswith("[") and host.endswith("]") else host
     if not host or not (port.isascii() and port.isdigit() and int(port) < 1 << 16) or (":" in bare and bare == host):
         raise InputError(f"--listen {listen}: must be ADDRESS:PORT, such as 127.0.0.1:8000 or [::1]:8000")
+    return bare, int(port)
+
+
+def opened(listen: str, feed: Feed) -> Server:
+    """The server at `listen`, as ``127.0.0.1:8000`` or ``[::1]:8000``; InputError if that cannot be had."""
+    host, port = host_and_port(listen)
     try:
-        return Server(bare, int(port), feed)
+        return Server(host, port, feed)
     except socket.gaierror as error:
         raise InputError(f"--listen {listen}: no such address: {error.strerror}") from error
     except OSError as error:
         if error.errno != errno.EADDRINUSE:
             raise InputError(f"--listen {listen}: {error.strerror}") from error
-        by = _who_has(bare, int(port))
-        other = f"{host}:{int(port) + 1 if int(port) < 65535 else 0}"
+        by = _who_has(host, port)
+        other = f"{listen.rpartition(':')[0]}:{port + 1 if port < 65535 else 0}"
         raise InputError(f"--listen {listen}: the port is taken{by}; give another one, such as {other}") from error
 
 

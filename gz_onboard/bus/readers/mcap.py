@@ -117,12 +117,12 @@ def json_channels(path: Path, data: Contents) -> dict[str, tuple[bytes, dict[str
 def samples(
     path: Path, data: Contents, damage: Damage, start: int | None, end: int | None
 ) -> Iterator[tuple[str, int, bytes]]:
-    """Topic, time [ns] and JSON text of the messages of the JSON topics."""
+    """Topic, time of publishing [ns] and JSON text of the messages of the JSON topics."""
     topics: dict[int, str] = {}
     for opcode, content in _unpacked_records(path, data, damage):
         try:
             if opcode == Opcode.MESSAGE:
-                channel, _, time_ns, _ = _MESSAGE.unpack_from(content)
+                channel, _, logged_ns, time_ns = _MESSAGE.unpack_from(content)
             elif opcode == Opcode.CHANNEL:
                 topic, position = _string(content, 4)
                 encoding, _ = _string(content, position)
@@ -132,8 +132,8 @@ def samples(
             damage.add("a record", str(error))
             continue
         if opcode == Opcode.MESSAGE and channel in topics:
-            if time_ns >= TIME_LIMIT_NS:
-                damage.add(f"a sample of {topics[channel]}", f"{time_ns} ns is no time")
+            if (latest := max(logged_ns, time_ns)) >= TIME_LIMIT_NS:
+                damage.add(f"a sample of {topics[channel]}", f"{latest} ns is no time")
             elif (start is None or time_ns >= start) and (end is None or time_ns < end):
                 yield topics[channel], time_ns, content[_MESSAGE.size :]
 

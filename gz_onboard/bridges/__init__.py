@@ -1,0 +1,1 @@
+"""What the range frames say, to who is not on the bus: an MQTT broker, Foxglove."""

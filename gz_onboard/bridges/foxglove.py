@@ -1,0 +1,100 @@
+"""``gz-onboard foxglove``: what the range frames say, live in Foxglove, on the topic and by the schema of the log."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import sys
+import time
+
+from gz_onboard import notify
+from gz_onboard.constants import WH
+from gz_onboard.dashboard.command import add_source, source_of
+from gz_onboard.dashboard.picture import Picture
+from gz_onboard.dashboard.pictures import pictures
+from gz_onboard.dashboard.server import host_and_port
+from gz_onboard.dashboard.stopping import until_signalled
+from gz_onboard.errors import OK, InputError, require
+from gz_onboard.events import RouteState
+from gz_onboard.log_rows import ESTIMATE_TOPIC, ESTIMATE_UNITS, estimate_schema
+
+LISTEN = "127.0.0.1:8765"
+UNKNOWN = "UNKNOWN"  # of state and activity, when nothing says so
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The options of ``gz-onboard foxglove``."""
+    add_source(parser)
+    listen = "where Foxglove finds it (default: %(default)s; port 0: any free one)"
+    parser.add_argument("--listen", metavar="ADDRESS:PORT", default=LISTEN, help=listen)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """``gz-onboard foxglove``: 0 when it is ended; InputError for what cannot be used."""
+    require("foxglove")
+    host, port = host_and_port(arguments.listen)
+    end = time.monotonic() + (arguments.duration or math.inf)
+    with source_of(arguments) as (view, channel), until_signalled() as stopped:
+        import foxglove
+
+        context = foxglove.Context()
+        estimates = foxglove.Channel(ESTIMATE_TOPIC, schema=estimate_schema(), context=context)
+        try:
+            server = foxglove.start_server(
+                name=f"gz-onboard {channel.name}", host=host, port=port, capabilities=[], context=context
+            )
+        except RuntimeError as error:  # an address that cannot be had
+            raise InputError(f"--listen {arguments.listen}: {error}") from error
+        try:
+            address = f"[{host}]" if ":" in host else host
+            _say(f"ws://{address}:{server.port} shows {channel.name} ({channel.interface})")
+            for new in pictures(view, channel, lambda: stopped() or time.monotonic() >= end):
+                estimates.log(encoded(new), log_time=time.time_ns())
+        finally:
+            notify.stopping()
+            server.stop()
+    return OK
+
+
+def _say(text: str) -> None:
+    if sys.stdout is not None:
+        print(f"foxglove: {text}", flush=True)
+    notify.ready(text)
+
+
+def encoded(picture: Picture) -> bytes:
+    """As a message of `ESTIMATE_TOPIC`."""
+    return json.dumps(row_of(picture), separators=(",", ":"), allow_nan=False).encode()
+
+
+def row_of(picture: Picture) -> dict[str, object]:
+    """A picture as an estimate stands in logs: SI units, None for what is stale or what no range frame says."""
+    charge, route, battery = picture.charge, picture.route, picture.battery
+    numbers = {
+        "soc": (battery.soc_percent, 0.01),
+        "soc_sd": (battery.soc_sigma_percent, 0.01),
+        "range": (picture.range.km, 1e3),
+        "range_p10": (picture.range.p10_km, 1e3),
+        "range_p90": (picture.range.p90_km, 1e3),
+        "energy_left": (battery.energy_left_wh, WH),
+        "consumption_recent": (picture.consumption.recent_wh_per_km, WH / 1e3),
+        "consumption_expected": (picture.consumption.expected_wh_per_km, WH / 1e3),
+        "charge_power": (charge.power_w if charge else None, 1.0),
+        "time_to_full": (charge.time_to_full_min if charge else None, 60.0),
+        "range_full": (charge.range_full_km if charge else None, 1e3),
+        "route_left": (route.left_km if route else None, 1e3),
+        "arrival_soc": (route.arrival_soc_percent if route else None, 0.01),
+        "arrival_soc_p10": (route.arrival_soc_p10_percent if route else None, 0.01),
+        "battery_ends_after": (route.battery_ends_after_km if route else None, 1e3),
+    }
+    row: dict[str, object] = dict.fromkeys(ESTIMATE_UNITS)
+    row |= {name: value if value is None else float(f"{value * unit:.7g}") for name, (value, unit) in numbers.items()}
+    on = RouteState.NONE if route is None else RouteState.ON if route.on_route else RouteState.OFF
+    return row | {
+        "state": (picture.state or UNKNOWN).upper(),
+        "reasons": " ".join(picture.reasons).upper(),
+        "activity": (picture.activity or UNKNOWN).upper(),
+        "route_state": on.name,
+        "distrusted": " ".join(picture.distrusted),
+    }

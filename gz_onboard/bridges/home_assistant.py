@@ -1,0 +1,153 @@
+"""What a broker is told: the values by name, and how Home Assistant finds and shows them.
+
+One topic has everything: ``gz-onboard/NAME/state``, a JSON object. It is also the last will, with nothing in it: the
+broker keeps no number of a vehicle that is gone.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from gz_onboard import __version__
+from gz_onboard.dashboard.picture import ALERTS, Picture
+from gz_onboard.events import Activity, State
+
+ONLINE, OFFLINE = "online", "offline"
+NONE = "none"  # of alerts and reasons, when all is well
+LONGEST = 255  # characters that Home Assistant takes as a state
+EXPIRES = 30  # s: a state that is older is no longer one of now, to the broker and to Home Assistant
+PREFIX = "homeassistant"  # where it looks, unless it is configured otherwise
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """One value. kind: Home Assistant's device class; options: all that a text may be."""
+
+    name: str
+    kind: str | None = None
+    unit: str | None = None
+    options: tuple[str, ...] = ()
+    digits: int | None = None  # that are shown
+    diagnostic: bool = False
+
+
+def _km(name: str) -> Sensor:
+    return Sensor(name, "distance", "km", digits=1)
+
+
+def _names(members: type[State] | type[Activity]) -> tuple[str, ...]:
+    return tuple(member.name.lower() for member in members)
+
+
+SENSORS = {
+    "range": _km("Range"),
+    "range_p10": _km("Range, surely (P10)"),
+    "range_p90": _km("Range, at best (P90)"),
+    "state_of_charge": Sensor("State of charge", "battery", "%", digits=0),
+    "state_of_charge_sigma": Sensor("State of charge, sigma", None, "%", digits=1, diagnostic=True),
+    "energy_left": Sensor("Energy left", "energy_storage", "Wh", digits=0),
+    "consumption_recent": Sensor("Consumption of the last kilometre", "energy_distance", "Wh/km", digits=1),
+    "consumption_expected": Sensor("Consumption expected", "energy_distance", "Wh/km", digits=1),
+    "charge_power": Sensor("Charging power", "power", "W", digits=0),
+    "time_to_full": Sensor("Time until full", "duration", "min", digits=0),
+    "range_full": _km("Range when full"),
+    "route_left": _km("Distance to the destination"),
+    "arrival_state_of_charge": Sensor("State of charge on arrival", "battery", "%", digits=0),
+    "rated_range": _km("Rated range"),
+    "activity": Sensor("Activity", "enum", options=_names(Activity)),
+    "state": Sensor("State of the estimate", "enum", options=_names(State)),
+    "alert": Sensor("Alert", "enum", options=(NONE, *ALERTS)),
+    "reasons": Sensor("Reasons", diagnostic=True),
+}
+"""By the names that they have in the state."""
+
+
+def topic_of(name: str) -> str:
+    """Where the state of the vehicle `name` is."""
+    return f"gz-onboard/{name}/state"
+
+
+def discovery_topic(name: str) -> str:
+    """Where Home Assistant learns of it."""
+    return f"{PREFIX}/device/gz-onboard-{name}/config"
+
+
+def state_of(picture: Picture, status: str) -> dict[str, object]:
+    """The values of a picture by name, None for what is stale, not available or never came."""
+    charge, route = picture.charge, picture.route
+    return {
+        "status": status,
+        "range": picture.range.km,
+        "range_p10": picture.range.p10_km,
+        "range_p90": picture.range.p90_km,
+        "state_of_charge": picture.battery.soc_percent,
+        "state_of_charge_sigma": picture.battery.soc_sigma_percent,
+        "energy_left": picture.battery.energy_left_wh,
+        "consumption_recent": picture.consumption.recent_wh_per_km,
+        "consumption_expected": picture.consumption.expected_wh_per_km,
+        "charge_power": charge.power_w if charge else None,
+        "time_to_full": charge.time_to_full_min if charge else None,
+        "range_full": charge.range_full_km if charge else None,
+        "route_left": route.left_km if route else None,
+        "arrival_state_of_charge": route.arrival_soc_percent if route else None,
+        "rated_range": picture.rated_km,
+        "activity": picture.activity,
+        "state": picture.state,
+        "alert": next(iter(picture.alerts), NONE) if status == ONLINE else None,
+        "reasons": _joined(picture.reasons) if picture.state else None,
+    }
+
+
+def _joined(reasons: Sequence[str]) -> str:
+    """As many as fit into a state."""
+    while len(text := ", ".join(reasons)) > LONGEST:
+        reasons = reasons[:-1]
+    return text or NONE
+
+
+def encoded(values: dict[str, object]) -> bytes:
+    """As one line of JSON."""
+    return json.dumps(values, separators=(",", ":"), allow_nan=False).encode()
+
+
+def discovery(name: str) -> dict[str, object]:
+    """What Home Assistant is told of the vehicle `name`: one device, and its sensors."""
+    return {
+        "device": {"identifiers": [f"gz-onboard-{name}"], "name": name, "manufacturer": "gz_onboard"},
+        "origin": {"name": "gz-onboard", "sw_version": __version__},
+        "state_topic": topic_of(name),
+        "components": {key: _component(name, key, sensor) for key, sensor in SENSORS.items()},
+    }
+
+
+def _component(name: str, key: str, sensor: Sensor) -> dict[str, object]:
+    """A sensor, available only while somebody is there who says it, and while there is something to say."""
+    there = f"value_json.status == '{ONLINE}' and value_json.{key} is not none"
+    about: dict[str, object] = {
+        "platform": "sensor",
+        "unique_id": f"gz-onboard-{name}-{key}",
+        "name": sensor.name,
+        "value_template": f"{{{{ value_json.{key} }}}}",
+        "availability": [
+            {
+                "topic": topic_of(name),
+                "value_template": f"{{{{ '{ONLINE}' if {there} else '{OFFLINE}' }}}}",
+                "payload_available": ONLINE,
+                "payload_not_available": OFFLINE,
+            }
+        ],
+        "expire_after": EXPIRES,
+    }
+    if sensor.kind:
+        about["device_class"] = sensor.kind
+    if sensor.unit:
+        about |= {"unit_of_measurement": sensor.unit, "state_class": "measurement"}
+    if sensor.options:
+        about["options"] = list(sensor.options)
+    if sensor.digits is not None:
+        about["suggested_display_precision"] = sensor.digits
+    if sensor.diagnostic:
+        about["entity_category"] = "diagnostic"
+    return about
