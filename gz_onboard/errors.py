@@ -82,9 +82,9 @@ def writable(text: str) -> str:
 
 
 def not_an_input(outputs: Iterable[Path | str | None], inputs: Iterable[Path]) -> None:
-    """InputError if a file to be written is an input, or the ``rides.json`` beside one, by whatever name.
+    """InputError if a file to be written is an input, or the ``rides.json`` beside one, or another output.
 
-    outputs: a name may be None, or ``-`` for standard output.
+    By whatever name. outputs: a name may be None, or ``-`` for standard output.
     """
     read = {
         identity: file
@@ -92,9 +92,14 @@ def not_an_input(outputs: Iterable[Path | str | None], inputs: Iterable[Path]) -
         for file in (given.parent / "rides.json", given)
         if (identity := _identity(file))
     }
+    written: dict[object, Path | str] = {}
     for out in outputs:
-        if out is not None and str(out) != "-" and (identity := _identity(out)) in read:
+        if out is None or str(out) == "-" or Path(out).is_char_device() or Path(out).is_fifo():
+            continue
+        if (identity := _identity(out)) in read:
             raise InputError(f"{out}: would overwrite the input {read[identity]}; give another name or folder")
+        if (other := written.setdefault(identity or Path(out).resolve(), out)) is not out:
+            raise InputError(f"{out}: would overwrite {other}, which is written too; give another name")
 
 
 def _identity(file: Path | str) -> tuple[int, int] | None:

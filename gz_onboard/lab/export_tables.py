@@ -69,6 +69,8 @@ def chosen(source: Source, known: Iterable[str]) -> set[str]:
     names = list(dict.fromkeys(known))
     if source.columns is None:
         return set(names)
+    if not source.columns:
+        raise InputError(f"--columns: names none; there are {', '.join(names) or 'none'}")
     plain = {name.partition("[")[0]: name for name in names} | {name: name for name in names}
     for name in source.columns:
         if name not in plain:

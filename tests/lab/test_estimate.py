@@ -264,8 +264,10 @@ def test_rides_of_the_same_name_in_several_folders(tmp_path, frames):
         candump(tmp_path / folder / "ride.log", frames[:2000])
     assert run(tmp_path / "a" / "ride.log", tmp_path / "b" / "ride.log", "--output", tmp_path, "--no-plot") == 0
     assert {f.name for f in tmp_path.glob("*.mcap")} == {"a-ride.estimate.mcap", "b-ride.estimate.mcap"}
-    (tmp_path / "a" / "ride.csv").touch()
-    assert run(tmp_path / "a" / "ride.log", tmp_path / "a" / "ride.csv", "--output", tmp_path) == 2
+    candump(tmp_path / "a" / "ride.csv", frames[:2000])
+    assert run(tmp_path / "a" / "ride.log", tmp_path / "a" / "ride.csv", "--output", tmp_path / "c", "--no-plot") == 0
+    assert {f.name for f in (tmp_path / "c").glob("*.mcap")} == {"ride.log.estimate.mcap", "ride.csv.estimate.mcap"}
+    assert run(tmp_path / "a" / "ride.log", tmp_path / "b" / ".." / "a" / "ride.log", "--output", tmp_path) == 2
 
 
 @pytest.mark.parametrize(

@@ -468,6 +468,8 @@ def test_columns_are_chosen_by_name_with_or_without_unit(tmp_path: Path, estimat
             ["out.csv", "--estimates", "--columns", "rnge"],
             r"has no column 'rnge' \(did you mean 'range'\?\); there are",
         ),
+        (["out.parquet", "--columns", ""], "--columns: names none; there are"),
+        (["out.csv", "--estimates", "--columns", " ,"], "--columns: names none; there are"),
         (["out.parquet", "--columns", "Voltag"], r"has no column 'Voltag' \(did you mean 'Voltage'\?\); there are"),
         (["out.blf", "--columns", "Voltage"], "--columns: are of estimates or signals"),
         (["out.mcap", "--columns", "Voltage"], "--columns: an .mcap has all"),
