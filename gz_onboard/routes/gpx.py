@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from xml.parsers import expat
 
 from gz_onboard.errors import InputError, shown
-from gz_onboard.routes.columns import LEAST_ROWS, Columns
+from gz_onboard.routes.columns import LEAST_ROWS, Columns, read_columns
 
 POINTS = ("trkpt", "rtept")  # a track is the road; a route may be the places on the way only
 Point = tuple[int, str, str, str]
@@ -51,6 +52,11 @@ class _Reader:
         elif kind in POINTS and self._at:
             self.points[kind].append(self._at)
             self._at = None
+
+
+def read_road(file: Path, known: Collection[str]) -> Columns:
+    """The columns of a road in a GPX file, or out of `known` in a CSV file. Raises InputError naming file and line."""
+    return read_gpx(file) if file.suffix.lower() == ".gpx" else read_columns(file, known)
 
 
 def read_gpx(file: Path) -> Columns:

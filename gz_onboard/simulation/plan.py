@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.offline.arguments import check_fields
 from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.options import LOG_SUFFIXES
@@ -125,6 +125,8 @@ def _kind(path: Path) -> str:
     """``ride``, ``route``, ``cycle``: of a CSV file by its first line, else by its name."""
     if path.suffix.lower() in _LOGS:
         return "ride"
+    if path.suffix.lower() == ".gpx":
+        return "route"
     if path.suffix.lower() != ".csv" or not path.is_file():
         return "cycle"
     with path.open(encoding="utf-8-sig", errors="replace") as file:
@@ -137,7 +139,7 @@ def _kind(path: Path) -> str:
         return "ride"
     known = ("time_s", "distance_m", "latitude_deg")
     raise InputError(
-        f"{path}:1: the columns {', '.join(header[:6])} are neither those of a cycle (time_s and speed_mps, "
+        f"{path}:1: the columns {shown(header[:6])} are neither those of a cycle (time_s and speed_mps, "
         "speed_kmh or speed_mph) nor of a route (distance_m or latitude_deg and longitude_deg; altitude_m)"
         f"{nearest(header[0], known)}"
     )

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard simulate``."""
     explain_keys(parser, "the summary", SUMMARY_VERSION, KEYS)
     add = parser.add_argument
-    what = "name of a built-in drive cycle, CSV file of a cycle or a route, or log of a recorded ride to be replayed"
+    what = "name of a built-in drive cycle, CSV of a cycle, CSV or GPX of a route, or log of a ride to be replayed"
     add("what", metavar="WHAT", help=what)
     add_shared(parser, "--vehicle", "--payload")
     charge = "state of charge at the start (default: 1; of a recorded ride, as recorded)"
