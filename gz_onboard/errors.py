@@ -19,6 +19,7 @@ EXIT_STATUSES = {
 }
 """What the exit status of a command means."""
 _DISK_FAILED = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+CLOSE, CLOSE_SHORT = 0.55, 0.5  # difflib's ratio of two names from which one may be meant; of up to three letters
 LONGEST_NAME = 100  # beyond it no near name is looked for, which takes the square of the length
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict = 3, 8, 4
@@ -61,11 +62,18 @@ def nearest(name: str, known: Iterable[str]) -> str:
     """`` (did you mean 'x'?)`` for the known name nearest to `name`, or an empty string."""
     if not 0 < len(name) <= LONGEST_NAME:
         return ""
-    names = list(known)
-    match = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    if not match:  # the same letters in another case, or a part of a name
-        match = [n for n in names if name.lower() in n.lower() or n.lower() in name.lower()][:1]
-    return f" (did you mean {match[0]!r}?)" if match else ""
+    names = {each.lower(): each for each in known}
+    match = difflib.get_close_matches(name.lower(), names, n=1, cutoff=CLOSE if len(name) > 3 else CLOSE_SHORT)
+    if not match:  # a part of a name, or a name with more about it
+        match = [each for each in names if name.lower() in each or each in name.lower()][:1]
+    return f" (did you mean {names[match[0]]!r}?)" if match else ""
+
+
+def near_file(file: Path) -> str:
+    """As `nearest`, of the files beside it, for a file that is not there."""
+    with suppress(OSError):
+        return "" if file.exists() else nearest(file.name, sorted(one.name for one in file.parent.iterdir()))
+    return ""
 
 
 def shown(value: object) -> str:
@@ -74,6 +82,12 @@ def shown(value: object) -> str:
         return _SHORT.repr(value)
     except ValueError:  # Python does not write out an integer of thousands of digits
         return "a number of thousands of digits"
+
+
+def brief(self: object) -> str:
+    """As `__repr__` of a dataclass that holds much: each field in the length that fits into a line."""
+    values = (f"{name}={shown(getattr(self, name))}" for name in getattr(self, "__dataclass_fields__", ()))
+    return f"{type(self).__name__}({', '.join(values)})"
 
 
 def writable(text: str) -> str:

@@ -48,6 +48,17 @@ def test_a_result_prints_as_its_command_and_is_short_otherwise(tmp_path, capsys)
     assert len(repr(simulated)) < 5000
 
 
+def test_nothing_of_the_api_shows_thousands_of_numbers():
+    found, ride = gz.discover(LOGS / "city_34C.blf"), gz.estimate(COASTDOWN)
+    bench = gz.calibrate([LOGS / "calibration" / "motor_dyno.csv.gz"], procedure="motor")
+    simulated = gz.simulate("ece15")
+    told = [gz.read_vehicle("reference"), gz.read_ride(COASTDOWN), ride.estimates, found, found.report, found.found]
+    for one in [*told, simulated.run, *bench.results]:
+        assert repr(one).startswith(f"{type(one).__name__}(")
+        assert 40 < len(repr(one)) < 3000
+    assert "verdict='ambiguous'" in repr(found)
+
+
 def test_the_names_are_those_of_the_api():
     assert sorted(set(gz.__all__) - {"__version__"}) == sorted(api.__all__)
     assert set(gz.__all__) <= set(dir(gz))

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from gz_onboard.api.given import PathLike, Signals, VehicleLike, read_ride, vehicle_of
-from gz_onboard.errors import not_an_input, writing
+from gz_onboard.errors import brief, not_an_input, writing
 from gz_onboard.lab.calibrate.vehicle_file import vehicle_output
 from gz_onboard.lab.discover import command as discovery
 from gz_onboard.lab.discover.command import DiscoveryOptions
@@ -28,10 +28,12 @@ _CAUSE = ("name", "parameter", "value", "unit", "ci95_low", "ci95_high", "change
 class Discovered(Tabular):
     """What rides show that the model of the vehicle does not. found: with the rides it was reached on."""
 
-    report: Report = field(repr=False)
-    vehicle: Vehicle = field(repr=False)
-    found: Discovery = field(repr=False)
-    read: Sequence[Path] = field(repr=False, default=())  # files, which are not written over
+    report: Report
+    vehicle: Vehicle
+    found: Discovery
+    read: Sequence[Path] = ()  # files, which are not written over
+
+    __repr__ = brief
 
     def to_table(self) -> Columns:
         """A row for each cause that was named."""

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from gz_onboard.api.given import PathLike, Signals, VehicleLike, source_of, vehicle_of
+from gz_onboard.errors import brief
 from gz_onboard.lab import estimate_table, export_tables
 from gz_onboard.lab.estimate import summary_text
 from gz_onboard.lab.estimate_ride import How, RideSummary, open_estimate, ride_through, summary_of
@@ -24,9 +25,11 @@ from gz_onboard.routes.ahead import read_ahead
 class LoggedEstimates(Tabular):
     """The estimates in a log. columns: of each field of the `rows` the column; times: [ns since the epoch]."""
 
-    columns: Mapping[str, str] = field(repr=False)
-    times: Sequence[int] = field(repr=False)
-    rows: Sequence[Mapping[str, object]] = field(repr=False)
+    columns: Mapping[str, str]
+    times: Sequence[int]
+    rows: Sequence[Mapping[str, object]]
+
+    __repr__ = brief
 
     def to_table(self) -> Columns:
         """A row for each estimate, with the columns that ``gz-onboard export --estimates`` writes."""

@@ -50,9 +50,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--reset",
         choices=(*BATTERY, RIDING, "all"),
-        help="forget this, as after a new battery; the daemon must not run",
+        help="forget this, as after a new battery or for a new owner; the daemon must not run",
     )
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="write a picture of it: PNG, SVG or PDF")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it: PNG, SVG or PDF")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, cast
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.logs import LogDamage, is_table, read_frames
 from gz_onboard.bus.mapping import BusMapping
-from gz_onboard.errors import InputError, nearest, shown
+from gz_onboard.errors import InputError, brief, nearest, shown
 from gz_onboard.events import INSTRUMENTS, ROLES, Event, Frame
 from gz_onboard.offline.arguments import check, within
 from gz_onboard.offline.signal_table import SignalTable, read_table, signal_frames
@@ -47,6 +47,8 @@ class Samples:
     name: str
     columns: dict[str, tuple[Array, Array]]
     facts: dict[str, object] = field(default_factory=dict)
+
+    __repr__ = brief
 
     def __post_init__(self) -> None:
         check("name", self.name, str)

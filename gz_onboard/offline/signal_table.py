@@ -36,6 +36,7 @@ _COLUMN = re.compile(r"\s*(?P<name>.*?)\s*(?:[\[(]\s*(?P<unit>[^\])]*?)\s*[\])])
 _TIME = re.compile(r"\s*(?:time|timestamp|t)(?:(?:_|\s+|\s*[\[(]\s*)(?P<unit>s|ms)\s*[\])]?)?\s*", re.I)
 _SECONDS = {"s": 1.0, "ms": 1e-3}
 _ALSO = {"speed": "vehicle_speed"}
+_WORDS = {"battery": "pack", "soc": "bms_state_of_charge", "temp": "temperature", "velocity": "speed"}
 _MISSING = ("", "nan", "null", "none", "n/a")
 _LAST = ("motor_speed", "inverter_voltage", "pack_voltage")  # the estimator makes its step with the last that is there
 _VALUE = Struct("<d")
@@ -266,15 +267,21 @@ def _database(file: Path, columns: Sequence[_Column]) -> Database:
     return database
 
 
+def _in_our_words(name: str) -> str:
+    """A name with the words of our roles for those of others."""
+    return "_".join(_WORDS.get(word, word) for word in name.lower().split("_"))
+
+
 def _by_role(file: Path, columns: Sequence[_Column]) -> tuple[Source, ...]:
     """The source of each role, from columns that have the roles' names."""
     sources: dict[str, Source] = {}
     for column in columns:
         role = _ALSO.get(column.name, column.name)
         if role not in ROLES:
+            meant = nearest(_in_our_words(role), (*_ALSO, *ROLES))
             raise InputError(
-                f"{file}:1: column {column.name!r} is no role{nearest(role, ROLES)}; rename it, leave it out, "
-                "or name it in the [roles] of a vehicle file without dbc"
+                f"{file}:1: column {column.name!r} is no role{meant}; rename it, leave it out, or name it in the "
+                "[roles] of a vehicle file without dbc"
             )
         if role in sources:
             raise InputError(f"{file}:1: columns {sources[role].signal!r} and {column.name!r} are both {role}")

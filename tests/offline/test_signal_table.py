@@ -122,6 +122,9 @@ def test_parquet(tmp_path, monkeypatch):
     ("old", "new", "parts"),
     [
         ("pack_current [mA]", "pack_curent [mA]", [":1:", "'pack_curent' is no role", "did you mean 'pack_current'"]),
+        ("pack_current [mA]", "battery_current [mA]", ["did you mean 'pack_current'"]),
+        ("pack_current [mA]", "soc [%]", ["did you mean 'bms_state_of_charge'"]),
+        ("speed [km/h]", "Speed [km/h]", ["did you mean 'speed'"]),
         ("pack_current [mA]", "pack_current [V]", [":1:", "'pack_current' has unit 'V'", "one of A, mA"]),
         ("pack_current [mA]", "pack_current", [":1:", "'pack_current' has no unit", "pack_current [A]"]),
         ("pack_current [mA]", "pack_voltage [V]", [":1:", "two columns are called 'pack_voltage'"]),

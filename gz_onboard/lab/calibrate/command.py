@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.bus.logs import logs_among
-from gz_onboard.errors import OK, InputError, nearest, not_an_input, writing
+from gz_onboard.errors import OK, InputError, near_file, nearest, not_an_input, writing
 from gz_onboard.lab.calibrate import manifest, report
 from gz_onboard.lab.calibrate.manifest import Option, Step, check_count
 from gz_onboard.lab.calibrate.prior_check import check_against_file
@@ -242,8 +242,7 @@ def step_of(name: str, files: Mapping[str, Sequence[Path]], options: Mapping[str
         check_count(name, slot, needed, len(found.get(slot, ())))
     for file in (file for group in found.values() for file in group):
         if not file.is_file():
-            there = [p.name for p in file.parent.glob("*")] if file.parent.is_dir() else []
-            raise InputError(f"{file}: no such file{nearest(file.name, there)}")
+            raise InputError(f"{file}: no such file{near_file(file)}")
     return Step(name, {slot: tuple(group) for slot, group in found.items()}, {}, dict(options))
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gz_onboard.bus.logs import log_suffix, logs_among
-from gz_onboard.errors import InputError, nearest, not_an_input, writing
+from gz_onboard.errors import InputError, near_file, nearest, not_an_input, writing
 from gz_onboard.lab.calibrate.vehicle_file import vehicle_output
 from gz_onboard.lab.discover.baseline import baseline
 from gz_onboard.lab.discover.baseline_file import write_baseline
@@ -211,7 +211,7 @@ def find_logs(paths: Sequence[Path]) -> list[Path]:
         raise InputError("no ride is given; gz-onboard discover --list prints what could be found in one")
     for log in logs:
         if not log.is_file():
-            raise InputError(f"{log}: no such log")
+            raise InputError(f"{log}: no such log{near_file(log)}")
         log_suffix(log)
     return logs
 
