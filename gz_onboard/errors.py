@@ -20,6 +20,7 @@ EXIT_STATUSES = {
 """What the exit status of a command means."""
 _DISK_FAILED = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 CLOSE, CLOSE_SHORT = 0.55, 0.5  # difflib's ratio of two names from which one may be meant; of up to three letters
+CLOSE_FILE = 0.75  # likewise of files, which have endings in common
 LONGEST_NAME = 100  # beyond it no near name is looked for, which takes the square of the length
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict = 3, 8, 4
@@ -58,13 +59,14 @@ def lacking_extra(error: ModuleNotFoundError) -> str | None:
     return None
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """`` (did you mean 'x'?)`` for the known name nearest to `name`, or an empty string."""
+def nearest(name: str, known: Iterable[str], close: float | None = None) -> str:
+    """`` (did you mean 'x'?)`` for the known name nearest to `name`, or an empty string; close: of `CLOSE`."""
     if not 0 < len(name) <= LONGEST_NAME:
         return ""
     names = {each.lower(): each for each in known}
-    match = difflib.get_close_matches(name.lower(), names, n=1, cutoff=CLOSE if len(name) > 3 else CLOSE_SHORT)
-    if not match:  # a part of a name, or a name with more about it
+    enough = close or (CLOSE if len(name) > 3 else CLOSE_SHORT)
+    match = difflib.get_close_matches(name.lower(), names, n=1, cutoff=enough)
+    if not match and not close:  # a part of a name, or a name with more about it
         match = [each for each in names if name.lower() in each or each in name.lower()][:1]
     return f" (did you mean {names[match[0]]!r}?)" if match else ""
 
@@ -72,7 +74,7 @@ def nearest(name: str, known: Iterable[str]) -> str:
 def near_file(file: Path) -> str:
     """As `nearest`, of the files beside it, for a file that is not there."""
     with suppress(OSError):
-        return "" if file.exists() else nearest(file.name, sorted(one.name for one in file.parent.iterdir()))
+        return "" if file.exists() else nearest(file.name, (one.name for one in file.parent.iterdir()), CLOSE_FILE)
     return ""
 
 
@@ -96,7 +98,7 @@ def writable(text: str) -> str:
 
 
 def not_an_input(outputs: Iterable[Path | str | None], inputs: Iterable[Path]) -> None:
-    """InputError if a file to be written is an input, or the ``rides.json`` beside one, or another output.
+    """InputError if a file to be written is an input, or the ``rides.json`` beside one, or another output, or a folder.
 
     By whatever name. outputs: a name may be None, or ``-`` for standard output.
     """
@@ -110,6 +112,8 @@ def not_an_input(outputs: Iterable[Path | str | None], inputs: Iterable[Path]) -
     for out in outputs:
         if out is None or str(out) == "-" or Path(out).is_char_device() or Path(out).is_fifo():
             continue
+        if Path(out).is_dir():
+            raise InputError(f"{out}: is a folder; give the name of a file")
         if (identity := _identity(out)) in read:
             raise InputError(f"{out}: would overwrite the input {read[identity]}; give another name or folder")
         if (other := written.setdefault(identity or Path(out).resolve(), out)) is not out:

@@ -228,6 +228,7 @@ def test_a_simulation_is_that_of_the_command(tmp_path, capsys):
         ({"repeat": 0}, "repeat 0: must be 1 to 1000"),
         ({"repeat": 2.5}, "repeat 2.5: must be a whole number"),
         ({"until_empty": "no"}, "until_empty 'no': must be True or False"),
+        ({"until_empty": True, "repeat": 2}, "repeat 2: it is repeated until_empty"),
         ({"dyno": 180}, "dyno 180: must be a text or None"),
         ({"dyno": "180,5"}, "--dyno 180,5: must be KG or KG,A,B,C"),
         ({"chassis": "plannar"}, "did you mean 'planar'"),

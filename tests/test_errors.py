@@ -31,4 +31,5 @@ def test_the_nearest_name_is_named_if_there_is_one(name, known, meant):
 def test_the_nearest_file_is_named_for_one_that_is_not_there(tmp_path: Path):
     (tmp_path / "coastdown.blf").touch()
     assert near_file(tmp_path / "coastdwn.blf") == " (did you mean 'coastdown.blf'?)"
+    assert near_file(tmp_path / "other.blf") == ""
     assert near_file(tmp_path / "coastdown.blf") == near_file(tmp_path / "nowhere" / "x") == ""

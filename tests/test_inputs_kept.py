@@ -84,6 +84,14 @@ def test_no_output_is_written_over_another(folder: Path, capsys: pytest.CaptureF
     assert {file.name for file in folder.iterdir()} == before
 
 
+def test_no_output_is_a_folder(folder: Path, capsys: pytest.CaptureFixture[str]):
+    before = {file.name for file in folder.iterdir()}
+    for arguments in (["estimate", "ride.blf", "--json=."], [*CALIBRATE, "--report", "."]):
+        assert main(arguments) == 2
+        assert ".: is a folder; give the name of a file" in capsys.readouterr().err
+    assert {file.name for file in folder.iterdir()} == before
+
+
 def test_devices_are_no_files(folder: Path):
     outputs = ["--json=/dev/null", "--markdown", "/dev/null"]
     assert main(["validate", "ride.blf", "--no-plot", *outputs, "--output", "new", "--quiet"]) == 0

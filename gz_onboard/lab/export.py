@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--table-format {arguments.table_format}: is for a folder of tables, and {out} is a file")
     if arguments.dbc and arguments.vehicle:
         raise InputError(f"--vehicle {arguments.vehicle}: has DBC files of its own; leave out --dbc")
-    not_an_input([out], [log, *(arguments.dbc or [])])
+    not_an_input([out] if suffix else [], [log, *(arguments.dbc or [])])
     source = Source(log, arguments.start, arguments.end, arguments.columns)
     with whole(out, suffix) as part:
         told = _write(arguments, source, part, suffix)

@@ -60,6 +60,8 @@ class SimulationOptions:
 
     def __post_init__(self) -> None:
         check_fields(self, RANGES)
+        if self.until_empty and self.repeat != 1:
+            raise InputError(f"repeat {self.repeat}: it is repeated until_empty")
         if self.dyno is not None:
             dynamometer(self.dyno)
         if self.chassis not in MODELS:
