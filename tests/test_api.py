@@ -254,6 +254,11 @@ def test_options_of_a_discovery_are_checked(options, said):
         gz.DiscoveryOptions(**options)
 
 
+def test_samples_may_be_lists():
+    ride = anyhow.Samples("x", {"vehicle_speed": ([0, 1], [3, 4])})
+    assert [one.dtype for one in ride.columns["vehicle_speed"]] == [float, float]
+
+
 def test_numbers_of_numpy_are_numbers():
     assert repr(anyhow.SimulationOptions(soc=np.float32(0.5), repeat=np.int64(2))) == repr(
         gz.SimulationOptions(soc=0.5, repeat=2)

@@ -53,8 +53,8 @@ class Samples:
     def __post_init__(self) -> None:
         check("name", self.name, str)
         check("columns", self.columns, Mapping[str, object])
-        for role, column in self.columns.items():
-            _check_column(f"{self.name}: {role}", role, column)
+        columns = {role: _column(f"{self.name}: {role}", role, column) for role, column in self.columns.items()}
+        object.__setattr__(self, "columns", columns)
         object.__setattr__(self, "facts", checked_facts(self.name, self.facts))
 
     @property
@@ -167,19 +167,23 @@ def checked_facts(place: str, facts: object) -> dict[str, object]:
     return known
 
 
-def _check_column(place: str, role: str, column: object) -> None:
-    """InputError if a column is not (times, values): two arrays of numbers of one length, the times increasing."""
+def _column(place: str, role: str, column: object) -> tuple[Array, Array]:
+    """(times, values) of a role; InputError if these are not two arrays of numbers of one length, times increasing."""
     import numpy as np
 
     if role not in ROLES and role not in INSTRUMENTS:
         raise InputError(f"{place}: is no role{nearest(role, (*ROLES, *INSTRUMENTS))}")
     if not isinstance(column, tuple | list) or len(column) != 2:
         raise InputError(f"{place}: must be two arrays, times [s] and values, is {shown(column)}")
-    time, values = (np.asarray(one) for one in column)
+    try:
+        time, values = (np.asarray(one) for one in column)
+    except ValueError:  # rows of unlike lengths
+        time, values = np.zeros(1), np.zeros(2)
     if time.shape != values.shape or time.ndim != 1 or not {time.dtype.kind, values.dtype.kind} <= set("fiu"):
         raise InputError(f"{place}: must be two arrays of numbers of one length, times [s] and values")
     if not (np.diff(time) >= 0).all():
         raise InputError(f"{place}: its times do not increase")
+    return time.astype(float, copy=False), values.astype(float, copy=False)
 
 
 def ride_name(log: Path) -> str:
