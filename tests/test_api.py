@@ -16,6 +16,8 @@ import pytest
 
 import gz_onboard as gz
 from gz_onboard import api, cli
+from gz_onboard.bus.logs import read_frames
+from gz_onboard.bus.writers import write_candump
 from tests.support import LOGS, ROOT
 
 PAGE = ROOT / "docs/python.md"
@@ -257,6 +259,15 @@ def test_options_of_a_discovery_are_checked(options, said):
 def test_samples_may_be_lists():
     ride = anyhow.Samples("x", {"vehicle_speed": ([0, 1], [3, 4])})
     assert [one.dtype for one in ride.columns["vehicle_speed"]] == [float, float]
+
+
+def test_frames_that_overtake_each_other_by_a_little_are_a_ride(tmp_path):
+    frames = [frame for batch in read_frames(COASTDOWN) for frame in batch][:4000]
+    late = [(t - 40_000_000 * (n % 5 == 4), i, data, ch) for n, (t, i, data, ch) in enumerate(frames)]
+    with (tmp_path / "ride.log").open("w") as stream:
+        write_candump(stream, [late])
+    ride = gz.read_ride(tmp_path / "ride.log")
+    assert min(np.diff(times).min() for times, _ in ride.columns.values()) < 0
 
 
 def test_numbers_of_numpy_are_numbers():

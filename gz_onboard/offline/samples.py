@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from gz_onboard.bus.codec import Codec
+from gz_onboard.bus.codec import BACK_NS, Codec
 from gz_onboard.bus.logs import LogDamage, is_table, read_frames
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.errors import InputError, brief, nearest, shown
@@ -181,7 +181,7 @@ def _column(place: str, role: str, column: object) -> tuple[Array, Array]:
         time, values = np.zeros(1), np.zeros(2)
     if time.shape != values.shape or time.ndim != 1 or not {time.dtype.kind, values.dtype.kind} <= set("fiu"):
         raise InputError(f"{place}: must be two arrays of numbers of one length, times [s] and values")
-    if not (np.diff(time) >= 0).all():
+    if not (np.diff(time) >= -1e-9 * BACK_NS).all():
         raise InputError(f"{place}: its times do not increase")
     return time.astype(float, copy=False), values.astype(float, copy=False)
 
