@@ -17,7 +17,7 @@ from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, Inp
 
 COMMANDS = {
     "run": ("gz_onboard.daemon.command", "estimate the range from a live bus and publish it (the daemon)"),
-    "learned": ("gz_onboard.daemon.learned", "show what the daemon has learned of the battery, or forget it"),
+    "learned": ("gz_onboard.daemon.learned", "show what the daemon has learned of battery and riding, or forget it"),
     "route": ("gz_onboard.daemon.route", "give the running daemon the route that is to be ridden, or take it away"),
     "dashboard": ("gz_onboard.dashboard.command", "show the range that the daemon sends, in a terminal or a browser"),
     "mqtt": ("gz_onboard.bridges.mqtt", "give the range that the daemon sends to an MQTT broker, for Home Assistant"),

@@ -20,6 +20,8 @@ EXIT_STATUSES = {
 """What the exit status of a command means."""
 _PACKAGES = {"paho": "paho-mqtt", "foxglove": "foxglove-sdk"}  # that are not named as their modules
 _DISK_FAILED = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
+CLOSE, CLOSE_SHORT = 0.55, 0.5  # difflib's ratio of two names from which one may be meant; of up to three letters
+CLOSE_FILE = 0.75  # likewise of files, which have endings in common
 LONGEST_NAME = 100  # beyond it no near name is looked for, which takes the square of the length
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxdict = 3, 8, 4
@@ -59,15 +61,23 @@ def lacking_extra(error: ModuleNotFoundError) -> str | None:
     return None
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """`` (did you mean 'x'?)`` for the known name nearest to `name`, or an empty string."""
+def nearest(name: str, known: Iterable[str], close: float | None = None) -> str:
+    """`` (did you mean 'x'?)`` for the known name nearest to `name`, or an empty string; close: of `CLOSE`."""
     if not 0 < len(name) <= LONGEST_NAME:
         return ""
-    names = list(known)
-    match = difflib.get_close_matches(name, names, n=1, cutoff=0.5)
-    if not match:  # the same letters in another case, or a part of a name
-        match = [n for n in names if name.lower() in n.lower() or n.lower() in name.lower()][:1]
-    return f" (did you mean {match[0]!r}?)" if match else ""
+    names = {each.lower(): each for each in known}
+    enough = close or (CLOSE if len(name) > 3 else CLOSE_SHORT)
+    match = difflib.get_close_matches(name.lower(), names, n=1, cutoff=enough)
+    if not match and not close:  # a part of a name, or a name with more about it
+        match = [each for each in names if name.lower() in each or each in name.lower()][:1]
+    return f" (did you mean {names[match[0]]!r}?)" if match else ""
+
+
+def near_file(file: Path) -> str:
+    """As `nearest`, of the files beside it, for a file that is not there."""
+    with suppress(OSError):
+        return "" if file.exists() else nearest(file.name, (one.name for one in file.parent.iterdir()), CLOSE_FILE)
+    return ""
 
 
 def shown(value: object) -> str:
@@ -78,15 +88,21 @@ def shown(value: object) -> str:
         return "a number of thousands of digits"
 
 
+def brief(self: object) -> str:
+    """As `__repr__` of a dataclass that holds much: each field in the length that fits into a line."""
+    values = (f"{name}={shown(getattr(self, name))}" for name in getattr(self, "__dataclass_fields__", ()))
+    return f"{type(self).__name__}({', '.join(values)})"
+
+
 def writable(text: str) -> str:
     """`text` without what no encoding has: the bytes of a file's name that are not UTF-8."""
     return text.encode("utf-8", "replace").decode()
 
 
 def not_an_input(outputs: Iterable[Path | str | None], inputs: Iterable[Path]) -> None:
-    """InputError if a file to be written is an input, or the ``rides.json`` beside one, by whatever name.
+    """InputError if a file to be written is an input, or the ``rides.json`` beside one, or another output, or a folder.
 
-    outputs: a name may be None, or ``-`` for standard output.
+    By whatever name. outputs: a name may be None, or ``-`` for standard output.
     """
     read = {
         identity: file
@@ -94,9 +110,16 @@ def not_an_input(outputs: Iterable[Path | str | None], inputs: Iterable[Path]) -
         for file in (given.parent / "rides.json", given)
         if (identity := _identity(file))
     }
+    written: dict[object, Path | str] = {}
     for out in outputs:
-        if out is not None and str(out) != "-" and (identity := _identity(out)) in read:
+        if out is None or str(out) == "-" or Path(out).is_char_device() or Path(out).is_fifo():
+            continue
+        if Path(out).is_dir():
+            raise InputError(f"{out}: is a folder; give the name of a file")
+        if (identity := _identity(out)) in read:
             raise InputError(f"{out}: would overwrite the input {read[identity]}; give another name or folder")
+        if (other := written.setdefault(identity or Path(out).resolve(), out)) is not out:
+            raise InputError(f"{out}: would overwrite {other}, which is written too; give another name")
 
 
 def _identity(file: Path | str) -> tuple[int, int] | None:

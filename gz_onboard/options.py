@@ -17,6 +17,7 @@ MOST_PAYLOAD = 3000.0  # kg, of a van
 MOST_SEED = 2**32 - 1
 LONGEST_LOG = 1e9  # s, thirty years
 CHANNEL = "can0"
+FILTERS = ("scalar", "filterpy")
 
 
 def number(
@@ -69,7 +70,7 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "--effects": ("folder with effects of your own: Python code you trust", {"type": Path, "metavar": "DIR"}),
     "--filter": (
         "implementation of the SOC filter (default: %(default)s)",
-        {"default": "scalar", "choices": ("scalar", "filterpy")},
+        {"default": FILTERS[0], "choices": FILTERS},
     ),
     "--interface": ("interface of python-can (default: %(default)s)", {"default": "socketcan", "metavar": "NAME"}),
     "--channel": ("channel (default: %(default)s)", {"default": CHANNEL, "metavar": "NAME"}),

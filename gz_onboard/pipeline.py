@@ -15,6 +15,7 @@ from gz_onboard.bus.layout import identifier_of
 from gz_onboard.bus.mapping import pgn
 from gz_onboard.bus.publisher import KNOWN, MESSAGES, Counts, Publisher
 from gz_onboard.constants import BENCH_TEMPERATURE, WH
+from gz_onboard.errors import InputError, nearest
 from gz_onboard.estimator import reasons
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.estimator import Estimator
@@ -33,6 +34,7 @@ from gz_onboard.log_rows import (
     explanation_row,
     reason_names,
 )
+from gz_onboard.options import FILTERS
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.vehicle import Vehicle
 
@@ -48,8 +50,10 @@ DROPPING = (LENGTH, CRC, COUNTER, TIME, UNDECODABLE)  # reasons that drop a fram
 
 
 def filter_maker(name: str) -> FilterMaker:
-    """The backend of the SOC filter: ``scalar`` or ``filterpy``; the second imports numpy and scipy."""
-    if name != "filterpy":
+    """The backend of the SOC filter, of `FILTERS`; ``filterpy`` imports numpy and scipy. InputError for another."""
+    if name not in FILTERS:
+        raise InputError(f"filter {name!r}: must be {' or '.join(FILTERS)}{nearest(name, FILTERS)}")
+    if name == "scalar":
         return ScalarFilter
     from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 

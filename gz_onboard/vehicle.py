@@ -10,7 +10,7 @@ from pathlib import Path
 from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.mapping import BusMapping, read_mapping
 from gz_onboard.bus.publisher import GROUP_STEP, MESSAGES, MOST_EXTENDED, MOST_STANDARD, RANGE_DBC, Publisher
-from gz_onboard.errors import InputError, nearest, shown
+from gz_onboard.errors import InputError, brief, nearest, shown
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.battery_file import read_battery
 from gz_onboard.physics.derating import Derating, read_derating
@@ -42,6 +42,8 @@ class Vehicle:
     derating: Derating = field(default_factory=Derating)
     range_identifier: int | None = None  # of the first range frame, in place of that in `range_dbc`
     healthy: object = None  # what the discovery learned of it on healthy rides
+
+    __repr__ = brief
 
     @property
     def key(self) -> str:

@@ -16,10 +16,13 @@ import pytest
 
 import gz_onboard as gz
 from gz_onboard import api, cli
+from gz_onboard.bus.logs import read_frames
+from gz_onboard.bus.writers import write_candump
 from tests.support import LOGS, ROOT
 
 PAGE = ROOT / "docs/python.md"
 COASTDOWN = LOGS / "coastdown.blf"
+anyhow: Any = gz  # for what a type checker would refuse
 BLOCK = re.compile(r"^```python\n(.*?)^```(?:\n\n```text\n(.*?)^```)?", re.M | re.S)
 
 
@@ -45,6 +48,17 @@ def test_a_result_prints_as_its_command_and_is_short_otherwise(tmp_path, capsys)
     simulated = gz.simulate("ece15")
     assert "rolling resistance" in str(simulated)
     assert len(repr(simulated)) < 5000
+
+
+def test_nothing_of_the_api_shows_thousands_of_numbers():
+    found, ride = gz.discover(LOGS / "city_34C.blf"), gz.estimate(COASTDOWN)
+    bench = gz.calibrate([LOGS / "calibration" / "motor_dyno.csv.gz"], procedure="motor")
+    simulated = gz.simulate("ece15")
+    told = [gz.read_vehicle("reference"), gz.read_ride(COASTDOWN), ride.estimates, found, found.report, found.found]
+    for one in [*told, simulated.run, *bench.results]:
+        assert repr(one).startswith(f"{type(one).__name__}(")
+        assert 40 < len(repr(one)) < 3000
+    assert "verdict='ambiguous'" in repr(found)
 
 
 def test_the_names_are_those_of_the_api():
@@ -214,12 +228,135 @@ def test_a_simulation_is_that_of_the_command(tmp_path, capsys):
         ({"soc": float("nan")}, "soc nan"),
         ({"ambient": 300.0}, "ambient 300: must be -40 to 60 degC"),
         ({"repeat": 0}, "repeat 0: must be 1 to 1000"),
+        ({"repeat": 2.5}, "repeat 2.5: must be a whole number"),
+        ({"until_empty": "no"}, "until_empty 'no': must be True or False"),
+        ({"until_empty": True, "repeat": 2}, "repeat 2: it is repeated until_empty"),
+        ({"dyno": 180}, "dyno 180: must be a text or None"),
+        ({"dyno": "180,5"}, "--dyno 180,5: must be KG or KG,A,B,C"),
         ({"chassis": "plannar"}, "did you mean 'planar'"),
     ],
 )
 def test_options_of_a_simulation_are_checked(options, said):
     with pytest.raises(gz.InputError, match=said):
         gz.SimulationOptions(**options)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"seed": -1}, "seed -1: must be 0 to 4294967295"),
+        ({"seed": "1"}, "seed '1': must be a whole number"),
+        ({"jobs": True}, "jobs True: must be a whole number"),
+        ({"effects": "nowhere"}, "effects nowhere: no such folder"),
+        ({"holdout": "city_14C"}, r"holdout 'city_14C': must be a list \(each a text\) or None"),
+    ],
+)
+def test_options_of_a_discovery_are_checked(options, said):
+    with pytest.raises(gz.InputError, match=said):
+        gz.DiscoveryOptions(**options)
+
+
+def test_samples_may_be_lists():
+    ride = anyhow.Samples("x", {"vehicle_speed": ([0, 1], [3, 4])})
+    assert [one.dtype for one in ride.columns["vehicle_speed"]] == [float, float]
+
+
+def test_frames_that_overtake_each_other_by_a_little_are_a_ride(tmp_path):
+    frames = [frame for batch in read_frames(COASTDOWN) for frame in batch][:4000]
+    late = [(t - 40_000_000 * (n % 5 == 4), i, data, ch) for n, (t, i, data, ch) in enumerate(frames)]
+    with (tmp_path / "ride.log").open("w") as stream:
+        write_candump(stream, [late])
+    ride = gz.read_ride(tmp_path / "ride.log")
+    assert min(np.diff(times).min() for times, _ in ride.columns.values()) < 0
+
+
+def test_numbers_of_numpy_are_numbers():
+    assert repr(anyhow.SimulationOptions(soc=np.float32(0.5), repeat=np.int64(2))) == repr(
+        gz.SimulationOptions(soc=0.5, repeat=2)
+    )
+    for mass in (np.float32(80), np.int64(80), 80):
+        found = gz.read_ride(COASTDOWN, facts={"rider_mass_kg": mass}).rider_mass
+        assert (found, type(found)) == (80.0, float)
+
+
+def test_the_rides_held_out_are_those_given():
+    for holdout, said in (["coastdwn"], "did you mean 'coastdown'"), (["coastdown"], "no ride is left"):
+        with pytest.raises(gz.InputError, match=said):
+            gz.discover(COASTDOWN, options=gz.DiscoveryOptions(holdout=holdout))
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: anyhow.estimate(COASTDOWN, filter_name="scaler"), "filter_name 'scaler'.*did you mean 'scalar'"),
+        (lambda: anyhow.estimate(COASTDOWN, None), "vehicle None: must be Vehicle, a text or a path"),
+        (lambda: anyhow.estimate(COASTDOWN, route=3), "route 3: must be"),
+        (lambda: anyhow.estimate(COASTDOWN, progress=3), "progress 3: must be a function"),
+        (lambda: anyhow.read_vehicle("reference", -1.0), "payload -1: must be 0 to 3000 kg"),
+        (lambda: anyhow.read_vehicle(["reference"]), r"name \['reference'\]: must be a text or a path"),
+        (lambda: anyhow.simulate("ece15", options={"soc": 1}), "options {'soc': 1}: must be SimulationOptions"),
+        (lambda: anyhow.calibrate({"data": "x.csv"}), r"data {'data': 'x.csv'}: must be .* \(each a list"),
+        (lambda: anyhow.calibrate(None), "data None: must be"),
+        (lambda: anyhow.calibrate({"dta": []}, procedure="motor"), "did you mean 'data'"),
+        (lambda: anyhow.discover(None), "NoneType is no table of signals"),
+        (lambda: anyhow.summary_table([3]), r"rides \[3\]: must be a list \(each EstimatedRide\)"),
+        (lambda: anyhow.read_estimates(3), "log 3: must be a text or a path"),
+        (
+            lambda: anyhow.Samples("x", {"vehicle_speed": (np.arange(2), np.arange(3))}),
+            "x: vehicle_speed: .* one length",
+        ),
+        (lambda: anyhow.Samples("x", {"vehicle_sped": (np.arange(2), np.arange(2))}), "did you mean 'vehicle_speed'"),
+        (lambda: anyhow.Samples("x", {"vehicle_speed": (np.array([1, 0]), np.arange(2))}), "times do not increase"),
+        (lambda: anyhow.Samples("x", None), "columns None: must be a mapping"),
+    ],
+)
+def test_what_is_not_of_its_type_is_an_input_error_with_its_name(call, said):
+    with pytest.raises(gz.InputError, match=said):
+        call()
+
+
+@pytest.mark.parametrize("column", [None, 14.0, "14", [[1], [2, 3]], np.array(14.0), np.zeros((2, 2))])
+def test_a_column_that_is_no_array_is_named(column):
+    with pytest.raises(gz.InputError, match=r"table: column 'speed \[km/h\]': must be an array of one dimension"):
+        gz.estimate({"time [s]": [0, 1], "speed [km/h]": column})
+
+
+@pytest.mark.parametrize(
+    ("facts", "said"),
+    [
+        ("heavy", "facts 'heavy': must be a mapping"),
+        ({"rider_mass_kg": "80"}, "rider_mass_kg '80': must be a number"),
+        ({"rider_mass_kg": True}, "must be a number"),
+        ({"rider_mass_kg": -80.0}, "rider_mass_kg -80: must be 0 to 3000 kg"),
+        ({"rider_mass_kg": float("nan")}, "rider_mass_kg nan: must be"),
+        ({"rider_mass": 80.0}, "'rider_mass' is no fact of a ride .did you mean 'rider_mass_kg'"),
+        ({"kind": 3}, "kind 3: must be a text"),
+    ],
+)
+def test_facts_are_checked_wherever_they_come_from(facts, said, tmp_path):
+    with pytest.raises(gz.InputError, match=said):
+        gz.read_ride(COASTDOWN, facts=facts)
+    with pytest.raises(gz.InputError, match=said):
+        gz.Samples("x", {}, facts)
+    if isinstance(facts, dict):
+        (tmp_path / "coastdown.blf").write_bytes(COASTDOWN.read_bytes())
+        (tmp_path / "rides.json").write_text(json.dumps([{"name": "coastdown", **facts}]))
+        with pytest.raises(gz.InputError, match=rf"rides\.json: coastdown: .*{said}"):
+            gz.read_ride(tmp_path / "coastdown.blf")
+
+
+def test_a_calibration_is_written_over_nothing_that_was_read(tmp_path):
+    dyno, base = tmp_path / "dyno.csv.gz", tmp_path / "mine.toml"
+    dyno.write_bytes((LOGS / "calibration" / "motor_dyno.csv.gz").read_bytes())
+    base.write_bytes((ROOT / "gz_onboard" / "vehicles" / "reference.toml").read_bytes())
+    found = gz.calibrate([dyno], base, procedure="motor")
+    before = dyno.read_bytes(), base.read_bytes()
+    for write, file in ((found.write, base), (found.write_report, base), (found.write_report, dyno)):
+        with pytest.raises(gz.InputError, match="would overwrite the input"):
+            write(file)
+    with pytest.raises(gz.InputError, match=r"a vehicle file is a \.toml"):
+        found.write(tmp_path / "new.csv.gz")
+    assert (dyno.read_bytes(), base.read_bytes()) == before
 
 
 def test_a_calibration_is_that_of_the_command(tmp_path, capsys):

@@ -158,6 +158,28 @@ def test_identifiers_of_others_are_not_taken_in(bus: str):
     channel.close()
 
 
+def test_what_a_bus_gives_back_to_its_sender_is_nobody_elses(bus: str):
+    channel = CanChannel("virtual", bus, receive_own_messages=True)
+    channel.open()
+    daemon = Daemon(reference(), [channel], recorder=None, state_file=None)
+    begin = time.time_ns()
+    sent: list[Frame] = []
+    with can.Bus(interface="virtual", channel=bus) as other:
+        for second in range(1, 4):
+            daemon.step(channel.drain(), begin + second * S)
+            while (message := other.recv(0)) is not None:
+                sent.append((0, message.arbitration_id, bytes(message.data), 0))
+        assert sent
+        daemon.step(channel.drain(), begin + 4 * S)
+        assert (daemon.pipeline.foreign, daemon.pipeline.codec.unknown) == ({}, {})
+        channel.drain()
+        last = next(frame for frame in reversed(sent) if frame[1] in daemon.pipeline.publisher.identifiers)
+        other.send(can.Message(arbitration_id=last[1], data=last[2], is_extended_id=False))
+        daemon.step(channel.drain(), begin + 5 * S)
+    assert sum(daemon.pipeline.foreign.values()) == 1  # from someone else, though it is alike
+    channel.close()
+
+
 @contextmanager
 def largest_file(size: int) -> Iterator[None]:
     """No file may grow beyond `size` bytes: writing fails as on a full disk."""

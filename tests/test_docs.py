@@ -64,6 +64,13 @@ def test_links_lead_somewhere(page):
             assert anchor in anchors(there), target
 
 
+def test_what_a_page_includes_is_also_linked_for_who_reads_it_where_nothing_is_included():
+    included = [(page, file) for page in DOCS for file in re.findall(r"^```\{include\} (\S+)", TEXT[page], re.M)]
+    assert len(included) >= 2
+    for page, file in included:
+        assert re.search(rf"^% .*\]\({re.escape(file)}[#)]", TEXT[page], re.M), name_of(page)
+
+
 def test_every_page_is_on_the_front_page():
     listed = re.findall(
         r"^([\w-]+)$",

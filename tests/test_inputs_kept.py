@@ -27,6 +27,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "calibration.toml").write_text('schema = 1\n[motor]\ndata = "motor_dyno.csv.gz"\n')
     os.link(tmp_path / "ride.blf", tmp_path / "linked.json")
     (tmp_path / "points.html").symlink_to("ride.blf")
+    shutil.copy(LOGS / "rides.json", tmp_path / "state.json")
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -51,6 +52,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ["validate", "ride.blf", "--no-plot", "--markdown", "ride.blf"],
         ["simulate", "cycle.csv", "--frames", "cycle.csv", "--output", "new"],
         ["simulate", "cycle.csv", "--json=cycle.csv", "--output", "new"],
+        ["learned", "--state", "state.json", "--json", "state.json"],
+        ["learned", "--state", "state.json", "--plot", "state.json"],
     ],
     ids=" ".join,
 )
@@ -59,6 +62,39 @@ def test_no_input_is_overwritten(folder: Path, capsys: pytest.CaptureFixture[str
     assert main(arguments) == 2
     assert "would overwrite the input" in capsys.readouterr().err
     assert {file.name: file.read_bytes() for file in folder.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["estimate", "ride.blf", "--output", "new", "--table", "new.csv", "--json=./new.csv"],
+        [*CALIBRATE, "--output", "new.toml", "--json=new.toml"],
+        [*DISCOVER, "--report", "new", "--json=new"],
+        ["validate", "ride.blf", "--no-plot", "--markdown", "new", "--json=new"],
+        ["simulate", "cycle.csv", "--output", "new", "--json=new/cycle.simulation.parquet"],
+        ["simulate", "cycle.csv", "--output", "new", "--frames", "new.csv", "--json=new.csv"],
+        ["learned", "--state", "state.json", "--json", "new.png", "--plot", "new.png"],
+    ],
+    ids=" ".join,
+)
+def test_no_output_is_written_over_another(folder: Path, capsys: pytest.CaptureFixture[str], arguments: list[str]):
+    before = {file.name for file in folder.iterdir()}
+    assert main(arguments) == 2
+    assert "which is written too" in capsys.readouterr().err
+    assert {file.name for file in folder.iterdir()} == before
+
+
+def test_no_output_is_a_folder(folder: Path, capsys: pytest.CaptureFixture[str]):
+    before = {file.name for file in folder.iterdir()}
+    for arguments in (["estimate", "ride.blf", "--json=."], [*CALIBRATE, "--report", "."]):
+        assert main(arguments) == 2
+        assert ".: is a folder; give the name of a file" in capsys.readouterr().err
+    assert {file.name for file in folder.iterdir()} == before
+
+
+def test_devices_are_no_files(folder: Path):
+    outputs = ["--json=/dev/null", "--markdown", "/dev/null"]
+    assert main(["validate", "ride.blf", "--no-plot", *outputs, "--output", "new", "--quiet"]) == 0
 
 
 def test_a_calibration_is_written_into_no_other_kind_of_file(folder: Path, capsys: pytest.CaptureFixture[str]):

@@ -119,3 +119,13 @@ def test_it_names_a_state_that_is_missing_damaged_or_another_s(saved: Path, caps
     assert "damaged" in capsys.readouterr().err
     saved.write_bytes(saved.read_bytes()[:-9])
     assert main(["learned", "--state", str(saved)]) == BAD_INPUT
+
+
+@pytest.mark.parametrize("name", ["out.txt", "out", "out.mcap"])
+def test_a_picture_of_another_kind_is_refused_before_anything_is_forgotten(
+    saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+):
+    before = saved.read_bytes()
+    assert main(["learned", "--state", str(saved), "--reset", "all", "--plot", str(tmp_path / name)]) == BAD_INPUT
+    assert f"{name}: a picture is one of .png .svg .pdf" in capsys.readouterr().err
+    assert saved.read_bytes() == before

@@ -10,6 +10,7 @@ from gz_onboard.bus import logs
 from gz_onboard.cli import COMMANDS, command_line
 from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, OK, InputError
 from gz_onboard.options import LOG_SUFFIXES, MOST_JOBS, add_shared, keep_old_name, number
+from gz_onboard.pipeline import filter_maker
 from tests.support import ROOT
 
 
@@ -63,6 +64,11 @@ def test_an_old_name_is_the_same_option(parser):
 
 def test_the_formats_of_logs_are_those_that_can_be_read():
     assert set(LOG_SUFFIXES) == {name for name in logs._READERS if name.startswith(".")}
+
+
+def test_a_filter_that_there_is_not_is_refused():
+    with pytest.raises(InputError, match=r"filter 'scaler': must be scalar or filterpy \(did you mean 'scalar'"):
+        filter_maker("scaler")
 
 
 def test_an_option_has_one_meaning():

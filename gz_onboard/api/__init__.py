@@ -7,13 +7,13 @@ Results are dataclasses; those with a table have ``to_table()`` (a dict of numpy
 from gz_onboard.api.calibrations import Calibration, calibrate
 from gz_onboard.api.discoveries import Discovered, discover
 from gz_onboard.api.estimates import EstimatedRide, LoggedEstimates, estimate, read_estimates, summary_table
-from gz_onboard.api.given import read_ride
+from gz_onboard.api.given import read_ride, read_vehicle
 from gz_onboard.api.simulations import SimulatedRide, simulate
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.command import DiscoveryOptions
 from gz_onboard.offline.samples import Samples
 from gz_onboard.simulation.plan import SimulationOptions
-from gz_onboard.vehicle import Vehicle, read_vehicle
+from gz_onboard.vehicle import Vehicle
 
 __all__ = [
     "Calibration",

@@ -5,28 +5,31 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
-from gz_onboard.api.given import PathLike, Signals, source_of, vehicle_of
+from gz_onboard.api.given import PathLike, Signals, VehicleLike, source_of, vehicle_of
+from gz_onboard.errors import brief
 from gz_onboard.lab import estimate_table, export_tables
 from gz_onboard.lab.estimate import summary_text
 from gz_onboard.lab.estimate_ride import How, RideSummary, open_estimate, ride_through, summary_of
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TEXTS, WHY_TOPIC, table_columns
+from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.table import Columns, Tabular, array_of, columns_of
 from gz_onboard.progress import Progress
 from gz_onboard.routes.ahead import read_ahead
-from gz_onboard.vehicle import Vehicle
 
 
 @dataclass(frozen=True)
 class LoggedEstimates(Tabular):
     """The estimates in a log. columns: of each field of the `rows` the column; times: [ns since the epoch]."""
 
-    columns: Mapping[str, str] = field(repr=False)
-    times: Sequence[int] = field(repr=False)
-    rows: Sequence[Mapping[str, object]] = field(repr=False)
+    columns: Mapping[str, str]
+    times: Sequence[int]
+    rows: Sequence[Mapping[str, object]]
+
+    __repr__ = brief
 
     def to_table(self) -> Columns:
         """A row for each estimate, with the columns that ``gz-onboard export --estimates`` writes."""
@@ -72,12 +75,13 @@ class _Kept:
         return [values for _, values in self.rows[topic]]
 
 
+@checked
 def estimate(
     source: PathLike | Signals,
-    vehicle: Vehicle | str | Path = "reference",
+    vehicle: VehicleLike = "reference",
     *,
     route: PathLike | None = None,
-    filter_name: str = "scalar",
+    filter_name: Literal["scalar", "filterpy"] = "scalar",
     progress: Progress | None = None,
 ) -> EstimatedRide:
     """Estimate state of charge and range over a log or a table of signals, as the daemon would.
@@ -85,7 +89,7 @@ def estimate(
     route: file of the road that is to be ridden. filter_name: scalar or filterpy. progress: takes numbers of frames.
     Raises InputError.
     """
-    road = read_ahead(Path(route))[1] if route else None
+    road = None if route is None else read_ahead(Path(route))[1]
     log = _Kept()
     ride = open_estimate(source_of(source), vehicle_of(vehicle))
     ridden = ride_through(ride, How(filter_name, route=road), log, progress)
@@ -95,12 +99,14 @@ def estimate(
     return EstimatedRide(summary_of(ridden), estimates, log.of(WHY_TOPIC), log.of(CHANGE_TOPIC))
 
 
+@checked
 def summary_table(rides: Iterable[EstimatedRide]) -> Columns:
     """The summaries of rides, a row each, with the columns that ``gz-onboard estimate --table`` writes."""
     table = estimate_table.summary_table([ride.summary for ride in rides])
     return {name: array_of(column) for name, column in table.items()}
 
 
+@checked
 def read_estimates(log: PathLike) -> LoggedEstimates:
     """The estimates that the daemon or ``gz-onboard estimate`` wrote into an MCAP log. InputError if it has none."""
     source = export_tables.Source(Path(log))

@@ -8,10 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol, TypeAlias
 
+from gz_onboard.offline.arguments import checked, within
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.offline.table import signal_table
-from gz_onboard.vehicle import Vehicle, read_vehicle
+from gz_onboard.options import MOST_PAYLOAD
+from gz_onboard.vehicle import Vehicle
+from gz_onboard.vehicle import read_vehicle as read_vehicle_file
 
 PathLike: TypeAlias = str | os.PathLike[str]
 
@@ -32,14 +35,35 @@ def source_of(data: PathLike | Signals, name: str = "table") -> Path | SignalTab
     return Path(data) if isinstance(data, str | os.PathLike) else signal_table(data, name)
 
 
-def vehicle_of(given: Vehicle | str | Path) -> Vehicle:
+VehicleLike: TypeAlias = Vehicle | PathLike
+"""A vehicle, or the name of a built-in one, or a vehicle file."""
+
+
+def file_of(name: PathLike) -> str | Path:
+    """The name of a vehicle or its file, as `find_vehicle` takes it."""
+    return name if isinstance(name, str) else Path(name)
+
+
+def vehicle_of(given: VehicleLike) -> Vehicle:
     """The vehicle given, or that of the name or file given."""
     return given if isinstance(given, Vehicle) else read_vehicle(given)
 
 
+@checked
+def read_vehicle(name: PathLike, payload: float | None = None, effects_folder: PathLike | None = None) -> Vehicle:
+    """The vehicle of a name or file, with the mass of rider and luggage [kg] if it is known.
+
+    effects_folder: where effects of your own are: Python code you trust. Raises InputError.
+    """
+    if payload is not None:
+        within("payload", payload, {"payload": (0.0, MOST_PAYLOAD, "kg")})
+    return read_vehicle_file(file_of(name), payload, None if effects_folder is None else Path(effects_folder))
+
+
+@checked
 def read_ride(
     source: PathLike | Signals,
-    vehicle: Vehicle | str | Path = "reference",
+    vehicle: VehicleLike = "reference",
     *,
     name: str | None = None,
     facts: Mapping[str, object] | None = None,

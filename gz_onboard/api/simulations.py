@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import time
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
-from gz_onboard.api.given import PathLike
+from gz_onboard.api.given import PathLike, VehicleLike, file_of
+from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.table import Columns, Tabular
 from gz_onboard.progress import Progress
 from gz_onboard.simulation.output import series_table
@@ -33,9 +33,10 @@ class SimulatedRide(Tabular):
         return dict(series_table(self.run))
 
 
+@checked
 def simulate(
     what: PathLike,
-    vehicle: Vehicle | str | Path = "reference",
+    vehicle: VehicleLike = "reference",
     options: SimulationOptions | None = None,
     progress: Progress | None = None,
 ) -> SimulatedRide:
@@ -47,7 +48,9 @@ def simulate(
     begin = time.perf_counter()
     options = options or SimulationOptions()
     known, payload_from = (
-        (vehicle, "the vehicle given") if isinstance(vehicle, Vehicle) else vehicle_on(os.fspath(what), vehicle)
+        (vehicle, "the vehicle given")
+        if isinstance(vehicle, Vehicle)
+        else vehicle_on(os.fspath(what), file_of(vehicle))
     )
     plan = find_plan(os.fspath(what), options, known)
     run, scooter = simulate_plan(known, plan, options, progress)

@@ -12,6 +12,7 @@ import errno
 import socket
 import struct
 import time
+from collections import deque
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus._can import NO_SOCKETS, can, check_interface, flagged
@@ -28,6 +29,8 @@ BUFFER = 4 << 20  # bytes; a frame takes some 800 of them in the kernel: 5000 fr
 MOST, READ_S = 5000, 0.08
 """Frames, and time [s], that one call of `drain` takes at most: what more comes waits, and is dropped by the kernel."""
 RETRY = 1.0  # s between attempts to open a bus that is down
+ECHOING = ("udp_multicast",)  # interfaces that give what is sent back to the sender
+ECHO_S = 2.0  # so long after it was sent
 _FRAME = struct.Struct("=IB3x8s")
 _FD_FRAME = struct.Struct("=IBB2x64s")
 _TIMESPEC = struct.Struct("=qq")
@@ -50,6 +53,10 @@ class CanChannel:
         self._identifiers = identifiers
         self._wanted = None if identifiers is None else {*identifiers, *(ERR_FLAG | bit for bit in (0, EFF_FLAG))}
         self._options = options
+        self._echoing = interface in ECHOING or bool(options.get("receive_own_messages"))
+        self._sent: deque[tuple[float, int, bytes]] = deque(
+            maxlen=1000
+        )  # time [s], identifier, data: that may come back
         self._bus: Any = None
         self._socket: socket.socket | None = None
         self._kernel_count = 0
@@ -162,8 +169,22 @@ class CanChannel:
             # Filtered here: with filters of its own python-can's recv(0) says "nothing" at each frame it rejects.
             if self._wanted is not None and identifier & ~RTR_FLAG not in self._wanted:
                 continue
+            data = bytes(message.data)
+            if self._sent and self._is_echo(identifier, data):
+                continue
             # Only the kernel's stamps are of one clock; other interfaces have clocks of their own.
-            frames.append((time.time_ns(), identifier, bytes(message.data), self.index))
+            frames.append((time.time_ns(), identifier, data, self.index))
+
+    def _is_echo(self, identifier: int, data: bytes) -> bool:
+        """Whether that is a frame of our own, which comes back once."""
+        now = time.monotonic()
+        while self._sent and now - self._sent[0][0] > ECHO_S:
+            self._sent.popleft()
+        for sent in self._sent:
+            if sent[1:] == (identifier, data):
+                self._sent.remove(sent)
+                return True
+        return False
 
     def send(self, frame: Frame) -> bool:
         """Send `frame`; False if the bus does not take it now."""
@@ -176,6 +197,8 @@ class CanChannel:
             else:
                 extended = bool(identifier & EFF_FLAG)
                 self._bus.send(can.Message(arbitration_id=identifier & 0x1FFFFFFF, data=data, is_extended_id=extended))
+                if self._echoing:
+                    self._sent.append((time.monotonic(), identifier, data))
             return True
         except (OSError, can.CanError) as error:
             self.send_failures += 1

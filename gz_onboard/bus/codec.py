@@ -31,7 +31,7 @@ RANGE = "out of range"
 TIME = "implausible time"
 UNDECODABLE = "undecodable"
 
-_BACK_NS = 50_000_000  # frames of two channels may overtake each other by a little
+BACK_NS = 50_000_000  # frames of two channels may overtake each other by a little
 _AHEAD_NS = 30_000_000_000
 _CONFIRM = 3  # so many frames in a row agree on a new time before it is believed
 _MOST_IDENTIFIERS = 4096  # are remembered: a babbling node must not fill the memory
@@ -78,7 +78,7 @@ class Codec:
         """The events of `frames`, in their order; their times are seconds since the first frame ever decoded."""
         handlers, latest = self._handlers, self.latest
         origin, last = self._origin_ns, self._last_ns
-        back, ahead = -_BACK_NS, _AHEAD_NS
+        back, ahead = -BACK_NS, _AHEAD_NS
         count = 0
         for time_ns, identifier, data, _channel in frames:
             count += 1
@@ -128,7 +128,7 @@ class Codec:
         if self._origin_ns is None:
             self._origin_ns = self._last_ns = time_ns
             return True
-        follows = self._before_ns == self._last_ns and -_BACK_NS <= time_ns - self._suspect_ns <= _AHEAD_NS
+        follows = self._before_ns == self._last_ns and -BACK_NS <= time_ns - self._suspect_ns <= _AHEAD_NS
         self._suspects = self._suspects + 1 if follows and self._suspects else 1
         self._suspect_ns, self._before_ns = time_ns, self._last_ns
         if self._suspects < _CONFIRM:

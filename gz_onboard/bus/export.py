@@ -44,7 +44,8 @@ def whole(out: Path, suffix: str) -> Iterator[Path]:
 
     Errors are as of `writing`.
     """
-    part = out.with_name(f".part.{out.name}") if suffix else out
+    packed = ".gz" if out.suffix.lower() == ".gz" else ""  # python-can takes a name with one dot more for no format
+    part = out.with_name(f".part-{out.name.replace('.', '-')}{suffix}{packed}") if suffix else out
     with writing(out):
         try:
             yield part

@@ -24,7 +24,7 @@ from typing import Any
 
 from gz_onboard.bus.readers import blf, candump, lines, mcap, pycan
 from gz_onboard.bus.readers.common import TIME_LIMIT_NS, Contents, Damage, Reader, unpacked
-from gz_onboard.errors import InputError, nearest, shown
+from gz_onboard.errors import InputError, near_file, nearest, shown
 from gz_onboard.events import Frame
 
 _LOG = logging.getLogger(__name__)
@@ -226,7 +226,7 @@ def _load(path: Path) -> Contents:
                 return b""
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from None
+        raise InputError(f"{path}: cannot be read: {error.strerror}{near_file(path)}") from None
 
 
 def _filtered(

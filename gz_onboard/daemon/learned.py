@@ -19,7 +19,7 @@ from typing import Any
 
 from gz_onboard import state
 from gz_onboard.daemon.keeper import state_file
-from gz_onboard.errors import OK, InputError, writing
+from gz_onboard.errors import OK, InputError, not_an_input, require, writing
 from gz_onboard.estimator.ageing import Ageing, Learned
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.usual import Habit, Usual
@@ -37,6 +37,7 @@ MEANING = {  # by name: what its factor is on
     "pace": "time of a kilometre, likewise",
     "factor": "measured over modelled energy of the same motion",
 }
+PICTURES = (".png", ".svg", ".pdf")
 BATTERY, RIDING = ("capacity", "resistance"), "riding"  # what can be forgotten
 
 
@@ -49,15 +50,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--reset",
         choices=(*BATTERY, RIDING, "all"),
-        help="forget this, as after a new battery; the daemon must not run",
+        help="forget this, as after a new battery or for a new owner; the daemon must not run",
     )
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="write a picture of it: PNG, SVG or PDF")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it: PNG, SVG or PDF")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Show, or forget. InputError if the state cannot be read, is another vehicle's, or is in use."""
     vehicle = read_vehicle(arguments.vehicle)
     file = arguments.state or state_file(USUAL_FOLDER, vehicle.name)
+    not_an_input((arguments.json, arguments.plot), [file, vehicle.file])
+    if arguments.plot and arguments.plot.suffix.lower() not in PICTURES:
+        raise InputError(f"--plot {arguments.plot}: a picture is one of {' '.join(PICTURES)}")
+    require("matplotlib", arguments.plot is not None)
     snapshot, age = _load(file, vehicle)
     if arguments.reset:
         names = (*BATTERY, RIDING) if arguments.reset == "all" else (arguments.reset,)

@@ -87,6 +87,7 @@ class Estimator:
         self._accel_z = groups[self._shaken].roles.index("accel_z") if self._shaken >= 0 else 0
         self._shown = next(iter(_carrying((SHOWN,), groups)), -1) if battery.window.given else -1
         self._time: float | None = None  # s, of the last step
+        self.gap_time = 0.0  # s between steps that were too far apart: distance and charge lack what was ridden in it
         self._deadline = float("-inf")
         self._activities = Activities()
         self._reading = PackReading()
@@ -154,6 +155,7 @@ class Estimator:
         self._deadline = now + STEP_AT_LEAST
         signals, road = self.signals, self.road
         elapsed = min(dt, self._timing.pause)
+        self.gap_time += dt - elapsed
         self.redundancy.step(StepInputs(now, dt, elapsed, signals, road.speed))
         road.step(now, elapsed, signals, self._radius, self._gear)
         self._reading = self._read_pack(now, elapsed)

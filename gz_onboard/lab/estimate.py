@@ -134,6 +134,7 @@ def summary_text(ride: RideSummary) -> str:
             f"{ride.frames} received, {ride.dropped} dropped, {ride.lost} lost, "
             f"{ride.unknown} unknown identifiers, {ride.error_frames} error frames",
         ),
+        *([("gaps", f"{ride.gaps_s:.1f} s, of which distance and energy hold nothing")] if ride.gaps_s else []),
         *(
             ("someone else's", f"{count} frames on {identifier}, a range frame's: give another range_identifier")
             for identifier, count in ride.foreign.items()

@@ -15,7 +15,7 @@ from gz_onboard.bus.logs import LogDamage
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.errors import InputError, writing
-from gz_onboard.events import Estimate, Frame, State
+from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.estimate_route import RouteSummary, route_summary
 from gz_onboard.lab.estimate_tally import Tally
 from gz_onboard.lab.plot import plot_log
@@ -35,6 +35,7 @@ SUMMARY_VERSION = 1
 TICK_S = TICK_NS * 1e-9
 _GAP_NS = 2_000_000_000  # a longer pause between two frames is ridden through in steps
 _PAUSE_NS = 30_000_000_000  # beyond this the recording was stopped, and nothing is estimated meanwhile
+MOST_SLOW = 0.1  # of the time: energy is not integrated if pack current and voltage come too slowly for longer
 _CONFIRM = 3  # fewer frames than this do not set the time
 
 
@@ -74,12 +75,12 @@ class RideSummary:
     filter: Annotated[str, "backend of the filter"]
     start_ns: Annotated[int, "time of the first frame [ns since the epoch, as in the log]"]
     duration_s: Annotated[float, "from the first to the last estimate"]
-    distance_km: Annotated[float, "ridden"]
+    distance_km: Annotated[float, "ridden, but for gaps_s"]
     speed_max_km_h: Annotated[float | None, "greatest speed, or null"]
     energy_wh: Annotated[
         float | None,
         "drawn from the pack, less what was recovered, the sensors' known gain and offsets taken off; "
-        "null if voltage or current was never known",
+        "null if voltage or current was never known, or came too slowly for more than a tenth of the time",
     ]
     energy_recovered_wh: Annotated[float | None, "charged into the pack while riding, or null"]
     consumption_wh_km: Annotated[float | None, "energy over distance; null below 0.1 km"]
@@ -112,6 +113,7 @@ class RideSummary:
     unknown: Annotated[int, "different identifiers that the database does not know"]
     foreign: Annotated[dict[str, int], "frames of someone else on the identifiers of the range frames, by identifier"]
     error_frames: Annotated[int, "error frames of the bus"]
+    gaps_s: Annotated[float, "without any measurement for too long to go on: distance and energy lack what was ridden"]
     faults: Annotated[dict[str, dict[str, int]], "what was dropped, by reason and by message or signal"]
     damage: Annotated[str | None, "what of the log could not be read, or null"]
     cpu_s: Annotated[float, "processor time taken, without drawing"]
@@ -291,10 +293,12 @@ def _unknown(ride: OpenRide, pipeline: Pipeline) -> InputError:
 def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = None) -> RideSummary:
     """The summary of a ride; log, picture: where its estimates were written and drawn."""
     pipeline, tally, route = ridden.pipeline, ridden.tally, ridden.how.route
-    last, changes = tally.last or Estimate(0.0), pipeline.estimator.attribution.changes
+    last, ranged = tally.last or Estimate(0.0), tally.ranged or Estimate(0.0)
+    changes = pipeline.estimator.attribution.changes
     soc_start, soc_end = tally.soc_start or (None, None), tally.soc_end or (None, None)
     counts, status = pipeline.counts(), pipeline.status()
     states, reasons = tally.by_name()
+    drawn = tally.drawn if reasons[Reason.SIGNALS_SLOW.name] <= MOST_SLOW * states.total() else None
     return RideSummary(
         file=str(ridden.source),
         log=str(log) if log else None,
@@ -305,18 +309,18 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         duration_s=last.time,
         distance_km=last.distance * 1e-3,
         speed_max_km_h=times(tally.speed_max, 3.6),
-        energy_wh=times(tally.drawn, 1 / WH),
-        energy_recovered_wh=None if tally.drawn is None else tally.recovered / WH,
-        consumption_wh_km=times(tally.drawn, 1 / last.distance / WH_PER_KM) if last.distance >= 100 else None,
+        energy_wh=times(drawn, 1 / WH),
+        energy_recovered_wh=None if drawn is None else tally.recovered / WH,
+        consumption_wh_km=times(drawn, 1 / last.distance / WH_PER_KM) if last.distance >= 100 else None,
         soc_start=soc_start[0],
         soc_start_sd=soc_start[1],
         soc_end=soc_end[0],
         soc_end_sd=soc_end[1],
         range_start_km=times(tally.range_start, 1e-3),
-        range_end_km=times(last.range, 1e-3),
-        range_end_p10_km=times(last.range_p10, 1e-3),
-        range_end_p90_km=times(last.range_p90, 1e-3),
-        energy_left_wh=times(last.energy_left, 1 / WH),
+        range_end_km=times(ranged.range, 1e-3),
+        range_end_p10_km=times(ranged.range_p10, 1e-3),
+        range_end_p90_km=times(ranged.range_p90, 1e-3),
+        energy_left_wh=times(ranged.energy_left, 1 / WH),
         why=why_of(last.why) if last.why else None,
         changes=list(map(why_of, changes)),
         route=route_summary(last, tally.on_route or last, route.grade_known) if route else None,
@@ -333,6 +337,7 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         unknown=counts.unknown,
         foreign=cast("dict[str, int]", status["foreign"]),
         error_frames=pipeline.codec.error_frames,
+        gaps_s=round(pipeline.estimator.gap_time, 1),
         faults=cast("dict[str, dict[str, int]]", status["faults"]),
         damage=str(ridden.damages[0]) if ridden.damages else None,
         cpu_s=ridden.took[0],

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import get_type_hints
 
 from gz_onboard.bus.tables import write_table
-from gz_onboard.errors import InputError, require, writing
+from gz_onboard.errors import InputError, nearest, require, writing
 from gz_onboard.events import State
 from gz_onboard.lab.estimate_ride import RideSummary
 from gz_onboard.offline.results import Failure
@@ -40,7 +40,7 @@ def check_table(out: Path) -> None:
     """InputError if no table can be written into `out`, ModuleNotFoundError if what writes it is not installed."""
     require("pyarrow", out.suffix.lower() == ".parquet")
     if not out.name.lower().endswith((*FORMATS, ".csv.gz", ".jsonl.gz")):
-        raise InputError(f"--table {out}: a table is written as {', '.join(FORMATS)}")
+        raise InputError(f"--table {out}: a table is written as {', '.join(FORMATS)}{nearest(out.suffix, FORMATS)}")
 
 
 def write_summaries(out: Path, rides: Sequence[RideSummary], failed: Sequence[Failure]) -> None:

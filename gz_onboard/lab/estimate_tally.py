@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from math import sqrt
 
+from gz_onboard.bus.publisher import KNOWN
 from gz_onboard.events import Estimate, Reason, RouteState, State
 from gz_onboard.log_rows import reason_names
 
@@ -20,6 +21,7 @@ class Tally:
     soc_start: tuple[float, float] | None = None
     soc_end: tuple[float, float] | None = None
     range_start: float | None = None  # m
+    ranged: Estimate | None = None  # the last whose range is published
     on_route: Estimate | None = None  # the last
     drawn: float | None = None  # J, net
     recovered: float = 0.0  # J
@@ -53,8 +55,9 @@ class Tally:
             self.soc_end = e.soc, e.soc_sd
             if self.soc_start is None:
                 self.soc_start = self.soc_end
-        if self.range_start is None:
-            self.range_start = e.range
+        if e.range is not None and e.state in KNOWN:
+            self.ranged = e
+            self.range_start = e.range if self.range_start is None else self.range_start
         if e.route_state == RouteState.ON:
             self.on_route = e
 

@@ -34,7 +34,6 @@ from gz_onboard.lab.export_tables import (
     recorded_messages,
     recorded_signals,
     write_estimates,
-    write_explanations,
     write_signals,
 )
 from gz_onboard.options import add_shared
@@ -79,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--table-format {arguments.table_format}: is for a folder of tables, and {out} is a file")
     if arguments.dbc and arguments.vehicle:
         raise InputError(f"--vehicle {arguments.vehicle}: has DBC files of its own; leave out --dbc")
-    not_an_input([out], [log, *(arguments.dbc or [])])
+    not_an_input([out] if suffix else [], [log, *(arguments.dbc or [])])
     source = Source(log, arguments.start, arguments.end, arguments.columns)
     with whole(out, suffix) as part:
         told = _write(arguments, source, part, suffix)
@@ -116,12 +115,11 @@ def _estimates(arguments: argparse.Namespace, source: Source, part: Path, kind: 
     if not kind.startswith("/"):
         if kind not in _TABLES:
             raise InputError(f"{arguments.out}: estimates can be written into {', '.join(_TABLES)} or a directory")
-        return f"{write_estimates(source, part)} estimates"
-    part.mkdir(parents=True, exist_ok=True)
-    for name in names:
-        if name != "estimate":
-            write_explanations(source, part / f"{name}{kind[1:]}", ESTIMATES[name])
-    return f"{write_estimates(source, part / f'estimate{kind[1:]}')} estimates"
+        files = {ESTIMATES["estimate"]: part}
+    else:
+        part.mkdir(parents=True, exist_ok=True)
+        files = {ESTIMATES[name]: part / f"{name}{kind[1:]}" for name in names}
+    return f"{write_estimates(source, files)} estimates"
 
 
 def _batches(source: Source) -> tuple[tuple[int | None, int | None], Iterator[list[Frame]]]:

@@ -69,13 +69,15 @@ def chosen(source: Source, known: Iterable[str]) -> set[str]:
     names = list(dict.fromkeys(known))
     if source.columns is None:
         return set(names)
-    plain = {name.partition("[")[0]: name for name in names} | {name: name for name in names}
+    if not source.columns:
+        raise InputError(f"--columns: names none; there are {', '.join(names) or 'none'}")
+    plain = [*names, *(name.partition("[")[0] for name in names)]
     for name in source.columns:
         if name not in plain:
             raise InputError(
                 f"{source.log}: has no column {name!r}{nearest(name, plain)}; there are {', '.join(names) or 'none'}"
             )
-    return {plain[name] for name in source.columns}
+    return {name for name in names if {name, name.partition("[")[0]} & set(source.columns)}
 
 
 def topic_columns(log: Path, topic: str) -> dict[str, str]:
@@ -99,24 +101,20 @@ def estimate_rows(source: Source) -> list[tuple[int, dict[str, Any]]]:
     raise InputError(f"{source.log}: holds no estimates ({ESTIMATE_TOPIC}){_other(source.log)}")
 
 
-def write_estimates(source: Source, out: Path) -> int:
-    """Write the estimates, a row each; gives how many. InputError if there are none."""
-    return _write_rows(source, out, ESTIMATE_TOPIC, estimate_rows(source))
+def write_estimates(source: Source, files: Mapping[str, Path]) -> int:
+    """Write a table, a row each, of the estimates and of each other topic in `files` that has rows and wanted columns.
 
-
-def write_explanations(source: Source, out: Path, topic: str) -> int:
-    """Write the explanations of a topic, a row each; gives how many. Without any, nothing is written."""
-    rows = source.rows(topic)
-    return _write_rows(source, out, topic, rows) if rows else 0
-
-
-def _write_rows(source: Source, out: Path, topic: str, rows: Sequence[tuple[int, Mapping[str, Any]]]) -> int:
-    """A column for each field of the topic, with its unit."""
-    columns = topic_columns(source.log, topic)
-    wanted = chosen(source, columns.values())
-    table = {c: [values.get(name) for _, values in rows] for name, c in columns.items() if c in wanted}
-    tables.write_table(out, table, [time_ns for time_ns, _ in rows])
-    return len(rows)
+    Gives how many estimates. InputError if there are none, or if no table has a column that is wanted.
+    """
+    estimates = estimate_rows(source)
+    columns = {topic: topic_columns(source.log, topic) for topic in files}
+    wanted = chosen(source, [column for of in columns.values() for column in of.values()])
+    for topic, out in files.items():
+        rows = estimates if topic == ESTIMATE_TOPIC else source.rows(topic)
+        table = {c: [values.get(name) for _, values in rows] for name, c in columns[topic].items() if c in wanted}
+        if rows and table:
+            tables.write_table(out, table, [time_ns for time_ns, _ in rows])
+    return len(estimates)
 
 
 def _other(log: Path) -> str:

@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 
 from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import InputError
-from gz_onboard.offline.results import Failure, output_names
+from gz_onboard.offline.results import Failure, distinct_names
 from gz_onboard.offline.samples import ride_name
 from gz_onboard.progress import Display, Progress
 
@@ -46,10 +46,10 @@ Answer = TypeVar("Answer")
 def tasks_of(arguments: argparse.Namespace, kind: type[TaskT], suffix: str, **options: Any) -> list[TaskT]:
     """A task for each of the logs that a command is given; `options` are those of their `kind` alone.
 
-    suffix: of a file that is written of each, which InputError names if two logs would be written as one.
+    suffix: of a file that is written of each. InputError if two logs would be written as one.
     """
     logs = list(dict.fromkeys(logs_among(arguments.logs)))
-    names = output_names(logs, [ride_name(log).removesuffix(Path(suffix).stem) for log in logs], suffix)
+    names = distinct_names(logs, [ride_name(log).removesuffix(Path(suffix).stem) for log in logs])
     given = arguments.vehicle, arguments.payload, not arguments.no_plot
     return [kind(log, arguments.output / name, *given, **options) for log, name in zip(logs, names, strict=True)]
 

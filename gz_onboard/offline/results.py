@@ -54,19 +54,18 @@ def write_json(file: str | None, version: int | None, result: object) -> None:
 # --- names of files -----------------------------------------------------------------------------------------------
 
 
-def output_names(logs: Sequence[Path], names: Sequence[str], suffix: str) -> list[str]:
-    """What the files of each log are called, without `suffix`: its name, with its folder's where several have the same.
+def distinct_names(logs: Sequence[Path], names: Sequence[str]) -> list[str]:
+    """What the ride of each log is called: its name, with that of its folder or its file where several have the same.
 
     InputError if that leaves two alike.
     """
-    full = [
-        name if names.count(name) == 1 else "-".join([*log.resolve().parent.parts[-1:], name])
-        for log, name in zip(logs, names, strict=True)
-    ]
-    if twice := [name for name in full if full.count(name) > 1][:1]:
-        both = " and ".join(str(log) for log, name in zip(logs, full, strict=True) if name == twice[0])
-        raise InputError(f"{both} would both be written as {twice[0]}{suffix}; give them one at a time")
-    return full
+    folders, files = [log.resolve().parent.name for log in logs], [log.name for log in logs]
+    forms = [form for known in (names, files) for form in (known, list(map("{}-{}".format, folders, known)))]
+    found = [next((form[i] for form in forms if form.count(form[i]) == 1), files[i]) for i in range(len(logs))]
+    if twice := [name for name in found if found.count(name) > 1][:1]:
+        both = " and ".join(str(log) for log, name in zip(logs, found, strict=True) if name == twice[0])
+        raise InputError(f"{both} would both be called {twice[0]}; give them one at a time")
+    return found
 
 
 # --- text ---------------------------------------------------------------------------------------------------------

@@ -6,21 +6,31 @@ The lab knows no other form of a ride. A log, a simulated ride and any other sou
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
-from gz_onboard.bus.codec import Codec
+from gz_onboard.bus.codec import BACK_NS, Codec
 from gz_onboard.bus.logs import LogDamage, is_table, read_frames
 from gz_onboard.bus.mapping import BusMapping
-from gz_onboard.errors import InputError
-from gz_onboard.events import Event, Frame
+from gz_onboard.errors import InputError, brief, nearest, shown
+from gz_onboard.events import INSTRUMENTS, ROLES, Event, Frame
+from gz_onboard.offline.arguments import check, within
 from gz_onboard.offline.signal_table import SignalTable, read_table, signal_frames
+from gz_onboard.options import MOST_PAYLOAD
 from gz_onboard.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from gz_onboard.arrays import Array
+
+NUMBERS = {
+    "rider_mass_kg": (0.0, MOST_PAYLOAD, "kg"),  # and luggage
+    "total_mass_kg": (1.0, 100_000.0, "kg"),  # of vehicle, rider and luggage
+    "ambient_C": (-60.0, 70.0, "degC"),
+}
+TEXTS = ("kind", "rider", "direction", "note")
+"""What can be written down of a ride: numbers with their range and unit, and texts."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +39,23 @@ class Samples:
 
     columns: by role (names and units of `events.ROLES`, and `events.INSTRUMENTS`) the times [s, of one clock for the
     whole ride, increasing] and values (SI) of every sample that passed the codec, no two roles at the same times.
-    facts: what was written down about the ride (``rider_mass_kg``, ``ambient_C``, ``kind``, ``direction``, ...).
+    facts: what was written down about the ride: of `NUMBERS` and `TEXTS`.
+
+    Raises InputError for what is none of these.
     """
 
     name: str
     columns: dict[str, tuple[Array, Array]]
     facts: dict[str, object] = field(default_factory=dict)
+
+    __repr__ = brief
+
+    def __post_init__(self) -> None:
+        check("name", self.name, str)
+        check("columns", self.columns, Mapping[str, object])
+        columns = {role: _column(f"{self.name}: {role}", role, column) for role, column in self.columns.items()}
+        object.__setattr__(self, "columns", columns)
+        object.__setattr__(self, "facts", checked_facts(self.name, self.facts))
 
     @property
     def rider_mass(self) -> float | None:
@@ -116,11 +137,53 @@ def read_facts(file: Path) -> dict[str, dict[str, object]]:
     """What is written down about rides, by their names: a JSON list of objects with ``name``. Empty without a file."""
     if not file.is_file():
         return {}
+    found: dict[str, dict[str, object]] = {}
     try:
-        rows = json.loads(file.read_text(encoding="utf-8"))
-        return {row["name"]: {key: value for key, value in row.items() if key != "name"} for row in rows}
-    except (ValueError, TypeError, KeyError) as error:
+        for row in json.loads(file.read_text(encoding="utf-8")):
+            name = row.pop("name")
+            if name in found:
+                raise InputError(f"{file}: two rides are called {name!r}")
+            found[name] = checked_facts(f"{file}: {name}", row)
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(f"{file}: must be a JSON list of objects with a name: {error!r}") from error
+    return found
+
+
+def checked_facts(place: str, facts: object) -> dict[str, object]:
+    """What is known of a ride, without what is None; InputError for what is not of `NUMBERS` and `TEXTS`."""
+    check(f"{place}: facts", facts, Mapping[str, object])
+    known = {key: value for key, value in cast("Mapping[str, object]", facts).items() if value is not None}
+    for key, value in known.items():
+        if key in NUMBERS:
+            check(f"{place}: {key}", value, float)
+            within(key, cast("float", value), NUMBERS, f"{place}: ")
+        elif key in TEXTS:
+            check(f"{place}: {key}", value, str)
+        else:
+            names = (*NUMBERS, *TEXTS)
+            raise InputError(
+                f"{place}: {key!r} is no fact of a ride{nearest(key, names)}; there are {', '.join(names)}"
+            )
+    return known
+
+
+def _column(place: str, role: str, column: object) -> tuple[Array, Array]:
+    """(times, values) of a role; InputError if these are not two arrays of numbers of one length, times increasing."""
+    import numpy as np
+
+    if role not in ROLES and role not in INSTRUMENTS:
+        raise InputError(f"{place}: is no role{nearest(role, (*ROLES, *INSTRUMENTS))}")
+    if not isinstance(column, tuple | list) or len(column) != 2:
+        raise InputError(f"{place}: must be two arrays, times [s] and values, is {shown(column)}")
+    try:
+        time, values = (np.asarray(one) for one in column)
+    except ValueError:  # rows of unlike lengths
+        time, values = np.zeros(1), np.zeros(2)
+    if time.shape != values.shape or time.ndim != 1 or not {time.dtype.kind, values.dtype.kind} <= set("fiu"):
+        raise InputError(f"{place}: must be two arrays of numbers of one length, times [s] and values")
+    if not (np.diff(time) >= -1e-9 * BACK_NS).all():
+        raise InputError(f"{place}: its times do not increase")
+    return time.astype(float, copy=False), values.astype(float, copy=False)
 
 
 def ride_name(log: Path) -> str:
@@ -133,10 +196,10 @@ def facts_of(log: Path) -> dict[str, object]:
     return read_facts(log.parent / "rides.json").get(ride_name(log), {})
 
 
-def rider_mass(facts: dict[str, object]) -> float | None:
+def rider_mass(facts: Mapping[str, object]) -> float | None:
     """The mass of rider and luggage [kg] that is written down of a ride, or None."""
     mass = facts.get("rider_mass_kg")
-    return float(mass) if isinstance(mass, int | float) else None
+    return None if mass is None else float(cast("float", mass))
 
 
 def extended(mapping: BusMapping) -> BusMapping:

@@ -33,11 +33,14 @@ if TYPE_CHECKING:
 
 _FIRST_IDENTIFIER = 0x1000_0000  # of 29 bits: no range frames have it
 _COLUMN = re.compile(r"\s*(?P<name>.*?)\s*(?:[\[(]\s*(?P<unit>[^\])]*?)\s*[\])])?\s*")
-_TIME = re.compile(r"\s*(?:time|timestamp|t)(?:_|\s*[\[(])?\s*(?P<unit>s|ms)?\s*[\])]?\s*", re.I)
+_TIME = re.compile(r"\s*(?:time|timestamp|t)(?:(?:_|\s+|\s*[\[(]\s*)(?P<unit>s|ms)\s*[\])]?)?\s*", re.I)
+_SECONDS = {"s": 1.0, "ms": 1e-3}
 _ALSO = {"speed": "vehicle_speed"}
+_WORDS = {"battery": "pack", "soc": "bms_state_of_charge", "temp": "temperature", "velocity": "speed"}
 _MISSING = ("", "nan", "null", "none", "n/a")
 _LAST = ("motor_speed", "inverter_voltage", "pack_voltage")  # the estimator makes its step with the last that is there
 _VALUE = Struct("<d")
+_LONGEST_STEP = 30.0  # s, the usual one from row to row: beyond it nothing can be followed
 _1970 = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -163,18 +166,22 @@ def _times(file: Path, name: str, rows: Rows) -> list[int]:
         raise InputError(
             f"{file}:1: the first column must be the time, such as 'time [s]' (in s, ms or ISO 8601), is {shown(name)}"
         )
-    factor = 1e-3 if header["unit"] == "ms" else 1.0
+    unit = (header["unit"] or "").lower()
     times: list[int] = []
     for line, row in rows:
         try:
-            times.append(_nanoseconds(row[0], factor))
+            times.append(_nanoseconds(row[0], unit))
+        except KeyError:
+            raise InputError(
+                f"{file}:{line}: {name}: {shown(row[0])} has no unit; call the column 'time [s]' or 'time [ms]'"
+            ) from None
         except (ValueError, OverflowError):
             raise InputError(
                 f"{file}:{line}: {name}: {shown(row[0])} is neither a number nor a time of ISO 8601"
             ) from None
         if not -TIME_LIMIT_NS < times[-1] < TIME_LIMIT_NS:
             raise InputError(
-                f"{file}:{line}: {name}: {shown(row[0])} {header['unit'] or 's'} is no time of this age; if it is in "
+                f"{file}:{line}: {name}: {shown(row[0])} {unit or 's'} is no time of this age; if it is in "
                 "ms, call the column 'time [ms]'"
             )
         if len(times) > 1 and times[-1] < times[-2]:
@@ -183,23 +190,32 @@ def _times(file: Path, name: str, rows: Rows) -> list[int]:
         raise InputError(f"{file}: {len(times)} rows are no ride")
     if times[0] == times[-1]:
         raise InputError(f"{file}: {name}: all rows have the same time, {shown(rows[0][1][0])}, which is no ride")
+    if (step := median(after - before for before, after in pairwise(times)) * 1e-9) > _LONGEST_STEP + 1e-6:
+        raise InputError(
+            f"{file}: {name}: from row to row it is usually {step:.4g} s, and {_LONGEST_STEP:g} s are the most; if "
+            "the times are in ms, call the column 'time [ms]'"
+        )
     return [time - times[0] for time in times] if times[0] < 0 else times
 
 
-def _nanoseconds(cell: object, factor: float) -> int:
-    """A time [ns]: a number in units of `factor` s, or since 1970 that of a date, which is UTC if it has no zone."""
+def _nanoseconds(cell: object, unit: str) -> int:
+    """A time [ns]: a number in `unit`, or since 1970 that of a date, which is UTC if it has no zone.
+
+    ValueError or OverflowError for what is neither, KeyError for a number without a unit.
+    """
     if isinstance(cell, str):
+        text = cell.strip()
         try:
-            return round(float(cell) * factor * 1e9)
+            cell = float(text)
         except ValueError:
-            cell = datetime.fromisoformat(cell.strip())
+            cell = datetime.fromisoformat(text)
     if isinstance(cell, date):
         cell = cell if isinstance(cell, datetime) else datetime(cell.year, cell.month, cell.day)
         moment = cell if cell.tzinfo else cell.replace(tzinfo=UTC)
         return (moment - _1970) // timedelta(microseconds=1) * 1000
     if not isinstance(cell, int | float):
         raise ValueError
-    return round(cell * factor * 1e9)
+    return round(cell * _SECONDS[unit] * 1e9)
 
 
 def _column(text: str, at: int) -> _Column:
@@ -251,15 +267,21 @@ def _database(file: Path, columns: Sequence[_Column]) -> Database:
     return database
 
 
+def _in_our_words(name: str) -> str:
+    """A name with the words of our roles for those of others."""
+    return "_".join(_WORDS.get(word, word) for word in name.lower().split("_"))
+
+
 def _by_role(file: Path, columns: Sequence[_Column]) -> tuple[Source, ...]:
     """The source of each role, from columns that have the roles' names."""
     sources: dict[str, Source] = {}
     for column in columns:
         role = _ALSO.get(column.name, column.name)
         if role not in ROLES:
+            meant = nearest(_in_our_words(role), (*_ALSO, *ROLES))
             raise InputError(
-                f"{file}:1: column {column.name!r} is no role{nearest(role, ROLES)}; rename it, leave it out, "
-                "or name it in the [roles] of a vehicle file without dbc"
+                f"{file}:1: column {column.name!r} is no role{meant}; rename it, leave it out, or name it in the "
+                "[roles] of a vehicle file without dbc"
             )
         if role in sources:
             raise InputError(f"{file}:1: columns {sources[role].signal!r} and {column.name!r} are both {role}")

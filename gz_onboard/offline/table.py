@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from gz_onboard.errors import InputError
+from gz_onboard.errors import InputError, shown
 from gz_onboard.offline.signal_table import SignalTable, arrow_rows, is_time
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
@@ -52,7 +53,7 @@ def signal_table(data: object, name: str = "table") -> SignalTable:
 def _mapping_rows(data: Mapping[Any, Any], name: str) -> tuple[list[str], list[tuple[int, tuple[Any, ...]]]]:
     names = list(data)
     order = [names[i] for i in _time_first([str(one) for one in names])]
-    columns = [_cells(data[one]) for one in order]
+    columns = [_cells(data[one], f"{name}: column {str(one)!r}") for one in order]
     lengths = {str(one): len(column) for one, column in zip(order, columns, strict=True)}
     if len(set(lengths.values())) > 1:
         said = ", ".join(f"{one} {length}" for one, length in lengths.items())
@@ -66,9 +67,14 @@ def _time_first(names: Sequence[str]) -> list[int]:
     return sorted(range(len(names)), key=lambda i: (i != at, i))
 
 
-def _cells(column: Iterable[Any]) -> list[Any]:
-    """The cells of a column as Python has them; times as dates."""
-    array = column if isinstance(column, np.ndarray) else np.asarray(list(column))
+def _cells(column: object, place: str) -> list[Any]:
+    """The cells of a column as Python has them; times as dates. InputError, which begins with `place`, for no array."""
+    array = np.array(0)
+    if isinstance(column, Iterable) and not isinstance(column, str):
+        with suppress(TypeError, ValueError):  # of no dimension, of rows of unlike lengths
+            array = column if isinstance(column, np.ndarray) else np.asarray(list(column))
+    if array.ndim != 1:
+        raise InputError(f"{place}: must be an array of one dimension, is {shown(column)}")
     if array.dtype.kind == "M":
         array = array.astype("datetime64[us]")  # as `datetime`, which has no ns
     cells: list[Any] = array.tolist()

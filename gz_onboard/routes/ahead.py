@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gz_onboard.errors import InputError
-from gz_onboard.routes.columns import Columns, read_columns
-from gz_onboard.routes.gpx import read_gpx
+from gz_onboard.errors import InputError, near_file
+from gz_onboard.routes.columns import Columns
+from gz_onboard.routes.gpx import read_road
 from gz_onboard.routes.route import KNOWN_AHEAD, Route, route_ahead_of
 
 LARGEST_FILE = 50_000_000  # bytes: a GPX of the most points that are taken has a tenth of it
@@ -17,8 +17,8 @@ def read_ahead(file: Path) -> tuple[Columns, Route]:
     try:
         size = file.stat().st_size
     except OSError as error:
-        raise InputError(f"{file}: {error.strerror or error}") from error
+        raise InputError(f"{file}: {error.strerror or error}{near_file(file)}") from error
     if size > LARGEST_FILE:
         raise InputError(f"{file}: has {size / 1e6:.0f} MB, a route has at most {LARGEST_FILE / 1e6:.0f} MB")
-    columns = read_gpx(file) if file.suffix.lower() == ".gpx" else read_columns(file, KNOWN_AHEAD)
+    columns = read_road(file, KNOWN_AHEAD)
     return columns, route_ahead_of(columns, file.stem.removesuffix(".route"))

@@ -11,7 +11,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, near_file, nearest, shown
 
 LEAST_ROWS = 2
 UNITS = {"mps": 1.0, "kmh": 1 / 3.6, "mph": 0.44704}  # [m/s] in one of each
@@ -56,7 +56,7 @@ def csv_rows(file: Path) -> list[tuple[int, list[str]]]:
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{file}: not a CSV file: {error}") from error
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"{file}: {getattr(error, 'strerror', None) or error}") from error
+        raise InputError(f"{file}: {getattr(error, 'strerror', None) or error}{near_file(file)}") from error
 
 
 def read_columns(file: Path, known: Collection[str]) -> Columns:
@@ -72,9 +72,9 @@ def read_columns(file: Path, known: Collection[str]) -> Columns:
     for column, name in enumerate(header):
         if name not in known:
             meant = nearest(_KMH.sub("kmh", name).replace("m/s", "mps"), known)  # or "kph" would be taken for "mph"
-            raise InputError(f"{file}:{line}: unknown column {name!r}{meant}; known are {', '.join(known)}")
+            raise InputError(f"{file}:{line}: unknown column {shown(name)}{meant}; known are {', '.join(known)}")
         if name in header[:column]:
-            raise InputError(f"{file}:{line}: column {name!r} is there twice")
+            raise InputError(f"{file}:{line}: column {shown(name)} is there twice")
     if len(records) <= LEAST_ROWS:
         raise InputError(f"{file}: has {len(records) - 1} rows below its header, must have at least {LEAST_ROWS}")
     table: list[list[float]] = []
@@ -90,7 +90,7 @@ def _number(place: str, field: str) -> float:
     try:
         value = float(field)
     except ValueError:
-        raise InputError(f"{place}: {field!r} is not a number") from None
+        raise InputError(f"{place}: {shown(field)} is not a number") from None
     if not math.isfinite(value):
-        raise InputError(f"{place}: must be a finite number, is {field}")
+        raise InputError(f"{place}: must be a finite number, is {shown(field)}")
     return value

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from xml.parsers import expat
 
-from gz_onboard.errors import InputError, shown
-from gz_onboard.routes.columns import LEAST_ROWS, Columns
+from gz_onboard.errors import InputError, near_file, shown
+from gz_onboard.routes.columns import LEAST_ROWS, Columns, read_columns
 
 POINTS = ("trkpt", "rtept")  # a track is the road; a route may be the places on the way only
 Point = tuple[int, str, str, str]
@@ -53,6 +54,11 @@ class _Reader:
             self._at = None
 
 
+def read_road(file: Path, known: Collection[str]) -> Columns:
+    """The columns of a road in a GPX file, or out of `known` in a CSV file. Raises InputError naming file and line."""
+    return read_gpx(file) if file.suffix.lower() == ".gpx" else read_columns(file, known)
+
+
 def read_gpx(file: Path) -> Columns:
     """Latitude, longitude and, if all points have it, altitude of the track in a GPX `file`.
 
@@ -64,7 +70,7 @@ def read_gpx(file: Path) -> Columns:
     except expat.ExpatError as error:
         raise InputError(f"{file}:{error.lineno}: not a GPX file: {expat.ErrorString(error.code)}") from error
     except OSError as error:
-        raise InputError(f"{file}: {error.strerror or error}") from error
+        raise InputError(f"{file}: {error.strerror or error}{near_file(file)}") from error
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
     points: list[Point] = next(filter(None, reader.points.values()), [])

@@ -16,7 +16,8 @@ from itertools import accumulate, pairwise
 from pathlib import Path
 
 from gz_onboard.errors import InputError
-from gz_onboard.routes.columns import UNITS, Columns, read_columns
+from gz_onboard.routes.columns import UNITS, Columns
+from gz_onboard.routes.gpx import read_road
 
 GRADE_LENGTH = 200.0  # [m]
 CURVE_LENGTH = 40.0  # [m]
@@ -59,9 +60,9 @@ class Route:
 
 
 def read_route(file: Path | str) -> Route:
-    """The route in a CSV `file`.
+    """The route in a GPX or CSV `file`.
 
-    Columns: altitude_m; distance_m along the road or latitude_deg and longitude_deg, or all three; optionally
+    Columns of CSV: altitude_m; distance_m along the road or latitude_deg and longitude_deg, or all three; optionally
     curvature_1pm (otherwise from the positions, 0 without these) and speed_limit_mps or speed_limit_kmh. Altitude
     is smoothed over `GRADE_LENGTH`, the heading for curvature over `CURVE_LENGTH`.
 
@@ -69,7 +70,8 @@ def read_route(file: Path | str) -> Route:
     not increase, positions that do not move or do not fit the distance, and values that no road has.
     """
     file = Path(file)
-    return route_of(read_columns(file, _KNOWN), file.name.removesuffix(".csv").removesuffix(".route"))
+    name = file.stem if file.suffix.lower() in (".csv", ".gpx") else file.name
+    return route_of(read_road(file, _KNOWN), name.removesuffix(".route"))
 
 
 def route_ahead_of(columns: Columns, name: str) -> Route:

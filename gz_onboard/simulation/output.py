@@ -23,6 +23,7 @@ from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle
 
 FORMATS = ("mcap", "parquet", "csv")
+PICTURES = (".png", ".ledger.png", ".measured.png", ".sweep.png", ".html")
 _TOPIC = "simulation"
 
 
@@ -35,12 +36,10 @@ def write(
     sweeps: Sequence[Sweep],
 ) -> list[str]:
     """The time series and the pictures; gives their names. Raises InputError if they cannot be written."""
-    mode = ".predictive" if arguments.predictive else ""
-    name = f"{plan.name}{mode}.simulation"
     files: list[Path] = []
 
     def file(ending: str) -> Path:
-        files.append(arguments.output / f"{name}{ending}")
+        files.append(output_file(arguments, plan, ending))
         return files[-1]
 
     with writing(arguments.output):
@@ -51,6 +50,12 @@ def write(
         if not arguments.no_plot:
             _draw(file, vehicle, plan, result, summary, sweeps)
     return [str(file) for file in files]
+
+
+def output_file(arguments: argparse.Namespace, plan: Plan, ending: str) -> Path:
+    """The file of a simulation that ends so."""
+    mode = ".predictive" if arguments.predictive else ""
+    return Path(arguments.output / f"{plan.name}{mode}.simulation{ending}")
 
 
 def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, scooter: Scooter) -> str:

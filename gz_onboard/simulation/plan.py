@@ -7,7 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from gz_onboard.errors import InputError, nearest
+from gz_onboard.errors import InputError, nearest, shown
+from gz_onboard.offline.arguments import check_fields
 from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.options import LOG_SUFFIXES
 from gz_onboard.routes.profile import speed_profile
@@ -43,8 +44,8 @@ class SimulationOptions:
 
     soc: state of charge at the start, 0 to 1. ambient: of air and vehicle at the start [degC]. grade: of the road [%,
     uphill positive]. wind: against the rider [m/s]. repeat: times that a cycle is ridden, or until_empty: until the
-    pack is. dyno: ``KG[,A[,B[,C]]]``, on a chassis dynamometer. chassis: straight, planar or leaning. predictive: a
-    rider follows the speed of a recorded ride. Raises InputError for a number out of its range.
+    pack is. dyno: ``KG[,A,B,C]``, on a chassis dynamometer. chassis: straight, planar or leaning. predictive: a
+    rider follows the speed of a recorded ride. Raises InputError for what is none of these, or out of its range.
     """
 
     soc: float | None = None
@@ -58,10 +59,11 @@ class SimulationOptions:
     predictive: bool = False
 
     def __post_init__(self) -> None:
-        for name, (low, high, unit) in RANGES.items():
-            value = getattr(self, name)
-            if value is not None and not low <= value <= high:
-                raise InputError(f"{name} {value:.10g}: must be {low:g} to {high:g} {unit}".rstrip())
+        check_fields(self, RANGES)
+        if self.until_empty and self.repeat != 1:
+            raise InputError(f"repeat {self.repeat}: it is repeated until_empty")
+        if self.dyno is not None:
+            dynamometer(self.dyno)
         if self.chassis not in MODELS:
             raise InputError(f"chassis {self.chassis!r}: must be {', '.join(MODELS)}{nearest(self.chassis, MODELS)}")
 
@@ -93,7 +95,11 @@ def find_plan(what: str, options: SimulationOptions, vehicle: Vehicle) -> Plan:
 def _plan(what: str, options: SimulationOptions, vehicle: Vehicle) -> Plan:
     path = Path(what)
     kind = _kind(path)
-    roller = dynamometer(options.dyno) if options.dyno else None
+    roller = None if options.dyno is None else dynamometer(options.dyno)
+    if options.grade and (roller or kind != "cycle"):
+        raise InputError(f"--grade {options.grade:g}: {'a roller has none' if roller else f'the {kind} has its own'}")
+    if options.wind and roller:
+        raise InputError(f"--wind {options.wind:g}: on a roller there is none")
     if kind == "ride":
         return _ride_plan(path, options, vehicle, roller)
     if options.predictive:
@@ -121,6 +127,8 @@ def _kind(path: Path) -> str:
     """``ride``, ``route``, ``cycle``: of a CSV file by its first line, else by its name."""
     if path.suffix.lower() in _LOGS:
         return "ride"
+    if path.suffix.lower() == ".gpx":
+        return "route"
     if path.suffix.lower() != ".csv" or not path.is_file():
         return "cycle"
     with path.open(encoding="utf-8-sig", errors="replace") as file:
@@ -133,7 +141,7 @@ def _kind(path: Path) -> str:
         return "ride"
     known = ("time_s", "distance_m", "latitude_deg")
     raise InputError(
-        f"{path}:1: the columns {', '.join(header[:6])} are neither those of a cycle (time_s and speed_mps, "
+        f"{path}:1: the columns {shown(header[:6])} are neither those of a cycle (time_s and speed_mps, "
         "speed_kmh or speed_mph) nor of a route (distance_m or latitude_deg and longitude_deg; altitude_m)"
         f"{nearest(header[0], known)}"
     )
@@ -199,12 +207,12 @@ def ridden_road(
 
 
 def dynamometer(text: str) -> Dynamometer:
-    """``KG[,A[,B[,C]]]`` as a dynamometer; InputError for anything else."""
+    """``KG`` or ``KG,A,B,C`` as a dynamometer; InputError for anything else, such as a decimal comma."""
     try:
         numbers = [float(part) for part in text.split(",")]
     except ValueError:
         numbers = []
-    if not 1 <= len(numbers) <= 4 or not all(map(math.isfinite, numbers)):
+    if len(numbers) not in (1, 4) or not all(map(math.isfinite, numbers)):
         raise InputError(f"--dyno {text}: must be KG or KG,A,B,C: inertia in kg, force in N, N·s/m, N·s²/m²")
     if not 1 <= numbers[0] <= 5000:
         raise InputError(f"--dyno {text}: an inertia of {numbers[0]:g} kg is outside 1 to 5000 kg")

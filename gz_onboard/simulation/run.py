@@ -13,6 +13,7 @@ from math import nan
 import numpy as np
 
 from gz_onboard.arrays import Array, stretches
+from gz_onboard.errors import brief
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.progress import Progress
 from gz_onboard.simulation.parts.rider import Rider
@@ -88,6 +89,8 @@ class Run:
     form_factor_squared: float  # mean square of the pack current over the square of its mean
     empty: bool = False  # the ride ended because the pack was empty
     shortfalls: list[Shortfall] = field(default_factory=list)
+
+    __repr__ = brief
 
     @property
     def mean_power(self) -> float:

@@ -19,7 +19,7 @@ from gz_onboard.offline.results import explain_keys, times, write_json
 from gz_onboard.options import add_shared, number
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.simulation.frames import Dropouts, check_output
-from gz_onboard.simulation.output import FORMATS, write, write_trace
+from gz_onboard.simulation.output import FORMATS, PICTURES, output_file, write, write_trace
 from gz_onboard.simulation.parts.chassis import MODELS, chassis
 from gz_onboard.simulation.plan import RANGES, Plan, SimulationOptions, find_plan, vehicle_on
 from gz_onboard.simulation.recorded import rest_soc, scooter_at_start
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard simulate``."""
     explain_keys(parser, "the summary", SUMMARY_VERSION, KEYS)
     add = parser.add_argument
-    what = "name of a built-in drive cycle, CSV file of a cycle or a route, or log of a recorded ride to be replayed"
+    what = "name of a built-in drive cycle, CSV of a cycle, CSV or GPX of a route, or log of a ride to be replayed"
     add("what", metavar="WHAT", help=what)
     add_shared(parser, "--vehicle", "--payload")
     charge = "state of charge at the start (default: 1; of a recorded ride, as recorded)"
@@ -93,8 +93,10 @@ def run(arguments: argparse.Namespace) -> int:
         check_output(arguments.frames)
     elif arguments.frame_loss is not None:
         raise InputError(f"--frame-loss {arguments.frame_loss:g}: is for --frames FILE")
-    not_an_input((arguments.frames, arguments.json), [Path(arguments.what), find_vehicle(arguments.vehicle)])
     plan = find_plan(arguments.what, options, vehicle)
+    endings = [*(() if arguments.no_series else [f".{arguments.format}"]), *(() if arguments.no_plot else PICTURES)]
+    written = [arguments.frames, arguments.json, *(output_file(arguments, plan, ending) for ending in endings)]
+    not_an_input(written, [Path(arguments.what), find_vehicle(arguments.vehicle)])
     trace = Trace() if arguments.frames else None
     begin = time.perf_counter()
     expected = _expected_seconds(options, plan, sweeps)

@@ -59,6 +59,7 @@ def test_every_role_has_a_unit_of_which_it_is_said_what_is_plausible():
     [
         ((-2750, 300, 52.0), "Ambient"),  # below absolute zero
         ((200, 32767, 52.0), "Speed"),  # 3277 km/h
+        ((200, -360, 52.0), "Speed"),  # backwards
         ((200, 300, -1.0), "Volts"),
         ((200, 300, 3e38), "Volts"),
         ((200, 300, float("nan")), "Volts"),

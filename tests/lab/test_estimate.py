@@ -264,8 +264,10 @@ def test_rides_of_the_same_name_in_several_folders(tmp_path, frames):
         candump(tmp_path / folder / "ride.log", frames[:2000])
     assert run(tmp_path / "a" / "ride.log", tmp_path / "b" / "ride.log", "--output", tmp_path, "--no-plot") == 0
     assert {f.name for f in tmp_path.glob("*.mcap")} == {"a-ride.estimate.mcap", "b-ride.estimate.mcap"}
-    (tmp_path / "a" / "ride.csv").touch()
-    assert run(tmp_path / "a" / "ride.log", tmp_path / "a" / "ride.csv", "--output", tmp_path) == 2
+    candump(tmp_path / "a" / "ride.csv", frames[:2000])
+    assert run(tmp_path / "a" / "ride.log", tmp_path / "a" / "ride.csv", "--output", tmp_path / "c", "--no-plot") == 0
+    assert {f.name for f in (tmp_path / "c").glob("*.mcap")} == {"ride.log.estimate.mcap", "ride.csv.estimate.mcap"}
+    assert run(tmp_path / "a" / "ride.log", tmp_path / "b" / ".." / "a" / "ride.log", "--output", tmp_path) == 2
 
 
 @pytest.mark.parametrize(
@@ -296,7 +298,7 @@ def test_a_slow_bus_is_estimated_ten_times_a_second(vehicle, frames):
 def test_a_summary_names_the_sensors_that_were_left_out(tmp_path, capsys):
     rows = "".join(f"{t / 2},361,14,{36 + t % 4},{0 if t > 60 else 36}\n" for t in range(241))
     (tmp_path / "ride.csv").write_text(
-        "time,pack_voltage [V],pack_current [A],vehicle_speed [km/h],gps_speed [km/h]\n" + rows
+        "time [s],pack_voltage [V],pack_current [A],vehicle_speed [km/h],gps_speed [km/h]\n" + rows
     )
     i3 = LOGS.parent / "tests" / "vehicles" / "i3" / "i3.toml"
     arguments = ["--vehicle", i3, "--no-plot", "--output", tmp_path]
@@ -308,7 +310,7 @@ def test_a_summary_names_the_sensors_that_were_left_out(tmp_path, capsys):
 
 
 def test_without_a_voltage_a_summary_says_why_there_is_no_range(tmp_path, capsys):
-    (tmp_path / "ride.csv").write_text("time,speed [m/s]\n" + "".join(f"{t},5\n" for t in range(40)))
+    (tmp_path / "ride.csv").write_text("time [s],speed [m/s]\n" + "".join(f"{t},5\n" for t in range(40)))
     assert run(tmp_path / "ride.csv", "--no-plot", "--output", tmp_path) == 0
     assert "range at the end  none: no voltage of the pack or the inverter came" in capsys.readouterr().out
 

@@ -319,6 +319,25 @@ def test_a_log_of_estimates_gives_their_table(tmp_path: Path, estimated: Path, n
     assert len(rows) == 11
 
 
+def test_columns_of_a_folder_may_be_of_any_of_its_tables(tmp_path: Path) -> None:
+    assert cli.main(["estimate", str(LOGS / "coastdown.blf"), "--no-plot", "--output", str(tmp_path), "--quiet"]) == 0
+    log = tmp_path / "coastdown.estimate.mcap"
+    for columns, tables in (("soc", {"estimate"}), ("speed", {"estimate", "why"}), ("stops[m]", {"why"})):
+        folder = tmp_path / columns
+        assert run(log, folder, "--columns", columns, "--table-format", "csv") == 0
+        assert {file.stem for file in folder.iterdir()} == tables
+    with pytest.raises(InputError, match=r"has no column .sped. \(did you mean .speed."):
+        run(log, tmp_path / "none", "--columns", "sped")
+
+
+@pytest.mark.parametrize("name", ["out.csv.gz", "my.ride.asc.gz", "out.TRC.gz"])
+def test_frames_are_packed_under_any_name(tmp_path: Path, log: Path, name: str) -> None:
+    assert run(log, tmp_path / name, "--frames") == 0
+    there = [frame for batch in read_frames(tmp_path / name) for frame in batch]
+    assert [frame[1:3] for frame in there] == [frame[1:3] for frame in recorded()]
+    assert {file.name for file in tmp_path.iterdir()} == {"ride.mcap", name}
+
+
 def test_estimates_in_parquet(tmp_path: Path, estimated: Path) -> None:
     pq = pytest.importorskip("pyarrow.parquet")
     assert run(estimated, tmp_path / "out.parquet", "--from", "2", "--to", "5") == 0
@@ -468,6 +487,8 @@ def test_columns_are_chosen_by_name_with_or_without_unit(tmp_path: Path, estimat
             ["out.csv", "--estimates", "--columns", "rnge"],
             r"has no column 'rnge' \(did you mean 'range'\?\); there are",
         ),
+        (["out.parquet", "--columns", ""], "--columns: names none; there are"),
+        (["out.csv", "--estimates", "--columns", " ,"], "--columns: names none; there are"),
         (["out.parquet", "--columns", "Voltag"], r"has no column 'Voltag' \(did you mean 'Voltage'\?\); there are"),
         (["out.blf", "--columns", "Voltage"], "--columns: are of estimates or signals"),
         (["out.mcap", "--columns", "Voltage"], "--columns: an .mcap has all"),

@@ -309,7 +309,7 @@ def test_a_ride_without_throttle_and_yaw_rate_is_judged_by_the_rest(tmp_path, ca
 
 @pytest.mark.parametrize("plot", [[], ["--no-plot"]])
 def test_a_ride_of_which_nothing_can_be_compared_has_not_passed(tmp_path, capsys, plot):
-    (tmp_path / "ride.csv").write_text("time,speed [m/s]\n" + "".join(f"{t},5\n" for t in range(40)))
+    (tmp_path / "ride.csv").write_text("time [s],speed [m/s]\n" + "".join(f"{t},5\n" for t in range(40)))
     assert main(["validate", str(tmp_path / "ride.csv"), "--output", str(tmp_path), *plot]) == 2
     out = capsys.readouterr()
     assert "ride.csv: nothing in it can be compared with its simulation: it has none of battery current" in out.err

@@ -8,6 +8,7 @@ import json
 import os
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,7 +71,8 @@ def test_semicolons_with_decimal_commas_and_other_encodings_and_packed(tmp_path)
 @pytest.mark.parametrize(
     ("head", "times"),
     [
-        ("time", ["10.0", "10.5", "11.0"]),
+        ("t (s)", ["10.0", "10.5", "11.0"]),
+        ("Time [MS]", ["10000", "10500", "11000"]),
         ("t_ms", ["10000", "10500", "11000"]),
         ("Timestamp", ["2024-05-01T10:00:00Z", "2024-05-01T10:00:00.5Z", "2024-05-01 12:00:01+02:00"]),
         ("time [s]", ["-1", "-0.5", "0"]),
@@ -120,6 +122,9 @@ def test_parquet(tmp_path, monkeypatch):
     ("old", "new", "parts"),
     [
         ("pack_current [mA]", "pack_curent [mA]", [":1:", "'pack_curent' is no role", "did you mean 'pack_current'"]),
+        ("pack_current [mA]", "battery_current [mA]", ["did you mean 'pack_current'"]),
+        ("pack_current [mA]", "soc [%]", ["did you mean 'bms_state_of_charge'"]),
+        ("speed [km/h]", "Speed [km/h]", ["did you mean 'speed'"]),
         ("pack_current [mA]", "pack_current [V]", [":1:", "'pack_current' has unit 'V'", "one of A, mA"]),
         ("pack_current [mA]", "pack_current", [":1:", "'pack_current' has no unit", "pack_current [A]"]),
         ("pack_current [mA]", "pack_voltage [V]", [":1:", "two columns are called 'pack_voltage'"]),
@@ -131,6 +136,9 @@ def test_parquet(tmp_path, monkeypatch):
         ("3500", "inf", [":3: column", "'inf' is not"]),
         ("3500,", "", [":3: 5 cells for 6 columns"]),
         ("11.0,", "1714557600000,", [":4: time [s]: '1714557600000' s is no time", "call the column 'time [ms]'"]),
+        ("time [s]", "time", [":2: time: '10.0' has no unit", "'time [s]' or 'time [ms]'"]),
+        ("time [s]", "times", [":1: neither a log of frames", "nor a table of signals"]),
+        ("\n11.0,", "\n91.0,", ["usually 40.5 s", "call the column 'time [ms]'"]),
         ("10.5,,3500,39.6,nan,0\n11.0,", "10.0,", ["time [s]: all rows have the same time, '10.0'"]),
     ],
 )
@@ -229,7 +237,7 @@ def test_a_table_of_a_ride_gives_the_estimate_of_its_frames(tmp_path):
     from gz_onboard.events import ROLES as UNITS
 
     roles = sorted({role for row in rows.values() for role in row})
-    lines = ["time," + ",".join(f"{role} [{UNITS[role]}]" for role in roles)]
+    lines = ["time [s]," + ",".join(f"{role} [{UNITS[role]}]" for role in roles)]
     lines += [f"{start * 1e-9 + t:.6f}," + ",".join(str(row.get(r, "")) for r in roles) for t, row in rows.items()]
     (tmp_path / "table.csv").write_text("\n".join(lines))
     from gz_onboard.bus.writers import write_candump
@@ -269,3 +277,30 @@ def test_the_trips_of_a_car_have_the_way_and_energy_of_their_index(tmp_path, wit
         assert np.trapezoid(power, time) / 3.6e6 == pytest.approx(float(row["e_batt_kWh"]), rel=0.01)
         speed = columns["vehicle_speed"]
         assert np.trapezoid(speed[1], speed[0]) / 1000 == pytest.approx(float(row["km"]), rel=0.01)
+
+
+def steady(tmp_path: Path, step: float, speed: float = 36.0) -> dict[str, Any]:
+    """The estimate of ten minutes at one speed [km/h] with a row each `step` [s]."""
+    rows = "".join(f"{step * i:g},52,14,{speed:g}\n" for i in range(round(600 / step) + 1))
+    (tmp_path / "steady.csv").write_text(f"time [s],pack_voltage [V],pack_current [A],speed [km/h]\n{rows}")
+    return estimate(tmp_path, tmp_path / "steady.csv")
+
+
+def test_up_to_five_seconds_between_rows_are_ridden_through(tmp_path):
+    ride = steady(tmp_path, 5.0)
+    assert (ride["distance_km"], ride["gaps_s"]) == (pytest.approx(6.0, rel=0.02), 0.0)
+    assert ride["energy_wh"] == pytest.approx(52 * 14 * 600 / 3600, rel=0.02)
+
+
+@pytest.mark.parametrize("step", [6.0, 20.0])
+def test_what_rows_too_far_apart_leave_out_is_said_and_no_number_is_made_of_it(tmp_path, step):
+    ride = steady(tmp_path, step)
+    assert ride["distance_km"] + ride["gaps_s"] / 100 == pytest.approx(6.0, rel=0.02)
+    assert (ride["energy_wh"], ride["energy_recovered_wh"], ride["consumption_wh_km"]) == (None, None, None)
+    assert (ride["range_end_km"], ride["energy_left_wh"]) == (None, None)
+
+
+def test_a_speed_at_which_nothing_reverses_is_out_of_range(tmp_path):
+    ride = steady(tmp_path, 0.5, -36.0)
+    assert (ride["distance_km"], ride["speed_max_km_h"], ride["implausible"]) == (0.0, None, 1201)
+    assert steady(tmp_path, 0.5, -7.2)["distance_km"] == pytest.approx(1.2, rel=0.02)

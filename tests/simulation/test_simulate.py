@@ -204,6 +204,10 @@ def test_sweep_of_two(short, tmp_path, capsys):
         (["ece15", "--ambient", "200"], ["200 degC"]),
         (["ece15", "--payload", "-5"], ["-5 kg"]),
         (["ece15", "--dyno", "heavy"], ["--dyno heavy", "KG,A,B,C"]),
+        (["ece15", "--dyno", "180,5"], ["--dyno 180,5", "KG,A,B,C"]),
+        (["ece15", "--dyno", ""], ["--dyno : must be"]),
+        (["ece15", "--dyno", "180", "--grade", "3"], ["--grade 3", "a roller has none"]),
+        (["ece15", "--dyno", "180", "--wind", "3"], ["--wind 3", "on a roller"]),
         (["ece15", "--repeat", "0"], ["--repeat 0"]),
         (["ece15", "--predictive"], ["recorded"]),
         (["ece15", "--vehicle", "referense"], ["reference"]),
@@ -225,6 +229,8 @@ def test_what_cannot_be_is_refused_by_name(tmp_path, capsys, arguments, words):
         ("time_s,speed_kmh\n0,0\n1,5\n2,6\n9,6\n10,6\n", [":5:", "gap"]),
         ("time_s,sped_kmh\n0,0\n1,5\n", ["sped_kmh", "speed_kmh"]),
         ("hello,world\n1,2\n", ["hello", "time_s"]),
+        (f"<gpx>{'<trkpt/>' * 9999}\n", ["<gpx>", "..."]),
+        (f"time_s,{'x' * 9999}\n", ["unknown column 'xxx", "..."]),
         ("distance_m,altitude_m\n0,1\n50,2\n40,3\n", [":4:", "distance_m"]),
     ],
 )
@@ -233,8 +239,27 @@ def test_bad_files_are_refused_by_line(tmp_path, capsys, text, words):
     file.write_text(text)
     assert simulate(file, "--output", tmp_path / "out") == 2
     message = capsys.readouterr().err
+    assert len(message) < 600 + len(str(file))
     for word in words:
         assert word in message
+
+
+def test_a_route_in_gpx_is_the_one_in_csv(tmp_path, capsys):
+    points = [(48 + i * 3e-4, 11.5, 500 + i % 7) for i in range(31)]
+    (tmp_path / "way.csv").write_text(
+        "latitude_deg,longitude_deg,altitude_m\n" + "".join(f"{x:.6f},{y},{z}\n" for x, y, z in points)
+    )
+    track = "".join(f'<trkpt lat="{x:.6f}" lon="{y}"><ele>{z}</ele></trkpt>' for x, y, z in points)
+    (tmp_path / "way.gpx").write_text(f"<gpx><trk><trkseg>{track}</trkseg></trk></gpx>")
+    told = []
+    for name in "way.csv", "way.gpx":
+        found = tmp_path / "out.json"
+        assert simulate(tmp_path / name, "--no-plot", "--no-series", "--json", found, "--output", tmp_path) == 0
+        told.append(json.loads(found.read_text()))
+    assert told[0]["consumption_wh_km"] == told[1]["consumption_wh_km"] > 0
+    (tmp_path / "flat.gpx").write_text((tmp_path / "way.gpx").read_text().replace("ele>", "el>"))
+    assert simulate(tmp_path / "flat.gpx", "--output", tmp_path) == 2
+    assert "column altitude_m is missing" in capsys.readouterr().err
 
 
 def test_a_directory_that_cannot_be_made(short, tmp_path, capsys):

@@ -79,9 +79,6 @@ def samples(table: Measurements, facts: Mapping[str, object] | None = None) -> S
             raise table.error(f"{notes.name} beside it says no {' or '.join(keys)} of {name!r}{close}")
     if "ambient_temperature" not in table and "ambient_C" not in known:
         raise table.error(f"no column ambient_temperature, and {notes.name} beside it says no ambient_C of {name!r}")
-    for key in ("total_mass_kg", "rider_mass_kg", "ambient_C"):
-        if key in known and (isinstance(known[key], bool) or not isinstance(known[key], int | float)):
-            raise table.error(f"{notes.name} beside it: {key} of {name!r} is {known[key]!r}, no number")
     return Samples(name, {new or old: (time, table[old]) for old, new in _ROLES.items() if old in table}, known)
 
 

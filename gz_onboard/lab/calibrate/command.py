@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 
 from gz_onboard.bus.logs import logs_among
-from gz_onboard.errors import OK, InputError, nearest, not_an_input, writing
+from gz_onboard.errors import OK, InputError, near_file, nearest, not_an_input, writing
 from gz_onboard.lab.calibrate import manifest, report
 from gz_onboard.lab.calibrate.manifest import Option, Step, check_count
 from gz_onboard.lab.calibrate.prior_check import check_against_file
 from gz_onboard.lab.calibrate.procedures import PROCEDURES, Given, Procedure
 from gz_onboard.lab.calibrate.result import LackingError, Result
 from gz_onboard.lab.calibrate.table import read_table
-from gz_onboard.lab.calibrate.vehicle_file import write_vehicle
+from gz_onboard.lab.calibrate.vehicle_file import vehicle_output, write_vehicle
 from gz_onboard.offline.results import explain_keys, write_json
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.options import add_shared, keep_old_name
@@ -150,11 +150,10 @@ def run(arguments: argparse.Namespace) -> int:
     for file in (arguments.output, arguments.report, arguments.json):
         if file is not None and str(file) != "-" and not Path(file).parent.is_dir():
             raise InputError(f"{file}: there is no folder {Path(file).parent}")
-    if arguments.output and arguments.output.suffix != ".toml":
-        raise InputError(f"--output {arguments.output}: a vehicle file is a .toml")
-    read = [file for step in steps for files in step.files.values() for file in files]
-    named = [base, *arguments.data, *(folder / manifest.NAME for folder in arguments.data)]
-    not_an_input((arguments.output, arguments.report, arguments.json), [*read, *named])
+    read = [base, *files_of(steps, arguments.data)]
+    if arguments.output:
+        vehicle_output(arguments.output, read, "--output ")
+    not_an_input((arguments.output, arguments.report, arguments.json), read)
     results, took, trouble = _found(steps, base, arguments.quiet)
     text = arguments.json != "-"
     if text:
@@ -212,6 +211,12 @@ def _asked(arguments: argparse.Namespace) -> tuple[Path, list[Step]]:
     return base, [step_of(arguments.what, files, options_of(arguments.set, arguments.what))]
 
 
+def files_of(steps: Sequence[Step], data: Sequence[Path]) -> list[Path]:
+    """The files that are read for `steps`, with the manifest in what was given as `data`."""
+    read = [file for step in steps for files in step.files.values() for file in files]
+    return [*read, *data, *(folder / manifest.NAME for folder in data)]
+
+
 def asked_of_manifest(data: Sequence[Path], vehicle: str | Path | None) -> tuple[Path, list[Step]]:
     """(vehicle file to start from, steps) of a folder's manifest; vehicle: another than the manifest's."""
     if len(data) != 1:
@@ -227,7 +232,8 @@ def step_of(name: str, files: Mapping[str, Sequence[Path]], options: Mapping[str
     for slot, group in found.items():
         if slot not in procedure.slots:
             raise InputError(
-                f"--with {slot}={group[0]}: {name} has no data {slot!r}{nearest(slot, procedure.slots)}; "
+                f"--with {slot}={', '.join(map(str, group[:1]))}: {name} has no data {slot!r}"
+                f"{nearest(slot, procedure.slots)}; "
                 f"there are {', '.join(procedure.slots)}"
             )
         if procedure.slots[slot].kind != "table":
@@ -236,8 +242,7 @@ def step_of(name: str, files: Mapping[str, Sequence[Path]], options: Mapping[str
         check_count(name, slot, needed, len(found.get(slot, ())))
     for file in (file for group in found.values() for file in group):
         if not file.is_file():
-            there = [p.name for p in file.parent.glob("*")] if file.parent.is_dir() else []
-            raise InputError(f"{file}: no such file{nearest(file.name, there)}")
+            raise InputError(f"{file}: no such file{near_file(file)}")
     return Step(name, {slot: tuple(group) for slot, group in found.items()}, {}, dict(options))
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.errors import InputError
+from gz_onboard.errors import InputError, brief
 
 
 class LackingError(InputError):
@@ -104,6 +104,8 @@ class Result:
     notes: list[str] = field(default_factory=list)
     panels: list[Panel] = field(default_factory=list)
     effects: dict[str, bool] = field(default_factory=dict)
+
+    __repr__ = brief
 
     def add(self, other: Result) -> None:
         """Put what `other` found into this."""

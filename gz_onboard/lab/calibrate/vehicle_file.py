@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.errors import InputError
+from gz_onboard.errors import InputError, not_an_input
 from gz_onboard.lab.calibrate import toml_text
 from gz_onboard.lab.calibrate.fit import correlation
 from gz_onboard.lab.calibrate.result import Curve, Found, Result
@@ -23,6 +23,13 @@ from gz_onboard.physics.effect import PACKAGE_EFFECTS, Effect
 from gz_onboard.physics.model import BASE_EFFECTS
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import Vehicle, read_vehicle
+
+
+def vehicle_output(out: Path, inputs: Sequence[Path], option: str = "") -> None:
+    """InputError if a vehicle file is not to be written as `out`. option: what stands before its name."""
+    if out.suffix != ".toml":
+        raise InputError(f"{option}{out}: a vehicle file is a .toml")
+    not_an_input([out], inputs)
 
 
 def write_vehicle(base: Path, results: Sequence[Result], out: Path) -> Vehicle:

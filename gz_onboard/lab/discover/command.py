@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gz_onboard.bus.logs import log_suffix, logs_among
-from gz_onboard.errors import InputError, nearest, not_an_input, writing
+from gz_onboard.errors import InputError, near_file, nearest, not_an_input, writing
+from gz_onboard.lab.calibrate.vehicle_file import vehicle_output
 from gz_onboard.lab.discover.baseline import baseline
 from gz_onboard.lab.discover.baseline_file import write_baseline
 from gz_onboard.lab.discover.breakdown import loads_by_ride, outlying_rides
@@ -22,11 +23,12 @@ from gz_onboard.lab.discover.result import VERSION, Report
 from gz_onboard.lab.discover.summary import listing, summary
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import Say
+from gz_onboard.offline.arguments import check_fields
 from gz_onboard.offline.processes import Task, over_rides
-from gz_onboard.offline.results import explain_keys, write_json
+from gz_onboard.offline.results import distinct_names, explain_keys, write_json
 from gz_onboard.offline.samples import Samples, read_samples, ride_name
 from gz_onboard.offline.schema import descriptions
-from gz_onboard.options import add_shared, keep_old_name
+from gz_onboard.options import MOST_JOBS, MOST_SEED, add_shared, keep_old_name
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
@@ -73,8 +75,7 @@ def run(arguments: argparse.Namespace) -> int:
     rides, refused = read_rides(logs, arguments)
     if arguments.baseline:
         return run_baseline(arguments, vehicle, rides, refused)
-    holdout = [name.strip() for name in arguments.holdout.split(",")] if arguments.holdout else None
-    options = DiscoveryOptions(arguments.seed, arguments.effects, arguments.jobs, holdout)
+    options = DiscoveryOptions(arguments.seed, arguments.effects, arguments.jobs, _names(arguments.holdout) or None)
     with progress_bar(lambda: None, quiet=arguments.quiet) as display:
         found = explain(vehicle, rides, options, refused, display.step)
     written = write_extended(found, vehicle, arguments.write_model) if arguments.write_model else []
@@ -92,14 +93,23 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
+RANGES = {"seed": (0, MOST_SEED, ""), "jobs": (1, MOST_JOBS, "processes")}
+"""What of `DiscoveryOptions` is a number: the least, the greatest, the unit."""
+
+
 @dataclass(frozen=True)
 class DiscoveryOptions:
-    """How is searched, as of `discover`."""
+    """How is searched, as of `discover`. Raises InputError for what is none of these, or out of its range."""
 
     seed: int = 0
-    effects: Path | None = None  # folder of the user's own
+    effects: str | os.PathLike[str] | None = None  # folder of the user's own
     jobs: int = 1
-    holdout: Sequence[str] | None = None
+    holdout: Sequence[str] | None = None  # rides by name
+
+    def __post_init__(self) -> None:
+        check_fields(self, RANGES)
+        if self.effects is not None and not Path(self.effects).is_dir():
+            raise InputError(f"effects {self.effects}: no such folder")
 
 
 def explain(
@@ -117,7 +127,9 @@ def explain(
     rides = [ride for ride in rides if "roller_speed" not in ride.columns]
     if not rides:
         raise InputError("; ".join(left) or "no ride is given")
-    found = discover(vehicle, rides, options.seed, options.effects, say, options.jobs, options.holdout)
+    known_rides(options.holdout or (), [ride.name for ride in rides])
+    effects = None if options.effects is None else Path(options.effects)
+    found = discover(vehicle, rides, options.seed, effects, say, options.jobs, options.holdout)
     report = found.report
     report.notes[:0] = left
     report.notes += [
@@ -152,28 +164,35 @@ def run_baseline(arguments: argparse.Namespace, vehicle: Vehicle, rides: list[Sa
 
 def _check(arguments: argparse.Namespace, logs: Sequence[Path]) -> None:
     """InputError for what cannot be, before anything takes long."""
-    own = find_vehicle(arguments.vehicle).resolve()
+    own = find_vehicle(arguments.vehicle)
     for option in ("baseline", "write_model"):
-        out: Path | None = getattr(arguments, option)
-        if out is None:
-            continue
-        shown = f"--{option.replace('_', '-')} {out}"
-        if out.resolve() == own:
-            raise InputError(f"{shown}: is the vehicle file itself; give another name")
-        if out.suffix != ".toml":
-            raise InputError(f"{shown}: a vehicle file is a .toml")
+        if out := getattr(arguments, option):
+            vehicle_output(out, [own], f"--{option.replace('_', '-')} ")
     for option in ("baseline", "write_model", "report", "json"):
         file = getattr(arguments, option)
         if file and str(file) != "-" and not Path(file).resolve().parent.is_dir():
             raise InputError(f"--{option.replace('_', '-')} {file}: no folder {Path(file).parent}")
     not_an_input((getattr(arguments, option) for option in ("baseline", "write_model", "report", "json")), [own, *logs])
-    names = [ride_name(log) for log in logs]
-    told_apart(names)
-    for name in filter(None, (part.strip() for part in (arguments.holdout or "").split(","))):
+    known_rides(_names(arguments.holdout), ride_names(logs))
+
+
+def _names(texts: str | None) -> list[str]:
+    """The names in a list of them."""
+    return [name.strip() for name in (texts or "").split(",") if name.strip()]
+
+
+def known_rides(holdout: Sequence[str], names: Sequence[str]) -> None:
+    """InputError if not all of the rides to be held out are among those called `names`, or none is left."""
+    for name in holdout:
         if name not in names:
-            raise InputError(f"--holdout: no ride is called {name!r}{nearest(name, names)}")
-    if arguments.holdout and len(logs) < 2:
-        raise InputError("--holdout: one ride alone cannot be held out of the fit")
+            raise InputError(f"holdout: no ride is called {name!r}{nearest(name, names)}")
+    if holdout and set(holdout) >= set(names):
+        raise InputError("holdout: no ride is left to be fitted")
+
+
+def ride_names(logs: Sequence[Path]) -> list[str]:
+    """What the ride of each log is called, each differently; InputError if that cannot be."""
+    return distinct_names(logs, [ride_name(log) for log in logs])
 
 
 def told_apart(names: Sequence[str]) -> None:
@@ -192,7 +211,7 @@ def find_logs(paths: Sequence[Path]) -> list[Path]:
         raise InputError("no ride is given; gz-onboard discover --list prints what could be found in one")
     for log in logs:
         if not log.is_file():
-            raise InputError(f"{log}: no such log")
+            raise InputError(f"{log}: no such log{near_file(log)}")
         log_suffix(log)
     return logs
 
@@ -217,11 +236,11 @@ def read_rides(logs: Sequence[Path], arguments: argparse.Namespace) -> tuple[lis
     rides: list[Samples] = []
     refused: list[str] = []
     with progress_bar(lambda: len(tasks), "rides", quiet=arguments.quiet) as display:
-        for _, result in over_rides(_read, tasks, arguments.jobs):
+        for (_, result), name in zip(over_rides(_read, tasks, arguments.jobs), ride_names(logs), strict=True):
             if isinstance(result, InputError):
                 refused.append(str(result))
             else:
-                rides.append(result)
+                rides.append(replace(result, name=name))
             display.update(1)
     if not rides:
         raise InputError("; ".join(refused))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from gz_onboard.constants import WH_PER_KM
+from gz_onboard.errors import brief
 from gz_onboard.offline.schema import OPTIONAL
 
 VERSION = 2  # of the keys: 1 had energy_per_way for consumption
@@ -220,3 +221,5 @@ class Report:
         "per candidate: parameter, change, unit, energy_share: the least that would be found half the time; needs: the "
         "roles that show it, any set of them",
     ] = field(default_factory=dict)
+
+    __repr__ = brief

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gz_onboard.arrays import Array
+from gz_onboard.errors import brief
 from gz_onboard.lab.discover.acceptance import within_bounds
 from gz_onboard.lab.discover.blocks import depends
 from gz_onboard.lab.discover.candidates import Candidate
@@ -48,6 +49,8 @@ class Discovery:
     at: Array
     lines: list[LinearRide]
     normals: list[Normal]
+
+    __repr__ = brief
 
 
 def conclude(problem: SearchProblem, notes: list[str], say: Say) -> Discovery:

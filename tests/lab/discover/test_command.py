@@ -41,8 +41,8 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         ([str(ROOT / "README.md")], "unknown log format '.md'"),
         ([str(RIDE), "--effects", "nowhere"], "--effects nowhere: no such folder"),
         ([str(RIDE), "--vehicle", "refrence"], "did you mean 'reference'"),
-        ([str(RIDE), str(RIDE)], "two rides are called city_14C"),
-        ([str(RIDE), "--holdout", "city_14C"], "one ride alone"),
+        ([str(RIDE), str(RIDE)], "would both be called city_14C.blf"),
+        ([str(RIDE), "--holdout", "city_14C"], "no ride is left to be fitted"),
         ([str(LOGS), "--holdout", "city_43C"], "no ride is called 'city_43C' (did you mean 'city_34C'?)"),
         ([str(RIDE), "--json", "nowhere/out.json"], "no folder nowhere"),
         ([str(RIDE), "--write-model", "new.txt"], "a vehicle file is a .toml"),
@@ -68,7 +68,7 @@ def test_the_model_may_have_an_effect_that_only_the_option_knows(capsys, tmp_pat
 
 def test_the_vehicle_file_itself_is_not_overwritten(capsys):
     own = str(ROOT / "gz_onboard" / "vehicles" / "reference.toml")
-    assert "is the vehicle file itself" in said(capsys, str(RIDE), "--write-model", own)
+    assert "would overwrite the input" in said(capsys, str(RIDE), "--write-model", own)
 
 
 def test_the_list_says_of_each_what_it_is_and_what_shows_it(capsys):
