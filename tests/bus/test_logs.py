@@ -328,7 +328,7 @@ def test_rubbish_in_the_middle_loses_what_it_hits_and_is_told(suffix: str, place
         if there != frames:
             assert damages or rubbish == before
         assert set(frames).issuperset(there)
-        assert len(there) > 13_000
+        assert len(there) >= 13_000  # two chunks at most
 
 
 def test_broken_lines_are_skipped_counted_and_the_first_one_named(tmp_path: Path) -> None:
