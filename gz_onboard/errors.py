@@ -13,7 +13,8 @@ from pathlib import Path
 OK, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 EXIT_STATUSES = {
     OK: "done",
-    FAILED: "the answer is no (validate --gate, dashboard --once), or the system failed: a full disk, a closed pipe",
+    FAILED: "the answer is no (validate --gate, vehicle check, dashboard --once), or the system failed: a full disk, "
+    "a closed pipe",
     BAD_INPUT: "the command line, a file or a parameter cannot be used, or one of several logs cannot",
     INTERRUPTED: "interrupted by Ctrl-C",
 }

@@ -1,0 +1,1 @@
+"""Whether a log fits a vehicle file."""

@@ -1,0 +1,172 @@
+"""A log against a vehicle file: what fills each role, what looks right and what wrong, what is missing for what."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from gz_onboard.arrays import Array
+from gz_onboard.bus.codec import RANGE, Codec
+from gz_onboard.bus.mapping import BusMapping
+from gz_onboard.bus.units import UNITS
+from gz_onboard.estimator.signals import DEFAULT_STALE
+from gz_onboard.events import STALE_PERIODS, Group
+from gz_onboard.lab.vehicle import electric, motion, others
+from gz_onboard.lab.vehicle.features import Feature, feature_text, features_of
+from gz_onboard.lab.vehicle.finding import Finding, Looks, unknown, wrong
+from gz_onboard.lab.vehicle.on_board import on_board
+from gz_onboard.lab.vehicle.seconds import Seconds, seconds_of
+from gz_onboard.offline.results import clock
+from gz_onboard.offline.samples import Samples, facts_of, open_ride, read_roles, ride_name
+from gz_onboard.vehicle import Vehicle
+
+CHECK_VERSION = 1
+RARE = 0.9  # of the time: a signal that is there for less is told
+DROPPED = 0.01  # of the values: as many out of the limits are wrong limits, or a wrong layout
+_LATER = unknown("on board", (), "not tried: what looks wrong would mislead it")
+
+
+@dataclass(frozen=True)
+class RoleSeen:
+    """What a log has of a role."""
+
+    role: Annotated[str, "its name"]
+    signal: Annotated[str, "its signal in the DBC file"]
+    looks: Annotated[Looks, "looks right, looks wrong, or cannot tell"]
+    unit: Annotated[str, "of low and high"]
+    rate_hz: Annotated[float | None, "how often it comes; null if never"]
+    low: Annotated[float | None, "least value"]
+    high: Annotated[float | None, "greatest value"]
+    share: Annotated[float, "of the log's time in which it is valid, 0 to 1"]
+
+
+@dataclass(frozen=True)
+class Checked:
+    """A log."""
+
+    file: Annotated[str, "the log"]
+    duration_s: Annotated[float, "from the first to the last value"]
+    roles: Annotated[list[RoleSeen], "of the vehicle file"]
+    findings: Annotated[list[Finding], "all checks"]
+    features: Annotated[list[Feature], "and what is missing for each"]
+
+    def those(self, looks: Looks) -> list[Finding]:
+        """The findings with this verdict."""
+        return [finding for finding in self.findings if finding.looks is looks]
+
+
+def check_log(
+    log: Path, vehicle: Vehicle, progress: Callable[[int], None] | None = None, quick: bool = False
+) -> Checked:
+    """Check one log; quick: without `on_board`. Raises InputError for one that cannot be read."""
+    mapping, frames = open_ride(log, vehicle)
+    codec = Codec(mapping)
+    columns = read_roles(log, vehicle, (codec, frames), progress)
+    samples = Samples(ride_name(log), columns, facts_of(log))
+    findings = list(_dropped(codec, columns))
+    if columns:
+        findings += _checks(seconds_of(samples, vehicle), vehicle, samples.rider_mass)
+    if columns and not quick:
+        suspected = any(finding.looks is Looks.WRONG for finding in findings)
+        findings += [_LATER] if suspected else on_board(log, vehicle)
+    end = max((float(times[-1]) for times, _ in columns.values()), default=0.0)
+    start = min((float(times[0]) for times, _ in columns.values()), default=0.0)
+    seen = _roles(mapping, codec.groups, samples, (start, end), findings)
+    return Checked(str(log), end - start, seen, findings, features_of(columns))
+
+
+def _dropped(codec: Codec, columns: Mapping[str, tuple[Array, Array]]) -> Iterator[Finding]:
+    """Signals whose values were dropped, out of the limits of the DBC file or of any vehicle."""
+    roles = {f"{source.message}.{source.signal}": source.role for source in codec.mapping.sources}
+    for (name, reason), count in sorted(codec.faults.items()):
+        role = roles.get(name)
+        kept = len(columns[role][0]) if role and role in columns else 0
+        if role and reason == RANGE and count > DROPPED * (count + kept):
+            text = f"{count} of {count + kept} values were dropped: out of the DBC file's limits, or of a vehicle's"
+            yield wrong("limits", (role,), text)
+
+
+def _checks(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterator[Finding]:
+    speeds = motion.speeds_of(ride, vehicle)
+    by_speed = list(motion.check_speeds(ride, speeds))
+    doubted = frozenset(role for finding in by_speed if finding.looks is Looks.WRONG for role in finding.roles)
+    best = next((speeds[role] for role in speeds if role not in doubted), next(iter(speeds.values()), None))
+    of = electric.drawn(ride, vehicle)
+    return chain(
+        by_speed,
+        motion.check_distances(ride, speeds, doubted),
+        motion.check_accelerations(ride, speeds, doubted),
+        motion.check_turning(ride, speeds),
+        electric.check_voltages(ride, vehicle.battery) if vehicle.battery else (),
+        electric.check_sag(of) if of else (),
+        electric.check_road(ride, of, best, electric.model_power(ride, vehicle, best, payload))
+        if of and best is not None
+        else (),
+        electric.check_currents(ride),
+        electric.check_motor(ride, of),
+        electric.check_charge(ride, of, vehicle),
+        others.check_temperatures(ride),
+        others.check_switches(ride, best),
+        others.check_throttle(ride, of.current if of else None),
+        others.check_stuck(ride, best),
+    )
+
+
+def _roles(
+    mapping: BusMapping,
+    groups: Sequence[Group],
+    samples: Samples,
+    span: tuple[float, float],
+    findings: Sequence[Finding],
+) -> list[RoleSeen]:
+    periods = {group.message: group.period for group in groups}
+    found = []
+    for source in mapping.sources:
+        said = {finding.looks for finding in findings if source.role in finding.roles}
+        looks = next((verdict for verdict in (Looks.WRONG, Looks.RIGHT) if verdict in said), Looks.UNKNOWN)
+        rate = low = high = None
+        share = 0.0
+        if source.role in samples.columns:
+            times, values = samples.columns[source.role]
+            period = periods.get(source.message)
+            stale = STALE_PERIODS * period if period else DEFAULT_STALE
+            rate = 1 / max(float(np.median(np.diff(times))), 1e-6)
+            low, high = float(values.min()), float(values.max())
+            held = float(np.minimum(np.diff(times, append=span[1]), stale).sum())
+            share = min(held / max(span[1] - span[0], 1e-9), 1.0)
+        found.append(RoleSeen(source.role, source.signal, looks, UNITS[source.role], rate, low, high, share))
+    return found
+
+
+def check_text(checked: Checked) -> str:
+    """For a terminal."""
+    suspected = Counter(role for finding in checked.those(Looks.WRONG) for role in finding.roles)
+    said = "looks right"
+    if suspected:
+        count, role = len(checked.those(Looks.WRONG)), suspected.most_common(1)[0][0]
+        said = "one thing looks wrong" if count == 1 else f"{count} things look wrong, above all {role}"
+    lines = [f"{checked.file} ({clock(checked.duration_s)}): {said}"]
+    lines += [f"  {seen.role:21} {_seen_text(seen)}" for seen in checked.roles]
+    for looks in (Looks.WRONG, Looks.RIGHT, Looks.UNKNOWN):
+        if those := checked.those(looks):
+            lines += [f"{looks}:", *(f"  {f.check} ({', '.join(f.roles)}): {f.text}" for f in those)]
+    return "\n".join([*lines, features_text(checked.features)])
+
+
+def features_text(features: Sequence[Feature]) -> str:
+    """What works and what lacks what, for a terminal."""
+    return "\n".join(["features:", *(f"  {feature.name:24} {feature_text(feature)}" for feature in features)])
+
+
+def _seen_text(seen: RoleSeen) -> str:
+    if seen.rate_hz is None or seen.low is None or seen.high is None:
+        return f"never came ({seen.signal})"
+    unit = "" if seen.unit == "1" else f" {seen.unit}"
+    share = "" if seen.share > RARE else f", only {seen.share:.0%} of the time"
+    return f"{seen.rate_hz:.3g} Hz, {seen.low:.4g} to {seen.high:.4g}{unit}{share}: {seen.looks}"

@@ -1,0 +1,264 @@
+"""Whether what a log says of voltages, currents and charge fits together, and fits the battery of the vehicle file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from gz_onboard.arrays import Array, Mask
+from gz_onboard.constants import BENCH_TEMPERATURE, HOUR
+from gz_onboard.estimator.redundancy.checks import MOVING
+from gz_onboard.estimator.redundancy.currents import APART_RELATIVE
+from gz_onboard.estimator.redundancy.motion import DRIVES
+from gz_onboard.estimator.redundancy.voltages import APART, HIGHEST, LOWEST
+from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
+from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, UNRELATED, Seconds, relation, unit_of
+from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.model import air_density, all_quantities
+from gz_onboard.vehicle import Vehicle
+
+PACK = ("pack_voltage", "pack_current")
+SAGS = 0.5  # a correlation of the changes of voltage and current from here on is that of a resistance
+RESISTANCES = (0.3, 3.5)  # of the file's: cold cells, aged ones
+ENERGIES = (0.5, 2.0)  # of the model's: hills, wind and payload are in it
+BRAKES = -0.4  # m/s²: slower than the road load alone
+SOC_APART = 0.3  # by the first voltage against the vehicle's own
+COUNTED, GAINS = (
+    0.06,
+    (0.6, 1.7),
+)  # of a state of charge counted, at least, and over what is shown: aged cells count less
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What the pack gives: voltage [V], current [A] of the ride, (n,), and its battery; temperature of the cells."""
+
+    voltage: Array
+    current: Array | None
+    battery: Battery
+    temperature: float  # degC
+
+
+def drawn(ride: Seconds, vehicle: Vehicle) -> Drawn | None:
+    """Pack or inverter; None without a voltage or a battery."""
+    voltages = ride.any_of("pack_voltage", "inverter_voltage")
+    if not voltages or vehicle.battery is None:
+        return None
+    currents = ride.any_of("pack_current", "inverter_current")
+    degrees = [float(np.nanmean(ride[role])) for role in ride.any_of("cell_temperature", "ambient_temperature")]
+    temperature = min(max(degrees[0], -30.0), 60.0) if degrees else BENCH_TEMPERATURE
+    current = ride[currents[0]] if currents else None
+    return Drawn(ride[voltages[0]], current, vehicle.battery, temperature)
+
+
+def check_voltages(ride: Seconds, battery: Battery) -> Iterator[Finding]:
+    """Each within what the cells can have, and both against each other."""
+    series = battery.cells_series
+    low, high = LOWEST * battery.cutoff_voltage, HIGHEST * battery.ocv_value[-1]
+    full, empty = battery.ocv_value[-1], battery.cutoff_voltage
+    inside: list[str] = []
+    for role in ride.any_of("pack_voltage", "inverter_voltage"):
+        least, middle, most = (float(x) / series for x in np.nanpercentile(ride[role], (1, 50, 99)))
+        text = f"{least:.2f} to {most:.2f} V a cell of {series} in series"
+        if low < middle < high and most < high:
+            inside.append(role)
+            yield right("voltage against the cells", (role,), f"{text}; they have {empty:.2f} to {full:.2f} V")
+            continue
+        like = unit_of(role, middle / (0.5 * (empty + full)))
+        fit = round(middle * series / (0.5 * (empty + full)))
+        hint = like or (f": {fit} in series would fit" if fit >= 1 else "")
+        yield wrong("voltage against the cells", (role,), f"{text}, which have {empty:.2f} to {full:.2f} V{hint}")
+    if len(inside) == 2:
+        apart = ride["inverter_voltage"] - ride["pack_voltage"]
+        known = np.isfinite(apart)
+        off = float(np.median(apart[known])) / series if known.any() else 0.0
+        looks = right if abs(off) < APART else wrong
+        yield looks("voltages against each other", (*inside,), f"the inverter's is {off:+.3f} V a cell off the pack's")
+
+
+def check_sag(of: Drawn) -> Iterator[Finding]:
+    """The current's sign and size by what the voltage lacks under it."""
+    if of.current is None:
+        return
+    check = "current against the voltage's drop"
+    capacity = of.battery.pack_capacity(BENCH_TEMPERATURE)
+    current, volts = np.diff(of.current), np.diff(of.voltage)
+    if np.nanstd(of.current) < DRIVES * capacity / 2 or np.nanstd(current) < DRIVES * capacity / 4:
+        yield unknown(check, PACK, f"the current hardly changes ({np.nanstd(of.current):.2f} A)" + _tiny(of, capacity))
+        return
+    found = relation(current, volts)
+    if found is None:
+        yield unknown(check, PACK, "the voltage does not move, or they are not there together")
+        return
+    r0 = of.battery.circuit(0.5, of.temperature)[0]
+    expected = of.battery.cells_series / of.battery.cells_parallel * r0 + of.battery.series_resistance
+    shown = -found.factor
+    text = f"{1e3 * abs(shown):.3g} mΩ of the pack, where the file has {1e3 * expected:.3g} mΩ"
+    if found.correlation > SAGS:
+        yield wrong(check, ("pack_current",), f"the voltage rises with it: its sign, scale = -1 ({text})")
+    elif found.correlation > -SAGS:
+        yield unknown(check, PACK, f"they hardly go together (correlation {found.correlation:.2f})")
+    elif RESISTANCES[0] < shown / expected < RESISTANCES[1]:
+        yield right(check, PACK, f"the voltage drops with it: {text}")
+    else:
+        like = unit_of("pack_current", expected / shown) or ": scale of the current, r0, or the cells' number"
+        yield wrong(check, ("pack_current",), text + like)
+
+
+def _tiny(of: Drawn, capacity: float) -> str:
+    """What else a current may be that moves too little for the pack."""
+    moved = float(np.nanstd(of.voltage)) / of.battery.cells_series
+    return f", though the voltage moves by {1e3 * moved:.0f} mV a cell" if moved > 0.02 and capacity else ""
+
+
+def model_power(ride: Seconds, vehicle: Vehicle, speed: Array, payload: float | None) -> Array:
+    """Power [W] of the pack by the model, (n,), on the level."""
+    p = vehicle.parameters
+    mass = p["vehicle_mass"] + (p["payload_mass"] if payload is None else payload)
+    ambient = float(np.nanmean(ride["ambient_temperature"])) if "ambient_temperature" in ride else BENCH_TEMPERATURE
+    ambient = min(max(ambient, -40.0), 60.0)
+    acceleration = np.gradient(speed, SECOND)
+    grade = np.zeros_like(speed)
+    quantities = all_quantities(
+        speed=speed,
+        acceleration=acceleration,
+        grade=grade,
+        mass=mass,
+        air_density=air_density(ambient),
+        ambient_temperature=ambient,
+        motor_temperature=ambient,
+    )
+    return np.asarray(sum(vehicle.model.power(quantities).values()))
+
+
+def check_road(ride: Seconds, of: Drawn, speed: Array, expected: Array) -> Iterator[Finding]:
+    """The pack's power against that of the model [W] (n,) at this speed [m/s] (n,)."""
+    if of.current is None:
+        return
+    check, power = "power against speed and acceleration", of.voltage * of.current
+    moving = np.isfinite(power) & np.isfinite(expected) & (np.abs(speed) > MOVING)
+    found = relation(expected, power, moving)
+    if found is None:
+        yield unknown(check, PACK, "the vehicle hardly moves in this log")
+        return
+    given, wanted = (float(x[moving & (expected > 0)].sum()) for x in (power, expected))
+    ratio = given / wanted if wanted > 0 else 0.0
+    text = f"{ratio:.2f} times the model's while it drives, correlation {found.correlation:.2f}"
+    if found.correlation < -UNRELATED * 2:
+        yield wrong(check, ("pack_current",), f"less where more is needed ({text}): its sign, scale = -1")
+    elif found.correlation < UNRELATED * 2:
+        yield unknown(check, PACK, f"hills hide it: {text}")
+    elif ENERGIES[0] < ratio < ENERGIES[1]:
+        yield right(check, PACK, text)
+    else:
+        like = unit_of("pack_current", ratio)
+        yield wrong(check, (*PACK, "speed"), f"{text}{like or ': a scale of current or speed, mass, or drag area'}")
+    yield from _braking(of, speed, moving)
+
+
+def _braking(of: Drawn, speed: Array, moving: Mask) -> Iterator[Finding]:
+    """Whether the current has a sign, and what is recovered is in it."""
+    assert of.current is not None
+    check, current = "current while braking", of.current
+    braking = moving & (np.gradient(np.abs(speed), SECOND) < BRAKES)
+    if braking.sum() < FEWEST:
+        yield unknown(check, ("pack_current",), "it was hardly braked")
+        return
+    size = float(np.nanpercentile(np.abs(current), 90))
+    if float(np.percentile(current[braking], 5)) < -0.05 * size:
+        yield right(check, ("pack_current",), "some of the energy comes back")
+        return
+    steps = np.concatenate(([False], braking[1:] & braking[:-1]))
+    found = relation(np.diff(current, prepend=current[0]), np.diff(of.voltage, prepend=of.voltage[0]), steps)
+    if found and found.correlation > SAGS and float(np.median(current[braking])) > 0.05 * size:
+        yield wrong(check, ("pack_current",), "the voltage rises with it there: the current comes without its sign")
+    else:
+        yield unknown(check, ("pack_current",), "it is never negative: nothing is recovered, or that part is cut off")
+
+
+def check_currents(ride: Seconds) -> Iterator[Finding]:
+    """Pack against inverter and auxiliaries."""
+    if not {"pack_current", "inverter_current"} <= ride.columns.keys():
+        return
+    check, roles = "currents against each other", ("pack_current", "inverter_current")
+    auxiliary = np.nan_to_num(ride["auxiliary_current"]) if "auxiliary_current" in ride else 0.0
+    pack, inverter = ride["pack_current"], ride["inverter_current"] + auxiliary
+    found = relation(pack, inverter)
+    if found is None or abs(found.correlation) < 2 * UNRELATED:
+        yield unknown(check, roles, "they hardly move together")
+        return
+    text = f"the inverter's is {found.factor:.3g} times the pack's"
+    if found.correlation < 0:
+        yield wrong(check, roles, f"{text}: the sign of one")
+    elif abs(found.factor - 1) < 2 * APART_RELATIVE:
+        yield right(check, roles, text)
+    else:
+        yield wrong(check, roles, text + unit_of("inverter_current", found.factor))
+
+
+def check_motor(ride: Seconds, of: Drawn | None) -> Iterator[Finding]:
+    """The signs of torque and current of the motor by the power of the pack."""
+    if of is None or of.current is None:
+        return
+    speed = ride.get("motor_speed")
+    for role in ride.any_of("motor_torque", "motor_current"):
+        check = f"{role.replace('_', ' ')} against the pack's power"
+        work = ride[role] * (speed if speed is not None else 1.0)
+        found = relation(of.voltage * of.current, work)
+        if found is None or abs(found.correlation) < 2 * UNRELATED:
+            yield unknown(check, (role,), "they hardly move together")
+        elif found.correlation < 0:
+            yield wrong(check, (role, "pack_current"), "it goes against it: the sign of one, positive when driving")
+        elif role == "motor_torque" and speed is not None and not 0.4 < found.factor < 1.4:
+            yield wrong(check, (role,), f"its work is {found.factor:.2g} times the pack's{unit_of(role, found.factor)}")
+        else:
+            yield right(check, (role,), f"correlation {found.correlation:.2f}")
+
+
+def check_charge(ride: Seconds, of: Drawn | None, vehicle: Vehicle) -> Iterator[Finding]:
+    """The vehicle's own state of charge by the first voltage, and by the charge that flowed."""
+    if "bms_state_of_charge" not in ride or of is None:
+        return
+    role, shown = "bms_state_of_charge", ride["bms_state_of_charge"]
+    known = np.isfinite(shown) & np.isfinite(of.voltage)
+    if not known.any():
+        return
+    current = of.current if of.current is not None else np.zeros_like(shown)
+    first = np.flatnonzero(known)[:10]
+    cell = of.battery.cell_voltage(float(of.voltage[first].mean()), float(np.nan_to_num(current[first]).mean()))
+    load = float(np.nan_to_num(current[first]).mean()) / of.battery.cells_parallel
+    by_voltage = min(max(of.battery.soc_at_load(cell, load, of.temperature), 0.0), 1.0)
+    expected = of.battery.window.shown(by_voltage, 0.0)[0]
+    text = f"{shown[first[0]]:.0%} at the start, {expected:.0%} by the voltage {cell:.3f} V a cell"
+    if abs(float(shown[first[0]]) - expected) < SOC_APART:
+        yield right("state of charge against the voltage", (role, "pack_voltage"), text)
+    else:
+        hint = "cells in series, the table ocv, or battery.window"
+        yield wrong("state of charge against the voltage", (role, "pack_voltage"), f"{text}: {hint}")
+    yield from _counted(of, role, shown)
+
+
+def _counted(of: Drawn, role: str, shown: Array) -> Iterator[Finding]:
+    check, capacity = "state of charge against the charge", of.battery.pack_capacity(of.temperature)
+    if of.current is None:
+        return
+    known = np.isfinite(shown) & np.isfinite(of.current)
+    if known.sum() < FEWEST:
+        return
+    width = of.battery.window.high - of.battery.window.low
+    counted = float(of.current[known].sum()) * SECOND / HOUR / capacity / width
+    fell = float(shown[known][0] - shown[known][-1])
+    text = f"it falls by {fell:.1%}, and {counted:.1%} of the file's {capacity:.3g} A·h were drawn"
+    if max(abs(counted), abs(fell)) < COUNTED or known.mean() < 0.5:
+        yield unknown(check, (role, "pack_current"), f"{text}: too little")
+    elif counted * fell < 0:
+        yield wrong(check, (role, "pack_current"), f"{text}: the sign of one")
+    elif abs(fell) > 1e-6 and GAINS[0] < counted / fell < GAINS[1]:
+        yield right(check, (role, "pack_current"), text)
+    else:
+        like = unit_of("pack_current", counted / fell) if abs(fell) > 1e-6 else ": it does not move"
+        yield wrong(
+            check, (role, "pack_current"), text + (like or ": the cell's capacity, cells in parallel, or a scale")
+        )

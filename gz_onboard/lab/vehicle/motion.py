@@ -1,0 +1,224 @@
+"""Whether what a log says of the motion fits together: speeds, odometer, positions, accelerations, turning."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from gz_onboard.arrays import Array, Mask
+from gz_onboard.constants import GRAVITY
+from gz_onboard.estimator.redundancy.checks import MOVING
+from gz_onboard.estimator.redundancy.odometer import APART as ODOMETER_APART
+from gz_onboard.estimator.redundancy.odometer import FASTEST
+from gz_onboard.estimator.redundancy.speeds import AXLE, GROUND, SPEED_APART, SPEED_APART_RELATIVE, vote
+from gz_onboard.events import SPEEDS
+from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
+from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, Seconds, relation, unit_of
+from gz_onboard.physics.sensors import speed_factors
+from gz_onboard.vehicle import Vehicle
+
+EARTH = 6_371_000.0  # m, its radius
+SHORTEST = 300.0  # m, over which two distances are compared
+COUNTS = 5  # steps of the odometer, likewise
+LEVEL = 2.5  # m/s²: by so much the gravity that an axis shows may be off, by bias, mounting and hills
+SWINGS = 0.25  # m/s²: an acceleration that moves by less, as a standard deviation, shows nothing
+CLOSE = 0.4  # a correlation from here on is one: hills, bends and shaking are in an accelerometer too
+FACTORS = (0.6, 1.7)  # of an acceleration, likewise
+ROUGH = 0.2  # relative: of a factor of accelerations
+TURNING = 0.03  # rad/s
+TURN_FACTORS = (0.6, 1.6)
+
+
+def speeds_of(ride: Seconds, vehicle: Vehicle) -> dict[str, Array]:
+    """Every speed of the ride [m/s] by role, (n,)."""
+    p = vehicle.parameters
+    factors = speed_factors(p["wheel_radius"], p["gear_ratio"])
+    return {role: factors[role] * ride[role] for role in ride.any_of(*SPEEDS)}
+
+
+def check_speeds(ride: Seconds, speeds: dict[str, Array]) -> Iterator[Finding]:
+    """The speeds by majority, as on board, in their mean over what was ridden."""
+    check = "speeds against each other"
+    for role, speed in speeds.items():
+        top = float(np.nanmax(np.abs(speed)))
+        if top > FASTEST:
+            yield wrong("speed", (role,), f"reaches {3.6 * top:.0f} km/h by the radius and gear ratio of the file")
+        if float(np.nanmean(speed)) < -SPEED_APART:
+            yield wrong("speed's sign", (role,), "is negative while riding: give scale = -1")
+    known = np.all(np.isfinite(list(speeds.values())), axis=0) if speeds else np.zeros(0, dtype=bool)
+    moving = known & (np.max(np.abs(list(speeds.values())), axis=0, initial=0.0) > MOVING) if speeds else known
+    roles = tuple(speeds)
+    if moving.sum() < FEWEST:
+        if roles:
+            yield unknown(check, roles, "the vehicle hardly moves in this log")
+        return
+    means = {role: float(np.mean(np.abs(speed[moving]))) for role, speed in speeds.items()}
+    if len(roles) < 2:
+        yield unknown(check, roles, "there is no other speed to compare it with")
+        return
+    if all(means[role] < SPEED_APART for role in roles if role in GROUND) and AXLE & set(roles) and len(roles) > 1:
+        ground = tuple(role for role in roles if role in GROUND)
+        if len(ground) > 1 or not set(roles) - AXLE - set(ground):
+            yield unknown(check, roles, "the driven axle turns and the ground stands: a roller bench")
+            return
+    apart = {role: SPEED_APART / 2 + SPEED_APART_RELATIVE * mean for role, mean in means.items()}
+    outvoted, tied = vote(means, apart, spins=False)
+    yield from _speed_verdicts(check, means, outvoted, tied)
+
+
+def _speed_verdicts(
+    check: str, means: dict[str, float], outvoted: frozenset[str], tied: frozenset[str]
+) -> Iterator[Finding]:
+    others = {role: mean for role, mean in means.items() if role not in outvoted}
+    if tied:
+        shown = ", ".join(f"{role} {3.6 * mean:.1f} km/h" for role, mean in means.items())
+        a, b = min(means, key=lambda role: means[role]), max(means, key=lambda role: means[role])
+        like = unit_of(b, means[b] / means[a]) if means[a] > 0 else ""
+        yield wrong(
+            check, tuple(sorted(tied)), f"they contradict each other, and none decides: {shown} in the mean{like}"
+        )
+        return
+    middle = float(np.median(list(others.values())))
+    for role in sorted(outvoted):
+        ratio = means[role] / middle
+        yield wrong(check, (role,), f"shows {ratio:.3g} times what {', '.join(others)} show{unit_of(role, ratio)}")
+    if len(others) > 1:
+        spread = max(others.values()) / min(others.values()) - 1
+        yield right(check, tuple(others), f"{' and '.join(others)} agree within {spread:.1%}")
+
+
+def _path(latitude: Array, longitude: Array, moving: Mask) -> float:
+    """The length [m] of the way by positions [deg], where `moving` (n,)."""
+    north = np.radians(np.diff(latitude)) * EARTH
+    east = np.radians(np.diff(longitude)) * EARTH * np.cos(np.radians(latitude[:-1]))
+    return float(np.nansum(np.hypot(north, east)[moving[:-1]]))
+
+
+def check_distances(ride: Seconds, speeds: dict[str, Array], doubted: frozenset[str]) -> Iterator[Finding]:
+    """The way by the best speed against that of the odometer and of the positions."""
+    best = next((role for role in speeds if role not in doubted), next(iter(speeds), None))
+    if best is None:
+        return
+    speed = np.abs(speeds[best])
+    if "odometer" in ride:
+        yield from _odometer(ride["odometer"], best, speed)
+    if {"latitude", "longitude"} <= ride.columns.keys():
+        yield from _positions(ride, best, speed)
+
+
+def _odometer(odometer: Array, best: str, speed: Array) -> Iterator[Finding]:
+    check, roles = "speed against odometer", (best, "odometer")
+    known = np.isfinite(odometer) & np.isfinite(speed)
+    steps = np.diff(odometer[known])
+    if (steps < -1.0).any():
+        yield wrong("odometer", ("odometer",), "counts back")
+        return
+    counts = steps[steps > 0]
+    counted, ridden = float(counts.sum()), float(speed[known].sum()) * SECOND
+    largest = float(counts.max()) if len(counts) else 0.0
+    if max(counted, ridden) < max(SHORTEST, COUNTS * largest) or (not len(counts) and ridden < 2500):
+        yield unknown(check, roles, f"{ridden:.0f} m are too few for its steps")
+        return
+    if not counted:
+        yield wrong(check, ("odometer",), f"stands while {best} goes {ridden / 1e3:.1f} km")
+        return
+    ratio = ridden / counted
+    text = f"{best} goes {ridden / 1e3:.2f} km, the odometer {counted / 1e3:.2f} km"
+    if abs(ridden - counted) <= max(ODOMETER_APART * max(ridden, counted), 2 * largest):
+        yield right(check, roles, text)
+    else:
+        yield wrong(check, roles, f"{text}, {ratio:.3g} times{unit_of(best, ratio) or unit_of('odometer', 1 / ratio)}")
+
+
+def _positions(ride: Seconds, best: str, speed: Array) -> Iterator[Finding]:
+    check, roles = "speed against positions", (best, "latitude", "longitude")
+    latitude, longitude = ride["latitude"], ride["longitude"]
+    known = np.isfinite(latitude) & np.isfinite(longitude) & np.isfinite(speed)
+    moving = known & (speed > MOVING)
+    ridden = float(speed[moving].sum()) * SECOND
+    if ridden < SHORTEST:
+        yield unknown(check, roles, f"{ridden:.0f} m were ridden with positions")
+        return
+    way = _path(latitude, longitude, moving)
+    text = f"{best} goes {ridden / 1e3:.2f} km, the positions {way / 1e3:.2f} km"
+    if abs(way / ridden - 1) < ODOMETER_APART:
+        yield right(check, roles, text)
+        return
+    turned = _path(longitude, latitude, moving)
+    if abs(turned / ridden - 1) < ODOMETER_APART:
+        yield wrong("positions", ("latitude", "longitude"), f"swapped: {text}, and exchanged {turned / 1e3:.2f} km")
+    elif way < SHORTEST / 10:
+        yield wrong("positions", ("latitude", "longitude"), f"stuck: {text}")
+    else:
+        yield wrong(check, roles, f"{text}{unit_of(best, ridden / way)}")
+
+
+def check_accelerations(ride: Seconds, speeds: dict[str, Array], doubted: frozenset[str]) -> Iterator[Finding]:
+    """Gravity along the vertical axis alone; the forward one against the change of speed."""
+    for role, gravity in (("accel_x", 0.0), ("accel_y", 0.0), ("accel_z", GRAVITY)):
+        if role not in ride:
+            continue
+        mean, check = float(np.nanmean(ride[role])), "gravity"
+        if abs(mean - gravity) < LEVEL:
+            if gravity:
+                yield right(check, (role,), f"shows {mean:.2f} m/s² in the mean, up")
+        elif gravity and abs(mean + gravity) < LEVEL:
+            yield wrong(check, (role,), f"shows {mean:.2f} m/s²: its sign, scale = -1")
+        elif gravity and abs(mean - 1) < 0.2:
+            yield wrong(check, (role,), f"shows {mean:.2f}{unit_of(role, mean / gravity) or ': g taken for m/s²'}")
+        elif not gravity and abs(abs(mean) - GRAVITY) < LEVEL:
+            yield wrong(check, (role,), f"shows {mean:.2f} m/s² in the mean: the vertical axis, swapped")
+        else:
+            yield wrong(check, (role,), f"shows {mean:.2f} m/s² in the mean, where {gravity:.1f} is expected")
+    best = next((role for role in speeds if role not in doubted), None)
+    if best and "accel_x" in ride:
+        yield _forward(ride, best, speeds[best], len(speeds) - len(doubted & speeds.keys()) > 1)
+
+
+def _forward(ride: Seconds, best: str, speed: Array, sure: bool) -> Finding:
+    """sure: other speeds agree with `best`."""
+    check, roles = "acceleration against speed", ("accel_x", best)
+    change = np.gradient(speed, SECOND)
+    if np.nanstd(change) < SWINGS:
+        return unknown(check, roles, "the speed hardly changes")
+    found = relation(change, ride["accel_x"])
+    if found is None:
+        return unknown(check, roles, "they are not there together")
+    sideways = relation(change, ride["accel_y"]) if "accel_y" in ride else None
+    if sideways and abs(sideways.correlation) > max(CLOSE, abs(found.correlation) + 0.3):
+        return wrong(
+            check, ("accel_x", "accel_y"), "accel_y goes with the change of speed, and accel_x does not: swapped"
+        )
+    text = f"goes with the change of {best}, factor {found.factor:.2f}, correlation {found.correlation:.2f}"
+    if found.correlation < -CLOSE:
+        return wrong(check, ("accel_x",), f"{text}: its sign, scale = -1")
+    if found.correlation < CLOSE:
+        return unknown(check, roles, f"{text}: hills and shaking hide it")
+    if FACTORS[0] < found.factor < FACTORS[1]:
+        return right(check, roles, text)
+    by_speed = "" if sure else unit_of(best, 1 / found.factor, ROUGH)
+    return wrong(check, roles[:1] if sure else roles, text + (by_speed or unit_of("accel_x", found.factor, ROUGH)))
+
+
+def check_turning(ride: Seconds, speeds: dict[str, Array]) -> Iterator[Finding]:
+    """The turning to the left against the change of course."""
+    if not {"rate_z", "gps_course"} <= ride.columns.keys() or not speeds:
+        return
+    check, roles = "turning against course", ("rate_z", "gps_course")
+    fast = np.abs(next(iter(speeds.values()))) > 2 * MOVING
+    turning = -np.gradient(ride["gps_course"], SECOND)
+    turning = np.where(np.abs(turning) < 1.0, turning, np.nan)
+    found = relation(turning, ride["rate_z"], fast)
+    if found is None or float(np.nanstd(turning[fast])) < TURNING:
+        yield unknown(check, roles, "hardly a bend was ridden with a course")
+        return
+    text = f"factor {found.factor:.2f}, correlation {found.correlation:.2f}"
+    if found.correlation < -CLOSE:
+        yield wrong(check, roles, f"{text}: the sign of one; rate_z is positive to the left, the course to the right")
+    elif found.correlation < CLOSE:
+        yield unknown(check, roles, f"{text}: too noisy")
+    elif TURN_FACTORS[0] < found.factor < TURN_FACTORS[1]:
+        yield right(check, roles, text)
+    else:
+        yield wrong(check, roles, text + unit_of("rate_z", found.factor))

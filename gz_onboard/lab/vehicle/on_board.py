@@ -1,0 +1,50 @@
+"""What the daemon's own checks of the sensors say of a log: the pipeline over it, and what was left out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from gz_onboard.errors import InputError
+from gz_onboard.lab.estimate_ride import How, open_estimate, ride_through, summary_of
+from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
+from gz_onboard.offline.results import clock
+from gz_onboard.vehicle import Vehicle
+
+LEFT_OUT = 0.2  # of the time: a sensor that contradicts the others for as long is no passing fault
+INNOVATION = 0.03  # V of a cell: what is more is no good table of a battery
+
+
+class Mute:
+    """A log that keeps nothing."""
+
+    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
+        """As of `log_rows.Log`."""
+
+    def frames(self, batch: Sequence[Any]) -> None:
+        """As of `log_rows.Log`."""
+
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
+        """As of `log_rows.Log`."""
+
+
+def on_board(log: Path, vehicle: Vehicle) -> Iterator[Finding]:
+    """What the daemon's own checks would leave out for long."""
+    if vehicle.battery is None:
+        return
+    try:
+        ride = open_estimate(log, vehicle)
+        summary = summary_of(ride_through(ride, How(), Mute()))
+    except InputError as error:  # no battery, range frames that do not fit: `run` says it
+        yield unknown("on board", (), str(error))
+        return
+    for role, seconds in summary.distrusted.items():
+        if seconds > LEFT_OUT * summary.duration_s:
+            text = f"the daemon would leave it out for {clock(seconds)}: it contradicts the others"
+            yield wrong("on board", (role,), text)
+    if summary.innovation_rms_v is not None:
+        text = f"voltage less its prediction: {1e3 * summary.innovation_rms_v:.0f} mV RMS of a cell"
+        known = "the battery's tables are about right" if summary.innovation_rms_v < INNOVATION else "wrong tables?"
+        looks = right if summary.innovation_rms_v < INNOVATION else unknown
+        yield looks("on board", ("pack_voltage",), f"{text}; {known}")
