@@ -20,6 +20,7 @@ from tests.plant.ride import Hidden, ride
 from tests.plant.roads import plan
 from tests.plant.sensors import measure
 from tests.support import LOGS, ROOT
+from tests.vehicles.test_scooter_to_van import BUILDS, Truth, drive, write
 
 REFERENCE = (ROOT / "gz_onboard/vehicles/reference.toml").read_text(encoding="utf-8")
 RECORDED = ["coastdown.blf", "city_14C.blf", "turning/oval_2C.blf", "calibration/dyno_02.blf"]
@@ -111,3 +112,23 @@ def test_without_a_log_it_says_what_the_roles_are_enough_for(capsys):
     out = capsys.readouterr().out
     assert re.search(r"^  range +yes", out, re.M)
     assert re.search(r"^  wind by heading +no: lacks GPS course", out, re.M)
+
+
+@pytest.mark.parametrize("name", ["kick-scooter", "van"])
+def test_other_vehicles_with_and_without_a_mistake(tmp_path, name):
+    file = write(tmp_path, BUILDS[name])
+    right, database, log = (
+        file.read_text(encoding="utf-8"),
+        read_vehicle(str(file)).mapping.database,
+        tmp_path / "r.log",
+    )
+    driven = [frame for frames in drive(BUILDS[name], database, Truth(0.8), 300.0) for frame in frames]
+    lines = [f"({1.7e9 + ns / 1e9:.6f}) can0 {identifier:03X}#{data.hex()}\n" for ns, identifier, data, _ in driven]
+    log.write_text("".join(lines), encoding="utf-8")
+    assert suspicions(log, right, tmp_path) == []
+    for role, was, now in (
+        ("pack_current", '"Current"', '{ signal = "Current", scale = -1 }'),
+        ("vehicle_speed", '"Speed"', '{ signal = "Speed", unit = "m/s" }'),
+        ("cell_temperature", '"Cells"', '{ signal = "Cells", scale = 1.8, offset = 32 }'),
+    ):
+        assert any(role in roles for roles, _ in suspicions(log, right.replace(was, now), tmp_path))
