@@ -25,7 +25,7 @@ class Mute:
     def frames(self, batch: Sequence[Any]) -> None:
         """As of `log_rows.Log`."""
 
-    def sample(self, topic: str, time_ns: int, values: Mapping[str, object]) -> None:
+    def sample(self, topic: str, time_ns: int, values: Mapping[str, object], seen_ns: int | None = None) -> None:
         """As of `log_rows.Log`."""
 
 
