@@ -240,7 +240,7 @@ class StateOfCharge:
 
     def _noise(self, counted: float, filter_: SocFilter, temperature: float) -> Noise:
         """`counted`: variance of SOC."""
-        return Noise(counted, *self.uncertainty.slow(filter_.soc, temperature))
+        return Noise(counted, *self.uncertainty.slow(filter_.soc, temperature, filter_.covariance[0]))
 
     def _update(self, filter_: SocFilter, now: float, dt: float, measured: tuple[float, float], at: PackState) -> None:
         """Update with the voltage [V] at a current [A], both of the pack, that represents `dt` [s]."""
@@ -272,7 +272,7 @@ class StateOfCharge:
         by_inverter = not self._signals.pack_voltage.fresh(now)
         voltage_sd = INVERTER_VOLTAGE_SD if by_inverter else reading.voltage_sd
         known = self._signals.cell_temperature.fresh(now)
-        slow = self.uncertainty.slow(filter_.soc, temperature)
+        slow = self.uncertainty.slow(filter_.soc, temperature, filter_.covariance[0])
         load = self.uncertainty.load(r0, (drop, filter_.v1), reading.source, known, voltage_sd)
         error, own = filter_.innovation(cell_voltage, cell_current, temperature)
         slope = battery.ocv(filter_.soc, temperature)[1]

@@ -34,7 +34,7 @@ class SlowError(NamedTuple):
     """Of a cell's voltage by the model, what stays the same for long."""
 
     variance: float  # V²
-    time: float  # s that it stays, in the mean over what it is made of
+    time: float  # s that it stays
 
 
 CURRENT_ERRORS = {
@@ -102,13 +102,19 @@ class VoltageUncertainty:
         share = min(max((EMPTY_BELOW - soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
         return model + share * max(empty - model, 0.0)
 
-    def slow(self, soc: float, temperature: float) -> SlowError:
-        """What errs the same way for a time: the circuit, the tables' place, the sensor."""
+    def slow(self, soc: float, temperature: float, soc_variance: float) -> SlowError:
+        """What errs the same way for a time: the circuit, the tables' place, the sensor.
+
+        While the state of charge is known to a large `soc_variance` only, the circuit's error is the one to wait for;
+        the better it is known, the more of what a voltage is off by is what stays.
+        """
         # The pack's cells are not the bench's: where SOC lies on their curve is known to their capacity's scatter.
-        axis_sd = self._capacity_scatter * (1 - soc) * self._battery.ocv(soc)[1]
-        circuit, stays = self.loaded(soc, temperature) ** 2, axis_sd**2 + self._history + self._sensor
-        variance = circuit + stays
-        return SlowError(variance, (circuit * self.error_time + stays * HISTORY_TIME) / variance)
+        slope = self._battery.ocv(soc)[1]
+        axis_sd = self._capacity_scatter * (1 - soc) * slope
+        stays = axis_sd**2 + self._history + self._sensor
+        share = stays / (stays + slope**2 * soc_variance)
+        time = self.error_time + share * max(HISTORY_TIME - self.error_time, 0.0)
+        return SlowError(self.loaded(soc, temperature) ** 2 + stays, time)
 
     def tells_more(self, soc: float, variance: float) -> bool:
         """Whether a voltage can tell more than a state of charge that is known to `variance`.

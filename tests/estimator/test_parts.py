@@ -165,12 +165,13 @@ def test_a_voltage_on_a_flat_curve_tells_no_more_than_hysteresis_allows():
 
 
 def test_what_stays_for_hours_does_not_fade_with_the_error_of_the_circuit():
-    """History, place on the curve and sensor stay: the less the circuit errs, the more of the error does."""
+    """History, place on the curve and sensor stay: the better a state of charge is known, the more of the error does."""
     uncertainty = VoltageUncertainty(VEHICLE.pack, VEHICLE.parameters)
-    known, worse = (uncertainty.slow(0.6, temperature) for temperature in (25.0, 10.0))
-    assert uncertainty.loaded(0.6, 10.0) > 1.5 * uncertainty.loaded(0.6, 25.0)
-    assert known.variance < worse.variance
-    assert uncertainty.error_time < worse.time < known.time < HISTORY_TIME
+    times = [uncertainty.slow(0.6, 25.0, sd**2).time for sd in (0.2, 0.05, 0.01, 0.003)]
+    assert times == sorted(times)
+    assert times[0] < 1.02 * uncertainty.error_time
+    assert 0.75 * HISTORY_TIME < times[-1] < HISTORY_TIME
+    assert uncertainty.slow(0.6, 10.0, 0.01**2).variance > uncertainty.slow(0.6, 25.0, 0.01**2).variance
 
 
 def test_resistances_that_are_guessed_make_a_loaded_voltage_worth_less():

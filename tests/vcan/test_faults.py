@@ -272,7 +272,7 @@ def test_what_the_kernel_drops_is_counted(running: Running, listener: Listener):
     assert lost > 1000
     # What the kernel drops before any socket sees it, where frames come faster than it hands them on, nobody counts.
     assert count + 10 - (dropped_on_the_way() - on_the_way) <= received + lost <= count + 10
-    assert daemon.statuses()[-1]["kernel_lost"] == lost
+    assert 1000 < daemon.statuses()[-1]["kernel_lost"] <= lost  # more may be told after the log's last row
     told = [row for row in listener.decoded("RANGE_Status") if row["RANGE_FramesLost"]]
     assert 9 <= len(told) <= 21
     assert listener.decoded("RANGE_Diagnosis")[-1]["RANGE_CountLost"] == min(lost, 4094)
