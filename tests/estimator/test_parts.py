@@ -165,7 +165,7 @@ def test_a_voltage_on_a_flat_curve_tells_no_more_than_hysteresis_allows():
 
 
 def test_what_stays_for_hours_does_not_fade_with_the_error_of_the_circuit():
-    """History, place on the curve and sensor stay: the better a state of charge is known, the more of the error does."""
+    """History, place on the curve and sensor stay: the better SOC is known, the more of the error does."""
     uncertainty = VoltageUncertainty(VEHICLE.pack, VEHICLE.parameters)
     times = [uncertainty.slow(0.6, 25.0, sd**2).time for sd in (0.2, 0.05, 0.01, 0.003)]
     assert times == sorted(times)
