@@ -111,7 +111,7 @@ def _checks(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterator[
         electric.check_currents(ride),
         electric.check_motor(ride, of),
         electric.check_charge(ride, of, vehicle),
-        others.check_temperatures(ride),
+        others.check_temperatures(ride, best),
         others.check_switches(ride, best),
         others.check_throttle(ride, of.current if of else None),
         others.check_stuck(ride, best),
