@@ -83,10 +83,9 @@ def test_a_temperature_swapped_with_the_motors_is_named(log, tmp_path, role):
     assert (role, "motor_temperature") in dict(suspicions(log, text, tmp_path))
 
 
-@pytest.mark.parametrize("cells", [13, 15])
-def test_one_cell_more_or_fewer_is_named(log, tmp_path, cells):
-    text = re.sub(r"cells_series = \d+", f"cells_series = {cells}", REFERENCE)
-    assert any(f"14 cells in series would fit, not {cells}" in said for _, said in suspicions(log, text, tmp_path))
+def test_one_cell_fewer_is_named(log, tmp_path):
+    text = re.sub(r"cells_series = \d+", "cells_series = 13", REFERENCE)
+    assert any("14 cells in series would fit, not 13" in said for _, said in suspicions(log, text, tmp_path))
 
 
 @pytest.mark.parametrize("cells", ["cells_series = 20", "cells_parallel = 4"])

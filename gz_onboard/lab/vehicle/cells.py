@@ -62,13 +62,13 @@ NMC = _HIGH_NICKEL(
     name="NMC",
     ocv=(2.5, 2.95, 3.18, 3.355, 3.508, 3.59, 3.662, 3.72, 3.81, 3.905, 3.998, 4.082, 4.124, 4.162, 4.195),
     ocv_sd=0.035,
-    ocv_source="mean of LG M50 (Chen 2020, its electrodes), Kokam 31 A·h (Huria 2012) and the 18650 cell of the "
-    "reference scooter, whose curve is one of NMC: within 0.05 V of each other; below 0.3 of the first and the "
-    "last, up to 0.15 V apart",
+    ocv_source="mean of LG M50 (Chen 2020, its electrodes), Kokam 28 A·h (Huria 2012) and the 18650 cell of the "
+    "reference scooter, whose curve is one of NMC: within 0.07 V of each other; below 0.3 of the first and the "
+    "last, up to 0.17 V apart",
     r0=0.080,
     r1=0.050,
     r_source="R0 and R1 at 25 degC together 0.13 ohm·A·h: BMW i3 0.10, 18650 of the reference scooter 0.16, Kokam "
-    "31 A·h (Huria 2012) 0.29",
+    "28 A·h (Huria 2012) 0.29",
     curve="rises by some 9 mV for each percent above 50 %, by 6 below it: a rest tells the charge to 3 to 5 %",
 )
 NCA = _HIGH_NICKEL(
@@ -87,8 +87,8 @@ NCA = _HIGH_NICKEL(
 LFP = Chemistry(
     name="LFP",
     cutoff=(2.6, 0.15),
-    ocv=(2.5, 2.94, 3.12, 3.205, 3.246, 3.281, 3.286, 3.294, 3.31, 3.324, 3.33, 3.335, 3.338, 3.348, 3.48),
-    ocv_sd=0.012,
+    ocv=(2.5, 2.94, 3.12, 3.205, 3.246, 3.281, 3.286, 3.294, 3.31, 3.324, 3.33, 3.335, 3.338, 3.36, 3.49),
+    ocv_sd=0.015,
     ocv_source="mean of Lithium Werks APR18650M1B (C/32, Sunil 2025) and a published table of an unnamed cell: "
     "within 0.02 V of each other from 0.1 to 0.95",
     rest_sd=0.015,
