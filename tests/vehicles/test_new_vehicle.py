@@ -96,7 +96,7 @@ def drive(cell: Cell, build: Build, database: Database, truth: Truth, duration: 
 def test_it_drives_to_a_range_within_its_interval(tmp_path, chemistry, soc):
     cell, vehicle, truth = CELLS[chemistry], read_vehicle(written(tmp_path, chemistry)), Truth(soc)
     pipeline = Pipeline(vehicle)
-    for frames in drive(cell, BUILDS["moped"], vehicle.mapping.database, truth, 100.0):
+    for frames in drive(cell, BUILDS["moped"], vehicle.mapping.database, truth, 80.0):
         pipeline.advance(frames, frames[0][0])
     e = pipeline.last
     assert e is not None and e.soc is not None and e.soc_sd is not None and e.range_p10 and e.range_p90
@@ -112,16 +112,17 @@ def test_it_drives_to_a_range_within_its_interval(tmp_path, chemistry, soc):
 
 
 def test_its_typical_cells_do_on_a_recorded_ride(tmp_path, capsys):
+    log = LOGS / "calibration" / "ride_005.blf"  # at 6 degC: the tables over temperature count
     new = written(tmp_path, "nmc").read_text(encoding="utf-8")
     new = new[new.index("[parameters]") :].replace("cells_parallel = 10", "cells_parallel = 12")
     bus = REFERENCE[: REFERENCE.index("[model]")]  # the scooter's frames, and nothing else of what was measured of it
     (tmp_path / "guessed.toml").write_text(bus + new, encoding="utf-8")
     capsys.readouterr()
     how = ["--no-plot", "--quiet", "--json", "-", "--output", str(tmp_path / "out")]
-    assert cli.main(["estimate", "--vehicle", str(tmp_path / "guessed.toml"), *how, str(LOGS / "city_14C.blf")]) == OK
+    assert cli.main(["estimate", "--vehicle", str(tmp_path / "guessed.toml"), *how, str(log)]) == OK
     ride = json.loads(capsys.readouterr().out)["rides"][0]
-    assert ride["range_end_p10_km"] < 27.6 < ride["range_end_p90_km"]  # by the measured vehicle file
-    assert abs(ride["soc_end"] - 0.554) < 2 * ride["soc_end_sd"]  # likewise
+    assert ride["range_end_p10_km"] < 32.7 < ride["range_end_p90_km"]  # by the measured vehicle file
+    assert abs(ride["soc_end"] - 0.746) < 2 * ride["soc_end_sd"]  # likewise
 
 
 def test_every_key_has_a_comment_and_is_one_that_the_reader_knows(tmp_path):
@@ -158,7 +159,7 @@ def test_each_kind_is_checked_and_sends_range_frames(tmp_path, kind, capsys):
 def test_an_estimate_and_a_check_on_a_log_of_it(tmp_path, capsys):
     file, log = written(tmp_path, "nmc"), tmp_path / "ride.log"
     database = read_vehicle(file).mapping.database
-    driven = (frame for frames in drive(CELLS["nmc"], BUILDS["moped"], database, Truth(0.6), 80.0) for frame in frames)
+    driven = (frame for frames in drive(CELLS["nmc"], BUILDS["moped"], database, Truth(0.6), 70.0) for frame in frames)
     lines = (f"({1.7e9 + ns / 1e9:.6f}) can0 {key:03X}#{data.hex()}\n" for ns, key, data, _ in driven)
     log.write_text("".join(lines), encoding="utf-8")
     capsys.readouterr()
