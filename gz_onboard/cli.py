@@ -32,7 +32,7 @@ COMMANDS = {
         "find what the model gets wrong on rides, name the cause, extend the model",
     ),
     "export": ("gz_onboard.lab.export", "convert a log to candump, BLF, ASC, or what it holds to Parquet, CSV, ..."),
-    "vehicle": ("gz_onboard.lab.vehicle.command", "check whether a vehicle file fits the logs of its vehicle"),
+    "vehicle": ("gz_onboard.lab.vehicle.command", "begin a vehicle file, or check whether it fits the vehicle's logs"),
     "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride as PNG"),
 }
 

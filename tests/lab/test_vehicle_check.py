@@ -75,6 +75,19 @@ def test_swapped_signals_are_named(log, tmp_path, one, other):
     assert any(roles == (one, other) or "swapped" in said for roles, said in suspicions(log, text, tmp_path))
 
 
+@pytest.mark.parametrize("role", ["cell_temperature", "ambient_temperature"])
+def test_a_temperature_swapped_with_the_motors_is_named(log, tmp_path, role):
+    found = {name: re.findall(rf'^{name} = "(\w+)"', REFERENCE, re.M)[0] for name in (role, "motor_temperature")}
+    text = REFERENCE.replace(found[role], "SWAP").replace(found["motor_temperature"], found[role])
+    text = text.replace("SWAP", found["motor_temperature"])
+    assert (role, "motor_temperature") in dict(suspicions(log, text, tmp_path))
+
+
+def test_one_cell_fewer_is_named(log, tmp_path):
+    text = re.sub(r"cells_series = \d+", "cells_series = 13", REFERENCE)
+    assert any("14 cells in series would fit, not 13" in said for _, said in suspicions(log, text, tmp_path))
+
+
 @pytest.mark.parametrize("cells", ["cells_series = 20", "cells_parallel = 4"])
 def test_a_wrong_number_of_cells_is_suspected(log, tmp_path, cells):
     text = re.sub(rf"{cells.split()[0]} = \d+", cells, REFERENCE)

@@ -18,7 +18,7 @@ from gz_onboard.bus.units import UNITS
 from gz_onboard.estimator.signals import DEFAULT_STALE
 from gz_onboard.events import STALE_PERIODS, Group
 from gz_onboard.lab.vehicle import electric, motion, others
-from gz_onboard.lab.vehicle.features import Feature, feature_text, features_of
+from gz_onboard.lab.vehicle.features import Feature, features_of, features_text
 from gz_onboard.lab.vehicle.finding import Finding, Looks, unknown, wrong
 from gz_onboard.lab.vehicle.on_board import on_board
 from gz_onboard.lab.vehicle.seconds import Seconds, seconds_of
@@ -111,7 +111,7 @@ def _checks(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterator[
         electric.check_currents(ride),
         electric.check_motor(ride, of),
         electric.check_charge(ride, of, vehicle),
-        others.check_temperatures(ride),
+        others.check_temperatures(ride, best),
         others.check_switches(ride, best),
         others.check_throttle(ride, of.current if of else None),
         others.check_stuck(ride, best),
@@ -157,11 +157,6 @@ def check_text(checked: Checked) -> str:
         if those := checked.those(looks):
             lines += [f"{looks}:", *(f"  {f.check} ({', '.join(f.roles)}): {f.text}" for f in those)]
     return "\n".join([*lines, features_text(checked.features)])
-
-
-def features_text(features: Sequence[Feature]) -> str:
-    """What works and what lacks what, for a terminal."""
-    return "\n".join(["features:", *(f"  {feature.name:24} {feature_text(feature)}" for feature in features)])
 
 
 def _seen_text(seen: RoleSeen) -> str:

@@ -1,4 +1,4 @@
-"""``gz-onboard vehicle``: check a vehicle file against logs."""
+"""``gz-onboard vehicle``: begin a vehicle file, check it against logs."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from pathlib import Path
 
 from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import BAD_INPUT, FAILED, OK, InputError, not_an_input
-from gz_onboard.lab.vehicle.check import CHECK_VERSION, Checked, check_log, check_text, features_text
-from gz_onboard.lab.vehicle.features import features_of
+from gz_onboard.lab.vehicle import new
+from gz_onboard.lab.vehicle.check import CHECK_VERSION, Checked, check_log, check_text
+from gz_onboard.lab.vehicle.features import features_of, features_text
 from gz_onboard.lab.vehicle.finding import Looks
 from gz_onboard.offline.results import Failure, explain_keys, write_json
 from gz_onboard.offline.schema import descriptions
@@ -21,7 +22,9 @@ from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard vehicle``."""
-    parts = parser.add_subparsers(dest="part", metavar="PART", required=True, help="check")
+    parts = parser.add_subparsers(dest="part", metavar="PART", required=True, help="new or check")
+    about = "write a vehicle file to begin with, a comment to each key, and a DBC skeleton; never over a file"
+    new.add_arguments(parts.add_parser("new", help=about, description=about, allow_abbrev=False))
     about = "does a vehicle file fit a log? what each role has, what looks right and what wrong, what is missing"
     check = parts.add_parser("check", help=about, description=about, allow_abbrev=False)
     explain_keys(check, "a log", CHECK_VERSION, descriptions(Checked))
@@ -34,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard vehicle``: gives the exit status of its part."""
-    return check_vehicle(arguments)
+    return new.run(arguments) if arguments.part == "new" else check_vehicle(arguments)
 
 
 def check_vehicle(arguments: argparse.Namespace) -> int:

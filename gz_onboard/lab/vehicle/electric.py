@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from math import sqrt
 
 import numpy as np
 
@@ -25,10 +26,11 @@ RESISTANCES = (0.3, 3.5)  # of the file's: cold cells, aged ones
 ENERGIES = (0.5, 2.0)  # of the model's: hills, wind and payload are in it
 BRAKES = -0.4  # m/s²: slower than the road load alone
 SOC_APART = 0.3  # by the first voltage against the vehicle's own
-COUNTED, GAINS = (
-    0.06,
-    (0.6, 1.7),
-)  # of a state of charge counted, at least, and over what is shown: aged cells count less
+FIRST, LEAST_LOADED = 60, 5  # s, that a log's first state of charge is taken from, and of these
+SHOWN_SD = 0.06  # of a vehicle's own state of charge, before any is counted
+CELLS_SD, MISCOUNTED = 0.4, 2  # cells in series: known so closely they are told apart; so many off are a miscount
+COUNTED, GAINS = 0.06, (0.6, 1.7)
+"""Of a state of charge counted, at least, and over what is shown: aged cells count less."""
 
 
 @dataclass(frozen=True)
@@ -232,12 +234,38 @@ def check_charge(ride: Seconds, of: Drawn | None, vehicle: Vehicle) -> Iterator[
     by_voltage = min(max(of.battery.soc_at_load(cell, load, of.temperature), 0.0), 1.0)
     expected = of.battery.window.shown(by_voltage, 0.0)[0]
     text = f"{shown[first[0]]:.0%} at the start, {expected:.0%} by the voltage {cell:.3f} V a cell"
-    if abs(float(shown[first[0]]) - expected) < SOC_APART:
+    fit = _cells_that_fit(of, current, shown)
+    if fit != of.battery.cells_series:
+        hint = f"{fit} cells in series would fit, not {of.battery.cells_series}"
+        yield wrong("state of charge against the voltage", (role, "pack_voltage"), f"{text}: {hint}")
+    elif abs(float(shown[first[0]]) - expected) < SOC_APART:
         yield right("state of charge against the voltage", (role, "pack_voltage"), text)
     else:
         hint = "cells in series, the table ocv, or battery.window"
         yield wrong("state of charge against the voltage", (role, "pack_voltage"), f"{text}: {hint}")
     yield from _counted(of, role, shown)
+
+
+def _cells_that_fit(of: Drawn, current: Array, shown: Array) -> int:
+    """The cells in series that have the pack's voltage where the vehicle shows its state of charge, both (n,).
+
+    The file's number unless another is clearly meant, by the seconds of least load within the first minute. It is known
+    as closely as the rest voltage: by the table's sd, the slope where the charge is in doubt, and the drop.
+    """
+    battery = of.battery
+    known = np.flatnonzero(np.isfinite(shown) & np.isfinite(of.voltage) & np.isfinite(current))[:FIRST]
+    least = known[np.argsort(np.abs(current[known]))[:LEAST_LOADED]]
+    if not len(least):
+        return battery.cells_series
+    volts, amperes, soc = (float(x[least].mean()) for x in (of.voltage, current, shown))
+    soc, load = battery.window.of_cells(soc), amperes / battery.cells_parallel
+    rest, slope = battery.ocv(soc, of.temperature)
+    drop = battery.circuit(soc, of.temperature)[0] * load
+    series = (volts + battery.series_resistance * amperes) / (rest - drop)
+    doubt = series / rest * sqrt((2 * battery.ocv_sd) ** 2 + (SHOWN_SD * slope) ** 2 + drop**2)
+    fit = round(series)
+    clear = doubt < CELLS_SD and abs(series - fit) < CELLS_SD
+    return fit if clear and 0 < abs(fit - battery.cells_series) <= MISCOUNTED else battery.cells_series
 
 
 def _counted(of: Drawn, role: str, shown: Array) -> Iterator[Finding]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -62,3 +62,8 @@ def feature_text(feature: Feature) -> str:
     if not feature.works:
         return f"no: lacks {one_of(feature.missing)}"
     return f"yes; better with {one_of(feature.better)}" if feature.better else "yes"
+
+
+def features_text(features: Sequence[Feature]) -> str:
+    """What works and what lacks what, for a terminal."""
+    return "\n".join(["features:", *(f"  {feature.name:24} {feature_text(feature)}" for feature in features)])

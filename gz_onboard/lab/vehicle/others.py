@@ -16,7 +16,8 @@ from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
 from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, Seconds, relation
 
 NEAR, FAR = 15.0, 25.0  # K between cells and air: usual; more than from a warm room, or a charge, into the cold
-WARMS = 12.0  # K: more than cells and air change in most rides
+WARMS = ((12.0, 2.0), (5.0, 4.0))
+"""K and a factor: cells or air that change by more on a ride, and by as many times what the motor does, are its."""
 FAHRENHEIT = 8.0  # K: so near the air are cells that were read in °F
 SWITCHES = {"brake_switch", "charge_plug", "key", "contactor", "rider", "gps_fix"}
 STEADY = SWITCHES | {"odometer", "bms_state_of_charge", "ambient_temperature", "cell_temperature", "heater_power"}
@@ -24,7 +25,7 @@ STEADY |= {"motor_temperature", "inverter_temperature", "air_conditioner_power",
 """Roles that may hold one value for a whole ride."""
 
 
-def check_temperatures(ride: Seconds) -> Iterator[Finding]:
+def check_temperatures(ride: Seconds, speed: Array | None) -> Iterator[Finding]:
     """Each within what vehicles have; the cells' against the air's."""
     for role in ride.any_of(*TEMPERATURES):
         low, high = TEMPERATURES[role][:2]
@@ -36,7 +37,8 @@ def check_temperatures(ride: Seconds) -> Iterator[Finding]:
             continue
         kelvin = ": that is K taken for °C" if low < middle - KELVIN < high else ""
         yield wrong("temperature", (role,), f"{least:.0f} to {most:.0f} °C, possible are {low:g} to {high:g}{kelvin}")
-    yield from _swapped(ride)
+    if speed is not None:
+        yield from _swapped(ride, np.abs(speed) > MOVING)
     if {"cell_temperature", "ambient_temperature"} <= ride.columns.keys():
         yield from _cells_and_air(ride["cell_temperature"], ride["ambient_temperature"])
     elif "cell_temperature" in ride or "ambient_temperature" in ride:
@@ -44,15 +46,20 @@ def check_temperatures(ride: Seconds) -> Iterator[Finding]:
         yield unknown("cells against air", (role,), "there is no other to compare it with")
 
 
-def _swapped(ride: Seconds) -> Iterator[Finding]:
-    """Cells and air warm slowly, a motor fast."""
+def _swapped(ride: Seconds, moving: Mask) -> Iterator[Finding]:
+    """Cells and air warm slowly, a motor fast: while the vehicle moves, as charging and heaters warm cells alone."""
     if "motor_temperature" not in ride:
         return
-    motor = float(np.ptp(ride["motor_temperature"][np.isfinite(ride["motor_temperature"])]))
-    for role in ride.any_of("cell_temperature", "ambient_temperature"):
-        span = float(np.ptp(ride[role][np.isfinite(ride[role])]))
-        if span > WARMS and span > 2 * motor:
-            text = f"changes by {span:.0f} K, and motor_temperature by {motor:.0f} K: swapped?"
+    spans = {}
+    for role in ride.any_of("motor_temperature", "cell_temperature", "ambient_temperature"):
+        known = ride[role][moving & np.isfinite(ride[role])]
+        if len(known) < FEWEST:
+            return
+        spans[role] = float(np.ptp(known))
+    motor = spans.pop("motor_temperature")
+    for role, span in spans.items():
+        if any(span > least and span > factor * motor for least, factor in WARMS):
+            text = f"changes by {span:.0f} K while riding, and motor_temperature by {motor:.0f} K: swapped?"
             yield wrong("temperature", (role, "motor_temperature"), text)
 
 

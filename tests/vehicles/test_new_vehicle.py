@@ -1,0 +1,215 @@
+"""`vehicle new`: the file that it writes reads, is commented key by key, and gives a range that holds."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from io import StringIO
+from itertools import pairwise
+from math import sqrt
+from pathlib import Path
+
+import pytest
+from cantools.database.can import Database
+
+from gz_onboard import cli
+from gz_onboard.errors import BAD_INPUT, OK, InputError
+from gz_onboard.events import ROLES, Frame, Reason, State
+from gz_onboard.lab.vehicle.cells import NCA
+from gz_onboard.lab.vehicle.kinds import KINDS
+from gz_onboard.pipeline import Pipeline
+from gz_onboard.vehicle import read_vehicle
+from tests.support import LOGS, ROOT
+from tests.vehicles.test_scooter_to_van import AIR, BUILDS, GRAVITY, STEP, Build, Truth, encode, speeds
+
+SCOOTER = ["--kind", "scooter", "--series", "14", "--parallel", "10", "--capacity", "3", "--mass", "90"]
+ARGUMENTS = [*SCOOTER, "--wheel-radius", "0.22"]
+Points = tuple[tuple[float, float], ...]
+KEY = re.compile(r"^(\w+) = ", re.M)
+REFERENCE = (ROOT / "gz_onboard/vehicles/reference.toml").read_text(encoding="utf-8")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell of a chemistry, as it was measured; not the mean of several that the written file has."""
+
+    ocv: Points  # V over SOC
+    r0: float  # ohm·A·h
+    r1: float
+
+    def rest(self, soc: float) -> float:
+        (s0, u0), (s1, u1) = next((a, b) for a, b in pairwise(self.ocv) if soc <= b[0])
+        return u0 + (soc - s0) * (u1 - u0) / (s1 - s0)
+
+    def energy(self, soc: float, cutoff: float) -> float:
+        """Wh of 1 A·h that come out slowly from `soc` to the `cutoff` [V]."""
+        step = soc / 500
+        return step * sum(volts for i in range(500) if (volts := self.rest(step * (i + 0.5))) > cutoff)
+
+
+M50: Points = ((0, 2.5), (0.02, 2.86), (0.05, 3.11), (0.1, 3.3), (0.2, 3.485), (0.3, 3.581), (0.4, 3.667), (0.6, 3.841))
+M50 += ((0.7, 3.948), (0.8, 4.042), (0.9, 4.097), (0.95, 4.124), (1, 4.2))
+P42A: Points = ((0, 2.506), (0.045, 3.146), (0.096, 3.323), (0.15, 3.422), (0.29, 3.574), (0.457, 3.702))
+P42A += ((0.834, 4.064), (0.95, 4.101), (1, 4.193))
+APR: Points = ((0, 2.01), (0.012, 2.74), (0.027, 2.93), (0.053, 3.087), (0.089, 3.194), (0.297, 3.277), (0.983, 3.351))
+APR += ((0.995, 3.418), (1, 3.598))
+CELLS = {"nmc": Cell(M50, 0.05, 0.05), "nca": Cell(P42A, 0.03, 0.02), "lfp": Cell(APR, 0.025, 0.02)}
+
+
+def written(folder: Path, chemistry: str) -> Path:
+    file = folder / f"{chemistry}.toml"
+    assert cli.main(["vehicle", "new", str(file), "--cells", chemistry, *ARGUMENTS]) == OK
+    return file
+
+
+def drive(cell: Cell, build: Build, database: Database, truth: Truth, duration: float) -> Iterator[list[Frame]]:
+    """The frames of a drive by the written DBC, of a pack of these cells: 14 by 10 of 3 A·h, and 90 kg with a rider."""
+    series, pack, mass, drag, rolling = 14, 30.0, 90 + 75.0, 0.5, 0.013
+    inside, pair, v1, before, way = series * cell.r0 / pack, series * cell.r1 / pack, 0.0, 0.0, 1000.0
+    for i, v in enumerate(speeds(build, duration)):
+        mean, a = (v + before) / 2, (v - before) / STEP
+        before = v
+        wheel = (mass * a + (rolling * mass * GRAVITY + 0.5 * AIR * drag * mean * mean) * (mean > 0)) * mean
+        power = 30.0 + (wheel / 0.85 if wheel > 0 else 0.4 * wheel)
+        source = series * cell.rest(truth.soc) - v1
+        current = (source - sqrt(source * source - 4 * inside * power)) / (2 * inside)
+        volts = source - inside * current
+        truth.soc -= current * STEP / 3600 / pack
+        v1 += STEP / 30.0 * (pair * current - v1)
+        truth.energy += volts * current * STEP
+        truth.distance += mean * STEP
+        way += mean * STEP / 1000
+        of = {"PackVoltage": volts, "PackCurrent": current, "CellTemperature": 25.0, "StateOfCharge": 100 * truth.soc}
+        motion = {"Speed": 3.6 * v, "Odometer": way, "OutsideTemperature": 20.0}
+        ns = round(i * STEP * 1e9)
+        frames = ((256, "Battery", of), (257, "Motion", motion))
+        yield [(ns + k, key, encode(database, name, **values), 0) for k, (key, name, values) in enumerate(frames)]
+
+
+@pytest.mark.parametrize(("chemistry", "soc"), [("nmc", 0.3), ("nca", 0.85), ("lfp", 0.85), ("lfp", 0.3)])
+def test_it_drives_to_a_range_within_its_interval(tmp_path, chemistry, soc):
+    cell, vehicle, truth = CELLS[chemistry], read_vehicle(written(tmp_path, chemistry)), Truth(soc)
+    pipeline = Pipeline(vehicle)
+    for frames in drive(cell, BUILDS["moped"], vehicle.mapping.database, truth, 80.0):
+        pipeline.advance(frames, frames[0][0])
+    e = pipeline.last
+    assert e is not None and e.soc is not None and e.soc_sd is not None and e.range_p10 and e.range_p90
+    assert pipeline.counts().dropped == pipeline.counts().implausible == 0
+    assert not e.reasons & (Reason.VOLTAGE_MISMATCH | Reason.CURRENT_MISMATCH | Reason.SENSOR_DISTRUSTED)
+    energy = cell.energy(truth.soc, vehicle.pack.cutoff_voltage) * 14 * 30 * 3600
+    assert e.range_p10 < energy * truth.distance / truth.energy < e.range_p90
+    assert abs(e.soc - truth.soc) < 2 * e.soc_sd
+    on_the_flat = chemistry == "lfp" and soc > 0.5
+    assert bool(e.reasons & Reason.SOC_UNCERTAIN) is on_the_flat
+    assert e.state is (State.DEGRADED if on_the_flat else State.VALID)
+    assert e.soc_sd > 0.1 if on_the_flat else e.soc_sd < 0.06
+
+
+def test_its_typical_cells_do_on_a_recorded_ride(tmp_path, capsys):
+    log = LOGS / "calibration" / "ride_005.blf"  # at 6 degC: the tables over temperature count
+    new = written(tmp_path, "nmc").read_text(encoding="utf-8")
+    new = new[new.index("[parameters]") :].replace("cells_parallel = 10", "cells_parallel = 12")
+    bus = REFERENCE[: REFERENCE.index("[model]")]  # the scooter's frames, and nothing else of what was measured of it
+    (tmp_path / "guessed.toml").write_text(bus + new, encoding="utf-8")
+    capsys.readouterr()
+    how = ["--no-plot", "--quiet", "--json", "-", "--output", str(tmp_path / "out")]
+    assert cli.main(["estimate", "--vehicle", str(tmp_path / "guessed.toml"), *how, str(log)]) == OK
+    ride = json.loads(capsys.readouterr().out)["rides"][0]
+    assert ride["range_end_p10_km"] < 32.7 < ride["range_end_p90_km"]  # by the measured vehicle file
+    assert abs(ride["soc_end"] - 0.746) < 2 * ride["soc_end_sd"]  # likewise
+
+
+def test_every_key_has_a_comment_and_is_one_that_the_reader_knows(tmp_path):
+    file = written(tmp_path, "nmc")
+    lines = file.read_text(encoding="utf-8").splitlines()
+    keys = [i for i, line in enumerate(lines) if KEY.match(line)]
+    assert len(keys) > 40
+    for i in keys:
+        assert lines[i - 1].startswith("# "), lines[i]
+        mistyped = [*lines[:i], KEY.sub(r"\1x = ", lines[i]), *lines[i + 1 :]]
+        file.write_text("\n".join(mistyped), encoding="utf-8")
+        with pytest.raises(InputError):
+            read_vehicle(file)
+            pytest.fail(f"nobody reads {lines[i]}")
+
+
+def test_roles_to_be_uncommented_are_roles(tmp_path):
+    offered = re.findall(r'^# (\w+) = "', written(tmp_path, "nca").read_text(encoding="utf-8"), re.M)
+    assert len(offered) > 4
+    assert set(offered) <= set(ROLES)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_kind_is_checked_and_sends_range_frames(tmp_path, kind, capsys):
+    series, mass = {"car": ("96", "1600"), "van": ("110", "2600")}.get(kind, ("14", "60"))
+    of = ["--kind", kind, "--cells", "LFP", "--series", series, "--capacity", "80", "--mass", mass]
+    file = tmp_path / "mine" / f"{kind}.toml"
+    assert cli.main(["vehicle", "new", str(file), *of, "--wheel-radius", "0.3"]) == OK
+    assert cli.main(["vehicle", "check", str(file)]) == OK
+    assert re.search(r"^  range +yes", capsys.readouterr().out, re.M)
+    assert cli.main(["run", "--vehicle", str(file), "--write-dbc", str(tmp_path / "range.dbc")]) == OK
+
+
+def test_an_estimate_and_a_check_on_a_log_of_it(tmp_path, capsys):
+    file, log = written(tmp_path, "nmc"), tmp_path / "ride.log"
+    database = read_vehicle(file).mapping.database
+    driven = (frame for frames in drive(CELLS["nmc"], BUILDS["moped"], database, Truth(0.6), 70.0) for frame in frames)
+    lines = (f"({1.7e9 + ns / 1e9:.6f}) can0 {key:03X}#{data.hex()}\n" for ns, key, data, _ in driven)
+    log.write_text("".join(lines), encoding="utf-8")
+    capsys.readouterr()
+    how = ["--no-plot", "--quiet", "--json", "-", "--output", str(tmp_path / "out")]
+    assert cli.main(["estimate", "--vehicle", str(file), *how, str(log)]) == OK
+    ride = json.loads(capsys.readouterr().out)["rides"][0]
+    assert 20 < ride["range_end_p10_km"] < ride["range_end_km"] < ride["range_end_p90_km"]
+    assert cli.main(["vehicle", "check", str(file), str(log), "--quiet"]) == OK
+    assert capsys.readouterr().out.splitlines()[0].endswith("looks right")
+
+
+@pytest.mark.parametrize("there", ["nmc.toml", "nmc.dbc"])
+def test_it_writes_over_nothing(tmp_path, there, capsys):
+    (tmp_path / there).write_text("mine", encoding="utf-8")
+    assert cli.main(["vehicle", "new", str(tmp_path / "nmc.toml"), "--cells", "nmc", *ARGUMENTS]) == BAD_INPUT
+    assert f"{there}: is there already" in capsys.readouterr().err
+    assert [(file.name, file.read_text(encoding="utf-8")) for file in tmp_path.iterdir()] == [(there, "mine")]
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "said"),
+    [
+        ("a.toml", ["--kind", "scooter"], "--series N"),
+        ("a.toml", ["--mass", "1"], "must be 5 to 5000 kg"),
+        ("a.toml", ["--cells", "lipo"], "nmc, nca, lfp"),
+        ("a.txt", [], "ends in .toml"),
+        ("ä b.toml", ["--cells", "nmc", *ARGUMENTS], "name: must be"),
+        ("a.toml", ["--cells", "nmc", *ARGUMENTS, "--series", "300", "--parallel", "1000"], "range_dbc"),
+    ],
+)
+def test_what_cannot_be_is_refused_and_nothing_written(tmp_path, name, options, said, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stdin", StringIO("scooter\n"))  # no terminal: nothing is asked for
+    assert cli.main(["vehicle", "new", str(tmp_path / name), *options]) == BAD_INPUT
+    error = capsys.readouterr().err
+    assert said in error
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_on_a_terminal_it_asks_for_what_is_missing(tmp_path):
+    ours, its = pty.openpty()
+    command = [sys.executable, "-m", "gz_onboard", "vehicle", "new", "a.toml", *SCOOTER]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, cwd=tmp_path, env=environment, stdin=its, stdout=its, stderr=its) as process:
+        os.write(ours, b"lead\nNCA\n0.2x\n0.21\n")
+        assert process.wait(120) == OK
+    said = os.read(ours, 100_000).decode()
+    os.close(ours)
+    os.close(its)
+    assert "its cells: nmc, nca, lfp" in said
+    assert "lead: must be one of" in said
+    assert "0.2x: is no number" in said
+    vehicle = read_vehicle(tmp_path / "a.toml")
+    assert (vehicle.parameters["wheel_radius"], vehicle.pack.ocv_value) == (0.21, NCA.ocv)
