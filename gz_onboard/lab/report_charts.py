@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import isfinite
 
 from gz_onboard.lab.report_svg import GRAIN, Axis, axis_of, band, line, picture, stretches
 
@@ -33,7 +34,8 @@ class Abscissa:
 
 
 def chart(title: str, unit: str, curves: Sequence[Curve], below: Abscissa, *, zero: bool = True) -> str:
-    """A figure with `curves` over `below`; zero: whether 0 is on the ordinate. Nothing without a curve."""
+    """A figure with `curves` over `below`; zero: whether 0 is on the ordinate. Nothing without a known value."""
+    curves = [curve for curve in curves if any(map(isfinite, curve.y))]
     if not curves:
         return ""
     shown = [column for curve in curves if curve.scales for column in (curve.y, *(curve.band or ()))]

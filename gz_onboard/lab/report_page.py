@@ -33,11 +33,11 @@ def section(ride: ReportedRide, anchor: str) -> str:
         _about(ride),
         _tiles(ride),
         _map(ride),
-        *_charts(ride, rows),
+        *(_charts(ride, rows) if rows else []),
         _ledger(ride),
         _why(ride.summary.why),
         _changes(ride.summary.changes),
-        _strips(ride, rows),
+        _strips(ride, rows) if rows else "",
         "<h3>Summary</h3>",
         _summary(ride),
     ]
@@ -122,14 +122,13 @@ def _charts(ride: ReportedRide, rows: Sequence[Logged]) -> list[str]:
         Curve(words(role).split()[0], [(t - start) / seconds for t in times], values, _TEMPERATURE_COLOURS[role])
         for role, (times, values) in ride.temperatures.items()
     ]
-    cells = column(rows, "cell_temperature")
-    known = [Curve("cells", time, cells, "orange")] if any(map(isfinite, cells)) else []
+    cells = Curve("cells", time, column(rows, "cell_temperature"), "orange")
     return [
         chart("Speed", "km/h", [Curve("", time, column(rows, "speed", 3.6), "blue")], below),
         chart("Power of the pack", "kW", [Curve("", time, power, "orange")], below),
         chart("State of charge", "%", [Curve("with ± σ", time, soc, "green", band)], below, zero=False),
         _range(rows),
-        chart("Temperatures", "°C", [*known, *others], below, zero=False),
+        chart("Temperatures", "°C", [cells, *others], below, zero=False),
     ]
 
 

@@ -19,7 +19,7 @@ from gz_onboard.routes.ahead import read_ahead
 
 TEMPERATURES = ("motor_temperature", "inverter_temperature", "ambient_temperature")
 """Those that are measured beside the cells', whose are in the estimates."""
-_APART = 10.0  # s: positions further apart have a hole between them
+_APART = 10.0  # s: samples further apart have a hole between them
 
 Position = tuple[float, float]
 """Latitude and longitude [deg]."""
@@ -67,8 +67,12 @@ def read_report(task: ReportTask, progress: Progress | None = None) -> ReportedR
 
 
 def _series(samples: Samples, role: str) -> Series:
+    """With a value that is no number in each hole, through which no line is drawn."""
+    import numpy as np
+
     times, values = samples.columns[role]
-    return times.tolist(), values.tolist()
+    holes = np.flatnonzero(np.diff(times) > _APART) + 1
+    return np.insert(times, holes, times[holes]).tolist(), np.insert(values, holes, np.nan).tolist()
 
 
 def path_of(samples: Samples) -> list[list[Position]]:

@@ -120,5 +120,17 @@ def test_several_rides_are_one_page_and_one_that_cannot_be_used_stops_no_other(t
     assert section[0] in text  # the same log, the same bytes
 
 
+@pytest.mark.parametrize(("lines", "titles"), [(2, []), (400, ["Speed"])])
+def test_a_ride_of_which_little_is_known(tmp_path, lines, titles):
+    """No estimate at all, or the speed alone."""
+    rows = "".join(f"{i / 10},30\n" for i in range(lines))
+    (tmp_path / "ride.csv").write_text(f"time [s],speed [km/h]\n{rows}")
+    assert main(["report", str(tmp_path / "ride.csv"), "-o", str(tmp_path / "ride.html"), "--quiet"]) == 0
+    text = (tmp_path / "ride.html").read_text()
+    assert re.findall(r"<figcaption><b>([^<]*)", text) == titles
+    assert "nan" not in text
+    assert "None" not in text
+
+
 def test_a_ledger_is_there_even_when_it_is_empty():
     assert Ledger()  # or none would be kept
