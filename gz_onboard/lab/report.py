@@ -38,6 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "--route")
     text = "page to write (default: the name of the ride, or of several `rides`, with .html)"
     parser.add_argument("-o", "--output", type=Path, metavar="HTML", help=text)
+    parser.add_argument("--no-path", action="store_true", help="leave out where the ride was")
     add_shared(parser, "--jobs", "--quiet")
 
 
@@ -47,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     out = arguments.output or Path(f"{ride_name(logs[0]) if len(logs) == 1 else 'rides'}.html")
     not_an_input([out], [*logs, *filter(None, [arguments.route]), find_vehicle(arguments.vehicle)])
     known_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
-    given = arguments.vehicle, arguments.payload, False, arguments.route
+    given = arguments.vehicle, arguments.payload, False, arguments.route, not arguments.no_path
     tasks = [ReportTask(log, Path(f"ride-{i}"), *given) for i, log in enumerate(logs, 1)]
     with progress_bar(lambda: expected_frames(logs), "frames", quiet=arguments.quiet) as display:
         results = over_rides(ride_section, tasks, arguments.jobs, display.update)

@@ -6,6 +6,7 @@ import html
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from math import isfinite, nan
+from pathlib import Path
 
 from gz_onboard.constants import WH
 from gz_onboard.events import TOLD, Activity, State, words
@@ -73,8 +74,9 @@ def _start(start_ns: int) -> str:
 
 def _about(ride: ReportedRide) -> str:
     s = ride.summary
-    damage = [f"damaged log: {s.damage}"] if s.damage else []
-    said = " · ".join([s.vehicle, _start(s.start_ns), s.file, *damage])
+    # The page may be sent to somebody, whom our folders do not concern.
+    damage = [f"damaged log: {s.damage.replace(s.file, '').lstrip(': ')}"] if s.damage else []
+    said = " · ".join([s.vehicle, _start(s.start_ns), Path(s.file).name, *damage])
     return f'<p class="about">{html.escape(said)}</p>'
 
 

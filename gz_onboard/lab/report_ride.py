@@ -32,6 +32,7 @@ class ReportTask(Task):
     """A log of which a page is made."""
 
     route: Path | None = None
+    located: bool = True  # whether the page says where the ride was
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ def read_report(task: ReportTask, progress: Progress | None = None) -> ReportedR
         summary_of(ridden),
         [dict(row) for row in log.of(ESTIMATE_TOPIC)],
         ledger,
-        path_of(samples),
+        path_of(samples) if task.located else [],
         {role: _series(samples, role) for role in TEMPERATURES if role in samples.columns},
     )
 

@@ -115,6 +115,10 @@ def test_several_rides_are_one_page_and_one_that_cannot_be_used_stops_no_other(t
         r'<a href="#([^"]*)">(\w+)</a>', text
     )
     assert text.count("<section") == 2
+    assert text.count('class="map"') == 2
+    assert str(LOGS) not in text  # the page may be sent to somebody
+    assert main(["report", rides[0], "--quiet", "--no-path", "-o", "nowhere.html"]) == 0
+    assert "map" not in re.findall(r'class="(\w+)', Path("nowhere.html").read_text())
     assert main(["report", rides[0], "--quiet"]) == 0
     section = re.findall(r"<section.*?</section>", Path("coastdown.html").read_text(), re.DOTALL)
     assert section[0] in text  # the same log, the same bytes
