@@ -17,7 +17,7 @@ from tests.support import LOGS
 if TYPE_CHECKING:
     from playwright.sync_api import BrowserContext, Page
 
-SECONDS = 100  # of the ride
+SECONDS = 50  # of the ride
 
 
 @pytest.fixture(scope="module")
