@@ -224,7 +224,7 @@ def _changes(changes: Sequence[Why]) -> str:
     for change in changes[-_MOST_CHANGES:]:
         causes = ", ".join(f"{words(name)} {km:+.1f}" for name, km in _told(change.causes_km))
         size = change.range_km - change.reference_km
-        lines.append(f'<tr><td>{clock(change.time_s)}</td><td class="n">{size:+.1f}</td><td>{causes}</td></tr>')
+        lines.append(f"<tr><td class=at>{clock(change.time_s)}</td><td class=n>{size:+.1f}</td><td>{causes}</td></tr>")
     more = f"; the last {_MOST_CHANGES} of {len(changes)}" if len(changes) > _MOST_CHANGES else ""
     return (
         f"<h3>Changes of the range, in km, beyond what was ridden{more}</h3>"

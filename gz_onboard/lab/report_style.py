@@ -43,7 +43,7 @@ table { border-collapse: collapse; width: 100%; font-size: .9rem; font-variant-n
 td, th { padding: .25rem .5rem .25rem 0; border-bottom: 1px solid var(--grid); text-align: left; vertical-align: top; }
 th { font-weight: 600; } .n { text-align: right; white-space: nowrap; } .summary td:first-child { width: 8.5rem; }
 td.bar { width: 40%; position: relative; } td.bar svg { top: 15%; height: 70%; }
-.total tr:last-child { font-weight: 600; } .scroll { overflow-x: auto; }
+.total tr:last-child { font-weight: 600; } .at { white-space: nowrap; } .scroll { overflow-x: auto; }
 .blue { color: var(--blue); } .orange { color: var(--orange); } .green { color: var(--green); }
 .red { color: var(--red); } .purple { color: var(--purple); } .grey { color: var(--grey); }
 .amber { color: var(--amber); } .muted { color: var(--muted); }
