@@ -32,6 +32,7 @@ GUIDE = {
     "road-ahead",
     "dashboard",
     "home-assistant",
+    "report",
     "log-format",
     "service",
     "limits",

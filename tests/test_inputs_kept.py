@@ -39,6 +39,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ["estimate", "other.estimate.mcap"],
         ["estimate", "ride.blf", "--json=rides.json"],
         ["estimate", "ride.blf", "--json=linked.json"],
+        ["report", "ride.blf", "-o", "points.html"],
         ["estimate", "ride.blf", "--vehicle", "mine.toml", "--json=mine.toml"],
         [*CALIBRATE, "--output", "mine.toml"],
         [*CALIBRATE, "--report", "motor_dyno.csv.gz"],

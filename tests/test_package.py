@@ -234,6 +234,12 @@ def test_a_simulation_without_pictures_needs_no_lab(board, tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["ece15.simulation.csv"]
 
 
+def test_the_page_of_a_ride_needs_no_lab(board, tmp_path):
+    told = run(board / "gz-onboard", "report", LOGS / "coastdown.blf", cwd=tmp_path)
+    assert told.stdout == "coastdown.html\n"
+    assert "<svg" in (tmp_path / "coastdown.html").read_text()
+
+
 @pytest.mark.parametrize("command", ["estimate", "simulate", "validate", "calibrate", "discover", "plot"])
 def test_a_command_of_the_lab_says_what_to_install(board, estimated, tmp_path, command):
     arguments: dict[str, list[object]] = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from gz_onboard.errors import brief
 from gz_onboard.lab import estimate_table, export_tables
 from gz_onboard.lab.estimate import summary_text
 from gz_onboard.lab.estimate_ride import How, RideSummary, open_estimate, ride_through, summary_of
+from gz_onboard.lab.kept_rows import KeptRows
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TEXTS, WHY_TOPIC, table_columns
 from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.table import Columns, Tabular, array_of, columns_of
@@ -53,28 +54,6 @@ class EstimatedRide(Tabular):
         return self.estimates.to_table()
 
 
-class _Kept:
-    """A log in memory, of rows by topic."""
-
-    def __init__(self) -> None:
-        self.rows: dict[str, list[tuple[int, Mapping[str, object]]]] = {}
-
-    def channel(self, topic: str, json_schema: Mapping[str, Any], metadata: Mapping[str, str] | None = None) -> None:
-        """As of `log_rows.Log`."""
-        self.rows[topic] = []
-
-    def frames(self, batch: Sequence[Any]) -> None:
-        """As of `log_rows.Log`."""
-
-    def sample(self, topic: str, time_ns: int, values: Mapping[str, object], seen_ns: int | None = None) -> None:
-        """As of `log_rows.Log`."""
-        self.rows[topic].append((time_ns, values))
-
-    def of(self, topic: str) -> list[Mapping[str, object]]:
-        """The rows of a topic."""
-        return [values for _, values in self.rows[topic]]
-
-
 @checked
 def estimate(
     source: PathLike | Signals,
@@ -90,7 +69,7 @@ def estimate(
     Raises InputError.
     """
     road = None if route is None else read_ahead(Path(route))[1]
-    log = _Kept()
+    log = KeptRows()
     ride = open_estimate(source_of(source), vehicle_of(vehicle))
     ridden = ride_through(ride, How(filter_name, route=road), log, progress)
     times = [time_ns for time_ns, _ in log.rows[ESTIMATE_TOPIC]]

@@ -135,6 +135,8 @@ class Forecaster:
             return False
         segment = r.current
         modelled, to_come = self._modelled(mean, acceleration, conditions, inputs)
+        if self.load.ledger:
+            self.load.ledger.measured += r.second.energy
         segment.distance += abs(r.second.distance)
         if abs(mean) > MOVING:
             r.still = 0.0
@@ -165,7 +167,7 @@ class Forecaster:
         if abs(second.distance) > LEAST_DISTANCE:
             q["grade"] = max(min(second.climb / abs(second.distance), STEEPEST), -STEEPEST)
         if not inputs:
-            energy = load.power(q) * second.seconds
+            energy = load.power_ridden(q, second.seconds) * second.seconds
             return energy, energy
         load.extend(q, inputs, conditions.ambient, r.time_moving)
         if second.lateral_seconds:

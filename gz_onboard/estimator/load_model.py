@@ -12,7 +12,9 @@ square over each second) and the time moving as they were. What is expected of t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from math import pi
 
 from gz_onboard.constants import MILD
@@ -67,12 +69,24 @@ class EffectInputs:
     vibration: float | None = None  # m/s²
 
 
+@dataclass
+class Ledger:
+    """Where the energy of the riding went [J]: what was `measured`, and by effect what the model gives for it."""
+
+    measured: float = 0.0
+    modelled: defaultdict[str, float] = field(default_factory=lambda: defaultdict(float))
+
+
 class LoadModel:
-    """The model of one vehicle with what is usual for it. `extended`: it reads `EffectInputs`."""
+    """The model of one vehicle with what is usual for it.
+
+    `extended`: it reads `EffectInputs`. `ledger`: is kept of what is ridden if there is one; on board there is none.
+    """
 
     def __init__(self, model: Model, battery: Battery, prior: PriorRiding) -> None:
         self.model = model
         self.prior = prior
+        self.ledger: Ledger | None = None
         self.states: dict[str, float] = {}  # of effects with memory between road and pack
         self.extended = not model.reads <= BASE or any(e.decay for e in model.effects)
         self._battery = battery
@@ -122,19 +136,34 @@ class LoadModel:
         """The power at the pack [W] with all effects settled."""
         return float(sum(self.model.power(q).values()))
 
+    def power_ridden(self, q: Quantities, dt: float) -> float:
+        """The power [W] over the last `dt` [s] with all effects settled."""
+        return self._entered([self.model.power(q)], dt)
+
+    def _entered(self, ledgers: Sequence[Mapping[str, float]], dt: float) -> float:
+        """The mean power [W] of `ledgers` over the last `dt` [s], which `ledger` takes in."""
+        if self.ledger:
+            for ledger in ledgers:
+                for name, power in ledger.items():
+                    self.ledger.modelled[name] += power * dt / len(ledgers)
+        return float(sum(sum(ledger.values()) for ledger in ledgers)) / len(ledgers)
+
     def power_with_memory(self, q: Quantities, heading_known: bool, dt: float) -> tuple[float, float]:
         """The power [W] as it was, over the last `dt` [s], and as it is to be expected of riding the same again."""
         to_come = self._over_headings(q | {"time_moving": q["time_moving"] + AHEAD})
         if self._by_heading and not heading_known:
-            return self._over_headings(q), to_come
-        return float(sum(self.model.power(q, stepping(self.states, dt)).values())), to_come
+            return self._entered(self._by_headings(q), dt), to_come
+        return self._entered([self.model.power(q, stepping(self.states, dt))], dt), to_come
+
+    def _by_headings(self, q: Quantities) -> list[dict[str, float]]:
+        """The ledger [W] with all settled, for each of `HEADINGS`."""
+        return [self.model.power(q | {"heading": heading}) for heading in HEADINGS]
 
     def _over_headings(self, q: Quantities) -> float:
         """The power [W] with all settled, in the mean over the headings if the model reads them."""
         if not self._by_heading:
             return self.power(q)
-        powers = (sum(self.model.power(q | {"heading": heading}).values()) for heading in HEADINGS)
-        return float(sum(powers)) / len(HEADINGS)
+        return float(sum(sum(ledger.values()) for ledger in self._by_headings(q))) / len(HEADINGS)
 
     def prior_ride(self, ambient: float, altitude: float) -> tuple[float, float]:
         """(power [W], speed [m/s]) of the prior riding at `ambient` [degC] and `altitude` [m]."""

@@ -56,7 +56,9 @@ def run(arguments: argparse.Namespace) -> int:
         written, [*(task.path for task in tasks), *filter(None, [arguments.route]), find_vehicle(arguments.vehicle)]
     )
     known_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
-    with progress_bar(lambda: _frames(tasks), "frames", quiet=arguments.quiet) as display:
+    with progress_bar(
+        lambda: expected_frames([task.path for task in tasks]), "frames", quiet=arguments.quiet
+    ) as display:
         results = _results(tasks, arguments.jobs, display.update)
         text = None if arguments.json == "-" else summary_text
         rides, failed = collect("estimate", results, display, text, lambda ride: ride.damage)
@@ -81,9 +83,9 @@ def _results(
 # --- what a person sees -------------------------------------------------------------------------------------------
 
 
-def _frames(tasks: Sequence[EstimateTask]) -> int | None:
+def expected_frames(logs: Sequence[Path]) -> int | None:
     """About how many frames all the logs hold; None if that of one is unknown."""
-    sizes = [_expected(task.path) for task in tasks]
+    sizes = [_expected(log) for log in logs]
     return sum(size for size in sizes if size) if all(sizes) else None
 
 
@@ -105,7 +107,21 @@ def _expected(path: Path) -> int | None:
 
 def summary_text(ride: RideSummary) -> str:
     """A ride's summary for a terminal."""
-    rows = [
+    rows = summary_rows(ride)
+    rows.append(
+        (
+            "computed",
+            f"{ride.cpu_s:.2f} s of processor time, {number(ride.real_time_factor, '.0f')} times as fast as the ride",
+        )
+    )
+    if ride.log:
+        rows.append(("written", f"{ride.log}{' and .png' if ride.plot else ''}"))
+    return text_rows(ride.file, rows)
+
+
+def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
+    """What a summary says of the ride: names and texts, the same for the same ride."""
+    return [
         (
             "ride",
             f"{clock(ride.duration_s)}, {ride.distance_km:z.2f} km, "
@@ -147,13 +163,7 @@ def summary_text(ride: RideSummary) -> str:
         *(("", f"{words(name)} {duration:.1f} s") for name, duration in ride.reasons.items()),
         *([("left out", _durations(ride.distrusted))] if ride.distrusted else []),
         *([("never there", ", ".join(words(name) for name in ride.lacking))] if ride.lacking else []),
-        (
-            "computed",
-            f"{ride.cpu_s:.2f} s of processor time, {number(ride.real_time_factor, '.0f')} times as fast as the ride",
-        ),
-        *([("written", f"{ride.log}{' and .png' if ride.plot else ''}")] if ride.log else []),
     ]
-    return text_rows(ride.file, rows)
 
 
 def _range(ride: RideSummary) -> str:

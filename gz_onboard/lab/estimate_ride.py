@@ -15,6 +15,7 @@ from gz_onboard.bus.logs import LogDamage
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.errors import InputError, writing
+from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.lab.estimate_route import RouteSummary, route_summary
 from gz_onboard.lab.estimate_tally import Tally
@@ -182,12 +183,13 @@ class OpenRide:
 
 @dataclass(frozen=True)
 class How:
-    """How a ride is estimated, and what is logged beside the estimates."""
+    """How a ride is estimated, and what is logged beside the estimates; ledger: whether the load model keeps one."""
 
     filter_name: str = "scalar"
     frames: bool = False
     signals: bool = False
     route: Route | None = None
+    ledger: bool = False
 
 
 @dataclass(frozen=True)
@@ -249,6 +251,8 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
         log_signals=how.signals,
         observer=tally,
     )
+    if how.ledger:
+        pipeline.estimator.forecaster.load.ledger = Ledger()
     if how.route:
         pipeline.estimator.ahead.follow(pipeline.estimator.ahead.ready(how.route))
     if not how.frames:

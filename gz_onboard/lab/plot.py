@@ -47,7 +47,7 @@ Logged = dict[str, Any]
 
 NAIVE_LENGTH = 25_000.0  # m: what usual displays average the consumption over
 NAIVE_FROM = 1_000.0  # m
-_STATES = {State.STARTING: "#9fb3c8", State.VALID: "#3f9d6b", State.DEGRADED: "#e8a33d", State.INVALID: "#c53030"}
+STATES = {State.STARTING: "#9fb3c8", State.VALID: "#3f9d6b", State.DEGRADED: "#e8a33d", State.INVALID: "#c53030"}
 _NAN = float("nan")
 _HOLE = 3.0  # s: estimates further apart than this have a hole between them; they come at least once a second
 
@@ -142,7 +142,7 @@ def plot_log(log: Path, picture: Path, over: str = "time") -> list[LogDamage]:
     return damages
 
 
-def _with_holes(rows: Sequence[Logged]) -> list[Logged]:
+def with_holes(rows: Sequence[Logged]) -> list[Logged]:
     """`rows` with an empty one in each hole of the log, through which no line is drawn."""
     shown = list(rows[:1])
     for before, row in pairwise(rows):
@@ -157,7 +157,7 @@ def draw(
     rows: Sequence[Logged], times: Sequence[int], status: Logged, title: tuple[str, str], over: str = "time"
 ) -> Figure:
     """The overview of a ride as a figure, over ``time`` or ``distance``."""
-    rows = _with_holes(rows)
+    rows = with_holes(rows)
     reasons = [reason for reason in Reason if any(str(reason.name) in row["reasons"].split() for row in rows)]
     strip = 0.34 + 0.17 * len(reasons)
     heights = [2.0, 1.3, 1.3, 1.0, 1.3, 1.3, strip]
@@ -198,7 +198,7 @@ def _abscissa(rows: Sequence[Logged], times: Sequence[int], over: str) -> tuple[
     return [(row["time"] - start) / seconds for row in rows], f"time [{unit}]"
 
 
-def _column(rows: Sequence[Logged], name: str, factor: float = 1.0) -> list[float]:
+def column(rows: Sequence[Logged], name: str, factor: float = 1.0) -> list[float]:
     """A field of the estimates; what is not known leaves a gap in the line."""
     return [_NAN if (value := row.get(name)) is None else value * factor for row in rows]
 
@@ -214,11 +214,11 @@ def _finite(*columns: Sequence[float]) -> list[float]:
 
 
 def _range(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
-    p10, p90 = _column(rows, "range_p10", 1e-3), _column(rows, "range_p90", 1e-3)
+    p10, p90 = column(rows, "range_p10", 1e-3), column(rows, "range_p90", 1e-3)
     naive = [_NAN if value is None else value / 1000 for value in naive_range(rows)]
     axis.fill_between(x, p10, p90, color=BLUE, alpha=0.18, linewidth=0, label="P10 to P90")
     axis.plot(x, naive, color=MUTED, linewidth=0.9, linestyle=(0, (4, 2)), label="by the last 25 km's Wh/km alone")
-    axis.plot(x, _column(rows, "range", 1e-3), color=BLUE, linewidth=1.8, label="range")
+    axis.plot(x, column(rows, "range", 1e-3), color=BLUE, linewidth=1.8, label="range")
     top = max(_finite(p90), default=1.0)
     axis.set_ylim(0, top * 1.12)  # the naive one may be anything: it does not set the scale
     ordinate(axis, "range [km]", BLUE)
@@ -226,8 +226,8 @@ def _range(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
 
 
 def _soc(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
-    soc = _column(rows, "soc", 100)
-    _band(axis, x, soc, _column(rows, "soc_sd", 100), GREEN, "± σ")
+    soc = column(rows, "soc", 100)
+    _band(axis, x, soc, column(rows, "soc_sd", 100), GREEN, "± σ")
     axis.plot(x, soc, color=GREEN, linewidth=1.6, label="state of charge")
     ordinate(axis, "SOC [%]", GREEN)
     legend(axis)
@@ -235,16 +235,16 @@ def _soc(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
 
 def _electric(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
     other = second(axis, "current [A]", ORANGE)
-    other.plot(x, _column(rows, "pack_current"), color=ORANGE, linewidth=0.7, alpha=0.8, label="pack current")
-    axis.plot(x, _column(rows, "pack_voltage"), color=PURPLE, linewidth=1.0, label="pack voltage")
+    other.plot(x, column(rows, "pack_current"), color=ORANGE, linewidth=0.7, alpha=0.8, label="pack current")
+    axis.plot(x, column(rows, "pack_voltage"), color=PURPLE, linewidth=1.0, label="pack voltage")
     ordinate(axis, "voltage [V]", PURPLE)
     legend(axis, other)
 
 
 def _innovation(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
-    rms = _column(rows, "innovation_rms", 1000)
+    rms = column(rows, "innovation_rms", 1000)
     axis.fill_between(x, [-v for v in rms], rms, color=PURPLE, alpha=0.2, linewidth=0, label="± RMS of 10 s")
-    axis.plot(x, _column(rows, "innovation", 1000), color=PURPLE, linewidth=0.8, label="innovation")
+    axis.plot(x, column(rows, "innovation", 1000), color=PURPLE, linewidth=0.8, label="innovation")
     axis.axhline(0, color=MUTED, linewidth=0.6, zorder=1)
     ordinate(axis, "innovation\n[mV of a cell]", PURPLE)
     legend(axis)
@@ -252,19 +252,19 @@ def _innovation(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
 
 def _motion(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
     other = second(axis, "grade [%], lean [°]", MUTED)
-    other.plot(x, _column(rows, "lean", degrees(1.0)), color=ORANGE, linewidth=0.6, alpha=0.75, label="lean")
-    other.plot(x, _column(rows, "grade", 100), color=GREEN, linewidth=1.0, label="grade")
+    other.plot(x, column(rows, "lean", degrees(1.0)), color=ORANGE, linewidth=0.6, alpha=0.75, label="lean")
+    other.plot(x, column(rows, "grade", 100), color=GREEN, linewidth=1.0, label="grade")
     other.axhline(0, color=MUTED, linewidth=0.6, zorder=1)
-    axis.plot(x, _column(rows, "speed", 3.6), color=BLUE, linewidth=1.1, label="speed")
+    axis.plot(x, column(rows, "speed", 3.6), color=BLUE, linewidth=1.1, label="speed")
     ordinate(axis, "speed [km/h]", BLUE)
     legend(axis, other)
 
 
 def _consumption(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None:
-    expected = _column(rows, "consumption_expected", 1 / WH_PER_KM)
-    _band(axis, x, expected, _column(rows, "consumption_expected_sd", 1 / WH_PER_KM), BLUE, "± σ")
+    expected = column(rows, "consumption_expected", 1 / WH_PER_KM)
+    _band(axis, x, expected, column(rows, "consumption_expected_sd", 1 / WH_PER_KM), BLUE, "± σ")
     axis.plot(x, expected, color=BLUE, linewidth=1.6, label="expected")
-    recent = _column(rows, "consumption_recent", 1 / WH_PER_KM)
+    recent = column(rows, "consumption_recent", 1 / WH_PER_KM)
     axis.plot(x, recent, color=ORANGE, linewidth=1.0, label="recent (last km)")
     ordinate(axis, "consumption\n[Wh/km]")
     legend(axis)
@@ -273,15 +273,15 @@ def _consumption(axis: Axes, x: Sequence[float], rows: Sequence[Logged]) -> None
 def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Logged], reasons: Sequence[Reason], status: Logged) -> None:
     """State and reasons over the ride, one line each."""
     axis.grid(visible=False)
-    for state, colour in _STATES.items():
-        spans = _spans(x, [row["state"] == state.name for row in rows])
+    for state, colour in STATES.items():
+        where = spans(x, [row["state"] == state.name for row in rows])
         axis.broken_barh(
-            spans, (-0.42, 0.84), facecolors=colour, linewidth=0, label=state.name.lower() if spans else None
+            where, (-0.42, 0.84), facecolors=colour, linewidth=0, label=state.name.lower() if where else None
         )
     labels = ["state"]
     for place, reason in enumerate(reasons, 1):
-        spans = _spans(x, [reason.name in row["reasons"].split() for row in rows])
-        axis.broken_barh(spans, (place - 0.3, 0.6), facecolors=MUTED, linewidth=0)
+        where = spans(x, [reason.name in row["reasons"].split() for row in rows])
+        axis.broken_barh(where, (place - 0.3, 0.6), facecolors=MUTED, linewidth=0)
         labels.append(words(str(reason.name)))
     axis.set_ylim(len(labels) - 0.4, -0.6)
     axis.set_yticks(range(len(labels)), labels, fontsize=7)
@@ -306,7 +306,7 @@ def _strip(axis: Axes, x: Sequence[float], rows: Sequence[Logged], reasons: Sequ
         )
 
 
-def _spans(x: Sequence[float], true: Sequence[bool]) -> list[tuple[float, float]]:
+def spans(x: Sequence[float], true: Sequence[bool]) -> list[tuple[float, float]]:
     """(begin, length) of the stretches in which something is true; each estimate holds until the next."""
     from gz_onboard.arrays import stretches
 

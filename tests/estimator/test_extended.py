@@ -10,7 +10,7 @@ import pytest
 
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.load_model import Conditions, EffectInputs
+from gz_onboard.estimator.load_model import Conditions, EffectInputs, Ledger
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.vehicle import Vehicle, read_vehicle
 from tests.estimator.test_estimator import CELLS, GROUPS, MOTOR, PACK, Plant
@@ -45,6 +45,29 @@ def run(vehicle, seconds, change=lambda events: events, plant=None):
 
 def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
+
+
+# --- the ledger ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("heading", [None, 1.0])
+@pytest.mark.parametrize("vehicle", [BASE, extended("headwind", "tyre_warm_up", wind_north=4.0)], ids=["base", "wind"])
+def test_the_ledger_is_what_the_forecast_models(vehicle, heading):
+    """By effect the same energy, and no forecast moves because it is kept."""
+    results = []
+    for ledger in (None, Ledger()):
+        f = Forecaster(vehicle.model, vehicle.battery, vehicle.riding)
+        f.load.ledger = ledger
+        inputs = EffectInputs(0.0, heading, 0.5, 25.0, 10.0) if f.load.extended else None
+        for second in range(240):
+            f.ride(1.0, 10.0 + 2 * math.sin(second / 5), 0.01, 900.0, AIR, inputs)
+        results.append([*f.riding.segments, f.riding.current])
+    assert results[0] == results[1]
+    assert ledger is not None
+    assert ledger.measured == pytest.approx(240 * 900.0)
+    assert sum(ledger.modelled.values()) == pytest.approx(sum(segment.modelled for segment in results[0]))
+    assert ledger.modelled.keys() >= {"rolling_resistance", "brakes"}
+    assert ("headwind" in ledger.modelled) == (vehicle is not BASE)
 
 
 # --- effects in the cells -----------------------------------------------------------------------------------------

@@ -272,6 +272,6 @@ def test_the_naive_range_forgets_what_is_more_than_25_km_ago():
 @given(st.lists(st.booleans(), min_size=1, max_size=60))
 def test_spans_cover_what_is_true(true):
     x = [float(i) for i in range(len(true))]
-    spans = plot._spans(x, true)
+    spans = plot.spans(x, true)
     inside = [any(begin <= place < begin + length for begin, length in spans) for place in x[:-1]]
     assert inside == true[:-1]

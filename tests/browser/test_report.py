@@ -1,0 +1,157 @@
+"""The page of a ride in Chromium says what the estimates say, on phone and desktop, and fetches nothing."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+import gz_onboard as gz
+from gz_onboard.api.estimates import EstimatedRide
+from gz_onboard.cli import main
+from tests.support import LOGS
+
+if TYPE_CHECKING:
+    from playwright.sync_api import BrowserContext, Page
+
+SECONDS = 50  # of the ride
+
+
+@pytest.fixture(scope="module")
+def ride(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first part of a recorded ride."""
+    log = tmp_path_factory.mktemp("report") / "part of <a> ride.blf"
+    assert main(["export", str(LOGS / "city_34C.blf"), str(log), "--to", str(SECONDS)]) == 0
+    return log
+
+
+@pytest.fixture(scope="module")
+def estimated(ride: Path) -> EstimatedRide:
+    return gz.estimate(ride)
+
+
+@pytest.fixture(scope="module")
+def file(ride: Path) -> Path:
+    """Its page."""
+    made = ride.with_name("ride.html")
+    assert main(["report", str(ride), "-o", str(made), "--quiet"]) == 0
+    return made
+
+
+@pytest.fixture
+def shown(browser: BrowserContext, file: Path) -> Iterator[Page]:
+    """The page as a phone shows it; fails on any request beside that for the file."""
+    page = browser.new_page()
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.set_viewport_size({"width": 390, "height": 844})
+    page.emulate_media(color_scheme="light")
+    page.goto(file.as_uri())
+    yield page
+    page.close()
+    assert asked == [file.as_uri()]
+
+
+def text(page: Page, of: str) -> str:
+    return page.inner_text(f"[data-of={of}]").replace("\u00a0", " ")
+
+
+def table(page: Page, of: str) -> dict[str, list[str]]:
+    """The cells of each row, by the first."""
+    rows = page.eval_on_selector_all(
+        f"[data-of={of}] tr", "rows => rows.map(row => [...row.cells].map(cell => cell.innerText.trim()))"
+    )
+    return {row[0]: row[1:] for row in rows}
+
+
+CURVES = """figures => Object.fromEntries(figures.map(figure => [figure.querySelector("b").innerText, {
+  lines: [...figure.querySelectorAll("path.line")].map(path => path.getAttribute("d")),
+  ticks: [...figure.querySelectorAll("span.y")].map(tick => [parseFloat(tick.style.top), parseFloat(tick.innerText)])
+}]))"""
+
+
+def heights(drawn: Any) -> list[float]:
+    """The values of the first line of a chart, by its own ordinate."""
+    (y0, v0), (y1, v1) = drawn["ticks"][0], drawn["ticks"][-1]
+    found = [float(y) / 10 for y in re.findall(r"[ML][-\d]+ (-?\d+)", drawn["lines"][0])]
+    return [v0 + (y - y0) * (v1 - v0) / (y1 - y0) for y in found]
+
+
+def test_the_page_says_what_the_estimates_say(shown: Page, estimated: EstimatedRide):
+    s, rows = estimated.summary, [row for row in estimated.estimates.rows if row["range"] is not None]
+    assert s.energy_wh is not None
+    assert s.consumption_wh_km is not None
+    assert text(shown, "distance") == f"{s.distance_km:.2f} km"
+    assert text(shown, "energy") == f"{s.energy_wh:.0f} Wh"
+    assert text(shown, "consumption") == f"{s.consumption_wh_km:.1f} Wh/km"
+    assert text(shown, "soc") == f"{100 * (s.soc_start or 0):.1f} → {100 * (s.soc_end or 0):.1f} %"
+    assert text(shown, "range") == f"{s.range_end_km:.1f} km"
+    said = re.findall(r"(\d+\.\d) km \((\d+\.\d) to (\d+\.\d)\)", text(shown, "forecast"))
+    names = ("range", "range_p10", "range_p90")
+    assert said == [tuple(f"{1e-3 * float(str(row[n])):.1f}" for n in names) for row in (rows[0], rows[-1])]
+    assert "part of <a> ride" in shown.inner_text("h2")
+    assert str(s.frames) in shown.inner_text(".summary")
+
+
+def test_the_curves_are_those_of_the_estimates(shown: Page, estimated: EstimatedRide):
+    drawn: Any = shown.eval_on_selector_all("figure:has(.plot)", CURVES)
+    table = estimated.to_table()
+    power = table["pack_voltage[V]"] * table["pack_current[A]"] * 1e-3
+    for title, values, precise in (
+        ("Speed", table["speed[m/s]"] * 3.6, 0.1),
+        ("Power of the pack", power, 0.01),
+        ("State of charge", table["soc"] * 100, 0.02),
+        ("Range over the distance", table["range[m]"] * 1e-3, 0.03),
+    ):
+        known = values[values == values]
+        found = heights(drawn[title])
+        assert min(found) == pytest.approx(known.min(), abs=precise), title
+        assert max(found) == pytest.approx(known.max(), abs=precise), title
+        assert found[-1] == pytest.approx(known[-1], abs=precise), title
+
+
+def test_the_ledger_adds_up_to_what_was_drawn(shown: Page, estimated: EstimatedRide):
+    entries = {name: float(cells[1]) for name, cells in table(shown, "ledger").items() if name}
+    drawn = entries.pop("drawn from the pack")
+    assert estimated.summary.energy_wh == pytest.approx(drawn, abs=0.051)
+    assert sum(entries.values()) == pytest.approx(drawn, abs=0.1 * len(entries))
+    assert {"aerodynamic drag", "rolling resistance", "motor copper loss", "beyond the model"} <= entries.keys()
+    assert abs(entries["beyond the model"]) < 0.3 * drawn
+
+
+def test_the_causes_lead_from_the_rated_range_to_the_range(shown: Page, estimated: EstimatedRide):
+    why, told = estimated.summary.why, {n: float(cells[1]) for n, cells in table(shown, "why").items()}
+    assert why is not None
+    rated, left = told.pop("rated range"), told.pop("range")
+    assert (rated, left) == (round(why.reference_km, 1), round(why.range_km, 1))
+    assert told["charge"] == round(why.causes_km["charge"], 1)
+    assert rated + sum(told.values()) == pytest.approx(left, abs=0.06 * (len(why.causes_km) + 1))
+
+
+@pytest.mark.parametrize("size", [(390, 844), (1280, 800)])
+def test_it_fits_its_screen(shown: Page, size: tuple[int, int]):
+    shown.set_viewport_size({"width": size[0], "height": size[1]})
+    assert shown.evaluate("document.documentElement.scrollWidth") == size[0]
+    smallest = (
+        "Math.min(...[...document.querySelectorAll('span, td')].map(e => parseFloat(getComputedStyle(e).fontSize)))"
+    )
+    assert shown.evaluate(smallest) >= 12
+    box = shown.locator("svg.map").bounding_box()
+    assert box is not None
+    assert 100 < box["height"] <= size[1]
+    wide = "[...document.querySelectorAll('.plot svg')].map(e => e.getBoundingClientRect().width)"
+    assert min(shown.evaluate(wide)) > 0.6 * min(size[0], 992)
+
+
+def test_light_and_dark(shown: Page):
+    ground = "getComputedStyle(document.body).backgroundColor"
+    assert shown.evaluate(ground) == "rgb(255, 255, 255)"
+    shown.emulate_media(color_scheme="dark")
+    assert max(map(int, re.findall(r"\d+", shown.evaluate(ground)))) < 50
+
+
+def test_nothing_in_it_can_be_fetched(file: Path):
+    assert not re.search(r"""<(script|link|img|iframe)|\b(src|href)=["']?(?!#)|url\(|@import""", file.read_text())
