@@ -49,7 +49,7 @@ LEAST_DISTANCE = 0.1  # m: over less a climb shows no grade
 LEAST = 0.2  # of the prior's consumption: no riding of any length consumes less
 MOST_SD = 3.0  # of the logarithm of the range: beyond, it is not known at all
 SHOWN_FROM = 500.0  # m: over less the recent consumption is that of one traffic light
-END_LOAD_SD = 0.5  # of the mean load: at which load a vehicle gives up is known so well
+END_LOAD_SD = 0.25  # of the mean load: at which load a vehicle gives up is known so well
 WARM_CELLS = 25.0  # degC, of a cooling that is only asked for its constants
 DECILE = 1.2815515655446004  # sd of a normal distribution: 10 % are beyond
 

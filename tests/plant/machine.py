@@ -86,9 +86,10 @@ class Machine:
     ohmic: float = 0.0215
     film: float = 0.0185
     diffusion_a: float = 0.0035  # 6 s
-    diffusion_b: float = 0.0150  # 45 s
-    diffusion_c: float = 0.0055  # 300 s
-    diffusion_d: float = 0.0070  # 1800 s
+    diffusion_b: float = 0.0060  # 45 s
+    depletion_a: float = 0.0120  # of SOC per A, of the particles' surface before their inside: 45 s
+    depletion_b: float = 0.0055  # 300 s
+    depletion_c: float = 0.0070  # 1800 s
     cathode_exchange: float = 2.0  # A at 25 degC
     anode_exchange: float = 8.0
     cathode_layer: float = 2.8  # s, until its double layer is charged
@@ -152,8 +153,9 @@ SPREAD = {
     "film": 0.06,
     "diffusion_a": 0.08,
     "diffusion_b": 0.08,
-    "diffusion_c": 0.15,
-    "diffusion_d": 0.2,
+    "depletion_a": 0.08,
+    "depletion_b": 0.15,
+    "depletion_c": 0.2,
     "hysteresis": 0.3,
     "series_resistance": 0.15,
     "core_capacity": 0.05,

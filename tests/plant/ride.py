@@ -1,8 +1,9 @@
 """The plant's equations: many rides ridden at once, a step of 20 ms, one array element for each ride.
 
 Written apart from the package: slip of the driven wheel, leaning with a crown radius, wind as a vector with gusts,
-tyres that warm up, a cell with four diffusion branches and two electrodes of Butler's and Volmer's kinetics, a motor
-whose copper loss grows with frequency and whose torque falls with temperature, a rider with delay and an unsteady hand.
+tyres that warm up, a cell whose particles are emptier at their surface than inside, with two electrodes of Butler's and
+Volmer's kinetics, a motor whose copper loss grows with frequency and whose torque falls with temperature, a rider with
+delay and an unsteady hand.
 """
 
 from __future__ import annotations
@@ -198,8 +199,7 @@ def ride(
     wind_north, wind_east = p.wind_north + h.wind_north, p.wind_east + h.wind_east
     gust = 0.25 + 0.22 * np.hypot(wind_north, wind_east)
     limit_pack = m.pack_limit
-    taus = np.array([6.0, 45.0, 300.0, 1800.0])[:, None]
-    keep = np.exp(-STEP / taus)
+    keep, deplete_keep = (np.exp(-STEP / np.array(taus)[:, None]) for taus in ((6.0, 45.0), (45.0, 300.0, 1800.0)))
     slow_keep = np.exp(-STEP / h.slow_time)
     layer = np.exp(-STEP / np.stack([m.cathode_layer, m.anode_layer]))
     warm = h.cooling_factor
@@ -214,7 +214,8 @@ def ride(
     tyre, moved = p.ambient.copy(), np.zeros(n)
     soc = p.soc.copy()
     reaction = np.zeros((2, n))
-    branch, slow, memory, hidden_memory = np.zeros((4, n)), np.zeros(n), m.hysteresis * 0.5, np.zeros(n)
+    branch, depleted = np.zeros((2, n)), np.zeros((3, n))
+    slow, memory, hidden_memory = np.zeros(n), m.hysteresis * 0.5, np.zeros(n)
     core = shell = p.ambient + p.pack_warmer
     stator = rotor = p.ambient + p.motor_warmer
     board = box = p.ambient + 0.5 * p.motor_warmer
@@ -353,10 +354,12 @@ def ride(
         ohmic = m.ohmic * np.exp(1100 * cold_factor) * ends
         cell_current = pack_current / PARALLEL
         film = m.film * np.exp(4300 * cold_factor) * ends
-        source_soc = np.clip(soc, 0, 1) * ocv_count
+        surface = soc - depleted.sum(axis=0)  # which the voltage follows; on a steep curve it falls much sooner
+        source_soc = np.clip(surface, 0, 1) * ocv_count
         low = np.minimum(source_soc.astype(int), ocv_count - 1)
-        rest = ocv_table[low] + (source_soc - low) * (ocv_table[low + 1] - ocv_table[low]) + m.ocv_shift
-        rest = rest + m.ocv_wave * np.sin(9 * soc + m.ocv_phase) + 2.0 * np.clip(soc, EMPTIEST, 0)
+        steepness = ocv_table[low + 1] - ocv_table[low]
+        rest = ocv_table[low] + (source_soc - low) * steepness + m.ocv_shift
+        rest = rest + m.ocv_wave * np.sin(9 * soc + m.ocv_phase) + 2.0 * np.clip(surface, EMPTIEST, 0)
         window = h.window_resistance * np.exp(-0.5 * ((soc - h.window_soc) / 0.03) ** 2)
         instant = (ohmic + film) * h.resistance_factor + window
         lag_voltage = branch.sum(axis=0) + reaction.sum(axis=0) + slow + memory + hidden_memory
@@ -368,18 +371,10 @@ def ride(
         pack_voltage = emf - inside * pack_current
         cell_current = pack_current / PARALLEL
         thermal = np.exp(3400 * cold_factor) * h.resistance_factor
-        settle = (
-            np.array(
-                [
-                    m.diffusion_a * thermal,
-                    m.diffusion_b * thermal * (1 + 0.3 * np.exp(-soc / 0.12)),
-                    m.diffusion_c * np.exp(2500 * cold_factor),
-                    m.diffusion_d * np.exp(1500 * cold_factor),
-                ]
-            )
-            * cell_current
-        )
-        branch = keep * branch + (1 - keep) * settle
+        branch = keep * branch + (1 - keep) * np.array([m.diffusion_a, m.diffusion_b]) * thermal * cell_current
+        faster = np.array([thermal, np.exp(2500 * cold_factor), np.exp(1500 * cold_factor)])
+        settled = np.array([m.depletion_a, m.depletion_b, m.depletion_c]) * faster * cell_current
+        depleted = deplete_keep * depleted + (1 - deplete_keep) * settled
         # each electrode's own reaction (Butler and Volmer), behind its own double layer
         exchange = np.stack(
             [m.cathode_exchange * np.exp(-5200 * cold_factor), m.anode_exchange * np.exp(-4000 * cold_factor)]
@@ -396,7 +391,8 @@ def ride(
         soc = soc - passed
         # --- heat
         blow = 0.55 + 0.07 * v
-        heat = SERIES * PARALLEL * (lag_voltage + (instant * cell_current)) * cell_current
+        diffusion = steepness * ocv_count * (soc - surface)  # V that the way from inside to the surface takes
+        heat = SERIES * PARALLEL * (lag_voltage + diffusion + (instant * cell_current)) * cell_current
         heat = heat + SERIES * PARALLEL * cell_current * kelvin * 0.00008 * np.sin(5 * soc)
         flow_heat = m.core_to_shell * (core - shell)
         core = core + STEP * (heat - flow_heat) / m.core_capacity
