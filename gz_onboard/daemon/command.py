@@ -107,7 +107,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise InputError(f"--channel {name}: given twice; each of its frames would come twice")
     # Nobody watches a daemon: the vehicle file's own code runs only if it is root's.
     vehicle = read_vehicle(arguments.vehicle, arguments.payload, arguments.effects, users={ROOT})
-    if not vehicle.mapping.dbc_files:
+    if not vehicle.mapping.reads_frames:
         raise vehicle.error("dbc is missing: the daemon reads frames")
     if arguments.write_dbc:
         not_an_input([arguments.write_dbc], [vehicle.file, *vehicle.mapping.dbc_files, vehicle.range_dbc])
