@@ -154,9 +154,12 @@ def _request(table: Table) -> Request:
             f"{plain:#x} is that of all ECUs together; give that of the one to be asked, such as 0x7e0 or 0x18da10f1",
             "request_identifier",
         )
+    response = _identifier(table, "response_identifier", 0, 0)
+    if (request ^ response) & EFF_FLAG:
+        raise table.error("must have as many bits as that of the request, 11 or 29", "response_identifier")
     return Request(
         request,
-        _identifier(table, "response_identifier", 0, 0),
+        response,
         _addresses(table),
         service,
         data_identifier,
