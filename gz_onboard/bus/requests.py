@@ -157,6 +157,8 @@ def _request(table: Table) -> Request:
     response = _identifier(table, "response_identifier", 0, 0)
     if (request ^ response) & EFF_FLAG:
         raise table.error("must have as many bits as that of the request, 11 or 29", "response_identifier")
+    if request == response:
+        raise table.error("is that of the request too", "response_identifier")
     return Request(
         request,
         response,
