@@ -106,7 +106,30 @@ def read_mapping(vehicle: Table) -> BusMapping:
 
     bus = vehicle.table("bus")
     bus.only(["not_available", "identifiers", "messages"])
-    messages = bus.table("messages")
+    protection, periods, delays = _options(database, bus.table("messages"))
+    j1939 = bus.text("identifiers", "exact", ["exact", "j1939"]) == "j1939"
+    if j1939:
+        _check_groups(database, bus)
+    named = _with_answers(database, requests, vehicle)
+    sources = _sources(named, left_out, vehicle.table("roles"), ROLES)
+    _check_witnesses(sources, vehicle.table("roles"))
+    return BusMapping(
+        database=database,
+        dbc_files=tuple(files),
+        sources=sources,
+        instruments=_sources(named, left_out, vehicle.table("instruments"), INSTRUMENTS),
+        protection=protection,
+        periods=periods | {request.name: request.period for request in requests},
+        not_available=bus.text("not_available", "all-ones", ["all-ones", "none"]) == "all-ones",
+        j1939=j1939,
+        delays=delays,
+        requests=requests,
+        polling=read_polling(vehicle, requests),
+    )
+
+
+def _options(database: Database, messages: Table) -> tuple[dict[str, Protection], dict[str, float], dict[str, float]]:
+    """Protection, period [s] and delay [s] by message, of all in the table `messages` and of the DBC files."""
     protection: dict[str, Protection] = {}
     delays: dict[str, float] = {}
     periods = {message.name: message.cycle_time / 1000 for message in database.messages if message.cycle_time}
@@ -130,26 +153,7 @@ def read_mapping(vehicle: Table) -> BusMapping:
             periods[name] = options.number("period", low=1e-4, high=3600)
         if "delay" in options.values:
             delays[name] = options.number("delay", low=-LONGEST_DELAY, high=LONGEST_DELAY)
-
-    j1939 = bus.text("identifiers", "exact", ["exact", "j1939"]) == "j1939"
-    if j1939:
-        _check_groups(database, bus)
-    named = _with_answers(database, requests, vehicle)
-    sources = _sources(named, left_out, vehicle.table("roles"), ROLES)
-    _check_witnesses(sources, vehicle.table("roles"))
-    return BusMapping(
-        database=database,
-        dbc_files=tuple(files),
-        sources=sources,
-        instruments=_sources(named, left_out, vehicle.table("instruments"), INSTRUMENTS),
-        protection=protection,
-        periods=periods | {request.name: request.period for request in requests},
-        not_available=bus.text("not_available", "all-ones", ["all-ones", "none"]) == "all-ones",
-        j1939=j1939,
-        delays=delays,
-        requests=requests,
-        polling=read_polling(vehicle, requests),
-    )
+    return protection, periods, delays
 
 
 def _with_answers(database: Database, requests: tuple[Request, ...], vehicle: Table) -> Database:
