@@ -46,11 +46,9 @@ LONGEST_ANSWER = 4092  # bytes behind a data identifier: ISO-TP has at most 4095
 PERIODS = 0.1, 3600.0  # s
 _FRAME_BITS = {False: 135, True: 160}  # of eight bytes, with the most stuffing there can be and the gap, by extended
 _FIRST, _FOLLOWING = 6, 7  # bytes in the first frame of a longer answer, and in each that follows
+_IDENTIFIERS = "request_identifier", "response_identifier"
+_ADDRESSES = "request_address", "response_address"
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
-_KEYS = (
-    "name request_identifier response_identifier request_address response_address service data_identifier length "
-    "period signals"
-)
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,7 @@ def read_requests(vehicle: Table, taken: Mapping[int, str]) -> tuple[Request, ..
     requests: list[Request] = []
     for table in vehicle.tables("request", MOST_REQUESTS):
         request = _request(table)
-        for key, identifier in (("request_identifier", request.request), ("response_identifier", request.response)):
+        for key, identifier in zip(_IDENTIFIERS, (request.request, request.response), strict=True):
             if identifier in taken:
                 raise table.error(
                     f"{identifier & ~EFF_FLAG:#x} is that of message {taken[identifier]} of the DBC files", key
@@ -142,7 +140,7 @@ def read_polling(vehicle: Table, requests: Iterable[Request]) -> Polling:
 
 
 def _request(table: Table) -> Request:
-    table.only(_KEYS.split())
+    table.only(["name", "service", "data_identifier", "length", "period", "signals", *_IDENTIFIERS, *_ADDRESSES])
     service = table.integer("service", 0, 255)
     if service not in SERVICES:
         raise table.error(f"is {service:#04x}; only 0x01 and 0x22 are ever sent, which change nothing", "service")
@@ -182,10 +180,9 @@ def _identifier(table: Table, key: str, standard: int, extended: int) -> int:
 
 
 def _addresses(table: Table) -> tuple[int, int] | None:
-    keys = "request_address", "response_address"
-    if not any(key in table.values for key in keys):
+    if not any(key in table.values for key in _ADDRESSES):
         return None
-    first, second = (table.integer(key, 0, 255) for key in keys)
+    first, second = (table.integer(key, 0, 255) for key in _ADDRESSES)
     return first, second
 
 
