@@ -147,6 +147,8 @@ def test_another_tester_has_the_ecu_for_himself(caplog):
         assert bus.asked(QUIET - 2.0) == 0
         assert bus.asked(5.0) >= 1
         assert caplog.text.count("someone else asks on") == 1
+        bus.step(b"\x02\x3e\x80", identifier=identifier)
+        assert caplog.text.count("someone else asks on") == 2
 
 
 def test_a_tester_on_another_bus_is_none():

@@ -10,7 +10,7 @@ multiplexed and floating-point signals go through cantools itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, Answers, by_response
@@ -19,7 +19,7 @@ from gz_onboard.bus.layout import MappedMessage, identifier_of, is_not_available
 from gz_onboard.bus.mapping import BusMapping, Protection, Source, pgn
 from gz_onboard.bus.requests import FUNCTIONAL
 from gz_onboard.bus.signals import MessageSignals, Values
-from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Event, Frame, Group
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Event, Frame, Group
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -76,12 +76,14 @@ class Codec:
                 self._by_pgn[pgn(message.frame_id)] = handler
             else:
                 self._handlers[identifier_of(message)] = handler
+        self._answering: dict[int, int | None] = {request.response: None for request in mapping.requests}  # channel
         self._listen_for_answers(by_message)
 
     # --- frames ---------------------------------------------------------------------------------------------
 
     def decode(self, frames: Iterable[Frame]) -> list[Event]:
         """The events of `frames`, in their order; their times are seconds since the first frame ever decoded."""
+        frames = self._of_one_channel(frames) if self._answering else frames
         handlers, latest = self._handlers, self.latest
         origin, last = self._origin_ns, self._last_ns
         back, ahead = -BACK_NS, _AHEAD_NS
@@ -218,6 +220,18 @@ class Codec:
             self._handlers[response] = Answers(those, takers, self._fault).take
         for identifier in {*FUNCTIONAL, *(request.request for request in requests)} if requests else ():
             self._handlers.setdefault(identifier, lambda _time, _data: True)
+
+    def _of_one_channel(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """Without the answers that come a second time, by way of a gateway, on another channel than the first one."""
+        answering = self._answering
+        for frame in frames:
+            if frame[1] in answering:
+                channel = frame[3] & ~TRANSMITTED
+                if answering[frame[1]] is None:
+                    answering[frame[1]] = channel
+                elif answering[frame[1]] != channel:
+                    continue
+            yield frame
 
     def _answer(self, key: int, sources: list[Source]) -> Handler:
         """What takes the data of the answer whose `latest` is that of `key`."""

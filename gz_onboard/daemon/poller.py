@@ -67,7 +67,7 @@ class Poller:
         }
         self._asked = {*FUNCTIONAL, *(request.request for request in requests)}
         self._quiet_until = 0.0  # s, monotonic
-        self._stopped = self._said = False
+        self._stopped = False
 
     @property
     def text(self) -> str:
@@ -97,7 +97,9 @@ class Poller:
                 self._stop(identifier, now)
             elif ecu := self._ecus.get(identifier):
                 ecu.hear(data)
-        self._stopped = now < self._quiet_until
+        if self._stopped and now >= self._quiet_until:
+            self._stopped = False
+            log.info("quiet for %d minutes: asking again", QUIET // 60)
         for ecu in self._ecus.values():
             ecu.step(now, not self._stopped)
 
@@ -106,8 +108,8 @@ class Poller:
         self._quiet_until = now + QUIET
         for ecu in self._ecus.values():
             ecu.stop()
-        if not self._said:
-            self._said = True
+        if not self._stopped:
+            self._stopped = True
             text = "someone else asks on %#x: nothing is asked until that has been quiet for %d minutes"
             log.warning(text, identifier & ~EFF_FLAG, QUIET // 60)
 

@@ -120,6 +120,15 @@ def test_a_wrong_length_is_dropped_and_kept_for_the_check():
     assert codec.wrong_lengths == {"Battery": 60}
 
 
+def test_a_gateway_that_repeats_the_answer_on_a_second_bus_does_no_harm():
+    frames = exchange(BATTERY, EPOCH, **STEADY)
+    both = sorted([*frames, *((time_ns + MS // 4, i, data, 1) for time_ns, i, data, _ in frames)])
+    codec, events = decoded(both)
+    assert [event[2] for event in events] == [VALUES]
+    assert not codec.faults
+    assert len(decoded([(t, i, data, 1) for t, i, data, _ in frames])[1]) == 1  # a log of that bus alone
+
+
 def test_negative_responses_are_counted_by_their_code():
     parts = [b"\x7f\x22\x78", b"\x7f\x22\x31", b"\x7f\x22\x31", b"\x7f\x22", b"\x7f"]
     codec, events = decoded([(EPOCH + i * MS, BATTERY.response, carried(p)[0], 0) for i, p in enumerate(parts)])
