@@ -78,6 +78,24 @@ def test_asks_once_and_goes_on_with_the_whole_answer():
     assert bus.sent[2:] == [(0x7E4, ASKED[0])]
 
 
+def test_what_comes_unasked_is_no_answer_and_gets_no_flow_control():
+    bus, frames = Bus(), carried(payload(BATTERY, **STEADY))
+    bus.step()
+    bus.step(*frames, after=0.01)
+    before = len(bus.sent)
+    bus.step(*frames, after=0.01)
+    assert len(bus.sent) == before
+    bus.step(after=0.2)
+    assert bus.counts == {"asked": 2, "answered": 1}
+
+
+def test_a_flood_of_beginnings_gets_no_flood_of_flow_control():
+    bus = Bus()
+    bus.step()
+    bus.step(*carried(payload(BATTERY, **STEADY))[:1] * 50, after=0.01)
+    assert bus.sent == [(0x7E4, ASKED[0])] + [(0x7E4, GO_ON)] * MOST_FLOW_CONTROLS
+
+
 def test_one_at_a_time_of_an_ecu_the_one_longest_due():
     bus = Bus(BATTERY, SHOWN)
     for _ in range(20):
