@@ -86,6 +86,7 @@ def test_what_comes_unasked_is_no_answer_and_gets_no_flow_control():
     bus.step(*frames, after=0.01)
     assert len(bus.sent) == before
     bus.step(after=0.2)
+    bus.step(after=0.01)
     assert bus.counts == {"asked": 2, "answered": 1}
 
 
