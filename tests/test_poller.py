@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import logging
-import threading
-import time
-from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import count
-from pathlib import Path
 
-import can
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.bus.channel import CanChannel
-from gz_onboard.bus.codec import Codec, known_identifiers
-from gz_onboard.bus.logs import read_frames, read_samples
-from gz_onboard.bus.recorder import Recorder
 from gz_onboard.bus.requests import SERVICES, Polling, Request
-from gz_onboard.daemon.loop import Daemon
 from gz_onboard.daemon.poller import MOST_FLOW_CONTROLS, MOST_PENDING, PAUSE, QUIET, REFUSED_S, SILENT_S, Poller
-from gz_onboard.events import EFF_FLAG, TRANSMITTED
-from tests.polled import CHARGE, STEADY, carried, kona, payload, request
+from gz_onboard.events import EFF_FLAG
+from tests.polled import STEADY, carried, payload, request
 
 BATTERY, SHOWN = request("Battery"), request("BatteryShown")
 ASKED = (b"\x03\x22\x01\x01" + b"\xcc" * 4, b"\x03\x22\x01\x05" + b"\xcc" * 4)
@@ -253,102 +243,3 @@ def test_identifiers_of_29_bits_and_addresses_in_the_first_byte(addresses, flag)
         (0x6F1 | flag, (before + b"\x30\0\0" + pad)[:8]),
     ]
     assert bus.counts["answered"] == 1
-
-
-class Ecu:
-    """An ECU on a bus of python-can, in a thread: answers each request of the Kona, waits for flow control."""
-
-    def __init__(self, bus: str) -> None:
-        self._bus = can.Bus(interface="virtual", channel=bus)
-        self.heard: list[tuple[int, bytes]] = []
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._serve)
-        self._left: list[bytes] = []
-
-    def __enter__(self) -> Ecu:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join(10)
-        self._bus.shutdown()
-
-    def send(self, data: bytes, identifier: int = BATTERY.response) -> None:
-        self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
-
-    def _serve(self) -> None:
-        while not self._end.is_set():
-            message = self._bus.recv(0.1)
-            if message is None or message.arbitration_id != 0x7E4:
-                continue
-            data = bytes(message.data)
-            self.heard.append((message.arbitration_id, data))
-            if data[0] >> 4 == 3:
-                for part in self._left:
-                    self.send(part)
-                self._left = []
-            elif data in ASKED:
-                said = payload(BATTERY, **STEADY) if data == ASKED[0] else payload(SHOWN, BatteryCharge=CHARGE)
-                first, *self._left = carried(said)
-                self.send(first)
-
-
-@pytest.fixture
-def polling(tmp_path: Path) -> Iterator[tuple[Daemon, Ecu, Recorder, threading.Thread]]:
-    """A daemon that asks, and the ECU that it asks, on a virtual bus."""
-    name = f"poll{next(_NUMBERS)}"
-    channel = CanChannel("virtual", name, identifiers=known_identifiers(kona().mapping))
-    channel.open()
-    recorder = Recorder(tmp_path, "kona")
-    daemon = Daemon(kona(), [channel], recorder, None)
-    daemon.poller = Poller(kona().mapping.requests, kona().mapping.polling, daemon.ask)
-    thread = threading.Thread(target=daemon.run)
-    with Ecu(name) as ecu:
-        thread.start()
-        yield daemon, ecu, recorder, thread
-        daemon.stop()
-        thread.join(60)
-
-
-def until(condition: Callable[[], object], what: str, seconds: float = 60.0) -> None:
-    end = time.monotonic() + seconds
-    while not condition():
-        assert time.monotonic() < end, f"not within {seconds:g} s: {what}"
-        time.sleep(0.05)
-
-
-def test_what_is_asked_is_estimated_logged_and_left_to_another_tester(polling):
-    daemon, ecu, recorder, thread = polling
-    pipeline, counts = daemon.pipeline, daemon.poller.counts["Battery"]
-    until(lambda: pipeline.last_known and counts["answered"] >= 8, "answers, and a range by them")
-    assert pipeline.last.pack_voltage == pytest.approx(365.0)
-    assert pipeline.last.pack_current == pytest.approx(20.0)
-    assert not pipeline.codec.faults
-    assert not pipeline.foreign
-
-    ecu.send(b"\x02\x3e\x80", 0x7E4)  # a scan tool is plugged in
-    until(lambda: daemon.poller.summary.endswith("nothing more: someone else asks"), "the tester is seen")
-    asked = counts["asked"]
-
-    def heard() -> bool:
-        for part in carried(payload(BATTERY, **(STEADY | {"BatteryVoltage": 364.0}))):
-            ecu.send(part)  # for the tool
-        time.sleep(0.3)
-        return bool(pipeline.codec.values(-1, pipeline.codec.latest[-1][1])["BatteryVoltage"] == pytest.approx(364.0))
-
-    until(heard, "what is answered to another is heard, too")
-    assert counts["asked"] == asked
-    daemon.stop()
-    thread.join(60)
-
-    frames = [frame for path in recorder.paths for batch in read_frames(path) for frame in batch]
-    sent = [(f[1], f[2]) for f in frames if f[3] & TRANSMITTED and f[1] == 0x7E4]
-    assert sent == ecu.heard
-    assert {data for _, data in sent} == {*ASKED, GO_ON}
-    again = Codec(kona().mapping)
-    events = again.decode(frames)
-    assert [event[2][1] for event in events if event[1] == 0][:8] == [pytest.approx(365.0)] * 8
-    assert again.latest[-1][1] == pipeline.codec.latest[-1][1]
-    told = [values for path in recorder.paths for topic, _, values in read_samples(path) if topic == "/status"]
-    assert told[-1]["requests"]["Battery"]["answered"] >= 8
