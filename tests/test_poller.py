@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.bus.requests import SERVICES, Polling, Request
-from gz_onboard.daemon.poller import MOST_FLOW_CONTROLS, MOST_PENDING, PAUSE, QUIET, REFUSED_S, SILENT_S, Poller
+from gz_onboard.daemon.poller import LISTEN, MOST_FLOW_CONTROLS, MOST_PENDING, PAUSE, QUIET, REFUSED_S, SILENT_S, Poller
 from gz_onboard.events import EFF_FLAG
 from tests.polled import STEADY, carried, payload, request
 
@@ -24,11 +24,14 @@ _NUMBERS = count()
 class Bus:
     """A poller, what it sends, and a clock that the test keeps."""
 
-    def __init__(self, *requests: Request, takes: bool = True) -> None:
+    def __init__(self, *requests: Request, takes: bool = True, listened: bool = True) -> None:
         self.sent: list[tuple[int, bytes]] = []
         self.now = 100.0
         self.takes = takes
         self.poller = Poller(requests or (BATTERY,), Polling(), self._send)
+        if listened:
+            self.step()
+            self.now += LISTEN
 
     def _send(self, identifier: int, data: bytes) -> bool:
         self.sent.append((identifier, data))
@@ -158,6 +161,16 @@ def test_another_tester_has_the_ecu_for_himself(caplog):
         assert caplog.text.count("someone else asks on") == 1
         bus.step(b"\x02\x3e\x80", identifier=identifier)
         assert caplog.text.count("someone else asks on") == 2
+
+
+def test_whoever_is_there_before_is_not_disturbed():
+    """Another tester, or a vehicle that has the identifier for something else."""
+    bus = Bus(listened=False)
+    bus.step()
+    bus.step(after=0.5 * LISTEN)
+    bus.step(bytes(8), identifier=0x7E4)
+    assert bus.asked(QUIET - 1.0) == 0
+    assert bus.sent == []
 
 
 def test_a_tester_on_another_bus_is_none():

@@ -20,6 +20,7 @@ from gz_onboard.bus.answers import NEGATIVE_RESPONSE, PENDING, by_response
 from gz_onboard.bus.requests import FUNCTIONAL, SERVICES, Polling, Request
 from gz_onboard.events import EFF_FLAG, Frame
 
+LISTEN = 1.0  # s at the start, in which whoever asks already, or sends on our identifiers, is noticed
 QUIET = 300.0  # s without a frame of another tester until we ask again
 PENDING_S = 5.0  # s that an ECU takes for an answer which it has announced: P2* of ISO 14229
 MOST_PENDING = 20  # such announcements for one answer
@@ -66,7 +67,7 @@ class Poller:
             response: _Ecu(those, polling, send, self.counts) for response, those in by_response(requests).items()
         }
         self._asked = {*FUNCTIONAL, *(request.request for request in requests)}
-        self._quiet_until = 0.0  # s, monotonic
+        self._quiet_until: float | None = None  # s, monotonic
         self._stopped = False
 
     @property
@@ -97,11 +98,14 @@ class Poller:
                 self._stop(identifier, now)
             elif ecu := self._ecus.get(identifier):
                 ecu.hear(data)
-        if self._stopped and now >= self._quiet_until:
+        if self._quiet_until is None:
+            self._quiet_until = now + LISTEN
+        quiet = now >= self._quiet_until
+        if self._stopped and quiet:
             self._stopped = False
             log.info("quiet for %d minutes: asking again", QUIET // 60)
         for ecu in self._ecus.values():
-            ecu.step(now, not self._stopped)
+            ecu.step(now, quiet)
 
     def _stop(self, identifier: int, now: float) -> None:
         """Someone else asks: he needs the ECUs for himself, and what he is at is none of our business."""

@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.bus.codec import Codec
@@ -161,6 +161,7 @@ def test_identifiers_that_someone_has(tmp_path):
     assert "0x7e4" in message
 
 
+@settings(max_examples=60)
 @given(
     st.integers(0, 12),
     st.integers(0, 7),
@@ -191,6 +192,7 @@ def with_signal(folder: Path, signal: str) -> Vehicle:
     return read_vehicle(changed(folder, *changes))
 
 
+@settings(max_examples=40)
 @given(st.text("ABCXYZabcxyz", min_size=1, max_size=2))
 def test_letters_count_as_the_lists_of_pids_do(tmp_path_factory, letters):
     order = [chr(65 + i) for i in range(26)]
