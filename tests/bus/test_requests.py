@@ -15,8 +15,8 @@ from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG
 from gz_onboard.pipeline import range_publisher
 from gz_onboard.vehicle import Vehicle, read_vehicle
-from tests.polled import KONA, carried, kona
-from tests.support import EPOCH
+from tests.polled import KONA, STEADY, carried, kona, payload
+from tests.support import EPOCH, MS
 
 TEXT = KONA.read_text(encoding="utf-8")
 LINES = TEXT.split("\n")
@@ -64,6 +64,34 @@ def test_a_pid_of_obd(tmp_path: Path):
     (event,) = codec.decode([(EPOCH, 0x7EC, carried(b"\x41\x5b\xff")[0], 0)])
     assert event[2][0] == pytest.approx(1.0)
     assert codec.mapping.requests[1].bits == 2 * 135
+
+
+@pytest.mark.parametrize("bus", ["", '[bus]\nidentifiers = "j1939"\n'])
+def test_identifiers_of_29_bits_are_exact_whatever_the_bus(tmp_path: Path, bus: str):
+    changes = [("0x7E4", "0x18DA10F1"), ("0x7EC", "0x18DAF110")] * 2
+    vehicle = read_vehicle(changed(tmp_path, *changes, ("[roles]", f"{bus}[roles]")))
+    battery, _ = vehicle.mapping.requests
+    assert (battery.request, battery.response) == (0x18DA10F1 | EFF_FLAG, 0x18DAF110 | EFF_FLAG)
+    assert battery.bits == (2 + 9) * 160
+    for identifier, expected in ((0x18DAF110 | EFF_FLAG, 1), (0x18DAF111 | EFF_FLAG, 0), (0x110, 0)):
+        parts = enumerate(carried(payload(battery, **STEADY)))
+        assert len(Codec(vehicle.mapping).decode([(EPOCH + i * MS, identifier, d, 0) for i, d in parts])) == expected
+
+
+def test_addresses_in_the_first_byte(tmp_path: Path):
+    own = "request_address = 0x07\nresponse_address = 0xF1\nservice = 0x22"
+    file = changed(
+        tmp_path, ("service = 0x22", own), ("service = 0x22\ndata_identifier = 0x0105", f"{own}\ndata_identifier = 5")
+    )
+    vehicle = read_vehicle(file)
+    battery, _ = vehicle.mapping.requests
+    assert battery.addresses == (0x07, 0xF1)
+    for address, expected in ((0xF1, 1), (0xF4, 0)):
+        parts = enumerate(carried(payload(battery, **STEADY), address))
+        assert len(Codec(vehicle.mapping).decode([(EPOCH + i * MS, 0x7EC, d, 0) for i, d in parts])) == expected
+    other = refusal(changed(tmp_path, ("service = 0x22", own)))
+    assert "0x7ec" not in other
+    assert "response_identifier: is that of Battery too, which is asked by another identifier or address" in other
 
 
 @pytest.mark.parametrize(
