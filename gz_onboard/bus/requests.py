@@ -129,7 +129,7 @@ def read_polling(vehicle: Table, requests: Iterable[Request]) -> Polling:
     padding = usual.padding
     if "padding" in table.values:
         padding = None if table.values["padding"] == "none" else table.integer("padding", 0, 255)
-    needed = sum(request.bits / request.period for request in requests) / bitrate
+    needed = share_of_bus(requests, bitrate)
     if needed > share:
         raise (table if "bus_share" in table.values else vehicle).error(
             f"the requests and their answers take {100 * needed:.1f} % of a bus of {bitrate / 1000:g} kbit/s, and "
@@ -137,6 +137,11 @@ def read_polling(vehicle: Table, requests: Iterable[Request]) -> Polling:
             "bus_share" if "bus_share" in table.values else "request",
         )
     return Polling(bitrate, share, table.number("timeout", usual.timeout, 0.05, 5.0), padding)
+
+
+def share_of_bus(requests: Iterable[Request], bitrate: float) -> float:
+    """The share of a bus of `bitrate` [bit/s] that `requests` and their answers take at most."""
+    return sum(request.bits / request.period for request in requests) / bitrate
 
 
 def _request(table: Table) -> Request:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Sequence
 import isotp
 
 from gz_onboard.bus.answers import NEGATIVE_RESPONSE, PENDING, by_response
-from gz_onboard.bus.requests import FUNCTIONAL, SERVICES, Polling, Request
+from gz_onboard.bus.requests import FUNCTIONAL, SERVICES, Polling, Request, share_of_bus
 from gz_onboard.events import EFF_FLAG, Frame
 
 LISTEN = 1.0  # s at the start, in which whoever asks already, or sends on our identifiers, is noticed
@@ -62,7 +62,7 @@ class Poller:
     def __init__(self, requests: Sequence[Request], polling: Polling, send: Send) -> None:
         self.counts: dict[str, Counter[str]] = {request.name: Counter() for request in requests}
         self._requests = requests
-        self._bits = polling.bitrate
+        self._bitrate = polling.bitrate
         self._ecus = {
             response: _Ecu(those, polling, send, self.counts) for response, those in by_response(requests).items()
         }
@@ -73,7 +73,7 @@ class Poller:
     @property
     def text(self) -> str:
         """What is asked."""
-        share = sum(request.bits / request.period for request in self._requests) / self._bits
+        share = share_of_bus(self._requests, self._bitrate)
         asked, ecus = len(self._requests), len(self._ecus)
         return f"asking {ecus} ECU{'s' * (ecus > 1)} for {asked} of their data, {100 * share:.1f} % of the bus at most"
 
