@@ -19,7 +19,11 @@ EXIT_STATUSES = {
     INTERRUPTED: "interrupted by Ctrl-C",
 }
 """What the exit status of a command means."""
-_PACKAGES = {"paho": "paho-mqtt", "foxglove": "foxglove-sdk"}  # that are not named as their modules
+_PACKAGES = {
+    "paho": "paho-mqtt",
+    "foxglove": "foxglove-sdk",
+    "isotp": "can-isotp",
+}  # that are not named as their modules
 _DISK_FAILED = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 CLOSE, CLOSE_SHORT = 0.55, 0.5  # difflib's ratio of two names from which one may be meant; of up to three letters
 CLOSE_FILE = 0.75  # likewise of files, which have endings in common

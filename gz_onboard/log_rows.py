@@ -129,7 +129,7 @@ def declare(log: Log, messages: Sequence[Message]) -> None:
     for topic, title in ((WHY_TOPIC, "gz_onboard.Why"), (CHANGE_TOPIC, "gz_onboard.RangeChange")):
         log.channel(topic, object_schema(title, {"time": ESTIMATE_UNITS["time"]} | units))
     counts = {name: {"type": "integer"} for name in COUNTS}
-    maps = {name: {"type": "object"} for name in ("foreign", "faults", "lost", "unknown")}
+    maps = {name: {"type": "object"} for name in ("foreign", "faults", "lost", "unknown", "requests")}
     reasons = {"reasons": {"type": "array", "items": {"type": "string"}}}
     log.channel(STATUS_TOPIC, {"title": "gz_onboard.Status", "type": "object", "properties": counts | maps | reasons})
     log.channel(BATTERY_ENDS_TOPIC, LOCATION_SCHEMA)

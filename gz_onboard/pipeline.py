@@ -7,10 +7,10 @@ portions the frames arrive.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from math import inf
 
-from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, RANGE, TIME, UNDECODABLE, Codec
+from gz_onboard.bus.codec import DROPPING, RANGE, Codec
 from gz_onboard.bus.layout import identifier_of
 from gz_onboard.bus.mapping import pgn
 from gz_onboard.bus.publisher import KNOWN, MESSAGES, Counts, Publisher
@@ -46,7 +46,6 @@ FREE = (
     *range(0x18FF_6000 | EFF_FLAG, 0x19FF_6000 | EFF_FLAG, 0x1000),
 )
 """Where range frames may begin, the first choice first: of 11 bits and low priority, not the diagnosis' above 0x700."""
-DROPPING = (LENGTH, CRC, COUNTER, TIME, UNDECODABLE)  # reasons that drop a frame
 
 
 def filter_maker(name: str) -> FilterMaker:
@@ -86,6 +85,7 @@ class Pipeline:
         self.kernel_lost = 0  # frames; set by the daemon
         self.overrun = 0  # frames left out because more came than can be decoded; set by the daemon
         self.log_lost = 0  # frames that are in no log; set by the daemon
+        self.polled: Mapping[str, Mapping[str, int]] = {}  # what came of requests, by name; set by the daemon
         self.send_failures = 0  # frames that a channel did not take; set by the daemon
         self.extra_reasons = Reason(0)  # set by the daemon: bus down, log failed
         self.last: Estimate | None = None
@@ -101,7 +101,8 @@ class Pipeline:
         self._topics: dict[int, str] = {}
         self._located = -inf  # s, of the last position logged
         if log:
-            declare(log, self.codec.mapping.database.messages if log_signals else ())
+            answers = [request.message for request in vehicle.mapping.requests]
+            declare(log, [*self.codec.mapping.database.messages, *answers] if log_signals else ())
 
     def advance(self, frames: Sequence[Frame], until_ns: int) -> list[Frame]:
         """Take in `frames`, in the order of their times, up to `until_ns`; gives the frames to be sent."""
@@ -198,7 +199,9 @@ class Pipeline:
             if time_ns - seen_ns < TICKS_PER_RANGE * TICK_NS:  # not again what was logged before
                 topic = topics.get(identifier)
                 if topic is None:
-                    topic = topics[identifier] = f"/can/{codec.message_name(identifier)}"
+                    if (name := codec.message_name(identifier)) is None:  # a frame of an answer
+                        continue
+                    topic = topics[identifier] = f"/can/{name}"
                 log.sample(topic, time_ns, codec.values(identifier, data), seen_ns)
         signals, now = self.estimator.signals, codec.seconds(time_ns)
         latitude, longitude = signals.latitude.get(now), signals.longitude.get(now)
@@ -235,7 +238,7 @@ class Pipeline:
             "lost": dict(sorted(codec.lost.items())),
             "unknown": {f"{i & ~EFF_FLAG:X}": n for i, n in sorted(codec.unknown.items())[:32]},
             "reasons": reason_names(self.last.reasons) if self.last else [],
-        }
+        } | ({"requests": {name: dict(of) for name, of in self.polled.items()}} if self.polled else {})
 
 
 def range_publisher(vehicle: Vehicle) -> Publisher:
@@ -245,11 +248,13 @@ def range_publisher(vehicle: Vehicle) -> Publisher:
     that takes it by the prior riding.
     """
     publisher = vehicle.publisher()
-    known = {_frame_key(vehicle, identifier_of(m)) for m in vehicle.mapping.database.messages}
+    mapping = vehicle.mapping
+    asked = [one for request in mapping.requests for one in (request.request, request.response)]
+    known = {_frame_key(vehicle, i) for i in (*map(identifier_of, mapping.database.messages), *asked)}
     if clash := [i for i in publisher.identifiers if _frame_key(vehicle, i) in known]:
         free = next(i for i in FREE if not any(_frame_key(vehicle, i + n) in known for n in range(MESSAGES)))
         raise vehicle.error(
-            f"its DBC files take the identifiers of our own range frames ({publisher.file}): "
+            f"its DBC files or requests take the identifiers of our own range frames ({publisher.file}): "
             f"{', '.join(hexadecimal(i) for i in sorted(clash))}; give range_identifier = {free:#x}, "
             f"from which on {MESSAGES} are free in them"
         )

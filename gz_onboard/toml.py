@@ -106,6 +106,23 @@ class Table:
             raise self.error(f"must be a table, is {shown(value)}", key)
         return Table(value, self.file, self._text, f"{self.name}.{key}" if self.name else key)
 
+    def tables(self, key: str, most: int) -> list[Table]:
+        """The tables of the array `key`, ``[[key]]``, at most `most`; none if it is not there."""
+        value = self.values.get(key, [])
+        if not isinstance(value, list) or not all(isinstance(one, Mapping) for one in value):
+            raise self.error(f"must be tables under headers [[{key}]], is {shown(value)}", key)
+        if len(value) > most:
+            raise self.error(f"there are {len(value)}, the most are {most}", key)
+        name = f"{self.name}.{key}" if self.name else key
+        header = re.compile(rf"^[ \t]*\[\[[ \t]*{_dotted(name.split('.'))}[ \t]*\]\]", re.M)
+        begins = [found.start() for found in header.finditer(self._text)]
+        if len(begins) != len(value):  # written in one line
+            return [Table(one, self.file, self._text, name) for one in value]
+        ends = [*begins, len(self._text)][1:]
+        # Of the text before it only the lines are left: its keys are found where they stand, not in another's.
+        texts = ["\n" * self._text.count("\n", 0, i) + self._text[i:k] for i, k in zip(begins, ends, strict=True)]
+        return [Table(one, self.file, text, name) for one, text in zip(value, texts, strict=True)]
+
     def text(self, key: str, default: str | None = None, choices: Collection[str] = ()) -> str:
         """The string `key`, one of `choices` if these are given."""
         value = self.values.get(key, default)

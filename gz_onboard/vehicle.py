@@ -22,8 +22,8 @@ from gz_onboard.toml import Table, is_file
 
 OWN = Path(__file__).resolve().parent / "vehicles"
 KEYS = (
-    "schema name dbc range_dbc range_identifier bus roles instruments model parameters correlation battery forecast "
-    "controller healthy"
+    "schema name dbc range_dbc range_identifier bus request poll roles instruments model parameters correlation "
+    "battery forecast controller healthy"
 )
 
 

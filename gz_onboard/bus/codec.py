@@ -10,14 +10,16 @@ multiplexed and floating-point signals go through cantools itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
+from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, Answers, by_response
 from gz_onboard.bus.checksum import sae_j1850_tables
 from gz_onboard.bus.layout import MappedMessage, identifier_of, is_not_available, raw_values
 from gz_onboard.bus.mapping import BusMapping, Protection, Source, pgn
+from gz_onboard.bus.requests import FUNCTIONAL
 from gz_onboard.bus.signals import MessageSignals, Values
-from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Event, Frame, Group
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Event, Frame, Group
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -30,6 +32,7 @@ NOT_AVAILABLE = "not available"
 RANGE = "out of range"
 TIME = "implausible time"
 UNDECODABLE = "undecodable"
+DROPPING = (LENGTH, CRC, COUNTER, TIME, UNDECODABLE, SEQUENCE, INTERRUPTED, MALFORMED)  # that drop a frame or an answer
 
 BACK_NS = 50_000_000  # frames of two channels may overtake each other by a little
 _AHEAD_NS = 30_000_000_000
@@ -53,6 +56,8 @@ class Codec:
         self.error_frames = 0
         self.received = 0
         self.latest: dict[int, tuple[int, bytes]] = {}  # identifier -> time [ns], data of the last good frame
+        # Likewise, below zero, of the last good answer to a request: -1 for the first request, and so on.
+        self.wrong_lengths: dict[str, int] = {}  # message of an answer -> bytes of the last that has another length
         self._events: list[Event] = []
         self._origin_ns: int | None = None
         self._signals: dict[str, MessageSignals] = {}  # by message, of those that were asked for
@@ -71,11 +76,14 @@ class Codec:
                 self._by_pgn[pgn(message.frame_id)] = handler
             else:
                 self._handlers[identifier_of(message)] = handler
+        self._answering: dict[int, int | None] = {request.response: None for request in mapping.requests}  # channel
+        self._listen_for_answers(by_message)
 
     # --- frames ---------------------------------------------------------------------------------------------
 
     def decode(self, frames: Iterable[Frame]) -> list[Event]:
         """The events of `frames`, in their order; their times are seconds since the first frame ever decoded."""
+        frames = self._of_one_channel(frames) if self._answering else frames
         handlers, latest = self._handlers, self.latest
         origin, last = self._origin_ns, self._last_ns
         back, ahead = -BACK_NS, _AHEAD_NS
@@ -182,7 +190,8 @@ class Codec:
         if message is None:
             return {}
         if (signals := self._signals.get(message.name)) is None:
-            self._signals[message.name] = signals = MessageSignals(message, self.mapping.not_available)
+            not_available = self.mapping.not_available and identifier >= 0
+            self._signals[message.name] = signals = MessageSignals(message, not_available)
         return signals.values(data) or {}
 
     def message_name(self, identifier: int) -> str | None:
@@ -191,6 +200,8 @@ class Codec:
         return message.name if message else None
 
     def _message(self, identifier: int) -> Message | None:
+        if identifier < 0:
+            return self.mapping.requests[-identifier - 1].message
         for message in self.mapping.database.messages:
             if self.mapping.j1939 and message.is_extended_frame:
                 if identifier & EFF_FLAG and pgn(message.frame_id) == pgn(identifier):
@@ -201,12 +212,47 @@ class Codec:
 
     # --- compiling ----------------------------------------------------------------------------------------------
 
-    def _handler(self, message: Message, sources: list[Source]) -> Handler:
+    def _listen_for_answers(self, by_message: dict[str, list[Source]]) -> None:
+        """Take the frames of requests and answers: the latter's data as those of the messages that they become."""
+        requests = self.mapping.requests
+        for response, those in by_response(requests).items():
+            takers = [self._answer(-1 - requests.index(one), by_message.get(one.name, [])) for one in those]
+            self._handlers[response] = Answers(those, takers, self._fault).take
+        for identifier in {*FUNCTIONAL, *(request.request for request in requests)} if requests else ():
+            self._handlers.setdefault(identifier, lambda _time, _data: True)
+
+    def _of_one_channel(self, frames: Iterable[Frame]) -> Iterator[Frame]:
+        """Without the answers that come a second time, by way of a gateway, on another channel than the first one."""
+        answering = self._answering
+        for frame in frames:
+            if frame[1] in answering:
+                channel = frame[3] & ~TRANSMITTED
+                if answering[frame[1]] is None:
+                    answering[frame[1]] = channel
+                elif answering[frame[1]] != channel:
+                    continue
+            yield frame
+
+    def _answer(self, key: int, sources: list[Source]) -> Handler:
+        """What takes the data of the answer whose `latest` is that of `key`."""
+        message = self.mapping.requests[-1 - key].message
+        decode = self._handler(message, sources, not_available=False)  # all ones are a value: what limits are for
+
+        def take(time: float, data: bytes) -> None:
+            if len(data) != message.length:
+                self.wrong_lengths[message.name] = len(data)
+            if not decode(time, data) and self._origin_ns is not None:
+                self.latest[key] = (self._origin_ns + round(time * 1e9), data)
+
+        return take
+
+    def _handler(self, message: Message, sources: list[Source], not_available: bool | None = None) -> Handler:
         if not sources:
             return self._check_length_only(message)
         mapping, name = self.mapping, message.name
         protection = mapping.protection.get(name, Protection())
-        mapped = MappedMessage(message, sources, protection, mapping.periods.get(name), mapping.not_available)
+        codes = mapping.not_available if not_available is None else not_available
+        mapped = MappedMessage(message, sources, protection, mapping.periods.get(name), codes)
         group = len(self.groups)
         self.groups.append(Group(name, tuple(source.role for source in sources), mapped.period))
         scope: dict[str, Any] = {"LENGTH": LENGTH, "CRC": CRC, "COUNTER": COUNTER}
@@ -273,4 +319,5 @@ def known_identifiers(mapping: BusMapping) -> list[int] | None:
     """The identifiers (with flags) that the database knows, for the kernel's filters; None if it goes by PGN."""
     if mapping.j1939:
         return None
-    return [identifier_of(message) for message in mapping.database.messages]
+    asked = {one for request in mapping.requests for one in (request.request, request.response, *FUNCTIONAL)}
+    return [*(identifier_of(message) for message in mapping.database.messages), *sorted(asked)]

@@ -99,10 +99,10 @@ def write_mcap(log: Path, out: Path, decoder: Decoder, batches: Iterator[list[Fr
     metadata = {**logs.read_metadata(log), "expanded_from": log.name}
     with out.open("wb") as stream:
         file = LogFile(stream, first[0][0], metadata, logs.read_attachments(log))
-        recorded, topics = logs.json_channels(log), {m.name: f"/can/{m.name}" for m in decoder.messages.values()}
+        recorded, topics = logs.json_channels(log), {m.name: f"/can/{m.name}" for m in decoder.all_messages}
         for topic, (schema, of_channel) in recorded.items():
             file.channel(topic, json.loads(schema), of_channel)
-        for message in decoder.messages.values():
+        for message in decoder.all_messages:
             if topics[message.name] not in recorded:
                 file.channel(topics[message.name], _message_schema(message, decoder.columns[message.name]))
 

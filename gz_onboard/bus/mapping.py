@@ -28,9 +28,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.dbc import LARGEST, SMALLEST, LeftOut, empty_database, find_dbc, load_database
+from gz_onboard.bus.requests import Polling, Request, read_polling, read_requests
 from gz_onboard.bus.units import UNITS, known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown
-from gz_onboard.events import CURRENTS, INSTRUMENTS, ROLES, SPEEDS, VOLTAGES
+from gz_onboard.events import CURRENTS, EFF_FLAG, INSTRUMENTS, ROLES, SPEEDS, VOLTAGES
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
@@ -75,26 +76,60 @@ class BusMapping:
     delays: dict[str, float] = field(default_factory=dict)  # s, by message: its values are so much older; where stated
     instruments: tuple[Source, ...] = ()  # of roles that no estimator needs
     columns: Table | None = None  # the roles of a vehicle without DBC files: their signals are columns of a table
+    requests: tuple[Request, ...] = ()  # what the vehicle tells only when it is asked
+    polling: Polling = field(default_factory=Polling)
+
+    @property
+    def reads_frames(self) -> bool:
+        """Whether anything on a bus is known: messages of DBC files, or answers."""
+        return bool(self.dbc_files or self.requests)
 
 
 def read_mapping(vehicle: Table) -> BusMapping:
     """The bus part of the vehicle file `vehicle`; InputError for whatever does not fit its DBC files.
 
-    Of a vehicle without DBC files only tables of signals can be read; it has a mapping without sources.
+    Of a vehicle without DBC files and requests only tables of signals can be read; it has a mapping without sources.
     """
-    if "dbc" not in vehicle.values:
+    if "poll" in vehicle.values and "request" not in vehicle.values:
+        raise vehicle.error("says how requests are sent, and there is no [[request]]", "poll")
+    if "dbc" not in vehicle.values and "request" not in vehicle.values:
         if "bus" in vehicle.values:
             raise vehicle.error("describes frames, for which dbc is missing", "bus")
         roles = vehicle.table("roles")
         roles.only(ROLES)
         return BusMapping(empty_database(), (), (), {}, {}, columns=roles if roles.values else None)
-    files = _dbc_files(vehicle)
+    files = _dbc_files(vehicle) if "dbc" in vehicle.values else []
     left_out: LeftOut = {}
-    database = load_database(files, left_out)
+    database = load_database(files, left_out) if files else empty_database()
+    flagged = {m.frame_id | (EFF_FLAG if m.is_extended_frame else 0): m.name for m in database.messages}
+    requests = read_requests(vehicle, flagged)
 
     bus = vehicle.table("bus")
     bus.only(["not_available", "identifiers", "messages"])
-    messages = bus.table("messages")
+    protection, periods, delays = _options(database, bus.table("messages"))
+    j1939 = bus.text("identifiers", "exact", ["exact", "j1939"]) == "j1939"
+    if j1939:
+        _check_groups(database, bus)
+    named = _with_answers(database, requests, vehicle)
+    sources = _sources(named, left_out, vehicle.table("roles"), ROLES)
+    _check_witnesses(sources, vehicle.table("roles"))
+    return BusMapping(
+        database=database,
+        dbc_files=tuple(files),
+        sources=sources,
+        instruments=_sources(named, left_out, vehicle.table("instruments"), INSTRUMENTS),
+        protection=protection,
+        periods=periods | {request.name: request.period for request in requests},
+        not_available=bus.text("not_available", "all-ones", ["all-ones", "none"]) == "all-ones",
+        j1939=j1939,
+        delays=delays,
+        requests=requests,
+        polling=read_polling(vehicle, requests),
+    )
+
+
+def _options(database: Database, messages: Table) -> tuple[dict[str, Protection], dict[str, float], dict[str, float]]:
+    """Protection, period [s] and delay [s] by message, of all in the table `messages` and of the DBC files."""
     protection: dict[str, Protection] = {}
     delays: dict[str, float] = {}
     periods = {message.name: message.cycle_time / 1000 for message in database.messages if message.cycle_time}
@@ -118,23 +153,20 @@ def read_mapping(vehicle: Table) -> BusMapping:
             periods[name] = options.number("period", low=1e-4, high=3600)
         if "delay" in options.values:
             delays[name] = options.number("delay", low=-LONGEST_DELAY, high=LONGEST_DELAY)
+    return protection, periods, delays
 
-    j1939 = bus.text("identifiers", "exact", ["exact", "j1939"]) == "j1939"
-    if j1939:
-        _check_groups(database, bus)
-    sources = _sources(database, left_out, vehicle.table("roles"), ROLES)
-    _check_witnesses(sources, vehicle.table("roles"))
-    return BusMapping(
-        database=database,
-        dbc_files=tuple(files),
-        sources=sources,
-        instruments=_sources(database, left_out, vehicle.table("instruments"), INSTRUMENTS),
-        protection=protection,
-        periods=periods,
-        not_available=bus.text("not_available", "all-ones", ["all-ones", "none"]) == "all-ones",
-        j1939=j1939,
-        delays=delays,
-    )
+
+def _with_answers(database: Database, requests: tuple[Request, ...], vehicle: Table) -> Database:
+    """What has the signals by name: the messages of the DBC files, and those that answers become."""
+    known = {message.name for message in database.messages}
+    if twice := next((request.name for request in requests if request.name in known), None):
+        raise vehicle.error(f"a message of the DBC files is called {twice} too", "request")
+    if not requests:
+        return database
+    named = empty_database(strict=False)
+    named.messages[:] = [*database.messages, *(request.message for request in requests)]
+    named.refresh()
+    return named
 
 
 def _dbc_files(vehicle: Table) -> list[Path]:
@@ -227,7 +259,7 @@ def _check_witnesses(sources: tuple[Source, ...], where: Table) -> None:
 def _message(database: Database, where: Table, key: str, name: str) -> Message:
     known = [message.name for message in database.messages]
     if name not in known:
-        raise where.error(f"the DBC files have no message {shown(name)}{nearest(name, known)}", key)
+        raise where.error(f"there is no message {shown(name)}{nearest(name, known)}", key)
     return database.get_message_by_name(name)
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
+from gz_onboard.bus.answers import NEGATIVE, Answers, Take, by_response
 from gz_onboard.bus.layout import identifier_of, raw_range, raw_values
+from gz_onboard.bus.requests import Request
 from gz_onboard.events import Frame
 
 if TYPE_CHECKING:
@@ -39,27 +41,58 @@ class MessageSignals:
 
 
 class Decoder:
-    """All signals of frames by a cantools database; what cannot be decoded is counted, never guessed."""
+    """All signals of frames by a cantools database; what cannot be decoded is counted, never guessed.
 
-    def __init__(self, database: Database) -> None:
+    requests: whose answers are decoded, too, as messages of their own.
+    """
+
+    def __init__(self, database: Database, requests: Sequence[Request] = ()) -> None:
         self.unknown = 0
         self.undecodable = 0
         self.messages: dict[int, Message] = {identifier_of(message): message for message in database.messages}
         self._signals = {name: MessageSignals(message) for name, message in self.messages.items()}
-        self.columns = {m.name: {column_name(s): s.unit or "" for s in m.signals} for m in database.messages}
+        self.all_messages: list[Message] = [*database.messages, *(request.message for request in requests)]
+        self.columns = {m.name: {column_name(s): s.unit or "" for s in m.signals} for m in self.all_messages}
+        self._whole: list[tuple[str, Values]] = []  # answers, of the frame that completed them
+        self._answers = {
+            response: Answers(those, [self._taker(request.message) for request in those], self._dropped)
+            for response, those in by_response(requests).items()
+        }
+        self._asked = {request.request for request in requests}
 
     def decode(self, batches: Iterable[list[Frame]]) -> Iterator[Decoded]:
-        """One item for each frame that the database knows."""
+        """One item for each frame that the database knows, and for each answer."""
         for batch in batches:
             for time_ns, identifier, data, _ in batch:
                 message = self.messages.get(identifier)
-                if message is None:
-                    self.unknown += 1
+                if answers := self._answers.get(identifier):
+                    answers.take(time_ns * 1e-9, data)
+                    yield from ((time_ns, name, values) for name, values in self._whole)
+                    self._whole.clear()
+                elif message is None:
+                    self.unknown += identifier not in self._asked
                 elif (values := self._signals[identifier].values(data)) is None:
                     self.undecodable += 1
                 else:
-                    pairs = zip(self.columns[message.name], message.signals, strict=True)
-                    yield time_ns, message.name, {column: values.get(s.name) for column, s in pairs}
+                    yield time_ns, message.name, self._row(message, values)
+
+    def _row(self, message: Message, values: Values) -> Values:
+        pairs = zip(self.columns[message.name], message.signals, strict=True)
+        return {column: values.get(s.name) for column, s in pairs}
+
+    def _taker(self, message: Message) -> Take:
+        signals = MessageSignals(message, not_available=False)
+
+        def take(_time: float, data: bytes) -> None:
+            if (values := signals.values(data)) is None:
+                self.undecodable += 1
+            else:
+                self._whole.append((message.name, self._row(message, values)))
+
+        return take
+
+    def _dropped(self, _message: str, reason: str) -> None:
+        self.undecodable += not reason.startswith(NEGATIVE)
 
 
 def column_name(signal: Signal) -> str:

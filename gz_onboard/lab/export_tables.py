@@ -184,7 +184,8 @@ def decoder_of(log: Path, files: list[Path] | None, vehicle: str | None) -> Deco
     """What decodes the frames of `log`: DBC files; else those of a vehicle; else those attached to the log; else those
     of the vehicle that the log names, if it is one of the package's own. InputError if none is known.
     """
-    return Decoder(_database(log, files, vehicle))
+    requests = read_vehicle(vehicle).mapping.requests if vehicle else ()
+    return Decoder(_database(log, files, vehicle), requests)
 
 
 def _database(log: Path, files: list[Path] | None, vehicle: str | None) -> Database:
@@ -216,6 +217,6 @@ def _database_of(name: str) -> Database:
     from gz_onboard.bus.dbc import load_database
 
     vehicle = read_vehicle(name)
-    if not vehicle.mapping.dbc_files:
+    if not vehicle.mapping.reads_frames:
         raise vehicle.error("dbc is missing: without it no frame can be decoded")
     return load_database([*vehicle.mapping.dbc_files, vehicle.range_dbc], {})

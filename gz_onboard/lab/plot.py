@@ -13,6 +13,7 @@ from math import degrees, isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from gz_onboard.bus.codec import DROPPING
 from gz_onboard.bus.logs import LogDamage, read_metadata, read_samples
 from gz_onboard.constants import WH_PER_KM
 from gz_onboard.errors import OK, InputError, writing
@@ -36,7 +37,6 @@ from gz_onboard.offline.style import (
     time_unit,
 )
 from gz_onboard.options import add_shared
-from gz_onboard.pipeline import DROPPING
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

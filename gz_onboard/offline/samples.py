@@ -86,7 +86,7 @@ def open_ride(
     if isinstance(log, SignalTable) or is_table(log):
         return signal_frames(log if isinstance(log, SignalTable) else read_table(log), vehicle.mapping)
     frames = read_frames(log, on_damage=on_damage)
-    if not vehicle.mapping.dbc_files:
+    if not vehicle.mapping.reads_frames:
         raise vehicle.error(f"dbc is missing: without it a table of signals can be read, but no frames as in {log}")
     return vehicle.mapping, _timed(log, frames)
 

@@ -17,12 +17,12 @@ from math import isfinite
 from operator import itemgetter
 from random import Random
 
-from gz_onboard.bus.codec import Codec
+from gz_onboard.bus.codec import DROPPING, Codec
 from gz_onboard.bus.layout import raw_range
 from gz_onboard.daemon.loop import CLOCK_STEP_NS
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Frame
 from gz_onboard.lab.estimate_ride import feed
-from gz_onboard.pipeline import DROPPING, TICK_NS
+from gz_onboard.pipeline import TICK_NS
 from gz_onboard.vehicle import Vehicle
 from tests.hardening.report import Report
 from tests.support import EPOCH, MS, Run, S, check_sound, recorded, reference, sealed

@@ -64,6 +64,7 @@ def test_it_names_every_role():
     "module",
     [
         "bus/mapping",
+        "bus/requests",
         "vehicle",
         "physics/model",
         "physics/riding",

@@ -12,6 +12,7 @@ from typing import Annotated
 import numpy as np
 
 from gz_onboard.arrays import Array
+from gz_onboard.bus.answers import NEGATIVE
 from gz_onboard.bus.codec import RANGE, Codec
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.bus.units import UNITS
@@ -69,7 +70,7 @@ def check_log(
     codec = Codec(mapping)
     columns = read_roles(log, vehicle, (codec, frames), progress)
     samples = Samples(ride_name(log), columns, facts_of(log))
-    findings = list(_dropped(codec, columns))
+    findings = [*_dropped(codec, columns), *_unanswered(codec, columns)]
     if columns:
         findings += _checks(seconds_of(samples, vehicle), vehicle, samples.rider_mass)
     if columns and not quick:
@@ -90,6 +91,26 @@ def _dropped(codec: Codec, columns: Mapping[str, tuple[Array, Array]]) -> Iterat
         if role and reason == RANGE and count > DROPPED * (count + kept):
             text = f"{count} of {count + kept} values were dropped: out of the DBC file's limits, or of a vehicle's"
             yield wrong("limits", (role,), text)
+
+
+def _unanswered(codec: Codec, columns: Mapping[str, tuple[Array, Array]]) -> Iterator[Finding]:
+    """Requests whose answers have another length than the file says, and those that an ECU refused."""
+    roles: dict[str, tuple[str, ...]] = {}
+    for source in codec.mapping.sources:
+        roles[source.message] = (*roles.get(source.message, ()), source.role)
+    for request in codec.mapping.requests:
+        named = roles.get(request.name, ())
+        if request.name in codec.wrong_lengths:
+            text = (
+                f"{request.name} has {codec.wrong_lengths[request.name]} bytes, the file says {request.message.length}"
+            )
+            yield wrong("length of the answer", named, text)
+    for (place, reason), count in sorted(codec.faults.items()):
+        if reason.startswith(NEGATIVE):
+            silent = tuple(
+                role for of in codec.mapping.requests for role in roles.get(of.name, ()) if role not in columns
+            )
+            yield unknown("requests", silent, f"{count} times {reason} on {place}")
 
 
 def _checks(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterator[Finding]:
