@@ -15,6 +15,7 @@ from pathlib import Path
 from gz_onboard.errors import BAD_INPUT, FAILED, OK, not_an_input, writing
 from gz_onboard.lab.validate_ride import log_size, validate_ride
 from gz_onboard.lab.validate_score import Means, PooledMeans, SimulationVerdict, ValidatedRide, pooled
+from gz_onboard.offline.page import mark_of, write_below
 from gz_onboard.offline.processes import Task, collect, over_rides, tasks_of
 from gz_onboard.offline.results import explain_keys, write_json
 from gz_onboard.offline.schema import descriptions
@@ -24,6 +25,7 @@ from gz_onboard.vehicle import find_vehicle, read_vehicle
 
 SUMMARY_VERSION = 1
 PAGE = "validation.html"
+MAKER = "gz-onboard validate"
 KEYS = descriptions(SimulationVerdict) | descriptions(ValidatedRide)
 """What ``--json`` holds of a ride: {"version", "rides", "pooled": splits of all rides, "failed": [{file, error}]}."""
 
@@ -64,7 +66,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard validate``."""
     explain_keys(parser, "a ride", SUMMARY_VERSION, KEYS)
     add_shared(parser, "logs", "--vehicle", "--payload", "--output", "--json")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables of the page as Markdown")
+    parser.add_argument(
+        "--markdown",
+        type=Path,
+        metavar="FILE",
+        help=f"write the tables of the page as Markdown; in a file that has the line {mark_of(MAKER)}, below it",
+    )
     add_shared(parser, "--no-plot", help="draw nothing and write no page")
     parser.add_argument("--gate", action="store_true", help="exit with status 1 if a ride does not pass")
     add_shared(parser, "--jobs", "--quiet")
@@ -101,7 +108,7 @@ def _write_tables(arguments: argparse.Namespace, rides: list[ValidatedRide], tog
             write_report(written[-1], rides, together)
         if arguments.markdown:
             written.append(arguments.markdown)
-            arguments.markdown.write_text(markdown(rides, together), encoding="utf-8", errors="replace")
+            write_below(arguments.markdown, MAKER, markdown(rides, together))
     if arguments.json != "-" and written:
         print(f"written: {', '.join(map(str, written))}")
 

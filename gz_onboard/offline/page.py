@@ -78,6 +78,18 @@ def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
+def write_below(file: Path, maker: str, text: str) -> None:
+    """Write Markdown. Where `file` says that the rest is made by `maker`, what is above it stays. Raises OSError."""
+    mark = mark_of(maker)
+    above, found, _ = file.read_text(encoding="utf-8", errors="replace").partition(mark) if file.is_file() else ("", "", "")
+    file.write_text((f"{above}{mark}\n\n" if found else "") + text, encoding="utf-8", errors="replace")
+
+
+def mark_of(maker: str) -> str:
+    """The comment in a page of Markdown below which `maker` writes."""
+    return f"<!-- made by {maker} from here on -->"
+
+
 def svg(figure: Figure) -> str:
     """A figure as SVG inside a page, the same text for the same figure."""
     import matplotlib as mpl
