@@ -13,8 +13,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gz_onboard.errors import BAD_INPUT, FAILED, OK, not_an_input, writing
-from gz_onboard.lab.validate_ride import log_size, validate_ride
+from gz_onboard.lab.validate_ride import PICTURE, log_size, validate_ride
 from gz_onboard.lab.validate_score import Means, PooledMeans, SimulationVerdict, ValidatedRide, pooled
+from gz_onboard.lab.validate_soc import soc_text
+from gz_onboard.lab.validate_thesis import of_component
 from gz_onboard.offline.page import mark_of, write_below
 from gz_onboard.offline.processes import Task, collect, over_rides, tasks_of
 from gz_onboard.offline.results import explain_keys, write_json
@@ -79,9 +81,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard validate``: `OK`; `BAD_INPUT` if a ride cannot be judged; `FAILED` if with --gate one fails."""
-    tasks = tasks_of(arguments, Task, ".validation.png")
+    tasks = tasks_of(arguments, Task, PICTURE)
     written = [arguments.json, arguments.markdown, arguments.output / PAGE]
-    written += [task.output(".validation.png") for task in tasks]
+    written += [task.output(PICTURE) for task in tasks]
     not_an_input(written, [*(task.path for task in tasks), find_vehicle(arguments.vehicle)])
     read_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
     with writing(arguments.output):
@@ -131,13 +133,17 @@ def ride_text(ride: ValidatedRide) -> str:
         for channel, e in verdict.channels.items():
             percent = "–" if e.percent is None else f"{e.percent:5.1f} %"
             spread = "" if e.of_spread is None else f", {e.of_spread:.2f} of its spread"
-            outcome = "ok" if e.passed else f"FAIL (limit {e.limit_percent:g} %)"
+            outcome = f"{'ok' if e.passed else 'FAIL'} (limit {e.limit_percent:g} %)"
+            thesis = of_component(channel) if form == "components" else ""
             lines.append(
                 f"    {channel.replace('_', ' '):21} {percent} {outcome:17} "
                 f"rms {e.rms:7.2f}, max {e.max:7.2f}, mean {e.mean_error:+7.2f} {e.unit}{spread}"
+                f"{f'; {thesis}' if thesis else ''}"
             )
         if not verdict.passed:
             lines.append(f"    FAIL: {meaning}")
+    if ride.soc_reference:
+        lines.append(f"  state of charge: {soc_text(ride.soc_reference)}")
     if not ride.passed:
         lines.append("  what each percentage is of, and where the model is known to fail: docs/validation.md")
     return "\n".join([*lines, *(f"  {text}" for text in ride.missing)])

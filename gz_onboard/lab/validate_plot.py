@@ -11,7 +11,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.validate_components import Component
-from gz_onboard.lab.validate_score import CHANNELS, ValidatedRide
+from gz_onboard.lab.validate_score import CHANNELS, GIVEN, ValidatedRide
 from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, new_figure, rule, time_unit
 
 if TYPE_CHECKING:
@@ -86,11 +86,17 @@ def _panels(
     panels = []
     for name, channel in CHANNELS.items():
         if name in measured:
-            lines = {form: series[name] for form, series in simulated.items()}
+            lines = {
+                form: channel.shown(series[name])
+                for form, series in simulated.items()
+                if name not in GIVEN.get(form, set())
+            }
             for component, of in _ALONE.items():
                 if of == name and component in alone:
                     lines["components"] = alone[component].modelled
-            panels.append(_Panel(channel.label, channel.unit.replace("degC", "°C"), measured[name], lines))
+            panels.append(
+                _Panel(channel.label, channel.unit.replace("degC", "°C"), channel.shown(measured[name]), lines)
+            )
     for name in ("inverter_power", "road_load"):
         if name in alone:
             c = alone[name]

@@ -81,8 +81,9 @@ def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def write_below(file: Path, maker: str, text: str) -> None:
     """Write Markdown. Where `file` says that the rest is made by `maker`, what is above it stays. Raises OSError."""
     mark = mark_of(maker)
-    above, found, _ = file.read_text(encoding="utf-8", errors="replace").partition(mark) if file.is_file() else ("", "", "")
-    file.write_text((f"{above}{mark}\n\n" if found else "") + text, encoding="utf-8", errors="replace")
+    before = file.read_text(encoding="utf-8", errors="replace") if file.is_file() else ""
+    kept = f"{before.partition(mark)[0]}{mark}\n\n" if mark in before else ""
+    file.write_text(kept + text, encoding="utf-8", errors="replace")
 
 
 def mark_of(maker: str) -> str:
