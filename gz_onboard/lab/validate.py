@@ -74,6 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help=f"write the tables of the page as Markdown; in a file that has the line {mark_of(MAKER)}, below it",
     )
+    add_shared(parser, "--format")
     add_shared(parser, "--no-plot", help="draw nothing and write no page")
     parser.add_argument("--gate", action="store_true", help="exit with status 1 if a ride does not pass")
     add_shared(parser, "--jobs", "--quiet")
@@ -83,7 +84,7 @@ def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard validate``: `OK`; `BAD_INPUT` if a ride cannot be judged; `FAILED` if with --gate one fails."""
     tasks = tasks_of(arguments, Task, PICTURE)
     written = [arguments.json, arguments.markdown, arguments.output / PAGE]
-    written += [task.output(PICTURE) for task in tasks]
+    written += [task.drawn(PICTURE) for task in tasks]
     not_an_input(written, [*(task.path for task in tasks), find_vehicle(arguments.vehicle)])
     read_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
     with writing(arguments.output):

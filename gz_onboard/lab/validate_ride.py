@@ -48,7 +48,7 @@ SHORTEST = 30  # s
 GRADE_ERROR = 0.005  # sine: of the on-board filter in the first minutes
 FRAME_BYTES = 13.0  # of a compressed log
 MOST_AT_ONCE = 1000  # steps between two reports of progress
-PICTURE = ".validation.png"
+PICTURE = ".validation"
 _READ, _RIDE = 0.4, 0.3  # shares of the work
 
 
@@ -85,11 +85,11 @@ def validate_ride(task: Task, progress: Progress = lambda _: None) -> ValidatedR
     """Compare one ride with its simulation, and draw it; `progress` counts bytes of the log. Raises InputError."""
     payload = task.payload if task.payload is not None else rider_mass(facts_of(task.path))
     compared = compare_ride(task.path, read_vehicle(task.vehicle, payload), progress)
-    if not task.plot:
+    picture = task.drawn(PICTURE)
+    if not picture:
         return compared.result
     from gz_onboard.lab.validate_plot import draw_ride
 
-    picture = task.output(PICTURE)
     result = replace(compared.result, plot=str(picture))
     with writing(picture):
         draw_ride(picture, result, compared.measured, compared.simulated, compared.alone)

@@ -8,8 +8,10 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import quote
 
-from gz_onboard.offline.style import GRID, INK
+from gz_onboard.errors import writable
+from gz_onboard.offline.style import GRID, INK, picture_format, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -93,15 +95,19 @@ def mark_of(maker: str) -> str:
 
 def svg(figure: Figure) -> str:
     """A figure as SVG inside a page, the same text for the same figure."""
-    import matplotlib as mpl
-
-    stream = io.StringIO()
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "gz-onboard", "font.family": "sans-serif"}):
-        figure.savefig(stream, format="svg", metadata={"Date": None})
-    return "<svg" + stream.getvalue().partition("<svg")[2]
+    stream = io.BytesIO()
+    write(figure, stream, "svg")
+    return "<svg" + stream.getvalue().decode("utf-8").partition("<svg")[2]
 
 
 def image(file: Path) -> str:
-    """A PNG file inside a page. Raises OSError."""
-    data = base64.b64encode(file.read_bytes()).decode("ascii")
-    return f"<img alt='' src='data:image/png;base64,{data}'>"
+    """The file of a picture inside a page; a link to a PDF, which no page can show. Raises OSError."""
+    kind = picture_format(file)
+    if kind == "pdf":
+        return f"<a href='{html.escape(quote(file.name))}'>{html.escape(writable(file.name))}</a>"
+    return embedded(file.read_bytes(), "svg+xml" if kind == "svg" else kind)
+
+
+def embedded(picture: bytes, kind: str = "png") -> str:
+    """A picture inside a page."""
+    return f'<img alt="" src="data:image/{kind};base64,{base64.b64encode(picture).decode("ascii")}">'
