@@ -34,7 +34,12 @@ _METADATA: dict[str, dict[str, Any]] = {
     "svg": {"Creator": "gz-onboard", "Date": None},
     "pdf": {"Creator": "gz-onboard", "CreationDate": None},
 }
-_TEXT_AS_TEXT: Any = {"svg.fonttype": "none", "svg.hashsalt": "gz-onboard", "pdf.fonttype": 42, "font.family": "sans-serif"}
+_TEXT_AS_TEXT: Any = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "gz-onboard",
+    "pdf.fonttype": 42,
+    "font.family": "sans-serif",
+}
 
 
 def save(figure: Figure, file: Path, dpi: float = 110) -> None:

@@ -360,8 +360,10 @@ def test_a_ride_without_throttle_and_yaw_rate_is_judged_by_the_rest(tmp_path, ca
     text = (OWN / "reference.toml").read_text().splitlines()
     text = [line for line in text if not line.startswith(("throttle =", "rate_z ="))]
     (tmp_path / "blind.toml").write_text("\n".join(text))
-    arguments = ["--vehicle", str(tmp_path / "blind.toml"), "--json", "--no-plot"]
+    arguments = ["--vehicle", str(tmp_path / "blind.toml"), "--json", "--format", "svg", "--output", str(tmp_path)]
     assert main(["validate", str(LOGS / "coastdown.blf"), *arguments]) == 0
+    assert "component alone" in (tmp_path / "coastdown.validation.svg").read_text()
+    assert "data:image/svg+xml;base64," in (tmp_path / "validation.html").read_text()
     found = json.loads(capsys.readouterr().out)["rides"][0]
     assert found["open_loop"] is None
     assert found["predictive"]["channels"]["motor_speed"]["passed"]
