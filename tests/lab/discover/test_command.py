@@ -91,7 +91,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
         f"--{option}={folder / name}"
         for option, name in (("json", "out.json"), ("report", "out.html"), ("write-model", "new.toml"))
     ]
-    assert main(["discover", str(RIDE), "--workers", "1", "--quiet", "--format", "svg", *files]) == 0
+    assert main(["discover", str(RIDE), "--workers", "1", "--quiet", *files]) == 0
     return folder
 
 
@@ -113,12 +113,6 @@ def test_the_report_is_one_file_with_its_pictures(alone: Path):
     page = (alone / "out.html").read_text()
     assert page.count("data:image/png;base64,") >= 3
     assert 'src="http' not in page
-
-
-def test_its_pictures_are_beside_it_for_papers(alone: Path):
-    names = {file.name for file in alone.glob("out.*.svg")}
-    assert names >= {"out.overview.svg", "out.ranking.svg", "out.road_force.svg"}
-    assert "grade" in (alone / "out.road_force.svg").read_text()
 
 
 def test_rides_held_out_by_name_have_no_part_in_anything():
