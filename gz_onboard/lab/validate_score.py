@@ -211,13 +211,13 @@ _SPEEDS = ("standing", "below 4 m/s", "4 to 8 m/s", "8 to 11 m/s", "above 11 m/s
 _PACE = "acceleration above {0:g}, {1:g} to {0:g}, within {1:g}, below −{1:g} m/s² without brake; with brake"
 _PACES = ("hard acceleration", "acceleration", "steady", "coasting", "braking")
 _TURNING = "lateral acceleration below {0:g}, {0:g} to {1:g}, above {1:g} m/s²"
-_AIR = "air below {0:g}, {0:g} to {1:g}, above {1:g} °C, straight on"
+_AIR = "air below {0:g}, {0:g} to {1:g}, above {1:g} °C, straight on where the yaw rate is known"
 _TIMES = ("first 3 min", "3 to 10 min", "later")
 _SORTINGS = {
     "turning": Sorting(_TURNING, ("straight", "slightly", "turning"), (0.5, 1.5)),
     "grade": Sorting("above {0:.0%}, within, below −{0:.0%}", ("uphill", "level", "downhill"), (0.01, -0.01)),
     "temperature": Sorting(_AIR, ("cold", "mild", "warm"), (12.0, 20.0)),
-    "since start": Sorting("time ridden since the start, straight on", _TIMES, (180.0, 600.0)),
+    "since start": Sorting("time ridden since the start, likewise", _TIMES, (180.0, 600.0)),
     "speed": Sorting("speed", _SPEEDS, (0.5, 4.0, 8.0, 11.0)),
     "pace": Sorting(_PACE, _PACES, (1.0, 0.3, -0.3)),
 }
