@@ -27,7 +27,7 @@ from gz_onboard.vehicle import Vehicle
 
 MOTOR, INVERTER, BOTH = "motor", "inverter", "motor and inverter"
 WARM = 40.0  # degC: of the motor, as on a dynamometer and in the middle of a ride
-GRID = 241  # points each way
+GRID = 181  # points each way
 LEAST_POWER = 0.02  # of the greatest: below, measured efficiencies are noise over nothing
 STEP, BLOCK = 0.1, 1.0  # s: of a ride, and over which it is a mean
 STEADY_CURRENT, STEADY_SPEED = 0.05, 0.02  # of the limit and of the greatest speed: sd within a block

@@ -90,6 +90,7 @@ def _draw(axis: Axes, maps: Maps, part: str, norm: Any) -> Any:
     rule(axis)
     shares = _PERCENT * maps.efficiency.of(part)
     filled = axis.contourf(maps.speed, maps.torque, shares, levels=_LEVELS, cmap=_COLOURS, norm=norm)
+    filled.set(edgecolor="face", linewidth=0.4)  # or SVG and PDF show seams between the colours
     axis.contour(maps.speed, maps.torque, shares, levels=_LABELLED, colors="white", linewidths=0.5)
     _label(axis, maps, shares)
     for edge in (maps.most, maps.least):
