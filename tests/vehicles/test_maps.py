@@ -81,8 +81,11 @@ def test_measured_points_are_where_the_map_says(vehicle):
 def test_without_a_controller_the_measured_speeds_are_the_limit(vehicle, tmp_path):
     free = replace(vehicle, derating=Derating())
     assert efficiency_maps(free, [DYNO]).speed[-1] == pytest.approx(56.5, abs=1)
-    with pytest.raises(InputError, match=r"how fast the motor turns.*give a ride"):
+    with pytest.raises(InputError, match=r"how fast the motor turns.*give --top-speed, or a ride"):
         efficiency_maps(free, [])
+    fast = efficiency_maps(free, [], top_speed=20.0)
+    assert fast.speed[-1] * vehicle.parameters["wheel_radius"] == pytest.approx(20.0)
+    assert np.isfinite(fast.efficiency.both[len(fast.torque) // 2, -1])
 
 
 def test_the_command_draws_it(tmp_path, capsys):
@@ -101,3 +104,5 @@ def test_what_has_no_points_is_told(vehicle, tmp_path, capsys):
     ride.write_text("time [s],speed [m/s]\n0,1\n1,1\n2,1\n")
     assert main(["vehicle", "maps", "reference", str(ride)]) == 2
     assert "ride.csv: has no motor_current" in capsys.readouterr().err
+    assert main(["vehicle", "maps", "reference", str(LOGS / "coastdown.blf")]) == 2
+    assert "coastdown.blf: has too little steady riding" in capsys.readouterr().err

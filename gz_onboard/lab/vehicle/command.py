@@ -47,6 +47,9 @@ def _add_maps(maps: argparse.ArgumentParser) -> None:
     maps.add_argument(
         "--temperature", type=number("--temperature", -40.0, 200.0, "degC"), default=WARM, metavar="DEGC", help=of_motor
     )
+    kmh = number("--top-speed", 1.0, 500.0, "km/h")
+    end = "of the vehicle, where the map ends (default: by the controller in the file, or as measured)"
+    maps.add_argument("--top-speed", type=kmh, metavar="KMH", help=end)
     add_shared(maps, "--output", "--format")
 
 
@@ -63,7 +66,8 @@ def draw_vehicle(arguments: argparse.Namespace) -> int:
     vehicle = read_vehicle(arguments.vehicle)
     picture = arguments.output / f"{vehicle.name}.maps.{arguments.picture_format}"
     not_an_input([picture], [*arguments.data, find_vehicle(arguments.vehicle)])
-    maps = efficiency_maps(vehicle, arguments.data, arguments.temperature)
+    top_speed = arguments.top_speed / 3.6 if arguments.top_speed else None
+    maps = efficiency_maps(vehicle, arguments.data, arguments.temperature, top_speed)
     for part, source, count, rms, r2 in fit_of(vehicle, maps):
         known = "" if r2 is None else f", R² {r2:.4f}"
         print(f"{part}: {count} points of {source}, measured less map {100 * rms:.2f} % RMS{known}")

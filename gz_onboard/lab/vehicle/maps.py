@@ -22,7 +22,7 @@ from gz_onboard.lab.calibrate.table import read_table
 from gz_onboard.lab.validate_components import losses
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.model import drag_torque
-from gz_onboard.physics.sensors import true_columns
+from gz_onboard.physics.sensors import road_speed, true_columns
 from gz_onboard.vehicle import Vehicle
 
 MOTOR, INVERTER, BOTH = "motor", "inverter", "motor and inverter"
@@ -99,14 +99,17 @@ def modelled(vehicle: Vehicle, speed: Array, torque: Array, temperature: Array) 
     return shares(torque * speed, alternating, alternating + inverter)
 
 
-def efficiency_maps(vehicle: Vehicle, data: Sequence[Path], temperature: float = WARM) -> Maps:
+def efficiency_maps(
+    vehicle: Vehicle, data: Sequence[Path], temperature: float = WARM, top_speed: float | None = None
+) -> Maps:
     """The maps of `vehicle`, its motor at `temperature` [degC], with what was measured in `data`.
 
-    data: tables of a dynamometer, or logs of rides. Raises InputError, also for a vehicle of whose motor it is not
-    known how fast it turns.
+    data: tables of a dynamometer, or logs of rides. top_speed: of the vehicle [m/s]; None: that of the controller, or
+    what was measured. Raises InputError, also where nothing says how fast the motor turns.
     """
     measured = [_measured(vehicle, file) for file in data]
-    speed = np.linspace(0.0, _top_speed(vehicle, measured), GRID)[1:]
+    fastest = top_speed / road_speed(1.0, vehicle.parameters) if top_speed else _fastest(vehicle, measured)
+    speed = np.linspace(0.0, fastest, GRID)[1:]
     p, derating = vehicle.parameters, vehicle.derating
     _, idle, _ = losses(vehicle, 0 * speed, speed, np.full(len(speed), temperature))
     drag = drag_torque(idle, speed)
@@ -124,15 +127,16 @@ def efficiency_maps(vehicle: Vehicle, data: Sequence[Path], temperature: float =
     return Maps(vehicle.name, temperature, speed, torque, shown, most, least, measured)
 
 
-def _top_speed(vehicle: Vehicle, measured: Sequence[Points]) -> float:
-    """Up to which speed [rad/s] the map goes: the controller's limit, else the fastest that was measured."""
+def _fastest(vehicle: Vehicle, measured: Sequence[Points]) -> float:
+    """Up to which speed of the motor [rad/s] the map goes: the controller's limit, else what was measured."""
     curve = vehicle.derating.current_by_motor_speed
     if curve.share[-1] <= 0:
         return curve.at[-1]
     if measured:
         return max(float(points.speed.max()) for points in measured)
     raise vehicle.error(
-        "says nothing of how fast the motor turns: current_by_motor_speed in [controller] has no end; give a ride"
+        "says nothing of how fast the motor turns: current_by_motor_speed in [controller] has no end; "
+        "give --top-speed, or a ride"
     )
 
 
@@ -197,11 +201,12 @@ def _ridden(vehicle: Vehicle, log: Path) -> Points:
 
 def _gathered(name: str, blocks: dict[str, Array]) -> Points:
     """The blocks of a ride in cells of a grid, each a point where there are enough."""
-    speed, torque = blocks["speed"], blocks["torque"]
-    if not len(speed):
-        raise InputError(f"{name}: has no steady riding, {BLOCK:g} s at one speed and current")
-    cells = np.stack([_cell(speed), _cell(torque)])
+    cells = np.stack([_cell(blocks["speed"]), _cell(blocks["torque"])])
     _, cell, count = np.unique(cells, axis=1, return_inverse=True, return_counts=True)
+    if not (count >= LEAST_BLOCKS).any():
+        raise InputError(
+            f"{name}: has too little steady riding: {LEAST_BLOCKS} times {BLOCK:g} s at one speed and current"
+        )
     means = {k: np.bincount(cell.ravel(), x) / count for k, x in blocks.items()}
     means = {k: x[count >= LEAST_BLOCKS] for k, x in means.items()}
     none = np.full(len(means["speed"]), np.nan)
@@ -210,5 +215,7 @@ def _gathered(name: str, blocks: dict[str, Array]) -> Points:
 
 
 def _cell(values: Array) -> Array:
+    if not len(values):
+        return values
     low, high = float(values.min()), float(values.max())
     return np.floor((values - low) / max((high - low) / CELLS, 1e-9))
