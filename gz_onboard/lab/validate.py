@@ -14,7 +14,7 @@ from pathlib import Path
 
 from gz_onboard.errors import BAD_INPUT, FAILED, OK, not_an_input, writing
 from gz_onboard.lab.validate_ride import PICTURE, log_size, validate_ride
-from gz_onboard.lab.validate_score import Means, PooledMeans, SimulationVerdict, ValidatedRide, pooled
+from gz_onboard.lab.validate_score import Means, PooledMeans, SimulationVerdict, ValidatedRide, channel_words, pooled
 from gz_onboard.lab.validate_soc import soc_text
 from gz_onboard.lab.validate_thesis import of_component
 from gz_onboard.offline.page import mark_of, write_below
@@ -137,7 +137,7 @@ def ride_text(ride: ValidatedRide) -> str:
             outcome = f"{'ok' if e.passed else 'FAIL'} (limit {e.limit_percent:g} %)"
             thesis = of_component(channel) if form == "components" else ""
             lines.append(
-                f"    {channel.replace('_', ' '):21} {percent} {outcome:17} "
+                f"    {channel_words(channel):21} {percent} {outcome:17} "
                 f"rms {e.rms:7.2f}, max {e.max:7.2f}, mean {e.mean_error:+7.2f} {e.unit}{spread}"
                 f"{f'; {thesis}' if thesis else ''}"
             )

@@ -18,6 +18,7 @@ from gz_onboard.lab.validate_score import (
     SimulationVerdict,
     ValidatedRide,
     Verdict,
+    channel_words,
 )
 from gz_onboard.lab.validate_thesis import HEAD, beside_thesis
 from gz_onboard.offline.page import Failed, Subheading, html_table, image, markdown_table, write_page
@@ -94,7 +95,7 @@ def _in_short(rides: Sequence[ValidatedRide]) -> HeadedRows:
             passed = f"{sum(e.passed for e in found)} of {len(found)}"
             rows.append(
                 [
-                    name.replace("_", " "),
+                    channel_words(name),
                     f"{known[0]:.1f} to {known[-1]:.1f} %" if known else "–",
                     f"{max(e.rms for e in found):.3g} {found[0].unit}",
                     f"{found[0].limit_percent:g} %",
@@ -132,7 +133,7 @@ def _gate(rides: Sequence[ValidatedRide], form: str) -> HeadedRows:
         if isinstance(verdict, SimulationVerdict):
             cells.append(number(verdict.energy_percent, "+.1f"))
         rows.append([ride, *cells])
-    return ["ride", *(name.replace("_", " ") for name in names), *energy], rows
+    return ["ride", *map(channel_words, names), *energy], rows
 
 
 def _percent(entry: ChannelErrors | None) -> str:

@@ -71,6 +71,11 @@ GIVEN = {"open_loop": {"throttle"}}
 """By form: channels that are an input of that simulation, not a result."""
 
 
+def channel_words(name: str) -> str:
+    """The name of a channel or component in text."""
+    return "state of charge" if name == "soc" else name.replace("_", " ")
+
+
 @dataclass(frozen=True)
 class ChannelErrors:
     """How far a simulated quantity is from the measured one: see the module's text."""

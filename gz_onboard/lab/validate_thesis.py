@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from gz_onboard.lab.validate_score import COMPONENT_GATE, GATE, ChannelErrors, ValidatedRide
+from gz_onboard.lab.validate_score import COMPONENT_GATE, GATE, ChannelErrors, ValidatedRide, channel_words
 from gz_onboard.offline.page import Failed
 
 SIMULATED = ("pack_current", "pack_voltage", "motor_torque", "motor_speed")
@@ -90,7 +90,7 @@ def beside_thesis(rides: Sequence[ValidatedRide]) -> list[list[str]]:
             for name, channel in errors.items():
                 error = row.error(channel, ride.cells_series)
                 if error is not None:
-                    found.append((error, name.replace("_", " "), ride.name))
+                    found.append((error, channel_words(name), ride.name))
         if found:
             worst, channel_name, where = max(found)
             told = f"{worst:.1f} %" if row.unit == "%" else f"{worst:.2g} {row.unit}"
