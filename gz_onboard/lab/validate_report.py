@@ -44,7 +44,9 @@ def write_report(file: Path, rides: Sequence[ValidatedRide], together: Mapping[s
     passed = sum(ride.passed for ride in rides)
     limits = f"each channel within {GATE:g} %, each component within {COMPONENT_GATE:g} %"
     parts = [f"<p>{passed} of {len(rides)} rides pass: {limits}.</p>"]
-    parts += [f"<h2>{title}</h2>{html_table(*table, range(1, len(table[0])))}" for title, table in _tables(rides)]
+    for title, table in _tables(rides):
+        numbers = () if table[0] == list(HEAD) else range(1, len(table[0]))
+        parts.append(f"<h2>{title}</h2>{html_table(*table, numbers)}")
     parts.append("<h2>Where the model fails</h2>")
     for where, forms in together.items():
         heads, rows = _failures(forms)

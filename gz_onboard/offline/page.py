@@ -20,7 +20,8 @@ _STYLE = f"""
 body {{ font-family: system-ui, sans-serif; color: {INK}; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; }}
 table {{ border-collapse: collapse; margin: 0.5rem 0 1.5rem; font-size: 0.9rem; font-variant-numeric: tabular-nums; }}
 td, th {{ padding: 0.2rem 0.6rem; border-bottom: 1px solid {GRID}; text-align: left; vertical-align: top; }}
-th {{ font-weight: 600; vertical-align: bottom; }} .n, .bad {{ text-align: right; white-space: nowrap; }}
+th {{ font-weight: 600; vertical-align: bottom; }}
+.n, .bad {{ text-align: right; }} td.n, td.bad {{ white-space: nowrap; }}
 .bad {{ background: #fde8e8; color: #9b1c1c; font-weight: 600; }}
 .no {{ background: #fdf1e3; padding: 0.5rem 1rem; border-left: 4px solid #e9a03b; }}
 figure {{ margin: 1.5rem 0; }} svg {{ width: 100%; height: auto; }} img {{ width: 100%; }}
