@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 
 from gz_onboard.errors import InputError
@@ -22,6 +24,7 @@ def test_a_picture_is_what_its_name_says(kind, begin, tmp_path):
     first, second = ((tmp_path / f"{name}.{kind}").read_bytes() for name in ("a", "b"))
     assert first.startswith(begin)
     assert first == second
+    assert not {b"CreationDate", b"dc:date"} & set(re.findall(rb"CreationDate|dc:date", first))  # of whole seconds
     if kind == "svg":
         assert b"speed [m/s]" in first  # words, not outlines
     shown = image(tmp_path / f"a.{kind}")
