@@ -16,6 +16,7 @@ if TYPE_CHECKING:
         Samples,
         SimulatedRide,
         SimulationOptions,
+        Validated,
         Vehicle,
         calibrate,
         discover,
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
         read_vehicle,
         simulate,
         summary_table,
+        validate,
     )
 
 __version__ = "0.1.0"
@@ -38,6 +40,7 @@ __all__ = [
     "Samples",
     "SimulatedRide",
     "SimulationOptions",
+    "Validated",
     "Vehicle",
     "__version__",
     "calibrate",
@@ -48,6 +51,7 @@ __all__ = [
     "read_vehicle",
     "simulate",
     "summary_table",
+    "validate",
 ]
 
 

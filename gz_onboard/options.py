@@ -16,6 +16,7 @@ MOST_JOBS = 256
 MOST_PAYLOAD = 3000.0  # kg, of a van
 MOST_SEED = 2**32 - 1
 LONGEST_LOG = 1e9  # s, thirty years
+PICTURE_FORMATS = ("png", "svg", "pdf")
 CHANNEL = "can0"
 FILTERS = ("scalar", "filterpy")
 
@@ -86,6 +87,10 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "--json": (
         "write the result as JSON to FILE, or instead of text to standard output",
         {"nargs": "?", "const": "-", "type": _json_file, "metavar": "FILE|-"},
+    ),
+    "--format": (
+        "of the pictures; svg and pdf are for papers (default: %(default)s)",
+        {"dest": "picture_format", "choices": PICTURE_FORMATS, "default": PICTURE_FORMATS[0]},
     ),
     "--no-plot": ("draw nothing", {"action": "store_true"}),
     "--output": ("folder to write to (default: the current one)", {"type": Path, "default": Path(), "metavar": "DIR"}),

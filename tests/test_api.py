@@ -135,6 +135,26 @@ def test_a_table_of_many_rides_has_a_row_each():
     assert {len(column) for column in table.values()} == {2}
 
 
+# --- validate -----------------------------------------------------------------------------------------------------
+
+
+def test_a_validation_is_that_of_the_command(capsys):
+    assert cli.main(["validate", str(COASTDOWN), "--no-plot", "--json"]) == 0
+    (told,) = json.loads(capsys.readouterr().out)["rides"]
+    found = gz.validate(COASTDOWN)
+    assert capsys.readouterr() == ("", "")
+    table = found.to_table()
+    assert found.passed == told["passed"]
+    assert len(table["ride"]) == sum(len(told[f]["channels"]) for f in ("open_loop", "predictive", "components"))
+    for i, (form, channel) in enumerate(zip(table["form"], table["channel"], strict=True)):
+        for name, value in told[form]["channels"][channel].items():
+            assert table[name][i] == value, (form, channel, name)
+    assert "coastdown.blf: not passed" in str(found)
+    assert found.markdown().startswith("### In short")
+    with pytest.raises(gz.InputError, match="no ride is given"):
+        gz.validate([])
+
+
 class Arrow:
     """A table that speaks Arrow and nothing else, as those of polars."""
 

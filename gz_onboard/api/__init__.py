@@ -9,6 +9,7 @@ from gz_onboard.api.discoveries import Discovered, discover
 from gz_onboard.api.estimates import EstimatedRide, LoggedEstimates, estimate, read_estimates, summary_table
 from gz_onboard.api.given import read_ride, read_vehicle
 from gz_onboard.api.simulations import SimulatedRide, simulate
+from gz_onboard.api.validations import Validated, validate
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.command import DiscoveryOptions
 from gz_onboard.offline.samples import Samples
@@ -25,6 +26,7 @@ __all__ = [
     "Samples",
     "SimulatedRide",
     "SimulationOptions",
+    "Validated",
     "Vehicle",
     "calibrate",
     "discover",
@@ -34,4 +36,5 @@ __all__ = [
     "read_vehicle",
     "simulate",
     "summary_table",
+    "validate",
 ]

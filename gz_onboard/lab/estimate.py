@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "--filter", "--output", "--json")
     table = f"also write the summaries as a table, a row for each log: {' '.join(FORMATS)}"
     parser.add_argument("--table", type=Path, metavar="FILE", help=table)
-    add_shared(parser, "--no-plot")
+    add_shared(parser, "--format", "--no-plot")
     parser.add_argument("--signals", action="store_true", help="also log the signals of each message, once a second")
     parser.add_argument("--frames", action="store_true", help="also log the raw frames and the range frames")
     add_shared(parser, "--jobs", "--quiet")
@@ -115,7 +115,7 @@ def summary_text(ride: RideSummary) -> str:
         )
     )
     if ride.log:
-        rows.append(("written", f"{ride.log}{' and .png' if ride.plot else ''}"))
+        rows.append(("written", f"{ride.log}{f' and {Path(ride.plot).suffix}' if ride.plot else ''}"))
     return text_rows(ride.file, rows)
 
 

@@ -56,8 +56,8 @@ class EstimateTask(Task):
 
     @property
     def picture(self) -> Path | None:
-        """The PNG, if one is to be drawn."""
-        return self.output(".estimate.png") if self.plot else None
+        """The picture, if one is to be drawn."""
+        return self.drawn(".estimate")
 
     @property
     def part(self) -> Path:
@@ -71,7 +71,7 @@ class RideSummary:
 
     file: Annotated[str, "the log"]
     log: Annotated[str | None, "the MCAP written, or null"]
-    plot: Annotated[str | None, "the PNG written, or null"]
+    plot: Annotated[str | None, "the picture written, or null"]
     vehicle: Annotated[str, "name of the vehicle"]
     filter: Annotated[str, "backend of the filter"]
     start_ns: Annotated[int, "time of the first frame [ns since the epoch, as in the log]"]

@@ -31,12 +31,13 @@ from gz_onboard.offline.style import (
     legend,
     new_figure,
     ordinate,
+    picture_format,
     save,
     second,
     stack,
     time_unit,
 )
-from gz_onboard.options import add_shared
+from gz_onboard.options import PICTURE_FORMATS, add_shared
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -130,7 +131,7 @@ def naive_range(rows: Sequence[Logged]) -> list[float | None]:
 
 
 def plot_log(log: Path, picture: Path, over: str = "time") -> list[LogDamage]:
-    """Draw the ride in `log` into the PNG `picture`, over ``time`` or ``distance``; gives what could not be read.
+    """Draw the ride in `log` into `picture`, over ``time`` or ``distance``; gives what could not be read.
 
     Raises InputError, OSError.
     """
@@ -316,18 +317,20 @@ def spans(x: Sequence[float], true: Sequence[bool]) -> list[tuple[float, float]]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard plot``."""
     add_shared(parser, "log", help="MCAP log of gz-onboard run or gz-onboard estimate")
-    parser.add_argument(
-        "picture", type=Path, nargs="?", metavar="PNG", help="file to write (default: the name of the log, with .png)"
-    )
+    ends = "file to write, .png, .svg or .pdf (default: the name of the log, ending as --format says)"
+    parser.add_argument("picture", type=Path, nargs="?", metavar="PICTURE", help=ends)
+    add_shared(parser, "--format", default=None, help="of the picture: for papers svg or pdf (default: png)")
     parser.add_argument("--why", action="store_true", help="instead, why the range at the end is not the rated one")
     parser.add_argument("--over", choices=("time", "distance"), default="time", help="abscissa (default: %(default)s)")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard plot``."""
-    picture = arguments.picture or arguments.log.with_suffix(".why.png" if arguments.why else ".png")
-    if picture.suffix.lower() != ".png":
-        raise InputError(f"{picture}: the picture's name has to end in .png")
+    kind = arguments.picture_format
+    ending = f"{'.why' if arguments.why else ''}.{kind or PICTURE_FORMATS[0]}"
+    picture = arguments.picture or arguments.log.with_suffix(ending)
+    if picture_format(picture) != (kind or picture_format(picture)):
+        raise InputError(f"{picture}: the picture's name does not end in .{kind}, as --format says")
     with writing(picture):
         plot = plot_why if arguments.why else partial(plot_log, over=arguments.over)
         for damage in plot(arguments.log, picture):

@@ -48,8 +48,9 @@ def run(arguments: argparse.Namespace) -> int:
     out = arguments.output or Path(f"{ride_name(logs[0]) if len(logs) == 1 else 'rides'}.html")
     not_an_input([out], [*logs, *filter(None, [arguments.route]), find_vehicle(arguments.vehicle)])
     known_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
-    given = arguments.vehicle, arguments.payload, False, arguments.route, not arguments.no_path
-    tasks = [ReportTask(log, Path(f"ride-{i}"), *given) for i, log in enumerate(logs, 1)]
+    given = arguments.vehicle, arguments.payload, False
+    more = {"route": arguments.route, "located": not arguments.no_path}
+    tasks = [ReportTask(log, Path(f"ride-{i}"), *given, **more) for i, log in enumerate(logs, 1)]
     with progress_bar(lambda: expected_frames(logs), "frames", quiet=arguments.quiet) as display:
         results = over_rides(ride_section, tasks, arguments.jobs, display.update)
         found, failed = collect("report", results, display, None, lambda ride: ride.damage)

@@ -13,8 +13,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gz_onboard.errors import BAD_INPUT, FAILED, OK, not_an_input, writing
-from gz_onboard.lab.validate_ride import log_size, validate_ride
-from gz_onboard.lab.validate_score import Means, PooledMeans, SimulationVerdict, ValidatedRide, pooled
+from gz_onboard.lab.validate_ride import PICTURE, log_size, validate_ride
+from gz_onboard.lab.validate_score import Means, PooledMeans, SimulationVerdict, ValidatedRide, channel_words, pooled
+from gz_onboard.lab.validate_soc import soc_text
+from gz_onboard.lab.validate_thesis import of_component
+from gz_onboard.offline.page import mark_of, write_below
 from gz_onboard.offline.processes import Task, collect, over_rides, tasks_of
 from gz_onboard.offline.results import explain_keys, write_json
 from gz_onboard.offline.schema import descriptions
@@ -24,6 +27,7 @@ from gz_onboard.vehicle import find_vehicle, read_vehicle
 
 SUMMARY_VERSION = 1
 PAGE = "validation.html"
+MAKER = "gz-onboard validate"
 KEYS = descriptions(SimulationVerdict) | descriptions(ValidatedRide)
 """What ``--json`` holds of a ride: {"version", "rides", "pooled": splits of all rides, "failed": [{file, error}]}."""
 
@@ -64,7 +68,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard validate``."""
     explain_keys(parser, "a ride", SUMMARY_VERSION, KEYS)
     add_shared(parser, "logs", "--vehicle", "--payload", "--output", "--json")
-    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables of the page as Markdown")
+    parser.add_argument(
+        "--markdown",
+        type=Path,
+        metavar="FILE",
+        help=f"write the tables of the page as Markdown; in a file that has the line {mark_of(MAKER)}, below it",
+    )
+    add_shared(parser, "--format")
     add_shared(parser, "--no-plot", help="draw nothing and write no page")
     parser.add_argument("--gate", action="store_true", help="exit with status 1 if a ride does not pass")
     add_shared(parser, "--jobs", "--quiet")
@@ -72,9 +82,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard validate``: `OK`; `BAD_INPUT` if a ride cannot be judged; `FAILED` if with --gate one fails."""
-    tasks = tasks_of(arguments, Task, ".validation.png")
+    tasks = tasks_of(arguments, Task, PICTURE)
     written = [arguments.json, arguments.markdown, arguments.output / PAGE]
-    written += [task.output(".validation.png") for task in tasks]
+    written += [task.drawn(PICTURE) for task in tasks]
     not_an_input(written, [*(task.path for task in tasks), find_vehicle(arguments.vehicle)])
     read_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
     with writing(arguments.output):
@@ -101,7 +111,7 @@ def _write_tables(arguments: argparse.Namespace, rides: list[ValidatedRide], tog
             write_report(written[-1], rides, together)
         if arguments.markdown:
             written.append(arguments.markdown)
-            arguments.markdown.write_text(markdown(rides, together), encoding="utf-8", errors="replace")
+            write_below(arguments.markdown, MAKER, markdown(rides, together))
     if arguments.json != "-" and written:
         print(f"written: {', '.join(map(str, written))}")
 
@@ -124,13 +134,17 @@ def ride_text(ride: ValidatedRide) -> str:
         for channel, e in verdict.channels.items():
             percent = "–" if e.percent is None else f"{e.percent:5.1f} %"
             spread = "" if e.of_spread is None else f", {e.of_spread:.2f} of its spread"
-            outcome = "ok" if e.passed else f"FAIL (limit {e.limit_percent:g} %)"
+            outcome = f"{'ok' if e.passed else 'FAIL'} (limit {e.limit_percent:g} %)"
+            thesis = of_component(channel) if form == "components" else ""
             lines.append(
-                f"    {channel.replace('_', ' '):21} {percent} {outcome:17} "
+                f"    {channel_words(channel):21} {percent} {outcome:17} "
                 f"rms {e.rms:7.2f}, max {e.max:7.2f}, mean {e.mean_error:+7.2f} {e.unit}{spread}"
+                f"{f'; {thesis}' if thesis else ''}"
             )
         if not verdict.passed:
             lines.append(f"    FAIL: {meaning}")
+    if ride.soc_reference:
+        lines.append(f"  state of charge: {soc_text(ride.soc_reference)}")
     if not ride.passed:
         lines.append("  what each percentage is of, and where the model is known to fail: docs/validation.md")
     return "\n".join([*lines, *(f"  {text}" for text in ride.missing)])

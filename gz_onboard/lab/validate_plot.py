@@ -11,8 +11,8 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.validate_components import Component
-from gz_onboard.lab.validate_score import CHANNELS, ValidatedRide
-from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, new_figure, rule, time_unit
+from gz_onboard.lab.validate_score import CHANNELS, GIVEN, ValidatedRide
+from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, new_figure, rule, save, time_unit
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,7 +47,7 @@ def draw_ride(
     simulated: Mapping[str, Mapping[str, Array]],
     alone: Mapping[str, Component],
 ) -> None:
-    """A PNG: each channel measured and simulated on the left, the errors on the right. Raises OSError."""
+    """A picture: each channel measured and simulated on the left, the errors on the right. Raises OSError."""
     panels = _panels(measured, simulated, alone)
     height = 1.0 + 1.45 * len(panels)
     figure = new_figure(15, height)
@@ -77,7 +77,7 @@ def draw_ride(
     air = "" if ride.ambient_c is None else f", air {ride.ambient_c:.0f} °C"
     title = f"{ride.name} · {ride.vehicle}, {ride.payload_kg:g} kg{air}, {ride.distance_km:.1f} km"
     headline(figure, 0.055, 1 - 0.3 / height, title, 12)
-    figure.savefig(file, format="png", dpi=_DPI, metadata={"Software": "gz-onboard"})
+    save(figure, file, _DPI)
 
 
 def _panels(
@@ -86,11 +86,17 @@ def _panels(
     panels = []
     for name, channel in CHANNELS.items():
         if name in measured:
-            lines = {form: series[name] for form, series in simulated.items()}
+            lines = {
+                form: channel.shown(series[name])
+                for form, series in simulated.items()
+                if name not in GIVEN.get(form, set())
+            }
             for component, of in _ALONE.items():
                 if of == name and component in alone:
                     lines["components"] = alone[component].modelled
-            panels.append(_Panel(channel.label, channel.unit.replace("degC", "°C"), measured[name], lines))
+            panels.append(
+                _Panel(channel.label, channel.unit.replace("degC", "°C"), channel.shown(measured[name]), lines)
+            )
     for name in ("inverter_power", "road_load"):
         if name in alone:
             c = alone[name]

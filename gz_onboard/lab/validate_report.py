@@ -17,7 +17,10 @@ from gz_onboard.lab.validate_score import (
     PooledMeans,
     SimulationVerdict,
     ValidatedRide,
+    Verdict,
+    channel_words,
 )
+from gz_onboard.lab.validate_thesis import HEAD, beside_thesis
 from gz_onboard.offline.page import Failed, Subheading, html_table, image, markdown_table, write_page
 from gz_onboard.offline.results import number
 
@@ -41,10 +44,9 @@ def write_report(file: Path, rides: Sequence[ValidatedRide], together: Mapping[s
     passed = sum(ride.passed for ride in rides)
     limits = f"each channel within {GATE:g} %, each component within {COMPONENT_GATE:g} %"
     parts = [f"<p>{passed} of {len(rides)} rides pass: {limits}.</p>"]
-    for form in NAMES:
-        heads, rows = _gate(rides, form)
-        table = html_table(heads, rows, range(1, len(heads)))
-        parts.append(f"<h2>{NAMES[form].capitalize()}: percent of each channel</h2>{table}")
+    for title, table in _tables(rides):
+        numbers = () if table[0] == list(HEAD) else range(1, len(table[0]))
+        parts.append(f"<h2>{title}</h2>{html_table(*table, numbers)}")
     parts.append("<h2>Where the model fails</h2>")
     for where, forms in together.items():
         heads, rows = _failures(forms)
@@ -58,12 +60,69 @@ def write_report(file: Path, rides: Sequence[ValidatedRide], together: Mapping[s
 
 def markdown(rides: Sequence[ValidatedRide], together: Mapping[str, Forms]) -> str:
     """The tables of the page as Markdown; what is beyond its limit in bold."""
-    parts = [f"### {NAMES[form].capitalize()}, percent\n\n{markdown_table(*_gate(rides, form))}" for form in NAMES]
+    parts = [f"### {title}\n\n{markdown_table(*table)}" for title, table in _tables(rides)]
     parts += [
         f"### Mean error by condition, {where}\n\n{markdown_table(*_failures(forms))}"
         for where, forms in together.items()
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _tables(rides: Sequence[ValidatedRide]) -> list[tuple[str, HeadedRows]]:
+    """With their titles: rides and channels against their limits, the thesis, the reference of the charge."""
+    limits = {"components": COMPONENT_GATE}
+    gates = [
+        (f"{NAMES[form].capitalize()}, percent (limit {limits.get(form, GATE):g} %)", _gate(rides, form))
+        for form in NAMES
+    ]
+    return [
+        ("In short", _in_short(rides)),
+        ("Beside the thesis", (list(HEAD), beside_thesis(rides))),
+        *gates,
+        ("What the state of charge is compared with, percent", _charge(rides)),
+    ]
+
+
+def _in_short(rides: Sequence[ValidatedRide]) -> HeadedRows:
+    """Of each channel the least and the greatest percent, and how many rides pass."""
+    rows: list[list[str]] = []
+    for form, title in NAMES.items():
+        verdicts = [ride.verdicts[form] for ride in rides if form in ride.verdicts]
+        names = list(dict.fromkeys(name for verdict in verdicts for name in verdict.channels))
+        if names:
+            rows.append([Subheading(title)])
+        for name in names:
+            found = [verdict.channels[name] for verdict in verdicts if name in verdict.channels]
+            known = sorted(e.percent for e in found if e.percent is not None)
+            passed = f"{sum(e.passed for e in found)} of {len(found)}"
+            rows.append(
+                [
+                    channel_words(name),
+                    f"{known[0]:.1f} to {known[-1]:.1f} %" if known else "–",
+                    f"{max(e.rms for e in found):.3g} {found[0].unit}",
+                    f"{found[0].limit_percent:g} %",
+                    passed if all(e.passed for e in found) else Failed(passed),
+                ]
+            )
+    return ["channel", "error", "RMS, worst ride", "limit", "rides within"], rows
+
+
+def _charge(rides: Sequence[ValidatedRide]) -> HeadedRows:
+    rows = []
+    for ride in rides:
+        soc = ride.soc_reference
+        if not soc:
+            continue
+        says = "–" if soc.voltage_says is None else f"{soc.voltage_says:+.1f} ± {soc.voltage_sd:.1f}"
+        cells = [f"{soc.start:.1f} ± {soc.start_sd:.1f}", f"{soc.drawn:.1f} ± {soc.drawn_sd:.1f}", says]
+        rows.append([ride.name, *cells, *(_at_most(ride.verdicts.get(form)) for form in ("open_loop", "predictive"))])
+    heads = ["ride", "at rest before", "counted", "voltage at the end says", "open loop, most", "rider model, most"]
+    return heads, rows
+
+
+def _at_most(verdict: Verdict | None) -> str:
+    """The greatest error of the charge in points."""
+    return f"{verdict.channels['soc'].max:.1f}" if verdict and "soc" in verdict.channels else "–"
 
 
 def _gate(rides: Sequence[ValidatedRide], form: str) -> HeadedRows:
@@ -76,7 +135,7 @@ def _gate(rides: Sequence[ValidatedRide], form: str) -> HeadedRows:
         if isinstance(verdict, SimulationVerdict):
             cells.append(number(verdict.energy_percent, "+.1f"))
         rows.append([ride, *cells])
-    return ["ride", *(name.replace("_", " ") for name in names), *energy], rows
+    return ["ride", *map(channel_words, names), *energy], rows
 
 
 def _percent(entry: ChannelErrors | None) -> str:

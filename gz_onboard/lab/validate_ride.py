@@ -7,12 +7,12 @@ the hills; so is the vibration.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from gz_onboard.arrays import Array, block_means, running_mean
+from gz_onboard.arrays import Array, Mask, block_means, running_mean
 from gz_onboard.constants import GRAVITY, MILD, WH
 from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.validate_components import Component, components, losses
@@ -20,7 +20,9 @@ from gz_onboard.lab.validate_score import (
     CHANNELS,
     COMPONENT_GATE,
     GATE,
+    GIVEN,
     LEAST_SECONDS,
+    POWER,
     SimulationVerdict,
     Splits,
     ValidatedRide,
@@ -29,6 +31,7 @@ from gz_onboard.lab.validate_score import (
     errors,
     split,
 )
+from gz_onboard.lab.validate_soc import soc_reference
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
 from gz_onboard.progress import Progress
@@ -45,6 +48,7 @@ SHORTEST = 30  # s
 GRADE_ERROR = 0.005  # sine: of the on-board filter in the first minutes
 FRAME_BYTES = 13.0  # of a compressed log
 MOST_AT_ONCE = 1000  # steps between two reports of progress
+PICTURE = ".validation"
 _READ, _RIDE = 0.4, 0.3  # shares of the work
 
 
@@ -67,44 +71,56 @@ def log_size(log: Path) -> int:
         return 1
 
 
+@dataclass(frozen=True)
+class ComparedRide:
+    """A validated ride with what was compared, per second and by role: measured, simulated by form, each component."""
+
+    result: ValidatedRide
+    measured: dict[str, Array]
+    simulated: dict[str, dict[str, Array]]
+    alone: dict[str, Component]
+
+
 def validate_ride(task: Task, progress: Progress = lambda _: None) -> ValidatedRide:
-    """Compare one ride with its simulation; `progress` counts bytes of the log. Raises InputError."""
-    facts = facts_of(task.path)
-    kind = facts.get("kind")
-    vehicle = read_vehicle(task.vehicle, task.payload if task.payload is not None else rider_mass(facts))
-    size = log_size(task.path)
-    ride = _measured(task.path, vehicle, size, progress)
+    """Compare one ride with its simulation, and draw it; `progress` counts bytes of the log. Raises InputError."""
+    payload = task.payload if task.payload is not None else rider_mass(facts_of(task.path))
+    compared = compare_ride(task.path, read_vehicle(task.vehicle, payload), progress)
+    picture = task.drawn(PICTURE)
+    if not picture:
+        return compared.result
+    from gz_onboard.lab.validate_plot import draw_ride
+
+    result = replace(compared.result, plot=str(picture))
+    with writing(picture):
+        draw_ride(picture, result, compared.measured, compared.simulated, compared.alone)
+    return result
+
+
+def compare_ride(log: Path, vehicle: Vehicle, progress: Progress = lambda _: None) -> ComparedRide:
+    """Compare one ride of `vehicle`, payload included, with its simulation. Raises InputError."""
+    size = log_size(log)
+    ride = _measured(log, vehicle, size, progress)
     recorded, measured = ride.recorded, ride.series
     found, missing = conditions(measured)
     commands = _commands(recorded)
-    missing += _not_judged(ride, task.path, commands)
+    missing += _not_judged(ride, log, commands)
     if "open_loop" not in commands:
         progress(_RIDE * size)
     simulated = {
         form: _series(_ride(ride, command, lambda share: progress(share * _RIDE * size)))
         for form, command in commands.items()
     }
-    verdicts = {form: _judge_ride(measured, series) for form, series in simulated.items()}
-    ambient = recorded.first("ambient_temperature", MILD)
+    verdicts = {form: _judge_ride(measured, series, GIVEN.get(form, set())) for form, series in simulated.items()}
     roller = ride.road if isinstance(ride.road, Dynamometer) else None
-    alone = components(vehicle, measured, ride.soc, ambient, roller)
-    judged = _judge_components(alone)
+    alone = components(vehicle, measured, ride.soc, recorded.first("ambient_temperature", MILD), roller)
+    judged, by_circuit = _judge_components(alone), alone.get("battery_voltage")
     if not judged and not any(verdict.channels for verdict in verdicts.values()):
         channels = ", ".join(channel.label for channel in CHANNELS.values())
-        raise InputError(f"{task.path}: nothing in it can be compared with its simulation: it has none of {channels}")
-    splits: dict[str, dict[str, Splits]] = {
-        form: {
-            name: split(measured[name], series[name], found)
-            for name in (*CHANNELS, "pack_power")
-            if name in measured and name in series
-        }
-        for form, series in simulated.items()
-    }
-    splits["components"] = {name: split(c.measured, c.modelled, found, c.valid) for name, c in alone.items()}
-    picture = task.output(".validation.png") if task.plot else None
+        raise InputError(f"{log}: nothing in it can be compared with its simulation: it has none of {channels}")
+    kind = facts_of(log).get("kind")
     result = ValidatedRide(
-        file=str(task.path),
-        name=ride_name(task.path),
+        file=str(log),
+        name=ride_name(log),
         kind=None if kind is None else str(kind),
         vehicle=vehicle.name,
         payload_kg=vehicle.parameters["payload_mass"],
@@ -116,17 +132,32 @@ def validate_ride(task: Task, progress: Progress = lambda _: None) -> ValidatedR
         open_loop=verdicts.get("open_loop"),
         predictive=verdicts["predictive"],
         components=judged,
-        splits=splits,
+        splits=_splits(measured, simulated, alone, found),
+        cells_series=vehicle.pack.cells_series,
+        soc_reference=soc_reference(vehicle, measured, ride.soc, by_circuit.modelled if by_circuit else None),
         missing=missing,
         passed=all(verdict.passed for verdict in (*verdicts.values(), judged) if verdict),
-        plot=str(picture) if picture else None,
+        plot=None,
     )
-    if picture:
-        from gz_onboard.lab.validate_plot import draw_ride
+    return ComparedRide(result, measured, simulated, alone)
 
-        with writing(picture):
-            draw_ride(picture, result, measured, simulated, alone)
-    return result
+
+def _splits(
+    measured: Mapping[str, Array],
+    simulated: Mapping[str, Mapping[str, Array]],
+    alone: Mapping[str, Component],
+    found: Mapping[str, Mapping[str, Mask]],
+) -> dict[str, dict[str, Splits]]:
+    """The means by form and channel in the conditions `found`."""
+    splits: dict[str, dict[str, Splits]] = {
+        form: {
+            name: split(quantity.shown(measured[name]), quantity.shown(series[name]), found)
+            for name, quantity in {**CHANNELS, "pack_power": POWER}.items()
+            if name in measured and name in series and name not in GIVEN.get(form, set())
+        }
+        for form, series in simulated.items()
+    }
+    return splits | {"components": {name: split(c.measured, c.modelled, found, c.valid) for name, c in alone.items()}}
 
 
 # --- what was measured --------------------------------------------------------------------------------------------
@@ -271,11 +302,12 @@ def _series(run: Run) -> dict[str, Array]:
 # --- how far they are apart ---------------------------------------------------------------------------------------
 
 
-def _judge_ride(measured: Mapping[str, Array], series: Mapping[str, Array]) -> SimulationVerdict:
+def _judge_ride(measured: Mapping[str, Array], series: Mapping[str, Array], given: set[str]) -> SimulationVerdict:
+    """given: channels that are no result of the simulation."""
     channels = {
-        name: errors(*_even(measured[name], series[name]), channel, GATE)
+        name: errors(*_even(channel.shown(measured[name]), channel.shown(series[name])), channel, GATE)
         for name, channel in CHANNELS.items()
-        if name in measured
+        if name in measured and name not in given
     }
     energy = _energy(measured)
     return SimulationVerdict(

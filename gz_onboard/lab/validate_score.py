@@ -8,7 +8,8 @@ Definitions, the same for every channel. Both signals are first averaged over wh
                    where a current or a torque passes through zero, and a share of the greatest value would flatter
     of_spread      rms error over the standard deviation of the measured: for a voltage, whose percent is small by
                    nature, this is the figure to look at. 1 is no better than its mean
-    of a temperature percent is the mean absolute error over the rise, max less min measured, at least 10 K
+    of a temperature and of the state of charge percent is the mean absolute error over the change, max less min
+                   measured, at least 10 K and 5 points
     energy         the integral of the error over the integral of the measured
 """
 
@@ -21,20 +22,36 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from gz_onboard.arrays import Array, Mask
+from gz_onboard.lab.validate_soc import SocReference
 
 GATE, COMPONENT_GATE = 20.0, 10.0  # percent: Lord 2016, ch. 3
 LEAST_RISE = 10.0  # K
+LEAST_DRAWN = 5.0  # % of charge
 ROLLING = 2.0  # m/s: below, road load is lost in what speed and torque err by
 LEAST_SECONDS = 20  # of a condition; fewer mean nothing
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What is compared: its unit and name."""
+    """What is compared: its unit and name.
+
+    least_change: percent is of the change measured, or of this if that is less; None: of the mean magnitude. factor:
+    what is multiplied with a value in SI units.
+    """
 
     unit: str
     label: str
-    temperature: bool = False
+    least_change: float | None = None
+    factor: float = 1.0
+
+    @property
+    def error_unit(self) -> str:
+        """Of a difference."""
+        return "K" if self.unit == "degC" else self.unit
+
+    def shown(self, values: Array) -> Array:
+        """`values` in SI units, in `unit`."""
+        return values * self.factor
 
 
 CHANNELS = {
@@ -42,11 +59,21 @@ CHANNELS = {
     "pack_voltage": Quantity("V", "battery voltage"),
     "motor_torque": Quantity("N·m", "motor torque"),
     "motor_speed": Quantity("rad/s", "motor speed"),
-    "motor_temperature": Quantity("degC", "motor temperature", True),
-    "inverter_temperature": Quantity("degC", "inverter temperature", True),
-    "cell_temperature": Quantity("degC", "cell temperature", True),
+    "motor_temperature": Quantity("degC", "motor temperature", LEAST_RISE),
+    "inverter_temperature": Quantity("degC", "inverter temperature", LEAST_RISE),
+    "cell_temperature": Quantity("degC", "cell temperature", LEAST_RISE),
+    "soc": Quantity("%", "state of charge", LEAST_DRAWN, 100.0),
+    "throttle": Quantity("%", "throttle", factor=100.0),
 }
-"""The thesis' gate is on the first four; temperatures are judged by the same percentage."""
+"""The thesis' gate is on the first four; the others are judged by the same percentage."""
+POWER = Quantity("W", "power at the pack")
+GIVEN = {"open_loop": {"throttle"}}
+"""By form: channels that are an input of that simulation, not a result."""
+
+
+def channel_words(name: str) -> str:
+    """The name of a channel or component in text."""
+    return "state of charge" if name == "soc" else name.replace("_", " ")
 
 
 @dataclass(frozen=True)
@@ -64,14 +91,17 @@ class ChannelErrors:
 
 
 def errors(measured: Array, simulated: Array, quantity: Quantity, limit: float) -> ChannelErrors:
-    """Compare two arrays of shape (n,), n > 0; limit: in percent."""
+    """Compare two arrays of shape (n,), n > 0, in the quantity's unit; limit: in percent."""
     error = simulated - measured
     mae, rms = float(np.abs(error).mean()), float(np.sqrt(np.mean(error**2)))
-    base = float(max(np.ptp(measured), LEAST_RISE)) if quantity.temperature else float(np.abs(measured).mean())
+    if quantity.least_change is None:
+        base = float(np.abs(measured).mean())
+    else:
+        base = float(max(np.ptp(measured), quantity.least_change))
     percent = 100 * mae / base if base > 0 else None
     spread = float(measured.std())
     return ChannelErrors(
-        unit="K" if quantity.temperature else quantity.unit,
+        unit=quantity.error_unit,
         rms=rms,
         max=float(np.abs(error).max()),
         mean_error=float(error.mean()),
@@ -152,6 +182,12 @@ class ValidatedRide:
         "by form, channel, sorting and condition: seconds, mean_measured, mean_error, mean_abs_error, "
         "mean_abs_measured",
     ]
+    cells_series: Annotated[int, "cells in series, whose voltages make the pack's"]
+    soc_reference: Annotated[
+        SocReference | None,
+        "what the state of charge is compared with, in percent of the charge: start, start_sd, drawn, drawn_sd, "
+        "voltage_says, voltage_sd; or null",
+    ]
     missing: Annotated[list[str], "what could not be judged, or not as well, and why"]
     passed: Annotated[bool, "whether open loop, predictive and components passed"]
     plot: Annotated[str | None, "file, or null"]
@@ -180,13 +216,13 @@ _SPEEDS = ("standing", "below 4 m/s", "4 to 8 m/s", "8 to 11 m/s", "above 11 m/s
 _PACE = "acceleration above {0:g}, {1:g} to {0:g}, within {1:g}, below −{1:g} m/s² without brake; with brake"
 _PACES = ("hard acceleration", "acceleration", "steady", "coasting", "braking")
 _TURNING = "lateral acceleration below {0:g}, {0:g} to {1:g}, above {1:g} m/s²"
-_AIR = "air below {0:g}, {0:g} to {1:g}, above {1:g} °C, straight on"
+_AIR = "air below {0:g}, {0:g} to {1:g}, above {1:g} °C, straight on where the yaw rate is known"
 _TIMES = ("first 3 min", "3 to 10 min", "later")
 _SORTINGS = {
     "turning": Sorting(_TURNING, ("straight", "slightly", "turning"), (0.5, 1.5)),
     "grade": Sorting("above {0:.0%}, within, below −{0:.0%}", ("uphill", "level", "downhill"), (0.01, -0.01)),
     "temperature": Sorting(_AIR, ("cold", "mild", "warm"), (12.0, 20.0)),
-    "since start": Sorting("time ridden since the start, straight on", _TIMES, (180.0, 600.0)),
+    "since start": Sorting("time ridden since the start, likewise", _TIMES, (180.0, 600.0)),
     "speed": Sorting("speed", _SPEEDS, (0.5, 4.0, 8.0, 11.0)),
     "pace": Sorting(_PACE, _PACES, (1.0, 0.3, -0.3)),
 }

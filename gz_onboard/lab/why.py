@@ -35,7 +35,7 @@ def why_of(e: Explanation) -> Why:
 
 
 def plot_why(log: Path, picture: Path) -> list[LogDamage]:
-    """Draw the last split of the range in one of our logs into the PNG `picture`; gives what could not be read.
+    """Draw the last split of the range in one of our logs into `picture`; gives what could not be read.
 
     Raises InputError, OSError.
     """

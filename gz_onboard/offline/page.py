@@ -8,8 +8,10 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
+from urllib.parse import quote
 
-from gz_onboard.offline.style import GRID, INK
+from gz_onboard.errors import writable
+from gz_onboard.offline.style import GRID, INK, picture_format, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -18,7 +20,8 @@ _STYLE = f"""
 body {{ font-family: system-ui, sans-serif; color: {INK}; max-width: 75rem; margin: 2rem auto; padding: 0 1rem; }}
 table {{ border-collapse: collapse; margin: 0.5rem 0 1.5rem; font-size: 0.9rem; font-variant-numeric: tabular-nums; }}
 td, th {{ padding: 0.2rem 0.6rem; border-bottom: 1px solid {GRID}; text-align: left; vertical-align: top; }}
-th {{ font-weight: 600; vertical-align: bottom; }} .n, .bad {{ text-align: right; white-space: nowrap; }}
+th {{ font-weight: 600; vertical-align: bottom; }}
+.n, .bad {{ text-align: right; }} td.n, td.bad {{ white-space: nowrap; }}
 .bad {{ background: #fde8e8; color: #9b1c1c; font-weight: 600; }}
 .no {{ background: #fdf1e3; padding: 0.5rem 1rem; border-left: 4px solid #e9a03b; }}
 figure {{ margin: 1.5rem 0; }} svg {{ width: 100%; height: auto; }} img {{ width: 100%; }}
@@ -78,17 +81,34 @@ def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
+def write_below(file: Path, maker: str, text: str) -> None:
+    """Write Markdown. Where `file` says that the rest is made by `maker`, what is above it stays. Raises OSError."""
+    mark = mark_of(maker)
+    before = file.read_text(encoding="utf-8", errors="replace") if file.is_file() else ""
+    kept = f"{before.partition(mark)[0]}{mark}\n\n" if mark in before else ""
+    file.write_text(kept + text, encoding="utf-8", errors="replace")
+
+
+def mark_of(maker: str) -> str:
+    """The comment in a page of Markdown below which `maker` writes."""
+    return f"<!-- made by {maker} from here on -->"
+
+
 def svg(figure: Figure) -> str:
     """A figure as SVG inside a page, the same text for the same figure."""
-    import matplotlib as mpl
-
-    stream = io.StringIO()
-    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": "gz-onboard", "font.family": "sans-serif"}):
-        figure.savefig(stream, format="svg", metadata={"Date": None})
-    return "<svg" + stream.getvalue().partition("<svg")[2]
+    stream = io.BytesIO()
+    write(figure, stream, "svg")
+    return "<svg" + stream.getvalue().decode("utf-8").partition("<svg")[2]
 
 
 def image(file: Path) -> str:
-    """A PNG file inside a page. Raises OSError."""
-    data = base64.b64encode(file.read_bytes()).decode("ascii")
-    return f"<img alt='' src='data:image/png;base64,{data}'>"
+    """The file of a picture inside a page; a link to a PDF, which no page can show. Raises OSError."""
+    kind = picture_format(file)
+    if kind == "pdf":
+        return f"<a href='{html.escape(quote(file.name))}'>{html.escape(writable(file.name))}</a>"
+    return embedded(file.read_bytes(), "svg+xml" if kind == "svg" else kind)
+
+
+def embedded(picture: bytes, kind: str = "png") -> str:
+    """A picture inside a page."""
+    return f'<img alt="" src="data:image/{kind};base64,{base64.b64encode(picture).decode("ascii")}">'

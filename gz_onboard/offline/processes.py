@@ -21,6 +21,7 @@ from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import InputError
 from gz_onboard.offline.results import Failure, distinct_names
 from gz_onboard.offline.samples import ride_name
+from gz_onboard.options import PICTURE_FORMATS
 from gz_onboard.progress import Display, Progress
 
 
@@ -33,6 +34,11 @@ class Task:
     vehicle: str
     payload: float | None = None  # kg
     plot: bool = True
+    picture_format: str = PICTURE_FORMATS[0]
+
+    def drawn(self, suffix: str) -> Path | None:
+        """The picture to be written, whose name ends in `suffix` and its format; None if none is."""
+        return self.output(f"{suffix}.{self.picture_format}") if self.plot else None
 
     def output(self, suffix: str) -> Path:
         """The file to be written that ends in `suffix`."""
@@ -50,7 +56,7 @@ def tasks_of(arguments: argparse.Namespace, kind: type[TaskT], suffix: str, **op
     """
     logs = list(dict.fromkeys(logs_among(arguments.logs)))
     names = distinct_names(logs, [ride_name(log).removesuffix(Path(suffix).stem) for log in logs])
-    given = arguments.vehicle, arguments.payload, not arguments.no_plot
+    given = arguments.vehicle, arguments.payload, not arguments.no_plot, arguments.picture_format
     return [kind(log, arguments.output / name, *given, **options) for log, name in zip(logs, names, strict=True)]
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING, Any
 
-from gz_onboard.errors import writable
+from gz_onboard.errors import InputError, writable
+from gz_onboard.options import PICTURE_FORMATS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,9 +29,39 @@ def new_figure(width: float, height: float) -> Figure:
     return figure
 
 
-def save(figure: Figure, file: Path) -> None:
-    """Write a PNG, the same bytes for the same figure. Raises OSError."""
-    figure.savefig(file, format="png", dpi=110, metadata={"Software": "gz-onboard"})
+_METADATA: dict[str, dict[str, Any]] = {
+    "png": {"Software": "gz-onboard"},
+    "svg": {"Creator": "gz-onboard", "Date": None},
+    "pdf": {"Creator": "gz-onboard", "CreationDate": None},
+}
+_TEXT_AS_TEXT: Any = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "gz-onboard",
+    "pdf.fonttype": 42,
+    "font.family": "sans-serif",
+}
+
+
+def save(figure: Figure, file: Path, dpi: float = 110) -> None:
+    """Write a picture of the format that the name of `file` ends in. Raises OSError."""
+    write(figure, file, picture_format(file), dpi)
+
+
+def write(figure: Figure, to: Path | IO[bytes], kind: str, dpi: float = 110) -> None:
+    """Write a picture, one of `PICTURE_FORMATS`: the same bytes for the same figure. Raises OSError."""
+    import matplotlib as mpl
+
+    with mpl.rc_context(_TEXT_AS_TEXT if kind != "png" else {}):
+        figure.savefig(to, format=kind, dpi=dpi, metadata=_METADATA[kind])
+
+
+def picture_format(file: Path) -> str:
+    """The format that the name of a picture ends in; InputError if it is none."""
+    kind = file.suffix.lower().removeprefix(".")
+    if kind not in PICTURE_FORMATS:
+        known = ", ".join(f".{known}" for known in PICTURE_FORMATS)
+        raise InputError(f"{file}: the picture's name has to end in one of {known}")
+    return kind
 
 
 def stack(

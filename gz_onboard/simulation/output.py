@@ -23,7 +23,7 @@ from gz_onboard.simulation.trace import Trace
 from gz_onboard.vehicle import Vehicle
 
 FORMATS = ("mcap", "parquet", "csv")
-PICTURES = (".png", ".ledger.png", ".measured.png", ".sweep.png", ".html")
+PICTURES = ("", ".ledger", ".measured", ".sweep")
 _TOPIC = "simulation"
 
 
@@ -48,7 +48,7 @@ def write(
             metadata = {"vehicle": summary.vehicle, "source": summary.what}
             write_series(result, file(f".{arguments.format}"), metadata)
         if not arguments.no_plot:
-            _draw(file, vehicle, plan, result, summary, sweeps)
+            _draw(file, arguments.picture_format, vehicle, plan, result, summary, sweeps)
     return [str(file) for file in files]
 
 
@@ -70,6 +70,7 @@ def write_trace(arguments: argparse.Namespace, vehicle: Vehicle, trace: Trace, s
 
 def _draw(
     file: Callable[[str], Path],
+    picture_format: str,
     vehicle: Vehicle,
     plan: Plan,
     result: Run,
@@ -92,7 +93,7 @@ def _draw(
         names, values = (one.label, two.label), (one.values, two.values)
         drawn.append((".sweep", figures.sweep_map(names, values, variants, title)))
     for ending, figure in drawn:
-        save(figure, file(f"{ending}.png"))
+        save(figure, file(f"{ending}.{picture_format}"))
     text = f"<pre>{html.escape(summary_text(summary))}</pre>"
     write_page(file(".html"), title, [text, *(f"<figure>{svg(figure)}</figure>" for _, figure in drawn)])
 

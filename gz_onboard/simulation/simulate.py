@@ -16,7 +16,7 @@ from typing import Any
 from gz_onboard.constants import HOUR, WH_PER_KM
 from gz_onboard.errors import OK, InputError, not_an_input, require
 from gz_onboard.offline.results import explain_keys, times, write_json
-from gz_onboard.options import add_shared, number
+from gz_onboard.options import PICTURE_FORMATS, add_shared, number
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.simulation.frames import Dropouts, check_output
 from gz_onboard.simulation.output import FORMATS, PICTURES, output_file, write, write_trace
@@ -60,7 +60,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     sweep = "ride it with other values of a parameter, battery.parallel or battery.series; at most twice"
     add("--sweep", action="append", default=[], metavar="NAME=LO..HI[:STEPS]", help=sweep)
     add_shared(parser, "--output", "--json")
-    add("--format", choices=FORMATS, default="parquet", help="of the time series (default: %(default)s)")
+    kinds = "of the time series (default: parquet) or of the pictures (default: png); may be given once for each"
+    add("--format", action=_Format, choices=(*FORMATS, *PICTURE_FORMATS), default="parquet", help=kinds)
+    parser.set_defaults(picture_format=PICTURE_FORMATS[0])
     add("--no-series", action="store_true", help="write no time series")
     add_shared(parser, "--no-plot")
     frames = "write the ride as CAN frames of the vehicle's sensors: .blf .log .asc .trc .csv .mf4"
@@ -69,6 +71,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     lost = f"share of the --frames that the bus loses (default: {Dropouts.frames:g})"
     _number(parser, "--frame-loss", 0.0, 1.0, metavar="SHARE", help=lost)
     add_shared(parser, "--quiet")
+
+
+class _Format(argparse.Action):
+    """A format of the time series, or of the pictures."""
+
+    def __call__(self, parser: object, namespace: argparse.Namespace, values: object, option: object = None) -> None:
+        setattr(namespace, "picture_format" if values in PICTURE_FORMATS else "format", values)
 
 
 def _number(
@@ -94,7 +103,8 @@ def run(arguments: argparse.Namespace) -> int:
     elif arguments.frame_loss is not None:
         raise InputError(f"--frame-loss {arguments.frame_loss:g}: is for --frames FILE")
     plan = find_plan(arguments.what, options, vehicle)
-    endings = [*(() if arguments.no_series else [f".{arguments.format}"]), *(() if arguments.no_plot else PICTURES)]
+    pictures = [".html", *(f"{name}.{arguments.picture_format}" for name in PICTURES)]
+    endings = [*(() if arguments.no_series else [f".{arguments.format}"]), *(() if arguments.no_plot else pictures)]
     written = [arguments.frames, arguments.json, *(output_file(arguments, plan, ending) for ending in endings)]
     not_an_input(written, [Path(arguments.what), find_vehicle(arguments.vehicle)])
     trace = Trace() if arguments.frames else None

@@ -100,6 +100,12 @@ def test_by_default_the_picture_is_beside_the_log(log, capsys):
     assert log.with_suffix(".png").exists()
 
 
+def test_for_a_paper_it_is_of_another_format(log, capsys):
+    assert cli.main(["plot", str(log), "--why", "--format", "pdf"]) == 0
+    assert capsys.readouterr().out.strip() == str(log.with_suffix(".why.pdf"))
+    assert log.with_suffix(".why.pdf").read_bytes().startswith(b"%PDF")
+
+
 def test_a_cut_log_is_drawn_as_far_as_it_goes(tmp_path, log):
     long = LOGS / "city_34C.blf"
     assert cli.main(["estimate", str(long), "--output", str(tmp_path), "--no-plot", "--frames"]) == 0
@@ -170,7 +176,8 @@ def test_what_cannot_be_drawn_is_told(tmp_path, log, capsys):
         (["none.mcap"], "none.mcap"),
         ([str(tmp_path / "text.mcap")], "not an MCAP file"),
         ([str(LOGS / "coastdown.blf")], "holds no estimates"),
-        ([str(log), str(tmp_path / "x.jpg")], "has to end in .png"),
+        ([str(log), str(tmp_path / "x.jpg")], "has to end in one of .png, .svg, .pdf"),
+        ([str(log), str(tmp_path / "x.svg"), "--format", "pdf"], "does not end in .pdf, as --format says"),
         ([str(log), "/dev/null/x.png"], "cannot be written"),
     ]:
         assert cli.main(["plot", *arguments]) == 2

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import re
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -23,6 +24,8 @@ from gz_onboard.lab.validate_components import components
 from gz_onboard.lab.validate_report import COLUMNS, failures
 from gz_onboard.lab.validate_ride import per_second
 from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, conditions, errors, pooled, split
+from gz_onboard.lab.validate_soc import soc_reference
+from gz_onboard.offline.page import mark_of, write_below
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
@@ -208,6 +211,38 @@ def test_effects_in_the_cells_count(city):
     assert first - second == pytest.approx(0.01 * cells, rel=0.02)
 
 
+def reference(city, **values):
+    vehicle, measured, soc = city
+    modelled = components(vehicle, measured, soc, 30.0, None)["battery_voltage"].modelled
+    return soc_reference(vehicle, measured | values, soc, modelled)
+
+
+def test_what_the_state_of_charge_is_compared_with(city):
+    vehicle, measured, soc = city
+    found = reference(city)
+    assert found.start == pytest.approx(100 * soc)
+    assert found.start - found.drawn == pytest.approx(100 * measured["soc"][-1])
+    charge = measured["pack_current"].sum() / 3600
+    assert found.drawn == pytest.approx(100 * charge / vehicle.battery.pack_capacity(34.0), rel=0.02)
+    assert 0.005 < found.drawn_sd / found.drawn < 0.02  # of a current sensor and a capacity known to a percent
+    assert abs(found.voltage_says) < 2 * found.voltage_sd
+    assert reference((vehicle, {k: v for k, v in measured.items() if k != "soc"}, soc)) is None
+
+
+def test_a_voltage_that_is_off_speaks_against_the_count(city):
+    vehicle, measured, _ = city
+    slope = vehicle.battery.ocv(float(measured["soc"][-120:].mean()))[1]
+    more = measured["pack_voltage"] + 0.03 * slope * vehicle.battery.cells_series
+    assert reference(city, pack_voltage=more).voltage_says - reference(city).voltage_says == pytest.approx(3.0)
+
+
+def test_charge_is_judged_by_what_was_drawn():
+    counted = CHANNELS["soc"].shown(np.linspace(0.8, 0.6, 50))
+    assert errors(counted, counted + 2, CHANNELS["soc"], 20.0).percent == pytest.approx(10.0)
+    little = CHANNELS["soc"].shown(np.linspace(0.8, 0.79, 50))
+    assert errors(little, little + 2, CHANNELS["soc"], 20.0).percent == pytest.approx(40.0)
+
+
 # --- the command --------------------------------------------------------------------------------------------------
 
 
@@ -234,7 +269,8 @@ def test_the_summary_has_its_keys(two):
     first, second = summary["rides"]
     assert set(first) == set(KEYS) - {"channels", "energy_percent"}
     assert set(first["open_loop"]) == {"channels", "energy_percent", "passed"}
-    assert set(first["open_loop"]["channels"]) == set(CHANNELS)
+    assert set(first["open_loop"]["channels"]) == set(CHANNELS) - {"throttle"}
+    assert set(first["predictive"]["channels"]) == set(CHANNELS)
     assert second["kind"] == "roll"
     assert second["payload_kg"] == 75.0
     assert {e["limit_percent"] for e in first["components"]["channels"].values()} == {10.0}
@@ -272,9 +308,36 @@ def test_tables_as_markdown(two):
     text = (out.parent / "v.md").read_text()
     percent = summary["rides"][0]["predictive"]["channels"]["motor_torque"]
     assert f"**{percent['percent']:.1f}**" in text or percent["passed"]
-    assert text.count("| coastdown |") == 6
+    assert text.count("| coastdown |") == 8
     assert "### Mean error by condition, road" in text
     assert text.index("| steady |") > text.index("| first 3 min |")
+
+
+def test_the_thesis_stands_beside_it(two):
+    out, summary, text = two
+    rides = summary["rides"]
+    table = (out.parent / "v.md").read_text().partition("### Beside the thesis")[2].partition("###")[0]
+    rows = {cells[1]: cells for cells in (re.split(r" *\| *", line) for line in table.splitlines()) if len(cells) > 6}
+    worst = max(ride["components"]["channels"]["motor_temperature"]["max"] for ride in rides)
+    assert rows["motor temperature"][2:5] == ["±10 K", "fig. 2.25, bench, p. 44", f"{worst:.2g} K"]
+    cell = max(ride["components"]["channels"]["battery_voltage"]["max"] for ride in rides) / 14
+    assert rows["voltage of a cell"][4] == f"{cell:.2g} V"
+    assert rows["voltage of a cell"][6] == ("yes" if cell <= 0.02 else "**no**")
+    assert not any("dynamometer" in what for what in rows)  # of none was one
+    lines = [line for line in text.splitlines() if "thesis ±0.02 V a cell" in line]
+    assert len(lines) == len(rides)
+    assert all("(limit 10 %)" in line for line in lines)
+
+
+def test_what_stands_above_the_mark_stays(tmp_path):
+    page = tmp_path / "page.md"
+    write_below(page, "a", "first\n")
+    assert page.read_text() == "first\n"
+    page.write_text(f"by hand\n\n{mark_of('a')}\nold\n")
+    write_below(page, "a", "new\n")
+    assert page.read_text() == f"by hand\n\n{mark_of('a')}\n\nnew\n"
+    write_below(page, "b", "all of it\n")
+    assert page.read_text() == "all of it\n"
 
 
 def test_each_condition_has_its_place_in_tables():
@@ -297,8 +360,10 @@ def test_a_ride_without_throttle_and_yaw_rate_is_judged_by_the_rest(tmp_path, ca
     text = (OWN / "reference.toml").read_text().splitlines()
     text = [line for line in text if not line.startswith(("throttle =", "rate_z ="))]
     (tmp_path / "blind.toml").write_text("\n".join(text))
-    arguments = ["--vehicle", str(tmp_path / "blind.toml"), "--json", "--no-plot"]
+    arguments = ["--vehicle", str(tmp_path / "blind.toml"), "--json", "--format", "svg", "--output", str(tmp_path)]
     assert main(["validate", str(LOGS / "coastdown.blf"), *arguments]) == 0
+    assert "component alone" in (tmp_path / "coastdown.validation.svg").read_text()
+    assert "data:image/svg+xml;base64," in (tmp_path / "validation.html").read_text()
     found = json.loads(capsys.readouterr().out)["rides"][0]
     assert found["open_loop"] is None
     assert found["predictive"]["channels"]["motor_speed"]["passed"]

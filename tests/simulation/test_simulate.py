@@ -163,14 +163,16 @@ def test_sweep_of_cells_takes_every_number(name):
 
 def test_sweep_of_two(short, tmp_path, capsys):
     sweeps = ("--sweep", "battery.parallel=10..12", "--sweep", "payload_mass=60..120:2")
-    assert simulate(short, *sweeps, "--no-series", "--output", tmp_path) == 0
+    assert simulate(short, *sweeps, "--format", "svg", "--format", "csv", "--output", tmp_path) == 0
     lines = capsys.readouterr().out.splitlines()
     head = next(i for i, line in enumerate(lines) if "battery.cells_parallel" in line)
     table = [[float(cell) for cell in line.split()] for line in lines[head + 1 :]]
     assert [row[:2] for row in table] == [[n, m] for n in (10, 11, 12) for m in (60, 120)]
     assert table[0][3] < table[4][3]  # two strings more go further
     assert table[0][2] < table[1][2]  # who is heavier takes more
-    assert (tmp_path / "short.simulation.sweep.png").exists()
+    assert (tmp_path / "short.simulation.sweep.svg").read_text().startswith("<?xml")
+    assert (tmp_path / "short.simulation.csv").exists()
+    assert not list(tmp_path.glob("*.png"))
 
 
 @pytest.mark.parametrize(

@@ -46,6 +46,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_shared(parser, "--payload", help="mass of rider and luggage, of rides that rides.json does not name")
     add_shared(parser, "--report", "--json")
+    beside = "write the pictures of --report beside it too, each as a file; svg and pdf are for papers"
+    add_shared(parser, "--format", default=None, help=beside)
     parser.add_argument("--write-model", type=Path, metavar="NEW.toml", help="write the extended vehicle file")
     parser.add_argument(
         "--holdout",
@@ -85,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
         from gz_onboard.lab.discover.page import write_report
 
         with writing(f"--report {arguments.report}"):
-            write_report(found, arguments.report)
+            write_report(found, arguments.report, arguments.picture_format)
     if arguments.json != "-":
         print(summary(found, written))
         if arguments.report:
@@ -173,6 +175,8 @@ def _check(arguments: argparse.Namespace, logs: Sequence[Path]) -> None:
         if file and str(file) != "-" and not Path(file).resolve().parent.is_dir():
             raise InputError(f"--{option.replace('_', '-')} {file}: no folder {Path(file).parent}")
     not_an_input((getattr(arguments, option) for option in ("baseline", "write_model", "report", "json")), [own, *logs])
+    if arguments.picture_format and not arguments.report:
+        raise InputError(f"--format {arguments.picture_format}: is for the pictures of --report HTML")
     known_rides(_names(arguments.holdout), ride_names(logs))
 
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,11 +19,14 @@ from gz_onboard.lab.discover.plots import curve, overview, panels, ranking
 from gz_onboard.lab.discover.result import METRICS, NO_INTERVAL, VERDICTS, Report
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import readable, with_unit
-from gz_onboard.offline.page import html_table, write_page
+from gz_onboard.offline.page import embedded, html_table, write_page
 from gz_onboard.offline.results import clock
+from gz_onboard.offline.style import save, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+Picture = Callable[["Figure", str], str]
 
 _GRADE = (
     "<p>Grade is made from the accelerometer, whose noise is in the road force too, with the other sign: "
@@ -32,13 +34,22 @@ _GRADE = (
 )
 
 
-def write_report(found: Discovery, out: Path) -> None:
-    """Write the report of `found` to the HTML file `out`. Raises OSError."""
-    write_page(out, f"{found.mixed.vehicle.name}: {found.report.verdict}", [body(found)])
+def write_report(found: Discovery, out: Path, picture_format: str | None = None) -> None:
+    """Write the report of `found` to the HTML file `out`. Raises OSError.
+
+    picture_format: each picture is also written beside it, as ``OUT.NAME.svg``.
+    """
+
+    def kept(figure: Figure, name: str) -> str:
+        if picture_format:
+            save(figure, out.with_name(f"{out.stem}.{name}.{picture_format}"))
+        return _picture(figure)
+
+    write_page(out, f"{found.mixed.vehicle.name}: {found.report.verdict}", [body(found, kept)])
 
 
-def body(found: Discovery) -> str:
-    """The report as HTML, below its title."""
+def body(found: Discovery, picture: Picture = lambda figure, _: _picture(figure)) -> str:
+    """The report as HTML, below its title; picture: gives that of a figure with a name."""
     report = found.report
     before, after = before_and_after(found)
     stages = {"before": before, "after": after} if report.causes else {"before": before}
@@ -50,20 +61,20 @@ def body(found: Discovery) -> str:
         "<h2>What the residuals are</h2>" + _residuals(report, before, after),
         "<h2>Where they live</h2>",
         f"<p>Share of each residual's variance that goes with a quantity, in percent: before{_named(report)}.</p>",
-        _picture(overview(stages, channels)),
+        picture(overview(stages, channels), "overview"),
     ]
     shown = _most(found, before, channels)
     for name in [*shown, *(c for c in channels if c not in shown)]:
         title = f"{readable(name)} [{CHANNEL[name].unit}]"
-        picture = _picture(panels(stages, name))
+        image = picture(panels(stages, name), name)
         note = _GRADE if name == "road_force" else ""
-        parts.append(f"<details{' open' if name in shown else ''}><summary>{title}</summary>{picture}{note}</details>")
+        parts.append(f"<details{' open' if name in shown else ''}><summary>{title}</summary>{image}{note}</details>")
     parts += [
-        "<h2>Which cause</h2>" + _picture(ranking(report)),
+        "<h2>Which cause</h2>" + picture(ranking(report), "ranking"),
         "<h2>What it is worth: rides held out of the fit</h2>" + _gain(report),
     ]
     if report.unknown:
-        parts.append("<h2>What has no name</h2>" + _picture(curve(report.unknown)))
+        parts.append("<h2>What has no name</h2>" + picture(curve(report.unknown), "unknown"))
     parts += [_constancy(report), _limits(report), _separable(report), _notes(report)]
     return "\n".join(parts)
 
@@ -271,5 +282,5 @@ def _notes(report: Report) -> str:
 
 def _picture(figure: Figure) -> str:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=100, metadata={"Software": "gz-onboard"})
-    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}">'
+    write(figure, buffer, "png", dpi=100)
+    return embedded(buffer.getvalue())

@@ -1,4 +1,4 @@
-"""``gz-onboard vehicle``: begin a vehicle file, check it against logs."""
+"""``gz-onboard vehicle``: begin a vehicle file, check it against logs, draw its efficiency."""
 
 from __future__ import annotations
 
@@ -8,21 +8,23 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from gz_onboard.bus.logs import logs_among
-from gz_onboard.errors import BAD_INPUT, FAILED, OK, InputError, not_an_input
+from gz_onboard.errors import BAD_INPUT, FAILED, OK, InputError, not_an_input, writing
 from gz_onboard.lab.vehicle import new
 from gz_onboard.lab.vehicle.check import CHECK_VERSION, Checked, check_log, check_text
 from gz_onboard.lab.vehicle.features import features_of, features_text
 from gz_onboard.lab.vehicle.finding import Looks
+from gz_onboard.lab.vehicle.maps import WARM, efficiency_maps, fit_of
 from gz_onboard.offline.results import Failure, explain_keys, write_json
 from gz_onboard.offline.schema import descriptions
-from gz_onboard.options import add_shared
+from gz_onboard.offline.style import save
+from gz_onboard.options import add_shared, number
 from gz_onboard.progress import progress_bar
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard vehicle``."""
-    parts = parser.add_subparsers(dest="part", metavar="PART", required=True, help="new or check")
+    parts = parser.add_subparsers(dest="part", metavar="PART", required=True, help="new, check or maps")
     about = "write a vehicle file to begin with, a comment to each key, and a DBC skeleton; never over a file"
     new.add_arguments(parts.add_parser("new", help=about, description=about, allow_abbrev=False))
     about = "does a vehicle file fit a log? what each role has, what looks right and what wrong, what is missing"
@@ -33,11 +35,47 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "leave out the run through the daemon's pipeline, which takes most of the time"
     check.add_argument("--quick", action="store_true", help=text)
     add_shared(check, "--json", "--quiet")
+    about = "draw the efficiency of motor, inverter and both over speed and torque, and what was measured of it"
+    _add_maps(parts.add_parser("maps", help=about, description=about, allow_abbrev=False))
+
+
+def _add_maps(maps: argparse.ArgumentParser) -> None:
+    maps.add_argument("vehicle", metavar="NAME|TOML", help="name of a built-in vehicle, or a vehicle file")
+    text = "points to be drawn over it: tables of a dynamometer as for `calibrate losses`, or logs of rides"
+    maps.add_argument("data", nargs="*", type=Path, metavar="DATA", help=text)
+    of_motor = "of the motor (default: %(default)g)"
+    maps.add_argument(
+        "--temperature", type=number("--temperature", -40.0, 200.0, "degC"), default=WARM, metavar="DEGC", help=of_motor
+    )
+    kmh = number("--top-speed", 1.0, 500.0, "km/h")
+    end = "of the vehicle, where the map ends (default: by the controller in the file, or as measured)"
+    maps.add_argument("--top-speed", type=kmh, metavar="KMH", help=end)
+    add_shared(maps, "--output", "--format")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard vehicle``: gives the exit status of its part."""
-    return new.run(arguments) if arguments.part == "new" else check_vehicle(arguments)
+    part = {"new": new.run, "check": check_vehicle, "maps": draw_vehicle}[arguments.part]
+    return part(arguments)
+
+
+def draw_vehicle(arguments: argparse.Namespace) -> int:
+    """``gz-onboard vehicle maps``."""
+    from gz_onboard.lab.vehicle.maps_plot import draw_maps
+
+    vehicle = read_vehicle(arguments.vehicle)
+    picture = arguments.output / f"{vehicle.name}.maps.{arguments.picture_format}"
+    not_an_input([picture], [*arguments.data, find_vehicle(arguments.vehicle)])
+    top_speed = arguments.top_speed / 3.6 if arguments.top_speed else None
+    maps = efficiency_maps(vehicle, arguments.data, arguments.temperature, top_speed)
+    for part, source, count, rms, r2 in fit_of(vehicle, maps):
+        known = "" if r2 is None else f", R² {r2:.4f}"
+        print(f"{part}: {count} points of {source}, measured less map {100 * rms:.2f} % RMS{known}")
+    with writing(picture):
+        arguments.output.mkdir(parents=True, exist_ok=True)
+        save(draw_maps(maps), picture)
+    print(picture)
+    return OK
 
 
 def check_vehicle(arguments: argparse.Namespace) -> int:

@@ -46,6 +46,7 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         ([str(LOGS), "--holdout", "city_43C"], "no ride is called 'city_43C' (did you mean 'city_34C'?)"),
         ([str(RIDE), "--json", "nowhere/out.json"], "no folder nowhere"),
         ([str(RIDE), "--write-model", "new.txt"], "a vehicle file is a .toml"),
+        ([str(RIDE), "--format", "svg"], "--format svg: is for the pictures of --report HTML"),
         ([str(RIDE), "--payload", "9000"], "must be 0 to 3000 kg"),
         ([str(RIDE), "--baseline", "out.toml", "--quiet"], "three are the least"),
         ([str(LOGS / "coastdown.blf"), "--quiet", "--vehicle", str(CAR)], "knows none of its"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from gz_onboard.lab.discover.gain import summarised
 from gz_onboard.lab.discover.grid import since_change
 from gz_onboard.lab.discover.linear import normal
 from gz_onboard.lab.discover.mixed_model import MixedModel, initial, linearise_all
-from gz_onboard.lab.discover.page import body
+from gz_onboard.lab.discover.page import body, write_report
 from gz_onboard.lab.discover.result import Cause, Errors, Gain, Isolability, Report, ResidualSize, Score, Unknown
 from gz_onboard.lab.discover.summary import summary
 from gz_onboard.lab.discover.uncalibrated import prior_of_file
@@ -131,9 +132,17 @@ def test_a_quantity_that_was_not_measured_is_not_made_up(found: Discovery):
         assert (len(x) == 0) == (name in ("lateral_acceleration", "heading")), name
 
 
-def test_the_page_says_it_all(found: Discovery):
+def unseen(figure: object, name: str) -> str:
+    """No picture, where the words are what is asked for."""
+    return ""
+
+
+def test_the_page_says_it_all(found: Discovery, tmp_path: Path):
     sizes = {"road_force": ResidualSize(0.1, 0.1, 0.1, 1, 0.1, 0.1)}
-    text = body(replace(found, report=replace(found.report, residuals=sizes)))
+    write_report(replace(found, report=replace(found.report, residuals=sizes)), tmp_path / "out.html", "svg")
+    text = (tmp_path / "out.html").read_text()
+    beside = {file.name for file in tmp_path.glob("out.*.svg")}
+    assert beside >= {"out.overview.svg", "out.ranking.svg", "out.unknown.svg", "out.road_force.svg"}
     said = (
         "none of the candidates",
         "rolling_resistance_constant",
@@ -185,7 +194,7 @@ def test_one_ride_held_out_has_no_interval(found: Discovery):
     assert errors == Errors(9.0, 8.0, 7.0, None)
     assert summarised([(9.0, 8.0, 7.0), (9.0, 8.0, 6.0)], rng).ci95 == (1.0, 2.0)
     report = replace(found.report, gain=Gain(("a",), power=errors))
-    for text in body(replace(found, report=report)), summary(replace(found, report=report)):
+    for text in body(replace(found, report=report), unseen), summary(replace(found, report=report)):
         assert "one ride: no interval" in text
 
 
@@ -211,4 +220,4 @@ def test_what_the_rides_lack_is_said(samples: Samples):
         "rolling_resistance",
         "tyre_radius",
     }
-    assert "not by these rides" in body(bare)
+    assert "not by these rides" in body(bare, unseen)
