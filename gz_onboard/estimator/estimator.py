@@ -65,8 +65,8 @@ class Estimator:
         make: FilterMaker = ScalarFilter,
     ) -> None:
         self.battery = battery = battery.own()  # what is learned of its age is of this one
-        self.road = RoadState()
-        self.forecaster = Forecaster(model, battery, riding)
+        self.road, self.forecaster = RoadState(), Forecaster(model, battery, riding)
+        self.road_load = RoadLoad(self.forecaster.load)
         self.signals = Signals(
             (role, STALE_PERIODS * group.period if group.period else DEFAULT_STALE)
             for group in groups
@@ -74,7 +74,7 @@ class Estimator:
         )
         inverter = [self.signals[role] for role in ("inverter_current", "inverter_voltage", "motor_speed")]
         self._inverter = [signal for signal in inverter if signal.stale_after]  # those that the vehicle has
-        self.attribution = Attribution(self.forecaster, self.signals)
+        self.attribution = Attribution(self.forecaster, self.signals, self.road_load)
         self.ahead = RoadAhead(self.forecaster, self.road, self.signals)
         self._missing = MissingSignals(self.signals)
         self._slots = [[self.signals[role] for role in group.roles] for group in groups]
@@ -90,8 +90,7 @@ class Estimator:
         self._time: float | None = None  # s, of the last step
         self.gap_time = 0.0  # s between steps that were too far apart: distance and charge lack what was ridden in it
         self._deadline = float("-inf")
-        self._activities = Activities()
-        self._reading = PackReading()
+        self._activities, self._reading = Activities(), PackReading()
         self._outlook = Outlook(self.forecaster, battery, self.ahead)
         self._distrusted: tuple[str, ...] = ()
         p = model.parameters
@@ -104,8 +103,7 @@ class Estimator:
         self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, sag)
         self.forecaster.ageing = self.soc.ageing
         self._present = Present(self.forecaster, self.road, self._temperatures, self.soc, self._vibration)
-        self._teacher = RoadTeacher(RoadLoad(load), self.road, self.signals, self._present, battery)
-        self.road_load = self._teacher.load
+        self._teacher = RoadTeacher(self.road_load, self.road, self.signals, self._present, battery)
 
     @property
     def filter(self) -> SocFilter | None:
@@ -239,12 +237,11 @@ class Estimator:
         unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.redundancy.speeds.unsettled
         known = 0 < dt <= self._timing.pause and not unsure and self._activities.teaches
         if speed is None or reading.voltage is None or reading.current is None or not known:
-            still = dt if dt > self._timing.pause or self._activities.now is not Activity.RIDING else 0.0
+            still = 0.0 if dt <= self._timing.pause and self._activities.now is Activity.RIDING else dt
             self.forecaster.pause(still)
             self.road_load.pause(still)
             return
-        period = max((self._timing.periods[i] for i in self._speeds), default=0.0)
-        self._teacher.step(now, dt, reading, self._distrusted, period, self.forecaster.riding.time_moving)
+        second, before = self.forecaster.riding.second, self.forecaster.riding.speed_before
         self.ahead.ride(dt, speed, reading.voltage * reading.current)
         learned = self.forecaster.ride(
             dt,
@@ -253,8 +250,10 @@ class Estimator:
             reading.voltage * reading.current,
             self._present.conditions(now, self.signals.motor_temperature.get(now)),
             self._present.effect_inputs(now),
-            period,
+            max((self._timing.periods[i] for i in self._speeds), default=0.0),
         )
+        if self.forecaster.riding.second is not second:  # it is complete
+            self._teacher.second(now, second, before, reading, self._distrusted)
         if learned and self.signals.cell_temperature.fresh(now):  # R0 is known only with it
             self.redundancy.currents.compare_consumption(self.forecaster.recent_factor)
 

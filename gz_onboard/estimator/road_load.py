@@ -18,14 +18,16 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from math import exp, hypot, inf, sqrt
 from typing import Any, NamedTuple
 
 from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.joint import Joint
-from gz_onboard.estimator.load_model import Conditions, EffectInputs, LoadModel
+from gz_onboard.estimator.load_model import Conditions, EffectInputs, LoadModel, Road
 from gz_onboard.estimator.pattern import STEEPEST
 from gz_onboard.estimator.ridden import RIDE_ENDS
+from gz_onboard.estimator.riders import MOST_RIDERS
 from gz_onboard.estimator.road_slopes import (
     AUXILIARIES,
     DRAG,
@@ -38,14 +40,14 @@ from gz_onboard.estimator.road_slopes import (
     ROLLING,
     RoadSlopes,
 )
-from gz_onboard.estimator.spans import Motion, Span, Spans
+from gz_onboard.estimator.spans import Second, Span, Spans
 from gz_onboard.physics.effect import MOVING
 
 NAMES = "mass", "rolling", "drag", "auxiliaries"
 # Relative sd by which vehicles and riders differ beside what the file says: none of the payload, whose sd is that;
 # tyres and their pressure; riders and their clothes; lights.
 DIFFER = 0.0, 0.25, 0.15, 0.33
-LEAST = 0.02, 0.08, 0.05, 0.05  # relative sd, of the mass that of all: no ride tells more, for what the model has wrong
+LEAST = 0.03, 0.08, 0.05, 0.05  # relative sd, of the mass that of all: no ride tells more, for what the model has wrong
 RESTED = 0.05, 0.03, 0.2  # of rolling, drag and auxiliaries: relative sd from ride to ride
 LUGGAGE = 5.0  # kg, sd: what a rider puts on or off at a halt
 NEW_DAY = 3 * 3600.0  # s: after so long a rider who is not known is another
@@ -69,21 +71,13 @@ SAME = 1e-6  # relative: the vehicle file says the same as when it was learned
 
 @dataclass(frozen=True)
 class RoadParameter:
-    """One parameter as learned; `filed`: what the vehicle file, or who rides, says of it."""
+    """One parameter as learned; filed: what the vehicle file says of it, or was entered."""
 
     value: float
     sd: float
     filed: float
     unit: str
     share: float  # 1 - sd²/prior sd²: 0 nothing is learned
-
-
-class Road(NamedTuple):
-    """What the model's road load is made with."""
-
-    mass: float  # kg, of all
-    rolling: float
-    drag: float  # m²
 
 
 class Surroundings(NamedTuple):
@@ -117,11 +111,11 @@ class RoadLoad:
         sds = [hypot(p.sd(name), d * x) for name, d, x in zip(PARAMETERS, DIFFER, self._filed, strict=True)]
         sds[MASS] = hypot(sds[MASS], p.sd("vehicle_mass"))
         self.cable = p["cable_resistance"]  # ohm, before which the pack's power is measured
-        self._empty = load.model.mass - self._filed[MASS]  # kg
+        self._empty = p["vehicle_mass"]  # kg
         weight = load.model.mass * GRAVITY
         gain = hypot(GAIN_SD, p.sd("pack_current_gain") / p["pack_current_gain"])
         self._force, self._white, self._drawn = SLOW_SHARE * weight, WHITE * weight, DRAWN * weight
-        self._scales = [max(abs(x), sd) for x, sd in zip(self._filed, sds, strict=True)]
+        self._scales = [max(x, p.declared[name].prior_sd) for name, x in zip(PARAMETERS, self._filed, strict=True)]
         self._prior = [x * x for x in (*sds, gain, NOSE_SD, GRADE_SD, self._force, WIND_SD, WIND_SD)]
         self.joint = Joint([0.0] * len(self._prior), self._prior)
         self._noise = 1.0  # mean square of the residuals over what is expected, at least 1
@@ -138,10 +132,9 @@ class RoadLoad:
     def learned(self) -> dict[str, RoadParameter]:
         """All four, by `NAMES`."""
         found = {}
-        for i, name in enumerate(NAMES):
+        for i, (name, value) in enumerate(zip(NAMES, self._within(), strict=True)):
             sd, prior = self._sd(i), self._prior[i]
             share = max(1 - sd * sd / prior, 0.0) if prior else 0.0
-            value = self._filed[i] + self.joint.means[i]
             found[name] = RoadParameter(value, sd if share else sqrt(prior), self._filed[i], self._units[i], share)
         return found
 
@@ -152,17 +145,23 @@ class RoadLoad:
 
     def believed(self, share: float = 1.0) -> Road:
         """As learned; `share`: of what was learned, the rest as filed."""
-        mass, rolling, drag = (x + share * d for x, d in zip(self.filed, self.joint.means, strict=False))
-        return Road(mass, rolling, drag)
+        payload, rolling, drag, _ = self._within(share)
+        return Road(self._empty + payload, rolling, drag)
 
     @property
     def more_auxiliaries(self) -> float:
         """What auxiliaries take beyond the file's [W]."""
         return self.joint.means[AUXILIARIES]
 
-    def correlation(self, first: str, second: str) -> float:
-        """Of two of `NAMES`: near 1 or -1, and the two cannot be told apart."""
-        return self.joint.correlation(NAMES.index(first), NAMES.index(second))
+    def correlations(self) -> dict[tuple[str, str], float]:
+        """Of each two of `NAMES`: near 1 or -1, and the two cannot be told apart."""
+        pairs = combinations(enumerate(NAMES), 2)
+        return {(one, other): self.joint.correlation(i, j) for (i, one), (j, other) in pairs}
+
+    def _within(self, share: float = 1.0) -> list[float]:
+        """The values of `PARAMETERS`, within what any vehicle has."""
+        found = zip(self._filed, self.joint.means, self._bounds, strict=False)
+        return [min(max(x + share * d, low), high) for x, d, (low, high) in found]
 
     def _sd(self, i: int) -> float:
         whole = self._empty + self._filed[MASS] if i == MASS else self._filed[i]
@@ -170,17 +169,14 @@ class RoadLoad:
 
     # --- learning ---------------------------------------------------------------------------------------------
 
-    def ride(self, motion: Motion, around: Callable[[], Surroundings], period: float = 0.0) -> None:
-        """A step whose power and speed are known and not doubted; period [s]: how often the speed comes, if seldom.
-
-        around: is asked once for each span.
-        """
+    def ride(self, second: Second, around: Callable[[], Surroundings]) -> None:
+        """A second whose power and speed are known and not doubted; around: is asked once for each span."""
         self.learning = True
-        if abs(motion.speed) > MOVING:
+        if second.distance > MOVING * second.seconds:
             self._still = 0.0
         else:
-            self.rest(motion.seconds)
-        span = self._spans.add(motion, period)
+            self.rest(second.seconds)
+        span = self._spans.add(second)
         if span:
             self._learn(span, around())
 
@@ -212,6 +208,8 @@ class RoadLoad:
             return
         self.riders[self.rider] = self.joint.means[MASS], self.joint.variance(MASS)
         mean, variance = self.riders.pop(rider, (0.0, self._prior[MASS]))
+        while len(self.riders) > MOST_RIDERS:  # the one who was first known
+            del self.riders[next(iter(self.riders))]
         self.joint.begin(MASS, mean, min(variance + LUGGAGE**2, self._prior[MASS]))
         self.rider = rider
         self._keep(anew=True)
@@ -231,10 +229,8 @@ class RoadLoad:
 
     def _relate(self) -> None:
         """Linearise the model about what is known now."""
-        means = self.joint.means
-        for i, (low, high) in enumerate(self._bounds):
-            means[i] = min(max(means[i], low - self._filed[i]), high - self._filed[i])
-        values = [x + d for x, d in zip(self._filed, means, strict=False)]
+        values = self._within()
+        self.joint.means[: len(NAMES)] = [x - filed for x, filed in zip(values, self._filed, strict=True)]
         self._slopes, self._since = RoadSlopes(self._load.model, values, self._scales), 0
 
     def _learn(self, span: Span, around: Surroundings) -> None:
@@ -252,7 +248,7 @@ class RoadLoad:
         grade = min(max(span.grade, -STEEPEST), STEEPEST)
         q = level | {"grade": grade, "grade_cosine": sqrt(1 - grade * grade)}
         power = model.power(q)
-        if min(power, span.power) < self._drawn:
+        if power < self._drawn or span.power < 0:
             return
         slopes = model.of(q, level, power, span.slow_acceleration, around.heading or 0.0)
         residual = span.power - power - self._off(slopes)

@@ -32,6 +32,8 @@ class RoadSlopes:
         own = p.replaced(**now)
         self.model = Model(effects, own)
         self._steps = {i: STEP * scales[i] for i in (ROLLING, DRAG)}
+        if values[DRAG] + self._steps[DRAG] > p.declared[PARAMETERS[DRAG]].high:
+            self._steps[DRAG] *= -1
         more = {i: {**own, PARAMETERS[i]: values[i] + step} for i, step in self._steps.items()}
         self._dragged = Model(effects, own.replaced(**{PARAMETERS[DRAG]: more[DRAG][PARAMETERS[DRAG]]}))
         on_road = [effect for effect in effects if effect.port in ROAD_LOAD]

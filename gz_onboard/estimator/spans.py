@@ -10,42 +10,27 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from math import sqrt
-from typing import NamedTuple
+from math import exp, sqrt
 
 from gz_onboard.estimator.road import GRADE_TIME
 
-SECOND = 1.0  # s
 SECONDS = 3  # of a span
 LEAST_DISTANCE = 1.0  # m: over less the speeds at both ends tell no acceleration
 
 
-class Motion(NamedTuple):
-    """What is known of one step; SI units."""
-
-    seconds: float
-    speed: float
-    acceleration: float
-    grade: float | None  # sine, low-passed; None: not known
-    power: float  # W, at the pack's terminals
-    braked: bool  # a brake may take what no sensor shows
-    lateral: float  # m/s²; 0 if it is not known
-
-
 @dataclass(slots=True)
 class Second:
-    """Sums over a second or so. `slow`: the acceleration as the grade's low pass has it."""
+    """A second or so of riding, as long as the speed's period if that is longer; SI units."""
 
+    seconds: float
+    distance: float
+    energy: float  # J, behind the pack's cable
     before: float  # m/s, at its begin
-    seconds: float = 0.0
-    distance: float = 0.0
-    energy: float = 0.0  # J
-    sideways: float = 0.0  # m²/s³
-    grade: float = 0.0  # s
-    slow: float = 0.0  # m/s
-    braked: bool = False
-    blind: bool = False  # no sensor showed the grade
-    after: float = 0.0  # m/s, at its end
+    after: float  # m/s, at its end
+    grade: float | None  # sine, low-passed, at its end; None: not known
+    lateral: float  # m/s²; 0 if it is not known
+    braked: bool  # at its end: a brake may take what no sensor shows
+    slow: float = 0.0  # m/s²: the acceleration as the grade's low pass has it
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,46 +49,33 @@ class Span:
 
 
 class Spans:
-    """Gathers steps."""
+    """Gathers seconds."""
 
     def __init__(self) -> None:
-        self._second: Second | None = None
         self._waiting: deque[Second] = deque()
         self._span: list[Second] = []
-        self._slow = 0.0  # m/s²
+        self._after: float | None = None  # m/s, at the end of the last second
+        self._slow, self._braked = 0.0, False  # m/s²; at its end
 
     def pause(self) -> None:
         """What was being gathered is left."""
-        self._second = None
         self._waiting.clear()
         self._span.clear()
+        self._slow, self._braked = 0.0, False
 
-    def add(self, m: Motion, period: float) -> Span | None:
-        """A step; gives a span each three seconds, or three of the `period` [s] of the speed if that is longer."""
-        s = self._second
-        if s is None:
-            s = self._second = Second(m.speed)
-        dt = m.seconds
-        s.seconds += dt
-        s.distance += m.speed * dt
-        s.energy += m.power * dt
-        s.sideways += m.lateral * m.lateral * dt
-        self._slow += (m.acceleration - self._slow) * min(dt / GRADE_TIME, 1.0)
-        s.slow += self._slow * dt
-        s.braked = s.braked or m.braked
-        if m.grade is None:
-            s.blind = True
-        else:
-            s.grade += m.grade * dt
-        if s.seconds < max(SECOND, period):
-            return None
-        s.after = m.speed
-        self._second = Second(m.speed)
-        self._waiting.append(s)
-        if len(self._waiting) <= max(round(GRADE_TIME / s.seconds), 1):
+    def add(self, second: Second) -> Span | None:
+        """A second; gives a span each three of them."""
+        if second.before != self._after:
+            self.pause()
+        rate = (second.after - second.before) / second.seconds
+        self._slow += (rate - self._slow) * (1 - exp(-second.seconds / GRADE_TIME))
+        second.slow, self._after = self._slow, second.after
+        second.braked, self._braked = second.braked or self._braked, second.braked
+        self._waiting.append(second)
+        if len(self._waiting) <= max(round(GRADE_TIME / second.seconds), 1):
             return None
         then = self._waiting.popleft()
-        then.grade, then.slow, then.blind = s.grade / s.seconds, s.slow / s.seconds, s.blind
+        then.grade, then.slow = second.grade, second.slow  # which lag
         self._span.append(then)
         if len(self._span) < SECONDS:
             return None
@@ -114,17 +86,18 @@ class Spans:
 def _span(parts: list[Second]) -> Span:
     seconds, distance = sum(s.seconds for s in parts), sum(s.distance for s in parts)
     before, after = parts[0].before, parts[-1].after
-    ways = [s.distance for s in parts] if distance > LEAST_DISTANCE else [s.seconds for s in parts]
-    way = sum(ways)
     far = distance > LEAST_DISTANCE
+    ways = [s.distance if far else s.seconds for s in parts]
+    way = sum(ways)
+    grades = [s.grade for s in parts if s.grade is not None]
     return Span(
         seconds,
         distance,
         distance / seconds,
         (after * after - before * before) / 2 / distance if far else (after - before) / seconds,
-        None if any(s.blind for s in parts) else sum(s.grade * w for s, w in zip(parts, ways, strict=True)) / way,
+        sum(g * w for g, w in zip(grades, ways, strict=True)) / way if len(grades) == SECONDS else None,
         sum(s.slow * w for s, w in zip(parts, ways, strict=True)) / way,
         sum(s.energy for s in parts) / seconds,
         any(s.braked for s in parts),
-        sqrt(sum(s.sideways for s in parts) / seconds),
+        sqrt(sum(s.lateral * s.lateral * s.seconds for s in parts) / seconds),
     )
