@@ -48,7 +48,7 @@ NAMES = "mass", "rolling", "drag", "auxiliaries"
 # tyres and their pressure; riders and their clothes; lights.
 DIFFER = 0.0, 0.25, 0.15, 0.33
 LEAST = 0.03, 0.08, 0.05, 0.05  # relative sd, of the mass that of all: no ride tells more, for what the model has wrong
-RESTED = 0.05, 0.03, 0.2  # of rolling, drag and auxiliaries: relative sd from ride to ride
+RESTED = 0.1, 0.03, 0.2  # of rolling, drag and auxiliaries: relative sd from ride to ride; of the first, by 10 K less
 LUGGAGE = 5.0  # kg, sd: what a rider puts on or off at a halt
 NEW_DAY = 3 * 3600.0  # s: after so long a rider who is not known is another
 MOST_STILL = 100 * NEW_DAY  # that is counted
@@ -138,11 +138,6 @@ class RoadLoad:
             found[name] = RoadParameter(value, sd if share else sqrt(prior), self._filed[i], self._units[i], share)
         return found
 
-    @property
-    def filed(self) -> Road:
-        """As the file says, with the payload that was entered."""
-        return Road(self._empty + self._filed[MASS], self._filed[ROLLING], self._filed[DRAG])
-
     def believed(self, share: float = 1.0) -> Road:
         """As learned; `share`: of what was learned, the rest as filed."""
         payload, rolling, drag, _ = self._within(share)
@@ -199,7 +194,7 @@ class RoadLoad:
                 joint.begin(i, 0.0, prior[i])
         if before < NEW_DAY <= self._still and not self.rider:
             joint.begin(MASS, 0.0, prior[MASS])
-        if before < RIDE_ENDS <= self._still:
+        if any(before < end <= self._still for end in (RIDE_ENDS, NEW_DAY)):
             self._keep(anew=True)
 
     def ridden_by(self, rider: str) -> None:
