@@ -194,11 +194,13 @@ class Cause(IntEnum):
     CLIMB = 5  # of roads like those ridden
     TURNING = 6
     AUXILIARIES = 7  # measured, beyond what the vehicle file says
-    PAYLOAD = 8  # as entered, against that of the vehicle file
+    PAYLOAD = 8  # as entered or learned, against that of the vehicle file
     AGE = 9  # capacity and resistance of the cells against new ones
     CHARGE = 10  # state of charge; of a change, beyond the distance ridden
     RIDING = 11  # what is expected of the riding to come beyond that of the last kilometres
-    UNEXPLAINED = 12  # measured over modelled consumption, as learned: wind, tyres, a dragging brake
+    UNEXPLAINED = 12  # measured over modelled consumption, as learned, beside what follows: wind, a dragging brake
+    ROLLING = 13  # resistance, as learned: tyres
+    DRAG = 14  # area, as learned: rider, clothes, luggage
 
 
 @dataclass(frozen=True, slots=True)

@@ -97,6 +97,30 @@ def test_it_forgets_one_and_keeps_the_rest(saved: Path, capsys: pytest.CaptureFi
     assert shown(saved, capsys, "--reset", "all")["resistance"]["factor"] == 1.0
 
 
+def test_it_shows_and_forgets_the_road_load(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    vehicle = read_vehicle("reference")
+    snapshot, _ = state.load(saved, time.time()) or ({}, None)
+    road = snapshot["learned"]["road"]
+    road["means"][0], road["rows"][0] = 15.0, 4.0**2
+    road["rows"][4] = -0.9 * (road["rows"][2] * road["rows"][5]) ** 0.5  # of rolling and drag
+    state.write(saved, state.encode(snapshot, time.time()))
+    assert main(["learned", "--state", str(saved), "--json", "--plot", str(tmp_path / "learned.png")]) == OK
+    document = json.loads(capsys.readouterr().out)["road"]
+    assert (document["mass"]["value"], document["mass"]["filed"], document["mass"]["unit"]) == (95.0, 80.0, "kg")
+    assert document["mass"]["percent_learned"] > 50
+    assert document["correlations"]["rolling drag"] == pytest.approx(-0.9)
+    assert main(["learned", "--state", str(saved)]) == OK
+    text = capsys.readouterr().out
+    assert "mass         95 ± " in text
+    assert "of rider and luggage, vehicle file 80" in text
+    assert "rolling and drag are hard to tell apart: correlation -0.90" in text
+    assert main(["learned", "--state", str(saved), "--reset", "road"]) == OK
+    assert "mass         80 ± 12 kg         nothing learned" in capsys.readouterr().out
+    after, _ = state.load(saved, time.time()) or ({}, None)
+    assert after["learned"] == {name: x for name, x in snapshot["learned"].items() if name != "road"}
+    Pipeline(vehicle).estimator.restore(after, vehicle.key, 0.0)
+
+
 def test_it_resets_nothing_under_a_daemon_that_runs(saved: Path, capsys: pytest.CaptureFixture[str]):
     descriptor = os.open(saved.parent, os.O_RDONLY)
     fcntl.flock(descriptor, fcntl.LOCK_EX)

@@ -22,11 +22,13 @@ from gz_onboard.daemon.keeper import state_file
 from gz_onboard.errors import OK, InputError, not_an_input, require, writing
 from gz_onboard.estimator.ageing import Ageing, Learned
 from gz_onboard.estimator.forecast import Forecaster
+from gz_onboard.estimator.road_load import RoadLoad, RoadParameter
 from gz_onboard.estimator.usual import Habit, Usual
 from gz_onboard.options import add_shared
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 VERSION = 2  # of the JSON keys
+ALIKE = 0.8  # correlation from which two are said to be hard to tell apart
 SOME = 0.05  # of what can be learned: less is drawn as unknown
 USUAL_FOLDER = Path("/var/lib/gz-onboard")
 MEANING = {  # by name: what its factor is on
@@ -36,9 +38,13 @@ MEANING = {  # by name: what its factor is on
     "standing": "energy at stops, likewise",
     "pace": "time of a kilometre, likewise",
     "factor": "measured over modelled energy of the same motion",
+    "mass": "of rider and luggage",
+    "rolling": "resistance over weight",
+    "drag": "area of vehicle and rider",
+    "auxiliaries": "power, lights and all",
 }
 PICTURES = (".png", ".svg", ".pdf")
-BATTERY, RIDING = ("capacity", "resistance"), "riding"  # what can be forgotten
+BATTERY, ROAD, RIDING = ("capacity", "resistance"), "road", "riding"  # what can be forgotten
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--reset",
-        choices=(*BATTERY, RIDING, "all"),
+        choices=(*BATTERY, ROAD, RIDING, "all"),
         help="forget this, as after a new battery or for a new owner; the daemon must not run",
     )
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it: PNG, SVG or PDF")
@@ -65,14 +71,17 @@ def run(arguments: argparse.Namespace) -> int:
     require("matplotlib", arguments.plot is not None)
     snapshot, age = _load(file, vehicle)
     if arguments.reset:
-        names = (*BATTERY, RIDING) if arguments.reset == "all" else (arguments.reset,)
+        names = (*BATTERY, ROAD, RIDING) if arguments.reset == "all" else (arguments.reset,)
         snapshot = _forget(file, snapshot, age, names, _fresh(vehicle))
     learned, riders = read_learned(vehicle, snapshot), read_riders(vehicle, snapshot)
+    road_load = read_road_load(vehicle, snapshot)
+    road = road_load.learned()
     if arguments.plot:
         with writing(arguments.plot):
-            _plot(arguments.plot, vehicle.name, learned, riders)
+            _plot(arguments.plot, vehicle.name, learned | _factors(road), riders)
     if arguments.json:
-        rows = {"learned": _rows(learned), "riders": {name: _rows(x) for name, x in riders.items()}}
+        rows = {"learned": _rows(learned), "road": _road_rows(road_load)}
+        rows |= {"riders": {name: _rows(x) for name, x in riders.items()}}
         text = json.dumps({"version": VERSION, "vehicle": vehicle.key, "age_s": age, **rows}, indent=1)
         if arguments.json == "-":
             print(text)
@@ -81,6 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
             Path(arguments.json).write_text(text + "\n", encoding="utf-8")
     for name, x in learned.items():
         print(_line(name, x))
+    print(*_road_lines(road_load), sep="\n")
     for rider, found in riders.items():
         if len(riders) > 1:
             print(f"rider {rider or 'not known'}:")
@@ -95,6 +105,14 @@ def read_learned(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Lea
     with _sound():
         ageing.restore(snapshot.get("learned", {}))
     return ageing.learned()
+
+
+def read_road_load(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> RoadLoad:
+    """What a saved state holds of the road load. InputError if it cannot be."""
+    road_load = RoadLoad(_fresh(vehicle).load)
+    with _sound():
+        road_load.take(road_load.read(snapshot.get("learned", {}).get(ROAD)))
+    return road_load
 
 
 def read_riders(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, dict[str, Learned]]:
@@ -137,9 +155,35 @@ def _rows(learned: Mapping[str, Learned]) -> dict[str, dict[str, object]]:
     }
 
 
+def _road_rows(road_load: RoadLoad) -> dict[str, object]:
+    rows: dict[str, object] = {
+        name: {"value": x.value, "sd": x.sd, "unit": x.unit, "filed": x.filed, "percent_learned": round(100 * x.share)}
+        for name, x in road_load.learned().items()
+    }
+    return rows | {"correlations": {" ".join(pair): r for pair, r in road_load.correlations().items()}}
+
+
+def _factors(road: Mapping[str, RoadParameter]) -> dict[str, Learned]:
+    """As factors on what the vehicle file says, where that is more than nothing."""
+    return {name: Learned(x.value / x.filed, x.sd / x.filed, x.share) for name, x in road.items() if x.filed > 0}
+
+
 def _line(name: str, x: Learned) -> str:
-    known = f"{100 * x.share:3.0f} % learned" if x.share else "nothing learned"
-    return f"{name:12} {x.value:5.3f} ± {x.sd:5.3f}  {known}: {MEANING[name]}"
+    return f"{name:12} {x.value:5.3f} ± {x.sd:5.3f}  {_known(x.share)}: {MEANING[name]}"
+
+
+def _known(share: float) -> str:
+    return f"{100 * share:3.0f} % learned" if share else "nothing learned"
+
+
+def _road_lines(road_load: RoadLoad) -> Iterator[str]:
+    for name, x in road_load.learned().items():
+        unit = "" if x.unit == "1" else f" {x.unit}"
+        number = f"{x.value:.3g} ± {x.sd:.2g}{unit}"
+        yield f"{name:12} {number:18} {_known(x.share)}: {MEANING[name]}, vehicle file {x.filed:.3g}"
+    for (first, second), r in road_load.correlations().items():
+        if abs(r) > ALIKE:
+            yield f"{first} and {second} are hard to tell apart: correlation {r:+.2f}"
 
 
 def _plot(

@@ -139,7 +139,7 @@ class Daemon:
         if self._keeper:
             self.pipeline, snapshot = self._keeper.restore(self.pipeline, self._make_pipeline)
         if self.rider:  # whoever rode when it was saved
-            self.pipeline.estimator.forecaster.ridden_by(self.rider)
+            self.pipeline.estimator.ridden_by(self.rider)
         return snapshot
 
     def round(self) -> int:

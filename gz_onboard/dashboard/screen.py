@@ -44,6 +44,8 @@ _CAUSE_WORDS = {cause: cause.name.lower() for cause in Cause} | {
     Cause.AUXILIARIES: "auxiliary load",
     Cause.AGE: "age of the battery",
     Cause.RIDING: "riding to come",
+    Cause.ROLLING: "rolling resistance",
+    Cause.DRAG: "air drag",
 }
 
 _NONE_YET = "Is the daemon on this bus? Is --dbc its range_dbc?"

@@ -12,16 +12,17 @@ wind, with its payload, its consumption factor, and a full battery as new, at th
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import exp
 from typing import NamedTuple
 
 from gz_onboard.constants import MILD
 from gz_onboard.estimator.composition import PARTS, Composition, Parts
 from gz_onboard.estimator.forecast import PRIOR_FORM_FACTOR_SQUARED, Forecast, Forecaster
-from gz_onboard.estimator.load_model import AHEAD, ALTITUDE_DIGITS, AMBIENT_DIGITS, USUAL_AIR, Conditions
+from gz_onboard.estimator.load_model import AHEAD, ALTITUDE_DIGITS, AMBIENT_DIGITS, USUAL_AIR, Conditions, Road
 from gz_onboard.estimator.pattern import Point
 from gz_onboard.estimator.ridden import MEMORY
+from gz_onboard.estimator.road_load import RoadLoad
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import LOADS, Cause, Explanation
 from gz_onboard.physics.battery import Battery
@@ -33,6 +34,9 @@ LEAST_MOVED = 100.0  # m: nothing new is to be said of a range that has not move
 MOVED = 1000.0  # m: so much more or less than the distance ridden, and a change is explained
 SETTLED = 60.0  # s: what goes back within is no change
 MOST_CHANGES = 100
+ROAD_STEPS = 0.005, 0.02, 0.01  # relative, of a `Road`
+# What beside the riding the modelled consumption depends on: the air, and what the road load is made with.
+BESIDE = {Cause.TEMPERATURE: None, Cause.PAYLOAD: "mass", Cause.ROLLING: "rolling", Cause.DRAG: "drag"}
 
 
 class Draw(NamedTuple):
@@ -56,19 +60,20 @@ class State:
     consumption: float
     draw: Draw
     air: Conditions
-    mass: float
-    factor: float
+    road: Road
+    factor: float  # on the model with this road load
     auxiliaries: float  # of the factor, what auxiliaries beyond the model's make
     points: tuple[Point, ...]  # lately ridden
     known: float = 0.0  # how much of the price expected is theirs, and not the prior riding's: 0 to 1
     rated: bool = False  # the prior riding without hills and wind, nothing ridden
-    parts: dict[tuple[Conditions, float], Parts] = field(default_factory=dict)  # as far as they were asked for
+    parts: dict[tuple[Conditions, Road], Parts] = field(default_factory=dict)  # as far as they were asked for
 
 
 class Attribution:
     """Explains the range of one vehicle. `latest`: against the rated range; `changes`: what moved it, the last few."""
 
-    def __init__(self, forecaster: Forecaster, signals: Signals) -> None:
+    def __init__(self, forecaster: Forecaster, signals: Signals, road_load: RoadLoad | None = None) -> None:
+        self._road_load = road_load
         self._forecaster, self._signals, load = forecaster, signals, forecaster.load
         modelled = any(p.name == "auxiliary_power" for effect in load.model.effects for p in effect.parameters)
         self._usual_load = load.model.parameters["auxiliary_power"] if modelled else 0.0  # W
@@ -105,9 +110,10 @@ class Attribution:
         return news
 
     def _state(self, now: float, forecast: Forecast, soc: float, air: Conditions, ridden: float) -> State:
-        load, riding = self._forecaster.load, self._forecaster.riding
+        riding = self._forecaster.riding
         known = forecast.range > 0 and forecast.energy > 0
-        return State(
+        filed, learned = self._composition.filed, self._factor_learned
+        state = State(
             time=now,
             ridden=ridden,
             range=forecast.range,
@@ -115,12 +121,15 @@ class Attribution:
             consumption=forecast.energy / forecast.range if known else forecast.consumption,
             draw=Draw(soc, forecast.cells, self._pack(), forecast.power, forecast.form_factor_squared),
             air=Conditions(round(air.ambient, AMBIENT_DIGITS), round(air.altitude, ALTITUDE_DIGITS)),
-            mass=load.model.mass,
+            road=_in_steps(filed, self._road_load.believed(learned)) if self._road_load else filed,
             factor=riding.factor,
             auxiliaries=self._auxiliaries(forecast.power),
             points=self._forecaster.pattern.points(),
             known=min(max(1 - riding.usual.price.variance / self._forecaster.prior.price.variance, 0.0), 1.0),
         )
+        # What the road load explains is no longer in the factor.
+        rest = self._total(state, state.air, filed) / self._total(state, state.air, state.road)
+        return replace(state, factor=rest * state.factor, auxiliaries=rest * state.auxiliaries)
 
     def _measure_auxiliaries(self, now: float, ridden: float) -> None:
         """What they take beyond the model's, in the mean over the way lately ridden."""
@@ -131,6 +140,8 @@ class Attribution:
         known = [power for power in beside if power is not None]
         if voltage is not None and current is not None:
             known.append(voltage * current - self._usual_load)
+        elif self._road_load and not known:
+            known.append(self._road_load.more_auxiliaries)
         if way > 0 and known:
             fade = exp(-way / MEMORY)
             self._more = fade * self._more + (1 - fade) * sum(known)
@@ -141,8 +152,13 @@ class Attribution:
         riding = self._forecaster.riding
         if not self._known or power <= 0:
             return 0.0
-        learned = min(max(1 - riding.factor_variance / self._forecaster.load.prior.factor_sd**2, 0.0), 1.0)
-        return learned * riding.factor * self._more / self._known / power
+        return self._factor_learned * riding.factor * self._more / self._known / power
+
+    @property
+    def _factor_learned(self) -> float:
+        """How much of what the parameters have wrong is in the consumption expected: 0 to 1."""
+        prior = self._forecaster.load.prior.factor_sd
+        return min(max(1 - self._forecaster.riding.factor_variance / prior**2, 0.0), 1.0)
 
     @property
     def rated(self) -> State:
@@ -151,8 +167,9 @@ class Attribution:
             load = self._forecaster.load
             parameters = load.model.parameters
             mass = parameters["vehicle_mass"] + parameters.filed("payload_mass")
+            road = self._composition.filed._replace(mass=mass)
             air, prior = Conditions(*USUAL_AIR), load.prior
-            calm = _without_hills_and_wind(self._composition.prior(air, mass))
+            calm = _without_hills_and_wind(self._composition.prior(air, road))
             consumption = prior.factor * sum(calm.values())
             full, power = self._new.window.of_cells(1.0), consumption * prior.speed
             load_ahead = power, PRIOR_FORM_FACTOR_SQUARED
@@ -167,7 +184,7 @@ class Attribution:
                 consumption=consumption,
                 draw=draw,
                 air=air,
-                mass=mass,
+                road=road,
                 factor=prior.factor,
                 auxiliaries=0.0,
                 points=(),
@@ -193,7 +210,7 @@ class Attribution:
     def _costs(self, a: State, b: State) -> Parts:
         """The difference of the consumptions [J/m]: factor times what is left open times the model's."""
         modelled = self._modelled(a, b)
-        f0, m0, f1, m1 = a.factor, self._total(a, a.air, a.mass), b.factor, self._total(b, b.air, b.mass)
+        f0, m0, f1, m1 = a.factor, self._total(a, a.air, a.road), b.factor, self._total(b, b.air, b.road)
         g0, g1 = a.consumption / (f0 * m0), b.consumption / (f1 * m1)
         of_model, of_factor = _worth(f0, g0, f1, g1), _worth(g0, m0, g1, m1)
         costs = {cause: of_model * part for cause, part in modelled.items()}
@@ -206,32 +223,38 @@ class Attribution:
 
     def _modelled(self, a: State, b: State) -> Parts:
         """The difference of the modelled consumptions [J/m]."""
-        parts: Parts = dict.fromkeys(PARTS, 0.0)
+        parts: Parts = dict.fromkeys((*PARTS, *BESIDE), 0.0)
         for at in (a, b):
-            before, after = self._parts(a, at.air, at.mass), self._parts(b, at.air, at.mass)
+            before, after = self._parts(a, at.air, at.road), self._parts(b, at.air, at.road)
             for part in PARTS:
                 parts[part] += (after[part] - before[part]) / 2
-        # The air, then the mass, of the riding as it is; the mass, then the air, of the riding as it was.
-        warm, light = self._total(b, b.air, a.mass), self._total(a, a.air, b.mass)
-        air = warm - self._total(b, a.air, a.mass) + self._total(a, b.air, b.mass) - light
-        mass = self._total(b, b.air, b.mass) - warm + light - self._total(a, a.air, a.mass)
-        return parts | {Cause.TEMPERATURE: air / 2, Cause.PAYLOAD: mass / 2}
+        # Air, mass, rolling, drag: in this order of the riding as it is, in the reverse one of that as it was.
+        for riding, causes in ((b, tuple(BESIDE)), (a, tuple(BESIDE)[::-1])):
+            air, road = a.air, a.road
+            before_it = self._total(riding, air, road)
+            for cause in causes:
+                name = BESIDE[cause]
+                air, road = (b.air, road) if name is None else (air, road._replace(**{name: getattr(b.road, name)}))
+                after_it = self._total(riding, air, road)
+                parts[cause] += (after_it - before_it) / 2
+                before_it = after_it
+        return parts
 
-    def _total(self, state: State, air: Conditions, mass: float) -> float:
-        return sum(self._parts(state, air, mass).values())
+    def _total(self, state: State, air: Conditions, road: Road) -> float:
+        return sum(self._parts(state, air, road).values())
 
-    def _parts(self, state: State, air: Conditions, mass: float) -> Parts:
-        """The modelled consumption [J/m] of the riding of `state` in another air, with another mass."""
-        at = air, mass
+    def _parts(self, state: State, air: Conditions, road: Road) -> Parts:
+        """The modelled consumption [J/m] of the riding of `state` in another air, with another road load."""
+        at = air, road
         if at not in state.parts:
-            prior = self._composition.prior(air, mass)
+            prior = self._composition.prior(air, road)
             distance = sum(p.distance for p in state.points)
             if state.rated:
                 state.parts[at] = _without_hills_and_wind(prior)
             elif not distance:
                 state.parts[at] = prior
             else:
-                ridden, share = self._composition.of(state.points, air, mass), state.known
+                ridden, share = self._composition.of(state.points, air, road), state.known
                 state.parts[at] = {part: share * ridden[part] + (1 - share) * prior[part] for part in PARTS}
         return state.parts[at]
 
@@ -268,6 +291,12 @@ class Attribution:
         usual = {"vibration": load.prior.vibration, "time_moving": AHEAD}
         lost = load.model.overpotential(draw.battery, usual)
         return drawable(draw.battery, draw.soc, draw.cells, draw.power, draw.form_factor_squared, lost).energy
+
+
+def _in_steps(filed: Road, learned: Road) -> Road:
+    """`learned`, in steps from what the file says: the prior riding is kept for each."""
+    each = zip(filed, learned, ROAD_STEPS, strict=True)
+    return Road(*(x * (1 + step * round((y / x - 1) / step)) if x else y for x, y, step in each))
 
 
 def _without_hills_and_wind(parts: Parts) -> Parts:

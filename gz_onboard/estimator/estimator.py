@@ -1,10 +1,9 @@
 """Events in, estimates out: what is done in which order at each step, and what of it is reported and saved.
 
 No I/O and no clock: time arrives with the events, so the same events give the same estimates, to the last bit.
-All state of the on-board software that matters lives here and in what is owned here; `snapshot` and `restore` carry it
-over a restart. One step: check the sensors (`redundancy`), move on the road (`road`), choose the pack's voltage and
-current (`sources`) and the temperatures, go on with the state of charge (`soc`), learn from the riding and forecast
-(`forecaster`).
+All state that matters lives here and in what is owned here; `snapshot` and `restore` carry it over a restart. One step:
+check the sensors (`redundancy`), move on the road (`road`), choose the pack's voltage and current (`sources`) and the
+temperatures, go on with the state of charge (`soc`), learn from the riding and forecast (`forecaster`, `road_load`).
 """
 
 from __future__ import annotations
@@ -26,6 +25,8 @@ from gz_onboard.estimator.redundancy.currents import CellEvidence
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.road import STANDSTILL, RoadState
+from gz_onboard.estimator.road_load import NEW_DAY, RoadLoad
+from gz_onboard.estimator.road_teacher import RoadTeacher
 from gz_onboard.estimator.route_ahead import RoadAhead
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.soc import StateOfCharge
@@ -64,16 +65,16 @@ class Estimator:
         make: FilterMaker = ScalarFilter,
     ) -> None:
         self.battery = battery = battery.own()  # what is learned of its age is of this one
-        self.road = RoadState()
-        self.forecaster = Forecaster(model, battery, riding)
+        self.road, self.forecaster = RoadState(), Forecaster(model, battery, riding)
+        self.road_load = RoadLoad(self.forecaster.load)
         self.signals = Signals(
             (role, STALE_PERIODS * group.period if group.period else DEFAULT_STALE)
             for group in groups
             for role in group.roles
         )
-        inverter = self.signals.inverter_current, self.signals.inverter_voltage, self.signals.motor_speed
+        inverter = [self.signals[role] for role in ("inverter_current", "inverter_voltage", "motor_speed")]
         self._inverter = [signal for signal in inverter if signal.stale_after]  # those that the vehicle has
-        self.attribution = Attribution(self.forecaster, self.signals)
+        self.attribution = Attribution(self.forecaster, self.signals, self.road_load)
         self.ahead = RoadAhead(self.forecaster, self.road, self.signals)
         self._missing = MissingSignals(self.signals)
         self._slots = [[self.signals[role] for role in group.roles] for group in groups]
@@ -89,8 +90,7 @@ class Estimator:
         self._time: float | None = None  # s, of the last step
         self.gap_time = 0.0  # s between steps that were too far apart: distance and charge lack what was ridden in it
         self._deadline = float("-inf")
-        self._activities = Activities()
-        self._reading = PackReading()
+        self._activities, self._reading = Activities(), PackReading()
         self._outlook = Outlook(self.forecaster, battery, self.ahead)
         self._distrusted: tuple[str, ...] = ()
         p = model.parameters
@@ -103,6 +103,7 @@ class Estimator:
         self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, sag)
         self.forecaster.ageing = self.soc.ageing
         self._present = Present(self.forecaster, self.road, self._temperatures, self.soc, self._vibration)
+        self._teacher = RoadTeacher(self.road_load, self.road, self.signals, self._present, battery)
 
     @property
     def filter(self) -> SocFilter | None:
@@ -112,6 +113,11 @@ class Estimator:
     def vibration(self, now: float) -> float:
         """What effects read as ``vibration`` [m/s²] at `now` [s]: the typical value while it is not known."""
         return self._present.vibration(now)
+
+    def ridden_by(self, rider: str) -> None:
+        """`rider` rides from now on."""
+        self.forecaster.ridden_by(rider)
+        self.road_load.ridden_by(rider)
 
     # --- events -----------------------------------------------------------------------------------------------
 
@@ -207,6 +213,7 @@ class Estimator:
         learned = LEARNED_FROM if self.road.speed is not None else LEARNED_FROM.union(SpeedCheck.ROLES)
         if any(role in learned and role not in self._distrusted for role in distrusted):
             self.forecaster.forget(max(UNLEARNED, self.redundancy.odometer.compared))
+            self.road_load.unlearn()
         if any(role in AGED_FROM and role not in self._distrusted for role in distrusted):
             self.soc.ageing.unlearn()
         self._distrusted = distrusted
@@ -221,7 +228,7 @@ class Estimator:
         off = signals.key.get(now) == 0 or signals.contactor.get(now) == 0
         rider = signals.rider.get(now)
         if rider is not None and abs(self.road.speed or 0.0) < STANDSTILL:
-            self.forecaster.ridden_by(f"{rider:g}")
+            self.ridden_by(f"{rider:g}")
         self._activities.step(dt, self.road.speed, rate, signals.charge_plug.get(now), silent, off)
 
     def _ride(self, now: float, dt: float) -> None:
@@ -230,8 +237,11 @@ class Estimator:
         unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.redundancy.speeds.unsettled
         known = 0 < dt <= self._timing.pause and not unsure and self._activities.teaches
         if speed is None or reading.voltage is None or reading.current is None or not known:
-            self.forecaster.pause(dt if dt > self._timing.pause or self._activities.now is not Activity.RIDING else 0.0)
+            still = 0.0 if dt <= self._timing.pause and self._activities.now is Activity.RIDING else dt
+            self.forecaster.pause(still)
+            self.road_load.pause(still)
             return
+        second, before = self.forecaster.riding.second, self.forecaster.riding.speed_before
         self.ahead.ride(dt, speed, reading.voltage * reading.current)
         learned = self.forecaster.ride(
             dt,
@@ -242,6 +252,8 @@ class Estimator:
             self._present.effect_inputs(now),
             max((self._timing.periods[i] for i in self._speeds), default=0.0),
         )
+        if self.forecaster.riding.second is not second:  # it is complete
+            self._teacher.second(now, second, before, reading, self._distrusted)
         if learned and self.signals.cell_temperature.fresh(now):  # R0 is known only with it
             self.redundancy.currents.compare_consumption(self.forecaster.recent_factor)
 
@@ -313,6 +325,7 @@ class Estimator:
             "cell_temperature": self._temperatures.cells,
             "gyro_bias": [self.road.bias_x, self.road.bias_z],
             "riding": self.forecaster.snapshot() | {"on_routes": self.ahead.rider.snapshot()},
+            "learned": self.soc.ageing.snapshot() | {"road": self.road_load.snapshot()},
         }
 
     def wait(self, seconds: float) -> None:
@@ -321,13 +334,15 @@ class Estimator:
 
     def restore(self, saved: Mapping[str, Any], key: str, age: float | None) -> None:
         """Go on from a snapshot that is `age` [s] old (None: not known). ValueError if it does not fit, whole."""
-        restored = snapshot.read(saved, key, age, self.soc.effects, self.soc.ageing, self.forecaster.restore)
+        learning = self.soc.ageing, self.road_load
+        restored = snapshot.read(saved, key, age, self.soc.effects, learning, self.forecaster.restore)
         self.ahead.restore(saved["riding"].get("on_routes"))
         self.road.bias_x, self.road.bias_z = restored.gyro_bias
         if restored.cell_temperature is not None:
             self._temperatures.cells = restored.cell_temperature
         self.soc.restore(restored.battery, restored.age, restored.cell_effects)
         self.forecaster.pause(restored.age or 0.0)
+        self.road_load.rest(NEW_DAY if restored.age is None else restored.age)
 
 
 def _carrying(roles: Sequence[str], groups: Sequence[Group]) -> list[int]:

@@ -16,6 +16,7 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from math import pi
+from typing import NamedTuple
 
 from gz_onboard.constants import MILD
 from gz_onboard.physics.battery import HALF_FULL, Battery
@@ -55,6 +56,14 @@ class Conditions:
     ambient: float  # degC
     altitude: float  # m
     motor_temperature: float = WARM_MOTOR  # degC
+
+
+class Road(NamedTuple):
+    """What the road load is made with."""
+
+    mass: float  # kg, of all
+    rolling: float  # rolling_resistance_constant
+    drag: float  # m²
 
 
 @dataclass(frozen=True, slots=True)

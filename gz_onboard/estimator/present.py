@@ -31,6 +31,11 @@ class Present:
         motor = WARM_MOTOR if motor_temperature is None else motor_temperature
         return Conditions(self._temperatures.ambient(now), self._road.altitude or 0.0, motor)
 
+    @property
+    def time_moving(self) -> float:
+        """See `QUANTITIES` [s]."""
+        return self._forecaster.riding.time_moving
+
     def power(self, now: float) -> float:
         """What the pack gives [W]."""
         road = self._road
@@ -42,7 +47,7 @@ class Present:
         quantities = self._load.quantities(speed, acceleration, conditions)
         quantities["grade"] = grade
         if inputs := self.effect_inputs(now):
-            self._load.extend(quantities, inputs, conditions.ambient, self._forecaster.riding.time_moving)
+            self._load.extend(quantities, inputs, conditions.ambient, self.time_moving)
         return self._load.power(quantities)
 
     def power_of_prior(self, now: float) -> float:

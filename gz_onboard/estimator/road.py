@@ -36,8 +36,8 @@ LARGEST_SHARE = 0.5  # of the error corrected in one step, however long
 def accelerated(slow: float, speed: float, dt: float) -> tuple[float, float]:
     """(low-passed speed [m/s], acceleration [m/s²]) after `dt` [s], from the low-passed speed before."""
     if dt < SPEED_TIME:
-        slow += (speed - slow) * dt / SPEED_TIME
-        return slow, (speed - slow) / SPEED_TIME
+        rate = (speed - slow) / SPEED_TIME  # of the lag before this step, which is what a steady rate settles to
+        return slow + rate * dt, rate
     return speed, (speed - slow) / dt  # slow messages: the mean over the step
 
 

@@ -10,6 +10,7 @@ from typing import Any
 from gz_onboard.estimator.ageing import Ageing
 from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.road import MOST_BIAS
+from gz_onboard.estimator.road_load import RoadLoad
 from gz_onboard.estimator.start import Saved
 
 VERSION = (
@@ -38,11 +39,11 @@ def read(
     key: str,
     age: float | None,
     effects: CellEffects,
-    ageing: Ageing,
+    learning: tuple[Ageing, RoadLoad],
     restore_riding: Callable[[Mapping[str, Any]], None],
 ) -> Restored:
     """The snapshot `saved`, `age` [s] old, of the vehicle `key`; the riding, and what was learned of the
-    pack's age, are restored if the rest fits.
+    pack's age and of the road load, are restored if the rest fits.
 
     ValueError if it does not fit, whole.
     """
@@ -59,9 +60,12 @@ def read(
             raise ValueError("holds implausible numbers")
         states = effects.read(saved["cell_effects"])
         learned = saved.get("learned", {})  # states from before there was any have none
+        ageing, road_load = learning
         ageing.read(learned)
+        on_road = road_load.read(learned.get("road"))
         restore_riding(saved["riding"])
         ageing.restore(learned)
+        road_load.take(on_road)
     except (KeyError, TypeError, AttributeError, OverflowError) as error:
         raise ValueError(f"is damaged: {error!r}") from error
     cells = saved.get("cell_temperature")

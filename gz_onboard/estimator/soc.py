@@ -168,7 +168,6 @@ class StateOfCharge:
             "odometer": self._signals.odometer.last,
             "own_soc": self._signals.bms_state_of_charge.last,
             "cell_effects": dict(self.effects.states),
-            "learned": self.ageing.snapshot(),
         }
 
     def restore(self, saved: Saved, age: float | None, effects: dict[str, float]) -> None:

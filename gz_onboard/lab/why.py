@@ -40,10 +40,11 @@ def plot_why(log: Path, picture: Path) -> list[LogDamage]:
     Raises InputError, OSError.
     """
     damages: list[LogDamage] = []
-    names = ["time", "reference", "range", *(cause.name.lower() for cause in Cause if cause)]
+    names = {cause.name.lower(): 0.0 for cause in Cause if cause}  # logs of older versions lack the latest
     last = None
     for topic, _, values in read_samples(log, on_damage=damages.append):
-        numbers = [values.get(name) for name in names] if topic == WHY_TOPIC else [None]
+        every = dict.fromkeys(("time", "reference", "range")) | names | values
+        numbers = [every[name] for name in ("time", "reference", "range", *names)] if topic == WHY_TOPIC else [None]
         if all(isinstance(x, int | float) and isfinite(x) for x in numbers):
             time, reference, range_, *causes = (float(x) for x in numbers if x is not None)
             known = dict(zip((cause for cause in Cause if cause), causes, strict=True))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from gz_onboard.constants import GRAVITY
-from gz_onboard.estimator.road import RoadState
+from gz_onboard.estimator.road import RoadState, accelerated
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import ROLES
 
@@ -135,3 +135,11 @@ def test_distance_and_steady_turn_sign():
     road, _ = drive(100, hill)
     assert road.distance == pytest.approx(800, rel=0.01)
     assert tan(-atan(9 * 0.35 / GRAVITY)) < 0
+
+
+@pytest.mark.parametrize("dt", [0.02, 0.1, 0.25, 1.0])
+def test_a_steady_acceleration_is_shown_as_it_is_whatever_the_step(dt):
+    slow = shown = 0.0
+    for step in range(round(5 / dt)):
+        slow, shown = accelerated(slow, 1.2 * dt * (step + 1), dt)
+    assert shown == pytest.approx(1.2, rel=1e-6)

@@ -93,7 +93,7 @@ export default {
   "causes": {
     "temperature": "Temperatur", "speed": "Geschwindigkeit", "stops": "Stopps", "wind": "Wind", "climb": "Hügel",
     "turning": "Kurven", "auxiliaries": "Nebenverbraucher", "payload": "Zuladung", "age": "Alter der Batterie",
-    "charge": "Ladung", "riding": "kommende Fahrt", "unexplained": "ungeklärt"
+    "charge": "Ladung", "riding": "kommende Fahrt", "unexplained": "ungeklärt", "rolling": "Rollwiderstand", "drag": "Luftwiderstand"
   },
   "messages": {
     "RANGE_Estimate": "Reichweite", "RANGE_Energy": "Energie und Verbrauch",
