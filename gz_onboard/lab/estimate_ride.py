@@ -302,7 +302,7 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
     soc_start, soc_end = tally.soc_start or (None, None), tally.soc_end or (None, None)
     counts, status = pipeline.counts(), pipeline.status()
     states, reasons = tally.by_name()
-    drawn = tally.drawn if reasons[Reason.SIGNALS_SLOW.name] <= MOST_SLOW * states.total() else None
+    drawn = pipeline.drawn.net if reasons[Reason.SIGNALS_SLOW.name] <= MOST_SLOW * states.total() else None
     return RideSummary(
         file=str(ridden.source),
         log=str(log) if log else None,
@@ -314,7 +314,7 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         distance_km=last.distance * 1e-3,
         speed_max_km_h=times(tally.speed_max, 3.6),
         energy_wh=times(drawn, 1 / WH),
-        energy_recovered_wh=None if drawn is None else tally.recovered / WH,
+        energy_recovered_wh=None if drawn is None else pipeline.drawn.recovered / WH,
         consumption_wh_km=times(drawn, 1 / last.distance / WH_PER_KM) if last.distance >= 100 else None,
         soc_start=soc_start[0],
         soc_start_sd=soc_start[1],

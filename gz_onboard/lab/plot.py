@@ -65,10 +65,10 @@ def read_ride(
     status: Logged = {}
     for topic, time_ns, values in read_samples(log, on_damage=on_damage):
         if topic == ESTIMATE_TOPIC:
-            if _is_estimate(values):
+            if is_estimate(values):
                 rows.append(values)
                 times.append(time_ns)
-        elif topic == STATUS_TOPIC and _is_status(values):
+        elif topic == STATUS_TOPIC and is_status(values):
             status = values
     if not rows:
         raise InputError(
@@ -77,30 +77,32 @@ def read_ride(
     return rows, times, status
 
 
-def _is_estimate(values: Logged) -> bool:
+def is_estimate(values: Logged) -> bool:
     """Whether it is a row as we write them: others may write to a topic of this name, too."""
     if values.get("state") not in State.__members__ or not isinstance(values.get("reasons"), str):
         return False
     numbers = {name: values.get(name) for name in ESTIMATE_UNITS}
-    if not all(_is_number(value) for value in numbers.values() if value is not None):
+    if not all(is_number(value) for value in numbers.values() if value is not None):
         return False
     for together in (("soc", "soc_sd"), ("range", "range_p10", "range_p90")):
         if len({values.get(name, "") is None for name in together}) > 1 or not set(together) <= values.keys():
             return False
-    return _is_number(numbers["time"]) and _is_number(numbers["distance"])
+    return is_number(numbers["time"]) and is_number(numbers["distance"])
 
 
-def _is_status(values: Logged) -> bool:
+def is_status(values: Logged) -> bool:
+    """Likewise."""
     faults, lost, unknown = (values.get(name, {}) for name in ("faults", "lost", "unknown"))
     if not all(isinstance(counts, dict) for counts in (faults, lost, unknown)):
         return False
     places = faults.values()
     return all(isinstance(counts, dict) for counts in places) and all(
-        _is_number(n) for counts in (lost, *places) for n in counts.values()
+        is_number(n) for counts in (lost, *places) for n in counts.values()
     )
 
 
-def _is_number(value: object) -> bool:
+def is_number(value: object) -> bool:
+    """Whether it is a finite number of a size that quantities have."""
     return isinstance(value, int | float) and isfinite(value) and abs(value) < 1e15
 
 
