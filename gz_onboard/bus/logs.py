@@ -184,10 +184,10 @@ def read_attachments(path: str | Path) -> dict[str, bytes]:
     return mcap.attachments(*own) if own else {}
 
 
-def read_metadata(path: str | Path) -> dict[str, str]:
-    """The metadata of one of our own logs (vehicle, version, ...); of other formats none."""
+def read_metadata(path: str | Path, record: str = "gz_onboard") -> dict[str, str]:
+    """The metadata of one of our own logs (vehicle, version, ...), or another record of it; of other formats none."""
     own = _own(path)
-    return mcap.metadata(*own) if own else {}
+    return mcap.metadata(*own, record) if own else {}
 
 
 def json_channels(path: str | Path) -> dict[str, tuple[bytes, dict[str, str]]]:
