@@ -8,6 +8,7 @@ from gz_onboard.api.calibrations import Calibration, calibrate
 from gz_onboard.api.discoveries import Discovered, discover
 from gz_onboard.api.estimates import EstimatedRide, LoggedEstimates, estimate, read_estimates, summary_table
 from gz_onboard.api.given import read_ride, read_vehicle
+from gz_onboard.api.histories import AddedRides, History, add_to_history, read_history
 from gz_onboard.api.simulations import SimulatedRide, simulate
 from gz_onboard.api.validations import Validated, validate
 from gz_onboard.errors import InputError
@@ -17,10 +18,12 @@ from gz_onboard.simulation.plan import SimulationOptions
 from gz_onboard.vehicle import Vehicle
 
 __all__ = [
+    "AddedRides",
     "Calibration",
     "Discovered",
     "DiscoveryOptions",
     "EstimatedRide",
+    "History",
     "InputError",
     "LoggedEstimates",
     "Samples",
@@ -28,10 +31,12 @@ __all__ = [
     "SimulationOptions",
     "Validated",
     "Vehicle",
+    "add_to_history",
     "calibrate",
     "discover",
     "estimate",
     "read_estimates",
+    "read_history",
     "read_ride",
     "read_vehicle",
     "simulate",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, TextIO
@@ -26,7 +26,7 @@ from gz_onboard.offline.samples import facts_of, ride_name
 from gz_onboard.options import add_shared
 from gz_onboard.progress import Progress, progress_bar
 from gz_onboard.routes.ahead import read_ahead
-from gz_onboard.vehicle import find_vehicle
+from gz_onboard.vehicle import Vehicle, find_vehicle
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class LogRides:
 
 
 @dataclass
-class Added:
+class AddedRides:
     """What ``history add --json`` writes, as it grows."""
 
     file: Annotated[str, "the history"]
@@ -80,7 +80,8 @@ def run(arguments: argparse.Namespace, file: Path) -> int:
     known_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
     with Store(file, begin=True) as store:
         seen = set() if arguments.replace else store.known_logs()
-        tasks, known, failed = _tasks(logs, seen, arguments)
+        given = arguments.vehicle, arguments.payload, arguments.name, arguments.route
+        tasks, known, failed = new_tasks(logs, seen, *given)
         paths = [task.path for task in tasks]
         with progress_bar(lambda: expected_frames(paths), "frames", quiet=arguments.quiet) as display:
             spoken = arguments.json != "-"
@@ -88,9 +89,9 @@ def run(arguments: argparse.Namespace, file: Path) -> int:
                 display.print(f"gz-onboard history: {failure.error}", sys.stderr)
             for path in known if spoken else ():
                 display.print(f"{path}: was read before", sys.stdout)
-            done = Added(str(file), [], known, [], 0, failed)
+            done = AddedRides(str(file), [], known, [], 0, failed)
             results = over_rides(log_rides, tasks, arguments.jobs, display.update)
-            for text, stream in _kept(store, results, done, arguments.replace):
+            for text, stream in keep(store, results, done, arguments.replace):
                 if spoken or stream is sys.stderr:
                     display.print(text, stream)
     write_json(arguments.json, HISTORY_VERSION, done)
@@ -99,8 +100,8 @@ def run(arguments: argparse.Namespace, file: Path) -> int:
     return BAD_INPUT if done.failed else OK
 
 
-def _tasks(
-    logs: Sequence[Path], seen: set[tuple[str, str]], arguments: argparse.Namespace
+def new_tasks(
+    logs: Sequence[Path], seen: set[tuple[str, str]], vehicle: str, payload: float | None, name: str, route: Path | None
 ) -> tuple[list[HistoryTask], list[str], list[Failure]]:
     """(a task for each log that is not yet known, those that are, those that cannot be read)."""
     tasks, known, failed = [], [], []
@@ -110,17 +111,16 @@ def _tasks(
         except InputError as error:
             failed.append(Failure(str(log), str(error)))
             continue
-        if (digest, arguments.name) in seen:
+        if (digest, name) in seen:
             known.append(str(log))
             continue
-        seen = seen | {(digest, arguments.name)}
-        given = arguments.vehicle, arguments.payload, False, digest, arguments.name, arguments.route
-        tasks.append(HistoryTask(log, Path(ride_name(log)), *given))
+        seen = seen | {(digest, name)}
+        tasks.append(HistoryTask(log, Path(ride_name(log)), vehicle, payload, False, digest, name, route))
     return tasks, known, failed
 
 
-def _kept(
-    store: Store, results: Iterable[tuple[HistoryTask, LogRides | InputError]], done: Added, again: bool
+def keep(
+    store: Store, results: Iterable[tuple[HistoryTask, LogRides | InputError]], done: AddedRides, again: bool = False
 ) -> Iterator[tuple[str, TextIO]]:
     """Keep the rides of each log; gives what is to be said of it, and where. done: what grows."""
     for task, result in results:
@@ -154,6 +154,11 @@ def _said(log: Path, kept: Kept) -> Iterator[str]:
 
 def log_rides(task: HistoryTask, progress: Progress | None = None) -> LogRides:
     """The rides in a log: of its estimates, or, of one that has none, of its frames. Raises InputError."""
+    return rides_in(task, lambda: known_vehicle(task.vehicle, task.payload), progress)
+
+
+def rides_in(task: HistoryTask, vehicle_of: Callable[[], Vehicle], progress: Progress | None = None) -> LogRides:
+    """As `log_rides`; vehicle_of: gives the vehicle whose frames are in the log."""
     damages: list[str] = []
     facts = facts_of(task.path)
     if log_suffix(task.path) == ".mcap":
@@ -171,7 +176,7 @@ def log_rides(task: HistoryTask, progress: Progress | None = None) -> LogRides:
                 facts,
             )
             return LogRides(rides_of(moments, whys, about), damages[0] if damages else None)
-    vehicle = known_vehicle(task.vehicle, task.payload)
+    vehicle = vehicle_of()
     road = read_ahead(task.route)[1] if task.route else None
     log = KeptRows()
     ridden = ride_through(open_estimate(task.path, vehicle), How(route=road), log, progress)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from dataclasses import dataclass
 from datetime import datetime, timedelta
@@ -11,6 +12,7 @@ from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.lab.history.store import Store
 from gz_onboard.lab.history.totals import NumberedRide, whole_rides
 
+FILE = Path("gz-onboard/history.sqlite")
 _PERIOD = re.compile(r"(\d{4})(?:-(\d{1,2})(?:-(\d{1,2}))?)?")
 
 
@@ -88,3 +90,16 @@ def read_rides(file: Path, choice: Choice) -> tuple[list[NumberedRide], int]:
     chosen = [one for one in rides if choice.has(one)]
     left_out = sum(not one.ride.dated for one in rides) if choice.by_date else 0
     return chosen, left_out
+
+
+def default_file() -> Path:
+    """The state directory of a service, else the user's data as the XDG base directories say. InputError if neither."""
+    if state := os.environ.get("STATE_DIRECTORY", "").split(":")[0]:
+        return Path(state) / FILE.name
+    data = Path(os.environ.get("XDG_DATA_HOME", ""))
+    if data.is_absolute():  # others are to be ignored
+        return data / FILE
+    try:
+        return Path.home() / ".local/share" / FILE
+    except RuntimeError as error:
+        raise InputError("--file: is missing, and there is no home directory to keep the history in") from error

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 
-from gz_onboard.errors import OK, InputError
+from gz_onboard.errors import OK
 from gz_onboard.lab.history import add, show
+from gz_onboard.lab.history.choice import FILE, default_file
 from gz_onboard.lab.history.store import Store
 from gz_onboard.lab.history.text import ride_text
 from gz_onboard.options import number
 
-FILE = Path("gz-onboard/history.sqlite")
 _MOST_RIDES = 10**12
 
 
@@ -45,16 +44,3 @@ def _add_remove(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard history remove``."""
     kind = number("NUMBER", 1, _MOST_RIDES, kind=int)
     parser.add_argument("numbers", nargs="+", type=kind, metavar="NUMBER", help="of a ride, as `history show` has it")
-
-
-def default_file() -> Path:
-    """The state directory of a service, else the user's data as the XDG base directories say. InputError if neither."""
-    if state := os.environ.get("STATE_DIRECTORY", "").split(":")[0]:
-        return Path(state) / FILE.name
-    data = Path(os.environ.get("XDG_DATA_HOME", ""))
-    if data.is_absolute():  # others are to be ignored
-        return data / FILE
-    try:
-        return Path.home() / ".local/share" / FILE
-    except RuntimeError as error:
-        raise InputError("--file: is missing, and there is no home directory to keep the history in") from error

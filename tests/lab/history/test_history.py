@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -16,7 +17,7 @@ COASTDOWN = LOGS / "coastdown.blf"
 
 
 @pytest.fixture(scope="module")
-def estimated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, object]]:
+def estimated(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """(the log of estimates of a ride, what ``estimate`` said of it)."""
     folder = tmp_path_factory.mktemp("estimated")
     said = folder / "said.json"
@@ -29,12 +30,10 @@ def history(file: Path, part: str, *arguments: object) -> int:
     return main(["history", part, *map(str, arguments), "--file", str(file)])
 
 
-def added(
-    capsys: pytest.CaptureFixture[str], file: Path, *arguments: object, status: int = 0
-) -> dict[str, list[object]]:
+def added(capsys: pytest.CaptureFixture[str], file: Path, *arguments: object, status: int = 0) -> dict[str, list[Any]]:
     """What ``history add --json`` says."""
     assert history(file, "add", *arguments, "--json", "--jobs", "1") == status
-    said: dict[str, list[object]] = json.loads(capsys.readouterr().out)
+    said: dict[str, list[Any]] = json.loads(capsys.readouterr().out)
     return said
 
 
