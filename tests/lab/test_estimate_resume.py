@@ -15,25 +15,11 @@ from typing import Any
 
 import pytest
 
-from gz_onboard.bus.export import write_frames_as
-from gz_onboard.bus.logs import read_frames
 from gz_onboard.cli import main
 from gz_onboard.lab import estimate_log
 from gz_onboard.vehicle import find_vehicle
-from tests.support import HEARS_CTRL_C, LOGS
-
-ENOUGH = 4000  # frames, of some seconds
-
-
-def short_log(file: Path, frames: int = ENOUGH) -> Path:
-    """The beginning of a recorded ride."""
-    begin: list[list[Any]] = []
-    for batch in read_frames(LOGS / "coastdown.blf"):
-        begin.append(batch)
-        if sum(map(len, begin)) >= frames:
-            break
-    write_frames_as(file, file.suffix, iter(begin))
-    return file
+from tests.lab.short_logs import ENOUGH, short_log
+from tests.support import HEARS_CTRL_C
 
 
 def run(folder: Path, *arguments: object) -> list[dict[str, Any]]:

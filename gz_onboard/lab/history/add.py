@@ -96,7 +96,7 @@ def run(arguments: argparse.Namespace, file: Path) -> int:
                     display.print(text, stream)
     write_json(arguments.json, HISTORY_VERSION, done)
     if spoken:
-        print(f"{len(done.rides)} rides added to {file}")
+        print(f"{len(done.rides)} {'ride' if len(done.rides) == 1 else 'rides'} added to {file}")
     return BAD_INPUT if done.failed else OK
 
 

@@ -68,7 +68,7 @@ def moments_of(samples: Iterable[tuple[str, int, Logged]]) -> tuple[list[Moment]
             moments[-1].status = values
             if _is_ride(values.get("ride")):
                 moments[-1].ride = values["ride"]
-        elif topic == WHY_TOPIC:
+        elif topic == WHY_TOPIC and is_number(values.get("time")) and is_number(values.get("reference")):
             whys.append(values)
     return moments, whys
 
@@ -144,7 +144,7 @@ def _ride(moments: Sequence[Moment], whys: Sequence[Logged], about: About, date:
     if first["time"] < _FIRST:  # of the sums' beginning, before the first estimate
         first = dict.fromkeys(first, 0.0)
     drawn, recovered = (_difference(first, last, key, 1 / WH) for key in ("energy", "energy_recovered"))
-    told = [why for why in whys if first["time"] <= why.get("time", -1.0) <= last["time"] + _LONGEST_STEP]
+    told = [why for why in whys if first["time"] <= why["time"] <= last["time"] + _LONGEST_STEP]
     ambient, rider = (_known(moment.ride.get(key) for moment in moments) for key in ("ambient_temperature", "rider"))
     length = round((last["distance"] - first["distance"]) * 1e-3, 5)
     return KeptRide(
@@ -156,7 +156,7 @@ def _ride(moments: Sequence[Moment], whys: Sequence[Logged], about: About, date:
         energy_recovered_wh=None if drawn is None else recovered,
         consumption_wh_km=round(drawn / length, 3) if drawn is not None and length else None,
         **_charge_and_range(moments),
-        rated_range_km=times(told[-1].get("reference"), 1e-3) if told else None,
+        rated_range_km=round(told[-1]["reference"] * 1e-3, 3) if told else None,
         ambient_C=_mean(ambient) if ambient else about.facts.get("ambient_C"),
         cells_C=_mean(_known(moment.estimate.get("cell_temperature") for moment in moments)),
         **_on_route(moments, about.route),

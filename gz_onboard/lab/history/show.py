@@ -63,7 +63,7 @@ def run(arguments: argparse.Namespace, file: Path) -> int:
     shown = overviews(rides)
     if arguments.json != "-":
         parts = [overview_text(overview, arguments.rides) for overview in shown]
-        print("\n\n".join(parts) if parts else f"{file}: no such ride")
+        print("\n\n".join(parts) if parts else f"{file}: no ride")
     if undated:
         print(f"gz-onboard history: {undated} without a date left out: their logs' clock was not set", file=sys.stderr)
     write_json(arguments.json, HISTORY_VERSION, {"file": str(file), "vehicles": [_in_json(each) for each in shown]})

@@ -16,12 +16,16 @@ from types import TracebackType
 from typing import Any, Self, get_args
 
 from gz_onboard.errors import InputError, near_file
-from gz_onboard.lab.history.ride import COLUMNS, KeptRide, covers, overlap, same_ride
+from gz_onboard.lab.history.ride import COLUMNS, SECOND_NS, KeptRide, covers, overlap, same_ride
+from gz_onboard.offline.results import FIRST_DATE_NS
 
 APPLICATION = 0x677A6F62  # "gzob", as the header of the file has it
 SCHEMA = 1
 WAIT = 60.0  # s for another process to end its transaction, which takes milliseconds
 
+_SELECT = f"SELECT id, {', '.join(COLUMNS)} FROM rides"
+_NEAR_NS = 48 * 3600 * SECOND_NS  # no ride is longer, and no two zones of time are further apart
+_LAST_NS = 2**63 - 1
 _SQL = {str: "TEXT", int: "INTEGER", float: "REAL"}
 _REFUSED = ("SQLITE_CANTOPEN", "SQLITE_READONLY", "SQLITE_PERM", "SQLITE_AUTH")
 _BROKEN = ("SQLITE_CORRUPT", "SQLITE_ERROR", "SQLITE_MISMATCH")  # SQLITE_ERROR: a table or column is not there
@@ -83,7 +87,7 @@ class Store:
     def rides(self) -> list[tuple[int, KeptRide]]:
         """All rides with their numbers, by vehicle and start."""
         with _understood(self.file):
-            rows = self._db.execute(f"SELECT id, {', '.join(COLUMNS)} FROM rides ORDER BY vehicle, start_ns, id")
+            rows = self._db.execute(f"{_SELECT} ORDER BY vehicle, start_ns, id")
             return [(row[0], KeptRide(*row[1:])) for row in rows]
 
     def known_logs(self) -> set[tuple[str, str]]:
@@ -99,9 +103,8 @@ class Store:
         """
         with self._transaction():
             found = _Found()
-            there = self._rides_of({ride.vehicle for ride in rides})
             for ride in rides:
-                _sort(ride, there, found, replace)
+                _sort(ride, self._near(ride), found, replace)
             self._db.executemany("DELETE FROM rides WHERE id = ?", [(number,) for number in sorted(found.obsolete)])
             marks = ", ".join("?" * len(COLUMNS))
             insert = f"INSERT INTO rides ({', '.join(COLUMNS)}) VALUES ({marks})"
@@ -124,8 +127,14 @@ class Store:
             self._db.executemany("DELETE FROM rides WHERE id = ?", [(number,) for number in numbers])
         return [there[number] for number in numbers]
 
-    def _rides_of(self, vehicles: set[str]) -> dict[int, KeptRide]:
-        return {number: ride for number, ride in self.rides() if ride.vehicle in vehicles}
+    def _near(self, ride: KeptRide) -> dict[int, KeptRide]:
+        """The rides of its vehicle, by number, that may be the same or at the same time."""
+        begin, end = ride.start_ns - _NEAR_NS, ride.end_ns + _NEAR_NS
+        if not ride.dated:
+            begin, end = 0, _LAST_NS
+        where = "vehicle = ? AND (start_ns < ? OR start_ns BETWEEN ? AND ?)"
+        rows = self._db.execute(f"{_SELECT} WHERE {where} ORDER BY id", (ride.vehicle, FIRST_DATE_NS, begin, end))
+        return {row[0]: KeptRide(*row[1:]) for row in rows}
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
@@ -155,6 +164,9 @@ class Store:
                 f"{self.file}: is by schema {schema}, of {older} gz-onboard; this one has {SCHEMA}. Nothing was "
                 "changed; use that gz-onboard, or another --file"
             )
+        if begin:
+            with self._transaction():  # whether it can be written is said before the work
+                pass
 
     def _empty(self) -> bool:
         tables = self._db.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
@@ -173,21 +185,18 @@ class Store:
 
 
 def _sort(ride: KeptRide, there: dict[int, KeptRide], found: _Found, replace: bool) -> None:
-    """Say of `ride` what it is beside those that are `there`, of which it takes the place of some."""
-    others = {number: other for number, other in there.items() if other.vehicle == ride.vehicle}
-    same = {number: other for number, other in others.items() if same_ride(other, ride)}
-    same |= {n: other for n, other in others.items() if overlap(other, ride) and covers(other, ride)}
-    parts = {n: other for n, other in others.items() if overlap(other, ride) and covers(ride, other)}
-    clash = {n: other for n, other in others.items() if overlap(other, ride)}.keys() - same.keys() - parts.keys()
-    if same and not replace:
-        found.known.append((ride, next(iter(same.values()))))
-    elif clash:
+    """Say what `ride` is beside those that are `there`, of which it takes the place of some."""
+    together = {number: other for number, other in there.items() if overlap(other, ride)}
+    parts = {number for number, other in together.items() if covers(ride, other)}
+    wholes = {number for number, other in together.items() if covers(other, ride)}
+    same = {number for number, other in there.items() if same_ride(other, ride)} | (parts & wholes)
+    if known := (wholes - same if replace else wholes | same):
+        found.known.append((ride, there[min(known)]))
+    elif clash := together.keys() - parts - same:
         found.clashes.append((ride, there[min(clash)]))
     else:
         found.added.append(ride)
-        found.obsolete |= same.keys() | parts.keys()
-        for number in same.keys() | parts.keys():
-            del there[number]
+        found.obsolete |= parts | same
 
 
 def _column(kind: Any) -> str:
