@@ -11,7 +11,8 @@ from pathlib import Path
 from gz_onboard.constants import WH
 from gz_onboard.events import TOLD, Activity, State, words
 from gz_onboard.lab.estimate import summary_rows
-from gz_onboard.lab.plot import Logged, column, spans, with_holes
+from gz_onboard.lab.logged import Logged
+from gz_onboard.lab.plot import column, spans, with_holes
 from gz_onboard.lab.report_charts import Abscissa, Curve, bar, chart, key, strip
 from gz_onboard.lab.report_ride import ReportedRide
 from gz_onboard.lab.report_svg import axis_of, draw_map

@@ -87,8 +87,9 @@ def run(arguments: argparse.Namespace, file: Path) -> int:
             spoken = arguments.json != "-"
             for failure in failed:
                 display.print(f"gz-onboard history: {failure.error}", sys.stderr)
-            for path in known if spoken else ():
-                display.print(f"{path}: was read before", sys.stdout)
+            if known and spoken:
+                more = f" and {len(known) - 1} more: were" if known[1:] else ": was"
+                display.print(f"{known[0]}{more} read before", sys.stdout)
             done = AddedRides(str(file), [], known, [], 0, failed)
             results = over_rides(log_rides, tasks, arguments.jobs, display.update)
             for text, stream in keep(store, results, done, arguments.replace):

@@ -16,7 +16,7 @@ from gz_onboard.constants import WH
 from gz_onboard.estimator.drawn import Drawn
 from gz_onboard.events import Activity, RouteState, State
 from gz_onboard.lab.history.ride import SECOND_NS, KeptRide
-from gz_onboard.lab.plot import Logged, is_estimate, is_number, is_status
+from gz_onboard.lab.logged import Logged, is_estimate, is_number, is_status
 from gz_onboard.log_rows import ESTIMATE_TOPIC, RIDE_UNITS, STATUS_TOPIC, WHY_TOPIC
 from gz_onboard.offline.results import FIRST_DATE_NS, times
 
