@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     ):
         part = parts.add_parser(name, help=about, description=about, allow_abbrev=False)
         declare(part)
-        text = f"the history (default: {FILE.name} in the folder gz-onboard of $STATE_DIRECTORY or ~/.local/share)"
+        text = f"the history (default: {FILE.name} in $STATE_DIRECTORY, or in ~/.local/share/gz-onboard)"
         part.add_argument("--file", type=Path, metavar="SQLITE", help=text)
 
 
