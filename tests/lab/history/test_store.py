@@ -145,14 +145,15 @@ def test_a_disk_that_takes_no_more(capsys, tmp_path, file, log):
 
 def test_two_processes_write_at_once(tmp_path, log):
     file, (one,) = tmp_path / "new.sqlite", rides_in(log)
-    writers = [SPAWN.Process(target=add_many, args=(file, one, name, 20)) for name in "ab"]
+    together = SPAWN.Barrier(2)
+    writers = [SPAWN.Process(target=add_many, args=(file, one, name, 100, together)) for name in "ab"]
     for writer in writers:
         writer.start()
     for writer in writers:
         writer.join(200)
         assert writer.exitcode == 0
     with Store(file) as store:
-        assert sorted(one.vehicle for _, one in store.rides()) == ["a"] * 60 + ["b"] * 60
+        assert sorted(one.vehicle for _, one in store.rides()) == ["a"] * 300 + ["b"] * 300
 
 
 def test_a_process_that_is_killed_leaves_whole_logs(tmp_path, log):
