@@ -9,6 +9,7 @@ import signal
 import sqlite3
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing, suppress
 from pathlib import Path
 
@@ -156,6 +157,20 @@ def test_two_processes_write_at_once(tmp_path, log):
         assert sorted(one.vehicle for _, one in store.rides()) == ["a"] * 300 + ["b"] * 300
 
 
+def test_one_waits_while_another_writes(file, log):
+    """And does not look before it may write: the other could not end, and what was seen would be of before."""
+    (one,) = rides_in(log)
+    with closing(sqlite3.connect(file, 1, isolation_level=None)) as other, ThreadPoolExecutor(1) as thread:
+        other.execute("BEGIN IMMEDIATE")
+        other.execute("DELETE FROM rides")
+        waiting = thread.submit(add_many, file, one, "scooter", 1)
+        assert not wait([waiting], 0.3).done  # it looks, if it is going to
+        other.execute("COMMIT")
+        waiting.result(200)
+    with Store(file) as store:
+        assert len(store.rides()) == 3
+
+
 def test_a_process_that_is_killed_leaves_whole_logs(tmp_path, log):
     file, (one,) = tmp_path / "new.sqlite", rides_in(log)
     writer = SPAWN.Process(target=add_many, args=(file, one, "a", 100_000))
@@ -175,7 +190,8 @@ def test_a_process_that_is_killed_leaves_whole_logs(tmp_path, log):
         assert rides % 3 == 0
         assert len(store.known_logs()) == rides // 3
         assert store._db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-    add_many(file, one, "a", rides // 3 + 2)
+    add_many(file, one, "a", 2)
+    add_many(file, one, "b", 2)
     with Store(file) as store:
         assert len(store.rides()) == rides + 6
 
