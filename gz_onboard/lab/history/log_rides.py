@@ -26,6 +26,12 @@ LEAST_DISTANCE = 100.0  # m: less is no ride
 _LONGEST_STEP = 10.0  # s between two estimates of which voltage and current tell the energy
 _FIRST = 1.5  # s: the first estimate of a run is not later
 _LEARNED = {"": "factor", "_sd": "sd", "_share": "share"}  # the ends of our names, and what a log calls them
+_USED = (  # of an estimate
+    *("time", "distance", "activity", "state", "reasons", "distrusted", "route_state", "cell_temperature"),
+    *("soc", "soc_sd", "range", "range_p10", "range_p90"),
+)
+_STATUS = ("faults", "lost", "kernel_lost", "overrun", "learned")
+_RIDE = (*RIDE_UNITS, "rider")
 _STANDS = (Activity.PARKED.name, Activity.ASLEEP.name, Activity.CHARGING.name)
 _RANGED = tuple(state.name for state in KNOWN)
 
@@ -63,11 +69,14 @@ def moments_of(samples: Iterable[tuple[str, int, Logged]]) -> tuple[list[Moment]
             drawn.add(values["time"], values.get("pack_voltage"), values.get("pack_current"))
             ride = {key: values[key] for key in ("time", "distance")}
             ride |= {"energy": drawn.net, "energy_recovered": drawn.recovered}  # of a log whose status does not say it
-            moments.append(Moment(time_ns, values, moments[-1].status if moments else {}, ride))
+            estimate = {key: values.get(key) for key in _USED}
+            moments.append(Moment(time_ns, estimate, moments[-1].status if moments else {}, ride))
         elif topic == STATUS_TOPIC and moments and is_status(values):
-            moments[-1].status = values
+            status = {key: values[key] for key in _STATUS if key in values}
+            if status != moments[-1].status:  # mostly nothing has changed, and six hours are held in memory
+                moments[-1].status = status
             if _is_ride(values.get("ride")):
-                moments[-1].ride = values["ride"]
+                moments[-1].ride = {key: values["ride"].get(key) for key in _RIDE}
         elif topic == WHY_TOPIC and is_number(values.get("time")) and is_number(values.get("reference")):
             whys.append(values)
     return moments, whys
