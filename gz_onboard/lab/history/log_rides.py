@@ -93,16 +93,13 @@ def _spans(moments: Sequence[Moment]) -> Iterator[tuple[int, int]]:
     """(first, last + 1) of the moments of each ride."""
     begin, riding = 0, False
     for first, last, stands in _stretches(moments):
-        if stands and _ends_a_ride(moments[first : last + 1]):
-            if riding:
-                yield begin, first + 1
-            begin, riding = last, False
-        elif first and _elapsed(moments[first - 1], moments[first]) > BREAK:  # a hole in the log
-            if riding:
-                yield begin, first
-            begin, riding = first, not stands
-        else:
-            riding = riding or not stands
+        hole = first > 0 and _elapsed(moments[first - 1], moments[first]) > BREAK  # in the log
+        over = stands and _ends_a_ride(moments[first : last + 1])
+        if riding and (hole or over):
+            yield begin, first if hole else first + 1  # what was drawn until the stand began belongs to the ride
+        if hole or over:
+            begin, riding = last if over else first, False
+        riding = riding or not stands
     if riding:
         yield begin, len(moments)
 

@@ -76,6 +76,13 @@ def test_a_hole_in_a_log_ends_a_ride_if_it_is_long(tmp_path):
         )
 
 
+def test_what_a_hole_hides_before_a_stand_is_no_ride(tmp_path):
+    samples = list(read_samples(write_log(tmp_path / "a.mcap", [ride(2000), stand(1000)])))
+    (found,) = rides_of(*moments_of(samples[:200] + samples[-300:]), ABOUT)
+    assert found.distance_km == pytest.approx(5.0, abs=0.051)
+    assert found.duration_s == pytest.approx(500, abs=6)
+
+
 @pytest.mark.parametrize(
     "status",
     [{"ride": 7, "learned": []}, {"ride": {"rider": "x"}}, {"learned": {"capacity": {"factor": "old"}}}, {"ride": {}}],
