@@ -42,7 +42,7 @@ def read_ride(
 
 def is_estimate(values: Logged) -> bool:
     """Whether it is a row as we write them: others may write to a topic of this name, too."""
-    if values.get("state") not in State.__members__ or not isinstance(values.get("reasons"), str):
+    if values.get("state") not in tuple(State.__members__) or not isinstance(values.get("reasons"), str):
         return False
     numbers = {name: values.get(name) for name in ESTIMATE_UNITS}
     if not all(is_number(value) for value in numbers.values() if value is not None):

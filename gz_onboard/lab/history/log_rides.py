@@ -238,13 +238,14 @@ def _seconds_in(moments: Sequence[Moment], state: State) -> float:
 
 def _words(moments: Sequence[Moment], key: str) -> str:
     """The names in a text of the estimates, each once."""
-    return " ".join(dict.fromkeys(word for moment in moments for word in (moment.estimate.get(key) or "").split()))
+    texts = [text for moment in moments if isinstance(text := moment.estimate[key], str)]
+    return " ".join(dict.fromkeys(word for text in texts for word in text.split()))
 
 
 def _dropped(status: Logged) -> int:
-    return sum(sum(places.values()) for places in status.get("faults", {}).values())
+    return int(sum(sum(places.values()) for places in status.get("faults", {}).values()))
 
 
 def _lost(status: Logged) -> int:
     counts = [*status.get("lost", {}).values(), *(status.get(name, 0) for name in ("kernel_lost", "overrun"))]
-    return int(sum(counts))
+    return int(sum(count for count in counts if is_number(count)))

@@ -18,6 +18,7 @@ from tests.lab.history.logs import CURRENT, NOON, SPEED, STEP, VOLTAGE, Told, ri
 from tests.support import S
 
 HOUR = 3600 * S
+HOSTILE: tuple[object, ...] = (None, [], {}, True, "x", 2**70)
 ABOUT = About("scooter", "", Path("a.mcap"), "", None, None, {})
 
 
@@ -93,6 +94,17 @@ def test_a_status_of_somebody_else_is_passed_over(tmp_path, status):
     (found,) = rides_of(*moments_of(others), ABOUT)
     assert found.distance_km == pytest.approx(1.0, abs=0.051)
     assert found.capacity is None
+
+
+def test_values_that_are_none(tmp_path):
+    """Of a log that somebody else wrote, or changed: what cannot be is not kept."""
+    samples = list(read_samples(write_log(tmp_path / "a.mcap", [ride(400)])))
+    with Store(tmp_path / "h.sqlite", begin=True) as store:
+        for key in "state", "activity", "distrusted", "route_state", "faults", "kernel_lost", "learned":
+            for value in HOSTILE:
+                changed = [(topic, time, values | {key: value}) for topic, time, values in samples[60:]]
+                (found,) = rides_of(*moments_of(samples[:60] + changed), ABOUT)
+                store.add("", "", [found], replace=True)
 
 
 def test_what_is_doubtful_is_told(tmp_path):
