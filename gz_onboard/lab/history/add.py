@@ -118,7 +118,8 @@ def new_tasks(
             known.append(str(log))
             continue
         seen = seen | {(digest, name)}
-        tasks.append(HistoryTask(log, Path(ride_name(log)), vehicle, payload, False, digest, name, route))
+        given = vehicle, payload, False
+        tasks.append(HistoryTask(log, Path(ride_name(log)), *given, digest=digest, name=name, route=route))
     return tasks, known, failed
 
 

@@ -20,7 +20,7 @@ from gz_onboard.lab.history.text import HISTORY_VERSION, overview_text
 from gz_onboard.lab.history.totals import LearnedAt, NumberedRide, Overview, Totals, overviews
 from gz_onboard.offline.results import explain_keys, write_json
 from gz_onboard.offline.schema import descriptions
-from gz_onboard.offline.style import save
+from gz_onboard.offline.style import picture_format, save
 from gz_onboard.options import add_shared
 
 _KINDS: dict[str, type] = {"number": int, **{name: (get_args(kind) or (kind,))[0] for name, kind in COLUMNS.items()}}
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--rides", action="store_true", help="list all rides, not only the latest")
     add_shared(parser, "--json")
     add("--table", type=Path, metavar="FILE", help=f"also write the rides as a table: {' '.join(FORMATS)}")
-    add("--plot", type=Path, metavar="PNG", help="also draw consumption, temperature, capacity and resistance")
+    add("--plot", type=Path, metavar="PICTURE", help="also draw consumption, temperature, capacity and resistance")
 
 
 def run(arguments: argparse.Namespace, file: Path) -> int:
@@ -81,8 +81,8 @@ def _check(arguments: argparse.Namespace, file: Path) -> None:
     not_an_input([arguments.json, arguments.table, arguments.plot], [file])
     if arguments.table:
         check_table(arguments.table)
-    if arguments.plot and arguments.plot.suffix.lower() != ".png":
-        raise InputError(f"--plot {arguments.plot}: the picture's name has to end in .png")
+    if arguments.plot:
+        picture_format(arguments.plot)
     require("matplotlib", arguments.plot is not None)
 
 
