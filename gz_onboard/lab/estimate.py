@@ -66,7 +66,12 @@ def run(arguments: argparse.Namespace) -> int:
     ) as display:
         results = _results(tasks, arguments.jobs, display.update)
         text = None if arguments.json == "-" else summary_text
-        rides, failed = collect("estimate", results, display, text, lambda ride: ride.damage)
+        try:
+            rides, failed = collect("estimate", results, display, text, lambda ride: ride.damage)
+        except KeyboardInterrupt:
+            if len(tasks) > 1:
+                display.print("gz-onboard estimate: interrupted; --resume goes on after what is written", sys.stderr)
+            raise
     write_json(arguments.json, SUMMARY_VERSION, {"rides": rides, "failed": failed})
     if arguments.table:
         write_summaries(arguments.table, rides, failed)
@@ -79,12 +84,6 @@ def _results(
     """Each task with its summary or its error, in order."""
     try:
         yield from over_rides(estimate_log, tasks, jobs, progress)
-    except KeyboardInterrupt:
-        if len(tasks) > 1:
-            print(
-                "gz-onboard estimate: interrupted; --resume goes on after the rides that are written", file=sys.stderr
-            )
-        raise
     finally:
         for task in tasks:  # of processes that were stopped
             with contextlib.suppress(OSError):  # no such folder; why was reported

@@ -127,10 +127,10 @@ def test_a_run_that_was_interrupted_goes_on(tmp_path):
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=100)
     assert not list(tmp_path.glob("*.part"))
-    if process.returncode:  # else it was faster than the signal
+    made = [file.name for file in tmp_path.glob("*.estimate.mcap")]
+    if len(made) < 4:  # else it was faster than the signal
         assert process.returncode == 130
         assert "--resume" in err
-    made = [file.name for file in tmp_path.glob("*.estimate.mcap")]
     rides = run(tmp_path, "--no-plot", "--resume")
     assert len(rides) == 4
     assert [Path(ride["log"]).name for ride in rides if not ride["cpu_s"]] == sorted(made)
