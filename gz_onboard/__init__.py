@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from gz_onboard.api import (
+        AddedRides,
         Calibration,
         Discovered,
         DiscoveryOptions,
         EstimatedRide,
+        History,
         InputError,
         LoggedEstimates,
         Samples,
@@ -18,10 +20,12 @@ if TYPE_CHECKING:
         SimulationOptions,
         Validated,
         Vehicle,
+        add_to_history,
         calibrate,
         discover,
         estimate,
         read_estimates,
+        read_history,
         read_ride,
         read_vehicle,
         simulate,
@@ -31,10 +35,12 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
+    "AddedRides",
     "Calibration",
     "Discovered",
     "DiscoveryOptions",
     "EstimatedRide",
+    "History",
     "InputError",
     "LoggedEstimates",
     "Samples",
@@ -43,10 +49,12 @@ __all__ = [
     "Validated",
     "Vehicle",
     "__version__",
+    "add_to_history",
     "calibrate",
     "discover",
     "estimate",
     "read_estimates",
+    "read_history",
     "read_ride",
     "read_vehicle",
     "simulate",

@@ -8,6 +8,8 @@ from math import isfinite
 from typing import TYPE_CHECKING, Any, Protocol
 
 from gz_onboard.bus.logfile import object_schema
+from gz_onboard.estimator.ageing import Learned
+from gz_onboard.estimator.drawn import Drawn
 from gz_onboard.events import Cause, Estimate, Explanation, Frame, Reason
 from gz_onboard.location_rows import BATTERY_ENDS_TOPIC, LOCATION_SCHEMA, LOCATION_TOPIC
 
@@ -60,6 +62,14 @@ ESTIMATE_UNITS = {
     "battery_ends_longitude": "deg",
 }
 
+RIDE_UNITS = {
+    "time": ESTIMATE_UNITS["time"],
+    "distance": "m",
+    "energy": "J, drawn net",
+    "energy_recovered": "J",
+    "ambient_temperature": "degC",
+}
+"""Of the numbers of `ride_row`."""
 TEXTS = ("state", "reasons", "activity", "route_state", "distrusted")
 
 
@@ -115,6 +125,26 @@ def explanation_row(why: Explanation) -> dict[str, object]:
     return {name: round(value, 2) for name, value in numbers.items()}
 
 
+def ride_row(last: Estimate, drawn: Drawn, ambient: float | None, rider: str) -> dict[str, object]:
+    """What was ridden and drawn until the `last` estimate, as it stands in logs; ambient: [degC]."""
+    return {
+        "time": round(last.time, 3),
+        "distance": round(last.distance, 2),
+        "energy": None if drawn.net is None else round(drawn.net, 1),
+        "energy_recovered": round(drawn.recovered, 1),
+        "ambient_temperature": None if ambient is None else round(ambient, 2),
+        "rider": rider,
+    }
+
+
+def learned_row(learned: Mapping[str, Learned]) -> dict[str, dict[str, float]]:
+    """What was learned of the battery, as it stands in logs."""
+    return {
+        name: {"factor": round(x.value, 4), "sd": round(x.sd, 4), "share": round(x.share, 3)}
+        for name, x in learned.items()
+    }
+
+
 def estimate_schema() -> dict[str, Any]:
     """The JSON schema of `estimate_row`."""
     schema = object_schema("gz_onboard.Estimate", ESTIMATE_UNITS)
@@ -131,7 +161,9 @@ def declare(log: Log, messages: Sequence[Message]) -> None:
     counts = {name: {"type": "integer"} for name in COUNTS}
     maps = {name: {"type": "object"} for name in ("foreign", "faults", "lost", "unknown", "requests")}
     reasons = {"reasons": {"type": "array", "items": {"type": "string"}}}
-    log.channel(STATUS_TOPIC, {"title": "gz_onboard.Status", "type": "object", "properties": counts | maps | reasons})
+    objects = {"ride": object_schema("gz_onboard.Ride", RIDE_UNITS), "learned": {"type": "object"}}
+    properties = counts | maps | reasons | objects
+    log.channel(STATUS_TOPIC, {"title": "gz_onboard.Status", "type": "object", "properties": properties})
     log.channel(BATTERY_ENDS_TOPIC, LOCATION_SCHEMA)
     if messages:
         log.channel(LOCATION_TOPIC, LOCATION_SCHEMA)

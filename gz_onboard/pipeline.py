@@ -17,6 +17,7 @@ from gz_onboard.bus.publisher import KNOWN, MESSAGES, Counts, Publisher
 from gz_onboard.constants import BENCH_TEMPERATURE, WH
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.estimator import reasons
+from gz_onboard.estimator.drawn import Drawn
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
@@ -32,7 +33,9 @@ from gz_onboard.log_rows import (
     declare,
     estimate_row,
     explanation_row,
+    learned_row,
     reason_names,
+    ride_row,
 )
 from gz_onboard.options import FILTERS
 from gz_onboard.physics.drawable import drawable
@@ -88,6 +91,7 @@ class Pipeline:
         self.polled: Mapping[str, Mapping[str, int]] = {}  # what came of requests, by name; set by the daemon
         self.send_failures = 0  # frames that a channel did not take; set by the daemon
         self.extra_reasons = Reason(0)  # set by the daemon: bus down, log failed
+        self.drawn = Drawn()
         self.last: Estimate | None = None
         self.last_known: Estimate | None = None  # the last that had a range
         self._log = log
@@ -150,6 +154,7 @@ class Pipeline:
         if self.extra_reasons & Reason.BUS_DOWN and estimate.state is State.VALID:
             estimate.state = State.DEGRADED
         self.last = estimate
+        self.drawn.add(estimate.time, estimate.pack_voltage, estimate.pack_current)
         if estimate.range is not None and estimate.state in KNOWN:
             self.last_known = estimate
         if self._observer:
@@ -220,7 +225,7 @@ class Pipeline:
         return {hexadecimal(i): unknown[i] for i in sorted(self.publisher.identifiers) if i in unknown}
 
     def status(self) -> dict[str, object]:
-        """What was received, dropped and lost since the start, by message and reason."""
+        """What was received, dropped and lost since the start, by message and reason; the ride; what was learned."""
         codec = self.codec
         faults: dict[str, dict[str, int]] = {}
         for (message, reason), count in sorted(codec.faults.items()):
@@ -238,7 +243,16 @@ class Pipeline:
             "lost": dict(sorted(codec.lost.items())),
             "unknown": {f"{i & ~EFF_FLAG:X}": n for i, n in sorted(codec.unknown.items())[:32]},
             "reasons": reason_names(self.last.reasons) if self.last else [],
+            "ride": self._ride(),
+            "learned": learned_row(self.estimator.soc.ageing.learned()),
         } | ({"requests": {name: dict(of) for name, of in self.polled.items()}} if self.polled else {})
+
+    def _ride(self) -> dict[str, object]:
+        """What the estimates of a log do not say of the ride, since the start."""
+        last, estimator = self.last or Estimate(0.0), self.estimator
+        return ride_row(
+            last, self.drawn, estimator.signals.ambient_temperature.get(last.time), estimator.forecaster.riders.now
+        )
 
 
 def range_publisher(vehicle: Vehicle) -> Publisher:

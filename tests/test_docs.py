@@ -33,6 +33,7 @@ GUIDE = {
     "dashboard",
     "home-assistant",
     "report",
+    "history",
     "log-format",
     "service",
     "limits",

@@ -8,19 +8,23 @@ from gz_onboard.api.calibrations import Calibration, calibrate
 from gz_onboard.api.discoveries import Discovered, discover
 from gz_onboard.api.estimates import EstimatedRide, LoggedEstimates, estimate, read_estimates, summary_table
 from gz_onboard.api.given import read_ride, read_vehicle
+from gz_onboard.api.histories import History, add_to_history, read_history
 from gz_onboard.api.simulations import SimulatedRide, simulate
 from gz_onboard.api.validations import Validated, validate
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.command import DiscoveryOptions
+from gz_onboard.lab.history.add import AddedRides
 from gz_onboard.offline.samples import Samples
 from gz_onboard.simulation.plan import SimulationOptions
 from gz_onboard.vehicle import Vehicle
 
 __all__ = [
+    "AddedRides",
     "Calibration",
     "Discovered",
     "DiscoveryOptions",
     "EstimatedRide",
+    "History",
     "InputError",
     "LoggedEstimates",
     "Samples",
@@ -28,10 +32,12 @@ __all__ = [
     "SimulationOptions",
     "Validated",
     "Vehicle",
+    "add_to_history",
     "calibrate",
     "discover",
     "estimate",
     "read_estimates",
+    "read_history",
     "read_ride",
     "read_vehicle",
     "simulate",

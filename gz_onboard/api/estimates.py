@@ -13,7 +13,8 @@ from gz_onboard.api.given import PathLike, Signals, VehicleLike, source_of, vehi
 from gz_onboard.errors import brief
 from gz_onboard.lab import estimate_table, export_tables
 from gz_onboard.lab.estimate import summary_text
-from gz_onboard.lab.estimate_ride import How, RideSummary, open_estimate, ride_through, summary_of
+from gz_onboard.lab.estimate_ride import How, open_estimate, ride_through
+from gz_onboard.lab.estimate_summary import RideSummary, summary_of
 from gz_onboard.lab.kept_rows import KeptRows
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TEXTS, WHY_TOPIC, table_columns
 from gz_onboard.offline.arguments import checked

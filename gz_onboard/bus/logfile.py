@@ -90,6 +90,10 @@ class LogFile:
         else:
             self._write_sample(sample)
 
+    def note(self, name: str, entries: Mapping[str, str]) -> None:
+        """Write a metadata record beside that of the beginning; `name` is another than ``gz_onboard``."""
+        self._writer.add_metadata(name, {key: writable(text) for key, text in entries.items()})
+
     def flush(self, *, to_disk: bool = False) -> None:
         """Write all that there is, so that it can be read though the file is cut off; to_disk: fsync as well."""
         while self._pending:

@@ -62,6 +62,8 @@ _FIRST_LINES = {
     _TABLE: re.compile(r"\s*\"?(time|timestamp|t)(\b|_m?s\b)[^,;]*[,;]", re.I),
 }
 """What a line of a text log looks like, by format: of its header or its frames."""
+ESTIMATED = ".estimate.mcap"
+"""The end of the name of what ``gz-onboard estimate`` writes."""
 _HEAD = 8192  # bytes within which a text log shows what it is
 
 
@@ -146,14 +148,17 @@ def _by_content(head: bytes) -> str | None:
     return None
 
 
-def logs_among(paths: Iterable[Path]) -> list[Path]:
+def logs_among(paths: Iterable[Path], *, estimates: bool = False) -> list[Path]:
     """`paths`, with the logs in it instead of each folder, by name. InputError for a folder without any.
 
-    Of a folder no .csv or .txt, which are mostly something else, and nothing that ``gz-onboard estimate`` wrote.
+    Of a folder no .csv or .txt, which are mostly something else, and nothing that ``gz-onboard estimate`` wrote; or,
+    for `estimates`, these in place of the logs that they are of.
     """
     logs: list[Path] = []
     for path in paths:
-        found = [path] if not path.is_dir() else sorted(file for file in path.iterdir() if _is_log(file))
+        found = [path] if not path.is_dir() else sorted(file for file in path.iterdir() if _is_log(file, estimates))
+        made = {file.name.removesuffix(ESTIMATED) for file in found if path.is_dir() and file.name.endswith(ESTIMATED)}
+        found = [file for file in found if log_stem(file) not in made]
         if not found:
             table = next((file.name for file in sorted(path.iterdir()) if file.is_file() and is_table(file)), None)
             hint = f"; its tables must be given one by one, such as {table}" if table else ""
@@ -162,9 +167,15 @@ def logs_among(paths: Iterable[Path]) -> list[Path]:
     return logs
 
 
-def _is_log(file: Path) -> bool:
+def log_stem(log: Path) -> str:
+    """The name of a log without its suffixes."""
+    return (log.with_suffix("") if log.suffix.lower() == ".gz" else log).stem
+
+
+def _is_log(file: Path, estimates: bool) -> bool:
     name = file.name.lower().removesuffix(".gz")
-    return name.endswith(tuple(_READERS)) and not name.endswith((".csv", ".estimate.mcap")) and file.is_file()
+    other = (".csv",) if estimates else (".csv", ESTIMATED)
+    return name.endswith(tuple(_READERS)) and not name.endswith(other) and file.is_file()
 
 
 def read_attachments(path: str | Path) -> dict[str, bytes]:
@@ -173,10 +184,10 @@ def read_attachments(path: str | Path) -> dict[str, bytes]:
     return mcap.attachments(*own) if own else {}
 
 
-def read_metadata(path: str | Path) -> dict[str, str]:
-    """The metadata of one of our own logs (vehicle, version, ...); of other formats none."""
+def read_metadata(path: str | Path, record: str = "gz_onboard") -> dict[str, str]:
+    """The metadata of one of our own logs (vehicle, version, ...), or another record of it; of other formats none."""
     own = _own(path)
-    return mcap.metadata(*own) if own else {}
+    return mcap.metadata(*own, record) if own else {}
 
 
 def json_channels(path: str | Path) -> dict[str, tuple[bytes, dict[str, str]]]:

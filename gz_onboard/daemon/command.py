@@ -130,10 +130,11 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
     route = read_ahead(arguments.route)[1] if arguments.route else None
     recorder = None
     if arguments.log_dir:
+        payload = {} if arguments.payload is None else {"payload_kg": f"{arguments.payload:g}"}
         recorder = Recorder(
             arguments.log_dir,
             vehicle.name,
-            metadata={"vehicle_key": vehicle.key, "lacking": " ".join(lacking(vehicle))},
+            metadata={"vehicle_key": vehicle.key, "lacking": " ".join(lacking(vehicle)), **payload},
             attachments=dbc_texts(vehicle),
             limits=Limits(
                 max_file_bytes=round(arguments.log_file_mb * 1e6),

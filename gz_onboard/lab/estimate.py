@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 from gz_onboard.bus.logs import is_table
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, require
 from gz_onboard.events import Reason, words
-from gz_onboard.lab.estimate_ride import SUMMARY_VERSION, EstimateTask, RideSummary, estimate_log, known_vehicle
+from gz_onboard.lab.estimate_log import EstimateTask, estimate_log
+from gz_onboard.lab.estimate_ride import known_vehicle
 from gz_onboard.lab.estimate_route import route_text
+from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary
 from gz_onboard.lab.estimate_table import FORMATS, check_table, write_summaries
 from gz_onboard.offline.processes import collect, over_rides, tasks_of
 from gz_onboard.offline.results import clock, explain_keys, number, text_rows, write_json
@@ -40,13 +43,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "--format", "--no-plot")
     parser.add_argument("--signals", action="store_true", help="also log the signals of each message, once a second")
     parser.add_argument("--frames", action="store_true", help="also log the raw frames and the range frames")
+    resume = "keep what an earlier run wrote, where it is whole and of the same log, vehicle, options and version"
+    parser.add_argument("--resume", action="store_true", help=resume)
     add_shared(parser, "--jobs", "--quiet")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard estimate``: `OK` if every log could be estimated, else `BAD_INPUT`."""
     parts = {"filter_name": arguments.filter, "frames": arguments.frames, "signals": arguments.signals}
-    parts["route"] = arguments.route
+    parts |= {"route": arguments.route, "resume": arguments.resume}
     tasks = tasks_of(arguments, EstimateTask, ".estimate.mcap", **parts)
     require("matplotlib", not arguments.no_plot)
     if arguments.table:
@@ -61,7 +66,12 @@ def run(arguments: argparse.Namespace) -> int:
     ) as display:
         results = _results(tasks, arguments.jobs, display.update)
         text = None if arguments.json == "-" else summary_text
-        rides, failed = collect("estimate", results, display, text, lambda ride: ride.damage)
+        try:
+            rides, failed = collect("estimate", results, display, text, lambda ride: ride.damage)
+        except KeyboardInterrupt:
+            if len(tasks) > 1:
+                display.print("gz-onboard estimate: interrupted; --resume goes on after what is written", sys.stderr)
+            raise
     write_json(arguments.json, SUMMARY_VERSION, {"rides": rides, "failed": failed})
     if arguments.table:
         write_summaries(arguments.table, rides, failed)
@@ -108,12 +118,8 @@ def _expected(path: Path) -> int | None:
 def summary_text(ride: RideSummary) -> str:
     """A ride's summary for a terminal."""
     rows = summary_rows(ride)
-    rows.append(
-        (
-            "computed",
-            f"{ride.cpu_s:.2f} s of processor time, {number(ride.real_time_factor, '.0f')} times as fast as the ride",
-        )
-    )
+    fast = f"{ride.cpu_s:.2f} s of processor time, {number(ride.real_time_factor, '.0f')} times as fast as the ride"
+    rows.append(("computed", fast if ride.cpu_s else "by an earlier run"))
     if ride.log:
         rows.append(("written", f"{ride.log}{f' and {Path(ride.plot).suffix}' if ride.plot else ''}"))
     return text_rows(ride.file, rows)

@@ -10,7 +10,7 @@ from typing import get_type_hints
 from gz_onboard.bus.tables import write_table
 from gz_onboard.errors import InputError, nearest, require, writing
 from gz_onboard.events import State
-from gz_onboard.lab.estimate_ride import RideSummary
+from gz_onboard.lab.estimate_summary import RideSummary
 from gz_onboard.offline.results import Failure
 
 FORMATS = (".csv", ".parquet", ".jsonl")

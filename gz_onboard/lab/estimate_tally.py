@@ -23,28 +23,20 @@ class Tally:
     range_start: float | None = None  # m
     ranged: Estimate | None = None  # the last whose range is published
     on_route: Estimate | None = None  # the last
-    drawn: float | None = None  # J, net
-    recovered: float = 0.0  # J
     speed_max: float | None = None  # m/s
     innovation_max: float = 0.0  # V
     ticks: Counter[tuple[State, int]] = field(default_factory=Counter)
     distrusted: Counter[str] = field(default_factory=Counter)  # ticks by role
     _squares: float = 0.0
     _innovations: int = 0
-    _before: float = 0.0
 
     def __call__(self, e: Estimate) -> None:
         """Take in the next estimate."""
         if self.first is None:
-            self.first, self._before = e, e.time
-        dt, self._before = e.time - self._before, e.time
+            self.first = e
         self.last = e
         self.ticks[e.state, int(e.reasons)] += 1
         self.distrusted.update(e.distrusted)
-        if e.pack_voltage is not None and e.pack_current is not None and 0 <= dt <= 1:
-            energy = e.pack_voltage * e.pack_current * dt
-            self.drawn = (self.drawn or 0.0) + energy
-            self.recovered -= min(energy, 0.0)
         if e.innovation is not None:
             self._squares += e.innovation * e.innovation
             self._innovations += 1

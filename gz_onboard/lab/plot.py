@@ -5,21 +5,21 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from functools import partial
 from itertools import pairwise
 from math import degrees, isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from gz_onboard.bus.codec import DROPPING
-from gz_onboard.bus.logs import LogDamage, read_metadata, read_samples
+from gz_onboard.bus.logs import LogDamage, logs_among, read_metadata
 from gz_onboard.constants import WH_PER_KM
-from gz_onboard.errors import OK, InputError, writing
+from gz_onboard.errors import BAD_INPUT, OK, InputError, writing
 from gz_onboard.events import Reason, State, words
+from gz_onboard.lab.logged import Logged, read_ride
 from gz_onboard.lab.why import plot_why
-from gz_onboard.log_rows import ESTIMATE_TOPIC, ESTIMATE_UNITS, STATUS_TOPIC
 from gz_onboard.offline.style import (
     BLUE,
     GREEN,
@@ -43,65 +43,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Logged = dict[str, Any]
-"""The values of one sample in a log, as its JSON has them."""
-
 NAIVE_LENGTH = 25_000.0  # m: what usual displays average the consumption over
 NAIVE_FROM = 1_000.0  # m
 STATES = {State.STARTING: "#9fb3c8", State.VALID: "#3f9d6b", State.DEGRADED: "#e8a33d", State.INVALID: "#c53030"}
 _NAN = float("nan")
 _HOLE = 3.0  # s: estimates further apart than this have a hole between them; they come at least once a second
-
-
-def read_ride(
-    log: Path, on_damage: Callable[[LogDamage], None] | None = None
-) -> tuple[list[Logged], list[int], Logged]:
-    """(estimates, their times [ns], the last status) of one of our logs, whole or cut off.
-
-    on_damage: is called if something could not be read. Raises InputError if the log holds no estimates.
-    """
-    rows: list[Logged] = []
-    times: list[int] = []
-    status: Logged = {}
-    for topic, time_ns, values in read_samples(log, on_damage=on_damage):
-        if topic == ESTIMATE_TOPIC:
-            if _is_estimate(values):
-                rows.append(values)
-                times.append(time_ns)
-        elif topic == STATUS_TOPIC and _is_status(values):
-            status = values
-    if not rows:
-        raise InputError(
-            f"{log}: holds no estimates ({ESTIMATE_TOPIC}): gz-onboard estimate makes such a log of a recorded ride"
-        )
-    return rows, times, status
-
-
-def _is_estimate(values: Logged) -> bool:
-    """Whether it is a row as we write them: others may write to a topic of this name, too."""
-    if values.get("state") not in State.__members__ or not isinstance(values.get("reasons"), str):
-        return False
-    numbers = {name: values.get(name) for name in ESTIMATE_UNITS}
-    if not all(_is_number(value) for value in numbers.values() if value is not None):
-        return False
-    for together in (("soc", "soc_sd"), ("range", "range_p10", "range_p90")):
-        if len({values.get(name, "") is None for name in together}) > 1 or not set(together) <= values.keys():
-            return False
-    return _is_number(numbers["time"]) and _is_number(numbers["distance"])
-
-
-def _is_status(values: Logged) -> bool:
-    faults, lost, unknown = (values.get(name, {}) for name in ("faults", "lost", "unknown"))
-    if not all(isinstance(counts, dict) for counts in (faults, lost, unknown)):
-        return False
-    places = faults.values()
-    return all(isinstance(counts, dict) for counts in places) and all(
-        _is_number(n) for counts in (lost, *places) for n in counts.values()
-    )
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and isfinite(value) and abs(value) < 1e15
 
 
 def naive_range(rows: Sequence[Logged]) -> list[float | None]:
@@ -316,7 +262,7 @@ def spans(x: Sequence[float], true: Sequence[bool]) -> list[tuple[float, float]]
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard plot``."""
-    add_shared(parser, "log", help="MCAP log of gz-onboard run or gz-onboard estimate")
+    add_shared(parser, "log", help="MCAP log of gz-onboard run or gz-onboard estimate, or a folder of them")
     ends = "file to write, .png, .svg or .pdf (default: the name of the log, ending as --format says)"
     parser.add_argument("picture", type=Path, nargs="?", metavar="PICTURE", help=ends)
     add_shared(parser, "--format", default=None, help="of the picture: for papers svg or pdf (default: png)")
@@ -325,15 +271,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """``gz-onboard plot``."""
+    """``gz-onboard plot``: `OK` if every log could be drawn, else `BAD_INPUT`."""
+    if not arguments.log.is_dir():
+        _plot_one(arguments.log, arguments)
+        return OK
+    if arguments.picture:
+        raise InputError(f"{arguments.picture}: of a folder, each picture has the name of its log; leave it out")
+    status = OK
+    for log in (log for log in logs_among([arguments.log], estimates=True) if log.suffix.lower() == ".mcap"):
+        try:
+            _plot_one(log, arguments)
+        except InputError as error:
+            print(f"gz-onboard plot: {error}", file=sys.stderr)
+            status = BAD_INPUT
+    return status
+
+
+def _plot_one(log: Path, arguments: argparse.Namespace) -> None:
     kind = arguments.picture_format
     ending = f"{'.why' if arguments.why else ''}.{kind or PICTURE_FORMATS[0]}"
-    picture = arguments.picture or arguments.log.with_suffix(ending)
+    picture = arguments.picture or log.with_suffix(ending)
     if picture_format(picture) != (kind or picture_format(picture)):
         raise InputError(f"{picture}: the picture's name does not end in .{kind}, as --format says")
     with writing(picture):
         plot = plot_why if arguments.why else partial(plot_log, over=arguments.over)
-        for damage in plot(arguments.log, picture):
+        for damage in plot(log, picture):
             print(f"gz-onboard plot: {damage}", file=sys.stderr)
     print(picture)
-    return OK

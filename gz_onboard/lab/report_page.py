@@ -11,19 +11,19 @@ from pathlib import Path
 from gz_onboard.constants import WH
 from gz_onboard.events import TOLD, Activity, State, words
 from gz_onboard.lab.estimate import summary_rows
-from gz_onboard.lab.plot import Logged, column, spans, with_holes
+from gz_onboard.lab.logged import Logged
+from gz_onboard.lab.plot import column, spans, with_holes
 from gz_onboard.lab.report_charts import Abscissa, Curve, bar, chart, key, strip
 from gz_onboard.lab.report_ride import ReportedRide
 from gz_onboard.lab.report_svg import axis_of, draw_map
 from gz_onboard.lab.why import Why
-from gz_onboard.offline.results import clock, number
+from gz_onboard.offline.results import FIRST_DATE_NS, clock, number
 from gz_onboard.offline.style import time_unit
 
 _STATE_COLOURS = {State.STARTING: "grey", State.VALID: "green", State.DEGRADED: "amber", State.INVALID: "red"}
 _TEMPERATURE_COLOURS = {"motor_temperature": "red", "inverter_temperature": "purple", "ambient_temperature": "blue"}
 _LEAST_WH = 0.05  # of the ledger: less is not shown
 _MOST_CHANGES = 20
-_FIRST_DATE = 946_684_800_000_000_000  # ns: a log before 2000 has no date
 
 
 def section(ride: ReportedRide, anchor: str) -> str:
@@ -67,7 +67,7 @@ def cells(ride: ReportedRide) -> list[str]:
 
 
 def _start(start_ns: int) -> str:
-    if start_ns < _FIRST_DATE:
+    if start_ns < FIRST_DATE_NS:
         return "–"
     return datetime.fromtimestamp(start_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M UTC")
 

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.estimator.signals import FIX_2D
-from gz_onboard.lab.estimate_ride import How, RideSummary, known_vehicle, open_estimate, ride_through, summary_of
+from gz_onboard.lab.estimate_ride import How, known_vehicle, open_estimate, ride_through
+from gz_onboard.lab.estimate_summary import RideSummary, summary_of
 from gz_onboard.lab.kept_rows import KeptRows
-from gz_onboard.lab.plot import Logged
+from gz_onboard.lab.logged import Logged
 from gz_onboard.log_rows import ESTIMATE_TOPIC
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.samples import Samples, read_samples

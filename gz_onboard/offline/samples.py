@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from gz_onboard.bus.codec import BACK_NS, Codec
-from gz_onboard.bus.logs import LogDamage, is_table, read_frames
+from gz_onboard.bus.logs import LogDamage, is_table, log_stem, read_frames
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.errors import InputError, brief, nearest, shown
 from gz_onboard.events import INSTRUMENTS, ROLES, Event, Frame
@@ -188,7 +188,7 @@ def _column(place: str, role: str, column: object) -> tuple[Array, Array]:
 
 def ride_name(log: Path) -> str:
     """The name of the ride in a log: the file's, without its suffixes."""
-    return (log.with_suffix("") if log.suffix.lower() == ".gz" else log).stem
+    return log_stem(log)
 
 
 def facts_of(log: Path) -> dict[str, object]:

@@ -15,7 +15,7 @@ from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import LogDamage
 from gz_onboard.errors import InputError
 from gz_onboard.events import Cause, Explanation, words
-from gz_onboard.lab import plot
+from gz_onboard.lab import logged, plot
 from gz_onboard.lab.why import draw_why
 
 LOGS = Path(__file__).resolve().parents[2] / "replay_logs"
@@ -62,7 +62,7 @@ def test_why_the_range_is_what_it_is(log, tmp_path, capsys):
 
 
 def test_the_panels_show_what_the_log_says(log):
-    rows, times, status = plot.read_ride(log)
+    rows, times, status = logged.read_ride(log)
     figure = plot.draw(rows, times, status, ("title", "subtitle"))
     lines = {line.get_label(): line for axis in figure.axes for line in axis.get_lines()}
     for label, name, factor in (
@@ -84,7 +84,7 @@ def test_the_panels_show_what_the_log_says(log):
 def test_the_picture_counts_what_the_summary_counts(tmp_path, capsys):
     assert cli.main(["estimate", str(LOGS / "city_34C.blf"), "--output", str(tmp_path), "--no-plot", "--json"]) == 0
     (ride,) = json.loads(capsys.readouterr().out)["rides"]
-    rows, times, status = plot.read_ride(tmp_path / "city_34C.estimate.mcap")
+    rows, times, status = logged.read_ride(tmp_path / "city_34C.estimate.mcap")
     figure = plot.draw(rows, times, status, ("", ""))
     (told,) = (t.get_text() for axis in figure.axes for t in axis.texts if "frames received" in t.get_text())
     withheld = sum(sum(places.values()) for places in ride["faults"].values()) - ride["dropped"]
@@ -112,8 +112,8 @@ def test_a_cut_log_is_drawn_as_far_as_it_goes(tmp_path, log):
     whole = tmp_path / "city_34C.estimate.mcap"
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
-    rows, _, _ = plot.read_ride(cut)
-    everything, _, _ = plot.read_ride(whole)
+    rows, _, _ = logged.read_ride(cut)
+    everything, _, _ = logged.read_ride(whole)
     assert 100 < len(rows) < len(everything)
     assert rows == everything[: len(rows)]
     assert cli.main(["plot", str(cut), str(tmp_path / "cut.png")]) == 0
@@ -141,7 +141,7 @@ def holed(tmp_path):
 
 def test_nothing_is_drawn_through_a_hole_in_the_log(holed):
     damages: list[LogDamage] = []
-    rows, times, status = plot.read_ride(holed, damages.append)
+    rows, times, status = logged.read_ride(holed, damages.append)
     assert [row["time"] for row in rows] == [*range(10), *range(20, 30)]
     assert "a chunk is broken" in damages[0].reason
     figure = plot.draw(rows, times, status, ("", ""))
@@ -216,7 +216,7 @@ def test_rows_that_are_none_of_ours_are_passed_over(tmp_path):
     for status in statuses:
         file.sample("/status", 0, status)
     file.close()
-    rows, times, last = plot.read_ride(path)
+    rows, times, last = logged.read_ride(path)
     assert (rows, times, last) == ([good], [len(wrong) * 10**9], {})
     plot.plot_log(path, tmp_path / "e.png")
 
@@ -249,14 +249,14 @@ def test_the_naive_range_of_steady_riding_is_energy_over_consumption(speed, cons
 
 def test_the_naive_range_begins_anew_after_a_hole():
     steady = {"pack_voltage": 50.0, "pack_current": 16.0, "energy_left": 8e6}
-    rows: list[plot.Logged] = [{"time": t, "distance": 10.0 * t, **steady} for t in range(900) if not 300 < t < 600]
+    rows: list[logged.Logged] = [{"time": t, "distance": 10.0 * t, **steady} for t in range(900) if not 300 < t < 600]
     naive = plot.naive_range(rows)
     assert naive[301] is None
     assert naive[-1] == pytest.approx(100_000)
 
 
 def test_the_naive_range_forgets_what_is_more_than_25_km_ago():
-    rows: list[plot.Logged] = []
+    rows: list[logged.Logged] = []
     distance = 0.0
     for t in range(12_000):  # 20 km at 160 J/m, then 100 km at 80 J/m
         rows.append(
@@ -282,3 +282,15 @@ def test_spans_cover_what_is_true(true):
     spans = plot.spans(x, true)
     inside = [any(begin <= place < begin + length for begin, length in spans) for place in x[:-1]]
     assert inside == true[:-1]
+
+
+def test_each_log_of_a_folder(log, tmp_path, capsys):
+    for name in "a.mcap", "b.estimate.mcap":
+        (tmp_path / name).write_bytes(log.read_bytes())
+    (tmp_path / "b.blf").write_bytes(b"of which b.estimate.mcap is")
+    assert cli.main(["plot", str(tmp_path), "--over", "distance"]) == 0
+    assert capsys.readouterr().out.split() == [str(tmp_path / name) for name in ("a.png", "b.estimate.png")]
+    (tmp_path / "a.mcap").write_bytes(log.read_bytes()[:9])
+    assert cli.main(["plot", str(tmp_path), "--why"]) == 2
+    assert (tmp_path / "b.estimate.why.png").exists()
+    assert cli.main(["plot", str(tmp_path), "all.png"]) == 2

@@ -83,14 +83,14 @@ def attachments(path: Path, data: Contents) -> dict[str, bytes]:
     return found
 
 
-def metadata(path: Path, data: Contents) -> dict[str, str]:
-    """The entries of the metadata record ``gz_onboard``."""
+def metadata(path: Path, data: Contents, record: str) -> dict[str, str]:
+    """The entries of the metadata record that is called so."""
     entries: dict[str, str] = {}
     for opcode, start, _ in records(path, data, Damage()):
         if opcode == Opcode.METADATA:
             with contextlib.suppress(*BROKEN):
                 name, position = _string(data, start)
-                if name == "gz_onboard":
+                if name == record:
                     entries = _string_map(data, position)
     return entries
 

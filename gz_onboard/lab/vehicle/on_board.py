@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard.errors import InputError
-from gz_onboard.lab.estimate_ride import How, open_estimate, ride_through, summary_of
+from gz_onboard.lab.estimate_ride import How, open_estimate, ride_through
+from gz_onboard.lab.estimate_summary import summary_of
 from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
 from gz_onboard.offline.results import clock
 from gz_onboard.vehicle import Vehicle

@@ -1,0 +1,144 @@
+"""A log estimated: its MCAP and its picture; or what an earlier run made of it, if that is whole and of the same."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from gz_onboard import __version__
+from gz_onboard.bus.completion import is_complete
+from gz_onboard.bus.logfile import LogFile
+from gz_onboard.bus.logs import ESTIMATED, read_metadata
+from gz_onboard.errors import InputError, writing
+from gz_onboard.lab.estimate_ride import How, known_vehicle, open_estimate, ride_through
+from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary, kept_summary, summary_of, summary_to_keep
+from gz_onboard.lab.plot import plot_log
+from gz_onboard.offline.digest import digest_of
+from gz_onboard.offline.processes import Task
+from gz_onboard.pipeline import dbc_texts, lacking
+from gz_onboard.progress import Progress
+from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.vehicle import Vehicle
+
+_RECORD = "gz_onboard.estimate"  # of metadata, at the end of the log: of what the estimates are, and their summary
+_SUMMARY = "summary"
+_ENDS = (b"IEND\xaeB`\x82", b"</svg>\n", b"%%EOF\n")  # of a picture
+
+
+@dataclass(frozen=True)
+class EstimateTask(Task):
+    """A log to be estimated; resume: not if it is already, as it would be now."""
+
+    filter_name: str = "scalar"
+    frames: bool = False
+    signals: bool = False
+    route: Path | None = None
+    resume: bool = False
+
+    @property
+    def log(self) -> Path:
+        """The MCAP."""
+        return self.output(ESTIMATED)
+
+    @property
+    def picture(self) -> Path | None:
+        """The picture, if one is to be drawn."""
+        return self.drawn(".estimate")
+
+    @property
+    def part(self) -> Path:
+        """The MCAP while it is not complete."""
+        return self.output(f"{ESTIMATED}.part")
+
+
+def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSummary:
+    """Estimate one log and write its MCAP and picture; gives its summary. Raises InputError."""
+    vehicle = known_vehicle(task.vehicle, task.payload)
+    made_of = _made_of(task, vehicle)
+    if task.resume and (kept := _kept(task, made_of)):
+        if progress:
+            progress(kept.frames)
+        return kept
+    route = read_ahead(task.route)[1] if task.route else None
+    ride = open_estimate(task.path, vehicle)
+    if task.frames and ride.vehicle.mapping is not vehicle.mapping:
+        raise InputError(f"{task.path}: is a table of signals: --frames has nothing to log")
+    with writing(task.log):
+        log = _open_log(task, ride.vehicle, ride.start_ns)
+        try:
+            ridden = ride_through(ride, How(task.filter_name, task.frames, task.signals, route), log, progress)
+            summary = summary_of(ridden, task.log, task.picture)
+            log.note(_RECORD, {**made_of, _SUMMARY: summary_to_keep(summary)})
+            log.close()
+            task.part.replace(task.log)
+        finally:
+            log.abandon()
+            task.part.unlink(missing_ok=True)
+        if task.picture:
+            plot_log(task.log, task.picture)
+    return summary
+
+
+def _open_log(task: EstimateTask, vehicle: Vehicle, start_ns: int) -> LogFile:
+    task.part.parent.mkdir(parents=True, exist_ok=True)
+    metadata = {
+        "vehicle": vehicle.name,
+        "vehicle_key": vehicle.key,
+        "lacking": " ".join(lacking(vehicle)),
+        "source": task.path.name,
+        "filter": task.filter_name,
+        **({} if task.payload is None else {"payload_kg": f"{task.payload:g}"}),
+        **({} if task.route is None else {"route": task.route.name}),
+    }
+    return LogFile(task.part.open("wb"), start_ns, metadata, dbc_texts(vehicle))
+
+
+# --- what an earlier run made ---------------------------------------------------------------------------------------
+
+
+def _made_of(task: EstimateTask, vehicle: Vehicle) -> dict[str, str]:
+    """All that the estimates of a log depend on, as texts."""
+    effects = {Path(effect.term.__code__.co_filename) for effect in vehicle.model.effects}
+    files = {vehicle.file, vehicle.range_dbc, *vehicle.mapping.dbc_files, *(file for file in effects if file.is_file())}
+    return {
+        "version": f"{__version__}, summary {SUMMARY_VERSION}",
+        "log": digest_of(task.path),
+        "vehicle": " ".join(sorted({_digest_once(file) for file in files})),
+        "payload_kg": "" if task.payload is None else f"{task.payload:g}",
+        "route": digest_of(task.route) if task.route else "",
+        "options": f"filter {task.filter_name}, frames {task.frames}, signals {task.signals}",
+    }
+
+
+_digest_once: Callable[[Path], str] = functools.lru_cache(maxsize=None)(digest_of)
+"""Of the files that are the same for all logs."""
+
+
+def _kept(task: EstimateTask, made_of: Mapping[str, str]) -> RideSummary | None:
+    """The summary of the log that an earlier run wrote, if that is whole and of the same; its picture is drawn anew
+    if it is not whole.
+    """
+    try:
+        if not is_complete(task.log):
+            return None
+        found = read_metadata(task.log, _RECORD)
+    except (OSError, InputError):
+        return None
+    kept = kept_summary(found.pop(_SUMMARY, ""), task.path, task.log, task.picture)
+    if kept is None or found != made_of:
+        return None
+    if task.picture and not _is_drawn(task.picture, task.log):
+        with writing(task.picture):
+            plot_log(task.log, task.picture)
+    return kept
+
+
+def _is_drawn(picture: Path, log: Path) -> bool:
+    """Whether a picture is whole, and no older than the log that it is of."""
+    try:
+        with picture.open("rb") as stream:
+            return stream.read().endswith(_ENDS) and picture.stat().st_mtime_ns >= log.stat().st_mtime_ns
+    except OSError:
+        return False

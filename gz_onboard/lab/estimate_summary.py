@@ -1,0 +1,154 @@
+"""The summary of a ride's estimates."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, cast
+
+from gz_onboard.constants import WH, WH_PER_KM
+from gz_onboard.events import Estimate, Reason, State
+from gz_onboard.lab.estimate_ride import TICK_S, Ridden
+from gz_onboard.lab.estimate_route import RouteSummary, route_summary
+from gz_onboard.lab.why import Why, why_of
+from gz_onboard.offline.results import times
+from gz_onboard.offline.schema import to_json
+from gz_onboard.pipeline import lacking
+
+SUMMARY_VERSION = 1
+MOST_SLOW = 0.1  # of the time: energy is not integrated if pack current and voltage come too slowly for longer
+
+
+@dataclass(frozen=True)
+class RideSummary:
+    """A ride in the JSON: {"version", "rides": [summaries], "failed": [{file, error}]}."""
+
+    file: Annotated[str, "the log"]
+    log: Annotated[str | None, "the MCAP written, or null"]
+    plot: Annotated[str | None, "the picture written, or null"]
+    vehicle: Annotated[str, "name of the vehicle"]
+    filter: Annotated[str, "backend of the filter"]
+    start_ns: Annotated[int, "time of the first frame [ns since the epoch, as in the log]"]
+    duration_s: Annotated[float, "from the first to the last estimate"]
+    distance_km: Annotated[float, "ridden, but for gaps_s"]
+    speed_max_km_h: Annotated[float | None, "greatest speed, or null"]
+    energy_wh: Annotated[
+        float | None,
+        "drawn from the pack, less what was recovered, the sensors' known gain and offsets taken off; "
+        "null if voltage or current was never known, or came too slowly for more than a tenth of the time",
+    ]
+    energy_recovered_wh: Annotated[float | None, "charged into the pack while riding, or null"]
+    consumption_wh_km: Annotated[float | None, "energy over distance; null below 0.1 km"]
+    soc_start: Annotated[float | None, "state of charge, 0 to 1, at the first estimate that has one"]
+    soc_start_sd: Annotated[float | None, "its standard deviation"]
+    soc_end: Annotated[float | None, "at the last estimate that has one"]
+    soc_end_sd: Annotated[float | None, "its standard deviation"]
+    range_start_km: Annotated[float | None, "first range published"]
+    range_end_km: Annotated[float | None, "last range published"]
+    range_end_p10_km: Annotated[float | None, "exceeded with 90 % probability"]
+    range_end_p90_km: Annotated[float | None, "exceeded with 10 % probability"]
+    energy_left_wh: Annotated[float | None, "to be drawn before the cut-off, at the end"]
+    why: Annotated[Why | None, "why the last range that was explained is not the rated one, or null"]
+    changes: Annotated[list[Why], "each change of the range by 1 km more or less than was ridden, and why"]
+    route: Annotated[
+        RouteSummary | None,
+        "of the route given: state at the end (ON, OFF); and of the last estimate on it km along and left, energy to "
+        "its end and state of charge there, km from its start and position where the battery ends before; or null",
+    ]
+    innovation_rms_v: Annotated[float | None, "root mean square of measured less predicted voltage of a cell [V]"]
+    innovation_max_v: Annotated[float | None, "greatest magnitude of the same"]
+    states: Annotated[dict[str, float], "seconds in each state"]
+    reasons: Annotated[dict[str, float], "seconds with each reason to distrust the estimate"]
+    distrusted: Annotated[dict[str, float], "seconds by role of a sensor that contradicted the others and was left out"]
+    lacking: Annotated[list[str], "reasons that hold for ever, as the vehicle has no such sensors: no degradation"]
+    frames: Annotated[int, "received"]
+    dropped: Annotated[int, "frames that failed a check"]
+    implausible: Annotated[int, "signals out of their physical range"]
+    lost: Annotated[int, "frames missing by their counters"]
+    unknown: Annotated[int, "different identifiers that the database does not know"]
+    foreign: Annotated[dict[str, int], "frames of someone else on the identifiers of the range frames, by identifier"]
+    error_frames: Annotated[int, "error frames of the bus"]
+    gaps_s: Annotated[float, "without any measurement for too long to go on: distance and energy lack what was ridden"]
+    faults: Annotated[dict[str, dict[str, int]], "what was dropped, by reason and by message or signal"]
+    damage: Annotated[str | None, "what of the log could not be read, or null"]
+    cpu_s: Annotated[float, "processor time taken, without drawing; 0 for a ride kept by --resume"]
+    real_time_factor: Annotated[
+        float | None, "duration of the ride over the time taken, without drawing; null for a ride kept by --resume"
+    ]
+
+
+def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = None) -> RideSummary:
+    """The summary of a ride; log, picture: where its estimates were written and drawn."""
+    pipeline, tally, route = ridden.pipeline, ridden.tally, ridden.how.route
+    last, ranged = tally.last or Estimate(0.0), tally.ranged or Estimate(0.0)
+    changes = pipeline.estimator.attribution.changes
+    soc_start, soc_end = tally.soc_start or (None, None), tally.soc_end or (None, None)
+    counts, status = pipeline.counts(), pipeline.status()
+    states, reasons = tally.by_name()
+    drawn = pipeline.drawn.net if reasons[Reason.SIGNALS_SLOW.name] <= MOST_SLOW * states.total() else None
+    return RideSummary(
+        file=str(ridden.source),
+        log=str(log) if log else None,
+        plot=str(picture) if picture else None,
+        vehicle=pipeline.vehicle.name,
+        filter=ridden.how.filter_name,
+        start_ns=tally.start_ns,
+        duration_s=last.time,
+        distance_km=last.distance * 1e-3,
+        speed_max_km_h=times(tally.speed_max, 3.6),
+        energy_wh=times(drawn, 1 / WH),
+        energy_recovered_wh=None if drawn is None else pipeline.drawn.recovered / WH,
+        consumption_wh_km=times(drawn, 1 / last.distance / WH_PER_KM) if last.distance >= 100 else None,
+        soc_start=soc_start[0],
+        soc_start_sd=soc_start[1],
+        soc_end=soc_end[0],
+        soc_end_sd=soc_end[1],
+        range_start_km=times(tally.range_start, 1e-3),
+        range_end_km=times(ranged.range, 1e-3),
+        range_end_p10_km=times(ranged.range_p10, 1e-3),
+        range_end_p90_km=times(ranged.range_p90, 1e-3),
+        energy_left_wh=times(ranged.energy_left, 1 / WH),
+        why=why_of(last.why) if last.why else None,
+        changes=list(map(why_of, changes)),
+        route=route_summary(last, tally.on_route or last, route.grade_known) if route else None,
+        innovation_rms_v=tally.innovation_rms,
+        innovation_max_v=tally.innovation_max if tally.innovation_rms is not None else None,
+        states={state.name: round(states[state.name] * TICK_S, 1) for state in State if states[state.name]},
+        reasons={name: round(ticks * TICK_S, 1) for name, ticks in sorted(reasons.items())},
+        distrusted={role: round(ticks * TICK_S, 1) for role, ticks in sorted(tally.distrusted.items())},
+        lacking=lacking(pipeline.vehicle),
+        frames=pipeline.codec.received,
+        dropped=counts.dropped,
+        implausible=counts.implausible,
+        lost=counts.lost,
+        unknown=counts.unknown,
+        foreign=cast("dict[str, int]", status["foreign"]),
+        error_frames=pipeline.codec.error_frames,
+        gaps_s=round(pipeline.estimator.gap_time, 1),
+        faults=cast("dict[str, dict[str, int]]", status["faults"]),
+        damage=str(ridden.damages[0]) if ridden.damages else None,
+        cpu_s=ridden.took[0],
+        real_time_factor=tally.last.time / ridden.took[1] if tally.last else None,
+    )
+
+
+def summary_to_keep(summary: RideSummary) -> str:
+    """A summary as JSON without what depends on the place of the files, and on the machine."""
+    damage = summary.damage and summary.damage.removeprefix(f"{summary.file}: ")
+    plain = replace(summary, file="", log=None, plot=None, damage=damage, cpu_s=0.0, real_time_factor=None)
+    return json.dumps(to_json(plain))
+
+
+def kept_summary(text: str, file: Path, log: Path, picture: Path | None) -> RideSummary | None:
+    """The summary that `summary_to_keep` gave, of these files; None for any other text."""
+    try:
+        values = json.loads(text)
+        values |= {"file": str(file), "log": str(log), "plot": str(picture) if picture else None}
+        values["damage"] = values["damage"] and f"{file}: {values['damage']}"
+        values["why"] = values["why"] and Why(**values["why"])
+        values["changes"] = [Why(**change) for change in values["changes"]]
+        values["route"] = values["route"] and RouteSummary(**values["route"])
+        return RideSummary(**values)
+    except (ValueError, TypeError, KeyError):
+        return None

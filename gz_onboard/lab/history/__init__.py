@@ -1,0 +1,1 @@
+"""``gz-onboard history``: the rides of months in one SQLite file."""

@@ -1,0 +1,17 @@
+"""Whether a file is the one that it was."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from gz_onboard.errors import InputError, near_file
+
+
+def digest_of(file: Path) -> str:
+    """The SHA-256 of what is in a file, hexadecimal. InputError if it cannot be read."""
+    try:
+        with file.open("rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{file}: cannot be read: {error.strerror}{near_file(file)}") from None
