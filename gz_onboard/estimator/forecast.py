@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from math import exp, hypot, sqrt
+from math import exp, hypot, inf, sqrt
 from typing import Any
 
 from gz_onboard.constants import GRAVITY, HOUR
@@ -51,6 +51,7 @@ MOST_SD = 3.0  # of the logarithm of the range: beyond, it is not known at all
 SHOWN_FROM = 500.0  # m: over less the recent consumption is that of one traffic light
 END_LOAD_SD = 0.25  # of the mean load: at which load a vehicle gives up is known so well
 WARM_CELLS = 25.0  # degC, of a cooling that is only asked for its constants
+COLDER_AGAIN = 0.005, 0.5, 0.5  # SOC, degC, degC: changed by more, what colder cells would give is asked anew
 DECILE = 1.2815515655446004  # sd of a normal distribution: 10 % are beyond
 
 
@@ -98,7 +99,7 @@ class Forecaster:
         self.riding = Riding(self.prior)
         self.calm, self.pattern, self.riders = Calm(), Pattern(), Riders()
         self.ageing: Ageing | None = None  # None: the pack is known to be as its file says
-        self._past = Past()
+        self._past, self._colder = Past(), ((inf, inf, inf), 0.0)  # SOC, cells and their sd [degC]; the share lost
         self._overpotential = model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
         self._weight = model.mass * GRAVITY  # N
         self._moving_mass = model.mass + rotating_mass(model.parameters)  # kg, with what rotates
@@ -254,18 +255,17 @@ class Forecaster:
         expected = self._expected(self._rough_way(soc, cell_temperature), ambient, altitude)
         consumption = expected.consumption
         ahead = cells_ahead(self.battery, self.cooling, (soc, cell_temperature), ambient, expected.load)
-        left, colder = (self._drawable(soc, t, expected) for t in (ahead, ahead - temperature_sd))
+        left = self._drawable(soc, ahead, expected)
         beside = (
             (self.battery.window.sd * left.slope) ** 2
-            + (left.energy - colder.energy) ** 2
+            + (left.energy * self._lost_colder(soc, (ahead, temperature_sd), expected, left)) ** 2
             + (self._cutoff_sd**2 + (END_LOAD_SD * left.end_drop) ** 2) * left.by_cutoff**2
         )
         fresh = hypot(soc_sd * left.slope, self.battery.capacity_sd * left.energy)
         of_pack = self.ageing.energy_sd(left.energy, left.slope, soc_sd) if self.ageing else (fresh, fresh)
         energy_sd, upwards = (sqrt(beside + sd * sd) for sd in of_pack)
         range_ = left.energy / consumption
-        variance = loss_variance + expected.variance
-        variance = min(variance, MOST_SD**2)
+        variance = min(loss_variance + expected.variance, MOST_SD**2)
         sd = sqrt(variance)
         if left.energy > energy_sd:
             down, up = (sqrt(variance + (sd / left.energy) ** 2) for sd in (energy_sd, upwards))
@@ -294,6 +294,14 @@ class Forecaster:
         return drawable(
             self.battery, soc, temperature, expected.power, expected.form_factor_squared, self._overpotential
         )
+
+    def _lost_colder(self, soc: float, cells: tuple[float, float], expected: Expected, left: Drawable) -> float:
+        """Share of the energy `left` that colder cells would not give. cells: temperature and its sd [degC]."""
+        now, before = (soc, *cells), self._colder[0]
+        if any(abs(x - then) > step for x, then, step in zip(now, before, COLDER_AGAIN, strict=True)):
+            colder = self._drawable(soc, cells[0] - cells[1], expected)
+            self._colder = now, 1 - colder.energy / left.energy if left.energy > 0 else 0.0
+        return self._colder[1]
 
     def _rough_way(self, soc: float, temperature: float) -> float:
         """How long the charge will last [m], roughly: by the battery's nominal energy and the prior's price."""

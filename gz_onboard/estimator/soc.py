@@ -71,8 +71,8 @@ class StateOfCharge:
         self._started = -inf  # s: when there was a first state of charge,
         self._started_from: tuple[Saved | None, float | None] = (None, None)  # and what it was made from, how old
         self._doubted = False  # a voltage
-        self._restarted_at = -inf  # s
-        self._joined = False
+        self._restarted_at, self._joined = -inf, False  # s
+        self._step_noise: Noise | None = None  # of the last step
         self._gap: tuple[float, Saved] | None = None  # when the pack was last measured [s], and what was known then
         self._voltage_time: float | None = None  # s, of the message whose voltage was taken in last
         self._voltage_taken = -inf  # s: when
@@ -239,7 +239,8 @@ class StateOfCharge:
 
     def _noise(self, counted: float, filter_: SocFilter, temperature: float) -> Noise:
         """`counted`: variance of SOC."""
-        return Noise(counted, *self.uncertainty.slow(filter_.soc, temperature, filter_.covariance[0]))
+        self._step_noise = Noise(counted, *self.uncertainty.slow(filter_.soc, temperature, filter_.covariance[0]))
+        return self._step_noise
 
     def _update(self, filter_: SocFilter, now: float, dt: float, measured: tuple[float, float], at: PackState) -> None:
         """Update with the voltage [V] at a current [A], both of the pack, that represents `dt` [s]."""
@@ -271,16 +272,16 @@ class StateOfCharge:
         by_inverter = not self._signals.pack_voltage.fresh(now)
         voltage_sd = INVERTER_VOLTAGE_SD if by_inverter else reading.voltage_sd
         known = self._signals.cell_temperature.fresh(now)
-        slow = self.uncertainty.slow(filter_.soc, temperature, filter_.covariance[0])
+        noise = self._step_noise or self._noise(0.0, filter_, temperature)
         load = self.uncertainty.load(r0, (drop, filter_.v1), reading.source, known, voltage_sd)
         error, own = filter_.innovation(cell_voltage, cell_current, temperature)
         slope = battery.ocv(filter_.soc, temperature)[1]
-        variance = self.gate.update(dt, *self.ageing.as_believed(error, own, slope), slow.variance, load)
+        variance = self.gate.update(dt, *self.ageing.as_believed(error, own, slope), noise.error, load)
         if self.gate.refuted:
             self._refute(now, filter_, error, drop + filter_.v1)
         elif variance is not None and self.uncertainty.tells_more(filter_.soc, filter_.covariance[0]):
             # What errs the same way for a time counts as one sample in that time, not one each step.
-            variance *= max(2 * slow.time / max(dt, SHORTEST), 1.0)
+            variance *= max(2 * noise.time / max(dt, SHORTEST), 1.0)
             filter_.update(cell_voltage, cell_current, temperature, variance)
             filter_.soc = bounded(filter_.soc)
             self.ageing.corrected(filter_, before)
