@@ -98,6 +98,7 @@ def estimate_row(estimate: Estimate) -> dict[str, object]:
         value = getattr(estimate, name)
         # Seven digits are more than any sensor gives, and compress to half the size of seventeen.
         row[name] = float(f"{value:.7g}") if value is not None and isfinite(value) else None
+    row["time"] = round(estimate.time, 3)  # of a clock that begins in 1970, after it was set, seven digits are minutes
     row["state"] = estimate.state.name
     row["reasons"] = " ".join(reason_names(estimate.reasons))
     row["activity"] = estimate.activity.name

@@ -131,12 +131,14 @@ class Ageing:
     @property
     def resistance(self) -> Learned:
         """Of R0, R1 and what effects in the cells take."""
-        time = self._fit.time
-        seen = time / (time + FIRST)
-        places = seen * (1 + time / PLACE_TIME)
-        sd = 1 / sqrt(1 / self._unknown_resistance**2 + places / RESISTANCE_SD**2)
-        unproven = believed(self._fit.factor) - self._resistance_factor
-        return Learned(self._resistance_factor, sqrt(sd * sd + unproven * unproven), 1 - sd / self._unknown_resistance)
+        sd, unproven = self._resistance_sd(self._fit.time), believed(self._fit.factor) - self._resistance_factor
+        share = 1 - self._resistance_sd(self._proven[0].time) / self._unknown_resistance  # of what is used and kept
+        return Learned(self._resistance_factor, sqrt(sd * sd + unproven * unproven), share)
+
+    def _resistance_sd(self, time: float) -> float:
+        """After so much `time` of load [s]."""
+        places = time / (time + FIRST) * (1 + time / PLACE_TIME)
+        return 1 / sqrt(1 / self._unknown_resistance**2 + places / RESISTANCE_SD**2)
 
     @property
     def _resistance_factor(self) -> float:

@@ -292,14 +292,12 @@ def test_pictures_and_page(two):
 
 def test_what_fails_is_told_with_its_limit_and_meaning(two):
     text = two[2].partition(two[1]["rides"][1]["file"])[0].splitlines()
-    (torque,) = [line for line in text if "FAIL (" in line and "motor torque" in line]
-    assert "FAIL (limit 20 %) rms" in torque
     (load,) = [line for line in text if "FAIL (" in line and "road load" in line]
     assert "FAIL (limit 10 %) rms" in load
     forms = [form["channels"] for form in two[1]["rides"][0].values() if isinstance(form, dict) and "channels" in form]
     failing = sum(any(not channel["passed"] for channel in channels.values()) for channels in forms)
     assert [line.split(":")[0] for line in text if "FAIL:" in line] == ["    FAIL"] * failing
-    assert failing >= 2
+    assert failing >= 1
     assert any("docs/validation.md" in line for line in text)
 
 

@@ -38,6 +38,10 @@ class Choice:
         """Whether a ride without a date is none of it."""
         return self.since is not None or self.until is not None
 
+    def __post_init__(self) -> None:
+        if self.since and self.until and self.until.end <= self.since.begin:
+            raise InputError("until: must not be before since")
+
     def has(self, one: NumberedRide) -> bool:
         """Whether a ride is among them."""
         ride = one.ride
@@ -84,9 +88,8 @@ def read_rides(file: Path, choice: Choice) -> tuple[list[NumberedRide], int]:
     for what, wanted in (("vehicle", choice.vehicle), ("rider", choice.rider)):
         names = sorted({name for one in rides if (name := getattr(one.ride, what)) is not None})
         if wanted is not None and wanted not in names:
-            raise InputError(
-                f"--{what} {wanted}: is not in {file}{nearest(wanted, names)}; there are {', '.join(names) or 'none'}"
-            )
+            others = f"there are {', '.join(names)}" if names else f"no ride in it has a {what}"
+            raise InputError(f"{what} {wanted}: is not in {file}{nearest(wanted, names)}; {others}")
     chosen = [one for one in rides if choice.has(one)]
     left_out = sum(not one.ride.dated for one in rides) if choice.by_date else 0
     return chosen, left_out

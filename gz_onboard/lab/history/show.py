@@ -61,18 +61,19 @@ def run(arguments: argparse.Namespace, file: Path) -> int:
     _check(arguments, file)
     rides, undated = read_rides(file, _choice(arguments))
     shown = overviews(rides)
-    if arguments.json != "-":
-        parts = [overview_text(overview, arguments.rides) for overview in shown]
-        print("\n\n".join(parts) if parts else f"{file}: no ride")
-    if undated:
-        print(f"gz-onboard history: {undated} without a date left out: their logs' clock was not set", file=sys.stderr)
-    write_json(arguments.json, HISTORY_VERSION, {"file": str(file), "vehicles": [_in_json(each) for each in shown]})
     if arguments.table:
         with writing(arguments.table):
             write_table(arguments.table, ride_table(rides), kinds={**_KINDS, "start": str})
     if arguments.plot:
         with writing(arguments.plot):
             save(draw_history(shown), arguments.plot)
+    if arguments.json != "-":
+        parts = [overview_text(overview, arguments.rides) for overview in shown]
+        print("\n\n".join(parts) if parts else f"{file}: no ride")
+    if undated:
+        print(f"gz-onboard history: {undated} without a date left out: their logs' clock was not set", file=sys.stderr)
+    # Last, as who reads it may have had enough before its end.
+    write_json(arguments.json, HISTORY_VERSION, {"file": str(file), "vehicles": [_in_json(each) for each in shown]})
     return OK
 
 

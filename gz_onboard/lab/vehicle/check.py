@@ -170,8 +170,10 @@ def check_text(checked: Checked) -> str:
     suspected = Counter(role for finding in checked.those(Looks.WRONG) for role in finding.roles)
     said = "looks right"
     if suspected:
-        count, role = len(checked.those(Looks.WRONG)), suspected.most_common(1)[0][0]
-        said = "one thing looks wrong" if count == 1 else f"{count} things look wrong, above all {role}"
+        count, often = len(checked.those(Looks.WRONG)), suspected.most_common(2)
+        clear = len(often) == 1 or often[0][1] > often[1][1]
+        above_all = f", above all {often[0][0]}" if clear else ""
+        said = "one thing looks wrong" if count == 1 else f"{count} things look wrong{above_all}"
     lines = [f"{checked.file} ({clock(checked.duration_s)}): {said}"]
     lines += [f"  {seen.role:21} {_seen_text(seen)}" for seen in checked.roles]
     for looks in (Looks.WRONG, Looks.RIGHT, Looks.UNKNOWN):

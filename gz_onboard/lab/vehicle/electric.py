@@ -278,7 +278,8 @@ def _counted(of: Drawn, role: str, shown: Array) -> Iterator[Finding]:
     width = of.battery.window.high - of.battery.window.low
     counted = float(of.current[known].sum()) * SECOND / HOUR / capacity / width
     fell = float(shown[known][0] - shown[known][-1])
-    text = f"it falls by {fell:.1%}, and {counted:.1%} of the file's {capacity:.3g} A·h were drawn"
+    moves = f"falls by {fell:.1%}" if fell >= 0 else f"rises by {-fell:.1%}"
+    text = f"it {moves}, and {counted:.1%} of the file's {capacity:.3g} A·h were drawn"
     if max(abs(counted), abs(fell)) < COUNTED or known.mean() < 0.5:
         yield unknown(check, (role, "pack_current"), f"{text}: too little")
     elif counted * fell < 0:
