@@ -90,7 +90,7 @@ def main() -> int:
         if path.exists():
             print(f"{what:13} {path.relative_to(ROOT) if path.is_relative_to(ROOT) else path}")
     if not picture.exists():
-        print(f"{'page':13} was at http://{listen}/; no picture of it, which takes Chromium (.ci/setup browser)")
+        print(f"{'page':13} was at http://{listen}/; no picture of it, which takes Chromium and some seconds")
     return 0
 
 

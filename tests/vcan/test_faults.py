@@ -284,6 +284,7 @@ def test_what_the_kernel_drops_is_counted(running: Running, listener: Listener):
 @pytest.mark.administers
 @pytest.mark.skipif(not Path("/run/vcan-guest").is_dir(), reason="sets the clock: only in a guest")
 def test_the_clock_is_set(running: Running, listener: Listener):
+    started = time.clock_gettime(time.CLOCK_BOOTTIME)
     daemon = running.daemon()
     real = time.clock_gettime(time.CLOCK_BOOTTIME)
     begin = time.time()
@@ -303,11 +304,13 @@ def test_the_clock_is_set(running: Running, listener: Listener):
         set_clock(0.0)
     wait_for(lambda: daemon.journal.count("the clock was set") == 4, 5, "the daemon says that the clock was set")
     daemon.stop()
+    elapsed = time.clock_gettime(time.CLOCK_BOOTTIME) - started
     rows = daemon.estimates()
     steps = [b["time"] - a["time"] for a, b in pairwise(rows)]
-    # A busy machine may hold the daemon up for seconds; the clock was set by 40 s and more.
-    assert all(0.5 < step < 20 for step in steps), [round(step, 2) for step in steps]
+    # A busy machine may hold the daemon up, but no time is in the log that did not pass, and none comes twice.
     assert median(steps) == pytest.approx(1.0, abs=0.11)
+    assert min(steps) > 0.5, [round(step, 2) for step in steps]
+    assert sum(steps) < elapsed, [round(step, 2) for step in steps]
     riding = [row for row in rows if row["speed"] is not None]
     assert all(row["state"] == "VALID" for row in riding[2:-2])
     assert all(0 < b["distance"] - a["distance"] < 12 for a, b in pairwise(riding))

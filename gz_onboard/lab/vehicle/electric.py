@@ -34,7 +34,7 @@ COUNTED, GAINS = 0.06, (0.6, 1.7)
 
 
 @dataclass(frozen=True)
-class Drawn:
+class PackRide:
     """What the pack gives: voltage [V], current [A] of the ride, (n,), and its battery; temperature of the cells."""
 
     voltage: Array
@@ -43,7 +43,7 @@ class Drawn:
     temperature: float  # degC
 
 
-def drawn(ride: Seconds, vehicle: Vehicle) -> Drawn | None:
+def drawn(ride: Seconds, vehicle: Vehicle) -> PackRide | None:
     """Pack or inverter; None without a voltage or a battery."""
     voltages = ride.any_of("pack_voltage", "inverter_voltage")
     if not voltages or vehicle.battery is None:
@@ -52,7 +52,7 @@ def drawn(ride: Seconds, vehicle: Vehicle) -> Drawn | None:
     degrees = [float(np.nanmean(ride[role])) for role in ride.any_of("cell_temperature", "ambient_temperature")]
     temperature = min(max(degrees[0], -30.0), 60.0) if degrees else BENCH_TEMPERATURE
     current = ride[currents[0]] if currents else None
-    return Drawn(ride[voltages[0]], current, vehicle.battery, temperature)
+    return PackRide(ride[voltages[0]], current, vehicle.battery, temperature)
 
 
 def check_voltages(ride: Seconds, battery: Battery) -> Iterator[Finding]:
@@ -80,7 +80,7 @@ def check_voltages(ride: Seconds, battery: Battery) -> Iterator[Finding]:
         yield looks("voltages against each other", (*inside,), f"the inverter's is {off:+.3f} V a cell off the pack's")
 
 
-def check_sag(of: Drawn) -> Iterator[Finding]:
+def check_sag(of: PackRide) -> Iterator[Finding]:
     """The current's sign and size by what the voltage lacks under it."""
     if of.current is None:
         return
@@ -109,7 +109,7 @@ def check_sag(of: Drawn) -> Iterator[Finding]:
         yield wrong(check, ("pack_current",), text + like)
 
 
-def _tiny(of: Drawn, capacity: float) -> str:
+def _tiny(of: PackRide, capacity: float) -> str:
     """What else a current may be that moves too little for the pack."""
     moved = float(np.nanstd(of.voltage)) / of.battery.cells_series
     return f", though the voltage moves by {1e3 * moved:.0f} mV a cell" if moved > 0.02 and capacity else ""
@@ -135,7 +135,7 @@ def model_power(ride: Seconds, vehicle: Vehicle, speed: Array, payload: float | 
     return np.asarray(sum(vehicle.model.power(quantities).values()))
 
 
-def check_road(ride: Seconds, of: Drawn, speed: Array, expected: Array) -> Iterator[Finding]:
+def check_road(ride: Seconds, of: PackRide, speed: Array, expected: Array) -> Iterator[Finding]:
     """The pack's power against that of the model [W] (n,) at this speed [m/s] (n,)."""
     if of.current is None:
         return
@@ -160,7 +160,7 @@ def check_road(ride: Seconds, of: Drawn, speed: Array, expected: Array) -> Itera
     yield from _braking(of, speed, moving)
 
 
-def _braking(of: Drawn, speed: Array, moving: Mask) -> Iterator[Finding]:
+def _braking(of: PackRide, speed: Array, moving: Mask) -> Iterator[Finding]:
     """Whether the current has a sign, and what is recovered is in it."""
     assert of.current is not None
     check, current = "current while braking", of.current
@@ -200,7 +200,7 @@ def check_currents(ride: Seconds) -> Iterator[Finding]:
         yield wrong(check, roles, text + unit_of("inverter_current", found.factor))
 
 
-def check_motor(ride: Seconds, of: Drawn | None) -> Iterator[Finding]:
+def check_motor(ride: Seconds, of: PackRide | None) -> Iterator[Finding]:
     """The signs of torque and current of the motor by the power of the pack."""
     if of is None or of.current is None:
         return
@@ -219,7 +219,7 @@ def check_motor(ride: Seconds, of: Drawn | None) -> Iterator[Finding]:
             yield right(check, (role,), f"correlation {found.correlation:.2f}")
 
 
-def check_charge(ride: Seconds, of: Drawn | None, vehicle: Vehicle) -> Iterator[Finding]:
+def check_charge(ride: Seconds, of: PackRide | None, vehicle: Vehicle) -> Iterator[Finding]:
     """The vehicle's own state of charge by the first voltage, and by the charge that flowed."""
     if "bms_state_of_charge" not in ride or of is None:
         return
@@ -246,7 +246,7 @@ def check_charge(ride: Seconds, of: Drawn | None, vehicle: Vehicle) -> Iterator[
     yield from _counted(of, role, shown)
 
 
-def _cells_that_fit(of: Drawn, current: Array, shown: Array) -> int:
+def _cells_that_fit(of: PackRide, current: Array, shown: Array) -> int:
     """The cells in series that have the pack's voltage where the vehicle shows its state of charge, both (n,).
 
     The file's number unless another is clearly meant, by the seconds of least load within the first minute. It is known
@@ -268,7 +268,7 @@ def _cells_that_fit(of: Drawn, current: Array, shown: Array) -> int:
     return fit if clear and 0 < abs(fit - battery.cells_series) <= MISCOUNTED else battery.cells_series
 
 
-def _counted(of: Drawn, role: str, shown: Array) -> Iterator[Finding]:
+def _counted(of: PackRide, role: str, shown: Array) -> Iterator[Finding]:
     check, capacity = "state of charge against the charge", of.battery.pack_capacity(of.temperature)
     if of.current is None:
         return
