@@ -3,8 +3,9 @@
 Each quantity (`Habit`) is a level that is usual, known with some uncertainty and hardly changing, plus a deviation of
 the present riding, which fades over `FADES` and begins anew with each ride: a first-order Gauss-Markov process. A
 Kalman filter learns both from segments. Their scatter, and how unlike each other rides are, are learned too: the
-expectation and maximisation of Shumway & Stoffer 1982, a little at each step instead of over all data again. What is
-left after a ride is the prior of the next.
+expectation and maximisation of Shumway & Stoffer 1982, a little at each step instead of over all data again. So is how
+alike neighbours are (a car's motorway, a hill): their mean is known less well by as much. What is left after a ride is
+the prior of the next.
 
 All are relative to what the model gives for the prior riding in the same air, so that cold air or a high pass is not
 taken for a habit.
@@ -13,13 +14,13 @@ taken for a habit.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import MISSING, asdict, dataclass, fields
 from math import exp, sqrt
 from typing import Any
 
-from gz_onboard.physics.riding import PriorRiding
+from gz_onboard.physics.riding import DRIFT, PriorRiding
 
-SEGMENT = 250.0  # m: neighbours of this length are not alike (correlation below 0.15 on ten recorded rides)
+SEGMENT = 250.0  # m: of a scooter in town neighbours of this length are hardly alike
 FADES = 200_000.0  # m: over which a ride loses its likeness to its begin; full discharges of 50 to 70 km did not
 SEASON = 500_000.0  # m: over which what is usual changes by `SEASON_CHANGE` (tyres, clothes, ways)
 SEASON_CHANGE = 0.1  # sd, relative
@@ -31,7 +32,8 @@ RUN_LENGTH = 2000.0  # m, over which residuals are averaged to see whether the r
 RUN_MOST = 0.9  # sd of one segment: 3.5 sd of that mean; nothing but scatter makes it in one of fifty full discharges
 MOST, MOST_VARIANCE = 10.0, 4.0  # everything is about 1; a heated van in a jam takes 5 times what the model says
 LEVEL_SD = 0.15  # of what riders and roads of one kind of vehicle cost
-PRIOR_SCATTER = 0.2  # sd of a segment's price
+PRIOR_SCATTER = 0.2 / DRIFT  # sd of a segment's price, over that of rides
+MOST_LIKENESS = 0.8  # correlation
 FACTOR_BETWEEN = 0.03  # sd of the factor between rides: wind, tyres, luggage
 FACTOR_SCATTER = 0.18  # sd of a segment's measured less modelled energy, of the eight commissioning rides
 STANDING_SD, STANDING_BETWEEN, STANDING_SCATTER = 0.03, 0.01, 0.06  # of the price: a wait of half a minute is 0.05
@@ -50,6 +52,8 @@ class Habit:
     present_variance: float = -1.0  # below 0: as between rides
     covariance: float = 0.0
     run: float = 0.0  # mean of the latest residuals, each over its sd
+    likeness: float = 0.0  # correlation of the scatter of neighbouring segments
+    beside: float = 0.0  # of the latest residual over its sd, less that mean; 0: of another ride
 
     def __post_init__(self) -> None:
         if self.present_variance < 0:
@@ -68,7 +72,11 @@ class Habit:
     @property
     def known_from(self) -> float:
         """As much riding [m] as would tell as much of `now`."""
-        return SEGMENT * self.scatter / max(self.variance, LEAST_SD**2 / 100)
+        return self._own(1.0) / max(self.variance, LEAST_SD**2 / 100)
+
+    def _own(self, distance: float) -> float:
+        """Variance that the scatter gives a mean over `distance` [m], of a first-order autoregressive process."""
+        return self.scatter * (1 + self.likeness) / (1 - self.likeness) * SEGMENT / distance
 
     def learned(self, residual: float, distance: float, noise: float = 0.0) -> Habit:
         """After `distance` [m] that differed from `now` by `residual`; `noise`: a variance beside the scatter."""
@@ -76,20 +84,26 @@ class Habit:
         season = SEASON_CHANGE**2 * self.usual**2 * distance / SEASON
         uu = min(self.usual_variance + season, max(self.usual_variance, MOST_VARIANCE))
         up, pp = fade * self.covariance, fade * fade * self.present_variance + (1 - fade * fade) * self.between
-        own = self.scatter * SEGMENT / distance
+        alone, own = self.scatter * SEGMENT / distance, self._own(distance)
         total = uu + 2 * up + pp + own + noise
         most = OUTLIER * sqrt(total)
         residual = min(max(residual + (1 - fade) * self.present, -most), most)
-        share = min(distance / RUN_LENGTH, 1.0) if noise < own else 0.0  # what else errs may err alike for long
+        told = noise < own  # what else errs may err alike for long
+        share = min(distance / RUN_LENGTH, 1.0) if told else 0.0
         run = self.run + share * (residual / sqrt(total) - self.run)
         if abs(run) > RUN_MOST:  # the riding changed: by about so much
             pp, run = min(max(pp, self.between, run * run * total), MOST_VARIANCE), 0.0
             total = uu + 2 * up + pp + own + noise
         gain_usual, gain_present = (uu + up) / total, (up + pp) / total
         # of the segment's own scatter: its mean square given the residual
-        seen = (own * residual / total) ** 2 + own * (1 - own / total)
+        whole = total - own + alone
+        seen = (alone * residual / whole) ** 2 + alone * (1 - alone / whole)
         seen *= distance / SEGMENT
         share = min(distance / SCATTER_LENGTH, 1.0)
+        # Less the mean of the latest, as a level that changed is no likeness; what is not scatter may be its error too.
+        beside = residual / sqrt(total) - self.run
+        scattered = share * (own / total) ** 2 if told and self.beside else 0.0
+        likeness = self.likeness + scattered * (beside * self.beside * total / alone - self.likeness)
         return Habit(
             min(max(self.usual + gain_usual * residual, -MOST), MOST),
             uu - gain_usual * (uu + up),
@@ -99,13 +113,15 @@ class Habit:
             pp - gain_present * (up + pp),
             up - gain_usual * (up + pp),
             run,
+            min(max(likeness, 0.0), MOST_LIKENESS),
+            beside,
         )
 
     def rested(self) -> Habit:
         """Before another ride: what this one was teaches how unlike rides are."""
         seen = self.present**2 + self.present_variance
         between = min(max(self.between + RIDE_SHARE * (seen - self.between), LEAST_SD**2), MOST_VARIANCE)
-        return Habit(self.usual, self.usual_variance, between, self.scatter)
+        return Habit(self.usual, self.usual_variance, between, self.scatter, likeness=self.likeness)
 
     def ahead(self, distance: float) -> tuple[float, float]:
         """(mean over the next `distance` [m], its variance).
@@ -116,7 +132,7 @@ class Habit:
         share = (1 - exp(-lengths)) / lengths
         whole = 2 * (1 - share) / lengths  # variance of the mean where nothing is known, over the variance between
         variance = self.usual_variance + 2 * share * self.covariance + share * share * self.present_variance
-        variance += (whole - share * share) * self.between + self.scatter * SEGMENT / max(distance, SEGMENT)
+        variance += (whole - share * share) * self.between + self._own(max(distance, SEGMENT))
         return self.usual + share * self.present, variance
 
 
@@ -132,7 +148,8 @@ class Usual:
     @classmethod
     def of(cls, prior: PriorRiding, standing: float) -> Usual:
         """Before anything is ridden; `standing`: the prior riding's."""
-        price = Habit(prior.factor, prior.factor_sd**2 + LEVEL_SD**2, prior.drift**2, PRIOR_SCATTER**2)
+        level, scatter = prior.factor_sd**2 + LEVEL_SD**2, max(PRIOR_SCATTER * prior.drift, LEAST_SD) ** 2
+        price = Habit(prior.factor, level, prior.drift**2, scatter)
         return cls(
             price,
             Habit(standing, STANDING_SD**2, STANDING_BETWEEN**2, STANDING_SCATTER**2),
@@ -155,10 +172,13 @@ def restored_usual(saved: Mapping[str, Any]) -> Usual:
 
 
 def _restored_habit(saved: Mapping[str, Any]) -> Habit:
-    habit = Habit(**{f.name: float(saved[f.name]) for f in fields(Habit)})
+    # What older versions saved lacks what has a default.
+    names = [f.name for f in fields(Habit) if f.name in saved or f.default is MISSING]
+    habit = Habit(**{name: float(saved[name]) for name in names})
     numbers = [getattr(habit, f.name) for f in fields(Habit)]
     least = min(habit.between, habit.scatter, habit.present_variance, habit.usual_variance)
     possible = habit.covariance**2 <= habit.usual_variance * habit.present_variance * (1 + 1e-9)
+    possible &= 0 <= habit.likeness <= MOST_LIKENESS
     if not (all(abs(x) <= MOST for x in numbers) and least >= 0 < habit.scatter and possible):
         raise ValueError("implausible habits")
     return habit

@@ -143,6 +143,49 @@ def test_a_habit_learns_its_scatter_and_how_unlike_rides_are():
     assert np.sqrt(habit.between) == pytest.approx(0.12, rel=0.35)
 
 
+def test_where_neighbours_are_alike_they_teach_less():
+    """Stretches of motorway and town: what is expected of the rest of a ride is as uncertain as it says."""
+    rng = np.random.default_rng(5)
+    habit, alike, normalised = Habit(1.0, 0.15**2, 0.2**2, 0.5**2), 0.6, []
+    for ride in range(200):
+        level, scatter, ridden = 1 + rng.normal(0, 0.1), rng.normal(0, 0.5), []
+        for _ in range(80):
+            scatter = alike * scatter + rng.normal(0, 0.5 * np.sqrt(1 - alike**2))
+            ridden.append(level + scatter)
+        for price in ridden[:40]:
+            habit = habit.learned(price - habit.now, 250.0)
+        mean, variance = habit.ahead(250.0 * 40)
+        if ride >= 20:
+            normalised.append((np.mean(ridden[40:]) - mean) / np.sqrt(variance))
+        for price in ridden[40:]:
+            habit = habit.learned(price - habit.now, 250.0)
+        habit = habit.rested()
+    assert 0.45 < habit.likeness < 0.75
+    assert 0.8 < np.std(normalised) < 1.25
+
+
+def test_where_neighbours_are_not_alike_none_is_learned():
+    rng = np.random.default_rng(6)
+    habit, found = Habit(1.0, 0.15**2, 0.055**2, 0.2**2), []
+    for _ in range(40):
+        for _ in range(60):
+            habit = habit.learned(1.0 + rng.normal(0, 0.2) - habit.now, 250.0)
+        found.append(habit.likeness)
+        habit = habit.rested()
+    assert np.mean(found) < 0.15
+
+
+def test_a_state_without_likeness_is_restored():
+    saved = Usual.of(PriorRiding(), 0.02).snapshot()
+    older = {name: {k: x for k, x in habit.items() if k not in ("likeness", "beside")} for name, habit in saved.items()}
+    assert restored_usual(older).snapshot() == saved
+
+
+def test_who_drives_unlike_from_ride_to_ride_does_so_on_the_way():
+    town, car = (Usual.of(PriorRiding(drift=drift), 0.02).price for drift in (0.055, 0.22))
+    assert car.scatter == pytest.approx(16 * town.scatter)
+
+
 def test_far_ahead_the_usual_counts_and_near_the_present():
     habit = Habit(1.0, 0.001, 0.01, 0.01, present=0.2, present_variance=0.001)
     near, far = habit.ahead(1000.0), habit.ahead(1e7)
@@ -156,14 +199,14 @@ def test_a_fifth_more_consumption_is_followed_within_the_stated_distance(before,
     """A headwind that stays: 63 % of it is in the range shown after at most so many km, in the mean over rides."""
     rng = np.random.default_rng(3)
     found = []
-    for _ in range(20):
+    for _ in range(80):
         habit, calm = Habit(1.0, 0.17**2, 0.055**2, 0.2**2), Calm()
         for k in range(4 * 70):
             habit = habit.learned((1.0 if k < 4 * before else 1.2) + rng.normal(0, 0.17) - habit.now, 250.0)
             left = 100_000 - 250.0 * k  # as though it lasted for long
             calm.ride(250.0 if k else 0.0)
             found.append(calm.follow(left / habit.ahead(left)[0], 90.0 * left, habit.known_from) / left)
-    price = 1 / np.mean(np.reshape(found, (20, -1)), axis=0)
+    price = 1 / np.mean(np.reshape(found, (80, -1)), axis=0)
     late = price[4 * before :]
     reached = np.argmax(late > 1 + 0.63 * 0.2) / 4
     assert 0 < reached < most
