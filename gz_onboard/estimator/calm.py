@@ -4,8 +4,11 @@ The errors of successive forecasts are nearly the same error: within `CALM` the 
 So what is ridden is taken off what was shown, and of the gap that is left to the forecast a share is closed with each
 metre: the Kalman filter of a constant (ridden plus remaining) seen through an error that fades over `CALM`. It closes
 faster
-- at first, while the forecast itself follows each kilometre: over as much riding as the forecast is known from;
+- at first, while the forecast itself follows each kilometre: over half as much riding as the forecast is known from;
 - near empty, where the forecast's error goes as its range does: over a third of that.
+
+Once the forecast has been known from `SETTLED` of riding, a better one is shown no faster than `FASTEST`: the range
+does not rise under who rides. A worse one is not held back.
 
 At standstill nothing is ridden that the gap could close over: what is drawn is taken off, and what else changes the
 forecast, as a rest does that shows the state of charge, waits for the riding to come; at most `STEP` of it. The rest of
@@ -22,7 +25,10 @@ from typing import Any
 
 CALM = 6000.0  # m
 NEAR_EMPTY = 3.0  # the gap closes over the range over this
+AT_FIRST = 2.0  # the gap closes over what the forecast is known from over this
 FIRST = 250.0  # m, over which it closes at first
+SETTLED = 3000.0  # m
+FASTEST = 0.8, 1.5e-5  # gained, of what is ridden; of the range for each m ridden, where that is more
 STEP = 0.05  # of the energy that is left, or of the range
 RATIO = 0.2, 5.0  # shown over forecast: beyond, it is not kept
 
@@ -32,6 +38,7 @@ class Calm:
 
     def __init__(self, ratio: float = 1.0) -> None:
         self.ratio = ratio  # shown over forecast
+        self._settled = False
         self._before: tuple[float, float] | None = None  # the last forecast's range [m] and energy [J]
         self._ridden = 0.0  # m since
         self._waiting = 0.0  # logarithm of the part of the ratio that waits for riding
@@ -53,10 +60,14 @@ class Calm:
             if drawn is not None and drawn < before[1]:
                 self._wait(log(before[0] / raw * (1 - drawn / before[1])))
             return raw * self.ratio
-        length = max(min(known, CALM, raw / NEAR_EMPTY), FIRST)
+        length = max(min(known / AT_FIRST, CALM, raw / NEAR_EMPTY), FIRST)
         fading = exp(-ridden / length)
-        gap = (before[0] * self.ratio - ridden - raw) * fading
-        self.ratio = min(max(1 + gap / raw, RATIO[0]), RATIO[1])
+        gap = before[0] * self.ratio - ridden - raw
+        closed = gap * (1 - fading)
+        self._settled |= known >= SETTLED
+        if self._settled:
+            closed = max(closed, -ridden * max(FASTEST[0], FASTEST[1] * raw))
+        self.ratio = min(max(1 + (gap - closed) / raw, RATIO[0]), RATIO[1])
         self._waiting *= fading
         return raw * self.ratio
 

@@ -71,6 +71,7 @@ class Forecast:
     power: float  # W, mean of the riding expected
     form_factor_squared: float
     cells: float  # degC, their mean on the way that is left
+    known_from: float  # m: as much riding would tell as much of the way to come
 
 
 @dataclass(frozen=True, slots=True)
@@ -179,11 +180,8 @@ class Forecaster:
         return then * second.seconds, to_come * second.seconds
 
     def shown(self, forecast: Forecast, drawn: float | None = None) -> Forecast:
-        """`forecast` as it is to be shown: its range and interval moved together; to be asked once for each.
-
-        drawn: see `Calm.follow`.
-        """
-        way = self.calm.follow(forecast.range, forecast.energy, self.riding.usual.price.known_from, drawn)
+        """`forecast` as it is to be shown, to be asked once for each; drawn: see `Calm.follow`."""
+        way = self.calm.follow(forecast.range, forecast.energy, forecast.known_from, drawn)
         move = way / forecast.range if forecast.range > 0 else 1.0
         return replace(forecast, range=way, p10=move * forecast.p10, p90=move * forecast.p90)
 
@@ -288,6 +286,7 @@ class Forecaster:
             power=expected.power,
             form_factor_squared=expected.form_factor_squared,
             cells=ahead,
+            known_from=self.riding.usual.price.known_from,
         )
 
     def _drawable(self, soc: float, temperature: float, expected: Expected) -> Drawable:

@@ -127,6 +127,11 @@ class RoadAhead:
         riding = self._forecaster.riding
         return self.rider.expected_cost(riding.factor, riding.factor_variance)
 
+    @property
+    def _known_from(self) -> float:
+        """As much of the route [m] as would tell as much of the cost."""
+        return SEGMENT * SEGMENT_SD**2 / self._cost[1]
+
     # --- forecasting ------------------------------------------------------------------------------------------
 
     def forecast(self, now: float, free: Forecast, pack: tuple[float, float], conditions: Conditions) -> Forecast:
@@ -211,7 +216,16 @@ class RoadAhead:
             None if ends is None else road.position.at(here + ends),
         )
         expected = free.energy / range_ if range_ > 0 and free.energy > 0 else free.consumption
-        return replace(free, range=range_, p10=p10, p90=p90, consumption=expected, consumption_sd=expected * spread)
+        known = on_route * self._known_from + (1 - on_route) * free.known_from
+        return replace(
+            free,
+            range=range_,
+            p10=p10,
+            p90=p90,
+            consumption=expected,
+            consumption_sd=expected * spread,
+            known_from=known,
+        )
 
     def _arrival(
         self, free: Forecast, pack: tuple[float, float], needed: float, needed_sd: float

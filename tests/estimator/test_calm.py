@@ -49,6 +49,24 @@ def test_a_real_change_is_followed_within_three_lengths():
     assert np.all(error[at[1:] > 5000 + 3 * CALM] < 100)
 
 
+def test_a_better_forecast_does_not_let_the_range_rise():
+    """10 km more within one: who rides sees no rise, and in the end all of it; while little is known it shows soon."""
+    ridden = np.full(4000, 10.0)
+    at = np.cumsum(ridden)
+    raw = np.interp(at, [5000, 6000], [50_000, 60_000]) - at
+    settled = shown(raw, ridden)
+    assert np.diff(settled).max() <= 0
+    assert settled[-1] == pytest.approx(raw[-1], rel=0.01)
+    assert shown(raw, ridden, known=1000.0)[at >= 9000][0] == pytest.approx(raw[at >= 9000][0], rel=0.01)
+
+
+def test_of_a_long_range_more_is_gained():
+    ridden = np.full(4000, 10.0)
+    at = np.cumsum(ridden)
+    found = shown(np.interp(at, [5000, 10_000], [350_000, 500_000]) - at, ridden)
+    assert np.diff((found + at)[(at > 12_000) & (at < 14_000)]) == pytest.approx(10 * 1.5e-5 * 487_000, rel=0.01)
+
+
 def test_a_step_that_no_riding_makes_is_shown_at_once():
     ridden = np.full(100, 10.0)
     raw = np.where(np.arange(100) < 50, 40_000.0, 30_000.0) - np.cumsum(ridden)

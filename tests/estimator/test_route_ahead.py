@@ -25,7 +25,7 @@ from tests.support import reference
 AIR = Conditions(20.0, 300.0)
 FREE = Forecast(
     range=40e3, p10=34e3, p90=47e3, energy=4e6, energy_sd=8e4, consumption=100.0, consumption_sd=12.0,
-    recent=None, mostly_prior=False, power=800.0, form_factor_squared=2.5, cells=25.0,
+    recent=None, mostly_prior=False, power=800.0, form_factor_squared=2.5, cells=25.0, known_from=5000.0,
 )  # fmt: skip
 
 
@@ -131,6 +131,17 @@ def test_the_cost_is_learned_and_kept():
     rider.ride(700, 1.4 * usual)
     assert rider.ahead.rider.cost == pytest.approx(1.4, abs=0.1)
     assert restored(rider.ahead.rider.snapshot()) == rider.ahead.rider
+
+
+def test_on_a_route_the_forecast_is_known_from_what_was_ridden_of_it():
+    rider = Rider(way(60e3))
+    early = rider.settled()[0].known_from
+    costs = rider.ahead._costs
+    assert costs
+    rider.ride(700, costs.level[-1] / 60e3 * 11.0)
+    later = rider.ask().known_from
+    assert early < 1500 < 5000 < later
+    assert Rider(way(1e3)).settled()[0].known_from == pytest.approx(FREE.known_from, rel=0.05)
 
 
 def test_the_pace_is_learned_where_it_shows():
