@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from math import isfinite
+from math import inf, isfinite
 from typing import TYPE_CHECKING, Any, Protocol
 
 from gz_onboard.bus.logfile import object_schema
 from gz_onboard.estimator.ageing import Learned
 from gz_onboard.estimator.drawn import Drawn
+from gz_onboard.estimator.signals import FIX_2D, FIX_3D, Signals
 from gz_onboard.events import Cause, Estimate, Explanation, Frame, Reason
-from gz_onboard.location_rows import BATTERY_ENDS_TOPIC, LOCATION_SCHEMA, LOCATION_TOPIC
+from gz_onboard.location_rows import BATTERY_ENDS_TOPIC, LOCATION_SCHEMA, LOCATION_TOPIC, location_row
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -144,6 +145,28 @@ def learned_row(learned: Mapping[str, Learned]) -> dict[str, dict[str, float]]:
         name: {"factor": round(x.value, 4), "sd": round(x.sd, 4), "share": round(x.share, 3)}
         for name, x in learned.items()
     }
+
+
+class Positions:
+    """The positions among a vehicle's signals, each once, as rows of `LOCATION_TOPIC`."""
+
+    def __init__(self) -> None:
+        self._located = -inf  # s, of the last position given
+
+    def new(self, signals: Signals, now: float, time_ns: int) -> tuple[int, dict[str, Any]] | None:
+        """When a position was seen [ns], and its row; None if there is none that was not given before, or no fix.
+
+        now: [s, on the timeline of the signals], the same time as `time_ns` [ns since 1970].
+        """
+        latitude, longitude = signals.latitude.get(now), signals.longitude.get(now)
+        if latitude is None or longitude is None or signals.longitude.time <= self._located:
+            return None
+        self._located = signals.longitude.time
+        if signals.fix_below(now, FIX_2D):
+            return None
+        altitude = None if signals.fix_below(now, FIX_3D) else signals.gps_altitude.get(now)
+        seen_ns = time_ns - round((now - self._located) * 1e9)
+        return seen_ns, location_row(seen_ns, "gps", latitude, longitude, altitude)
 
 
 def estimate_schema() -> dict[str, Any]:

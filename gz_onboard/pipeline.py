@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Mapping, Sequence
-from math import inf
 
 from gz_onboard.bus.codec import DROPPING, RANGE, Codec
 from gz_onboard.bus.layout import identifier_of
@@ -21,7 +20,6 @@ from gz_onboard.estimator.drawn import Drawn
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.signals import FIX_2D, FIX_3D
 from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
 from gz_onboard.location_rows import BATTERY_ENDS_TOPIC, LOCATION_TOPIC, location_row
 from gz_onboard.log_rows import (
@@ -30,6 +28,7 @@ from gz_onboard.log_rows import (
     STATUS_TOPIC,
     WHY_TOPIC,
     Log,
+    Positions,
     declare,
     estimate_row,
     explanation_row,
@@ -103,7 +102,7 @@ class Pipeline:
         self._dropped_before = self._lost_before = 0
         self._recent = Reason(0)
         self._topics: dict[int, str] = {}
-        self._located = -inf  # s, of the last position logged
+        self._positions = Positions()
         if log:
             answers = [request.message for request in vehicle.mapping.requests]
             declare(log, [*self.codec.mapping.database.messages, *answers] if log_signals else ())
@@ -208,15 +207,9 @@ class Pipeline:
                         continue
                     topic = topics[identifier] = f"/can/{name}"
                 log.sample(topic, time_ns, codec.values(identifier, data), seen_ns)
-        signals, now = self.estimator.signals, codec.seconds(time_ns)
-        latitude, longitude = signals.latitude.get(now), signals.longitude.get(now)
-        if latitude is None or longitude is None or signals.longitude.time <= self._located:
-            return
-        self._located = signals.longitude.time
-        if not signals.fix_below(now, FIX_2D):
-            altitude = None if signals.fix_below(now, FIX_3D) else signals.gps_altitude.get(now)
-            seen_ns = time_ns - round((now - self._located) * 1e9)
-            log.sample(LOCATION_TOPIC, time_ns, location_row(seen_ns, "gps", latitude, longitude, altitude), seen_ns)
+        if found := self._positions.new(self.estimator.signals, codec.seconds(time_ns), time_ns):
+            seen_ns, row = found
+            log.sample(LOCATION_TOPIC, time_ns, row, seen_ns)
 
     @property
     def foreign(self) -> dict[str, int]:

@@ -1,4 +1,4 @@
-"""``gz-onboard foxglove``: what the range frames say, live in Foxglove, on the topic and by the schema of the log."""
+"""``gz-onboard foxglove``: range frames and positions, live in Foxglove, on topics and by schemas of the log."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ import json
 import math
 import sys
 import time
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from gz_onboard import notify
+from gz_onboard.bridges.live_positions import LivePositions
 from gz_onboard.constants import WH
 from gz_onboard.dashboard.command import add_source, source_of
 from gz_onboard.dashboard.picture import Picture
@@ -16,8 +19,14 @@ from gz_onboard.dashboard.pictures import pictures
 from gz_onboard.dashboard.server import host_and_port
 from gz_onboard.dashboard.stopping import until_signalled
 from gz_onboard.errors import OK, InputError, require
-from gz_onboard.events import RouteState
+from gz_onboard.events import Frame, RouteState
+from gz_onboard.location_rows import LOCATION_SCHEMA, LOCATION_TOPIC
 from gz_onboard.log_rows import ESTIMATE_TOPIC, ESTIMATE_UNITS, estimate_schema
+from gz_onboard.options import add_shared
+from gz_onboard.vehicle import read_vehicle
+
+if TYPE_CHECKING:
+    import foxglove
 
 LISTEN = "127.0.0.1:8765"
 UNKNOWN = "UNKNOWN"  # of state and activity, when nothing says so
@@ -26,6 +35,8 @@ UNKNOWN = "UNKNOWN"  # of state and activity, when nothing says so
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard foxglove``."""
     add_source(parser)
+    vehicle = "show also where it is: name of a built-in vehicle, or a vehicle file that maps latitude and longitude"
+    add_shared(parser, "--vehicle", default=None, help=vehicle)
     listen = "where Foxglove finds it (default: %(default)s; port 0: any free one)"
     parser.add_argument("--listen", metavar="ADDRESS:PORT", default=LISTEN, help=listen)
 
@@ -35,11 +46,16 @@ def run(arguments: argparse.Namespace) -> int:
     require("foxglove")
     host, port = host_and_port(arguments.listen)
     end = time.monotonic() + (arguments.duration or math.inf)
-    with source_of(arguments) as (view, channel), until_signalled() as stopped:
+    positions = LivePositions(read_vehicle(arguments.vehicle)) if arguments.vehicle else None
+    with (
+        source_of(arguments, positions.identifiers if positions else ()) as (view, channel),
+        until_signalled() as stopped,
+    ):
         import foxglove
 
         context = foxglove.Context()
         estimates = foxglove.Channel(ESTIMATE_TOPIC, schema=estimate_schema(), context=context)
+        places = _Places(positions, context) if positions else None
         try:
             server = foxglove.start_server(
                 name=f"gz-onboard {channel.name}", host=host, port=port, capabilities=[], context=context
@@ -49,12 +65,27 @@ def run(arguments: argparse.Namespace) -> int:
         try:
             address = f"[{host}]" if ":" in host else host
             _say(f"ws://{address}:{server.port} shows {channel.name} ({channel.interface})")
-            for new in pictures(view, channel, lambda: stopped() or time.monotonic() >= end):
+            heard = places.show if places else lambda _: None
+            for new in pictures(view, channel, lambda: stopped() or time.monotonic() >= end, heard):
                 estimates.log(encoded(new), log_time=time.time_ns())
         finally:
             notify.stopping()
             server.stop()
     return OK
+
+
+class _Places:
+    """Shows positions as they come."""
+
+    def __init__(self, positions: LivePositions, context: foxglove.Context) -> None:
+        import foxglove
+
+        self._positions = positions
+        self._channel = foxglove.Channel(LOCATION_TOPIC, schema=LOCATION_SCHEMA, context=context)
+
+    def show(self, frames: Sequence[Frame]) -> None:
+        for row in self._positions.take(frames):
+            self._channel.log(_message(row), log_time=time.time_ns())
 
 
 def _say(text: str) -> None:
@@ -65,7 +96,11 @@ def _say(text: str) -> None:
 
 def encoded(picture: Picture) -> bytes:
     """As a message of `ESTIMATE_TOPIC`."""
-    return json.dumps(row_of(picture), separators=(",", ":"), allow_nan=False).encode()
+    return _message(row_of(picture))
+
+
+def _message(row: Mapping[str, object]) -> bytes:
+    return json.dumps(row, separators=(",", ":"), allow_nan=False).encode()
 
 
 def row_of(picture: Picture) -> dict[str, object]:

@@ -38,10 +38,11 @@ def add_source(parser: argparse.ArgumentParser) -> None:
 
 
 @contextmanager
-def source_of(arguments: argparse.Namespace, others: Sequence[int] = ()) -> Iterator[tuple[View, CanChannel]]:
-    """The view, and the open channel of its frames and of those with the identifiers `others`."""
+def source_of(arguments: argparse.Namespace, others: Sequence[int] | None = ()) -> Iterator[tuple[View, CanChannel]]:
+    """The view, and the open channel of its frames and of those with the identifiers `others`; None: of all frames."""
     view = View(find_dbc(arguments.dbc, Path.cwd()))
-    channel = CanChannel(arguments.interface, arguments.channel, identifiers=[*view.identifiers, *others])
+    identifiers = None if others is None else [*view.identifiers, *others]
+    channel = CanChannel(arguments.interface, arguments.channel, identifiers=identifiers)
     channel.open()
     try:
         yield view, channel

@@ -6,9 +6,11 @@ import json
 import re
 import struct
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import chain, takewhile
 from typing import Any
 
 import pytest
@@ -16,17 +18,40 @@ from websockets.sync.client import ClientConnection, connect
 
 from gz_onboard import cli
 from gz_onboard.bridges import foxglove as command
+from gz_onboard.bridges.live_positions import LivePositions
+from gz_onboard.bus._can import can
+from gz_onboard.bus.logs import read_frames
+from gz_onboard.events import EFF_FLAG, Frame
+from gz_onboard.location_rows import LOCATION_SCHEMA
 from gz_onboard.log_rows import ESTIMATE_UNITS, TEXTS, declare, estimate_row
+from gz_onboard.pipeline import Pipeline
+from gz_onboard.vehicle import read_vehicle
 from tests.bridges.broker import PATIENCE, wait_for
 from tests.dashboard.served import Sender
-from tests.dashboard.test_terminal import ESTIMATE
+from tests.dashboard.test_terminal import ESTIMATE, send
+from tests.support import LOGS
 
 SUBSCRIPTION = 7
+SECONDS = 5
+GPS_MOTION = 1073
+TRUCK_DBC = """VERSION ""
+BO_ 2566845438 VP: 8 Vector__XXX
+ SG_ Latitude : 0|32@1+ (1E-07,-210) [-210|211] "deg" Vector__XXX
+ SG_ Longitude : 32|32@1+ (1E-07,-210) [-210|211] "deg" Vector__XXX
+"""
+TRUCK = """schema = 1
+name = "truck"
+dbc = ["truck.dbc"]
+[bus]
+identifiers = "j1939"
+[roles]
+{roles}
+"""
 _DATA = struct.Struct("<BIQ")  # operation, subscription, log time
 
 
 @contextmanager
-def serving(channel: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def serving(channel: str, monkeypatch: pytest.MonkeyPatch, *options: str) -> Iterator[str]:
     """Its address."""
     said: list[str] = []
     stop = threading.Event()
@@ -38,7 +63,7 @@ def serving(channel: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     monkeypatch.setattr(command, "until_signalled", stopped)
     monkeypatch.setattr(command, "_say", said.append)
     arguments = ["foxglove", "--interface", "virtual", "--channel", channel, "--listen", "127.0.0.1:0"]
-    thread = threading.Thread(target=cli.main, args=(arguments,))
+    thread = threading.Thread(target=cli.main, args=([*arguments, *options],))
     thread.start()
     try:
         wait_for(lambda: bool(said), "it serves")
@@ -65,11 +90,12 @@ def messages(client: ClientConnection) -> Iterator[tuple[int, dict[str, Any]]]:
             yield time_ns, json.loads(data[_DATA.size :])
 
 
-class Schemas:
-    """A log that keeps what is declared."""
+class Kept:
+    """A log that keeps what is declared, and the rows of each topic."""
 
     def __init__(self) -> None:
         self.of: dict[str, Any] = {}
+        self.rows: dict[str, list[Any]] = {}
 
     def channel(self, topic: str, json_schema: Any, metadata: Any = None) -> None:
         self.of[topic] = json_schema
@@ -78,11 +104,11 @@ class Schemas:
         """Nothing."""
 
     def sample(self, topic: str, time_ns: int, values: Any, seen_ns: Any = None) -> None:
-        """Nothing."""
+        self.rows.setdefault(topic, []).append(values)
 
 
 def test_the_estimate_is_that_of_the_log_and_nothing_old(monkeypatch):
-    logged = Schemas()
+    logged = Kept()
     declare(logged, ())
     with serving("f1", monkeypatch) as address, connect(address, subprotocols=["foxglove.sdk.v1"]) as client:  # type: ignore[list-item]
         (channel,) = advertised(client)
@@ -123,3 +149,85 @@ def test_a_port_that_is_taken(monkeypatch, capsys):
         assert cli.main(["foxglove", "--interface", "virtual", "--channel", "f2", "--listen", place]) == 2
     assert re.search(rf"--listen {place}: .*in use", capsys.readouterr().err)
     assert cli.main(["foxglove", "--interface", "virtual", "--channel", "f2", "--listen", "nowhere"]) == 2
+
+
+@pytest.fixture(scope="module")
+def ridden() -> list[Frame]:
+    """The frames of the first seconds of a recorded ride."""
+    frames = chain.from_iterable(read_frames(LOGS / "city_14C.blf"))
+    first = next(frames)
+    return [first, *takewhile(lambda frame: frame[0] - first[0] < SECONDS * 10**9, frames)]
+
+
+def test_positions_are_those_of_the_log(ridden):
+    logged = Kept()
+    Pipeline(read_vehicle("reference"), log=logged).advance(ridden, ridden[-1][0])
+    rows = list(LivePositions(read_vehicle("reference")).take(ridden))
+    once_a_second = logged.rows["/location"]
+    assert len(once_a_second) >= SECONDS - 1
+    at = {(row["timestamp"]["sec"], row["timestamp"]["nsec"]): row for row in rows}
+    assert list(at) == sorted(at)
+    for row in once_a_second:
+        place = at[row["timestamp"]["sec"], row["timestamp"]["nsec"]]
+        assert {**place, "altitude": None} == {**row, "altitude": None}
+        if place is not rows[0]:  # the altitude comes by a message of its own
+            assert place["altitude"] == pytest.approx(row["altitude"], abs=1.0)
+    assert len(rows) > 4 * len(once_a_second)  # each as it comes
+
+
+@pytest.mark.parametrize(("fix", "told"), [(0, None), (1, None), (2, False), (3, True)])
+def test_what_a_fix_tells(ridden, fix, told):
+    """Nothing of one that is none; no altitude of one in two dimensions."""
+    positions = LivePositions(read_vehicle("reference"))
+    for frame in ridden:
+        time_ns, identifier, data, channel = frame
+        if identifier == GPS_MOTION:
+            data = bytes([*data[:6], data[6] & 0b1001_1111 | fix << 5, *data[7:]])
+        list_of = list(positions.take([(time_ns, identifier, data, channel)]))
+        if time_ns - ridden[0][0] > 10**9:
+            assert [("altitude" in row) for row in list_of] in ([], [told]), list_of
+
+
+def test_positions_of_a_truck_whoever_sends_them(tmp_path):
+    """J1939: the source address is not in the DBC file, so the kernel cannot let through the position alone."""
+    (tmp_path / "truck.dbc").write_text(TRUCK_DBC)
+    (tmp_path / "truck.toml").write_text(TRUCK.format(roles='latitude = "Latitude"\nlongitude = "Longitude"'))
+    positions = LivePositions(read_vehicle(tmp_path / "truck.toml"))
+    assert positions.identifiers is None
+    place = struct.pack("<II", round((48.1 + 210) * 1e7), round((11.6 + 210) * 1e7))
+    frames = [(10**18, identifier | EFF_FLAG, place, 0) for identifier in (0x18FEF34A, 0x18FEF44A)]
+    (row,) = positions.take(frames)
+    assert (row["latitude"], row["longitude"]) == (48.1, 11.6)
+
+
+def test_a_vehicle_without_positions(tmp_path, capsys):
+    (tmp_path / "truck.dbc").write_text(TRUCK_DBC)
+    (tmp_path / "truck.toml").write_text(TRUCK.format(roles='latitude = "Latitude"'))
+    assert cli.main(["foxglove", "--interface", "virtual", "--vehicle", str(tmp_path / "truck.toml")]) == 2
+    assert "[roles] has no longitude, so there is no position to show; leave --vehicle out" in capsys.readouterr().err
+
+
+def test_positions_live(monkeypatch, ridden):
+    vehicle = read_vehicle("reference")
+    identifiers = LivePositions(vehicle).identifiers or []
+    mine = [frame for frame in ridden if frame[1] in identifiers]
+    recorded = {(row["latitude"], row["longitude"]) for row in LivePositions(vehicle).take(ridden)}
+    began = time.time()
+    with (
+        serving("f3", monkeypatch, "--vehicle", "reference") as address,
+        connect(address, subprotocols=["foxglove.sdk.v1"]) as client,  # type: ignore[list-item]
+        can.Bus(interface="virtual", channel="f3") as bus,
+    ):
+        (channel,) = [one for one in advertised(client) if one["topic"] == "/location"]
+        assert channel["schemaName"] == "foxglove.LocationFix"
+        assert json.loads(channel["schema"]) == LOCATION_SCHEMA
+        wanted = [{"id": SUBSCRIPTION, "channelId": channel["id"]}]
+        client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+        send(bus, mine[:4])
+        heard = messages(client)
+        for start in range(4, 40, 4):
+            send(bus, mine[start : start + 4])
+            time_ns, row = next(heard)
+            assert (row["latitude"], row["longitude"]) in recorded
+            assert began <= row["timestamp"]["sec"] + 1
+            assert began <= time_ns * 1e-9 <= time.time() + 1

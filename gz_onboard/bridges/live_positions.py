@@ -1,0 +1,51 @@
+"""Where the vehicle is, from its own frames on the bus: the range frames do not say it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from gz_onboard.bus.codec import Codec
+from gz_onboard.bus.layout import identifier_of
+from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
+from gz_onboard.events import STALE_PERIODS, Frame
+from gz_onboard.log_rows import Positions
+from gz_onboard.vehicle import Vehicle
+
+NEEDED = "latitude", "longitude"
+ROLES = *NEEDED, "gps_altitude", "gps_fix"
+
+
+class LivePositions:
+    """The positions in a vehicle's frames, as they come; InputError if its file maps none."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        mapping = vehicle.mapping
+        mapped = {source.role: source.message for source in mapping.sources if source.role in ROLES}
+        if lacking := [role for role in NEEDED if role not in mapped]:
+            raise vehicle.error(
+                f"[roles] has no {' and no '.join(lacking)}, so there is no position to show; leave --vehicle out"
+            )
+        messages = set(mapped.values())
+        self.identifiers: list[int] | None = None  # of the frames that it needs; None: a J1939 sender may have any
+        if not mapping.j1939:
+            self.identifiers = [identifier_of(m) for m in mapping.database.messages if m.name in messages]
+            self.identifiers += [request.response for request in mapping.requests if request.name in messages]
+        self._codec = Codec(mapping)
+        self._signals = Signals(
+            (role, STALE_PERIODS * group.period if group.period else DEFAULT_STALE)
+            for group in self._codec.groups
+            for role in group.roles
+        )
+        self._positions = Positions()
+
+    def take(self, frames: Sequence[Frame]) -> Iterator[dict[str, Any]]:
+        """Take in frames, in the order of their times; gives each new position as a row."""
+        codec, signals = self._codec, self._signals
+        for frame in frames:
+            for time, group, values in codec.decode([frame]):
+                for role, value in zip(codec.groups[group].roles, values, strict=True):
+                    if value is not None:
+                        signals[role].value, signals[role].time = value, time
+            if found := self._positions.new(signals, codec.seconds(frame[0]), frame[0]):
+                yield found[1]
