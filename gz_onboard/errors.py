@@ -85,6 +85,13 @@ def near_file(file: Path) -> str:
     return ""
 
 
+def unreadable(file: Path, error: Exception) -> InputError:
+    """That `file` cannot be read, what the operating system says of it, and what to do."""
+    if isinstance(error, IsADirectoryError):
+        return InputError(f"{file}: is a folder; give the file in it")
+    return InputError(f"{file}: cannot be read: {getattr(error, 'strerror', None) or error}{near_file(file)}")
+
+
 def shown(value: object) -> str:
     """`value` as Python writes it, in a length that fits into a message."""
     try:

@@ -93,13 +93,19 @@ def find_vehicle(name: str | Path, beside: Path | None = None) -> Path:
     if isinstance(name, Path) or "/" in name or name.endswith(".toml"):
         if is_file(path):
             return path
-        if path.is_dir():
-            raise InputError(f"{path}: is a folder; give the vehicle file in it")
+        _check_no_folder(path)
         raise InputError(f"{path if beside else name}: no such vehicle file; {there_are}{nearest(str(name), own)}")
     if name in own:
         return OWN / f"{name}.toml"
     meant = f" (did you mean './{name}'?)" if is_file(path) else nearest(name, own)
+    if not meant:
+        _check_no_folder(path)
     raise InputError(f"{name}: no such vehicle file; {there_are}{meant}")
+
+
+def _check_no_folder(path: Path) -> None:
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; give the vehicle file in it")
 
 
 def read_vehicle(

@@ -44,6 +44,8 @@ def find_dbc(name: str, beside: Path | None = None) -> Path:
     for place in places:
         if is_file(place / name):
             return place / name
+    if Path(name).is_dir():
+        raise InputError(f"{name}: is a folder; give the DBC file in it")
     own = [file.name for place in places if place.is_dir() for file in place.glob("*.dbc")]
     raise InputError(f"{name}: no such DBC file beside {beside or 'the vehicle file'} or in dbc/{nearest(name, own)}")
 

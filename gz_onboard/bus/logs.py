@@ -24,7 +24,7 @@ from typing import Any
 
 from gz_onboard.bus.readers import blf, candump, lines, mcap, pycan
 from gz_onboard.bus.readers.common import TIME_LIMIT_NS, Contents, Damage, Reader, unpacked
-from gz_onboard.errors import InputError, near_file, nearest, shown
+from gz_onboard.errors import InputError, nearest, shown, unreadable
 from gz_onboard.events import Frame
 
 _LOG = logging.getLogger(__name__)
@@ -148,17 +148,18 @@ def _by_content(head: bytes) -> str | None:
     return None
 
 
-def logs_among(paths: Iterable[Path], *, estimates: bool = False) -> list[Path]:
+def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list[Path]:
     """`paths`, with the logs in it instead of each folder, by name. InputError for a folder without any.
 
     Of a folder no .csv or .txt, which are mostly something else, and nothing that ``gz-onboard estimate`` wrote; or,
-    for `estimates`, these in place of the logs that they are of.
+    for `estimates`, these in place of the logs that they are of; None: both.
     """
     logs: list[Path] = []
     for path in paths:
         found = [path] if not path.is_dir() else sorted(file for file in path.iterdir() if _is_log(file, estimates))
-        made = {file.name.removesuffix(ESTIMATED) for file in found if path.is_dir() and file.name.endswith(ESTIMATED)}
-        found = [file for file in found if log_stem(file) not in made]
+        if estimates and path.is_dir():
+            made = {file.name.removesuffix(ESTIMATED) for file in found if file.name.endswith(ESTIMATED)}
+            found = [file for file in found if log_stem(file) not in made]
         if not found:
             table = next((file.name for file in sorted(path.iterdir()) if file.is_file() and is_table(file)), None)
             hint = f"; its tables must be given one by one, such as {table}" if table else ""
@@ -172,9 +173,9 @@ def log_stem(log: Path) -> str:
     return (log.with_suffix("") if log.suffix.lower() == ".gz" else log).stem
 
 
-def _is_log(file: Path, estimates: bool) -> bool:
+def _is_log(file: Path, estimates: bool | None) -> bool:
     name = file.name.lower().removesuffix(".gz")
-    other = (".csv",) if estimates else (".csv", ESTIMATED)
+    other = (".csv", ESTIMATED) if estimates is False else (".csv",)
     return name.endswith(tuple(_READERS)) and not name.endswith(other) and file.is_file()
 
 
@@ -237,7 +238,7 @@ def _load(path: Path) -> Contents:
                 return b""
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}{near_file(path)}") from None
+        raise unreadable(path, error) from None
 
 
 def _filtered(

@@ -14,10 +14,11 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gz_onboard.bus.logs import LogDamage, log_suffix, read_frames
+from gz_onboard.bus.logs import LogDamage, log_suffix, logs_among, read_frames
 from gz_onboard.errors import INTERRUPTED, OK, InputError, nearest
 from gz_onboard.events import ERR_FLAG, TRANSMITTED, Frame
 from gz_onboard.options import add_shared
@@ -82,7 +83,6 @@ def replay(
     told_ns = begin_ns
     now_ns = begin_ns
     worst_ns = round(summary.worst_lateness_s * 1e9)
-    summary.loops += 1
     try:
         for batch in batches:
             for frame in batch:
@@ -154,7 +154,9 @@ def _patient(put: Callable[[Frame], None]) -> Send:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``gz-onboard replay``."""
-    add_shared(parser, "log", "--interface")
+    logs = "log, or a folder of them, which are sent one after the other by name"
+    add_shared(parser, "log", help=logs)
+    add_shared(parser, "--interface")
     channel = (
         "where to send (default: %(default)s, so that no recording reaches a vehicle unasked); several by commas: the "
         "log's channels 0, 1, ... in this order"
@@ -176,9 +178,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(
             f"--speed {arguments.speed:g}: must be 0 (as fast as possible) or a factor of {SLOWEST:g} or more"
         )
-    start_ns, end_ns = log_section(arguments.log, arguments.start, arguments.end)
-    received_only = log_suffix(arguments.log) == ".mcap" and not arguments.all
-    read_frames(arguments.log)  # that it is missing comes before what is wrong with the bus
+    parts = _parts(arguments)
     names = [name for name in arguments.channel.split(",") if name]
     buses = _open_buses(arguments.interface, names)
     summary = Sent()
@@ -189,12 +189,16 @@ def run(arguments: argparse.Namespace) -> int:
         send = senders[0] if len(senders) == 1 else _by_channel(senders)
         with progress_bar(lambda: None, quiet=arguments.quiet) as display:
 
-            def show(seconds: float) -> None:
-                display.step(f"{int(seconds) // 60}:{seconds % 60:04.1f} of the log sent")
+            def show(part: _Part, seconds: float) -> None:
+                what = "the log" if len(parts) == 1 else part.log.name
+                display.step(f"{int(seconds) // 60}:{seconds % 60:04.1f} of {what} sent")
 
             while True:
-                batches = read_frames(arguments.log, start_ns, end_ns, damages.append)
-                replay(_sendable(batches, received_only, len(senders), summary), send, arguments.speed, summary, show)
+                summary.loops += 1
+                for part in parts:
+                    batches = read_frames(part.log, part.start_ns, part.end_ns, damages.append)
+                    kept = _sendable(batches, part.received_only, len(senders), summary)
+                    replay(kept, send, arguments.speed, summary, partial(show, part))
                 if not summary.sent and not summary.failed:
                     raise InputError(f"{arguments.log}: no frames to send in the chosen part")
                 if not arguments.loop:
@@ -205,10 +209,33 @@ def run(arguments: argparse.Namespace) -> int:
     finally:
         for bus in buses:
             bus.shutdown()
-    for damage in damages[:1]:
-        print(damage, file=sys.stderr)
+    for text in dict.fromkeys(map(str, damages)):
+        print(text, file=sys.stderr)
     print(f"replayed {arguments.log}: {summary}")
     return status
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What is sent of a log: between two times [ns], where they are given."""
+
+    log: Path
+    start_ns: int | None
+    end_ns: int | None
+    received_only: bool
+
+
+def _parts(arguments: argparse.Namespace) -> list[_Part]:
+    """What is sent, of each log; InputError for one that is missing, which comes before what is wrong with the bus."""
+    logs = logs_among([arguments.log])
+    if len(logs) > 1 and (arguments.start or arguments.end is not None):
+        raise InputError(f"--from and --to: are of one log, and {arguments.log} holds {len(logs)}; give one of them")
+    parts = []
+    for log in logs:
+        section = log_section(log, arguments.start, arguments.end)
+        parts.append(_Part(log, *section, received_only=log_suffix(log) == ".mcap" and not arguments.all))
+        read_frames(log)
+    return parts
 
 
 def log_section(path: Path, start_s: float, end_s: float | None) -> tuple[int | None, int | None]:

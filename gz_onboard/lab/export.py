@@ -17,14 +17,16 @@ the DBC's range, is null.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from gz_onboard.bus import logs
 from gz_onboard.bus.export import out_suffix, whole, write_frames_as, write_mcap
 from gz_onboard.bus.replay import log_section
 from gz_onboard.bus.tables import write_frame_table
-from gz_onboard.errors import OK, InputError, not_an_input
+from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
 from gz_onboard.events import Frame
 from gz_onboard.lab.export_contents import contents_text, log_contents
 from gz_onboard.lab.export_tables import (
@@ -39,11 +41,17 @@ from gz_onboard.lab.export_tables import (
 from gz_onboard.options import add_shared
 
 _TABLES = (".csv", ".parquet", ".jsonl")
+_OF_OUTPUT = {
+    **{f"--{name}": name for name in ("estimates", "signals", "frames", "columns", "vehicle", "dbc")},
+    "--table-format": "table_format",
+    "--from": "start",
+    "--to": "end",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of ``gz-onboard export``."""
-    add_shared(parser, "log")
+    add_shared(parser, "log", help="log, or a folder of them: a folder of tables for each")
     out = (
         "frames: .log .blf .asc .trc .csv .mf4; signals: .parquet or .jsonl (one long table), .mcap (for Foxglove), or "
         "a name without suffix (a folder with a table per message and one of the estimates); without it: what LOG holds"
@@ -68,16 +76,50 @@ def _names(text: str) -> list[str]:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Run ``gz-onboard export``; raises InputError for what cannot be used."""
+    """Run ``gz-onboard export``: `BAD_INPUT` if one of several logs cannot be used; InputError if nothing can."""
     log, out = arguments.log, arguments.out
     if out is None:
-        print(contents_text(log_contents(log)))
-        return OK
+        if unfit := [name for name, field in _OF_OUTPUT.items() if getattr(arguments, field)]:
+            raise InputError(
+                f"{unfit[0]}: says what is written to OUT, and none is given; name a file or folder for it"
+            )
+        return _each(logs.logs_among([log], estimates=None), lambda log: print(contents_text(log_contents(log))))
     suffix = out_suffix(out)
     if suffix and arguments.table_format:
         raise InputError(f"--table-format {arguments.table_format}: is for a folder of tables, and {out} is a file")
     if arguments.dbc and arguments.vehicle:
         raise InputError(f"--vehicle {arguments.vehicle}: has DBC files of its own; leave out --dbc")
+    if not log.is_dir():
+        _export(arguments, log, out, suffix)
+        return OK
+    if suffix:
+        raise InputError(
+            f"{out}: is one file, and {log} a folder of logs; give a name without a suffix: "
+            "a folder in which each log has a folder of tables"
+        )
+    found = logs.logs_among([log], estimates=None)
+    stems = Counter(map(logs.log_stem, found))
+    names = {one: logs.log_stem(one) if stems[logs.log_stem(one)] == 1 else one.name for one in found}
+    return _each(found, lambda one: _export(arguments, one, out / names[one], suffix))
+
+
+def _each(found: Sequence[Path], work: Callable[[Path], None]) -> int:
+    """Do it with each log; of several, one that cannot be used keeps nobody from the others."""
+    if len(found) == 1:
+        work(found[0])
+        return OK
+    status = OK
+    for log in found:
+        try:
+            work(log)
+        except InputError as error:
+            print(f"gz-onboard export: {error}", file=sys.stderr)
+            status = BAD_INPUT
+    return status
+
+
+def _export(arguments: argparse.Namespace, log: Path, out: Path, suffix: str) -> None:
+    """Write what is asked for of one log, and say it."""
     not_an_input([out] if suffix else [], [log, *(arguments.dbc or [])])
     source = Source(log, arguments.start, arguments.end, arguments.columns)
     with whole(out, suffix) as part:
@@ -85,7 +127,6 @@ def run(arguments: argparse.Namespace) -> int:
     for damage in dict.fromkeys(map(str, source.damages)):
         print(f"damaged log: {damage}")
     print(f"wrote {out}: {told}")
-    return OK
 
 
 def _write(arguments: argparse.Namespace, source: Source, part: Path, suffix: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from gz_onboard.errors import InputError, near_file
+from gz_onboard.errors import unreadable
 
 
 def digest_of(file: Path) -> str:
@@ -14,4 +14,4 @@ def digest_of(file: Path) -> str:
         with file.open("rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror}{near_file(file)}") from None
+        raise unreadable(file, error) from None

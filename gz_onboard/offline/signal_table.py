@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from gz_onboard.bus.mapping import BusMapping, Source, column_sources
 from gz_onboard.bus.readers.common import BATCH, TIME_LIMIT_NS, Damage, unpacked
 from gz_onboard.bus.units import known_units, to_si
-from gz_onboard.errors import InputError, nearest, shown
+from gz_onboard.errors import InputError, nearest, shown, unreadable
 from gz_onboard.events import EFF_FLAG, ROLES, Frame
 
 if TYPE_CHECKING:
@@ -112,7 +112,7 @@ def _csv(file: Path) -> tuple[list[str], Rows]:
     try:
         data = bytes(unpacked(file, file.read_bytes(), Damage()))
     except OSError as error:
-        raise InputError(f"{file}: cannot be read: {error.strerror}") from error
+        raise unreadable(file, error) from error
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gz_onboard.errors import InputError, near_file
+from gz_onboard.errors import InputError, unreadable
 from gz_onboard.routes.columns import Columns
 from gz_onboard.routes.gpx import read_road
 from gz_onboard.routes.route import KNOWN_AHEAD, Route, route_ahead_of
@@ -17,7 +17,7 @@ def read_ahead(file: Path) -> tuple[Columns, Route]:
     try:
         size = file.stat().st_size
     except OSError as error:
-        raise InputError(f"{file}: {error.strerror or error}{near_file(file)}") from error
+        raise unreadable(file, error) from error
     if size > LARGEST_FILE:
         raise InputError(f"{file}: has {size / 1e6:.0f} MB, a route has at most {LARGEST_FILE / 1e6:.0f} MB")
     columns = read_road(file, KNOWN_AHEAD)

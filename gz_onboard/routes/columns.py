@@ -11,7 +11,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
-from gz_onboard.errors import InputError, near_file, nearest, shown
+from gz_onboard.errors import InputError, nearest, shown, unreadable
 
 LEAST_ROWS = 2
 UNITS = {"mps": 1.0, "kmh": 1 / 3.6, "mph": 0.44704}  # [m/s] in one of each
@@ -56,7 +56,7 @@ def csv_rows(file: Path) -> list[tuple[int, list[str]]]:
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{file}: not a CSV file: {error}") from error
     except (OSError, EOFError, zlib.error) as error:
-        raise InputError(f"{file}: {getattr(error, 'strerror', None) or error}{near_file(file)}") from error
+        raise unreadable(file, error) from error
 
 
 def read_columns(file: Path, known: Collection[str]) -> Columns:

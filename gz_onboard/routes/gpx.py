@@ -6,7 +6,7 @@ from collections.abc import Collection
 from pathlib import Path
 from xml.parsers import expat
 
-from gz_onboard.errors import InputError, near_file, shown
+from gz_onboard.errors import InputError, shown, unreadable
 from gz_onboard.routes.columns import LEAST_ROWS, Columns, read_columns
 
 POINTS = ("trkpt", "rtept")  # a track is the road; a route may be the places on the way only
@@ -70,7 +70,7 @@ def read_gpx(file: Path) -> Columns:
     except expat.ExpatError as error:
         raise InputError(f"{file}:{error.lineno}: not a GPX file: {expat.ErrorString(error.code)}") from error
     except OSError as error:
-        raise InputError(f"{file}: {error.strerror or error}{near_file(file)}") from error
+        raise unreadable(file, error) from error
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
     points: list[Point] = next(filter(None, reader.points.values()), [])

@@ -124,7 +124,11 @@ def vehicle_on(what: str, vehicle: str | Path, payload: float | None = None) -> 
 
 
 def _kind(path: Path) -> str:
-    """``ride``, ``route``, ``cycle``: of a CSV file by its first line, else by its name."""
+    """``ride``, ``route``, ``cycle``: of a CSV file by its first line, else by its name. InputError for a folder."""
+    if path.is_dir():
+        raise InputError(
+            f"{path}: is a folder; give one log, route or cycle in it; `validate` simulates every ride of a folder"
+        )
     if path.suffix.lower() in _LOGS:
         return "ride"
     if path.suffix.lower() == ".gpx":

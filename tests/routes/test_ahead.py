@@ -105,5 +105,5 @@ def test_csv_refused(tmp_path, text, message):
 
 
 def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(InputError, match=r"gone\.gpx: No such file"):
+    with pytest.raises(InputError, match=r"gone\.gpx: cannot be read: No such file"):
         read_ahead(tmp_path / "gone.gpx")

@@ -151,9 +151,9 @@ def test_file_that_is_no_text_or_not_there(tmp_path):
     (tmp_path / "mine.csv").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(InputError, match=r"mine\.csv: not a CSV file"):
         read_cycle(tmp_path / "mine.csv")
-    with pytest.raises(InputError, match=r"none\.csv: No such file"):
+    with pytest.raises(InputError, match=r"none\.csv: cannot be read: No such file"):
         find_cycle(str(tmp_path / "none.csv"))
-    with pytest.raises(InputError, match="Is a directory"):
+    with pytest.raises(InputError, match="is a folder; give the file in it"):
         find_cycle(str(tmp_path))
 
 

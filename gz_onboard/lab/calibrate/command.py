@@ -242,7 +242,8 @@ def step_of(name: str, files: Mapping[str, Sequence[Path]], options: Mapping[str
         check_count(name, slot, needed, len(found.get(slot, ())))
     for file in (file for group in found.values() for file in group):
         if not file.is_file():
-            raise InputError(f"{file}: no such file{near_file(file)}")
+            what = "is a folder; give the files in it" if file.is_dir() else f"no such file{near_file(file)}"
+            raise InputError(f"{file}: {what}")
     return Step(name, {slot: tuple(group) for slot, group in found.items()}, {}, dict(options))
 
 
