@@ -19,6 +19,9 @@ from gz_onboard import api, cli
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.writers import write_candump
 from tests.support import LOGS, ROOT
+from tests.test_learned import CAPACITY, saved
+
+__all__ = ["saved"]  # a fixture
 
 PAGE = ROOT / "docs/python.md"
 COASTDOWN = LOGS / "coastdown.blf"
@@ -441,6 +444,87 @@ def test_facts_of_a_ride_are_those_given_or_noted():
     table = gz.read_ride(signals(), name="mine")
     assert table.name == "mine"
     assert set(table.columns) == {"vehicle_speed", "pack_voltage", "pack_current"}
+
+
+def test_a_sweep_is_that_of_the_command(tmp_path, capsys):
+    swept = ["--sweep", "drag_area=0.4..0.6:2", "--sweep", "battery.parallel=4..5"]
+    options = ["--soc", "0.9", "--no-plot", "--no-series", "--output", str(tmp_path), "--json"]
+    (tmp_path / "short.csv").write_text("time_s,speed_kmh\n0,0\n10,30\n20,30\n30,0\n")
+    assert cli.main(["simulate", str(tmp_path / "short.csv"), *swept, *options]) == 0
+    told = json.loads(capsys.readouterr().out)["sweep"]
+    parameters: dict[str, Any] = {"drag_area": np.array([0.4, 0.6]), "battery.parallel": [4, 5]}
+    found = gz.sweep(tmp_path / "short.csv", parameters, options=gz.SimulationOptions(soc=0.9))
+    table = found.to_table()
+    assert list(table)[:2] == ["drag_area[m²]", "battery.cells_parallel"]
+    assert table["consumption[Wh/km]"].tolist() == [one["consumption_wh_km"] for one in told]
+    assert table["range[km]"].tolist() == [one["range_km"] for one in told]
+    assert table["drag_area[m²]"].tolist() == [0.4, 0.4, 0.6, 0.6]
+    assert str(found).splitlines()[0].split() == [
+        "drag_area",
+        "battery.cells_parallel",
+        "Wh/km",
+        "range",
+        "km",
+        "shortfall",
+        "s",
+    ]
+
+
+def test_a_report_has_what_its_page_shows(tmp_path, capsys):
+    assert cli.main(["report", str(COASTDOWN), "-o", str(tmp_path / "told.html")]) == 0
+    found = gz.report(COASTDOWN)
+    found.write(tmp_path / "own.html")
+    told = (tmp_path / "told.html").read_text()
+    same = re.compile(r"computed.*?<")  # how long it took
+    assert same.sub("", (tmp_path / "own.html").read_text()) == same.sub("", told)
+    (ride,) = found.rides
+    assert len(ride.path) == 1
+    table = found.to_table()
+    assert sum(table["energy[Wh]"]) == pytest.approx(ride.summary.energy_wh)
+    assert table["ride"].tolist() == ["coastdown"] * len(table["where"])
+    assert not gz.report([COASTDOWN], located=False).rides[0].path
+    with pytest.raises(gz.InputError, match="would overwrite the input"):
+        found.write(COASTDOWN)
+
+
+def test_what_was_learned_is_that_of_the_command(saved, capsys):
+    assert cli.main(["learned", "--state", str(saved), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    found = gz.read_learned(saved)
+    assert {name: x.value for name, x in found.battery.items()} == {n: x["factor"] for n, x in told["learned"].items()}
+    assert {name: x.sd for name, x in found.road.items()} == {
+        name: x["sd"] for name, x in told["road"].items() if name != "correlations"
+    }
+    assert found.age_s == pytest.approx(told["age_s"], abs=60)
+    table = found.to_table()
+    assert table["value"][table["name"].tolist().index("capacity")] == pytest.approx(CAPACITY, abs=0.01)
+    assert set(table["part"]) == {"battery", "road", "rider"}
+    assert cli.main(["learned", "--state", str(saved)]) == 0
+    assert capsys.readouterr().out == f"{found}\n"
+    with pytest.raises(gz.InputError, match=r"none\.json: no saved state"):
+        gz.read_learned(saved.parent / "none.json")
+
+
+def test_a_baseline_is_of_healthy_rides_on_a_road():
+    with pytest.raises(gz.InputError, match=r"0 healthy rides: three are the least .*; left out, .*: coastdown"):
+        gz.baseline(COASTDOWN)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ({}, "parameters: name at least one"),
+        ({"drag_area": []}, "each with at least one value"),
+        ({"drag_area": 0.4}, r"must be a mapping \(each a list \(each a number\)\)"),
+        ({"dragarea": [0.4]}, r"parameters\['dragarea'\]: no parameter is .*did you mean 'drag_area'"),
+        ({"drag_area": [0.4, 40]}, "drag_area of 40 m² is outside 0.05 to 8 m²"),
+        ({"battery.series": [14.5]}, "counts cells; 14.5 is not a whole number"),
+        ({"battery.parallel": [4], "battery.cells_parallel": [5]}, "two of them are the same"),
+    ],
+)
+def test_parameters_of_a_sweep_are_checked(parameters, said):
+    with pytest.raises(gz.InputError, match=said):
+        gz.sweep("ece15", parameters)
 
 
 # --- types --------------------------------------------------------------------------------------------------------

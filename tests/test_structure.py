@@ -29,7 +29,8 @@ LAYERS = [
     ["simulation"],
     ["lab", "dashboard"],
     ["bridges"],
-    ["daemon", "api"],
+    ["daemon"],
+    ["api"],
     ["cli", "__init__"],  # the latter has the names of the API, imported when first asked for
     ["__main__"],
 ]

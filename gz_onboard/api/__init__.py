@@ -5,11 +5,13 @@ Results are dataclasses; those with a table have ``to_table()`` (a dict of numpy
 """
 
 from gz_onboard.api.calibrations import Calibration, calibrate
-from gz_onboard.api.discoveries import Discovered, discover
+from gz_onboard.api.discoveries import Baseline, Discovered, baseline, discover
 from gz_onboard.api.estimates import EstimatedRide, LoggedEstimates, estimate, read_estimates, summary_table
 from gz_onboard.api.given import read_ride, read_vehicle
 from gz_onboard.api.histories import History, add_to_history, read_history
-from gz_onboard.api.simulations import SimulatedRide, simulate
+from gz_onboard.api.learnings import LearnedState, read_learned
+from gz_onboard.api.reports import Reported, report
+from gz_onboard.api.simulations import SimulatedRide, Swept, simulate, sweep
 from gz_onboard.api.validations import Validated, validate
 from gz_onboard.errors import InputError
 from gz_onboard.lab.discover.command import DiscoveryOptions
@@ -20,27 +22,35 @@ from gz_onboard.vehicle import Vehicle
 
 __all__ = [
     "AddedRides",
+    "Baseline",
     "Calibration",
     "Discovered",
     "DiscoveryOptions",
     "EstimatedRide",
     "History",
     "InputError",
+    "LearnedState",
     "LoggedEstimates",
+    "Reported",
     "Samples",
     "SimulatedRide",
     "SimulationOptions",
+    "Swept",
     "Validated",
     "Vehicle",
     "add_to_history",
+    "baseline",
     "calibrate",
     "discover",
     "estimate",
     "read_estimates",
     "read_history",
+    "read_learned",
     "read_ride",
     "read_vehicle",
+    "report",
     "simulate",
     "summary_table",
+    "sweep",
     "validate",
 ]

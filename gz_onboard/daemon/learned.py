@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.plot and arguments.plot.suffix.lower() not in PICTURES:
         raise InputError(f"--plot {arguments.plot}: a picture is one of {' '.join(PICTURES)}")
     require("matplotlib", arguments.plot is not None)
-    snapshot, age = _load(file, vehicle)
+    snapshot, age = load(file, vehicle)
     if arguments.reset:
         names = (*BATTERY, ROAD, RIDING) if arguments.reset == "all" else (arguments.reset,)
         snapshot = _forget(file, snapshot, age, names, _fresh(vehicle))
@@ -88,15 +88,22 @@ def run(arguments: argparse.Namespace) -> int:
             return OK
         with writing(arguments.json):
             Path(arguments.json).write_text(text + "\n", encoding="utf-8")
-    for name, x in learned.items():
-        print(_line(name, x))
-    print(*_road_lines(road_load), sep="\n")
-    for rider, found in riders.items():
-        if len(riders) > 1:
-            print(f"rider {rider or 'not known'}:")
-        for name, x in found.items():
-            print(_line(name, x))
+    print(learned_text(learned, road, road_load.correlations(), riders))
     return OK
+
+
+def learned_text(
+    learned: Mapping[str, Learned],
+    road: Mapping[str, RoadParameter],
+    correlations: Mapping[tuple[str, str], float],
+    riders: Mapping[str, Mapping[str, Learned]],
+) -> str:
+    """For a terminal."""
+    lines = [*(_line(name, x) for name, x in learned.items()), *_road_lines(road, correlations)]
+    for rider, found in riders.items():
+        lines += [f"rider {rider or 'not known'}:"] if len(riders) > 1 else []
+        lines += [_line(name, x) for name, x in found.items()]
+    return "\n".join(lines)
 
 
 def read_learned(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Learned]:
@@ -176,12 +183,12 @@ def _known(share: float) -> str:
     return f"{100 * share:3.0f} % learned" if share else "nothing learned"
 
 
-def _road_lines(road_load: RoadLoad) -> Iterator[str]:
-    for name, x in road_load.learned().items():
+def _road_lines(road: Mapping[str, RoadParameter], correlations: Mapping[tuple[str, str], float]) -> Iterator[str]:
+    for name, x in road.items():
         unit = "" if x.unit == "1" else f" {x.unit}"
         number = f"{x.value:.3g} ± {x.sd:.2g}{unit}"
         yield f"{name:12} {number:18} {_known(x.share)}: {MEANING[name]}, vehicle file {x.filed:.3g}"
-    for (first, second), r in road_load.correlations().items():
+    for (first, second), r in correlations.items():
         if abs(r) > ALIKE:
             yield f"{first} and {second} are hard to tell apart: correlation {r:+.2f}"
 
@@ -217,8 +224,8 @@ def _plot(
     figure.savefig(file, dpi=120)
 
 
-def _load(file: Path, vehicle: Vehicle) -> tuple[Mapping[str, Any], float | None]:
-    """(snapshot, its age by the clock [s] if known)."""
+def load(file: Path, vehicle: Vehicle) -> tuple[Mapping[str, Any], float | None]:
+    """(snapshot, its age by the clock [s] if known). InputError for a state that is missing, or another vehicle's."""
     try:
         found = state.load(file, time.time())
     except ValueError as error:

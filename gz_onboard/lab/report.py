@@ -12,7 +12,7 @@ from gz_onboard.errors import BAD_INPUT, OK, not_an_input, writing
 from gz_onboard.lab.estimate import expected_frames
 from gz_onboard.lab.estimate_ride import known_vehicle
 from gz_onboard.lab.report_page import cells, contents, section
-from gz_onboard.lab.report_ride import ReportTask, read_report
+from gz_onboard.lab.report_ride import ReportedRide, ReportTask, read_report
 from gz_onboard.lab.report_style import page
 from gz_onboard.offline.processes import collect, over_rides
 from gz_onboard.offline.samples import ride_name
@@ -63,8 +63,12 @@ def run(arguments: argparse.Namespace) -> int:
 
 def ride_section(task: ReportTask, progress: Progress | None = None) -> RideSection:
     """The section of the page for one log. Raises InputError."""
-    ride = read_report(task, progress)
-    return RideSection(task.stem.name, cells(ride), section(ride, task.stem.name), ride.summary.damage)
+    return section_of(read_report(task, progress), task.stem.name)
+
+
+def section_of(ride: ReportedRide, anchor: str) -> RideSection:
+    """The section of a ride; anchor: its id in the page."""
+    return RideSection(anchor, cells(ride), section(ride, anchor), ride.summary.damage)
 
 
 def page_of(rides: Sequence[RideSection]) -> str:

@@ -8,7 +8,6 @@ from datetime import UTC, datetime
 from math import isfinite, nan
 from pathlib import Path
 
-from gz_onboard.constants import WH
 from gz_onboard.events import TOLD, Activity, State, words
 from gz_onboard.lab.estimate import summary_rows
 from gz_onboard.lab.logged import Logged
@@ -160,13 +159,7 @@ def _said(words_: str, left: Sequence[float], p10: Sequence[float], p90: Sequenc
 def _ledger(ride: ReportedRide) -> str:
     """Where the energy went, by the model; and what that leaves of what was measured."""
     drawn, distance = ride.summary.energy_wh, ride.summary.distance_km
-    modelled = ride.ledger.modelled
-    entries = {words(name): joule / WH for name, joule in modelled.items()}
-    if entries:
-        entries["beyond the model"] = (ride.ledger.measured - sum(modelled.values())) / WH
-    if entries and drawn is not None:
-        entries["not modelled"] = drawn - ride.ledger.measured / WH
-    told = sorted(((n, e) for n, e in entries.items() if abs(e) >= _LEAST_WH), key=lambda entry: -entry[1])
+    told = [(name, energy) for name, energy in ride.ledger_wh().items() if abs(energy) >= _LEAST_WH]
     if not told:
         return ""
     axis = axis_of([energy for _, energy in told], whole=False, zero=True)

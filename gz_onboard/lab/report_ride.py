@@ -6,8 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from gz_onboard.constants import WH
 from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.estimator.signals import FIX_2D
+from gz_onboard.events import words
 from gz_onboard.lab.estimate_ride import How, known_vehicle, open_estimate, ride_through
 from gz_onboard.lab.estimate_summary import RideSummary, summary_of
 from gz_onboard.lab.kept_rows import KeptRows
@@ -15,8 +17,10 @@ from gz_onboard.lab.logged import Logged
 from gz_onboard.log_rows import ESTIMATE_TOPIC
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.samples import Samples, read_samples
+from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.progress import Progress
 from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.vehicle import Vehicle
 
 TEMPERATURES = ("motor_temperature", "inverter_temperature", "ambient_temperature")
 """Those that are measured beside the cells', whose are in the estimates."""
@@ -49,21 +53,46 @@ class ReportedRide:
     path: list[list[Position]]
     temperatures: dict[str, Series]
 
+    def ledger_wh(self) -> dict[str, float]:
+        """Where the energy went [Wh], the most first: by effect what the model says, and what it leaves. Negative:
+        gained.
+
+        ``beyond the model`` is what was measured more than modelled; ``not modelled`` what flowed while nothing was
+        learned: charging, standing long, a sensor in doubt.
+        """
+        drawn, modelled = self.summary.energy_wh, self.ledger.modelled
+        entries = {words(name): joule / WH for name, joule in modelled.items()}
+        if entries:
+            entries["beyond the model"] = (self.ledger.measured - sum(modelled.values())) / WH
+        if entries and drawn is not None:
+            entries["not modelled"] = drawn - self.ledger.measured / WH
+        return dict(sorted(entries.items(), key=lambda entry: -entry[1]))
+
 
 def read_report(task: ReportTask, progress: Progress | None = None) -> ReportedRide:
-    """Estimate the log of `task` as the daemon would, and read what the estimates do not hold. Raises InputError."""
-    vehicle = known_vehicle(task.vehicle, task.payload)
-    road = read_ahead(task.route)[1] if task.route else None
+    """The ride in the log of `task`. Raises InputError."""
+    return report_of(task.path, known_vehicle(task.vehicle, task.payload), task.route, task.located, progress)
+
+
+def report_of(
+    source: Path | SignalTable,
+    vehicle: Vehicle,
+    route: Path | None = None,
+    located: bool = True,
+    progress: Progress | None = None,
+) -> ReportedRide:
+    """Estimate a ride as the daemon would, and read what the estimates do not hold. Raises InputError."""
+    road = read_ahead(route)[1] if route else None
     log = KeptRows()
-    ridden = ride_through(open_estimate(task.path, vehicle), How(route=road, ledger=True), log, progress)
+    ridden = ride_through(open_estimate(source, vehicle), How(route=road, ledger=True), log, progress)
     ledger = ridden.pipeline.estimator.forecaster.load.ledger or Ledger()
-    samples = read_samples(task.path, vehicle)
+    samples = read_samples(source, vehicle)
     return ReportedRide(
         samples.name,
         summary_of(ridden),
         [dict(row) for row in log.of(ESTIMATE_TOPIC)],
         ledger,
-        path_of(samples) if task.located else [],
+        path_of(samples) if located else [],
         {role: _series(samples, role) for role in TEMPERATURES if role in samples.columns},
     )
 

@@ -114,7 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
         result, scooter = ride(vehicle, plan, options, display.update, trace)
         wall = time.perf_counter() - begin
         variants = (
-            [_variant(vehicle, values, plan, options, display.update) for values in grid(sweeps)] if sweeps else None
+            [variant(vehicle, values, plan, options, display.update) for values in grid(sweeps)] if sweeps else None
         )
     found = summarise(vehicle, plan, arguments.what, result, scooter)
     found = replace(found, payload_from=payload_from, wall_s=wall, sweep=variants)
@@ -161,9 +161,10 @@ def _expected_seconds(options: SimulationOptions, plan: Plan, sweeps: Sequence[S
     return plan.seconds * float(options.repeat) * rides
 
 
-def _variant(
+def variant(
     vehicle: Vehicle, values: dict[str, float], plan: Plan, options: SimulationOptions, progress: Progress | None
 ) -> Variant:
+    """What the ride is with other `values` of the swept parameters."""
     result, scooter = ride(redesigned(vehicle, values), plan, options, progress)
     metres, _ = cycle_range(result, scooter)
     shortfall = sum(s.duration for s in result.shortfalls)

@@ -220,7 +220,7 @@ def summary_text(summary: SimulationSummary) -> str:
     ]
     rows += [("written", ", ".join(summary.files))] if summary.files else []
     head = f"{summary.what}, {summary.vehicle}, payload {summary.payload_kg:g} kg (by {summary.payload_from})"
-    return "\n".join([text_rows(head, rows), *(["", *_table(summary.sweep)] if summary.sweep else [])])
+    return "\n".join([text_rows(head, rows), *(["", variants_text(summary.sweep)] if summary.sweep else [])])
 
 
 def _shortfall_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
@@ -267,7 +267,8 @@ def _measured_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
     ]
 
 
-def _table(sweep: Sequence[Variant]) -> list[str]:
+def variants_text(sweep: Sequence[Variant]) -> str:
+    """A table of the variants, for a terminal."""
     names = list(sweep[0].values)
     heads = [*names, "Wh/km", "range km", "shortfall s"]
     width = [max(len(head), 10) for head in heads]
@@ -280,4 +281,4 @@ def _table(sweep: Sequence[Variant]) -> list[str]:
             f"{variant.shortfall_s:.0f}",
         ]
         lines.append("  ".join(f"{cell:>{w}}" for cell, w in zip(cells, width, strict=True)))
-    return lines
+    return "\n".join(lines)

@@ -54,36 +54,44 @@ def read_sweep(text: str, vehicle: Vehicle) -> Sweep:
     first, dots, second = span.partition("..")
     if not dots or (steps and not steps.isdecimal()):
         raise InputError(f"--sweep {text}: must be NAME=LOW..HIGH or NAME=LOW..HIGH:STEPS, as in drag_area=0.4..0.6:5")
-    name = _SHORT.get(name.strip(), name.strip())
-    declared = declared_parameters(vehicle.model.effects)
-    if name not in (*declared, *CELLS):
-        raise InputError(f"--sweep {text}: no parameter is called {name!r}{_meant(name, declared, vehicle)}")
-    low_bound, high_bound, unit = (1.0, 1000.0, "1")
-    if name in declared:
-        low_bound, high_bound, unit = declared[name].low, declared[name].high, declared[name].unit
     ends = []
     for number in (first, second):
         try:
-            value = float(number)
+            ends.append(float(number))
         except ValueError:
             raise InputError(f"--sweep {text}: {number!r} is not a number") from None
-        if not low_bound <= value <= high_bound:
-            raise InputError(
-                f"--sweep {text}: {name} of {value:g} {unit} is outside {low_bound:g} to {high_bound:g} {unit}"
-            )
-        if name in CELLS and value != round(value):
-            raise InputError(f"--sweep {text}: {name} counts cells; {value:g} is not a whole number")
-        ends.append(value)
+    found = sweep_of(name.strip(), ends, vehicle, f"--sweep {text}")
     low, high = ends
     if not low < high:
         raise InputError(f"--sweep {text}: {low:g} is not below {high:g}")
-    count = int(steps) if steps else min(round(high - low) + 1, 9) if name in CELLS else _STEPS
+    of_cells = found.name in CELLS
+    count = int(steps) if steps else min(round(high - low) + 1, 9) if of_cells else _STEPS
     if not 2 <= count <= _MOST_STEPS:
         raise InputError(f"--sweep {text}: {count} steps; must be 2 to {_MOST_STEPS}")
     values = [low + (high - low) * i / (count - 1) for i in range(count)]
-    if name in CELLS:
+    if of_cells:
         values = sorted({float(round(value)) for value in values})
-    return Sweep(name, unit, tuple(values))
+    return replace(found, values=tuple(values))
+
+
+def sweep_of(name: str, values: Sequence[float], vehicle: Vehicle, place: str) -> Sweep:
+    """`values` of a parameter of `vehicle` by name, or of a number of cells; place: what an error begins with.
+
+    InputError for an unknown name (with the nearest) and a value out of the parameter's bounds (with its unit).
+    """
+    name = _SHORT.get(name, name)
+    declared = declared_parameters(vehicle.model.effects)
+    if name not in (*declared, *CELLS):
+        raise InputError(f"{place}: no parameter is called {name!r}{_meant(name, declared, vehicle)}")
+    low, high, unit = (1.0, 1000.0, "1")
+    if name in declared:
+        low, high, unit = declared[name].low, declared[name].high, declared[name].unit
+    for value in values:
+        if not low <= value <= high:
+            raise InputError(f"{place}: {name} of {value:g} {unit} is outside {low:g} to {high:g} {unit}")
+        if name in CELLS and value != round(value):
+            raise InputError(f"{place}: {name} counts cells; {value:g} is not a whole number")
+    return Sweep(name, unit, tuple(map(float, values)))
 
 
 def _meant(name: str, declared: Iterable[str], vehicle: Vehicle) -> str:

@@ -11,7 +11,7 @@ from pathlib import Path
 from gz_onboard.bus.logs import log_suffix, logs_among
 from gz_onboard.errors import InputError, near_file, nearest, not_an_input, writing
 from gz_onboard.lab.calibrate.vehicle_file import vehicle_output
-from gz_onboard.lab.discover.baseline import baseline
+from gz_onboard.lab.discover.baseline import LEAST_RIDES, baseline
 from gz_onboard.lab.discover.baseline_file import write_baseline
 from gz_onboard.lab.discover.breakdown import loads_by_ride, outlying_rides
 from gz_onboard.lab.discover.candidates import candidates
@@ -146,8 +146,7 @@ def explain(
 
 def run_baseline(arguments: argparse.Namespace, vehicle: Vehicle, rides: list[Samples], refused: list[str]) -> int:
     """Learn from healthy rides and write the vehicle file; 0."""
-    healthy = [ride for ride in rides if on_road(ride)]
-    left = [ride.name for ride in rides if not on_road(ride)]
+    healthy, left = on_roads(rides)
     with progress_bar(lambda: None, quiet=arguments.quiet) as display:
         found = baseline(vehicle, healthy, arguments.effects, display.step, arguments.jobs)
     write_baseline(found, find_vehicle(arguments.vehicle), arguments.baseline)
@@ -251,9 +250,19 @@ def read_rides(logs: Sequence[Path], arguments: argparse.Namespace) -> tuple[lis
     return rides, refused
 
 
-def on_road(ride: Samples) -> bool:
-    """Whether the ride is one on the road, not on a roller and no coast-down, as far as is written down."""
-    return "roller_speed" not in ride.columns and ride.facts.get("kind") != "coastdown"
+def on_roads(rides: Sequence[Samples]) -> tuple[list[Samples], list[str]]:
+    """The rides on a road, not on a roller and no coast-downs, as far as is written down; the names of the others.
+
+    InputError if these are missing to the rides that a baseline needs.
+    """
+    roads = [r for r in rides if "roller_speed" not in r.columns and r.facts.get("kind") != "coastdown"]
+    left = [ride.name for ride in rides if all(ride is not road for road in roads)]
+    if left and len(roads) < LEAST_RIDES:
+        raise InputError(
+            f"{len(roads)} healthy rides: three are the least that tell how rides differ; "
+            f"left out, as no rides on a road: {', '.join(left)}"
+        )
+    return roads, left
 
 
 # --- the extended model -------------------------------------------------------------------------------------------

@@ -1,0 +1,75 @@
+"""What the daemon has learned of a vehicle and its riders."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
+from gz_onboard.daemon import learned as command
+from gz_onboard.daemon.keeper import state_file
+from gz_onboard.errors import brief
+from gz_onboard.estimator.ageing import Learned
+from gz_onboard.estimator.road_load import RoadParameter
+from gz_onboard.offline.arguments import checked
+from gz_onboard.offline.table import Columns, Tabular, columns_of
+
+_COLUMNS = ("part", "name", "value", "sd", "unit", "filed", "percent_learned")
+
+
+@dataclass(frozen=True)
+class LearnedState(Tabular):
+    """What a saved state holds. age_s: of the state by this clock, if it is known; battery: by name, factors on what
+    the vehicle file says; road: by name; correlations: of two of these; riders: by rider and name, factors; who rode
+    last comes first, and one who is not known is "".
+    """
+
+    vehicle: str
+    age_s: float | None
+    battery: Mapping[str, Learned]
+    road: Mapping[str, RoadParameter]
+    correlations: Mapping[tuple[str, str], float]
+    riders: Mapping[str, Mapping[str, Learned]]
+
+    __repr__ = brief
+
+    def __str__(self) -> str:
+        return command.learned_text(self.battery, self.road, self.correlations, self.riders)
+
+    def to_table(self) -> Columns:
+        """A row for each of what can be learned. part: ``battery``, ``road``, or ``rider`` and who that is."""
+        factors = [("battery", self.battery), *((f"rider {who}".strip(), of) for who, of in self.riders.items())]
+        rows: list[dict[str, object]] = [
+            {"part": part, "name": name, "value": x.value, "sd": x.sd, "unit": "1", "filed": 1.0}
+            | {"percent_learned": 100 * x.share}
+            for part, found in factors
+            for name, x in found.items()
+        ]
+        rows += [
+            {"part": "road", "name": name, "value": x.value, "sd": x.sd, "unit": x.unit, "filed": x.filed}
+            | {"percent_learned": 100 * x.share}
+            for name, x in self.road.items()
+        ]
+        return columns_of(rows, {name: name for name in _COLUMNS})
+
+
+@checked
+def read_learned(file: PathLike | None = None, vehicle: VehicleLike = "reference") -> LearnedState:
+    """What the daemon has learned of `vehicle`, out of the state that it saves.
+
+    file: the state; where the service keeps the vehicle's if not given. Raises InputError if there is none, or it is
+    another vehicle's or damaged.
+    """
+    known = vehicle_of(vehicle)
+    path = state_file(command.USUAL_FOLDER, known.name) if file is None else Path(file)
+    snapshot, age = command.load(path, known)
+    road_load = command.read_road_load(known, snapshot)
+    return LearnedState(
+        known.name,
+        age,
+        command.read_learned(known, snapshot),
+        road_load.learned(),
+        road_load.correlations(),
+        command.read_riders(known, snapshot),
+    )
