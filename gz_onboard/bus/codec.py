@@ -36,6 +36,9 @@ DROPPING = (LENGTH, CRC, COUNTER, TIME, UNDECODABLE, SEQUENCE, INTERRUPTED, MALF
 
 BACK_NS = 50_000_000  # frames of two channels may overtake each other by a little
 _AHEAD_NS = 30_000_000_000
+LONGEST_PAUSE_NS = 30 * 86_400 * 1_000_000_000
+"""Of a log: a leap ahead by more is a clock that was set. A live bus may be silent for as long as it likes."""
+_MOST_LEAPS = 100  # are remembered
 _CONFIRM = 3  # so many frames in a row agree on a new time before it is believed
 _MOST_IDENTIFIERS = 4096  # are remembered: a babbling node must not fill the memory
 
@@ -46,8 +49,10 @@ Handler = Callable[[float, bytes], bool | None]
 class Codec:
     """Decodes frames of one vehicle. Its state is what the checks need: counters, the last time, the counts."""
 
-    def __init__(self, mapping: BusMapping) -> None:
+    def __init__(self, mapping: BusMapping, longest_pause_ns: int | None = None) -> None:
         self.mapping = mapping
+        self.longest_pause_ns = longest_pause_ns  # None: any leap ahead is a pause
+        self.leaps: list[tuple[float, float]] = []  # of the clock: when [s on our timeline], by how much [s]
         self.groups: list[Group] = []
         self.faults: dict[tuple[str, str], int] = {}  # (message, reason) -> frames or signals dropped
         self.lost: dict[str, int] = {}  # message -> frames that its counter shows as missing
@@ -130,8 +135,9 @@ class Codec:
     def _retime(self, time_ns: int) -> bool:
         """Take a time that does not follow the last one: True if the frame is to be used.
 
-        One odd stamp is dropped. Several in a row that follow each other mean that the clock was set: back, and the
-        timeline goes on from where it was; ahead, and it is taken as a gap in the recording.
+        One odd stamp is dropped. Several in a row that follow each other mean that the clock was set: back, or ahead by
+        more than the longest pause, and the timeline goes on from where it was; else ahead, and it is taken as a gap in
+        the recording.
         """
         if self._origin_ns is None:
             self._origin_ns = self._last_ns = time_ns
@@ -143,8 +149,11 @@ class Codec:
             self._fault("", TIME)
             return False
         self._suspects = 0
-        if time_ns < self._last_ns:
-            self._origin_ns += time_ns - self._last_ns
+        leap = time_ns - self._last_ns
+        if leap < 0 or (self.longest_pause_ns is not None and leap > self.longest_pause_ns):
+            if len(self.leaps) < _MOST_LEAPS:
+                self.leaps.append((self.seconds(self._last_ns), leap * 1e-9))
+            self._origin_ns += leap
         self._last_ns = time_ns
         return True
 

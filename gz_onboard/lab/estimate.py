@@ -156,6 +156,8 @@ def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
             f"{ride.frames} received, {ride.dropped} dropped, {ride.lost} lost, "
             f"{ride.unknown} unknown identifiers, {ride.error_frames} error frames",
         ),
+        *(("clock", text) for text in ride.clock),
+        *([("pauses", f"{clock(ride.paused_s)} without frames, not counted as ridden")] if ride.paused_s else []),
         *([("gaps", f"{ride.gaps_s:.1f} s, of which distance and energy hold nothing")] if ride.gaps_s else []),
         *(
             ("someone else's", f"{count} frames on {identifier}, a range frame's: give another range_identifier")

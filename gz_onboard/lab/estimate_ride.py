@@ -9,12 +9,13 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
+from gz_onboard.bus.codec import LONGEST_PAUSE_NS
 from gz_onboard.bus.logs import LogDamage
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.events import Estimate, Frame
-from gz_onboard.lab.estimate_tally import Tally
+from gz_onboard.lab.estimate_tally import PAUSE, Tally
 from gz_onboard.log_rows import STATUS_TOPIC, Log
 from gz_onboard.offline.samples import open_ride
 from gz_onboard.offline.signal_table import SignalTable
@@ -25,7 +26,7 @@ from gz_onboard.vehicle import Vehicle, read_vehicle
 
 TICK_S = TICK_NS * 1e-9
 _GAP_NS = 2_000_000_000  # a longer pause between two frames is ridden through in steps
-_PAUSE_NS = 30_000_000_000  # beyond this the recording was stopped, and nothing is estimated meanwhile
+_PAUSE_NS = round(PAUSE * 1e9)  # beyond this nothing is estimated meanwhile
 _CONFIRM = 3  # fewer frames than this do not set the time
 
 
@@ -138,6 +139,7 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
         log_signals=how.signals,
         observer=tally,
     )
+    pipeline.codec.longest_pause_ns = LONGEST_PAUSE_NS
     if how.ledger:
         pipeline.estimator.forecaster.load.ledger = Ledger()
     if how.route:

@@ -12,7 +12,7 @@ from gz_onboard.events import Estimate, Reason, State
 from gz_onboard.lab.estimate_ride import TICK_S, Ridden
 from gz_onboard.lab.estimate_route import RouteSummary, route_summary
 from gz_onboard.lab.why import Why, why_of
-from gz_onboard.offline.results import times
+from gz_onboard.offline.results import leap_text, times
 from gz_onboard.offline.schema import to_json
 from gz_onboard.pipeline import lacking
 
@@ -30,7 +30,7 @@ class RideSummary:
     vehicle: Annotated[str, "name of the vehicle"]
     filter: Annotated[str, "backend of the filter"]
     start_ns: Annotated[int, "time of the first frame [ns since the epoch, as in the log]"]
-    duration_s: Annotated[float, "from the first to the last estimate"]
+    duration_s: Annotated[float, "from the first to the last estimate, without paused_s"]
     distance_km: Annotated[float, "ridden, but for gaps_s"]
     speed_max_km_h: Annotated[float | None, "greatest speed, or null"]
     energy_wh: Annotated[
@@ -70,6 +70,8 @@ class RideSummary:
     foreign: Annotated[dict[str, int], "frames of someone else on the identifiers of the range frames, by identifier"]
     error_frames: Annotated[int, "error frames of the bus"]
     gaps_s: Annotated[float, "without any measurement for too long to go on: distance and energy lack what was ridden"]
+    paused_s: Annotated[float, "in pauses of the recording, each of more than 30 s without frames"]
+    clock: Annotated[list[str], "where the log's clock leaps and is taken as set, in words"]
     faults: Annotated[dict[str, dict[str, int]], "what was dropped, by reason and by message or signal"]
     damage: Annotated[str | None, "what of the log could not be read, or null"]
     cpu_s: Annotated[float, "processor time taken, without drawing; 0 for a ride kept by --resume"]
@@ -94,7 +96,7 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         vehicle=pipeline.vehicle.name,
         filter=ridden.how.filter_name,
         start_ns=tally.start_ns,
-        duration_s=last.time,
+        duration_s=last.time - tally.paused,
         distance_km=last.distance * 1e-3,
         speed_max_km_h=times(tally.speed_max, 3.6),
         energy_wh=times(drawn, 1 / WH),
@@ -126,10 +128,12 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         foreign=cast("dict[str, int]", status["foreign"]),
         error_frames=pipeline.codec.error_frames,
         gaps_s=round(pipeline.estimator.gap_time, 1),
+        paused_s=round(tally.paused, 1),
+        clock=[leap_text(*leap) for leap in pipeline.codec.leaps],
         faults=cast("dict[str, dict[str, int]]", status["faults"]),
         damage=str(ridden.damages[0]) if ridden.damages else None,
         cpu_s=ridden.took[0],
-        real_time_factor=tally.last.time / ridden.took[1] if tally.last else None,
+        real_time_factor=(last.time - tally.paused) / ridden.took[1] if tally.last else None,
     )
 
 

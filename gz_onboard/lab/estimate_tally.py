@@ -10,6 +10,8 @@ from gz_onboard.bus.publisher import KNOWN
 from gz_onboard.events import Estimate, Reason, RouteState, State
 from gz_onboard.log_rows import reason_names
 
+PAUSE = 30.0  # s without frames: beyond it the recording was stopped
+
 
 @dataclass
 class Tally:
@@ -23,6 +25,7 @@ class Tally:
     range_start: float | None = None  # m
     ranged: Estimate | None = None  # the last whose range is published
     on_route: Estimate | None = None  # the last
+    paused: float = 0.0  # s, between estimates further apart than a pause
     speed_max: float | None = None  # m/s
     innovation_max: float = 0.0  # V
     ticks: Counter[tuple[State, int]] = field(default_factory=Counter)
@@ -34,6 +37,8 @@ class Tally:
         """Take in the next estimate."""
         if self.first is None:
             self.first = e
+        if self.last is not None and e.time - self.last.time > PAUSE:
+            self.paused += e.time - self.last.time
         self.last = e
         self.ticks[e.state, int(e.reasons)] += 1
         self.distrusted.update(e.distrusted)

@@ -85,6 +85,15 @@ def clock(seconds: float) -> str:
     return f"{f'{hours} h ' if hours else ''}{minutes} min {rest:02} s"
 
 
+def leap_text(when: float, leap: float) -> str:
+    """That the clock of a log leaps by `leap` [s], `when` [s] into the ride."""
+    by = abs(leap)
+    years, days = by / (365.25 * 86_400), by / 86_400
+    told = f"{years:.1f} years" if years >= 1 else f"{days:.0f} days" if days >= 2 else clock(by)
+    way = "ahead" if leap > 0 else "back"
+    return f"the log's clock leaps {way} by {told} after {clock(when)}: taken as set then, and the ride goes on"
+
+
 def number(value: float | None, form: str, unit: str = "", factor: float = 1.0) -> str:
     """A value times `factor` with its unit; a dash for None."""
     return "–" if value is None else f"{value * factor:{form}} {unit}".rstrip()

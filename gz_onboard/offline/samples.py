@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from gz_onboard.bus.codec import BACK_NS, Codec
+from gz_onboard.bus.codec import BACK_NS, LONGEST_PAUSE_NS, Codec
 from gz_onboard.bus.logs import LogDamage, is_table, log_stem, read_frames
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.errors import InputError, brief, nearest, shown
@@ -71,7 +71,7 @@ def read_samples(log: Path | SignalTable, vehicle: Vehicle, progress: Callable[[
     """
     mapping, frames = open_ride(log, vehicle)
     file = log.name if isinstance(log, SignalTable) else log
-    columns = read_roles(file, vehicle, (Codec(extended(mapping)), frames), progress)
+    columns = read_roles(file, vehicle, (Codec(extended(mapping), LONGEST_PAUSE_NS), frames), progress)
     return Samples(ride_name(file), columns, {} if isinstance(log, SignalTable) else facts_of(log))
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from gz_onboard.arrays import Array, block_means, held_at, running_mean
-from gz_onboard.bus.codec import Codec
+from gz_onboard.bus.codec import LONGEST_PAUSE_NS, Codec
 from gz_onboard.constants import MILD
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.estimator import Estimator
@@ -107,7 +107,7 @@ def read_recorded(log: Path, vehicle: Vehicle, progress: Callable[[int], None] |
     if vehicle.battery is None:
         raise vehicle.error("has no [battery], which a simulation needs")
     mapping, frames = open_ride(log, vehicle)
-    codec = Codec(extended(mapping))
+    codec = Codec(extended(mapping), LONGEST_PAUSE_NS)
     estimator_groups = [replace(g, roles=()) if set(INSTRUMENTS).intersection(g.roles) else g for g in codec.groups]
     estimator = Estimator(estimator_groups, vehicle.battery, vehicle.model, vehicle.riding)
     known = [bool(group.roles) for group in estimator_groups]

@@ -12,7 +12,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
-from gz_onboard.bus.codec import COUNTER, CRC, LENGTH, NOT_AVAILABLE, RANGE, TIME, UNDECODABLE, Codec, known_identifiers
+from gz_onboard.bus.codec import (
+    COUNTER,
+    CRC,
+    LENGTH,
+    LONGEST_PAUSE_NS,
+    NOT_AVAILABLE,
+    RANGE,
+    TIME,
+    UNDECODABLE,
+    Codec,
+    known_identifiers,
+)
 from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.layout import identifier_of, is_not_available, raw_values
 from gz_onboard.bus.mapping import BusMapping, Source, read_mapping
@@ -23,6 +34,7 @@ from gz_onboard.vehicle import read_vehicle
 
 MS = 1_000_000
 S = 1_000_000_000
+DAY = 86_400 * S
 EPOCH = 1_700_000_000 * S
 
 
@@ -378,6 +390,21 @@ def test_a_gap_is_a_gap():
     codec = Codec(reference())
     frames = [temperatures(EPOCH), *(temperatures(EPOCH + 600 * S + i * 100 * MS) for i in range(4))]
     assert [time for time, _, _ in codec.decode(frames)] == pytest.approx([0.0, 600.2, 600.3])
+
+
+@pytest.mark.parametrize("days", [31, 20_000, -20_000])
+def test_in_a_log_a_leap_of_a_month_is_a_clock_that_was_set(days):
+    frames = [temperatures(EPOCH + 20_000 * DAY + i * 100 * MS) for i in range(10)]
+    frames += [temperatures(EPOCH + (20_000 + days) * DAY + i * 100 * MS) for i in range(10)]
+    codec = Codec(reference(), LONGEST_PAUSE_NS)
+    times = [time for time, _, _ in codec.decode(frames)]
+    assert times == sorted(times)
+    assert times[-1] == pytest.approx(0.9 + 0.7)
+    ((when, leap),) = codec.leaps
+    assert when == pytest.approx(0.9)
+    assert leap == pytest.approx(days * 86_400.0, abs=1.0)
+    live = Codec(reference())  # where a pause may be of any length
+    assert max(time for time, _, _ in live.decode(frames)) == pytest.approx(max(days, 0) * 86_400.0, abs=2.0)
 
 
 def test_clock_set_goes_on_with_the_timeline():

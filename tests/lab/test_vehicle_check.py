@@ -7,12 +7,17 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gz_onboard import cli
+from gz_onboard.arrays import Array
 from gz_onboard.errors import FAILED, OK
 from gz_onboard.lab.vehicle.check import check_log
-from gz_onboard.lab.vehicle.finding import Looks
+from gz_onboard.lab.vehicle.finding import Finding, Looks
+from gz_onboard.lab.vehicle.motion import check_distances, speeds_of
+from gz_onboard.lab.vehicle.seconds import seconds_of
+from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.plant.logs import write_log
 from tests.plant.machine import scooter
@@ -145,3 +150,59 @@ def test_other_vehicles_with_and_without_a_mistake(tmp_path, name):
         ("cell_temperature", '"Cells"', '{ signal = "Cells", scale = 1.8, offset = 32 }'),
     ):
         assert any(role in roles for roles, _ in suspicions(log, right.replace(was, now), tmp_path))
+
+
+# --- positions ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rides() -> list[Samples]:
+    return [read_samples(LOGS / name, read_vehicle("reference")) for name in ("city_34C.blf", "turning/oval_2C.blf")]
+
+
+def elsewhere(ride: Samples, latitude: float, longitude: float) -> dict[str, tuple[Array, Array]]:
+    """The columns of `ride` as if it had been ridden at another place [deg], as long to the north and the east."""
+    north, east = ride.columns["latitude"], ride.columns["longitude"]
+    wider = np.cos(np.radians(north[1].mean())) / np.cos(np.radians(latitude))
+    return {
+        **ride.columns,
+        "latitude": (north[0], latitude + north[1] - north[1].mean()),
+        "longitude": (east[0], longitude + (east[1] - east[1].mean()) * wider),
+    }
+
+
+def said_of_positions(columns: dict[str, tuple[Array, Array]], scale: float) -> list[Finding]:
+    """By what checks say of them where the speed is off by a factor; nothing but speed and positions is there."""
+    vehicle = read_vehicle("reference")
+    kept = {role: columns[role] for role in ("motor_speed", "latitude", "longitude")}
+    kept["motor_speed"] = kept["motor_speed"][0], kept["motor_speed"][1] * scale
+    ride = seconds_of(Samples("x", kept), vehicle)
+    found = check_distances(ride, speeds_of(ride, vehicle), frozenset())
+    return [one for one in found if {"latitude", "longitude"} <= set(one.roles)]
+
+
+PLACES = [(40.3, -83.5), (48.0, 11.0), (60.0, 25.0), (35.7, 139.7), (-33.9, 151.2), (1.3, 103.8), (0.2, 36.8)]
+
+
+@pytest.mark.parametrize("place", PLACES, ids=str)
+@pytest.mark.parametrize("scale", [0.92, 1.0, 1.08])
+def test_swapped_positions_are_named_wherever_the_ride_was(rides, place, scale):
+    for recorded in rides:
+        there = elsewhere(recorded, *place)
+        (said,) = said_of_positions(there, scale)
+        assert said.looks is Looks.RIGHT, said
+        swapped = {**there, "latitude": there["longitude"], "longitude": there["latitude"]}
+        (said,) = said_of_positions(swapped, scale)
+        if recorded is rides[0] or place == PLACES[0]:  # on an oval all ways are alike, and near the equator lengths
+            assert said.looks is Looks.WRONG
+            assert "swapped" in said.text
+
+
+def test_a_latitude_beyond_the_poles_needs_no_ride(rides):
+    there = elsewhere(rides[0], 35.7, 139.7)
+    standing = {role: (times, values * 0 + values[0]) for role, (times, values) in there.items()}
+    swapped = {**standing, "latitude": standing["longitude"], "longitude": standing["latitude"]}
+    (said,) = said_of_positions(swapped, 0.0)
+    assert "reaches 139.7°, beyond the poles: swapped with the longitude" in said.text
+    wild = {**standing, "latitude": standing["longitude"]}
+    assert "beyond the poles: a wrong scale" in said_of_positions(wild, 0.0)[0].text

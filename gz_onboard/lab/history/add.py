@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, TextIO
 
@@ -21,7 +21,7 @@ from gz_onboard.lab.history.text import HISTORY_VERSION, ride_text
 from gz_onboard.lab.kept_rows import KeptRows
 from gz_onboard.offline.digest import digest_of
 from gz_onboard.offline.processes import Task, over_rides
-from gz_onboard.offline.results import Failure, explain_keys, write_json
+from gz_onboard.offline.results import Failure, explain_keys, leap_text, write_json
 from gz_onboard.offline.samples import facts_of, ride_name
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
@@ -45,6 +45,7 @@ class LogRides:
 
     rides: Sequence[KeptRide]
     damage: str | None
+    clock: list[str] = field(default_factory=list)  # where it leaps and is taken as set, in words
 
 
 @dataclass
@@ -134,6 +135,7 @@ def keep(
             continue
         if result.damage:
             yield f"gz-onboard history: {result.damage}", sys.stderr
+        yield from ((f"{task.path}: {text}", sys.stderr) for text in result.clock)
         kept = store.add(task.digest, task.name, result.rides, replace=again)
         done.rides.extend(kept.added)
         done.replaced += kept.replaced
@@ -187,7 +189,8 @@ def rides_in(task: HistoryTask, vehicle_of: Callable[[], Vehicle], progress: Pro
     route = task.route.name if task.route else None
     about = About(task.name or vehicle.name, vehicle.key, task.path, __version__, task.payload, route, facts)
     moments, whys = moments_of(log.samples)
-    return LogRides(rides_of(moments, whys, about), str(ridden.damages[0]) if ridden.damages else None)
+    leaps = [leap_text(*leap) for leap in ridden.pipeline.codec.leaps]
+    return LogRides(rides_of(moments, whys, about), str(ridden.damages[0]) if ridden.damages else None, leaps)
 
 
 def _mass(text: str | None) -> float | None:

@@ -13,17 +13,18 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.bus.answers import NEGATIVE
-from gz_onboard.bus.codec import RANGE, Codec
+from gz_onboard.bus.codec import LONGEST_PAUSE_NS, RANGE, Codec
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.bus.units import UNITS
 from gz_onboard.estimator.signals import DEFAULT_STALE
 from gz_onboard.events import STALE_PERIODS, Group
+from gz_onboard.lab.estimate_tally import PAUSE
 from gz_onboard.lab.vehicle import electric, motion, others
 from gz_onboard.lab.vehicle.features import Feature, features_of, features_text
 from gz_onboard.lab.vehicle.finding import Finding, Looks, unknown, wrong
 from gz_onboard.lab.vehicle.on_board import on_board
 from gz_onboard.lab.vehicle.seconds import Seconds, seconds_of
-from gz_onboard.offline.results import clock
+from gz_onboard.offline.results import clock, leap_text
 from gz_onboard.offline.samples import Samples, facts_of, open_ride, read_roles, ride_name
 from gz_onboard.vehicle import Vehicle
 
@@ -52,7 +53,7 @@ class Checked:
     """A log."""
 
     file: Annotated[str, "the log"]
-    duration_s: Annotated[float, "from the first to the last value"]
+    duration_s: Annotated[float, "from the first to the last value, without pauses"]
     roles: Annotated[list[RoleSeen], "of the vehicle file"]
     findings: Annotated[list[Finding], "all checks"]
     features: Annotated[list[Feature], "and what is missing for each"]
@@ -67,19 +68,29 @@ def check_log(
 ) -> Checked:
     """Check one log; quick: without `on_board`. Raises InputError for one that cannot be read."""
     mapping, frames = open_ride(log, vehicle)
-    codec = Codec(mapping)
+    codec = Codec(mapping, LONGEST_PAUSE_NS)
     columns = read_roles(log, vehicle, (codec, frames), progress)
     samples = Samples(ride_name(log), columns, facts_of(log))
-    findings = [*_dropped(codec, columns), *_unanswered(codec, columns)]
+    findings = [unknown("clock", (), leap_text(*leap)) for leap in codec.leaps]
+    findings += [*_dropped(codec, columns), *_unanswered(codec, columns)]
     if columns:
         findings += _checks(seconds_of(samples, vehicle), vehicle, samples.rider_mass)
     if columns and not quick:
         suspected = any(finding.looks is Looks.WRONG for finding in findings)
         findings += [_LATER] if suspected else on_board(log, vehicle)
-    end = max((float(times[-1]) for times, _ in columns.values()), default=0.0)
-    start = min((float(times[0]) for times, _ in columns.values()), default=0.0)
-    seen = _roles(mapping, codec.groups, samples, (start, end), findings)
-    return Checked(str(log), end - start, seen, findings, features_of(columns))
+    duration, end = _passed(columns)
+    seen = _roles(mapping, codec.groups, samples, (duration, end), findings)
+    return Checked(str(log), duration, seen, findings, features_of(columns))
+
+
+def _passed(columns: Mapping[str, tuple[Array, Array]]) -> tuple[float, float]:
+    """(time [s] that passed while values came, without pauses; when the last one came)."""
+    if not columns:
+        return 0.0, 0.0
+    start = min(float(times[0]) for times, _ in columns.values())
+    end = max(float(times[-1]) for times, _ in columns.values())
+    steps = np.diff(np.unique(np.concatenate([np.floor(times) for times, _ in columns.values()])))
+    return end - start - float(steps[steps > PAUSE].sum()), end
 
 
 def _dropped(codec: Codec, columns: Mapping[str, tuple[Array, Array]]) -> Iterator[Finding]:
@@ -146,6 +157,7 @@ def _roles(
     span: tuple[float, float],
     findings: Sequence[Finding],
 ) -> list[RoleSeen]:
+    """span: as of `_passed`."""
     periods = {group.message: group.period for group in groups}
     found = []
     for source in mapping.sources:
@@ -160,7 +172,7 @@ def _roles(
             rate = 1 / max(float(np.median(np.diff(times))), 1e-6)
             low, high = float(values.min()), float(values.max())
             held = float(np.minimum(np.diff(times, append=span[1]), stale).sum())
-            share = min(held / max(span[1] - span[0], 1e-9), 1.0)
+            share = min(held / max(span[0], 1e-9), 1.0)
         found.append(RoleSeen(source.role, source.signal, looks, UNITS[source.role], rate, low, high, share))
     return found
 
@@ -178,8 +190,12 @@ def check_text(checked: Checked) -> str:
     lines += [f"  {seen.role:21} {_seen_text(seen)}" for seen in checked.roles]
     for looks in (Looks.WRONG, Looks.RIGHT, Looks.UNKNOWN):
         if those := checked.those(looks):
-            lines += [f"{looks}:", *(f"  {f.check} ({', '.join(f.roles)}): {f.text}" for f in those)]
+            lines += [f"{looks}:", *(f"  {f.check}{_about(f.roles)}: {f.text}" for f in those)]
     return "\n".join([*lines, features_text(checked.features)])
+
+
+def _about(roles: Sequence[str]) -> str:
+    return f" ({', '.join(roles)})" if roles else ""
 
 
 def _seen_text(seen: RoleSeen) -> str:

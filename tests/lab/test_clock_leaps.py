@@ -1,0 +1,76 @@
+"""A log whose clock was set, or that pauses: time is what passed while frames came, and the leap is told in words."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from gz_onboard import cli
+from gz_onboard.bus.logs import read_frames
+from gz_onboard.bus.writers import write_blf
+from gz_onboard.lab.vehicle.check import check_log, check_text
+from gz_onboard.offline.samples import read_samples
+from gz_onboard.vehicle import read_vehicle
+from tests.support import LOGS
+
+DAY = 86_400 * 10**9
+YEARS = 5 * 365 * DAY
+SECONDS, METRES = 60.2, 360.0  # of the whole ride
+
+
+def leaping(file: Path, leap_ns: int) -> Path:
+    """A recorded ride whose clock leaps in its middle."""
+    frames = [frame for batch in read_frames(LOGS / "coastdown.blf") for frame in batch]
+    half = frames[len(frames) // 2][0]
+    with file.open("wb") as stream:
+        write_blf(stream, [[(t + leap_ns * (t >= half), i, data, channel) for t, i, data, channel in frames]])
+    return file
+
+
+def estimated(log: Path, capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, float | list[str]], str]:
+    """(its summary, what is said on the terminal)."""
+    options = ["--no-plot", "--quiet", "--output", str(log.parent)]
+    assert cli.main(["estimate", str(log), *options]) == 0
+    said = capsys.readouterr().out
+    assert cli.main(["estimate", str(log), *options, "--json"]) == 0
+    (ride,) = json.loads(capsys.readouterr().out)["rides"]
+    return ride, said
+
+
+@pytest.mark.parametrize(("leap", "told"), [(YEARS, "ahead by 5.0 years"), (-40 * DAY, "back by 40 days")])
+def test_a_clock_that_was_set_is_one_ride(tmp_path, capsys, leap, told):
+    log = leaping(tmp_path / "leap.blf", leap)
+    ride, said = estimated(log, capsys)
+    assert ride["duration_s"] == pytest.approx(SECONDS, abs=1)
+    assert ride["distance_km"] == pytest.approx(METRES / 1e3, rel=0.02)
+    assert (ride["paused_s"], ride["gaps_s"]) == (0, 0)
+    assert f"clock leaps {told} after 0 min 30 s: taken as set then, and the ride goes on" in said
+    assert ride["clock"] == [said.partition("clock  ")[2].partition("\n")[0].strip()]
+    history = tmp_path / "h.sqlite"
+    assert cli.main(["history", "add", str(log), "--file", str(history), "--quiet"]) == 0
+    out, err = capsys.readouterr()
+    assert "1 ride added" in out
+    assert told in err
+    checked = check_log(log, read_vehicle("reference"), quick=True)
+    assert checked.duration_s == pytest.approx(SECONDS, abs=1)
+    assert f"\n  clock: the log's clock leaps {told}" in check_text(checked)
+
+
+def test_a_pause_is_not_counted_as_ridden(tmp_path, capsys):
+    log = leaping(tmp_path / "pause.blf", DAY)
+    ride, said = estimated(log, capsys)
+    assert ride["duration_s"] == pytest.approx(SECONDS, abs=1)
+    assert ride["paused_s"] == pytest.approx(86_400, abs=1)
+    assert ride["clock"] == []
+    assert re.search(r"^  pauses +2[34] h \d+ min \d+ s without frames, not counted as ridden$", said, re.M)
+    checked = check_log(log, read_vehicle("reference"), quick=True)
+    assert checked.duration_s == pytest.approx(SECONDS, abs=2)
+    assert max(role.share for role in checked.roles) > 0.9
+
+
+def test_every_tool_reads_such_a_log(tmp_path):
+    samples = read_samples(leaping(tmp_path / "leap.blf", YEARS), read_vehicle("reference"))
+    assert max(times[-1] for times, _ in samples.columns.values()) == pytest.approx(SECONDS, abs=1)
