@@ -151,7 +151,11 @@ def writing(place: object) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        message = f"{error.filename or place}: cannot be written: {error.strerror or error}"
+        file = error.filename or place
+        folder = Path(str(file)).parent
+        gone = error.errno == errno.ENOENT and not folder.exists()
+        why = f"there is no folder {folder}; make it" if gone else error.strerror
+        message = f"{file}: cannot be written: {why or error}"
         if error.errno in _DISK_FAILED:
             raise OSError(error.errno, message) from error
         raise InputError(message) from error

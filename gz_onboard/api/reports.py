@@ -11,7 +11,7 @@ from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
 from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import InputError, not_an_input, writing
 from gz_onboard.lab.estimate import summary_text
-from gz_onboard.lab.report import page_of, section_of
+from gz_onboard.lab.report import check_page, page_of, section_of
 from gz_onboard.lab.report_ride import ReportedRide, report_of
 from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.table import Columns, Tabular, columns_of
@@ -45,6 +45,7 @@ class Reported(Tabular):
     @checked
     def write(self, file: PathLike) -> None:
         """Write the page. Raises InputError."""
+        check_page(Path(file))
         not_an_input([Path(file)], self.read)
         page = page_of([section_of(ride, f"ride-{i}") for i, ride in enumerate(self.rides, 1)])
         with writing(file):

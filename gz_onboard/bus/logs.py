@@ -222,9 +222,10 @@ def read_samples(
 
 
 def _own(path: str | Path, damage: Damage | None = None) -> tuple[Path, Contents] | None:
-    """(path, contents) of a log in our own format; None for other formats."""
+    """(path, contents) of a log in our own format; None for other formats. InputError for one that is not there."""
     path = Path(path)
-    return (path, unpacked(path, _load(path), damage or Damage())) if log_suffix(path) == ".mcap" else None
+    form, data = log_suffix(path), _load(path)
+    return (path, unpacked(path, data, damage or Damage())) if form == ".mcap" else None
 
 
 def _warn(damage: LogDamage) -> None:
@@ -235,7 +236,7 @@ def _load(path: Path) -> Contents:
     try:
         with path.open("rb") as file:
             if not path.stat().st_size:
-                return b""
+                raise InputError(f"{path}: is empty, a file of 0 bytes; copy or record it again")
             return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
         raise unreadable(path, error) from None

@@ -229,7 +229,7 @@ def load(file: Path, vehicle: Vehicle) -> tuple[Mapping[str, Any], float | None]
     try:
         found = state.load(file, time.time())
     except ValueError as error:
-        raise InputError(f"{file}: {error}") from error
+        raise InputError(f"{file}: {error}; the daemon keeps one in its --state-dir") from error
     if found is None:
         raise InputError(f"{file}: no saved state; --state FILE names it, in the daemon's --state-dir")
     if (key := found[0].get("key")) != vehicle.key:

@@ -17,7 +17,7 @@ from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.events import Estimate, Frame
 from gz_onboard.lab.estimate_tally import PAUSE, Tally
 from gz_onboard.log_rows import STATUS_TOPIC, Log
-from gz_onboard.offline.samples import open_ride
+from gz_onboard.offline.samples import of_another, open_ride
 from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.pipeline import TICK_NS, Pipeline, range_publisher
 from gz_onboard.progress import Progress
@@ -148,7 +148,7 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
         pipeline.publisher = _Mute()
     feed(pipeline, ride.batches, progress)
     if not pipeline.codec.latest:
-        raise _unknown(ride, pipeline)
+        raise of_another(ride.source, ride.vehicle, pipeline.codec)
     if tally.last:  # what came after the last whole second counts too
         log.sample(STATUS_TOPIC, ride.start_ns + round(tally.last.time * 1e9), pipeline.status())
     took = time.process_time() - cpu, time.perf_counter() - wall
@@ -159,12 +159,3 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
 def known_vehicle(name: str, payload: float | None) -> Vehicle:
     """The vehicle, read once for all logs of a process."""
     return read_vehicle(name, payload)
-
-
-def _unknown(ride: OpenRide, pipeline: Pipeline) -> InputError:
-    unknown = sorted(pipeline.codec.unknown)[:5]
-    names = ", ".join(f"{identifier & 0x1FFFFFFF:X}" for identifier in unknown)
-    return InputError(
-        f"{ride.source}: vehicle {ride.vehicle.name!r} knows none of its {pipeline.codec.received} frames"
-        f"{f' (identifiers {names}, ...)' if names else ''}; name its vehicle with --vehicle"
-    )

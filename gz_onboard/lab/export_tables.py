@@ -29,6 +29,7 @@ _FOLDERS: dict[str, Callable[[Path, Mapping[str, Mapping[str, str]], ExitStack],
     "/.jsonl": tables.JsonTables,
 }
 _FORMATS = (".csv", ".parquet", ".jsonl", *_FOLDERS)
+_SHOWN = 20  # columns in a message: a log may have hundreds
 _MESSAGE = "/can/"  # begins the topic of a message's signals
 
 
@@ -70,13 +71,13 @@ def chosen(source: Source, known: Iterable[str]) -> set[str]:
     if source.columns is None:
         return set(names)
     if not source.columns:
-        raise InputError(f"--columns: names none; there are {', '.join(names) or 'none'}")
+        raise InputError(f"--columns: names none; there are {', '.join(names[:_SHOWN]) or 'none'}")
     plain = [*names, *(name.partition("[")[0] for name in names)]
     for name in source.columns:
         if name not in plain:
-            raise InputError(
-                f"{source.log}: has no column {name!r}{nearest(name, plain)}; there are {', '.join(names) or 'none'}"
-            )
+            more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+            there = f"{', '.join(names[:_SHOWN]) or 'none'}{more}"
+            raise InputError(f"{source.log}: has no column {name!r}{nearest(name, plain)}; there are {there}")
     return {name for name in names if {name, name.partition("[")[0]} & set(source.columns)}
 
 
@@ -161,7 +162,7 @@ def write_signals(
     suffix: of `out`; of a folder, that of its tables with a slash before. columns: the units by column, by message.
     """
     if suffix not in _FORMATS:
-        raise InputError(f"{out.name}: signals can be written into .csv, .parquet, .jsonl, .mcap or a directory")
+        raise InputError(f"{source.log}: its signals can be written into .csv, .parquet, .jsonl, .mcap or a directory")
     wanted = chosen(source, (column for of in columns.values() for column in of))
     kept = {message: {c: unit for c, unit in of.items() if c in wanted} for message, of in columns.items()}
     if source.columns is not None:

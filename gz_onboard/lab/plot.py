@@ -278,7 +278,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.picture:
         raise InputError(f"{arguments.picture}: of a folder, each picture has the name of its log; leave it out")
     status = OK
-    for log in (log for log in logs_among([arguments.log], estimates=True) if log.suffix.lower() == ".mcap"):
+    logs = [log for log in logs_among([arguments.log], estimates=True) if log.suffix.lower() == ".mcap"]
+    if not logs:
+        raise InputError(
+            f"{arguments.log}: its logs hold no estimates; `gz-onboard estimate {arguments.log}` makes them"
+        )
+    for log in logs:
         try:
             _plot_one(log, arguments)
         except InputError as error:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gz_onboard.bus.logs import logs_among
-from gz_onboard.errors import BAD_INPUT, OK, not_an_input, writing
+from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, writing
 from gz_onboard.lab.estimate import expected_frames
 from gz_onboard.lab.estimate_ride import known_vehicle
 from gz_onboard.lab.report_page import cells, contents, section
@@ -46,6 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard report``: `OK` if every log is in the page, else `BAD_INPUT`."""
     logs = list(dict.fromkeys(logs_among(arguments.logs)))
     out = arguments.output or Path(f"{ride_name(logs[0]) if len(logs) == 1 else 'rides'}.html")
+    check_page(out)
     not_an_input([out], [*logs, *filter(None, [arguments.route]), find_vehicle(arguments.vehicle)])
     known_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
     given = arguments.vehicle, arguments.payload, False
@@ -59,6 +60,14 @@ def run(arguments: argparse.Namespace) -> int:
             out.write_text(page_of(found), encoding="utf-8", errors="replace")
         print(out)
     return BAD_INPUT if failed else OK
+
+
+def check_page(out: Path) -> None:
+    """InputError for a page that cannot be, before anything takes long."""
+    if out.suffix.lower() not in (".html", ".htm") and not out.is_dir():
+        raise InputError(f"{out}: the report is a page in HTML; give it a name that ends in .html")
+    if not out.parent.is_dir():
+        raise InputError(f"{out}: cannot be written: there is no folder {out.parent}; make it")
 
 
 def ride_section(task: ReportTask, progress: Progress | None = None) -> RideSection:

@@ -50,7 +50,9 @@ def plot_why(log: Path, picture: Path) -> list[LogDamage]:
             known = dict(zip((cause for cause in Cause if cause), causes, strict=True))
             last = Explanation(time, reference, range_, known)
     if last is None:
-        raise InputError(f"{log}: says nothing of why the range is what it is ({WHY_TOPIC})")
+        raise InputError(
+            f"{log}: says nothing of why the range is what it is; `gz-onboard estimate` makes a log that does"
+        )
     save(draw_why(last, log.name), picture)
     return damages
 

@@ -129,8 +129,17 @@ def read_roles(
         if progress:
             progress(len(batch))
     if not codec.latest:
-        raise InputError(f"{log}: vehicle {vehicle.name!r} knows none of its {codec.received} frames")
+        raise of_another(log, vehicle, codec)
     return {role: (np.array(t), np.array(v)) for role, (t, v) in found.items() if len(t) > 1}
+
+
+def of_another(log: Path, vehicle: Vehicle, codec: Codec) -> InputError:
+    """That none of the frames in a log is the vehicle's; codec: that has seen them."""
+    names = ", ".join(f"{identifier & 0x1FFFFFFF:X}" for identifier in sorted(codec.unknown)[:5])
+    return InputError(
+        f"{log}: vehicle {vehicle.name!r} knows none of its {codec.received} frames"
+        f"{f' (identifiers {names}, ...)' if names else ''}; give the vehicle that it is of, by --vehicle or its file"
+    )
 
 
 def read_facts(file: Path) -> dict[str, dict[str, object]]:

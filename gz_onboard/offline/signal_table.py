@@ -187,7 +187,7 @@ def _times(file: Path, name: str, rows: Rows) -> list[int]:
         if len(times) > 1 and times[-1] < times[-2]:
             raise InputError(f"{file}:{line}: {name}: {shown(row[0])} is before the time of the row above")
     if len(times) < 2:
-        raise InputError(f"{file}: {len(times)} rows are no ride")
+        raise InputError(f"{file}: {len(times)} rows below the names of the columns are no ride")
     if times[0] == times[-1]:
         raise InputError(f"{file}: {name}: all rows have the same time, {shown(rows[0][1][0])}, which is no ride")
     if (step := median(after - before for before, after in pairwise(times)) * 1e-9) > _LONGEST_STEP + 1e-6:

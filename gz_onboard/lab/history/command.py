@@ -17,7 +17,7 @@ _MOST_RIDES = 10**12
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard history``."""
-    parts = parser.add_subparsers(dest="part", metavar="PART", required=True, help="add, show or remove")
+    parts = parser.add_subparsers(dest="part", metavar="add|show|remove", required=True, help="add, show or remove")
     for name, about, declare in (
         ("add", "keep the rides in logs; a ride that is there already is not counted twice", add.add_arguments),
         ("show", "totals by month and temperature, what was learned of the battery, the rides", show.add_arguments),

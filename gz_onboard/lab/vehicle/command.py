@@ -17,14 +17,14 @@ from gz_onboard.lab.vehicle.maps import WARM, efficiency_maps, fit_of
 from gz_onboard.offline.results import Failure, explain_keys, write_json
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.offline.style import save
-from gz_onboard.options import add_shared, number
+from gz_onboard.options import LOG_SUFFIXES, add_shared, number
 from gz_onboard.progress import progress_bar
 from gz_onboard.vehicle import Vehicle, find_vehicle, read_vehicle
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard vehicle``."""
-    parts = parser.add_subparsers(dest="part", metavar="PART", required=True, help="new, check or maps")
+    parts = parser.add_subparsers(dest="part", metavar="new|check|maps", required=True, help="new, check or maps")
     about = "write a vehicle file to begin with, a comment to each key, and a DBC skeleton; never over a file"
     new.add_arguments(parts.add_parser("new", help=about, description=about, allow_abbrev=False))
     about = "does a vehicle file fit a log? what each role has, what looks right and what wrong, what is missing"
@@ -80,6 +80,8 @@ def draw_vehicle(arguments: argparse.Namespace) -> int:
 
 def check_vehicle(arguments: argparse.Namespace) -> int:
     """``gz-onboard vehicle check``: `FAILED` if anything looks wrong, `BAD_INPUT` if a log cannot be used."""
+    if Path(arguments.vehicle).suffix.lower() in LOG_SUFFIXES:
+        raise InputError(f"{arguments.vehicle}: is a log; the vehicle comes first, by name or file, then its logs")
     vehicle = read_vehicle(arguments.vehicle)
     logs = list(dict.fromkeys(logs_among(arguments.logs))) if arguments.logs else []
     not_an_input([arguments.json], [*logs, find_vehicle(arguments.vehicle)])

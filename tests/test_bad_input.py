@@ -1,0 +1,87 @@
+"""What a newcomer gives by mistake: each command says what is wrong with what, and what to do, in a line or two."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from gz_onboard import cli
+from tests.lab.short_logs import short_log
+
+EMPTY = "is empty, a file of 0 bytes; copy or record it again"
+MISSING = "cannot be read: No such file or directory (did you mean 'ride.blf'?)"
+ANOTHER = "knows none of its 40 frames (identifiers 123, ...); give the vehicle that it is of"
+NO_SUFFIX = "unknown log format '.txt', and it begins with 'hello'; known are .mcap, .blf"
+NO_FOLDER = "cannot be written: there is no folder nowhere; make it"
+READING = {
+    "report": ["report", "LOG"],
+    "check": ["vehicle", "check", "reference", "LOG"],
+    "history": ["history", "add", "LOG", "--file", "h.sqlite"],
+    "export": ["export", "LOG", "out", "--vehicle", "reference"],
+    "why": ["plot", "--why", "LOG"],
+}
+WRONG = [
+    (["report", "ride.blf", "-o", "ride.pdf"], "ride.pdf: the report is a page in HTML; give it a name that ends in"),
+    (["report", "ride.blf", "-o", "nowhere/ride.html"], NO_FOLDER),
+    (["report", "ride.blf", "--route", "ride.gpx"], "ride.gpx: cannot be read: No such file or directory"),
+    (["vehicle", "check", "ride.blf", "reference"], "ride.blf: is a log; the vehicle comes first, by name or file"),
+    (["vehicle", "check", "reference", "ride.blf", "--quick", "--json", "nowhere/x.json"], NO_FOLDER),
+    (["vehicle", "check", "none.toml", "ride.blf"], "none.toml: no such vehicle file; the package's own are reference"),
+    (["history", "show", "--file", "none.sqlite"], "there is no history yet; `gz-onboard history add LOG` begins one"),
+    (["history", "show", "--file", "ride.blf"], "ride.blf: is no history: not an SQLite file"),
+    (["export", "ride.blf", "x.csv", "--estimates"], "of which `gz-onboard estimate ride.blf` makes them"),
+    (
+        ["export", "ride.blf", "x.mf4", "--signals", "--vehicle", "reference"],
+        "ride.blf: its signals can be written into",
+    ),
+    (["export", "ride.blf", "x.csv", "--signals", "--vehicle", "reference", "--columns", "x"], " more"),
+    (["learned", "--state", "none.json"], "none.json: no saved state; --state FILE names it, in the daemon's"),
+    (["learned", "--state", "hello.txt"], "is not a saved state; the daemon keeps one in its --state-dir"),
+    (["learned", "--state", "folder"], "it is not a file; the daemon keeps one in its --state-dir"),
+    (["learned", "--state", "x.json", "--plot", "x.bmp"], "--plot x.bmp: a picture is one of .png .svg .pdf"),
+    (["plot", "--why", "ride.blf"], "`gz-onboard estimate` makes a log that does"),
+    (["plot", "folder"], "folder: its logs hold no estimates; `gz-onboard estimate folder` makes them"),
+]
+
+
+@pytest.fixture(autouse=True)
+def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder to be in: with a log, and what is none of this vehicle's."""
+    monkeypatch.chdir(tmp_path)
+    Path("folder").mkdir()
+    short_log(Path("ride.blf"))
+    short_log(Path("folder/ride.blf"), 100)
+    Path("empty.blf").touch()
+    Path("hello.txt").write_text("hello\n")
+    Path("another.log").write_text("".join(f"({i}.0) can0 123#00\n" for i in range(1_700_000_000, 1_700_000_040)))
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert cli.main(arguments) == 2
+    said = capsys.readouterr().err.strip()
+    assert len(said) < 600
+    assert "Traceback" not in said
+    return said
+
+
+@pytest.mark.parametrize("arguments", READING.values(), ids=READING)
+def test_a_log_that_is_none(arguments, capsys):
+    given = {"rid.blf": MISSING, "empty.blf": EMPTY, "hello.txt": NO_SUFFIX}
+    if arguments[0] not in ("plot", "export"):  # which read any vehicle's
+        given["another.log"] = ANOTHER
+    for log, said in given.items():
+        assert f"{log}: " in (told := refused(capsys, *(log if x == "LOG" else x for x in arguments)))
+        assert said in told
+
+
+@pytest.mark.parametrize(("arguments", "said"), WRONG, ids=lambda x: " ".join(x)[:40] if isinstance(x, list) else "")
+def test_what_does_not_fit(arguments, said, capsys):
+    assert said in refused(capsys, *arguments)
+
+
+@pytest.mark.parametrize("command", ["history", "vehicle"])
+def test_the_parts_of_a_command_are_named(command, capsys):
+    with pytest.raises(SystemExit):
+        cli.main([command])
+    assert {"history": "add|show|remove", "vehicle": "new|check|maps"}[command] in capsys.readouterr().err
