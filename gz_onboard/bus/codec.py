@@ -126,6 +126,10 @@ class Codec:
         """`time_ns` on the timeline of the events."""
         return 0.0 if self._origin_ns is None else (time_ns - self._origin_ns) * 1e-9
 
+    def time_ns(self, seconds: float) -> int:
+        """`seconds` of the timeline by the clock of the frames, as it is set now [ns]; 0 before the first frame."""
+        return 0 if self._origin_ns is None else self._origin_ns + round(seconds * 1e9)
+
     def clock_set(self, delta_ns: int) -> None:
         """The clock that stamps the frames was set by `delta_ns`; the timeline goes on."""
         if self._origin_ns is not None:

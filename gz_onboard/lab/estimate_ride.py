@@ -150,7 +150,7 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
     if not pipeline.codec.latest:
         raise of_another(ride.source, ride.vehicle, pipeline.codec)
     if tally.last:  # what came after the last whole second counts too
-        log.sample(STATUS_TOPIC, ride.start_ns + round(tally.last.time * 1e9), pipeline.status())
+        log.sample(STATUS_TOPIC, pipeline.codec.time_ns(tally.last.time), pipeline.status())
     took = time.process_time() - cpu, time.perf_counter() - wall
     return Ridden(ride.source, pipeline, tally, how, ride.damages, took)
 

@@ -14,6 +14,7 @@ from gz_onboard.bus.writers import write_blf
 from gz_onboard.lab.vehicle.check import check_log, check_text
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.vehicle import read_vehicle
+from tests.bus.doctor import complaints
 from tests.support import LOGS
 
 DAY = 86_400 * 10**9
@@ -49,6 +50,8 @@ def test_a_clock_that_was_set_is_one_ride(tmp_path, capsys, leap, told):
     assert (ride["paused_s"], ride["gaps_s"]) == (0, 0)
     assert f"clock leaps {told} after 0 min 30 s: taken as set then, and the ride goes on" in said
     assert ride["clock"] == [said.partition("clock  ")[2].partition("\n")[0].strip()]
+    if leap > 0:
+        assert complaints(tmp_path / "leap.estimate.mcap") == []
     history = tmp_path / "h.sqlite"
     assert cli.main(["history", "add", str(log), "--file", str(history), "--quiet"]) == 0
     out, err = capsys.readouterr()
