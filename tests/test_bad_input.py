@@ -45,16 +45,23 @@ WRONG = [
 ]
 
 
+@pytest.fixture(scope="module")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a log, and with what is none, or none of this vehicle's."""
+    place = tmp_path_factory.mktemp("given")
+    (place / "folder").mkdir()
+    short_log(place / "ride.blf")
+    short_log(place / "folder" / "ride.blf", 100)
+    (place / "empty.blf").touch()
+    (place / "hello.txt").write_text("hello\n")
+    frames = (f"({i}.0) can0 123#00\n" for i in range(1_700_000_000, 1_700_000_040))
+    (place / "another.log").write_text("".join(frames))
+    return place
+
+
 @pytest.fixture(autouse=True)
-def given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder to be in: with a log, and what is none of this vehicle's."""
-    monkeypatch.chdir(tmp_path)
-    Path("folder").mkdir()
-    short_log(Path("ride.blf"))
-    short_log(Path("folder/ride.blf"), 100)
-    Path("empty.blf").touch()
-    Path("hello.txt").write_text("hello\n")
-    Path("another.log").write_text("".join(f"({i}.0) can0 123#00\n" for i in range(1_700_000_000, 1_700_000_040)))
+def _there(given: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(given)
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -67,10 +74,10 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
 
 @pytest.mark.parametrize("arguments", READING.values(), ids=READING)
 def test_a_log_that_is_none(arguments, capsys):
-    given = {"rid.blf": MISSING, "empty.blf": EMPTY, "hello.txt": NO_SUFFIX}
+    logs = {"rid.blf": MISSING, "empty.blf": EMPTY, "hello.txt": NO_SUFFIX}
     if arguments[0] not in ("plot", "export"):  # which read any vehicle's
-        given["another.log"] = ANOTHER
-    for log, said in given.items():
+        logs["another.log"] = ANOTHER
+    for log, said in logs.items():
         assert f"{log}: " in (told := refused(capsys, *(log if x == "LOG" else x for x in arguments)))
         assert said in told
 

@@ -33,25 +33,22 @@ def leaping(file: Path, leap_ns: int) -> Path:
 
 def estimated(log: Path, capsys: pytest.CaptureFixture[str]) -> tuple[dict[str, float | list[str]], str]:
     """(its summary, what is said on the terminal)."""
-    options = ["--no-plot", "--quiet", "--output", str(log.parent)]
+    out = log.parent / "summary.json"
+    options = ["--no-plot", "--quiet", "--output", str(log.parent), "--json", str(out)]
     assert cli.main(["estimate", str(log), *options]) == 0
-    said = capsys.readouterr().out
-    assert cli.main(["estimate", str(log), *options, "--json"]) == 0
-    (ride,) = json.loads(capsys.readouterr().out)["rides"]
-    return ride, said
+    (ride,) = json.loads(out.read_text())["rides"]
+    return ride, capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("leap", "told"), [(YEARS, "ahead by 5.0 years"), (-40 * DAY, "back by 40 days")])
-def test_a_clock_that_was_set_is_one_ride(tmp_path, capsys, leap, told):
-    log = leaping(tmp_path / "leap.blf", leap)
+def test_a_clock_that_was_set_is_one_ride(tmp_path, capsys):
+    log, told = leaping(tmp_path / "leap.blf", YEARS), "ahead by 5.0 years"
     ride, said = estimated(log, capsys)
     assert ride["duration_s"] == pytest.approx(SECONDS, abs=1)
     assert ride["distance_km"] == pytest.approx(METRES / 1e3, rel=0.02)
     assert (ride["paused_s"], ride["gaps_s"]) == (0, 0)
     assert f"clock leaps {told} after 0 min 30 s: taken as set then, and the ride goes on" in said
     assert ride["clock"] == [said.partition("clock  ")[2].partition("\n")[0].strip()]
-    if leap > 0:
-        assert complaints(tmp_path / "leap.estimate.mcap") == []
+    assert complaints(tmp_path / "leap.estimate.mcap") == []
     history = tmp_path / "h.sqlite"
     assert cli.main(["history", "add", str(log), "--file", str(history), "--quiet"]) == 0
     out, err = capsys.readouterr()
@@ -74,6 +71,6 @@ def test_a_pause_is_not_counted_as_ridden(tmp_path, capsys):
     assert max(role.share for role in checked.roles) > 0.9
 
 
-def test_every_tool_reads_such_a_log(tmp_path):
-    samples = read_samples(leaping(tmp_path / "leap.blf", YEARS), read_vehicle("reference"))
+def test_the_other_tools_read_such_a_log(tmp_path):
+    samples = read_samples(leaping(tmp_path / "leap.blf", -YEARS), read_vehicle("reference"))
     assert max(times[-1] for times, _ in samples.columns.values()) == pytest.approx(SECONDS, abs=1)

@@ -181,11 +181,11 @@ def said_of_positions(columns: dict[str, tuple[Array, Array]], scale: float) -> 
     return [one for one in found if {"latitude", "longitude"} <= set(one.roles)]
 
 
-PLACES = [(40.3, -83.5), (48.0, 11.0), (60.0, 25.0), (35.7, 139.7), (-33.9, 151.2), (1.3, 103.8), (0.2, 36.8)]
+PLACES = [(40.3, -83.5), (48.0, 11.0), (35.7, 139.7), (-33.9, 151.2), (0.2, 36.8)]
 
 
 @pytest.mark.parametrize("place", PLACES, ids=str)
-@pytest.mark.parametrize("scale", [0.92, 1.0, 1.08])
+@pytest.mark.parametrize("scale", [0.92, 1.08])
 def test_swapped_positions_are_named_wherever_the_ride_was(rides, place, scale):
     for recorded in rides:
         there = elsewhere(recorded, *place)
