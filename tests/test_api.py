@@ -476,8 +476,7 @@ def test_a_report_has_what_its_page_shows(tmp_path, capsys):
     found = gz.report(COASTDOWN)
     found.write(tmp_path / "own.html")
     told = (tmp_path / "told.html").read_text()
-    same = re.compile(r"[\d.]+ s of processor time, [\d.]+ times as fast")
-    assert same.sub("", (tmp_path / "own.html").read_text()) == same.sub("", told)
+    assert (tmp_path / "own.html").read_text() == told
     (ride,) = found.rides
     assert len(ride.path) == 1
     table = found.to_table()
@@ -485,6 +484,8 @@ def test_a_report_has_what_its_page_shows(tmp_path, capsys):
     assert table["ride"].tolist() == ["coastdown"] * len(table["where"])
     with pytest.raises(gz.InputError, match="would overwrite the input"):
         found.write(COASTDOWN)
+    with pytest.raises(gz.InputError, match=r"give it a name that ends in \.html"):
+        found.write(tmp_path / "page.pdf")
 
 
 def test_what_was_learned_is_that_of_the_command(saved, capsys):
@@ -509,12 +510,12 @@ def test_a_baseline_is_written_and_compared_with(tmp_path):
     ride = gz.read_ride(LOGS / "city_34C.blf")
 
     def part(start: float) -> gz.Samples:
-        held = {role: (times >= start) & (times < start + 60) for role, (times, _) in ride.columns.items()}
+        held = {role: (times >= start) & (times < start + 90) for role, (times, _) in ride.columns.items()}
         columns = {role: (times[held[role]], values[held[role]]) for role, (times, values) in ride.columns.items()}
         return replace(ride, name=f"from {start:g} s", columns=columns)
 
     roller = replace(part(0.0), name="roller", facts={"kind": "coastdown"})
-    found = gz.baseline([*(part(60.0 * i) for i in range(3)), roller])
+    found = gz.baseline([*(part(90.0 * i) for i in range(3)), roller])
     assert found.left_out == ["roller"]
     assert str(found).endswith("left out, as no rides on a road: roller")
     table = found.to_table()

@@ -45,8 +45,8 @@ class Reported(Tabular):
     @checked
     def write(self, file: PathLike) -> None:
         """Write the page. Raises InputError."""
-        check_page(Path(file))
         not_an_input([Path(file)], self.read)
+        check_page(Path(file))
         page = page_of([section_of(ride, f"ride-{i}") for i, ride in enumerate(self.rides, 1)])
         with writing(file):
             Path(file).write_text(page, encoding="utf-8", errors="replace")

@@ -46,8 +46,8 @@ def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard report``: `OK` if every log is in the page, else `BAD_INPUT`."""
     logs = list(dict.fromkeys(logs_among(arguments.logs)))
     out = arguments.output or Path(f"{ride_name(logs[0]) if len(logs) == 1 else 'rides'}.html")
-    check_page(out)
     not_an_input([out], [*logs, *filter(None, [arguments.route]), find_vehicle(arguments.vehicle)])
+    check_page(out)
     known_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
     given = arguments.vehicle, arguments.payload, False
     more = {"route": arguments.route, "located": not arguments.no_path}
@@ -64,7 +64,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def check_page(out: Path) -> None:
     """InputError for a page that cannot be, before anything takes long."""
-    if out.suffix.lower() not in (".html", ".htm") and not out.is_dir():
+    if out.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{out}: the report is a page in HTML; give it a name that ends in .html")
     if not out.parent.is_dir():
         raise InputError(f"{out}: cannot be written: there is no folder {out.parent}; make it")
