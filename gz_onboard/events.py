@@ -50,6 +50,7 @@ ROLES: dict[str, str] = {
     "auxiliary_current": "A",  # at pack voltage, positive when consuming
     "heater_power": "W",  # electric, out of the pack, beside the auxiliary current
     "air_conditioner_power": "W",  # likewise
+    "lowest_cell_voltage": "V",  # of the group of cells in series that has the lowest
     "cell_temperature": "degC",
     "ambient_temperature": "degC",
     "motor_temperature": "degC",
@@ -90,6 +91,7 @@ INSTRUMENTS: dict[str, str] = {
     "suspension_rear": "m",
     "roller_speed": "m/s",  # of a chassis dynamometer
     "roller_force": "N",  # positive against the vehicle
+    "highest_cell_voltage": "V",
     "bms_temperature": "degC",
     **{f"pack_temperature_{i}": "degC" for i in range(1, 7)},
 }

@@ -18,7 +18,7 @@ from gz_onboard.events import EFF_FLAG, TRANSMITTED, Estimate, Frame, Reason, St
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.physics.effect import Port
 from gz_onboard.pipeline import TICK_NS, Pipeline
-from gz_onboard.vehicle import Vehicle, read_vehicle
+from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 
 ROOT = Path(__file__).resolve().parents[1]
 LOGS = ROOT / "replay_logs"
@@ -32,6 +32,15 @@ HEARS_CTRL_C = ("env", "--default-signal=INT")
 @cache
 def reference() -> Vehicle:
     return read_vehicle("reference")
+
+
+def with_cell_voltages(folder: Path) -> Vehicle:
+    """The reference scooter with a battery management that sends what its DBC has, its file in `folder`."""
+    text = (OWN / "reference.toml").read_text(encoding="utf-8")
+    text = text.replace("[roles]", '[roles]\nlowest_cell_voltage = "BMS_CellVoltageMin"')
+    text = text.replace("[instruments]", '[instruments]\nhighest_cell_voltage = "BMS_CellVoltageMax"')
+    (folder / "scooter.toml").write_text(text, encoding="utf-8")
+    return read_vehicle(folder / "scooter.toml")
 
 
 def without_cell_effects(vehicle: Vehicle) -> Vehicle:

@@ -23,7 +23,9 @@ from gz_onboard.errors import OK, InputError, not_an_input, require, writing
 from gz_onboard.estimator.ageing import Ageing, Learned
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.road_load import RoadLoad, RoadParameter
+from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.usual import Habit, Usual
+from gz_onboard.estimator.weakest import Weakest
 from gz_onboard.options import add_shared
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -34,6 +36,9 @@ USUAL_FOLDER = Path("/var/lib/gz-onboard")
 MEANING = {  # by name: what its factor is on
     "capacity": "of the pack, over cell_capacity in the vehicle file, as the pack's current sensor counts it",
     "resistance": "of the cells, over the vehicle file's R0, R1 and effects in the cells",
+    "weak_charge": "of the weakest group of cells, over the mean cell's, when that is full",
+    "weak_capacity": "of that group, over the mean cell's",
+    "weak_resistance": "of that group, over the mean cell's",
     "price": "energy of a kilometre in motion, over the prior riding's in the vehicle file",
     "standing": "energy at stops, likewise",
     "pace": "time of a kilometre, likewise",
@@ -44,7 +49,8 @@ MEANING = {  # by name: what its factor is on
     "auxiliaries": "power, lights and all",
 }
 PICTURES = (".png", ".svg", ".pdf")
-BATTERY, ROAD, RIDING = ("capacity", "resistance"), "road", "riding"  # what can be forgotten
+BATTERY, ROAD, RIDING = ("capacity", "resistance", "weakest"), "road", "riding"  # what can be forgotten
+LOWEST = "lowest_cell_voltage"  # the role without which nothing is known of the weakest group
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -111,7 +117,16 @@ def read_learned(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Lea
     ageing = Ageing(vehicle.pack.own())
     with _sound():
         ageing.restore(snapshot.get("learned", {}))
-    return ageing.learned()
+    return ageing.learned() | _of_weakest(vehicle, snapshot)
+
+
+def _of_weakest(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Learned]:
+    if all(source.role != LOWEST for source in vehicle.mapping.sources):
+        return {}
+    weakest = Weakest(vehicle.pack.own(), Signals([(LOWEST, DEFAULT_STALE)]), vehicle.parameters)
+    with _sound():
+        weakest.take_on(weakest.read(snapshot.get("learned", {}).get("weakest")))
+    return weakest.learned()
 
 
 def read_road_load(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> RoadLoad:

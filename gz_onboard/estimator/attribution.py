@@ -284,6 +284,7 @@ class Attribution:
         """The battery as it is now: what is learned of it later is another state's."""
         pack, health = self._new.own(), self._forecaster.battery.health
         pack.age(health.capacity, health.resistance)
+        pack.weaken(health.weakest)
         return pack
 
     def _energy(self, draw: Draw) -> float:

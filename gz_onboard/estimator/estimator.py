@@ -34,6 +34,7 @@ from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources
 from gz_onboard.estimator.temperatures import Temperatures, at_rest
 from gz_onboard.estimator.timing import SLOW_GAP, SLOWEST, MessageTiming
 from gz_onboard.estimator.vibration import VibrationMonitor
+from gz_onboard.estimator.weakest import Weakest
 from gz_onboard.events import STALE_PERIODS, Activity, Estimate, Event, Group, Reason, State
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import MOVING
@@ -95,13 +96,11 @@ class Estimator:
         self._distrusted: tuple[str, ...] = ()
         p = model.parameters
         self._radius, self._gear = p["wheel_radius"], p["gear_ratio"] / p["speed_sensor_scale"]
-        load = self.forecaster.load
-        self.redundancy = Redundancy(self._radius, self._gear, model.mass, load.usual_force(), battery)
+        self.redundancy = Redundancy(self._radius, self._gear, model.mass, self.forecaster.load.usual_force(), battery)
         self._sources = PackSources(self.signals, self.redundancy, battery, p)
         self._temperatures = Temperatures(self.signals, p)
-        sag = self.redundancy.currents.sag
-        self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, sag)
-        self.forecaster.ageing = self.soc.ageing
+        self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, self.redundancy.currents.sag)
+        self.forecaster.ageing, self.weakest = self.soc.ageing, Weakest(battery, self.signals, p)
         self._present = Present(self.forecaster, self.road, self._temperatures, self.soc, self._vibration)
         self._teacher = RoadTeacher(self.road_load, self.road, self.signals, self._present, battery)
 
@@ -169,6 +168,7 @@ class Estimator:
         temperature = self._temperatures.step(now, dt, self.soc.heat if dt <= self._timing.pause else at_rest)
         self.soc.follow_gap(now, dt, self._reading, self._temperatures.cells_or_bench, self._outlook.consumption)
         self.soc.step(now, dt, PackState(self._reading, temperature, road.speed), self._present)
+        self.weakest.step(now, self._reading, temperature, self.soc)
         self._follow_activity(now, dt)
         self._ride(now, dt)
         signals.next_step()
@@ -325,7 +325,7 @@ class Estimator:
             "cell_temperature": self._temperatures.cells,
             "gyro_bias": [self.road.bias_x, self.road.bias_z],
             "riding": self.forecaster.snapshot() | {"on_routes": self.ahead.rider.snapshot()},
-            "learned": self.soc.ageing.snapshot() | {"road": self.road_load.snapshot()},
+            "learned": snapshot.of_learned(self.soc.ageing, self.road_load, self.weakest),
         }
 
     def wait(self, seconds: float) -> None:
@@ -334,8 +334,8 @@ class Estimator:
 
     def restore(self, saved: Mapping[str, Any], key: str, age: float | None) -> None:
         """Go on from a snapshot that is `age` [s] old (None: not known). ValueError if it does not fit, whole."""
-        learning = self.soc.ageing, self.road_load
-        restored = snapshot.read(saved, key, age, self.soc.effects, learning, self.forecaster.restore)
+        learned = self.soc.ageing, self.road_load, self.weakest
+        restored = snapshot.read(saved, key, age, self.soc.effects, learned, self.forecaster.restore)
         self.ahead.restore(saved["riding"].get("on_routes"))
         self.road.bias_x, self.road.bias_z = restored.gyro_bias
         if restored.cell_temperature is not None:

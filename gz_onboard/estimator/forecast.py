@@ -255,7 +255,7 @@ class Forecaster:
         ahead = cells_ahead(self.battery, self.cooling, (soc, cell_temperature), ambient, expected.load)
         left = self._drawable(soc, ahead, expected)
         beside = (
-            (self.battery.window.sd * left.slope) ** 2
+            (hypot(self.battery.window.sd, left.end_sd) * left.slope) ** 2
             + (left.energy * self._lost_colder(soc, (ahead, temperature_sd), expected, left)) ** 2
             + (self._cutoff_sd**2 + (END_LOAD_SD * left.end_drop) ** 2) * left.by_cutoff**2
         )

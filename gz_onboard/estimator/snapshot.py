@@ -12,6 +12,7 @@ from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.road import MOST_BIAS
 from gz_onboard.estimator.road_load import RoadLoad
 from gz_onboard.estimator.start import Saved
+from gz_onboard.estimator.weakest import Weakest
 
 VERSION = (
     3  # 2: the states of effects with memory; 3: odometer, own SOC and consumption, for the charge that flows uncounted
@@ -39,7 +40,7 @@ def read(
     key: str,
     age: float | None,
     effects: CellEffects,
-    learning: tuple[Ageing, RoadLoad],
+    learning: tuple[Ageing, RoadLoad, Weakest],
     restore_riding: Callable[[Mapping[str, Any]], None],
 ) -> Restored:
     """The snapshot `saved`, `age` [s] old, of the vehicle `key`; the riding, and what was learned of the
@@ -60,18 +61,25 @@ def read(
             raise ValueError("holds implausible numbers")
         states = effects.read(saved["cell_effects"])
         learned = saved.get("learned", {})  # states from before there was any have none
-        ageing, road_load = learning
+        ageing, road_load, weakest = learning
         ageing.read(learned)
-        on_road = road_load.read(learned.get("road"))
+        on_road, of_group = road_load.read(learned.get("road")), weakest.read(learned.get("weakest"))
         restore_riding(saved["riding"])
         ageing.restore(learned)
         road_load.take(on_road)
+        weakest.take_on(of_group)
     except (KeyError, TypeError, AttributeError, OverflowError) as error:
         raise ValueError(f"is damaged: {error!r}") from error
     cells = saved.get("cell_temperature")
     if not isinstance(cells, int | float) or not CELLS[0] < cells < CELLS[1] or age is None or age >= CELLS_KEEP:
         cells = None
     return Restored(battery, age, (bias_x, bias_z), states, None if cells is None else float(cells))
+
+
+def of_learned(ageing: Ageing, road_load: RoadLoad, weakest: Weakest) -> dict[str, Any]:
+    """What was learned of the vehicle, by name; of the weakest group only where its voltage is on the bus."""
+    of_group = {"weakest": weakest.snapshot()} if weakest.mapped else {}
+    return {**ageing.snapshot(), "road": road_load.snapshot(), **of_group}
 
 
 def _battery(saved: Mapping[str, Any]) -> Saved:

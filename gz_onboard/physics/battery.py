@@ -97,12 +97,27 @@ class Window:
         return self.low + shown * (self.high - self.low)
 
 
+@dataclass(frozen=True, slots=True)
+class WeakGroup:
+    """How the weakest of the groups in series differs from the mean cell."""
+
+    charge: float  # of SOC: so much less it holds when the mean cell is full
+    capacity: float  # by so much faster than the mean cell's its SOC falls: what it holds less, relative
+    resistance: float  # by so much higher, relative
+    sd: float = 0.0  # of the mean cell's SOC at which it ends
+
+    def soc(self, mean: float) -> float:
+        """Of the group, where the mean cell's is `mean`."""
+        return mean - self.charge - self.capacity * (1 - mean)
+
+
 @dataclass(slots=True)
 class Health:
     """How a pack has aged, as factors on what its file says; every equation of `Battery` has them in it."""
 
     capacity: float = 1.0
     resistance: float = 1.0  # of R0, R1 and what effects in the cells take
+    weakest: WeakGroup | None = None  # None: all groups are taken to be alike
 
 
 @dataclass(frozen=True)
@@ -133,7 +148,7 @@ class Battery:
     voltage_error_value: Row = ()  # V of a cell, sd
     as_new: float = 0.5  # probability that the pack is as its file says, before anything is learned of its age
     capacity_sd: float = 0.01  # relative: how closely a pack that is as new holds `capacity`
-    health: Health = field(default_factory=Health)  # changed by `age` only
+    health: Health = field(default_factory=Health)  # changed by `age` and `weaken` only
 
     def cell_capacity(self, temperature: float) -> float:
         """Capacity of a cell [A·h] at `temperature` [degC]: the charge between SOC 0 and 1."""
@@ -282,6 +297,23 @@ class Battery:
         self.r0.rescale(resistance)
         self.r1.rescale(resistance)
         self.c1.rescale(1 / resistance)  # the time constant stays
+
+    def weaken(self, weakest: WeakGroup | None) -> None:
+        """From now on one group is weaker than the mean cell by so much. In place, as `age`."""
+        self.health.weakest = weakest
+
+    def settled_lowest(
+        self, current: float, soc: float, temperature: float, overpotential: Overpotential | None = None
+    ) -> float:
+        """Voltage of the weakest group [V] at a mean pack `current` [A] once the RC pair has settled.
+
+        soc: of the mean cell; overpotential: see `settled_current`.
+        """
+        weakest, cell = self.health.weakest, current / self.cells_parallel
+        own, more = (weakest.soc(soc), weakest.resistance) if weakest else (soc, 0.0)
+        r0, r1, _ = self.circuit(own, temperature)
+        lost = overpotential(cell, own, temperature, 1.0) if overpotential else 0.0
+        return self.ocv(own, temperature)[0] - (1 + more) * ((r0 + r1) * cell + lost)
 
     def settled_current(
         self,

@@ -1,4 +1,4 @@
-"""What a pack still delivers until its cells reach the cut-off voltage."""
+"""What a pack still delivers until its cells reach the cut-off voltage: the weakest group of them, if one is known."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ class Drawable:
     slope: float  # J: how much more energy there would be for more SOC
     by_cutoff: float = 0.0  # J/V: how much less there would be for a higher cut-off voltage of a cell
     end_drop: float = 0.0  # V of a cell: what the mean load takes from its rest voltage at the end
+    end_sd: float = 0.0  # of SOC: how closely it is known where the weakest group ends
 
 
 # Gauss-Legendre nodes and weights on [0, 1], of order 8
@@ -40,20 +41,29 @@ def drawable(
     At constant power P the charge Q·dSOC passes in dt = Q·dSOC/I, so the energy is P·Q·∫ dSOC/I(SOC), from the
     SOC at which the terminal voltage at the mean load meets the cut-off: bursts are held back by the vehicle before.
     form_factor_squared, overpotential: see `Battery.settled_current`. The RC pair is taken as settled (V1 = R1·I):
-    discharging takes an hour, its time constant is a minute.
+    discharging takes an hour, its time constant is a minute. A group that is weaker than the mean cell
+    (`Health.weakest`) ends it before; until then the pack delivers what the mean cell does.
     """
     least = battery.window.low if battery.window.given else BELOW_EMPTY
     low, high = least, soc
     charge = battery.pack_capacity(temperature) * HOUR
     cutoff = battery.cutoff_voltage * battery.cells_series
+    weakest = battery.health.weakest
+    end_sd = weakest.sd if weakest else 0.0
+
+    def ended(soc: float, current: float) -> bool:
+        if power < cutoff * current or not weakest:
+            return power < cutoff * current
+        return battery.settled_lowest(current, soc, temperature, overpotential) < battery.cutoff_voltage
+
     current = battery.settled_current(power, soc, temperature, overpotential=overpotential)
-    if current is None or power < cutoff * current or soc <= least:
-        return Drawable(0.0, charge * cutoff)
+    if current is None or soc <= least or ended(soc, current):
+        return Drawable(0.0, charge * cutoff, end_sd=end_sd)
     slope = charge * power / current
     for _ in range(14):  # to 6e-5 of SOC
         middle = (low + high) / 2
         current = battery.settled_current(power, middle, temperature, overpotential=overpotential)
-        if current is None or power < cutoff * current:
+        if current is None or ended(middle, current):
             low = middle
         else:
             high = middle
@@ -64,9 +74,9 @@ def drawable(
         total += weight / current if current else 0.0
     energy = power * charge * width * total
     if high - least <= LEAST_WIDTH:  # where the vehicle ends before the voltage does, the cut-off does not count
-        return Drawable(energy, slope)
-    rest, rise = battery.ocv(high, temperature)
-    return Drawable(energy, slope, charge * cutoff / rise, max(rest - battery.cutoff_voltage, 0.0))
+        return Drawable(energy, slope, end_sd=end_sd)
+    rest, rise = battery.ocv(weakest.soc(high) if weakest else high, temperature)
+    return Drawable(energy, slope, charge * cutoff / rise, max(rest - battery.cutoff_voltage, 0.0), end_sd)
 
 
 NEWTON_STEPS = 3  # to 1e-4 of SOC: the energy is nearly linear in it

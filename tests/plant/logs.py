@@ -30,6 +30,8 @@ SIGNALS = {
     "BMS_PackCurrent": ("pack_current", 1),
     "BMS_StateOfCharge": ("bms_state_of_charge", 0.01),
     "BMS_Contactor": ("contactor", 1),
+    "BMS_CellVoltageMin": ("lowest_cell_voltage", 1),
+    "BMS_CellVoltageMax": ("highest_cell_voltage", 1),
     "BMS_CellTempMean": ("cell_temperature", 1),
     "VCU_Throttle": ("throttle", 0.01),
     "VCU_BrakeSwitch": ("brake_switch", 1),

@@ -1,9 +1,8 @@
 """The plant's equations: many rides ridden at once, a step of 20 ms, one array element for each ride.
 
 Written apart from the package: slip of the driven wheel, leaning with a crown radius, wind as a vector with gusts,
-tyres that warm up, a cell whose particles are emptier at their surface than inside, with two electrodes of Butler's and
-Volmer's kinetics, a motor whose copper loss grows with frequency and whose torque falls with temperature, a rider with
-delay and an unsteady hand.
+tyres that warm up, the cells of `cells.py`, a motor whose copper loss grows with frequency and whose torque falls with
+temperature, a rider with delay and an unsteady hand.
 """
 
 from __future__ import annotations
@@ -14,10 +13,9 @@ from types import SimpleNamespace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator
 
-from gz_onboard.arrays import Array
-from tests.plant.machine import OCV_POINTS, PARALLEL, SERIES, G, Machine
+from tests.plant.cells import KELVIN, Cells
+from tests.plant.machine import PARALLEL, SERIES, G, Machine
 from tests.plant.roads import (
     BRAKE_HAND,
     DECISION,
@@ -35,9 +33,6 @@ from tests.plant.roads import (
 STEP = 0.02  # s
 DELAY = 10  # steps that a rider takes to react
 REST = 12.0  # s of standing before the start and, at most, after the end
-KELVIN = 273.15
-EMPTIEST = -0.02  # SOC down to which the voltage falls on
-GAS, FARADAY = 8.314, 96485.0
 DERATED = 0.3  # V of a cell above where it gives up: from there on the controller takes the current away
 LEFT_AT_LEAST, TOO_SLOW, PATIENCE = (
     0.1,
@@ -100,6 +95,10 @@ class Hidden:
     recovery_lost: float = 0.0
     capacity_factor: float = 1.0
     resistance_factor: float = 1.0
+    # one group of cells in series, beside what all have
+    weak_charge: float = 0.0  # of SOC: less than the others at the start
+    weak_capacity: float = 1.0
+    weak_resistance: float = 1.0
     slow_resistance: float = 0.0  # ohm of a cell
     slow_time: float = 1200.0
     hysteresis: float = 0.0  # V
@@ -125,10 +124,18 @@ class Hidden:
     late_time: float = 300.0
     rough_drag: float = 0.0  # N at 10 m/s, by the square of how rough the road is: what worn dampers take
 
+    @property
+    def weak(self) -> bool:
+        """Whether one group is weaker than the others."""
+        return (self.weak_charge, self.weak_capacity, self.weak_resistance) != (0.0, 1.0, 1.0)
+
 
 @dataclass
 class Ridden:
-    """What happened: columns by name of (steps,) for one ride, and what its truths are reckoned from."""
+    """What happened: columns by name of (steps,) for one ride, and what its truths are reckoned from.
+
+    Of a pack with a weak group `weak_group` is its voltage [V].
+    """
 
     plan: Plan
     machine: Machine
@@ -139,19 +146,14 @@ class Ridden:
     energy_per_metre: float  # J/m at the pack's terminals
 
 
-def _curve() -> tuple[Array, int]:
-    soc, volts = zip(*OCV_POINTS, strict=True)
-    count = 4000
-    return PchipInterpolator(soc, volts)(np.linspace(0, 1, count + 1)), count
-
-
 def ride(
     plans: Sequence[Plan], machines: Sequence[Machine], hiddens: Sequence[Hidden], gives_up: float = 0.0
 ) -> list[Ridden]:
     """Ride them all; one array element for each.
 
     With `gives_up` [V at the terminals] the controller takes current away above it, and a ride ends with a second below
-    it, or when the rider has had enough of creeping along.
+    it, or when the rider has had enough of creeping along. Of a pack with a weak group it is a pack of such groups
+    that counts.
     """
     n = len(plans)
     m = SimpleNamespace(**{f.name: np.array([getattr(x, f.name) for x in machines]) for f in fields(Machine)})
@@ -189,7 +191,6 @@ def ride(
     record = {name: np.empty((steps, n), np.float32) for name in COLUMNS}
 
     # constants of the ride
-    ocv_table, ocv_count = _curve()
     rho = p.pressure / (287.05 * (p.ambient + KELVIN))
     mass = m.mass + r.mass + h.luggage
     felt_mass = m.mass + r.mass + 0.5 * h.luggage  # a rider feels part of it
@@ -199,9 +200,6 @@ def ride(
     wind_north, wind_east = p.wind_north + h.wind_north, p.wind_east + h.wind_east
     gust = 0.25 + 0.22 * np.hypot(wind_north, wind_east)
     limit_pack = m.pack_limit
-    keep, deplete_keep = (np.exp(-STEP / np.array(taus)[:, None]) for taus in ((6.0, 45.0), (45.0, 300.0, 1800.0)))
-    slow_keep = np.exp(-STEP / h.slow_time)
-    layer = np.exp(-STEP / np.stack([m.cathode_layer, m.anode_layer]))
     warm = h.cooling_factor
 
     # state
@@ -212,14 +210,18 @@ def ride(
     braking = np.ones(n, bool)
     waiting, wait_left, next_stop = np.ones(n, bool), np.full(n, REST), np.zeros(n, int)
     tyre, moved = p.ambient.copy(), np.zeros(n)
-    soc = p.soc.copy()
-    reaction = np.zeros((2, n))
-    branch, depleted = np.zeros((2, n)), np.zeros((3, n))
-    slow, memory, hidden_memory = np.zeros(n), m.hysteresis * 0.5, np.zeros(n)
+    cells = Cells(m, h, p.soc.copy(), STEP)
+    weak, is_weak = None, np.array([x.weak for x in hiddens])
+    if is_weak.any():
+        more = {"capacity_factor": h.weak_capacity, "resistance_factor": h.weak_resistance}
+        own_faults = SimpleNamespace(**{**vars(h), **{name: getattr(h, name) * x for name, x in more.items()}})
+        weak = Cells(m, own_faults, p.soc - h.weak_charge, STEP)
+        record["weak_group"] = np.empty((steps, n), np.float32)
     core = shell = p.ambient + p.pack_warmer
     stator = rotor = p.ambient + p.motor_warmer
     board = box = p.ambient + 0.5 * p.motor_warmer
     pack_current, pack_voltage, torque_before = np.full(n, 1.0), np.full(n, 50.0), np.zeros(n)
+    lowest = pack_voltage  # V, of a pack of the weakest groups
     targets = np.zeros((DELAY, n))
     roll_work, drag_work, load_way, drag_way = (np.zeros(n) for _ in range(4))
     energy, energy_way = np.zeros(n), np.zeros(n)
@@ -278,7 +280,7 @@ def ride(
         limit = np.minimum(limit, limit_pack * pack_voltage / (0.456 * rear + 6.0))
         command = np.where(braking, -m.regeneration_current * np.clip(rear / 7.5, 0, 1), throttle * m.current_limit)
         if gives_up:
-            felt = felt + STEP / FELT_TIME * (pack_voltage - felt)
+            felt = felt + STEP / FELT_TIME * (lowest - felt)
             share = np.clip((felt - gives_up) / (DERATED * SERIES), LEFT_AT_LEAST, 1.0)
             limit = limit * share
         command = np.where(step < last, command, 0.0)  # a pack that gave up
@@ -348,52 +350,30 @@ def ride(
         auxiliary = m.auxiliary + m.brake_light * braking + 1.5 * noise[LOAD] + h.auxiliary
         unseen = h.hot_load / (1 + np.exp(-(stator - h.hot_at) / 0.7))
         # --- cell
-        kelvin = core + KELVIN
-        cold_factor = 1 / kelvin - 1 / 298.15
-        ends = 1 + 0.22 * np.exp(-np.maximum(soc, 0) / 0.06) + 0.35 * (soc - 0.45) ** 2
-        ohmic = m.ohmic * np.exp(1100 * cold_factor) * ends
-        cell_current = pack_current / PARALLEL
-        film = m.film * np.exp(4300 * cold_factor) * ends
-        surface = soc - depleted.sum(axis=0)  # which the voltage follows; on a steep curve it falls much sooner
-        source_soc = np.clip(surface, 0, 1) * ocv_count
-        low = np.minimum(source_soc.astype(int), ocv_count - 1)
-        steepness = ocv_table[low + 1] - ocv_table[low]
-        rest = ocv_table[low] + (source_soc - low) * steepness + m.ocv_shift
-        rest = rest + m.ocv_wave * np.sin(9 * soc + m.ocv_phase) + 2.0 * np.clip(surface, EMPTIEST, 0)
-        window = h.window_resistance * np.exp(-0.5 * ((soc - h.window_soc) / 0.03) ** 2)
-        instant = (ohmic + film) * h.resistance_factor + window
-        lag_voltage = branch.sum(axis=0) + reaction.sum(axis=0) + slow + memory + hidden_memory
-        emf = SERIES * (rest - lag_voltage)
+        one, instant = cells.source(core)
+        emf = SERIES * one
         inside = SERIES * instant / PARALLEL + m.series_resistance
+        if weak:
+            other, other_instant = weak.source(core)
+            emf = np.where(is_weak, (SERIES - 1) * one + other, emf)
+            both = ((SERIES - 1) * instant + other_instant) / PARALLEL + m.series_resistance
+            inside = np.where(is_weak, both, inside)
         inverter_now = pack_current - auxiliary / pack_voltage
         power = dc + auxiliary + unseen + m.cable * inverter_now * inverter_now
         pack_current = 2 * power / (emf + np.sqrt(np.maximum(emf * emf - 4 * inside * power, 1.0)))
         pack_voltage = emf - inside * pack_current
         cell_current = pack_current / PARALLEL
-        thermal = np.exp(3400 * cold_factor) * h.resistance_factor
-        branch = keep * branch + (1 - keep) * np.array([m.diffusion_a, m.diffusion_b]) * thermal * cell_current
-        faster = np.array([thermal, np.exp(2500 * cold_factor), np.exp(1500 * cold_factor)])
-        settled = np.array([m.depletion_a, m.depletion_b, m.depletion_c]) * faster * cell_current
-        depleted = deplete_keep * depleted + (1 - deplete_keep) * settled
-        # each electrode's own reaction (Butler and Volmer), behind its own double layer
-        exchange = np.stack(
-            [m.cathode_exchange * np.exp(-5200 * cold_factor), m.anode_exchange * np.exp(-4000 * cold_factor)]
-        )
-        wanted = h.resistance_factor * 2 * GAS / FARADAY * kelvin * np.arcsinh(cell_current / (2 * exchange / ends))
-        reaction = layer * reaction + (1 - layer) * wanted
-        slow = slow_keep * slow + (1 - slow_keep) * h.slow_resistance * cell_current
-        capacity = m.capacity * (1 - m.capacity_temperature * np.maximum(25 - core, 0)) * h.capacity_factor
-        passed = cell_current * STEP / 3600 / capacity
-        memory = memory + 40 * np.abs(passed) * (np.sign(passed) * m.hysteresis - memory)
-        hidden_memory = hidden_memory + h.hysteresis_rate * np.abs(passed) * (
-            np.sign(passed) * h.hysteresis - hidden_memory
-        )
-        soc = soc - passed
         # --- heat
         blow = 0.55 + 0.07 * v
-        diffusion = steepness * ocv_count * (soc - surface)  # V that the way from inside to the surface takes
-        heat = SERIES * PARALLEL * (lag_voltage + diffusion + (instant * cell_current)) * cell_current
-        heat = heat + SERIES * PARALLEL * cell_current * kelvin * 0.00008 * np.sin(5 * soc)
+        heat = SERIES * PARALLEL * cells.flow(cell_current, core) * cell_current
+        lowest = pack_voltage
+        if weak:
+            group = other - other_instant * cell_current
+            lowest = np.where(is_weak, np.minimum(SERIES * group, pack_voltage), pack_voltage)
+            record["weak_group"][step] = group
+            weak.flow(cell_current, core)
+        soc = cells.soc
+        heat = heat + SERIES * PARALLEL * cell_current * (core + KELVIN) * 0.00008 * np.sin(5 * soc)
         flow_heat = m.core_to_shell * (core - shell)
         core = core + STEP * (heat - flow_heat) / m.core_capacity
         shell = (
@@ -472,14 +452,15 @@ def ride(
         )
         for name, value in zip(COLUMNS, now, strict=True):
             record[name][step] = value
-        low_for = np.where(pack_voltage < gives_up, low_for + STEP, 0.0)
+        low_for = np.where(lowest < gives_up, low_for + STEP, 0.0)
         creeps_for = np.where(share < TOO_SLOW, creeps_for + STEP, 0.0)
         last = np.where((low_for >= 1.0) | (creeps_for >= PATIENCE), np.minimum(last, step + 1), last)
 
     out = []
     for i in range(n):
         count = int(last[i])
-        columns = {name: np.ascontiguousarray(record[name][:count, i]) for name in COLUMNS}
+        kept = [name for name in record if name in COLUMNS or hiddens[i].weak]
+        columns = {name: np.ascontiguousarray(record[name][:count, i]) for name in kept}
         out.append(
             Ridden(
                 plans[i],

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from gz_onboard.arrays import Array
 from gz_onboard.offline.samples import Samples
-from tests.plant.machine import G
+from tests.plant.cells import curve
+from tests.plant.machine import PARALLEL, SERIES, G
 from tests.plant.ride import STEP, Ridden
 
 ORIGIN = (40.307, -83.537)  # deg
@@ -22,8 +23,14 @@ PULSES = 2.9  # rad/s: wheel sensors give nothing below
 ODOMETER_RADIUS = 0.245
 
 
-def measure(ridden: Ridden, name: str) -> Samples:
-    """The ride as its log would give it."""
+# How much the groups of a healthy pack differ, one standard deviation: charge when full, capacity, resistance, and the
+# monitor's channels [V], which have noise too
+GROUPS = 0.002, 0.004, 0.02, 0.0015
+GROUP_NOISE = 0.0007
+
+
+def measure(ridden: Ridden, name: str, cells: bool = False) -> Samples:
+    """The ride as its log would give it; with `cells` the monitor tells lowest and highest voltage of the groups."""
     rng = np.random.default_rng([ridden.plan.seed, 83])
     c, m, h = ridden.columns, ridden.machine, ridden.hidden
     count = len(c["speed"])
@@ -86,6 +93,11 @@ def measure(ridden: Ridden, name: str) -> Samples:
     t = message(1.0, 1.0, 0.0)
     put("cell_temperature", t, at(c["shell"], t) + m.cell_probe_bias, 1.0, 0.05)
     put("ambient_temperature", message(1.0, 1.0, 0.0), np.zeros(0), 0.1)
+    if cells:
+        t = out["cell_temperature"][0]
+        groups = _groups(ridden, t, lambda column, late: at(block(column, 2), t, late))
+        put("lowest_cell_voltage", t, groups.min(axis=0), 0.001)
+        put("highest_cell_voltage", t, groups.max(axis=0), 0.001)
     t = out["ambient_temperature"][0]
     put("ambient_temperature", t, np.full(len(t), ridden.plan.ambient + m.ambient_bias), 0.1, 0.2)
     # vehicle control unit
@@ -137,6 +149,28 @@ def measure(ridden: Ridden, name: str) -> Samples:
         "ambient_C": round(ridden.plan.ambient + float(rng.normal(0, 0.7)), 1),
     }
     return Samples(name, out, facts)
+
+
+def _groups(ridden: Ridden, times: Array, at: Callable[[NDArray[np.float32], float], Array]) -> Array:
+    """Voltages of the groups at `times`, (SERIES, times): of a healthy pack about the mean cell's, and a weak one."""
+    c, m = ridden.columns, ridden.machine
+    rng = np.random.default_rng([int(1e9 * m.capacity), 89])
+    amperes, soc = at(c["pack_current"], m.bms_latency), at(c["soc"], m.bms_latency)
+    sum_of_all = at(c["pack_voltage"], m.bms_latency) + m.series_resistance * amperes
+    healthy = sum_of_all / SERIES
+    weak = at(c["weak_group"], m.bms_latency) if "weak_group" in c else None
+    if weak is not None:
+        healthy = (sum_of_all - weak) / (SERIES - 1)
+    volts, count = curve()
+    slope = np.interp(soc, np.linspace(0, 1, count + 1), np.gradient(volts) * count)
+    drop = (m.ohmic + m.film) * amperes / PARALLEL
+    charge, capacity, resistance, channel = (sd * rng.normal(size=(SERIES, 1)) for sd in GROUPS)
+    charge, capacity, resistance = (x - x.mean() for x in (charge, capacity, resistance))
+    found = healthy - slope * (charge + capacity * (1 - soc)) - resistance * drop
+    if weak is not None:
+        found[0] = weak
+    noise = np.random.default_rng([ridden.plan.seed, 97]).normal(size=found.shape)
+    return np.asarray(found + channel + GROUP_NOISE * noise)
 
 
 def _shaken(rng: np.random.Generator, column: tuple[Array, Array], sd: Array, step: float) -> tuple[Array, Array]:

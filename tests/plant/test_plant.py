@@ -11,13 +11,13 @@ import pytest
 
 from gz_onboard.events import ROLES
 from gz_onboard.offline.samples import read_samples
-from gz_onboard.vehicle import read_vehicle
 from tests.plant.cases import EFFECTS, RIDES, UNKNOWN, _draft
 from tests.plant.logs import write_logs
 from tests.plant.machine import G, scooter
 from tests.plant.ride import STEP, Hidden, Ridden, ride
 from tests.plant.roads import plan
 from tests.plant.sensors import measure
+from tests.support import with_cell_voltages
 
 FOLDER = Path(__file__).parent
 WAYS = (("city", 80.0), ("oval", 100.0))
@@ -107,9 +107,9 @@ def test_sensors_lie_as_told():
 
 
 def test_a_log_of_it_reads_back_as_it_is(tmp_path, healthy):
-    sent = measure(healthy[0], "ride_000")
+    sent = measure(healthy[0], "ride_000", cells=True)
     (file,) = write_logs([sent], tmp_path)
-    read = read_samples(file, read_vehicle("reference"))
+    read = read_samples(file, with_cell_voltages(tmp_path))
     assert read.facts == sent.facts
     assert set(read.columns) == set(sent.columns)
     assert set(sent.columns) >= set(ROLES) - {"vehicle_speed", "heater_power", "air_conditioner_power", "key", "rider"}
