@@ -118,11 +118,12 @@ PLAUSIBLE: dict[str, tuple[float, float]] = {
     "1": (-10.0, 1000.0),
 }
 
-# Likewise of a role whose unit allows more: 65 is a state of charge in percent whose unit the DBC does not tell, and
-# nothing reverses at 36 km/h.
+# Likewise of a role whose unit allows more: 65 is a state of charge in percent whose unit the DBC does not tell, no
+# cell has 6 V, and nothing reverses at 36 km/h.
 _FASTEST_BACK = -7.0  # m/s
 PLAUSIBLE_OF: dict[str, tuple[float, float]] = {
     "bms_state_of_charge": (-0.1, 1.1),
+    "lowest_cell_voltage": (0.0, 6.0),
     "vehicle_speed": (_FASTEST_BACK, PLAUSIBLE["m/s"][1]),
     "gps_speed": (_FASTEST_BACK, PLAUSIBLE["m/s"][1]),
 }

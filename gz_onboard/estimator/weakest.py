@@ -35,7 +35,7 @@ from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.physics.battery import Battery, WeakGroup
 from gz_onboard.physics.parameters import Parameters
 
-CHARGE, CAPACITY, RESISTANCE = (-0.05, 0.25), (-0.1, 0.6), (-0.5, 3.0)  # differences that a pack at work has
+CHARGE, CAPACITY, RESISTANCE = (-0.05, 0.25), (-0.1, 0.6), (-0.4, 3.0)  # differences that a pack at work has
 CHARGE_SD, CAPACITY_SD, RESISTANCE_SD = 0.03, 0.08, 0.4  # of packs of which nothing is known
 EDGE_SD = 0.004  # V: by how much channels of one monitor differ, and the lowest of many that are noisy from their mean
 LEAST_SD = 0.002  # V: of what a block says
@@ -49,14 +49,16 @@ LOAD_MEMORY = 300.0  # blocks
 LOAD_SD = 0.04  # of ρ: resistance in the pack beside the cells, and what one RC pair leaves
 MOST_BEHIND = 0.25  # of SOC
 ABOVE = 0.015  # V: the lowest is not above the mean by more
-JUMPS = 0.02  # V: sd within a block beyond what the load explains
+JUMPS = 0.012  # V: sd within a block beyond what the load explains
 HELD = 0.03  # V: by so much the mean moves while the lowest holds one value
 GATE = 5.0  # sd: a block that is further off is left out
-MISFIT_SD = 0.002  # of SOC: what such a block adds to what is not known
-DOUBT, DOUBTED, TRUSTED = 0.2, 0.5, 0.02  # share of the next block; of refused blocks: from which, until which
+MISFIT_SD = 0.0007  # of SOC: what such a block adds to what is not known
+TELLING = 0.35  # of SOC: nearer to empty a low voltage is possible, whatever it is
+DOUBT, DOUBTED, TRUSTED = 0.1, 0.5, 0.02  # share of the next block; of refused blocks: from which, until which
 PROVEN = 12  # blocks before anything is used
-KEPT = 100  # blocks without a doubt: then what is learned is kept
-SPREAD, SPREAD_RESISTANCE = 0.012, 0.08  # sd of healthy packs' weakest group: of SOC at the end; relative
+KEPT = 80  # blocks above `TELLING` without a doubt: then what is learned is kept
+SEEN = 2.0  # sd
+SPREAD, SPREAD_RESISTANCE = 0.008, 0.06  # sd of healthy packs' weakest group: of SOC at the end; relative
 DRIFT = 0.01 / 20  # of SOC: sd that the difference in charge gains over sqrt(blocks), by leaks and balancing
 NAMES = "weak_charge", "weak_capacity", "weak_resistance"
 
@@ -129,7 +131,7 @@ class Weakest:
         self.known = self._new()
         self._kept, self._sound = self._new(), 0  # what to go back to; blocks without a doubt since
         self._block = Block()
-        self._before, self._heard = inf, -inf  # V of the mean cell at the last pack voltage; s, of the signal then
+        self._before, self._then = inf, -inf  # V of the mean cell, s: at the last of the pack's voltages
         self._doubt = 0.0
         self.refused = False
 
@@ -159,16 +161,17 @@ class Weakest:
         return dict(zip(NAMES, found, strict=True))
 
     def believed(self) -> WeakGroup | None:
-        """What is used: of a difference that is small beside its sd and healthy groups' spread little (Wiener)."""
+        """What is used: of a difference that is small beside its sd and healthy groups' spread next to nothing."""
         known = self.known
         if known.blocks < PROVEN:
             return None
         charge, faster, _ = known.joint.means
         (v00, _, _), (v10, v11, _), _ = known.joint.rows
         behind, variance = max(charge + faster, 0.0), v00 + 2 * v10 + v11  # at the end
-        share = behind**2 / (behind**2 + variance + SPREAD**2)
-        more, more_sd = max(known.resistance, 0.0), known.resistance_sd
-        more *= more**2 / (more**2 + more_sd**2 + SPREAD_RESISTANCE**2)
+        seen = (charge, v00), (behind, variance)  # that there is one may be clear from full on, or only at the end
+        share = max(trusted(max(x, 0.0), own + SPREAD**2) for x, own in seen)
+        more = max(known.resistance, 0.0)
+        more *= trusted(more, known.resistance_sd**2 + SPREAD_RESISTANCE**2)
         return WeakGroup(share * charge, share * faster, more, sd=hypot(share * sqrt(variance), (1 - share) * behind))
 
     # --- learning ---------------------------------------------------------------------------------------------
@@ -176,9 +179,9 @@ class Weakest:
     def step(self, now: float, reading: PackReading, temperature: float, soc: StateOfCharge) -> None:
         """Take in what came since the last step, at `now` [s]; temperature: of the cells [degC]."""
         signal = self._signal
-        if not self.mapped or not self._signals.pack_voltage.count:
+        if not self.mapped or self._signals.pack_voltage.time != now:
             return
-        new, self._heard = signal.time > self._heard, signal.time  # since the pack's voltage before this one
+        new, self._then = signal.time > self._then, now  # between two of the pack's voltages
         if reading.voltage is None or reading.current is None or soc.filter is None:
             self._before = inf
             return
@@ -207,16 +210,16 @@ class Weakest:
 
     def take(self, block: Block) -> None:
         """Learn from a whole block, if it can be true."""
-        possible = self._possible(block)
-        self._doubt += DOUBT * ((not possible) - self._doubt)
+        possible, telling = self._possible(block), block.began > TELLING
+        if telling or not possible:
+            self._doubt += DOUBT * ((not possible) - self._doubt)
         if self._doubt > DOUBTED and not self.refused:
             self.refused = True
             self.known, self._sound = self._kept.copy(), 0
         self.refused = self.refused and self._doubt > TRUSTED
-        if self.refused or not possible:
-            return
-        self._learn(block)
-        self._sound += 1
+        if possible and not self.refused:
+            self._learn(block)
+            self._sound += telling
         if self._sound >= KEPT and self._doubt < TRUSTED:
             self._kept, self._sound = self.known.copy(), 0
         self._battery.weaken(self.believed())
@@ -228,8 +231,9 @@ class Weakest:
         held = block.lowest[0] == block.lowest[1] and block.mean[1] - block.mean[0] > HELD
         if held or left > JUMPS**2 * block.count:
             return False
-        load, response = self.known.load + uu, self.known.response + du
-        slope = min(max(response / (load + LOAD_WEIGHT), -RESISTANCE[1]), -RESISTANCE[0])
+        slope = (self.known.response + du) / (self.known.load + uu + LOAD_WEIGHT)
+        if not RESISTANCE[0] < -slope < RESISTANCE[1]:
+            return False
         soc, alone = block.soc / block.count, (block.d - slope * block.u) / block.count
         lowest = self._behind(soc, MOST_BEHIND) - self._above
         return lowest < alone < self._above
@@ -267,17 +271,18 @@ class Weakest:
 
     def snapshot(self) -> dict[str, Any]:
         """What is to be kept over a restart; of: what the vehicle file says."""
-        known = self._kept if self.refused or self._doubt > TRUSTED else self.known
-        sums = {"load": known.load, "response": known.response, "blocks": known.blocks}
-        return {"of": self._battery.capacity, **known.joint.snapshot(), **sums}
+        return {"of": self._battery.capacity, "known": _numbers(self.known), "kept": _numbers(self._kept)}
 
-    def read(self, saved: Mapping[str, Any] | None) -> Differences:
+    def read(self, saved: Mapping[str, Any] | None) -> tuple[Differences, Differences]:
         """What a snapshot holds: nothing learned if there is none, or if it is of another pack.
 
-        KeyError, TypeError or ValueError if it holds what cannot be.
+        Gives what is known, and what to go back to. KeyError, TypeError or ValueError if it holds what cannot be.
         """
         if saved is None or abs(float(saved["of"]) / self._battery.capacity - 1) > SAME:
-            return self._new()
+            return self._new(), self._new()
+        return self._read(saved["known"]), self._read(saved["kept"])
+
+    def _read(self, saved: Mapping[str, Any]) -> Differences:
         joint = self._new().joint.restored(saved["means"], saved["rows"])
         load, response, blocks = float(saved["load"]), float(saved["response"]), int(saved["blocks"])
         if not (isfinite(load + response) and load >= 0 and blocks >= 0):
@@ -287,7 +292,19 @@ class Weakest:
             raise ValueError("holds an implausible weakest group")
         return Differences(joint, load, response, blocks)
 
-    def take_on(self, known: Differences) -> None:
+    def take_on(self, saved: tuple[Differences, Differences]) -> None:
         """Go on from what `read` gave."""
-        self.known, self._kept = known, known.copy()
+        self.known, kept = saved
+        # Once something was learned where a lie shows, one that begins elsewhere contradicts it and is left out.
+        self._kept = self.known.copy() if kept.blocks >= PROVEN else kept
         self._battery.weaken(self.believed())
+
+
+def _numbers(of: Differences) -> dict[str, Any]:
+    return {**of.joint.snapshot(), "load": of.load, "response": of.response, "blocks": of.blocks}
+
+
+def trusted(difference: float, variance: float) -> float:
+    """The share that is used of a difference: a sixteenth of one sd, half of `SEEN` sd, nearly all of many."""
+    ratio = difference**4
+    return ratio / (ratio + (SEEN**2 * variance) ** 2)

@@ -16,7 +16,7 @@ from tests.plant.cells import Cells
 from tests.plant.machine import PARALLEL, SERIES, Machine
 from tests.plant.ride import Hidden
 
-STEP = 0.5  # s
+STEP = 1.0  # s
 GIVES_UP = 2.8  # V of the weakest group, in the mean over `FELT`: the controller takes the bursts away before
 FELT = 20.0  # s
 AUXILIARY = 45.0  # W
@@ -54,12 +54,13 @@ def speeds(steps: int, seed: int) -> Array:
 def discharge(packs: Sequence[Hidden], seed: int, soc: float = 1.0, temperature: float = 18.0) -> list[Discharge]:
     """Each of `packs` on the same way from `soc` until its weakest group gives up, after a rest of a minute."""
     machine = Machine()
-    n, steps = len(packs), 40_000
+    n, steps = len(packs), 20_000
     m = SimpleNamespace(**{f.name: np.full(n, getattr(machine, f.name)) for f in fields(Machine)})
     h = SimpleNamespace(**{f.name: np.array([float(getattr(x, f.name)) for x in packs]) for f in fields(Hidden)})
     more = {"capacity_factor": h.weak_capacity, "resistance_factor": h.weak_resistance}
     weak_h = SimpleNamespace(**{**vars(h), **{name: getattr(h, name) * x for name, x in more.items()}})
-    cells, weak = Cells(m, h, np.full(n, soc), STEP), Cells(m, weak_h, soc - h.weak_charge, STEP)
+    weak_soc = 1 - h.weak_charge - (1 - soc) / h.weak_capacity  # full together, but for its charge
+    cells, weak = Cells(m, h, np.full(n, soc), STEP), Cells(m, weak_h, weak_soc, STEP)
     speed = np.concatenate((np.zeros(round(60 / STEP)), speeds(steps, seed)))[:steps]
     acceleration = np.gradient(speed, STEP)
     power = speed * (200 * acceleration + 27 + 0.36 * speed**2) * np.where(acceleration > -0.2, 1.15, 0.4)

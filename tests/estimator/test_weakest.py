@@ -1,0 +1,269 @@
+"""The weakest group of cells, on packs of the tests' plant: learned, used, refused, kept, forgotten."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.estimator.load_model import Conditions
+from gz_onboard.estimator.weakest import NAMES, PROVEN
+from gz_onboard.events import Cause, Event, Group
+from gz_onboard.physics.battery import Battery, WeakGroup
+from gz_onboard.physics.drawable import drawable
+from gz_onboard.vehicle import read_vehicle
+from tests.plant.machine import SERIES
+from tests.plant.packs import STEP, Discharge, discharge
+from tests.plant.ride import Hidden
+from tests.plant.sensors import GROUP_NOISE, GROUPS
+
+Lie = Callable[[float, float], float | None]
+"""Another value of time [s] and lowest voltage [V]."""
+VEHICLE = read_vehicle("reference")
+BUS = [
+    Group("Pack", ("pack_voltage", "pack_current"), STEP),
+    Group("Motor", ("motor_speed",), STEP),
+    Group("Inverter", ("inverter_voltage", "inverter_current"), STEP),
+    Group("Cells", ("cell_temperature", "ambient_temperature", "lowest_cell_voltage"), 1.0),
+]
+PACK, MOTOR, INVERTER, CELLS = range(4)
+WEAK = Hidden(weak_capacity=0.92, weak_resistance=1.15)
+LOW = Hidden(weak_charge=0.04)
+SEED, START = 11, 0.65  # SOC: half a discharge shows enough, and takes half of the time
+
+
+@cache
+def packs() -> dict[Hidden, Discharge]:
+    kinds = (Hidden(), WEAK, LOW)
+    return dict(zip(kinds, discharge(kinds, SEED, soc=START), strict=True))
+
+
+def heard(pack: Discharge, lie: Lie | None = None) -> Iterator[Event]:
+    """What the bus says, with noise, steps and channels that differ."""
+    rng = np.random.default_rng([SEED, 3])
+    n = len(pack.time)
+    channels = GROUPS[3] * rng.normal(size=(SERIES, 1)) + GROUP_NOISE * rng.normal(size=(SERIES, n))
+    lowest = np.round((pack.groups + channels).min(axis=0), 3).tolist()
+    voltage = np.round(pack.voltage + 0.01 * rng.normal(size=n), 2).tolist()
+    current = np.round(1.011 * pack.current + 0.026 + 0.06 * rng.normal(size=n), 2).tolist()
+    behind = pack.voltage - 0.0087 * pack.current, pack.current - 45 / pack.voltage
+    inverter = np.stack(behind, axis=1).round(2).tolist()
+    for i, time in enumerate(pack.time.tolist()):
+        told = lie(time, lowest[i]) if lie else lowest[i]
+        yield time - 0.03, CELLS, (pack.temperature, pack.temperature - 2, told)
+        yield time - 0.02, MOTOR, (float(pack.speed[i]) / 0.2438,)
+        yield time - 0.01, INVERTER, tuple(inverter[i])
+        yield time, PACK, (voltage[i], current[i])
+
+
+def ridden(pack: Discharge, until: float, lie: Lie | None = None, saved: dict[str, Any] | None = None) -> Any:
+    """The estimator when the mean cell is at `until`."""
+    estimator = Estimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    if saved:
+        estimator.restore(json.loads(json.dumps(saved)), "key", None)
+    end = pack.time[int(np.argmax(pack.soc <= until))]
+    for event in heard(pack, lie):
+        if event[0] > end:
+            break
+        estimator.handle(event)
+    return estimator
+
+
+@cache
+def at(kind: Hidden, until: float) -> Any:
+    return ridden(packs()[kind], until)
+
+
+def left(estimator: Any, weakest: WeakGroup | None) -> float:
+    """The energy [J] that it expects to be left, were this known of the weakest group."""
+    known = estimator.battery.health.weakest
+    estimator.battery.weaken(weakest)
+    soc, sd = estimator.soc.ageing.state_of_charge(estimator.filter)
+    found = estimator.forecaster.forecast(soc, sd, 18.0, 1.0, 16.0, 0.0).energy
+    estimator.battery.weaken(known)
+    return float(found)
+
+
+def drawn(kind: Hidden, since: float) -> float:
+    """The energy [J] that the pack really gave from this state of charge of the mean cell on."""
+    pack = packs()[kind]
+    first = int(np.argmax(pack.soc <= since))
+    return float(np.sum(pack.voltage[first:] * pack.current[first:]) * STEP)
+
+
+# --- learned and used -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "charge", "capacity", "resistance"), [(WEAK, 1.0, 0.92, 1.15), (LOW, 0.96, 1.0, 1.0)])
+def test_a_weak_group_is_found_and_ends_the_range(kind: Hidden, charge: float, capacity: float, resistance: float):
+    found = at(kind, 0.2)
+    learned = found.weakest.learned()
+    for name, truth in zip(NAMES, (charge, capacity, resistance), strict=True):
+        assert abs(learned[name].value - truth) < 2.5 * learned[name].sd
+    assert learned["weak_capacity"].sd < 0.02
+    whole = drawn(Hidden(), START) / START
+    with_it, without = (left(found, x) - drawn(kind, 0.2) for x in (found.battery.health.weakest, None))
+    assert abs(with_it) < 0.015 * whole
+    assert without > 0.03 * whole
+
+
+def test_a_healthy_pack_has_none():
+    for until in (0.55, 0.2):
+        found = at(Hidden(), until)
+        assert found.weakest.known.blocks > PROVEN
+        for x in found.weakest.learned().values():
+            assert abs(x.value - 1) < 2 * x.sd
+        assert left(found, found.battery.health.weakest) == pytest.approx(left(found, None), rel=0.01)
+
+
+def test_without_the_signal_nothing_is_known():
+    pack = packs()[WEAK]
+    estimator: Any = Estimator(
+        [*BUS[:3], Group("Cells", BUS[3].roles[:2], 1.0)], VEHICLE.pack, VEHICLE.model, VEHICLE.riding
+    )
+    for time, group, values in heard(pack):
+        if time > 600:
+            break
+        estimator.handle((time, group, values[:2]))
+    assert estimator.battery.health.weakest is None
+    assert "weakest" not in estimator.snapshot("key")["learned"]
+
+
+def test_the_state_of_charge_stays_the_mean_cell_s():
+    found, pack = at(WEAK, 0.2), packs()[WEAK]
+    end = found.estimate(found._time)
+    assert end.soc == pytest.approx(0.2, abs=0.02)
+    assert end.range < 0.6 * left(found, None) / end.consumption_expected
+    assert pack.soc[-1] > 0.1
+
+
+def test_its_share_in_the_range_is_age_and_the_sum_is_exact():
+    found = at(WEAK, 0.2)
+    attribution, conditions = found.attribution, Conditions(16.0, 0.0)
+    ends = []
+    for weakest in (found.battery.health.weakest, None):
+        known = found.battery.health.weakest
+        found.battery.weaken(weakest)
+        soc, sd = found.soc.ageing.state_of_charge(found.filter)
+        forecast = found.forecaster.forecast(soc, sd, 18.0, 1.0, 16.0, 0.0)
+        ends.append(attribution._state(0.0, forecast, soc, conditions, 0.0))
+        found.battery.weaken(known)
+    why = attribution.explained(*reversed(ends))
+    assert why.causes[Cause.AGE] == pytest.approx(ends[0].range - ends[1].range, rel=1e-6)
+    assert why.causes[Cause.AGE] < -1000
+    rated = attribution.explained(attribution.rated, ends[0])
+    assert sum(rated.causes.values()) == pytest.approx(rated.range - rated.reference, abs=1e-6)
+
+
+# --- signals that lie -----------------------------------------------------------------------------------------------
+
+
+def jumping() -> Lie:
+    rng = np.random.default_rng(5)
+    return lambda t, v: round(v - (0.25 if rng.random() < 0.3 else 0.0), 3)
+
+
+LIES: dict[str, Callable[[], Lie]] = {
+    "stuck": lambda: lambda t, v: 3.7,
+    "high": lambda: lambda t, v: v + 0.3,
+    "low": lambda: lambda t, v: v - 0.3,
+    "jumping": jumping,
+    "silent": lambda: lambda t, v: None,
+}
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_a_lie_from_the_start_teaches_nothing(name: str):
+    found = ridden(packs()[Hidden()], 0.57, LIES[name]())
+    assert found.weakest.refused is (name != "silent")
+    assert all(x.value == 1.0 for x in found.weakest.learned().values())
+    assert left(found, found.battery.health.weakest) == left(found, None)
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_a_lie_changes_nothing_that_was_learned(name: str):
+    before = at(WEAK, 0.2)
+    saved, known = before.snapshot("key"), before.weakest.learned()
+    saved["soc"], saved["covariance"] = START, [1e-4, 0.0, 1e-4]  # charged meanwhile
+    found = ridden(packs()[WEAK], 0.57, LIES[name](), saved)
+    for x, learned in found.weakest.learned().items():
+        assert abs(learned.value - known[x].value) < 0.5 * known[x].sd
+    assert found.battery.health.weakest.capacity > 0.05
+
+
+def test_a_signal_that_tells_the_truth_again_is_believed_again():
+    lie = LIES["high"]()
+    found = ridden(packs()[WEAK], 0.4, lambda t, v: lie(t, v) if t < 400 else v)
+    assert not found.weakest.refused
+    assert found.weakest.learned()["weak_capacity"].value < 0.96
+
+
+# --- kept -----------------------------------------------------------------------------------------------------------
+
+
+def test_what_was_learned_survives_a_restart():
+    before = at(WEAK, 0.2)
+    saved = json.loads(json.dumps(before.snapshot("key")))
+    again: Any = Estimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    again.restore(saved, "key", 10.0)
+    assert again.weakest.learned() == before.weakest.learned()
+    assert again.battery.health.weakest == before.battery.health.weakest
+    assert again.weakest.snapshot()["known"] == before.weakest.snapshot()["known"]
+
+
+def test_a_state_without_it_or_of_another_pack_has_none():
+    saved = at(WEAK, 0.2).snapshot("key")
+    del saved["learned"]["weakest"]
+    again: Any = Estimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    again.restore(saved, "key", 10.0)
+    assert again.weakest.known.blocks == 0
+    saved = at(WEAK, 0.2).snapshot("key")
+    saved["learned"]["weakest"]["of"] *= 1.1
+    again.restore(saved, "key", 10.0)
+    assert again.weakest.known.blocks == 0
+    assert again.battery.health.weakest is None
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"means": [9.0, 0, 0]}, {"rows": [1]}, {"load": -1.0}, {"load": "x"}, {"response": float("nan")}]
+)
+def test_what_cannot_be_is_refused_whole(wrong: dict[str, Any]):
+    saved = json.loads(json.dumps(at(WEAK, 0.2).snapshot("key")))
+    saved["learned"]["weakest"]["known"] |= wrong
+    again: Any = Estimator(BUS, VEHICLE.pack, VEHICLE.model, VEHICLE.riding)
+    with pytest.raises(ValueError):
+        again.restore(saved, "key", 10.0)
+    assert again.weakest.known.blocks == 0
+
+
+# --- the energy of a pack with a weak group ---------------------------------------------------------------------------
+
+
+def pack_with(weakest: WeakGroup | None) -> Battery:
+    battery = VEHICLE.pack.own()
+    battery.weaken(weakest)
+    return battery
+
+
+def test_a_pack_delivers_until_its_weakest_group_ends():
+    whole = drawable(pack_with(None), 0.5, 18.0, 700.0)
+    lower = drawable(pack_with(WeakGroup(0.04, 0.0, 0.0, 0.01)), 0.5, 18.0, 700.0)
+    assert whole.energy - lower.energy == pytest.approx(0.035 * lower.slope, rel=0.2)
+    assert (whole.end_sd, lower.end_sd) == (0.0, 0.01)
+    smaller = drawable(pack_with(WeakGroup(0.0, 0.08, 0.0)), 0.5, 18.0, 700.0)
+    assert whole.energy - smaller.energy == pytest.approx(0.065 * smaller.slope, rel=0.2)
+    harder = drawable(pack_with(WeakGroup(0.0, 0.0, 0.5)), 0.5, 18.0, 700.0)
+    assert 0 < whole.energy - harder.energy < 0.02 * whole.slope
+    alike = drawable(pack_with(WeakGroup(0.0, 0.0, 0.0)), 0.5, 18.0, 700.0)
+    assert alike.energy == pytest.approx(whole.energy, rel=2e-3)
+
+
+def test_what_is_weak_in_one_vehicle_is_not_in_another():
+    battery = VEHICLE.pack
+    battery.own().weaken(WeakGroup(0.1, 0.1, 0.1))
+    assert battery.health.weakest is None
