@@ -15,8 +15,10 @@ from gz_onboard import state
 from gz_onboard.cli import main
 from gz_onboard.errors import BAD_INPUT, OK
 from gz_onboard.estimator.ekf import ScalarFilter
+from gz_onboard.estimator.weakest import NAMES
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
+from tests.support import with_cell_voltages
 
 CAPACITY, RESISTANCE = 0.8, 1.5
 
@@ -119,6 +121,30 @@ def test_it_shows_and_forgets_the_road_load(saved: Path, tmp_path: Path, capsys:
     after, _ = state.load(saved, time.time()) or ({}, None)
     assert after["learned"] == {name: x for name, x in snapshot["learned"].items() if name != "road"}
     Pipeline(vehicle).estimator.restore(after, vehicle.key, 0.0)
+
+
+def test_it_shows_and_forgets_the_weakest_group(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    vehicle = with_cell_voltages(tmp_path)
+    assert not set(NAMES) & set(shown(saved, capsys))  # a vehicle without the signal
+    estimator = Pipeline(vehicle).estimator
+    snapshot, _ = state.load(saved, time.time()) or ({}, None)
+    estimator.restore(snapshot, vehicle.key, 0.0)
+    estimator.soc.filter = ScalarFilter(estimator.battery, 0.6, 0.0, (1e-4, 0.0, 1e-4))
+    estimator.weakest.known.joint.means[:2] = [0.04, 1 / 0.9 - 1]
+    changed = estimator.snapshot(vehicle.key)
+    assert changed
+    state.write(saved, state.encode(changed, time.time()))
+    options = "--vehicle", str(vehicle.file)
+    learned = shown(saved, capsys, *options)
+    assert learned["weak_charge"]["factor"] == pytest.approx(0.96)
+    assert learned["weak_capacity"]["factor"] == pytest.approx(0.9)
+    picture = tmp_path / "learned.png"
+    assert main(["learned", "--state", str(saved), *options, "--plot", str(picture), "--reset", "weakest"]) == OK
+    assert "weak_capacity 1.000 ± 0.080  nothing learned: of that group" in capsys.readouterr().out
+    assert picture.exists()
+    learned = shown(saved, capsys, *options)
+    assert learned["weak_charge"]["factor"] == 1.0
+    assert learned["capacity"]["factor"] == pytest.approx(CAPACITY, abs=0.01)
 
 
 def test_it_resets_nothing_under_a_daemon_that_runs(saved: Path, capsys: pytest.CaptureFixture[str]):

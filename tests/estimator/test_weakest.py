@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterator
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from gz_onboard.bus.codec import Codec
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.weakest import NAMES, PROVEN
@@ -21,6 +23,7 @@ from tests.plant.machine import SERIES
 from tests.plant.packs import STEP, Discharge, discharge
 from tests.plant.ride import Hidden
 from tests.plant.sensors import GROUP_NOISE, GROUPS
+from tests.support import EPOCH, identifier, with_cell_voltages
 
 Lie = Callable[[float, float], float | None]
 """Another value of time [s] and lowest voltage [V]."""
@@ -94,6 +97,18 @@ def drawn(kind: Hidden, since: float) -> float:
     pack = packs()[kind]
     first = int(np.argmax(pack.soc <= since))
     return float(np.sum(pack.voltage[first:] * pack.current[first:]) * STEP)
+
+
+# --- the signal -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("raw", "value", "faults"), [(3612, 3.612, 0), (0xFFFF, None, 1), (5600, None, 1)])
+def test_a_voltage_that_no_cell_has_is_dropped_and_counted(tmp_path: Path, raw: int, value: float | None, faults: int):
+    codec = Codec(with_cell_voltages(tmp_path).mapping)
+    frame = EPOCH, identifier("BMS_Cells"), raw.to_bytes(2, "little") + bytes(6), 0
+    ((_, group, values),) = codec.decode([frame])
+    assert values[codec.groups[group].roles.index("lowest_cell_voltage")] == value
+    assert sum(codec.faults.values()) == faults
 
 
 # --- learned and used -----------------------------------------------------------------------------------------------

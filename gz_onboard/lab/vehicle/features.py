@@ -17,6 +17,7 @@ NEEDS: dict[str, tuple[tuple[tuple[str, ...], ...], tuple[tuple[str, ...], ...]]
     "route ahead": ((("latitude",), ("longitude",)), (("gps_fix",),)),
     "wind by heading": ((("gps_course",),), (("rate_z",),)),
     "ageing": ((("pack_voltage",), ("pack_current",)), (("cell_temperature",), ("inverter_current",))),
+    "weakest group of cells": ((("lowest_cell_voltage",), ("pack_voltage",), ("pack_current",)), ()),
     "restart after a break": ((("odometer", "bms_state_of_charge"),), (("odometer",), ("bms_state_of_charge",))),
     "charging": ((("charge_plug",),), (("pack_current",),)),
     "parked or riding": ((("key", "contactor"),), ()),
