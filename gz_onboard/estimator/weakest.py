@@ -41,7 +41,7 @@ EDGE_SD = 0.004  # V: by how much channels of one monitor differ, and the lowest
 LEAST_SD = 0.002  # V: of what a block says
 SLOPE_SD = 0.12  # relative: of the curve's slope at its place
 PLACE = 0.03  # of SOC, over which the curve errs the same way
-BLOCK, FEWEST, MOST = 0.0025, 8, 3600  # of SOC that flows in a block; samples in one
+BLOCK, FEWEST = 0.0025, 8  # of SOC that flows in a block, at least; samples in one
 STEADY = 0.006  # V of a cell between two steps: more, and lowest and mean voltage are of different loads
 KNOWN_SD = 0.04  # of SOC: sd from which the mean cell's place on the curve is known
 LOAD_WEIGHT = 0.002  # V²: what no difference in resistance counts beside the load that is seen
@@ -49,7 +49,7 @@ LOAD_MEMORY = 300.0  # blocks
 LOAD_SD = 0.04  # of ρ: resistance in the pack beside the cells, and what one RC pair leaves
 MOST_BEHIND = 0.25  # of SOC
 ABOVE = 0.015  # V: the lowest is not above the mean by more
-JUMPS = 0.012  # V: sd within a block beyond what the load explains
+JUMPS, FALLS = 0.012, 0.1  # V: sd within a block beyond what the load explains; of the difference: where it falls fast
 HELD = 0.03  # V: by so much the mean moves while the lowest holds one value
 GATE = 5.0  # sd: a block that is further off is left out
 MISFIT_SD = 0.0007  # of SOC: what such a block adds to what is not known
@@ -80,8 +80,6 @@ class Block:
 
     def add(self, lowest: float, mean: float, drop: float, soc: float) -> None:
         """Take in a sample."""
-        if not self.count:
-            self.began = soc
         d = lowest - mean
         self.count += 1
         self.d, self.u, self.soc = self.d + d, self.u + drop, self.soc + soc
@@ -194,13 +192,14 @@ class Weakest:
         current = reading.current / battery.cells_parallel
         if sd > KNOWN_SD or current < 0:  # of a charge the lowest is another group
             return
-        r0 = battery.r0.at(place, temperature)[0]
-        self._block.add(signal.value, mean, r0 * current + soc.effects.overpotential + soc.filter.v1, place)
+        if not -BLOCK < self._block.began - place < PLACE:  # the first, after a charge, or of another state of charge
+            self._block = Block(place)
+        drop = battery.r0.at(place, temperature)[0] * current + soc.effects.overpotential + soc.filter.v1
+        self._block.add(signal.value, mean, drop, place)
         block = self._block
-        if (block.began - place >= BLOCK and block.count >= FEWEST) or block.count >= MOST:
-            self._block = Block()
-            if block.began - place >= BLOCK:
-                self.take(block)
+        if block.began - place >= BLOCK and block.count >= FEWEST:
+            self._block = Block(place)
+            self.take(block)
 
     def _permitted(self, now: float, reading: PackReading) -> bool:
         """Whether all else that the learning depends on is beyond doubt."""
@@ -229,7 +228,8 @@ class Weakest:
         dd, du, uu = block.scatter
         left = max(dd - du * du / uu, 0.0) if uu > 0 else dd
         held = block.lowest[0] == block.lowest[1] and block.mean[1] - block.mean[0] > HELD
-        if held or left > JUMPS**2 * block.count:
+        jumps = JUMPS + FALLS * abs(block.d) / block.count
+        if held or left > jumps**2 * block.count:
             return False
         slope = (self.known.response + du) / (self.known.load + uu + LOAD_WEIGHT)
         if not RESISTANCE[0] < -slope < RESISTANCE[1]:
