@@ -113,6 +113,8 @@ def main() -> None:
     parser.add_argument("seeds", nargs="+", type=int, metavar="SEED")
     parser.add_argument("--keep", type=Path, metavar="FOLDER")
     arguments = parser.parse_args()
+    print("| ride | end | at 50 %, without | with | at 20 %, without | with | charge | capacity | resistance |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     for seed in arguments.seeds:
         file = arguments.keep / f"weakest_{seed}.npz" if arguments.keep else None
         if file and file.exists():
@@ -124,14 +126,15 @@ def main() -> None:
         else:
             rides = ride_all([seed])
             if file:
-                np.savez_compressed(file, **{f"{n}/{c}": x for n, r in rides.items() for c, x in r.items()})
+                flat: dict[str, Any] = {f"{name}/{c}": x for name, ride in rides.items() for c, x in ride.items()}
+                np.savez_compressed(file, **flat)
         for name, columns in rides.items():
             made, estimator = estimates(columns)
             without, _ = estimates(columns, lambda t, v: None)
-            learned = ", ".join(f"{x.value:.3f} ± {x.sd:.3f}" for x in estimator.weakest.learned().values())
-            told = " ".join(f"{100 * x:+.1f}" for x in (*errors(columns, made), *errors(columns, without)))
-            end = f"{columns['true soc'][-1]:.3f}"
-            print(f"| {name} | {end} | {told} | {learned} | {estimator.weakest.refused}", flush=True)
+            learned = " | ".join(f"{x.value:.3f} ± {x.sd:.3f}" for x in estimator.weakest.learned().values())
+            pairs = zip(errors(columns, without), errors(columns, made), strict=True)
+            told = " | ".join(f"{100 * before:+.1f} % | {100 * now:+.1f} %" for before, now in pairs)
+            print(f"| {name} | {100 * columns['true soc'][-1]:.1f} % | {told} | {learned} |", flush=True)
 
 
 if __name__ == "__main__":
