@@ -40,9 +40,9 @@ CHARGE_SD, CAPACITY_SD, RESISTANCE_SD = 0.03, 0.08, 0.4  # of packs of which not
 EDGE_SD = 0.004  # V: by how much channels of one monitor differ, and the lowest of many that are noisy from their mean
 LEAST_SD = 0.002  # V: of what a block says
 SLOPE_SD = 0.12  # relative: of the curve's slope at its place
-PLACE = 0.03  # of SOC, over which the curve errs the same way
-BLOCK, FEWEST = 0.0025, 8  # of SOC that flows in a block, at least; samples in one
-STEADY = 0.006  # V of a cell between two steps: more, and lowest and mean voltage are of different loads
+PLACE, PLACE_SD = 0.03, 0.005  # of SOC: over which the curve errs the same way; of the mean cell's place on it
+BLOCK, FEWEST = 0.0025, 5  # of SOC that flows in a block, at least; samples in one
+STEADY, HOLDS = 0.008, 0.9  # V of a cell, s: a voltage that moves by less for so long; monitors are slow, and late
 KNOWN_SD = 0.04  # of SOC: sd from which the mean cell's place on the curve is known
 LOAD_WEIGHT = 0.002  # V²: what no difference in resistance counts beside the load that is seen
 LOAD_MEMORY = 300.0  # blocks
@@ -54,9 +54,9 @@ HELD = 0.03  # V: by so much the mean moves while the lowest holds one value
 GATE = 5.0  # sd: a block that is further off is left out
 MISFIT_SD = 0.0007  # of SOC: what such a block adds to what is not known
 TELLING = 0.35  # of SOC: nearer to empty a low voltage is possible, whatever it is
-DOUBT, DOUBTED, TRUSTED = 0.1, 0.5, 0.02  # share of the next block; of refused blocks: from which, until which
+DOUBT, DOUBTED, TRUSTED = 0.15, 0.5, 0.02  # share of the next block; of refused blocks: from which, until which
 PROVEN = 12  # blocks before anything is used
-KEPT = 80  # blocks above `TELLING` without a doubt: then what is learned is kept
+KEPT = 40  # blocks above `TELLING` without a doubt: then what is learned is kept
 SEEN = 2.0  # sd
 SPREAD, SPREAD_RESISTANCE = 0.008, 0.06  # sd of healthy packs' weakest group: of SOC at the end; relative
 DRIFT = 0.01 / 20  # of SOC: sd that the difference in charge gains over sqrt(blocks), by leaks and balancing
@@ -129,7 +129,8 @@ class Weakest:
         self.known = self._new()
         self._kept, self._sound = self._new(), 0  # what to go back to; blocks without a doubt since
         self._block = Block()
-        self._before, self._then = inf, -inf  # V of the mean cell, s: at the last of the pack's voltages
+        self._held, self._since = inf, inf  # V about which the mean cell's voltage has held, s: since when
+        self._then = -inf  # s: when the pack's voltage came last
         self._doubt = 0.0
         self.refused = False
 
@@ -181,12 +182,13 @@ class Weakest:
             return
         new, self._then = signal.time > self._then, now  # between two of the pack's voltages
         if reading.voltage is None or reading.current is None or soc.filter is None:
-            self._before = inf
+            self._held = inf
             return
         battery = self._battery
-        mean, before = battery.cell_voltage(reading.voltage, reading.current), self._before
-        self._before = mean
-        if not new or abs(mean - before) > STEADY or not self._permitted(now, reading):
+        mean = battery.cell_voltage(reading.voltage, reading.current)
+        if abs(mean - self._held) > STEADY:
+            self._held, self._since = mean, now
+        if not new or now - self._since < HOLDS or not self._permitted(now, reading):
             return
         place, sd = soc.ageing.state_of_charge(soc.filter)
         current = reading.current / battery.cells_parallel
@@ -254,7 +256,9 @@ class Weakest:
         predicted = self._behind(soc, behind)
         slope = self._battery.ocv(soc - behind)[1]
         residual = (block.d + known.resistance * block.u) / n - predicted - offset
-        noise = LEAST_SD**2 + (SLOPE_SD * predicted) ** 2 + (known.resistance_sd * drop) ** 2
+        steeper = slope - self._battery.ocv(soc)[1]
+        curve = (SLOPE_SD * predicted) ** 2 + (PLACE_SD * steeper) ** 2
+        noise = LEAST_SD**2 + curve + (known.resistance_sd * drop) ** 2
         noise *= max(PLACE / BLOCK, 1.0)
         slopes = (-slope, -slope * (1 - soc), 1.0)
         gains = [sum(p * h for p, h in zip(row, slopes, strict=True)) for row in joint.rows]
