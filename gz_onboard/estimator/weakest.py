@@ -3,13 +3,13 @@
 The mean cell is that of the filter; small slow filters follow the difference to it (bar-delta filtering: Plett 2009,
 EVS24). Both carry the same current, so that what the cell model errs by cancels in the difference of their voltages,
 
-    V_low - V_mean = U(z - Δ) - U(z) - ρ·drop + b,      Δ = missing + faster·(1 - z)
+    V_low - V_mean = U(z - Δ) - U(z) - ρ·drop + b,      Δ = charge + faster·(1 - z)
 
 with z the mean cell's state of charge, U the open-circuit voltage, and `drop` what the load takes from the mean cell's
-voltage. `missing` is a difference in charge, `faster` one in capacity, ρ one in resistance, and b what the two sensors
-differ by. As the difference follows from z alone, nothing is to be predicted between two measurements: each block of
-some charge gives one. Within a block the difference moves with the load by ρ, pooled over blocks by least squares;
-what there is without load goes into a filter of (missing, faster, b).
+voltage. `charge` is a difference in charge when full, `faster` one in capacity, ρ one in resistance, and b what the two
+sensors differ by. As the difference follows from z alone, nothing is to be predicted between two measurements: each
+block of some charge gives one. Within a block the difference moves with the load by ρ, pooled over blocks by least
+squares; what there is without load goes into a filter of (charge, faster, b).
 
 The curve's slope errs by `SLOPE_SD` at its place, however many blocks lie there. Without charge that flows no block
 ends. The lowest voltage is that of whichever group has it: the difference is that of the lower edge of them all. A
@@ -259,7 +259,7 @@ class Weakest:
         steeper = slope - self._battery.ocv(soc)[1]
         curve = (SLOPE_SD * predicted) ** 2 + (PLACE_SD * steeper) ** 2
         noise = LEAST_SD**2 + curve + (known.resistance_sd * drop) ** 2
-        noise *= max(PLACE / BLOCK, 1.0)
+        noise *= PLACE / BLOCK
         slopes = (-slope, -slope * (1 - soc), 1.0)
         gains = [sum(p * h for p, h in zip(row, slopes, strict=True)) for row in joint.rows]
         if residual**2 > GATE**2 * (noise * BLOCK / PLACE + sum(g * h for g, h in zip(gains, slopes, strict=True))):
