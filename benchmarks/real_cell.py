@@ -151,11 +151,13 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
     ocv_table = tuple(map(float, cell.ocv_soc)), tuple(map(float, cell.ocv)), float(np.median(sd))
     circuit = mesh(cell.r0), mesh(cell.r1), mesh(cell.c1)
     battery = Battery(1, 1, capacity_25, temperature, share, 2.5, 0.0, *ocv_table, *circuit)
-    error = result.curves["battery.voltage_error"]
+    error, time = (result.curves[f"battery.voltage_error{name}"] for name in ("", "_time"))
     battery = replace(
         battery,
         voltage_error_temperature=tuple(map(float, error.axes["temperature"])),
         voltage_error_value=tuple(map(float, error.value)),
+        voltage_error_time_temperature=tuple(map(float, time.axes["temperature"])),
+        voltage_error_time_value=tuple(map(float, time.value)),
         as_new=AS_NEW,
         capacity_sd=result.parameters["cell_capacity"].sd / capacity_25,
     )
@@ -386,8 +388,9 @@ def _tables(result: Result) -> list[str]:
     c = result.curves
     lines = [
         "",
-        "| °C | capacity, A·h | rest voltage, mV | R0, R1 half full, mΩ | τ1, s | slow R, mΩ | slow τ, s |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
+        "| °C | capacity, A·h | rest voltage, mV | R0, R1 half full, mΩ | τ1, s | slow R, mΩ | slow τ, s "
+        "| errs by, mV, for, s |",
+        "| --- " * 8 + "|",
     ]
     soc = c["battery.r0"].axes["soc"]
     k = int(np.argmin(np.abs(soc - 0.5)))
@@ -398,7 +401,8 @@ def _tables(result: Result) -> list[str]:
         lines.append(
             f"| {t:.0f} | {c['battery.capacity'].value[j]:.3f} | {shift:+.0f} | "
             f"{1e3 * r0:.0f}, {1e3 * r1:.0f} | {r1 * c1:.0f} | {1e3 * c['slow_resistance'].value[j, k]:.0f} | "
-            f"{c['slow_time'].value[j, k]:.0f} |"
+            f"{c['slow_time'].value[j, k]:.0f} | {1e3 * c['battery.voltage_error'].value[j]:.0f}, "
+            f"{c['battery.voltage_error_time'].value[j]:.0f} |"
         )
     lines += ["", "| fit, in sample | RMS, mV | largest, mV |", "| --- | --- | --- |"]
     lines += [f"| {f.what} | {1e3 * f.rms:.1f} | {1e3 * f.largest:.0f} |" for f in result.fits if f.unit == "V"]

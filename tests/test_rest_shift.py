@@ -1,4 +1,4 @@
-"""What depends on temperature beside resistance: `[battery.rest_shift]` and `[battery.voltage_error]`."""
+"""What depends on temperature beside resistance: `rest_shift`, `voltage_error` and its time."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.estimator.ekf import Noise, ScalarFilter
 from gz_onboard.estimator.ekf_filterpy import FilterpyFilter
 from gz_onboard.estimator.estimator import Estimator
+from gz_onboard.estimator.uncertainty import VoltageUncertainty
 from gz_onboard.events import Group
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.drawable import drawable
@@ -176,3 +177,43 @@ def test_what_the_circuit_errs_by_is_read_over_temperature(tmp_path):
     assert without.voltage_error(7.5, 0.01) == 0.01
     with pytest.raises(InputError, match=r"voltage_error.* 2 numbers within 0 to 0\.2 V"):
         read(tmp_path, ERRORS.replace("0.020", "-0.020"))
+
+
+TIMES = """
+[battery.voltage_error_time]
+temperature = [-10.0, 25.0]
+value = [1000.0, 160.0]
+unit = "s"
+sd_relative = 0.2
+"""
+
+
+def test_for_how_long_it_errs_the_same_way_is_read_over_temperature(tmp_path):
+    battery = read(tmp_path, TIMES)
+    usual = VEHICLE.parameters["cell_voltage_error_time"]
+    over, plain = (VoltageUncertainty(b, VEHICLE.parameters) for b in (battery, PLAIN))
+    assert [over.error_time(t) for t in (-20.0, 7.5, 40.0)] == pytest.approx([1000.0, 580.0, 160.0])
+    assert plain.error_time(-20.0) == plain.error_time(40.0) == usual
+    cold, warm = (over.slow(0.6, t, 0.2**2).time for t in (-10.0, 25.0))  # before anything is known of the charge
+    assert cold == pytest.approx(1000.0, rel=0.01)
+    assert 160.0 < warm < 0.2 * cold
+    with pytest.raises(InputError, match=r"voltage_error_time.* 2 numbers within 10 to 36000 s"):
+        read(tmp_path, TIMES.replace("160.0", "1.0"))
+    with pytest.raises(InputError, match=r"voltage_error_time.*min"):
+        read(tmp_path, TIMES.replace('"s"', '"min"'))
+
+
+def test_a_wrong_start_is_left_by_less_where_errors_stay_longer(tmp_path):
+    """Ten minutes of one voltage: less than a mean of independent errors where they stay for a quarter of an hour."""
+    sd = {}
+    for name, battery in (("long", read(tmp_path, TIMES)), ("usual", PLAIN)):
+        groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
+        estimator = Estimator(groups, battery, VEHICLE.model, VEHICLE.riding)
+        volts = 14 * battery.ocv(0.6, -10.0)[0]
+        for k in range(1, 600):
+            estimator.handle((k - 0.1, 0, (-10.0,)))
+            load = 20.0 if k % 20 < 10 else 2.0  # no rest
+            estimator.handle((float(k), 1, (volts - 0.05 * load, load)))
+        assert estimator.filter
+        sd[name] = estimator.filter.covariance[0] ** 0.5
+    assert sd["long"] > 1.02 * sd["usual"]

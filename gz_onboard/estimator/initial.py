@@ -151,7 +151,7 @@ def first_filter(
             v1_sd = sqrt(saved.covariance[2] * decay**2 + v1_sd**2 * (1 - decay**2))
         # The cell model errs the same way for a time: after a shorter gap the voltage adds no information.
         if age is not None:
-            factor = sqrt(max(2 * uncertainty.error_time / max(age, SHORTEST_AGE), 1.0))
+            factor = sqrt(max(2 * uncertainty.error_time(temperature) / max(age, SHORTEST_AGE), 1.0))
             slow_sd, once_sd = factor * slow_sd, factor * once_sd
     error_sd = hypot(v1_sd, slow_sd)
     soc, covariance = from_voltage(battery, cell_voltage, cell_current, temperature, v1, error_sd, once_sd)

@@ -90,7 +90,7 @@ class VoltageUncertainty:
         self.rest = sqrt(p.sd("rest_voltage_error") ** 2 + battery.ocv_sd**2 + battery.rest_shift_sd**2)
         self.resistance = max(RESISTANCE_SD, p.sd("cell_resistance_factor"))  # relative
         self._empty = p.sd("cell_voltage_error_empty")
-        self.error_time = p["cell_voltage_error_time"]
+        self._error_time = p["cell_voltage_error_time"]
         self._sensor = (p.sd("pack_voltage_offset") / battery.cells_series) ** 2  # V²
         # What depends on the cell's history, hysteresis before all.
         self._history = p.sd("rest_voltage_error") ** 2 + battery.rest_shift_sd**2  # V²
@@ -101,6 +101,10 @@ class VoltageUncertainty:
         model, empty = self._battery.voltage_error(temperature, self.model), self._empty
         share = min(max((EMPTY_BELOW - soc) / (EMPTY_BELOW - EMPTY_FROM), 0.0), 1.0)
         return model + share * max(empty - model, 0.0)
+
+    def error_time(self, temperature: float) -> float:
+        """For how long [s] the circuit errs the same way: in the cold for longer, as what it lacks is slower there."""
+        return self._battery.voltage_error_time(temperature, self._error_time)
 
     def slow(self, soc: float, temperature: float, soc_variance: float) -> SlowError:
         """What errs the same way for a time: the circuit, the tables' place, the sensor.
@@ -113,7 +117,8 @@ class VoltageUncertainty:
         axis_sd = self._capacity_scatter * (1 - soc) * slope
         stays = axis_sd**2 + self._history + self._sensor
         share = stays / (stays + slope**2 * soc_variance)
-        time = self.error_time + share * max(HISTORY_TIME - self.error_time, 0.0)
+        circuit = self.error_time(temperature)
+        time = circuit + share * max(HISTORY_TIME - circuit, 0.0)
         return SlowError(self.loaded(soc, temperature) ** 2 + stays, time)
 
     def tells_more(self, soc: float, variance: float) -> bool:

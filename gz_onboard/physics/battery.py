@@ -146,6 +146,8 @@ class Battery:
     entropy_value: Row = ()  # V/K of a cell
     voltage_error_temperature: Row = ()  # degC; none: one error of the circuit for all temperatures
     voltage_error_value: Row = ()  # V of a cell, sd
+    voltage_error_time_temperature: Row = ()  # degC; none: it errs the same way for as long at all temperatures
+    voltage_error_time_value: Row = ()  # s
     as_new: float = 0.5  # probability that the pack is as its file says, before anything is learned of its age
     capacity_sd: float = 0.01  # relative: how closely a pack that is as new holds `capacity`
     health: Health = field(default_factory=Health)  # changed by `age` and `weaken` only
@@ -176,6 +178,12 @@ class Battery:
         if not self.voltage_error_value:
             return usual
         return linear(self.voltage_error_temperature, self.voltage_error_value, temperature)
+
+    def voltage_error_time(self, temperature: float, usual: float) -> float:
+        """For how long [s] the circuit errs the same way at `temperature` [degC]; `usual` [s] if that is not known."""
+        if not self.voltage_error_time_value:
+            return usual
+        return linear(self.voltage_error_time_temperature, self.voltage_error_time_value, temperature)
 
     def ocv(self, soc: float, temperature: float | None = None) -> tuple[float, float]:
         """(open-circuit voltage of a cell [V], its slope [V]) at `temperature` [degC]; None: as tabulated over SOC."""

@@ -20,6 +20,7 @@ KEYS = (
     "ocv",
     "rest_shift",
     "voltage_error",
+    "voltage_error_time",
     "entropy",
     "capacity",
     "window",
@@ -52,8 +53,10 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         raise ocv.error(f"has {len(volts)} numbers for {len(soc)} of soc", "value")
     temperatures, capacities = _capacity(table)
     entropy_soc, entropy = _entropy(table)
-    shift_temperatures, shifts, shift_sd = _over_temperature(table, "rest_shift", -LARGEST_SHIFT)
-    error_temperatures, errors, _ = _over_temperature(table, "voltage_error", 0.0)
+    shift_temperatures, shifts, shift_sd = _over_temperature(table, "rest_shift", "V", -LARGEST_SHIFT, LARGEST_SHIFT)
+    error_temperatures, errors, _ = _over_temperature(table, "voltage_error", "V", 0.0, LARGEST_SHIFT)
+    usual = parameters.declared["cell_voltage_error_time"]
+    time_temperatures, times, _ = _over_temperature(table, "voltage_error_time", "s", usual.low, usual.high)
     battery = Battery(
         cells_series=table.integer("cells_series", 1, MOST_CELLS),
         cells_parallel=table.integer("cells_parallel", 1, MOST_CELLS),
@@ -76,6 +79,8 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         entropy_value=entropy,
         voltage_error_temperature=error_temperatures,
         voltage_error_value=errors,
+        voltage_error_time_temperature=time_temperatures,
+        voltage_error_time_value=times,
         capacity_sd=parameters.sd("cell_capacity") / parameters["cell_capacity"],
         as_new=table.number("as_new", Battery.as_new, low=LEAST_AS_NEW, high=1 - LEAST_AS_NEW),
     )
@@ -107,18 +112,18 @@ def _capacity(battery: Table) -> tuple[Row, Row]:
     return temperatures, shares
 
 
-def _over_temperature(battery: Table, name: str, least: float) -> tuple[Row, Row, float]:
-    """(temperatures [degC], voltages [V], their sd [V]) of a table; nothing if the file does not have it."""
+def _over_temperature(battery: Table, name: str, unit: str, least: float, most: float) -> tuple[Row, Row, float]:
+    """(temperatures [degC], values in `unit`, their sd) of a table; nothing if the file does not have it."""
     if name not in battery.values:
         return (), (), 0.0
     table = battery.table(name)
-    table.only(["temperature", "value", "unit", "sd", "source", "status"])
-    table.text("unit", choices=["V"])
-    temperatures, volts = _axis(table, "temperature", *TEMPERATURE, least=1), table.numbers("value")
-    if len(volts) != len(temperatures) or min(volts) < least or max(volts) > LARGEST_SHIFT:
-        wanted = f"must be {len(temperatures)} numbers within {least:g} to {LARGEST_SHIFT:g} V"
+    table.only(["temperature", "value", "unit", "sd", "sd_relative", "source", "status"])
+    table.text("unit", choices=[unit])
+    temperatures, values = _axis(table, "temperature", *TEMPERATURE, least=1), table.numbers("value")
+    if len(values) != len(temperatures) or min(values) < least or max(values) > most:
+        wanted = f"must be {len(temperatures)} numbers within {least:g} to {most:g} {unit}"
         raise table.error(f"{wanted}, one for each temperature", "value")
-    return temperatures, volts, table.number("sd", 0.005, low=0.0, high=LARGEST_SHIFT)
+    return temperatures, values, table.number("sd", 0.005, low=0.0, high=most)
 
 
 def _window(battery: Table) -> Window:

@@ -169,7 +169,7 @@ def test_what_stays_for_hours_does_not_fade_with_the_error_of_the_circuit():
     uncertainty = VoltageUncertainty(VEHICLE.pack, VEHICLE.parameters)
     times = [uncertainty.slow(0.6, 25.0, sd**2).time for sd in (0.2, 0.05, 0.01, 0.003)]
     assert times == sorted(times)
-    assert times[0] < 1.02 * uncertainty.error_time
+    assert times[0] < 1.02 * uncertainty.error_time(25.0)
     assert 0.75 * HISTORY_TIME < times[-1] < HISTORY_TIME
     assert uncertainty.slow(0.6, 10.0, 0.01**2).variance > uncertainty.slow(0.6, 25.0, 0.01**2).variance
 

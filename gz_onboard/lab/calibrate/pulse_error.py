@@ -35,23 +35,25 @@ class Residual(NamedTuple):
 
 
 def voltage_errors(residuals: Sequence[Residual], names: str, result: Result) -> None:
-    """``battery.voltage_error`` and ``cell_voltage_error_time`` into `result`."""
+    """``battery.voltage_error`` and ``battery.voltage_error_time`` into `result`, and the mean of the latter.
+
+    That is ``cell_voltage_error_time``.
+    """
     found = [(r.temperature, *_evenly(r)) for r in residuals]
     known = [(at, left, rest) for at, left, rest in found if len(left) > LONGEST / GRID]
     if not known:
         return
     sizes = np.array([_size(left, rest) for _, left, rest in known])
     times = np.array([_correlation_time(left) for _, left, _ in known])
+    axes = {"temperature": np.array([at for at, _, _ in known])}
+    shares = np.sqrt(times / np.array([GRID * len(left) for _, left, _ in known]))
     result.curves["battery.voltage_error"] = Curve(
-        {"temperature": np.array([at for at, _, _ in known])},
-        sizes,
-        sizes * np.sqrt(times / np.array([GRID * len(left) for _, left, _ in known])),
-        "V",
-        f"{names}: rms of one RC pair above 10 % SOC, rest and load alike",
+        axes, sizes, sizes * shares, "V", f"{names}: rms of one RC pair above 10 % SOC, rest and load alike"
     )
     middle = float(np.exp(np.mean(np.log(times))))
     spread = middle * float(np.std(np.log(times))) if len(known) > 1 else middle
     source = f"{names}: correlation of what one RC pair leaves falls to 1/e"
+    result.curves["battery.voltage_error_time"] = Curve(axes, times, times * shares, "s", source)
     result.parameters["cell_voltage_error_time"] = Found(middle, spread, "s", source)
 
 

@@ -38,6 +38,19 @@ def test_size_and_time_come_back():
     assert time.value == pytest.approx(400, rel=0.35)
 
 
+def test_the_time_comes_back_at_each_temperature():
+    true = {-10.0: 1500.0, 25.0: 150.0}
+    residuals = []
+    for seed, (temperature, tau) in enumerate(true.items()):
+        time, values = wandering(seed, 0.01, tau)
+        residuals.append(Residual(temperature, time, values, np.full(len(time), 0.5), resting(time)))
+    result = Result("pulse")
+    voltage_errors(residuals, "t", result)
+    curve = result.curves["battery.voltage_error_time"]
+    assert dict(zip(curve.axes["temperature"], curve.value, strict=True)) == pytest.approx(true, rel=0.5)
+    assert result.parameters["cell_voltage_error_time"].value == pytest.approx(np.sqrt(np.prod(curve.value)))
+
+
 def test_what_is_near_empty_is_left_out():
     time, values = wandering(3, 0.005, 300.0)
     level = np.linspace(1.0, 0.0, len(time))
