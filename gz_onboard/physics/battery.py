@@ -175,15 +175,13 @@ class Battery:
 
     def voltage_error(self, temperature: float, usual: float) -> float:
         """By how much [V] the circuit errs at `temperature` [degC], one sd; `usual` [V] if that is not known."""
-        if not self.voltage_error_value:
-            return usual
-        return linear(self.voltage_error_temperature, self.voltage_error_value, temperature)
+        errors = self.voltage_error_value
+        return linear(self.voltage_error_temperature, errors, temperature) if errors else usual
 
     def voltage_error_time(self, temperature: float, usual: float) -> float:
         """For how long [s] the circuit errs the same way at `temperature` [degC]; `usual` [s] if that is not known."""
-        if not self.voltage_error_time_value:
-            return usual
-        return linear(self.voltage_error_time_temperature, self.voltage_error_time_value, temperature)
+        times = self.voltage_error_time_value
+        return linear(self.voltage_error_time_temperature, times, temperature) if times else usual
 
     def ocv(self, soc: float, temperature: float | None = None) -> tuple[float, float]:
         """(open-circuit voltage of a cell [V], its slope [V]) at `temperature` [degC]; None: as tabulated over SOC."""
