@@ -151,7 +151,7 @@ def battery_of(cell: Circuit, result: Result, capacity_25: float) -> Battery:
     ocv_table = tuple(map(float, cell.ocv_soc)), tuple(map(float, cell.ocv)), float(np.median(sd))
     circuit = mesh(cell.r0), mesh(cell.r1), mesh(cell.c1)
     battery = Battery(1, 1, capacity_25, temperature, share, 2.5, 0.0, *ocv_table, *circuit)
-    error, time = (result.curves[f"battery.voltage_error{name}"] for name in ("", "_time"))
+    error, time = (result.curves[name] for name in ("battery.voltage_error", "voltage_error_time"))
     battery = replace(
         battery,
         voltage_error_temperature=tuple(map(float, error.axes["temperature"])),
@@ -402,7 +402,7 @@ def _tables(result: Result) -> list[str]:
             f"| {t:.0f} | {c['battery.capacity'].value[j]:.3f} | {shift:+.0f} | "
             f"{1e3 * r0:.0f}, {1e3 * r1:.0f} | {r1 * c1:.0f} | {1e3 * c['slow_resistance'].value[j, k]:.0f} | "
             f"{c['slow_time'].value[j, k]:.0f} | {1e3 * c['battery.voltage_error'].value[j]:.0f}, "
-            f"{c['battery.voltage_error_time'].value[j]:.0f} |"
+            f"{c['voltage_error_time'].value[j]:.0f} |"
         )
     lines += ["", "| fit, in sample | RMS, mV | largest, mV |", "| --- | --- | --- |"]
     lines += [f"| {f.what} | {1e3 * f.rms:.1f} | {1e3 * f.largest:.0f} |" for f in result.fits if f.unit == "V"]

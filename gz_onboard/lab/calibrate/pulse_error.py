@@ -35,9 +35,9 @@ class Residual(NamedTuple):
 
 
 def voltage_errors(residuals: Sequence[Residual], names: str, result: Result) -> None:
-    """``battery.voltage_error`` and ``battery.voltage_error_time`` into `result`, and the mean of the latter.
+    """``battery.voltage_error`` and the mean time, ``cell_voltage_error_time``, into `result`.
 
-    That is ``cell_voltage_error_time``.
+    Beside them ``voltage_error_time`` over temperature, which is shown and not written into the vehicle file.
     """
     found = [(r.temperature, *_evenly(r)) for r in residuals]
     known = [(at, left, rest) for at, left, rest in found if len(left) > LONGEST / GRID]
@@ -53,7 +53,7 @@ def voltage_errors(residuals: Sequence[Residual], names: str, result: Result) ->
     middle = float(np.exp(np.mean(np.log(times))))
     spread = middle * float(np.std(np.log(times))) if len(known) > 1 else middle
     source = f"{names}: correlation of what one RC pair leaves falls to 1/e"
-    result.curves["battery.voltage_error_time"] = Curve(axes, times, times * shares, "s", source)
+    result.curves["voltage_error_time"] = Curve(axes, times, times * shares, "s", source)
     result.parameters["cell_voltage_error_time"] = Found(middle, spread, "s", source)
 
 

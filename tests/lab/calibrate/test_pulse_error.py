@@ -46,7 +46,7 @@ def test_the_time_comes_back_at_each_temperature():
         residuals.append(Residual(temperature, time, values, np.full(len(time), 0.5), resting(time)))
     result = Result("pulse")
     voltage_errors(residuals, "t", result)
-    curve = result.curves["battery.voltage_error_time"]
+    curve = result.curves["voltage_error_time"]
     assert dict(zip(curve.axes["temperature"], curve.value, strict=True)) == pytest.approx(true, rel=0.5)
     assert result.parameters["cell_voltage_error_time"].value == pytest.approx(np.sqrt(np.prod(curve.value)))
 
