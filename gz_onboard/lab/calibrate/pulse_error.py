@@ -37,7 +37,7 @@ class Residual(NamedTuple):
 def voltage_errors(residuals: Sequence[Residual], names: str, result: Result) -> None:
     """``battery.voltage_error`` and the mean time, ``cell_voltage_error_time``, into `result`.
 
-    Beside them ``voltage_error_time`` over temperature, which is shown and not written into the vehicle file.
+    Beside them ``voltage_error_time`` over temperature, which no vehicle file gets from here.
     """
     found = [(r.temperature, *_evenly(r)) for r in residuals]
     known = [(at, left, rest) for at, left, rest in found if len(left) > LONGEST / GRID]
