@@ -445,6 +445,38 @@ def test_the_clock_is_set_in_the_middle_of_a_round(bus: str, monkeypatch: pytest
     assert all(0 <= told == pytest.approx(passed, abs=0.21) for told, passed in steps), steps
 
 
+def test_a_channel_that_was_not_read_out_is_waited_for(monkeypatch: pytest.MonkeyPatch):
+    """Two channels, one read in parts by a busy machine: frames are taken in the order of their times, and all."""
+    left, right = (CanChannel("virtual", f"unused{i}", index=i) for i in range(2))
+    daemon = Daemon(reference(), [left, right], recorder=None, state_file=None)
+    taken: list[Frame] = []
+    monkeypatch.setattr(daemon, "step", lambda frames, now_ns: taken.extend(frames))
+    monkeypatch.setattr(left, "up", True)
+    monkeypatch.setattr(right, "up", True)
+    came = [(time.time_ns() - (60 - i) * 1_000_000, 0x123, b"", i % 2) for i in range(60)]
+
+    def parts(channel: CanChannel, of: list[Frame], count: int):
+        def drain() -> list[Frame]:
+            new, of[:] = of[:count], of[count:]
+            channel.behind = bool(of)
+            return new
+
+        return drain
+
+    monkeypatch.setattr(left, "drain", parts(left, came[0::2], 4))
+    monkeypatch.setattr(right, "drain", parts(right, came[1::2], 100))
+    for _ in range(10):
+        daemon.round()
+    assert taken == came
+    silent = [(time.time_ns() - 10_000_000, 0x123, b"", 1)]
+    monkeypatch.setattr(left, "drain", parts(left, [(time.time_ns() - S, 0x123, b"", 0)] * 100, 1))  # a second behind
+    monkeypatch.setattr(right, "drain", parts(right, silent[:], 1))
+    for _ in range(5):
+        time.sleep(0.1)
+        daemon.round()
+    assert silent[0] in taken
+
+
 def test_held_up_while_it_reads_it_tells_the_same(bus: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Frames that came after a tick do not count before it, however long the reading took: as of the log offline."""
     recorder = Recorder(tmp_path, "v")

@@ -48,6 +48,7 @@ class CanChannel:
         self.name = channel
         self.index = index
         self.up = False
+        self.behind = False  # whether `drain` had no time for all that had come
         self.overflow = 0  # frames that the kernel had to drop, as it counts them
         self.send_failures = 0
         self._identifiers = identifiers
@@ -119,6 +120,7 @@ class CanChannel:
 
     def drain(self) -> list[Frame]:
         """The frames that have come since the last call, without waiting, as far as `READ_S` and `MOST` allow."""
+        self.behind = False
         if not self.up and not self.reopen():
             return []
         frames: list[Frame] = []
@@ -158,12 +160,15 @@ class CanChannel:
                 payload = payload[:length]
             frames.append((time_ns or time.time_ns(), identifier, payload, index))
             if not number & 31 and now() > until:
-                return
+                break
+        self.behind = True
 
     def _drain_bus(self, frames: list[Frame]) -> None:
         until = time.monotonic() + READ_S
         for _ in range(MOST):
-            if time.monotonic() > until or (message := self._bus.recv(0)) is None:
+            if time.monotonic() > until:
+                break
+            if (message := self._bus.recv(0)) is None:
                 return
             identifier = flagged(message)
             # Filtered here: with filters of its own python-can's recv(0) says "nothing" at each frame it rejects.
@@ -174,6 +179,7 @@ class CanChannel:
                 continue
             # Only the kernel's stamps are of one clock; other interfaces have clocks of their own.
             frames.append((time.time_ns(), identifier, data, self.index))
+        self.behind = True
 
     def _is_echo(self, identifier: int, data: bytes) -> bool:
         """Whether that is a frame of our own, which comes back once."""

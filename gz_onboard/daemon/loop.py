@@ -36,6 +36,7 @@ WORK_S = 0.06  # s of CPU that the frames of one tick may cost
 FRAME_S = 20e-6  # s of CPU for a frame, until it is measured
 STOP_S = 6.0  # to write what waits when stopped; systemd kills after 10 s
 CLOCK_STEP_NS = 500_000_000
+HELD_NS = 200_000_000  # so long a channel waits for another that could not be read out
 
 log = logging.getLogger("gz-onboard")
 
@@ -146,10 +147,13 @@ class Daemon:
         """One tick; gives the number of frames that came."""
         boot_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
         frames, self._later = self._later, []
+        whole = []  # ns: until when the channels with more to read were read
         for channel in self.channels:
-            frames += channel.drain()
+            frames += (new := channel.drain())
+            whole += [new[-1][0]] if channel.behind and new else []
         offset = _wall_offset()
         now_ns = boot_ns + offset  # by the same clock as `offset`, whenever that was set
+        now_ns = max(min([now_ns, *whole]), now_ns - HELD_NS)
         self.pipeline.estimator.wait((boot_ns - self._boot_ns) * 1e-9)
         self._boot_ns = boot_ns
         # What came while we read, or were held up, waits for its own tick: of a channel read before, some is missing.

@@ -394,7 +394,7 @@ def test_once_without_frames(capsys):
         (["--interface", "virtual", "--onse"], "--once"),
         (["--dbc", "range_larg.dbc"], "did you mean 'range_large.dbc'"),
         (["--dbc", "vehicle.dbc"], "vehicle.dbc: has no message RANGE_Estimate"),
-        (["--dbc", "."], "no such DBC file"),
+        (["--dbc", "."], "is a folder; give the DBC file"),
     ],
 )
 def test_wrong_use_is_told(arguments, told, capsys):

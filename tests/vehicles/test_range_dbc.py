@@ -81,7 +81,7 @@ def test_a_file_of_ones_own_beside_the_vehicle_file(tmp_path):
     ("line", "dbc", "told"),
     [
         ('range_dbc = "range_larg.dbc"', "", r"van\.toml:1: range_dbc: .*no such DBC file.*mean 'range_large\.dbc'"),
-        ('range_dbc = "."', "", r"van\.toml:1: range_dbc: \.: no such DBC file"),
+        ('range_dbc = "."', "", r"van\.toml:1: range_dbc: \.: is a folder; give the DBC file in it"),
         ('range_dbc = ""', "", r"van\.toml:1: range_dbc: '' cannot be the name of a file"),
         (f'range_dbc = "{"x" * 5000}"', "", r"van\.toml:1: range_dbc: 'xxx.{0,100}' cannot be the name of a file"),
         (f'range_dbc = "{"ä" * 200}"', "", r"van\.toml:1: range_dbc: '.*ää.*': cannot be read: File name too long"),
