@@ -345,6 +345,13 @@ def test_a_column_that_is_no_array_is_named(column):
         gz.estimate({"time [s]": [0, 1], "speed [km/h]": column})
 
 
+def test_a_column_that_a_data_frame_has_twice_is_named():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame(np.zeros((2, 3)), columns=["time [s]", "speed [km/h]", "speed [km/h]"])
+    with pytest.raises(gz.InputError, match=r"table: has two columns 'speed \[km/h\]'"):
+        gz.estimate(frame)
+
+
 @pytest.mark.parametrize(
     ("facts", "said"),
     [

@@ -166,7 +166,7 @@ def _fresh(vehicle: Vehicle) -> Forecaster:
 def _sound() -> Iterator[None]:
     try:
         yield
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
         raise InputError(f"the saved state is damaged: {error!r}") from error
 
 

@@ -16,8 +16,9 @@ ends. The lowest voltage is that of whichever group has it: the difference is th
 small difference is mostly the spread of healthy groups: of it little is used.
 
 A signal that no group can have is refused, and what was learned from it: above the mean, further below than
-`MOST_BEHIND`, held while the pack's voltage moves, jumping. A block that only contradicts what is known is left out,
-and makes what is known less certain, for packs are balanced and mended.
+`MOST_BEHIND`, held while the pack's voltage moves, jumping; or the pack goes on when the group would long be empty. A
+block that only contradicts what is known is left out, and makes what is known less certain, for packs are balanced and
+mended.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ MOST_BEHIND = 0.25  # of SOC
 ABOVE = 0.015  # V: the lowest is not above the mean by more
 JUMPS, FALLS = 0.012, 0.1  # V: sd within a block beyond what the load explains; of the difference: where it falls fast
 HELD = 0.03  # V: by so much the mean moves while the lowest holds one value
+PAST = 0.02  # of SOC, beside two sd: a group that is believed to be emptier, while charge flows, is no group
 GATE = 5.0  # sd: a block that is further off is left out
 MISFIT_SD = 0.0007  # of SOC: what such a block adds to what is not known
 TELLING = 0.35  # of SOC: nearer to empty a low voltage is possible, whatever it is
@@ -60,6 +62,7 @@ KEPT = 40  # blocks above `TELLING` without a doubt: then what is learned is kep
 SEEN = 2.0  # sd
 SPREAD, SPREAD_RESISTANCE = 0.008, 0.06  # sd of healthy packs' weakest group: of SOC at the end; relative
 DRIFT = 0.01 / 20  # of SOC: sd that the difference in charge gains over sqrt(blocks), by leaks and balancing
+ROUNDED, MOST_OFFSET = 1.001, 20.0  # of a saved state: of a variance; sd
 NAMES = "weak_charge", "weak_capacity", "weak_resistance"
 
 
@@ -218,12 +221,23 @@ class Weakest:
             self.refused = True
             self.known, self._sound = self._kept.copy(), 0
         self.refused = self.refused and self._doubt > TRUSTED
+        if self._past_its_end(block):
+            self.refused, self._doubt, self._sound = True, 1.0, 0
+            self.known, self._kept = self._new(), self._new()
         if possible and not self.refused:
             self._learn(block)
             self._sound += telling
         if self._sound >= KEPT and self._doubt < TRUSTED:
             self._kept, self._sound = self.known.copy(), 0
         self._battery.weaken(self.believed())
+
+    def _past_its_end(self, block: Block) -> bool:
+        """Whether the pack goes on where its weakest group would long be empty by what is known of it."""
+        gone = 1 - block.soc / block.count
+        charge, faster, _ = self.known.joint.means
+        (v00, _, _), (v10, v11, _), _ = self.known.joint.rows
+        sd = sqrt(max(v00 + gone * (2 * v10 + gone * v11), 0.0))
+        return self.known.blocks >= PROVEN and 1 - gone - charge - faster * gone + 2 * sd < -PAST
 
     def _possible(self, block: Block) -> bool:
         """Whether any group can have had such voltages."""
@@ -282,7 +296,7 @@ class Weakest:
 
         Gives what is known, and what to go back to. KeyError, TypeError or ValueError if it holds what cannot be.
         """
-        if saved is None or abs(float(saved["of"]) / self._battery.capacity - 1) > SAME:
+        if saved is None or not abs(float(saved["of"]) / self._battery.capacity - 1) <= SAME:
             return self._new(), self._new()
         return self._read(saved["known"]), self._read(saved["kept"])
 
@@ -291,8 +305,10 @@ class Weakest:
         load, response, blocks = float(saved["load"]), float(saved["response"]), int(saved["blocks"])
         if not (isfinite(load + response) and load >= 0 and blocks >= 0):
             raise ValueError("holds an impossible weakest group")
-        charge, faster, _ = joint.means
-        if not (CHARGE[0] <= charge <= CHARGE[1] and CAPACITY[0] <= faster <= CAPACITY[1]):
+        charge, faster, offset = joint.means
+        known = all(0 < joint.variance(i) <= most * ROUNDED for i, most in enumerate(self._unknown))
+        plausible = CHARGE[0] <= charge <= CHARGE[1] and CAPACITY[0] <= faster <= CAPACITY[1]
+        if not (known and plausible and abs(offset) <= MOST_OFFSET * sqrt(self._unknown[2])):
             raise ValueError("holds an implausible weakest group")
         return Differences(joint, load, response, blocks)
 

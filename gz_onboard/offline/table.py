@@ -35,6 +35,9 @@ def signal_table(data: object, name: str = "table") -> SignalTable:
     if isinstance(data, pyarrow.Table):
         table = data
     elif hasattr(data, "iloc") and hasattr(data, "reset_index"):  # pandas
+        if not data.columns.is_unique:  # type: ignore[attr-defined]
+            twice = data.columns[data.columns.duplicated()][0]  # type: ignore[attr-defined]
+            raise InputError(f"{name}: has two columns {str(twice)!r}")
         table = pyarrow.Table.from_pandas(
             data.reset_index() if is_time(str(data.index.name)) else data,  # type: ignore[attr-defined]
             preserve_index=False,

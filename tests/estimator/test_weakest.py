@@ -269,6 +269,16 @@ def test_a_lie_changes_nothing_that_was_learned(name: str):
     assert found.battery.health.weakest.capacity > 0.05
 
 
+def test_a_group_that_would_long_be_empty_is_none():
+    """A signal 0.15 V too low from the start looks like a weak group, until the pack goes on without it."""
+    deceived, later = (ridden(Hidden(), until, lambda t, v: v - 0.15) for until in (0.3, 0.12))
+    assert not deceived.weakest.refused
+    assert left(deceived, deceived.weakest.believed()) < 0.5 * left(deceived, None)
+    assert later.weakest.refused
+    assert later.weakest.believed() is None
+    assert left(later, later.battery.health.weakest) == pytest.approx(left(later, None))
+
+
 def test_a_signal_that_tells_the_truth_again_is_believed_again():
     lie = LIES["high"]()
     found = ridden(WEAK, 0.45, lambda t, v: lie(t, v) if t < 200 else v)
@@ -296,14 +306,25 @@ def test_a_state_without_it_or_of_another_pack_has_none():
     again.restore(saved, "key", 10.0)
     assert again.weakest.known.blocks == 0
     saved = at(WEAK, 0.2).snapshot("key")
-    saved["learned"]["weakest"]["of"] *= 1.1
-    again.restore(saved, "key", 10.0)
-    assert again.weakest.known.blocks == 0
+    for of in (1.1 * saved["learned"]["weakest"]["of"], float("nan")):
+        saved["learned"]["weakest"]["of"] = of
+        again.restore(saved, "key", 10.0)
+        assert again.weakest.known.blocks == 0
     assert again.battery.health.weakest is None
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"means": [9.0, 0, 0]}, {"rows": [1]}, {"load": -1.0}, {"load": "x"}, {"response": float("nan")}]
+    "wrong",
+    [
+        {"means": [9.0, 0, 0]},
+        {"means": [0, 0, 1e6]},
+        {"rows": [1]},
+        {"rows": [0.0] * 6},
+        {"rows": [9e9, 0, 9e9, 0, 0, 1]},
+        {"load": -1.0},
+        {"load": "x"},
+        {"response": float("nan")},
+    ],
 )
 def test_what_cannot_be_is_refused_whole(wrong: dict[str, Any]):
     saved = json.loads(json.dumps(at(WEAK, 0.2).snapshot("key")))
