@@ -229,9 +229,12 @@ def test_one_of_two_channels_goes_down(running: Running, listener: Listener):
 def test_unknown_identifiers(running: Running, listener: Listener, all_frames: bool):
     daemon = running.daemon(*(["--all-frames"] if all_frames else []))
     with sender() as raw:
-        for i in range(300):
-            raw.send(FRAME.pack(0x7E0 + i % 3, 8, bytes(8)))
-            raw.send(FRAME.pack(EFF_FLAG | 0x200, 8, bytes(8)))
+        for _ in range(6):
+            for i in range(51):
+                raw.send(FRAME.pack(0x7E0 + i % 3, 8, bytes(8)))
+                raw.send(FRAME.pack(EFF_FLAG | 0x200, 8, bytes(8)))
+            for _ in range(2):  # rounds: of more at once a busy daemon leaves out what is too much
+                listener.wait_for_new("RANGE_Status", 10)
         for frame in Scooter().steady(1.0):
             raw.send(FRAME.pack(frame[1], 8, frame[2].ljust(8, b"\0")))
         found = listener.wait_for_new("RANGE_Diagnosis", 5, RANGE_CountUnknown=4 if all_frames else 0)
@@ -239,10 +242,10 @@ def test_unknown_identifiers(running: Running, listener: Listener, all_frames: b
     known = len(Scooter().steady(1.0))
     assert found["RANGE_CountDropped"] <= known
     strangers = [frame for frame in raw_frames(daemon.logs[-1]) if frame[1] in (0x7E0, 0x7E1, 0x7E2, EFF_FLAG | 0x200)]
-    assert len(strangers) == (600 if all_frames else 0)
-    assert number(summary, r"received (\d+)") == known + (600 if all_frames else 0)
+    assert len(strangers) == (612 if all_frames else 0)
+    assert number(summary, r"received (\d+)") == known + (612 if all_frames else 0)
     unknown = daemon.statuses()[-1]["unknown"]
-    assert unknown == ({"7E0": 100, "7E1": 100, "7E2": 100, "200": 300} if all_frames else {})
+    assert unknown == ({"7E0": 102, "7E1": 102, "7E2": 102, "200": 306} if all_frames else {})
 
 
 def dropped_on_the_way() -> int:
