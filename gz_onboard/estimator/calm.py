@@ -7,14 +7,15 @@ faster
 - at first, while the forecast itself follows each kilometre: over half as much riding as the forecast is known from;
 - near empty, where the forecast's error goes as its range does: over a third of that.
 
-Once the forecast has been known from `SETTLED` of riding, a better one is shown no faster than `FASTEST`: the range
-does not rise under who rides. A worse one is not held back.
+Once the forecast has been known from `SETTLED` of riding, a change is shown no faster than `FASTEST`: the range does
+not rise under who rides, nor fall by more than twice what is ridden. A worse forecast is held back only as long as that
+closes the gap over a third of the range.
 
 At standstill nothing is ridden that the gap could close over: what is drawn is taken off, and what else changes the
 forecast, as a rest does that shows the state of charge, waits for the riding to come; at most `STEP` of it. The rest of
 it shows at once. So does a step of the energy by more than `STEP` from one forecast to the next, at standstill or not,
-which nothing makes but a state of charge that was begun anew. While the pack is charged, and over a restart, the shown
-range keeps its ratio to the forecast.
+which nothing makes but a state of charge that was begun anew, and a route that is given or taken back. While the pack
+is charged, and over a restart, the shown range keeps its ratio to the forecast.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ NEAR_EMPTY = 3.0  # the gap closes over the range over this
 AT_FIRST = 2.0  # the gap closes over what the forecast is known from over this
 FIRST = 250.0  # m, over which it closes at first
 SETTLED = 2500.0  # m
-FASTEST = 0.8, 1.5e-5  # gained, of what is ridden; of the range for each m ridden, where that is more
+FASTEST = 0.8, 1.5e-5  # gained or lost, of what is ridden; of the range for each m ridden, where that is more
 STEP = 0.05  # of the energy that is left, or of the range
 RATIO = 0.2, 5.0  # shown over forecast: beyond, it is not kept
 
@@ -46,6 +47,10 @@ class Calm:
     def ride(self, distance: float) -> None:
         """`distance` [m] was ridden."""
         self._ridden += distance
+
+    def show_next(self) -> None:
+        """The next forecast shows at once: it stands on something else, which the rider has changed."""
+        self._before = None
 
     def follow(self, raw: float, energy: float, known: float, drawn: float | None = None) -> float:
         """The range to show [m] for a forecast of `raw` [m] with `energy` [J], from so much riding `known` [m].
@@ -66,7 +71,8 @@ class Calm:
         closed = gap * (1 - fading)
         self._settled |= known >= SETTLED
         if self._settled:
-            closed = max(closed, -ridden * max(FASTEST[0], FASTEST[1] * raw))
+            most = ridden * max(FASTEST[0], FASTEST[1] * raw)
+            closed = min(max(closed, -most), max(most, gap * (1 - exp(-ridden * NEAR_EMPTY / raw))))
         self.ratio = min(max(1 + (gap - closed) / raw, RATIO[0]), RATIO[1])
         self._waiting *= fading
         return raw * self.ratio

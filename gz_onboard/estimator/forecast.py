@@ -48,7 +48,6 @@ SPEEDS = -5.0, 70.0  # m/s: the same
 LEAST_DISTANCE = 0.1  # m: over less a climb shows no grade
 LEAST = 0.2  # of the prior's consumption: no riding of any length consumes less
 MOST_SD = 3.0  # of the logarithm of the range: beyond, it is not known at all
-SHOWN_FROM = 500.0  # m: over less the recent consumption is that of one traffic light
 END_LOAD_SD = 0.25  # of the mean load: at which load a vehicle gives up is known so well
 WARM_CELLS = 25.0  # degC, of a cooling that is only asked for its constants
 COLDER_AGAIN = 0.005, 0.5, 0.5  # SOC, degC, degC: changed by more, what colder cells would give is asked anew
@@ -63,7 +62,8 @@ class Forecast:
     p10: float
     p90: float
     energy: float
-    energy_sd: float
+    energy_sd: float  # downwards
+    energy_sd_up: float
     consumption: float  # J/m
     consumption_sd: float
     recent: float | None  # J/m, measured over the last kilometre or so
@@ -270,18 +270,16 @@ class Forecaster:
             p10, p90 = range_ * exp(-DECILE * down), range_ * exp(DECILE * up)
         else:  # near empty the energy's error rules, and that is not relative
             p10, p90 = 0.0, (left.energy + DECILE * upwards) * exp(DECILE * sd) / consumption
-        recent_distance = past.recent_distance + now.distance
         return Forecast(
             range=range_,
             p10=p10,
             p90=p90,
             energy=left.energy,
             energy_sd=energy_sd,
+            energy_sd_up=upwards,
             consumption=consumption,
             consumption_sd=consumption * sd,
-            recent=(past.recent + past.recent_standing + now.measured + now.standing) / recent_distance
-            if recent_distance >= SHOWN_FROM
-            else None,
+            recent=past.recent_price(now),
             mostly_prior=past.whole + now.distance < PRIOR_LENGTH,
             power=expected.power,
             form_factor_squared=expected.form_factor_squared,

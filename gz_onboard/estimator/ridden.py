@@ -15,6 +15,7 @@ from gz_onboard.physics.effect import MOVING
 MEMORY = 12000.0  # m: what is further back counts for less than 1/e
 MOST_SEGMENTS = 200  # 50 km: of what is further back nothing counts
 RECENT = 1000.0  # m: what a rider calls his consumption
+SHOWN_FROM = 500.0  # m: over less the recent consumption is that of one traffic light
 LEAST_PRICE = 0.2  # of the prior riding: the price that a factor is weighted by
 RIDE_ENDS = 600.0  # s without motion: what comes then is another ride
 FACTOR = 0.1, 10.0  # measured over modelled energy: a heated van in a jam has 5; beyond, parameters are wrong
@@ -211,6 +212,13 @@ class Past:
                 past.recent_modelled += segment.modelled
                 past.recent_distance += segment.distance
         return past
+
+    def recent_price(self, now: Segment) -> float | None:
+        """Measured over the last kilometre or so, stops included [J/m], with the segment `now`; None: too short."""
+        distance = self.recent_distance + now.distance
+        if distance < SHOWN_FROM:
+            return None
+        return (self.recent + self.recent_standing + now.measured + now.standing) / distance
 
     @property
     def blind(self) -> float:

@@ -28,7 +28,7 @@ from gz_onboard.physics.effects.inertia import rotating_mass
 from gz_onboard.routes.route import Route
 
 SEGMENT = 250.0  # m of the route from which the cost is learned
-AHEAD_SD = 0.03  # relative, of the cost of what is left, beyond what its segments scatter
+AHEAD_SD = 0.015  # relative, of the cost of what is left, beyond what its segments scatter
 UNLIKE = 0.1  # of a segment: what was ridden is not what is modelled
 COURSE_FROM = 3.0  # m/s: slower, the heading is noise
 STEADY = 0.3  # m/s², and m/s within a second of the profile: there the pace shows
@@ -74,6 +74,7 @@ class RoadAhead:
         self._modelled: tuple[Conditions, float] | None = None
         self._segment: tuple[float, float] | None = None  # m along the route, m/s: its start
         self._energy = self._ridden = self._distance = 0.0  # J, m of the segment; m of the vehicle at the last forecast
+        self._new = False  # whether nothing was forecast on this route yet
 
     def ready(self, route: Route) -> Road:
         """`route` made ready, in any thread. The fastest of the prior riding stands in for limits."""
@@ -83,7 +84,8 @@ class RoadAhead:
     def follow(self, road: Road | None) -> None:
         """Have `road` from now on, or none."""
         self._road, self._costs, self._modelling, self._segment = road, None, None, None
-        self._distance = self._motion.distance
+        self._distance, self._new = self._motion.distance, True
+        self._forecaster.calm.show_next()
         self.answer = Answer(RouteState.OFF if road else RouteState.NONE)
 
     # --- learning ---------------------------------------------------------------------------------------------
@@ -148,6 +150,9 @@ class RoadAhead:
             self._segment, self.answer = None, Answer(RouteState.OFF)
             return free
         self._learn(road, self._costs)
+        if self._new:
+            self._new = False
+            self._forecaster.calm.show_next()
         return self._ahead(road, self._costs, free, pack)
 
     def _move(self, now: float, road: Road) -> None:
@@ -199,10 +204,10 @@ class RoadAhead:
         on_route = min(1.0, (end - here) / range_) if range_ > 0 else 1.0
         spread = on_route * sd(range_) + (1 - on_route) * free.consumption_sd / free.consumption
         if free.energy > free.energy_sd:
-            whole = DECILE * sqrt(spread**2 + (free.energy_sd / free.energy) ** 2)
-            p10, p90 = reach(free.energy * exp(-whole)), reach(free.energy * exp(whole))
+            down, up = (sqrt(spread**2 + (of / free.energy) ** 2) for of in (free.energy_sd, free.energy_sd_up))
+            p10, p90 = reach(free.energy * exp(-DECILE * down)), reach(free.energy * exp(DECILE * up))
         else:  # near empty the energy's error rules, and that is not relative
-            p10, p90 = 0.0, reach((free.energy + DECILE * free.energy_sd) * exp(DECILE * spread))
+            p10, p90 = 0.0, reach((free.energy + DECILE * free.energy_sd_up) * exp(DECILE * spread))
         arrival = self._arrival(free, pack, needed, level * sd(end - here))
         ends = range_ if range_ < end - here else None
         self.answer = Answer(
@@ -235,11 +240,13 @@ class RoadAhead:
             return 0.0, 0.0, 0.0
         window, soc, share = self._forecaster.battery.window, pack[0], max(1 - needed / free.energy, 0.0)
         arrival = soc_left(self._forecaster.battery, soc, free.cells, share)
-        spread = DECILE * sqrt(needed_sd**2 + free.energy_sd**2) * soc / free.energy
+        down, up = (
+            DECILE * sqrt(needed_sd**2 + of**2) * soc / free.energy for of in (free.energy_sd, free.energy_sd_up)
+        )
         beyond = soc * (needed / free.energy - 1)  # how much the battery lacks, if it does
         if share <= 0:
-            return 0.0, 0.0, max(window.shown(arrival + spread - beyond, 0.0)[0], 0.0)
-        median, p10, p90 = (window.shown(arrival + x * spread, 0.0)[0] for x in (0, -1, 1))
+            return 0.0, 0.0, max(window.shown(arrival + up - beyond, 0.0)[0], 0.0)
+        median, p10, p90 = (window.shown(arrival + x, 0.0)[0] for x in (0.0, -down, up))
         return max(median, 0.0), max(p10, 0.0), min(p90, 1.0)
 
     # --- results ----------------------------------------------------------------------------------------------

@@ -212,7 +212,7 @@ def test_far_ahead_the_usual_counts_and_near_the_present():
     assert far[1] == pytest.approx(0.001, rel=0.5)
 
 
-@pytest.mark.parametrize(("before", "most"), [(5, 12.0), (20, 12.0), (40, 12.0)])
+@pytest.mark.parametrize(("before", "most"), [(5, 14.0), (20, 14.0), (40, 14.0)])
 def test_a_fifth_more_consumption_is_followed_within_the_stated_distance(before, most):
     """A headwind that stays: 63 % of it is in the range shown after at most so many km, in the mean over rides."""
     rng = np.random.default_rng(3)
@@ -259,3 +259,28 @@ def test_whatever_was_learned_can_be_restored(segments, repeats):
     assert restored_usual(usual.snapshot()) == usual
     assert habit.ahead(10_000.0)[1] >= 0
     assert habit.variance >= 0
+
+
+def test_a_worse_forecast_lets_the_range_fall_by_no_more_than_twice_what_is_ridden_until_it_is_short():
+    """8 km less within one, of 60: it is shown over ten; 5 km less, of 12, at once: none is left to wait over."""
+    ridden = np.full(1000, 10.0)
+    at = np.cumsum(ridden)
+    far = shown(np.interp(at, [1000, 2000], [60_000, 52_000]) - at, ridden)
+    assert np.diff(far).min() >= -2 * 10.0
+    near = shown(np.interp(at, [1000, 1010], [13_000, 8_000]) - at, ridden)
+    assert near[at >= 4000][0] < 1.3 * 4000
+
+
+@pytest.mark.parametrize("ridden", [0.0, 10.0])
+def test_what_the_rider_changes_shows_at_once(ridden):
+    """A route makes the range a fifth longer, at standstill or under way: no part of it waits for riding."""
+    found = []
+    for told in (False, True):
+        calm = Calm()
+        calm.follow(50_000.0, 4e6, KNOWN)
+        calm.ride(ridden)
+        if told:
+            calm.show_next()
+        found.append(calm.follow(60_000.0, 4e6, KNOWN, drawn=0.0))
+    assert found[0] < 58_000
+    assert found[1] == 60_000

@@ -24,7 +24,7 @@ from tests.support import reference
 
 AIR = Conditions(20.0, 300.0)
 FREE = Forecast(
-    range=40e3, p10=34e3, p90=47e3, energy=4e6, energy_sd=8e4, consumption=100.0, consumption_sd=12.0,
+    range=40e3, p10=34e3, p90=47e3, energy=4e6, energy_sd=8e4, energy_sd_up=8e4, consumption=100.0, consumption_sd=12.0,
     recent=None, mostly_prior=False, power=800.0, form_factor_squared=2.5, cells=25.0, known_from=5000.0,
 )  # fmt: skip
 
@@ -89,6 +89,26 @@ def test_arrival_and_range_on_a_short_route():
     assert found.p10 < found.range < found.p90
     assert 0.7 - answer.soc == pytest.approx(0.7 * answer.energy / FREE.energy, rel=0.15)
     assert answer.soc_p10 < answer.soc < answer.soc_p90 < 0.7
+
+
+def test_a_route_shows_at_once_and_so_does_its_end():
+    """Before the first metre, and again when it is taken back: nothing of it waits for riding."""
+    rider = Rider(way(60e3))
+    for _ in range(50):
+        found = rider.ask()
+        shown = rider.forecaster.shown(found, drawn=0.0)
+    assert found.range > 1.1 * FREE.range
+    assert shown.range == pytest.approx(found.range)
+    rider.ahead.follow(None)
+    assert rider.forecaster.shown(rider.ask(), drawn=0.0).range == pytest.approx(FREE.range)
+
+
+def test_no_pack_is_better_than_new_on_a_route_either():
+    found, answer = Rider(way(60e3)).settled(replace(FREE, energy_sd=6e5))
+    alike, same = Rider(way(60e3)).settled()
+    assert found.p10 < 0.95 * alike.p10
+    assert found.p90 == pytest.approx(alike.p90)
+    assert answer.soc_p90 == pytest.approx(same.soc_p90)
 
 
 def test_where_the_battery_ends():
