@@ -7,9 +7,9 @@ faster
 - at first, while the forecast itself follows each kilometre: over half as much riding as the forecast is known from;
 - near empty, where the forecast's error goes as its range does: over a third of that.
 
-Once the forecast has been known from `SETTLED` of riding, a change is shown no faster than `FASTEST`: the range does
-not rise under who rides, nor fall by more than twice what is ridden. A worse forecast is held back only as long as that
-closes the gap over a third of the range.
+Once a ride has gone on for `SETTLED` and the forecast is known from as much, a change is shown no faster than
+`FASTEST`: the range does not rise under who rides, nor fall by more than twice what is ridden. A worse forecast is held
+back only as long as that closes the gap over a third of the range.
 
 At standstill nothing is ridden that the gap could close over: what is drawn is taken off, and what else changes the
 forecast, as a rest does that shows the state of charge, waits for the riding to come; at most `STEP` of it. The rest of
@@ -40,6 +40,7 @@ class Calm:
     def __init__(self, ratio: float = 1.0) -> None:
         self.ratio = ratio  # shown over forecast
         self._settled = False
+        self._way = 0.0  # m of this ride
         self._before: tuple[float, float] | None = None  # the last forecast's range [m] and energy [J]
         self._ridden = 0.0  # m since
         self._waiting = 0.0  # logarithm of the part of the ratio that waits for riding
@@ -47,6 +48,10 @@ class Calm:
     def ride(self, distance: float) -> None:
         """`distance` [m] was ridden."""
         self._ridden += distance
+
+    def begin_ride(self) -> None:
+        """Another ride: what was held back on the last one shows in the first kilometres of this."""
+        self._settled, self._way = False, 0.0
 
     def show_next(self) -> None:
         """The next forecast shows at once: it stands on something else, which the rider has changed."""
@@ -69,7 +74,8 @@ class Calm:
         fading = exp(-ridden / length)
         gap = before[0] * self.ratio - ridden - raw
         closed = gap * (1 - fading)
-        self._settled |= known >= SETTLED
+        self._way += ridden
+        self._settled |= min(known, self._way) >= SETTLED
         if self._settled:
             most = ridden * max(FASTEST[0], FASTEST[1] * raw)
             closed = min(max(closed, -most), max(most, gap * (1 - exp(-ridden * NEAR_EMPTY / raw))))

@@ -146,7 +146,7 @@ class Forecaster:
             segment.modelled += modelled
             segment.level += to_come
         else:
-            r.stand(r.second.seconds)
+            self._stand(r.second.seconds)
             segment.standing += r.second.energy if r.still <= STOP_TIME else 0.0
         if r.still <= STOP_TIME:
             segment.duration += r.second.seconds
@@ -217,7 +217,11 @@ class Forecaster:
     def pause(self, dt: float = 0.0) -> None:
         """`dt` [s] that teach nothing: parked, or something is not known. Leave the second that was being gathered."""
         self.riding.second, self.riding.speed_before = Second(), None
-        self.riding.stand(dt)
+        self._stand(dt)
+
+    def _stand(self, dt: float) -> None:
+        if self.riding.stand(dt):
+            self.calm.begin_ride()
 
     def _close(self, segment: Segment, conditions: Conditions) -> None:
         r = self.riding
@@ -317,7 +321,6 @@ class Forecaster:
         variance += (past.blind * price / self.riding.factor) ** 2 * self.riding.factor_variance
         pace, _ = usual.pace.ahead(way)
         consumption = moving * (price + max(standing, 0.0))
-        speed = self.load.prior.speed / max(pace, LEAST)
         prior_power, prior_time = (moving + stops) * self.load.prior.speed, PRIOR_LENGTH / self.load.prior.speed
         # Downhill next to nothing is drawn in the mean; what is to come is not all downhill.
         energy = prior_power * prior_time + max(past.measured, self.riding.factor * past.level)
@@ -326,7 +329,7 @@ class Forecaster:
         form_factor_squared = squares * (prior_time + past.duration) / energy**2
         return Expected(
             consumption,
-            consumption * speed,
+            consumption * self.load.prior.speed / max(pace, LEAST),
             form_factor_squared=min(max(form_factor_squared, FORM_FACTOR_SQUARED[0]), FORM_FACTOR_SQUARED[1]),
             variance=(variance + standing_variance) * (moving / consumption) ** 2,
         )

@@ -89,11 +89,13 @@ class Riding:
         """Of `factor`."""
         return self.usual.factor.variance
 
-    def stand(self, dt: float) -> None:
-        """`dt` [s] without motion; after long enough what follows is another ride."""
+    def stand(self, dt: float) -> bool:
+        """`dt` [s] without motion; gives whether the ride has ended with it: what follows is another."""
         riding, self.still = self.still < RIDE_ENDS, self.still + dt
-        if riding and self.still >= RIDE_ENDS:
+        ended = riding and self.still >= RIDE_ENDS
+        if ended:
             self.usual = self.usual.rested()
+        return ended
 
     def add(self, dt: float, speed: float, grade: float | None, power: float, inputs: EffectInputs | None) -> None:
         """`dt` [s] at `speed` [m/s], `grade` (sine) and `power` [W]."""

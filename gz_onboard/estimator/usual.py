@@ -91,8 +91,10 @@ class Habit:
         told = noise < own  # what else errs may err alike for long
         share = min(distance / RUN_LENGTH, 1.0) if told else 0.0
         run = self.run + share * (residual / sqrt(total) - self.run)
-        if abs(run) > RUN_MOST:  # the riding changed: by about so much
-            pp, run = min(max(pp, self.between, run * run * total), MOST_VARIANCE), 0.0
+        if abs(run) > RUN_MOST:  # by about so much the riding changed, or what is usual is another than was thought
+            more = max(min(max(self.between, run * run * total), MOST_VARIANCE) - pp, 0.0)
+            of_usual = uu / (uu + self.between)
+            uu, pp, run = uu + of_usual * more, pp + (1 - of_usual) * more, 0.0
             total = uu + 2 * up + pp + own + noise
         gain_usual, gain_present = (uu + up) / total, (up + pp) / total
         # of the segment's own scatter: its mean square given the residual

@@ -265,10 +265,27 @@ def test_a_worse_forecast_lets_the_range_fall_by_no_more_than_twice_what_is_ridd
     """8 km less within one, of 60: it is shown over ten; 5 km less, of 12, at once: none is left to wait over."""
     ridden = np.full(1000, 10.0)
     at = np.cumsum(ridden)
-    far = shown(np.interp(at, [1000, 2000], [60_000, 52_000]) - at, ridden)
+    far = shown(np.interp(at, [3000, 4000], [60_000, 52_000]) - at, ridden)
     assert np.diff(far).min() >= -2 * 10.0
-    near = shown(np.interp(at, [1000, 1010], [13_000, 8_000]) - at, ridden)
-    assert near[at >= 4000][0] < 1.3 * 4000
+    near = shown(np.interp(at, [3000, 3010], [15_000, 10_000]) - at, ridden)
+    assert near[at >= 6000][0] < 1.3 * 4000
+
+
+def test_what_was_held_back_on_one_ride_shows_in_the_first_kilometres_of_the_next():
+    """The forecast grows by a half as the ride ends: five kilometres later nearly all of that is shown, not 4 km."""
+    ridden = np.full(500, 10.0)
+    at = np.cumsum(ridden)
+    found = []
+    for begun in (False, True):
+        calm = Calm()
+        for k in range(1000):
+            if begun and k == 500:
+                calm.begin_ride()
+            calm.ride(10.0)
+            left = (40_000 if k < 500 else 60_000) - 10 * k
+            found.append(calm.follow(left, 4e6, 3000.0))
+    assert found[999] < 45_000
+    assert found[1999] > 48_000
 
 
 @pytest.mark.parametrize("ridden", [0.0, 10.0])
