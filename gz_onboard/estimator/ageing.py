@@ -26,9 +26,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import exp, isfinite, sqrt
+from math import isfinite, sqrt
 
 from gz_onboard.constants import BENCH_TEMPERATURE
+from gz_onboard.estimator.ageing_kinds import Belief, Kinds
 from gz_onboard.estimator.ekf import Covariance, SocFilter
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading
@@ -39,6 +40,7 @@ CAPACITY, RESISTANCE = (0.5, 1.1), (0.5, 4.0)  # factors that a pack at work has
 CAPACITY_SD, RESISTANCE_AGED_SD = 0.16, 0.42  # of packs that are not as new
 NEW_SD = 0.003, CAPACITY_SD / 2  # of a pack that is as new: whatever the file says, no capacity is known more closely
 LEAST_VARIANCE = 0.01**2  # of ψ: the curve's place, and what of an ageing cell is not capacity
+LEAST_SPAN, NOTHING = 1e-3, (2.0, -1.0)  # of SOC
 CAPACITY_DRIFT = 0.02**2  # of ψ: variance that it gains over as much charge as a pack holds a hundred times
 CYCLES = 100.0  # see above
 LEAST_SOC = 0.001**2  # variance
@@ -76,27 +78,17 @@ class Fit:
     time: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Belief:
-    """What of ψ is used: its mean and variance, and what it makes of the filter's SOC."""
-
-    inverse: float
-    variance: float
-    soc_shift: float
-    soc_variance: float  # beside the filter's; may be negative
-
-
 class Ageing:
     """Learns the factors of one pack, and gives them to its `Battery`."""
 
     def __init__(self, battery: Battery) -> None:
         self._battery = battery
         self._new_sd = min(max(battery.capacity_sd, NEW_SD[0]), NEW_SD[1])  # of ψ, of a pack that is as new
-        self._unknown = battery.as_new * self._new_sd**2 + (1 - battery.as_new) * CAPACITY_SD**2
+        self._unknown = Kinds(battery.as_new, self._new_sd, CAPACITY_SD).variance
         self.inverse, self.variance = 1.0, self._unknown  # ψ
         self._with_soc = self._with_error = 0.0  # covariances of ψ with SOC and e
         self.belief = self._believe()
-        self._learning = False
+        self._learning, self._seen = False, NOTHING
         self._agreeing = AGREEING_RATE * battery.pack_capacity(BENCH_TEMPERATURE)  # A
         self._unknown_resistance = RESISTANCE_AGED_SD * sqrt(1 - battery.as_new)  # sd of it before anything is learned
         self._fit = Fit()
@@ -168,6 +160,7 @@ class Ageing:
             soc, sd = self.state_of_charge(filter_)
             filter_.soc, filter_.covariance = soc, (sd * sd, *filter_.covariance[1:])
         self._with_soc = self._with_error = 0.0
+        self._seen = NOTHING
         self.belief = self._believe()
 
     def resume(self, filter_: SocFilter, counted: tuple[float, float] | None) -> None:
@@ -205,13 +198,26 @@ class Ageing:
             return
         c0, c1 = self._with_soc, self._with_error
         g0, g1 = (p11 * c0 - p01 * c1) / determinant, (p00 * c1 - p01 * c0) / determinant
-        self._with_soc, self._with_error = n00 * g0 + n01 * g1, n01 * g0 + n11 * g1
+        counted, self._with_soc, self._with_error = abs(c0), n00 * g0 + n01 * g1, n01 * g0 + n11 * g1
         if not self._learning:
             return
-        inverse = self.inverse + g0 * (filter_.soc - soc) + g1 * (filter_.error - error)
-        self.inverse = min(max(inverse, 1 / CAPACITY[1]), 1 / CAPACITY[0])
         less = g0 * g0 * (p00 - n00) + 2 * g0 * g1 * (p01 - n01) + g1 * g1 * (p11 - n11)
-        self.variance = max(self.variance - less, LEAST_VARIANCE)
+        share = self._admitted(less, filter_.soc, counted / self.variance)
+        inverse = self.inverse + share * (g0 * (filter_.soc - soc) + g1 * (filter_.error - error))
+        self.inverse = min(max(inverse, 1 / CAPACITY[1]), 1 / CAPACITY[0])
+        self.variance = max(self.variance - share * less, LEAST_VARIANCE)
+
+    def _admitted(self, less: float, soc: float, counted: float) -> float:
+        """The share of what a voltage at `soc` tells that is believed, where it would take `less` off ψ's variance.
+
+        counted: the charge [SOC] that SOC is known by.
+        The curve errs the same way each time: between two places of it no number of cycles tells more than that.
+        """
+        self._seen = min(self._seen[0], soc), max(self._seen[1], soc)
+        span = max(self._seen[1] - self._seen[0], counted, LEAST_SPAN)
+        curve = self._battery.ocv_sd / self._battery.ocv(soc)[1]
+        least = LEAST_VARIANCE + 2 * (curve / span) ** 2
+        return min(max(self.variance - least, 0.0) / less, 1.0) if less > 0 else 1.0
 
     def permit(self, now: float, reading: PackReading, signals: Signals, filter_: SocFilter) -> None:
         """Whether all that the learning depends on is beyond doubt at `now` [s]; else a sensor's fault may be learned.
@@ -267,23 +273,8 @@ class Ageing:
         return True
 
     def _believe(self) -> Belief:
-        """Two kinds of pack, as new and of unknown age, each by how well it explains what was seen (Bayes).
-
-        The filter's ψ began with mean and variance of both. Where that of a kind is elsewhere, SOC is so too.
-        """
-        told = max(1 / self.variance - 1 / self._unknown, 0.0)  # information beyond the prior's
-        off = (self.inverse - 1) / self.variance
-        narrow, wide = 1 + self._new_sd**2 * told, 1 + CAPACITY_SD**2 * told
-        odds = self._battery.as_new / (1 - self._battery.as_new)
-        if told > 0:
-            odds *= sqrt(wide / narrow) * exp(-off * off / told * (1 / narrow - 1 / wide) / 2)
-        as_new = odds / (1 + odds)
-        new_variance, old_variance = self._new_sd**2 / narrow, CAPACITY_SD**2 / wide
-        new, old = 1 + off * new_variance, 1 + off * old_variance
-        inverse = as_new * new + (1 - as_new) * old
-        variance = as_new * (new_variance + (new - inverse) ** 2) + (1 - as_new) * (old_variance + (old - inverse) ** 2)
-        moves = self._with_soc / self.variance
-        return Belief(inverse, variance, moves * (inverse - self.inverse), moves * moves * (variance - self.variance))
+        kinds = Kinds(self._battery.as_new, self._new_sd, CAPACITY_SD)
+        return kinds.belief(self.inverse, self.variance, self._with_soc)
 
     # --- saving -----------------------------------------------------------------------------------------------
 

@@ -15,13 +15,14 @@ At standstill nothing is ridden that the gap could close over: what is drawn is 
 forecast, as a rest does that shows the state of charge, waits for the riding to come; at most `STEP` of it. The rest of
 it shows at once. So does a step of the energy by more than `STEP` from one forecast to the next, at standstill or not,
 which nothing makes but a state of charge that was begun anew, and a route that is given or taken back. While the pack
-is charged, and over a restart, the shown range keeps its ratio to the forecast.
+is charged, and over a restart, the gap stays as it is, in metres: fifty metres are a third of the range near empty, and
+nothing of a full one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import exp, log
+from math import exp
 from typing import Any
 
 CALM = 6000.0  # m
@@ -31,19 +32,20 @@ FIRST = 250.0  # m, over which it closes at first
 SETTLED = 2500.0  # m
 FASTEST = 0.8, 1.5e-5  # gained or lost, of what is ridden; of the range for each m ridden, where that is more
 STEP = 0.05  # of the energy that is left, or of the range
-RATIO = 0.2, 5.0  # shown over forecast: beyond, it is not kept
+RATIO = 0.2, 5.0  # shown over forecast: beyond, the gap is not kept
+MOST = 1e6  # m, of a saved gap
 
 
 class Calm:
     """Follows the forecast's range."""
 
-    def __init__(self, ratio: float = 1.0) -> None:
-        self.ratio = ratio  # shown over forecast
+    def __init__(self, gap: float = 0.0) -> None:
+        self.gap = gap  # m: shown less forecast
         self._settled = False
         self._way = 0.0  # m of this ride
         self._before: tuple[float, float] | None = None  # the last forecast's range [m] and energy [J]
         self._ridden = 0.0  # m since
-        self._waiting = 0.0  # logarithm of the part of the ratio that waits for riding
+        self._waiting = 0.0  # m, the part of the gap that waits for riding
 
     def ride(self, distance: float) -> None:
         """`distance` [m] was ridden."""
@@ -57,6 +59,10 @@ class Calm:
         """The next forecast shows at once: it stands on something else, which the rider has changed."""
         self._before = None
 
+    def shown(self, raw: float) -> float:
+        """The range to show [m] with the present gap, for a forecast of `raw` [m]."""
+        return min(max(raw + self.gap, RATIO[0] * raw), RATIO[1] * raw)
+
     def follow(self, raw: float, energy: float, known: float, drawn: float | None = None) -> float:
         """The range to show [m] for a forecast of `raw` [m] with `energy` [J], from so much riding `known` [m].
 
@@ -65,34 +71,35 @@ class Calm:
         before, ridden = self._before, self._ridden
         self._before, self._ridden = (raw, energy), 0.0
         if before is None or min(raw, energy, *before) <= 0 or abs(energy - before[1]) > STEP * before[1]:
-            return raw * self.ratio
+            return self.shown(raw)
         if ridden == 0:
             if drawn is not None and drawn < before[1]:
-                self._wait(log(before[0] / raw * (1 - drawn / before[1])))
-            return raw * self.ratio
+                held = self.shown(before[0]) * (1 - drawn / before[1])
+                self._wait(held - self.shown(raw), STEP * raw)
+            return self.shown(raw)
         length = max(min(known / AT_FIRST, CALM, raw / NEAR_EMPTY), FIRST)
         fading = exp(-ridden / length)
-        gap = before[0] * self.ratio - ridden - raw
+        gap = self.shown(before[0]) - ridden - raw
         closed = gap * (1 - fading)
         self._way += ridden
         self._settled |= min(known, self._way) >= SETTLED
         if self._settled:
             most = ridden * max(FASTEST[0], FASTEST[1] * raw)
             closed = min(max(closed, -most), max(most, gap * (1 - exp(-ridden * NEAR_EMPTY / raw))))
-        self.ratio = min(max(1 + (gap - closed) / raw, RATIO[0]), RATIO[1])
+        self.gap = gap - closed
         self._waiting *= fading
-        return raw * self.ratio
+        return self.shown(raw)
 
-    def _wait(self, change: float) -> None:
-        """The forecast has changed by the factor exp(-`change`) at standstill, and nothing drawn explains it."""
+    def _wait(self, change: float, most: float) -> None:
+        """The forecast has become less by `change` [m] at standstill, and nothing drawn explains it; `most` waits."""
         before = self._waiting
-        self._waiting = min(max(before + change, -STEP), STEP)
-        self.ratio = min(max(self.ratio * exp(self._waiting - before), RATIO[0]), RATIO[1])
+        self._waiting = min(max(before + change, -most), most)
+        self.gap += self._waiting - before
 
 
-def restored_ratio(saved: Mapping[str, Any]) -> float:
-    """The ratio that was saved as `shown`, 1 where none was; TypeError or ValueError if it is implausible."""
-    ratio = float(saved.get("shown", 1.0))
-    if not RATIO[0] <= ratio <= RATIO[1]:
+def restored_gap(saved: Mapping[str, Any]) -> float:
+    """The gap [m] that was saved as `gap`, 0 where none was; TypeError or ValueError if it is implausible."""
+    gap = float(saved.get("gap", 0.0))
+    if not abs(gap) <= MOST:
         raise ValueError("implausible range shown")
-    return ratio
+    return gap

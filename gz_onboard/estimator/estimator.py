@@ -341,8 +341,8 @@ class Estimator:
         if restored.cell_temperature is not None:
             self._temperatures.cells = restored.cell_temperature
         self.soc.restore(restored.battery, restored.age, restored.cell_effects)
-        self.forecaster.pause(restored.age or 0.0)
-        self.road_load.rest(NEW_DAY if restored.age is None else restored.age)
+        self.forecaster.pause(stood := NEW_DAY if restored.age is None else restored.age)
+        self.road_load.rest(stood)
 
 
 def _carrying(roles: Sequence[str], groups: Sequence[Group]) -> list[int]:

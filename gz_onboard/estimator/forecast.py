@@ -17,19 +17,20 @@ on the way that it lasts, with a log-normal distribution. What is shown of it mo
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from math import exp, hypot, inf, sqrt
+from dataclasses import asdict, dataclass, replace
+from math import hypot, inf, sqrt
 from typing import Any
 
 from gz_onboard.constants import GRAVITY, HOUR
 from gz_onboard.estimator.activity import STOP_TIME
 from gz_onboard.estimator.ageing import Ageing
-from gz_onboard.estimator.calm import Calm, restored_ratio
+from gz_onboard.estimator.calm import Calm, restored_gap
+from gz_onboard.estimator.interval import deciles
 from gz_onboard.estimator.load_model import AHEAD, USUAL_AIR, Conditions, EffectInputs, LoadModel
 from gz_onboard.estimator.pattern import STEEPEST, Pattern, restored_pattern
 from gz_onboard.estimator.ridden import Past, Riding, Second, Segment, learned, restored, restored_states
 from gz_onboard.estimator.riders import Riders, restored_riders
-from gz_onboard.estimator.usual import SEGMENT, Usual
+from gz_onboard.estimator.usual import SEGMENT, Unit, Usual, restored_unit
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.cooling import LumpedCooling
 from gz_onboard.physics.drawable import Drawable, drawable
@@ -51,7 +52,6 @@ MOST_SD = 3.0  # of the logarithm of the range: beyond, it is not known at all
 END_LOAD_SD = 0.25  # of the mean load: at which load a vehicle gives up is known so well
 WARM_CELLS = 25.0  # degC, of a cooling that is only asked for its constants
 COLDER_AGAIN = 0.005, 0.5, 0.5  # SOC, degC, degC: changed by more, what colder cells would give is asked anew
-DECILE = 1.2815515655446004  # sd of a normal distribution: 10 % are beyond
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Forecaster:
         self.load = LoadModel(model, battery, prior)
         self.battery = battery
         price, stops = self.load.prior_prices(*USUAL_AIR)
-        self.prior, self._usual_price = Usual.of(prior, stops / price), price + stops
+        self.prior, self._unit = Usual.of(prior, stops / price), Unit(price + stops, prior.speed)
         self.riding = Riding(self.prior)
         self.calm, self.pattern, self.riders = Calm(), Pattern(), Riders()
         self.ageing: Ageing | None = None  # None: the pack is known to be as its file says
@@ -269,15 +269,11 @@ class Forecaster:
         range_ = left.energy / consumption
         variance = min(loss_variance + expected.variance, MOST_SD**2)
         sd = sqrt(variance)
-        if left.energy > energy_sd:
-            down, up = (sqrt(variance + (sd / left.energy) ** 2) for sd in (energy_sd, upwards))
-            p10, p90 = range_ * exp(-DECILE * down), range_ * exp(DECILE * up)
-        else:  # near empty the energy's error rules, and that is not relative
-            p10, p90 = 0.0, (left.energy + DECILE * upwards) * exp(DECILE * sd) / consumption
+        p10, p90 = deciles(left.energy, energy_sd, upwards, variance)
         return Forecast(
             range=range_,
-            p10=p10,
-            p90=p90,
+            p10=p10 / consumption,
+            p90=p90 / consumption,
             energy=left.energy,
             energy_sd=energy_sd,
             energy_sd_up=upwards,
@@ -308,7 +304,7 @@ class Forecaster:
         """How long the charge will last [m], roughly: by the battery's nominal energy and the prior's price."""
         charge = soc * self.battery.pack_capacity(temperature) * HOUR
         energy = charge * self.battery.ocv(HALF_FULL)[0] * self.battery.cells_series
-        return max(energy / self._usual_price, SEGMENT)
+        return max(energy / self._unit.price, SEGMENT)
 
     def _expected(self, way: float, ambient: float, altitude: float) -> Expected:
         """The riding on the next `way` [m]."""
@@ -338,13 +334,15 @@ class Forecaster:
 
     def snapshot(self) -> dict[str, object]:
         """What is to be kept over a restart."""
-        kept = {"states": dict(self.load.states), "shown": self.calm.ratio, "pattern": self.pattern.snapshot()}
+        kept = {"states": dict(self.load.states), "gap": self.calm.gap, "pattern": self.pattern.snapshot()}
+        kept |= {"of": asdict(self._unit)}
         return self.riding.snapshot() | self.riders.snapshot() | kept
 
     def restore(self, saved: Mapping[str, Any]) -> None:
         """Take what `snapshot` gave; raises KeyError, TypeError or ValueError if it is not that."""
-        riding, states = restored(saved, self.prior), restored_states(saved["states"])
-        pattern, riders = restored_pattern(saved.get("pattern", ())), restored_riders(saved)
-        self.calm = Calm(restored_ratio(saved))
+        unit = restored_unit(saved, self._unit)
+        riding, states = restored(saved, self.prior, unit), restored_states(saved["states"])
+        pattern, riders = restored_pattern(saved.get("pattern", ())), restored_riders(saved, unit)
+        self.calm = Calm(restored_gap(saved))
         self.riding, self.load.states, self.pattern, self.riders = riding, states, pattern, riders
         self._sum_past()

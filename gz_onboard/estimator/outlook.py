@@ -85,4 +85,4 @@ class Outlook:
             estimate.reasons |= Reason.PRIOR_RIDING
         if estimate.activity is Activity.CHARGING:  # not of a bus that fell silent
             estimate.charge_power, estimate.time_to_full = self._charging.power, self._charging.to_full
-            estimate.range_full = self._full.range * self._forecaster.calm.ratio if self._full else None
+            estimate.range_full = self._forecaster.calm.shown(self._full.range) if self._full else None

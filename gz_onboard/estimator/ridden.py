@@ -9,7 +9,7 @@ from math import exp, inf, isfinite
 from typing import Any
 
 from gz_onboard.estimator.load_model import EffectInputs
-from gz_onboard.estimator.usual import Usual, restored_usual
+from gz_onboard.estimator.usual import Unit, Usual, restored_usual
 from gz_onboard.physics.effect import MOVING
 
 MEMORY = 12000.0  # m: what is further back counts for less than 1/e
@@ -18,6 +18,7 @@ RECENT = 1000.0  # m: what a rider calls his consumption
 SHOWN_FROM = 500.0  # m: over less the recent consumption is that of one traffic light
 LEAST_PRICE = 0.2  # of the prior riding: the price that a factor is weighted by
 RIDE_ENDS = 600.0  # s without motion: what comes then is another ride
+COLD_AGAIN = 3600.0  # s without motion: tyres have cooled, and what rolls begins anew
 FACTOR = 0.1, 10.0  # measured over modelled energy: a heated van in a jam has 5; beyond, parameters are wrong
 # What a saved segment can have at most: m, s, J, W²·s and J; time moving in s.
 MOST_DISTANCE, MOST_DURATION, MOST_ENERGY, MOST_TIME_MOVING = 1e5, 1e6, 1e12, 1e7
@@ -75,7 +76,7 @@ class Riding:
     segments: deque[Segment] = field(default_factory=lambda: deque(maxlen=MOST_SEGMENTS))
     current: Segment = field(default_factory=Segment)
     second: Second = field(default_factory=Second)
-    time_moving: float = 0.0  # s since the start
+    time_moving: float = 0.0  # s, since the start or the last long standstill
     speed_before: float | None = None  # m/s, at the start of the second
     still: float = 0.0  # s since the last motion
 
@@ -95,6 +96,8 @@ class Riding:
         ended = riding and self.still >= RIDE_ENDS
         if ended:
             self.usual = self.usual.rested()
+        if self.still >= COLD_AGAIN:
+            self.time_moving = 0.0
         return ended
 
     def add(self, dt: float, speed: float, grade: float | None, power: float, inputs: EffectInputs | None) -> None:
@@ -119,8 +122,8 @@ class Riding:
         return {"segments": rows, "usual": self.usual.snapshot(), "still": self.still, "time_moving": self.time_moving}
 
 
-def restored(saved: Mapping[str, Any], prior: Usual) -> Riding:
-    """What `Riding.snapshot` gave; KeyError, TypeError or ValueError if it is not that.
+def restored(saved: Mapping[str, Any], prior: Usual, unit: Unit) -> Riding:
+    """What `Riding.snapshot` gave; KeyError, TypeError or ValueError if it is not that. unit: see `restored_usual`.
 
     What older versions saved has stops within the rest of a segment, and of what is usual only the factor: the rest is
     taken from `prior`.
@@ -134,7 +137,7 @@ def restored(saved: Mapping[str, Any], prior: Usual) -> Riding:
         for name, value in zip(KEPT, row, strict=False):
             setattr(segments[-1], name, value)
     if "usual" in saved:
-        usual = restored_usual(saved["usual"])
+        usual = restored_usual(saved["usual"], unit)
     else:
         factor = replace(prior.factor, usual=float(saved["factor"]), usual_variance=float(saved["factor_variance"]))
         usual = restored_usual(replace(prior, factor=factor).snapshot())

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from gz_onboard.estimator.usual import LEVEL_SD, Habit, Usual, restored_usual
+from gz_onboard.estimator.usual import LEVEL_SD, Habit, Unit, Usual, restored_usual
 
 MOST_RIDERS = 50
 LONGEST_NAME = 40  # letters
@@ -44,14 +44,17 @@ def _of_another(habit: Habit) -> Habit:
     return replace(habit, usual_variance=habit.usual_variance + LEVEL_SD**2)
 
 
-def restored_riders(saved: Mapping[str, Any]) -> Riders:
-    """What `Riders.snapshot` gave; nobody where nothing was saved. KeyError, TypeError or ValueError if damaged."""
+def restored_riders(saved: Mapping[str, Any], unit: Unit) -> Riders:
+    """What `Riders.snapshot` gave; nobody where nothing was saved. KeyError, TypeError or ValueError if damaged.
+
+    unit: see `restored_usual`.
+    """
     riders = Riders()
     riders.now = _name(saved.get("rider", NOBODY))
     others = saved.get("riders", {})
     if len(others) > MOST_RIDERS or riders.now in others:
         raise ValueError("implausible riders")
-    riders.others = {_name(name): restored_usual(usual) for name, usual in others.items()}
+    riders.others = {_name(name): restored_usual(usual, unit) for name, usual in others.items()}
     return riders
 
 

@@ -11,10 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from math import exp, sqrt
+from math import sqrt
 from typing import Any
 
-from gz_onboard.estimator.forecast import DECILE, Forecast, Forecaster
+from gz_onboard.estimator.forecast import Forecast, Forecaster
+from gz_onboard.estimator.interval import DECILE, deciles
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.road import RoadState
 from gz_onboard.estimator.route_energy import Costs, RouteEnergy
@@ -203,11 +204,7 @@ class RoadAhead:
         range_ = reach(free.energy)
         on_route = min(1.0, (end - here) / range_) if range_ > 0 else 1.0
         spread = on_route * sd(range_) + (1 - on_route) * free.consumption_sd / free.consumption
-        if free.energy > free.energy_sd:
-            down, up = (sqrt(spread**2 + (of / free.energy) ** 2) for of in (free.energy_sd, free.energy_sd_up))
-            p10, p90 = reach(free.energy * exp(-DECILE * down)), reach(free.energy * exp(DECILE * up))
-        else:  # near empty the energy's error rules, and that is not relative
-            p10, p90 = 0.0, reach((free.energy + DECILE * free.energy_sd_up) * exp(DECILE * spread))
+        low, high = deciles(free.energy, free.energy_sd, free.energy_sd_up, spread**2)
         arrival = self._arrival(free, pack, needed, level * sd(end - here))
         ends = range_ if range_ < end - here else None
         self.answer = Answer(
@@ -225,8 +222,8 @@ class RoadAhead:
         return replace(
             free,
             range=range_,
-            p10=p10,
-            p90=p90,
+            p10=reach(low),
+            p90=reach(high),
             consumption=expected,
             consumption_sd=expected * spread,
             known_from=known,

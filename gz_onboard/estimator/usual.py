@@ -14,8 +14,8 @@ taken for a habit.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import MISSING, asdict, dataclass, fields
-from math import exp, sqrt
+from dataclasses import MISSING, asdict, dataclass, fields, replace
+from math import exp, inf, sqrt
 from typing import Any
 
 from gz_onboard.physics.riding import DRIFT, PriorRiding
@@ -119,6 +119,20 @@ class Habit:
             beside,
         )
 
+    def scaled(self, by: float) -> Habit:
+        """The same in a unit that is so many times smaller."""
+        square = by * by
+        return replace(
+            self,
+            usual=by * self.usual,
+            present=by * self.present,
+            usual_variance=square * self.usual_variance,
+            present_variance=square * self.present_variance,
+            covariance=square * self.covariance,
+            between=square * self.between,
+            scatter=square * self.scatter,
+        )
+
     def rested(self) -> Habit:
         """Before another ride: what this one was teaches how unlike rides are."""
         seen = self.present**2 + self.present_variance
@@ -168,9 +182,37 @@ class Usual:
         return asdict(self)
 
 
-def restored_usual(saved: Mapping[str, Any]) -> Usual:
-    """What `Usual.snapshot` gave; KeyError, TypeError or ValueError if it is not that."""
-    return Usual(*(_restored_habit(saved[f.name]) for f in fields(Usual)))
+@dataclass(frozen=True, slots=True)
+class Unit:
+    """What habits are relative to: price [J/m] and speed [m/s] of the prior riding by the vehicle file."""
+
+    price: float = 1.0
+    speed: float = 1.0
+
+
+def restored_unit(saved: Mapping[str, Any], now: Unit) -> Unit:
+    """The unit of saved habits over that of `now`; 1 for older versions, which did not say.
+
+    TypeError or ValueError if it cannot be.
+    """
+    if "of" not in saved:
+        return Unit()
+    unit = Unit(float(saved["of"]["price"]) / now.price, float(saved["of"]["speed"]) / now.speed)
+    if not (0 < unit.price < inf and 0 < unit.speed < inf):
+        raise ValueError("implausible unit of habits")
+    return unit
+
+
+def restored_usual(saved: Mapping[str, Any], unit: Unit = Unit()) -> Usual:
+    """What `Usual.snapshot` gave; KeyError, TypeError or ValueError if it is not that.
+
+    unit: of it over today's. A vehicle file that was calibrated anew changes that, and not what was ridden.
+    """
+    usual = Usual(*(_restored_habit(saved[f.name]) for f in fields(Usual)))
+    if unit == Unit():
+        return usual
+    scales = {"price": unit.price, "standing": unit.price, "pace": 1 / unit.speed, "factor": unit.price}
+    return Usual(*(_restored_habit(asdict(getattr(usual, name).scaled(by))) for name, by in scales.items()))
 
 
 def _restored_habit(saved: Mapping[str, Any]) -> Habit:

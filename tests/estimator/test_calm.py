@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.calm import CALM, STEP, Calm, restored_ratio
+from gz_onboard.estimator.calm import CALM, STEP, Calm, restored_gap
 from gz_onboard.estimator.usual import Habit, Usual, restored_usual
 from gz_onboard.physics.riding import PriorRiding
 
@@ -74,8 +74,11 @@ def test_a_step_that_no_riding_makes_is_shown_at_once():
 
 
 def test_what_is_drawn_or_charged_at_standstill_shows_at_once():
-    calm = Calm(0.95)
-    assert shown([40_000.0, 38_000.0, 60_000.0], np.zeros(3), calm=calm) == pytest.approx([38_000, 36_100, 57_000])
+    """And fifty metres near empty are fifty of a full charge, in place of a third of it."""
+    calm = Calm(-2000.0)
+    assert shown([40_000.0, 38_000.0, 60_000.0], np.zeros(3), calm=calm) == pytest.approx([38_000, 36_000, 58_000])
+    calm = Calm(50.0)
+    assert shown([150.0, 60_000.0], np.zeros(2), calm=calm) == pytest.approx([200, 60_050])
 
 
 def standing(raws, drawn=0.0):
@@ -99,8 +102,8 @@ def test_what_a_rest_shows_waits_for_the_riding_to_come():
 
 def test_a_rest_that_shows_much_is_followed_at_once():
     found, calm = standing(np.linspace(40_000, 25_000, 100))
-    assert found[-1] == pytest.approx(25_000 * np.exp(STEP))
-    assert calm.follow(40_000.0, 1e6, KNOWN, 0.0) == pytest.approx(40_000 * np.exp(-STEP))
+    assert found[-1] == pytest.approx(25_000 * (1 + STEP))
+    assert calm.follow(40_000.0, 1e6, KNOWN, 0.0) == pytest.approx(40_000 * (1 - STEP))
 
 
 def test_a_restart_keeps_what_was_shown():
@@ -108,13 +111,13 @@ def test_a_restart_keeps_what_was_shown():
     ridden = np.full(500, 10.0)
     before = shown(42_000 + 800 * np.sin(np.arange(500) / 50) - np.cumsum(ridden), ridden, calm=calm)[-1]
     raw = 42_000 + 800 * np.sin(499 / 50) - 5000
-    assert Calm(calm.ratio).follow(raw, 90.0 * raw, KNOWN) == pytest.approx(before)
+    assert Calm(calm.gap).follow(raw, 90.0 * raw, KNOWN) == pytest.approx(before)
 
 
 def test_it_is_right_when_empty():
     ridden = np.full(2000, 10.0)
     left = 20_000 - np.cumsum(ridden)
-    found = shown(left, ridden, calm=Calm(1.2))
+    found = shown(left, ridden, calm=Calm(4000.0))
     assert np.all(np.abs(found - left)[left < 1000] < 50)
     assert found[-1] < 1
 
@@ -125,10 +128,10 @@ def test_nothing_known_is_followed_at_once():
     assert shown(raw, ridden, known=0.0)[150] == pytest.approx(raw[150], rel=0.002)
 
 
-@pytest.mark.parametrize("saved", [{"shown": 0.0}, {"shown": float("nan")}, {"shown": "x"}, {"shown": None}])
+@pytest.mark.parametrize("saved", [{"gap": 1e9}, {"gap": float("nan")}, {"gap": "x"}, {"gap": None}])
 def test_an_implausible_ratio_is_refused(saved):
     with pytest.raises((TypeError, ValueError)):
-        restored_ratio(saved)
+        restored_gap(saved)
 
 
 def test_a_habit_knows_how_well_it_knows():
@@ -273,8 +276,6 @@ def test_a_worse_forecast_lets_the_range_fall_by_no_more_than_twice_what_is_ridd
 
 def test_what_was_held_back_on_one_ride_shows_in_the_first_kilometres_of_the_next():
     """The forecast grows by a half as the ride ends: five kilometres later nearly all of that is shown, not 4 km."""
-    ridden = np.full(500, 10.0)
-    at = np.cumsum(ridden)
     found = []
     for begun in (False, True):
         calm = Calm()

@@ -13,6 +13,7 @@ from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.physics.cooling import LumpedCooling
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
+from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.warming import cells_ahead
 from gz_onboard.vehicle import read_vehicle
 
@@ -151,7 +152,8 @@ def test_snapshot_goes_on_as_if_nothing_had_been():
     "damage",
     [
         {"usual": {}},
-        {"shown": 0.0},
+        {"gap": 1e9},
+        {"of": {"price": 0.0, "speed": 9.0}},
         {"still": -1.0},
         {"segments": [[0, 0, 0, 0, 0, 0]]},
         {"segments": [["x"] * 6]},
@@ -289,7 +291,7 @@ def test_an_old_snapshot_is_still_read():
     f, again = forecaster(), forecaster()
     ride(f, 4)
     saved = f.snapshot()
-    old = {k: v for k, v in saved.items() if k not in ("usual", "still", "shown")}
+    old = {k: v for k, v in saved.items() if k not in ("usual", "still", "gap", "of")}
     old |= {"segments": [row[:6] for row in saved["segments"]], "factor": 1.1, "factor_variance": 0.002}
     again.restore(json.loads(json.dumps(old)))
     assert again.riding.factor == 1.1
@@ -299,10 +301,11 @@ def test_an_old_snapshot_is_still_read():
 def test_a_restart_keeps_what_was_shown():
     f, again = forecaster(), forecaster()
     ride(f, 4)
-    f.calm.ratio = 0.93
+    f.calm.gap = -900.0
     again.restore(json.loads(json.dumps(f.snapshot())))
     assert again.shown(forecast(again)).range == pytest.approx(f.shown(forecast(f)).range, rel=1e-3)
-    assert again.shown(forecast(again)).p10 == pytest.approx(0.93 * forecast(f).p10, rel=1e-3)
+    share = 1 - 900.0 / forecast(f).range
+    assert again.shown(forecast(again)).p10 == pytest.approx(share * forecast(f).p10, rel=1e-3)
 
 
 @pytest.mark.parametrize(("start", "ambient"), [(-15.0, -15.0), (5.0, 5.0), (25.0, 25.0), (30.0, -10.0)])
@@ -320,3 +323,29 @@ def test_the_cells_warm_on_the_way_as_their_equation_says(start, ambient):
         charge -= 20.0 * current / 3600 / pack.pack_capacity(cooling.temperature)
     found = cells_ahead(pack, cooling, (0.8, start), ambient, expected.load)
     assert found == pytest.approx(np.mean(temperatures), abs=2.5)
+
+
+def test_a_vehicle_file_that_was_calibrated_anew_changes_nothing_of_what_was_ridden():
+    """A file with half as much drag and rolling again, restored from what was learned by the one before."""
+    known = dict(VEHICLE.parameters.known)
+    for name in ("drag_area", "rolling_resistance_constant"):
+        known[name] = replace(known[name], value=1.5 * known[name].value)
+    f = forecaster()
+    ride(f, 25)
+    f.ridden_by("another")
+    other = Forecaster(Model(VEHICLE.model.effects, Parameters(known)), VEHICLE.pack, VEHICLE.riding)
+    assert forecast(other).consumption > 1.2 * forecast(forecaster()).consumption
+    other.restore(json.loads(json.dumps(f.snapshot())))
+    assert forecast(other).consumption == pytest.approx(forecast(f).consumption, rel=0.03)
+    other.ridden_by("")
+    f.ridden_by("")
+    assert forecast(other).consumption == pytest.approx(forecast(f).consumption, rel=0.03)
+
+
+def test_tyres_are_cold_again_after_an_hour():
+    f = forecaster()
+    f.riding.time_moving = 900.0
+    f.pause(1800.0)
+    assert f.riding.time_moving == 900.0
+    f.pause(1800.0)
+    assert f.riding.time_moving == 0.0

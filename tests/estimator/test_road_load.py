@@ -12,6 +12,7 @@ import pytest
 
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.load_model import Conditions, LoadModel
+from gz_onboard.estimator.ridden import RIDE_ENDS
 from gz_onboard.estimator.road_load import NAMES, NEW_DAY, RoadLoad, Surroundings
 from gz_onboard.estimator.road_slopes import PARAMETERS
 from gz_onboard.estimator.spans import Second
@@ -267,6 +268,7 @@ def test_the_estimator_keeps_it_over_a_restart_and_takes_none_of_a_damaged_state
     later.restore(saved, "key", None)
     assert later.road_load.learned()["mass"].share == 0
     assert later.road_load.learned()["drag"].share > 0.2
+    assert later.forecaster.riding.still >= RIDE_ENDS > restored.forecaster.riding.still
     saved["learned"]["road"]["means"] = [0.0]
     refusing = life.estimator()
     with pytest.raises(ValueError, match="another form"):

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from cantools.database.can import Database
 
-from gz_onboard.estimator.forecast import DECILE
+from gz_onboard.estimator.interval import DECILE
 from gz_onboard.events import Estimate, Frame, Reason, State
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle, read_vehicle
