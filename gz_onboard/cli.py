@@ -10,10 +10,12 @@ import re
 import sys
 from collections.abc import Collection, Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import NoReturn
 
 from gz_onboard import __version__
 from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, InputError, lacking_extra, nearest
+from gz_onboard.options import LOG_SUFFIXES
 
 COMMANDS = {
     "run": ("gz_onboard.daemon.command", "estimate the range from a live bus and publish it (the daemon)"),
@@ -47,11 +49,23 @@ class _Parser(argparse.ArgumentParser):
         if wrong:
             message += nearest(wrong.strip("'"), re.findall(r"[^\s',)]+", choices))
         elif message.startswith("unrecognized arguments: "):
-            wrong = next((word for word in message.split()[2:] if word.startswith("-")), "")
-            message += (
-                nearest(wrong.partition("=")[0], self.known_options()) if wrong else "; files go before the options"
-            )
+            words = message.split()[2:]
+            wrong = next((word for word in words if word.startswith("-")), "")
+            message += nearest(wrong.partition("=")[0], self.known_options()) if wrong else self._place_of(words[0])
         super().error(message)
+
+    def _place_of(self, word: str) -> str:
+        """Where a file or folder `word` goes on the command line of the command that was called."""
+        choices = [a.choices for a in self._actions if isinstance(a, argparse._SubParsersAction)]
+        # The one that was called: it alone has its arguments, see `command_line`.
+        name, called = max(choices[0].items(), key=lambda one: len(one[1]._actions))
+        if any(not action.option_strings for action in called._actions):
+            return "; files go before the options"
+        named = ((str(action.metavar), action) for action in called._actions if action.help != argparse.SUPPRESS)
+        taking = [f"{action.option_strings[0]} {of}" for of, action in named if re.search("FILE|TOML|DIR", of)]
+        replayed = Path(word).is_dir() or word.lower().removesuffix(".gz").endswith(LOG_SUFFIXES)
+        ride = "; a recorded ride is for estimate, or for replay onto a bus" if replayed else ""
+        return f"; {name} takes files and folders behind its options only: {', '.join(taking)}{ride}"
 
     def known_options(self) -> list[str]:
         """The options of this command and of its subcommands, without their old names."""

@@ -57,7 +57,7 @@ def decode(
         document = json.loads(b"{" + body)
         snapshot, saved_at, began = document["estimator"], document["saved_at"], document.get("uptime")
     except (ValueError, LookupError, TypeError, RecursionError) as error:  # the checksum is right: not written by us
-        raise ValueError(f"is not a saved state: {error!r}") from error
+        raise ValueError("is not a saved state, although its checksum is right") from error
     age = time - saved_at if isinstance(saved_at, int | float) and saved_at > 1e9 and time >= saved_at else None
     # A board without a clock of its own goes on from the last time it knew, however long it was off; one whose clock
     # has no battery as well, but that clock begins anew. What two clocks say of the same boot is believed all the same.

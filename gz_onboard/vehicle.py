@@ -105,7 +105,8 @@ def find_vehicle(name: str | Path, beside: Path | None = None) -> Path:
 
 def _check_no_folder(path: Path) -> None:
     if path.is_dir():
-        raise InputError(f"{path}: is a folder; give the vehicle file in it")
+        one = next((f"the vehicle file in it, such as {file}" for file in sorted(path.glob("*.toml"))), None)
+        raise InputError(f"{path}: is a folder; give {one or 'a vehicle file, which ends in .toml'}")
 
 
 def read_vehicle(

@@ -9,6 +9,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from typing import Any
 
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 
 import gz_onboard as gz
-from gz_onboard import api, cli
+from gz_onboard import api, cli, state
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.writers import write_candump
 from tests.support import LOGS, ROOT
@@ -509,8 +510,22 @@ def test_what_was_learned_is_that_of_the_command(saved, capsys):
     assert set(table["part"]) == {"battery", "road", "rider"}
     assert cli.main(["learned", "--state", str(saved)]) == 0
     assert capsys.readouterr().out == f"{found}\n"
-    with pytest.raises(gz.InputError, match=r"none\.json: no saved state"):
-        gz.read_learned(saved.parent / "none.json")
+    whole = saved.read_bytes()
+    snapshot, _ = state.load(saved, time.time()) or ({}, None)
+    refused = {
+        "no saved state": None,
+        "is not a saved state": b"hello",
+        "its checksum is wrong": whole[:-9],
+        "is of 'car', this is": state.encode({**snapshot, "key": "car"}, time.time()),
+        "is damaged: its riding lacks ": state.encode({**snapshot, "riding": {}}, time.time()),
+    }
+    for said, text in refused.items():
+        saved.unlink(missing_ok=True)
+        if text is not None:
+            saved.write_bytes(text)
+        with pytest.raises(gz.InputError, match=f"{saved}: .*{said}") as error:
+            gz.read_learned(saved)
+        assert not re.search(r"--|Error|\(", str(error.value))
 
 
 def test_a_baseline_is_written_and_compared_with(tmp_path):

@@ -103,7 +103,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["plot", "a.mcap", "--over", "distance", "d.png"], "d.png; files go before the options"),
         (["estimate", RIDE, "--no-plot", RIDE], "; files go before the options"),
         (["replay", "nowhere.blf", "--channel", "a"], "nowhere.blf"),
-        (["run", "--vehicle", f"{LOGS}/"], "is a folder; give the vehicle file in it"),
+        (["run", "--vehicle", f"{LOGS}/"], "is a folder; give a vehicle file, which ends in .toml"),
         (["dashboard", "--interface", "virtul"], "virtul"),
     ],
     ids=lambda value: " ".join(value).replace(RIDE, "RIDE")[:60] if isinstance(value, list) else "",

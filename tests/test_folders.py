@@ -37,17 +37,20 @@ REFUSING = {
     "simulate": (["simulate", FULL], "is a folder; give one log, route or cycle in it; `validate` simulates every"),
     "route": (["route", FULL], "is a folder; give the file in it"),
     "run": (["run", "--route", FULL], "is a folder; give the file in it"),
-    "learned": (["learned", "--vehicle", FULL], "is a folder; give the vehicle file in it"),
+    "learned": (["learned", "--vehicle", FULL], "is a folder; give a vehicle file, which ends in .toml"),
     "dashboard": (["dashboard", "--dbc", FULL], "is a folder; give the DBC file in it"),
     "mqtt": (["mqtt", "localhost", "--dbc", FULL], "is a folder; give the DBC file in it"),
-    "foxglove": (["foxglove", "--vehicle", FULL], "is a folder; give the vehicle file in it"),
+    "foxglove": (["foxglove", "--vehicle", FULL], "is a folder; give a vehicle file, which ends in .toml"),
     "calibrate": (["calibrate", "ocv", FULL], "is a folder; give the files in it"),
 }
 MORE = [
     (["calibrate", "all", EMPTY], "no such file; `calibrate all` takes a folder with a manifest calibration.toml"),
     (["estimate", RIDE, "--route", FULL], "is a folder; give the file in it"),
-    (["estimate", RIDE, "--vehicle", FULL], "is a folder; give the vehicle file in it"),
-    (["vehicle", "check", FULL, RIDE], "is a folder; give the vehicle file in it"),
+    (["estimate", RIDE, "--vehicle", FULL], "is a folder; give a vehicle file, which ends in .toml"),
+    (["vehicle", "check", FULL, RIDE], "FULL: is a folder; the vehicle comes first, by name or file, then its logs"),
+    (["vehicle", "check", FULL, "v.toml"], "FULL: is a folder; the vehicle comes first, by name or file, then its"),
+    (["vehicle", "check", "a.blf.gz", "v.toml"], "a.blf.gz: is a log; the vehicle comes first"),
+    (["vehicle", "check", "vehicles", RIDE], "is a folder; give the vehicle file in it, such as vehicles/v.toml"),
     (["report", RIDE, "-o", FULL], "is a folder; give the name of a file"),
     (["plot", FULL, "one.png"], "one.png: of a folder, each picture has the name of its log; leave it out"),
     (["export", FULL, "rides.csv"], "rides.csv: is one file, and FULL a folder of logs; give a name without a suffix"),
@@ -63,6 +66,8 @@ def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for name in ("a.blf", "b.log"):
         short_log(tmp_path / FULL / name, FRAMES)
     (tmp_path / FULL / "notes.csv").write_text("time_s,note\n")
+    (tmp_path / "vehicles").mkdir()
+    (tmp_path / "vehicles" / "v.toml").touch()
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -85,6 +90,27 @@ def test_a_folder_without_logs(arguments: list[str], capsys: pytest.CaptureFixtu
 def test_a_folder_that_means_nothing(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(arguments) == 2
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.usefixtures("folders")
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["run", FULL], "run takes files and folders behind its options only: --vehicle NAME|TOML, "),
+        (["run", "a.blf.gz"], "; a recorded ride is for estimate, or for replay onto a bus"),
+        (["learned", FULL], "learned takes files and folders behind its options only: --vehicle NAME|TOML, --json"),
+        (["learned", "scooter.json"], "--state FILE, --plot FILE\n"),
+        (["foxglove", FULL], "options only: --dbc FILE, --vehicle NAME|TOML; a recorded ride is for estimate, or for"),
+    ],
+)
+def test_a_command_without_files_says_where_they_go(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(arguments)
+    told = capsys.readouterr().err
+    assert said in told
+    assert "before the options" not in told
 
 
 def test_the_page_of_the_commands_has_them() -> None:

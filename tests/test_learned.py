@@ -8,6 +8,7 @@ import os
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -166,7 +167,17 @@ def test_it_names_a_state_that_is_missing_damaged_or_another_s(saved: Path, caps
     wrong = {**snapshot, "learned": {"capacity": {"of": "much"}}}
     state.write(saved, state.encode(wrong, time.time()))
     assert main(["learned", "--state", str(saved)]) == BAD_INPUT
-    assert "damaged" in capsys.readouterr().err
+    assert f"{saved}: is damaged: its capacity or resistance holds implausible numbers\n" in capsys.readouterr().err
+    state.write(saved, state.encode({**snapshot, "riding": {}}, time.time()))
+    assert main(["learned", "--state", str(saved)]) == BAD_INPUT
+    assert f"{saved}: is damaged: its riding lacks " in capsys.readouterr().err
+    text = state.encode(snapshot, time.time())
+    nothing: list[Any] = [[1], 7, None]
+    for none in nothing:
+        saved.write_bytes(state.encode(none, time.time()))
+        assert main(["learned", "--state", str(saved)]) == BAD_INPUT
+        assert f"{saved}: is damaged: its state is not as it was saved" in capsys.readouterr().err
+    saved.write_bytes(text)
     saved.write_bytes(saved.read_bytes()[:-9])
     assert main(["learned", "--state", str(saved)]) == BAD_INPUT
 

@@ -5,8 +5,10 @@ Results are dataclasses; those with a table have ``to_table()`` (a dict of numpy
 """
 
 from gz_onboard.api.calibrations import Calibration, calibrate
+from gz_onboard.api.checks import CheckedVehicle, check_vehicle
 from gz_onboard.api.discoveries import Baseline, Discovered, baseline, discover
 from gz_onboard.api.estimates import EstimatedRide, LoggedEstimates, estimate, read_estimates, summary_table
+from gz_onboard.api.exports import LoggedFrames, LoggedMessage, LoggedSignals, read_frames, read_signals
 from gz_onboard.api.given import read_ride, read_vehicle
 from gz_onboard.api.histories import History, add_to_history, read_history
 from gz_onboard.api.learnings import LearnedState, read_learned
@@ -24,6 +26,7 @@ __all__ = [
     "AddedRides",
     "Baseline",
     "Calibration",
+    "CheckedVehicle",
     "Discovered",
     "DiscoveryOptions",
     "EstimatedRide",
@@ -31,6 +34,9 @@ __all__ = [
     "InputError",
     "LearnedState",
     "LoggedEstimates",
+    "LoggedFrames",
+    "LoggedMessage",
+    "LoggedSignals",
     "Reported",
     "Samples",
     "SimulatedRide",
@@ -41,12 +47,15 @@ __all__ = [
     "add_to_history",
     "baseline",
     "calibrate",
+    "check_vehicle",
     "discover",
     "estimate",
     "read_estimates",
+    "read_frames",
     "read_history",
     "read_learned",
     "read_ride",
+    "read_signals",
     "read_vehicle",
     "report",
     "simulate",

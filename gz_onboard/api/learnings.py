@@ -64,12 +64,7 @@ def read_learned(file: PathLike | None = None, vehicle: VehicleLike = "reference
     known = vehicle_of(vehicle)
     path = state_file(command.USUAL_FOLDER, known.name) if file is None else Path(file)
     snapshot, age = command.load(path, known)
-    road_load = command.read_road_load(known, snapshot)
-    return LearnedState(
-        known.name,
-        age,
-        command.read_learned(known, snapshot),
-        road_load.learned(),
-        road_load.correlations(),
-        command.read_riders(known, snapshot),
-    )
+    with command.sound(path):
+        road_load = command.read_road_load(known, snapshot)
+        battery, riders = command.read_learned(known, snapshot), command.read_riders(known, snapshot)
+    return LearnedState(known.name, age, battery, road_load.learned(), road_load.correlations(), riders)

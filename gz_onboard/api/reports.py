@@ -8,12 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from gz_onboard.api.given import PathLike, VehicleLike, vehicle_of
-from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import InputError, not_an_input, writing
 from gz_onboard.lab.estimate import summary_text
 from gz_onboard.lab.report import check_page, page_of, section_of
 from gz_onboard.lab.report_ride import ReportedRide, report_of
 from gz_onboard.offline.arguments import checked
+from gz_onboard.offline.digest import distinct_logs
 from gz_onboard.offline.table import Columns, Tabular, columns_of
 from gz_onboard.progress import Progress
 
@@ -69,7 +69,7 @@ def report(
     """
     known = vehicle_of(vehicle)
     several = [rides] if isinstance(rides, str | os.PathLike) else rides
-    logs = list(dict.fromkeys(logs_among([Path(ride) for ride in several])))
+    logs = distinct_logs(map(Path, several))
     if not logs:
         raise InputError("no ride is given")
     road = None if route is None else Path(route)

@@ -35,11 +35,11 @@ UNDECODABLE = "undecodable"
 DROPPING = (LENGTH, CRC, COUNTER, TIME, UNDECODABLE, SEQUENCE, INTERRUPTED, MALFORMED)  # that drop a frame or an answer
 
 BACK_NS = 50_000_000  # frames of two channels may overtake each other by a little
-_AHEAD_NS = 30_000_000_000
+AHEAD_NS = 30_000_000_000
 LONGEST_PAUSE_NS = 30 * 86_400 * 1_000_000_000
 """Of a log: a leap ahead by more is a clock that was set. A live bus may be silent for as long as it likes."""
 _MOST_LEAPS = 100  # are remembered
-_CONFIRM = 3  # so many frames in a row agree on a new time before it is believed
+CONFIRM = 3  # so many frames in a row agree on a new time before it is believed
 _MOST_IDENTIFIERS = 4096  # are remembered: a babbling node must not fill the memory
 
 Handler = Callable[[float, bytes], bool | None]
@@ -91,7 +91,7 @@ class Codec:
         frames = self._of_one_channel(frames) if self._answering else frames
         handlers, latest = self._handlers, self.latest
         origin, last = self._origin_ns, self._last_ns
-        back, ahead = -BACK_NS, _AHEAD_NS
+        back, ahead = -BACK_NS, AHEAD_NS
         count = 0
         for time_ns, identifier, data, _channel in frames:
             count += 1
@@ -122,6 +122,17 @@ class Codec:
         """Whether any frame has come."""
         return self._origin_ns is not None
 
+    @property
+    def passed(self) -> float:
+        """The time of the last frame on the timeline of the events [s]."""
+        return self.seconds(self._last_ns)
+
+    def odd(self, frames: Sequence[Frame]) -> None:
+        """Count `frames` of implausible time, which are not decoded."""
+        self.received += len(frames)
+        for _ in frames:
+            self._fault("", TIME)
+
     def seconds(self, time_ns: int) -> float:
         """`time_ns` on the timeline of the events."""
         return 0.0 if self._origin_ns is None else (time_ns - self._origin_ns) * 1e-9
@@ -146,10 +157,10 @@ class Codec:
         if self._origin_ns is None:
             self._origin_ns = self._last_ns = time_ns
             return True
-        follows = self._before_ns == self._last_ns and -BACK_NS <= time_ns - self._suspect_ns <= _AHEAD_NS
+        follows = self._before_ns == self._last_ns and -BACK_NS <= time_ns - self._suspect_ns <= AHEAD_NS
         self._suspects = self._suspects + 1 if follows and self._suspects else 1
         self._suspect_ns, self._before_ns = time_ns, self._last_ns
-        if self._suspects < _CONFIRM:
+        if self._suspects < CONFIRM:
             self._fault("", TIME)
             return False
         self._suspects = 0

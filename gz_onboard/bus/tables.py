@@ -158,22 +158,26 @@ def write_frame_table(out: Path, batches: Iterable[list[Frame]]) -> int:
         stream = None if out.suffix.lower() == ".parquet" else stack.enter_context(open_text(out))
         for batch in batches:
             count += len(batch)
-            rows = [_frame_row(frame) for frame in batch]
             if stream:
                 stream.writelines(
-                    _json_line(frame[0], dict(zip(FRAME, row, strict=True)))
-                    for frame, row in zip(batch, rows, strict=True)
+                    _json_line(frame[0], dict(zip(FRAME, _frame_row(frame), strict=True))) for frame in batch
                 )
                 continue
             import pyarrow as pa
             import pyarrow.parquet as pq
 
-            columns = dict(zip(FRAME, zip(*rows, strict=True), strict=True))
+            columns = frame_columns(batch)
             times = pa.array([frame[0] for frame in batch], pa.timestamp("ns", "UTC"))
             table = pa.table({"time": times, **{name: pa.array(column) for name, column in columns.items()}})
             writer = writer or stack.enter_context(pq.ParquetWriter(out, table.schema))
             writer.write_table(table)
     return count
+
+
+def frame_columns(frames: Sequence[Frame]) -> dict[str, Sequence[Any]]:
+    """By the names of `FRAME`; of no frame each is empty."""
+    rows = list(map(_frame_row, frames))
+    return {name: [row[i] for row in rows] for i, name in enumerate(FRAME)}
 
 
 def _frame_row(frame: Frame) -> tuple[object, ...]:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import logging
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from gz_onboard import state
 from gz_onboard.background import Background
+from gz_onboard.estimator.snapshot import mended
 from gz_onboard.pipeline import Pipeline
 
 SAVE_PERIOD_NS, SAVE_AT_MOST_NS = 10_000_000_000, 1_000_000_000
@@ -44,9 +45,12 @@ class StateKeeper:
     def restore(self, pipeline: Pipeline, anew: Callable[[], Pipeline]) -> tuple[Pipeline, dict[str, Any] | None]:
         """(the pipeline to go on with, the latest saved state that could be used). Others are set aside.
 
+        If none is whole, the sound parts of the latest that is the vehicle's are gone on from, and saved.
         Nothing is raised: after a state that may have been taken over in part the pipeline is made `anew`.
         """
+        damaged: list[tuple[Path, Mapping[str, Any], float | None]] = []
         for copy in state.copies(self.file):
+            found = None
             try:
                 found = state.load(copy, time.time(), _uptime(), state.kept_time())
                 if found is None:
@@ -59,11 +63,30 @@ class StateKeeper:
                 aside = state.set_aside(self.file, copy)
                 kept = f", kept as {aside}" if aside else ""
                 log.warning("saved state %s %s: not used%s", copy, str(error) or repr(error), kept)
+                damaged += [(aside or copy, *found)] if found and isinstance(error, ValueError) else []
             else:
                 when = "at an unknown time" if age is None else f"{age:.0f} s ago"
                 log.info("going on from the state saved %s", when)
                 return pipeline, dict(snapshot)
+        for copy, saved, age in damaged:
+            try:
+                return pipeline, self._restore_mended(pipeline, copy, saved, age)
+            except Exception:  # another vehicle's; why it is not used was said
+                pipeline = anew()
         return pipeline, None
+
+    def _restore_mended(
+        self, pipeline: Pipeline, copy: Path, saved: Mapping[str, Any], age: float | None
+    ) -> dict[str, Any]:
+        """Go on from a saved state without its damaged parts, which is saved; it is given. Raises if it cannot be."""
+        known = pipeline.estimator
+        learning = known.soc.ageing, known.road_load, known.weakest
+        snapshot, lost = mended(saved, self.key, known.soc.effects, learning, known.forecaster)
+        known.restore(snapshot, self.key, age)
+        text = state.encode(snapshot, 0.0 if age is None else time.time() - age)
+        log.warning("going on from %s without its damaged parts, which begin anew: %s", copy, ", ".join(lost))
+        self._write(text)
+        return snapshot
 
     def save_if_due(self, pipeline: Pipeline, now_ns: int) -> None:
         """Save once in the period, or when the state of charge has moved; not while the last save is under way."""

@@ -24,6 +24,7 @@ from gz_onboard.estimator.ageing import Ageing, Learned
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.road_load import RoadLoad, RoadParameter
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
+from gz_onboard.estimator.snapshot import part
 from gz_onboard.estimator.usual import Habit, Usual
 from gz_onboard.estimator.weakest import Weakest
 from gz_onboard.options import add_shared
@@ -75,12 +76,16 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.plot and arguments.plot.suffix.lower() not in PICTURES:
         raise InputError(f"--plot {arguments.plot}: a picture is one of {' '.join(PICTURES)}")
     require("matplotlib", arguments.plot is not None)
-    snapshot, age = load(file, vehicle)
+    try:
+        snapshot, age = load(file, vehicle)
+    except InputError as error:
+        raise InputError(f"{error}; --state FILE and --vehicle NAME|TOML say which") from error
     if arguments.reset:
         names = (*BATTERY, ROAD, RIDING) if arguments.reset == "all" else (arguments.reset,)
         snapshot = _forget(file, snapshot, age, names, _fresh(vehicle))
-    learned, riders = read_learned(vehicle, snapshot), read_riders(vehicle, snapshot)
-    road_load = read_road_load(vehicle, snapshot)
+    with sound(file):
+        learned, riders = read_learned(vehicle, snapshot), read_riders(vehicle, snapshot)
+        road_load = read_road_load(vehicle, snapshot)
     road = road_load.learned()
     if arguments.plot:
         with writing(arguments.plot):
@@ -113,9 +118,9 @@ def learned_text(
 
 
 def read_learned(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Learned]:
-    """What a saved state holds of the battery, by name. InputError if it cannot be."""
+    """What a saved state holds of the battery, by name. ValueError if it cannot be."""
     ageing = Ageing(vehicle.pack.own())
-    with _sound():
+    with part("capacity or resistance"):
         ageing.restore(snapshot.get("learned", {}))
     return ageing.learned() | _of_weakest(vehicle, snapshot)
 
@@ -124,24 +129,24 @@ def _of_weakest(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Lear
     if all(source.role != LOWEST for source in vehicle.mapping.sources):
         return {}
     weakest = Weakest(vehicle.pack.own(), Signals([(LOWEST, DEFAULT_STALE)]), vehicle.parameters)
-    with _sound():
+    with part("weakest"):
         weakest.take_on(weakest.read(snapshot.get("learned", {}).get("weakest")))
     return weakest.learned()
 
 
 def read_road_load(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> RoadLoad:
-    """What a saved state holds of the road load. InputError if it cannot be."""
+    """What a saved state holds of the road load. ValueError if it cannot be."""
     road_load = RoadLoad(_fresh(vehicle).load)
-    with _sound():
+    with part(ROAD):
         road_load.take(road_load.read(snapshot.get("learned", {}).get(ROAD)))
     return road_load
 
 
 def read_riders(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, dict[str, Learned]]:
-    """What a saved state holds of the riding, by rider and name; who rode last comes first. InputError likewise."""
+    """What a saved state holds of the riding, by rider and name; who rode last comes first. ValueError likewise."""
     forecaster = _fresh(vehicle)
     prior = forecaster.prior
-    with _sound():
+    with part(RIDING):
         forecaster.restore(snapshot["riding"])
     riders = {forecaster.riders.now: forecaster.riding.usual, **forecaster.riders.others}
     return {name: _of_usual(usual, prior) for name, usual in riders.items()}
@@ -163,11 +168,12 @@ def _fresh(vehicle: Vehicle) -> Forecaster:
 
 
 @contextmanager
-def _sound() -> Iterator[None]:
+def sound(file: Path) -> Iterator[None]:
+    """InputError, which names the `file`, for a saved state that holds what cannot be."""
     try:
         yield
-    except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise InputError(f"the saved state is damaged: {error!r}") from error
+    except ValueError as error:
+        raise InputError(f"{file}: {error}") from error
 
 
 def _rows(learned: Mapping[str, Learned]) -> dict[str, dict[str, object]]:
@@ -241,14 +247,14 @@ def _plot(
 
 def load(file: Path, vehicle: Vehicle) -> tuple[Mapping[str, Any], float | None]:
     """(snapshot, its age by the clock [s] if known). InputError for a state that is missing, or another vehicle's."""
-    try:
+    with sound(file):
         found = state.load(file, time.time())
-    except ValueError as error:
-        raise InputError(f"{file}: {error}; the daemon keeps one in its --state-dir") from error
     if found is None:
-        raise InputError(f"{file}: no saved state; --state FILE names it, in the daemon's --state-dir")
-    if (key := found[0].get("key")) != vehicle.key:
-        raise InputError(f"{file}: is of {key!r}, this is {vehicle.key!r}; --vehicle names it")
+        raise InputError(f"{file}: no saved state; the daemon keeps one in its state folder")
+    with sound(file), part("state"):
+        key = found[0].get("key")
+    if key != vehicle.key:
+        raise InputError(f"{file}: is of {key!r}, this is {vehicle.key!r}")
     return found
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import functools
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from math import inf
 from typing import Any
 
 from gz_onboard.estimator.ageing import Ageing
 from gz_onboard.estimator.cell_effects import CellEffects
+from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.road import MOST_BIAS
 from gz_onboard.estimator.road_load import RoadLoad
 from gz_onboard.estimator.start import Saved
@@ -28,11 +31,24 @@ CELLS_KEEP = 3600.0  # s: for so long the cells' temperature is known
 class Restored:
     """The contents of a snapshot, checked."""
 
-    battery: Saved
+    battery: Saved | None  # None: what was saved of it was damaged, see `mended`
     age: float | None  # s; None: not known
     gyro_bias: tuple[float, float]  # rad/s, of roll and yaw rate
     cell_effects: dict[str, float]  # V of a cell, by name
     cell_temperature: float | None  # degC; None if it is too old
+
+
+@contextmanager
+def part(name: str) -> Iterator[None]:
+    """ValueError, in words, for what a part of a saved state holds and cannot be."""
+    try:
+        yield
+    except KeyError as error:
+        raise ValueError(f"is damaged: its {name} lacks {error.args[0]}") from error
+    except (TypeError, AttributeError, IndexError) as error:
+        raise ValueError(f"is damaged: its {name} is not as it was saved") from error
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f"is damaged: its {name} holds implausible numbers") from error
 
 
 def read(
@@ -50,36 +66,110 @@ def read(
     """
     if age is not None and not 0 <= age < inf:
         age = None
-    if not isinstance(saved, Mapping) or saved.get("version") != VERSION:
-        raise ValueError(f"is of version {saved.get('version') if isinstance(saved, Mapping) else saved!r}")
-    if saved.get("key") != key:
-        raise ValueError(f"is of {saved.get('key')!r}, this is {key!r}")
-    try:
-        battery = _battery(saved)
-        bias_x, bias_z = (float(x) for x in saved["gyro_bias"])
-        if not (abs(bias_x) < MOST_BIAS and abs(bias_z) < MOST_BIAS):
-            raise ValueError("holds implausible numbers")
-        states = effects.read(saved["cell_effects"])
-        learned = saved.get("learned", {})  # states from before there was any have none
-        ageing, road_load, weakest = learning
+    _check_head(saved, key)
+    battery, states = _charge(saved, effects)
+    bias_x, bias_z = _biases(saved)
+    learned = saved.get("learned", {})  # states from before there was any have none
+    ageing, road_load, weakest = learning
+    with part("capacity or resistance"):
         ageing.read(learned)
-        on_road, of_group = road_load.read(learned.get("road")), weakest.read(learned.get("weakest"))
+    with part("road"):
+        on_road = road_load.read(learned.get("road"))
+    with part("weakest"):
+        of_group = weakest.read(learned.get("weakest"))
+    with part("riding"):
         restore_riding(saved["riding"])
         ageing.restore(learned)
         road_load.take(on_road)
         weakest.take_on(of_group)
-    except (KeyError, TypeError, AttributeError, OverflowError) as error:
-        raise ValueError(f"is damaged: {error!r}") from error
     cells = saved.get("cell_temperature")
     if not isinstance(cells, int | float) or not CELLS[0] < cells < CELLS[1] or age is None or age >= CELLS_KEEP:
         cells = None
     return Restored(battery, age, (bias_x, bias_z), states, None if cells is None else float(cells))
 
 
+def mended(
+    saved: Mapping[str, Any],
+    key: str,
+    effects: CellEffects,
+    learning: tuple[Ageing, RoadLoad, Weakest],
+    forecaster: Forecaster,
+) -> tuple[dict[str, Any], list[str]]:
+    """`saved` without its parts that are damaged, and their names; of estimators that have taken up no state.
+
+    A part goes as a whole, and what was learned of one thing says nothing of another. But the capacity's covariance is
+    with the state of charge that was saved: without that there is none. ValueError if it is of another vehicle `key`.
+    """
+    _check_head(saved, key)
+    ageing, road_load, weakest = learning
+    reads: dict[str, Callable[[Any], object]] = {
+        "capacity": lambda x: ageing.read({"capacity": x}),
+        "resistance": lambda x: ageing.read({"resistance": x}),
+        "road": road_load.read,
+        "weakest": weakest.read,
+    }
+    learned, damaged = saved.get("learned", {}), []
+    if not isinstance(learned, Mapping):
+        learned, damaged = {}, ["learned"]
+    kept: dict[str, Any] = {}
+    for name, read_it in reads.items():
+        if name not in learned:
+            continue
+        if _fits(name, functools.partial(read_it, learned[name])):
+            kept[name] = learned[name]
+        else:
+            damaged.append(name)
+    whole: dict[str, Any] = {**saved, "learned": kept}
+    anew: dict[str, tuple[Callable[[], object], dict[str, Any]]] = {
+        "riding": (lambda: forecaster.restore(saved["riding"]), {"riding": forecaster.snapshot()}),
+        "gyro bias": (lambda: _biases(saved), {"gyro_bias": [0.0, 0.0]}),
+        "charge": (lambda: _charge(saved, effects), {"soc": None, "covariance": None}),
+    }
+    for name, (check, begun) in anew.items():
+        if not _fits(name, check):
+            whole |= begun
+            damaged.append(name)
+    if whole["soc"] is None and kept.get("capacity"):
+        kept["capacity"] = {**kept["capacity"], "with_soc": 0.0}
+    return whole, damaged
+
+
+def _check_head(saved: Mapping[str, Any], key: str) -> None:
+    if not isinstance(saved, Mapping) or saved.get("version") != VERSION:
+        raise ValueError(f"is of version {saved.get('version') if isinstance(saved, Mapping) else saved!r}")
+    if saved.get("key") != key:
+        raise ValueError(f"is of {saved.get('key')!r}, this is {key!r}")
+
+
+def _fits(name: str, check: Callable[[], object]) -> bool:
+    try:
+        with part(name):
+            check()
+    except ValueError:
+        return False
+    return True
+
+
 def of_learned(ageing: Ageing, road_load: RoadLoad, weakest: Weakest) -> dict[str, Any]:
     """What was learned of the vehicle, by name; of the weakest group only where its voltage is on the bus."""
     of_group = {"weakest": weakest.snapshot()} if weakest.mapped else {}
     return {**ageing.snapshot(), "road": road_load.snapshot(), **of_group}
+
+
+def _charge(saved: Mapping[str, Any], effects: CellEffects) -> tuple[Saved | None, dict[str, float]]:
+    """The state of charge, and the states of the effects in the cells, which go with it."""
+    with part("charge"):
+        if saved["soc"] is None and saved["covariance"] is None:  # `mended`
+            return None, {}
+        return _battery(saved), effects.read(saved["cell_effects"])
+
+
+def _biases(saved: Mapping[str, Any]) -> tuple[float, float]:
+    with part("gyro bias"):
+        bias_x, bias_z = (float(x) for x in saved["gyro_bias"])
+        if not (abs(bias_x) < MOST_BIAS and abs(bias_z) < MOST_BIAS):
+            raise ValueError("more than any gyroscope has")
+    return bias_x, bias_z
 
 
 def _battery(saved: Mapping[str, Any]) -> Saved:

@@ -170,11 +170,11 @@ class StateOfCharge:
             "cell_effects": dict(self.effects.states),
         }
 
-    def restore(self, saved: Saved, age: float | None, effects: dict[str, float]) -> None:
-        """Go on from what is `age` [s] old; effects: their states [V of a cell]."""
+    def restore(self, saved: Saved | None, age: float | None, effects: dict[str, float]) -> None:
+        """Go on from what is `age` [s] old, if anything; effects: their states [V of a cell]."""
         self.saved, self.saved_age = saved, age
-        self._unseen = STOOD if age is None else min(age, STOOD)
-        self.effects.restore(effects, age, saved.soc)
+        self._unseen = STOOD if saved is None or age is None else min(age, STOOD)
+        self.effects.restore(effects, age, saved.soc if saved else 0.0)
 
     # --- step by step -----------------------------------------------------------------------------------------
 

@@ -9,15 +9,16 @@ from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 
-from gz_onboard.bus.codec import LONGEST_PAUSE_NS
+from gz_onboard.bus.codec import CONFIRM, LONGEST_PAUSE_NS
 from gz_onboard.bus.logs import LogDamage
 from gz_onboard.bus.publisher import Counts, Publisher
+from gz_onboard.bus.stamps import without_lone
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.events import Estimate, Frame
 from gz_onboard.lab.estimate_tally import PAUSE, Tally
 from gz_onboard.log_rows import STATUS_TOPIC, Log
-from gz_onboard.offline.samples import of_another, open_ride
+from gz_onboard.offline.samples import check_ridden, open_ride
 from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.pipeline import TICK_NS, Pipeline, range_publisher
 from gz_onboard.progress import Progress
@@ -27,7 +28,6 @@ from gz_onboard.vehicle import Vehicle, read_vehicle
 TICK_S = TICK_NS * 1e-9
 _GAP_NS = 2_000_000_000  # a longer pause between two frames is ridden through in steps
 _PAUSE_NS = round(PAUSE * 1e9)  # beyond this nothing is estimated meanwhile
-_CONFIRM = 3  # fewer frames than this do not set the time
 
 
 class _Mute(Publisher):
@@ -46,12 +46,12 @@ def feed(pipeline: Pipeline, batches: Iterable[Sequence[Frame]], progress: Progr
     Gaps are ridden through as a live bus would have it, up to a minute; a longer one is a pause of the recording.
     """
     now: int | None = None
-    for batch in batches:
+    for batch, count in without_lone(batches, pipeline.codec.odd):
         for portion in _without_jumps(batch):
             first, last = portion[0][0], portion[-1][0]
             if now is None:
                 now = first
-            if len(portion) < _CONFIRM and not -TICK_NS <= last - now <= _PAUSE_NS:  # an odd stamp: the codec judges it
+            if len(portion) < CONFIRM and not -TICK_NS <= last - now <= _PAUSE_NS:  # an odd stamp: the codec judges it
                 pipeline.advance(portion, now)
                 continue
             if _GAP_NS < first - now <= _PAUSE_NS:
@@ -60,7 +60,7 @@ def feed(pipeline: Pipeline, batches: Iterable[Sequence[Frame]], progress: Progr
             pipeline.advance(portion, last)
             now = last
         if progress:
-            progress(len(batch))
+            progress(count)
 
 
 def _without_jumps(batch: Sequence[Frame]) -> Iterator[Sequence[Frame]]:
@@ -147,8 +147,7 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
     if not how.frames:
         pipeline.publisher = _Mute()
     feed(pipeline, ride.batches, progress)
-    if not pipeline.codec.latest:
-        raise of_another(ride.source, ride.vehicle, pipeline.codec)
+    check_ridden(ride.source, ride.vehicle, pipeline.codec)
     if tally.last:  # what came after the last whole second counts too
         log.sample(STATUS_TOPIC, pipeline.codec.time_ns(tally.last.time), pipeline.status())
     took = time.process_time() - cpu, time.perf_counter() - wall

@@ -19,26 +19,26 @@ from __future__ import annotations
 import argparse
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from gz_onboard.bus import logs
 from gz_onboard.bus.export import out_suffix, whole, write_frames_as, write_mcap
-from gz_onboard.bus.replay import log_section
 from gz_onboard.bus.tables import write_frame_table
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
-from gz_onboard.events import Frame
 from gz_onboard.lab.export_contents import contents_text, log_contents
 from gz_onboard.lab.export_tables import (
     ESTIMATES,
+    DecoderError,
     Source,
     decoder_of,
-    recorded_messages,
-    recorded_signals,
+    holds_frames,
+    signals_of,
     write_estimates,
     write_signals,
 )
 from gz_onboard.options import add_shared
+from gz_onboard.vehicle import read_vehicle
 
 _TABLES = (".csv", ".parquet", ".jsonl")
 _OF_OUTPUT = {
@@ -132,7 +132,7 @@ def _export(arguments: argparse.Namespace, log: Path, out: Path, suffix: str) ->
 def _write(arguments: argparse.Namespace, source: Source, part: Path, suffix: str) -> str:
     """Write what is asked for to `part`, in the format of `suffix`, none for a folder; gives what it was."""
     kind = suffix or f"/.{arguments.table_format or 'parquet'}"
-    has_frames, topics = _holds_frames(source.log), logs.json_channels(source.log)
+    has_frames, topics = holds_frames(source.log), logs.json_channels(source.log)
     if arguments.estimates:
         return _estimates(arguments, source, part, kind, ["estimate"])
     told = [name for name, topic in ESTIMATES.items() if topic in topics]
@@ -140,15 +140,13 @@ def _write(arguments: argparse.Namespace, source: Source, part: Path, suffix: st
         return _estimates(arguments, source, part, kind, told)
     if arguments.frames or not (arguments.signals or suffix in (".parquet", ".jsonl", ".mcap", "")):
         return _frames(source, part, suffix)
-    texts = [_signals(arguments, source, part, kind, has_frames)]
+    try:
+        texts = [_signals(arguments, source, part, kind)]
+    except DecoderError as error:
+        raise InputError(f"{error}; say what, with --vehicle NAME|TOML or --dbc FILE") from error
     if not suffix and not arguments.signals and told:
         texts.append(_estimates(arguments, source, part, kind, told))
     return "; ".join(texts)
-
-
-def _holds_frames(log: Path) -> bool:
-    """Whether a log holds a frame; of one in another format than ours it is taken for granted."""
-    return logs.log_suffix(log) != ".mcap" or next(logs.read_frames(log, on_damage=lambda _: None), None) is not None
 
 
 def _estimates(arguments: argparse.Namespace, source: Source, part: Path, kind: str, names: Sequence[str]) -> str:
@@ -163,21 +161,10 @@ def _estimates(arguments: argparse.Namespace, source: Source, part: Path, kind: 
     return f"{write_estimates(source, files)} estimates"
 
 
-def _batches(source: Source) -> tuple[tuple[int | None, int | None], Iterator[list[Frame]]]:
-    """(the part that is wanted [ns], its frames); InputError if there are none."""
-    section = log_section(source.log, source.start, source.end)
-    batches = source.frames(section)
-    if batches is None:
-        where = "this log" if section == (None, None) else "the chosen part"
-        why = "".join(f"; damaged at {damage.place}: {damage.reason}" for damage in source.damages)
-        raise InputError(f"{source.log}: no frames in {where}{why}")
-    return section, batches
-
-
 def _frames(source: Source, part: Path, suffix: str) -> str:
     if source.columns is not None:
         raise InputError("--columns: are of estimates or signals, with --estimates or --signals")
-    _, batches = _batches(source)
+    _, batches = source.frames()
     if suffix in (".parquet", ".jsonl"):
         return f"{write_frame_table(part, batches)} frames"
     if suffix in ("", ".mcap"):
@@ -185,16 +172,18 @@ def _frames(source: Source, part: Path, suffix: str) -> str:
     return f"{write_frames_as(part, suffix, batches)} frames"
 
 
-def _signals(arguments: argparse.Namespace, source: Source, part: Path, kind: str, has_frames: bool) -> str:
-    if not has_frames and recorded_messages(source.log):
-        count = write_signals(source, part, kind, *recorded_signals(source))
-        return f"{count} rows of signals, as they were logged once a second"
-    section, batches = _batches(source)
-    decoder = decoder_of(source.log, arguments.dbc, arguments.vehicle)
-    if kind == ".mcap":
+def _signals(arguments: argparse.Namespace, source: Source, part: Path, kind: str) -> str:
+    vehicle = read_vehicle(arguments.vehicle) if arguments.vehicle else None
+    if kind == ".mcap" and holds_frames(source.log):
+        section, batches = source.frames()
+        decoder = decoder_of(source.log, arguments.dbc, vehicle)
         if source.columns is not None:
             raise InputError("--columns: an .mcap has all that is in the log")
-        count, what = write_mcap(source.log, part, decoder, batches, section), "samples"
+        text = f"{write_mcap(source.log, part, decoder, batches, section)} samples"
     else:
-        count, what = write_signals(source, part, kind, decoder.columns, decoder.decode(batches)), "frames"
-    return f"{count} {what}; {decoder.unknown} frames are in no DBC file, {decoder.undecodable} do not fit theirs"
+        found = signals_of(source, arguments.dbc, vehicle)
+        count = write_signals(source, part, kind, found)
+        if found.decoder is None:
+            return f"{count} rows of signals, as they were logged once a second"
+        text, decoder = f"{count} frames", found.decoder
+    return f"{text}; {decoder.unknown} frames are in no DBC file, {decoder.undecodable} do not fit theirs"

@@ -5,21 +5,26 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from itertools import accumulate
 from pathlib import Path
 
 from gz_onboard.bus import logs
+from gz_onboard.bus.codec import BACK_NS
 from gz_onboard.lab.export_tables import recorded_messages
 from gz_onboard.offline.results import clock, text_rows
 
 
 @dataclass(frozen=True)
 class Contents:
-    """Of a log; times in ns since the epoch, None if nothing in it has one. topics: rows by topic."""
+    """Of a log; times in ns since the epoch, None if nothing in it has one. back: frames earlier than one before;
+    topics: rows by topic.
+    """
 
     log: Path
     metadata: dict[str, str]
     attached: list[str]
     frames: int
+    back: int
     first: int | None
     last: int | None
     topics: dict[str, int]
@@ -29,18 +34,21 @@ class Contents:
 def log_contents(log: Path) -> Contents:
     """What `log` holds, by reading it whole; InputError if it cannot be read."""
     damages: list[logs.LogDamage] = []
-    count, first, last = 0, None, None
+    count = back = 0
+    times: list[int] = []  # the least and the greatest
     for batch in logs.read_frames(log, on_damage=damages.append):
+        stamps = [frame[0] for frame in batch]
+        latest = accumulate(stamps, max, initial=times[-1] if times else 0)
+        back += sum(time_ns < before - BACK_NS for time_ns, before in zip(stamps, latest, strict=False))
         count += len(batch)
-        first = batch[0][0] if first is None else first
-        last = batch[-1][0]
+        times = [min(stamps + times), max(stamps + times)]
     topics: Counter[str] = Counter()
     for topic, time_ns, _ in logs.read_samples(log):
         topics[topic] += 1
-        first = time_ns if first is None else min(first, time_ns)
-        last = time_ns if last is None else max(last, time_ns)
-    attached = sorted(logs.read_attachments(log))
-    return Contents(log, logs.read_metadata(log), attached, count, first, last, dict(topics), list(map(str, damages)))
+        times = [min([time_ns, *times]), max([time_ns, *times])]
+    metadata, attached = logs.read_metadata(log), sorted(logs.read_attachments(log))
+    first, last = times or (None, None)
+    return Contents(log, metadata, attached, count, back, first, last, dict(topics), list(map(str, damages)))
 
 
 def contents_text(found: Contents) -> str:
@@ -49,7 +57,8 @@ def contents_text(found: Contents) -> str:
     if found.first is not None and found.last is not None:
         begin = datetime.fromtimestamp(found.first // 1_000_000_000, UTC)
         rows.append(("time", f"{clock((found.last - found.first) * 1e-9)} from {begin:%Y-%m-%d %H:%M:%S} UTC"))
-    rows.append(("frames", f"{found.frames}" if found.frames else "none"))
+    back = f", {found.back} of them earlier than others before them" if found.back else ""
+    rows.append(("frames", f"{found.frames}{back}" if found.frames else "none"))
     messages = {f"/can/{name}" for name in recorded_messages(found.log)}
     rows += [(topic.strip("/"), f"{count} rows") for topic, count in found.topics.items() if topic not in messages]
     if messages:

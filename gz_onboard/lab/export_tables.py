@@ -12,14 +12,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus import logs, tables
-from gz_onboard.bus.signals import Decoded, Decoder
+from gz_onboard.bus.replay import log_section
+from gz_onboard.bus.signals import Decoded, Decoder, Values
 from gz_onboard.errors import InputError, nearest
 from gz_onboard.events import Frame
 from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, WHY_TOPIC, table_columns
-from gz_onboard.vehicle import OWN, read_vehicle
+from gz_onboard.offline.table import Columns, array_of
+from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
+    from numpy.typing import NDArray
 
 ESTIMATES = {"estimate": ESTIMATE_TOPIC, "why": WHY_TOPIC, "range_change": CHANGE_TOPIC}
 """The topics that a folder of tables has beside the messages, by the name of the table."""
@@ -43,11 +46,15 @@ class Source:
     columns: Sequence[str] | None = None
     damages: list[logs.LogDamage] = field(default_factory=list)
 
-    def frames(self, section: tuple[int | None, int | None]) -> Iterator[list[Frame]] | None:
-        """The frames in a part [ns since the epoch]; None if there are none."""
+    def frames(self) -> tuple[tuple[int | None, int | None], Iterator[list[Frame]]]:
+        """(the part that is wanted [ns since the epoch], its frames); InputError if there are none."""
+        section = log_section(self.log, self.start, self.end)
         batches = logs.read_frames(self.log, *section, self.damages.append)
-        first = next(batches, None)
-        return None if first is None else chain([first], batches)
+        if (first := next(batches, None)) is not None:
+            return section, chain([first], batches)
+        where = "this log" if section == (None, None) else "the chosen part"
+        why = "".join(f"; damaged at {damage.place}: {damage.reason}" for damage in self.damages)
+        raise InputError(f"{self.log}: no frames in {where}{why}")
 
     def rows(self, topic: str) -> list[tuple[int, dict[str, Any]]]:
         """(time [ns], values) of the samples of a topic, in the part that is wanted."""
@@ -71,7 +78,7 @@ def chosen(source: Source, known: Iterable[str]) -> set[str]:
     if source.columns is None:
         return set(names)
     if not source.columns:
-        raise InputError(f"--columns: names none; there are {', '.join(names[:_SHOWN]) or 'none'}")
+        raise InputError(f"columns: names none; there are {', '.join(names[:_SHOWN]) or 'none'}")
     plain = [*names, *(name.partition("[")[0] for name in names)]
     for name in source.columns:
         if name not in plain:
@@ -118,6 +125,11 @@ def write_estimates(source: Source, files: Mapping[str, Path]) -> int:
     return len(estimates)
 
 
+def holds_frames(log: Path) -> bool:
+    """Whether a log holds a frame; of one in another format than ours it is taken for granted."""
+    return logs.log_suffix(log) != ".mcap" or next(logs.read_frames(log, on_damage=lambda _: None), None) is not None
+
+
 def _other(log: Path) -> str:
     if next(logs.read_frames(log, on_damage=lambda _: None), None) is not None:
         return f"; it holds frames, of which `gz-onboard estimate {log.name}` makes them"
@@ -154,19 +166,64 @@ def _signal_columns(log: Path, message: str) -> dict[str, str]:
     return {name: name if name.endswith("]") else column for name, column in columns.items()}
 
 
-def write_signals(
-    source: Source, out: Path, suffix: str, columns: Mapping[str, Mapping[str, str]], decoded: Iterable[Decoded]
-) -> int:
-    """Signals as one long table, or a table for each message in the folder `out`; gives the number of frames.
-
-    suffix: of `out`; of a folder, that of its tables with a slash before. columns: the units by column, by message.
+@dataclass(frozen=True)
+class LogSignals:
+    """The signals of a log, those that are wanted. columns: the units by column, by message; decoded: as they come;
+    decoder: that counts what it cannot decode, None if they stand decoded in the log, once a second.
     """
-    if suffix not in _FORMATS:
-        raise InputError(f"{source.log}: its signals can be written into .csv, .parquet, .jsonl, .mcap or a directory")
+
+    columns: Mapping[str, Mapping[str, str]]
+    decoded: Iterable[Decoded]
+    decoder: Decoder | None
+
+
+def signals_of(source: Source, files: list[Path] | None, vehicle: Vehicle | None) -> LogSignals:
+    """The signals of `source`, decoded as of `decoder_of` where it has frames. InputError if there are none."""
+    decoded: Iterable[Decoded]
+    columns: Mapping[str, Mapping[str, str]]
+    if not holds_frames(source.log) and recorded_messages(source.log):
+        decoder, (columns, decoded) = None, recorded_signals(source)
+    else:
+        _, batches = source.frames()
+        decoder = decoder_of(source.log, files, vehicle)
+        columns, decoded = decoder.columns, decoder.decode(batches)
     wanted = chosen(source, (column for of in columns.values() for column in of))
     kept = {message: {c: unit for c, unit in of.items() if c in wanted} for message, of in columns.items()}
     if source.columns is not None:
         decoded = ((t, m, {c: v for c, v in values.items() if c in wanted}) for t, m, values in decoded if kept[m])
+    return LogSignals(kept, decoded, decoder)
+
+
+class KeptSignals:
+    """A table of each message, in memory."""
+
+    def __init__(self) -> None:
+        self._parts: dict[str, tuple[list[int], dict[str, list[NDArray[Any]]]]] = {}
+
+    def write(self, message: str, times: list[int], rows: list[Values]) -> None:
+        """As of `tables.Sink`."""
+        known, parts = self._parts.setdefault(message, ([], {name: [] for name in rows[0]}))
+        known += times
+        for name, arrays in parts.items():
+            arrays.append(array_of([row[name] for row in rows]))
+
+    def messages(self) -> dict[str, tuple[list[int], Columns]]:
+        """By message times [ns since the epoch] and columns."""
+        import numpy as np
+
+        return {
+            message: (times, {name: np.concatenate(arrays) for name, arrays in parts.items()})
+            for message, (times, parts) in self._parts.items()
+        }
+
+
+def write_signals(source: Source, out: Path, suffix: str, signals: LogSignals) -> int:
+    """Signals as one long table, or a table for each message in the folder `out`; gives the number of frames.
+
+    suffix: of `out`; of a folder, that of its tables with a slash before.
+    """
+    if suffix not in _FORMATS:
+        raise InputError(f"{source.log}: its signals can be written into .csv, .parquet, .jsonl, .mcap or a directory")
     with ExitStack() as stack:
         sink: tables.Sink
         if suffix == ".parquet":
@@ -177,19 +234,23 @@ def write_signals(
             sink = tables.JsonLong(stack.enter_context(tables.open_text(out)))
         else:
             out.mkdir(parents=True, exist_ok=True)
-            sink = _FOLDERS[suffix](out, kept, stack)
-        return tables.write_signals(decoded, sink)
+            sink = _FOLDERS[suffix](out, signals.columns, stack)
+        return tables.write_signals(signals.decoded, sink)
 
 
-def decoder_of(log: Path, files: list[Path] | None, vehicle: str | None) -> Decoder:
+class DecoderError(InputError):
+    """A log that does not say what decodes it."""
+
+
+def decoder_of(log: Path, files: list[Path] | None, vehicle: Vehicle | None) -> Decoder:
     """What decodes the frames of `log`: DBC files; else those of a vehicle; else those attached to the log; else those
-    of the vehicle that the log names, if it is one of the package's own. InputError if none is known.
+    of the vehicle that the log names, if it is one of the package's own. `DecoderError` if none is known.
     """
-    requests = read_vehicle(vehicle).mapping.requests if vehicle else ()
+    requests = vehicle.mapping.requests if vehicle else ()
     return Decoder(_database(log, files, vehicle), requests)
 
 
-def _database(log: Path, files: list[Path] | None, vehicle: str | None) -> Database:
+def _database(log: Path, files: list[Path] | None, vehicle: Vehicle | None) -> Database:
     from gz_onboard.bus.dbc import database_of, load_database
 
     if files:
@@ -200,24 +261,20 @@ def _database(log: Path, files: list[Path] | None, vehicle: str | None) -> Datab
     named = logs.read_metadata(log).get("vehicle", "")
     for own in () if attached else sorted(file.stem for file in OWN.glob("*.toml")):
         if named in (own, read_vehicle(own).name):
-            return _database_of(own)
+            return _database_of(read_vehicle(own))
     if not attached:
-        raise InputError(
-            f"{log}: no DBC file is attached to this log; say what to decode it by, with --vehicle NAME|TOML or "
-            "--dbc FILE"
-        )
+        raise DecoderError(f"{log}: no DBC file is attached to this log; a vehicle or DBC files must decode it")
     texts = [(Path(f"{log}, attached {name}"), data.decode("utf-8", "replace")) for name, data in attached.items()]
     try:
         return database_of(texts, {})
     except InputError as error:
-        raise InputError(f"{error}; give the right one with --dbc FILE") from error
+        raise DecoderError(f"{error}; a vehicle or DBC files must decode it") from error
 
 
-def _database_of(name: str) -> Database:
+def _database_of(vehicle: Vehicle) -> Database:
     """Of the vehicle's bus, its own range frames beside."""
     from gz_onboard.bus.dbc import load_database
 
-    vehicle = read_vehicle(name)
     if not vehicle.mapping.reads_frames:
         raise vehicle.error("dbc is missing: without it no frame can be decoded")
     return load_database([*vehicle.mapping.dbc_files, vehicle.range_dbc], {})

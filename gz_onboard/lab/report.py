@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, writing
 from gz_onboard.lab.estimate import expected_frames
 from gz_onboard.lab.estimate_ride import known_vehicle
 from gz_onboard.lab.report_page import cells, contents, section
 from gz_onboard.lab.report_ride import ReportedRide, ReportTask, read_report
 from gz_onboard.lab.report_style import page
+from gz_onboard.offline.digest import distinct_logs
 from gz_onboard.offline.processes import collect, over_rides
 from gz_onboard.offline.samples import ride_name
 from gz_onboard.options import add_shared
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard report``: `OK` if every log is in the page, else `BAD_INPUT`."""
-    logs = list(dict.fromkeys(logs_among(arguments.logs)))
+    logs = distinct_logs(arguments.logs)
     out = arguments.output or Path(f"{ride_name(logs[0]) if len(logs) == 1 else 'rides'}.html")
     not_an_input([out], [*logs, *filter(None, [arguments.route]), find_vehicle(arguments.vehicle)])
     check_page(out)

@@ -90,6 +90,7 @@ def leap_text(when: float, leap: float) -> str:
     by = abs(leap)
     years, days = by / (365.25 * 86_400), by / 86_400
     told = f"{years:.1f} years" if years >= 1 else f"{days:.0f} days" if days >= 2 else clock(by)
+    told = told if by >= 9.5 else f"{by:.1f} s"
     way = "ahead" if leap > 0 else "back"
     return f"the log's clock leaps {way} by {told} after {clock(when)}: taken as set then, and the ride goes on"
 

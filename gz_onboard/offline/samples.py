@@ -11,9 +11,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
-from gz_onboard.bus.codec import BACK_NS, LONGEST_PAUSE_NS, Codec
+from gz_onboard.bus.codec import BACK_NS, LONGEST_PAUSE_NS, TIME, Codec
 from gz_onboard.bus.logs import LogDamage, is_table, log_stem, read_frames
 from gz_onboard.bus.mapping import BusMapping
+from gz_onboard.bus.stamps import without_lone
 from gz_onboard.errors import InputError, brief, nearest, shown
 from gz_onboard.events import INSTRUMENTS, ROLES, Event, Frame
 from gz_onboard.offline.arguments import check, within
@@ -24,6 +25,7 @@ from gz_onboard.vehicle import Vehicle
 if TYPE_CHECKING:
     from gz_onboard.arrays import Array
 
+_MOST_BACK = 3  # times a clock may be set back; more, and more often than once a second, is none that was set
 NUMBERS = {
     "rider_mass_kg": (0.0, MOST_PAYLOAD, "kg"),  # and luggage
     "total_mass_kg": (1.0, 100_000.0, "kg"),  # of vehicle, rider and luggage
@@ -117,7 +119,7 @@ def read_roles(
     codec, frames = source
     found: dict[str, tuple[list[float], list[float]]] = {}
     slots = [[found.setdefault(role, ([], [])) for role in group.roles] for group in codec.groups]
-    for batch in frames:
+    for batch, count in without_lone(frames, codec.odd):
         for event in codec.decode(batch):
             time, group, values = event
             for (times, column), value in zip(slots[group], values, strict=True):
@@ -127,18 +129,31 @@ def read_roles(
             if observe:
                 observe(event)
         if progress:
-            progress(len(batch))
-    if not codec.latest:
-        raise of_another(log, vehicle, codec)
+            progress(count)
+    check_ridden(log, vehicle, codec)
     return {role: (np.array(t), np.array(v)) for role, (t, v) in found.items() if len(t) > 1}
 
 
-def of_another(log: Path, vehicle: Vehicle, codec: Codec) -> InputError:
+def check_ridden(log: Path, vehicle: Vehicle, codec: Codec) -> None:
+    """InputError if none of the frames in a log is the vehicle's, or their times make no ride; codec: has seen all."""
+    if not codec.latest:
+        raise _of_another(log, vehicle, codec)
+    if codec.received > 1 and not codec.passed and not codec.leaps and not codec.faults.get(("", TIME)):
+        raise InputError(f"{log}: all its {codec.received} frames have one and the same time; they tell no ride")
+    back = sum(leap < 0 for _, leap in codec.leaps)
+    if back > _MOST_BACK and back > codec.passed:
+        raise InputError(
+            f"{log}: its time runs back again and again, at least {back} times within {max(codec.passed, 0.0):.0f} s; "
+            "sort its frames by time, or record it again"
+        )
+
+
+def _of_another(log: Path, vehicle: Vehicle, codec: Codec) -> InputError:
     """That none of the frames in a log is the vehicle's; codec: that has seen them."""
     names = ", ".join(f"{identifier & 0x1FFFFFFF:X}" for identifier in sorted(codec.unknown)[:5])
     return InputError(
         f"{log}: vehicle {vehicle.name!r} knows none of its {codec.received} frames"
-        f"{f' (identifiers {names}, ...)' if names else ''}; give the vehicle that it is of, by --vehicle or its file"
+        f"{f' (identifiers {names}, ...)' if names else ''}; give the vehicle that it is of"
     )
 
 

@@ -31,14 +31,10 @@ def restamped(index: int, offset_s: float) -> list[Frame]:
     return frames
 
 
-@pytest.mark.parametrize(
-    ("live", "offset"),
-    [
-        *((live, offset) for live in (False, True) for offset in (-1e9, -3600.0, -10.0, -0.2, 3600.0, 1e9)),
-        (True, 31.0),
-        (False, 31.0),
-    ],
-)
+ODD = [(live, offset) for live in (False, True) for offset in (-1e9, -3600.0, -10.0, -0.2, 31.0, 3600.0, 1e9)]
+
+
+@pytest.mark.parametrize(("live", "offset"), [*ODD, (False, 2.0), (False, 9.0), (False, 29.0)])
 def test_one_odd_time_stamp_is_dropped(live: bool, offset: float):
     frames = restamped(30_000, offset)
     if live:
@@ -51,9 +47,9 @@ def test_one_odd_time_stamp_is_dropped(live: bool, offset: float):
     assert len(run.estimates) == pytest.approx(len(unspoilt().estimates), abs=10)
 
 
-@pytest.mark.parametrize("offset", [2.0, 10.0, 29.0])
+@pytest.mark.parametrize("offset", [2.0, 29.0])
 def test_one_time_stamp_a_little_ahead_does_no_harm(offset: float):
-    """It cannot be told from a gap before its successors have come, so that much of the timeline is skipped."""
+    """Live it cannot be told from a gap before its successors have come, so that much of the timeline is skipped."""
     frames = restamped(30_000, offset)
     run = received((right[0], frame) for right, frame in zip(ride(), frames, strict=True))
     check_sound(run)

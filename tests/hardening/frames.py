@@ -253,6 +253,13 @@ def offline(watch: Watch, frames: Iterator[tuple[int, Frame]]) -> None:
             yield portion
             watch.check()
 
+    codec, odd = watch.run.pipeline.codec, watch.run.pipeline.codec.odd
+
+    def told(frames: Sequence[Frame]) -> None:
+        odd(frames)
+        watch.second.odd(frames)
+
+    codec.odd = told  # type: ignore[method-assign]
     feed(watch.run.pipeline, checked())
     watch.check()
 

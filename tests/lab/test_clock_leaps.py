@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from gz_onboard import cli
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.writers import write_blf
+from gz_onboard.errors import InputError
 from gz_onboard.lab.vehicle.check import check_log, check_text
 from gz_onboard.offline.samples import read_samples
 from gz_onboard.vehicle import read_vehicle
@@ -69,6 +71,51 @@ def test_a_pause_is_not_counted_as_ridden(tmp_path, capsys):
     checked = check_log(log, read_vehicle("reference"), quick=True)
     assert checked.duration_s == pytest.approx(SECONDS, abs=2)
     assert max(role.share for role in checked.roles) > 0.9
+
+
+def restamped(file: Path, time_of: Callable[[int, int], int]) -> Path:
+    """The ride with the time [ns] that `time_of` makes of each frame's number and time since the beginning."""
+    frames = [frame for batch in read_frames(LOGS / "coastdown.blf") for frame in batch]
+    first = frames[0][0]
+    with file.open("wb") as stream:
+        changed = [(first + time_of(n, t - first), i, data, channel) for n, (t, i, data, channel) in enumerate(frames)]
+        write_blf(stream, [changed])
+    return file
+
+
+@pytest.mark.parametrize(
+    ("time_of", "said"),
+    [
+        (lambda _, time: 60_300_000_000 - time, "its time runs back again and again, at least 100 times within 0 s"),
+        (lambda _, time: 0, "all its 32721 frames have one and the same time"),
+    ],
+)
+def test_times_that_make_no_ride_are_refused(tmp_path, capsys, time_of, said):
+    log = restamped(tmp_path / "ride.blf", time_of)
+    with pytest.raises(InputError, match=said):
+        read_samples(log, read_vehicle("reference"))
+    assert cli.main(["estimate", str(log), "--no-plot", "--quiet", "--output", str(tmp_path)]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "ride.estimate.mcap").exists()
+
+
+def test_what_a_log_holds_says_that_its_time_runs_back(tmp_path, capsys):
+    log = restamped(tmp_path / "ride.blf", lambda n, time: time if n < 16_000 else 90_000_000_000 - time)
+    assert cli.main(["export", str(log)]) == 0
+    said = capsys.readouterr().out
+    assert re.search(r"^  time +1 min 00 s from 2025-06-15 15:06:40 UTC$", said, re.M)
+    assert re.search(r"^  frames +32721, 16\d\d\d of them earlier than others before them$", said, re.M)
+
+
+def test_single_frames_ahead_of_all_others_do_not_move_time(tmp_path, capsys):
+    log = restamped(tmp_path / "ride.blf", lambda n, time: time + 9_000_000_000 * (n % 500 == 250))
+    ride, _ = estimated(log, capsys)
+    assert ride["duration_s"] == pytest.approx(SECONDS, abs=1)
+    assert ride["distance_km"] == pytest.approx(METRES / 1e3, rel=0.02)
+    assert (ride["clock"], ride["gaps_s"], ride["paused_s"], ride["dropped"]) == ([], 0, 0, 65)
+    samples = read_samples(log, read_vehicle("reference"))
+    assert max(times[-1] for times, _ in samples.columns.values()) == pytest.approx(SECONDS, abs=1)
+    assert all((times[1:] >= times[:-1]).all() for times, _ in samples.columns.values())
 
 
 def test_the_other_tools_read_such_a_log(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from math import inf, nan
 from pathlib import Path
 
@@ -11,6 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import gz_onboard as gz
+from gz_onboard.bus.logs import read_frames
+from gz_onboard.bus.writers import write_candump
 from gz_onboard.cli import main
 from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.lab.report_ride import path_of
@@ -122,6 +126,29 @@ def test_several_rides_are_one_page_and_one_that_cannot_be_used_stops_no_other(t
     assert main(["report", rides[0], "--quiet"]) == 0
     section = re.findall(r"<section.*?</section>", Path("coastdown.html").read_text(), re.DOTALL)
     assert section[0] in text  # the same log, the same bytes
+
+
+def test_a_log_of_several_names_is_one_ride_and_that_is_said(tmp_path, monkeypatch, caplog, capsys):
+    monkeypatch.chdir(tmp_path)
+    frames = next(read_frames(LOGS / "coastdown.blf"))
+    for name, part in (("one.log", frames[:-1]), ("other.log", frames[1:])):
+        with Path(name).open("w") as stream:
+            write_candump(stream, [part])
+    shutil.copy("one.log", "copy.log")
+    Path("link.log").symlink_to("one.log")
+    given = ["one.log", "one.log", "copy.log", "link.log", str(tmp_path / "one.log"), "other.log"]
+    said = [
+        "one.log: is given twice; it counts once",
+        "copy.log: is the same log as one.log; it counts once",
+        "link.log: is the same log as one.log; it counts once",
+        f"{tmp_path}/one.log: is the same log as one.log; it counts once",
+    ]
+    assert main(["report", *given, "--quiet", "--jobs", "1"]) == 0
+    assert "<h1>2 rides</h1>" in Path("rides.html").read_text()
+    assert caplog.messages == said
+    caplog.clear()
+    assert [ride.name for ride in gz.report(given).rides] == ["one", "other"]
+    assert caplog.messages == said
 
 
 @pytest.mark.parametrize(("lines", "titles"), [(2, []), (400, ["Speed"])])

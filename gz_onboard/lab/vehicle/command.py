@@ -7,13 +7,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from gz_onboard.bus.logs import logs_among
 from gz_onboard.errors import BAD_INPUT, FAILED, OK, InputError, not_an_input, writing
 from gz_onboard.lab.vehicle import new
 from gz_onboard.lab.vehicle.check import CHECK_VERSION, Checked, check_log, check_text
 from gz_onboard.lab.vehicle.features import features_of, features_text
 from gz_onboard.lab.vehicle.finding import Looks
 from gz_onboard.lab.vehicle.maps import WARM, efficiency_maps, fit_of
+from gz_onboard.offline.digest import distinct_logs
 from gz_onboard.offline.results import Failure, explain_keys, write_json
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.offline.style import save
@@ -80,10 +80,10 @@ def draw_vehicle(arguments: argparse.Namespace) -> int:
 
 def check_vehicle(arguments: argparse.Namespace) -> int:
     """``gz-onboard vehicle check``: `FAILED` if anything looks wrong, `BAD_INPUT` if a log cannot be used."""
-    if Path(arguments.vehicle).suffix.lower() in LOG_SUFFIXES:
-        raise InputError(f"{arguments.vehicle}: is a log; the vehicle comes first, by name or file, then its logs")
+    if what := _no_vehicle(Path(arguments.vehicle)):
+        raise InputError(f"{arguments.vehicle}: is {what}; the vehicle comes first, by name or file, then its logs")
     vehicle = read_vehicle(arguments.vehicle)
-    logs = list(dict.fromkeys(logs_among(arguments.logs))) if arguments.logs else []
+    logs = distinct_logs(arguments.logs)
     not_an_input([arguments.json], [*logs, find_vehicle(arguments.vehicle)])
     spoken = arguments.json != "-"
     if not logs and spoken:
@@ -95,6 +95,13 @@ def check_vehicle(arguments: argparse.Namespace) -> int:
     if failed:
         return BAD_INPUT
     return FAILED if any(ride.those(Looks.WRONG) for ride in checked) else OK
+
+
+def _no_vehicle(given: Path) -> str | None:
+    """What stands in the vehicle's place, if that is a log, or a folder in which there is no vehicle file."""
+    if given.name.lower().removesuffix(".gz").endswith(LOG_SUFFIXES):
+        return "a log"
+    return "a folder" if given.is_dir() and not any(given.glob("*.toml")) else None
 
 
 def check_logs(

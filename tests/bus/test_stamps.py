@@ -1,0 +1,87 @@
+"""A few frames of a log that are stamped ahead of all others do not move time; a gap is a gap."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import chain
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gz_onboard.bus.codec import CONFIRM
+from gz_onboard.bus.stamps import without_lone
+from gz_onboard.events import Frame
+from tests.support import EPOCH, MS, S
+
+
+def stamped(times: Sequence[int]) -> list[Frame]:
+    """A frame for each time [ms]."""
+    return [(EPOCH + time * MS, 0x100, bytes([number % 256]), 0) for number, time in enumerate(times)]
+
+
+def told_apart(frames: list[Frame], size: int = 1000) -> tuple[list[Frame], list[Frame]]:
+    """(those kept, those that are odd) of frames in batches of `size`."""
+    odd: list[Frame] = []
+    batches = [frames[i : i + size] for i in range(0, len(frames), size)]
+    found = list(without_lone(batches, odd.extend))
+    assert sum(count for _, count in found) == len(frames)
+    return list(chain.from_iterable(kept for kept, _ in found)), odd
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    places=st.sets(st.integers(1, 58)),
+    ahead=st.integers(700, 29_900),
+    in_row=st.integers(1, CONFIRM - 1),
+    size=st.integers(1, 70),
+)
+def test_lone_frames_are_odd_wherever_they_are(places, ahead, in_row, size):
+    frames = stamped([10 * i for i in range(100)])
+    apart = sorted(place for place in places if place % 4 == 0)
+    wrong = [(EPOCH + (10 * i + ahead) * MS, 0x200, bytes([k]), 1) for i in apart for k in range(in_row)]
+    mixed = list(frames)
+    for number, place in reversed(list(enumerate(apart))):
+        mixed[place:place] = wrong[number * in_row : (number + 1) * in_row]
+    assert told_apart(mixed, size) == (frames, wrong)
+
+
+@given(
+    gaps=st.lists(st.tuples(st.integers(501, 200_000), st.integers(CONFIRM, 30)), max_size=8), size=st.integers(1, 40)
+)
+def test_a_gap_loses_nothing(gaps, size):
+    times = list(range(0, 300, 10))
+    for gap, count in gaps:
+        times += [times[-1] + gap + 10 * i for i in range(count)]
+    frames = stamped(times)
+    assert told_apart(frames, size) == (frames, [])
+
+
+@given(times=st.lists(st.integers(0, 60_000), min_size=1, max_size=19), size=st.integers(1, 20))
+def test_where_frames_are_few_none_is_odd(times, size):
+    frames = stamped(sorted(times))
+    assert told_apart(frames, size) == (frames, [])
+
+
+@given(times=st.lists(st.integers(-(10**12), 10**12), max_size=60), size=st.integers(1, 60))
+def test_whatever_the_times_each_frame_is_kept_in_its_order_or_odd(times, size):
+    frames = stamped(times)
+    kept, odd = told_apart(frames, size)
+    numbers = {id(frame): number for number, frame in enumerate(frames)}
+    for some in kept, odd:
+        assert [numbers[id(frame)] for frame in some] == sorted(numbers[id(frame)] for frame in some)
+    assert sorted(numbers[id(frame)] for frame in kept + odd) == list(range(len(frames)))
+
+
+@pytest.mark.parametrize(("last", "odd"), [(9000, 1), (400, 0)])
+def test_a_log_that_comes_all_the_time_does_not_end_in_one_frame_after_a_gap(last, odd):
+    frames = stamped([*range(0, 1000, 10), 990 + last])
+    kept, left_out = told_apart(frames)
+    assert (kept, left_out) == (frames[: len(frames) - odd], frames[len(frames) - odd :])
+
+
+def test_frames_of_two_channels_may_overtake_each_other():
+    frames = stamped([t - 40 * (i % 3 == 2) for i, t in enumerate(range(0, 3000, 15))])
+    assert told_apart(frames) == (frames, [])
+    after = [(time + 9 * S, identifier, data, channel) for time, identifier, data, channel in frames]
+    assert told_apart([*frames, *after]) == ([*frames, *after], [])
