@@ -12,11 +12,11 @@ VALIDATED := $(addprefix replay_logs/,calibration/ride_000.blf turning/city_11C.
 MAPPED := $(addprefix replay_logs/,calibration/motor_dyno.csv.gz calibration/ride_000.blf city_14C.blf)
 DEMO = replay_logs/demo.py "$(RIDE)" --speed $(SPEED) --seconds $(SECONDS)
 
-.PHONY: help setup run test lint format docs man deb bench trial range-benchmark validation hardening clean
+.PHONY: help setup run test lint format docs man deb deb-clean-root bench trial range-benchmark validation hardening clean
 .DEFAULT_GOAL := help
 
 help:  ## this list
-	@sed -n 's/^\([a-z]*\):.*##/\1:/p' $(MAKEFILE_LIST) | awk -F: '{printf "make %-10s%s\n", $$1, $$2}'
+	@sed -n 's/^\([a-z-]*\):.*##/\1:/p' $(MAKEFILE_LIST) | awk -F: '{printf "make %-16s%s\n", $$1, $$2}'
 
 setup: .venv/.ready  ## virtual environment .venv with the pinned dependencies
 
@@ -51,6 +51,11 @@ man: setup  ## the manual page and the completions of bash and zsh, in build/she
 
 deb: setup  ## a Debian package of the daemon for machines like this one, in dist/
 	$(PYTHON_IN_VENV) packaging/debian/build.py dist
+
+deb-clean-root: setup  ## the package's life on a minimal Debian in a guest, from installation to purge (3 minutes)
+	.ci/setup root
+	.ci/setup service
+	GZ_ONBOARD_CLEAN_ROOT=build/clean-root.ext4 $(PYTHON_IN_VENV) -m pytest -n 0 tests/clean_root
 
 .venv/.docs-ready: .venv/.ready .ci/requirements-docs.txt
 	@.ci/setup docs

@@ -39,6 +39,7 @@ def test_everything_it_installs_is_pinned_and_it_does_not_run_as_root():
     installs = [command for command in of("RUN") if "pip install" in command]
     assert len(installs) == 2
     assert all("--require-hashes" in command or "PIP_CONSTRAINT=" in command for command in installs)
+    assert all("PIP_BUILD_CONSTRAINT=" in command for command in installs if "PIP_CONSTRAINT=" in command)
     last_stage = [name for name, _ in STEPS][len(STEPS) - [name for name, _ in reversed(STEPS)].index("FROM") :]
     assert "USER" in last_stage
     assert of("USER") == ["rider"]
