@@ -14,6 +14,7 @@ from itertools import chain, takewhile
 from typing import Any
 
 import pytest
+from websockets.exceptions import InvalidStatus
 
 from gz_onboard import cli
 from gz_onboard.bridges import foxglove as command
@@ -25,8 +26,9 @@ from gz_onboard.location_rows import LOCATION_SCHEMA
 from gz_onboard.log_rows import ESTIMATE_UNITS, TEXTS, declare, estimate_row
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
+from tests.bridges import foxglove_clients
 from tests.bridges.broker import wait_for
-from tests.bridges.foxglove_clients import CLIENTS
+from tests.bridges.foxglove_clients import CLIENTS, FOLDER, documented
 from tests.dashboard.served import Sender
 from tests.dashboard.test_terminal import ESTIMATE, send
 from tests.support import LOGS
@@ -121,6 +123,24 @@ def test_the_estimate_is_that_of_the_log_and_nothing_old(client, monkeypatch):
         gone = next(one.row for one in heard if one.row["soc"] is None)  # the status is stale after a second
         assert gone["soc_sd"] is None
         assert gone["state"] == "UNKNOWN"
+
+
+def test_the_subprotocol_before_the_sdk_is_refused(monkeypatch):
+    """As the documentation says: the reason why the library's own constant is not offered."""
+    monkeypatch.setattr(foxglove_clients, "SUBPROTOCOL", "foxglove.websocket.v1")
+    with (
+        serving("f4", monkeypatch) as address,
+        pytest.raises(InvalidStatus, match="HTTP 400"),
+        documented(address, "/estimate"),
+    ):
+        pass
+
+
+def test_the_library_is_pinned_by_hash_and_by_no_address():
+    lock = json.loads((FOLDER / "package-lock.json").read_text(encoding="utf-8"))
+    packages = [pinned for folder, pinned in lock["packages"].items() if folder]
+    assert packages
+    assert all("integrity" in pinned and "resolved" not in pinned for pinned in packages)
 
 
 def test_a_port_that_is_taken(monkeypatch, capsys):
