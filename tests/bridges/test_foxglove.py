@@ -1,4 +1,4 @@
-"""The live estimate, as a client that speaks Foxglove's documented protocol gets it."""
+"""The live estimate and position, as clients of Foxglove's protocol get them: one written by hand, and its own."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from itertools import chain, takewhile
 from typing import Any
 
 import pytest
-from websockets.sync.client import ClientConnection, connect
+from websockets.exceptions import InvalidStatus
 
 from gz_onboard import cli
 from gz_onboard.bridges import foxglove as command
@@ -26,12 +26,13 @@ from gz_onboard.location_rows import LOCATION_SCHEMA
 from gz_onboard.log_rows import ESTIMATE_UNITS, TEXTS, declare, estimate_row
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
-from tests.bridges.broker import PATIENCE, wait_for
+from tests.bridges import foxglove_clients
+from tests.bridges.broker import wait_for
+from tests.bridges.foxglove_clients import CLIENTS, FOLDER, documented
 from tests.dashboard.served import Sender
 from tests.dashboard.test_terminal import ESTIMATE, send
 from tests.support import LOGS
 
-SUBSCRIPTION = 7
 SECONDS = 5
 GPS_MOTION = 1073
 TRUCK_DBC = """VERSION ""
@@ -47,7 +48,6 @@ identifiers = "j1939"
 [roles]
 {roles}
 """
-_DATA = struct.Struct("<BIQ")  # operation, subscription, log time
 
 
 @contextmanager
@@ -73,23 +73,6 @@ def serving(channel: str, monkeypatch: pytest.MonkeyPatch, *options: str) -> Ite
         thread.join()
 
 
-def advertised(client: ClientConnection) -> list[dict[str, Any]]:
-    while True:
-        told = json.loads(client.recv(PATIENCE))
-        if told["op"] == "advertise":
-            channels: list[dict[str, Any]] = told["channels"]
-            return channels
-
-
-def messages(client: ClientConnection) -> Iterator[tuple[int, dict[str, Any]]]:
-    while True:
-        data = client.recv(PATIENCE)
-        if isinstance(data, bytes):
-            operation, subscription, time_ns = _DATA.unpack_from(data)
-            assert (operation, subscription) == (1, SUBSCRIPTION)
-            yield time_ns, json.loads(data[_DATA.size :])
-
-
 class Kept:
     """A log that keeps what is declared, and the rows of each topic."""
 
@@ -107,28 +90,27 @@ class Kept:
         self.rows.setdefault(topic, []).append(values)
 
 
-def test_the_estimate_is_that_of_the_log_and_nothing_old(monkeypatch):
+@pytest.mark.parametrize("client", CLIENTS)
+def test_the_estimate_is_that_of_the_log_and_nothing_old(client, monkeypatch):
     logged = Kept()
     declare(logged, ())
-    with serving("f1", monkeypatch) as address, connect(address, subprotocols=["foxglove.sdk.v1"]) as client:  # type: ignore[list-item]
-        (channel,) = advertised(client)
+    with serving("f1", monkeypatch) as address, client(address, "/estimate") as (channels, heard):
+        assert channels.keys() == {"/estimate"}
+        channel = channels["/estimate"]
         assert (channel["topic"], channel["encoding"], channel["schemaName"]) == (
             "/estimate",
             "json",
             "gz_onboard.Estimate",
         )
         assert json.loads(channel["schema"]) == logged.of["/estimate"]
-        wanted = [{"id": SUBSCRIPTION, "channelId": channel["id"]}]
-        client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
-        heard = messages(client)
-        _, silent = next(heard)
+        silent = next(heard).row
         assert silent.keys() == {*ESTIMATE_UNITS, *TEXTS}
         assert not any(silent[name] is not None for name in ESTIMATE_UNITS)
         assert silent["state"] == "UNKNOWN"
         there = replace(ESTIMATE, charge_power=500.0, time_to_full=3600.0, range_full=50_000.0)
         with Sender("f1", there):
-            time_ns, row = next(
-                (t, v) for t, v in heard if v["range"] and v["soc"] and v["charge_power"] and v["energy_left"]
+            _, time_ns, row = next(
+                one for one in heard if all(one.row[name] for name in ("range", "soc", "charge_power", "energy_left"))
             )
         assert time_ns > 1e18
         expected = estimate_row(there)
@@ -138,9 +120,27 @@ def test_the_estimate_is_that_of_the_log_and_nothing_old(monkeypatch):
         said = {name for name in ESTIMATE_UNITS if row[name] is not None}
         assert {"range", "range_p10", "range_p90", "soc", "soc_sd", "energy_left", "time_to_full", "range_full"} <= said
         assert {name: row[name] for name in TEXTS} == {name: expected[name] for name in TEXTS}
-        gone = next(v for _, v in heard if v["soc"] is None)  # the status is stale after a second
+        gone = next(one.row for one in heard if one.row["soc"] is None)  # the status is stale after a second
         assert gone["soc_sd"] is None
         assert gone["state"] == "UNKNOWN"
+
+
+def test_the_subprotocol_before_the_sdk_is_refused(monkeypatch):
+    """As the documentation says: the reason why the library's own constant is not offered."""
+    monkeypatch.setattr(foxglove_clients, "SUBPROTOCOL", "foxglove.websocket.v1")
+    with (
+        serving("f4", monkeypatch) as address,
+        pytest.raises(InvalidStatus, match="HTTP 400"),
+        documented(address, "/estimate"),
+    ):
+        pass
+
+
+def test_the_library_is_pinned_by_hash_and_by_no_address():
+    lock = json.loads((FOLDER / "package-lock.json").read_text(encoding="utf-8"))
+    packages = [pinned for folder, pinned in lock["packages"].items() if folder]
+    assert packages
+    assert all("integrity" in pinned and "resolved" not in pinned for pinned in packages)
 
 
 def test_a_port_that_is_taken(monkeypatch, capsys):
@@ -207,7 +207,8 @@ def test_a_vehicle_without_positions(tmp_path, capsys):
     assert "[roles] has no longitude, so there is no position to show; leave --vehicle out" in capsys.readouterr().err
 
 
-def test_positions_live(monkeypatch, ridden):
+@pytest.mark.parametrize("client", CLIENTS)
+def test_positions_live(client, monkeypatch, ridden):
     vehicle = read_vehicle("reference")
     identifiers = LivePositions(vehicle).identifiers or []
     mine = [frame for frame in ridden if frame[1] in identifiers]
@@ -215,19 +216,16 @@ def test_positions_live(monkeypatch, ridden):
     began = time.time()
     with (
         serving("f3", monkeypatch, "--vehicle", "reference") as address,
-        connect(address, subprotocols=["foxglove.sdk.v1"]) as client,  # type: ignore[list-item]
+        client(address, "/location", "/estimate") as (channels, heard),
         can.Bus(interface="virtual", channel="f3") as bus,
     ):
-        (channel,) = [one for one in advertised(client) if one["topic"] == "/location"]
-        assert channel["schemaName"] == "foxglove.LocationFix"
-        assert json.loads(channel["schema"]) == LOCATION_SCHEMA
-        wanted = [{"id": SUBSCRIPTION, "channelId": channel["id"]}]
-        client.send(json.dumps({"op": "subscribe", "subscriptions": wanted}))
+        assert channels["/location"]["schemaName"] == "foxglove.LocationFix"
+        assert json.loads(channels["/location"]["schema"]) == LOCATION_SCHEMA
+        assert next(heard).topic == "/estimate"  # comes each second; so what was asked for before is subscribed to, too
         send(bus, mine[:4])
-        heard = messages(client)
         for start in range(4, 40, 4):
             send(bus, mine[start : start + 4])
-            time_ns, row = next(heard)
+            _, time_ns, row = next(one for one in heard if one.topic == "/location")
             assert (row["latitude"], row["longitude"]) in recorded
             assert began <= row["timestamp"]["sec"] + 1
             assert began <= time_ns * 1e-9 <= time.time() + 1
