@@ -7,12 +7,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from gz_onboard import __version__
+from gz_onboard import __version__, state
 from gz_onboard.bus.completion import is_complete
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import ESTIMATED, read_metadata
 from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.estimate_ride import How, known_vehicle, open_estimate, ride_through
+from gz_onboard.lab.estimate_state import StateAt, text_of
 from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary, kept_summary, summary_of, summary_to_keep
 from gz_onboard.lab.plot import plot_log
 from gz_onboard.offline.digest import digest_of
@@ -29,13 +30,14 @@ _ENDS = (b"IEND\xaeB`\x82", b"</svg>\n", b"%%EOF\n")  # of a picture
 
 @dataclass(frozen=True)
 class EstimateTask(Task):
-    """A log to be estimated; resume: not if it is already, as it would be now."""
+    """A log to be estimated; resume: not if it is already, as it would be now; state: the saved state to go on from."""
 
     filter_name: str = "scalar"
     frames: bool = False
     signals: bool = False
     route: Path | None = None
     resume: bool = False
+    state: StateAt | None = None
 
     @property
     def log(self) -> Path:
@@ -68,11 +70,15 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSu
     with writing(task.log):
         log = _open_log(task, ride.vehicle, ride.start_ns)
         try:
-            ridden = ride_through(ride, How(task.filter_name, task.frames, task.signals, route), log, progress)
+            how = How(task.filter_name, task.frames, task.signals, route, state=task.state)
+            ridden = ride_through(ride, how, log, progress)
+            learned = text_of(ridden.pipeline) if task.state else None
             summary = summary_of(ridden, task.log, task.picture)
             log.note(_RECORD, {**made_of, _SUMMARY: summary_to_keep(summary)})
             log.close()
             task.part.replace(task.log)
+            if task.state and learned:
+                state.write(task.state.file, learned)
         finally:
             log.abandon()
             task.part.unlink(missing_ok=True)
@@ -91,6 +97,7 @@ def _open_log(task: EstimateTask, vehicle: Vehicle, start_ns: int) -> LogFile:
         "filter": task.filter_name,
         **({} if task.payload is None else {"payload_kg": f"{task.payload:g}"}),
         **({} if task.route is None else {"route": task.route.name}),
+        **({} if task.state is None else {"state": task.state.file.name}),
     }
     return LogFile(task.part.open("wb"), start_ns, metadata, dbc_texts(vehicle))
 

@@ -1,0 +1,126 @@
+"""The saved state of the daemon, gone on from by a recorded ride and saved after it.
+
+A daemon that cannot use a state sets it aside and begins anew: nobody is there. Here it is refused, and left as it is.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from gz_onboard import state
+from gz_onboard.errors import InputError, writing
+from gz_onboard.pipeline import Pipeline
+
+SUFFIX = ".json"
+_LATE = 1e11  # s since the epoch: after any state
+
+
+@dataclass(frozen=True)
+class StateAt:
+    """A saved state, and the ride that goes on from it. begin_ns: when that begins [ns since the epoch]; rider: who
+    rides, if that is known.
+    """
+
+    file: Path
+    begin_ns: int
+    rider: str = ""
+
+
+@dataclass(frozen=True)
+class WentOn:
+    """How a ride began: whether there was a saved state to go on from, and its age [s] if that is known."""
+
+    found: bool
+    age: float | None = None
+
+
+def go_on(pipeline: Pipeline, at: StateAt, ride: Path) -> WentOn:
+    """Restore what was saved, as the daemon does when it starts. ride: what errors call it.
+
+    InputError for a state that is damaged, of another vehicle or version, or saved after the ride began.
+    """
+    went_on = WentOn(False)
+    unfinished, *_ = copies = state.copies(at.file)
+    for copy in copies:
+        try:
+            found = state.load(copy, at.begin_ns * 1e-9)
+        except ValueError as error:
+            if copy == unfinished:  # cut off while it was written: the one before it is whole
+                continue
+            raise _refused(copy, error) from error
+        if found is None:
+            continue
+        snapshot, age = found
+        if age is None:
+            _check_before(copy, at.begin_ns * 1e-9, ride)
+        try:
+            pipeline.estimator.restore(snapshot, pipeline.vehicle.key, age)
+        except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
+            raise _refused(copy, error) from error
+        went_on = WentOn(True, age)
+        break
+    if at.rider:
+        pipeline.estimator.ridden_by(at.rider)
+    return went_on
+
+
+def _refused(copy: Path, error: Exception) -> InputError:
+    return InputError(
+        f"{copy}: {str(error) or repr(error)}; give the state of this vehicle, or a new name to begin anew"
+    )
+
+
+def _check_before(copy: Path, begin: float, ride: Path) -> None:
+    """InputError if a state is of after `begin` [s since the epoch]; one of no known time may be of any."""
+    found = state.load(copy, _LATE)
+    if found and found[1] is not None:
+        raise InputError(
+            f"{ride}: began at {when(begin)}, before the state {copy} was saved at {when(_LATE - found[1])}; "
+            "give the rides that came after it, or a new name to begin anew"
+        )
+
+
+def text_of(pipeline: Pipeline) -> bytes | None:
+    """The text of the state file after a ride; None while nothing is known. InputError if it cannot be saved."""
+    snapshot = pipeline.estimator.snapshot(pipeline.vehicle.key)
+    try:
+        return None if snapshot is None else state.encode(snapshot, pipeline.codec.last_ns * 1e-9)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"the state after the ride cannot be saved: {error}") from error
+
+
+@contextmanager
+def held(file: Path) -> Iterator[None]:
+    """Keep the daemon, and others who write states, from the folder of the state `file`, which is made if need be.
+
+    InputError if one of them has it, or if it cannot be.
+    """
+    if file.suffix != SUFFIX:
+        raise InputError(f"state {file}: give it a name that ends in {SUFFIX}")
+    with writing(file):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(
+                f"state {file}: another gz-onboard (run, estimate) saves states in its folder; "
+                "wait for it or stop it, or take a copy to another folder"
+            ) from error
+        except OSError:  # a file system without locks
+            pass
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def when(seconds: float) -> str:
+    """A time [s since the epoch] as it is written."""
+    return datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
