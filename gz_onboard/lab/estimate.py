@@ -18,7 +18,7 @@ from gz_onboard.bus.logs import is_table
 from gz_onboard.constants import HOUR
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, require
 from gz_onboard.events import Reason, words
-from gz_onboard.lab.estimate_log import EstimateTask, estimate_log
+from gz_onboard.lab.estimate_log import EstimateTask, estimate_log, kept_in_turn
 from gz_onboard.lab.estimate_order import Unread, in_order
 from gz_onboard.lab.estimate_ride import known_vehicle, open_estimate
 from gz_onboard.lab.estimate_route import route_text
@@ -83,19 +83,21 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _check_state(arguments: argparse.Namespace) -> None:
     """InputError for what cannot be together with ``--state``."""
-    if arguments.resume:
-        raise InputError("--resume with --state: a state goes on by itself; give the rides that came after it")
     if (arguments.jobs or 1) > 1:
         raise InputError(f"--jobs {arguments.jobs} with --state: each ride goes on from the one before; leave it out")
 
 
 def _in_turn(arguments: argparse.Namespace, tasks: Sequence[EstimateTask]) -> tuple[list[EstimateTask], list[Unread]]:
-    """As `in_order`; InputError if the first ride cannot go on from the state that is there."""
+    """As `in_order`; InputError if the first that is not kept cannot go on from the state."""
     with _frames_bar(arguments, tasks) as display:
         tasks, unread = in_order(tasks, arguments.state, display.update)
-    if tasks and (at := tasks[0].state):
-        vehicle = open_estimate(tasks[0].path, known_vehicle(arguments.vehicle, arguments.payload)).vehicle
-        go_on(Pipeline(vehicle), at, tasks[0].path)
+    if arguments.resume:
+        tasks = kept_in_turn(tasks)
+    *_, last = -1, *(number for number, task in enumerate(tasks) if task.resume)
+    for task in tasks[last + 1 : last + 2]:  # the first that goes on from the state that is there
+        vehicle = open_estimate(task.path, known_vehicle(arguments.vehicle, arguments.payload)).vehicle
+        if task.state:
+            go_on(Pipeline(vehicle), task.state, task.path)
     return tasks, unread
 
 

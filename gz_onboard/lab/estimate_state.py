@@ -8,13 +8,14 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
 from gz_onboard import state
 from gz_onboard.errors import InputError, writing
+from gz_onboard.offline.digest import digest_of
 from gz_onboard.pipeline import Pipeline
 
 SUFFIX = ".json"
@@ -34,10 +35,14 @@ class StateAt:
 
 @dataclass(frozen=True)
 class WentOn:
-    """How a ride began: whether there was a saved state to go on from, and its age [s] if that is known."""
+    """How a ride began: whether there was a saved state to go on from, and its age [s] if that is known.
+
+    digest: of the state's file.
+    """
 
     found: bool
     age: float | None = None
+    digest: str = ""
 
 
 def go_on(pipeline: Pipeline, at: StateAt, ride: Path) -> WentOn:
@@ -45,35 +50,33 @@ def go_on(pipeline: Pipeline, at: StateAt, ride: Path) -> WentOn:
 
     InputError for a state that is damaged, of another vehicle or version, or saved after the ride began.
     """
-    went_on = WentOn(False)
-    unfinished, *_ = copies = state.copies(at.file)
-    for copy in copies:
+    began, begin = WentOn(False), at.begin_ns * 1e-9
+    if copy := latest(at.file):
         try:
-            found = state.load(copy, at.begin_ns * 1e-9)
-        except ValueError as error:
-            if copy == unfinished:  # cut off while it was written: the one before it is whole
-                continue
-            raise _refused(copy, error) from error
-        if found is None:
-            continue
-        snapshot, age = found
-        if age is None:
-            _check_before(copy, at.begin_ns * 1e-9, ride)
-        try:
+            found = state.load(copy, begin)
+            if found is None:
+                raise ValueError("is gone")
+            snapshot, age = found
+            if age is None:
+                _check_before(copy, begin, ride)
             pipeline.estimator.restore(snapshot, pipeline.vehicle.key, age)
         except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
-            raise _refused(copy, error) from error
-        went_on = WentOn(True, age)
-        break
+            raise InputError(
+                f"{copy}: {str(error) or repr(error)}; give the state of this vehicle, or a new name to begin anew"
+            ) from error
+        began = WentOn(True, age, digest_of(copy))
     if at.rider:
         pipeline.estimator.ridden_by(at.rider)
-    return went_on
+    return began
 
 
-def _refused(copy: Path, error: Exception) -> InputError:
-    return InputError(
-        f"{copy}: {str(error) or repr(error)}; give the state of this vehicle, or a new name to begin anew"
-    )
+def latest(file: Path) -> Path | None:
+    """Where the latest state is, of the copies of `file`; None if there is none."""
+    unfinished, *whole = state.copies(file)
+    with suppress(ValueError):  # cut off while it was written: the one before it is whole
+        if state.load(unfinished, _LATE):
+            return unfinished
+    return next((copy for copy in whole if copy.exists()), None)
 
 
 def _check_before(copy: Path, begin: float, ride: Path) -> None:

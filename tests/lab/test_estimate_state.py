@@ -23,13 +23,12 @@ from gz_onboard.bus.writers import write_blf
 from gz_onboard.cli import main
 from gz_onboard.daemon import keeper
 from gz_onboard.daemon.loop import Daemon
-from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.events import Frame
 from gz_onboard.lab.estimate_order import span_of
 from gz_onboard.pipeline import TICK_NS
 from gz_onboard.vehicle import find_vehicle
 from tests.lab.short_logs import short_log
-from tests.support import S, recorded, reference
+from tests.support import S, identifier, recorded, reference
 
 DAY = 86_400 * S
 CUTS = {"a": (0.0, 60.0), "b": (70.0, 130.0), "c": (170.0, 220.0)}  # s of a ride, each a ride of its own
@@ -68,7 +67,7 @@ def kept(rides: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def estimate(out: Path, *rides: Path, options: Sequence[object] = ()) -> int:
     """``gz-onboard estimate`` with its state and its results in `out`."""
-    given = ["--no-plot", "--output", out, "--state", out / "s.json", "--json", out / "rides.json", *options]
+    given = ["--no-plot", "--output", out, "--state", out / "s.json", "--json", out / "said.json", *options]
     return main(["estimate", *map(str, (*rides, *given))])
 
 
@@ -122,7 +121,7 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> None:
 
 
 def test_the_rides_are_in_their_order_and_each_goes_on_from_the_one_before(kept):
-    rides = json.loads((kept / "rides.json").read_text())["rides"]
+    rides = json.loads((kept / "said.json").read_text())["rides"]
     assert [Path(ride["file"]).stem for ride in rides] == ["c", "a", "b"]
     assert [ride["saved_state"] for ride in rides] == ["begun", "gone on", "gone on"]
     ages = [ride["saved_state_age_s"] for ride in rides]
@@ -134,7 +133,7 @@ def test_the_rides_are_in_their_order_and_each_goes_on_from_the_one_before(kept)
 
 def test_what_was_learned_carries_over(kept, rides, tmp_path):
     alone = gz.estimate(rides / "b.blf", state=tmp_path / "alone.json").summary
-    last = json.loads((kept / "rides.json").read_text())["rides"][-1]
+    last = json.loads((kept / "said.json").read_text())["rides"][-1]
     assert alone.saved_state == "begun"
     assert last["soc_start_sd"] < alone.soc_start_sd
     by_one, by_all = (gz.read_learned(file).riders[""] for file in (tmp_path / "alone.json", kept / "s.json"))
@@ -158,17 +157,17 @@ def test_it_is_as_of_a_daemon_that_is_restarted(kept, cuts, tmp_path, monkeypatc
 
 def test_from_python_it_is_the_same(kept, rides, tmp_path):
     file = tmp_path / "s.json"
-    found = [gz.estimate(rides / f"{name}.blf", state=file).summary for name in "cab"]
+    shutil.copy(kept / "s.previous.json", file)
+    found = gz.estimate(rides / "b.blf", state=file).summary
     assert file.read_bytes() == (kept / "s.json").read_bytes()
-    assert (tmp_path / "s.previous.json").read_bytes() == (kept / "s.previous.json").read_bytes()
-    told = json.loads((kept / "rides.json").read_text())["rides"]
-    assert [ride.range_end_km for ride in found] == [ride["range_end_km"] for ride in told]
-    with pytest.raises(gz.InputError, match=r"a\.blf: began at .*, before the state .*s\.json was saved at"):
-        gz.estimate(rides / "a.blf", state=file)
+    told = json.loads((kept / "said.json").read_text())["rides"][-1]
+    assert (found.range_end_km, found.saved_state_age_s) == (told["range_end_km"], told["saved_state_age_s"])
+    with pytest.raises(gz.InputError, match=r"b\.blf: began at .*, before the state .*s\.json was saved at"):
+        gz.estimate(rides / "b.blf", state=file)
 
 
 def test_a_table_of_signals_goes_on_too(tmp_path):
-    seconds = np.arange(0, 120, 0.5)
+    seconds = np.arange(0, 60, 0.5)
     columns = {"pack_voltage [V]": 52 - 1e-4 * seconds, "pack_current [A]": 14 + np.sin(seconds), "speed [km/h]": 36.0}
 
     def table(begin: float) -> dict[str, Any]:
@@ -191,15 +190,19 @@ def test_a_table_of_signals_goes_on_too(tmp_path):
 
 
 def test_what_was_restored_is_as_old_as_the_first_voltage_finds_it(kept, cuts, tmp_path, monkeypatch):
-    """A battery management that wakes long after the others: SOC is known that much worse."""
-    late = [f for f in cuts["c"] if f[0] - cuts["c"][0][0] > 20 * S or f[1] not in (0x200, 0x201)]
-    waited: list[float] = []
-    monkeypatch.setattr(Estimator, "wait", lambda _, seconds: waited.append(seconds))
+    """A ride five seconds after the last, whose pack and inverter wake twenty seconds after the others."""
+    begin = cuts["b"][-1][0] + 5 * S
+    silent = [identifier("BMS_Pack"), identifier("INV_Power")]
+    moved = [(begin + t - cuts["c"][0][0], *rest) for t, *rest in cuts["c"]]
+    late: list[Frame] = [f for f in moved if f[0] > begin + 20 * S or f[1] not in silent]
     with (tmp_path / "late.blf").open("wb") as stream:
         write_blf(stream, [late])
-    shutil.copy(kept / "s.previous.json", tmp_path / "s.json")
+    (tmp_path / "daemon").mkdir()
+    for file in (tmp_path / "s.json", tmp_path / "daemon" / "s.json"):
+        shutil.copy(kept / "s.previous.json", file)
     assert estimate(tmp_path, tmp_path / "late.blf") == 0
-    assert sum(waited) == pytest.approx(50, abs=0.2)
+    by_the_daemon(late, tmp_path / "daemon" / "s.json", monkeypatch)
+    same(snapshot(tmp_path / "s.json"), snapshot(tmp_path / "daemon" / "s.json"))
 
 
 def test_who_rides_is_as_written_beside_the_logs(tmp_path):
@@ -281,10 +284,42 @@ def test_a_state_that_cannot_be_used_is_left_as_it_is(short, tmp_path, capsys):
     assert not (out / "s.new").exists()
 
 
-def test_a_log_that_is_no_ride_does_not_stop_the_others(kept, rides, tmp_path, capsys):
+# --- resumed -----------------------------------------------------------------------------------------------------
+
+
+def resumed(out: Path, *rides: Path) -> list[bool]:
+    """Which rides are kept from an earlier run."""
+    assert estimate(out, *rides, options=["--resume"]) == 0
+    return [ride["cpu_s"] == 0 for ride in json.loads((out / "said.json").read_text())["rides"]]
+
+
+def test_a_run_that_was_interrupted_goes_on(kept, rides, tmp_path, capsys):
+    shutil.copytree(kept, out := tmp_path / "out")
+    before, after = (kept / "s.previous.json").read_bytes(), (kept / "s.json").read_bytes()
+    assert resumed(out, rides) == [True, True, True]
+    assert (out / "s.json").read_bytes() == after
+    (out / "s.json").write_bytes(before)  # of the last ride the log was written, the state was not
+    assert resumed(out, rides) == [True, True, False]
+    assert (out / "s.json").read_bytes() == after
+    (out / "s.json").write_bytes(state.encode({**snapshot(out / "s.json"), "cell_temperature": 20.0}, 2e9))
+    capsys.readouterr()
+    assert "before the state" in refused(out, capsys, rides, options=["--resume"])
+
+
+def test_a_month_later_only_the_new_ride_is_estimated(kept, rides, cuts, tmp_path, capsys):
+    """With them are the log of something else and one that is damaged, which fail every time and stop no other."""
     for name in "ca":
         shutil.copy(rides / f"{name}.blf", tmp_path)
     (tmp_path / "bad.blf").write_bytes(b"no log")
+    begin = cuts["a"][0][0] + DAY // 2
+    with (tmp_path / "other.blf").open("wb") as stream:
+        write_blf(stream, [[(begin + i * S, 0x7F, b"x", 0) for i in range(9)]])
     assert estimate(tmp_path, tmp_path) == 2
-    assert "bad.blf" in capsys.readouterr().err
+    assert "knows none of its 9 frames" in capsys.readouterr().err
     assert (tmp_path / "s.json").read_bytes() == (kept / "s.previous.json").read_bytes()
+    shutil.copy(rides / "b.blf", tmp_path)
+    assert estimate(tmp_path, tmp_path, options=["--resume"]) == 2
+    said = json.loads((tmp_path / "said.json").read_text())
+    assert [ride["cpu_s"] == 0 for ride in said["rides"]] == [True, True, False]
+    assert [Path(failure["file"]).name for failure in said["failed"]] == ["other.blf", "bad.blf"]
+    assert (tmp_path / "s.json").read_bytes() == (kept / "s.json").read_bytes()
