@@ -13,7 +13,7 @@ from gz_onboard.errors import InputError
 from gz_onboard.estimator.riders import LONGEST_NAME
 from gz_onboard.lab.estimate_log import EstimateTask
 from gz_onboard.lab.estimate_ride import known_vehicle, open_estimate
-from gz_onboard.lab.estimate_state import StateAt, when
+from gz_onboard.lab.estimate_state import OVERTAKEN, StateAt, when
 from gz_onboard.offline.results import FIRST_DATE_NS
 from gz_onboard.offline.samples import facts_of
 from gz_onboard.offline.signal_table import SignalTable
@@ -79,7 +79,7 @@ def in_order(
         raise undated(without)
     spans.sort(key=lambda one: one[0].begin_ns)
     for (one, before), (other, after) in pairwise(spans):
-        if other.begin_ns < one.end_ns:
+        if (one.end_ns - other.begin_ns) * 1e-9 > OVERTAKEN:
             raise InputError(
                 f"{before.path} and {after.path} overlap: {_times(one)} and {_times(other)}; "
                 "a saved state goes from one ride to the next; give one of the two"

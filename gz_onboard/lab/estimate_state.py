@@ -14,11 +14,13 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from gz_onboard import state
+from gz_onboard.bus.codec import BACK_NS
 from gz_onboard.errors import InputError, writing
 from gz_onboard.offline.digest import digest_of
 from gz_onboard.pipeline import Pipeline
 
 SUFFIX = ".json"
+OVERTAKEN = 2e-9 * BACK_NS  # s: of a log that was cut in two, the second may begin so much before the first ends
 _LATE = 1e11  # s since the epoch: after any state
 
 
@@ -58,16 +60,21 @@ def go_on(pipeline: Pipeline, at: StateAt, ride: Path) -> WentOn:
                 raise ValueError("is gone")
             snapshot, age = found
             if age is None:
-                _check_before(copy, begin, ride)
+                age = _age_after(copy, begin, ride)
             pipeline.estimator.restore(snapshot, pipeline.vehicle.key, age)
         except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
-            raise InputError(
-                f"{copy}: {str(error) or repr(error)}; give the state of this vehicle, or a new name to begin anew"
-            ) from error
+            raise _refused(at.file, copy, error) from error
         began = WentOn(True, age, digest_of(copy))
     if at.rider:
         pipeline.estimator.ridden_by(at.rider)
     return began
+
+
+def _refused(file: Path, copy: Path, error: Exception) -> InputError:
+    *_, before = state.copies(file)
+    older = f"; the one before it is {before}" if copy != before and before.exists() else ""
+    why = str(error) or repr(error)
+    return InputError(f"{copy}: {why}; give the state of this vehicle, or a new name to begin anew{older}")
 
 
 def latest(file: Path) -> Path | None:
@@ -79,14 +86,21 @@ def latest(file: Path) -> Path | None:
     return next((copy for copy in whole if copy.exists()), None)
 
 
-def _check_before(copy: Path, begin: float, ride: Path) -> None:
-    """InputError if a state is of after `begin` [s since the epoch]; one of no known time may be of any."""
+def _age_after(copy: Path, begin: float, ride: Path) -> float | None:
+    """The age of a state that is of after `begin` [s since the epoch] by no more than frames may overtake each other.
+
+    None for one of no known time, which may be of any. InputError for one that is of later.
+    """
     found = state.load(copy, _LATE)
-    if found and found[1] is not None:
+    if found is None or found[1] is None:
+        return None
+    saved = _LATE - found[1]
+    if saved - begin > OVERTAKEN:
         raise InputError(
-            f"{ride}: began at {when(begin)}, before the state {copy} was saved at {when(_LATE - found[1])}; "
+            f"{ride}: began at {when(begin)}, before the state {copy} was saved at {when(saved)}; "
             "give the rides that came after it, or a new name to begin anew"
         )
+    return 0.0
 
 
 def text_of(pipeline: Pipeline) -> bytes | None:

@@ -215,6 +215,17 @@ def test_who_rides_is_as_written_beside_the_logs(tmp_path):
         gz.estimate(tmp_path / "ride.blf", state=tmp_path / "new.json")
 
 
+def test_a_log_that_was_cut_in_two_is_two_rides(cuts, tmp_path, capsys):
+    """Where it was cut, frames of two channels overtake each other by a little."""
+    frames = cuts["c"][:4000]
+    for name, part, moved in (("x", frames[:2000], 20 * 10**6), ("y", frames[2000:], 0)):
+        with (tmp_path / f"{name}.blf").open("wb") as stream:
+            write_blf(stream, [[*part[:-1], (part[-1][0] + moved, *part[-1][1:])]])
+    assert estimate(tmp_path, tmp_path) == 0
+    rides = json.loads((tmp_path / "said.json").read_text())["rides"]
+    assert [ride["saved_state_age_s"] for ride in rides] == [None, 0.0]
+
+
 def test_a_clock_that_was_set_on_the_way_is_right_at_the_end(tmp_path, cuts):
     frames = cuts["c"]
     begin, half = frames[0][0], frames[len(frames) // 2][0]
