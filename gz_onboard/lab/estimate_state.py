@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import fcntl
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 from gz_onboard import state
 from gz_onboard.bus.codec import BACK_NS
@@ -39,12 +40,13 @@ class StateAt:
 class WentOn:
     """How a ride began: whether there was a saved state to go on from, and its age [s] if that is known.
 
-    digest: of the state's file.
+    digest: of the state's file; learned: what that had of the vehicle, by name.
     """
 
     found: bool
     age: float | None = None
     digest: str = ""
+    learned: Mapping[str, Any] = field(default_factory=dict)
 
 
 def go_on(pipeline: Pipeline, at: StateAt, ride: Path) -> WentOn:
@@ -64,7 +66,7 @@ def go_on(pipeline: Pipeline, at: StateAt, ride: Path) -> WentOn:
             pipeline.estimator.restore(snapshot, pipeline.vehicle.key, age)
         except (ValueError, LookupError, TypeError, AttributeError, OverflowError) as error:
             raise _refused(at.file, copy, error) from error
-        began = WentOn(True, age, digest_of(copy))
+        began = WentOn(True, age, digest_of(copy), snapshot.get("learned", {}))
     if at.rider:
         pipeline.estimator.ridden_by(at.rider)
     return began
@@ -103,11 +105,17 @@ def _age_after(copy: Path, begin: float, ride: Path) -> float | None:
     return 0.0
 
 
-def text_of(pipeline: Pipeline) -> bytes | None:
-    """The text of the state file after a ride; None while nothing is known. InputError if it cannot be saved."""
+def text_of(pipeline: Pipeline, went_on: WentOn) -> bytes | None:
+    """The text of the state file after a ride; None while nothing is known. InputError if it cannot be saved.
+
+    What a ride could not go on with, as its table has no column for it, stays as it was learned before.
+    """
     snapshot = pipeline.estimator.snapshot(pipeline.vehicle.key)
+    if snapshot is None:
+        return None
+    snapshot["learned"] = {**went_on.learned, **snapshot["learned"]}
     try:
-        return None if snapshot is None else state.encode(snapshot, pipeline.codec.last_ns * 1e-9)
+        return state.encode(snapshot, pipeline.codec.last_ns * 1e-9)
     except (ValueError, TypeError) as error:
         raise InputError(f"the state after the ride cannot be saved: {error}") from error
 

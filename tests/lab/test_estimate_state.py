@@ -28,7 +28,7 @@ from gz_onboard.lab.estimate_order import span_of
 from gz_onboard.pipeline import TICK_NS
 from gz_onboard.vehicle import find_vehicle
 from tests.lab.short_logs import short_log
-from tests.support import S, identifier, recorded, reference
+from tests.support import S, identifier, recorded, reference, with_cell_voltages
 
 DAY = 86_400 * S
 CUTS = {"a": (0.0, 60.0), "b": (70.0, 130.0), "c": (170.0, 220.0)}  # s of a ride, each a ride of its own
@@ -117,6 +117,13 @@ def same(one: dict[str, Any], other: dict[str, Any]) -> None:
         assert (name, found) == (place, close)
 
 
+def table(begin: float) -> dict[str, Any]:
+    """A minute at 36 km/h from `begin` [s since the epoch]."""
+    seconds = np.arange(0, 60, 0.5)
+    columns = {"pack_voltage [V]": 52 - 1e-4 * seconds, "pack_current [A]": 14 + np.sin(seconds), "speed [km/h]": 36.0}
+    return {"time [s]": begin + seconds, **{name: x * np.ones(len(seconds)) for name, x in columns.items()}}
+
+
 # --- as the daemon -----------------------------------------------------------------------------------------------
 
 
@@ -167,16 +174,10 @@ def test_from_python_it_is_the_same(kept, rides, tmp_path):
 
 
 def test_a_table_of_signals_goes_on_too(tmp_path):
-    seconds = np.arange(0, 60, 0.5)
-    columns = {"pack_voltage [V]": 52 - 1e-4 * seconds, "pack_current [A]": 14 + np.sin(seconds), "speed [km/h]": 36.0}
-
-    def table(begin: float) -> dict[str, Any]:
-        return {"time [s]": begin + seconds, **{name: x * np.ones(len(seconds)) for name, x in columns.items()}}
-
     rides = [table(1.7e9), table(1.7e9 + 3600)]
     first, second = (gz.estimate(ride, state=tmp_path / "s.json").summary for ride in rides)
     assert (first.saved_state, second.saved_state) == ("begun", "gone on")
-    assert second.saved_state_age_s == pytest.approx(3600 - seconds[-1])
+    assert second.saved_state_age_s == pytest.approx(3600 - 59.5)
     files = []
     for number, ride in enumerate(rides):
         files.append(tmp_path / f"{9 - number}.csv")
@@ -187,6 +188,15 @@ def test_a_table_of_signals_goes_on_too(tmp_path):
     same(snapshot(tmp_path / "again" / "s.json"), snapshot(tmp_path / "s.json"))
     with pytest.raises(gz.InputError, match="has no date"):
         gz.estimate(table(0.0), state=tmp_path / "other.json")
+
+
+def test_what_a_table_has_no_column_for_stays_learned(tmp_path):
+    vehicle, file = with_cell_voltages(tmp_path), tmp_path / "s.json"
+    gz.estimate(short_log(tmp_path / "ride.blf"), vehicle, state=file)
+    before = snapshot(file)["learned"]["weakest"]
+    found = gz.estimate(table(1.76e9), vehicle, state=file).summary
+    assert found.saved_state == "gone on"
+    assert snapshot(file)["learned"]["weakest"] == before
 
 
 def test_what_was_restored_is_as_old_as_the_first_voltage_finds_it(kept, cuts, tmp_path, monkeypatch):
