@@ -3,24 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from gz_onboard import state as saved_state
 from gz_onboard.api.given import PathLike, Signals, VehicleLike, source_of, vehicle_of
-from gz_onboard.errors import brief
+from gz_onboard.errors import brief, not_an_input, writing
 from gz_onboard.lab import estimate_table, export_tables
 from gz_onboard.lab.estimate import summary_text
-from gz_onboard.lab.estimate_ride import How, open_estimate, ride_through
+from gz_onboard.lab.estimate_order import span_of, state_at
+from gz_onboard.lab.estimate_ride import How, Ridden, open_estimate, ride_through
+from gz_onboard.lab.estimate_state import held, text_of
 from gz_onboard.lab.estimate_summary import RideSummary, summary_of
 from gz_onboard.lab.kept_rows import KeptRows
-from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TEXTS, WHY_TOPIC, table_columns
+from gz_onboard.log_rows import CHANGE_TOPIC, ESTIMATE_TOPIC, ESTIMATE_UNITS, TEXTS, WHY_TOPIC, Log, table_columns
 from gz_onboard.offline.arguments import checked
+from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.offline.table import Columns, Tabular, array_of, columns_of
 from gz_onboard.progress import Progress
 from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.vehicle import Vehicle
 
 
 @dataclass(frozen=True)
@@ -62,21 +67,40 @@ def estimate(
     *,
     route: PathLike | None = None,
     filter_name: Literal["scalar", "filterpy"] = "scalar",
+    state: PathLike | None = None,
     progress: Progress | None = None,
 ) -> EstimatedRide:
     """Estimate state of charge and range over a log or a table of signals, as the daemon would.
 
-    route: file of the road that is to be ridden. filter_name: scalar or filterpy. progress: takes numbers of frames.
-    Raises InputError.
+    route: file of the road that is to be ridden. filter_name: scalar or filterpy. state: file of a saved state to go
+    on from, if there is one, and to save after the ride; it must have been saved before the ride began. progress: takes
+    numbers of frames. Raises InputError.
     """
     road = None if route is None else read_ahead(Path(route))[1]
-    log = KeptRows()
-    ride = open_estimate(source_of(source), vehicle_of(vehicle))
-    ridden = ride_through(ride, How(filter_name, route=road), log, progress)
+    how, log = How(filter_name, route=road), KeptRows()
+    given, known = source_of(source), vehicle_of(vehicle)
+    if state is None:
+        ridden = ride_through(open_estimate(given, known), how, log, progress)
+    else:
+        ridden = _going_on(given, known, Path(state), how, log, progress)
     times = [time_ns for time_ns, _ in log.rows[ESTIMATE_TOPIC]]
     columns = table_columns({**ESTIMATE_UNITS, **dict.fromkeys(TEXTS, "")})
     estimates = LoggedEstimates(columns, times, log.of(ESTIMATE_TOPIC))
     return EstimatedRide(summary_of(ridden), estimates, log.of(WHY_TOPIC), log.of(CHANGE_TOPIC))
+
+
+def _going_on(
+    source: Path | SignalTable, vehicle: Vehicle, file: Path, how: How, log: Log, progress: Progress | None
+) -> Ridden:
+    """The ride, gone on from the saved state `file`, which is saved after it."""
+    not_an_input(saved_state.copies(file), [source] if isinstance(source, Path) else [])
+    with held(file):
+        at = state_at(file, source, span_of(source, vehicle))
+        ridden = ride_through(open_estimate(source, vehicle), replace(how, state=at), log, progress)
+        if ridden.went_on and (text := text_of(ridden.pipeline, ridden.went_on)):
+            with writing(file):
+                saved_state.write(file, text)
+    return ridden
 
 
 @checked

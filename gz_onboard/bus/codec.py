@@ -141,6 +141,11 @@ class Codec:
         """`seconds` of the timeline by the clock of the frames, as it is set now [ns]; 0 before the first frame."""
         return 0 if self._origin_ns is None else self._origin_ns + round(seconds * 1e9)
 
+    @property
+    def last_ns(self) -> int:
+        """The time of the last frame by their clock as it is set now [ns]; 0 before the first."""
+        return 0 if self._origin_ns is None else self._last_ns
+
     def clock_set(self, delta_ns: int) -> None:
         """The clock that stamps the frames was set by `delta_ns`; the timeline goes on."""
         if self._origin_ns is not None:

@@ -10,21 +10,27 @@ import argparse
 import contextlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 
+from gz_onboard import state
 from gz_onboard.bus.logs import is_table
+from gz_onboard.constants import HOUR
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input, require
 from gz_onboard.events import Reason, words
-from gz_onboard.lab.estimate_log import EstimateTask, estimate_log
-from gz_onboard.lab.estimate_ride import known_vehicle
+from gz_onboard.lab.estimate_log import EstimateTask, estimate_log, kept_in_turn
+from gz_onboard.lab.estimate_order import Unread, in_order
+from gz_onboard.lab.estimate_ride import known_vehicle, open_estimate
 from gz_onboard.lab.estimate_route import route_text
+from gz_onboard.lab.estimate_state import go_on, held
 from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary
 from gz_onboard.lab.estimate_table import FORMATS, check_table, write_summaries
 from gz_onboard.offline.processes import collect, over_rides, tasks_of
-from gz_onboard.offline.results import clock, explain_keys, number, text_rows, write_json
+from gz_onboard.offline.results import Failure, clock, explain_keys, number, text_rows, write_json
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.options import add_shared
-from gz_onboard.progress import Progress, progress_bar
+from gz_onboard.pipeline import Pipeline
+from gz_onboard.progress import Display, Progress, progress_bar
 from gz_onboard.vehicle import find_vehicle
 
 KEYS = descriptions(RideSummary)
@@ -45,6 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", action="store_true", help="also log the raw frames and the range frames")
     resume = "keep what an earlier run wrote, where it is whole and of the same log, vehicle, options and version"
     parser.add_argument("--resume", action="store_true", help=resume)
+    keep = "take the rides in the order of their times; each goes on from this saved state, as the daemon does"
+    parser.add_argument("--state", type=Path, metavar="FILE", help=f"{keep} (default: each begins anew)")
     add_shared(parser, "--jobs", "--quiet")
 
 
@@ -53,29 +61,68 @@ def run(arguments: argparse.Namespace) -> int:
     parts = {"filter_name": arguments.filter, "frames": arguments.frames, "signals": arguments.signals}
     parts |= {"route": arguments.route, "resume": arguments.resume}
     tasks = tasks_of(arguments, EstimateTask, ".estimate.mcap", **parts)
+    if arguments.state:
+        _check_state(arguments)
     require("matplotlib", not arguments.no_plot)
     if arguments.table:
         check_table(arguments.table)
     written = [arguments.json, arguments.table, *(file for task in tasks for file in (task.log, task.picture))]
+    written += state.copies(arguments.state) if arguments.state else ()
     not_an_input(
         written, [*(task.path for task in tasks), *filter(None, [arguments.route]), find_vehicle(arguments.vehicle)]
     )
     known_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
-    with progress_bar(
-        lambda: expected_frames([task.path for task in tasks]), "frames", quiet=arguments.quiet
-    ) as display:
-        results = _results(tasks, arguments.jobs, display.update)
+    with held(arguments.state) if arguments.state else contextlib.nullcontext():
+        tasks, unread = _in_turn(arguments, tasks) if arguments.state else (tasks, [])
+        rides, failed = _estimate(arguments, tasks, unread)
+    write_json(arguments.json, SUMMARY_VERSION, {"rides": rides, "failed": failed})
+    if arguments.table:
+        write_summaries(arguments.table, rides, failed)
+    if arguments.state and arguments.json != "-":
+        shown = f"--vehicle {arguments.vehicle} --state {arguments.state}"
+        print(f"what was learned is in {arguments.state}; `gz-onboard learned {shown}` shows it")
+    return BAD_INPUT if failed else OK
+
+
+def _check_state(arguments: argparse.Namespace) -> None:
+    """InputError for what cannot be together with ``--state``."""
+    if (arguments.jobs or 1) > 1:
+        raise InputError(f"--jobs {arguments.jobs} with --state: each ride goes on from the one before; leave it out")
+
+
+def _in_turn(arguments: argparse.Namespace, tasks: Sequence[EstimateTask]) -> tuple[list[EstimateTask], list[Unread]]:
+    """As `in_order`; InputError if the first that is not kept cannot go on from the state."""
+    with _frames_bar(arguments, tasks) as display:
+        tasks, unread = in_order(tasks, arguments.state, display.update)
+    if arguments.resume:
+        tasks = kept_in_turn(tasks)
+    *_, last = -1, *(number for number, task in enumerate(tasks) if task.resume)
+    for task in tasks[last + 1 : last + 2]:  # the first that goes on from the state that is there
+        vehicle = open_estimate(task.path, known_vehicle(arguments.vehicle, arguments.payload)).vehicle
+        if task.state:
+            go_on(Pipeline(vehicle), task.state, task.path)
+    return tasks, unread
+
+
+def _estimate(
+    arguments: argparse.Namespace, tasks: Sequence[EstimateTask], unread: Sequence[Unread]
+) -> tuple[list[RideSummary], list[Failure]]:
+    """The summaries, each printed at once, and the failures."""
+    with _frames_bar(arguments, tasks) as display:
+        results = chain(_results(tasks, 1 if arguments.state else arguments.jobs, display.update), unread)
         text = None if arguments.json == "-" else summary_text
         try:
-            rides, failed = collect("estimate", results, display, text, lambda ride: ride.damage)
+            return collect("estimate", results, display, text, lambda ride: ride.damage)
         except KeyboardInterrupt:
             if len(tasks) > 1:
                 display.print("gz-onboard estimate: interrupted; --resume goes on after what is written", sys.stderr)
             raise
-    write_json(arguments.json, SUMMARY_VERSION, {"rides": rides, "failed": failed})
-    if arguments.table:
-        write_summaries(arguments.table, rides, failed)
-    return BAD_INPUT if failed else OK
+
+
+def _frames_bar(
+    arguments: argparse.Namespace, tasks: Sequence[EstimateTask]
+) -> contextlib.AbstractContextManager[Display]:
+    return progress_bar(lambda: expected_frames([task.path for task in tasks]), "frames", quiet=arguments.quiet)
 
 
 def _results(
@@ -146,6 +193,7 @@ def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
         ),
         ("range at the end", _range(ride)),
         *([("route", route_text(ride.route))] if ride.route else []),
+        *([("saved state", _state_text(ride))] if ride.saved_state else []),
         (
             "innovation",
             f"{number(ride.innovation_rms_v, '.1f', 'mV', 1000)} RMS, "
@@ -183,6 +231,14 @@ def _range(ride: RideSummary) -> str:
         f"{number(ride.range_end_p90_km, '.1f')}, 80 % interval), "
         f"{number(ride.energy_left_wh, '.0f', 'Wh')} left"
     )
+
+
+def _state_text(ride: RideSummary) -> str:
+    if ride.saved_state == "begun":
+        return "begun with this ride"
+    age, day = ride.saved_state_age_s, 24 * HOUR
+    old = "of an unknown age" if age is None else f"{age / day:.1f} days old" if age > 2 * day else f"{clock(age)} old"
+    return f"gone on from, {old} at the start"
 
 
 def _durations(seconds: Mapping[str, float]) -> str:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 
-from gz_onboard import __version__
+from gz_onboard import __version__, state
 from gz_onboard.bus.completion import is_complete
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import ESTIMATED, read_metadata
 from gz_onboard.errors import InputError, writing
-from gz_onboard.lab.estimate_ride import How, known_vehicle, open_estimate, ride_through
+from gz_onboard.lab.estimate_ride import How, Ridden, known_vehicle, open_estimate, ride_through
+from gz_onboard.lab.estimate_state import StateAt, latest, text_of
 from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary, kept_summary, summary_of, summary_to_keep
 from gz_onboard.lab.plot import plot_log
 from gz_onboard.offline.digest import digest_of
@@ -24,18 +26,20 @@ from gz_onboard.vehicle import Vehicle
 
 _RECORD = "gz_onboard.estimate"  # of metadata, at the end of the log: of what the estimates are, and their summary
 _SUMMARY = "summary"
+_BEFORE, _AFTER = "state_before", "state_after"  # digests of the saved state
 _ENDS = (b"IEND\xaeB`\x82", b"</svg>\n", b"%%EOF\n")  # of a picture
 
 
 @dataclass(frozen=True)
 class EstimateTask(Task):
-    """A log to be estimated; resume: not if it is already, as it would be now."""
+    """A log to be estimated; resume: not if it is already, as it would be now; state: the saved state to go on from."""
 
     filter_name: str = "scalar"
     frames: bool = False
     signals: bool = False
     route: Path | None = None
     resume: bool = False
+    state: StateAt | None = None
 
     @property
     def log(self) -> Path:
@@ -68,17 +72,29 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSu
     with writing(task.log):
         log = _open_log(task, ride.vehicle, ride.start_ns)
         try:
-            ridden = ride_through(ride, How(task.filter_name, task.frames, task.signals, route), log, progress)
+            how = How(task.filter_name, task.frames, task.signals, route, state=task.state)
+            ridden = ride_through(ride, how, log, progress)
+            learned = text_of(ridden.pipeline, ridden.went_on) if ridden.went_on else None
             summary = summary_of(ridden, task.log, task.picture)
-            log.note(_RECORD, {**made_of, _SUMMARY: summary_to_keep(summary)})
+            log.note(_RECORD, {**made_of, **_link(ridden, learned), _SUMMARY: summary_to_keep(summary)})
             log.close()
             task.part.replace(task.log)
+            if task.state and learned:
+                state.write(task.state.file, learned)
         finally:
             log.abandon()
             task.part.unlink(missing_ok=True)
         if task.picture:
             plot_log(task.log, task.picture)
     return summary
+
+
+def _link(ridden: Ridden, learned: bytes | None) -> dict[str, str]:
+    """Which state the ride went on from and which it left, if any, for what goes on after them."""
+    if ridden.went_on is None:
+        return {}
+    before = ridden.went_on.digest
+    return {_BEFORE: before, _AFTER: sha256(learned).hexdigest() if learned else before}
 
 
 def _open_log(task: EstimateTask, vehicle: Vehicle, start_ns: int) -> LogFile:
@@ -91,11 +107,26 @@ def _open_log(task: EstimateTask, vehicle: Vehicle, start_ns: int) -> LogFile:
         "filter": task.filter_name,
         **({} if task.payload is None else {"payload_kg": f"{task.payload:g}"}),
         **({} if task.route is None else {"route": task.route.name}),
+        **({} if task.state is None else {"state": task.state.file.name}),
     }
     return LogFile(task.part.open("wb"), start_ns, metadata, dbc_texts(vehicle))
 
 
 # --- what an earlier run made ---------------------------------------------------------------------------------------
+
+
+def kept_in_turn(tasks: Sequence[EstimateTask]) -> list[EstimateTask]:
+    """The `tasks`, of one saved state, of which only those resume that led to the state that is there."""
+    first = next((task.state for task in tasks if task.state), None)
+    there = latest(first.file) if first else None
+    wanted = digest_of(there) if there else None
+    found: list[EstimateTask] = []
+    for task in reversed(tasks):
+        made = _made(task, _made_of(task, known_vehicle(task.vehicle, task.payload))) if wanted else None
+        led = made is not None and made.get(_AFTER) == wanted
+        wanted = made[_BEFORE] if made and led else wanted
+        found.append(replace(task, resume=led))
+    return found[::-1]
 
 
 def _made_of(task: EstimateTask, vehicle: Vehicle) -> dict[str, str]:
@@ -109,6 +140,7 @@ def _made_of(task: EstimateTask, vehicle: Vehicle) -> dict[str, str]:
         "payload_kg": "" if task.payload is None else f"{task.payload:g}",
         "route": digest_of(task.route) if task.route else "",
         "options": f"filter {task.filter_name}, frames {task.frames}, signals {task.signals}",
+        **({} if task.state is None else {"rider": task.state.rider}),
     }
 
 
@@ -120,19 +152,26 @@ def _kept(task: EstimateTask, made_of: Mapping[str, str]) -> RideSummary | None:
     """The summary of the log that an earlier run wrote, if that is whole and of the same; its picture is drawn anew
     if it is not whole.
     """
+    made = _made(task, made_of)
+    kept = kept_summary(made.get(_SUMMARY, ""), task.path, task.log, task.picture) if made else None
+    if kept is None:
+        return None
+    if task.picture and not _is_drawn(task.picture, task.log):
+        with writing(task.picture):
+            plot_log(task.log, task.picture)
+    return kept
+
+
+def _made(task: EstimateTask, made_of: Mapping[str, str]) -> dict[str, str] | None:
+    """What an earlier run noted in the log that it wrote, if that is whole and of the same."""
     try:
         if not is_complete(task.log):
             return None
         found = read_metadata(task.log, _RECORD)
     except (OSError, InputError):
         return None
-    kept = kept_summary(found.pop(_SUMMARY, ""), task.path, task.log, task.picture)
-    if kept is None or found != made_of:
-        return None
-    if task.picture and not _is_drawn(task.picture, task.log):
-        with writing(task.picture):
-            plot_log(task.log, task.picture)
-    return kept
+    same = {key: text for key, text in found.items() if key not in (_SUMMARY, _BEFORE, _AFTER)} == made_of
+    return found if same and (_BEFORE in found) == (task.state is not None) else None
 
 
 def _is_drawn(picture: Path, log: Path) -> bool:

@@ -16,6 +16,7 @@ from gz_onboard.bus.stamps import without_lone
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.events import Estimate, Frame
+from gz_onboard.lab.estimate_state import StateAt, WentOn, go_on
 from gz_onboard.lab.estimate_tally import PAUSE, Tally
 from gz_onboard.log_rows import STATUS_TOPIC, Log
 from gz_onboard.offline.samples import check_ridden, open_ride
@@ -92,18 +93,22 @@ class OpenRide:
 
 @dataclass(frozen=True)
 class How:
-    """How a ride is estimated, and what is logged beside the estimates; ledger: whether the load model keeps one."""
+    """How a ride is estimated, and what is logged beside the estimates; ledger: whether the load model keeps one.
+
+    state: the saved state to go on from.
+    """
 
     filter_name: str = "scalar"
     frames: bool = False
     signals: bool = False
     route: Route | None = None
     ledger: bool = False
+    state: StateAt | None = None
 
 
 @dataclass(frozen=True)
 class Ridden:
-    """A ride that went through the pipeline. took: processor and wall time [s]."""
+    """A ride that went through the pipeline. took: processor and wall time [s]; went_on: from a saved state or not."""
 
     source: Path
     pipeline: Pipeline
@@ -111,6 +116,7 @@ class Ridden:
     how: How
     damages: Sequence[LogDamage]
     took: tuple[float, float]
+    went_on: WentOn | None = None
 
 
 def open_estimate(source: Path | SignalTable, vehicle: Vehicle) -> OpenRide:
@@ -128,18 +134,28 @@ def open_estimate(source: Path | SignalTable, vehicle: Vehicle) -> OpenRide:
 
 
 def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None = None) -> Ridden:
-    """Take all frames of `ride` through the pipeline, which writes to `log`. InputError if not one is the vehicle's."""
+    """Take all frames of `ride` through the pipeline, which writes to `log`.
+
+    InputError if not one is the vehicle's, or if the state to go on from does not fit.
+    """
     cpu, wall = time.process_time(), time.perf_counter()
     tally = Tally(ride.start_ns)
+
+    def observe(estimate: Estimate) -> None:
+        if went_on:  # as the daemon has it: until a voltage comes, what was restored grows older
+            pipeline.estimator.wait(estimate.time - (tally.last.time if tally.last else 0.0))
+        tally(estimate)
+
     pipeline = Pipeline(
         ride.vehicle,
         filter_name=how.filter_name,
         log=log,
         log_frames=how.frames,
         log_signals=how.signals,
-        observer=tally,
+        observer=observe,
     )
     pipeline.codec.longest_pause_ns = LONGEST_PAUSE_NS
+    went_on = go_on(pipeline, how.state, ride.source) if how.state else None
     if how.ledger:
         pipeline.estimator.forecaster.load.ledger = Ledger()
     if how.route:
@@ -151,7 +167,7 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
     if tally.last:  # what came after the last whole second counts too
         log.sample(STATUS_TOPIC, pipeline.codec.time_ns(tally.last.time), pipeline.status())
     took = time.process_time() - cpu, time.perf_counter() - wall
-    return Ridden(ride.source, pipeline, tally, how, ride.damages, took)
+    return Ridden(ride.source, pipeline, tally, how, ride.damages, took, went_on)
 
 
 @functools.lru_cache(maxsize=1)

@@ -56,6 +56,8 @@ class RideSummary:
         "of the route given: state at the end (ON, OFF); and of the last estimate on it km along and left, energy to "
         "its end and state of charge there, km from its start and position where the battery ends before; or null",
     ]
+    saved_state: Annotated[str | None, "with --state: `gone on` from a saved state, or `begun` with this ride; or null"]
+    saved_state_age_s: Annotated[float | None, "age of that state when the ride began, if it is known"]
     innovation_rms_v: Annotated[float | None, "root mean square of measured less predicted voltage of a cell [V]"]
     innovation_max_v: Annotated[float | None, "greatest magnitude of the same"]
     states: Annotated[dict[str, float], "seconds in each state"]
@@ -82,7 +84,7 @@ class RideSummary:
 
 def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = None) -> RideSummary:
     """The summary of a ride; log, picture: where its estimates were written and drawn."""
-    pipeline, tally, route = ridden.pipeline, ridden.tally, ridden.how.route
+    pipeline, tally, route, went_on = ridden.pipeline, ridden.tally, ridden.how.route, ridden.went_on
     last, ranged = tally.last or Estimate(0.0), tally.ranged or Estimate(0.0)
     changes = pipeline.estimator.attribution.changes
     soc_start, soc_end = tally.soc_start or (None, None), tally.soc_end or (None, None)
@@ -114,6 +116,8 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         why=why_of(last.why) if last.why else None,
         changes=list(map(why_of, changes)),
         route=route_summary(last, tally.on_route or last, route.grade_known) if route else None,
+        saved_state=("gone on" if went_on.found else "begun") if went_on else None,
+        saved_state_age_s=went_on.age if went_on else None,
         innovation_rms_v=tally.innovation_rms,
         innovation_max_v=tally.innovation_max if tally.innovation_rms is not None else None,
         states={state.name: round(states[state.name] * TICK_S, 1) for state in State if states[state.name]},

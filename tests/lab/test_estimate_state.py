@@ -1,0 +1,346 @@
+"""``gz-onboard estimate --state``: what was learned goes from ride to ride, as a daemon that is restarted has it."""
+
+from __future__ import annotations
+
+import csv
+import fcntl
+import json
+import os
+import shutil
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import gz_onboard as gz
+from gz_onboard import state
+from gz_onboard.bus.channel import CanChannel
+from gz_onboard.bus.writers import write_blf
+from gz_onboard.cli import main
+from gz_onboard.daemon import keeper
+from gz_onboard.daemon.loop import Daemon
+from gz_onboard.events import Frame
+from gz_onboard.lab.estimate_order import span_of
+from gz_onboard.pipeline import TICK_NS
+from gz_onboard.vehicle import find_vehicle
+from tests.lab.short_logs import short_log
+from tests.support import S, identifier, recorded, reference, with_cell_voltages
+
+DAY = 86_400 * S
+CUTS = {"a": (0.0, 60.0), "b": (70.0, 130.0), "c": (170.0, 220.0)}  # s of a ride, each a ride of its own
+LATER = {"a": 0, "b": DAY, "c": 3 * DAY}  # ns: by so much later are they ridden
+
+
+@pytest.fixture(scope="module")
+def cuts() -> dict[str, list[Frame]]:
+    frames = recorded("city_14C", 0.0, 220.0)
+    times = [frame[0] for frame in frames]
+
+    def cut(name: str) -> list[Frame]:
+        begin, end = (bisect_left(times, times[0] + round(s * S)) for s in CUTS[name])
+        return [(t + LATER[name], *rest) for t, *rest in frames[begin:end]]  # type: ignore[misc]
+
+    return {name: cut(name) for name in CUTS}
+
+
+@pytest.fixture(scope="module")
+def rides(cuts: dict[str, list[Frame]], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the log of each cut, whose names are not in the order of their times."""
+    folder = tmp_path_factory.mktemp("rides")
+    for name, frames in cuts.items():
+        with (folder / f"{'cab'['abc'.index(name)]}.blf").open("wb") as stream:
+            write_blf(stream, [frames])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def kept(rides: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what ``estimate`` made of all the rides, one state going through them."""
+    out = tmp_path_factory.mktemp("kept")
+    assert estimate(out, rides, options=["--table", out / "rides.csv"]) == 0
+    return out
+
+
+def estimate(out: Path, *rides: Path, options: Sequence[object] = ()) -> int:
+    """``gz-onboard estimate`` with its state and its results in `out`."""
+    given = ["--no-plot", "--output", out, "--state", out / "s.json", "--json", out / "said.json", *options]
+    return main(["estimate", *map(str, (*rides, *given))])
+
+
+def snapshot(file: Path) -> dict[str, Any]:
+    found = state.load(file, 4e9)
+    assert found
+    return dict(found[0])
+
+
+def by_the_daemon(frames: list[Frame], file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frames through a daemon that is started as they begin and stopped as they end, whose clock is theirs."""
+    now = [frames[0][0]]
+    clock = SimpleNamespace(time=lambda: now[0] * 1e-9, clock_gettime=lambda _: now[0] * 1e-9, CLOCK_BOOTTIME=7)
+    monkeypatch.setattr(keeper, "time", clock)
+    monkeypatch.setattr(state, "kept_time", lambda: float("inf"))
+    channel = CanChannel("virtual", str(file))
+    channel.open()
+    daemon = Daemon(reference(), [channel], None, file)
+    daemon.restore()
+    times = [frame[0] for frame in frames]
+    done = 0
+    for until in [*range(times[0], times[-1], TICK_NS)[1:], times[-1]]:
+        end = bisect_left(times, until + (until == times[-1]))
+        daemon.step(frames[done:end], until)
+        daemon.pipeline.estimator.wait(TICK_NS * 1e-9)
+        now[0], done = until, end
+    assert daemon._keeper
+    assert daemon._keeper._thread.wait(60)
+    daemon._keeper.save(daemon.pipeline, now[0])
+    assert daemon._keeper.close(60)
+    channel.close()
+
+
+def leaves(found: object, name: str = "") -> Iterator[tuple[str, object]]:
+    """Each number or text in it with where it is."""
+    parts = found.items() if isinstance(found, dict) else enumerate(found) if isinstance(found, list) else None
+    if parts is None:
+        yield name, found
+    else:
+        for key, value in parts:
+            yield from leaves(value, f"{name}.{key}")
+
+
+def same(one: dict[str, Any], other: dict[str, Any]) -> None:
+    for (name, found), (place, expected) in zip(leaves(one), leaves(other), strict=True):
+        close = pytest.approx(expected, rel=1e-6, abs=1e-9) if isinstance(expected, float) else expected
+        assert (name, found) == (place, close)
+
+
+def table(begin: float) -> dict[str, Any]:
+    """A minute at 36 km/h from `begin` [s since the epoch]."""
+    seconds = np.arange(0, 60, 0.5)
+    columns = {"pack_voltage [V]": 52 - 1e-4 * seconds, "pack_current [A]": 14 + np.sin(seconds), "speed [km/h]": 36.0}
+    return {"time [s]": begin + seconds, **{name: x * np.ones(len(seconds)) for name, x in columns.items()}}
+
+
+# --- as the daemon -----------------------------------------------------------------------------------------------
+
+
+def test_the_rides_are_in_their_order_and_each_goes_on_from_the_one_before(kept):
+    rides = json.loads((kept / "said.json").read_text())["rides"]
+    assert [Path(ride["file"]).stem for ride in rides] == ["c", "a", "b"]
+    assert [ride["saved_state"] for ride in rides] == ["begun", "gone on", "gone on"]
+    ages = [ride["saved_state_age_s"] for ride in rides]
+    assert ages[0] is None
+    assert ages[1:] == pytest.approx([86_400 + 10, 2 * 86_400 + 40], abs=0.1)
+    with (kept / "rides.csv").open() as table:
+        assert [row["saved_state"] for row in csv.DictReader(table)] == ["begun", "gone on", "gone on"]
+
+
+def test_what_was_learned_carries_over(kept, rides, tmp_path):
+    alone = gz.estimate(rides / "b.blf", state=tmp_path / "alone.json").summary
+    last = json.loads((kept / "said.json").read_text())["rides"][-1]
+    assert alone.saved_state == "begun"
+    assert last["soc_start_sd"] < alone.soc_start_sd
+    by_one, by_all = (gz.read_learned(file).riders[""] for file in (tmp_path / "alone.json", kept / "s.json"))
+    assert all(by_one[name].share < by_all[name].share for name in ("price", "pace", "factor"))
+
+
+def test_it_is_as_of_a_daemon_that_is_restarted(kept, cuts, tmp_path, monkeypatch):
+    """Each goes on where the other ended: the daemon rides the first, `estimate` the second, the daemon the third."""
+    file = tmp_path / "s.json"
+    by_the_daemon(cuts["a"], file, monkeypatch)
+    log = tmp_path / "second.blf"
+    with log.open("wb") as stream:
+        write_blf(stream, [cuts["b"]])
+    assert estimate(tmp_path, log) == 0
+    same(snapshot(file), snapshot(kept / "s.previous.json"))
+    by_the_daemon(cuts["c"], file, monkeypatch)
+    same(snapshot(file), snapshot(kept / "s.json"))
+    monkeypatch.undo()
+    assert snapshot(kept / "s.json")["soc"] != pytest.approx(snapshot(kept / "s.previous.json")["soc"], rel=1e-6)
+
+
+def test_from_python_it_is_the_same(kept, rides, tmp_path):
+    file = tmp_path / "s.json"
+    shutil.copy(kept / "s.previous.json", file)
+    found = gz.estimate(rides / "b.blf", state=file).summary
+    assert file.read_bytes() == (kept / "s.json").read_bytes()
+    told = json.loads((kept / "said.json").read_text())["rides"][-1]
+    assert (found.range_end_km, found.saved_state_age_s) == (told["range_end_km"], told["saved_state_age_s"])
+    with pytest.raises(gz.InputError, match=r"b\.blf: began at .*, before the state .*s\.json was saved at"):
+        gz.estimate(rides / "b.blf", state=file)
+
+
+def test_a_table_of_signals_goes_on_too(tmp_path):
+    rides = [table(1.7e9), table(1.7e9 + 3600)]
+    first, second = (gz.estimate(ride, state=tmp_path / "s.json").summary for ride in rides)
+    assert (first.saved_state, second.saved_state) == ("begun", "gone on")
+    assert second.saved_state_age_s == pytest.approx(3600 - 59.5)
+    files = []
+    for number, ride in enumerate(rides):
+        files.append(tmp_path / f"{9 - number}.csv")
+        with files[-1].open("w", newline="") as stream:
+            csv.writer(stream).writerows([list(ride), *zip(*(x.tolist() for x in ride.values()), strict=True)])
+    (tmp_path / "again").mkdir()
+    assert estimate(tmp_path / "again", *files) == 0
+    same(snapshot(tmp_path / "again" / "s.json"), snapshot(tmp_path / "s.json"))
+    with pytest.raises(gz.InputError, match="has no date"):
+        gz.estimate(table(0.0), state=tmp_path / "other.json")
+
+
+def test_what_a_table_has_no_column_for_stays_learned(tmp_path):
+    vehicle, file = with_cell_voltages(tmp_path), tmp_path / "s.json"
+    gz.estimate(short_log(tmp_path / "ride.blf"), vehicle, state=file)
+    before = snapshot(file)["learned"]["weakest"]
+    found = gz.estimate(table(1.76e9), vehicle, state=file).summary
+    assert found.saved_state == "gone on"
+    assert snapshot(file)["learned"]["weakest"] == before
+
+
+def test_what_was_restored_is_as_old_as_the_first_voltage_finds_it(kept, cuts, tmp_path, monkeypatch):
+    """A ride five seconds after the last, whose pack and inverter wake twenty seconds after the others."""
+    begin = cuts["b"][-1][0] + 5 * S
+    silent = [identifier("BMS_Pack"), identifier("INV_Power")]
+    moved = [(begin + t - cuts["c"][0][0], *rest) for t, *rest in cuts["c"]]
+    late: list[Frame] = [f for f in moved if f[0] > begin + 20 * S or f[1] not in silent]
+    with (tmp_path / "late.blf").open("wb") as stream:
+        write_blf(stream, [late])
+    (tmp_path / "daemon").mkdir()
+    for file in (tmp_path / "s.json", tmp_path / "daemon" / "s.json"):
+        shutil.copy(kept / "s.previous.json", file)
+    assert estimate(tmp_path, tmp_path / "late.blf") == 0
+    by_the_daemon(late, tmp_path / "daemon" / "s.json", monkeypatch)
+    same(snapshot(tmp_path / "s.json"), snapshot(tmp_path / "daemon" / "s.json"))
+
+
+def test_who_rides_is_as_written_beside_the_logs(tmp_path):
+    short_log(tmp_path / "ride.blf")
+    (tmp_path / "rides.json").write_text(json.dumps([{"name": "ride", "rider": "Jo"}]))
+    gz.estimate(tmp_path / "ride.blf", state=tmp_path / "s.json")
+    assert next(iter(gz.read_learned(tmp_path / "s.json").riders)) == "Jo"
+    (tmp_path / "rides.json").write_text(json.dumps([{"name": "ride", "rider": 41 * "Jo"}]))
+    with pytest.raises(gz.InputError, match="must have at most 40 letters"):
+        gz.estimate(tmp_path / "ride.blf", state=tmp_path / "new.json")
+
+
+def test_a_log_that_was_cut_in_two_is_two_rides(cuts, tmp_path, capsys):
+    """Where it was cut, frames of two channels overtake each other by a little."""
+    frames = cuts["c"][:4000]
+    for name, part, moved in (("x", frames[:2000], 20 * 10**6), ("y", frames[2000:], 0)):
+        with (tmp_path / f"{name}.blf").open("wb") as stream:
+            write_blf(stream, [[*part[:-1], (part[-1][0] + moved, *part[-1][1:])]])
+    assert estimate(tmp_path, tmp_path) == 0
+    rides = json.loads((tmp_path / "said.json").read_text())["rides"]
+    assert [ride["saved_state_age_s"] for ride in rides] == [None, 0.0]
+
+
+def test_a_clock_that_was_set_on_the_way_is_right_at_the_end(tmp_path, cuts):
+    frames = cuts["c"]
+    begin, half = frames[0][0], frames[len(frames) // 2][0]
+    with (tmp_path / "set.blf").open("wb") as stream:
+        write_blf(stream, [[(t - (begin - DAY) * (t < half), *rest) for t, *rest in frames]])
+    span = span_of(tmp_path / "set.blf", reference())
+    assert span.end_ns == frames[-1][0]
+    assert span.begin_ns == pytest.approx(begin, abs=0.1 * S)
+
+
+# --- what is refused ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def short(tmp_path: Path) -> Path:
+    """The log of a short ride in a folder of its own."""
+    return short_log(tmp_path / "ride.blf")
+
+
+def refused(out: Path, capsys: pytest.CaptureFixture[str], *rides: Path, options: Sequence[object] = ()) -> str:
+    """What is said of it; nothing is written."""
+    before = {file: file.read_bytes() for file in out.iterdir()}
+    assert estimate(out, *rides, options=options) == 2
+    assert {file: file.read_bytes() for file in out.iterdir()} == before
+    return capsys.readouterr().err
+
+
+def test_what_does_not_go_together(short, tmp_path, capsys):
+    (tmp_path / "copy").mkdir()
+    copy = short_log(tmp_path / "copy" / "again.blf", 3000)
+    (out := tmp_path / "out").mkdir()
+    said = refused(out, capsys, short, copy)
+    assert f"{short} and {copy} overlap: 2025-06-15 " in said
+    assert "--jobs 2 with --state" in refused(out, capsys, short, options=["--jobs", 2])
+    undated = tmp_path / "undated.blf"
+    with undated.open("wb") as stream:
+        write_blf(stream, [[(t % DAY, *rest) for t, *rest in recorded("coastdown", 0, 5)]])  # type: ignore[misc]
+    assert f"{undated}: has no date" in refused(out, capsys, undated, short)
+    assert "ends in .json" in refused(out, capsys, short, options=["--state", "s.blf"])
+    assert "would overwrite the input" in refused(out, capsys, short, options=["--state", short])
+    descriptor = os.open(out, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
+    assert "saves states in its folder" in refused(out, capsys, short)
+    os.close(descriptor)
+    assert estimate(out, short) == 0
+
+
+def test_a_state_that_cannot_be_used_is_left_as_it_is(short, tmp_path, capsys):
+    built_in = find_vehicle("reference")
+    text = built_in.read_text().replace('name = "reference-scooter"', 'name = "another"')
+    (tmp_path / "other.toml").write_text(text.replace("../../dbc/", f"{built_in.parents[2]}/dbc/"))
+    (out := tmp_path / "out").mkdir()
+    assert estimate(out, short) == 0
+    capsys.readouterr()
+    good = (out / "s.json").read_bytes()
+    assert "before the state" in refused(out, capsys, short)
+    before = state.encode(snapshot(out / "s.json"), 1.7e9)
+    (out / "s.json").write_bytes(before)
+    assert "is of 'reference-scooter|" in refused(out, capsys, short, options=["--vehicle", tmp_path / "other.toml"])
+    (out / "s.json").write_bytes(before[:-9])
+    assert "s.json: is damaged: its checksum is wrong" in refused(out, capsys, short)
+    (out / "s.json").write_bytes(state.encode({"version": 1}, 1.7e9))
+    assert "is of version 1" in refused(out, capsys, short)
+    (out / "s.json").write_bytes(before)
+    (out / "s.new").write_bytes(good[:-9])  # cut off while it was written
+    assert estimate(out, short) == 0
+    assert not (out / "s.new").exists()
+
+
+# --- resumed -----------------------------------------------------------------------------------------------------
+
+
+def resumed(out: Path, *rides: Path) -> list[bool]:
+    """Which rides are kept from an earlier run."""
+    assert estimate(out, *rides, options=["--resume"]) == 0
+    return [ride["cpu_s"] == 0 for ride in json.loads((out / "said.json").read_text())["rides"]]
+
+
+def test_a_run_that_was_interrupted_goes_on(kept, rides, tmp_path, capsys):
+    shutil.copytree(kept, out := tmp_path / "out")
+    before, after = (kept / "s.previous.json").read_bytes(), (kept / "s.json").read_bytes()
+    assert resumed(out, rides) == [True, True, True]
+    assert (out / "s.json").read_bytes() == after
+    (out / "s.json").write_bytes(before)  # of the last ride the log was written, the state was not
+    assert resumed(out, rides) == [True, True, False]
+    assert (out / "s.json").read_bytes() == after
+    (out / "s.json").write_bytes(state.encode({**snapshot(out / "s.json"), "cell_temperature": 20.0}, 2e9))
+    capsys.readouterr()
+    assert "before the state" in refused(out, capsys, rides, options=["--resume"])
+
+
+def test_a_month_later_only_the_new_ride_is_estimated(kept, rides, cuts, tmp_path, capsys):
+    """With them are the log of something else and one that is damaged, which fail every time and stop no other."""
+    for name in "ca":
+        shutil.copy(rides / f"{name}.blf", tmp_path)
+    (tmp_path / "bad.blf").write_bytes(b"no log")
+    begin = cuts["a"][0][0] + DAY // 2
+    with (tmp_path / "other.blf").open("wb") as stream:
+        write_blf(stream, [[(begin + i * S, 0x7F, b"x", 0) for i in range(9)]])
+    assert estimate(tmp_path, tmp_path) == 2
+    assert "knows none of its 9 frames" in capsys.readouterr().err
+    assert (tmp_path / "s.json").read_bytes() == (kept / "s.previous.json").read_bytes()
+    shutil.copy(rides / "b.blf", tmp_path)
+    assert estimate(tmp_path, tmp_path, options=["--resume"]) == 2
+    said = json.loads((tmp_path / "said.json").read_text())
+    assert [ride["cpu_s"] == 0 for ride in said["rides"]] == [True, True, False]
+    assert [Path(failure["file"]).name for failure in said["failed"]] == ["other.blf", "bad.blf"]
+    assert (tmp_path / "s.json").read_bytes() == (kept / "s.json").read_bytes()
