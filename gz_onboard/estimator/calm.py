@@ -9,7 +9,8 @@ faster
 
 Once a ride has gone on for `SETTLED` and the forecast is known from as much, a change is shown no faster than
 `FASTEST`: the range does not rise under who rides, nor fall by more than twice what is ridden. A worse forecast is held
-back only as long as that closes the gap over a third of the range.
+back only once the range shown has been near the forecast, and not near empty: a first guess that was too good is no
+calm to keep.
 
 At standstill nothing is ridden that the gap could close over: what is drawn is taken off, and what else changes the
 forecast, as a rest does that shows the state of charge, waits for the riding to come; at most `STEP` of it. The rest of
@@ -41,7 +42,7 @@ class Calm:
 
     def __init__(self, gap: float = 0.0) -> None:
         self.gap = gap  # m: shown less forecast
-        self._settled = False
+        self._settled = self._met = False
         self._way = 0.0  # m of this ride
         self._before: tuple[float, float] | None = None  # the last forecast's range [m] and energy [J]
         self._ridden = 0.0  # m since
@@ -53,7 +54,7 @@ class Calm:
 
     def begin_ride(self) -> None:
         """Another ride: what was held back on the last one shows in the first kilometres of this."""
-        self._settled, self._way = False, 0.0
+        self._settled, self._met, self._way = False, False, 0.0
 
     def show_next(self) -> None:
         """The next forecast shows at once: it stands on something else, which the rider has changed."""
@@ -85,7 +86,10 @@ class Calm:
         self._settled |= min(known, self._way) >= SETTLED
         if self._settled:
             most = ridden * max(FASTEST[0], FASTEST[1] * raw)
-            closed = min(max(closed, -most), max(most, gap * (1 - exp(-ridden * NEAR_EMPTY / raw))))
+            closed = max(closed, -most)
+            self._met |= abs(gap) < STEP * raw
+            if self._met:
+                closed = min(closed, max(most, gap * (1 - exp(-ridden * NEAR_EMPTY / raw))))
         self.gap = gap - closed
         self._waiting *= fading
         return self.shown(raw)

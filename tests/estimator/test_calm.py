@@ -302,3 +302,17 @@ def test_what_the_rider_changes_shows_at_once(ridden):
         found.append(calm.follow(60_000.0, 4e6, KNOWN, drawn=0.0))
     assert found[0] < 58_000
     assert found[1] == 60_000
+
+
+def test_a_first_guess_that_was_too_good_is_left_as_soon_as_the_riding_is_known():
+    """A third too long at first: ten kilometres on it is within a tenth, not 8 km less."""
+    ridden = np.full(1000, 10.0)
+    at = np.cumsum(ridden)
+    known = np.maximum(at, 250.0)
+    calm, found = Calm(), []
+    for way, so_far in zip(at, known, strict=True):
+        calm.ride(10.0)
+        raw = (60_000 if way < 1500 else 45_000) - way
+        found.append(calm.follow(raw, 4e6, so_far) / raw)
+    assert found[250] > 1.1
+    assert found[-1] < 1.1
