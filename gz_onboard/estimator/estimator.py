@@ -21,7 +21,7 @@ from gz_onboard.estimator.outlook import Now, Outlook
 from gz_onboard.estimator.present import Present
 from gz_onboard.estimator.reasons import DEGRADING, NO_PACK, MissingSignals, loss_variance
 from gz_onboard.estimator.redundancy.checks import StepInputs
-from gz_onboard.estimator.redundancy.currents import CellEvidence
+from gz_onboard.estimator.redundancy.electric import CellEvidence
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.road import STANDSTILL, RoadState

@@ -8,8 +8,7 @@ from enum import Enum, auto
 from math import hypot, inf, isinf
 
 from gz_onboard.constants import BENCH_TEMPERATURE
-from gz_onboard.estimator.redundancy.currents import CellEvidence
-from gz_onboard.estimator.redundancy.electric import Readings
+from gz_onboard.estimator.redundancy.electric import CellEvidence, Readings
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.signals import Signal, Signals
 from gz_onboard.estimator.timing import SLOW_GAP
@@ -93,6 +92,7 @@ class PackSources:
             voltage,
             inverter_voltage,
             speed,
+            signals.pack_voltage.time - signals.inverter_voltage.time,
         )
         current, source = self._current(dt, readings, evidence)
         if voltage is not None:
@@ -101,7 +101,7 @@ class PackSources:
             inverter_voltage += self._cable * (current or 0.0)
         together = _together(signals.pack_voltage, signals.inverter_voltage)
         compared = replace(readings, pack_voltage=voltage, inverter_voltage=inverter_voltage if together else None)
-        distrusted = voltages.update(dt, compared, current, evidence.error)
+        distrusted = voltages.update(dt, compared, current, evidence)
         for role in voltages.ROLES:
             signals[role].trusted = role not in distrusted
         if voltages.apart and voltage is not None and inverter_voltage is not None:

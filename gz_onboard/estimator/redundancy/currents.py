@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from math import sqrt
 
 from gz_onboard.estimator.redundancy.checks import AGREES, NO_SENSOR, counters, faulty, share_of_new
-from gz_onboard.estimator.redundancy.electric import ERROR_LEAST, CellError, Readings, ResidualComparison
+from gz_onboard.estimator.redundancy.electric import ERROR_LEAST, CellError, CellEvidence, Readings, ResidualComparison
 from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.road import STANDSTILL
 from gz_onboard.events import CURRENTS
@@ -20,15 +18,6 @@ ROAD_TIME, OFF_ROAD, OFF_ROAD_RELATIVE = 30.0, 0.15, 0.7  # s, 1/h, 1: by the ro
 TWICE = 2.0  # a current that is off by so many times as much as another is the worse of the two
 EXPLAINS = 1 / 4  # of the mean square: a sensor without which so little remains is the one that is wrong
 PACK, INVERTER, AUXILIARY = (frozenset({f"{name}_current"}) for name in ("pack", "inverter", "auxiliary"))
-
-
-@dataclass(frozen=True, slots=True)
-class CellEvidence:
-    """What else is known of the pack's current."""
-
-    error: CellError
-    road_power: Callable[[], float | None]  # W of the pack, by the model; None while the motion is not known
-    innovation_rms: float  # V of a cell, of the last ten seconds
 
 
 class CurrentCheck:
