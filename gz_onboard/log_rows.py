@@ -124,7 +124,8 @@ def explanation_row(why: Explanation) -> dict[str, object]:
     """An explanation as it stands in logs: causes by name."""
     causes = {cause.name.lower(): size for cause, size in why.causes.items()}
     numbers = {"time": why.time, "reference": why.reference, "range": why.range} | causes
-    return {name: round(value, 2) for name, value in numbers.items()}
+    row: dict[str, object] = {name: round(value, 2) for name, value in numbers.items()}
+    return row | ({"forgotten": " ".join(why.forgotten)} if why.forgotten else {})
 
 
 def ride_row(last: Estimate, drawn: Drawn, ambient: float | None, rider: str) -> dict[str, object]:
@@ -181,7 +182,9 @@ def declare(log: Log, messages: Sequence[Message]) -> None:
     log.channel(ESTIMATE_TOPIC, estimate_schema())
     units = dict.fromkeys(("reference", "range", *(cause.name.lower() for cause in Cause if cause)), "m")
     for topic, title in ((WHY_TOPIC, "gz_onboard.Why"), (CHANGE_TOPIC, "gz_onboard.RangeChange")):
-        log.channel(topic, object_schema(title, {"time": ESTIMATE_UNITS["time"]} | units))
+        schema = object_schema(title, {"time": ESTIMATE_UNITS["time"]} | units)
+        schema["properties"] |= {"forgotten": {"type": "string"}} if topic == CHANGE_TOPIC else {}
+        log.channel(topic, schema)
     counts = {name: {"type": "integer"} for name in COUNTS}
     maps = {name: {"type": "object"} for name in ("foreign", "faults", "lost", "unknown", "requests")}
     reasons = {"reasons": {"type": "array", "items": {"type": "string"}}}

@@ -23,6 +23,7 @@ _STATE_COLOURS = {State.STARTING: "grey", State.VALID: "green", State.DEGRADED: 
 _TEMPERATURE_COLOURS = {"motor_temperature": "red", "inverter_temperature": "purple", "ambient_temperature": "blue"}
 _LEAST_WH = 0.05  # of the ledger: less is not shown
 _MOST_CHANGES = 20
+_TAUGHT = ("riding", "unexplained", "payload", "rolling", "drag")  # what sensors that are left out may have taught
 
 
 def section(ride: ReportedRide, anchor: str) -> str:
@@ -209,13 +210,22 @@ def _why(why: Why | None) -> str:
     )
 
 
+def _by_sensor(change: Why) -> dict[str, float]:
+    """The causes of a change, in words: what is forgotten with a sensor that is left out is not the riding's."""
+    causes = {words(name): km for name, km in change.causes_km.items()}
+    if change.forgotten:
+        left_out = " and ".join(map(words, change.forgotten))
+        causes[f"{left_out} left out, what it taught forgotten"] = sum(causes.pop(words(name), 0.0) for name in _TAUGHT)
+    return causes
+
+
 def _changes(changes: Sequence[Why]) -> str:
     """When the range changed by other than what was ridden, and why."""
     if not changes:
         return ""
     lines = []
     for change in changes[-_MOST_CHANGES:]:
-        causes = ", ".join(f"{words(name)} {km:+.1f}" for name, km in _told(change.causes_km))
+        causes = ", ".join(f"{name} {km:+.1f}" for name, km in _told(_by_sensor(change)))
         size = change.range_km - change.reference_km
         lines.append(f"<tr><td class=at>{clock(change.time_s)}</td><td class=n>{size:+.1f}</td><td>{causes}</td></tr>")
     more = f"; the last {_MOST_CHANGES} of {len(changes)}" if len(changes) > _MOST_CHANGES else ""
