@@ -246,6 +246,7 @@ class Estimate:
     innovation_rms: float | None = None  # V, of a cell, over the last 10 s or so
     pack_voltage: float | None = None  # V
     pack_current: float | None = None  # A
+    current_modelled: bool = False  # no sensor showed it
     cell_temperature: float | None = None  # degC
     speed: float | None = None  # m/s
     acceleration: float | None = None  # m/s²

@@ -68,6 +68,8 @@ RIDE_UNITS = {
     "distance": "m",
     "energy": "J, drawn net",
     "energy_recovered": "J",
+    "energy_distance": "m of the distance, which the energy is of",
+    "energy_missing": "s without voltage or current, which the energy lacks",
     "ambient_temperature": "degC",
 }
 """Of the numbers of `ride_row`."""
@@ -135,6 +137,8 @@ def ride_row(last: Estimate, drawn: Drawn, ambient: float | None, rider: str) ->
         "distance": round(last.distance, 2),
         "energy": None if drawn.net is None else round(drawn.net, 1),
         "energy_recovered": round(drawn.recovered, 1),
+        "energy_distance": round(drawn.distance, 2),
+        "energy_missing": round(drawn.missing, 1),
         "ambient_temperature": None if ambient is None else round(ambient, 2),
         "rider": rider,
     }

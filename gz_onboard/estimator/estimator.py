@@ -279,7 +279,7 @@ class Estimator:
         if not silent:
             estimate.speed, estimate.acceleration, estimate.grade = road.speed, road.acceleration, road.grade
             estimate.lean, estimate.yaw_rate, estimate.heading = road.lean, road.yaw_rate, road.heading
-            estimate.pack_voltage, estimate.pack_current = self._reading.voltage, self._reading.current
+            self._reading.report(estimate)
             estimate.innovation = self.soc.gate.innovation
         estimate.cell_temperature = self._temperatures.cells
         if filter_ is None:

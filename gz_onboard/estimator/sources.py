@@ -12,6 +12,7 @@ from gz_onboard.estimator.redundancy.electric import CellEvidence, Readings
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.signals import Signal, Signals
 from gz_onboard.estimator.timing import SLOW_GAP
+from gz_onboard.events import Estimate
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.sensors import true_current, true_voltage
@@ -47,6 +48,11 @@ class PackReading:
     def unmeasured(self) -> bool:
         """Whether no sensor shows anything of the pack."""
         return self.voltage is None and self.source in (CurrentSource.MODEL, CurrentSource.NONE)
+
+    def report(self, estimate: Estimate) -> None:
+        """Into an estimate."""
+        estimate.pack_voltage, estimate.pack_current = self.voltage, self.current
+        estimate.current_modelled = self.source is CurrentSource.MODEL
 
 
 @dataclass(frozen=True, slots=True)

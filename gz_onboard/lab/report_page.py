@@ -9,7 +9,7 @@ from math import isfinite, nan
 from pathlib import Path
 
 from gz_onboard.events import TOLD, Activity, State, words
-from gz_onboard.lab.estimate import summary_rows
+from gz_onboard.lab.estimate import lacks_energy, summary_rows
 from gz_onboard.lab.logged import Logged
 from gz_onboard.lab.plot import column, spans, with_holes
 from gz_onboard.lab.report_charts import Abscissa, Curve, bar, chart, key, strip
@@ -88,10 +88,11 @@ def _soc(ride: ReportedRide) -> str:
 def _tiles(ride: ReportedRide) -> str:
     s = ride.summary
     band = f"range left, {number(s.range_end_p10_km, '.1f')} to {number(s.range_end_p90_km, '.1f')} km"
+    over = f"over {s.energy_distance_km:.2f} km: {lacks}" if (lacks := lacks_energy(s)) else "over the ride"
     tiles = [
         ("distance", number(s.distance_km, ".2f", "km"), f"in {clock(s.duration_s)}"),
         ("energy", number(s.energy_wh, ".0f", "Wh"), f"drawn, {number(s.energy_recovered_wh, '.0f', 'Wh')} recovered"),
-        ("consumption", number(s.consumption_wh_km, ".1f", "Wh/km"), "over the ride"),
+        ("consumption", number(s.consumption_wh_km, ".1f", "Wh/km"), over),
         ("soc", _soc(ride), f"state of charge, ± {number(s.soc_end_sd, '.1f', '%', 100)}"),
         ("range", number(s.range_end_km, ".1f", "km"), band),
     ]
@@ -159,7 +160,7 @@ def _said(words_: str, left: Sequence[float], p10: Sequence[float], p90: Sequenc
 
 def _ledger(ride: ReportedRide) -> str:
     """Where the energy went, by the model; and what that leaves of what was measured."""
-    drawn, distance = ride.summary.energy_wh, ride.summary.distance_km
+    drawn, distance = ride.summary.energy_wh, ride.ledger_km
     told = [(name, energy) for name, energy in ride.ledger_wh().items() if abs(energy) >= _LEAST_WH]
     if not told:
         return ""
