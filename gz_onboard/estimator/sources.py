@@ -70,6 +70,7 @@ class PackSources:
     def __init__(self, signals: Signals, redundancy: Redundancy, battery: Battery, parameters: Parameters) -> None:
         p = parameters
         self._signals, self._currents, self._voltages = signals, redundancy.currents, redundancy.voltages
+        self._currents.there = frozenset(role for role in self._currents.ROLES if signals[role].stale_after)
         self._parameters, self._cable = dict(p), p["cable_resistance"]
         self._voltage_sd = p.sd("pack_voltage_offset") / battery.cells_series
         self._auxiliary_power = p["auxiliary_power"]

@@ -28,6 +28,7 @@ class CurrentCheck:
     def __init__(self, capacity: float) -> None:
         self._capacity = capacity  # A·h of the pack
         self.counters = counters(self.ROLES)
+        self.there = frozenset(self.ROLES)  # those that the vehicle has: no other is ever faulty
         self.disputed = False  # the two differ, and it is not known which of them is right
         self.sag = VoltageSag()
         self._scaled = False  # both are
@@ -50,7 +51,7 @@ class CurrentCheck:
             self._scaled = not self.sag.agrees
             against, agree = PACK | INVERTER, None
         for role in self.ROLES:
-            self.counters[role].update(dt, True if role in against else agree)
+            self.counters[role].update(dt, True if role in against & self.there else agree)
         return (against if not self.disputed else NO_SENSOR) | faulty(self.counters)
 
     def compare_consumption(self, relative: float) -> None:
