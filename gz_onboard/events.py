@@ -214,6 +214,7 @@ class Explanation:
     reference: float  # m: the vehicle's rated range; of a change, the range before
     range: float  # m; of a change, with the distance ridden since
     causes: Mapping[Cause, float]  # m, by cause
+    forgotten: tuple[str, ...] = ()  # roles found faulty between, so that what they had taught was forgotten
 
     def largest(self) -> list[tuple[Cause, float]]:
         """The causes that are worth telling, the largest first, but for the charge, which is shown elsewhere."""
@@ -245,6 +246,7 @@ class Estimate:
     innovation_rms: float | None = None  # V, of a cell, over the last 10 s or so
     pack_voltage: float | None = None  # V
     pack_current: float | None = None  # A
+    current_modelled: bool = False  # no sensor showed it
     cell_temperature: float | None = None  # degC
     speed: float | None = None  # m/s
     acceleration: float | None = None  # m/s²

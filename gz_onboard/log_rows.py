@@ -68,6 +68,8 @@ RIDE_UNITS = {
     "distance": "m",
     "energy": "J, drawn net",
     "energy_recovered": "J",
+    "energy_distance": "m of the distance, which the energy is of",
+    "energy_missing": "s without voltage or current, which the energy lacks",
     "ambient_temperature": "degC",
 }
 """Of the numbers of `ride_row`."""
@@ -124,7 +126,8 @@ def explanation_row(why: Explanation) -> dict[str, object]:
     """An explanation as it stands in logs: causes by name."""
     causes = {cause.name.lower(): size for cause, size in why.causes.items()}
     numbers = {"time": why.time, "reference": why.reference, "range": why.range} | causes
-    return {name: round(value, 2) for name, value in numbers.items()}
+    row: dict[str, object] = {name: round(value, 2) for name, value in numbers.items()}
+    return row | ({"forgotten": " ".join(why.forgotten)} if why.forgotten else {})
 
 
 def ride_row(last: Estimate, drawn: Drawn, ambient: float | None, rider: str) -> dict[str, object]:
@@ -134,6 +137,8 @@ def ride_row(last: Estimate, drawn: Drawn, ambient: float | None, rider: str) ->
         "distance": round(last.distance, 2),
         "energy": None if drawn.net is None else round(drawn.net, 1),
         "energy_recovered": round(drawn.recovered, 1),
+        "energy_distance": round(drawn.distance, 2),
+        "energy_missing": round(drawn.missing, 1),
         "ambient_temperature": None if ambient is None else round(ambient, 2),
         "rider": rider,
     }
@@ -181,7 +186,9 @@ def declare(log: Log, messages: Sequence[Message]) -> None:
     log.channel(ESTIMATE_TOPIC, estimate_schema())
     units = dict.fromkeys(("reference", "range", *(cause.name.lower() for cause in Cause if cause)), "m")
     for topic, title in ((WHY_TOPIC, "gz_onboard.Why"), (CHANGE_TOPIC, "gz_onboard.RangeChange")):
-        log.channel(topic, object_schema(title, {"time": ESTIMATE_UNITS["time"]} | units))
+        schema = object_schema(title, {"time": ESTIMATE_UNITS["time"]} | units)
+        schema["properties"] |= {"forgotten": {"type": "string"}} if topic == CHANGE_TOPIC else {}
+        log.channel(topic, schema)
     counts = {name: {"type": "integer"} for name in COUNTS}
     maps = {name: {"type": "object"} for name in ("foreign", "faults", "lost", "unknown", "requests")}
     reasons = {"reasons": {"type": "array", "items": {"type": "string"}}}

@@ -153,7 +153,7 @@ class Pipeline:
         if self.extra_reasons & Reason.BUS_DOWN and estimate.state is State.VALID:
             estimate.state = State.DEGRADED
         self.last = estimate
-        self.drawn.add(estimate.time, estimate.pack_voltage, estimate.pack_current)
+        self.drawn.take(estimate)
         if estimate.range is not None and estimate.state in KNOWN:
             self.last_known = estimate
         if self._observer:

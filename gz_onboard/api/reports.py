@@ -34,7 +34,7 @@ class Reported(Tabular):
         """Where the energy went: a row for each ride and entry of its ledger."""
         rows = [
             {"ride": ride.name, "where": where, "energy": energy}
-            | {"per_km": energy / ride.summary.distance_km if ride.summary.distance_km else None}
+            | {"per_km": energy / ride.ledger_km if ride.ledger_km else None}
             for ride in self.rides
             for where, energy in ride.ledger_wh().items()
         ]

@@ -12,6 +12,7 @@ wind, with its payload, its consumption factor, and a full battery as new, at th
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from math import exp
 from typing import NamedTuple
@@ -83,6 +84,7 @@ class Attribution:
         self._new = forecaster.battery.own()
         self._rated: State | None = None
         self._since: State | None = None
+        self._forgotten: set[str] = set()  # roles, since then
         self.latest: Explanation | None = None
         self.changes: deque[Explanation] = deque(maxlen=MOST_CHANGES)
         self._news: deque[tuple[bool, Explanation]] = deque(maxlen=MOST_CHANGES)
@@ -95,13 +97,18 @@ class Attribution:
         moved = since and abs(forecast.range + ridden - since.range - since.ridden) > MOVED
         if since and moved and now - since.time >= SETTLED:
             self._since = self._state(now, forecast, soc, air, ridden)
-            self.changes.append(self.explained(since, self._since))
+            self.changes.append(replace(self.explained(since, self._since), forgotten=tuple(sorted(self._forgotten))))
+            self._forgotten.clear()
             self._news.append((True, self.changes[-1]))
         if due:
             state = self._state(now, forecast, soc, air, ridden)
             self._since = self._since or state
             self.latest = self.explained(self.rated, state)
             self._news.append((False, self.latest))
+
+    def forget(self, roles: Iterable[str]) -> None:
+        """What was learned of these sensors is forgotten, as they are found faulty."""
+        self._forgotten.update(roles)
 
     def news(self) -> list[tuple[bool, Explanation]]:
         """What was explained since it was last asked for: (whether it is a change, explanation)."""

@@ -21,7 +21,7 @@ from gz_onboard.estimator.outlook import Now, Outlook
 from gz_onboard.estimator.present import Present
 from gz_onboard.estimator.reasons import DEGRADING, NO_PACK, MissingSignals, loss_variance
 from gz_onboard.estimator.redundancy.checks import StepInputs
-from gz_onboard.estimator.redundancy.currents import CellEvidence
+from gz_onboard.estimator.redundancy.electric import CellEvidence
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.road import STANDSTILL, RoadState
@@ -200,23 +200,23 @@ class Estimator:
     def _compare_grades(self, now: float, dt: float) -> None:
         """Compare what shows the grade; forget what was learned from a sensor that is newly distrusted."""
         grades, reading = self.redundancy.grades, self._reading
-        voltage, current = reading.voltage, reading.current
-        unknown = voltage is None or current is None or reading.source is CurrentSource.MODEL
-        power = None if voltage is None or current is None or unknown else voltage * current
+        voltage, current, modelled = reading.voltage, reading.current, reading.source is CurrentSource.MODEL
+        power = None if voltage is None or current is None or modelled else voltage * current
         before = grades.faulty
         grades.compare(
             now, dt, self.signals, self.redundancy.speeds, power, lambda v, a: self._present.power_at(now, v, a)
         )
         if grades.faulty != before:
             self.road.forget_grade(grades.offset, self.signals.gps_altitude.fresh(now))
-        distrusted = self.redundancy.distrusted
+        left_out, self._distrusted = self._distrusted, self.redundancy.distrusted
+        newly = set(self._distrusted).difference(left_out)
         learned = LEARNED_FROM if self.road.speed is not None else LEARNED_FROM.union(SpeedCheck.ROLES)
-        if any(role in learned and role not in self._distrusted for role in distrusted):
+        if forgotten := newly & learned:
             self.forecaster.forget(max(UNLEARNED, self.redundancy.odometer.compared))
             self.road_load.unlearn()
-        if any(role in AGED_FROM and role not in self._distrusted for role in distrusted):
+            self.attribution.forget(forgotten)
+        if newly & AGED_FROM:
             self.soc.ageing.unlearn()
-        self._distrusted = distrusted
 
     # --- riding and range -------------------------------------------------------------------------------------
 
@@ -279,7 +279,7 @@ class Estimator:
         if not silent:
             estimate.speed, estimate.acceleration, estimate.grade = road.speed, road.acceleration, road.grade
             estimate.lean, estimate.yaw_rate, estimate.heading = road.lean, road.yaw_rate, road.heading
-            estimate.pack_voltage, estimate.pack_current = self._reading.voltage, self._reading.current
+            self._reading.report(estimate)
             estimate.innovation = self.soc.gate.innovation
         estimate.cell_temperature = self._temperatures.cells
         if filter_ is None:

@@ -28,7 +28,7 @@ from gz_onboard.estimator.calm import Calm, restored_gap
 from gz_onboard.estimator.interval import deciles
 from gz_onboard.estimator.load_model import AHEAD, USUAL_AIR, Conditions, EffectInputs, LoadModel
 from gz_onboard.estimator.pattern import STEEPEST, Pattern, restored_pattern
-from gz_onboard.estimator.ridden import Past, Riding, Second, Segment, learned, restored, restored_states
+from gz_onboard.estimator.ridden import Past, Riding, Second, Segment, learned, restored, restored_states, unlearned
 from gz_onboard.estimator.riders import Riders, restored_riders
 from gz_onboard.estimator.usual import SEGMENT, Unit, Usual, restored_unit
 from gz_onboard.physics.battery import HALF_FULL, Battery
@@ -192,7 +192,7 @@ class Forecaster:
 
     def forget(self, distance: float) -> None:
         """Unlearn the last `distance` [m] or a little more: a sensor that it was learned from is faulty."""
-        r = self.riding
+        r, seen = self.riding, self.riding.usual
         self.pause()
         distance -= r.current.distance
         r.current = Segment()
@@ -200,6 +200,7 @@ class Forecaster:
         while distance > 0 and r.segments and (before := r.segments[-1].learned):
             distance -= r.segments.pop().distance
             r.usual = before
+        r.usual = unlearned(r.usual, seen)
         self._sum_past()
 
     def ridden_by(self, rider: str) -> None:

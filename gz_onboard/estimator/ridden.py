@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from math import exp, inf, isfinite
 from typing import Any
 
 from gz_onboard.estimator.load_model import EffectInputs
-from gz_onboard.estimator.usual import Unit, Usual, restored_usual
+from gz_onboard.estimator.usual import MOST_VARIANCE, Habit, Unit, Usual, restored_usual
 from gz_onboard.physics.effect import MOVING
 
+IN_DOUBT = 1.25  # of the difference that a sensor in doubt made: sd; price and stops may differ the same way
 MEMORY = 12000.0  # m: what is further back counts for less than 1/e
 MOST_SEGMENTS = 200  # 50 km: of what is further back nothing counts
 RECENT = 1000.0  # m: what a rider calls his consumption
@@ -180,6 +181,17 @@ def learned(usual: Usual, segment: Segment, price: float, speed: float, height: 
         usual.pace.learned(segment.duration * speed / way - usual.pace.now, way),
         usual.factor.learned(excess, way, (height * factor / (likely * unit)) ** 2),
     )
+
+
+def unlearned(usual: Usual, seen: Usual) -> Usual:
+    """What is `usual` without what a sensor taught that errs. `seen`: with it; that may be true all the same."""
+    return Usual(*(_in_doubt(getattr(usual, f.name), getattr(seen, f.name).now) for f in fields(Usual)))
+
+
+def _in_doubt(habit: Habit, seen: float) -> Habit:
+    more = (IN_DOUBT * (seen - habit.now)) ** 2
+    variance = min(habit.present_variance + more, max(habit.present_variance, MOST_VARIANCE))
+    return replace(habit, present_variance=variance)
 
 
 @dataclass(slots=True)

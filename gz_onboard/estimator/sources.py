@@ -8,11 +8,11 @@ from enum import Enum, auto
 from math import hypot, inf, isinf
 
 from gz_onboard.constants import BENCH_TEMPERATURE
-from gz_onboard.estimator.redundancy.currents import CellEvidence
-from gz_onboard.estimator.redundancy.electric import Readings
+from gz_onboard.estimator.redundancy.electric import CellEvidence, Readings
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.signals import Signal, Signals
 from gz_onboard.estimator.timing import SLOW_GAP
+from gz_onboard.events import Estimate
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.sensors import true_current, true_voltage
@@ -49,6 +49,11 @@ class PackReading:
         """Whether no sensor shows anything of the pack."""
         return self.voltage is None and self.source in (CurrentSource.MODEL, CurrentSource.NONE)
 
+    def report(self, estimate: Estimate) -> None:
+        """Into an estimate."""
+        estimate.pack_voltage, estimate.pack_current = self.voltage, self.current
+        estimate.current_modelled = self.source is CurrentSource.MODEL
+
 
 @dataclass(frozen=True, slots=True)
 class PackState:
@@ -65,6 +70,7 @@ class PackSources:
     def __init__(self, signals: Signals, redundancy: Redundancy, battery: Battery, parameters: Parameters) -> None:
         p = parameters
         self._signals, self._currents, self._voltages = signals, redundancy.currents, redundancy.voltages
+        self._currents.there = frozenset(role for role in self._currents.ROLES if signals[role].stale_after)
         self._parameters, self._cable = dict(p), p["cable_resistance"]
         self._voltage_sd = p.sd("pack_voltage_offset") / battery.cells_series
         self._auxiliary_power = p["auxiliary_power"]
@@ -93,6 +99,7 @@ class PackSources:
             voltage,
             inverter_voltage,
             speed,
+            signals.pack_voltage.time - signals.inverter_voltage.time,
         )
         current, source = self._current(dt, readings, evidence)
         if voltage is not None:
@@ -101,7 +108,7 @@ class PackSources:
             inverter_voltage += self._cable * (current or 0.0)
         together = _together(signals.pack_voltage, signals.inverter_voltage)
         compared = replace(readings, pack_voltage=voltage, inverter_voltage=inverter_voltage if together else None)
-        distrusted = voltages.update(dt, compared, current, evidence.error)
+        distrusted = voltages.update(dt, compared, current, evidence)
         for role in voltages.ROLES:
             signals[role].trusted = role not in distrusted
         if voltages.apart and voltage is not None and inverter_voltage is not None:

@@ -33,6 +33,7 @@ from gz_onboard.pipeline import Pipeline
 from gz_onboard.progress import Display, Progress, progress_bar
 from gz_onboard.vehicle import find_vehicle
 
+LEAST_MISSING = 1.0  # s: less is not told
 KEYS = descriptions(RideSummary)
 """What the summary of a ride holds."""
 
@@ -180,12 +181,7 @@ def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
             f"{clock(ride.duration_s)}, {ride.distance_km:z.2f} km, "
             f"at most {number(ride.speed_max_km_h, '.0f', 'km/h')}",
         ),
-        (
-            "energy",
-            f"{number(ride.energy_wh, '.0f', 'Wh')} drawn net, "
-            f"{number(ride.energy_recovered_wh, '.0f', 'Wh')} of it recovered before; "
-            f"{number(ride.consumption_wh_km, '.1f', 'Wh/km')}",
-        ),
+        *_energy_rows(ride),
         (
             "state of charge",
             f"{_percent(ride.soc_start, ride.soc_start_sd)} at the start, "
@@ -220,6 +216,24 @@ def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
         *([("left out", _durations(ride.distrusted))] if ride.distrusted else []),
         *([("never there", ", ".join(words(name) for name in ride.lacking))] if ride.lacking else []),
     ]
+
+
+def _energy_rows(ride: RideSummary) -> list[tuple[str, str]]:
+    if ride.energy_wh is None:
+        return [("energy", "not known: voltage or current of the pack was not measured, or too seldom")]
+    text = (
+        f"{ride.energy_wh:.0f} Wh drawn net, {number(ride.energy_recovered_wh, '.0f', 'Wh')} of it recovered before; "
+        f"{number(ride.consumption_wh_km, '.1f', 'Wh/km')}"
+    )
+    lacks = lacks_energy(ride)
+    return [("energy", text), *([("", f"of {ride.energy_distance_km:.2f} km: {lacks}")] if lacks else [])]
+
+
+def lacks_energy(ride: RideSummary) -> str:
+    """What a known energy does not hold of the ride; empty if it is next to nothing."""
+    if ride.energy_wh is None or ride.energy_missing_s < LEAST_MISSING:
+        return ""
+    return f"{ride.energy_missing_s:.1f} s without voltage or current to be believed are not in it"
 
 
 def _range(ride: RideSummary) -> str:

@@ -35,11 +35,13 @@ class RideSummary:
     speed_max_km_h: Annotated[float | None, "greatest speed, or null"]
     energy_wh: Annotated[
         float | None,
-        "drawn from the pack, less what was recovered, the sensors' known gain and offsets taken off; "
+        "drawn from the pack as measured, less what was recovered, the sensors' known gain and offsets taken off; "
         "null if voltage or current was never known, or came too slowly for more than a tenth of the time",
     ]
     energy_recovered_wh: Annotated[float | None, "charged into the pack while riding, or null"]
-    consumption_wh_km: Annotated[float | None, "energy over distance; null below 0.1 km"]
+    energy_distance_km: Annotated[float, "of distance_km, ridden while voltage and current were known"]
+    energy_missing_s: Annotated[float, "without a voltage or current to be believed: the energy lacks it"]
+    consumption_wh_km: Annotated[float | None, "energy over energy_distance_km; null below 0.1 km"]
     soc_start: Annotated[float | None, "state of charge, 0 to 1, at the first estimate that has one"]
     soc_start_sd: Annotated[float | None, "its standard deviation"]
     soc_end: Annotated[float | None, "at the last estimate that has one"]
@@ -91,6 +93,7 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
     counts, status = pipeline.counts(), pipeline.status()
     states, reasons = tally.by_name()
     drawn = pipeline.drawn.net if reasons[Reason.SIGNALS_SLOW.name] <= MOST_SLOW * states.total() else None
+    way = pipeline.drawn.distance
     return RideSummary(
         file=str(ridden.source),
         log=str(log) if log else None,
@@ -103,7 +106,9 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         speed_max_km_h=times(tally.speed_max, 3.6),
         energy_wh=times(drawn, 1 / WH),
         energy_recovered_wh=None if drawn is None else pipeline.drawn.recovered / WH,
-        consumption_wh_km=times(drawn, 1 / last.distance / WH_PER_KM) if last.distance >= 100 else None,
+        energy_distance_km=way * 1e-3,
+        energy_missing_s=round(pipeline.drawn.missing, 1),
+        consumption_wh_km=times(drawn, 1 / way / WH_PER_KM) if way >= 100 else None,
         soc_start=soc_start[0],
         soc_start_sd=soc_start[1],
         soc_end=soc_end[0],

@@ -9,7 +9,7 @@ from math import isfinite, nan
 from pathlib import Path
 
 from gz_onboard.events import TOLD, Activity, State, words
-from gz_onboard.lab.estimate import summary_rows
+from gz_onboard.lab.estimate import lacks_energy, summary_rows
 from gz_onboard.lab.logged import Logged
 from gz_onboard.lab.plot import column, spans, with_holes
 from gz_onboard.lab.report_charts import Abscissa, Curve, bar, chart, key, strip
@@ -23,6 +23,7 @@ _STATE_COLOURS = {State.STARTING: "grey", State.VALID: "green", State.DEGRADED: 
 _TEMPERATURE_COLOURS = {"motor_temperature": "red", "inverter_temperature": "purple", "ambient_temperature": "blue"}
 _LEAST_WH = 0.05  # of the ledger: less is not shown
 _MOST_CHANGES = 20
+_TAUGHT = ("riding", "unexplained", "payload", "rolling", "drag")  # what sensors that are left out may have taught
 
 
 def section(ride: ReportedRide, anchor: str) -> str:
@@ -87,10 +88,11 @@ def _soc(ride: ReportedRide) -> str:
 def _tiles(ride: ReportedRide) -> str:
     s = ride.summary
     band = f"range left, {number(s.range_end_p10_km, '.1f')} to {number(s.range_end_p90_km, '.1f')} km"
+    over = f"over {s.energy_distance_km:.2f} km: {lacks}" if (lacks := lacks_energy(s)) else "over the ride"
     tiles = [
         ("distance", number(s.distance_km, ".2f", "km"), f"in {clock(s.duration_s)}"),
         ("energy", number(s.energy_wh, ".0f", "Wh"), f"drawn, {number(s.energy_recovered_wh, '.0f', 'Wh')} recovered"),
-        ("consumption", number(s.consumption_wh_km, ".1f", "Wh/km"), "over the ride"),
+        ("consumption", number(s.consumption_wh_km, ".1f", "Wh/km"), over),
         ("soc", _soc(ride), f"state of charge, ± {number(s.soc_end_sd, '.1f', '%', 100)}"),
         ("range", number(s.range_end_km, ".1f", "km"), band),
     ]
@@ -158,7 +160,7 @@ def _said(words_: str, left: Sequence[float], p10: Sequence[float], p90: Sequenc
 
 def _ledger(ride: ReportedRide) -> str:
     """Where the energy went, by the model; and what that leaves of what was measured."""
-    drawn, distance = ride.summary.energy_wh, ride.summary.distance_km
+    drawn, distance = ride.summary.energy_wh, ride.ledger_km
     told = [(name, energy) for name, energy in ride.ledger_wh().items() if abs(energy) >= _LEAST_WH]
     if not told:
         return ""
@@ -209,13 +211,22 @@ def _why(why: Why | None) -> str:
     )
 
 
+def _by_sensor(change: Why) -> dict[str, float]:
+    """The causes of a change, in words: what is forgotten with a sensor that is left out is not the riding's."""
+    causes = {words(name): km for name, km in change.causes_km.items()}
+    if change.forgotten:
+        left_out = " and ".join(map(words, change.forgotten))
+        causes[f"{left_out} left out, what it taught forgotten"] = sum(causes.pop(words(name), 0.0) for name in _TAUGHT)
+    return causes
+
+
 def _changes(changes: Sequence[Why]) -> str:
     """When the range changed by other than what was ridden, and why."""
     if not changes:
         return ""
     lines = []
     for change in changes[-_MOST_CHANGES:]:
-        causes = ", ".join(f"{words(name)} {km:+.1f}" for name, km in _told(change.causes_km))
+        causes = ", ".join(f"{name} {km:+.1f}" for name, km in _told(_by_sensor(change)))
         size = change.range_km - change.reference_km
         lines.append(f"<tr><td class=at>{clock(change.time_s)}</td><td class=n>{size:+.1f}</td><td>{causes}</td></tr>")
     more = f"; the last {_MOST_CHANGES} of {len(changes)}" if len(changes) > _MOST_CHANGES else ""

@@ -53,6 +53,11 @@ class ReportedRide:
     path: list[list[Position]]
     temperatures: dict[str, Series]
 
+    @property
+    def ledger_km(self) -> float:
+        """The distance that the ledger is of, like the energy."""
+        return self.summary.energy_distance_km or self.summary.distance_km
+
     def ledger_wh(self) -> dict[str, float]:
         """Where the energy went [Wh], the most first: by effect what the model says, and what it leaves. Negative:
         gained.

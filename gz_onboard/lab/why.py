@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from math import isfinite
 from pathlib import Path
@@ -26,12 +26,15 @@ class Why:
     reference_km: Annotated[float, "the rated range; of a change, the range before"]
     range_km: Annotated[float, "the range then; of a change, with the distance ridden since"]
     causes_km: Annotated[dict[str, float], "what each cause makes of the difference, to which they add up"]
+    forgotten: Annotated[list[str], "roles of sensors found faulty between, what they taught being forgotten"] = field(
+        default_factory=list
+    )
 
 
 def why_of(e: Explanation) -> Why:
     """An explanation in km."""
     causes = {cause.name.lower(): size * 1e-3 for cause, size in e.causes.items()}
-    return Why(e.time, e.reference * 1e-3, e.range * 1e-3, causes)
+    return Why(e.time, e.reference * 1e-3, e.range * 1e-3, causes, list(e.forgotten))
 
 
 def plot_why(log: Path, picture: Path) -> list[LogDamage]:

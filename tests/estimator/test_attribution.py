@@ -16,6 +16,7 @@ from gz_onboard.estimator.road_load import RoadLoad
 from gz_onboard.estimator.road_slopes import AUXILIARIES, DRAG, MASS, ROLLING
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import Cause, Explanation
+from gz_onboard.log_rows import explanation_row
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
 from gz_onboard.vehicle import Vehicle, read_vehicle
@@ -286,6 +287,26 @@ def test_what_is_ridden_as_expected_is_no_change():
     then = f.forecast(0.6, 0.01, 20.0, 1.0, 20.0, 0.0)
     attribution.take(500.0, then, 0.6, MILD, first.range - then.range)
     assert not attribution.changes
+
+
+def test_a_sensor_whose_teaching_is_forgotten_is_named_with_the_change():
+    f = forecaster()
+    ride(f, 3)
+    attribution = Attribution(f, Signals(()))
+
+    def take(now: float) -> None:
+        attribution.take(now, f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0), 0.7, MILD, 0.0)
+
+    take(0.0)
+    ride(f, 1.5, factor=2.5)
+    take(100.0)
+    f.forget(1500.0)
+    attribution.forget({"pack_voltage"})
+    take(200.0)
+    ride(f, 1.5, factor=2.5)
+    take(300.0)
+    assert [change.forgotten for change in attribution.changes] == [(), ("pack_voltage",), ()]
+    assert [explanation_row(change).get("forgotten") for change in attribution.changes] == [None, "pack_voltage", None]
 
 
 def test_the_split_is_made_seldom_and_not_of_a_range_that_stays():

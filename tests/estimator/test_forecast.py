@@ -210,6 +210,23 @@ def test_what_a_liar_taught_is_unlearned():
     assert forecast(f).consumption == pytest.approx(before * forecast(f).consumption / f.riding.factor, rel=0.02)
 
 
+@pytest.mark.parametrize("factor", [0.5, 1.6, 2.5])
+def test_what_was_forgotten_is_not_replaced_by_certainty(factor: float):
+    """It may be true all the same: the interval holds what was forecast before, and much riding narrows it again."""
+    f = forecaster()
+    ride(f, 3, seed=1)
+    narrow = forecast(f)
+    ride(f, 1.5, factor=factor, seed=2)
+    seen = forecast(f)
+    f.forget(1500.0)
+    doubted = forecast(f)
+    assert doubted.p10 < seen.range < doubted.p90
+    assert doubted.p90 / doubted.p10 > narrow.p90 / narrow.p10
+    ride(f, 6, seed=3)
+    again = forecast(f)
+    assert again.p90 / again.p10 < 1.1 * narrow.p90 / narrow.p10
+
+
 def test_nothing_from_before_a_restart_is_unlearned():
     f = forecaster()
     ride(f, 3)

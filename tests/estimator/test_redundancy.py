@@ -10,6 +10,7 @@ import pytest
 from gz_onboard.constants import GRAVITY
 from gz_onboard.estimator.redundancy.checks import NO_SENSOR, RECOVERED_AFTER, StepInputs, faulty
 from gz_onboard.estimator.redundancy.currents import CurrentCheck
+from gz_onboard.estimator.redundancy.electric import CellEvidence, Readings
 from gz_onboard.estimator.redundancy.grades import GradeCheck
 from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck, vote
@@ -246,6 +247,20 @@ def test_neither_a_frugal_rider_nor_an_aged_pack_is_a_fault():
             currents.sag.update(STEP, 3.7 - sags * drop, drop)
         currents.compare_consumption(takes)
         assert currents._scaled == scaled
+
+
+def test_a_sensor_that_the_vehicle_does_not_have_is_not_left_out():
+    """A single current that the road and the cells both contradict: it, and no other, is named."""
+    for there in (frozenset({"pack_current"}), frozenset(CurrentCheck.ROLES)):
+        check = CurrentCheck(30.0)
+        check.there = there
+        evidence = CellEvidence(lambda voltage, current, sensor: -0.004 * (100.0 - current), lambda: 5000.0, 0.1)
+        both = "inverter_current" in there
+        for _ in range(600):
+            readings = Readings(-20.0, -20.5 if both else None, None, 0.5, 50.0, None, 10.0)
+            left_out = check.update(STEP, readings, evidence)
+        assert "pack_current" in left_out
+        assert faulty(check.counters) == there - {"auxiliary_current"}
 
 
 # --- grade --------------------------------------------------------------------------------------------------------

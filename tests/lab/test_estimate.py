@@ -91,7 +91,7 @@ def test_the_summary_of_a_ride_agrees_with_its_frames(tmp_path, capsys):
     assert ride["duration_s"] == pytest.approx((every[-1][0] - every[0][0]) * 1e-9, abs=0.11)
     assert ride["energy_wh"] == pytest.approx(energy / 3600, rel=0.03)
     assert ride["energy_recovered_wh"] == pytest.approx(recovered / 3600, rel=0.1)
-    assert ride["consumption_wh_km"] == pytest.approx(ride["energy_wh"] / ride["distance_km"])
+    assert ride["consumption_wh_km"] == pytest.approx(ride["energy_wh"] / ride["energy_distance_km"])
     assert sum(ride["states"].values()) == pytest.approx(ride["duration_s"], abs=0.2)
 
     logged = [values for _, values in estimates(ride["log"])]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from math import inf, nan
 from pathlib import Path
 
@@ -17,8 +18,10 @@ from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.writers import write_candump
 from gz_onboard.cli import main
 from gz_onboard.estimator.load_model import Ledger
+from gz_onboard.lab import report_page
 from gz_onboard.lab.report_ride import path_of
 from gz_onboard.lab.report_svg import GRAIN, axis_of, band, draw_map, line, stretches
+from gz_onboard.lab.why import Why
 from gz_onboard.offline.samples import Samples
 from tests.support import LOGS
 
@@ -59,6 +62,14 @@ def test_a_long_line_is_thinned_and_keeps_its_peaks(some):
     heights = [GRAIN - round(up.at(value)) for value in values]
     assert {min(heights), max(heights)} <= {y for _, y in found}
     assert (found[0][1], found[-1][1]) == (heights[0], heights[-1])
+
+
+def test_a_change_by_a_sensor_that_is_left_out_is_not_called_riding():
+    change = Why(250.0, 46.2, 110.4, {"riding": 54.8, "unexplained": 6.0, "speed": 3.4}, ["pack_voltage"])
+    text = report_page._changes([change, replace(change, forgotten=[])])
+    named, plain = re.findall("<td>([^<]*)</td></tr>", text)
+    assert named == "pack voltage left out, what it taught forgotten +60.8, speed +3.4"
+    assert plain == "riding +54.8, unexplained +6.0, speed +3.4"
 
 
 def test_what_is_not_known_breaks_a_line_and_a_band():

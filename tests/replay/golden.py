@@ -59,6 +59,7 @@ TOLERANCE = {
     "consumption_factor": 1e-5,
     "consumption_factor_sd": 1e-5,
     "why": 0.0,
+    "current_modelled": 0.0,
     "charge_power": 1.0,
     "time_to_full": 10.0,
     "range_full": 1.0,

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from math import sqrt
 
 from gz_onboard.estimator.redundancy.checks import AGREES, NO_SENSOR, counters, faulty, share_of_new
-from gz_onboard.estimator.redundancy.electric import ERROR_LEAST, CellError, Readings, ResidualComparison
+from gz_onboard.estimator.redundancy.electric import ERROR_LEAST, CellError, CellEvidence, Readings, ResidualComparison
 from gz_onboard.estimator.redundancy.sag import VoltageSag
 from gz_onboard.estimator.road import STANDSTILL
 from gz_onboard.events import CURRENTS
@@ -22,15 +20,6 @@ EXPLAINS = 1 / 4  # of the mean square: a sensor without which so little remains
 PACK, INVERTER, AUXILIARY = (frozenset({f"{name}_current"}) for name in ("pack", "inverter", "auxiliary"))
 
 
-@dataclass(frozen=True, slots=True)
-class CellEvidence:
-    """What else is known of the pack's current."""
-
-    error: CellError
-    road_power: Callable[[], float | None]  # W of the pack, by the model; None while the motion is not known
-    innovation_rms: float  # V of a cell, of the last ten seconds
-
-
 class CurrentCheck:
     """Compares once a step; see `Redundancy`."""
 
@@ -39,6 +28,7 @@ class CurrentCheck:
     def __init__(self, capacity: float) -> None:
         self._capacity = capacity  # A·h of the pack
         self.counters = counters(self.ROLES)
+        self.there = frozenset(self.ROLES)  # those that the vehicle has: no other is ever faulty
         self.disputed = False  # the two differ, and it is not known which of them is right
         self.sag = VoltageSag()
         self._scaled = False  # both are
@@ -61,7 +51,7 @@ class CurrentCheck:
             self._scaled = not self.sag.agrees
             against, agree = PACK | INVERTER, None
         for role in self.ROLES:
-            self.counters[role].update(dt, True if role in against else agree)
+            self.counters[role].update(dt, True if role in against & self.there else agree)
         return (against if not self.disputed else NO_SENSOR) | faulty(self.counters)
 
     def compare_consumption(self, relative: float) -> None:

@@ -30,6 +30,7 @@ class Readings:
     pack_voltage: float | None
     inverter_voltage: float | None  # with the cable's drop
     speed: float | None  # m/s
+    voltages_apart: float = 0.0  # s: the time of the pack voltage's message less that of the inverter voltage's
 
     @property
     def through_inverter(self) -> float | None:
@@ -51,6 +52,15 @@ class Readings:
         return self.pack is not None and self.pack < 0 and abs(self.speed or 0.0) < STANDSTILL
 
 
+@dataclass(frozen=True, slots=True)
+class CellEvidence:
+    """What else is known of the pack's current and voltage."""
+
+    error: CellError
+    road_power: Callable[[], float | None]  # W of the pack, by the model; None while the motion is not known
+    innovation_rms: float  # V of a cell, of the last ten seconds
+
+
 class ResidualComparison:
     """Which of two readings the cells' voltage contradicts: mean squares of what the cell model leaves of each."""
 
@@ -62,14 +72,17 @@ class ResidualComparison:
         self._first = self._second = 0.0  # V²
         self._time = 0.0  # s
 
-    def update(self, dt: float, first: float | None, second: float | None) -> int:
-        """0 while nothing decides, 1 or 2: which is wrong. first, second [V of a cell]: measured less predicted."""
+    def update(self, dt: float, first: float | None, second: float | None, usual: float = 0.0) -> int:
+        """0 while nothing decides, 1 or 2: which is wrong. first, second [V of a cell]: measured less predicted.
+
+        usual: mean square [V²] of what the cell model leaves of what is right: no smaller difference decides.
+        """
         if first is None or second is None:
             return 0
         self._time = min(self._time + dt, ERROR_TIME)
         share = share_of_new(dt, self._time)
         self._first += (first * first - self._first) * share
         self._second += (second * second - self._second) * share
-        if abs(self._first - self._second) < DECIDES**2:
+        if abs(self._first - self._second) < max(DECIDES**2, CLEARLY * usual):
             return 0
         return 1 if self._first > CLEARLY * self._second else 2 if self._second > CLEARLY * self._first else 0

@@ -5,13 +5,15 @@ from __future__ import annotations
 from math import sqrt
 
 from gz_onboard.estimator.redundancy.checks import AGREES, counters, faulty, share_of_new
-from gz_onboard.estimator.redundancy.electric import CellError, Readings, ResidualComparison
+from gz_onboard.estimator.redundancy.electric import CellError, CellEvidence, Readings, ResidualComparison
+from gz_onboard.estimator.redundancy.skew import SkewedPair
 from gz_onboard.events import VOLTAGES
 from gz_onboard.physics.battery import Battery
 
 MEAN_TIME, APART, GROSS = 10.0, 0.07, 0.3  # s, V, V at once
 LINK_TIME = 1.0  # s: an inverter that is being charged or discharges moves by more in it than half of `USUAL`
 USUAL = 0.02  # V: sensors that do not sample at the same time, on the rides
+MODEL_TIME = 300.0  # s of agreement over which it is seen how well the cell model follows both
 AGREED_BEFORE = 30.0  # s: two voltages that agreed so long knew the state of charge, and one of them left it
 STUCK_AFTER, STUCK_CURRENT = 5.0, 0.5  # s of one voltage; 1/h: a current that varies by more moves it
 LOWEST, HIGHEST = 0.6, 1.12  # of the cut-off voltage, of that of a full cell at rest
@@ -31,16 +33,20 @@ class VoltageCheck:
         self._residuals = ResidualComparison()
         self._link: float | None = None  # V, of the inverter, low-passed
         self._square = self._compared = 0.0  # V² of a cell, low-passed; s of it
+        self._beyond = 0.0  # V², the same of what is no difference of the times that they are of
+        self._pair = SkewedPair()
+        self._model = 0.0  # V²: mean square of what the cell model leaves of two that agree
         self._agreed = 0.0  # s
         self._last, self._still = 0.0, 0.0  # V; s without a change
         self._least = self._most = 0.0  # A, since the pack voltage has not changed
 
-    def update(self, dt: float, readings: Readings, current: float | None, error: CellError) -> frozenset[str]:
+    def update(self, dt: float, readings: Readings, current: float | None, evidence: CellEvidence) -> frozenset[str]:
         """The roles that are not to be believed now, at this `current` [A] of the pack."""
         pack, inverter = readings.pack_voltage, readings.inverter_voltage
         if inverter is not None and self._disconnected(dt, inverter, readings):
             inverter = None
-            self._square = self._compared = 0.0
+            self._square = self._beyond = self._compared = 0.0
+            self._pair = SkewedPair()
         against = {
             role
             for role, voltage in zip(self.ROLES, (pack, inverter), strict=True)
@@ -48,23 +54,36 @@ class VoltageCheck:
         }
         if pack is not None and current is not None and self._stuck(dt, pack, current):
             against.add("pack_voltage")
-        agree: bool | None = False
+        differ: bool | None = False
         self.apart = 0.0
+        beyond = None if against else self._pair.update(dt, pack, inverter, readings.voltages_apart)
         if not against and pack is not None and inverter is not None:
-            difference = (pack - inverter) / self._series
-            self._compared = min(self._compared + dt, MEAN_TIME)
-            self._square += (difference * difference - self._square) * share_of_new(dt, self._compared)
-            if self._square < APART**2 and abs(difference) < GROSS:
-                self._agreed += dt
-                self._residuals.forget()
-                agree = None if self._square > (AGREES * APART) ** 2 else False
-            else:
-                agree = None
-                against |= self._wrong(dt, pack, inverter, current, error)
-                self.apart = 0.0 if against else abs(difference)
+            differ = self._differ(dt, (pack - inverter) / self._series, beyond, evidence)
+            if differ:
+                against |= self._wrong(dt, pack, inverter, current, evidence.error)
+                self.apart = 0.0 if against else abs(pack - inverter) / self._series
+        agree = None if differ else differ
         for (role, counter), voltage in zip(self.counters.items(), (pack, inverter), strict=True):
             counter.update(dt, True if role in against or self.apart else None if voltage is None else agree)
         return frozenset(against if self.apart else against | faulty(self.counters))
+
+    def _differ(self, dt: float, difference: float, beyond: float | None, evidence: CellEvidence) -> bool | None:
+        """Whether two sensors differ, and not only the times that their values are of; None: not enough to say.
+
+        difference: of their latest values [V of a cell]; beyond: see `SkewedPair` [V of the pack].
+        """
+        self._compared = min(self._compared + dt, MEAN_TIME)
+        self._square += (difference * difference - self._square) * share_of_new(dt, self._compared)
+        if beyond is None:
+            return None
+        beyond = min(beyond / self._series, GROSS)
+        self._beyond += (beyond * beyond - self._beyond) * share_of_new(dt, MEAN_TIME)
+        if self._beyond >= APART**2 or beyond >= GROSS:
+            return True
+        self._agreed += dt
+        self._model += (evidence.innovation_rms**2 - self._model) * share_of_new(dt, min(self._agreed, MODEL_TIME))
+        self._residuals.forget()
+        return None if self._beyond > (AGREES * APART) ** 2 else False
 
     @property
     def spread(self) -> float:
@@ -82,10 +101,14 @@ class VoltageCheck:
     def _wrong(
         self, dt: float, pack: float, inverter: float, current: float | None, error: CellError
     ) -> frozenset[str]:
-        """Which of two that differ is wrong; nothing while that is not known."""
+        """Which of two that differ is wrong; nothing while that is not known.
+
+        A cell model that did not follow both while they agreed is no witness: what is wrong then is the model.
+        """
         wrong = 0
         if current is not None and self._agreed > AGREED_BEFORE:
-            wrong = self._residuals.update(dt, error(pack, current, "chosen"), error(inverter, current, "chosen"))
+            errors = error(pack, current, "chosen"), error(inverter, current, "chosen")
+            wrong = self._residuals.update(dt, *errors, self._model)
         known = faulty(self.counters)
         return frozenset({self.ROLES[wrong - 1]}) if wrong else known if len(known) == 1 else frozenset()
 

@@ -66,9 +66,10 @@ def moments_of(samples: Iterable[tuple[str, int, Logged]]) -> tuple[list[Moment]
     drawn = Drawn(_LONGEST_STEP)
     for topic, time_ns, values in samples:
         if topic == ESTIMATE_TOPIC and is_estimate(values):
-            drawn.add(values["time"], values.get("pack_voltage"), values.get("pack_current"))
+            drawn.add(values["time"], values.get("pack_voltage"), values.get("pack_current"), values["distance"])
             ride = {key: values[key] for key in ("time", "distance")}
             ride |= {"energy": drawn.net, "energy_recovered": drawn.recovered}  # of a log whose status does not say it
+            ride |= {"energy_distance": drawn.distance}
             estimate = {key: values.get(key) for key in _USED}
             moments.append(Moment(time_ns, estimate, moments[-1].status if moments else {}, ride))
         elif topic == STATUS_TOPIC and moments and is_status(values):
@@ -153,6 +154,9 @@ def _ride(moments: Sequence[Moment], whys: Sequence[Logged], about: About, date:
     told = [why for why in whys if first["time"] <= why["time"] <= last["time"] + _LONGEST_STEP]
     ambient, rider = (_known(moment.ride.get(key) for moment in moments) for key in ("ambient_temperature", "rider"))
     length = round((last["distance"] - first["distance"]) * 1e-3, 5)
+    metered = length  # an older log does not say it
+    if last.get("energy_distance") is not None:
+        metered = (last["energy_distance"] - (first.get("energy_distance") or 0.0)) * 1e-3
     return KeptRide(
         vehicle=about.vehicle,
         start_ns=date + round(first["time"] * SECOND_NS),
@@ -160,7 +164,7 @@ def _ride(moments: Sequence[Moment], whys: Sequence[Logged], about: About, date:
         distance_km=length,
         energy_wh=drawn,
         energy_recovered_wh=None if drawn is None else recovered,
-        consumption_wh_km=round(drawn / length, 3) if drawn is not None and length else None,
+        consumption_wh_km=round(drawn / metered, 3) if drawn is not None and metered >= LEAST_DISTANCE / 1000 else None,
         **_charge_and_range(moments),
         rated_range_km=round(told[-1]["reference"] * 1e-3, 3) if told else None,
         ambient_C=_mean(ambient) if ambient else about.facts.get("ambient_C"),

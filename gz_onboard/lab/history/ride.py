@@ -28,7 +28,7 @@ class KeptRide:
     distance_km: Annotated[float, "ridden"]
     energy_wh: Annotated[float | None, "drawn from the pack, less what was recovered; null if it is not known"]
     energy_recovered_wh: Annotated[float | None, "charged into the pack while riding, or null"]
-    consumption_wh_km: Annotated[float | None, "energy over distance, or null"]
+    consumption_wh_km: Annotated[float | None, "energy over that of the distance on which it is known, or null"]
     soc_start: Annotated[float | None, "state of charge, 0 to 1, at the first estimate that has one"]
     soc_start_sd: Annotated[float | None, "its standard deviation"]
     soc_end: Annotated[float | None, "at the last estimate that has one"]
@@ -71,6 +71,13 @@ class KeptRide:
     def dated(self) -> bool:
         """Whether its date is one: without a clock the date is 1970."""
         return self.start_ns >= FIRST_DATE_NS
+
+    @property
+    def metered_km(self) -> float:
+        """Of the distance, that on which the energy is known."""
+        if not (self.energy_wh and self.consumption_wh_km):
+            return 0.0 if self.consumption_wh_km is None else self.distance_km
+        return min(self.energy_wh / self.consumption_wh_km, self.distance_km)
 
 
 COLUMNS: Mapping[str, Any] = {f.name: get_type_hints(KeptRide)[f.name] for f in fields(KeptRide)}
@@ -136,7 +143,7 @@ def joined(one: KeptRide, other: KeptRide) -> KeptRide:
         whole[name] = sum(value * seconds for value, seconds in known) / length if length else whole[name]
     for name in ("reasons", "distrusted"):
         whole[name] = " ".join(dict.fromkeys([*first[name].split(), *last[name].split()]))
-    energy, length = whole["energy_wh"], whole["distance_km"]
-    whole["consumption_wh_km"] = None if energy is None else energy / length
+    energy, length = whole["energy_wh"], one.metered_km + other.metered_km
+    whole["consumption_wh_km"] = energy / length if energy is not None and length else None
     whole["duration_s"] = (other.end_ns - one.start_ns) * 1e-9
     return replace(one, **whole)

@@ -12,6 +12,7 @@ from gz_onboard.offline.results import clock, number
 HISTORY_VERSION = 1  # of the keys in JSON
 LATEST = 10  # rides that are listed if not all are asked for
 _DOUBTFUL = 60.0  # s of a ride without a whole estimate: less is not told
+_METERED = 0.99  # of the distance: less is told
 _TO_THE_LEFT = ("", "month", "air", "start", "rider")  # columns
 
 
@@ -19,6 +20,11 @@ def ride_text(ride: KeptRide) -> str:
     """A ride in half a line."""
     drawn = number(ride.energy_wh, ".0f", "Wh")
     return f"{_start(ride)}, {ride.distance_km:.2f} km in {clock(ride.duration_s)}, {drawn}"
+
+
+def lacks_energy(ride: KeptRide) -> bool:
+    """Whether the energy of a part of it is not known."""
+    return ride.energy_wh is not None and ride.metered_km < _METERED * ride.distance_km
 
 
 def overview_text(overview: Overview, every: bool) -> str:
@@ -67,6 +73,7 @@ def _rides(rides: Sequence[NumberedRide]) -> str:
     for one in rides:
         r = one.ride
         doubts = [f"{r.degraded_s + r.invalid_s:.0f} s degraded"] if r.degraded_s + r.invalid_s >= _DOUBTFUL else []
+        doubts += [f"energy of {r.metered_km:.1f} km only"] if lacks_energy(r) else []
         doubts += [f"{', '.join(map(words, r.distrusted.split()))} left out"] if r.distrusted else []
         lines.append(
             (

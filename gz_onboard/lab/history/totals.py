@@ -27,7 +27,7 @@ class Totals:
     duration_s: Annotated[float, "of the rides"]
     energy_wh: Annotated[float | None, "drawn, less what was recovered, on rides of which it is known"]
     energy_recovered_wh: Annotated[float | None, "charged into the pack while riding, likewise"]
-    consumption_wh_km: Annotated[float | None, "energy over distance of these rides"]
+    consumption_wh_km: Annotated[float | None, "energy over the distance on which it is known"]
     ambient_C: Annotated[float | None, "mean temperature of the air, by distance"]  # noqa: N815 - as of a ride
 
 
@@ -119,7 +119,7 @@ def _totals(of: str, rides: Sequence[KeptRide]) -> Totals:
     known = [ride for ride in rides if ride.energy_wh is not None]
     at = [ride for ride in rides if ride.ambient_C is not None]
     energy = _sum(known, "energy_wh") if known else None
-    length = _sum(known, "distance_km")
+    length = sum(ride.metered_km for ride in known)
     warmth = sum((ride.ambient_C or 0.0) * ride.distance_km for ride in at)
     return Totals(
         of,

@@ -77,7 +77,7 @@ def write_log(
                     range_p10=40_000 - distance,
                     range_p90=50_000 - distance,
                 )
-                drawn.add(time, estimate.pack_voltage, estimate.pack_current)
+                drawn.add(time, estimate.pack_voltage, estimate.pack_current, distance)
                 log.sample(ESTIMATE_TOPIC, clock(time), estimate_row(estimate))
                 learned = {"capacity": Learned(part.capacity, 0.02, 0.5), "resistance": Learned(1.1, 0.05, 0.5)}
                 row = {"ride": ride_row(estimate, drawn, 20.0, part.rider), "learned": learned_row(learned)}
