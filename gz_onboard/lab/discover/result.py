@@ -24,6 +24,7 @@ METRICS = {
 }
 """Of the gain: label, factor and unit."""
 RIDE_TO_RIDE = "ride"  # the quantity of what differs from ride to ride
+CONSTANT = "constant"  # the quantity of what is the same everywhere
 Interval = tuple[float, float]
 NO_INTERVAL = "one ride: no interval"
 
@@ -67,7 +68,8 @@ class Cause:
 
 @dataclass(frozen=True)
 class Unknown:
-    """What has no name: a curve that a `channel` leaves over a `quantity`, or over the rides (`RIDE_TO_RIDE`).
+    """What has no name: a curve that a `channel` leaves over a `quantity`, over the rides (`RIDE_TO_RIDE`), or a
+    `CONSTANT`, of one row.
 
     straight: it is in proportion. curve: rows (at [unit], value [the channel's unit], sd). denies: causes that it
     shows to be none. share: of the energy.

@@ -19,7 +19,17 @@ from gz_onboard.lab.discover.energy import energy_share, residual_sizes
 from gz_onboard.lab.discover.linear import LinearRide, Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.prior import stepped
-from gz_onboard.lab.discover.result import RIDE_TO_RIDE, Cause, Estimate, Gain, Isolability, Report, Score, Unknown
+from gz_onboard.lab.discover.result import (
+    CONSTANT,
+    RIDE_TO_RIDE,
+    Cause,
+    Estimate,
+    Gain,
+    Isolability,
+    Report,
+    Score,
+    Unknown,
+)
 from gz_onboard.lab.discover.search import Search
 from gz_onboard.lab.discover.selection import SearchProblem
 from gz_onboard.lab.discover.unexplained import unexplained
@@ -208,6 +218,9 @@ def advice(search: Search, sets: Sequence[Sequence[str]], unknown: Unknown | Non
         lines.append(
             f"Ride one and the same way several times: what {unknown.channel} leaves differs from ride to ride."
             if unknown.quantity == RIDE_TO_RIDE
+            else f"Stand with the vehicle switched on, and ride at several steady speeds, for minutes each: a constant "
+            f"{unknown.channel} is one at all of them. A current sensor whose zero is off would show one too."
+            if unknown.quantity == CONSTANT
             else f"Ride over the whole span of {unknown.quantity} with all else the same, twice: what "
             f"{unknown.channel} leaves goes with it, or with what changes along with it."
         )
