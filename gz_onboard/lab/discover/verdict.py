@@ -32,6 +32,8 @@ from gz_onboard.lab.discover.result import (
 )
 from gz_onboard.lab.discover.search import Search
 from gz_onboard.lab.discover.selection import SearchProblem
+from gz_onboard.lab.discover.strain import advice as strain_advice
+from gz_onboard.lab.discover.strain import strain_of
 from gz_onboard.lab.discover.unexplained import unexplained
 from gz_onboard.lab.discover.winds import Winds, search_causes
 from gz_onboard.lab.discover.wording import Say
@@ -76,33 +78,35 @@ def conclude(problem: SearchProblem, notes: list[str], say: Say) -> Discovery:
     found = causes_of(now.search, chosen, now.lines)
     sets = alternatives(now.search, chosen, problem.limit)
     scores = {name: every.part(chosen, name) for name in every.causes}
-    notes = [*notes, *unseen(problem), *searched.rejected]
+    notes = [*notes, *unseen(problem), *map(str, searched.rejected)]
     if winds is not None:
         scores[winds.cause.name] = max(scores.get(winds.cause.name, 0.0), winds.score)
         if winds.score > problem.limit:
             found = [*found, wind_cause(every, chosen, winds, now.lines)]
             notes.append("the wind differed from ride to ride: " + winds.words)
+    strain = strain_of(now, chosen, searched.rejected, scores, problem.limit)
     ranking = sorted((Score(name, round(score, 2)) for name, score in scores.items()), key=lambda row: -row.score)
     report = Report(
-        verdict=verdict_of(found, sets, unknown),
+        verdict=verdict_of(found, sets, unknown is not None or strain is not None),
         causes=found,
         ambiguous=sets,
         unknown=unknown,
         ranking=ranking,
         residuals=residual_sizes(now.lines),
         gain=Gain(),
-        advice=advice(now.search, sets, unknown),
+        advice=[*([strain_advice(strain)] if strain else []), *advice(now.search, sets, unknown)],
         notes=notes,
         isolability=separability(every),
         threshold=problem.limit,
         constancy=constancy,
+        strain=strain,
     )
     return Discovery(report, now.mixed, now.offset, now.lines, now.normals)
 
 
-def verdict_of(found: Sequence[Cause], sets: Sequence[Sequence[str]], unknown: Unknown | None) -> str:
-    """One of `result.VERDICTS`."""
-    if unknown is not None and not found:
+def verdict_of(found: Sequence[Cause], sets: Sequence[Sequence[str]], more: bool) -> str:
+    """One of `result.VERDICTS`. more: something differs that has no name."""
+    if more and not found:
         return "unknown"
     if sets:
         return "ambiguous"
