@@ -127,7 +127,7 @@ def drive(
     dt = scooter.dt
     every = max(round(SAMPLE / dt), 1)
     battery = scooter.vehicle.pack
-    cutoff = battery.cutoff_voltage * battery.cells_series if until_empty else -1.0
+    cutoff = battery.cutoff_voltage * battery.cells_series
     end = finish if finish is not None else float("inf")
     kinetic, soc_start = scooter.kinetic_energy(), scooter.pack.soc
     energy = recovered = charge = squares = 0.0
@@ -156,7 +156,6 @@ def drive(
     if done % every:
         rows.append(_row(scooter, wanted, energy))
     series = _series(rows)
-    limit = battery.cutoff_voltage * battery.cells_series
     return Run(
         series=series,
         ledger=_ledger(scooter, kinetic),
@@ -169,7 +168,7 @@ def drive(
         soc_end=scooter.pack.soc,
         form_factor_squared=max(squares * done / (charge * charge), 1.0) if charge else 1.0,
         empty=empty,
-        beyond=beyond_pack(series, limit),
+        beyond=beyond_pack(series, cutoff),
         shortfalls=shortfalls(series),
     )
 
