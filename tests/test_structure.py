@@ -57,7 +57,7 @@ STAGES = {
     "residuals": ["system", "residuals", "pack_power", "channels", "blocks"],
     "linear model": ["prior", "candidates", "linear", "mixed_model", "uncalibrated", "baseline_file"],
     "search": ["search", "curve_forms", "curves", "selection"],
-    "judgement": ["constancy", "cross_validation", "acceptance", "winds", "energy", "unexplained", "verdict"],
+    "judgement": ["constancy", "cross_validation", "acceptance", "winds", "energy", "unexplained", "strain", "verdict"],
     "report": [
         "gain",
         "baseline_check",

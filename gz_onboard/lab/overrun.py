@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from gz_onboard.errors import InputError
 from gz_onboard.physics.parameters import Value
 
+ENTERED = "as entered"
+"""The status of what is told with the rides, which counts before the file's."""
 FAR = 4.0  # standard deviations of what was known and of the data together, beyond which they contradict it
 
 
@@ -16,8 +18,9 @@ def overrun(name: str, known: Value, found: tuple[float, float], far: float, pul
     pulled: which signals lead it there.
     """
     value, sd = found
+    origin = known.status if known.status == ENTERED else f"({known.status}) by the file"
     return (
-        f"{name} is {known.value:.4g} ± {known.sd:.2g} {known.unit} ({known.status}) by the file and {value:.4g} ± "
+        f"{name} is {known.value:.4g} ± {known.sd:.2g} {known.unit} {origin} and {value:.4g} ± "
         f"{sd:.2g} {known.unit} by these rides, {far:.0f} standard deviations apart; {pulled}"
     )
 

@@ -16,6 +16,7 @@ from gz_onboard.arrays import Array, stretches
 from gz_onboard.errors import brief
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.progress import Progress
+from gz_onboard.simulation.beyond import Beyond, beyond_pack
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.parts.road import RoadProfile
 from gz_onboard.simulation.scooter import Scooter
@@ -88,6 +89,7 @@ class Run:
     soc_end: float
     form_factor_squared: float  # mean square of the pack current over the square of its mean
     empty: bool = False  # the ride ended because the pack was empty
+    beyond: tuple[Beyond, ...] = ()  # what the battery could not give
     shortfalls: list[Shortfall] = field(default_factory=list)
 
     __repr__ = brief
@@ -125,7 +127,7 @@ def drive(
     dt = scooter.dt
     every = max(round(SAMPLE / dt), 1)
     battery = scooter.vehicle.pack
-    cutoff = battery.cutoff_voltage * battery.cells_series if until_empty else -1.0
+    cutoff = battery.cutoff_voltage * battery.cells_series
     end = finish if finish is not None else float("inf")
     kinetic, soc_start = scooter.kinetic_energy(), scooter.pack.soc
     energy = recovered = charge = squares = 0.0
@@ -166,6 +168,7 @@ def drive(
         soc_end=scooter.pack.soc,
         form_factor_squared=max(squares * done / (charge * charge), 1.0) if charge else 1.0,
         empty=empty,
+        beyond=beyond_pack(series, cutoff),
         shortfalls=shortfalls(series),
     )
 

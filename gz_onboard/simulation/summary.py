@@ -21,9 +21,12 @@ from gz_onboard.vehicle import Vehicle
 SUMMARY_VERSION = 1
 _RANGE_BY = {
     "repetition": "ridden until empty",
+    "charge": "ridden until no charge was left",
+    "cut-off": "ridden until the load pulled the voltage to the cut-off",
     "energy": "energy left at the start over the consumption",
     None: "not known",
 }
+LOADED = 0.1  # state of charge: an end with more left was one of the load
 _SHOWN = 5  # shortfalls
 _LEAST = 0.005  # Wh: less of the ledger is not shown
 
@@ -38,6 +41,20 @@ class ShortfallEntry:
     missing_km_h: float
     wanted_km_h: float
     beyond_vehicle: bool
+
+
+@dataclass(frozen=True)
+class BeyondEntry:
+    """What the ride asked of the battery that it cannot give."""
+
+    charge: bool
+    time_s: float
+    distance_km: float
+    duration_s: float
+    soc: float
+    current_a: float
+    voltage_v: float
+    cutoff_v: float
 
 
 @dataclass(frozen=True)
@@ -87,7 +104,9 @@ class SimulationSummary:
     soc_end: Annotated[float, "at the end"]
     range_km: Annotated[float | None, "on this riding from soc_start, or null"]
     range_by: Annotated[
-        str | None, "repetition: ridden until empty; energy: energy left at the start over the consumption"
+        str | None,
+        "repetition: ridden until empty; energy: energy left at the start over the consumption; cut-off: ridden until "
+        "a load pulled the voltage there; charge: ridden until none was left",
     ]
     shortfalls: Annotated[
         list[ShortfallEntry],
@@ -95,6 +114,12 @@ class SimulationSummary:
         ", missing_km_h at most, wanted_km_h there, beyond_vehicle (the throttle was open)",
     ]
     shortfall_s: Annotated[float, "their time in all"]
+    beyond_battery: Annotated[
+        list[BeyondEntry],
+        "what the battery cannot give: charge (true: none is left; false: a load pulled its voltage to the cut-off), "
+        "where it begins time_s, distance_km, soc, current_a, voltage_v; duration_s in all; cutoff_v",
+    ]
+    range_by_energy_km: Annotated[float | None, "energy left at the start over the consumption, or null"]
     ledger_wh: Annotated[dict[str, float], "where the energy of the cells went, by name; negative: a source"]
     closure: Annotated[float, "energy_cells_wh less the sum of the ledger, over the sum of all magnitudes"]
     chassis: Annotated[str, "straight, planar or leaning"]
@@ -119,10 +144,20 @@ KEYS = descriptions(SimulationSummary)
 def cycle_range(result: Run, scooter: Scooter) -> tuple[float | None, str | None]:
     """(range [m], how it was found)."""
     if result.empty:
-        return result.distance, "repetition"
-    temperature = float(result.series["cell_temperature"].mean())
-    metres = range_by_energy(scooter, result, result.soc_start, temperature)
+        load = result.beyond and result.soc_end > LOADED
+        return result.distance, "cut-off" if load else "repetition"
+    if result.beyond and result.beyond[-1].charge and result.soc_start > 0.0:
+        return result.beyond[-1].distance, "charge"
+    metres = by_energy(result, scooter)
     return metres, None if metres is None else "energy"
+
+
+def by_energy(result: Run, scooter: Scooter) -> float | None:
+    """The energy left at the start over the consumption [m]; None of a ride that went on without charge."""
+    if result.beyond and result.beyond[-1].charge and not result.empty:
+        return None
+    temperature = float(result.series["cell_temperature"].mean())
+    return range_by_energy(scooter, result, result.soc_start, temperature)
 
 
 def summarise(vehicle: Vehicle, plan: Plan, what: str, result: Run, scooter: Scooter) -> SimulationSummary:
@@ -151,6 +186,11 @@ def summarise(vehicle: Vehicle, plan: Plan, what: str, result: Run, scooter: Sco
             for s in result.shortfalls
         ],
         shortfall_s=sum(s.duration for s in result.shortfalls),
+        beyond_battery=[
+            BeyondEntry(b.charge, b.time, b.distance * 1e-3, b.duration, b.soc, b.current, b.voltage, b.cutoff)
+            for b in result.beyond
+        ],
+        range_by_energy_km=times(by_energy(result, scooter), 1e-3),
         ledger_wh={name: energy / WH for name, energy in result.ledger.items()},
         closure=result.closure,
         chassis=scooter.chassis.name,
@@ -205,6 +245,7 @@ def summary_text(summary: SimulationSummary) -> str:
         ),
         ("state of charge", f"{100 * summary.soc_start:.1f} → {100 * summary.soc_end:.1f} %"),
         ("range", f"{number(summary.range_km, '.1f', 'km')} ({_RANGE_BY[summary.range_by]})"),
+        *_beyond_rows(summary),
         *_shortfall_rows(summary),
         *(
             (
@@ -221,6 +262,30 @@ def summary_text(summary: SimulationSummary) -> str:
     rows += [("written", ", ".join(summary.files))] if summary.files else []
     head = f"{summary.what}, {summary.vehicle}, payload {summary.payload_kg:g} kg (by {summary.payload_from})"
     return "\n".join([text_rows(head, rows), *(["", variants_text(summary.sweep)] if summary.sweep else [])])
+
+
+def _beyond_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
+    """What the battery cannot give, and why two ranges differ."""
+    rows = []
+    for b in summary.beyond_battery:
+        place = f"from {b.time_s:.0f} s, {b.distance_km:.2f} km"
+        if b.charge:
+            text = f"no charge is left {place}: the ride goes on {b.duration_s:.0f} s that no pack can give"
+            rows.append(text if b.duration_s > 1.0 else f"no charge is left at {b.time_s:.0f} s")
+            continue
+        rows.append(
+            f"{place}, for {b.duration_s:.0f} s in all, {b.current_a:.0f} A pull the pack to {b.voltage_v:.1f} V at "
+            f"{100 * b.soc:.0f} % of charge: its cut-off is {b.cutoff_v:.1f} V"
+        )
+    energy, soc = summary.range_by_energy_km, summary.soc_end
+    if summary.range_by == "cut-off" and energy is not None:
+        rows.append(
+            f"so it ends with {100 * soc:.0f} % left; its energy would do for {energy:.1f} km at a lower current "
+            "(motor_current_limit, [controller] of the vehicle file)"
+        )
+    elif rows and summary.range_by == "energy":
+        rows.append("the range is that of the energy: a vehicle that gives up there, as --until-empty, ends there")
+    return [("beyond the battery" if not i else "", row) for i, row in enumerate(rows)]
 
 
 def _shortfall_rows(summary: SimulationSummary) -> list[tuple[str, str]]:

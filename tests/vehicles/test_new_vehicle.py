@@ -171,6 +171,28 @@ def test_an_estimate_and_a_check_on_a_log_of_it(tmp_path, capsys):
     assert capsys.readouterr().out.splitlines()[0].endswith("looks right")
 
 
+def test_power_and_top_speed_are_what_is_entered(tmp_path):
+    of = ["--power", "600", "--top-speed", "20"]
+    file = tmp_path / "slow.toml"
+    assert cli.main(["vehicle", "new", str(file), "--cells", "nmc", *ARGUMENTS, *of]) == OK
+    vehicle = read_vehicle(file)
+    text, most, p = file.read_text(encoding="utf-8"), vehicle.derating.current_by_motor_speed, vehicle.parameters
+    assert 'status = "data sheet"\n# Where it comes from.\nsource = "600 W at the peak, as entered; 20 km/h' in text
+    torque = p["motor_current_limit"] * p["torque_constant"]
+    fastest = 20 / 3.6 / p["wheel_radius"]
+    for share in (0.3, 0.5, 0.7, 0.9):
+        power = torque * most(share * fastest) * share * fastest
+        assert power < 1.04 * 600 and (share < 0.4 or power > 0.99 * 600)
+    assert most(1.04 * fastest) == 0.0
+
+
+@pytest.mark.parametrize(("kind", "drift"), [("scooter", 0.055), ("motorcycle", 0.2), ("car", 0.2)])
+def test_what_goes_between_towns_differs_more_from_ride_to_ride(tmp_path, kind, drift):
+    file = tmp_path / "a.toml"
+    assert cli.main(["vehicle", "new", str(file), "--cells", "nmc", *ARGUMENTS, "--kind", kind]) == OK
+    assert read_vehicle(file).riding.drift == drift
+
+
 @pytest.mark.parametrize("there", ["nmc.toml", "nmc.dbc"])
 def test_it_writes_over_nothing(tmp_path, there, capsys):
     (tmp_path / there).write_text("mine", encoding="utf-8")

@@ -8,10 +8,11 @@ did widens the scatter, beside a common part that is free; and what was found on
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.constancy import RIDE_PREFIX, splits, unequal
 from gz_onboard.lab.discover.cross_validation import Fold, held_out, improves, squares
@@ -23,6 +24,7 @@ from gz_onboard.lab.discover.selection import SearchProblem, Selection, select_c
 
 ROUNDS = 25
 SURE = 2.0  # standard deviations: an estimate further beyond a bound is none of its cause
+BEYOND = "would be beyond what it can be"
 MAX_REJECTIONS = 6  # names at most that are tried and refused
 
 
@@ -57,37 +59,57 @@ def predicts_held_out(now: Selection, name: str) -> bool:
     return improves(squares(held), now.search.shares.get(name, {}))
 
 
-def rejection(now: Selection, limit: float) -> tuple[str, str] | None:
-    """(the least certain of the causes chosen that cannot be accepted, why); None if all can."""
+@dataclass(frozen=True)
+class Rejected:
+    """A candidate that was chosen and is no cause: why, and the change of its parameters, (k,) [scales]."""
+
+    name: str
+    why: str
+    change: Array
+
+    @property
+    def impossible(self) -> bool:
+        """Whether its parameters cannot be what they would have to be."""
+        return self.why == BEYOND
+
+    def __str__(self) -> str:
+        return f"{self.name} {self.why}: not named"
+
+
+def rejection(now: Selection, limit: float) -> Rejected | None:
+    """The least certain of the causes chosen that cannot be accepted; None if all can."""
     mixed, search = now.mixed, now.search
     wide = with_observed_scatter(mixed, now.normals)
     strict = Search(wide, evidence(wide, now.normals), list(search.causes.values()), search.shares)
     # against a file what differs between rides cannot be separated from what its model lacks; a baseline knows it
     parts = [] if mixed.healthy else splits(now)
     uneven = {split.cause for split in parts if unequal(split) and split.quantity.startswith(RIDE_PREFIX)}
-    found: list[tuple[float, str, str]] = []
+    found: list[tuple[float, Rejected]] = []
+
+    def reject(why: str) -> None:
+        found.append((score, Rejected(name, why, change)))
+
     for name, (change, variance) in search.fitted(now.chosen).items():
         score = strict.part(now.chosen, name)
         if not within_bounds(mixed, search.causes[name], change, np.sqrt(variance)):
-            found.append((score, name, "would be beyond what it can be"))
+            reject(BEYOND)
         elif score < limit:
-            found.append((score, name, "differs from ride to ride as much as it is"))
+            reject("differs from ride to ride as much as it is")
         elif name in uneven:
-            found.append((score, name, "acts in some rides and not in others"))
+            reject("acts in some rides and not in others")
         elif not predicts_held_out(now, name):
-            found.append((score, name, "does not foretell rides held out"))
-    return min(found)[1:] if found else None
+            reject("does not foretell rides held out")
+    return min(found, key=lambda row: (row[0], row[1].name))[1] if found else None
 
 
-def accept(problem: SearchProblem, now: Selection) -> tuple[Selection, SearchProblem, list[str]]:
+def accept(problem: SearchProblem, now: Selection) -> tuple[Selection, SearchProblem, list[Rejected]]:
     """`now` searched again without each cause that is rejected, the problem less these, and what was rejected."""
-    rejected: list[str] = []
+    rejected: list[Rejected] = []
     while now.chosen and len(rejected) < MAX_REJECTIONS:
         bad = rejection(now, problem.limit)
         if bad is None:
             break
-        name, why = bad
-        rejected.append(f"{name} {why}: not named")
-        problem = replace(problem, causes=[c for c in problem.causes if c.name != name])
+        rejected.append(bad)
+        problem = replace(problem, causes=[c for c in problem.causes if c.name != bad.name])
         now = select_causes(problem)
     return now, problem, rejected

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,12 +15,14 @@ from gz_onboard.lab.discover.cross_validation import start_equations, with_own_s
 from gz_onboard.lab.discover.gain import errors
 from gz_onboard.lab.discover.linear import LinearRide, normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.prior import LOG_SCALED
-from gz_onboard.lab.overrun import FAR, overrun, stop_at
-from gz_onboard.physics.parameters import declared_parameters
+from gz_onboard.lab.discover.prior import HEALTHY_SD, LOG_SCALED
+from gz_onboard.lab.overrun import ENTERED, FAR, overrun, stop_at
+from gz_onboard.physics.parameters import Value, declared_parameters
 
 APART = 12.0  # times what differs between rides: of eight healthy rides 5 at most, of a current 30 % wrong in one 61
 LEAST_RIDES = 5  # to hold two out at a time and learn from the others
+PAYLOAD = "payload_mass"
+ALIKE = 1.5  # times: standard deviations that differ by more are said
 MOST_SAID = 3  # parameters: one bad signal may pull dozens
 
 
@@ -46,20 +48,40 @@ def check_against_file(learned: Learned) -> None:
     """
     before, after = learned.before, learned.after
     known = before.vehicle.parameters.known
+    payload = payload_known(learned)
     sd = np.sqrt(np.diag(before.prior) + learned.usual_scatter)
+    if PAYLOAD in before.names:
+        (i,) = before.index([PAYLOAD])
+        sd[i] = np.hypot(payload.sd / before.scale[i], np.sqrt(learned.usual_scatter[i]))
     far = np.abs(after.mean - before.mean) / sd
     found = [i for i in sorted(_judged(before), key=lambda i: -far[i]) if far[i] > FAR]
     rows = []
     for i in found[:MOST_SAID]:
         name, old = before.names[i], known[before.names[i]]
         new = after.values_at(after.mean)[name]
-        wide = float(np.sqrt(after.prior[i, i]) * after.scale[i]) * (new if name in LOG_SCALED else 1.0)
+        unit_step = float(after.scale[i]) * (new if name in LOG_SCALED else 1.0)
+        wide = float(np.sqrt(after.prior[i, i])) * unit_step
         channel, without = pulling(learned, i)
+        if name == PAYLOAD:  # what was entered counts, and is corrected by as much
+            new, without = (value + payload.value - old.value for value in (new, without))
+            old = payload
         pulled = f"{channel} ({', '.join(CHANNEL[channel].roles)}) pulls it there, without which it is {without:.4g}"
+        if not 1 / ALIKE < (used := sd[i] * unit_step) / max(old.sd, 1e-12) < ALIKE:
+            pulled = f"one is {used:.2g} {old.unit} here, for a vehicle on the road, from ride to ride; {pulled}"
         rows.append(overrun(name, old, (new, wide), float(far[i]), pulled))
     if more := len(found) - len(rows):
         rows.append(f"and {more} more")
     stop_at(rows)
+
+
+def payload_known(learned: Learned) -> Value:
+    """The payload before the rides: as entered with them, within what that is known to; else as the file has it."""
+    before = learned.before
+    known, entered = before.vehicle.parameters.known[PAYLOAD], [line.ride.payload for line in learned.lines]
+    given = [mass for mass in entered if mass is not None]
+    if len(given) < len(entered) or not given:
+        return known
+    return replace(known, value=float(np.mean(given)), sd=HEALTHY_SD[PAYLOAD], status=ENTERED, source="entered")
 
 
 def _judged(before: MixedModel) -> list[int]:

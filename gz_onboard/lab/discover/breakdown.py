@@ -22,25 +22,25 @@ OUTSTANDING = 3.5  # standard deviations of what differs between healthy rides
 STILL = 0.99  # of a block
 LOADED = 2.0  # standard deviations of the auxiliary power of the file, beyond which its median is another
 
-COVARIATES: dict[str, tuple[str, str, str]] = {
-    "speed": ("speed", "m/s", "motor_speed"),
-    "acceleration": ("acceleration", "m/s²", "motor_speed"),
-    "lateral_acceleration": ("lateral acceleration, left positive", "m/s²", "rate_z"),
-    "grade": ("grade", "1", "accel_x"),
-    "heading": ("heading, clockwise from north", "rad", "gps_course"),
-    "ambient_temperature": ("air", "degC", "ambient_temperature"),
-    "motor_temperature": ("motor", "degC", "motor_temperature"),
-    "cell_temperature": ("cells", "degC", "cell_temperature"),
-    "soc": ("state of charge", "1", "pack_current"),
-    "pack_current": ("pack current", "A", "pack_current"),
-    "motor_current": ("motor current", "A", "motor_current"),
-    "time": ("time since the start", "s", "motor_speed"),
-    "since_change": ("time since the current changed", "s", "motor_current"),
-    "since_braking": ("time since a brake was touched", "s", "motor_speed"),
-    "suspension_speed": ("speed of the suspension", "m/s", "motor_speed"),
-    "vibration": ("vibration: how rough the road is", "m/s²", "motor_speed"),
+COVARIATES: dict[str, tuple[str, str]] = {
+    "speed": ("speed", "m/s"),
+    "acceleration": ("acceleration", "m/s²"),
+    "lateral_acceleration": ("lateral acceleration, left positive", "m/s²"),
+    "grade": ("grade", "1"),
+    "heading": ("heading, clockwise from north", "rad"),
+    "ambient_temperature": ("air", "degC"),
+    "motor_temperature": ("motor", "degC"),
+    "cell_temperature": ("cells", "degC"),
+    "soc": ("state of charge", "1"),
+    "pack_current": ("pack current", "A"),
+    "motor_current": ("motor current", "A"),
+    "time": ("time since the start", "s"),
+    "since_change": ("time since the current changed", "s"),
+    "since_braking": ("time since a brake was touched", "s"),
+    "suspension_speed": ("speed of the suspension", "m/s"),
+    "vibration": ("vibration: how rough the road is", "m/s²"),
 }
-"""What residuals are looked at over: words, unit, and the role without which it is made up."""
+"""What residuals are looked at over: words and unit."""
 
 
 def before_and_after(found: Discovery) -> tuple[list[LinearRide], list[LinearRide]]:
@@ -102,7 +102,7 @@ def loads_by_ride(found: Discovery) -> list[str]:
 
 def over(line: LinearRide, name: str, table: LinearChannel) -> Array | None:
     """The quantity `name` of `COVARIATES` over the blocks in `table`, (m,); None if the ride has it not."""
-    values = line.ride.quantities.get(name) if COVARIATES[name][2] in line.ride.have else None
+    values = line.ride.quantities.get(name) if line.ride.shows(name) else None
     return None if values is None else over_blocks(table.channel, values)[table.used]
 
 

@@ -12,6 +12,7 @@ from gz_onboard.lab.discover.blocks import over_blocks
 from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.grid import STEP, Ride, smooth
 from gz_onboard.lab.discover.linear import LinearChannel, LinearRide
+from gz_onboard.lab.discover.result import CONSTANT
 from gz_onboard.lab.sizes import USUAL_SIZES, Sizes
 
 # knots of the hat functions, of a vehicle of size 1 (see `KNOT_SIZES`); unit
@@ -31,11 +32,15 @@ KNOTS: dict[str, tuple[tuple[float, ...], str]] = {
     "vibration": ((0.3, 0.7, 1.0, 1.4, 1.9, 2.5, 3.3), "m/s²"),
     "suspension_speed": ((0.02, 0.06, 0.1, 0.14, 0.19, 0.25, 0.35), "m/s"),
     "since_braking": ((0.0, 4.0, 8.0, 15.0, 30.0, 60.0), "s"),
+    CONSTANT: ((0.0,), "1"),
 }
 PAIRS: tuple[tuple[str, tuple[str, ...]], ...] = (
-    ("road_force", tuple(name for name in KNOTS if name not in ("pack_current", "soc"))),
+    ("road_force", tuple(name for name in KNOTS if name not in ("pack_current", "soc", CONSTANT))),
     ("inverter_power", ("speed", "motor_current", "motor_temperature", "time", "current_change")),
-    ("pack_power", ("speed", "acceleration", "lateral_acceleration", "grade", "heading", "time", "vibration")),
+    (
+        "pack_power",
+        ("speed", "acceleration", "lateral_acceleration", "grade", "heading", "time", "vibration", CONSTANT),
+    ),
     ("auxiliary", ("speed", "motor_temperature", "time", "pack_current", "vibration")),
     ("pack_balance", ("speed", "pack_current", "motor_temperature", "time")),
     ("cell_voltage", ("pack_current", "soc", "time", "current_change", "vibration")),
@@ -112,11 +117,13 @@ def curve_forms(sizes: Sizes = USUAL_SIZES) -> list[CurveForm]:
 
 
 def quantity(ride: Ride, name: str, table: LinearChannel) -> Array | None:
-    """The quantity over the blocks of `table`, (m,); None if the ride has it not."""
+    """The quantity over the blocks of `table`, (m,); None if the ride has it not, or did not measure it."""
     channel = table.channel
-    values = ride.quantities.get(name)
-    if name in ("current_change", "motor_current") and "motor_current" not in ride.have:
+    if not ride.shows(name):
         return None
+    if name == CONSTANT:
+        return np.zeros(len(table.y))
+    values = ride.quantities.get(name)
     if name == "current_change":
         n = round(channel.block / STEP)
         mean = over_blocks(channel, ride.signals["motor_current"])

@@ -11,6 +11,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.lab.discover.curve_forms import CurveForm, columns_of, curve_forms
 from gz_onboard.lab.discover.linear import LinearRide, Noise, Normal, Population, fit_mixed, marginal
 from gz_onboard.lab.discover.mixed_model import HealthyCurve, MixedModel
+from gz_onboard.lab.discover.result import CONSTANT
 from gz_onboard.lab.discover.search import evidence
 
 
@@ -27,6 +28,7 @@ def extended(linear: LinearRide, normal: Normal, form: CurveForm, noise: Noise) 
 CURVE_RIDGE = 1e-3  # information, in `CurveForm.size`, that keeps knots without data from running away
 OWN_ROUNDS = 10  # of expectation and maximisation
 OWN_FREE = 100.0  # variance in `CurveForm.size` of the common curve while its scatter between rides is sought
+LEAST_SPREAD = 0.05  # standard deviation of a quantity, over the distance of two knots, of which a curve can be told
 ENOUGH = 1.0  # sum of squared weights of a ride's blocks at a knot, from which on it counts as visited
 
 
@@ -62,14 +64,25 @@ def visits(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
     return np.array(rows).reshape(-1, len(form.knots))
 
 
+def varies(form: CurveForm, linears: Sequence[LinearRide]) -> bool:
+    """Whether the rides differ in the quantity of `form`, within or between them, by `LEAST_SPREAD` or more."""
+    found = [knots for line in linears if (knots := columns_of(line, form)) is not None]
+    return bool(found) and float(np.concatenate(found).var(axis=0).sum()) > 2 * LEAST_SPREAD**2
+
+
 def supported_knots(form: CurveForm, linears: Sequence[LinearRide]) -> Array:
     """The coefficients of `form` that these rides determine, (k, free): a knot that less than `ENOUGH` of two rides is
-    at goes with the nearest that has it, so that no curve bends where hardly anything was measured.
+    at goes with the nearest that has it, so that no curve bends where hardly anything was measured. None of them where
+    the rides hardly differ in the quantity: it would be a constant by another name.
     """
+    if form.quantity != CONSTANT and not varies(form, linears):
+        return np.zeros((form.basis.shape[1], 0))
     if form.straight:
         return np.eye(1)
     good = np.flatnonzero((visits(form, linears) >= ENOUGH).sum(axis=0) >= min(2, len(linears)))
     if not len(good):
+        return np.zeros((len(form.knots), 0))
+    if len(good) == 1 and form.quantity != CONSTANT:
         return np.zeros((len(form.knots), 0))
     nearest = np.abs(np.arange(len(form.knots))[:, None] - good).argmin(axis=1)
     return np.asarray(np.eye(len(good))[nearest])

@@ -21,6 +21,7 @@ from gz_onboard.lab.discover.residuals import voltage_timing
 from gz_onboard.lab.discover.result import Gain
 from gz_onboard.lab.discover.selection import linearised_about, search_problem
 from gz_onboard.lab.discover.uncalibrated import NOTE, without_baseline
+from gz_onboard.lab.discover.unexplained import in_words
 from gz_onboard.lab.discover.verdict import Discovery, conclude
 from gz_onboard.lab.discover.wording import Say
 from gz_onboard.offline.samples import Samples
@@ -119,8 +120,7 @@ def drop_curve(found: Discovery, gain: Gain) -> None:
     without, with_it = gain.errors.get(metric), report.gain.errors.get(metric)
     if without is not None and with_it is not None and without.after <= with_it.after:
         report.notes.append(
-            f"what {channel} leaves over {report.unknown.quantity} beside the causes is no better known on rides held "
-            "out: left alone"
+            f"{in_words(report.unknown)} beside the causes is no better known on rides held out: left alone"
         )
         report.unknown, report.gain = None, gain
         report.advice.pop()  # the last is on what has no name

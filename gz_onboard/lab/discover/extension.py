@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from gz_onboard.lab.calibrate.result import Found, Result
 from gz_onboard.lab.calibrate.toml_text import number, string, with_keys
 from gz_onboard.lab.calibrate.vehicle_file import copied_effects, merged, write_whole
 from gz_onboard.lab.discover.energy import energy_share
-from gz_onboard.lab.discover.result import Unknown
+from gz_onboard.lab.discover.result import CONSTANT, Unknown
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import with_unit
 from gz_onboard.physics.effect import QUANTITIES, Effect
@@ -25,7 +26,7 @@ PORTS = {
     "auxiliary": ("DC_POWER", "W", 1.0),
     "cell_voltage": ("CELL_VOLTAGE", "V", -1.0),
 }
-READS = {"time": "time_moving", "pack_current": "cell_current"}
+READS = {CONSTANT: "speed", "time": "time_moving", "pack_current": "cell_current"}
 MODELLED = ("road_force", "inverter_power", "pack_power", "auxiliary")
 """The channels whose residual is energy that the model lacks; elsewhere it is a sensor's."""
 
@@ -145,6 +146,8 @@ def curve_text(found: Discovery) -> tuple[str, str] | None:
     port, unit, sign = PORTS[unknown.channel]
     cells = battery.cells_parallel if battery else 1
     stretch = 1 / cells if reads == "cell_current" else 1.0
+    if unknown.quantity == CONSTANT:
+        unknown = replace(unknown, curve=(*unknown.curve, (1.0, *unknown.curve[0][1:])))
     rows = [(float(at) * stretch, float(value) * sign) for at, value, _ in unknown.curve]
     if reads == "heading":
         rows.append((2 * np.pi, rows[0][1]))
@@ -153,14 +156,15 @@ def curve_text(found: Discovery) -> tuple[str, str] | None:
     bends = np.diff(slopes) / 2
     middle = (slopes[0] + slopes[-1]) / 2
     constant = values[0] - middle * knots[0] - float(np.sum(bends * np.abs(knots[0] - knots[1:-1])))
-    name = f"empirical_{unknown.channel}_{reads}"
+    name = f"empirical_{unknown.channel}_{CONSTANT if unknown.quantity == CONSTANT else reads}"
     pieces = "".join(f"\n        + {b:.6g} * abs(x - {k:.6g})" for b, k in zip(bends, knots[1:-1], strict=True))
+    over = "a constant" if unknown.quantity == CONSTANT else f"a curve over {reads}"
     low, high = float(knots[0]), float(knots[-1])
     # a road load and a loss at the motor fade at standstill, where there is no motion to hold back
     fade = " * (speed * speed / (speed * speed + 1.0))" if port == "WHEEL_FORCE" else ""
     arguments = f"{reads}, speed" if fade and reads != "speed" else reads
     return name, (
-        f'"""What {len(found.lines)} rides left over {reads} in {unknown.channel}: a curve without a cause.\n\n'
+        f'"""What {len(found.lines)} rides left in {unknown.channel}, {over}: without a cause.\n\n'
         f"Straight pieces between {low:g} and {high:g}, constant beyond, as discovered; {unknown.share:.1%} of the "
         f'energy.\n"""\n\n'
         "from gz_onboard.physics.effect import Parameter, Port\n\n"

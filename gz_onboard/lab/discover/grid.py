@@ -41,6 +41,19 @@ JUMP, WITHIN = 10.0, 0.5  # A within s: the motor current has changed
 HALVINGS = 20  # of the span of motor currents
 BRAKED = -0.6  # m/s²: what slows a vehicle more, its road load apart, may be more than its motor
 CLIMB, FEWEST = 60.0, 5.0  # m of way that an altitude's steps average out over; m from one point of it to the next
+MADE_OF: Mapping[str, tuple[str, ...]] = {
+    "grade": ("accel_x", "gps_altitude"),
+    "heading": ("gps_course",),
+    "lateral_acceleration": ("rate_z",),
+    "steering": ("rate_z",),
+    "motor_current": ("motor_current",),
+    "current_change": ("motor_current",),
+    "since_change": ("motor_current",),
+    "motor_temperature": ("motor_temperature",),
+    "ambient_temperature": ("ambient_temperature",),
+    "cell_temperature": ("cell_temperature",),
+}
+"""Of what every ride has a quantity of, the roles without any of which it is made up."""
 LONGEST = 60.0  # s since a brake was touched, or a current changed: what was longer ago is as good as never
 
 
@@ -71,6 +84,10 @@ class Ride:
     def have(self) -> set[str]:
         """The roles that are there."""
         return set(self.signals)
+
+    def shows(self, quantity: str) -> bool:
+        """Whether the ride has `quantity`, and measured it."""
+        return any(role in self.signals for role in MADE_OF.get(quantity, self.signals))
 
     def mask(self, *roles: str) -> Mask:
         """Where all of `roles` were measured, shape (n,)."""

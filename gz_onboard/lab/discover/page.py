@@ -17,6 +17,8 @@ from gz_onboard.lab.discover.energy import residual_sizes
 from gz_onboard.lab.discover.linear import LinearRide
 from gz_onboard.lab.discover.plots import curve, overview, panels, ranking
 from gz_onboard.lab.discover.result import METRICS, NO_INTERVAL, VERDICTS, Report
+from gz_onboard.lab.discover.strain import in_words as strain_words
+from gz_onboard.lab.discover.unexplained import in_words
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import readable, with_unit
 from gz_onboard.offline.page import embedded, html_table, write_page
@@ -145,13 +147,12 @@ def _causes(report: Report) -> str:
         text += f"<p><b>Not told apart by these rides:</b> {', '.join(readable(name) for name in group)}.</p>"
     if report.unknown:
         u = report.unknown
-        text += (
-            f"<p><b>No candidate explains</b> what {readable(u.channel)} leaves over {readable(u.quantity)}: "
-            f"{u.share:+.1%} of the energy, score {u.score:.0f}.</p>"
-        )
+        text += f"<p><b>No candidate explains</b> {in_words(u)}: {u.share:+.1%} of the energy, score {u.score:.0f}.</p>"
         if u.denies:
             names = ", ".join(readable(name) for name in u.denies)
             text += f"<p><b>Denied:</b> {names}, which would not act alike everywhere.</p>"
+    for sentence in strain_words(report.strain) if report.strain else ():
+        text += f"<p><b>Cannot be:</b> {html.escape(sentence)}.</p>"
     return text
 
 

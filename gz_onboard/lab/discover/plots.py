@@ -82,7 +82,7 @@ def panels(stages: Stages, channel: str) -> Figure:
             axis.fill_between(x, y - error, y + error, color=colour, alpha=0.2, linewidth=0)
             axis.plot(x, y, "o-", color=colour, markersize=3, linewidth=1.3, label=label)
         axis.axhline(0, color=INK, linewidth=0.6)
-        label, unit, _ = COVARIATES[name]
+        label, unit = COVARIATES[name]
         axis.set_xlabel(label if unit == "1" else f"{label} [{unit}]", fontsize=8, color=INK, labelpad=2)
         if i % columns:
             axis.tick_params(labelleft=False)

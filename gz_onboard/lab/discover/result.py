@@ -24,6 +24,7 @@ METRICS = {
 }
 """Of the gain: label, factor and unit."""
 RIDE_TO_RIDE = "ride"  # the quantity of what differs from ride to ride
+CONSTANT = "constant"  # the quantity of what is the same everywhere
 Interval = tuple[float, float]
 NO_INTERVAL = "one ride: no interval"
 
@@ -67,7 +68,8 @@ class Cause:
 
 @dataclass(frozen=True)
 class Unknown:
-    """What has no name: a curve that a `channel` leaves over a `quantity`, or over the rides (`RIDE_TO_RIDE`).
+    """What has no name: a curve that a `channel` leaves over a `quantity`, over the rides (`RIDE_TO_RIDE`), or a
+    `CONSTANT`, of one row.
 
     straight: it is in proportion. curve: rows (at [unit], value [the channel's unit], sd). denies: causes that it
     shows to be none. share: of the energy.
@@ -82,6 +84,48 @@ class Unknown:
     curve: tuple[tuple[float, float, float], ...]
     denies: tuple[str, ...] = ()
     share: float = 0.0
+
+
+@dataclass(frozen=True)
+class Impossible:
+    """A candidate whose evidence asks for a `value` of its first parameter beyond its `bounds`, so that it is no cause.
+
+    energy_share: that it would take.
+    """
+
+    name: str
+    parameter: str
+    value: float
+    unit: str
+    bounds: Interval
+    score: float
+    energy_share: float
+
+
+@dataclass(frozen=True)
+class Refitted:
+    """A parameter that no cause is named after, before the rides and in the fit to them. energy_share: of its change.
+
+    stated: not a parameter that the vehicle file could state and does not.
+    """
+
+    parameter: str
+    known: float
+    value: float
+    unit: str
+    energy_share: float
+    stated: bool
+
+
+@dataclass(frozen=True)
+class Strain:
+    """What explains the rides without a cause and yet cannot be. energy_share: of all that was refitted together;
+    refitted: what took most of it, empty where it is plausible.
+    """
+
+    energy_share: float
+    refitted: tuple[Refitted, ...]
+    impossible: tuple[Impossible, ...]
 
 
 @dataclass(frozen=True)
@@ -216,6 +260,11 @@ class Report:
         "whether a cause acts alike everywhere: cause, quantity, ratio (half the difference of the halves of the "
         "quantity over the mean), chi2",
     ] = field(default_factory=list)
+    strain: Annotated[
+        Strain | None,
+        "what explains the rides without a cause and cannot be: energy_share of all that was refitted, refitted (the "
+        "parameters that took most), impossible (candidates at values beyond their bounds); or null",
+    ] = None
     limits: Annotated[
         dict[str, Limit],
         "per candidate: parameter, change, unit, energy_share: the least that would be found half the time; needs: the "

@@ -11,6 +11,8 @@ from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.detectability import extent
 from gz_onboard.lab.discover.energy import residual_sizes
 from gz_onboard.lab.discover.result import METRICS, NO_INTERVAL, VERDICTS, Gain, Limit, Report
+from gz_onboard.lab.discover.strain import in_words as strain_words
+from gz_onboard.lab.discover.unexplained import in_words
 from gz_onboard.lab.discover.verdict import Discovery
 from gz_onboard.lab.discover.wording import readable, with_unit
 from gz_onboard.offline.results import clock
@@ -84,13 +86,13 @@ def _causes(report: Report) -> list[str]:
         lines.append(f"  not told apart:      {', '.join(group)}")
     if report.unknown:
         u = report.unknown
-        lines.append(
-            f"  no name:             {readable(u.channel)} over {readable(u.quantity)}, "
-            f"{u.share:+.1%} of the energy, score {u.score:.0f}"
-        )
+        lines.append(f"  no name:             {in_words(u)}, {u.share:+.1%} of the energy, score {u.score:.0f}")
         if u.denies:
             lines.append(f"  denied:              {', '.join(u.denies)}, which would not act alike everywhere")
-    return lines
+    return [
+        *lines,
+        *(f"  cannot be:           {text}" for text in (strain_words(report.strain) if report.strain else ())),
+    ]
 
 
 def _scores(found: Discovery) -> list[str]:

@@ -8,15 +8,17 @@ from dataclasses import replace
 import numpy as np
 
 from gz_onboard.lab.discover.acceptance import with_observed_scatter
+from gz_onboard.lab.discover.channels import CHANNEL
 from gz_onboard.lab.discover.constancy import RIDE_PREFIX, unequal
 from gz_onboard.lab.discover.cross_validation import Fold, held_out, improves, squares
 from gz_onboard.lab.discover.curve_forms import CurveForm, curve_forms
 from gz_onboard.lab.discover.curves import CurveFit, fit_curve
 from gz_onboard.lab.discover.energy import curve_energy_share, energy_share
 from gz_onboard.lab.discover.mixed_model import MixedModel
-from gz_onboard.lab.discover.result import RIDE_TO_RIDE, Split, Unknown
+from gz_onboard.lab.discover.result import CONSTANT, RIDE_TO_RIDE, Split, Unknown
 from gz_onboard.lab.discover.search import one_degree
 from gz_onboard.lab.discover.selection import Selection
+from gz_onboard.lab.discover.wording import readable
 from gz_onboard.lab.sizes import Sizes
 
 LEFT = 0.1  # of what causes explain: a curve beside them that takes less is the bend of a large effect
@@ -176,6 +178,15 @@ def described(form: CurveForm, curve: CurveFit, score: float, denies: Sequence[s
     """The curve for the report, its share of the energy still open."""
     rows = tuple(zip(form.knots.tolist(), curve.values.tolist(), curve.sd.tolist(), strict=True))
     return Unknown(form.channel, form.quantity, form.straight, form.unit, score, curve.chi2, rows, tuple(denies))
+
+
+def in_words(unknown: Unknown) -> str:
+    """What it is that has no name."""
+    if unknown.quantity != CONSTANT:
+        return f"{readable(unknown.channel)} over {readable(unknown.quantity)}"
+    ((_, value, sd),) = unknown.curve
+    unit = CHANNEL[unknown.channel].unit
+    return f"a constant {readable(unknown.channel)}, {value:+.4g} ± {sd:.2g} {unit} wherever the rides are"
 
 
 def contradicts_causes(curve: CurveFit, inflation: float, size: float, share: float) -> bool:

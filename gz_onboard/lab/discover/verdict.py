@@ -19,9 +19,21 @@ from gz_onboard.lab.discover.energy import energy_share, residual_sizes
 from gz_onboard.lab.discover.linear import LinearRide, Normal
 from gz_onboard.lab.discover.mixed_model import MixedModel
 from gz_onboard.lab.discover.prior import stepped
-from gz_onboard.lab.discover.result import RIDE_TO_RIDE, Cause, Estimate, Gain, Isolability, Report, Score, Unknown
+from gz_onboard.lab.discover.result import (
+    CONSTANT,
+    RIDE_TO_RIDE,
+    Cause,
+    Estimate,
+    Gain,
+    Isolability,
+    Report,
+    Score,
+    Unknown,
+)
 from gz_onboard.lab.discover.search import Search
 from gz_onboard.lab.discover.selection import SearchProblem
+from gz_onboard.lab.discover.strain import advice as strain_advice
+from gz_onboard.lab.discover.strain import strain_of
 from gz_onboard.lab.discover.unexplained import unexplained
 from gz_onboard.lab.discover.winds import Winds, search_causes
 from gz_onboard.lab.discover.wording import Say
@@ -66,33 +78,35 @@ def conclude(problem: SearchProblem, notes: list[str], say: Say) -> Discovery:
     found = causes_of(now.search, chosen, now.lines)
     sets = alternatives(now.search, chosen, problem.limit)
     scores = {name: every.part(chosen, name) for name in every.causes}
-    notes = [*notes, *unseen(problem), *searched.rejected]
+    notes = [*notes, *unseen(problem), *map(str, searched.rejected)]
     if winds is not None:
         scores[winds.cause.name] = max(scores.get(winds.cause.name, 0.0), winds.score)
         if winds.score > problem.limit:
             found = [*found, wind_cause(every, chosen, winds, now.lines)]
             notes.append("the wind differed from ride to ride: " + winds.words)
+    strain = strain_of(now, chosen, searched.rejected, scores, problem.limit)
     ranking = sorted((Score(name, round(score, 2)) for name, score in scores.items()), key=lambda row: -row.score)
     report = Report(
-        verdict=verdict_of(found, sets, unknown),
+        verdict=verdict_of(found, sets, unknown is not None or strain is not None),
         causes=found,
         ambiguous=sets,
         unknown=unknown,
         ranking=ranking,
         residuals=residual_sizes(now.lines),
         gain=Gain(),
-        advice=advice(now.search, sets, unknown),
+        advice=[*([strain_advice(strain)] if strain else []), *advice(now.search, sets, unknown)],
         notes=notes,
         isolability=separability(every),
         threshold=problem.limit,
         constancy=constancy,
+        strain=strain,
     )
     return Discovery(report, now.mixed, now.offset, now.lines, now.normals)
 
 
-def verdict_of(found: Sequence[Cause], sets: Sequence[Sequence[str]], unknown: Unknown | None) -> str:
-    """One of `result.VERDICTS`."""
-    if unknown is not None and not found:
+def verdict_of(found: Sequence[Cause], sets: Sequence[Sequence[str]], more: bool) -> str:
+    """One of `result.VERDICTS`. more: something differs that has no name."""
+    if more and not found:
         return "unknown"
     if sets:
         return "ambiguous"
@@ -208,6 +222,9 @@ def advice(search: Search, sets: Sequence[Sequence[str]], unknown: Unknown | Non
         lines.append(
             f"Ride one and the same way several times: what {unknown.channel} leaves differs from ride to ride."
             if unknown.quantity == RIDE_TO_RIDE
+            else f"Stand with the vehicle switched on, and ride at several steady speeds, for minutes each: a constant "
+            f"{unknown.channel} is one at all of them. A current sensor whose zero is off would show one too."
+            if unknown.quantity == CONSTANT
             else f"Ride over the whole span of {unknown.quantity} with all else the same, twice: what "
             f"{unknown.channel} leaves goes with it, or with what changes along with it."
         )

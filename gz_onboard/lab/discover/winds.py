@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from gz_onboard.arrays import Array
-from gz_onboard.lab.discover.acceptance import accept
+from gz_onboard.lab.discover.acceptance import Rejected, accept
 from gz_onboard.lab.discover.candidates import Candidate
 from gz_onboard.lab.discover.search import one_degree
 from gz_onboard.lab.discover.selection import SearchProblem, Selection, linearised_about, select_causes
@@ -32,11 +32,11 @@ class Winds:
 
 @dataclass(frozen=True)
 class Searched:
-    """What the search found: the causes, the winds if these are no common cause, and what was rejected, in words."""
+    """What the search found: the causes, the winds if these are no common cause, and what was rejected."""
 
     selection: Selection
     winds: Winds | None
-    rejected: list[str]
+    rejected: list[Rejected]
 
 
 def search_causes(problem: SearchProblem) -> Searched:

@@ -27,6 +27,7 @@ from gz_onboard.lab.vehicle.cells import (
 )
 from gz_onboard.lab.vehicle.features import features_of, features_text
 from gz_onboard.lab.vehicle.kinds import KINDS, LARGE
+from gz_onboard.lab.vehicle.power import Motor
 from gz_onboard.options import number
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.physics.similarity import MOST_CELLS
@@ -34,6 +35,7 @@ from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 MASS_SD, RADIUS_SD, CAPACITY_SD = 0.03, 0.02, 0.03  # relative: of what a data sheet says
+PULL_SD = 0.3  # relative: of how hard a kind of vehicle pulls off
 WIRES = 0.1  # of the cells' R0
 MARGIN = (0.7, 1.1)  # of the empty and the full pack's voltage: beyond them a value is no voltage of it
 FASTEST_DISCHARGE = 10.0  # capacities per hour
@@ -54,6 +56,8 @@ class Answers:
     wheel_radius: float  # m
     parallel: int
     gear_ratio: float
+    power: float | None = None  # W, peak; None: as usual for the kind
+    top_speed: float | None = None  # km/h; likewise
 
 
 @dataclass(frozen=True)
@@ -65,6 +69,7 @@ class Question:
     text: str
     parse: Parser
     default: float | None = None
+    of_kind: bool = False  # it need not be given: as usual for the kind
 
     @property
     def key(self) -> str:
@@ -93,6 +98,8 @@ def questions() -> tuple[Question, ...]:
     def count(option: str) -> Parser:
         return number(option, 1, MOST_CELLS, kind=int, counted="cells")
 
+    usual = "; as usual for the kind if left out"
+    peak, fastest = number("--power", 50.0, 1e6, "W"), number("--top-speed", 5.0, 400.0, "km/h")
     full = "the full pack's voltage over 4.2 V, of LFP over 3.5 V"
     return (
         Question("--kind", "KIND", f"what it is: {', '.join(KINDS)}", _one_of("--kind", KINDS)),
@@ -105,6 +112,8 @@ def questions() -> tuple[Question, ...]:
         Question("--wheel-radius", "M", "m, of the driven wheel", _bounded("--wheel-radius", "wheel_radius")),
         Question("--parallel", "N", "cells in parallel; 1 with --capacity of the pack will do", count("--parallel"), 1),
         Question("--gear-ratio", "RATIO", "wheel speed over motor speed", _bounded("--gear-ratio", "gear_ratio"), 1.0),
+        Question("--power", "W", f"W of the motor at its peak, twice its rated or so{usual}", peak, of_kind=True),
+        Question("--top-speed", "KM/H", f"km/h that it goes at most{usual}", fastest, of_kind=True),
     )
 
 
@@ -139,7 +148,8 @@ def run(arguments: argparse.Namespace) -> int:
 def completed(given: Mapping[str, Any], terminal: TextIO | None) -> Answers:
     """Every answer: as given, as asked for on a `terminal`, or the default. InputError for what is missing."""
     answers: dict[str, Any] = {question.key: given.get(question.key) for question in questions()}
-    missing = [question for question in questions() if answers[question.key] is None and question.default is None]
+    needed = [question for question in questions() if question.default is None and not question.of_kind]
+    missing = [question for question in needed if answers[question.key] is None]
     if missing and terminal is None:
         wanted = "; ".join(f"{question.option} {question.metavar} ({question.text})" for question in missing)
         raise InputError(f"give {wanted}")
@@ -216,6 +226,7 @@ def vehicle_text(name: str, answers: Answers) -> str:
     energy = fmean(chemistry.ocv) * answers.series * charge
     of_cells = chemistry.r0 * answers.series / charge
     numbers: dict[str, float] = {
+        "drift": kind.drift,
         "mass": answers.mass,
         "mass_sd": MASS_SD * answers.mass,
         "payload": kind.payload[0],
@@ -241,6 +252,7 @@ def vehicle_text(name: str, answers: Answers) -> str:
     }
     return _template("new.toml").substitute(
         {key: f"{value:.4g}" for key, value in numbers.items()},
+        **motor_keys(answers),
         name=name,
         dbc=f"{name}.dbc",
         kind=answers.kind,
@@ -258,6 +270,33 @@ def vehicle_text(name: str, answers: Answers) -> str:
         capacity_source=chemistry.capacity_source,
         circuit=circuit_text(chemistry, answers.capacity),
     )
+
+
+def motor_keys(answers: Answers) -> dict[str, str]:
+    """What the motor gives at most, for the template: as answered, else as usual for the kind."""
+    kind, usual = KINDS[answers.kind], f"usual for a {answers.kind}"
+    motor = Motor(
+        answers.power or kind.power,
+        answers.top_speed or kind.top_speed,
+        answers.mass + kind.payload[0],
+        kind.pull,
+        answers.wheel_radius,
+        answers.gear_ratio,
+        declared_parameters()["torque_constant"].prior,
+    )
+    speeds, shares = motor.shares()
+    return {
+        "current_limit": f"{motor.current_limit:.4g}",
+        "current_limit_sd": f"{PULL_SD * motor.current_limit:.4g}",
+        "pull": f"{motor.pull:g}",
+        "power": f"{motor.power:g}",
+        "power_from": "as entered" if answers.power else usual,
+        "top_speed": f"{motor.top_speed:g}",
+        "top_speed_from": "as entered" if answers.top_speed else usual,
+        "motor_speeds": _row(speeds),
+        "motor_shares": _row(shares),
+        "motor_status": "data sheet" if answers.power and answers.top_speed else "guess",
+    }
 
 
 def circuit_text(chemistry: Chemistry, capacity: float) -> str:

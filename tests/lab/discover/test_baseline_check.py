@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +67,34 @@ def test_a_radius_far_from_the_files_is_refused_with_the_channel_that_asks_for_i
     assert "Nothing is written" in str(error.value)
 
 
+def figures(error: object) -> tuple[float, float, float, float]:
+    """(value before, its sd, value found, standard deviations apart), as they are told."""
+    row = re.search(r"is ([\d.]+) ± ([\d.]+) kg .* and (-?[\d.]+) ± [\d.]+ kg by these rides, (\d+) st", str(error))
+    assert row is not None
+    before, sd, found, far = map(float, row.groups())
+    return before, sd, found, far
+
+
+def test_a_payload_is_as_far_off_as_its_figures_say(mixed: MixedModel):
+    """By what was entered, where that was; else by the file, whose rider may be another."""
+    usual = mixed.vehicle.parameters.known["payload_mass"]
+    rides = learned(mixed, "road_force", "payload_mass", usual.value - 70.0, usual.value)
+    with pytest.raises(InputError, match=r"payload_mass is [\d.]+ ± [\d.]+ kg \(guess\) by the file") as error:
+        check_against_file(rides)
+    before, sd, found, far = figures(error.value)
+    assert [before, sd, found] == pytest.approx([usual.value, usual.sd, usual.value - 70])
+    assert far == pytest.approx(70 / sd, abs=1.0)
+    for line in rides.lines:
+        line.ride.payload = usual.value + 5.0
+    with pytest.raises(InputError, match=r"payload_mass is [\d.]+ ± 2 kg as entered and") as error:
+        check_against_file(rides)
+    before, sd, found, far = figures(error.value)
+    assert [before, found] == pytest.approx([usual.value + 5, usual.value - 65])
+    assert far == pytest.approx(70 / sd, abs=1.0)
+    near = learned(mixed, "road_force", "payload_mass", usual.value - 1.5 * usual.sd, usual.value)
+    check_against_file(near)  # a rider of another mass than the file's, which nobody entered
+
+
 def test_a_guess_that_rides_say_nothing_of_stays_one(mixed: MixedModel):
     known = mixed.vehicle.parameters.known["payload_mass"]
     assert known.status == "guess"
@@ -95,7 +124,7 @@ def test_too_few_rides_are_not_checked_and_it_is_said(mixed: MixedModel):
 
 def test_of_many_parameters_the_farthest_are_named_and_the_others_counted(mixed: MixedModel):
     it = learned(mixed, "altitude", "wheel_radius", mixed.values["wheel_radius"] - 0.03, 0.0)
-    names = ["wheel_radius", "auxiliary_power", "drag_area", "cell_capacity", "payload_mass"]
+    names = ["wheel_radius", "auxiliary_power", "drag_area", "cell_capacity", "rolling_resistance_constant"]
     mean = it.before.mean + np.isin(mixed.names, names) * 100.0
     with pytest.raises(InputError, match=r"standard deviations apart.*; and 2 more") as error:
         check_against_file(replace(it, after=replace(it.after, mean=mean)))
