@@ -76,6 +76,7 @@ def test_the_report_of_a_discovery_has_the_keys_that_it_explains():
         Isolability({"a": ["road_force"]}, [["a", "b"]], [("a", "b", 0.9)]),
         15.0,
         [Split("a", "time", 0.1, 2.0)],
+        None,
         {"a": Limit("wind_north", "m/s", None, None)},
     )
     written = to_json(report)
