@@ -199,16 +199,16 @@ class Estimator:
 
     def _compare_grades(self, now: float, dt: float) -> None:
         """Compare what shows the grade; forget what was learned from a sensor that is newly distrusted."""
-        grades, reading = self.redundancy.grades, self._reading
+        grades, speeds, reading = self.redundancy.grades, self.redundancy.speeds, self._reading
         voltage, current, modelled = reading.voltage, reading.current, reading.source is CurrentSource.MODEL
         power = None if voltage is None or current is None or modelled else voltage * current
         before = grades.faulty
-        grades.compare(
-            now, dt, self.signals, self.redundancy.speeds, power, lambda v, a: self._present.power_at(now, v, a)
-        )
+        grades.compare(now, dt, self.signals, speeds, power, lambda v, a: self._present.power_at(now, v, a))
         if grades.faulty != before:
             self.road.forget_grade(grades.offset, self.signals.gps_altitude.fresh(now))
         left_out, self._distrusted = self._distrusted, self.redundancy.distrusted
+        if self._distrusted == left_out:
+            return
         newly = set(self._distrusted).difference(left_out)
         learned = LEARNED_FROM if self.road.speed is not None else LEARNED_FROM.union(SpeedCheck.ROLES)
         if forgotten := newly & learned:

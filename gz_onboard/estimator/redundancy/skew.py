@@ -17,32 +17,39 @@ FORGOTTEN = 10.0  # s: after this a message that came late no longer says that m
 class SkewedPair:
     """Compares a value of each with all of the other's within the time by which they are apart; so much later, too."""
 
-    __slots__ = ("_apart", "_moments", "_now")
+    __slots__ = ("_apart", "_coming", "_judged", "_now")
 
     def __init__(self) -> None:
         self._now = 0.0  # s
         self._apart = 0.0  # s: by how much the two messages are, at most of late
-        self._moments: deque[tuple[float, float | None, float | None]] = deque()  # s, both values
+        self._coming: deque[tuple[float, float | None, float | None]] = deque()  # s, both values; not judged yet
+        self._judged: deque[tuple[float, float | None, float | None]] = deque()
 
-    def update(self, dt: float, first: float | None, second: float | None, apart: float) -> float | None:
+    def update(
+        self, dt: float, first: float | None, second: float | None, apart: float, least: float = 0.0
+    ) -> float | None:
         """By how much they differed a moment ago, at least, after `dt` [s]; None if nothing is known of that time.
 
-        apart: the time of the one's message less that of the other's [s].
+        apart: the time of the one's message less that of the other's [s]. Up to `least` it is the plain difference,
+        which is no less.
         """
         self._now += dt
         if first is not None and second is not None:
             self._apart = max(abs(apart), self._apart * (1 - min(dt / FORGOTTEN, 1.0)))
-        skew, moments = self._apart + JITTER, self._moments
-        moments.append((self._now, first, second))
-        middle = next((i for i in range(len(moments) - 1, -1, -1) if moments[i][0] <= self._now - skew), None)
-        if middle is None:
+        skew, coming, judged = self._apart + JITTER, self._coming, self._judged
+        coming.append((self._now, first, second))
+        while coming[0][0] <= self._now - skew:
+            judged.append(coming.popleft())
+        if not judged:
             return None
-        time, first, second = moments[middle]
-        while moments[0][0] < time - skew:
-            moments.popleft()
+        time, first, second = judged[-1]
+        while judged[0][0] < time - skew:
+            judged.popleft()
         if first is None or second is None:
             return None
-        near = [moment for moment in moments if moment[0] <= time + skew]
+        if abs(first - second) <= least:
+            return abs(first - second)
+        near = [*judged, *(moment for moment in coming if moment[0] <= time + skew)]
         return max(_outside(first, (of[2] for of in near)), _outside(second, (of[1] for of in near)))
 
 

@@ -56,7 +56,8 @@ class VoltageCheck:
             against.add("pack_voltage")
         differ: bool | None = False
         self.apart = 0.0
-        beyond = None if against else self._pair.update(dt, pack, inverter, readings.voltages_apart)
+        usual = USUAL * self._series
+        beyond = None if against else self._pair.update(dt, pack, inverter, readings.voltages_apart, usual)
         if not against and pack is not None and inverter is not None:
             differ = self._differ(dt, (pack - inverter) / self._series, beyond, evidence)
             if differ:
