@@ -31,6 +31,7 @@ SCRIPTS = ("preinst", "postinst", "prerm", "postrm")
 FILES = {
     "systemd/gz-onboard.service": "usr/lib/systemd/system/gz-onboard.service",
     "systemd/gz-onboard-dashboard.service": "usr/lib/systemd/system/gz-onboard-dashboard.service",
+    "systemd/gz-onboard-mqtt.service": "usr/lib/systemd/system/gz-onboard-mqtt.service",
     "systemd/gz-onboard.default": "etc/default/gz-onboard",
     "systemd/80-can0.network": "etc/systemd/network/80-can0.network",
     "systemd/80-vcan0.netdev": f"{DOC}/examples/80-vcan0.netdev",

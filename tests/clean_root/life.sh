@@ -4,14 +4,14 @@
 set -eu
 package=$1 newer=$2 ride=$3
 export DEBIAN_FRONTEND=noninteractive LC_ALL=C HOME=/root PATH=/usr/sbin:/usr/bin:/sbin:/bin
-unit=gz-onboard.service page=gz-onboard-dashboard.service
+unit=gz-onboard.service page=gz-onboard-dashboard.service bridge=gz-onboard-mqtt.service
 settings=/etc/default/gz-onboard network=/etc/systemd/network/80-can0.network
 
 step() { echo "--- $*"; }
 
 fail() {
     echo "FAILED: $*"
-    journalctl --no-pager -n 40 -u "$unit" -u "$page" || true
+    journalctl --no-pager -n 40 -u "$unit" -u "$page" -u "$bridge" || true
     exit 1
 }
 
@@ -59,7 +59,9 @@ step "installs, with what it depends on and nothing else"
 apt install "$package"
 [ -z "$(dpkg --audit)" ] || fail "dpkg --audit: $(dpkg --audit)"
 [ "$(systemctl is-enabled $unit)" = enabled ] || fail "$unit is not enabled"
-[ "$(systemctl is-enabled $page || true)" = disabled ] || fail "$page is enabled"
+for other in $page $bridge; do
+    [ "$(systemctl is-enabled $other || true)" = disabled ] || fail "$other is enabled"
+done
 find /opt/gz-onboard -name '*.so*' -exec ldd {} + >/run/libraries 2>&1 || true
 ! grep -B 9 'not found' /run/libraries || fail "a library is missing"
 
@@ -72,6 +74,9 @@ wait_for "range in the status" tells_range
 systemctl --quiet enable "$page"
 systemctl --no-block start "$page"
 wait_for "page" page_answers
+install -m 600 /dev/null /etc/gz-onboard-mqtt.toml
+systemctl --quiet enable "$bridge"
+systemctl start "$bridge" || fail "$bridge does not start without a broker"
 wait_for "saved state" saved
 
 step "keeps state and edited settings when upgraded"
@@ -90,7 +95,7 @@ step "keeps them when removed, and leaves nothing when purged"
 kill "$replay"
 wait "$replay" || true
 apt remove gz-onboard
-! systemctl --quiet is-active "$unit" "$page" || fail "a service still runs"
+! systemctl --quiet is-active "$unit" "$page" "$bridge" || fail "a service still runs"
 grep -q 'Edited by' "$settings" && saved || fail "removed more than a removal may"
 mv /usr/sbin/userdel /usr/sbin/groupdel /run/  # by then, what the package depends on may be gone
 /var/lib/dpkg/info/gz-onboard.postrm purge || fail "the purge needs more than a Debian always has"

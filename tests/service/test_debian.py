@@ -18,12 +18,14 @@ import pytest
 
 from tests.service.support import ROOT, SOC, UNIT, Listener, main_pid, output, show, systemctl, wait_for
 from tests.service.test_dashboard import PAGE, active, latest
+from tests.service.test_mqtt import BRIDGE
 
 OPT = Path("/opt/gz-onboard")
 SETTINGS = Path("/etc/default/gz-onboard")
 NETWORK = Path("/etc/systemd/network/80-can0.network")
 OWN = ("/var/lib/private", "/var/log/private", "/var/lib", "/var/log")  # the service's folders, and the links to them
-BY_HAND = [OPT, SETTINGS, *(Path("/etc/systemd/system") / name for name in (UNIT, f"{UNIT}.d", PAGE, f"{PAGE}.d"))]
+UNITS = UNIT, PAGE, BRIDGE
+BY_HAND = [OPT, SETTINGS, *(Path("/etc/systemd/system") / name for unit in UNITS for name in (unit, f"{unit}.d"))]
 BY_HAND += [Path(folder) / "gz-onboard" for folder in OWN]
 WRITTEN = ["/etc", "/etc/default", "/etc/systemd", "/etc/systemd/network", "/etc/systemd/system", "/opt", "/usr/bin"]
 WRITTEN += ["/usr/lib/systemd/system", "/usr/lib/sysusers.d", "/usr/share/doc", "/usr/share/man/man1"]
@@ -50,7 +52,7 @@ def package(guest: None, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def board(guest: None, tmp_path: Path) -> Iterator[None]:
     """Without what the other tests install by hand, and their state; it is put back afterwards."""
-    systemctl("stop", UNIT, PAGE) if OPT.exists() else None
+    systemctl("stop", *UNITS) if OPT.exists() else None
     for number, path in enumerate(BY_HAND):
         if os.path.lexists(path):
             shutil.move(path, tmp_path / str(number))
@@ -106,8 +108,9 @@ def test_from_installation_to_purge(package, board, listener, ride, tmp_path):
     dpkg("--install", package)
     assert pwd.getpwnam("gz-onboard").pw_uid < 1000
     assert systemctl("is-enabled", UNIT) == "enabled"
-    assert output("systemctl", "is-enabled", PAGE, check=False) == "disabled"
-    assert output("systemd-analyze", "verify", UNIT, PAGE) == ""
+    for other in UNITS[1:]:
+        assert output("systemctl", "is-enabled", other, check=False) == "disabled"
+    assert output("systemd-analyze", "verify", *UNITS) == ""
     check_contents()
     check_settings_and_start(listener)
     check_upgrade(next_version(package, tmp_path), listener)
@@ -141,7 +144,7 @@ def check_contents() -> None:
     marked = Path("/var/lib/dpkg/info/gz-onboard.conffiles").read_text().split()
     assert {str(path) for path in listed if path.parts[1:2] == ("etc",) and path.is_file()} == set(marked)
     bundled = {path.name for path in listed if path.suffix == ".dist-info"}
-    assert {"python_can", "mcap", "numpy"} <= {name.split("-")[0] for name in bundled}
+    assert {"python_can", "mcap", "numpy", "paho_mqtt"} <= {name.split("-")[0] for name in bundled}
     assert not {"scipy", "matplotlib", "pyarrow", "pip"} & {path.name for path in listed}
     terms = Path("/usr/share/doc/gz-onboard/copyright").read_text()
     for name in bundled - {path for path in bundled if path.startswith("gz_onboard-")}:
