@@ -271,7 +271,7 @@ def test_the_estimator_keeps_it_over_a_restart_and_takes_none_of_a_damaged_state
     assert later.forecaster.riding.still >= RIDE_ENDS > restored.forecaster.riding.still
     saved["learned"]["road"]["means"] = [0.0]
     refusing = life.estimator()
-    with pytest.raises(ValueError, match="another form"):
+    with pytest.raises(ValueError, match="its road holds implausible numbers"):
         refusing.restore(saved, "key", 60.0)
     assert refusing.road_load.learned() == life.estimator().road_load.learned()
     del saved["learned"]["road"]  # of an earlier version
