@@ -217,10 +217,10 @@ def stated(one: Distribution) -> str:
 
 def full_text(name: str, one: Distribution) -> str:
     """All that the package has of texts of terms; what it lacks is in the folder licenses."""
-    files = [path for path in one.files or () if re.fullmatch(r"(?:LICEN[CS]E|COPYING|NOTICE)\S*", path.name, re.I)]
-    texts = [
-        Path(str(one.locate_file(path))).read_text(encoding="utf-8") for path in files if ".dist-info" in path.parts[0]
-    ]
+    own = [path for path in one.files or () if ".dist-info" in path.parts[0]]
+    named = re.compile(r"(?:LICEN[CS]E|COPYING|NOTICE)\S*", re.I)
+    files = [path for path in own if named.fullmatch(path.name) or path.parts[1] == "licenses"]
+    texts = [Path(str(one.locate_file(path))).read_text(encoding="utf-8") for path in files]
     missing = HERE / "licenses" / f"{name}.txt"
     if not texts and not missing.exists():
         sys.exit(f"deb: {name} brings no text of its terms; put it into {missing.relative_to(ROOT)}")
