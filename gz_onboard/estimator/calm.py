@@ -7,10 +7,8 @@ faster
 - at first, while the forecast itself follows each kilometre: over half as much riding as the forecast is known from;
 - near empty, where the forecast's error goes as its range does: over a third of that.
 
-Once a ride has gone on for `SETTLED` and the forecast is known from as much, a change is shown no faster than
-`FASTEST`: the range does not rise under who rides, nor fall by more than twice what is ridden. A worse forecast is held
-back only once the range shown has been near the forecast, and not near empty: a first guess that was too good is no
-calm to keep.
+Once a ride has gone on for `SETTLED` and the forecast is known from as much, a better one is shown no faster than
+`FASTEST`: the range does not rise under who rides. A worse one is not held back: who is to turn round must know.
 
 At standstill nothing is ridden that the gap could close over: what is drawn is taken off, and what else changes the
 forecast, as a rest does that shows the state of charge, waits for the riding to come; at most `STEP` of it. The rest of
@@ -31,7 +29,7 @@ NEAR_EMPTY = 3.0  # the gap closes over the range over this
 AT_FIRST = 2.0  # the gap closes over what the forecast is known from over this
 FIRST = 250.0  # m, over which it closes at first
 SETTLED = 2500.0  # m
-FASTEST = 0.8, 1.5e-5  # gained or lost, of what is ridden; of the range for each m ridden, where that is more
+FASTEST = 0.8, 1.5e-5  # gained, of what is ridden; of the range for each m ridden, where that is more
 STEP = 0.05  # of the energy that is left, or of the range
 RATIO = 0.2, 5.0  # shown over forecast: beyond, the gap is not kept
 MOST = 1e6  # m, of a saved gap
@@ -42,7 +40,7 @@ class Calm:
 
     def __init__(self, gap: float = 0.0) -> None:
         self.gap = gap  # m: shown less forecast
-        self._settled = self._met = False
+        self._settled = False
         self._way = 0.0  # m of this ride
         self._before: tuple[float, float] | None = None  # the last forecast's range [m] and energy [J]
         self._ridden = 0.0  # m since
@@ -54,7 +52,7 @@ class Calm:
 
     def begin_ride(self) -> None:
         """Another ride: what was held back on the last one shows in the first kilometres of this."""
-        self._settled, self._met, self._way = False, False, 0.0
+        self._settled, self._way = False, 0.0
 
     def show_next(self) -> None:
         """The next forecast shows at once: it stands on something else, which the rider has changed."""
@@ -85,11 +83,7 @@ class Calm:
         self._way += ridden
         self._settled |= min(known, self._way) >= SETTLED
         if self._settled:
-            most = ridden * max(FASTEST[0], FASTEST[1] * raw)
-            closed = max(closed, -most)
-            self._met |= abs(gap) < STEP * raw
-            if self._met:
-                closed = min(closed, max(most, gap * (1 - exp(-ridden * NEAR_EMPTY / raw))))
+            closed = max(closed, -ridden * max(FASTEST[0], FASTEST[1] * raw))
         self.gap = gap - closed
         self._waiting *= fading
         return self.shown(raw)
