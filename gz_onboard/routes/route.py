@@ -30,6 +30,7 @@ _AHEAD = {"stop_s": (0.0, 3600.0, "s"), "headwind_mps": (-40.0, 40.0, "m/s"), "t
 KNOWN_AHEAD = (*_KNOWN, *_AHEAD)
 """Columns of a route that is still to be ridden."""
 MOST_POINTS = 50_000  # of a route on board: 1000 km at 20 m
+LONGEST_AHEAD = 1e6  # m of a route on board: making it ready takes some 50 MB
 LONGEST_HOLE = 5000.0  # m: what is farther apart are places on the way, not the road
 
 
@@ -77,13 +78,16 @@ def read_route(file: Path | str) -> Route:
 def route_ahead_of(columns: Columns, name: str) -> Route:
     """The route in `columns` (of `KNOWN_AHEAD`) for the road ahead: altitude may be missing.
 
-    Raises InputError as `read_route`, and for more than `MOST_POINTS`, or points over `LONGEST_HOLE` apart.
+    Raises InputError as `read_route`, and for more than `MOST_POINTS` or `LONGEST_AHEAD`, or points over `LONGEST_HOLE` apart.
     """
     if len(columns) > MOST_POINTS:
         raise InputError(
             f"{columns.file}: has {len(columns)} points, must have at most {MOST_POINTS}; one each 20 m is enough"
         )
     route = route_of(columns, name, altitude_needed=False)
+    if route.length > LONGEST_AHEAD:
+        told = f"is {route.length / 1000:.0f} km long, must be at most {LONGEST_AHEAD / 1000:.0f} km"
+        raise InputError(f"{columns.file}: {told}; are distances in m?")
     for row, (before, after) in enumerate(pairwise(route.distance), start=1):
         if after - before > LONGEST_HOLE:
             raise columns.error(row, f"is {(after - before) / 1000:.1f} km from the point before: that is no road")

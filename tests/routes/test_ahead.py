@@ -93,6 +93,7 @@ def test_what_is_no_gpx_is_refused(tmp_path, text, message):
         ("distance_m,speed_limit_kmh\n0,50\n20,500\n", r":3: speed_limit_kmh: 500 kmh is outside"),
         ("distance_m,temperature_degc\n0,20\n20,293\n", r":3: temperature_degc: 293 degC is outside"),
         ("distance_m,stop\n0,20\n20,293\n", r":1: unknown column 'stop' \(did you mean 'stop_s'\?\)"),
+        ("distance_m\n" + "".join(f"{4000 * i}\n" for i in range(252)), r"is 1004 km long, must be at most 1000 km; are"),
         ("distance_m\n0\n20000\n", r":3: is 20\.0 km from the point before"),
         ("distance_m\n" + "".join(f"{i}\n" for i in range(MOST_POINTS + 1)), rf"has {MOST_POINTS + 1} points, must"),
     ],
