@@ -163,7 +163,9 @@ class Publisher:
         values[layout.counter] = counter
         word = layout.unused
         for field in layout.fields:
-            word |= field.bits(values.get(field.name))  # None: not one of ours
+            value = values.get(field.name)  # None: not one of ours
+            if value is not False:  # most flags are that, and 0 is nothing to set
+                word |= field.bits(value)
         data = word.to_bytes(7, layout.order)
         return time_ns, layout.identifier, data + bytes((crc8_sae_j1850(data),)), TRANSMITTED
 
