@@ -29,6 +29,7 @@ class Activities:
     def __init__(self) -> None:
         self.now = Activity.UNKNOWN
         self._still = inf  # s since the last motion; none yet
+        self._followed = 0.0  # s since the first step
         self._moving = 0.0  # s of motion
         self._charging = 0.0  # s of a charging current without motion
         self._drawing = 0.0  # s of a drive's current without motion, less those without it
@@ -51,6 +52,7 @@ class Activities:
         moving = speed is not None and abs(speed) > MOVING
         self._moving = self._moving + dt if moving else 0.0
         self._still = 0.0 if self._moving >= MOVING_AFTER else self._still + dt
+        self._followed += dt
         drawing = c_rate is not None and c_rate > DRAWING_RATE
         self._drawing = 0.0 if moving else min(max(self._drawing + (dt if drawing else -dt), 0.0), DRAWING_MOST)
         if self._drawing >= DRAWING_AFTER:
@@ -65,13 +67,19 @@ class Activities:
         elif moving or self._still < STANDING_AFTER:
             self.now = Activity.RIDING
         else:
-            self.now = Activity.PARKED if off or self._still > STOP_TIME else Activity.STANDING
+            parked = off or min(self._still, self._followed) > STOP_TIME
+            self.now = Activity.PARKED if parked else Activity.STANDING
 
     def shown(self, silent: bool, joined: bool) -> Activity:
         """The activity; silent: nothing comes from the bus; joined: no rest has shown the state of charge yet."""
         if silent:
             return Activity.UNKNOWN if self.now in (Activity.UNKNOWN, Activity.RIDING) else Activity.ASLEEP
         return Activity.JOINED if joined and self.now is Activity.RIDING else self.now
+
+    @property
+    def takes_charge(self) -> bool:
+        """Whether the pack is charged, or could be: nothing drives."""
+        return self.now is Activity.CHARGING and self._drawing == 0
 
     @property
     def teaches(self) -> bool:

@@ -35,6 +35,7 @@ LEAST_MOVED = 100.0  # m: nothing new is to be said of a range that has not move
 MOVED = 1000.0  # m: so much more or less than the distance ridden, and a change is explained
 SETTLED = 60.0  # s: what goes back within is no change
 MOST_CHANGES = 100
+SHOWN_OVER = 1000.0  # m: on less way than this, what was ridden is more chance than a pattern
 ROAD_STEPS = 0.005, 0.02, 0.01  # relative, of a `Road`
 # What beside the riding the modelled consumption depends on: the air, and what the road load is made with.
 BESIDE = {Cause.TEMPERATURE: None, Cause.PAYLOAD: "mass", Cause.ROLLING: "rolling", Cause.DRAG: "drag"}
@@ -261,7 +262,8 @@ class Attribution:
             elif not distance:
                 state.parts[at] = prior
             else:
-                ridden, share = self._composition.of(state.points, air, road), state.known
+                ridden = self._composition.of(state.points, air, road)
+                share = state.known * distance / (distance + SHOWN_OVER)
                 state.parts[at] = {part: share * ridden[part] + (1 - share) * prior[part] for part in PARTS}
         return state.parts[at]
 

@@ -14,8 +14,8 @@ At standstill nothing is ridden that the gap could close over: what is drawn is 
 forecast, as a rest does that shows the state of charge, waits for the riding to come; at most `STEP` of it. The rest of
 it shows at once. So does a step of the energy by more than `STEP` from one forecast to the next, at standstill or not,
 which nothing makes but a state of charge that was begun anew, and a route that is given or taken back. While the pack
-is charged, and over a restart, the gap stays as it is, in metres: fifty metres are a third of the range near empty, and
-nothing of a full one.
+is charged the gap stays as it is, in metres: fifty metres are a third of the range near empty, and nothing of a full
+one. A restart is a standstill, at which the energy that is gone was drawn; over a charge the gap stays.
 """
 
 from __future__ import annotations
@@ -32,17 +32,20 @@ SETTLED = 2500.0  # m
 FASTEST = 0.8, 1.5e-5  # gained, of what is ridden; of the range for each m ridden, where that is more
 STEP = 0.05  # of the energy that is left, or of the range
 RATIO = 0.2, 5.0  # shown over forecast: beyond, the gap is not kept
-MOST = 1e6  # m, of a saved gap
+MOST_GAP = 1e6  # m, of a saved gap
+MOST_RANGE, MOST_ENERGY = 1e7, 1e12  # m, J: of a saved forecast
 
 
 class Calm:
     """Follows the forecast's range."""
 
-    def __init__(self, gap: float = 0.0) -> None:
+    def __init__(self, gap: float = 0.0, before: tuple[float, float] | None = None) -> None:
+        """`gap` and `before`: see `snapshot`."""
         self.gap = gap  # m: shown less forecast
         self._settled = False
         self._way = 0.0  # m of this ride
-        self._before: tuple[float, float] | None = None  # the last forecast's range [m] and energy [J]
+        self._before = before  # the last forecast's range [m] and energy [J]
+        self._restarted = before is not None
         self._ridden = 0.0  # m since
         self._waiting = 0.0  # m, the part of the gap that waits for riding
 
@@ -67,10 +70,12 @@ class Calm:
 
         drawn: what was taken from the pack since the last one [J]; None: not known, or it is charged.
         """
-        before, ridden = self._before, self._ridden
-        self._before, self._ridden = (raw, energy), 0.0
+        before, ridden, restarted = self._before, self._ridden, self._restarted
+        self._before, self._ridden, self._restarted = (raw, energy), 0.0, False
         if before is None or min(raw, energy, *before) <= 0 or abs(energy - before[1]) > STEP * before[1]:
             return self.shown(raw)
+        if restarted:
+            drawn = before[1] - energy  # or charged, a little
         if ridden == 0:
             if drawn is not None and drawn < before[1]:
                 held = self.shown(before[0]) * (1 - drawn / before[1])
@@ -94,10 +99,20 @@ class Calm:
         self._waiting = min(max(before + change, -most), most)
         self.gap += self._waiting - before
 
+    def snapshot(self) -> dict[str, object]:
+        """What is to be kept over a restart: the gap [m], and the last forecast's range [m] and energy [J]."""
+        return {"gap": self.gap} | ({} if self._before is None else {"forecast": list(self._before)})
 
-def restored_gap(saved: Mapping[str, Any]) -> float:
-    """The gap [m] that was saved as `gap`, 0 where none was; TypeError or ValueError if it is implausible."""
+
+def restored_calm(saved: Mapping[str, Any]) -> Calm:
+    """What `Calm.snapshot` gave; TypeError or ValueError if it is implausible."""
     gap = float(saved.get("gap", 0.0))
-    if not abs(gap) <= MOST:
+    before = saved.get("forecast")
+    if before is not None:
+        range_, energy = map(float, before)
+        if not (0 <= range_ <= MOST_RANGE and 0 <= energy <= MOST_ENERGY):
+            raise ValueError("implausible forecast")
+        before = range_, energy
+    if not abs(gap) <= MOST_GAP:
         raise ValueError("implausible range shown")
-    return gap
+    return Calm(gap, before)

@@ -298,7 +298,7 @@ class Estimator:
         return estimate
 
     def _reasons(self, now: float) -> Reason:
-        s, reasons = self.signals, self._missing.reasons(now)
+        s, reasons = self.signals, self._missing.reasons(now, self._activities.takes_charge)
         if self._sources.currents_differ:
             reasons |= Reason.CURRENT_MISMATCH
         differ = self.redundancy.voltages.apart or not (s.pack_voltage.trusted and s.inverter_voltage.trusted)

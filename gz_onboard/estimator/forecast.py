@@ -24,7 +24,7 @@ from typing import Any
 from gz_onboard.constants import GRAVITY, HOUR
 from gz_onboard.estimator.activity import STOP_TIME
 from gz_onboard.estimator.ageing import Ageing
-from gz_onboard.estimator.calm import Calm, restored_gap
+from gz_onboard.estimator.calm import Calm, restored_calm
 from gz_onboard.estimator.interval import deciles
 from gz_onboard.estimator.load_model import AHEAD, USUAL_AIR, Conditions, EffectInputs, LoadModel
 from gz_onboard.estimator.pattern import STEEPEST, Pattern, restored_pattern
@@ -335,8 +335,12 @@ class Forecaster:
 
     def snapshot(self) -> dict[str, object]:
         """What is to be kept over a restart."""
-        kept = {"states": dict(self.load.states), "gap": self.calm.gap, "pattern": self.pattern.snapshot()}
-        kept |= {"of": asdict(self._unit)}
+        kept: dict[str, object] = {
+            "states": dict(self.load.states),
+            "of": asdict(self._unit),
+            "pattern": self.pattern.snapshot(),
+        }
+        kept |= self.calm.snapshot()
         return self.riding.snapshot() | self.riders.snapshot() | kept
 
     def restore(self, saved: Mapping[str, Any]) -> None:
@@ -344,6 +348,6 @@ class Forecaster:
         unit = restored_unit(saved, self._unit)
         riding, states = restored(saved, self.prior, unit), restored_states(saved["states"])
         pattern, riders = restored_pattern(saved.get("pattern", ())), restored_riders(saved, unit)
-        self.calm = Calm(restored_gap(saved))
+        self.calm = restored_calm(saved)
         self.riding, self.load.states, self.pattern, self.riders = riding, states, pattern, riders
         self._sum_past()

@@ -20,6 +20,8 @@ LOSS_SD = {
     Reason.SENSOR_DISTRUSTED: 0.05,  # what was learned from it before it was found out
 }
 DEGRADING = ~(Reason.PRIOR_RIDING | Reason.FRAMES_DROPPED | Reason.FRAMES_LOST)  # reasons that degrade an estimate
+OF_RIDING = Reason.NO_SPEED | Reason.NO_IMU | Reason.NO_GPS | Reason.NO_INVERTER_CURRENT
+"""What sleeps on many vehicles while they are charged, and is not missed then."""
 NO_PACK = Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT
 NEEDED = {
     Reason.NO_PACK_VOLTAGE: ("pack_voltage",),
@@ -58,8 +60,8 @@ class MissingSignals:
         self._needed = [(reason, signals[role]) for reason, roles in NEEDED.items() for role in roles if role in mapped]
         self._speeds = [signals[role] for role in SpeedCheck.ROLES]
 
-    def reasons(self, now: float) -> Reason:
-        """The reasons for those that the vehicle has and that are missing at `now` [s]."""
+    def reasons(self, now: float, charged: bool = False) -> Reason:
+        """The reasons for those that the vehicle has and that are missing at `now` [s], `charged` or not."""
         signals, reasons, never = self._signals, Reason(0), self.lacking
         for reason, signal in self._needed:
             if not signal.fresh(now):
@@ -70,7 +72,7 @@ class MissingSignals:
         altitude = signals.gps_altitude.fresh(now) or not signals.gps_altitude.stale_after
         if not never & Reason.NO_GPS and (signals.fix_below(now, FIX_3D) or not position or not altitude):
             reasons |= Reason.NO_GPS
-        return reasons
+        return reasons & ~OF_RIDING if charged else reasons
 
 
 def loss_variance(reasons: Reason) -> float:

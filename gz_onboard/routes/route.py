@@ -78,7 +78,8 @@ def read_route(file: Path | str) -> Route:
 def route_ahead_of(columns: Columns, name: str) -> Route:
     """The route in `columns` (of `KNOWN_AHEAD`) for the road ahead: altitude may be missing.
 
-    Raises InputError as `read_route`, and for more than `MOST_POINTS` or `LONGEST_AHEAD`, or points over `LONGEST_HOLE` apart.
+    Raises InputError as `read_route`, and for more than `MOST_POINTS` or `LONGEST_AHEAD`, or points over `LONGEST_HOLE`
+    apart.
     """
     if len(columns) > MOST_POINTS:
         raise InputError(

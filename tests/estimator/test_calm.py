@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.calm import CALM, STEP, Calm, restored_gap
+from gz_onboard.estimator.calm import CALM, STEP, Calm, restored_calm
 from gz_onboard.estimator.usual import Habit, Usual, restored_usual
 from gz_onboard.physics.riding import PriorRiding
 
@@ -111,7 +111,24 @@ def test_a_restart_keeps_what_was_shown():
     ridden = np.full(500, 10.0)
     before = shown(42_000 + 800 * np.sin(np.arange(500) / 50) - np.cumsum(ridden), ridden, calm=calm)[-1]
     raw = 42_000 + 800 * np.sin(499 / 50) - 5000
-    assert Calm(calm.gap).follow(raw, 90.0 * raw, KNOWN) == pytest.approx(before)
+    assert restored_calm(calm.snapshot()).follow(raw, 90.0 * raw, KNOWN) == pytest.approx(before)
+
+
+@pytest.mark.parametrize("energy", [4e6, 3.96e6, 4.04e6, 6e6])
+def test_over_a_restart_the_range_moves_as_the_energy_does(energy):
+    """A night that changes what a kilometre is to cost by 3 % shows in the first kilometres, a charge at once."""
+    calm = Calm()
+    before = calm.follow(40_000.0, 4e6, KNOWN)
+    calm = restored_calm(calm.snapshot())
+    calm.begin_ride()
+    raw = 0.97 * 40_000.0 * energy / 4e6
+    found = calm.follow(raw, energy, KNOWN)
+    assert found == pytest.approx(raw if energy == 6e6 else before * energy / 4e6)
+    for _ in range(500):
+        calm.ride(10.0)
+        raw -= 10.0
+        found = calm.follow(raw, energy, 1000.0)
+    assert found == pytest.approx(raw, rel=0.001)
 
 
 def test_it_is_right_when_empty():
@@ -128,10 +145,14 @@ def test_nothing_known_is_followed_at_once():
     assert shown(raw, ridden, known=0.0)[150] == pytest.approx(raw[150], rel=0.002)
 
 
-@pytest.mark.parametrize("saved", [{"gap": 1e9}, {"gap": float("nan")}, {"gap": "x"}, {"gap": None}])
-def test_an_implausible_ratio_is_refused(saved):
+@pytest.mark.parametrize(
+    "saved",
+    [{"gap": 1e9}, {"gap": float("nan")}, {"gap": "x"}, {"gap": None}]
+    + [{"forecast": x} for x in ([1.0], [-1.0, 1.0], [1.0, float("nan")], "ab", 3.0)],
+)
+def test_what_is_implausible_is_refused(saved):
     with pytest.raises((TypeError, ValueError)):
-        restored_gap(saved)
+        restored_calm(saved)
 
 
 def test_a_habit_knows_how_well_it_knows():
@@ -265,7 +286,7 @@ def test_whatever_was_learned_can_be_restored(segments, repeats):
 
 
 def test_a_worse_forecast_is_not_held_back():
-    """8 km less within one, of 60: one `CALM` later 37 % of that is left; 5 km less, of 12, sooner: it is the shorter."""
+    """8 km less within one, of 60: one `CALM` later 37 % of that is left; 5 km less, of 12: sooner."""
     ridden = np.full(1000, 10.0)
     at = np.cumsum(ridden)
     raw = np.interp(at, [3000, 3010], [60_000, 52_000]) - at
