@@ -103,7 +103,10 @@ def write(file: Path, text: bytes) -> None:
 
 def target(file: Path) -> Path:
     """The file that is meant, where `file` is a link to it: what is beside a state is beside that."""
-    return Path(os.path.realpath(file)) if file.is_symlink() else file
+    with contextlib.suppress(OSError):  # it cannot be looked up: whoever reads or writes it says so
+        if file.is_symlink():
+            return Path(os.path.realpath(file))
+    return file
 
 
 def copies(file: Path) -> tuple[Path, Path, Path]:

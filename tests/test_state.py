@@ -228,6 +228,13 @@ def test_a_state_by_a_link_is_that_of_its_target(tmp_path: Path):
     assert [file.name for file in link.parent.iterdir()] == ["mine.json"]
 
 
+def test_a_name_that_cannot_be_looked_up_is_no_link(tmp_path: Path):
+    file = tmp_path / f"{'x' * 300}.json"
+    assert state.copies(file)[1] == file
+    with pytest.raises(ValueError, match="cannot be read"):
+        state.load(file, NOW)
+
+
 def test_a_full_disk_leaves_the_old_one_and_nothing_else(tmp_path: Path):
     file = tmp_path / "scooter.json"
     state.write(file, state.encode(SNAPSHOT, NOW))
