@@ -9,15 +9,15 @@ from decimal import Decimal
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.offline.signal_table import signal_frames
+from gz_onboard.offline.signal_table import read_table, signal_frames
 from gz_onboard.offline.table import signal_table
 from gz_onboard.vehicle import read_vehicle
 
+pd = pytest.importorskip("pandas")
 MAPPING = read_vehicle("reference").mapping
 SECONDS = np.arange(8) * 0.5
 AMPERES = np.arange(14.0, 22.0)
@@ -162,6 +162,13 @@ def test_times_that_are_rounded_to_minutes_are_refused(as_table):
     said = r"table: time \[s\]: 'pack_current' mostly has several values at one time, then none for 128 s: .*float32"
     with pytest.raises(InputError, match=said):
         currents(as_table(data))
+
+
+def test_so_are_those_of_a_csv_with_few_digits(tmp_path):
+    rows = "".join(f"{1.7e9 + second:.8g},14\n" for second in range(3600))
+    (tmp_path / "ride.csv").write_text(f"time [s],pack_current [A]\n{rows}")
+    with pytest.raises(InputError, match=r"ride\.csv: time \[s\]: .* then none for 100 s: the times are rounded"):
+        signal_frames(read_table(tmp_path / "ride.csv"), MAPPING)
 
 
 def test_values_that_share_whole_seconds_or_have_a_row_each_are_a_ride():
