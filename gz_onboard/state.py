@@ -84,20 +84,34 @@ def write(file: Path, text: bytes) -> None:
 
     The directory is made if it is not there. OSError if it cannot be written.
     """
+    unfinished, file, previous = copies(file)
     file.parent.mkdir(parents=True, exist_ok=True)
-    unfinished, _, previous = copies(file)
-    with unfinished.open("wb") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
+    try:
+        with unfinished.open("wb") as stream:
+            stream.write(text)
+            stream.flush()
+            os.fsync(stream.fileno())
+    except OSError:
+        with contextlib.suppress(OSError):
+            unfinished.unlink()
+        raise
     with contextlib.suppress(FileNotFoundError):
         file.replace(previous)
     unfinished.replace(file)
     sync_directory(file.parent)
 
 
+def target(file: Path) -> Path:
+    """The file that is meant, where `file` is a link to it: what is beside a state is beside that."""
+    with contextlib.suppress(OSError):  # it cannot be looked up: whoever reads or writes it says so
+        if file.is_symlink():
+            return Path(os.path.realpath(file))
+    return file
+
+
 def copies(file: Path) -> tuple[Path, Path, Path]:
     """Where states are, the latest first: one not yet in its place (whole or cut off), the state, the one before."""
+    file = target(file)
     return file.with_suffix(".new"), file, file.with_suffix(".previous.json")
 
 
@@ -118,7 +132,7 @@ def load(
 
 def set_aside(file: Path, copy: Path) -> Path | None:
     """Rename `copy` of the state `file`, which cannot be used; gives its new name, None if it cannot be renamed."""
-    names = [file.with_suffix(f".refused-{number}.json") for number in range(1, REFUSED + 1)]
+    names = [target(file).with_suffix(f".refused-{number}.json") for number in range(1, REFUSED + 1)]
     with contextlib.suppress(OSError):
         for newer, older in zip(names[-2::-1], names[:0:-1], strict=True):
             if newer.exists():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -54,6 +55,12 @@ def test_frames_are_those_of_the_command(tmp_path, capsys):
     assert len(repr(frames)) < 3000
 
 
+@pytest.mark.parametrize("end", [math.inf, 1e300])
+def test_what_has_no_end_goes_to_the_end(end):
+    last = gz.read_frames(COASTDOWN, start=40.0)
+    assert gz.read_frames(COASTDOWN, start=40.0, end=end).frames == last.frames != []
+
+
 @pytest.mark.parametrize("columns", [None, ["BMS_PackVoltage", "BMS_PackCurrent[A]", "INV_MotorSpeed"]])
 def test_signals_are_those_of_the_command(columns, tmp_path):
     only = ["--columns", ",".join(columns)] if columns else []
@@ -90,9 +97,18 @@ def test_a_damaged_log_says_so(tmp_path):
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        (lambda: gz.read_frames(COASTDOWN, start=-1), "start -1 s: must not be negative"),
+        (lambda: gz.read_frames(COASTDOWN, start=-1), "start -1: must be 0 to"),
         (lambda: gz.read_frames(COASTDOWN, start=2, end=2), "end 2 s: must be after start 2 s"),
         (lambda: gz.read_frames(COASTDOWN, start=1e6), "no frames in the chosen part"),
+        (lambda: gz.read_frames(COASTDOWN, start=1e300), "start 1e[+]300: must be 0 to 1000000000 s"),
+        (lambda: gz.read_frames(COASTDOWN, start=math.inf), "start inf: must be 0 to 1000000000 s"),
+        (lambda: gz.read_frames(COASTDOWN, start=math.nan), "start nan: must be 0 to"),
+        (lambda: gz.read_frames(COASTDOWN, end=math.nan), "end nan s: must be after start 0 s"),
+        (lambda: gz.read_frames("a\0b.blf"), r"log 'a\\x00b.blf': must be a text or a path"),
+        (lambda: gz.estimate("a\0b.blf"), r"source 'a\\x00b.blf': must be"),
+        (lambda: gz.estimate(COASTDOWN, route="a\0b.gpx"), r"route 'a\\x00b.gpx': must be"),
+        (lambda: gz.estimate(COASTDOWN, state=Path("a\0b.json")), r"state .*a\\x00b.json'\): must be"),
+        (lambda: gz.read_vehicle("a\0b"), r"name 'a\\x00b': must be"),
         (lambda: gz.read_frames("nowhere.blf"), "nowhere.blf: cannot be read"),
         (lambda: gz.read_signals(COASTDOWN), "no DBC file is attached to this log; a vehicle or DBC files must"),
         (lambda: gz.read_signals(COASTDOWN, "reference", columns=["BMS_PackVoltge"]), "did you mean 'BMS_PackVolt"),

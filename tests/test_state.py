@@ -212,3 +212,34 @@ def test_killed_at_any_time_it_leaves_a_whole_one(tmp_path: Path):
         assert snapshot["row"] == [snapshot["n"]] * 2000
         last = max(last, snapshot["n"])
     assert last > 1
+
+
+def test_a_state_by_a_link_is_that_of_its_target(tmp_path: Path):
+    target, link = tmp_path / "real" / "scooter.json", tmp_path / "link" / "mine.json"
+    for n in range(2):
+        state.write(target, state.encode({"n": n}, NOW))
+    link.parent.mkdir()
+    link.symlink_to("../real/scooter.json")
+    state.write(link, state.encode({"n": 2}, NOW))
+    assert link.is_symlink()
+    assert state.copies(link) == state.copies(target)
+    assert [state.load(copy, NOW) for copy in state.copies(target)[1:]] == [({"n": 2}, 0.0), ({"n": 1}, 0.0)]
+    assert state.set_aside(link, state.copies(link)[1]) == target.with_suffix(".refused-1.json")
+    assert [file.name for file in link.parent.iterdir()] == ["mine.json"]
+
+
+def test_a_name_that_cannot_be_looked_up_is_no_link(tmp_path: Path):
+    file = tmp_path / f"{'x' * 300}.json"
+    assert state.copies(file)[1] == file
+    with pytest.raises(ValueError, match="cannot be read"):
+        state.load(file, NOW)
+
+
+def test_a_full_disk_leaves_the_old_one_and_nothing_else(tmp_path: Path):
+    file = tmp_path / "scooter.json"
+    state.write(file, state.encode(SNAPSHOT, NOW))
+    (tmp_path / "scooter.new").symlink_to("/dev/full")
+    with pytest.raises(OSError, match="No space left"):
+        state.write(file, state.encode({"n": 2}, NOW))
+    assert list(tmp_path.iterdir()) == [file]
+    assert state.load(file, NOW) == (SNAPSHOT, 0.0)

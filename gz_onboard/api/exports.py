@@ -14,8 +14,9 @@ from gz_onboard.bus.logs import LogDamage
 from gz_onboard.errors import InputError, brief
 from gz_onboard.events import Frame
 from gz_onboard.lab import export_tables
-from gz_onboard.offline.arguments import checked
+from gz_onboard.offline.arguments import checked, within
 from gz_onboard.offline.table import Columns, Tabular
+from gz_onboard.options import LONGEST_LOG
 
 _KINDS = {"channel": np.int64, "identifier": np.int64, "data": object}  # the others are truth values
 
@@ -116,11 +117,10 @@ def read_signals(
 def _source(
     log: PathLike, start: float, end: float | None, columns: Sequence[str] | None = None
 ) -> export_tables.Source:
-    if not start >= 0:
-        raise InputError(f"start {start:g} s: must not be negative")
+    within("start", start, {"start": (0.0, LONGEST_LOG, "s")})
     if end is not None and not end > start:
         raise InputError(f"end {end:g} s: must be after start {start:g} s")
-    return export_tables.Source(Path(log), start, end, columns)
+    return export_tables.Source(Path(log), start, None if end is None else min(end, LONGEST_LOG), columns)
 
 
 def _times(times: Sequence[int]) -> np.ndarray[tuple[int], np.dtype[np.datetime64]]:

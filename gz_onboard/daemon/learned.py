@@ -268,7 +268,7 @@ def _forget(
         changed["riding"] = fresh.snapshot()
     text = state.encode(changed, 0.0 if age is None else time.time() - age)
     with writing(file):
-        descriptor = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY)
+        descriptor = os.open(state.target(file).parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             state.write(file, text)

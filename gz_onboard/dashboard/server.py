@@ -10,6 +10,7 @@ import contextlib
 import errno
 import hashlib
 import http.client
+import io
 import ipaddress
 import json
 import socket
@@ -161,6 +162,33 @@ class Server(ThreadingHTTPServer):
         """Nothing: a browser that goes away is no error of ours."""
 
 
+class _Received(io.RawIOBase):
+    """What a client sends. TimeoutError once `seconds` have passed since the last `begin`, however it trickles in."""
+
+    def __init__(self, connection: socket.socket, seconds: float) -> None:
+        self._connection, self._seconds = connection, seconds
+        self.begin()
+
+    def begin(self) -> None:
+        """From now on the time counts."""
+        self._end = time.monotonic() + self._seconds
+
+    def readable(self) -> bool:
+        """As the base class has it."""
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        """As the base class has it."""
+        left = self._end - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        self._connection.settimeout(left)
+        try:
+            return self._connection.recv_into(buffer)
+        finally:
+            self._connection.settimeout(self._seconds)
+
+
 class Handler(BaseHTTPRequestHandler):
     """One connection."""
 
@@ -168,7 +196,7 @@ class Handler(BaseHTTPRequestHandler):
     protocol_version = "HTTP/1.1"
     server_version = "gz-onboard"
     sys_version = ""
-    timeout = PATIENCE  # of the socket, by the base class
+    timeout = PATIENCE  # of the socket, by the base class; also for all of a request's header
 
     def setup(self) -> None:
         """Keep little in the kernel, and find out soon that nobody is there."""
@@ -177,11 +205,22 @@ class Handler(BaseHTTPRequestHandler):
         if hasattr(socket, "TCP_USER_TIMEOUT"):
             self.request.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(PATIENCE * 1000))
         super().setup()
+        self.rfile.close()
+        self._received = _Received(self.connection, self.timeout)
+        self.rfile = io.BufferedReader(self._received)
+
+    def handle_one_request(self) -> None:
+        """As the base class does, within the time."""
+        self._received.begin()
+        super().handle_one_request()
 
     def do_GET(self) -> None:
         """Answer."""
         path = self.path.partition("?")[0]
-        if not self._addressed_to_us():
+        if self._has_body():
+            self.close_connection = True  # or what is not read would be taken for another request
+            self._say(HTTPStatus.BAD_REQUEST, "There is nothing to send here.\n")
+        elif not self._addressed_to_us():
             self._say(HTTPStatus.MISDIRECTED_REQUEST, "This is not the address of this dashboard.\n")
         elif path == "/api/stream":
             self._stream()
@@ -198,13 +237,18 @@ class Handler(BaseHTTPRequestHandler):
 
     do_HEAD = do_GET  # noqa: N815 - the base class's name
 
+    def _has_body(self) -> bool:
+        """Whether something follows the header."""
+        lengths = self.headers.get_all("Content-Length", [])
+        return "Transfer-Encoding" in self.headers or any(length.strip() != "0" for length in lengths)
+
     def _addressed_to_us(self) -> bool:
         """Whether a local server is asked by a local name: pages of others could have any name point here."""
         if not self.server.local:
             return True
         host = self.headers.get("Host", "localhost")
         name = host.rpartition(":")[0] if host.rpartition(":")[2].isdigit() else host
-        if name == "localhost":
+        if name.lower() in ("localhost", "localhost."):
             return True
         with contextlib.suppress(ValueError):
             ipaddress.ip_address(name.strip("[]"))
@@ -221,7 +265,7 @@ class Handler(BaseHTTPRequestHandler):
     def _stream(self) -> None:
         """Events until the browser goes away: `build` once, then a picture when it changes and every second."""
         self.close_connection = True
-        self._head(HTTPStatus.OK, Content_Type="text/event-stream", Cache_Control="no-store", Connection="close")
+        self._head(HTTPStatus.OK, Content_Type="text/event-stream", Cache_Control="no-store")
         if self.command == "HEAD":
             return
         with contextlib.suppress(OSError):
@@ -241,6 +285,8 @@ class Handler(BaseHTTPRequestHandler):
 
     def _head(self, status: HTTPStatus, **headers: str) -> None:
         self.send_response(status)
+        if self.close_connection:
+            headers["Connection"] = "close"
         for name, value in {**HEADERS, **headers}.items():
             self.send_header(name.replace("_", "-"), value)
         self.end_headers()

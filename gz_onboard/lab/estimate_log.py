@@ -79,12 +79,14 @@ def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSu
             log.note(_RECORD, {**made_of, **_link(ridden, learned), _SUMMARY: summary_to_keep(summary)})
             log.close()
             task.part.replace(task.log)
-            if task.state and learned:
-                state.write(task.state.file, learned)
         finally:
             log.abandon()
             task.part.unlink(missing_ok=True)
-        if task.picture:
+    if task.state and learned:
+        with writing(task.state.file):
+            state.write(task.state.file, learned)
+    if task.picture:
+        with writing(task.picture):
             plot_log(task.log, task.picture)
     return summary
 

@@ -128,9 +128,10 @@ def held(file: Path) -> Iterator[None]:
     """
     if file.suffix != SUFFIX:
         raise InputError(f"state {file}: give it a name that ends in {SUFFIX}")
+    folder = state.target(file).parent
     with writing(file):
-        file.parent.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(file.parent, os.O_RDONLY | os.O_DIRECTORY)
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

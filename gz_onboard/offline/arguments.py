@@ -82,6 +82,8 @@ def check(name: str, value: object, hint: Any) -> None:
 
 def fits(value: object, hint: Any) -> bool:
     """Whether `value` is what a type hint says; of a protocol always, as it says itself what it lacks."""
+    if isinstance(value, str | os.PathLike) and "\0" in str(value):  # NUL: no name has it
+        return False
     kind, parts = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, types.UnionType):
         return any(fits(value, part) for part in parts)

@@ -37,10 +37,11 @@ _TIME = re.compile(r"\s*(?:time|timestamp|t)(?:(?:_|\s+|\s*[\[(]\s*)(?P<unit>s|m
 _SECONDS = {"s": 1.0, "ms": 1e-3}
 _ALSO = {"speed": "vehicle_speed"}
 _WORDS = {"battery": "pack", "soc": "bms_state_of_charge", "temp": "temperature", "velocity": "speed"}
-_MISSING = ("", "nan", "null", "none", "n/a")
+_MISSING = ("", "nan", "nat", "null", "none", "n/a", "<na>")
 _LAST = ("motor_speed", "inverter_voltage", "pack_voltage")  # the estimator makes its step with the last that is there
 _VALUE = Struct("<d")
 _LONGEST_STEP = 30.0  # s, the usual one from row to row: beyond it nothing can be followed
+_COARSEST = 1.0  # s: times of whole seconds are clocks', coarser ones that several rows share were rounded
 _1970 = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -92,7 +93,7 @@ def signal_frames(table: SignalTable, mapping: BusMapping) -> tuple[BusMapping, 
     order = {role: i for i, role in enumerate(_LAST)}
     used = sorted((c for c in columns if c.name in played), key=lambda c: order.get(played[c.name], -1))
     values = {column.name: _values(file, rows, column) for column in used}
-    periods = {name: period for name, found in values.items() if (period := _period(times, found))}
+    periods = {name: period for name, found in values.items() if (period := _period(table, times, name, found))}
     numbers = {m.name: m.frame_id | EFF_FLAG for m in database.messages}
     made = replace(mapping, database=database, sources=sources, protection={}, periods=periods, j1939=False)
     return made, _frames(times, [(numbers[name], found) for name, found in values.items()])
@@ -135,6 +136,8 @@ def _parquet(file: Path) -> tuple[list[str], Rows]:
     try:
         import pyarrow
         import pyarrow.parquet
+
+        from gz_onboard.offline.cells import rows_of
     except ImportError as error:
         raise InputError(
             f"{file}: Parquet needs pyarrow: pip install 'gz-onboard[lab]'; or give the table as CSV"
@@ -143,20 +146,7 @@ def _parquet(file: Path) -> tuple[list[str], Rows]:
         table = pyarrow.parquet.ParquetFile(file).read()  # `read_table` chokes on two columns of one name
     except (OSError, pyarrow.ArrowException) as error:
         raise InputError(f"{file}: not a Parquet file: {error}") from error
-    return arrow_rows(table)
-
-
-def arrow_rows(table: Any) -> tuple[list[str], Rows]:
-    """(header, rows) of a table of pyarrow."""
-    import pyarrow
-
-    columns = [
-        column.cast(pyarrow.timestamp("us", "UTC"), safe=False)  # datetime has no ns, and may not know the zone
-        if pyarrow.types.is_timestamp(column.type)
-        else column
-        for column in table.columns
-    ]
-    return table.column_names, list(enumerate(zip(*(column.to_pylist() for column in columns), strict=True), 1))
+    return rows_of(list(zip(table.column_names, table.columns, strict=True)), str(file))
 
 
 def _times(file: Path, name: str, rows: Rows) -> list[int]:
@@ -175,7 +165,7 @@ def _times(file: Path, name: str, rows: Rows) -> list[int]:
             raise InputError(
                 f"{file}:{line}: {name}: {shown(row[0])} has no unit; call the column 'time [s]' or 'time [ms]'"
             ) from None
-        except (ValueError, OverflowError):
+        except (TypeError, ValueError, OverflowError):
             raise InputError(
                 f"{file}:{line}: {name}: {shown(row[0])} is neither a number nor a time of ISO 8601"
             ) from None
@@ -199,10 +189,12 @@ def _times(file: Path, name: str, rows: Rows) -> list[int]:
 
 
 def _nanoseconds(cell: object, unit: str) -> int:
-    """A time [ns]: a number in `unit`, or since 1970 that of a date, which is UTC if it has no zone.
+    """A time [ns]: a number in `unit`, a duration, or since 1970 that of a date, which is UTC if it has no zone.
 
-    ValueError or OverflowError for what is neither, KeyError for a number without a unit.
+    TypeError, ValueError or OverflowError for what is none, KeyError for a number without a unit.
     """
+    if _is_missing(cell):
+        raise ValueError
     if isinstance(cell, str):
         text = cell.strip()
         try:
@@ -212,10 +204,11 @@ def _nanoseconds(cell: object, unit: str) -> int:
     if isinstance(cell, date):
         cell = cell if isinstance(cell, datetime) else datetime(cell.year, cell.month, cell.day)
         moment = cell if cell.tzinfo else cell.replace(tzinfo=UTC)
-        return (moment - _1970) // timedelta(microseconds=1) * 1000
-    if not isinstance(cell, int | float):
-        raise ValueError
-    return round(cell * _SECONDS[unit] * 1e9)
+        cell = moment - _1970
+    if isinstance(cell, timedelta):
+        return cell // timedelta(microseconds=1) * 1000
+    number = float(cell)  # type: ignore[arg-type]  # of Decimal too
+    return round(number * _SECONDS[unit] * 1e9)
 
 
 def _column(text: str, at: int) -> _Column:
@@ -224,7 +217,9 @@ def _column(text: str, at: int) -> _Column:
 
 
 def _is_missing(cell: object) -> bool:
-    return cell is None or (isinstance(cell, str) and cell.strip().lower() in _MISSING)
+    if isinstance(cell, int | float):
+        return False
+    return cell is None or str(cell).strip().lower() in _MISSING
 
 
 def _values(file: Path, rows: Rows, column: _Column) -> list[float | None]:
@@ -237,7 +232,7 @@ def _values(file: Path, rows: Rows, column: _Column) -> list[float | None]:
             continue
         try:
             value = float(cell)
-        except (ValueError, TypeError):
+        except (TypeError, ValueError, OverflowError):
             value = math.inf
         if math.isinf(value):
             unit = f" [{column.unit}]" if column.unit else ""
@@ -296,11 +291,23 @@ def _by_role(file: Path, columns: Sequence[_Column]) -> tuple[Source, ...]:
     return tuple(sources.values())
 
 
-def _period(times: Sequence[int], values: Sequence[float | None]) -> float | None:
-    """The usual time from one of a column's values to the next [s]; None if there are too few."""
+def _period(table: SignalTable, times: Sequence[int], name: str, values: Sequence[float | None]) -> float | None:
+    """The usual time from one of a column's values to the next [s]; None if there are too few.
+
+    InputError if most share their time with the one before, and the others are far apart.
+    """
     known = [time for time, value in zip(times, values, strict=True) if value is not None]
-    steps = [after - before for before, after in pairwise(known) if after > before]
-    return median(steps) * 1e-9 if steps else None
+    steps = [after - before for before, after in pairwise(known)]
+    forward = [step for step in steps if step]
+    if not forward:
+        return None
+    period = median(forward) * 1e-9
+    if 2 * len(forward) < len(steps) and period > _COARSEST + 1e-6:
+        raise InputError(
+            f"{table.name}: {table.header[0]}: {name!r} mostly has several values at one time, then none for "
+            f"{period:.4g} s: the times are rounded; give them as float64, not float32, or since the start of the ride"
+        )
+    return period
 
 
 def _frames(times: Sequence[int], columns: Sequence[tuple[int, list[float | None]]]) -> Iterator[list[Frame]]:

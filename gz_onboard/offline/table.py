@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -11,8 +11,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from gz_onboard.errors import InputError, shown
-from gz_onboard.offline.signal_table import SignalTable, arrow_rows, is_time
+from gz_onboard.errors import InputError
+from gz_onboard.offline.cells import rows_of
+from gz_onboard.offline.signal_table import SignalTable, is_time
 
 Columns: TypeAlias = dict[str, NDArray[Any]]
 """Arrays of one length by the name of the column, with its unit: ``range[m]``."""
@@ -26,62 +27,34 @@ def signal_table(data: object, name: str = "table") -> SignalTable:
     The first column is the time, as in a CSV file; of a mapping, the column that is one, wherever it stands; of pandas
     also the index. name: what errors call it. Raises InputError for what is no table, or has columns of unlike lengths.
     """
+    columns = _columns(data, name)
+    columns.sort(key=lambda column: not is_time(column[0]))
+    return SignalTable(Path(name), *rows_of(columns, name))
+
+
+def _columns(data: Any, name: str) -> list[tuple[str, object]]:
+    """The columns of a table, each with its name."""
     if isinstance(data, Mapping):
-        return SignalTable(Path(name), *_mapping_rows(data, name))
-    try:
-        import pyarrow
-    except ImportError as error:
-        raise InputError(f"{name}: a {type(data).__name__} needs pyarrow; a dict of arrays does without") from error
-    if isinstance(data, pyarrow.Table):
-        table = data
-    elif hasattr(data, "iloc") and hasattr(data, "reset_index"):  # pandas
-        if not data.columns.is_unique:  # type: ignore[attr-defined]
-            twice = data.columns[data.columns.duplicated()][0]  # type: ignore[attr-defined]
-            raise InputError(f"{name}: has two columns {str(twice)!r}")
-        table = pyarrow.Table.from_pandas(
-            data.reset_index() if is_time(str(data.index.name)) else data,  # type: ignore[attr-defined]
-            preserve_index=False,
-        )
-    elif hasattr(data, "__arrow_c_stream__"):
-        table = pyarrow.table(data)
-    else:
-        raise InputError(
-            f"{name}: {type(data).__name__} is no table of signals; give a dict of arrays by column, or a table of "
-            "pandas, polars or pyarrow"
-        )
-    names = table.column_names
-    return SignalTable(Path(name), *arrow_rows(table.select(_time_first(names))))
-
-
-def _mapping_rows(data: Mapping[Any, Any], name: str) -> tuple[list[str], list[tuple[int, tuple[Any, ...]]]]:
-    names = list(data)
-    order = [names[i] for i in _time_first([str(one) for one in names])]
-    columns = [_cells(data[one], f"{name}: column {str(one)!r}") for one in order]
-    lengths = {str(one): len(column) for one, column in zip(order, columns, strict=True)}
-    if len(set(lengths.values())) > 1:
-        said = ", ".join(f"{one} {length}" for one, length in lengths.items())
-        raise InputError(f"{name}: its columns have unlike lengths: {said}")
-    return [str(one) for one in order], list(enumerate(zip(*columns, strict=True), 1))
-
-
-def _time_first(names: Sequence[str]) -> list[int]:
-    """The places of the columns, that of the time first."""
-    at = next((i for i, name in enumerate(names) if is_time(name)), 0)
-    return sorted(range(len(names)), key=lambda i: (i != at, i))
-
-
-def _cells(column: object, place: str) -> list[Any]:
-    """The cells of a column as Python has them; times as dates. InputError, which begins with `place`, for no array."""
-    array = np.array(0)
-    if isinstance(column, Iterable) and not isinstance(column, str):
-        with suppress(TypeError, ValueError):  # of no dimension, of rows of unlike lengths
-            array = column if isinstance(column, np.ndarray) else np.asarray(list(column))
-    if array.ndim != 1:
-        raise InputError(f"{place}: must be an array of one dimension, is {shown(column)}")
-    if array.dtype.kind == "M":
-        array = array.astype("datetime64[us]")  # as `datetime`, which has no ns
-    cells: list[Any] = array.tolist()
-    return cells
+        return [(str(header), column) for header, column in data.items()]
+    if hasattr(data, "iloc") and hasattr(data, "columns"):  # pandas, which may have two columns of one name
+        columns = [(str(header), data.iloc[:, i]) for i, header in enumerate(data.columns)]
+        headers = [header for header, _ in columns]
+        if twice := next((header for header in headers if headers.count(header) > 1), None):
+            raise InputError(f"{name}: has two columns {twice!r}")
+        index = str(data.index.name)
+        return [(index, data.index), *columns] if is_time(index) and index not in headers else columns
+    if hasattr(data, "__arrow_c_stream__"):
+        try:
+            import pyarrow
+        except ImportError as error:
+            raise InputError(f"{name}: a {type(data).__name__} needs pyarrow; a dict of arrays does without") from error
+        with suppress(pyarrow.ArrowException, TypeError, ValueError, RuntimeError):  # a column alone speaks Arrow too
+            table = pyarrow.table(data)
+            return list(zip(table.column_names, table.columns, strict=True))
+    raise InputError(
+        f"{name}: {type(data).__name__} is no table of signals; give a dict of arrays by column, or a table of "
+        "pandas, polars or pyarrow"
+    )
 
 
 # --- out ----------------------------------------------------------------------------------------------------------

@@ -71,6 +71,8 @@ def read_gpx(file: Path) -> Columns:
         raise InputError(f"{file}:{error.lineno}: not a GPX file: {expat.ErrorString(error.code)}") from error
     except OSError as error:
         raise unreadable(file, error) from error
+    except (LookupError, ValueError) as error:  # an encoding that the parser does not know, or not of several bytes
+        raise InputError(f"{file}: cannot be read: {error}; save it as UTF-8") from error
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
     points: list[Point] = next(filter(None, reader.points.values()), [])

@@ -23,7 +23,8 @@ GRADE_LENGTH = 200.0  # [m]
 CURVE_LENGTH = 40.0  # [m]
 _CHORD = 10.0  # [m]: shorter chords have no heading worth the name
 _STEEPEST = 0.5  # sine; no road is steeper, a wrong unit is
-_CLOSEST = 0.01  # [m] between points
+_CLOSEST = 0.01  # [m] between positions
+_SHORTEST = 0.001  # [m] between distances: none is too short to be ridden in a time above 0
 _LIMITS = {f"speed_limit_{unit}": UNITS[unit] for unit in ("mps", "kmh")}
 _KNOWN = ("distance_m", "latitude_deg", "longitude_deg", "altitude_m", "curvature_1pm", *_LIMITS)
 _AHEAD = {"stop_s": (0.0, 3600.0, "s"), "headwind_mps": (-40.0, 40.0, "m/s"), "temperature_degc": (-50.0, 60.0, "degC")}
@@ -109,6 +110,9 @@ def route_of(columns: Columns, name: str, altitude_needed: bool = True) -> Route
     positions = _positions(columns)
     if "distance_m" in values:
         columns.increasing("distance_m", "m")
+        for row, (before, after) in enumerate(pairwise(values["distance_m"]), start=1):
+            if after - before < _SHORTEST:
+                raise columns.error(row, f"distance_m: {after:g} m is less than {_SHORTEST:g} m from the point before")
         distance = tuple(d - values["distance_m"][0] for d in values["distance_m"])
     elif positions:
         distance = _lengths(positions)

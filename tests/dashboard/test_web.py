@@ -6,6 +6,7 @@ import http.client
 import json
 import os
 import re
+import select
 import signal
 import socket
 import subprocess
@@ -13,7 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from typing import Any
 from urllib.parse import urlsplit
@@ -176,11 +177,66 @@ def test_what_else_is_asked(path, method, status, feed):
 
 @pytest.mark.parametrize(
     ("host", "status"),
-    [("localhost:8000", 200), ("127.0.0.1", 200), ("[::1]:80", 200), ("evil.example", 421), ("evil.example:8000", 421)],
+    [
+        ("localhost:8000", 200),
+        ("LOCALHOST:8000", 200),
+        ("localhost.", 200),
+        ("127.0.0.1", 200),
+        ("[::1]:80", 200),
+        ("evil.example", 421),
+        ("evil.example:8000", 421),
+        ("localhost..", 421),
+        ("", 421),
+    ],
 )
 def test_a_local_server_has_only_local_names(host, status, feed):
     with served(feed, "127.0.0.1:0") as address:
         assert asked(address, "/api/latest", Host=host)[0].status == status
+
+
+@pytest.mark.parametrize("length", [b"Content-Length: 65", b"Transfer-Encoding: chunked"])
+def test_a_body_is_no_second_request(length, feed):
+    request = b"GET /api/latest HTTP/1.1\r\nHost: localhost\r\n"
+    said = b""
+    with served(feed, "127.0.0.1:0") as address:
+        place = urlsplit(address)
+        with socket.create_connection((place.hostname, place.port or 0), timeout=LONG) as raw:
+            raw.sendall(request + length + b"\r\n\r\n" + request + b"Connection: close\r\n\r\n")
+            with suppress(ConnectionError):  # what it did not read
+                while piece := raw.recv(65536):
+                    said += piece
+    assert said.startswith(b"HTTP/1.1 400 ")
+    assert said.count(b"HTTP/1.1 ") == 1
+    assert b"\r\nConnection: close\r\n" in said
+
+
+def test_a_header_that_trickles_in_is_not_waited_for(feed, monkeypatch):
+    monkeypatch.setattr(web_server.Handler, "timeout", 0.5)
+    with served(feed, "127.0.0.1:0") as address:
+        place = urlsplit(address)
+        with socket.create_connection((place.hostname, place.port or 0), timeout=LONG) as slow:
+            slow.sendall(b"GET / HTTP/1.1\r\nX: ")
+
+            def left() -> bool:
+                try:
+                    slow.sendall(b"x")
+                    return bool(select.select([slow], [], [], 0.0)[0]) and slow.recv(1) == b""
+                except ConnectionError:
+                    return True
+
+            wait_for(left, "the end of the connection")
+        assert latest(address) == {"channel": "x"}
+
+
+def test_a_connection_that_is_kept_serves_one_request_after_the_other(feed, monkeypatch):
+    monkeypatch.setattr(web_server.Handler, "timeout", LONG)
+    with served(feed, "127.0.0.1:0") as address:
+        connection = http.client.HTTPConnection(urlsplit(address).netloc, timeout=LONG)
+        for _ in range(3):
+            connection.request("GET", "/api/latest", headers={"Content-Length": "0"})
+            answer = connection.getresponse()
+            assert (answer.status, answer.read()) == (200, b'{"channel":"x"}\n')
+        connection.close()
 
 
 def test_nonsense_on_the_port_does_not_end_it(feed):

@@ -19,6 +19,7 @@ import pytest
 import gz_onboard as gz
 from gz_onboard import state
 from gz_onboard.bus.channel import CanChannel
+from gz_onboard.bus.completion import is_complete
 from gz_onboard.bus.writers import write_blf
 from gz_onboard.cli import main
 from gz_onboard.daemon import keeper
@@ -281,6 +282,15 @@ def test_what_does_not_go_together(short, tmp_path, capsys):
     assert "saves states in its folder" in refused(out, capsys, short)
     os.close(descriptor)
     assert estimate(out, short) == 0
+
+
+def test_where_the_state_finds_no_room_it_is_named_and_the_log_is_whole(short, tmp_path, capsys):
+    (out := tmp_path / "out").mkdir()
+    (out / "s.new").symlink_to("/dev/full")
+    assert estimate(out, short) == 1
+    assert f"{out / 's.json'}: cannot be written: No space left on device" in capsys.readouterr().err
+    assert [file.name for file in out.iterdir()] == ["ride.estimate.mcap"]
+    assert is_complete(out / "ride.estimate.mcap")
 
 
 def test_a_state_that_cannot_be_used_is_left_as_it_is(short, tmp_path, capsys):

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import csv
+import gzip
+
 import pytest
 
 from gz_onboard.errors import InputError
-from gz_onboard.routes.ahead import read_ahead
+from gz_onboard.routes.ahead import LARGEST_FILE, read_ahead
 from gz_onboard.routes.profile import speed_profile
 from gz_onboard.routes.route import MOST_POINTS
 
@@ -77,6 +80,8 @@ def test_gpx_refused(tmp_path, points, message):
     [
         ("nonsense", r"way\.gpx:1: not a GPX file: syntax error"),
         (HEAD + "<trk>", r"way\.gpx:3: not a GPX file"),
+        ('<?xml version="1.0" encoding="GBK"?><gpx/>', r"way\.gpx: cannot be read: multi-byte .*; save it as UTF-8"),
+        ('<?xml version="1.0" encoding="klingon"?><gpx/>', r"way\.gpx: cannot be read: .*klingon; save it as UTF-8"),
         ('<!DOCTYPE x [<!ENTITY a "aaaa">]>' + HEAD[22:] + "</gpx>", r"way\.gpx: has a document type"),
     ],
 )
@@ -93,7 +98,9 @@ def test_what_is_no_gpx_is_refused(tmp_path, text, message):
         ("distance_m,speed_limit_kmh\n0,50\n20,500\n", r":3: speed_limit_kmh: 500 kmh is outside"),
         ("distance_m,temperature_degc\n0,20\n20,293\n", r":3: temperature_degc: 293 degC is outside"),
         ("distance_m,stop\n0,20\n20,293\n", r":1: unknown column 'stop' \(did you mean 'stop_s'\?\)"),
-        ("distance_m\n" + "".join(f"{4000 * i}\n" for i in range(252)), r"is 1004 km long, must be at most 1000 km; are"),
+        ("distance_m\n" + "".join(f"{4000 * i}\n" for i in range(252)), r"is 1004 km long, must be at most 1000"),
+        ("distance_m\n0\n20\n20.0001\n", r":4: distance_m: 20\.0001 m is less than 0\.001 m from the point before"),
+        ("distance_m\n0\n5e-324\n", r":3: distance_m: 4.94066e-324 m is less than 0\.001 m from the point before"),
         ("distance_m\n0\n20000\n", r":3: is 20\.0 km from the point before"),
         ("distance_m\n" + "".join(f"{i}\n" for i in range(MOST_POINTS + 1)), rf"has {MOST_POINTS + 1} points, must"),
     ],
@@ -108,3 +115,11 @@ def test_csv_refused(tmp_path, text, message):
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises(InputError, match=r"gone\.gpx: cannot be read: No such file"):
         read_ahead(tmp_path / "gone.gpx")
+
+
+def test_a_packed_file_that_unpacks_to_a_huge_one_is_refused_before_it_is_parsed(tmp_path, monkeypatch):
+    file = tmp_path / "way.csv.gz"
+    file.write_bytes(gzip.compress(b"distance_m\n" + b"\n" * LARGEST_FILE, 1))
+    monkeypatch.setattr(csv, "reader", None)
+    with pytest.raises(InputError, match=r"way\.csv\.gz: has more than 50 MB, unpacked"):
+        read_ahead(file)
