@@ -29,6 +29,7 @@ from dataclasses import dataclass
 from math import isfinite, sqrt
 
 from gz_onboard.constants import BENCH_TEMPERATURE
+from gz_onboard.estimator.ageing_fit import COMPARED, RESISTANCE, RESISTANCE_MEMORY, Fit, believed
 from gz_onboard.estimator.ageing_kinds import Belief, Kinds
 from gz_onboard.estimator.ekf import Covariance, SocFilter
 from gz_onboard.estimator.signals import Signals
@@ -36,7 +37,7 @@ from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.estimator.uncertainty import RESISTANCE_SD
 from gz_onboard.physics.battery import Battery
 
-CAPACITY, RESISTANCE = (0.5, 1.1), (0.5, 4.0)  # factors that a pack at work has
+CAPACITY = 0.5, 1.1  # factors that a pack at work has
 CAPACITY_SD, RESISTANCE_AGED_SD = 0.16, 0.42  # of packs that are not as new
 NEW_SD = 0.003, CAPACITY_SD / 2  # of a pack that is as new: whatever the file says, no capacity is known more closely
 LEAST_VARIANCE = 0.01**2  # of ψ: the curve's place, and what of an ageing cell is not capacity
@@ -48,11 +49,9 @@ MOST_COUNTED = 1.0  # of SOC in one step: a pause of years is no charge
 TRUSTED = 0.03  # of SOC: sd by itself from which the charge that passes tells of the capacity
 QUICK = 60.0  # s: changes of the voltage that are slower may be the charge's
 PLACE_TIME = 600.0  # s for which the tables' place errs the same way
-RESISTANCE_MEMORY = 3600.0  # s of load: the mean over a ride's charge and temperature is what lasts
 EXCITED = 0.01  # V of a cell: a load that changes its voltage by less shows no resistance
 PROVEN, KEPT = 150.0, 5  # s of load; so many times in it what was learned is kept
 FIRST = 10.0  # s of load before the resistance is more than a guess
-PRIOR_WEIGHT = 0.02  # V²·s: what the guess counts beside the load
 AGREEING_RATE = 0.01  # 1/h: two currents that differ by more in the mean, over capacity, show no capacity
 APPLIED_EVERY = 10.0  # s
 SAME = 1e-6  # relative: the vehicle file says the same as when it was learned
@@ -67,15 +66,6 @@ class Learned:
     value: float
     sd: float
     share: float  # 0 nothing is learned, 1 as much as can be
-
-
-@dataclass(frozen=True, slots=True)
-class Fit:
-    """Of the resistance: its factor, what it is from [V²·s], and the time of load [s]."""
-
-    factor: float = 1.0
-    weight: float = PRIOR_WEIGHT
-    time: float = 0.0
 
 
 class Ageing:
@@ -94,6 +84,7 @@ class Ageing:
         self._fit = Fit()
         self._proven = deque([self._fit], KEPT + 1)  # the first is used
         self._unproven = 0.0  # s of load since it was kept
+        self._before, self._ride = Fit(), Fit()  # of the rides before this, and of this one until the two are compared
         self._slow = 0.0, 0.0  # V: low-passed drop at a factor of 1, and measured
         self._since = 0.0  # s
 
@@ -224,6 +215,8 @@ class Ageing:
 
         What was counted before is not gone on from.
         """
+        if self._ride.of_another_pack(self._before):
+            self._begin_pack(filter_)
         by_itself = filter_.covariance[0] - self._with_soc**2 / self.variance
         if by_itself <= 0:  # SOC was made known from elsewhere
             self.part()
@@ -245,15 +238,21 @@ class Ageing:
         quick, quick_measured = unit - slow, measured - slow_measured
         if not self._learning or abs(quick) < EXCITED:
             return
-        fit = self._fit
-        weight = fit.weight + quick * quick * dt - fit.weight * dt / RESISTANCE_MEMORY
-        factor = fit.factor + quick * (quick_measured - fit.factor * quick) * dt / weight
-        factor = min(max(factor, RESISTANCE[0]), RESISTANCE[1])
-        self._fit = Fit(factor, weight, min(fit.time + dt, RESISTANCE_MEMORY))
+        self._fit = self._fit.after(dt, quick, quick_measured)
+        if self._ride.time < COMPARED <= self._before.time:
+            self._ride = self._ride.after(dt, quick, quick_measured)
         self._unproven += dt
         if self._unproven >= PROVEN / KEPT:
             self._unproven = 0.0
             self._proven.append(self._fit)
+
+    def _begin_pack(self, filter_: SocFilter) -> None:
+        """The pack was replaced: its resistance is that of this ride, and of its capacity nothing is known."""
+        self.part(filter_)
+        self.inverse, self.variance = 1.0, self._unknown
+        self._fit, self._before, self._unproven = self._ride, Fit(), 0.0
+        self._proven = deque([self._fit], KEPT + 1)
+        self.belief = self._believe()
 
     def unlearn(self) -> None:
         """A sensor was found faulty: the resistance is what it was before, unless that was confirmed."""
@@ -319,16 +318,10 @@ class Ageing:
         if capacity:
             self.inverse, self.variance, self._with_soc = capacity
         if resistance:
-            self._fit = Fit(*resistance)
+            self._fit = self._before = Fit(*resistance)
             self._proven = deque([self._fit], KEPT + 1)
         self.belief = self._believe()
         self._battery.age(1 / self.belief.inverse, self._resistance_factor)
-
-
-def believed(factor: float) -> float:
-    """A resistance's factor: a change that is small beside the tables' own error is mostly that (a Wiener filter)."""
-    change = factor - 1
-    return 1 + change**3 / (change**2 + RESISTANCE_SD**2)
 
 
 def _numbers(saved: Mapping[str, float] | None, *names: str, of: float) -> Numbers:

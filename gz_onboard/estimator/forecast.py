@@ -180,10 +180,11 @@ class Forecaster:
         return then * second.seconds, to_come * second.seconds
 
     def shown(self, forecast: Forecast, drawn: float | None = None) -> Forecast:
-        """`forecast` as it is to be shown, to be asked once for each; drawn: see `Calm.follow`."""
+        """`forecast` as it is to be shown, within P10 and P90; to be asked once for each; drawn: see `Calm.follow`."""
         way = self.calm.follow(forecast.range, forecast.energy, forecast.known_from, drawn)
         move = way / forecast.range if forecast.range > 0 else 1.0
-        return replace(forecast, range=way, p10=move * forecast.p10, p90=move * forecast.p90)
+        p10, p90 = min(move * forecast.p10, forecast.range), max(move * forecast.p90, forecast.range)
+        return replace(forecast, range=way, p10=p10, p90=p90)
 
     @property
     def recent_factor(self) -> float:
@@ -335,12 +336,8 @@ class Forecaster:
 
     def snapshot(self) -> dict[str, object]:
         """What is to be kept over a restart."""
-        kept: dict[str, object] = {
-            "states": dict(self.load.states),
-            "of": asdict(self._unit),
-            "pattern": self.pattern.snapshot(),
-        }
-        kept |= self.calm.snapshot()
+        kept = self.calm.snapshot() | {"of": asdict(self._unit), "pattern": self.pattern.snapshot()}
+        kept |= {"states": dict(self.load.states)}
         return self.riding.snapshot() | self.riders.snapshot() | kept
 
     def restore(self, saved: Mapping[str, Any]) -> None:

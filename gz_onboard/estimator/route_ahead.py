@@ -148,6 +148,9 @@ class RoadAhead:
         self._move(now, road)
         self._model(road, conditions)
         if not road.position.on or self._costs is None:
+            if self.answer.state is RouteState.ON:  # left: what lay ahead on it is no part of the range
+                self._new = True
+                self._forecaster.calm.show_next()
             self._segment, self.answer = None, Answer(RouteState.OFF)
             return free
         self._learn(road, self._costs)

@@ -136,6 +136,28 @@ def test_what_was_learned_survives_and_goes_on(fresh: Battery):
     assert found.state_of_charge(filter_)[0] == pytest.approx(soc, abs=0.008)
 
 
+@pytest.mark.parametrize(("before", "now"), [((0.78, 1.5), (1.0, 1.0)), ((1.0, 1.0), (0.78, 1.6))])
+def test_another_pack_is_told_by_its_resistance(fresh: Battery, before: tuple[float, float], now: tuple[float, float]):
+    """A pack that was replaced: of its capacity nothing is known, rather than what that of the one before was."""
+    ageing, _, _ = discharge(fresh, *before, 0.2)
+    battery = fresh.own()
+    again = Ageing(battery)
+    again.restore(ageing.snapshot())
+    found, filter_, soc = discharge(fresh, *now, 0.5, ageing=again, battery=battery)
+    assert found.state_of_charge(filter_)[0] == pytest.approx(soc, abs=0.02)
+    assert found.capacity.value == pytest.approx(now[0], abs=0.05)
+    assert found.resistance.value == pytest.approx(now[1], rel=0.06)
+
+
+def test_the_same_pack_is_no_other_one_for_a_little_more_resistance(fresh: Battery):
+    ageing, _, _ = discharge(fresh, 0.8, 1.3, 0.2)
+    battery = fresh.own()
+    again = Ageing(battery)
+    again.restore(ageing.snapshot())
+    found, _, _ = discharge(fresh, 0.8, 1.5, 0.8, ageing=again, battery=battery)
+    assert found.capacity.share > 0.9 * ageing.capacity.share
+
+
 def test_a_state_without_it_or_of_another_pack_is_as_new(fresh: Battery):
     ageing, _, _ = discharge(fresh, 0.8, 1.5, 0.6)
     saved = ageing.snapshot()

@@ -315,6 +315,18 @@ def test_an_old_snapshot_is_still_read():
     assert forecast(again).range > 0
 
 
+def test_the_interval_holds_the_newest_forecast_however_calm_the_range_is():
+    f = forecaster()
+    f.shown(forecast(f))
+    f.calm.ride(10.0)
+    better = replace(
+        forecast(f), range=1.5 * forecast(f).range, p10=1.4 * forecast(f).range, p90=1.6 * forecast(f).range
+    )
+    shown = f.shown(better)
+    assert shown.range < 1.4 * forecast(f).range
+    assert shown.p10 <= shown.range <= better.range <= shown.p90
+
+
 def test_a_restart_keeps_what_was_shown():
     f, again = forecaster(), forecaster()
     ride(f, 4)

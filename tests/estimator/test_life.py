@@ -423,6 +423,15 @@ def test_a_sensor_that_twitches_at_standstill_is_no_motion():
     assert e.forecaster.riding.current.duration == duration
 
 
+def test_a_charge_that_pauses_says_no_time_until_full():
+    scooter, e = Scooter(soc=0.5), estimator()
+    follow(e, scooter.live(20), scooter)
+    assert follow(e, scooter.live(60, charge=10.9), scooter)[-1][1].time_to_full
+    _, row = follow(e, scooter.live(5, charge=0.9), scooter)[-1]  # plugged in, and nothing flows into the pack
+    assert row.activity is Activity.CHARGING
+    assert row.time_to_full is None
+
+
 @pytest.mark.parametrize("start", [0.2, 0.6])
 def test_a_charge_says_when_it_will_be_full_and_how_far_that_goes(start):
     """Against the truth of a charger that holds 10 A and then the voltage of a full cell."""

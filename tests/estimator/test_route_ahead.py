@@ -200,6 +200,21 @@ def test_off_the_route_it_is_as_without_one_and_comes_back():
     assert rider.ahead.answer.along == pytest.approx(890, abs=5)
 
 
+def test_who_leaves_the_route_is_shown_the_range_without_it_at_once():
+    rider = Rider(way(5e3))
+    calm, answers = rider.forecaster.calm, []
+    for k in range(600):  # its end is reached after 5 km
+        rider.ride(1, 1000.0)
+        calm.ride(11.0)
+        free = replace(FREE, range=2 * FREE.range)
+        found = rider.ask(free if k > 300 else FREE)
+        answers.append((rider.ahead.answer.state, found.range, rider.forecaster.shown(found).range))
+    left = next(k for k, (state, *_) in enumerate(answers) if k > 300 and state == RouteState.OFF)
+    (_, raw, shown), (_, raw_before, shown_before) = answers[left], answers[left - 1]
+    assert raw - raw_before > 1000
+    assert shown - shown_before == pytest.approx(raw - raw_before, abs=50)
+
+
 def test_its_end_is_the_end_of_it():
     rider = Rider(way(1e3))
     rider.ride(120, 1000.0)
