@@ -80,7 +80,7 @@ def residual(found: Discovery, file: Path) -> None:
             low, middle, high = (c * mass * a**2 / GRAVITY for c in (cause.ci95[0], cause.value, cause.ci95[1]))
             axis.fill_between(a, low, high, color=GREEN, alpha=0.2, linewidth=0)
             axis.plot(
-                a, middle, color=GREEN, linewidth=1.6, label=f"c·m·a²/g, c = {cause.value:.3f} rad, 95 % interval"
+                a, middle, color=GREEN, linewidth=1.6, label=f"c·m·a²/g, c = {cause.value:.3f} rad,\n95 % interval"
             )
             ordinate(axis, "road force, measured less model [N]")
             axis.set_ylim(-30, 50)

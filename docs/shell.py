@@ -15,8 +15,20 @@ import shtab
 
 from gz_onboard import __version__
 from gz_onboard.cli import COMMANDS, command_line
+from gz_onboard.lab.calibrate.procedures import PROCEDURES
+from gz_onboard.lab.vehicle.cells import CHEMISTRIES
+from gz_onboard.lab.vehicle.kinds import KINDS
+from gz_onboard.simulation import cycles
+from gz_onboard.vehicle import OWN
 
 ABOUT = "the remaining range of an electric scooter, estimated from its CAN bus"
+
+VALUES = {"KIND": tuple(KINDS), "NAME": tuple(CHEMISTRIES)}  # by metavar, of options of `vehicle new`
+OR_FILE = {  # names in place of which a file may be given, by the function that completes them
+    "_gz_onboard_vehicles": tuple(sorted(file.stem for file in OWN.glob("*.toml"))),
+    "_gz_onboard_procedures": ("all", *PROCEDURES),
+    "_gz_onboard_cycles": cycles.names(),
+}
 
 
 def actions_of(parser: argparse.ArgumentParser) -> Iterator[argparse.Action]:
@@ -34,7 +46,34 @@ def completion(shell: str) -> str:
     for action in actions_of(parser):
         if action.type is Path or "TOML" in str(action.metavar) or action.metavar in ("FILE|-", "WHAT"):
             action.complete = shtab.FILE  # type: ignore[attr-defined]
-    return shtab.complete(parser, shell)
+        if {"--kind", "--cells"} & set(action.option_strings):
+            action.choices = VALUES[str(action.metavar)]
+        if function := named_by(action):
+            action.complete = {"bash": function, "zsh": function}  # type: ignore[attr-defined]
+    return shtab.complete(parser, shell, preamble={"bash": preamble(BASH), "zsh": preamble(ZSH)})
+
+
+BASH = """{name}() {{
+  compgen -W "{names}" -- "$1"
+  compgen -f -- "$1"
+}}"""
+ZSH = """{name}() {{
+  _alternative 'names:name:({names})' 'files:file:_files'
+}}"""
+
+
+def named_by(action: argparse.Action) -> str:
+    """The function of `OR_FILE` that completes it, or nothing."""
+    if "NAME|TOML" in str(action.metavar):
+        return "_gz_onboard_vehicles"
+    if action.metavar != "WHAT":
+        return ""
+    return "_gz_onboard_procedures" if "procedure" in (action.help or "") else "_gz_onboard_cycles"
+
+
+def preamble(function: str) -> str:
+    """The functions of `OR_FILE` for a shell."""
+    return "\n".join(function.format(name=name, names=" ".join(names)) for name, names in OR_FILE.items())
 
 
 def manual() -> str:

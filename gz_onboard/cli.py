@@ -27,7 +27,10 @@ COMMANDS = {
     "replay": ("gz_onboard.bus.replay", "send a recorded log onto a bus, in its own timing"),
     "estimate": ("gz_onboard.lab.estimate", "estimate the range on recorded rides, without a bus, as fast as possible"),
     "simulate": ("gz_onboard.simulation.simulate", "simulate a drive cycle, a route or a recorded ride"),
-    "validate": ("gz_onboard.lab.validate", "compare recorded rides with their simulation; the gate is 20 %"),
+    "validate": (
+        "gz_onboard.lab.validate",
+        "compare recorded rides with their simulation: within 20 %, components within 10 %",
+    ),
     "calibrate": ("gz_onboard.lab.calibrate.command", "determine a vehicle's parameters from measurements"),
     "discover": (
         "gz_onboard.lab.discover.command",

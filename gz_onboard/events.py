@@ -230,6 +230,22 @@ def words(name: str) -> str:
     return " ".join(_WORDS.get(word, word) for word in name.lower().split("_"))
 
 
+_CAUSE_WORDS = {
+    "climb": "hills",
+    "turning": "bends",
+    "auxiliaries": "auxiliary load",
+    "age": "age of the battery",
+    "riding": "riding to come",
+    "rolling": "rolling resistance",
+    "drag": "air drag",
+}
+
+
+def cause_words(name: str) -> str:
+    """The name of a cause as people read it, such as ``hills``."""
+    return _CAUSE_WORDS.get(name.lower(), words(name))
+
+
 @dataclass(slots=True)
 class Estimate:
     """What is known at one time. None stands for what is not known; it is never published as a number."""

@@ -57,6 +57,7 @@ def test_it_shows_what_was_learned(saved: Path, capsys: pytest.CaptureFixture[st
     text = capsys.readouterr().out
     assert "capacity     0.799 ± 0.0" in text
     assert "91 % learned" in text
+    assert text.startswith("per cent learned: how much of what was uncertain")
 
 
 def test_it_shows_each_rider_and_draws_it(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -114,11 +115,11 @@ def test_it_shows_and_forgets_the_road_load(saved: Path, tmp_path: Path, capsys:
     assert document["correlations"]["rolling drag"] == pytest.approx(-0.9)
     assert main(["learned", "--state", str(saved)]) == OK
     text = capsys.readouterr().out
-    assert "mass         95 ± " in text
-    assert "of rider and luggage, vehicle file 80" in text
+    assert "payload      95 ± " in text
+    assert ": mass of rider and luggage, vehicle file 80" in text
     assert "rolling and drag are hard to tell apart: correlation -0.90" in text
     assert main(["learned", "--state", str(saved), "--reset", "road"]) == OK
-    assert "mass         80 ± 12 kg         nothing learned" in capsys.readouterr().out
+    assert "payload      80 ± 12 kg         nothing learned" in capsys.readouterr().out
     after, _ = state.load(saved, time.time()) or ({}, None)
     assert after["learned"] == {name: x for name, x in snapshot["learned"].items() if name != "road"}
     Pipeline(vehicle).estimator.restore(after, vehicle.key, 0.0)

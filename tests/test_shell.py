@@ -44,6 +44,11 @@ def test_bash_completes_commands_options_choices_and_files(made):
     assert completions(made, "run", "--filter", "") == {"scalar", "filterpy"}
     assert completions(made, "estimate", "./coast") == {"./coastdown.blf"}
     assert completions(made, "run", "--vehicle", "./ri") == {"./rides.json"}
+    assert completions(made, "run", "--vehicle", "ref") == {"reference"}
+    assert completions(made, "vehicle", "new", "--kind", "s") == {"scooter"}
+    assert completions(made, "vehicle", "new", "--cells", "l") == {"lfp"}
+    assert completions(made, "calibrate", "coastd") == {"coastdown", "coastdown.blf"}
+    assert completions(made, "simulate", "ud") == {"udds"}
 
 
 def test_zsh_has_every_command_and_option(made):

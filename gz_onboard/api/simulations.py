@@ -95,8 +95,9 @@ def sweep(
 ) -> Swept:
     """Ride what `simulate` rides with each combination of values of `parameters`.
 
-    parameters: by name, such as ``{"drag_area": [0.4, 0.5, 0.6]}``; ``battery.parallel`` and ``battery.series`` are
-    numbers of cells, which change mass and heat capacity too. progress: takes the seconds ridden. Raises InputError.
+    parameters: by name, such as ``{"drag_area": [0.4, 0.5, 0.6]}``; ``battery.cells_parallel`` and
+    ``battery.cells_series`` are numbers of cells, which change mass and heat capacity too. progress: takes the seconds
+    ridden. Raises InputError.
     """
     options = options or SimulationOptions()
     known, _ = _vehicle_on(what, vehicle)

@@ -44,11 +44,13 @@ MEANING = {  # by name: what its factor is on
     "standing": "energy at stops, likewise",
     "pace": "time of a kilometre, likewise",
     "factor": "measured over modelled energy of the same motion",
-    "mass": "of rider and luggage",
+    "mass": "mass of rider and luggage",
     "rolling": "resistance over weight",
     "drag": "area of vehicle and rider",
     "auxiliaries": "power, lights and all",
 }
+SPOKEN = {"mass": "payload"}  # what a text calls it
+LEARNED = "per cent learned: how much of what was uncertain before the first ride no longer is"
 PICTURES = (".png", ".svg", ".pdf")
 BATTERY, ROAD, RIDING = ("capacity", "resistance", "weakest"), "road", "riding"  # what can be forgotten
 LOWEST = "lowest_cell_voltage"  # the role without which nothing is known of the weakest group
@@ -110,7 +112,7 @@ def learned_text(
     riders: Mapping[str, Mapping[str, Learned]],
 ) -> str:
     """For a terminal."""
-    lines = [*(_line(name, x) for name, x in learned.items()), *_road_lines(road, correlations)]
+    lines = [LEARNED, *(_line(name, x) for name, x in learned.items()), *_road_lines(road, correlations)]
     for rider, found in riders.items():
         lines += [f"rider {rider or 'not known'}:"] if len(riders) > 1 else []
         lines += [_line(name, x) for name, x in found.items()]
@@ -208,10 +210,11 @@ def _road_lines(road: Mapping[str, RoadParameter], correlations: Mapping[tuple[s
     for name, x in road.items():
         unit = "" if x.unit == "1" else f" {x.unit}"
         number = f"{x.value:.3g} ± {x.sd:.2g}{unit}"
-        yield f"{name:12} {number:18} {_known(x.share)}: {MEANING[name]}, vehicle file {x.filed:.3g}"
+        yield f"{SPOKEN.get(name, name):12} {number:18} {_known(x.share)}: {MEANING[name]}, vehicle file {x.filed:.3g}"
     for (first, second), r in correlations.items():
         if abs(r) > ALIKE:
-            yield f"{first} and {second} are hard to tell apart: correlation {r:+.2f}"
+            one, other = (SPOKEN.get(name, name) for name in (first, second))
+            yield f"{one} and {other} are hard to tell apart: correlation {r:+.2f}"
 
 
 def _plot(

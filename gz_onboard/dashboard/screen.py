@@ -9,7 +9,7 @@ from functools import partial
 
 from gz_onboard.bus.publisher import reason_signal
 from gz_onboard.dashboard.view import NEARLY_EMPTY, View
-from gz_onboard.events import Cause, State, words
+from gz_onboard.events import State, cause_words, words
 
 
 @dataclass(frozen=True)
@@ -36,16 +36,6 @@ _STATE_WORDS = {
     State.VALID: "valid",
     State.DEGRADED: "degraded: an input is missing, the interval is wider",
     State.INVALID: "invalid: no range can be told",
-}
-
-_CAUSE_WORDS = {cause: cause.name.lower() for cause in Cause} | {
-    Cause.CLIMB: "hills",
-    Cause.TURNING: "bends",
-    Cause.AUXILIARIES: "auxiliary load",
-    Cause.AGE: "age of the battery",
-    Cause.RIDING: "riding to come",
-    Cause.ROLLING: "rolling resistance",
-    Cause.DRAG: "air drag",
 }
 
 _NONE_YET = "Is the daemon on this bus? Is --dbc its range_dbc?"
@@ -75,7 +65,7 @@ def screen(view: View, now: float, source: str, width: int) -> list[Line]:
         _soc(view, now, width),
         _row("Energy left", number("RANGE_EnergyLeft")),
         _row("Consumption", number("RANGE_ConsumptionExpected"), (" expected, ", ""), *recent),
-        *_why(view, now, width),
+        *_why(view, now),
         [],
         _row("State", trust),
     ]
@@ -85,7 +75,7 @@ def screen(view: View, now: float, source: str, width: int) -> list[Line]:
         lines.append(_row("Charge", (charge, "")))
     for i, reason in enumerate(view.reasons(now)):
         name, comment = words(str(reason.name)), view.comments[reason_signal(reason)]
-        lines.append(_row("" if i else "Because", (name, "33")))
+        lines.append(_row("" if i else "Less certain" if state is State.VALID else "Because", (name, "33")))
         if len(name) + len(comment) + 24 <= width:
             lines[-1].append((f": {comment.rstrip('.')}", _DIM))
     left_out = ", ".join(words(role) for role in view.distrusted(now))
@@ -105,19 +95,25 @@ def _row(label: str, *spans: Span, codes: str = "") -> Line:
     return [(f"  {label:18}", codes), *spans]
 
 
-def _why(view: View, now: float, width: int) -> list[Line]:
+def _why(view: View, now: float) -> list[Line]:
     """The largest causes; nothing where none is known."""
     causes = causes_text(view, now)
     if not causes:
         return []
     codes = _DIM if view.messages["RANGE_Why"].late(now) else ""
-    rated = f" (rated {view.text('RANGE_WhyRated', now)})"
-    return [_row("Why", (causes, codes), *([(rated, _DIM)] if len(causes) + len(rated) + 20 <= width else []))]
+    rated = f"besides the charge; rated {view.text('RANGE_WhyRated', now)}"
+    return [_row("Why", (causes, codes)), _row("", (rated, _DIM))]
 
 
 def causes_text(view: View, now: float) -> str:
     """The largest causes in words, such as ``temperature -3.4 km, stops +1.2 km``."""
-    return ", ".join(f"{_CAUSE_WORDS[cause]} {size:+.1f} km" for cause, size in view.why(now))
+    return ", ".join(f"{cause_words(cause.name)} {size:+.1f} km" for cause, size in view.why(now))
+
+
+def _because(state: State | None) -> str:
+    """What reasons are said to be the cause of: they leave a valid estimate valid."""
+    known = "" if state is None else f"{state.name.lower()} "
+    return "less certain because" if state is State.VALID else f"{known}because"
 
 
 def _band(view: View, now: float, width: int, colour: str) -> list[Line]:
@@ -218,9 +214,9 @@ def summary_line(view: View, now: float) -> str:
     if charge := view.charge(now):
         parts.append(charge)
     if causes := causes_text(view, now):
-        parts.append(f"why: {causes}")
+        parts.append(f"why, besides charge: {causes}")
     for what, names in (
-        ("because", [words(str(reason.name)) for reason in view.reasons(now)]),
+        (_because(state), [words(str(reason.name)) for reason in view.reasons(now)]),
         ("left out", [words(role) for role in view.distrusted(now)]),
         ("stale", list(view.stale(now))),
     ):

@@ -106,7 +106,12 @@ class View:
             entry.values[signal.name] = value * scale + offset if low <= value <= high else None
 
     def value(self, signal: str, now: float) -> float | None:
-        """A signal's value in the units of the DBC; None if it is stale, not available or never came."""
+        """A signal's value in the units of the DBC; None if it is stale, not available or never came.
+
+        Of the last kilometre nothing is told while the state is invalid: nobody knows how old it is.
+        """
+        if signal == "RANGE_ConsumptionRecent" and self.state(now) is State.INVALID:
+            return None
         for entry in self.messages.values():
             if signal in entry.limits:
                 return None if entry.stale(now) else entry.values.get(signal)

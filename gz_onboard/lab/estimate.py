@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard estimate``."""
     explain_keys(parser, "a ride", SUMMARY_VERSION, KEYS)
     add_shared(parser, "logs", "--vehicle")
-    add_shared(parser, "--payload", help="mass of rider and luggage (default: unknown)")
+    add_shared(parser, "--payload", help="mass of rider and luggage (default: unknown, also where rides.json says it)")
     add_shared(parser, "--route")
     add_shared(parser, "--filter", "--output", "--json")
     table = f"also write the summaries as a table, a row for each log: {' '.join(FORMATS)}"
@@ -222,7 +222,7 @@ def _energy_rows(ride: RideSummary) -> list[tuple[str, str]]:
     if ride.energy_wh is None:
         return [("energy", "not known: voltage or current of the pack was not measured, or too seldom")]
     text = (
-        f"{ride.energy_wh:.0f} Wh drawn net, {number(ride.energy_recovered_wh, '.0f', 'Wh')} of it recovered before; "
+        f"{ride.energy_wh:.0f} Wh drawn net, after {number(ride.energy_recovered_wh, '.0f', 'Wh')} recovered; "
         f"{number(ride.consumption_wh_km, '.1f', 'Wh/km')}"
     )
     lacks = lacks_energy(ride)
@@ -252,7 +252,7 @@ def _state_text(ride: RideSummary) -> str:
         return "begun with this ride"
     age, day = ride.saved_state_age_s, 24 * HOUR
     old = "of an unknown age" if age is None else f"{age / day:.1f} days old" if age > 2 * day else f"{clock(age)} old"
-    return f"gone on from, {old} at the start"
+    return f"continued from a saved state, {old} at the start"
 
 
 def _durations(seconds: Mapping[str, float]) -> str:

@@ -52,10 +52,10 @@ def route_text(route: RouteSummary) -> str:
     if route.left_km is None:
         return "the ride was never on it"
     low, high = (number(soc, ".0f", "", 100) for soc in (route.arrival_soc_p10, route.arrival_soc_p90))
-    text = "" if route.state == RouteState.ON.name else "left, or at its end; before, "
-    text += f"{route.left_km:.1f} km and {number(route.energy_wh, '.0f', 'Wh')} to its end, "
+    text = "" if route.state == RouteState.ON.name else "when last on it, "
+    text += f"{route.left_km:.1f} km and {number(route.energy_wh, '.0f', 'Wh')} to its end; "
     if route.battery_ends_km is None:
-        text += f"{number(route.arrival_soc, '.0f', '%', 100)} ({low} to {high}, 80 % interval) there"
+        text += f"{number(route.arrival_soc, '.0f', '%', 100)} of charge there ({low} to {high}, 80 % interval)"
     else:
         text += f"the battery ends at km {route.battery_ends_km:.1f}"
         if route.battery_ends_latitude_deg is not None:

@@ -58,7 +58,10 @@ class RideSummary:
         "of the route given: state at the end (ON, OFF); and of the last estimate on it km along and left, energy to "
         "its end and state of charge there, km from its start and position where the battery ends before; or null",
     ]
-    saved_state: Annotated[str | None, "with --state: `gone on` from a saved state, or `begun` with this ride; or null"]
+    saved_state: Annotated[
+        str | None,
+        "with --state: `gone on`: continued from a saved state; `begun`: the state begins with this ride; or null",
+    ]
     saved_state_age_s: Annotated[float | None, "age of that state when the ride began, if it is known"]
     innovation_rms_v: Annotated[float | None, "root mean square of measured less predicted voltage of a cell [V]"]
     innovation_max_v: Annotated[float | None, "greatest magnitude of the same"]

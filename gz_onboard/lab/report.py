@@ -34,7 +34,7 @@ class RideSection:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard report``."""
     add_shared(parser, "logs", "--vehicle")
-    add_shared(parser, "--payload", help="mass of rider and luggage (default: unknown)")
+    add_shared(parser, "--payload", help="mass of rider and luggage (default: unknown, also where rides.json says it)")
     add_shared(parser, "--route")
     text = "page to write (default: the name of the ride, or of several `rides`, with .html)"
     parser.add_argument("-o", "--output", type=Path, metavar="HTML", help=text)

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from math import isfinite, nan
 from pathlib import Path
 
-from gz_onboard.events import TOLD, Activity, State, words
+from gz_onboard.events import TOLD, Activity, State, cause_words, words
 from gz_onboard.lab.estimate import lacks_energy, summary_rows
 from gz_onboard.lab.logged import Logged
 from gz_onboard.lab.plot import column, spans, with_holes
@@ -200,7 +200,7 @@ def _why(why: Why | None) -> str:
         reached += size
     axis = axis_of([0.0, why.reference_km, why.range_km, *(end for _, _, end in steps)], whole=False)
     whole = [("rated range", 0.0, why.reference_km, "grey", ""), ("range", 0.0, why.range_km, "blue", "")]
-    middle = [(words(name), b, e, "green" if e > b else "red", "+") for name, b, e in steps]
+    middle = [(cause_words(name), b, e, "green" if e > b else "red", "+") for name, b, e in steps]
     lines = [
         f"<tr><td>{html.escape(name)}</td>{bar(begin, end, axis, colour)}<td class=n>{end - begin:{sign}.1f}</td></tr>"
         for name, begin, end, colour, sign in (whole[0], *middle, whole[1])
@@ -213,10 +213,11 @@ def _why(why: Why | None) -> str:
 
 def _by_sensor(change: Why) -> dict[str, float]:
     """The causes of a change, in words: what is forgotten with a sensor that is left out is not the riding's."""
-    causes = {words(name): km for name, km in change.causes_km.items()}
+    causes = {cause_words(name): km for name, km in change.causes_km.items()}
     if change.forgotten:
         left_out = " and ".join(map(words, change.forgotten))
-        causes[f"{left_out} left out, what it taught forgotten"] = sum(causes.pop(words(name), 0.0) for name in _TAUGHT)
+        taught = sum(causes.pop(cause_words(name), 0.0) for name in _TAUGHT)
+        causes[f"{left_out} left out, what it taught forgotten"] = taught
     return causes
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from gz_onboard.bus.logs import LogDamage, read_samples
 from gz_onboard.errors import InputError
-from gz_onboard.events import TOLD, Cause, Explanation
+from gz_onboard.events import TOLD, Cause, Explanation, cause_words
 from gz_onboard.log_rows import WHY_TOPIC
 from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, RED, headline, new_figure, rule, save
 
@@ -77,7 +77,7 @@ def draw_why(why: Explanation, title: str) -> Figure:
         furthest = max(furthest, right)
         number(f"{size * 1e-3:+.1f}", (right * 1e-3, i))
         reached += size
-        labels.append(cause.name.lower())
+        labels.append(cause_words(cause.name))
     rest = why.range - reached
     axis.barh(rows - 1, why.range * 1e-3, color=BLUE)
     labels.append("range")

@@ -7,6 +7,7 @@ import json
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Annotated
 
@@ -98,6 +99,11 @@ def leap_text(when: float, leap: float) -> str:
 def number(value: float | None, form: str, unit: str = "", factor: float = 1.0) -> str:
     """A value times `factor` with its unit; a dash for None."""
     return "–" if value is None else f"{value * factor:{form}} {unit}".rstrip()
+
+
+def plain(value: float) -> str:
+    """With one digit that counts, and no exponent: 0.00005."""
+    return f"{Decimal(f'{value:.1g}'):f}"
 
 
 def times(value: float | None, factor: float) -> float | None:

@@ -86,12 +86,15 @@ def _draw(
         columns = measured_columns(plan.recorded, result)
         drawn.append((".measured", figures.comparison(result, columns, title)))
     variants = summary.sweep or []
+    swept = f"{plan.name}, {summary.kind} · {summary.vehicle}"
+    if all(sweep.name != "payload_mass" for sweep in sweeps):
+        swept += f", payload {summary.payload_kg:g} kg"
     if len(sweeps) == 1:
-        drawn.append((".sweep", figures.sweep_lines(sweeps[0].label, sweeps[0].values, variants, title)))
+        drawn.append((".sweep", figures.sweep_lines(sweeps[0].label, sweeps[0].values, variants, swept)))
     elif sweeps:
         one, two = sweeps
         names, values = (one.label, two.label), (one.values, two.values)
-        drawn.append((".sweep", figures.sweep_map(names, values, variants, title)))
+        drawn.append((".sweep", figures.sweep_map(names, values, variants, swept)))
     for ending, figure in drawn:
         save(figure, file(f"{ending}.{picture_format}"))
     text = f"<pre>{html.escape(summary_text(summary))}</pre>"

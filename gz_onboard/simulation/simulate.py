@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--chassis", choices=tuple(MODELS), default="straight", help=bends)
     predictive = "of a recorded ride: a rider model follows its speed, instead of replaying throttle and brake"
     add("--predictive", action="store_true", help=predictive)
-    sweep = "ride it with other values of a parameter, battery.parallel or battery.series; at most twice"
+    sweep = "ride it with other values of a parameter, battery.cells_parallel or battery.cells_series; at most twice"
     add("--sweep", action="append", default=[], metavar="NAME=LO..HI[:STEPS]", help=sweep)
     add_shared(parser, "--output", "--json")
     kinds = "of the time series (default: parquet) or of the pictures (default: png); may be given once for each"

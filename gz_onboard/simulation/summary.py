@@ -10,7 +10,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.constants import WH, WH_PER_KM
-from gz_onboard.offline.results import clock, number, text_rows, times
+from gz_onboard.offline.results import clock, number, plain, text_rows, times
 from gz_onboard.offline.schema import descriptions
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.recorded import Recorded
@@ -240,11 +240,11 @@ def summary_text(summary: SimulationSummary) -> str:
         ),
         (
             "energy",
-            f"{summary.energy_wh:.1f} Wh net, {summary.energy_recovered_wh:.1f} Wh recovered before; "
+            f"{summary.energy_wh:.1f} Wh net, after {summary.energy_recovered_wh:.1f} Wh recovered; "
             f"{number(summary.consumption_wh_km, '.2f', 'Wh/km')}",
         ),
         ("state of charge", f"{100 * summary.soc_start:.1f} → {100 * summary.soc_end:.1f} %"),
-        ("range", f"{number(summary.range_km, '.1f', 'km')} ({_RANGE_BY[summary.range_by]})"),
+        ("range", f"{number(summary.range_km, '.1f', 'km')} from the start ({_RANGE_BY[summary.range_by]})"),
         *_beyond_rows(summary),
         *_shortfall_rows(summary),
         *(
@@ -256,7 +256,7 @@ def summary_text(summary: SimulationSummary) -> str:
         ),
         *_measured_rows(summary),
         *_turning_rows(summary),
-        ("closes to", f"{100 * summary.closure:.1g} % of what was turned over"),
+        ("energy balance", f"closes to {plain(100 * abs(summary.closure))} % of all that flowed"),
         ("computed in", f"{summary.wall_s:.2f} s, step {1000 * summary.step_s:g} ms"),
     ]
     rows += [("written", ", ".join(summary.files))] if summary.files else []

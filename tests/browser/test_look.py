@@ -22,9 +22,15 @@ def test_miles_and_german_are_kept(page):
         page.goto(address)
         shows(page, range_value="34")
         page.click("#unit")
-        shows(page, range_value="21", interval="16 to 28 mi", recent="40", rated="against the rated 35 mi")
+        shows(
+            page,
+            range_value="21",
+            interval="16 to 28 mi",
+            recent="40",
+            rated="besides the charge, against the rated 36 mi",
+        )
         page.click("#language")
-        shows(page, interval="16 bis 28 mi", compared="6 % weniger als erwartet", trust_word="gültig")
+        shows(page, interval="16 bis 28 mi", compared="5 % weniger als erwartet", trust_word="gültig")
         shows(page, soc_sigma="± 1,2", causes="Temperatur −2,1 mi\nStopps +1,0 mi")
         assert page.get_attribute("html", "lang") == "de"
         page.reload()

@@ -57,7 +57,7 @@ def test_every_number_of_the_frames():
         "consumption": {"recent_wh_per_km": 24.6, "expected_wh_per_km": 26.2},
         "charge": None,
         "route": None,
-        "rated_km": 56.0,
+        "rated_km": 57.6,
         "causes": [{"cause": "temperature", "km": -3.4}, {"cause": "stops", "km": 1.6}],
         "reasons": ["no_imu", "prior_riding"],
         "distrusted": [],

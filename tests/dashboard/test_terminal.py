@@ -44,7 +44,7 @@ ESTIMATE = Estimate(
     consumption_recent=24.6 * 3.6,
     consumption_expected=26.2 * 3.6,
     why=Explanation(
-        1.0, 56_000.0, 34_210.0, {Cause.CHARGE: -20_000.0, Cause.TEMPERATURE: -3_420.0, Cause.STOPS: 1_630.0}
+        1.0, 57_600.0, 34_210.0, {Cause.CHARGE: -20_000.0, Cause.TEMPERATURE: -3_420.0, Cause.STOPS: 1_630.0}
     ),
 )
 COUNTS = Counts(dropped=7, implausible=3, lost=24, unknown=2)
@@ -84,7 +84,7 @@ def test_it_shows_what_the_daemon_sends():
         "895 Wh",
         "26.2 Wh/km expected",
         "24.6 Wh/km over",
-        "Why               temperature -3.4 km, stops +1.6 km (rated 56.0 km)",
+        "Why               temperature -3.4 km, stops +1.6 km\n                    besides the charge; rated 57.6 km",
         "degraded",
         "no IMU: No lean",
         "prior riding",
@@ -97,8 +97,15 @@ def test_it_shows_what_the_daemon_sends():
     line = screen.summary_line(seen(), 100.0)
     assert line == (
         "range 34.2 km (26.5 km to 44.3 km); SOC 62.4 % ± 1.2 %; 895 Wh left; 24.6 Wh/km recent, "
-        "26.2 Wh/km expected; degraded; riding; why: temperature -3.4 km, stops +1.6 km; because: no IMU, prior riding"
+        "26.2 Wh/km expected; degraded; riding; why, besides charge: temperature -3.4 km, stops +1.6 km; "
+        "degraded because: no IMU, prior riding"
     )
+
+
+def test_reasons_of_a_valid_estimate_make_it_less_certain():
+    view = seen(replace(ESTIMATE, state=State.VALID, reasons=Reason.PRIOR_RIDING))
+    assert "Less certain      prior riding" in picture(view, 100.0)
+    assert screen.summary_line(view, 100.0).endswith("; less certain because: prior riding")
 
 
 def test_the_bar_stands_where_the_numbers_are():
@@ -166,7 +173,9 @@ def test_before_the_first_range_it_is_starting(heard):
     assert "; valid; riding;" in screen.summary_line(view, 1.1)
     for frame in publisher.status(replace(ESTIMATE, state=State.INVALID), 0):  # bad news is shown at once
         view.take(frame, 1.2)
-    assert "; invalid; riding;" in screen.summary_line(view, 1.2)
+    line = screen.summary_line(view, 1.2)
+    assert "; invalid; riding;" in line
+    assert "; – recent" in line  # the last kilometre was ridden who knows when
 
 
 @pytest.mark.parametrize("activity", Activity)
@@ -189,7 +198,7 @@ def test_sensors_left_out_are_named():
     for shown in "sensor distrusted", "signals slow", "SOC restarted", "save failed":
         assert shown in text
     assert screen.summary_line(view, 100.0).endswith(
-        "; because: sensor distrusted, signals slow, SOC restarted, save failed; "
+        "; degraded because: sensor distrusted, signals slow, SOC restarted, save failed; "
         "left out: acceleration x, GPS altitude, BMS state of charge"
     )
     assert "GPS altitude" not in picture(view, 111.0)  # stale

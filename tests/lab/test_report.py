@@ -69,7 +69,7 @@ def test_a_change_by_a_sensor_that_is_left_out_is_not_called_riding():
     text = report_page._changes([change, replace(change, forgotten=[])])
     named, plain = re.findall("<td>([^<]*)</td></tr>", text)
     assert named == "pack voltage left out, what it taught forgotten +60.8, speed +3.4"
-    assert plain == "riding +54.8, unexplained +6.0, speed +3.4"
+    assert plain == "riding to come +54.8, unexplained +6.0, speed +3.4"
 
 
 def test_what_is_not_known_breaks_a_line_and_a_band():

@@ -1,7 +1,7 @@
 // One picture onto the page. Every number that it does not have is a dash; nothing of the last one stays.
 import { announce, drawAlerts } from "./alerts.js";
 import { drawBand } from "./band.js";
-import { DASH, change, consumption, distance, distanceOnly, duration, energy, known, number, percent, power } from "./numbers.js";
+import { DASH, change, consumption, distance, distanceOnly, duration, energy, known, number, perUnit, percent, power } from "./numbers.js";
 import { settings } from "./settings.js";
 import { said, word, words } from "./words.js";
 
@@ -73,8 +73,10 @@ function drawConsumption({ consumption: used }) {
     byId(id).hidden = !(value > 0);
     byId(id).style.width = `${value > 0 ? (100 * value) / most : 0}%`;
   }
-  if (!known(recent) || !known(expected) || expected <= 0) return put("compared", DASH);
-  const share = recent / expected - 1;
+  // Of the numbers as they are shown, which a reader compares; nothing where one is missing.
+  const [shown, against] = [recent, expected].map((value) => Math.round((value ?? 0) * perUnit()));
+  if (!known(recent) || !known(expected) || against <= 0) return put("compared", "");
+  const share = shown / against - 1;
   const key = Math.abs(share) < SAME ? "as_expected" : share > 0 ? "more" : "less";
   return put("compared", said(words()[key], { share: percent(Math.abs(share) * 100) }));
 }
@@ -109,7 +111,8 @@ function drawState(picture, problem) {
   put("source", picture.channel);
   put("activity", picture.activity ? word("activities", picture.activity) : DASH);
   put("meaning", word("meanings", state));
-  bullets("reasons", words().because, picture.reasons.map((name) => word("reasons", name)));
+  const because = said(state === "valid" ? words().less_certain : words().because, { state: word("states", state) });
+  bullets("reasons", because, picture.reasons.map((name) => word("reasons", name)));
   bullets("distrusted", words().left_out, picture.distrusted.map((name) => word("sensors", name)));
   const named = (names) => names.map((name) => word("messages", name));
   const late = picture.late.filter((name) => !picture.stale.includes(name));

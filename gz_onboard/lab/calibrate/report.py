@@ -59,7 +59,9 @@ class Document:
     thesis: Annotated[list[dict[str, str]], "what the thesis gives beside what was found here"]
 
 
-KEYS = descriptions(Document) | {f"  {key}": text for key, text in descriptions(ProcedureEntry).items()}
+_OF_ALL = descriptions(Document)
+KEYS = {name: _OF_ALL[name] for name in ("vehicle", "out", "thesis", "procedures")}
+KEYS |= {f"  {key}": text for key, text in descriptions(ProcedureEntry).items()}
 
 
 def document(results: Sequence[Result], vehicle: str, out: str | None) -> Document:

@@ -69,7 +69,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--name", default="", metavar="NAME", help="what to call the vehicle (default: its file's name)"
     )
     add_shared(parser, "--vehicle", help="vehicle of logs of raw frames, by name or file (default: %(default)s)")
-    add_shared(parser, "--payload", help="mass of rider and luggage on logs of raw frames (default: unknown)")
+    add_shared(
+        parser,
+        "--payload",
+        help="mass of rider and luggage on logs of raw frames (default: unknown; of rides.json it is only noted)",
+    )
     add_shared(parser, "--route")
     replaces = "read logs again that were read before, and put their rides in place of those that are there"
     parser.add_argument("--replace", action="store_true", help=replaces)

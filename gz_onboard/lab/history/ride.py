@@ -45,7 +45,9 @@ class KeptRide:
     route: Annotated[str | None, "file of the route that was given; 'given' if its name is not known"]
     route_km: Annotated[float | None, "ridden on it"]
     rider: Annotated[str | None, "who rode, or null"]
-    payload_kg: Annotated[float | None, "mass of rider and luggage, where it was given"]
+    payload_kg: Annotated[
+        float | None, "mass of rider and luggage: --payload, or of rides.json, which the estimate does not use"
+    ]
     degraded_s: Annotated[float, "an input was missing"]
     invalid_s: Annotated[float, "no range was shown"]
     reasons: Annotated[str, "why, and other reasons to distrust the estimate"]

@@ -224,13 +224,15 @@ def plot(runs: dict[tuple[str, float], CoastDown], output: Path) -> None:
 
 
 def _draw_energy(runs: dict[tuple[str, float], CoastDown], grid: Sequence[Axes]) -> None:
-    _lines(runs, grid[0], lambda run: (run.time, [s["speed"] for s in run.seen]), "Speed [m/s] over time [s]")
+    _lines(runs, grid[0], lambda run: (run.time, [s["speed"] for s in run.seen]), "Speed")
+    grid[0].set(xlabel="time [s]", ylabel="speed [m/s]")
     _legend(grid[0])
     turned = {key: run for key, run in runs.items() if key[1] and key[0] != "straight"}
     for (model, roll), run in turned.items():
         grid[1].plot([s[3] for s in run.states], [s[4] for s in run.states], STYLES[model], color=COLOURS[roll])
     grid[1].set_aspect("equal", adjustable="datalim")
-    grid[1].set_title("Path of the coast-down [m]", fontsize=10, loc="left")
+    grid[1].set_title("Path of the coast-down", fontsize=10, loc="left")
+    grid[1].set(xlabel="ahead [m]", ylabel="to the side [m]")
     keys = [(model, roll) for roll in ROLLS for model in CHASSIS_MODELS]
     rows = [row(model, roll, runs[model, roll]) for model, roll in keys]
     places = [i + i // len(CHASSIS_MODELS) for i in range(len(keys))]
@@ -243,18 +245,20 @@ def _draw_energy(runs: dict[tuple[str, float], CoastDown], grid: Sequence[Axes])
     grid[2].set_xticks(places, labels)
     grid[2].set_ylim(0, bottoms.max() * 1.3)
     grid[2].legend(fontsize=8, frameon=False, ncols=2)
-    grid[2].set_title(f"Lost in {DISTANCE:.0f} m [kJ]: straight, planar, leaning", fontsize=10, loc="left")
+    grid[2].set(xlabel="model and roll", ylabel="energy [kJ]")
+    grid[2].set_title(f"Lost in {DISTANCE:.0f} m: straight, planar, leaning", fontsize=10, loc="left")
 
 
 def _draw_tyres(runs: dict[tuple[str, float], CoastDown], grid: Sequence[Axes]) -> None:
     panels = (
-        ("load_front", 1.0, "Front load [N] over speed [m/s]"),
+        ("load_front", 1.0, "Front load [N]"),
         ("rolling_radius", 1000.0, "Rolling radius [mm]"),
         ("slip_front", -180 / pi, "Front slip into the turn [°]"),
         ("slip_rear", -180 / pi, "Rear slip into the turn [°]"),
     )
     for axes, (name, factor, title) in zip(grid, panels, strict=True):
         _lines(runs, axes, lambda run: ([s["speed"] for s in run.seen], [factor * s[name] for s in run.seen]), title)  # noqa: B023
+        axes.set_xlabel("speed [m/s], falling as time passes")
         axes.invert_xaxis()
     _legend(grid[0])
 
