@@ -215,8 +215,8 @@ class Ageing:
 
         What was counted before is not gone on from.
         """
-        if self._ride.of_another_pack(self._before):
-            self._begin_pack(filter_)
+        if self._ride.time >= COMPARED:
+            self._compare_packs(filter_)
         by_itself = filter_.covariance[0] - self._with_soc**2 / self.variance
         if by_itself <= 0:  # SOC was made known from elsewhere
             self.part()
@@ -246,12 +246,16 @@ class Ageing:
             self._unproven = 0.0
             self._proven.append(self._fit)
 
-    def _begin_pack(self, filter_: SocFilter) -> None:
-        """The pack was replaced: its resistance is that of this ride, and of its capacity nothing is known."""
+    def _compare_packs(self, filter_: SocFilter) -> None:
+        """Once: if the pack was replaced, its resistance is that of this ride, and of its capacity nothing is known."""
+        before, ride = self._before, self._ride
+        self._before, self._ride = Fit(), Fit()
+        if not ride.of_another_pack(before):
+            return
         self.part(filter_)
         self.inverse, self.variance = 1.0, self._unknown
-        self._fit, self._before, self._unproven = self._ride, Fit(), 0.0
-        self._proven = deque([self._fit], KEPT + 1)
+        self._fit, self._unproven = ride, 0.0
+        self._proven = deque([ride], KEPT + 1)
         self.belief = self._believe()
 
     def unlearn(self) -> None:
