@@ -58,13 +58,13 @@ class Address:
         return f"{f'[{self.host}]' if ':' in self.host else self.host}:{self.port}"
 
 
-def _login(file: Path) -> tuple[str, str]:
-    """User and password; InputError if others than the owner may read them."""
+def _login(file: Path) -> tuple[str | None, str | None]:
+    """User and password, none of an empty file; InputError if others than the owner may read them."""
     table = Table.read(file)
     if stat.S_IMODE(file.stat().st_mode) & 0o077:
         raise InputError(f"{file}: others can read the password in it: chmod 600 {file}")
     table.only({"user", "password"})
-    return table.text("user"), table.text("password")
+    return (table.text("user"), table.text("password")) if table.values else (None, None)
 
 
 class Broker:

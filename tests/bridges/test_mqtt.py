@@ -260,3 +260,13 @@ def test_a_login_that_others_can_read(tmp_path: Path):
     file.chmod(0o640)
     with pytest.raises(InputError, match="chmod 600"):
         Address.of("broker", None, file, {})
+
+
+def test_an_empty_login_is_none(tmp_path: Path):
+    file = tmp_path / "login.toml"
+    file.touch(0o600)
+    address = Address.of("broker", None, file, {})
+    assert (address.user, address.password) == (None, None)
+    file.write_text('user = "a"\n')
+    with pytest.raises(InputError, match="password: is missing"):
+        Address.of("broker", None, file, {})
