@@ -34,6 +34,7 @@ FILES = {
     "systemd/gz-onboard-mqtt.service": "usr/lib/systemd/system/gz-onboard-mqtt.service",
     "systemd/gz-onboard.default": "etc/default/gz-onboard",
     "systemd/80-can0.network": "etc/systemd/network/80-can0.network",
+    "systemd/gz-onboard-kiosk.service": f"{DOC}/examples/gz-onboard-kiosk.service",
     "systemd/80-vcan0.netdev": f"{DOC}/examples/80-vcan0.netdev",
     "systemd/80-vcan0.network": f"{DOC}/examples/80-vcan0.network",
     "packaging/debian/sysusers.conf": "usr/lib/sysusers.d/gz-onboard.conf",
