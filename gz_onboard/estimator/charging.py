@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from math import ceil
 
 from gz_onboard.constants import HOUR
+from gz_onboard.estimator.activity import CHARGING_RATE
 from gz_onboard.physics.battery import Battery
 
 CUT_OFF = 0.05  # 1/h: current over capacity at which chargers of lithium-ion cells end
 SLICE = 0.01  # of SOC, over which the current is taken to be the same
-LEAST = 0.02  # 1/h: current over capacity; while less flows, as in a pause, it is not known when it is full
 SETTLING = 20.0  # s over which current and voltage are averaged: chargers ripple, and taper off in steps
 
 
@@ -52,7 +52,8 @@ class Charging:
         share = 1.0 if self.power is None else dt / (dt + SETTLING)
         self._current += share * (-current - self._current)
         self.power = max(voltage * self._current, 0.0)
-        flows = -current > LEAST * battery.pack_capacity(temperature)
+        # While less flows, as in a pause, it is not known when it is full.
+        flows = -current > CHARGING_RATE * battery.pack_capacity(temperature)
         self.to_full = time_to_full(battery, soc, self._current, temperature) if flows else None
 
     def end(self) -> None:

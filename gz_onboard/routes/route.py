@@ -31,7 +31,7 @@ _AHEAD = {"stop_s": (0.0, 3600.0, "s"), "headwind_mps": (-40.0, 40.0, "m/s"), "t
 KNOWN_AHEAD = (*_KNOWN, *_AHEAD)
 """Columns of a route that is still to be ridden."""
 MOST_POINTS = 50_000  # of a route on board: 1000 km at 20 m
-LONGEST_AHEAD = 1e6  # m of a route on board: making it ready takes some 50 MB
+LONGEST_AHEAD = 1e6  # m of a route on board: reading it and making it ready takes 70 MB
 LONGEST_HOLE = 5000.0  # m: what is farther apart are places on the way, not the road
 
 
