@@ -279,7 +279,7 @@ def test_what_the_kernel_drops_is_counted(running: Running, listener: Listener):
     assert count + 10 - (dropped_on_the_way() - on_the_way) <= received + lost <= count + 10
     assert 1000 < daemon.statuses()[-1]["kernel_lost"] <= lost  # more may be told after the log's last row
     told = [row for row in listener.decoded("RANGE_Status") if row["RANGE_FramesLost"]]
-    assert 9 <= len(told) <= 21
+    assert len(told) >= 9  # a second; another loss while it catches up begins that anew
     assert listener.decoded("RANGE_Diagnosis")[-1]["RANGE_CountLost"] == min(lost, 4094)
 
 
