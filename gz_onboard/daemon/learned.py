@@ -52,7 +52,14 @@ MEANING = {  # by name: what its factor is on
 SPOKEN = {"mass": "payload"}  # what a text calls it
 LEARNED = "per cent learned: how much of what was uncertain before the first ride no longer is"
 PICTURES = (".png", ".svg", ".pdf")
-BATTERY, ROAD, RIDING = ("capacity", "resistance", "weakest"), "road", "riding"  # what can be forgotten
+BATTERY, ROAD, RIDING = ("capacity", "resistance", "weakest"), "road", "riding"
+FORGOTTEN = {  # by the word of --reset: what it forgets
+    **{name: (name,) for name in BATTERY},
+    "battery": BATTERY,
+    ROAD: (ROAD,),
+    RIDING: (RIDING,),
+    "all": (*BATTERY, ROAD, RIDING),
+}
 LOWEST = "lowest_cell_voltage"  # the role without which nothing is known of the weakest group
 
 
@@ -64,8 +71,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--reset",
-        choices=(*BATTERY, ROAD, RIDING, "all"),
-        help="forget this, as after a new battery or for a new owner; the daemon must not run",
+        choices=tuple(FORGOTTEN),
+        help="forget this, as `battery` after a new one, or `all` for a new owner; the daemon must not run",
     )
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it: PNG, SVG or PDF")
 
@@ -83,8 +90,7 @@ def run(arguments: argparse.Namespace) -> int:
     except InputError as error:
         raise InputError(f"{error}; --state FILE and --vehicle NAME|TOML say which") from error
     if arguments.reset:
-        names = (*BATTERY, ROAD, RIDING) if arguments.reset == "all" else (arguments.reset,)
-        snapshot = _forget(file, snapshot, age, names, _fresh(vehicle))
+        snapshot = _forget(file, snapshot, age, FORGOTTEN[arguments.reset], _fresh(vehicle))
     with sound(file):
         learned, riders = read_learned(vehicle, snapshot), read_riders(vehicle, snapshot)
         road_load = read_road_load(vehicle, snapshot)

@@ -13,12 +13,13 @@ it has stood for `PROVEN` of load: a current that is doubled looks like half the
 refute that current must not have been explained by then.
 
 A pack of unknown age holds anything from all of what its file says down to little more than half. A share of the packs
-(`Battery.as_new`, half if the file does not say) is taken to be as new, which the voltages of a healthy pack confirm
-soon, so that it is not made wrong; those of an aged pack refute it within some tens of per cent of charge. The interval
-of the range is wider on the lower side only: no pack is better than new. Nothing is learned while a sensor is doubted,
-or where SOC is not known by itself to `TRUSTED`: an age would explain what is none. With one current sensor its gain
-and the capacity cannot be told apart, and the factor is that of what the sensor counts; with two that differ nothing is
-learned.
+(`Battery.as_new`, half if the file does not say) is taken to be as new. Resistance tells the two apart within minutes:
+one that has grown makes less capacity likely, long before any charge has shown it. A healthy pack's voltages confirm
+that it is as new soon, so that it is not made wrong; those of an aged one refute it within some tens of per cent of
+charge. The interval of the range is wider on the lower side only: no pack is better than new. Nothing is learned while
+a sensor is doubted, or where SOC is not known by itself to `TRUSTED`: an age would explain what is none. With one
+current sensor its gain and the capacity cannot be told apart, and the factor is that of what the sensor counts; with
+two that differ nothing is learned.
 """
 
 from __future__ import annotations
@@ -30,15 +31,16 @@ from math import isfinite, sqrt
 
 from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.estimator.ageing_fit import COMPARED, RESISTANCE, RESISTANCE_MEMORY, Fit, believed
-from gz_onboard.estimator.ageing_kinds import Belief, Kinds
+from gz_onboard.estimator.ageing_kinds import RESISTANCE_AGED_SD, Belief, Kinds
 from gz_onboard.estimator.ekf import Covariance, SocFilter
+from gz_onboard.estimator.interval import DECILE
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.estimator.uncertainty import RESISTANCE_SD
 from gz_onboard.physics.battery import Battery
 
 CAPACITY = 0.5, 1.1  # factors that a pack at work has
-CAPACITY_SD, RESISTANCE_AGED_SD = 0.16, 0.42  # of packs that are not as new
+CAPACITY_SD = 0.16  # of ψ, of packs that are not as new
 NEW_SD = 0.003, CAPACITY_SD / 2  # of a pack that is as new: whatever the file says, no capacity is known more closely
 LEAST_VARIANCE = 0.01**2  # of ψ: the curve's place, and what of an ageing cell is not capacity
 LEAST_SPAN, NOTHING = 1e-3, (2.0, -1.0)  # of SOC
@@ -77,12 +79,12 @@ class Ageing:
         self._unknown = Kinds(battery.as_new, self._new_sd, CAPACITY_SD).variance
         self.inverse, self.variance = 1.0, self._unknown  # ψ
         self._with_soc = self._with_error = 0.0  # covariances of ψ with SOC and e
-        self.belief = self._believe()
         self._learning, self._seen = False, NOTHING
         self._agreeing = AGREEING_RATE * battery.pack_capacity(BENCH_TEMPERATURE)  # A
         self._unknown_resistance = RESISTANCE_AGED_SD * sqrt(1 - battery.as_new)  # sd of it before anything is learned
         self._fit = Fit()
         self._proven = deque([self._fit], KEPT + 1)  # the first is used
+        self.belief = self._believe()
         self._unproven = 0.0  # s of load since it was kept
         self._before, self._ride = Fit(), Fit()  # of the rides before this, and of this one until the two are compared
         self._slow = 0.0, 0.0  # V: low-passed drop at a factor of 1, and measured
@@ -94,7 +96,8 @@ class Ageing:
     def capacity(self) -> Learned:
         """What the pack holds over what its file says."""
         factor, sd = 1 / self.belief.inverse, sqrt(self.belief.variance)
-        return Learned(factor, sd * factor * factor, max(1 - sqrt(self.variance / self._unknown), 0.0))
+        left = min(self.belief.variance, self.variance, self._unknown)
+        return Learned(factor, sd * factor * factor, 1 - sqrt(left / self._unknown))
 
     def energy_sd(self, energy: float, slope: float, soc_sd: float) -> tuple[float, float]:
         """(sd of the energy that is left [J] downwards, upwards), by SOC and capacity, which err together.
@@ -102,12 +105,14 @@ class Ageing:
         slope: how much more `energy` [J] there would be for more SOC [J].
         """
         belief = self.belief
-        sd = sqrt(belief.variance)
         by_capacity = energy / belief.inverse
         together = self._with_soc / self.variance  # of SOC, for ψ
+        by_itself = max(soc_sd * soc_sd - together * together * belief.variance, 0.0)
+        down, up = (
+            max(x, self._new_sd * DECILE) / DECILE for x in (belief.high - belief.inverse, belief.inverse - belief.low)
+        )
         found = []
-        for age_sd in (sd, min(sd, max(belief.inverse - 1, 0.0) + self._new_sd)):
-            by_itself = max(soc_sd * soc_sd - (together * sd) ** 2, 0.0)
+        for age_sd in (down, min(up, max(belief.inverse - 1, 0.0) + self._new_sd)):
             found.append(sqrt(slope * slope * by_itself + (age_sd * (by_capacity - slope * together)) ** 2))
         return found[0], found[1]
 
@@ -277,7 +282,9 @@ class Ageing:
 
     def _believe(self) -> Belief:
         kinds = Kinds(self._battery.as_new, self._new_sd, CAPACITY_SD)
-        return kinds.belief(self.inverse, self.variance, self._with_soc)
+        used = self._proven[0]
+        resistance = (used.factor, RESISTANCE_SD * sqrt(1 + FIRST / used.time)) if used.time > 0 else None
+        return kinds.belief(self.inverse, self.variance, self._with_soc, resistance)
 
     # --- saving -----------------------------------------------------------------------------------------------
 

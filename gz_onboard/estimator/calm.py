@@ -7,8 +7,9 @@ faster
 - at first, while the forecast itself follows each kilometre: over half as much riding as the forecast is known from;
 - near empty, where the forecast's error goes as its range does: over a third of that.
 
-Once a ride has gone on for `SETTLED` and the forecast is known from as much, a better one is shown no faster than
-`FASTEST`: the range does not rise under who rides. A worse one is not held back: who is to turn round must know.
+Once a ride has gone on for `SETTLED` and the forecast is known from as much, another one is shown no faster than
+`FASTEST`: the range does not rise under who rides, nor falls twice as fast as he rides. A worse one is held back no
+further than the gap closes near empty, over a third of the range: who is to turn round must know in time.
 
 At standstill nothing is ridden that the gap could close over: what is drawn is taken off, and what else changes the
 forecast, as a rest does that shows the state of charge, waits for the riding to come; at most `STEP` of it. The rest of
@@ -29,7 +30,7 @@ NEAR_EMPTY = 3.0  # the gap closes over the range over this
 AT_FIRST = 2.0  # the gap closes over what the forecast is known from over this
 FIRST = 250.0  # m, over which it closes at first
 SETTLED = 2500.0  # m
-FASTEST = 0.8, 1.5e-5  # gained, of what is ridden; of the range for each m ridden, where that is more
+FASTEST = 0.8, 1.5e-5  # moved, of what is ridden; of the range for each m ridden, where that is more
 STEP = 0.05  # of the energy that is left, or of the range
 RATIO = 0.2, 5.0  # shown over forecast: beyond, the gap is not kept
 MOST_GAP = 1e6  # m, of a saved gap
@@ -88,7 +89,9 @@ class Calm:
         self._way += ridden
         self._settled |= min(known, self._way) >= SETTLED
         if self._settled:
-            closed = max(closed, -ridden * max(FASTEST[0], FASTEST[1] * raw))
+            most = ridden * max(FASTEST[0], FASTEST[1] * raw)
+            least = gap * (1 - exp(-ridden * NEAR_EMPTY / raw))
+            closed = min(max(closed, -most), max(most, least))
         self.gap = gap - closed
         self._waiting *= fading
         return self.shown(raw)

@@ -1,7 +1,8 @@
 """The road ahead: what the rest of a route costs, what is left at its end, or where the battery ends before.
 
-The model is ridden along the route once, and again when air or pace have changed. What was ridden of it corrects it:
-the cost, measured over modelled energy of the level road, and the pace, see `route_rider`.
+The model is ridden along the route once, and again when the air has changed. What was ridden of it corrects it: the
+cost, measured over modelled energy of the level road, see `route_rider`. Who rides slower than limits and bends allow
+shows it there too: a speed that is low for a while may be a climb's, and is no pace of the rider's to go on with.
 
 The range is the distance along the route that the energy left goes, beyond the end of the route at the consumption that
 is expected without one.
@@ -24,7 +25,6 @@ from gz_onboard.estimator.route_rider import SEGMENT_SD, RouteRider, restored
 from gz_onboard.estimator.signals import FIX_2D, Signals
 from gz_onboard.events import Estimate, RouteState
 from gz_onboard.physics.drawable import soc_left
-from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.effects.inertia import rotating_mass
 from gz_onboard.routes.route import Route
 
@@ -32,8 +32,7 @@ SEGMENT = 250.0  # m of the route from which the cost is learned
 AHEAD_SD = 0.015  # relative, of the cost of what is left, beyond what its segments scatter
 UNLIKE = 0.1  # of a segment: what was ridden is not what is modelled
 COURSE_FROM = 3.0  # m/s: slower, the heading is noise
-STEADY = 0.3  # m/s², and m/s within a second of the profile: there the pace shows
-CHANGED = Conditions(2.0, 200.0), 0.02  # degC, m; of the pace: by so much and the route is modelled anew
+CHANGED = Conditions(2.0, 200.0)  # degC, m: by so much and the route is modelled anew
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +71,7 @@ class RoadAhead:
         self._road: Road | None = None
         self._costs: Costs | None = None
         self._modelling: Iterator[Costs | None] | None = None
-        self._modelled: tuple[Conditions, float] | None = None
+        self._modelled: Conditions | None = None
         self._segment: tuple[float, float] | None = None  # m along the route, m/s: its start
         self._energy = self._ridden = self._distance = 0.0  # J, m of the segment; m of the vehicle at the last forecast
         self._new = False  # whether nothing was forecast on this route yet
@@ -84,6 +83,8 @@ class RoadAhead:
 
     def follow(self, road: Road | None) -> None:
         """Have `road` from now on, or none."""
+        if road and (self._road is None or road.route != self._road.route):
+            self.rider.begin_route()
         self._road, self._costs, self._modelling, self._segment = road, None, None, None
         self._distance, self._new = self._motion.distance, True
         self._forecaster.calm.show_next()
@@ -100,7 +101,6 @@ class RoadAhead:
     def _learn(self, road: Road, costs: Costs) -> None:
         """Learn the cost if a segment ends here."""
         speed, along = self._motion.speed or 0.0, road.position.along
-        self._learn_pace(road, along, speed)
         start, before = self._segment or (along, speed)
         way = along - start
         if self._segment and 0 <= way < SEGMENT:
@@ -115,15 +115,9 @@ class RoadAhead:
         )
         usual = way * float(costs.level[-1]) / energies.length
         if usual > 0:
-            level -= self._moving_mass * self.rider.pace**2 * allowed / 2
+            level -= self._moving_mass * allowed / 2
             energy -= height + self._moving_mass * (speed**2 - before**2) / 2
             self.rider.learn_cost(energy / usual, level / usual, self._cost)
-
-    def _learn_pace(self, road: Road, along: float, speed: float) -> None:
-        if speed > MOVING and abs(self._motion.acceleration or 0.0) < STEADY:
-            allowed, before = road.energy.allowed(along), road.energy.allowed(along - speed)
-            if allowed >= 0.98 * road.energy.limit(along) and abs(allowed - before) < STEADY:
-                self.rider.learn_pace(speed / allowed)
 
     @property
     def _cost(self) -> tuple[float, float]:
@@ -170,22 +164,18 @@ class RoadAhead:
 
     def _model(self, road: Road, conditions: Conditions) -> None:
         """Model a part of the route if that is due."""
-        pace = self.rider.pace
         if self._modelling is None:
-            (change, of_pace), then = CHANGED, self._modelled
+            then = self._modelled
             if (
                 then
                 and self._costs
-                and (
-                    abs(conditions.ambient - then[0].ambient) < change.ambient
-                    and abs(conditions.altitude - then[0].altitude) < change.altitude
-                    and abs(pace - then[1]) < of_pace
-                )
+                and abs(conditions.ambient - then.ambient) < CHANGED.ambient
+                and abs(conditions.altitude - then.altitude) < CHANGED.altitude
             ):
                 return
             moving = self._forecaster.riding.time_moving
-            self._modelling = road.energy.modelled(self._forecaster.load, conditions, pace, moving)
-            self._modelled = conditions, pace
+            self._modelling = road.energy.modelled(self._forecaster.load, conditions, moving)
+            self._modelled = conditions
         costs = next(self._modelling)
         if costs:
             self._costs, self._modelling = costs, None

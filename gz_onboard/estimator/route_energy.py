@@ -1,6 +1,6 @@
-"""What riding along a route costs by the model, and the time it takes, from its start to each point.
+"""What riding along a route costs by the model, from its start to each point.
 
-The speed is the profile's that limits and bends allow, times the rider's pace. The cost of the way is in two parts,
+The speed is the profile's that limits and bends allow. The cost of the way is in two parts,
 since only the first is to be corrected by what is learned: that of the level road, and what its height adds. Roads
 with low limits have more stops, which no map shows: of the differences along the route in the cost of the level road
 `EVEN` are taken as made up for by stops.
@@ -30,11 +30,10 @@ SLOWEST = 0.5  # m/s, in the mean over a piece
 
 @dataclass(frozen=True)
 class Costs:
-    """From the start of the route to each of its points, shape (n,); energies in J, time in s."""
+    """Energies from the start of the route to each of its points [J], shape (n,)."""
 
     level: Array
     height: Array
-    time: Array
 
 
 class RouteEnergy:
@@ -49,8 +48,6 @@ class RouteEnergy:
         profile = speed_profile(route, top_speed=top_speed if unlimited else inf)
         self.distance, self.speed = np.array(profile.distance), np.array(profile.speed)
         middles = (self.distance[1:] + self.distance[:-1]) / 2
-        at = np.searchsorted(np.array(route.distance), middles, side="right") - 1
-        self._limits = np.minimum(np.array(route.speed_limit), top_speed if unlimited else inf)[at]
         known = {"grade": route.grade, "curvature": route.curvature, "heading": route.heading}
         known |= {"headwind": route.headwind or (0.0,) * len(route.distance)}
         self._pieces = {name: np.interp(middles, route.distance, values) for name, values in known.items()}
@@ -69,14 +66,6 @@ class RouteEnergy:
         """How much of `values` (n,), at `distance`, lies between two distances [m]."""
         first, last = self._np.interp((start, end), self.distance, values)
         return float(last - first)
-
-    def allowed(self, at: float) -> float:
-        """Speed [m/s] of the profile at the distance `at` [m]."""
-        return float(self._np.interp(at, self.distance, self.speed))
-
-    def limit(self, at: float) -> float:
-        """The fastest [m/s] that the profile is around the distance `at` [m], bends not counted."""
-        return float(self._limits[min(int(self._np.searchsorted(self.distance, at)), len(self._limits)) - 1])
 
     def reach(self, energy: Array, start: float, given: float) -> float | None:
         """How far [m] from the distance `start` [m] `given` [J] go, by `energy` (n,) from the start of the route.
@@ -98,9 +87,7 @@ class RouteEnergy:
         share = (target - before) / (energy[i] - before) if energy[i] > before else 0.0
         return float(here + share * step - start)
 
-    def modelled(
-        self, load: LoadModel, conditions: Conditions, pace: float, time_moving: float
-    ) -> Iterator[Costs | None]:
+    def modelled(self, load: LoadModel, conditions: Conditions, time_moving: float) -> Iterator[Costs | None]:
         """Model the route, a part at each call of `next`: None, and at last its costs.
 
         time_moving: of the ride so far [s].
@@ -109,7 +96,7 @@ class RouteEnergy:
         level, height, time = (np.zeros(count + 1) for _ in range(3))
         for begin in range(0, count, PART):
             part, ends = slice(begin, begin + PART), slice(begin + 1, min(begin + PART, count) + 1)
-            speed, length = pace * self.speed[begin : ends.stop], np.diff(self.distance[begin : ends.stop])
+            speed, length = self.speed[begin : ends.stop], np.diff(self.distance[begin : ends.stop])
             mean = np.maximum((speed[1:] + speed[:-1]) / 2, SLOWEST)
             times = length / mean
             motion = (
@@ -124,7 +111,7 @@ class RouteEnergy:
             height[ends] = height[begin] + np.cumsum((whole - flat) * times)
             time[ends] = time[begin] + np.cumsum(times + stops)
             yield None
-        yield Costs((1 - EVEN) * level + EVEN * level[-1] * self.distance / self.length, height, time)
+        yield Costs((1 - EVEN) * level + EVEN * level[-1] * self.distance / self.length, height)
 
     def _power(
         self, load: LoadModel, conditions: Conditions, part: slice, motion: tuple[Any, Any, Any], hills: bool

@@ -163,7 +163,7 @@ def test_a_state_without_it_or_of_another_pack_is_as_new(fresh: Battery):
     saved = ageing.snapshot()
     other = Ageing(replace(fresh, capacity=2.0).own())
     other.restore(saved)
-    assert other.capacity.value == 1.0
+    assert other.inverse == 1.0
     assert other.resistance.value == ageing.resistance.value
     other.restore({})
 

@@ -164,15 +164,32 @@ def test_on_a_route_the_forecast_is_known_from_what_was_ridden_of_it():
     assert Rider(way(1e3)).settled()[0].known_from == pytest.approx(FREE.known_from, rel=0.05)
 
 
-def test_the_pace_is_learned_where_it_shows():
+def test_a_slow_climb_makes_no_slow_rider():
+    """At the pace of the first, steep kilometres no map's level roads would be ridden, nor cost less."""
     rider = Rider(way(30e3, limit=lambda x: 12.0))
     rider.settled()
-    rider.ride(300, 1000.0, speed=9.6)
-    assert rider.ahead.rider.pace == pytest.approx(0.8, abs=0.03)
+    before = rider.ahead._costs
+    rider.ride(300, 1000.0, speed=6.0)
+    assert before
+    assert rider.ahead._costs is before
+
+
+def test_another_route_is_known_less_well_and_the_same_one_as_before():
+    rider = Rider(way(30e3))
+    rider.settled()
+    costs = rider.ahead._costs
+    assert costs
+    rider.ride(700, 1.4 * costs.level[-1] / 30e3 * 11.0)
+    cost, known = rider.ahead._cost
+    rider.ahead.follow(rider.ahead.ready(way(30e3)))
+    assert rider.ahead._cost == (cost, known)
+    rider.ahead.follow(rider.ahead.ready(way(20e3)))
+    assert rider.ahead._cost[0] == cost
+    assert rider.ahead._cost[1] > 2 * known
 
 
 @pytest.mark.parametrize(
-    "saved", [None, 3, [], [1, 2], ["x", 0, 1, 1], [1.0, 0.01, 9.0, 0.1], [99.0, 0.01, 1.0, 0.1], [1.0, None, 1.0, 1.0]]
+    "saved", [None, 3, {"a": 1}, [], [1.0, 2.0], ["x", 0], [99.0, 0.01], [1.0, None], [1.0, -1.0], [1.0, float("nan")]]
 )
 def test_what_is_saved_wrongly_is_learned_anew(saved):
     assert restored(saved) == RouteRider()
@@ -263,5 +280,5 @@ def test_a_long_route_is_modelled_in_parts():
         asked += 1
     assert 5 < asked < 60
     assert rider.ahead._costs
-    assert all(b >= a for a, b in pairwise(rider.ahead._costs.time.tolist()))
+    assert all(b >= a for a, b in pairwise(rider.ahead._costs.level.tolist()))
     assert rider.ahead.answer.energy == pytest.approx(200e3 * 95, rel=0.3)
