@@ -60,13 +60,13 @@ class Scene:
         self.heard: list[Frame] = []
         self.end = threading.Event()
         self._bus = bus
+        self._listening = can.Bus(interface="virtual", channel=bus)  # before the daemon says its first
         self._thread = threading.Thread(target=self.daemon.run)
         self._ear = threading.Thread(target=self._listen)
 
     def _listen(self) -> None:
-        with can.Bus(interface="virtual", channel=self._bus) as bus:
-            while not self.end.is_set():
-                message = bus.recv(0.1)
+        with self._listening as bus:
+            while (message := bus.recv(0.1)) is not None or not self.end.is_set():  # to the last that is waiting
                 if message is not None and message.arbitration_id >= 0x600:
                     stamp = round(message.timestamp * 1e9)
                     self.heard.append((stamp, message.arbitration_id, bytes(message.data), 0))
