@@ -27,7 +27,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import isfinite, sqrt
+from math import inf, isfinite, sqrt
 
 from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.estimator.ageing_fit import COMPARED, RESISTANCE, RESISTANCE_MEMORY, Fit, believed
@@ -53,6 +53,7 @@ QUICK = 60.0  # s: changes of the voltage that are slower may be the charge's
 PLACE_TIME = 600.0  # s for which the tables' place errs the same way
 EXCITED = 0.01  # V of a cell: a load that changes its voltage by less shows no resistance
 PROVEN, KEPT = 150.0, 5  # s of load; so many times in it what was learned is kept
+TOLD = 2 * PROVEN  # s of load before the resistance tells an old pack as well as it can: the range shall not leap
 FIRST = 10.0  # s of load before the resistance is more than a guess
 AGREEING_RATE = 0.01  # 1/h: two currents that differ by more in the mean, over capacity, show no capacity
 APPLIED_EVERY = 10.0  # s
@@ -283,8 +284,8 @@ class Ageing:
     def _believe(self) -> Belief:
         kinds = Kinds(self._battery.as_new, self._new_sd, CAPACITY_SD)
         used = self._proven[0]
-        resistance = (used.factor, RESISTANCE_SD * sqrt(1 + FIRST / used.time)) if used.time > 0 else None
-        return kinds.belief(self.inverse, self.variance, self._with_soc, resistance)
+        told = max(RESISTANCE_SD, self._battery.resistance_sd) * sqrt(1 + TOLD / used.time) if used.time > 0 else inf
+        return kinds.belief(self.inverse, self.variance, self._with_soc, (used.factor, told))
 
     # --- saving -----------------------------------------------------------------------------------------------
 

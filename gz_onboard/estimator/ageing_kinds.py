@@ -6,7 +6,7 @@ have less capacity: both are normal, with the correlation `TOGETHER`.
 
 from __future__ import annotations
 
-from math import erf, exp, sqrt
+from math import erf, exp, inf, isinf, sqrt
 from typing import NamedTuple
 
 from gz_onboard.estimator.interval import DECILE
@@ -41,9 +41,11 @@ class Kinds(NamedTuple):
         return self.as_new * self.new_sd**2 + (1 - self.as_new) * self.old_sd**2
 
     def belief(
-        self, inverse: float, variance: float, with_soc: float, resistance: tuple[float, float] | None = None
+        self, inverse: float, variance: float, with_soc: float, resistance: tuple[float, float] = (1.0, inf)
     ) -> Belief:
-        """For the filter's ψ, its variance and its covariance with SOC; resistance: fitted factor and its sd, if known.
+        """For the filter's ψ, its variance and its covariance with SOC; resistance: fitted factor and its sd.
+
+        Less resistance than the file says makes no pack better than new.
 
         The filter's ψ began with mean and variance of both. Where that of a kind is elsewhere, SOC is so too.
         """
@@ -63,12 +65,12 @@ class Kinds(NamedTuple):
         shift = moves * (1 + mean - inverse)
         return Belief(1 + mean, both, shift, moves * moves * (both - variance), 1 + low, 1 + high)
 
-    def _by_resistance(self, resistance: tuple[float, float] | None) -> tuple[float, float, float]:
+    def _by_resistance(self, resistance: tuple[float, float]) -> tuple[float, float, float]:
         """(mean and variance of an old pack's ψ less 1, odds of a pack as new) with the resistance alone."""
         odds = self.as_new / (1 - self.as_new)
-        if resistance is None:
+        if isinf(resistance[1]):
             return 0.0, self.old_sd**2, odds
-        more, own = resistance[0] - 1, resistance[1] ** 2
+        more, own = max(resistance[0] - 1, 0.0), resistance[1] ** 2
         aged = RESISTANCE_AGED_SD**2 + own
         gain = TOGETHER * self.old_sd * RESISTANCE_AGED_SD / aged
         odds *= sqrt(aged / own) * exp(min(max(more * more * (1 / aged - 1 / own) / 2, -SURE), SURE))

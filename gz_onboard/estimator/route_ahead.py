@@ -69,6 +69,7 @@ class RoadAhead:
         self._forecaster, self._motion, self._signals = forecaster, motion, signals
         self._moving_mass = model.mass + rotating_mass(model.parameters)
         self._road: Road | None = None
+        self._last: Route | None = None  # that was followed, also if it was taken back since
         self._costs: Costs | None = None
         self._modelling: Iterator[Costs | None] | None = None
         self._modelled: Conditions | None = None
@@ -83,8 +84,10 @@ class RoadAhead:
 
     def follow(self, road: Road | None) -> None:
         """Have `road` from now on, or none."""
-        if road and (self._road is None or road.route != self._road.route):
-            self.rider.begin_route()
+        if road:
+            if self._last and road.route != self._last:
+                self.rider.begin_route()
+            self._last = road.route
         self._road, self._costs, self._modelling, self._segment = road, None, None, None
         self._distance, self._new = self._motion.distance, True
         self._forecaster.calm.show_next()

@@ -48,9 +48,9 @@ class RouteRider:
 def restored(saved: Any) -> RouteRider:
     """What `RouteRider.snapshot` gave; anew for what is not that, as an old state has none."""
     try:
-        cost, variance = (None if x is None else float(x) for x in saved[:2])  # an older state has more
+        cost, variance = (None if x is None else float(x) for x in saved)
     except (TypeError, ValueError, OverflowError, KeyError):
         return RouteRider()
-    if variance is None or not 0 <= variance < 1 or not (cost is None or COST[0] <= cost <= COST[1]):
+    if cost is None or variance is None or not (0 < variance < 1 and COST[0] <= cost <= COST[1]):
         return RouteRider()
     return RouteRider(cost, variance)

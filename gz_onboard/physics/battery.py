@@ -138,6 +138,7 @@ class Battery:
     r1: Mesh  # ohm
     c1: Mesh  # F
     resistance_factor: float = 1.0  # that is in r0, r1 and c1
+    resistance_sd: float = 0.0  # relative, of that factor
     rest_shift_temperature: Row = ()  # degC; none: V_oc does not depend on temperature
     rest_shift_value: Row = ()  # V of a cell
     rest_shift_sd: float = 0.0  # V

@@ -82,6 +82,7 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         voltage_error_time_temperature=time_temperatures,
         voltage_error_time_value=times,
         capacity_sd=parameters.sd("cell_capacity") / parameters["cell_capacity"],
+        resistance_sd=parameters.sd("cell_resistance_factor") / parameters["cell_resistance_factor"],
         as_new=table.number("as_new", Battery.as_new, low=LEAST_AS_NEW, high=1 - LEAST_AS_NEW),
     )
     return battery.with_parameters(parameters)

@@ -34,7 +34,7 @@ def by_force(seen, seen_sd, factor, factor_sd):
 
 
 @pytest.mark.parametrize("seen", [(0.0, 0.03), (0.02, 0.05), (0.2, 0.05), (0.3, 0.4), (-0.05, 0.02)])
-@pytest.mark.parametrize("resistance", [(1.0, 0.12), (1.3, 0.15), (1.5, 0.12), (0.9, 0.3)])
+@pytest.mark.parametrize("resistance", [(1.0, 0.12), (1.3, 0.15), (1.5, 0.12), (1.1, 0.3)])
 def test_it_is_what_bayes_theorem_says(seen, resistance):
     """The filter's ψ is a sight of it together with the prior of both kinds as one normal distribution."""
     prior = KINDS.variance
@@ -50,6 +50,12 @@ def test_nothing_seen_is_the_prior():
     found = KINDS.belief(1.0, KINDS.variance, 0.0)
     assert (found.inverse, found.variance) == pytest.approx((1.0, KINDS.variance))
     assert found.high - 1 == pytest.approx(1 - found.low)
+
+
+def test_a_resistance_that_is_known_badly_or_low_tells_next_to_nothing():
+    """Tables that are not of this cell, and a pack with less resistance than its file's."""
+    assert KINDS.belief(1.0, KINDS.variance, 0.0, (2.0, 5.0)).inverse == pytest.approx(1.0, abs=0.01)
+    assert KINDS.belief(1.0, KINDS.variance, 0.0, (0.5, 0.12)).inverse == 1.0
 
 
 def test_more_resistance_makes_less_capacity_likely():

@@ -181,6 +181,7 @@ def test_another_route_is_known_less_well_and_the_same_one_as_before():
     assert costs
     rider.ride(700, 1.4 * costs.level[-1] / 30e3 * 11.0)
     cost, known = rider.ahead._cost
+    rider.ahead.follow(None)
     rider.ahead.follow(rider.ahead.ready(way(30e3)))
     assert rider.ahead._cost == (cost, known)
     rider.ahead.follow(rider.ahead.ready(way(20e3)))
@@ -189,7 +190,21 @@ def test_another_route_is_known_less_well_and_the_same_one_as_before():
 
 
 @pytest.mark.parametrize(
-    "saved", [None, 3, {"a": 1}, [], [1.0, 2.0], ["x", 0], [99.0, 0.01], [1.0, None], [1.0, -1.0], [1.0, float("nan")]]
+    "saved",
+    [
+        None,
+        3,
+        {"a": 1},
+        [],
+        [1.0, 2.0],
+        ["x", 0],
+        [1.0, 0.0],
+        [1.0, 0.01, 0.7, 0.1],
+        [99.0, 0.01],
+        [1.0, None],
+        [1.0, -1.0],
+        [1.0, float("nan")],
+    ],
 )
 def test_what_is_saved_wrongly_is_learned_anew(saved):
     assert restored(saved) == RouteRider()
