@@ -12,7 +12,8 @@ late.
 
 A week has fifteen rides of 4 to 9 km, three a day, with rests and charges between; the state is kept.
 
-Seeds 0 to 999 are for development; 1000 and up for the tables.
+Seeds 0 to 999 are for development; 1000 and up for the tables. Those of 1000 to 1007 were looked at ride by ride when the
+shown range was mended, so the tables begin behind them.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ from gz_onboard.vehicle import read_vehicle
 
 PAGE = Path(__file__).parents[1] / "docs" / "range-benchmark.md"
 PICTURE = "images/range-benchmark.png"  # beside the page
-FIRST = 1000
+FIRST = 1008
 TOGETHER = 4  # rides that are ridden at once, for memory
 LEVELS = tuple(x / 10 for x in range(9, 0, -1))  # SOC, at which estimates are judged
 JUDGED_FROM = 0.2  # SOC: below, an error is of little use in per cent
