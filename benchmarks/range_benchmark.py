@@ -12,8 +12,8 @@ late.
 
 A week has fifteen rides of 4 to 9 km, three a day, with rests and charges between; the state is kept.
 
-Seeds 0 to 999 are for development; 1000 and up for the tables. Those of 1000 to 1007 were looked at ride by ride when the
-shown range was mended, so the tables begin behind them.
+Seeds 0 to 999 are for development; 1000 and up for the tables. Those of 1000 to 1007 were looked at ride by
+ride when the range that is shown was mended, so the tables begin behind them.
 """
 
 from __future__ import annotations
