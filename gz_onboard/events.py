@@ -92,6 +92,8 @@ INSTRUMENTS: dict[str, str] = {
     "roller_speed": "m/s",  # of a chassis dynamometer
     "roller_force": "N",  # positive against the vehicle
     "highest_cell_voltage": "V",
+    "coldest_cell_temperature": "degC",
+    "hottest_cell_temperature": "degC",
     "bms_temperature": "degC",
     **{f"pack_temperature_{i}": "degC" for i in range(1, 7)},
 }

@@ -64,7 +64,7 @@ def main() -> int:
     dbc = read_vehicle(args.vehicle).range_dbc
     dashboard = ["dashboard", *bus, "--dbc", str(dbc)]
     listen = f"127.0.0.1:{free_port()}"
-    page = [*dashboard, "--web", "--listen", listen]
+    page = [*dashboard, "--web", "--listen", listen, "--vehicle", args.vehicle]
 
     where = "in-process virtual bus" if args.interface == "virtual" else f"{args.channel} of Linux {os.uname().release}"
     print(f"=== {args.ride.name} on the {where}, for at most {args.seconds:g} s")

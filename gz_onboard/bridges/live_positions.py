@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from gz_onboard.bus.codec import Codec
-from gz_onboard.bus.layout import identifier_of
+from gz_onboard.bus.layout import identifiers_of
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.events import STALE_PERIODS, Frame
 from gz_onboard.log_rows import Positions
@@ -26,11 +26,7 @@ class LivePositions:
             raise vehicle.error(
                 f"[roles] has no {' and no '.join(lacking)}, so there is no position to show; leave --vehicle out"
             )
-        messages = set(mapped.values())
-        self.identifiers: list[int] | None = None  # of the frames that it needs; None: a J1939 sender may have any
-        if not mapping.j1939:
-            self.identifiers = [identifier_of(m) for m in mapping.database.messages if m.name in messages]
-            self.identifiers += [request.response for request in mapping.requests if request.name in messages]
+        self.identifiers = identifiers_of(mapping, set(mapped.values()))  # of the frames that it needs
         self._codec = Codec(mapping)
         self._signals = Signals(
             (role, STALE_PERIODS * group.period if group.period else DEFAULT_STALE)

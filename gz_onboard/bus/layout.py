@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
-from gz_onboard.bus.mapping import Protection, Source
+from gz_onboard.bus.mapping import BusMapping, Protection, Source
 from gz_onboard.events import EFF_FLAG, PLAUSIBLE, PLAUSIBLE_OF, ROLES, STALE_PERIODS
 
 if TYPE_CHECKING:
@@ -21,6 +22,14 @@ PAUSE = 1.0  # s: after that any counter goes, where the message's period is not
 def identifier_of(message: Message) -> int:
     """The identifier of the message's frames, with its flag."""
     return int(message.frame_id) | (EFF_FLAG if message.is_extended_frame else 0)
+
+
+def identifiers_of(mapping: BusMapping, messages: Collection[str]) -> list[int] | None:
+    """Of the frames that bring `messages`, answers too; None: any, as a J1939 sender may have any."""
+    if mapping.j1939:
+        return None
+    found = [identifier_of(m) for m in mapping.database.messages if m.name in messages]
+    return found + [request.response for request in mapping.requests if request.name in messages]
 
 
 def raw_values(message: Message, data: bytes) -> dict[str, float] | None:

@@ -10,11 +10,13 @@ import math
 from dataclasses import asdict, dataclass, field
 from functools import partial
 
+from gz_onboard.dashboard.vehicle_frames import CELLS, ODOMETER
 from gz_onboard.dashboard.view import NEARLY_EMPTY, View
 from gz_onboard.events import Activity, Reason, RouteState, State
 
 VERSION = 1
 NO_LONGER_EMPTY = NEARLY_EMPTY + 2.0  # %: an alert that stands goes only here, not at each wobble
+NO_LONGER = 2.0  # K, of a cell that was too hot or too cold: likewise
 SENSOR_LOST = (
     Reason.NO_PACK_VOLTAGE
     | Reason.NO_PACK_CURRENT
@@ -36,7 +38,9 @@ UNREACHABLE = "destination_unreachable"
 BATTERY_LOW = "battery_nearly_empty"
 UNCERTAIN = "destination_uncertain"
 SENSORS = "sensor_lost"
-ALERTS = (BUS_DOWN, SILENT, PARTLY_SILENT, RANGE_INVALID, UNREACHABLE, BATTERY_LOW, UNCERTAIN, SENSORS)
+HOT = "cell_too_hot"
+COLD = "cell_too_cold"
+ALERTS = (BUS_DOWN, SILENT, PARTLY_SILENT, RANGE_INVALID, HOT, UNREACHABLE, BATTERY_LOW, COLD, UNCERTAIN, SENSORS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +59,14 @@ class BatteryLevel:
     soc_percent: float | None
     soc_sigma_percent: float | None
     energy_left_wh: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Cells:
+    """How warm they are."""
+
+    coldest_degc: float
+    hottest_degc: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,6 +127,8 @@ class Picture:
     activity: str | None
     range: Range
     battery: BatteryLevel
+    cells: Cells | None
+    ridden_today_km: float | None
     consumption: Consumption
     charge: Charge | None
     route: Destination | None
@@ -122,7 +136,7 @@ class Picture:
     causes: tuple[CauseOfRange, ...]
     reasons: tuple[str, ...]
     distrusted: tuple[str, ...]
-    late: tuple[str, ...]  # messages of which a newer one should have come
+    late: tuple[str, ...]  # messages, and roles of the vehicle's, of which a newer one should have come
     stale: tuple[str, ...]  # messages whose numbers are no longer given
     alerts: tuple[str, ...]
     age_s: float | None = field(compare=False)  # since the last good frame
@@ -148,6 +162,9 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
     route, reasons = _route(view, now), view.reasons(now)
     stale = tuple(view.stale(now))
     charging = activity is Activity.CHARGING
+    distrusted, vehicle = tuple(view.distrusted(now)), view.vehicle
+    cells = vehicle.cells(now) if vehicle and CELLS not in distrusted else None
+    ridden = vehicle.ridden(now) if vehicle and ODOMETER not in distrusted else None
     said = {
         BUS_DOWN: not up,
         SILENT: len(stale) == len(view.messages),
@@ -156,6 +173,7 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
         RANGE_INVALID: state is State.INVALID,
         BATTERY_LOW: not charging and _low(battery.soc_percent, BATTERY_LOW in before),
         SENSORS: any(reason & SENSOR_LOST for reason in reasons),
+        **_of_cells(cells, vehicle.limits(charging) if vehicle else None, before),
         **_of_destination(route),
     }
     return Picture(
@@ -168,6 +186,8 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
         activity=_name(activity),
         range=Range(*(_rounded(value(f"RANGE_Remaining{part}")) for part in ("", "P10", "P90"))),
         battery=battery,
+        cells=Cells(*(round(value, 1) for value in cells)) if cells else None,
+        ridden_today_km=None if ridden is None else round(ridden, 1),
         consumption=Consumption(
             _rounded(value("RANGE_ConsumptionRecent")), _rounded(value("RANGE_ConsumptionExpected"))
         ),
@@ -176,8 +196,11 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
         rated_km=_rounded(value("RANGE_WhyRated")),
         causes=tuple(CauseOfRange(cause.name.lower(), round(km, 3)) for cause, km in view.why(now)),
         reasons=tuple(str(reason.name).lower() for reason in reasons),
-        distrusted=tuple(view.distrusted(now)),
-        late=tuple(name for name, entry in view.messages.items() if entry.late(now)),
+        distrusted=distrusted,
+        late=(
+            *(name for name, entry in view.messages.items() if entry.late(now)),
+            *(vehicle.late(now) if vehicle else ()),
+        ),
         stale=stale,
         alerts=tuple(alert for alert in ALERTS if said[alert]),
         age_s=None if math.isinf(age) else round(age, 3),
@@ -227,6 +250,17 @@ def _of_destination(route: Destination | None) -> dict[str, bool]:
         return {UNREACHABLE: False, UNCERTAIN: False}
     unreachable = route.battery_ends_after_km is not None or route.arrival_soc_percent == 0
     return {UNREACHABLE: unreachable, UNCERTAIN: not unreachable and route.arrival_soc_p10_percent == 0}
+
+
+def _of_cells(
+    cells: tuple[float, float] | None, limits: tuple[float, float] | None, before: tuple[str, ...]
+) -> dict[str, bool]:
+    """Whether one is hotter or colder [degC] than the limits; an alert that stands goes only some way from them."""
+    if cells is None or limits is None:
+        return {HOT: False, COLD: False}
+    (coldest, hottest), (low, high) = cells, limits
+    hot = hottest > high - (NO_LONGER * (HOT in before))
+    return {HOT: hot, COLD: coldest < low + (NO_LONGER * (COLD in before))}
 
 
 def _low(soc: float | None, stands: bool) -> bool:

@@ -16,6 +16,8 @@ from gz_onboard.events import ROLES, STALE_PERIODS, Activity, Cause, Frame, Reas
 if TYPE_CHECKING:
     from cantools.database.can import Message
 
+    from gz_onboard.dashboard.vehicle_frames import VehicleFrames
+
 LATE_PERIODS = 3  # after so many the numbers are shown in grey, after STALE_PERIODS not at all
 NEARLY_EMPTY = 15.0  # %: a state of charge that the rider is told of
 PERIODS = {"RANGE_Status": 100}  # ms, where the DBC does not say; of the others 1000
@@ -63,8 +65,9 @@ class View:
     No clock: times [s, monotonic] come with the frames. InputError if the file has not what ``range.dbc`` has.
     """
 
-    def __init__(self, file: Path | None = None) -> None:
+    def __init__(self, file: Path | None = None, vehicle: VehicleFrames | None = None) -> None:
         self.file = file or find_dbc(RANGE_DBC)
+        self.vehicle = vehicle  # of what is shown of the vehicle's own frames
         messages = range_messages(self.file)
         self.messages: dict[str, Received] = {}
         self.comments = {s.name: s.comment or "" for m in messages.values() for s in m.signals}
@@ -74,15 +77,18 @@ class View:
         self._by_identifier = {identifier_of(entry.definition): entry for entry in self.messages.values()}
 
     @property
-    def identifiers(self) -> list[int]:
-        """Of the frames that it reads: all that the kernel need let through."""
-        return list(self._by_identifier)
+    def identifiers(self) -> list[int] | None:
+        """Of the frames that it reads: all that the kernel need let through; None: any."""
+        others = self.vehicle.identifiers if self.vehicle else []
+        return None if others is None else [*self._by_identifier, *others]
 
     def take(self, frame: Frame, now: float) -> None:
         """Take in a frame that came at `now`; one that fails a check is counted and not used."""
         _, identifier, data, _ = frame
         entry = self._by_identifier.get(identifier)
         if entry is None:
+            if self.vehicle:
+                self.vehicle.take(frame, now)
             return
         message = entry.definition
         if len(data) != message.length or crc8_sae_j1850(data[:-1]) != data[-1]:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from gz_onboard.events import Estimate
 from tests.browser.support import opened_browser, shows
 from tests.browser.test_page import UNREACHABLE
-from tests.dashboard.served import Sender, dashboard
+from tests.dashboard.served import Sender, cells, dashboard, odometer, vehicle_frames
 from tests.dashboard.test_picture import CHARGING, HEALTHY, ON_ROUTE
 from tests.dashboard.test_terminal import ESTIMATE
 from tests.support import ROOT
@@ -35,7 +35,8 @@ def main() -> None:
             name = f"{width}x{height}-{theme}"
             page = context.new_page()
             page.set_viewport_size({"width": width, "height": height})
-            with dashboard("can0") as address, Sender("can0", estimate):
+            own = [odometer(1012.4), cells(22, 24, 27)]
+            with dashboard("can0", vehicle=vehicle_frames(1000.0)) as address, Sender("can0", estimate, own):
                 page.goto(f"{address}?theme={theme}&language={language}")
                 shows(page, range_value="8.2" if estimate is UNREACHABLE else "34")
                 page.wait_for_timeout(500)

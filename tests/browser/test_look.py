@@ -10,7 +10,7 @@ import pytest
 from gz_onboard.events import Reason, State
 from tests.browser.support import plain, shows, texts, wait_for
 from tests.browser.test_page import UNREACHABLE
-from tests.dashboard.served import Sender, dashboard
+from tests.dashboard.served import Sender, cells, dashboard, odometer, vehicle_frames
 from tests.dashboard.test_picture import CHARGING, HEALTHY, ON_ROUTE
 from tests.dashboard.test_terminal import ESTIMATE
 
@@ -77,7 +77,8 @@ def test_it_fits(page, width, height, language):
     """Nothing wider than the screen, whatever stands on it; the range and the charge without scrolling."""
     page.set_viewport_size({"width": width, "height": height})
     name = f"fit-{width}-{language}"
-    with dashboard(name) as address, Sender(name, UNREACHABLE) as sender:
+    own = [odometer(1112.4), cells(-8, 24, 57)]
+    with dashboard(name, vehicle=vehicle_frames(1000.0)) as address, Sender(name, UNREACHABLE, own) as sender:
         page.goto(f"{address}?language={language}")
         far = replace(HEALTHY, range=412e3, range_p10=365e3, range_p90=466e3)
         for estimate, km in (UNREACHABLE, ("8.2", "8,2")), (CHARGING, ("34",)), (far, ("412",)):

@@ -12,7 +12,7 @@ from gz_onboard.dashboard.server import Feed
 from gz_onboard.dashboard.web import served
 from gz_onboard.events import Estimate, Reason, State
 from tests.browser.support import alerts, numbers, plain, shows, texts, wait_for
-from tests.dashboard.served import Sender, dashboard
+from tests.dashboard.served import Sender, cells, dashboard, odometer, vehicle_frames
 from tests.dashboard.test_picture import CHARGING, HEALTHY, ON_ROUTE
 from tests.dashboard.test_terminal import ESTIMATE
 
@@ -91,6 +91,33 @@ def test_a_destination(page):
             "A sensor is lost: no GPS, pack current.",
         ]
         shows(page, distrusted="sensors left out:\npack current")
+
+
+def test_the_days_distance_and_the_cells(page):
+    """What was ridden stands left of here, on one scale with what is left and the destination."""
+    begun = vehicle_frames(1000.0)
+    own = [odometer(1012.5), cells(22, 24, 27)]
+    with dashboard("day", vehicle=begun) as address, Sender("day", ON_ROUTE, own) as sender:
+        page.goto(address)
+        shows(page, range_value="34", ridden="13 km ridden", cells="cells 22 to 27 °C", alerts="")
+        assert plain(page.get_attribute("#band", "aria-label")).endswith("13 km were ridden today.")
+        assert page.inner_text("#band .ticks").split("\n") == ["−13", "0", "10", "20", "30", "40", "50"]
+        behind, goal = page.evaluate(
+            """() => [parseFloat(document.querySelector("#band .behind").style.width),
+                      parseFloat(document.querySelector("#band .goal").style.left)]"""
+        )
+        assert behind == pytest.approx(12.5 / 62.5 * 100, abs=0.1)
+        assert goal == pytest.approx((12.5 + 18.3) / 62.5 * 100, abs=0.1)
+        sender.own = [cells(22, 40, 52)]
+        shows(page, alerts="A battery cell is too hot: 52 °C.", cells="cells 22 to 52 °C")
+        late = "[...document.querySelectorAll('.late')].map((e) => e.id)"
+        wait_for(lambda: page.evaluate(late) == ["ridden"], "the odometer is late")
+        shows(page, ridden="")
+        assert page.is_hidden("#band .behind")
+        sender.own = [cells(-8, -7, -7)]
+        shows(page, alerts="A battery cell is too cold: −8 °C.", cells="cells −8 to −7 °C")
+        page.click("#language")
+        shows(page, alerts="Eine Batteriezelle ist zu kalt: −8 °C.", cells="Zellen −8 bis −7 °C")
 
 
 @pytest.mark.parametrize("state", [State.STARTING, State.INVALID])

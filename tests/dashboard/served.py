@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 from gz_onboard.bus._can import can
 from gz_onboard.bus.channel import CanChannel
+from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.publisher import Publisher
 from gz_onboard.dashboard.server import Feed
+from gz_onboard.dashboard.vehicle_frames import VehicleFrames
 from gz_onboard.dashboard.view import View
 from gz_onboard.dashboard.web import feed_from, served
-from gz_onboard.events import Estimate
+from gz_onboard.events import Estimate, Frame
+from gz_onboard.vehicle import read_vehicle
 from tests.dashboard.test_terminal import COUNTS, send
+
+VEHICLE = load_database([find_dbc("vehicle.dbc")])
 
 
 @contextmanager
-def dashboard(channel: str, listen: str = "127.0.0.1:0") -> Iterator[str]:
+def dashboard(channel: str, listen: str = "127.0.0.1:0", vehicle: VehicleFrames | None = None) -> Iterator[str]:
     """The address of a dashboard of the virtual bus `channel`."""
-    view, stop, feed = View(), threading.Event(), Feed()
+    view, stop, feed = View(vehicle=vehicle), threading.Event(), Feed()
     bus = CanChannel("virtual", channel, identifiers=view.identifiers)
     bus.open()
     with served(feed, listen) as address:
@@ -33,11 +39,40 @@ def dashboard(channel: str, listen: str = "127.0.0.1:0") -> Iterator[str]:
             bus.close()
 
 
+Own = tuple[str, dict[str, float]]
+"""A message of the reference scooter, and of its signals what is not 0."""
+
+
+def own_frame(name: str, values: dict[str, float], time_ns: int = 0) -> Frame:
+    """As the reference scooter sends it."""
+    message = VEHICLE.get_message_by_name(name)
+    data = message.encode({signal.name: values.get(signal.name, 0) for signal in message.signals}, strict=False)
+    return time_ns, message.frame_id, data, 0
+
+
+def cells(coldest: float, mean: float, hottest: float) -> Own:
+    """How warm they are [degC]."""
+    return "BMS_Cells", {"BMS_CellTempMin": coldest, "BMS_CellTempMean": mean, "BMS_CellTempMax": hottest}
+
+
+def odometer(km: float) -> Own:
+    """What it shows."""
+    return "VCU_Odometer", {"VCU_Odometer": km}
+
+
+def vehicle_frames(begin: float) -> VehicleFrames:
+    """Of the reference scooter, whose odometer was at `begin` [km] when the day began."""
+    made = VehicleFrames(read_vehicle("reference"))
+    made.take(own_frame(*odometer(begin), time.time_ns()), 0.0)
+    return made
+
+
 class Sender:
     """What a daemon sends, in its rhythm, of an estimate that can be changed meanwhile."""
 
-    def __init__(self, channel: str, estimate: Estimate) -> None:
+    def __init__(self, channel: str, estimate: Estimate, own: Sequence[Own] = ()) -> None:
         self.estimate = estimate
+        self.own = own
         self._channel = channel
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
@@ -48,6 +83,7 @@ class Sender:
             while not self._stop.wait(0.1):
                 if number % 10 == 0:
                     send(bus, publisher.range(self.estimate, COUNTS, 0))
+                    send(bus, [own_frame(*own) for own in self.own])
                 send(bus, publisher.status(self.estimate, 0))
                 number += 1
 

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from gz_onboard.bus.publisher import Publisher, sensor_signal
 from gz_onboard.dashboard.picture import ALERTS, NO_LONGER_EMPTY, Picture, picture
 from gz_onboard.dashboard.server import STATIC
+from gz_onboard.dashboard.vehicle_frames import CELLS, ODOMETER
 from gz_onboard.dashboard.view import NEARLY_EMPTY, View
 from gz_onboard.events import ROLES, Activity, Cause, Estimate, Reason, RouteState, State
 from tests.dashboard.test_terminal import COUNTS, ESTIMATE, second, seen
@@ -54,6 +55,8 @@ def test_every_number_of_the_frames():
         "activity": "riding",
         "range": {"km": 34.21, "p10_km": 26.54, "p90_km": 44.34},
         "battery": {"soc_percent": 62.4, "soc_sigma_percent": 1.2, "energy_left_wh": 895.0},
+        "cells": None,
+        "ridden_today_km": None,
         "consumption": {"recent_wh_per_km": 24.6, "expected_wh_per_km": 26.2},
         "charge": None,
         "route": None,
@@ -232,7 +235,7 @@ def test_there_is_a_word_for_everything(language):
         "activities": [activity.name.lower() for activity in Activity],
         "reasons": [str(reason.name).lower() for reason in Reason],
         "causes": [cause.name.lower() for cause in Cause if cause],
-        "messages": list(View().messages),
+        "messages": [*View().messages, CELLS, ODOMETER],
         "sensors": [r for r in ROLES if sensor_signal(r) in View().messages["RANGE_Sensors"].limits],
     }
     for group, names in groups.items():

@@ -60,6 +60,9 @@ def test_unit_is_valid_and_closed(page):
 def test_it_shows_the_daemon_and_outlives_it(page, service, ride):
     assert urlopen(f"{ADDRESS}/", timeout=30).read().startswith(b"<!doctype html>")
     wait_for(lambda: latest()["range"]["km"] is not None, 30, "a range")
+    wait_for(lambda: latest()["cells"] and latest()["odometer_km"], 30, "the vehicle's own frames")
+    day = json.loads(Path("/var/lib/gz-onboard-dashboard/day.json").read_text())
+    assert day["odometer_km"] == pytest.approx(latest()["odometer_km"], abs=5.0)
     before = pid()
     systemctl("stop", UNIT)
     wait_for(lambda: latest()["alerts"] == ["silent"], 30, "silence is told")

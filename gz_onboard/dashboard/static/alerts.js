@@ -1,8 +1,8 @@
 // What the rider must know: shown while it holds, and read out once when it begins.
-import { DASH, distance, known, percent } from "./numbers.js";
+import { DASH, distance, known, number, percent } from "./numbers.js";
 import { said, word, words } from "./words.js";
 
-const WARNINGS = ["destination_uncertain", "sensor_lost", "partly_silent"];  // the others are critical
+const WARNINGS = ["destination_uncertain", "sensor_lost", "partly_silent", "cell_too_cold"];  // the others are critical
 const SETTLED = 1500;  // ms that something holds before it is read out
 const AGAIN = 60000;  // ms until the same is read out once more
 const list = document.getElementById("alerts");
@@ -23,6 +23,8 @@ function text(alert, picture) {
     channel: picture?.channel ?? "",
     file: picture?.file ?? "",
     end: distance(end),
+    coldest: `${number(picture?.cells?.coldest_degc)}\u00a0°C`,
+    hottest: `${number(picture?.cells?.hottest_degc)}\u00a0°C`,
     soc: percent(picture?.battery.soc_percent),
     which: [...lost, ...bad].join(", ") || DASH,
   });

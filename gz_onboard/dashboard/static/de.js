@@ -29,7 +29,10 @@ export default {
   "ends_after": "Batterie endet nach {end}",
   "rated": "neben der Ladung, gegen die Nennreichweite {range}",
   "no_causes": "keine Ursache bekannt",
-  "not_known": "nicht bekannt",
+  "ridden": "{ridden} gefahren",
+  "band_ridden": "Heute wurden {ridden} gefahren.",
+  "cells": "Zellen {hottest}\u00a0°C",
+  "cells_between": "Zellen {coldest} bis {hottest}\u00a0°C",
   "frames": "{received} Botschaften, {lost} verloren, {bad} fehlerhaft",
   "because": "{state}, weil:",
   "less_certain": "weniger sicher, weil:",
@@ -63,6 +66,8 @@ export default {
     "unheard": "Von der Reichweitenschätzung kam auf {channel} noch nichts ({file}).",
     "partly_silent": "Einige Werte werden nicht mehr erneuert.",
     "range_invalid": "Die Reichweite lässt sich nicht angeben.",
+    "cell_too_hot": "Eine Batteriezelle ist zu heiß: {hottest}.",
+    "cell_too_cold": "Eine Batteriezelle ist zu kalt: {coldest}.",
     "destination_unreachable": "Das Ziel ist nicht erreichbar.",
     "destination_unreachable_after": "Das Ziel ist nicht erreichbar: die Batterie endet nach {end}.",
     "battery_nearly_empty": "Die Batterie ist fast leer: {soc}.",
@@ -99,7 +104,8 @@ export default {
   "messages": {
     "RANGE_Estimate": "Reichweite", "RANGE_Energy": "Energie und Verbrauch",
     "RANGE_Status": "Ladezustand und Zustand", "RANGE_Diagnosis": "Zähler", "RANGE_Sensors": "Sensoren",
-    "RANGE_Why": "Ursachen", "RANGE_Route": "Route", "RANGE_Charge": "Laden"
+    "RANGE_Why": "Ursachen", "RANGE_Route": "Route", "RANGE_Charge": "Laden",
+    "cell_temperature": "Zelltemperatur", "odometer": "Kilometerzähler"
   },
   "sensors": {
     "pack_voltage": "Batteriespannung", "pack_current": "Batteriestrom", "inverter_voltage": "Umrichterspannung",

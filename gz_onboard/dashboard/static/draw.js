@@ -7,13 +7,14 @@ import { said, word, words } from "./words.js";
 
 const NOTHING = {
   channel: "", state: null, activity: null, range: { km: null, p10_km: null, p90_km: null },
-  battery: { soc_percent: null, soc_sigma_percent: null, energy_left_wh: null },
+  battery: { soc_percent: null, soc_sigma_percent: null, energy_left_wh: null }, cells: null, ridden_today_km: null,
   consumption: { recent_wh_per_km: null, expected_wh_per_km: null }, charge: null, route: null, rated_km: null,
   causes: [], reasons: [], distrusted: [], late: [], stale: [], alerts: [], counts: null,
 };
 const SHOWN_BY = {  // the places that a message fills
   RANGE_Estimate: ["range"], RANGE_Status: ["charge-level", "state"], RANGE_Energy: ["energy", "consumption"],
   RANGE_Charge: ["charge"], RANGE_Route: ["route"], RANGE_Why: ["why"],
+  cell_temperature: ["cells"], odometer: ["ridden"],
 };
 const SIGNS = { valid: "✓", degraded: "!", invalid: "✕", starting: "…", none: "?" };
 const SAME = 0.03;  // a consumption so near to the expected is as expected
@@ -42,19 +43,23 @@ function bullets(id, title, lines) {
   );
 }
 
-function drawRange({ range, route }) {
+function drawRange({ range, route, ridden_today_km: ridden }) {
   put("range-value", distanceOnly(range.km));
   const places = { p10: distanceOnly(range.p10_km), p90: distanceOnly(range.p90_km), unit: settings.unit };
   put("interval", known(range.km) ? said(words().interval, places) : DASH);
   put("share", known(range.km) ? words().share : "");
-  drawBand(range, route);
+  put("ridden", known(ridden) ? said(words().ridden, { ridden: distance(ridden) }) : "");
+  drawBand(range, route, ridden);
 }
 
-function drawBattery({ battery }) {
+function drawBattery({ battery, cells }) {
   const { soc_percent: soc, soc_sigma_percent: sigma } = battery;
   put("soc-value", number(soc));
   put("soc-sigma", known(sigma) ? said(words().sigma, { sigma: number(sigma, 1) }) : "");
   put("energy", known(battery.energy_left_wh) ? said(words().left, { energy: energy(battery.energy_left_wh) }) : DASH);
+  hide("cells", !cells);
+  const [coldest, hottest] = [cells?.coldest_degc, cells?.hottest_degc].map((value) => number(value));
+  put("cells", coldest === hottest ? said(words().cells, { hottest }) : said(words().cells_between, { coldest, hottest }));
   const [full, doubt] = byId("soc-bar").children;
   full.hidden = !known(soc);
   doubt.hidden = !known(soc) || !known(sigma);

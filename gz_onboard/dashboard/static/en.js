@@ -29,7 +29,10 @@ export default {
   "ends_after": "battery ends after {end}",
   "rated": "besides the charge, against the rated {range}",
   "no_causes": "no cause is known",
-  "not_known": "not known",
+  "ridden": "{ridden} ridden",
+  "band_ridden": "{ridden} were ridden today.",
+  "cells": "cells {hottest}\u00a0°C",
+  "cells_between": "cells {coldest} to {hottest}\u00a0°C",
   "frames": "{received} range frames, {lost} lost, {bad} bad",
   "because": "{state} because:",
   "less_certain": "less certain because:",
@@ -63,6 +66,8 @@ export default {
     "unheard": "Nothing has come yet from the range estimator on {channel} ({file}).",
     "partly_silent": "Some values are no longer renewed.",
     "range_invalid": "The range cannot be told.",
+    "cell_too_hot": "A battery cell is too hot: {hottest}.",
+    "cell_too_cold": "A battery cell is too cold: {coldest}.",
     "destination_unreachable": "The destination cannot be reached.",
     "destination_unreachable_after": "The destination cannot be reached: the battery ends after {end}.",
     "battery_nearly_empty": "The battery is nearly empty: {soc}.",
@@ -99,7 +104,7 @@ export default {
   "messages": {
     "RANGE_Estimate": "range", "RANGE_Energy": "energy and consumption", "RANGE_Status": "state of charge and state",
     "RANGE_Diagnosis": "counts", "RANGE_Sensors": "sensors", "RANGE_Why": "causes", "RANGE_Route": "route",
-    "RANGE_Charge": "charge"
+    "RANGE_Charge": "charge", "cell_temperature": "cell temperature", "odometer": "odometer"
   },
   "sensors": {
     "pack_voltage": "pack voltage", "pack_current": "pack current", "inverter_voltage": "inverter voltage",

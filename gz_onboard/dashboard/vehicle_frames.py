@@ -1,0 +1,136 @@
+"""What the page shows of the vehicle's own frames: how warm its cells are, and how far it was ridden today.
+
+The range frames say neither. The frames are read by the vehicle's DBC files, as the daemon reads them.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+from gz_onboard.bus.codec import Codec
+from gz_onboard.bus.layout import identifiers_of
+from gz_onboard.events import STALE_PERIODS, Frame
+from gz_onboard.physics.derating import Derating
+from gz_onboard.vehicle import Vehicle
+
+CELLS = "cell_temperature"
+COLDEST, HOTTEST = "coldest_cell_temperature", "hottest_cell_temperature"
+ODOMETER = "odometer"
+SHOWN = CELLS, COLDEST, HOTTEST, ODOMETER
+LATE_PERIODS = 3
+PERIOD = 1.0  # s, where nothing says it
+RIDING = -20.0, 60.0  # degC: usual data sheets of lithium-ion cells, where the vehicle file says nothing
+CHARGING = 0.0, 45.0  # degC: likewise
+
+
+class VehicleFrames:
+    """The newest of what is shown, by the vehicle's mapping.
+
+    No clock: times [s, monotonic] come with the frames, and the day is that of their stamps. kept: the file that says
+    where the day began, which may not be there yet.
+    """
+
+    def __init__(self, vehicle: Vehicle, kept: Path | None = None) -> None:
+        mapping = vehicle.mapping
+        chosen, of_instruments = (
+            tuple(source for source in sources if source.role in SHOWN)
+            for sources in (mapping.sources, mapping.instruments)
+        )
+        self.identifiers = identifiers_of(mapping, {source.message for source in (*chosen, *of_instruments)})
+        self._limits = cell_limits(vehicle.derating)
+        self._codec = Codec(replace(mapping, sources=chosen + of_instruments))
+        self._period = {role: group.period or PERIOD for group in self._codec.groups for role in group.roles}
+        self._last: dict[str, tuple[float, float]] = {}  # by role: value, time
+        self._day = Day(kept)
+
+    def take(self, frame: Frame, now: float) -> None:
+        """Take in a frame that came at `now`; one that is not of these, or fails a check, is left out."""
+        for _, group, values in self._codec.decode([frame]):
+            for role, value in zip(self._codec.groups[group].roles, values, strict=True):
+                if value is not None:
+                    self._last[role] = value, now
+                    if role == ODOMETER:
+                        self._day.take(value / 1e3, frame[0])
+
+    def value(self, role: str, now: float) -> float | None:
+        """The newest of a role; None if it is stale or never came."""
+        if role not in self._last:
+            return None
+        value, came = self._last[role]
+        return value if now - came <= STALE_PERIODS * self._period[role] else None
+
+    def cells(self, now: float) -> tuple[float, float] | None:
+        """The coldest and the warmest cell [degC]; None if nothing says it."""
+        known = [value for role in (COLDEST, CELLS, HOTTEST) if (value := self.value(role, now)) is not None]
+        return (min(known), max(known)) if known else None
+
+    def ridden(self, now: float) -> float | None:
+        """[km] since the day began, or since this was started if nothing was kept; None if nothing says it."""
+        return None if self.value(ODOMETER, now) is None else self._day.ridden
+
+    def late(self, now: float) -> tuple[str, ...]:
+        """Of which a newer value should have come, and which are not stale yet."""
+        roles = {CELLS: (COLDEST, CELLS, HOTTEST), ODOMETER: (ODOMETER,)}
+        return tuple(name for name, of in roles.items() if self._late(of, now))
+
+    def _late(self, roles: tuple[str, ...], now: float) -> bool:
+        there = [role for role in roles if self.value(role, now) is not None]
+        return any(now - self._last[role][1] > LATE_PERIODS * self._period[role] for role in there)
+
+    def limits(self, charging: bool) -> tuple[float, float]:
+        """Between which temperatures [degC] the cells should be."""
+        low, high = self._limits
+        return (max(low, CHARGING[0]), min(high, CHARGING[1])) if charging else (low, high)
+
+
+def cell_limits(derating: Derating) -> tuple[float, float]:
+    """Between which temperatures [degC] the controller gives its full current; the usual ones if it says nothing."""
+    curve = derating.current_by_cell_temperature
+    full = [at for at, share in zip(curve.at, curve.share, strict=True) if share >= 1.0] or list(RIDING)
+    low = full[0] if curve.share[0] < 1.0 else RIDING[0]
+    return low, full[-1] if curve.share[-1] < 1.0 else RIDING[1]
+
+
+class Day:
+    """How far was ridden on the day of the last frame, by the odometer."""
+
+    def __init__(self, kept: Path | None) -> None:
+        self._kept = kept
+        self._date, self._begin = _read(kept) if kept else ("", 0.0)  # of the day; the odometer [km] then
+        self._last: float | None = None  # km
+
+    @property
+    def ridden(self) -> float | None:
+        """[km]; None before the odometer was seen."""
+        return None if self._last is None else self._last - self._begin
+
+    def take(self, odometer: float, stamp_ns: int) -> None:
+        """The odometer [km] at a time [ns since 1970]."""
+        date = time.strftime("%Y-%m-%d", time.localtime(stamp_ns * 1e-9))
+        if date != self._date or odometer < self._begin:
+            before = self._last if self._last is not None and self._last <= odometer else odometer
+            self._date, self._begin = date, before
+            if self._kept:
+                self._keep(self._kept)
+        self._last = odometer
+
+    def _keep(self, file: Path) -> None:
+        new = file.with_name(f"{file.name}.new")
+        try:
+            new.write_text(json.dumps({"date": self._date, "odometer_km": round(self._begin, 3)}), encoding="utf-8")
+            new.replace(file)
+        except OSError as error:
+            print(f"dashboard: where the day began is not kept: {file}: {error.strerror}", file=sys.stderr)
+
+
+def _read(file: Path) -> tuple[str, float]:
+    """Date and odometer [km] in the file; of one that is damaged or not there a day that never was."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+        return str(found["date"]), float(found["odometer_km"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "", 0.0

@@ -1,0 +1,151 @@
+"""What the page shows of the vehicle's own frames: the cells' temperature, and the day's distance by the odometer."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from gz_onboard import cli
+from gz_onboard.bus.codec import CONFIRM
+from gz_onboard.bus.publisher import Publisher
+from gz_onboard.dashboard.picture import Picture, picture
+from gz_onboard.dashboard.vehicle_frames import RIDING, VehicleFrames, cell_limits
+from gz_onboard.dashboard.view import View
+from gz_onboard.events import Activity, Estimate
+from gz_onboard.physics.derating import Derating, DeratingCurve
+from gz_onboard.vehicle import read_vehicle
+from tests.dashboard.served import Own, cells, odometer, own_frame
+from tests.dashboard.test_picture import HEALTHY, SOURCE
+from tests.dashboard.test_terminal import second
+from tests.support import ROOT
+
+REFERENCE = read_vehicle("reference")
+DAY = 86_400 * 10**9
+NOON = 1_750_000_000 * 10**9 // DAY * DAY + DAY // 2
+
+
+def of(estimate: Estimate, *own: Own, before: tuple[str, ...] = (), after: float = 0.0) -> Picture:
+    view = View(vehicle=VehicleFrames(REFERENCE))
+    for frame in [*second(Publisher(), estimate), *(own_frame(*one) for one in own)]:
+        view.take(frame, 100.0)
+    return picture(view, 100.0 + after, SOURCE, True, before)
+
+
+def test_cells_and_distance_are_those_of_the_frames():
+    got = json.loads(of(HEALTHY, odometer(1000.0), cells(21, 24, 27), odometer(1012.4)).encoded())
+    assert got["cells"] == {"coldest_degc": 21.0, "hottest_degc": 27.0}
+    assert got["ridden_today_km"] == 12.4
+    assert got["alerts"] == []
+
+
+def test_without_them_there_is_nothing():
+    got = of(HEALTHY)
+    assert (got.cells, got.ridden_today_km) == (None, None)
+    assert got.late == ()
+
+
+@pytest.mark.parametrize(("after", "late", "there"), [(2.9, False, True), (3.1, True, True), (10.1, False, False)])
+def test_an_old_value_is_said_to_be_late_and_then_is_gone(after, late, there):
+    got = of(HEALTHY, odometer(1000.0), cells(21, 24, 55), after=after)
+    assert ("cell_temperature" in got.late) == ("odometer" in got.late) == late
+    assert (got.cells is not None) == (got.ridden_today_km is not None) == there
+    assert ("cell_too_hot" in got.alerts) == there
+
+
+def test_a_sensor_that_the_estimator_does_not_trust_is_not_shown():
+    distrusted = replace(HEALTHY, distrusted=("cell_temperature", "odometer"))
+    got = of(distrusted, odometer(1000.0), cells(21, 24, 55))
+    assert (got.cells, got.ridden_today_km) == (None, None)
+    assert "cell_too_hot" not in got.alerts
+
+
+@pytest.mark.parametrize(
+    ("activity", "own", "before", "alerts"),
+    [  # the controller of the reference scooter gives its full current from -5 to 50 degC
+        (Activity.RIDING, cells(-5, 0, 50), (), ()),
+        (Activity.RIDING, cells(20, 30, 51), (), ("cell_too_hot",)),
+        (Activity.RIDING, cells(-6, 0, 2), (), ("cell_too_cold",)),
+        (Activity.RIDING, cells(20, 30, 49), ("cell_too_hot",), ("cell_too_hot",)),
+        (Activity.RIDING, cells(20, 30, 47), ("cell_too_hot",), ()),
+        (Activity.RIDING, cells(-4, 0, 2), ("cell_too_cold",), ("cell_too_cold",)),
+        (Activity.CHARGING, cells(0, 20, 45), (), ()),
+        (Activity.CHARGING, cells(-1, 0, 2), (), ("cell_too_cold",)),
+        (Activity.CHARGING, cells(20, 30, 46), (), ("cell_too_hot",)),
+    ],
+)
+def test_a_cell_that_is_too_hot_or_too_cold_is_an_alert(activity, own, before, alerts):
+    assert of(replace(HEALTHY, activity=activity), own, before=before).alerts == alerts
+
+
+def test_limits_are_those_of_the_controller():
+    assert cell_limits(REFERENCE.derating) == (-5.0, 50.0)
+    assert cell_limits(Derating()) == RIDING
+    hot = DeratingCurve((0.0, 55.0, 60.0), (1.0, 1.0, 0.0))
+    assert cell_limits(Derating(current_by_cell_temperature=hot)) == (RIDING[0], 55.0)
+    never = DeratingCurve((0.0, 55.0), (0.9, 0.5))
+    assert cell_limits(Derating(current_by_cell_temperature=never)) == RIDING
+
+
+# --- the day ------------------------------------------------------------------------------------------------------
+
+
+def ridden(kept: Path | None, *seen: tuple[float, int]) -> float | None:
+    """Of odometers [km] at times [ns]."""
+    frames = VehicleFrames(REFERENCE, kept)
+    for km, stamp in seen:
+        for i in range(CONFIRM + 1):  # of a leap in time
+            frames.take(own_frame(*odometer(km), stamp + i), 1.0)
+    return frames.ridden(1.0)
+
+
+def test_a_day_begins_at_midnight_and_goes_on_over_a_restart(tmp_path):
+    file = tmp_path / "day.json"
+    assert ridden(file, (1000.0, NOON), (1008.0, NOON + 10**12)) == pytest.approx(8.0)
+    assert ridden(file, (1010.0, NOON + 2 * 10**12)) == pytest.approx(10.0)
+    assert ridden(file, (1010.0, NOON), (1011.0, NOON + DAY)) == pytest.approx(1.0)  # since the last of yesterday
+    assert ridden(file, (1015.0, NOON + DAY)) == pytest.approx(5.0)
+    assert ridden(file, (1020.0, NOON + 5 * DAY)) == 0.0
+    assert ridden(None, (1020.0, NOON + 5 * DAY)) == 0.0
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"date": 1}', '{"date": "2025-06-15", "odometer_km": "x"}', "\xff"])
+def test_a_damaged_file_is_begun_anew(tmp_path, text):
+    file = tmp_path / "day.json"
+    file.write_text(text, encoding="latin-1")
+    assert ridden(file, (1000.0, NOON), (1003.0, NOON)) == pytest.approx(3.0)
+    assert json.loads(file.read_text())["odometer_km"] == 1000.0
+
+
+def test_an_odometer_that_goes_back_begins_anew(tmp_path):
+    assert ridden(tmp_path / "day.json", (1000.0, NOON), (10.0, NOON), (12.0, NOON)) == pytest.approx(2.0)
+
+
+def test_a_file_that_cannot_be_written_is_said_and_costs_nothing_else(tmp_path, capsys):
+    assert ridden(tmp_path / "none" / "day.json", (1000.0, NOON), (1003.0, NOON)) == pytest.approx(3.0)
+    assert "where the day began is not kept" in capsys.readouterr().err
+
+
+# --- the command --------------------------------------------------------------------------------------------------
+
+WEB = ["dashboard", "--web", "--interface", "virtual", "--channel", "own", "--listen", "127.0.0.1:0"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status"),
+    [
+        (["--vehicle", "reference"], 0),
+        (["--dbc", "range_large.dbc"], 0),
+        (["--vehicle", str(ROOT / "tests/vehicles/none.toml")], 2),
+    ],
+)
+def test_the_vehicle_of_the_page(arguments, status):
+    assert cli.main([*WEB, "--duration", "0.1", *arguments]) == status
+
+
+@pytest.mark.parametrize("option", ["--vehicle", "--day"])
+def test_only_the_page_shows_a_vehicle(option, capsys):
+    assert cli.main(["dashboard", option, "reference", "--duration", "0.1"]) == 2
+    assert f"{option}: only with --web" in capsys.readouterr().err
