@@ -62,9 +62,9 @@ def main() -> int:
     daemon = ["run", "--vehicle", args.vehicle, *bus, *own_directories]
     replay = ["replay", str(args.ride), *bus, "--speed", str(args.speed)]
     dbc = read_vehicle(args.vehicle).range_dbc
-    dashboard = ["dashboard", *bus, "--dbc", str(dbc)]
+    dashboard = ["dashboard", *bus, "--vehicle", args.vehicle]
     listen = f"127.0.0.1:{free_port()}"
-    page = [*dashboard, "--web", "--listen", listen, "--vehicle", args.vehicle]
+    page = [*dashboard, "--web", "--listen", listen]
 
     where = "in-process virtual bus" if args.interface == "virtual" else f"{args.channel} of Linux {os.uname().release}"
     print(f"=== {args.ride.name} on the {where}, for at most {args.seconds:g} s")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from gz_onboard import notify
 from gz_onboard.bridges.live_positions import LivePositions
 from gz_onboard.constants import WH
-from gz_onboard.dashboard.command import add_source, source_of
+from gz_onboard.dashboard.command import add_source, channel_of, range_view
 from gz_onboard.dashboard.picture import Picture
 from gz_onboard.dashboard.pictures import pictures
 from gz_onboard.dashboard.server import host_and_port
@@ -23,7 +23,7 @@ from gz_onboard.events import Frame, RouteState
 from gz_onboard.location_rows import LOCATION_SCHEMA, LOCATION_TOPIC
 from gz_onboard.log_rows import ESTIMATE_TOPIC, ESTIMATE_UNITS, estimate_schema
 from gz_onboard.options import add_shared
-from gz_onboard.vehicle import read_vehicle
+from gz_onboard.vehicle import Vehicle, read_vehicle
 
 if TYPE_CHECKING:
     import foxglove
@@ -35,7 +35,7 @@ UNKNOWN = "UNKNOWN"  # of state and activity, when nothing says so
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard foxglove``."""
     add_source(parser)
-    vehicle = "show also where it is: name of a built-in vehicle, or a vehicle file that maps latitude and longitude"
+    vehicle = "the vehicle, as for run: its range frames, and where it is, if its file maps latitude and longitude"
     add_shared(parser, "--vehicle", default=None, help=vehicle)
     listen = "where Foxglove finds it (default: %(default)s; port 0: any free one)"
     parser.add_argument("--listen", metavar="ADDRESS:PORT", default=LISTEN, help=listen)
@@ -46,11 +46,10 @@ def run(arguments: argparse.Namespace) -> int:
     require("foxglove")
     host, port = host_and_port(arguments.listen)
     end = time.monotonic() + (arguments.duration or math.inf)
-    positions = LivePositions(read_vehicle(arguments.vehicle)) if arguments.vehicle else None
-    with (
-        source_of(arguments, positions.identifiers if positions else ()) as (view, channel),
-        until_signalled() as stopped,
-    ):
+    view = range_view(arguments)
+    positions = _positions(read_vehicle(arguments.vehicle)) if arguments.vehicle else None
+    others = positions.identifiers if positions else ()
+    with channel_of(arguments, view, others) as channel, until_signalled() as stopped:
         import foxglove
 
         context = foxglove.Context()
@@ -72,6 +71,14 @@ def run(arguments: argparse.Namespace) -> int:
             notify.stopping()
             server.stop()
     return OK
+
+
+def _positions(vehicle: Vehicle) -> LivePositions | None:
+    """Those of the vehicle, if its file maps any."""
+    if lacking := LivePositions.lacking(vehicle):
+        _say(f"{vehicle.file}: [roles] has no {' and no '.join(lacking)}: no position is shown")
+        return None
+    return LivePositions(vehicle)
 
 
 class _Places:

@@ -37,6 +37,10 @@ def _km(name: str) -> Sensor:
     return Sensor(name, "distance", "km", digits=1)
 
 
+def _degrees(name: str) -> Sensor:
+    return Sensor(name, "temperature", "°C", digits=0)
+
+
 def _names(members: type[State] | type[Activity]) -> tuple[str, ...]:
     return tuple(member.name.lower() for member in members)
 
@@ -56,6 +60,9 @@ SENSORS = {
     "route_left": _km("Distance to the destination"),
     "arrival_state_of_charge": Sensor("State of charge on arrival", "battery", "%", digits=0),
     "rated_range": _km("Rated range"),
+    "ridden_today": _km("Ridden today"),
+    "cell_temperature_coldest": _degrees("Coldest cell"),
+    "cell_temperature_hottest": _degrees("Hottest cell"),
     "activity": Sensor("Activity", "enum", options=_names(Activity)),
     "state": Sensor("State of the estimate", "enum", options=_names(State)),
     "alert": Sensor("Alert", "enum", options=(NONE, *ALERTS)),
@@ -76,7 +83,7 @@ def discovery_topic(name: str) -> str:
 
 def state_of(picture: Picture, status: str) -> dict[str, object]:
     """The values of a picture by name, None for what is stale, not available or never came."""
-    charge, route = picture.charge, picture.route
+    charge, route, cells = picture.charge, picture.route, picture.cells
     return {
         "status": status,
         "range": picture.range.km,
@@ -93,6 +100,9 @@ def state_of(picture: Picture, status: str) -> dict[str, object]:
         "route_left": route.left_km if route else None,
         "arrival_state_of_charge": route.arrival_soc_percent if route else None,
         "rated_range": picture.rated_km,
+        "ridden_today": picture.ridden_today_km,
+        "cell_temperature_coldest": cells.coldest_degc if cells else None,
+        "cell_temperature_hottest": cells.hottest_degc if cells else None,
         "activity": picture.activity,
         "state": picture.state,
         "alert": next(iter(picture.alerts), NONE) if status == ONLINE else None,

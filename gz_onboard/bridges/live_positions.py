@@ -17,15 +17,11 @@ ROLES = *NEEDED, "gps_altitude", "gps_fix"
 
 
 class LivePositions:
-    """The positions in a vehicle's frames, as they come; InputError if its file maps none."""
+    """The positions in a vehicle's frames, as they come."""
 
     def __init__(self, vehicle: Vehicle) -> None:
         mapping = vehicle.mapping
         mapped = {source.role: source.message for source in mapping.sources if source.role in ROLES}
-        if lacking := [role for role in NEEDED if role not in mapped]:
-            raise vehicle.error(
-                f"[roles] has no {' and no '.join(lacking)}, so there is no position to show; leave --vehicle out"
-            )
         self.identifiers = identifiers_of(mapping, set(mapped.values()))  # of the frames that it needs
         self._codec = Codec(mapping)
         self._signals = Signals(
@@ -34,6 +30,12 @@ class LivePositions:
             for role in group.roles
         )
         self._positions = Positions()
+
+    @staticmethod
+    def lacking(vehicle: Vehicle) -> list[str]:
+        """The roles without which there are none."""
+        mapped = {source.role for source in vehicle.mapping.sources}
+        return [role for role in NEEDED if role not in mapped]
 
     def take(self, frames: Sequence[Frame]) -> Iterator[dict[str, Any]]:
         """Take in frames, in the order of their times; gives each new position as a row."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from gz_onboard import notify
 from gz_onboard.bridges import home_assistant
 from gz_onboard.bridges.broker import PASSWORD, USER, Address, Broker
-from gz_onboard.dashboard.command import add_source, source_of
+from gz_onboard.dashboard.command import add_source, add_vehicle, channel_of, view_of
 from gz_onboard.dashboard.picture import Picture, picture
 from gz_onboard.dashboard.pictures import clock, pictures
 from gz_onboard.dashboard.stopping import until_signalled
@@ -29,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("broker", metavar="HOST[:PORT]", help="the broker (port: 1883, with --tls 8883)")
     add_source(parser)
+    add_vehicle(parser)
     add("--name", help="name of the vehicle, in topics and in Home Assistant (default: that of this machine)")
     add(
         "--tls",
@@ -49,8 +50,9 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--name {name}: must be of letters, digits, - and _, at most 64")
     address = Address.of(arguments.broker, arguments.tls, arguments.login)
     end = time.monotonic() + (arguments.duration or math.inf)
-    with source_of(arguments) as (view, channel), until_signalled() as stopped:
-        nothing = picture(View(view.file), clock(), (channel.name, channel.interface), False)
+    view = view_of(arguments)
+    with channel_of(arguments, view) as channel, until_signalled() as stopped:
+        nothing = picture(View(view.source), clock(), (channel.name, channel.interface), False)
         offline = home_assistant.encoded(home_assistant.state_of(nothing, home_assistant.OFFLINE))
         broker = Broker(address, name, (home_assistant.topic_of(name), offline), _say)
         bridge = Bridge(broker, name)

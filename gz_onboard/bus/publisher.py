@@ -65,6 +65,10 @@ class Publisher:
         """Of the frames that are sent; EFF_FLAG is set in those of 29 bits."""
         return frozenset(layout.identifier for layout in self._layouts.values())
 
+    def sent(self) -> dict[int, Message]:
+        """What is sent, by the identifiers that are used."""
+        return {self._layouts[name].identifier: message for name, message in self.messages.items()}
+
     def may_have_sent(self, frame: Frame) -> bool:
         """Whether `frame` is like ours, in identifier and checksum: an earlier run's, if it stands in a log."""
         _, identifier, data, _ = frame

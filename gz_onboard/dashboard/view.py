@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.checksum import crc8_sae_j1850
-from gz_onboard.bus.dbc import find_dbc
-from gz_onboard.bus.layout import identifier_of, raw_range
-from gz_onboard.bus.publisher import KNOWN, RANGE_DBC, range_messages, reason_signal, sensor_signal
+from gz_onboard.bus.layout import raw_range
+from gz_onboard.bus.publisher import KNOWN, Publisher, reason_signal, sensor_signal
 from gz_onboard.events import ROLES, STALE_PERIODS, Activity, Cause, Frame, Reason, State
 
 if TYPE_CHECKING:
@@ -60,21 +59,24 @@ class Received:
 
 
 class View:
-    """What the range frames of a DBC file say, of the package's ``range.dbc`` if none is given.
+    """What the range frames say: those of a vehicle's publisher, or of a DBC file, the package's ``range.dbc`` if none
+    is given.
 
     No clock: times [s, monotonic] come with the frames. InputError if the file has not what ``range.dbc`` has.
     """
 
-    def __init__(self, file: Path | None = None, vehicle: VehicleFrames | None = None) -> None:
-        self.file = file or find_dbc(RANGE_DBC)
+    def __init__(self, source: Publisher | Path | None = None, vehicle: VehicleFrames | None = None) -> None:
+        publisher = source if isinstance(source, Publisher) else Publisher(source)
+        self.source = publisher
+        self.file = publisher.file
         self.vehicle = vehicle  # of what is shown of the vehicle's own frames
-        messages = range_messages(self.file)
+        messages = publisher.messages
         self.messages: dict[str, Received] = {}
         self.comments = {s.name: s.comment or "" for m in messages.values() for s in m.signals}
         for name, message in messages.items():
             limits = {s.name: raw_range(s, not_available=True) for s in message.signals}
             self.messages[name] = Received(message, (message.cycle_time or PERIODS.get(name, 1000)) / 1000, limits)
-        self._by_identifier = {identifier_of(entry.definition): entry for entry in self.messages.values()}
+        self._by_identifier = {i: self.messages[message.name] for i, message in publisher.sent().items()}
 
     @property
     def identifiers(self) -> list[int] | None:

@@ -216,7 +216,7 @@ def test_encrypted(tmp_path, monkeypatch):
 def test_units_and_classes_go_together():
     """As Home Assistant's documentation has them; a pair that it does not know makes it drop the sensor."""
     known = {"distance": "km", "battery": "%", "energy_storage": "Wh", "energy_distance": "Wh/km", "power": "W"}
-    known["duration"] = "min"
+    known |= {"duration": "min", "temperature": "°C"}
     about: Any = home_assistant.discovery("scooter")
     assert len({sensor["unique_id"] for sensor in about["components"].values()}) == len(home_assistant.SENSORS)
     for key, sensor in about["components"].items():

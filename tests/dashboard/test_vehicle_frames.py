@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 from gz_onboard import cli
 from gz_onboard.bus.codec import CONFIRM
 from gz_onboard.bus.publisher import Publisher
+from gz_onboard.dashboard.command import range_view, view_of
 from gz_onboard.dashboard.picture import Picture, picture
 from gz_onboard.dashboard.vehicle_frames import RIDING, VehicleFrames, cell_limits
 from gz_onboard.dashboard.view import View
@@ -145,7 +147,21 @@ def test_the_vehicle_of_the_page(arguments, status):
     assert cli.main([*WEB, "--duration", "0.1", *arguments]) == status
 
 
-@pytest.mark.parametrize("option", ["--vehicle", "--day"])
-def test_only_the_page_shows_a_vehicle(option, capsys):
-    assert cli.main(["dashboard", option, "reference", "--duration", "0.1"]) == 2
-    assert f"{option}: only with --web" in capsys.readouterr().err
+@pytest.mark.parametrize("shows", [view_of, range_view])
+def test_a_vehicle_whose_range_frames_have_identifiers_of_its_own(tmp_path, shows):
+    """As `vehicle new` writes them: nobody need write a DBC file for the dashboard."""
+    file = tmp_path / "v.toml"
+    new = ["--kind", "scooter", "--cells", "nmc", "--series", "14", "--capacity", "30", "--mass", "110"]
+    assert cli.main(["vehicle", "new", str(file), *new, "--wheel-radius", "0.22"]) == 0
+    view = shows(argparse.Namespace(vehicle=str(file), dbc=None))
+    frames = second(read_vehicle(file).publisher(), HEALTHY)
+    assert min(frame[1] for frame in frames) == 0x6A0
+    assert {frame[1] for frame in frames} <= set(view.identifiers or [])
+    for frame in frames:
+        view.take(frame, 100.0)
+    assert view.value("RANGE_Remaining", 100.0) == 34.21
+
+
+def test_only_the_page_keeps_a_day(capsys):
+    assert cli.main(["dashboard", "--day", "day.json", "--duration", "0.1"]) == 2
+    assert "--day day.json: only with --web" in capsys.readouterr().err
