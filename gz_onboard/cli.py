@@ -48,6 +48,9 @@ class _Parser(argparse.ArgumentParser):
     """argparse that names the nearest right option or command."""
 
     def error(self, message: str) -> NoReturn:
+        if message.startswith("the following arguments are required: ") and self._subparsers:
+            self.print_help(sys.stderr)  # which commands there are is what is asked
+            self.exit(BAD_INPUT, f"\n{self.prog}: error: {message}\n")
         wrong, _, choices = message.partition("invalid choice: ")[2].partition(" (choose from ")
         if wrong:
             message += nearest(wrong.strip("'"), re.findall(r"[^\s',)]+", choices))

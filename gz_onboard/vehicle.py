@@ -45,6 +45,21 @@ class Vehicle:
 
     __repr__ = brief
 
+    def __str__(self) -> str:
+        """In a few lines: what somebody wants to see who has read it."""
+        cells = (
+            self.battery and f"{self.battery.cells_series} cells in series, {self.battery.cells_parallel} in parallel"
+        )
+        columns = self.mapping.columns
+        roles = columns.values if columns else [source.role for source in self.mapping.sources]
+        lines = [
+            f"{self.name} ({self.file})",
+            f"  battery  {cells or 'none'}",
+            f"  effects  {', '.join(effect.name for effect in self.model.effects)}",
+            f"  roles    {', '.join(roles) or 'none'}",
+        ]
+        return "\n".join(lines)
+
     @property
     def key(self) -> str:
         """What a saved state must agree with to be of use: the vehicle, its cells and its model list."""

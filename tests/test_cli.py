@@ -274,6 +274,16 @@ def test_every_page_of_help(command: str):
     assert "%(" not in page
 
 
+@pytest.mark.parametrize(("words", "among"), [([], "estimate"), (["vehicle"], "check"), (["history"], "remove")])
+def test_without_a_command_it_says_which_there_are(capsys: pytest.CaptureFixture[str], words: list[str], among: str):
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert f"\n    {among} " in said
+    assert "error: the following arguments are required" in said.splitlines()[-1]
+
+
 def test_help_as_it_is_asked_for(capsys: pytest.CaptureFixture[str]):
     assert status("--help") == 0
     page = capsys.readouterr().out

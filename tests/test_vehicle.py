@@ -71,6 +71,13 @@ def test_a_vehicle_without_a_battery_has_none(tmp_path):
     assert read_vehicle(str(file)).battery is None
 
 
+def test_a_vehicle_is_printed_in_a_few_lines():
+    lines = str(read_vehicle("reference")).splitlines()
+    assert lines[0] == f"reference-scooter ({OWN / 'reference.toml'})"
+    assert [line.split()[0] for line in lines[1:]] == ["battery", "effects", "roles"]
+    assert "14 cells in series" in lines[1]
+
+
 def test_a_vehicle_that_is_not_there():
     with pytest.raises(InputError, match=r"refrence: no such vehicle file; .*reference.*did you mean 'reference'"):
         find_vehicle("refrence")
