@@ -10,6 +10,7 @@ import argparse
 import json
 import os
 import resource
+import struct
 import subprocess
 import sys
 import threading
@@ -23,7 +24,7 @@ from urllib.request import urlopen
 from gz_onboard import cli
 from gz_onboard.bus._can import can
 from gz_onboard.bus.publisher import Counts, Publisher
-from gz_onboard.events import Activity, Estimate, State
+from gz_onboard.events import Activity, Estimate, Frame, State
 
 FIRST = 3.0  # s: start-up, which is not measured
 ESTIMATE = Estimate(
@@ -44,6 +45,12 @@ WATCH = """() => { window.drawn = []; new MutationObserver(
 ).observe(energy, {childList: true, characterData: true, subtree: true}); }"""
 
 
+def _of_the_vehicle(number: int) -> list[Frame]:
+    """Odometer [m] and cell temperatures, as the reference scooter sends them each second."""
+    cells = struct.pack("<HHBBBB", 3700, 3720, 40 + 22, 40 + 27, 40 + 24, 40 + 23)
+    return [(0, 769, struct.pack("<II", 1_000_000 + number, 0), 0), (0, 513, cells, 0)]
+
+
 def child(seconds: float) -> None:
     """Serve, send and measure; writes a line of JSON at the end."""
     sent: dict[str, float] = {}
@@ -57,7 +64,8 @@ def child(seconds: float) -> None:
             while (passed := time.monotonic() - begin) < FIRST + seconds:
                 estimate = replace(ESTIMATE, energy_left=(895 - number // 10) * 3600.0, soc=0.624 - 2e-5 * number)
                 frames = publisher.range(estimate, Counts(), 0) if number % 10 == 0 else []
-                for _, identifier, data, _ in [*frames, *publisher.status(estimate, 0)]:
+                vehicle = _of_the_vehicle(number) if frames else []
+                for _, identifier, data, _ in [*vehicle, *frames, *publisher.status(estimate, 0)]:
                     bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
                 if frames:
                     sent[f"{895 - number // 10} Wh left"] = time.time() * 1000
