@@ -8,6 +8,7 @@ import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard import notify
@@ -18,7 +19,7 @@ from gz_onboard.dashboard.picture import Picture
 from gz_onboard.dashboard.pictures import pictures
 from gz_onboard.dashboard.server import host_and_port
 from gz_onboard.dashboard.stopping import until_signalled
-from gz_onboard.errors import OK, InputError, require
+from gz_onboard.errors import OK, InputError, require, writing
 from gz_onboard.events import Frame, RouteState
 from gz_onboard.location_rows import LOCATION_SCHEMA, LOCATION_TOPIC
 from gz_onboard.log_rows import ESTIMATE_TOPIC, ESTIMATE_UNITS, estimate_schema
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     import foxglove
 
 LISTEN = "127.0.0.1:8765"
+LAYOUT = Path(__file__).with_name("foxglove_layout.json")
 UNKNOWN = "UNKNOWN"  # of state and activity, when nothing says so
 
 
@@ -39,10 +41,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_shared(parser, "--vehicle", default=None, help=vehicle)
     listen = "where Foxglove finds it (default: %(default)s; port 0: any free one)"
     parser.add_argument("--listen", metavar="ADDRESS:PORT", default=LISTEN, help=listen)
+    layout = "write the layout that fits logs and live topics, for Foxglove to import, and end"
+    parser.add_argument("--write-layout", type=Path, metavar="FILE", help=layout)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard foxglove``: 0 when it is ended; InputError for what cannot be used."""
+    if arguments.write_layout:
+        with writing(arguments.write_layout):
+            arguments.write_layout.write_bytes(LAYOUT.read_bytes())
+        return OK
     require("foxglove")
     host, port = host_and_port(arguments.listen)
     end = time.monotonic() + (arguments.duration or math.inf)

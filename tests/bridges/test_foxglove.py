@@ -18,6 +18,7 @@ from websockets.exceptions import InvalidStatus
 
 from gz_onboard import cli
 from gz_onboard.bridges import foxglove as command
+from gz_onboard.bridges.foxglove import LAYOUT
 from gz_onboard.bridges.live_positions import LivePositions
 from gz_onboard.bus._can import can
 from gz_onboard.bus.logs import read_frames
@@ -198,6 +199,13 @@ def test_positions_of_a_truck_whoever_sends_them(tmp_path):
     frames = [(10**18, identifier | EFF_FLAG, place, 0) for identifier in (0x18FEF34A, 0x18FEF44A)]
     (row,) = positions.take(frames)
     assert (row["latitude"], row["longitude"]) == (48.1, 11.6)
+
+
+def test_the_layout_is_written_where_it_is_wanted(tmp_path, capsys):
+    assert cli.main(["foxglove", "--write-layout", str(tmp_path / "layout.json")]) == 0
+    assert (tmp_path / "layout.json").read_bytes() == LAYOUT.read_bytes()
+    assert cli.main(["foxglove", "--write-layout", str(tmp_path / "none" / "layout.json")]) == 2
+    assert "there is no folder" in capsys.readouterr().err
 
 
 def test_a_vehicle_without_positions(tmp_path, capsys):
