@@ -124,6 +124,7 @@ class Broker:
         if was:
             done = self._client.publish(*self._will, qos=1, retain=True)
             done.wait_for_publish(GOODBYE)
+        self.connected = False  # it is we who go: nothing to be said of the broker
         self._client.disconnect()
         if was:
             self._client.loop_stop()  # else its thread may be waiting for an address, and ends by itself

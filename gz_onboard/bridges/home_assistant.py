@@ -31,6 +31,7 @@ class Sensor:
     options: tuple[str, ...] = ()
     digits: int | None = None  # that are shown
     diagnostic: bool = False
+    total: bool = False  # it only grows, so that Home Assistant can make days and months of it
 
 
 def _km(name: str) -> Sensor:
@@ -60,7 +61,7 @@ SENSORS = {
     "route_left": _km("Distance to the destination"),
     "arrival_state_of_charge": Sensor("State of charge on arrival", "battery", "%", digits=0),
     "rated_range": _km("Rated range"),
-    "ridden_today": _km("Ridden today"),
+    "odometer": Sensor("Odometer", "distance", "km", digits=0, total=True),
     "cell_temperature_coldest": _degrees("Coldest cell"),
     "cell_temperature_hottest": _degrees("Hottest cell"),
     "activity": Sensor("Activity", "enum", options=_names(Activity)),
@@ -100,7 +101,7 @@ def state_of(picture: Picture, status: str) -> dict[str, object]:
         "route_left": route.left_km if route else None,
         "arrival_state_of_charge": route.arrival_soc_percent if route else None,
         "rated_range": picture.rated_km,
-        "ridden_today": picture.ridden_today_km,
+        "odometer": picture.odometer_km,
         "cell_temperature_coldest": cells.coldest_degc if cells else None,
         "cell_temperature_hottest": cells.hottest_degc if cells else None,
         "activity": picture.activity,
@@ -153,7 +154,10 @@ def _component(name: str, key: str, sensor: Sensor) -> dict[str, object]:
     if sensor.kind:
         about["device_class"] = sensor.kind
     if sensor.unit:
-        about |= {"unit_of_measurement": sensor.unit, "state_class": "measurement"}
+        about |= {
+            "unit_of_measurement": sensor.unit,
+            "state_class": "total_increasing" if sensor.total else "measurement",
+        }
     if sensor.options:
         about["options"] = list(sensor.options)
     if sensor.digits is not None:

@@ -128,6 +128,7 @@ class Picture:
     range: Range
     battery: BatteryLevel
     cells: Cells | None
+    odometer_km: float | None
     ridden_today_km: float | None
     consumption: Consumption
     charge: Charge | None
@@ -164,7 +165,7 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
     charging = activity is Activity.CHARGING
     distrusted, vehicle = tuple(view.distrusted(now)), view.vehicle
     cells = vehicle.cells(now) if vehicle and CELLS not in distrusted else None
-    ridden = vehicle.ridden(now) if vehicle and ODOMETER not in distrusted else None
+    odometer, ridden = vehicle.odometer(now) if vehicle and ODOMETER not in distrusted else (None, None)
     said = {
         BUS_DOWN: not up,
         SILENT: len(stale) == len(view.messages),
@@ -187,6 +188,7 @@ def picture(view: View, now: float, source: tuple[str, str], up: bool, before: t
         range=Range(*(_rounded(value(f"RANGE_Remaining{part}")) for part in ("", "P10", "P90"))),
         battery=battery,
         cells=Cells(*(round(value, 1) for value in cells)) if cells else None,
+        odometer_km=None if odometer is None else round(odometer, 1),
         ridden_today_km=None if ridden is None else round(ridden, 1),
         consumption=Consumption(
             _rounded(value("RANGE_ConsumptionRecent")), _rounded(value("RANGE_ConsumptionExpected"))

@@ -68,9 +68,10 @@ class VehicleFrames:
         known = [value for role in (COLDEST, CELLS, HOTTEST) if (value := self.value(role, now)) is not None]
         return (min(known), max(known)) if known else None
 
-    def ridden(self, now: float) -> float | None:
-        """[km] since the day began, or since this was started if nothing was kept; None if nothing says it."""
-        return None if self.value(ODOMETER, now) is None else self._day.ridden
+    def odometer(self, now: float) -> tuple[float | None, float | None]:
+        """What it shows, and what was ridden since the day began, or since the start if nothing was kept [km]."""
+        metres = self.value(ODOMETER, now)
+        return (None, None) if metres is None else (metres / 1e3, self._day.ridden)
 
     def late(self, now: float) -> tuple[str, ...]:
         """Of which a newer value should have come, and which are not stale yet."""

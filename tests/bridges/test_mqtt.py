@@ -27,7 +27,7 @@ from gz_onboard.dashboard.view import View
 from gz_onboard.errors import InputError
 from gz_onboard.events import Activity, State
 from tests.bridges.broker import Listener, broker, free_port, listening, wait_for
-from tests.dashboard.served import Sender
+from tests.dashboard.served import Sender, cells, odometer
 from tests.dashboard.test_terminal import ESTIMATE
 
 STATE, ABOUT = "gz-onboard/scooter/state", "homeassistant/device/gz-onboard-scooter/config"
@@ -108,6 +108,18 @@ def test_home_assistant_finds_the_vehicle_and_shows_what_is_on_the_bus(tmp_path,
         assert said == [f"connected to the broker 127.0.0.1:{port}"]
     assert {topic for topic, _ in listener.heard} == {STATE, ABOUT}
     assert listener.last[STATE]["status"] == "offline"
+    assert said == [f"connected to the broker 127.0.0.1:{port}"]  # that the bridge is ended says nothing of the broker
+
+
+def test_the_vehicles_own_frames(tmp_path, monkeypatch):
+    """Read by its file: the reference scooter's, where nothing else is said."""
+    port = free_port()
+    sender = Sender("m6", ESTIMATE, [odometer(1012.4), cells(22, 24, 53)])
+    with broker(tmp_path, port), listening(port) as listener, bridge(port, "m6", monkeypatch=monkeypatch), sender:
+        wait_for(lambda: seen(listener).get("alert") == "cell_too_hot", "a hot cell")
+        found = seen(listener)
+        assert [float(found[f"cell_temperature_{end}"]) for end in ("coldest", "hottest")] == [22.0, 53.0]
+        assert float(found["odometer"]) == 1012.4
     assert seen(listener) == {}
 
 
@@ -228,7 +240,7 @@ def test_units_and_classes_go_together():
             assert sensor["options"]
         elif kind:
             assert sensor["unit_of_measurement"] == known[kind]
-            assert sensor["state_class"] == "measurement"
+            assert sensor["state_class"] == ("total_increasing" if key == "odometer" else "measurement")
 
 
 def test_each_value_of_a_picture_has_a_sensor():

@@ -100,7 +100,7 @@ def test_the_days_distance_and_the_cells(page):
     with dashboard("day", vehicle=begun) as address, Sender("day", ON_ROUTE, own) as sender:
         page.goto(address)
         shows(page, range_value="34", ridden="13 km ridden", cells="cells 22 to 27 °C", alerts="")
-        assert plain(page.get_attribute("#band", "aria-label")).endswith("13 km were ridden today.")
+        assert plain(page.get_attribute("#band", "aria-label")).endswith("13 km were ridden.")
         assert page.inner_text("#band .ticks").split("\n") == ["−13", "0", "10", "20", "30", "40", "50"]
         behind, goal = page.evaluate(
             """() => [parseFloat(document.querySelector("#band .behind").style.width),

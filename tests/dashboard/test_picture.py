@@ -56,6 +56,7 @@ def test_every_number_of_the_frames():
         "range": {"km": 34.21, "p10_km": 26.54, "p90_km": 44.34},
         "battery": {"soc_percent": 62.4, "soc_sigma_percent": 1.2, "energy_left_wh": 895.0},
         "cells": None,
+        "odometer_km": None,
         "ridden_today_km": None,
         "consumption": {"recent_wh_per_km": 24.6, "expected_wh_per_km": 26.2},
         "charge": None,

@@ -39,13 +39,13 @@ def of(estimate: Estimate, *own: Own, before: tuple[str, ...] = (), after: float
 def test_cells_and_distance_are_those_of_the_frames():
     got = json.loads(of(HEALTHY, odometer(1000.0), cells(21, 24, 27), odometer(1012.4)).encoded())
     assert got["cells"] == {"coldest_degc": 21.0, "hottest_degc": 27.0}
-    assert got["ridden_today_km"] == 12.4
+    assert (got["odometer_km"], got["ridden_today_km"]) == (1012.4, 12.4)
     assert got["alerts"] == []
 
 
 def test_without_them_there_is_nothing():
     got = of(HEALTHY)
-    assert (got.cells, got.ridden_today_km) == (None, None)
+    assert (got.cells, got.odometer_km, got.ridden_today_km) == (None, None, None)
     assert got.late == ()
 
 
@@ -60,7 +60,7 @@ def test_an_old_value_is_said_to_be_late_and_then_is_gone(after, late, there):
 def test_a_sensor_that_the_estimator_does_not_trust_is_not_shown():
     distrusted = replace(HEALTHY, distrusted=("cell_temperature", "odometer"))
     got = of(distrusted, odometer(1000.0), cells(21, 24, 55))
-    assert (got.cells, got.ridden_today_km) == (None, None)
+    assert (got.cells, got.odometer_km, got.ridden_today_km) == (None, None, None)
     assert "cell_too_hot" not in got.alerts
 
 
@@ -100,7 +100,7 @@ def ridden(kept: Path | None, *seen: tuple[float, int]) -> float | None:
     for km, stamp in seen:
         for i in range(CONFIRM + 1):  # of a leap in time
             frames.take(own_frame(*odometer(km), stamp + i), 1.0)
-    return frames.ridden(1.0)
+    return frames.odometer(1.0)[1]
 
 
 def test_a_day_begins_at_midnight_and_goes_on_over_a_restart(tmp_path):

@@ -30,7 +30,7 @@ export default {
   "rated": "neben der Ladung, gegen die Nennreichweite {range}",
   "no_causes": "keine Ursache bekannt",
   "ridden": "{ridden} gefahren",
-  "band_ridden": "Heute wurden {ridden} gefahren.",
+  "band_ridden": "{ridden} wurden gefahren.",
   "cells": "Zellen {hottest}\u00a0°C",
   "cells_between": "Zellen {coldest} bis {hottest}\u00a0°C",
   "frames": "{received} Botschaften, {lost} verloren, {bad} fehlerhaft",

@@ -30,7 +30,7 @@ export default {
   "rated": "besides the charge, against the rated {range}",
   "no_causes": "no cause is known",
   "ridden": "{ridden} ridden",
-  "band_ridden": "{ridden} were ridden today.",
+  "band_ridden": "{ridden} were ridden.",
   "cells": "cells {hottest}\u00a0°C",
   "cells_between": "cells {coldest} to {hottest}\u00a0°C",
   "frames": "{received} range frames, {lost} lost, {bad} bad",
