@@ -38,10 +38,9 @@ function tick(text, left) {
 function drawTicks(end, here, ridden) {
   const marks = here >= ROOM ? [tick(`−${distanceOnly(ridden)}`, 0)] : [];
   marks[0]?.classList.add("behind-us");
-  const room = (100 - here) / ROOM;
-  let parts = end ? PARTS[String(end / 10 ** Math.floor(Math.log10(end)))] ?? 4 : -1;
-  if (parts > room) parts = room >= 2 && parts % 2 === 0 ? 2 : 1;
-  for (let i = 0; i <= parts; i += 1) {
+  const parts = end ? PARTS[String(end / 10 ** Math.floor(Math.log10(end)))] ?? 4 : -1;
+  const every = Math.max(Math.ceil((parts * ROOM) / (100 - here)), 1);
+  for (let i = 0; i <= parts; i += every) {
     const value = (end * i) / parts;
     marks.push(tick(number(value, Number.isInteger(value) ? 0 : end < 2 ? 2 : 1), here + ((100 - here) * i) / parts));
   }
