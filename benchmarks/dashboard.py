@@ -23,6 +23,7 @@ from urllib.request import urlopen
 
 from gz_onboard import cli
 from gz_onboard.bus._can import can
+from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.publisher import Counts, Publisher
 from gz_onboard.events import Activity, Estimate, Frame, State
 
@@ -46,9 +47,14 @@ WATCH = """() => { window.drawn = []; new MutationObserver(
 
 
 def _of_the_vehicle(number: int) -> list[Frame]:
-    """Odometer [m] and cell temperatures, as the reference scooter sends them each second."""
+    """Pack, odometer [m] and cell temperatures, as the reference scooter sends them, each second."""
     cells = struct.pack("<HHBBBB", 3700, 3720, 40 + 22, 40 + 27, 40 + 24, 40 + 23)
-    return [(0, 769, struct.pack("<II", 1_000_000 + number, 0), 0), (0, 513, cells, 0)]
+    pack = struct.pack("<HhBBB", 5200, 1000, 120, 1, number // 10 % 15)
+    return [
+        (0, 512, pack + bytes([crc8_sae_j1850(pack)]), 0),
+        (0, 769, struct.pack("<II", 1_000_000 + number, 0), 0),
+        (0, 513, cells, 0),
+    ]
 
 
 def child(seconds: float) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 
 from gz_onboard.bus.codec import Codec
 from gz_onboard.bus.layout import identifiers_of
+from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.events import STALE_PERIODS, Frame
 from gz_onboard.physics.derating import Derating
 from gz_onboard.vehicle import Vehicle
@@ -40,6 +41,11 @@ class VehicleFrames:
             tuple(source for source in sources if source.role in SHOWN)
             for sources in (mapping.sources, mapping.instruments)
         )
+        # That it is this vehicle's bus is believed once a frame with its checksum came, if it has such.
+        of_witness = tuple(s for s in mapping.sources if s.message == _witness(mapping))[:1]
+        self._witness = of_witness[0].message if of_witness else ""
+        chosen += tuple(source for source in of_witness if source not in chosen)
+        self._believed = not self._witness
         self.identifiers = identifiers_of(mapping, {source.message for source in (*chosen, *of_instruments)})
         self._limits = cell_limits(vehicle.derating)
         self._codec = Codec(replace(mapping, sources=chosen + of_instruments))
@@ -49,9 +55,11 @@ class VehicleFrames:
 
     def take(self, frame: Frame, now: float) -> None:
         """Take in a frame that came at `now`; one that is not of these, or fails a check, is left out."""
-        for _, group, values in self._codec.decode([frame]):
-            for role, value in zip(self._codec.groups[group].roles, values, strict=True):
-                if value is not None:
+        for _, number, values in self._codec.decode([frame]):
+            group = self._codec.groups[number]
+            self._believed = self._believed or group.message == self._witness
+            for role, value in zip(group.roles, values, strict=True):
+                if value is not None and self._believed:
                     self._last[role] = value, now
                     if role == ODOMETER:
                         self._day.take(value / 1e3, frame[0])
@@ -86,6 +94,12 @@ class VehicleFrames:
         """Between which temperatures [degC] the cells should be."""
         low, high = self._limits
         return (max(low, CHARGING[0]), min(high, CHARGING[1])) if charging else (low, high)
+
+
+def _witness(mapping: BusMapping) -> str:
+    """The message with a checksum that comes least often; empty if none has one."""
+    protected = [name for name, protection in mapping.protection.items() if protection.crc]
+    return max(protected, key=lambda name: mapping.periods.get(name, 0.0), default="")
 
 
 def cell_limits(derating: Derating) -> tuple[float, float]:

@@ -27,7 +27,7 @@ from gz_onboard.dashboard.view import View
 from gz_onboard.errors import InputError
 from gz_onboard.events import Activity, State
 from tests.bridges.broker import Listener, broker, free_port, listening, wait_for
-from tests.dashboard.served import Sender, cells, odometer
+from tests.dashboard.served import PACK, Sender, cells, odometer
 from tests.dashboard.test_terminal import ESTIMATE
 
 STATE, ABOUT = "gz-onboard/scooter/state", "homeassistant/device/gz-onboard-scooter/config"
@@ -114,7 +114,7 @@ def test_home_assistant_finds_the_vehicle_and_shows_what_is_on_the_bus(tmp_path,
 def test_the_vehicles_own_frames(tmp_path, monkeypatch):
     """Read by its file: the reference scooter's, where nothing else is said."""
     port = free_port()
-    sender = Sender("m6", ESTIMATE, [odometer(1012.4), cells(22, 24, 53)])
+    sender = Sender("m6", ESTIMATE, [PACK, odometer(1012.4), cells(22, 24, 53)])
     with broker(tmp_path, port), listening(port) as listener, bridge(port, "m6", monkeypatch=monkeypatch), sender:
         wait_for(lambda: seen(listener).get("alert") == "cell_too_hot", "a hot cell")
         found = seen(listener)

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 
 from gz_onboard.bus._can import can
 from gz_onboard.bus.channel import CanChannel
+from gz_onboard.bus.checksum import crc8_sae_j1850
 from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.publisher import Publisher
 from gz_onboard.dashboard.server import Feed
@@ -47,7 +48,13 @@ def own_frame(name: str, values: dict[str, float], time_ns: int = 0) -> Frame:
     """As the reference scooter sends it."""
     message = VEHICLE.get_message_by_name(name)
     data = message.encode({signal.name: values.get(signal.name, 0) for signal in message.signals}, strict=False)
+    if f"{name}CRC" in message.signal_tree:
+        data = data[:-1] + bytes([crc8_sae_j1850(data[:-1])])
     return time_ns, message.frame_id, data, 0
+
+
+PACK: Own = "BMS_Pack", {"BMS_PackVoltage": 52.0}
+"""It has a checksum: by it the vehicle is known."""
 
 
 def cells(coldest: float, mean: float, hottest: float) -> Own:
@@ -63,7 +70,8 @@ def odometer(km: float) -> Own:
 def vehicle_frames(begin: float) -> VehicleFrames:
     """Of the reference scooter, whose odometer was at `begin` [km] when the day began."""
     made = VehicleFrames(read_vehicle("reference"))
-    made.take(own_frame(*odometer(begin), time.time_ns()), 0.0)
+    for own in PACK, odometer(begin):
+        made.take(own_frame(*own, time.time_ns()), 0.0)
     return made
 
 

@@ -19,7 +19,7 @@ from gz_onboard.dashboard.view import View
 from gz_onboard.events import Activity, Estimate
 from gz_onboard.physics.derating import Derating, DeratingCurve
 from gz_onboard.vehicle import read_vehicle
-from tests.dashboard.served import Own, cells, odometer, own_frame
+from tests.dashboard.served import PACK, Own, cells, odometer, own_frame
 from tests.dashboard.test_picture import HEALTHY, SOURCE
 from tests.dashboard.test_terminal import second
 from tests.support import ROOT
@@ -31,7 +31,7 @@ NOON = 1_750_000_000 * 10**9 // DAY * DAY + DAY // 2
 
 def of(estimate: Estimate, *own: Own, before: tuple[str, ...] = (), after: float = 0.0) -> Picture:
     view = View(vehicle=VehicleFrames(REFERENCE))
-    for frame in [*second(Publisher(), estimate), *(own_frame(*one) for one in own)]:
+    for frame in [*second(Publisher(), estimate), *(own_frame(*one) for one in (PACK, *own))]:
         view.take(frame, 100.0)
     return picture(view, 100.0 + after, SOURCE, True, before)
 
@@ -47,6 +47,19 @@ def test_without_them_there_is_nothing():
     got = of(HEALTHY)
     assert (got.cells, got.odometer_km, got.ridden_today_km) == (None, None, None)
     assert got.late == ()
+
+
+def test_on_another_vehicles_bus_nothing_is_taken_for_its_own():
+    """Its frames may have the same identifiers; a checksum of the reference scooter's they have not."""
+    frames = VehicleFrames(REFERENCE)
+    wrong = (0, own_frame(*PACK)[1], bytes(8), 0)
+    for frame in own_frame(*cells(21, 24, 155)), own_frame(*odometer(1000.0)), wrong, own_frame(*cells(21, 24, 155)):
+        frames.take(frame, 1.0)
+    assert frames.cells(1.0) is None
+    assert frames.odometer(1.0) == (None, None)
+    for own in PACK, cells(21, 24, 27):
+        frames.take(own_frame(*own), 1.0)
+    assert frames.cells(1.0) == (21.0, 27.0)
 
 
 @pytest.mark.parametrize(("after", "late", "there"), [(2.9, False, True), (3.1, True, True), (10.1, False, False)])
@@ -97,6 +110,7 @@ def test_limits_are_those_of_the_controller():
 def ridden(kept: Path | None, *seen: tuple[float, int]) -> float | None:
     """Of odometers [km] at times [ns]."""
     frames = VehicleFrames(REFERENCE, kept)
+    frames.take(own_frame(*PACK, seen[0][1]), 1.0)
     for km, stamp in seen:
         for i in range(CONFIRM + 1):  # of a leap in time
             frames.take(own_frame(*odometer(km), stamp + i), 1.0)
