@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from gz_onboard import __version__
-from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, InputError, lacking_extra, nearest
+from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, InputError, lacking_extra, naming, nearest
 from gz_onboard.options import LOG_SUFFIXES
 
 COMMANDS = {
@@ -112,8 +112,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = list(sys.argv[1:] if argv is None else argv)
     called = next((word for word in argv if not word.startswith("-")), "")
     try:
-        arguments = command_line([called]).parse_args(argv)
-        status: int = importlib.import_module(COMMANDS[arguments.command][0]).run(arguments)
+        with naming():
+            arguments = command_line([called]).parse_args(argv)
+            status: int = importlib.import_module(COMMANDS[arguments.command][0]).run(arguments)
         sys.stdout.flush()  # here, where a full disk is a message
         return status
     except InputError as error:

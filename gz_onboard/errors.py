@@ -24,6 +24,7 @@ _PACKAGES = {
     "foxglove": "foxglove-sdk",
     "isotp": "can-isotp",
 }  # that are not named as their modules
+_NAMES_REFUSED = (errno.ENAMETOOLONG, errno.EACCES)
 _DISK_FAILED = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 CLOSE, CLOSE_SHORT = 0.55, 0.5  # difflib's ratio of two names from which one may be meant; of up to three letters
 CLOSE_FILE = 0.75  # likewise of files, which have endings in common
@@ -140,6 +141,17 @@ def _identity(file: Path | str) -> tuple[int, int] | None:
         found = Path(file).stat()
         return found.st_dev, found.st_ino
     return None
+
+
+@contextmanager
+def naming() -> Iterator[None]:
+    """InputError for a name that the operating system refuses within: one too long, or in a folder that is closed."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _NAMES_REFUSED or error.filename is None:
+            raise
+        raise InputError(f"{error.filename}: {error.strerror}") from error
 
 
 @contextmanager

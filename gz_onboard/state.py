@@ -127,7 +127,7 @@ def load(
         with file.open("rb") as stream:
             return decode(stream.read(_LARGEST), time, uptime, kept)
     except OSError as error:
-        raise ValueError(f"cannot be read: {error}") from error
+        raise ValueError(f"cannot be read: {error.strerror or error}") from error
 
 
 def set_aside(file: Path, copy: Path) -> Path | None:

@@ -340,6 +340,33 @@ def test_what_is_not_of_its_type_is_an_input_error_with_its_name(call, said):
         call()
 
 
+@pytest.mark.parametrize(
+    "call",
+    [
+        gz.estimate,
+        lambda name: gz.estimate(COASTDOWN, state=name),
+        lambda name: gz.estimate(COASTDOWN, route=name),
+        lambda name: gz.estimate(COASTDOWN, name),
+        lambda name: gz.read_vehicle("reference", effects_folder=name),
+        gz.read_learned,
+        gz.read_estimates,
+        gz.read_history,
+        lambda name: gz.add_to_history([COASTDOWN], name),
+        gz.read_signals,
+        lambda name: gz.check_vehicle("reference", name),
+        gz.discover,
+        gz.calibrate,
+        gz.report,
+        gz.validate,
+        gz.simulate,
+    ],
+)
+@pytest.mark.parametrize("name", ["n" * 300, "\ud800"])
+def test_a_name_that_no_file_can_have_is_an_input_error(call, name):
+    with pytest.raises(gz.InputError, match=r"File name too long|must be|unable to open"):
+        call(name)
+
+
 @pytest.mark.parametrize("column", [None, 14.0, "14", [[1], [2, 3]], np.array(14.0), np.zeros((2, 2))])
 def test_a_column_that_is_no_array_is_named(column):
     with pytest.raises(gz.InputError, match=r"table: column 'speed \[km/h\]': must be an array of one dimension"):

@@ -90,6 +90,34 @@ def test_what_does_not_fit(arguments, said, capsys):
     assert said in refused(capsys, *arguments)
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["estimate", "NAME"],
+        ["estimate", "ride.blf", "--state", "NAME"],
+        ["estimate", "ride.blf", "--json", "NAME"],
+        ["estimate", "ride.blf", "--output", "NAME"],
+        ["estimate", "ride.blf", "--route", "NAME"],
+        ["estimate", "ride.blf", "--vehicle", "NAME"],
+        ["history", "add", "ride.blf", "--file", "NAME"],
+        ["history", "show", "--file", "NAME"],
+        ["report", "ride.blf", "--output", "NAME"],
+        ["vehicle", "check", "NAME", "ride.blf"],
+        ["learned", "--state", "NAME"],
+        ["plot", "NAME"],
+        ["export", "ride.blf", "NAME.csv"],
+        ["validate", "NAME"],
+        ["calibrate", "all", "NAME"],
+        ["discover", "ride.blf", "--effects", "NAME"],
+        ["replay", "NAME"],
+        ["route", "NAME"],
+    ],
+    ids=" ".join,
+)
+def test_a_name_that_no_file_can_have(arguments, capsys):
+    assert "File name too long" in refused(capsys, *(x.replace("NAME", "n" * 300) for x in arguments))
+
+
 @pytest.mark.parametrize("command", ["history", "vehicle"])
 def test_the_parts_of_a_command_are_named(command, capsys):
     with pytest.raises(SystemExit):

@@ -16,7 +16,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, Literal, ParamSpec, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from gz_onboard.errors import InputError, nearest, shown
+from gz_onboard.errors import InputError, naming, nearest, shown
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -36,7 +36,7 @@ _WORDS: dict[object, str] = {
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
-    """`function`, which raises InputError for an argument that is not what its hint says."""
+    """`function`, which raises InputError for an argument that is not what its hint says, or names no possible file."""
     signature = inspect.signature(function)
 
     @functools.wraps(function)
@@ -45,7 +45,8 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
         for name, value in signature.bind(*args, **kwargs).arguments.items():
             if name in hints:
                 check(name, value, hints[name])
-        return function(*args, **kwargs)
+        with naming():
+            return function(*args, **kwargs)
 
     return call
 
@@ -82,7 +83,7 @@ def check(name: str, value: object, hint: Any) -> None:
 
 def fits(value: object, hint: Any) -> bool:
     """Whether `value` is what a type hint says; of a protocol always, as it says itself what it lacks."""
-    if isinstance(value, str | os.PathLike) and "\0" in str(value):  # NUL: no name has it
+    if isinstance(value, str | os.PathLike) and not _possible(str(value)):
         return False
     kind, parts = get_origin(hint) or hint, get_args(hint)
     if kind in (Union, types.UnionType):
@@ -108,6 +109,14 @@ def fits(value: object, hint: Any) -> bool:
             return False
         return all(fits(one, parts[0]) for one in value) if isinstance(value, Collection) else True
     return True
+
+
+def _possible(name: str) -> bool:
+    """Whether a file could be called that: no NUL, no half of a character."""
+    try:
+        return b"\0" not in os.fsencode(name)
+    except UnicodeEncodeError:
+        return False
 
 
 def _words(hint: Any) -> str:
