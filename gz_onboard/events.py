@@ -196,7 +196,7 @@ class Cause(IntEnum):
     SPEED = 2
     STOPS = 3  # accelerating, braking, standing
     WIND = 4  # that the model knows of
-    CLIMB = 5  # of roads like those ridden
+    CLIMB = 5  # of roads like those ridden; of a route, ahead on it
     TURNING = 6
     AUXILIARIES = 7  # measured, beyond what the vehicle file says
     PAYLOAD = 8  # as entered or learned, against that of the vehicle file

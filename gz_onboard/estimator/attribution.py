@@ -66,6 +66,7 @@ class State:
     factor: float  # on the model with this road load
     auxiliaries: float  # of the factor, what auxiliaries beyond the model's make
     points: tuple[Point, ...]  # lately ridden
+    hills: float = 0.0  # J/m: how much more those of a route ahead take than hills like those ridden
     known: float = 0.0  # how much of the price expected is theirs, and not the prior riding's: 0 to 1
     rated: bool = False  # the prior riding without hills and wind, nothing ridden
     parts: dict[tuple[Conditions, Road], Parts] = field(default_factory=dict)  # as far as they were asked for
@@ -90,19 +91,27 @@ class Attribution:
         self.changes: deque[Explanation] = deque(maxlen=MOST_CHANGES)
         self._news: deque[tuple[bool, Explanation]] = deque(maxlen=MOST_CHANGES)
 
-    def take(self, now: float, forecast: Forecast, soc: float, air: Conditions, ridden: float) -> None:
-        """A new `forecast`, of this state of charge in this air, after `ridden` [m]."""
+    def take(
+        self,
+        now: float,
+        forecast: Forecast,
+        soc: float,
+        air: Conditions,
+        ridden: float,
+        hills: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """A new `forecast`, of this state of charge in this air, after `ridden` [m]; hills: see `Answer`."""
         self._measure_auxiliaries(now, ridden)
         last, since = self.latest, self._since
         due = last is None or (now - last.time >= EVERY and abs(forecast.range - last.range) > LEAST_MOVED)
         moved = since and abs(forecast.range + ridden - since.range - since.ridden) > MOVED
         if since and moved and now - since.time >= SETTLED:
-            self._since = self._state(now, forecast, soc, air, ridden)
+            self._since = self._state(now, forecast, soc, air, ridden, hills)
             self.changes.append(replace(self.explained(since, self._since), forgotten=tuple(sorted(self._forgotten))))
             self._forgotten.clear()
             self._news.append((True, self.changes[-1]))
         if due:
-            state = self._state(now, forecast, soc, air, ridden)
+            state = self._state(now, forecast, soc, air, ridden, hills)
             self._since = self._since or state
             self.latest = self.explained(self.rated, state)
             self._news.append((False, self.latest))
@@ -117,7 +126,15 @@ class Attribution:
         self._news.clear()
         return news
 
-    def _state(self, now: float, forecast: Forecast, soc: float, air: Conditions, ridden: float) -> State:
+    def _state(
+        self,
+        now: float,
+        forecast: Forecast,
+        soc: float,
+        air: Conditions,
+        ridden: float,
+        hills: tuple[float, float] = (0.0, 0.0),
+    ) -> State:
         riding = self._forecaster.riding
         known = forecast.range > 0 and forecast.energy > 0
         filed, learned = self._composition.filed, self._factor_learned
@@ -137,7 +154,10 @@ class Attribution:
         )
         # What the road load explains is no longer in the factor.
         rest = self._total(state, state.air, filed) / self._total(state, state.air, state.road)
-        return replace(state, factor=rest * state.factor, auxiliaries=rest * state.auxiliaries)
+        factor, (energy, way) = rest * state.factor, hills
+        like_ridden = way * factor * self._parts(state, state.air, state.road)[Cause.CLIMB]
+        ahead = (energy - like_ridden) / state.range if known else 0.0
+        return replace(state, factor=factor, auxiliaries=rest * state.auxiliaries, hills=ahead)
 
     def _measure_auxiliaries(self, now: float, ridden: float) -> None:
         """What they take beyond the model's, in the mean over the way lately ridden."""
@@ -216,12 +236,13 @@ class Attribution:
         return Explanation(b.time, a.range, b.range + ridden, causes)
 
     def _costs(self, a: State, b: State) -> Parts:
-        """The difference of the consumptions [J/m]: factor times what is left open times the model's."""
+        """The difference of the consumptions [J/m]: factor times what is left open times the model's, and hills."""
         modelled = self._modelled(a, b)
         f0, m0, f1, m1 = a.factor, self._total(a, a.air, a.road), b.factor, self._total(b, b.air, b.road)
-        g0, g1 = a.consumption / (f0 * m0), b.consumption / (f1 * m1)
+        g0, g1 = (a.consumption - a.hills) / (f0 * m0), (b.consumption - b.hills) / (f1 * m1)
         of_model, of_factor = _worth(f0, g0, f1, g1), _worth(g0, m0, g1, m1)
         costs = {cause: of_model * part for cause, part in modelled.items()}
+        costs[Cause.CLIMB] += b.hills - a.hills
         auxiliaries = b.auxiliaries - a.auxiliaries
         return costs | {
             Cause.AUXILIARIES: of_factor * auxiliaries,

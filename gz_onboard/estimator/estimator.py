@@ -266,7 +266,8 @@ class Estimator:
         soc = self.soc.ageing.state_of_charge(self.filter)
         self._outlook.step(Now(now, *soc, *cells, conditions, lost, self._reading, self._activities.now))
         if self._outlook.forecast:
-            self.attribution.take(now, self._outlook.forecast, soc[0], conditions, self.road.distance)
+            hills = self.ahead.answer.hills
+            self.attribution.take(now, self._outlook.forecast, soc[0], conditions, self.road.distance, hills)
 
     # --- results ----------------------------------------------------------------------------------------------
 

@@ -58,6 +58,7 @@ class Answer:
     soc_p90: float | None = None
     ends_after: float | None = None  # from here
     ends_at: tuple[float, float] | None = None  # latitude, longitude [deg]
+    hills: tuple[float, float] = 0.0, 0.0  # J that they take, on so many m: what of the range lies on the route
 
 
 class RoadAhead:
@@ -198,7 +199,8 @@ class RoadAhead:
             return sqrt(variance + SEGMENT_SD**2 * SEGMENT / max(way, SEGMENT))
 
         range_ = reach(free.energy)
-        on_route = min(1.0, (end - here) / range_) if range_ > 0 else 1.0
+        within = min(range_, end - here)
+        on_route = within / range_ if range_ > 0 else 1.0
         spread = on_route * sd(range_) + (1 - on_route) * free.consumption_sd / free.consumption
         low, high = deciles(free.energy, free.energy_sd, free.energy_sd_up, spread**2)
         arrival = self._arrival(free, pack, needed, level * sd(end - here))
@@ -212,6 +214,7 @@ class RoadAhead:
             *arrival,
             ends,
             None if ends is None else road.position.at(here + ends),
+            (road.energy.between(costs.height, here, here + within), within),
         )
         expected = free.energy / range_ if range_ > 0 and free.energy > 0 else free.consumption
         known = on_route * self._known_from + (1 - on_route) * free.known_from

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gz_onboard.estimator.attribution import Attribution
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.road import RoadState
@@ -17,7 +18,7 @@ from gz_onboard.estimator.route_ahead import RoadAhead
 from gz_onboard.estimator.route_energy import RouteEnergy
 from gz_onboard.estimator.route_rider import RouteRider, restored
 from gz_onboard.estimator.signals import Signals
-from gz_onboard.events import Estimate, RouteState
+from gz_onboard.events import Cause, Estimate, Explanation, RouteState
 from gz_onboard.physics.drawable import drawable, soc_left
 from gz_onboard.routes.route import Route
 from tests.support import reference
@@ -101,6 +102,30 @@ def test_a_route_shows_at_once_and_so_does_its_end():
     assert shown.range == pytest.approx(found.range)
     rider.ahead.follow(None)
     assert rider.forecaster.shown(rider.ask(), drawn=0.0).range == pytest.approx(FREE.range)
+
+
+def given_on_the_way(route: Route) -> Explanation:
+    """The change of the range with the route, in causes."""
+    rider = Rider()
+    free = rider.forecaster.forecast(0.7, 0.01, 20.0, 1.0, AIR.ambient, AIR.altitude)
+    attribution = Attribution(rider.forecaster, rider.signals)
+    for now, road in enumerate((None, rider.ahead.ready(route))):
+        rider.ahead.follow(road)
+        found, answer = rider.settled(free)
+        attribution.take(100.0 * now, found, 0.7, AIR, 0.0, answer.hills)
+    (change,) = attribution.changes
+    assert sum(change.causes.values()) == pytest.approx(change.range - change.reference, abs=1e-6)
+    return change
+
+
+@pytest.mark.parametrize("grade", [0.06, -0.03])
+def test_hills_ahead_are_called_that(grade):
+    level = given_on_the_way(way(20e3))
+    hilly = given_on_the_way(way(20e3, grade=lambda x: grade if x > 10e3 else 0.0))
+    hills = hilly.causes[Cause.CLIMB] - level.causes[Cause.CLIMB]
+    assert abs(hills) > 5e3
+    assert hills == pytest.approx(hilly.range - level.range, rel=0.01)
+    assert hilly.causes[Cause.RIDING] == pytest.approx(level.causes[Cause.RIDING], rel=0.01)
 
 
 def test_no_pack_is_better_than_new_on_a_route_either():
