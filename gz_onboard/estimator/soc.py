@@ -76,6 +76,7 @@ class StateOfCharge:
         self._gap: tuple[float, Saved] | None = None  # when the pack was last measured [s], and what was known then
         self._voltage_time: float | None = None  # s, of the message whose voltage was taken in last
         self._voltage_taken = -inf  # s: when
+        self.another_pack = False  # whether this step has shown it to be another than it was
 
     # --- what others ask --------------------------------------------------------------------------------------
 
@@ -180,6 +181,7 @@ class StateOfCharge:
 
     def step(self, now: float, dt: float, pack: PackState, riding: RidingModel) -> None:
         """Go `dt` [s] ahead to `now` [s]."""
+        self.another_pack = False
         reading, filter_ = pack.reading, self.filter
         voltage, current = reading.voltage, reading.current
         if voltage is not None and not self._plausible(voltage, current or 0.0, pack.temperature):
@@ -262,8 +264,9 @@ class StateOfCharge:
             # Both with what lies beside the cells: of a pack of which little is known, r0 may hold it already.
             cell, beside = explaining / battery.cells_parallel, battery.series_resistance / battery.cells_series
             self._sag.update(dt, voltage / battery.cells_series, r0 * cell + beside * explaining + lost)
-        before = filter_.soc, filter_.error, filter_.covariance
+        before, known = (filter_.soc, filter_.error, filter_.covariance), self.ageing.variance
         self.ageing.permit(now, reading, self._signals, filter_)
+        self.another_pack = self.ageing.variance > known  # what was known of it is forgotten for nothing else here
         if dt <= self._timing.pause and self._rest.step(
             filter_, dt, shown, cell_current, temperature, reading.voltage_sd
         ):

@@ -181,6 +181,8 @@ class Weakest:
     def step(self, now: float, reading: PackReading, temperature: float, soc: StateOfCharge) -> None:
         """Take in what came since the last step, at `now` [s]; temperature: of the cells [degC]."""
         signal = self._signal
+        if soc.another_pack:
+            self._begin_anew()
         if not self.mapped or self._signals.pack_voltage.time != now:
             return
         new, self._then = signal.time > self._then, now  # between two of the pack's voltages
@@ -205,6 +207,12 @@ class Weakest:
         if block.began - place >= BLOCK and block.count >= FEWEST:
             self._block = Block(place)
             self.take(block)
+
+    def _begin_anew(self) -> None:
+        """Nothing is known: the pack is another one."""
+        self.known, self._kept, self._block = self._new(), self._new(), Block()
+        self._sound, self._doubt, self.refused = 0, 0.0, False
+        self._battery.weaken(None)
 
     def _permitted(self, now: float, reading: PackReading) -> bool:
         """Whether all else that the learning depends on is beyond doubt."""

@@ -361,3 +361,14 @@ def test_what_is_weak_in_one_vehicle_is_not_in_another():
     battery = VEHICLE.pack
     battery.own().weaken(WeakGroup(0.1, 0.1, 0.1))
     assert battery.health.weakest is None
+
+
+def test_another_pack_begins_with_no_weak_group():
+    """Of packs that are told apart by their resistance."""
+    saved = at(WEAK, 0.2).snapshot("key")
+    saved["learned"]["resistance"]["factor"] = 1.6
+    saved["soc"], saved["covariance"] = START, [1e-4, 0.0, 1e-4]
+    found = ridden(Hidden(), 0.55, saved=saved)
+    assert left(found, found.battery.health.weakest) == pytest.approx(left(found, None), rel=0.01)
+    for x in found.weakest.learned().values():
+        assert abs(x.value - 1) < 2 * x.sd
