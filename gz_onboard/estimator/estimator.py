@@ -172,8 +172,10 @@ class Estimator:
         self._follow_activity(now, dt)
         self._ride(now, dt)
         signals.next_step()
-        if self._outlook.due(now):
-            self._look_ahead(now, temperature)
+        if self.filter is None:
+            self._outlook.outdate()
+        elif self._outlook.due(now):
+            self._look_ahead(now, self.filter, temperature)
 
     def _read_pack(self, now: float, dt: float) -> PackReading:
         """What the pack gives by the sensors, else by the model."""
@@ -257,13 +259,11 @@ class Estimator:
         if learned and self.signals.cell_temperature.fresh(now):  # R0 is known only with it
             self.redundancy.currents.compare_consumption(self.forecaster.recent_factor)
 
-    def _look_ahead(self, now: float, temperature: float) -> None:
-        if self.filter is None:
-            return
+    def _look_ahead(self, now: float, filter_: SocFilter, temperature: float) -> None:
         cells = temperature, self._temperatures.cells_sd(now)
         lost = loss_variance(self._reasons(now) | self._missing.lacking)
         conditions = self._present.conditions(now)
-        soc = self.soc.ageing.state_of_charge(self.filter)
+        soc = self.soc.ageing.state_of_charge(filter_)
         self._outlook.step(Now(now, *soc, *cells, conditions, lost, self._reading, self._activities.now))
         if self._outlook.forecast:
             hills = self.ahead.answer.hills

@@ -46,6 +46,10 @@ class Outlook:
         """Whether the next forecast is to be made at `now` [s]."""
         return now - self._time >= PERIOD - EARLY
 
+    def outdate(self) -> None:
+        """The next forecast is due at once: what the last one was made from is no longer so."""
+        self._time = -inf
+
     @property
     def consumption(self) -> float | None:
         """That is to be expected [J/m]."""

@@ -137,7 +137,7 @@ class StateOfCharge:
         if self._gap is None and (blind or dt > BRIDGE):
             known = self.current, self._odometer, self._own_soc, price
             self._gap = now - dt, Saved(filter_.soc, filter_.v1, filter_.covariance, *known)
-        if self._gap is None or blind:
+        if self._gap is None or (blind and dt <= BRIDGE):
             return
         began, saved = self._gap
         self._gap = None

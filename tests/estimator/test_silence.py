@@ -9,7 +9,7 @@ import pytest
 from gz_onboard.estimator.redundancy.checks import SETTLED, RateLimit
 from gz_onboard.estimator.start import Saved, uncounted, uncounted_sd
 from gz_onboard.events import Activity, Group, Reason, State
-from tests.estimator.life import CELLS, GROUPS, INVERTER, PACK, Scooter, estimator, follow, worst
+from tests.estimator.life import CELLS, GROUPS, INVERTER, MOTOR, PACK, Scooter, estimator, follow, worst
 
 MORE = [*GROUPS, Group("Temperatures", ("motor_temperature",), 1.0), Group("GPS", ("gps_altitude",), 1.0)]
 
@@ -193,6 +193,30 @@ def test_charged_or_parked_while_the_bus_was_silent(soc, seconds, charge):
     assert worst(rows) < 3
     assert rows[-1][1].soc_sd < 0.1
     assert {role for _, row in rows for role in row.distrusted} == set()
+
+
+@pytest.mark.parametrize("asleep", [True, False], ids=["all", "pack"])
+@pytest.mark.parametrize("late", [0.3, 3.0])
+def test_after_a_silence_no_range_is_guessed_before_the_pack_is_heard(late, asleep):
+    """Charged meanwhile. All slept, and other messages come first; or the pack's alone were not heard."""
+    scooter, e, rows = Scooter(soc=0.3), estimator(), []
+    follow(e, scooter.live(200), scooter)
+    if asleep:
+        scooter.away(7200, charge=5.0)
+    else:
+        scooter.period = 1.0
+        follow(e, (event for event in scooter.live(7200, charge=5.0) if event[1] in (MOTOR, CELLS)), scooter)
+        scooter.period = 0.1
+    heard_from = scooter.time + late
+    for event in scooter.live(late + 2.0):
+        if event[1] not in (PACK, INVERTER) or event[0] > heard_from:
+            e.handle(event)
+            rows.append((scooter.soc, e.estimate(event[0])))
+    assert not asleep or all(row.range is None for _, row in rows if row.time < heard_from)
+    back = [row.range for _, row in rows if row.time > heard_from and row.range is not None]
+    assert back == pytest.approx([back[-1]] * len(back), rel=0.01)
+    assert rows[-1][1].state is State.VALID
+    assert worst(rows) < 3
 
 
 @pytest.mark.parametrize(("on", "off"), [(3.0, 6.0), (2.5, 20.0), (5.0, 60.0), (30.0, 30.0)])
