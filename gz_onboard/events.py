@@ -136,7 +136,7 @@ class State(IntEnum):
 
     STARTING = 0  # no estimate yet
     VALID = 1
-    DEGRADED = 2  # an input is missing: the interval is wider, `Reason` says why
+    DEGRADED = 2  # an input is missing or doubtful: the interval is wider, `Reason` says why
     INVALID = 3  # no number is published
 
 
@@ -183,6 +183,10 @@ class Reason(IntFlag):
     SIGNALS_SLOW = 1 << 17  # pack current or voltage comes too slowly to be integrated
     SOC_RESTARTED = 1 << 18  # the state of charge was contradicted for long and was begun anew from the voltage
     SAVE_FAILED = 1 << 19  # the state cannot be saved for the next start
+
+
+KEEPING = Reason.LOG_FAILED | Reason.SAVE_FAILED
+"""Of what is kept of a ride: no range is less certain for them."""
 
 
 TOLD = 50.0  # m: RANGE_Why counts tenths of a kilometre

@@ -9,7 +9,7 @@ from functools import partial
 
 from gz_onboard.bus.publisher import reason_signal
 from gz_onboard.dashboard.view import NEARLY_EMPTY, View
-from gz_onboard.events import State, cause_words, words
+from gz_onboard.events import KEEPING, State, cause_words, words
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ _STATE_COLOURS = {State.STARTING: "36", State.VALID: "32", State.DEGRADED: "33",
 _STATE_WORDS = {
     State.STARTING: "starting: no estimate yet",
     State.VALID: "valid",
-    State.DEGRADED: "degraded: an input is missing, the interval is wider",
+    State.DEGRADED: "degraded: an input is missing or doubtful, interval wider",
     State.INVALID: "invalid: no range can be told",
 }
 
@@ -73,9 +73,12 @@ def screen(view: View, now: float, source: str, width: int) -> list[Line]:
         lines.append(_row("Activity", (activity, "")))
     if charge := view.charge(now):
         lines.append(_row("Charge", (charge, "")))
-    for i, reason in enumerate(view.reasons(now)):
+    last = ""
+    for reason in sorted(view.reasons(now), key=KEEPING.__contains__):
         name, comment = words(str(reason.name)), view.comments[reason_signal(reason)]
-        lines.append(_row("" if i else "Less certain" if state is State.VALID else "Because", (name, "33")))
+        label = "Note" if reason in KEEPING else "Less certain" if state is State.VALID else "Because"
+        lines.append(_row("" if label == last else label, (name, "33")))
+        last = label
         if len(name) + len(comment) + 24 <= width:
             lines[-1].append((f": {comment.rstrip('.')}", _DIM))
     left_out = ", ".join(words(role) for role in view.distrusted(now))
@@ -216,7 +219,8 @@ def summary_line(view: View, now: float) -> str:
     if causes := causes_text(view, now):
         parts.append(f"why, besides charge: {causes}")
     for what, names in (
-        (_because(state), [words(str(reason.name)) for reason in view.reasons(now)]),
+        (_because(state), [words(str(reason.name)) for reason in view.reasons(now) if reason not in KEEPING]),
+        ("note", [words(str(reason.name)) for reason in view.reasons(now) if reason in KEEPING]),
         ("left out", [words(role) for role in view.distrusted(now)]),
         ("stale", list(view.stale(now))),
     ):

@@ -70,6 +70,17 @@ def test_everything_that_the_frames_say(page):
         assert middle / 2 == pytest.approx(34.21, abs=0.01)
 
 
+def test_what_cannot_be_kept_makes_no_range_less_certain(page):
+    reasons = Reason.LOG_FAILED | Reason.PRIOR_RIDING
+    with dashboard("kept") as address, Sender("kept", replace(HEALTHY, reasons=reasons)):
+        page.goto(address)
+        shows(
+            page,
+            meaning="All inputs are there. The log cannot be written.",
+            reasons="less certain because:\ntoo little ridden to know this rider",
+        )
+
+
 def test_a_charge(page):
     with dashboard("charge") as address, Sender("charge", CHARGING):
         page.goto(address)

@@ -108,6 +108,20 @@ def test_reasons_of_a_valid_estimate_make_it_less_certain():
     assert screen.summary_line(view, 100.0).endswith("; less certain because: prior riding")
 
 
+@pytest.mark.parametrize("state", [State.VALID, State.DEGRADED])
+def test_what_cannot_be_kept_makes_no_range_less_certain(state):
+    reasons = Reason.LOG_FAILED | Reason.SAVE_FAILED | (Reason.SOC_RESTARTED if state is State.DEGRADED else Reason(0))
+    view = seen(replace(ESTIMATE, state=state, reasons=reasons))
+    text = picture(view, 100.0)
+    assert "Note              log failed" in text
+    assert "Less certain" not in text
+    assert ("Because           SOC restarted" in text) is (state is State.DEGRADED)
+    line = screen.summary_line(view, 100.0)
+    assert line.endswith("; note: log failed, save failed")
+    assert ("degraded because: SOC restarted;" in line) is (state is State.DEGRADED)
+    assert "certain" not in line
+
+
 def test_the_bar_stands_where_the_numbers_are():
     bar = next(line for line in picture(seen(), 100.0, 54).splitlines() if "●" in line)
     assert len(bar) == 52
@@ -198,7 +212,7 @@ def test_sensors_left_out_are_named():
     for shown in "sensor distrusted", "signals slow", "SOC restarted", "save failed":
         assert shown in text
     assert screen.summary_line(view, 100.0).endswith(
-        "; degraded because: sensor distrusted, signals slow, SOC restarted, save failed; "
+        "; degraded because: sensor distrusted, signals slow, SOC restarted; note: save failed; "
         "left out: acceleration x, GPS altitude, BMS state of charge"
     )
     assert "GPS altitude" not in picture(view, 111.0)  # stale

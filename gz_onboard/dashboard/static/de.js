@@ -50,7 +50,7 @@ export default {
   "meanings": {
     "starting": "Es gibt noch keine Schätzung.",
     "valid": "Alle Eingänge sind da.",
-    "degraded": "Ein Eingang fehlt: der Bereich ist weiter.",
+    "degraded": "Ein Eingang fehlt oder ist zweifelhaft: der Bereich ist weiter.",
     "invalid": "Keine Reichweite lässt sich angeben.",
     "none": "Nichts sagt, wie weit den Zahlen zu trauen ist."
   },

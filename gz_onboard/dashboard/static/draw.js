@@ -16,6 +16,7 @@ const SHOWN_BY = {  // the places that a message fills
   RANGE_Charge: ["charge"], RANGE_Route: ["route"], RANGE_Why: ["why"],
   cell_temperature: ["cells"], odometer: ["ridden"],
 };
+const KEEPING = ["log_failed", "save_failed"];
 const SIGNS = { valid: "✓", degraded: "!", invalid: "✕", starting: "…", none: "?" };
 const SAME = 0.03;  // a consumption so near to the expected is as expected
 const byId = (id) => document.getElementById(id);
@@ -115,9 +116,12 @@ function drawState(picture, problem) {
   put("trust-word", word("states", state));
   put("source", picture.channel);
   put("activity", picture.activity ? word("activities", picture.activity) : DASH);
-  put("meaning", word("meanings", state));
+  // What fails of keeping the ride makes no range less certain.
+  const [kept, why] = [true, false].map((is) => picture.reasons.filter((name) => KEEPING.includes(name) === is));
+  const notes = kept.map((name) => word("reasons", name)).map((text) => `${text[0].toUpperCase()}${text.slice(1)}.`);
+  put("meaning", [word("meanings", state), ...notes].join(" "));
   const because = said(state === "valid" ? words().less_certain : words().because, { state: word("states", state) });
-  bullets("reasons", because, picture.reasons.map((name) => word("reasons", name)));
+  bullets("reasons", because, why.map((name) => word("reasons", name)));
   bullets("distrusted", words().left_out, picture.distrusted.map((name) => word("sensors", name)));
   const named = (names) => names.map((name) => word("messages", name));
   const late = picture.late.filter((name) => !picture.stale.includes(name));

@@ -50,7 +50,7 @@ export default {
   "meanings": {
     "starting": "There is no estimate yet.",
     "valid": "All inputs are there.",
-    "degraded": "An input is missing: the interval is wider.",
+    "degraded": "An input is missing or doubtful: the interval is wider.",
     "invalid": "No range can be told.",
     "none": "Nothing says how far the numbers can be trusted."
   },
