@@ -57,32 +57,41 @@ class Stream:
 
 
 def simulate_frames(vehicle: Vehicle, truth: Truth, seed: int = 0, dropouts: Dropouts = Dropouts()) -> list[Stream]:
-    """The messages that the sensors of a ride send, from `START_NS` on.
-
-    Raises InputError if the vehicle's DBC files have none of the sensors' signals, or a message that has no
-    period or cannot be packed.
-    """
+    """The messages that the sensors of a ride send, from `START_NS` on. Raises InputError as `messages_sent` does."""
     sensors = {sensor.signal: sensor for sensor in (*SENSORS, *(ROLLER if truth.on_dynamometer else ()))}
-    known = {s.signal for s in (*SENSORS, *ROLLER)}
-    found = [m for m in vehicle.mapping.database.messages if known & {s.name for s in m.signals}]
+    roller = {sensor.signal for sensor in (() if truth.on_dynamometer else ROLLER)}
+    return [
+        _send(vehicle, message, sensors, truth, seed, dropouts)
+        for message in messages_sent(vehicle)
+        if not roller & {signal.name for signal in message.signals}
+    ]
+
+
+def messages_sent(vehicle: Vehicle) -> list[Message]:
+    """The messages of which frames can be simulated.
+
+    InputError if the vehicle's DBC files have none of the sensors' signals, or a message that has no period or cannot
+    be packed.
+    """
+    known, periods = {sensor.signal for sensor in (*SENSORS, *ROLLER)}, vehicle.mapping.periods
+    messages = vehicle.mapping.database.messages
+    found = [message for message in messages if known & {signal.name for signal in message.signals}]
     if not found:
-        raise vehicle.error("its DBC files have none of the reference scooter's signals, which simulated frames carry")
+        raise vehicle.error(
+            "--frames simulates the reference scooter's sensors, and none of their signals (BMS_PackVoltage, "
+            "INV_MotorSpeed, ...) is in its DBC files: how the sensors of another bus err is not known"
+        )
     for message in found:
-        if message.name not in vehicle.mapping.periods:
+        if message.name not in periods:
             raise vehicle.error(
                 f"message {message.name}: its DBC file gives no GenMsgCycleTime, the period of its frames"
             )
-    sent = []
-    for message in vehicle.mapping.database.messages:
-        period = vehicle.mapping.periods.get(message.name)
-        roller = any(s.signal in {g.name for g in message.signals} for s in ROLLER)
-        if period is None or (roller and not truth.on_dynamometer):
-            continue
+    sent = [message for message in messages if message.name in periods]
+    for message in sent:
         if message.length != 8 or message.is_multiplexed() or not all(map(_can_be_packed, message.signals)):
             raise vehicle.error(
                 f"message {message.name}: simulated frames have eight bytes and little-endian integers, not multiplexed"
             )
-        sent.append(_send(vehicle, message, sensors, truth, seed, dropouts))
     return sent
 
 

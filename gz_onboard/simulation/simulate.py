@@ -18,7 +18,7 @@ from gz_onboard.errors import OK, InputError, not_an_input, require
 from gz_onboard.offline.results import explain_keys, times, write_json
 from gz_onboard.options import PICTURE_FORMATS, add_shared, number
 from gz_onboard.progress import Progress, progress_bar
-from gz_onboard.simulation.frames import Dropouts, check_output
+from gz_onboard.simulation.frames import Dropouts, check_output, messages_sent
 from gz_onboard.simulation.output import FORMATS, PICTURES, output_file, write, write_trace
 from gz_onboard.simulation.parts.chassis import MODELS, chassis
 from gz_onboard.simulation.plan import RANGES, Plan, SimulationOptions, find_plan, vehicle_on
@@ -100,6 +100,7 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--sweep {sweeps[0].name}: given twice")
     if arguments.frames:
         check_output(arguments.frames)
+        messages_sent(vehicle)
     elif arguments.frame_loss is not None:
         raise InputError(f"--frame-loss {arguments.frame_loss:g}: is for --frames FILE")
     plan = find_plan(arguments.what, options, vehicle)

@@ -277,9 +277,15 @@ def test_a_vehicle_whose_bus_cannot_carry_them_is_refused(tmp_path):
     file.write_text((ROOT / "gz_onboard" / "vehicles" / "reference.toml").read_text())
     with pytest.raises(InputError, match="BMS_Pack: its DBC file gives no GenMsgCycleTime"):
         simulate_frames(read_vehicle(str(file)), ride()[1])
-    other = read_vehicle(str(ROOT / "tests" / "vehicles" / "tlmoto" / "tlmoto.toml"))
-    with pytest.raises(InputError, match="none of the reference scooter's signals"):
-        simulate_frames(other, ride()[1])
+
+
+def test_frames_of_another_bus_are_refused_before_anything_is_computed_or_written(tmp_path, capsys):
+    other = str(ROOT / "tests" / "vehicles" / "tlmoto" / "tlmoto.toml")
+    frames, written = tmp_path / "ride.blf", tmp_path / "written"
+    assert main(["simulate", "ece15", "--vehicle", other, "--frames", str(frames), "--output", str(written)]) == 2
+    assert "--frames simulates the reference scooter's sensors, and none of their signals" in capsys.readouterr().err
+    assert not frames.exists()
+    assert not written.exists()
 
 
 @pytest.mark.parametrize(
