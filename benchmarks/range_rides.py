@@ -14,7 +14,7 @@ from tests.plant.cases import stranger
 from tests.plant.logs import write_log
 from tests.plant.machine import SERIES, scooter
 from tests.plant.ride import STEP, Hidden, Ridden, ride
-from tests.plant.roads import GRID, KINDS, Plan, plan
+from tests.plant.roads import GRID, JOURNEY, KINDS, Plan, plan
 from tests.plant.sensors import DEGREE, ORIGIN, measure
 
 LONGEST = 20_000.0  # s: more than any full discharge takes
@@ -24,10 +24,11 @@ EVERY = 50  # steps of the plant between truths that are kept: each second
 ANOTHER_DAY = 1_000_000  # from a seed to that of a second discharge of the same scooter
 HIDDEN = {
     "healthy": Hidden(),
+    "journey": Hidden(),
     "aged": Hidden(capacity_factor=0.8, resistance_factor=1.5),
     "punctured": Hidden(late_force=15.0, late_time=2400.0),  # N: a soft tyre rolls with nearly twice the resistance
 }
-CONDITIONS = "healthy", "aged", "healthy", "punctured"  # by seed
+CONDITIONS = "healthy", "aged", "healthy", "punctured", "journey"  # by seed
 ROUTE_GRID = 20.0  # m between points of a route
 BEFORE_BEND = 30.0  # m around a point, whose fastest is its limit: within, riders brake for bends
 MAP_ERROR, MAP_LENGTH = 0.3, 400.0  # m of sd of a map's altitude, m over which its errors are alike
@@ -60,7 +61,7 @@ def draw(seed: int) -> Drawn:
     rng = np.random.default_rng([seed, 29])
     kind, ambient = str(rng.choice(sorted(set(KINDS) - {"oval"}))), float(rng.uniform(-5, 35))
     mass, condition = stranger(np.random.default_rng([seed, 31])).mass, CONDITIONS[seed % len(CONDITIONS)]
-    return Drawn(seed, seed, kind, ambient, mass, condition)
+    return Drawn(seed, seed, JOURNEY if condition == JOURNEY else kind, ambient, mass, condition)
 
 
 def again(drawn: Drawn) -> Drawn:

@@ -25,6 +25,7 @@ from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.road_load import RoadLoad, RoadParameter
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.snapshot import part
+from gz_onboard.estimator.terrain import RATE, Terrain
 from gz_onboard.estimator.usual import Habit, Usual
 from gz_onboard.estimator.weakest import Weakest
 from gz_onboard.options import add_shared
@@ -44,6 +45,7 @@ MEANING = {  # by name: what its factor is on
     "standing": "energy at stops, likewise",
     "pace": "time of a kilometre, likewise",
     "factor": "measured over modelled energy of the same motion",
+    "terrain": "height that roads climb or fall for good, whoever rides, over that of a car's trips around one town",
     "mass": "mass of rider and luggage",
     "rolling": "resistance over weight",
     "drag": "area of vehicle and rider",
@@ -156,8 +158,11 @@ def read_riders(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, dict
     prior = forecaster.prior
     with part(RIDING):
         forecaster.restore(snapshot["riding"])
-    riders = {forecaster.riders.now: forecaster.riding.usual, **forecaster.riders.others}
-    return {name: _of_usual(usual, prior) for name, usual in riders.items()}
+    now = forecaster.riders.now
+    riders = {now: forecaster.riding.usual, **forecaster.riders.others}
+    found = {name: _of_usual(usual, prior) for name, usual in riders.items()}
+    found[now]["terrain"] = _of_terrain(forecaster.terrain)
+    return found
 
 
 def _of_usual(usual: Usual, prior: Usual) -> dict[str, Learned]:
@@ -168,6 +173,10 @@ def _of_usual(usual: Usual, prior: Usual) -> dict[str, Learned]:
 def _of_habit(habit: Habit, prior: Habit) -> Learned:
     sd, unknown = sqrt(habit.usual_variance), sqrt(prior.usual_variance)
     return Learned(habit.usual / prior.usual, sd / prior.usual, max(1 - sd / unknown, 0.0))
+
+
+def _of_terrain(terrain: Terrain) -> Learned:
+    return Learned(sqrt(terrain.rate / RATE), terrain.relative_sd * sqrt(terrain.rate / RATE), terrain.share)
 
 
 def _fresh(vehicle: Vehicle) -> Forecaster:

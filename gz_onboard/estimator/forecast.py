@@ -30,6 +30,7 @@ from gz_onboard.estimator.load_model import AHEAD, USUAL_AIR, Conditions, Effect
 from gz_onboard.estimator.pattern import STEEPEST, Pattern, restored_pattern
 from gz_onboard.estimator.ridden import Past, Riding, Second, Segment, learned, restored, restored_states, unlearned
 from gz_onboard.estimator.riders import Riders, restored_riders
+from gz_onboard.estimator.terrain import Terrain, restored_terrain
 from gz_onboard.estimator.usual import SEGMENT, Unit, Usual, restored_unit
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.cooling import LumpedCooling
@@ -98,7 +99,7 @@ class Forecaster:
         price, stops = self.load.prior_prices(*USUAL_AIR)
         self.prior, self._unit = Usual.of(prior, stops / price), Unit(price + stops, prior.speed)
         self.riding = Riding(self.prior)
-        self.calm, self.pattern, self.riders = Calm(), Pattern(), Riders()
+        self.calm, self.pattern, self.riders, self.terrain = Calm(), Pattern(), Riders(), Terrain()
         self.ageing: Ageing | None = None  # None: the pack is known to be as its file says
         self._past, self._colder = Past(), ((inf, inf, inf), 0.0)  # SOC, cells and their sd [degC]; the share lost
         self._overpotential = model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
@@ -153,6 +154,7 @@ class Forecaster:
             segment.squares += r.second.squares
         stored = self._weight * r.second.climb + self._moving_mass * (speed * speed - before * before) / 2
         segment.level -= stored
+        segment.climb += r.second.climb
         self.pattern.add(r.second, mean, acceleration)
         r.second, r.speed_before = Second(), speed
         if segment.distance < SEGMENT:
@@ -232,6 +234,7 @@ class Forecaster:
         r.current = Segment()
         self._sum_past()
         price, _ = self.load.prior_prices(conditions.ambient, conditions.altitude)
+        self.terrain = self.terrain.ridden(segment.distance, segment.climb, segment.unseen)
         height = self._weight * HEIGHT_WALK * sqrt(segment.unseen)
         r.usual = learned(r.usual, segment, price, self.load.prior.speed, height)
 
@@ -319,6 +322,7 @@ class Forecaster:
         variance += (past.blind * price / self.riding.factor) ** 2 * self.riding.factor_variance
         pace, _ = usual.pace.ahead(way)
         consumption = moving * (price + max(standing, 0.0))
+        height_variance = self._weight**2 * self.terrain.variance(way) / (consumption * way) ** 2
         prior_power, prior_time = (moving + stops) * self.load.prior.speed, PRIOR_LENGTH / self.load.prior.speed
         # Downhill next to nothing is drawn in the mean; what is to come is not all downhill.
         energy = prior_power * prior_time + max(past.measured, self.riding.factor * past.level)
@@ -329,7 +333,7 @@ class Forecaster:
             consumption,
             consumption * self.load.prior.speed / max(pace, LEAST),
             form_factor_squared=min(max(form_factor_squared, FORM_FACTOR_SQUARED[0]), FORM_FACTOR_SQUARED[1]),
-            variance=(variance + standing_variance) * (moving / consumption) ** 2,
+            variance=(variance + standing_variance) * (moving / consumption) ** 2 + height_variance,
         )
 
     # --- saving -----------------------------------------------------------------------------------------------
@@ -337,7 +341,7 @@ class Forecaster:
     def snapshot(self) -> dict[str, object]:
         """What is to be kept over a restart."""
         kept = self.calm.snapshot() | {"of": asdict(self._unit), "pattern": self.pattern.snapshot()}
-        kept |= {"states": dict(self.load.states)}
+        kept |= {"states": dict(self.load.states), "terrain": self.terrain.snapshot()}
         return self.riding.snapshot() | self.riders.snapshot() | kept
 
     def restore(self, saved: Mapping[str, Any]) -> None:
@@ -345,6 +349,7 @@ class Forecaster:
         unit = restored_unit(saved, self._unit)
         riding, states = restored(saved, self.prior, unit), restored_states(saved["states"])
         pattern, riders = restored_pattern(saved.get("pattern", ())), restored_riders(saved, unit)
-        self.calm = restored_calm(saved)
+        terrain = restored_terrain(saved["terrain"]) if "terrain" in saved else Terrain()  # older versions have none
+        self.calm, self.terrain = restored_calm(saved), terrain
         self.riding, self.load.states, self.pattern, self.riders = riding, states, pattern, riders
         self._sum_past()

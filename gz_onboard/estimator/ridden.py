@@ -37,6 +37,7 @@ class Segment:
     level: float = 0.0  # modelled, less what height and speed have stored: its hills, but back where it began
     standing: float = 0.0  # measured, at stops
     unseen: float = 0.0  # m of which no sensor showed the grade
+    climb: float = 0.0  # m, of the rest
     learned: Usual | None = None  # what was usual before it; None after a restart
 
 

@@ -22,6 +22,10 @@ KINDS = {
     "arterial": (420.0, (15.0, 120.0), 0.25, (11.5, 13.0), 0.4),
     "oval": (300.0, (28.0, 50.0), 0.02, (11.5, 12.8), 0.0),
 }
+JOURNEY = "journey"  # over land: through towns and between them in turn, up and down for kilometres
+JOURNEY_OF = "city", "arterial"
+PART = (4000.0, 14000.0)  # m of each
+SLOPE, SLOPE_LENGTH, SLOPE_AFTER = (0.01, 0.035), (1500.0, 6000.0), (3000.0, 12000.0)  # sine, m, m after the one before
 
 
 @dataclass(frozen=True)
@@ -97,7 +101,8 @@ def plan(
     person = make_rider(rng, rider) if isinstance(rider, str) else rider
     drawn = float(rng.uniform(*DURATION))
     duration = drawn if duration is None else duration
-    curvature, speed, stops = _way(rng, kind, person, 14.0 * duration)
+    way = _journey if kind == JOURNEY else _way
+    curvature, speed, stops = way(rng, kind, person, 14.0 * duration)
     own_wind = rng.normal(0, 1.0, 2)
     north, east = own_wind if wind is None else wind
     return Plan(
@@ -113,7 +118,7 @@ def plan(
         pack_warmer=float(rng.choice([0.0, 0.0, rng.uniform(0, 5)])),
         motor_warmer=float(rng.choice([0.0, 0.0, rng.uniform(0, 8)])),
         curvature=curvature,
-        grade=_hills(rng, len(curvature), hilly),
+        grade=_hills(rng, len(curvature), hilly) + (_slopes(rng, len(curvature)) if kind == JOURNEY else 0.0),
         rough=_surface(np.random.default_rng([seed, 23]), len(curvature)),
         speed=speed,
         stops=stops,
@@ -157,6 +162,18 @@ def _way(rng: np.random.Generator, kind: str, rider: Rider, length: float) -> tu
     return curvature, speed, np.array([*stops, 1e9])
 
 
+def _journey(rng: np.random.Generator, kind: str, rider: Rider, length: float) -> tuple[Array, Array, Array]:
+    """The ways of `JOURNEY_OF` in turn."""
+    curvatures, speeds, stops, at, turn = [], [], [], 0.0, int(rng.integers(len(JOURNEY_OF)))
+    while at < length:
+        curvature, speed, stop = _way(rng, JOURNEY_OF[turn % len(JOURNEY_OF)], rider, float(rng.uniform(*PART)))
+        curvatures.append(curvature)
+        speeds.append(speed)
+        stops.append(at + stop[:-1])
+        at, turn = at + GRID * len(curvature), turn + 1
+    return np.concatenate(curvatures), np.concatenate(speeds), np.append(np.concatenate(stops), 1e9)
+
+
 def _smooth(values: Array, width: int) -> Array:
     out: Array = np.convolve(np.pad(values, width // 2, mode="edge"), np.ones(width) / width, "valid")
     return out
@@ -178,6 +195,16 @@ def _hills(rng: np.random.Generator, count: int, hilly: float) -> Array:
             * np.cos(2 * np.pi * x / length + rng.uniform(0, 2 * np.pi))
         )
     return np.clip(grade, -0.09, 0.09)
+
+
+def _slopes(rng: np.random.Generator, count: int) -> Array:
+    """Grade of long ascents and descents, which do not come back to their height."""
+    grade, at = np.zeros(count), float(rng.uniform(*SLOPE_AFTER))
+    while at < count * GRID:
+        end = at + float(rng.uniform(*SLOPE_LENGTH))
+        grade[int(at / GRID) : int(end / GRID)] = rng.choice([-1.0, 1.0]) * rng.uniform(*SLOPE)
+        at = end + float(rng.uniform(*SLOPE_AFTER))
+    return _smooth(grade, 51)
 
 
 def _surface(rng: np.random.Generator, count: int) -> Array:

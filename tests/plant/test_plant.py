@@ -15,7 +15,7 @@ from tests.plant.cases import EFFECTS, RIDES, UNKNOWN, _draft
 from tests.plant.logs import write_logs
 from tests.plant.machine import G, scooter
 from tests.plant.ride import STEP, Hidden, Ridden, ride
-from tests.plant.roads import plan
+from tests.plant.roads import GRID, JOURNEY, plan
 from tests.plant.sensors import measure
 from tests.support import with_cell_voltages
 
@@ -128,3 +128,13 @@ def test_all_that_can_be_hidden_is_drawn_and_no_kind_is_left_out():
     assert {name for d in drafts if d.kind == "unknown" for name in d.parts} == set(UNKNOWN)
     assert all(len(d.parts) == 2 for d in drafts if d.kind == "two")
     assert RIDES >= 4
+
+
+def test_a_journey_goes_through_towns_and_between_them_and_up_for_good():
+    way = plan(11, JOURNEY, "B", 15.0, 1.0, duration=5000.0)
+    assert len(way.curvature) == len(way.grade) == len(way.speed)
+    kilometres = np.abs(way.curvature)[: len(way.curvature) // 500 * 500].reshape(-1, 500).mean(axis=1)
+    assert kilometres.max() > 3 * kilometres.min()  # towns bend, roads do not
+    assert np.all(np.diff(way.stops) > 0) and way.stops[-2] < GRID * len(way.speed)
+    there, suburb = (np.ptp(GRID * np.cumsum(x.grade)) for x in (way, plan(11, "suburban", "B", 15.0, 1.0)))
+    assert there > 3 * suburb > 0  # m

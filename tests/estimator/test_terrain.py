@@ -1,0 +1,80 @@
+"""How far roads climb for good is learned from net climbs, and widens the interval where they do."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gz_onboard.estimator.terrain import RATE, STRETCH, Terrain, restored_terrain
+
+SEGMENT = 250.0  # m
+NEW = Terrain()
+
+
+def ridden(climbs: list[float], terrain: Terrain = NEW, unseen: float = 0.0) -> Terrain:
+    """After stretches that climb by so many metres each."""
+    for climb in climbs:
+        for _ in range(int(STRETCH / SEGMENT)):
+            terrain = terrain.ridden(SEGMENT, climb * SEGMENT / STRETCH, unseen * SEGMENT)
+    return terrain
+
+
+def test_before_any_riding_a_guess():
+    assert Terrain().rate == RATE
+    assert sqrt(Terrain().variance(50_000.0)) == pytest.approx(50.0)
+
+
+def test_level_roads_are_learned_as_such():
+    assert ridden([1.0, -1.0] * 10).rate < RATE / 5
+
+
+def test_mountains_are_learned_within_some_stretches():
+    found = ridden([150.0, -100.0, 120.0])
+    assert found.rate == pytest.approx((150**2 + 100**2 + 120**2) / 3 / STRETCH, rel=0.5)
+    assert found.rate > 30 * RATE
+
+
+def test_hills_that_give_back_what_they_took_do_not_count():
+    terrain = Terrain()
+    for i in range(64):
+        terrain = terrain.ridden(SEGMENT, 12.0 * (-1) ** i, 0.0)
+    assert terrain.rate < RATE
+
+
+def test_another_country_is_learned_after_the_first():
+    there = ridden([100.0] * 60)
+    assert ridden([2.0] * 150, there).rate < there.rate / 10
+
+
+def test_a_stretch_whose_grade_was_not_seen_tells_nothing():
+    assert ridden([0.0] * 10, unseen=0.5) == Terrain()
+
+
+def test_no_road_is_as_steep_as_a_faulty_sensor_says():
+    assert ridden([3000.0]) == Terrain()
+
+
+def test_on_a_short_way_a_slope_goes_on():
+    assert sqrt(Terrain().variance(200.0)) == pytest.approx(2 * sqrt(Terrain().variance(100.0)))
+    assert Terrain().variance(2 * STRETCH) == pytest.approx(2 * Terrain().variance(STRETCH))
+
+
+@given(st.lists(st.tuples(st.floats(1, 2000), st.floats(-500, 500), st.floats(0, 1)), max_size=60))
+def test_any_riding_gives_a_state_that_can_be_kept(segments):
+    terrain = Terrain()
+    for way, climb, unseen in segments:
+        terrain = terrain.ridden(way, climb, unseen * way)
+        assert terrain.rate > 0
+        assert restored_terrain(terrain.snapshot()) == terrain
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [{"squares": -1.0}, {"squares": float("nan")}, {"stretches": 1e9}, {"climb": float("inf")}, {"way": "far"}],
+)
+def test_a_damaged_state_is_refused(damage):
+    with pytest.raises((KeyError, TypeError, ValueError)):
+        restored_terrain(Terrain().snapshot() | damage)
