@@ -349,7 +349,6 @@ class Forecaster:
         unit = restored_unit(saved, self._unit)
         riding, states = restored(saved, self.prior, unit), restored_states(saved["states"])
         pattern, riders = restored_pattern(saved.get("pattern", ())), restored_riders(saved, unit)
-        terrain = restored_terrain(saved["terrain"]) if "terrain" in saved else Terrain()  # older versions have none
-        self.calm, self.terrain = restored_calm(saved), terrain
+        self.calm, self.terrain = restored_calm(saved), restored_terrain(saved.get("terrain"))
         self.riding, self.load.states, self.pattern, self.riders = riding, states, pattern, riders
         self._sum_past()

@@ -64,8 +64,10 @@ class Terrain:
         return asdict(self)
 
 
-def restored_terrain(saved: Mapping[str, Any]) -> Terrain:
-    """What `Terrain.snapshot` gave; KeyError, TypeError or ValueError if it is not that."""
+def restored_terrain(saved: Mapping[str, Any] | None) -> Terrain:
+    """What `Terrain.snapshot` gave, None for an older version; KeyError, TypeError or ValueError if it is not that."""
+    if saved is None:
+        return Terrain()
     terrain = Terrain(**{name: float(saved[name]) for name in asdict(Terrain())})
     numbers = asdict(terrain).values()
     possible = min(terrain.squares, terrain.stretches, terrain.way, terrain.unseen) >= 0
