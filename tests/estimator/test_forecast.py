@@ -119,6 +119,18 @@ def test_a_long_descent_that_no_sensor_tells_is_hardly_learned():
     assert forecast(unseen).consumption == pytest.approx(forecast(seen).consumption, rel=0.2)
 
 
+def test_who_rides_in_mountains_has_a_wider_interval_over_a_restart_too():
+    """Up and down by 3 % for 4 km each, against a plain; the median expects neither."""
+    plain, mountains = forecaster(), forecaster()
+    ride(plain, 25)
+    ride(mountains, 25, grade=lambda x: 0.03 * (-1) ** int(x / 4000))
+    again = forecaster()
+    again.restore(json.loads(json.dumps(mountains.snapshot())))
+    flat, steep, kept = map(forecast, (plain, mountains, again))
+    assert steep.consumption_sd / steep.consumption > 1.5 * flat.consumption_sd / flat.consumption
+    assert (kept.p10, kept.p90) == pytest.approx((steep.p10, steep.p90))
+
+
 def test_uncertainty_of_soc_widens_the_interval():
     f = forecaster()
     narrow, wide = f.forecast(0.5, 0.005, 25.0, 1.0, 20.0, 0.0), f.forecast(0.5, 0.05, 25.0, 1.0, 20.0, 0.0)
