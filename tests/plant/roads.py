@@ -26,6 +26,7 @@ JOURNEY = "journey"  # over land: through towns and between them in turn, up and
 JOURNEY_OF = "city", "arterial"
 PART = (4000.0, 14000.0)  # m of each
 SLOPE, SLOPE_LENGTH, SLOPE_AFTER = (0.01, 0.035), (1500.0, 6000.0), (3000.0, 12000.0)  # sine, m, m after the one before
+HIGHEST = 300.0  # m above or below its begin, from which a journey comes back
 
 
 @dataclass(frozen=True)
@@ -198,11 +199,15 @@ def _hills(rng: np.random.Generator, count: int, hilly: float) -> Array:
 
 
 def _slopes(rng: np.random.Generator, count: int) -> Array:
-    """Grade of long ascents and descents, which do not come back to their height."""
-    grade, at = np.zeros(count), float(rng.uniform(*SLOPE_AFTER))
+    """Grade of long ascents and descents, which come back to their height from `HIGHEST` only."""
+    grade, at, height = np.zeros(count), float(rng.uniform(*SLOPE_AFTER)), 0.0
     while at < count * GRID:
         end = at + float(rng.uniform(*SLOPE_LENGTH))
-        grade[int(at / GRID) : int(end / GRID)] = rng.choice([-1.0, 1.0]) * rng.uniform(*SLOPE)
+        slope = float(rng.choice([-1.0, 1.0]) * rng.uniform(*SLOPE))
+        if slope * height > 0 and abs(height) > HIGHEST:
+            slope = -slope
+        grade[int(at / GRID) : int(end / GRID)] = slope
+        height += slope * (end - at)
         at = end + float(rng.uniform(*SLOPE_AFTER))
     return _smooth(grade, 51)
 
