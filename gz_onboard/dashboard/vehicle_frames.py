@@ -9,6 +9,7 @@ import json
 import sys
 import time
 from dataclasses import replace
+from math import inf
 from pathlib import Path
 
 from gz_onboard.bus.codec import Codec
@@ -146,6 +147,7 @@ def _read(file: Path) -> tuple[str, float]:
     """Date and odometer [km] in the file; of one that is damaged or not there a day that never was."""
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
-        return str(found["date"]), float(found["odometer_km"])
-    except (OSError, ValueError, KeyError, TypeError):
+        date, odometer = str(found["date"]), float(found["odometer_km"])
+    except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return "", 0.0
+    return (date, odometer) if 0 <= odometer < inf else ("", 0.0)

@@ -127,7 +127,21 @@ def test_a_day_begins_at_midnight_and_goes_on_over_a_restart(tmp_path):
     assert ridden(None, (1020.0, NOON + 5 * DAY)) == 0.0
 
 
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"date": 1}', '{"date": "2025-06-15", "odometer_km": "x"}', "\xff"])
+IMPOSSIBLE = "NaN", "Infinity", "-Infinity", "-5000", "1" + 400 * "0", '"x"'
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "{",
+        "[]",
+        '{"date": 1}',
+        "\xff",
+        9999 * "[",
+        *(f'{{"date": "2025-06-15", "odometer_km": {x}}}' for x in IMPOSSIBLE),
+    ],
+)
 def test_a_damaged_file_is_begun_anew(tmp_path, text):
     file = tmp_path / "day.json"
     file.write_text(text, encoding="latin-1")
