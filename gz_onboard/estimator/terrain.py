@@ -71,7 +71,8 @@ def restored_terrain(saved: Mapping[str, Any] | None) -> Terrain:
     terrain = Terrain(**{name: float(saved[name]) for name in asdict(Terrain())})
     numbers = asdict(terrain).values()
     possible = min(terrain.squares, terrain.stretches, terrain.way, terrain.unseen) >= 0
-    possible &= terrain.stretches <= REMEMBERED and terrain.squares <= REMEMBERED * MOST_CLIMB**2
+    possible &= terrain.stretches <= REMEMBERED and terrain.way < STRETCH
+    possible &= terrain.squares <= 2 * MOST_CLIMB**2 * terrain.stretches  # a stretch may end late, but not so late
     if not (possible and all(map(isfinite, numbers))):
         raise ValueError("implausible terrain")
     return terrain

@@ -73,7 +73,15 @@ def test_any_riding_gives_a_state_that_can_be_kept(segments):
 
 @pytest.mark.parametrize(
     "damage",
-    [{"squares": -1.0}, {"squares": float("nan")}, {"stretches": 1e9}, {"climb": float("inf")}, {"way": "far"}],
+    [
+        {"squares": -1.0},
+        {"squares": float("nan")},
+        {"squares": 1e7},  # of no stretch
+        {"stretches": 1e9},
+        {"climb": float("inf")},
+        {"way": "far"},
+        {"way": 1e9, "climb": 1e8},
+    ],
 )
 def test_a_damaged_state_is_refused(damage):
     with pytest.raises((KeyError, TypeError, ValueError)):
