@@ -27,6 +27,8 @@ LATE_PERIODS = 3
 PERIOD = 1.0  # s, where nothing says it
 RIDING = -20.0, 60.0  # degC: usual data sheets of lithium-ion cells, where the vehicle file says nothing
 CHARGING = 0.0, 45.0  # degC: likewise
+FASTEST, LEAP = 0.07, 100.0  # km/s and km: an odometer that goes further ahead, or goes back, is doubted
+DOUBTED = 10.0  # s: one that errs for so long was set
 
 
 class VehicleFrames:
@@ -60,10 +62,10 @@ class VehicleFrames:
             group = self._codec.groups[number]
             self._believed = self._believed or group.message == self._witness
             for role, value in zip(group.roles, values, strict=True):
-                if value is not None and self._believed:
+                if value is None or not self._believed:
+                    continue
+                if role != ODOMETER or self._day.take(value / 1e3, frame[0], now):
                     self._last[role] = value, now
-                    if role == ODOMETER:
-                        self._day.take(value / 1e3, frame[0])
 
     def value(self, role: str, now: float) -> float | None:
         """The newest of a role; None if it is stale or never came."""
@@ -117,22 +119,39 @@ class Day:
     def __init__(self, kept: Path | None) -> None:
         self._kept = kept
         self._date, self._begin = _read(kept) if kept else ("", 0.0)  # of the day; the odometer [km] then
-        self._last: float | None = None  # km
+        self._last: tuple[float, float] | None = None  # km, and when [s]
+        self._doubt: float | None = None  # s: since when it is doubted
 
     @property
     def ridden(self) -> float | None:
         """[km]; None before the odometer was seen."""
-        return None if self._last is None else self._last - self._begin
+        return None if self._last is None else self._last[0] - self._begin
 
-    def take(self, odometer: float, stamp_ns: int) -> None:
-        """The odometer [km] at a time [ns since 1970]."""
+    def take(self, odometer: float, stamp_ns: int, now: float) -> bool:
+        """The odometer [km] at a time [ns since 1970], which came at `now` [s]; False if it is not believed.
+
+        Its ECU may say 0 until it has found what it kept: of that no day is made.
+        """
+        if self._possible(odometer, now):
+            self._doubt = None
+        else:
+            self._doubt = now if self._doubt is None else self._doubt
+            if now - self._doubt < DOUBTED:
+                return False
+            self._date, self._last, self._doubt = "", None, None
         date = time.strftime("%Y-%m-%d", time.localtime(stamp_ns * 1e-9))
-        if date != self._date or odometer < self._begin:
-            before = self._last if self._last is not None and self._last <= odometer else odometer
-            self._date, self._begin = date, before
+        if date != self._date:
+            self._date, self._begin = date, self._last[0] if self._last else odometer
             if self._kept:
                 self._keep(self._kept)
-        self._last = odometer
+        self._last = odometer, now
+        return True
+
+    def _possible(self, odometer: float, now: float) -> bool:
+        if self._last is None:
+            return odometer >= self._begin
+        before, then = self._last
+        return 0 <= odometer - before <= LEAP + FASTEST * (now - then)
 
     def _keep(self, file: Path) -> None:
         new = file.with_name(f"{file.name}.new")

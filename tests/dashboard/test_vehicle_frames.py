@@ -14,7 +14,7 @@ from gz_onboard.bus.codec import CONFIRM
 from gz_onboard.bus.publisher import Publisher
 from gz_onboard.dashboard.command import range_view, view_of
 from gz_onboard.dashboard.picture import Picture, picture
-from gz_onboard.dashboard.vehicle_frames import RIDING, VehicleFrames, cell_limits
+from gz_onboard.dashboard.vehicle_frames import DOUBTED, RIDING, VehicleFrames, cell_limits
 from gz_onboard.dashboard.view import View
 from gz_onboard.events import Activity, Estimate
 from gz_onboard.physics.derating import Derating, DeratingCurve
@@ -107,14 +107,15 @@ def test_limits_are_those_of_the_controller():
 # --- the day ------------------------------------------------------------------------------------------------------
 
 
-def ridden(kept: Path | None, *seen: tuple[float, int]) -> float | None:
-    """Of odometers [km] at times [ns]."""
-    frames = VehicleFrames(REFERENCE, kept)
-    frames.take(own_frame(*PACK, seen[0][1]), 1.0)
+def ridden(kept: Path | None, *seen: tuple[float, int], lasts: float = DOUBTED) -> float | None:
+    """Of odometers [km] at times [ns], each of which lasts so long [s]."""
+    frames, now = VehicleFrames(REFERENCE, kept), 1.0
+    frames.take(own_frame(*PACK, seen[0][1]), now)
     for km, stamp in seen:
         for i in range(CONFIRM + 1):  # of a leap in time
-            frames.take(own_frame(*odometer(km), stamp + i), 1.0)
-    return frames.odometer(1.0)[1]
+            frames.take(own_frame(*odometer(km), stamp + i), now + i / CONFIRM * lasts)
+        now += lasts
+    return frames.odometer(now)[1]
 
 
 def test_a_day_begins_at_midnight_and_goes_on_over_a_restart(tmp_path):
@@ -151,6 +152,23 @@ def test_a_damaged_file_is_begun_anew(tmp_path, text):
 
 def test_an_odometer_that_goes_back_begins_anew(tmp_path):
     assert ridden(tmp_path / "day.json", (1000.0, NOON), (10.0, NOON), (12.0, NOON)) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("wrong", [0.0, 900.0, 4e6])
+def test_an_odometer_that_errs_for_some_seconds_makes_no_day(tmp_path, wrong):
+    """As of an ECU that has just been started."""
+    file = tmp_path / "day.json"
+    assert ridden(file, (1000.0, NOON), (1003.0, NOON), (wrong, NOON), (1004.0, NOON), lasts=2.0) == pytest.approx(4.0)
+    assert ridden(file, (1005.0, NOON), (wrong, NOON + DAY), (1006.0, NOON + DAY), lasts=2.0) == pytest.approx(1.0)
+    assert json.loads(file.read_text())["odometer_km"] == 1005.0
+
+
+def test_an_odometer_that_begins_with_nothing_makes_no_day(tmp_path):
+    file = tmp_path / "day.json"
+    assert ridden(file, (1000.0, NOON)) == 0.0
+    assert ridden(file, (0.0, NOON), lasts=2.0) is None
+    assert ridden(file, (0.0, NOON), (1008.0, NOON), lasts=2.0) == pytest.approx(8.0)
+    assert ridden(None, (0.0, NOON), (1008.0, NOON), (1009.0, NOON)) == pytest.approx(1.0)
 
 
 def test_a_file_that_cannot_be_written_is_said_and_costs_nothing_else(tmp_path, capsys):
