@@ -15,7 +15,7 @@ from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.publisher import RANGE_DBC
 from gz_onboard.dashboard import terminal
 from gz_onboard.dashboard.view import View
-from gz_onboard.errors import InputError
+from gz_onboard.errors import InputError, not_an_input
 from gz_onboard.options import add_shared, number
 from gz_onboard.vehicle import read_vehicle
 
@@ -56,8 +56,14 @@ def view_of(arguments: argparse.Namespace, day: Path | None = None) -> View:
     from gz_onboard.dashboard.vehicle_frames import VehicleFrames  # not for the terminal
 
     if arguments.dbc and not arguments.vehicle:
+        if day:
+            raise InputError(f"--day {day}: with --dbc alone no odometer is read; give --vehicle, too")
         return range_view(arguments)
     vehicle = read_vehicle(arguments.vehicle or REFERENCE)
+    if day:
+        not_an_input([day], [vehicle.file])
+        if day.exists() and not day.is_file():
+            raise InputError(f"--day {day}: is not a file")
     own = VehicleFrames(vehicle, day) if vehicle.mapping.reads_frames else None
     return View(find_dbc(arguments.dbc, Path.cwd()) if arguments.dbc else vehicle.publisher(), own)
 

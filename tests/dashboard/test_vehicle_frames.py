@@ -211,3 +211,25 @@ def test_a_vehicle_whose_range_frames_have_identifiers_of_its_own(tmp_path, show
 def test_only_the_page_keeps_a_day(capsys):
     assert cli.main(["dashboard", "--day", "day.json", "--duration", "0.1"]) == 2
     assert "--day day.json: only with --web" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        (".", ".: is a folder"),
+        ("", ".: is a folder"),
+        ("v.toml", "would overwrite the input"),
+        ("/dev/null", "is not a file"),
+    ],
+)
+def test_a_day_that_cannot_be_kept_is_refused_at_the_start(tmp_path, monkeypatch, capsys, name, said):
+    monkeypatch.chdir(tmp_path)
+    new = ["--kind", "scooter", "--cells", "nmc", "--series", "14", "--capacity", "30", "--mass", "110"]
+    assert cli.main(["vehicle", "new", "v.toml", *new, "--wheel-radius", "0.22"]) == 0
+    assert cli.main([*WEB, "--duration", "0.1", "--vehicle", "v.toml", "--day", name]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_day_is_of_a_vehicle(capsys):
+    assert cli.main([*WEB, "--duration", "0.1", "--dbc", "range.dbc", "--day", "day.json"]) == 2
+    assert "--day day.json: with --dbc alone no odometer is read" in capsys.readouterr().err
