@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
     write_json(arguments.json, SUMMARY_VERSION, {"rides": rides, "failed": failed})
     if arguments.table:
         write_summaries(arguments.table, rides, failed)
-    if arguments.state and arguments.json != "-":
+    if arguments.state and arguments.state.exists() and arguments.json != "-":
         shown = f"--vehicle {arguments.vehicle} --state {arguments.state}"
         print(f"what was learned is in {arguments.state}; `gz-onboard learned {shown}` shows it")
     return BAD_INPUT if failed else OK

@@ -354,3 +354,9 @@ def test_a_month_later_only_the_new_ride_is_estimated(kept, rides, cuts, tmp_pat
     assert [ride["cpu_s"] == 0 for ride in said["rides"]] == [True, True, False]
     assert [Path(failure["file"]).name for failure in said["failed"]] == ["other.blf", "bad.blf"]
     assert (tmp_path / "s.json").read_bytes() == (kept / "s.json").read_bytes()
+
+
+def test_where_no_log_can_be_read_nothing_is_said_to_be_learned(tmp_path, capsys):
+    assert estimate(tmp_path, tmp_path / "none.blf") == 2
+    assert "what was learned" not in capsys.readouterr().out
+    assert not (tmp_path / "s.json").exists()
