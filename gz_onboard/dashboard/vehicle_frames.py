@@ -29,6 +29,7 @@ RIDING = -20.0, 60.0  # degC: usual data sheets of lithium-ion cells, where the 
 CHARGING = 0.0, 45.0  # degC: likewise
 FASTEST, LEAP = 0.07, 100.0  # km/s and km: an odometer that goes further ahead, or goes back, is doubted
 DOUBTED = 10.0  # s: one that errs for so long was set
+CLOCK_SET = 10**18  # ns since 1970: earlier says the clock of a board that begins with 1970 and was not told the time
 
 
 class VehicleFrames:
@@ -121,11 +122,12 @@ class Day:
         self._date, self._begin = _read(kept) if kept else ("", 0.0)  # of the day; the odometer [km] then
         self._last: tuple[float, float] | None = None  # km, and when [s]
         self._doubt: float | None = None  # s: since when it is doubted
+        self._clock_set = False
 
     @property
     def ridden(self) -> float | None:
-        """[km]; None before the odometer was seen."""
-        return None if self._last is None else self._last[0] - self._begin
+        """[km]; None before the odometer was seen, and while nobody knows which day it is."""
+        return self._last[0] - self._begin if self._last and self._clock_set else None
 
     def take(self, odometer: float, stamp_ns: int, now: float) -> bool:
         """The odometer [km] at a time [ns since 1970], which came at `now` [s]; False if it is not believed.
@@ -139,6 +141,10 @@ class Day:
             if now - self._doubt < DOUBTED:
                 return False
             self._date, self._last, self._doubt = "", None, None
+        self._clock_set = stamp_ns >= CLOCK_SET
+        if not self._clock_set:
+            self._last = self._last or (odometer, now)  # what is ridden until then counts for the day that it will be
+            return True
         date = time.strftime("%Y-%m-%d", time.localtime(stamp_ns * 1e-9))
         if date != self._date:
             self._date, self._begin = date, self._last[0] if self._last else odometer

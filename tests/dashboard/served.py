@@ -44,7 +44,7 @@ Own = tuple[str, dict[str, float]]
 """A message of the reference scooter, and of its signals what is not 0."""
 
 
-def own_frame(name: str, values: dict[str, float], time_ns: int = 0) -> Frame:
+def own_frame(name: str, values: dict[str, float], time_ns: int = 1_750_000_000 * 10**9) -> Frame:
     """As the reference scooter sends it."""
     message = VEHICLE.get_message_by_name(name)
     data = message.encode({signal.name: values.get(signal.name, 0) for signal in message.signals}, strict=False)

@@ -171,6 +171,14 @@ def test_an_odometer_that_begins_with_nothing_makes_no_day(tmp_path):
     assert ridden(None, (0.0, NOON), (1008.0, NOON), (1009.0, NOON)) == pytest.approx(1.0)
 
 
+def test_a_board_that_does_not_know_the_time_yet_begins_no_day(tmp_path):
+    file = tmp_path / "day.json"
+    assert ridden(file, (1000.0, NOON), (1020.0, NOON)) == pytest.approx(20.0)
+    assert ridden(file, (1021.0, 0), (1022.0, 0)) is None
+    assert ridden(file, (1022.0, 0), (1023.0, NOON)) == pytest.approx(23.0)
+    assert ridden(file, (1024.0, 0), (1025.0, 0), (1026.0, NOON + DAY)) == pytest.approx(2.0)
+
+
 def test_a_file_that_cannot_be_written_is_said_and_costs_nothing_else(tmp_path, capsys):
     assert ridden(tmp_path / "none" / "day.json", (1000.0, NOON), (1003.0, NOON)) == pytest.approx(3.0)
     assert "where the day began is not kept" in capsys.readouterr().err
