@@ -12,7 +12,7 @@ from dataclasses import replace
 from math import inf
 from pathlib import Path
 
-from gz_onboard.bus.codec import Codec
+from gz_onboard.bus.codec import CRC, Codec
 from gz_onboard.bus.layout import identifiers_of
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.events import STALE_PERIODS, Frame
@@ -45,11 +45,11 @@ class VehicleFrames:
             tuple(source for source in sources if source.role in SHOWN)
             for sources in (mapping.sources, mapping.instruments)
         )
-        # That it is this vehicle's bus is believed once a frame with its checksum came, if it has such.
+        # That it is this vehicle's bus is believed where its checksum is right, if it has such, and not by chance.
         of_witness = tuple(s for s in mapping.sources if s.message == _witness(mapping))[:1]
         self._witness = of_witness[0].message if of_witness else ""
         chosen += tuple(source for source in of_witness if source not in chosen)
-        self._believed = not self._witness
+        self._witnessed = 0
         self.identifiers = identifiers_of(mapping, {source.message for source in (*chosen, *of_instruments)})
         self._limits = cell_limits(vehicle.derating)
         self._codec = Codec(replace(mapping, sources=chosen + of_instruments))
@@ -61,12 +61,18 @@ class VehicleFrames:
         """Take in a frame that came at `now`; one that is not of these, or fails a check, is left out."""
         for _, number, values in self._codec.decode([frame]):
             group = self._codec.groups[number]
-            self._believed = self._believed or group.message == self._witness
+            self._witnessed += group.message == self._witness
             for role, value in zip(group.roles, values, strict=True):
                 if value is None or not self._believed:
                     continue
                 if role != ODOMETER or self._day.take(value / 1e3, frame[0], now):
                     self._last[role] = value, now
+
+    @property
+    def _believed(self) -> bool:
+        """Of another vehicle's frames with the same identifier one in 256 has the checksum, too."""
+        wrong = self._codec.faults.get((self._witness, CRC), 0)
+        return not self._witness or self._witnessed >= max(wrong, 1)
 
     def value(self, role: str, now: float) -> float | None:
         """The newest of a role; None if it is stale or never came."""

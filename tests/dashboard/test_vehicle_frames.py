@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import random
 from dataclasses import replace
 from pathlib import Path
 
@@ -60,6 +61,15 @@ def test_on_another_vehicles_bus_nothing_is_taken_for_its_own():
     for own in PACK, cells(21, 24, 27):
         frames.take(own_frame(*own), 1.0)
     assert frames.cells(1.0) == (21.0, 27.0)
+
+
+def test_a_checksum_that_is_right_by_chance_makes_no_vehicle():
+    """Of frames of any other content one in 256 has it."""
+    frames, chance = VehicleFrames(REFERENCE), random.Random(1)
+    for i in range(2000):
+        frames.take((NOON + i, own_frame(*PACK)[1], chance.randbytes(8), 0), 1.0)
+    frames.take(own_frame(*cells(21, 24, 155), NOON + 2000), 1.0)
+    assert frames.cells(1.0) is None
 
 
 @pytest.mark.parametrize(("after", "late", "there"), [(2.9, False, True), (3.1, True, True), (10.1, False, False)])
