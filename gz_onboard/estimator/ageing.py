@@ -253,13 +253,20 @@ class Ageing:
             self._proven.append(self._fit)
 
     def _compare_packs(self, filter_: SocFilter) -> None:
-        """Once: if the pack was replaced, its resistance is that of this ride, and of its capacity nothing is known."""
+        """Once: if the pack was replaced, its resistance is that of this ride, and of its capacity nothing is known.
+
+        One with more resistance than before is no newer: what was learned counts as much as the prior does. So an aged
+        pack that shows more resistance on a colder day, or at another place of the curve, is not taken for half a new one.
+        """
         before, ride = self._before, self._ride
         self._before, self._ride = Fit(), Fit()
         if not ride.of_another_pack(before):
             return
         self.part(filter_)
-        self.inverse, self.variance = 1.0, self._unknown
+        if ride.factor > before.factor:
+            self.variance = max(self.variance, self._unknown / 2)
+        else:
+            self.inverse, self.variance = 1.0, self._unknown
         self._fit, self._unproven = ride, 0.0
         self._proven = deque([ride], KEPT + 1)
         self.belief = self._believe()

@@ -149,6 +149,19 @@ def test_another_pack_is_told_by_its_resistance(fresh: Battery, before: tuple[fl
     assert found.resistance.value == pytest.approx(now[1], rel=0.06)
 
 
+def test_an_aged_pack_that_shows_more_resistance_is_not_taken_for_half_a_new_one(fresh: Battery):
+    """As on a colder day: it may be another pack, but no newer one."""
+    ageing, _, _ = discharge(fresh, 0.78, 1.25, 0.2)
+    battery = fresh.own()
+    again = Ageing(battery)
+    again.restore(ageing.snapshot())
+    found, filter_, soc = discharge(fresh, 0.78, 1.65, 0.85, ageing=again, battery=battery)
+    assert found.resistance.value == pytest.approx(1.65, rel=0.06)  # it was begun with
+    assert found.capacity.value == pytest.approx(0.78, abs=0.04)  # 0.85 if of its capacity nothing were known
+    assert found.capacity.sd > ageing.capacity.sd
+    assert found.state_of_charge(filter_)[0] == pytest.approx(soc, abs=0.02)
+
+
 def test_the_same_pack_is_no_other_one_for_a_little_more_resistance(fresh: Battery):
     ageing, _, _ = discharge(fresh, 0.8, 1.3, 0.2)
     battery = fresh.own()
