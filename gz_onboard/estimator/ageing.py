@@ -256,7 +256,7 @@ class Ageing:
         """Once: if the pack was replaced, its resistance is that of this ride, and of its capacity nothing is known.
 
         One with more resistance than before is no newer: what was learned counts as much as the prior does. So an aged
-        pack that shows more resistance on a colder day, or at another place of the curve, is not taken for half a new one.
+        pack that shows more of it on a colder day, or at another place of the curve, is not taken for half a new one.
         """
         before, ride = self._before, self._ride
         self._before, self._ride = Fit(), Fit()
