@@ -29,6 +29,7 @@ RIDING = -20.0, 60.0  # degC: usual data sheets of lithium-ion cells, where the 
 CHARGING = 0.0, 45.0  # degC: likewise
 FASTEST, LEAP = 0.07, 100.0  # km/s and km: an odometer that goes further ahead, or goes back, is doubted
 DOUBTED = 10.0  # s: one that errs for so long was set
+MOST_OF_A_DAY = 86_400 * FASTEST  # km
 CLOCK_SET = 10**18  # ns since 1970: earlier says the clock of a board that begins with 1970 and was not told the time
 
 
@@ -55,7 +56,7 @@ class VehicleFrames:
         self._codec = Codec(replace(mapping, sources=chosen + of_instruments))
         self._period = {role: group.period or PERIOD for group in self._codec.groups for role in group.roles}
         self._last: dict[str, tuple[float, float]] = {}  # by role: value, time
-        self._day = Day(kept)
+        self._day = Day(kept, vehicle.name)
 
     def take(self, frame: Frame, now: float) -> None:
         """Take in a frame that came at `now`; one that is not of these, or fails a check, is left out."""
@@ -123,9 +124,9 @@ def cell_limits(derating: Derating) -> tuple[float, float]:
 class Day:
     """How far was ridden on the day of the last frame, by the odometer."""
 
-    def __init__(self, kept: Path | None) -> None:
-        self._kept = kept
-        self._date, self._begin = _read(kept) if kept else ("", 0.0)  # of the day; the odometer [km] then
+    def __init__(self, kept: Path | None, vehicle: str) -> None:
+        self._kept, self._vehicle = kept, vehicle
+        self._date, self._begin = _read(kept, vehicle) if kept else ("", 0.0)  # of the day; the odometer [km] then
         self._last: tuple[float, float] | None = None  # km, and when [s]
         self._doubt: float | None = None  # s: since when it is doubted
         self._clock_set = False
@@ -152,7 +153,7 @@ class Day:
             self._last = self._last or (odometer, now)  # what is ridden until then counts for the day that it will be
             return True
         date = time.strftime("%Y-%m-%d", time.localtime(stamp_ns * 1e-9))
-        if date != self._date:
+        if date != self._date or odometer - self._begin > MOST_OF_A_DAY:
             self._date, self._begin = date, self._last[0] if self._last else odometer
             if self._kept:
                 self._keep(self._kept)
@@ -167,18 +168,19 @@ class Day:
 
     def _keep(self, file: Path) -> None:
         new = file.with_name(f"{file.name}.new")
+        day = {"vehicle": self._vehicle, "date": self._date, "odometer_km": round(self._begin, 3)}
         try:
-            new.write_text(json.dumps({"date": self._date, "odometer_km": round(self._begin, 3)}), encoding="utf-8")
+            new.write_text(json.dumps(day), encoding="utf-8")
             new.replace(file)
         except OSError as error:
             print(f"dashboard: where the day began is not kept: {file}: {error.strerror}", file=sys.stderr)
 
 
-def _read(file: Path) -> tuple[str, float]:
-    """Date and odometer [km] in the file; of one that is damaged or not there a day that never was."""
+def _read(file: Path, vehicle: str) -> tuple[str, float]:
+    """Date and odometer [km] in the file; of one that is damaged, not there or another's a day that never was."""
     try:
         found = json.loads(file.read_text(encoding="utf-8"))
-        date, odometer = str(found["date"]), float(found["odometer_km"])
+        date, odometer, of = str(found["date"]), float(found["odometer_km"]), found["vehicle"]
     except (OSError, ValueError, KeyError, TypeError, OverflowError, RecursionError):
         return "", 0.0
-    return (date, odometer) if 0 <= odometer < inf else ("", 0.0)
+    return (date, odometer) if of == vehicle and 0 <= odometer < inf else ("", 0.0)

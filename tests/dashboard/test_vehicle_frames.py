@@ -150,7 +150,7 @@ IMPOSSIBLE = "NaN", "Infinity", "-Infinity", "-5000", "1" + 400 * "0", '"x"'
         '{"date": 1}',
         "\xff",
         9999 * "[",
-        *(f'{{"date": "2025-06-15", "odometer_km": {x}}}' for x in IMPOSSIBLE),
+        *(f'{{"vehicle": "reference-scooter", "date": "2025-06-15", "odometer_km": {x}}}' for x in IMPOSSIBLE),
     ],
 )
 def test_a_damaged_file_is_begun_anew(tmp_path, text):
@@ -158,6 +158,15 @@ def test_a_damaged_file_is_begun_anew(tmp_path, text):
     file.write_text(text, encoding="latin-1")
     assert ridden(file, (1000.0, NOON), (1003.0, NOON)) == pytest.approx(3.0)
     assert json.loads(file.read_text())["odometer_km"] == 1000.0
+
+
+@pytest.mark.parametrize("changed", [{"vehicle": "another"}, {"odometer_km": 0.0}])
+def test_a_day_of_another_vehicle_is_begun_anew(tmp_path, changed):
+    """Of one with another name, or that would have been ridden further than can be in a day."""
+    file = tmp_path / "day.json"
+    assert ridden(file, (54_300.0, NOON), (54_301.0, NOON)) == pytest.approx(1.0)
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"odometer_km": 54_200.0} | changed))
+    assert ridden(file, (54_301.0, NOON), (54_303.0, NOON)) == pytest.approx(2.0)
 
 
 def test_an_odometer_that_goes_back_begins_anew(tmp_path):
