@@ -100,7 +100,7 @@ def test_a_folder_that_means_nothing(arguments: list[str], said: str, capsys: py
         (["run", "a.blf.gz"], "; a recorded ride is for estimate, or for replay onto a bus"),
         (["learned", FULL], "learned takes files and folders behind its options only: --vehicle NAME|TOML, --json"),
         (["learned", "scooter.json"], "--state FILE, --plot FILE\n"),
-        (["foxglove", FULL], "options only: --dbc FILE, --vehicle NAME|TOML; a recorded ride is for estimate, or for"),
+        (["foxglove", FULL], "--vehicle NAME|TOML, --write-layout FILE; a recorded ride is for estimate, or for"),
     ],
 )
 def test_a_command_without_files_says_where_they_go(
