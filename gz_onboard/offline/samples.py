@@ -146,6 +146,8 @@ def check_ridden(log: Path, vehicle: Vehicle, codec: Codec) -> None:
             f"{log}: its time runs back again and again, at least {back} times within {max(codec.passed, 0.0):.0f} s; "
             "sort its frames by time, or record it again"
         )
+    if codec.passed < 0 or (back and not codec.passed):
+        raise InputError(f"{log}: its last frame is not after its first; sort its frames by time, or record it again")
 
 
 def _of_another(log: Path, vehicle: Vehicle, codec: Codec) -> InputError:

@@ -11,7 +11,7 @@ import pytest
 
 from gz_onboard import cli
 from gz_onboard.bus.logs import read_frames
-from gz_onboard.bus.writers import write_blf
+from gz_onboard.bus.writers import write_blf, write_candump
 from gz_onboard.errors import InputError
 from gz_onboard.lab.vehicle.check import check_log, check_text
 from gz_onboard.offline.samples import read_samples
@@ -97,6 +97,16 @@ def test_times_that_make_no_ride_are_refused(tmp_path, capsys, time_of, said):
     assert cli.main(["estimate", str(log), "--no-plot", "--quiet", "--output", str(tmp_path)]) == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "ride.estimate.mcap").exists()
+
+
+@pytest.mark.parametrize("count", [60, 90])
+def test_a_short_log_in_reverse_is_refused(tmp_path, count):
+    frames = [frame for batch in read_frames(LOGS / "coastdown.blf") for frame in batch][:count]
+    log = tmp_path / "ride.log"
+    with log.open("w") as stream:
+        write_candump(stream, [frames[::-1]])
+    with pytest.raises(InputError, match="its last frame is not after its first; sort its frames by time"):
+        read_samples(log, read_vehicle("reference"))
 
 
 def test_what_a_log_holds_says_that_its_time_runs_back(tmp_path, capsys):
