@@ -216,13 +216,12 @@ class Ageing:
         least = LEAST_VARIANCE + 2 * (curve / span) ** 2
         return min(max(self.variance - least, 0.0) / less, 1.0) if less > 0 else 1.0
 
-    def permit(self, now: float, reading: PackReading, signals: Signals, filter_: SocFilter) -> None:
-        """Whether all that the learning depends on is beyond doubt at `now` [s]; else a sensor's fault may be learned.
+    def permit(self, now: float, reading: PackReading, signals: Signals, filter_: SocFilter) -> bool:
+        """Learn only if all that it depends on is beyond doubt at `now` [s]; else a sensor's fault may be learned.
 
-        What was counted before is not gone on from.
+        What was counted before is not gone on from. Gives whether the pack has shown to be another one.
         """
-        if self._ride.time >= COMPARED:
-            self._compare_packs(filter_)
+        another = self._ride.time >= COMPARED and self._compare_packs(filter_)
         by_itself = filter_.covariance[0] - self._with_soc**2 / self.variance
         if by_itself <= 0:  # SOC was made known from elsewhere
             self.part()
@@ -234,6 +233,7 @@ class Ageing:
         if permitted != self._learning:
             self._learning = permitted
             self.part(filter_)
+        return another
 
     def load(self, dt: float, drop: float, error: float) -> None:
         """A cell's voltage [V] over `dt` [s]: `drop` by the load as predicted, `error` measured less predicted."""
@@ -252,7 +252,7 @@ class Ageing:
             self._unproven = 0.0
             self._proven.append(self._fit)
 
-    def _compare_packs(self, filter_: SocFilter) -> None:
+    def _compare_packs(self, filter_: SocFilter) -> bool:
         """Once: if the pack was replaced, its resistance is that of this ride, and of its capacity nothing is known.
 
         One with more resistance than before is no newer: what was learned counts as much as the prior does. So an aged
@@ -261,7 +261,7 @@ class Ageing:
         before, ride = self._before, self._ride
         self._before, self._ride = Fit(), Fit()
         if not ride.of_another_pack(before):
-            return
+            return False
         self.part(filter_)
         if ride.factor > before.factor:
             self.variance = max(self.variance, self._unknown / 2)
@@ -270,6 +270,7 @@ class Ageing:
         self._fit, self._unproven = ride, 0.0
         self._proven = deque([ride], KEPT + 1)
         self.belief = self._believe()
+        return True
 
     def unlearn(self) -> None:
         """A sensor was found faulty: the resistance is what it was before, unless that was confirmed."""

@@ -41,6 +41,17 @@ ROAD_STEPS = 0.005, 0.02, 0.01  # relative, of a `Road`
 BESIDE = {Cause.TEMPERATURE: None, Cause.PAYLOAD: "mass", Cause.ROLLING: "rolling", Cause.DRAG: "drag"}
 
 
+class Moment(NamedTuple):
+    """What a range is explained from."""
+
+    time: float  # s
+    forecast: Forecast
+    soc: float
+    air: Conditions
+    ridden: float  # m, since the start
+    hills: tuple[float, float] = 0.0, 0.0  # of a route ahead: see `Answer`
+
+
 class Draw(NamedTuple):
     """What the energy that can be drawn follows from; cells in degC, power in W."""
 
@@ -91,27 +102,20 @@ class Attribution:
         self.changes: deque[Explanation] = deque(maxlen=MOST_CHANGES)
         self._news: deque[tuple[bool, Explanation]] = deque(maxlen=MOST_CHANGES)
 
-    def take(
-        self,
-        now: float,
-        forecast: Forecast,
-        soc: float,
-        air: Conditions,
-        ridden: float,
-        hills: tuple[float, float] = (0.0, 0.0),
-    ) -> None:
-        """A new `forecast`, of this state of charge in this air, after `ridden` [m]; hills: see `Answer`."""
+    def take(self, moment: Moment) -> None:
+        """A new forecast."""
+        now, forecast, ridden = moment.time, moment.forecast, moment.ridden
         self._measure_auxiliaries(now, ridden)
         last, since = self.latest, self._since
         due = last is None or (now - last.time >= EVERY and abs(forecast.range - last.range) > LEAST_MOVED)
         moved = since and abs(forecast.range + ridden - since.range - since.ridden) > MOVED
         if since and moved and now - since.time >= SETTLED:
-            self._since = self._state(now, forecast, soc, air, ridden, hills)
+            self._since = self._state(moment)
             self.changes.append(replace(self.explained(since, self._since), forgotten=tuple(sorted(self._forgotten))))
             self._forgotten.clear()
             self._news.append((True, self.changes[-1]))
         if due:
-            state = self._state(now, forecast, soc, air, ridden, hills)
+            state = self._state(moment)
             self._since = self._since or state
             self.latest = self.explained(self.rated, state)
             self._news.append((False, self.latest))
@@ -126,15 +130,8 @@ class Attribution:
         self._news.clear()
         return news
 
-    def _state(
-        self,
-        now: float,
-        forecast: Forecast,
-        soc: float,
-        air: Conditions,
-        ridden: float,
-        hills: tuple[float, float] = (0.0, 0.0),
-    ) -> State:
+    def _state(self, moment: Moment) -> State:
+        now, forecast, soc, air, ridden, hills = moment
         riding = self._forecaster.riding
         known = forecast.range > 0 and forecast.energy > 0
         filed, learned = self._composition.filed, self._factor_learned

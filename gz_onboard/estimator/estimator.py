@@ -14,7 +14,7 @@ from typing import Any
 
 from gz_onboard.estimator import snapshot
 from gz_onboard.estimator.activity import Activities
-from gz_onboard.estimator.attribution import Attribution
+from gz_onboard.estimator.attribution import Attribution, Moment
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter, SocFilter
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.outlook import Now, Outlook
@@ -266,8 +266,8 @@ class Estimator:
         soc = self.soc.ageing.state_of_charge(filter_)
         self._outlook.step(Now(now, *soc, *cells, conditions, lost, self._reading, self._activities.now))
         if self._outlook.forecast:
-            hills = self.ahead.answer.hills
-            self.attribution.take(now, self._outlook.forecast, soc[0], conditions, self.road.distance, hills)
+            of_road = self.road.distance, self.ahead.answer.hills
+            self.attribution.take(Moment(now, self._outlook.forecast, soc[0], conditions, *of_road))
 
     # --- results ----------------------------------------------------------------------------------------------
 

@@ -264,9 +264,8 @@ class StateOfCharge:
             # Both with what lies beside the cells: of a pack of which little is known, r0 may hold it already.
             cell, beside = explaining / battery.cells_parallel, battery.series_resistance / battery.cells_series
             self._sag.update(dt, voltage / battery.cells_series, r0 * cell + beside * explaining + lost)
-        before, known = (filter_.soc, filter_.error, filter_.covariance), self.ageing.variance
-        self.ageing.permit(now, reading, self._signals, filter_)
-        self.another_pack = self.ageing.variance > known  # what was known of it is forgotten for nothing else here
+        before = filter_.soc, filter_.error, filter_.covariance
+        self.another_pack = self.ageing.permit(now, reading, self._signals, filter_)
         if dt <= self._timing.pause and self._rest.step(
             filter_, dt, shown, cell_current, temperature, reading.voltage_sd
         ):

@@ -12,12 +12,14 @@ from dataclasses import asdict, dataclass
 from math import isfinite, sqrt
 from typing import Any
 
+from gz_onboard.estimator.pattern import STEEPEST
+
 STRETCH = 4000.0  # m
-RATE = 0.05  # m² per m, of 32 trips of a car around one town: 0 to 0.24 (docs/real-car.md)
+RATE = 0.05  # m² per m, of the altitudes of 32 trips of a car, 0 to 0.24 each; recorded rides of the scooter 0 to 0.05
 WEIGHT = 2.0  # stretches that this guess counts for
 REMEMBERED = 50.0  # stretches: of what is further back than 200 km less and less counts
 MOST_UNSEEN = 0.2  # of a stretch: with more way whose grade was not seen it tells nothing
-MOST_CLIMB = 0.3 * STRETCH  # m: no road is steeper
+MOST_CLIMB = STEEPEST * STRETCH  # m
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +52,7 @@ class Terrain:
         way, climb, unseen = self.way + way, self.climb + climb, self.unseen + unseen
         if way < STRETCH:
             return Terrain(self.squares, self.stretches, way, climb, unseen)
-        if unseen > MOST_UNSEEN * way or abs(climb) > MOST_CLIMB * way / STRETCH:
+        if unseen > MOST_UNSEEN * way or abs(climb) > STEEPEST * way:
             return Terrain(self.squares, self.stretches)
         keep = 1 - 1 / REMEMBERED
         return Terrain(keep * self.squares + climb * climb * STRETCH / way, keep * self.stretches + 1)

@@ -16,7 +16,7 @@ from gz_onboard.dashboard.picture import ALERTS, NO_LONGER_EMPTY, Picture, pictu
 from gz_onboard.dashboard.server import STATIC
 from gz_onboard.dashboard.vehicle_frames import CELLS, ODOMETER
 from gz_onboard.dashboard.view import NEARLY_EMPTY, View
-from gz_onboard.events import ROLES, Activity, Cause, Estimate, Reason, RouteState, State
+from gz_onboard.events import KEEPING, ROLES, Activity, Cause, Estimate, Reason, RouteState, State
 from tests.dashboard.test_terminal import COUNTS, ESTIMATE, second, seen
 
 SOURCE = "vcan0", "socketcan"
@@ -104,6 +104,12 @@ def test_an_old_number_is_not_given(after, gone, stay):
     }
     assert not any(has[name] for name in gone)
     assert all(has[name] for name in stay)
+
+
+def test_the_page_has_the_same_reasons_for_notes():
+    """Reasons for which no range is less certain."""
+    (names,) = re.findall(r"^const KEEPING = (\[.*\]);$", (STATIC / "draw.js").read_text(), re.MULTILINE)
+    assert json.loads(names) == [str(reason.name).lower() for reason in KEEPING]
 
 
 def test_a_state_is_not_older_than_the_status():

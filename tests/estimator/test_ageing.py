@@ -125,11 +125,17 @@ def test_two_rests_and_the_charge_between_show_the_capacity(fresh: Battery):
     assert 1 / again.inverse == pytest.approx(0.8, abs=0.02)
 
 
-def test_what_was_learned_survives_and_goes_on(fresh: Battery):
-    ageing, _, _ = discharge(fresh, 0.8, 1.5, 0.3)
+def restarted(fresh: Battery, ageing: Ageing) -> tuple[Ageing, Battery]:
+    """What goes on from what `ageing` has saved, and its battery."""
     battery = fresh.own()
     again = Ageing(battery)
     again.restore(ageing.snapshot())
+    return again, battery
+
+
+def test_what_was_learned_survives_and_goes_on(fresh: Battery):
+    ageing, _, _ = discharge(fresh, 0.8, 1.5, 0.3)
+    again, battery = restarted(fresh, ageing)
     assert again.capacity.value == pytest.approx(ageing.capacity.value, abs=1e-4)
     assert battery.cell_capacity(WARM) == pytest.approx(again.capacity.value * fresh.cell_capacity(WARM))
     found, filter_, soc = discharge(fresh, 0.8, 1.5, 0.9, ageing=again, battery=battery)
@@ -140,9 +146,7 @@ def test_what_was_learned_survives_and_goes_on(fresh: Battery):
 def test_another_pack_is_told_by_its_resistance(fresh: Battery, before: tuple[float, float], now: tuple[float, float]):
     """A pack that was replaced: of its capacity nothing is known, rather than what that of the one before was."""
     ageing, _, _ = discharge(fresh, *before, 0.2)
-    battery = fresh.own()
-    again = Ageing(battery)
-    again.restore(ageing.snapshot())
+    again, battery = restarted(fresh, ageing)
     found, filter_, soc = discharge(fresh, *now, 0.5, ageing=again, battery=battery)
     assert found.state_of_charge(filter_)[0] == pytest.approx(soc, abs=0.02)
     assert found.capacity.value == pytest.approx(now[0], abs=0.05)
@@ -152,9 +156,7 @@ def test_another_pack_is_told_by_its_resistance(fresh: Battery, before: tuple[fl
 def test_an_aged_pack_that_shows_more_resistance_is_not_taken_for_half_a_new_one(fresh: Battery):
     """As on a colder day: it may be another pack, but no newer one."""
     ageing, _, _ = discharge(fresh, 0.78, 1.25, 0.2)
-    battery = fresh.own()
-    again = Ageing(battery)
-    again.restore(ageing.snapshot())
+    again, battery = restarted(fresh, ageing)
     found, filter_, soc = discharge(fresh, 0.78, 1.65, 0.85, ageing=again, battery=battery)
     assert found.resistance.value == pytest.approx(1.65, rel=0.06)  # it was begun with
     assert found.capacity.value == pytest.approx(0.78, abs=0.04)  # 0.85 if of its capacity nothing were known
@@ -164,9 +166,7 @@ def test_an_aged_pack_that_shows_more_resistance_is_not_taken_for_half_a_new_one
 
 def test_the_same_pack_is_no_other_one_for_a_little_more_resistance(fresh: Battery):
     ageing, _, _ = discharge(fresh, 0.8, 1.3, 0.2)
-    battery = fresh.own()
-    again = Ageing(battery)
-    again.restore(ageing.snapshot())
+    again, battery = restarted(fresh, ageing)
     found, _, _ = discharge(fresh, 0.8, 1.5, 0.8, ageing=again, battery=battery)
     assert found.capacity.share > 0.9 * ageing.capacity.share
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.attribution import Attribution
+from gz_onboard.estimator.attribution import Attribution, Moment
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import Conditions, EffectInputs
 from gz_onboard.estimator.road_load import RoadLoad
@@ -55,7 +55,7 @@ def ride(
 def explained(f: Forecaster, *, soc: float = 0.7, cells: float = 20.0, air: Conditions = MILD) -> Explanation:
     attribution = Attribution(f, Signals(()))
     result = f.forecast(soc, 0.01, cells, 1.0, air.ambient, air.altitude)
-    attribution.take(0.0, result, soc, air, 0.0)
+    attribution.take(Moment(0.0, result, soc, air, 0.0))
     why = attribution.latest
     assert why is not None
     assert why.range == pytest.approx(result.range)
@@ -87,7 +87,7 @@ def test_the_causes_add_up(riding, first, then, payload):
     for time, (soc, cells, ambient, altitude) in enumerate((first, then)):
         air = Conditions(ambient, altitude)
         result = f.forecast(soc, 0.01, cells, 1.0, ambient, altitude)
-        attribution.take(1000.0 * time, result, soc, air, distance)
+        attribution.take(Moment(1000.0 * time, result, soc, air, distance))
         distance += ride(f, **riding)
     why = attribution.latest
     assert why is not None
@@ -116,7 +116,7 @@ def against(f: Forecaster, usual: Forecaster, **state: float) -> Explanation:
         if each is usual:
             ambient = cells = 20.0
         result = each.forecast(soc, 0.01, cells, 1.0, ambient, 0.0)
-        results.append(attribution._state(0.0, result, soc, Conditions(ambient, 0.0), 0.0))
+        results.append(attribution._state(Moment(0.0, result, soc, Conditions(ambient, 0.0), 0.0)))
     return Attribution(f, Signals(())).explained(*results)
 
 
@@ -219,7 +219,7 @@ def test_a_heater_is_told_from_what_nobody_knows():
         f.ride(1.0, v, 0.0, f.load.power(f.load.quantities(v, 0.0, MILD)) + heater, MILD)
         x += v
         result = f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0)
-        attribution.take(float(second), result, 0.7, MILD, x)
+        attribution.take(Moment(float(second), result, 0.7, MILD, x))
     why = attribution.latest
     assert why is not None
     check_sum(why)
@@ -233,8 +233,8 @@ def told(f: Forecaster, means: dict[int, float]) -> Explanation:
     for i, mean in means.items():
         road_load.joint.means[i] = mean
     attribution = Attribution(f, Signals(()), road_load)
-    attribution.take(0.0, f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0), 0.7, MILD, 0.0)
-    attribution.take(1.0, f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0), 0.7, MILD, 100.0)
+    attribution.take(Moment(0.0, f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0), 0.7, MILD, 0.0))
+    attribution.take(Moment(1.0, f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0), 0.7, MILD, 100.0))
     assert attribution.latest is not None
     return attribution.latest
 
@@ -271,7 +271,9 @@ def test_a_cause_that_did_not_change_has_no_part_in_a_change():
     f = forecaster()
     attribution = Attribution(f, Signals(()))
     for time, soc in enumerate((0.7, 0.6)):
-        attribution.take(100.0 * time, f.forecast(soc, 0.01, 0.0, 1.0, 0.0, 0.0), soc, Conditions(0.0, 0.0), 0.0)
+        attribution.take(
+            Moment(100.0 * time, f.forecast(soc, 0.01, 0.0, 1.0, 0.0, 0.0), soc, Conditions(0.0, 0.0), 0.0)
+        )
     (change,) = attribution.changes
     moved = {cause for cause, size in change.causes.items() if abs(size) > 1.0}
     assert moved == {Cause.CHARGE, Cause.TEMPERATURE}  # with less charge the cells have less time to warm
@@ -283,9 +285,9 @@ def test_what_is_ridden_as_expected_is_no_change():
     f = forecaster()
     attribution = Attribution(f, Signals(()))
     first = f.forecast(0.8, 0.01, 20.0, 1.0, 20.0, 0.0)
-    attribution.take(0.0, first, 0.8, MILD, 0.0)
+    attribution.take(Moment(0.0, first, 0.8, MILD, 0.0))
     then = f.forecast(0.6, 0.01, 20.0, 1.0, 20.0, 0.0)
-    attribution.take(500.0, then, 0.6, MILD, first.range - then.range)
+    attribution.take(Moment(500.0, then, 0.6, MILD, first.range - then.range))
     assert not attribution.changes
 
 
@@ -295,7 +297,7 @@ def test_a_sensor_whose_teaching_is_forgotten_is_named_with_the_change():
     attribution = Attribution(f, Signals(()))
 
     def take(now: float) -> None:
-        attribution.take(now, f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0), 0.7, MILD, 0.0)
+        attribution.take(Moment(now, f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0), 0.7, MILD, 0.0))
 
     take(0.0)
     ride(f, 1.5, factor=2.5)
@@ -314,7 +316,7 @@ def test_the_split_is_made_seldom_and_not_of_a_range_that_stays():
     attribution = Attribution(f, Signals(()))
     for second in range(400):
         soc = 0.8 - second * 1e-6
-        attribution.take(float(second), f.forecast(soc, 0.01, 20.0, 1.0, 20.0, 0.0), soc, MILD, 0.0)
+        attribution.take(Moment(float(second), f.forecast(soc, 0.01, 20.0, 1.0, 20.0, 0.0), soc, MILD, 0.0))
     assert len(attribution.news()) == 1
     assert attribution.news() == []
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gz_onboard.estimator.attribution import Attribution
+from gz_onboard.estimator.attribution import Attribution, Moment
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.road import RoadState
@@ -112,7 +112,7 @@ def given_on_the_way(route: Route) -> Explanation:
     for now, road in enumerate((None, rider.ahead.ready(route))):
         rider.ahead.follow(road)
         found, answer = rider.settled(free)
-        attribution.take(100.0 * now, found, 0.7, AIR, 0.0, answer.hills)
+        attribution.take(Moment(100.0 * now, found, 0.7, AIR, 0.0, answer.hills))
     (change,) = attribution.changes
     assert sum(change.causes.values()) == pytest.approx(change.range - change.reference, abs=1e-6)
     return change

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.estimator.terrain import RATE, STRETCH, Terrain, restored_terrain
+from gz_onboard.estimator.usual import SEGMENT
 
-SEGMENT = 250.0  # m
 NEW = Terrain()
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from gz_onboard.bus.codec import Codec
 from gz_onboard.estimator import outlook
+from gz_onboard.estimator.attribution import Moment
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.signals import Signals
@@ -180,7 +181,7 @@ def test_its_share_in_the_range_is_age_and_the_sum_is_exact():
         found.battery.weaken(known)
         soc, sd = found.soc.ageing.state_of_charge(found.filter)
         forecast = found.forecaster.forecast(soc, sd, 18.0, 1.0, 16.0, 0.0)
-        ends.append(attribution._state(0.0, forecast, soc, Conditions(16.0, 0.0), 0.0))
+        ends.append(attribution._state(Moment(0.0, forecast, soc, Conditions(16.0, 0.0), 0.0)))
     found.battery.weaken(weakest)
     with_it, without = (attribution.explained(attribution.rated, end) for end in ends)
     for why in (with_it, without):
