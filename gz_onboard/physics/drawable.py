@@ -8,6 +8,7 @@ from gz_onboard.constants import HOUR
 from gz_onboard.physics.battery import Battery, Overpotential
 
 BELOW_EMPTY = -0.05  # SOC down to which the cut-off is sought
+HALVINGS = 9  # of the SOC left, to 0.002 of it; between the two ends of that the voltage is taken as straight
 LEAST_WIDTH = 1e-3  # SOC: an end found nearer to the last one allowed is that
 
 
@@ -51,22 +52,29 @@ def drawable(
     weakest = battery.health.weakest
     end_sd = weakest.sd if weakest else 0.0
 
-    def ended(soc: float, current: float) -> bool:
-        if power < cutoff * current or not weakest:
-            return power < cutoff * current
-        return battery.settled_lowest(current, soc, temperature, overpotential) < battery.cutoff_voltage
+    def above(soc: float, current: float) -> float:
+        """By how much the lowest cell's voltage is above the cut-off [V]."""
+        mean = (power / current - cutoff) / battery.cells_series
+        if mean < 0 or not weakest:
+            return mean
+        lowest = battery.settled_lowest(current, soc, temperature, overpotential)
+        return min(mean, lowest - battery.cutoff_voltage)
 
     current = battery.settled_current(power, soc, temperature, overpotential=overpotential)
-    if current is None or soc <= least or ended(soc, current):
+    if current is None or soc <= least or (over := above(soc, current)) < 0:
         return Drawable(0.0, charge * cutoff, end_sd=end_sd)
     slope = charge * power / current
-    for _ in range(14):  # to 6e-5 of SOC
+    under = None
+    for _ in range(HALVINGS):
         middle = (low + high) / 2
         current = battery.settled_current(power, middle, temperature, overpotential=overpotential)
-        if current is None or ended(middle, current):
-            low = middle
+        margin = None if current is None else above(middle, current)
+        if margin is None or margin < 0:
+            low, under = middle, margin
         else:
-            high = middle
+            high, over = middle, margin
+    if under is not None:
+        high -= (high - low) * over / (over - under)
     width = soc - high
     total = 0.0
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
