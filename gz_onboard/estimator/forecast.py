@@ -50,7 +50,6 @@ SPEEDS = -5.0, 70.0  # m/s: the same
 LEAST_DISTANCE = 0.1  # m: over less a climb shows no grade
 LEAST = 0.2  # of the prior's consumption: no riding of any length consumes less
 MOST_SD = 3.0  # of the logarithm of the range: beyond, it is not known at all
-END_LOAD_SD = 0.25  # of the mean load: at which load a vehicle gives up is known so well
 WARM_CELLS = 25.0  # degC, of a cooling that is only asked for its constants
 COLDER_AGAIN = 0.005, 0.5, 0.5  # SOC, degC, degC: changed by more, what colder cells would give is asked anew
 
@@ -107,7 +106,7 @@ class Forecaster:
         self._moving_mass = model.mass + rotating_mass(model.parameters)  # kg, with what rotates
         self.cooling = LumpedCooling.of(model.parameters, "pack", WARM_CELLS)
         p = model.parameters
-        self._cutoff_sd = hypot(p.sd("cell_cutoff_voltage"), p.sd("cell_voltage_error_empty"))  # V
+        self._cutoff_sd, self._empty_sd = p.sd("cell_cutoff_voltage"), p.sd("cell_voltage_error_empty")  # V
 
     # --- learning ---------------------------------------------------------------------------------------------
 
@@ -266,7 +265,8 @@ class Forecaster:
         beside = (
             (hypot(self.battery.window.sd, left.end_sd) * left.slope) ** 2
             + (left.energy * self._lost_colder(soc, (ahead, temperature_sd), expected, left)) ** 2
-            + (self._cutoff_sd**2 + (END_LOAD_SD * left.end_drop) ** 2) * left.by_cutoff**2
+            # Where vehicles were seen to give up has the error of an empty cell's voltage in it.
+            + (self._cutoff_sd**2 + max(self._empty_sd, left.end_drop_sd) ** 2) * left.by_cutoff**2
         )
         fresh = hypot(soc_sd * left.slope, self.battery.capacity_sd * left.energy)
         of_pack = self.ageing.energy_sd(left.energy, left.slope, soc_sd) if self.ageing else (fresh, fresh)

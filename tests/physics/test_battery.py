@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.physics.battery import current_of, dissipation, heat, terminal_voltage
-from gz_onboard.physics.drawable import drawable
+from gz_onboard.physics.drawable import GIVES_UP, GIVES_UP_SD, drawable
 from gz_onboard.physics.effect import Port
 from gz_onboard.physics.model import first_soc
 from gz_onboard.physics.tables import Mesh
@@ -132,11 +132,10 @@ def discharge(soc, temperature, power, *, burst=1.0, dt=1.0):
         voltage = source - resistance * current
         if burst == 1.0 and voltage < battery.cutoff_voltage * n:
             return energy
-        # With bursts the vehicle holds them back near the end: it ends where the mean load meets the cut-off.
-        if burst > 1.0 and battery.settled_current(power, soc, temperature) is None:
-            return energy
-        mean = battery.settled_current(power, soc, temperature)
-        if burst > 1.0 and power / mean < battery.cutoff_voltage * n:
+        # With bursts the vehicle holds back the highest of them: it ends where a load near the mean meets the cut-off.
+        end = (1 + GIVES_UP * math.sqrt(burst - 1)) * power
+        mean = battery.settled_current(end, soc, temperature)
+        if burst > 1.0 and (mean is None or end / mean < battery.cutoff_voltage * n):
             return energy
         energy += voltage * current * dt
         v1, _ = battery.relax(
@@ -197,8 +196,32 @@ def test_drawable_is_sane(soc, temperature, power):
     assert drawable(BATTERY, soc, temperature, 1.5 * power).energy <= now.energy * (1 + 1e-9)
     full = BATTERY.pack_capacity(temperature) * 3600 * BATTERY.cells_series * BATTERY.ocv(soc)[0]
     assert now.energy < full * (soc + 0.06)
-    assert 0 <= now.end_drop < BATTERY.ocv(soc)[0]
+    assert now.end_drop_sd == 0  # of a steady load
     assert now.by_cutoff >= 0
+
+
+@given(st.floats(10, 45), st.floats(300, 1200), st.floats(1.2, 3.0))
+def test_bursts_end_it_before_the_mean_load_would(temperature, power, form_factor_squared):
+    """At a load that is above its mean by `GIVES_UP` of its sd, which is known to `GIVES_UP_SD` of that."""
+    low, high = 0.0, 1.0
+    for _ in range(30):
+        middle = (low + high) / 2
+        empty = drawable(BATTERY, middle, temperature, power, form_factor_squared).energy == 0
+        low, high = (middle, high) if empty else (low, middle)
+    sd, cutoff = math.sqrt(form_factor_squared - 1), BATTERY.cutoff_voltage * BATTERY.cells_series
+
+    def voltage(soc, load):
+        current = BATTERY.settled_current(load * power, soc, temperature)
+        return load * power / current if current else 0.0  # more than the pack can give
+
+    end = 1 + GIVES_UP * sd
+    assert voltage(low - 1e-6, end) < cutoff
+    assert voltage(high + 1e-6, end) >= cutoff
+    lower = voltage(high, end) - voltage(high, end + GIVES_UP_SD * sd)
+    found = drawable(BATTERY, high + 0.05, temperature, power, form_factor_squared)
+    if lower < 0.3 * cutoff:
+        assert found.end_drop_sd == pytest.approx(lower / BATTERY.cells_series, rel=0.4)
+    assert drawable(BATTERY, high + 0.05, temperature, power).end_drop_sd == 0
 
 
 @given(st.floats(0.3, 3.0), st.floats(0.02, 1.0), st.floats(-10, 45))
