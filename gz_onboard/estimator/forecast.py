@@ -181,11 +181,13 @@ class Forecaster:
         return then * second.seconds, to_come * second.seconds
 
     def shown(self, forecast: Forecast, drawn: float | None = None) -> Forecast:
-        """`forecast` as it is to be shown, within P10 and P90; to be asked once for each; drawn: see `Calm.follow`."""
+        """`forecast` as it is to be shown; to be asked once for each; drawn: see `Calm.follow`.
+
+        P10 and P90 are those of the newest forecast, since what it has just learned must be in them; they hold the
+        range shown, too.
+        """
         way = self.calm.follow(forecast.range, forecast.energy, forecast.known_from, drawn)
-        move = way / forecast.range if forecast.range > 0 else 1.0
-        p10, p90 = min(move * forecast.p10, forecast.range), max(move * forecast.p90, forecast.range)
-        return replace(forecast, range=way, p10=p10, p90=p90)
+        return replace(forecast, range=way, p10=min(forecast.p10, way), p90=max(forecast.p90, way))
 
     @property
     def recent_factor(self) -> float:
