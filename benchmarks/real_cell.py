@@ -29,7 +29,7 @@ from gz_onboard.lab.calibrate.cell_circuit import Circuit, voltage
 from gz_onboard.lab.calibrate.result import Found, Result
 from gz_onboard.lab.calibrate.table import Measurements, Named, read_table
 from gz_onboard.physics.battery import Battery
-from gz_onboard.physics.effects import charge_transfer
+from gz_onboard.physics.effects import charge_transfer, slow_relaxation
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.tables import Mesh
@@ -237,12 +237,13 @@ def estimator_of(setting: Setting, offset: float) -> Estimator:
         "cell_voltage_error_time": (result.parameters["cell_voltage_error_time"].value, 0.0),
         "rest_voltage_error": (0.0, float(np.mean(rests))),
     }
-    for parameter in charge_transfer.PARAMETERS:
+    for parameter in (*charge_transfer.PARAMETERS, *slow_relaxation.PARAMETERS):
         if found := result.parameters.get(parameter.name):
             values[parameter.name] = found.value, found.sd
     for name, (value, sd) in values.items():
         known[name] = replace(known[name], value=value, sd=sd)
-    model = Model(vehicle.model.effects, Parameters(known))
+    beside = {**result.effects, **({"slow_relaxation": False} if setting.slow else {})}
+    model = Model(tuple(e for e in vehicle.model.effects if beside.get(e.name, True)), Parameters(known))
     groups = [Group("Cells", ("cell_temperature",), 1.0), Group("Pack", ("pack_voltage", "pack_current"), 1.0)]
     estimator = Estimator(groups, battery, model, vehicle.riding, setting.make)
     estimator._outlook._time = float("inf")  # no range is asked for
@@ -329,7 +330,7 @@ def settings(rest: Result, result: Result) -> list[Setting]:
         Mesh(*axes, tuple(map(tuple, t.tolist())), geometric=True) for t in (two.slow_resistance, two.slow_time)
     )
     return [
-        Setting("on board: one RC pair", single, result),
+        Setting("on board: one RC pair and slow relaxation", single, result),
         Setting("rest voltage one for all temperatures", _unshifted(single), result),
         Setting("two RC pairs", double, result, slow=(slow[0], slow[1])),
         Setting("two RC pairs, rest voltage one for all", _unshifted(double), result, slow=(slow[0], slow[1])),

@@ -63,7 +63,7 @@ def test_nothing_of_the_api_shows_thousands_of_numbers():
     for one in [*told, simulated.run, *bench.results]:
         assert repr(one).startswith(f"{type(one).__name__}(")
         assert 40 < len(repr(one)) < 3000
-    assert "verdict='ambiguous'" in repr(found)
+    assert "verdict='cause'" in repr(found)
 
 
 def test_the_names_are_those_of_the_api():

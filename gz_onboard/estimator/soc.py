@@ -23,6 +23,7 @@ from gz_onboard.physics.model import STOOD, Model, standing_load
 
 DOUBTED_START = 30.0  # s: a voltage that is doubted so soon has misled the first state of charge
 RESTARTED_FOR = 600.0  # s: for so long it is reported
+JOINED = 900.0  # s: how long ago a ride began that is joined under way, for all that is known
 STEADY_NOISE = 1e-9  # variance of SOC from the first voltage to the end of the wait
 SHORTEST = 0.02  # s: a step, to divide by
 
@@ -330,7 +331,10 @@ class StateOfCharge:
         first, unsteady_sd = found
         if self.effects and self._unseen:
             load = first.current
-            if not first.moving:
+            if first.moving and not self.saved:
+                ridden = riding.power_of_prior(now) / first.voltage / battery.cells_parallel
+                self.effects.step(JOINED, ridden, HALF_FULL, pack.temperature)
+            elif not first.moving:
                 load = standing_load(load, first.voltage, self._auxiliary_power)
             self.effects.step(self._unseen, load / battery.cells_parallel, HALF_FULL, pack.temperature)
             self._unseen = 0.0

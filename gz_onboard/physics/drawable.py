@@ -11,7 +11,7 @@ from gz_onboard.physics.battery import Battery, Overpotential
 BELOW_EMPTY = -0.05  # SOC down to which the cut-off is sought
 HALVINGS = 9  # of the SOC left, to 0.002 of it; between the two ends of that the voltage is taken as straight
 LEAST_WIDTH = 1e-3  # SOC: an end found nearer to the last one allowed is that
-GIVES_UP, GIVES_UP_SD = 0.2, 0.3  # of the load's sd over time: how far above its mean a vehicle gives up
+GIVES_UP, GIVES_UP_SD = 0.5, 0.3  # of the load's sd over time: how far above its mean a vehicle gives up
 
 
 @dataclass(frozen=True)

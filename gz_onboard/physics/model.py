@@ -56,7 +56,8 @@ class Bound:
         self.effect = effect
         self._values = {name: parameters[name] for name in (*effect.keywords, *effect.decay_keywords)}
         self.term = _with(effect.term, effect.quantities, {name: parameters[name] for name in effect.keywords})
-        self._decay_values = {name: parameters[name] for name in effect.decay_keywords}
+        values = {name: parameters[name] for name in effect.decay_keywords}
+        self._decay = _valued(effect.decay, values) if effect.decay else None
 
     def __reduce__(self) -> tuple[type[Bound], tuple[Effect, dict[str, float]]]:
         """Pickled as effect and values: another process does not know the functions of a user's own file."""
@@ -68,10 +69,9 @@ class Bound:
 
     def decay(self, dt: Any, quantities: Mapping[str, Any]) -> Any:
         """The factor that its state keeps over `dt` [s]; of an effect without memory 0."""
-        effect = self.effect
-        if effect.decay is None:
+        if self._decay is None:
             return 0.0
-        return effect.decay(dt, *[quantities[name] for name in effect.decay_quantities], **self._decay_values)
+        return self._decay(dt, *[quantities[name] for name in self.effect.decay_quantities])
 
     def step(self, state: float, dt: float, quantities: Mapping[str, Any]) -> float:
         """Its value after `dt` [s] from `state`."""
@@ -92,18 +92,25 @@ class Bound:
         return relaxation_over(target, decay, before=before)
 
 
+def _valued(function: Callable[..., Any], values: Mapping[str, float]) -> Callable[..., Any]:
+    """`function` with these keyword arguments.
+
+    A simulation calls it a hundred times for each second ridden: values as the defaults of a copy take half the time
+    that a `partial` takes.
+    """
+    f = function
+    if isinstance(f, FunctionType) and f.__code__.co_kwonlyargcount == len(values):
+        copy = FunctionType(f.__code__, f.__globals__, f.__name__, f.__defaults__, f.__closure__)
+        copy.__kwdefaults__ = dict(values)
+        return copy
+    return partial(function, **values)
+
+
 def _with(
     function: Callable[..., Any], names: tuple[str, ...], values: Mapping[str, float]
 ) -> Callable[[Mapping[str, Any]], Any]:
-    """`function` of the quantities called `names`.
-
-    A simulation calls it a hundred times for each second ridden: values as the defaults of a copy take half the time
-    that a `partial` takes, and items one by one two thirds of the time of a tuple of them.
-    """
-    term: Callable[..., Any] = partial(function, **values)
-    if isinstance(f := function, FunctionType) and f.__code__.co_kwonlyargcount == len(values):
-        term = FunctionType(f.__code__, f.__globals__, f.__name__, f.__defaults__, f.__closure__)
-        term.__kwdefaults__ = dict(values)
+    """`function` of the quantities called `names`; items one by one take two thirds of the time of a tuple of them."""
+    term = _valued(function, values)
     match names:
         case ():
             return lambda q: term()
@@ -153,6 +160,13 @@ def remembering(effect: Bound, dt: float) -> Callable[[Mapping[str, Any]], float
 
 
 BURST = 10.0  # s: a load in traffic
+UNMOVED = 0.01  # of a burst: what shows less of it sees the mean current only
+
+
+def _share_of_bursts(effect: Bound) -> float | None:
+    """What of a burst an effect in the cells shows in the mean over it; None if that depends on how they are."""
+    return None if effect.effect.decay_quantities else mean_response(effect.decay(BURST, {}))
+
 
 STOOD = 60.0  # s: for so long the load of a ride's first voltages has flowed: lights, a heater
 STANDING_LOADS = 1.5  # times the auxiliary power: the most that is believed to have flowed before it was seen
@@ -273,7 +287,7 @@ class Model:
         if not self.cell_voltage:
             return None
         others = dict.fromkeys(QUANTITIES, 0.0) | dict(beside or {})
-        effects = self.at(Port.CELL_VOLTAGE)
+        effects = [(effect, _share_of_bursts(effect)) for effect in self.at(Port.CELL_VOLTAGE)]
         by_capacity = "cell_capacity" in self.reads
 
         def settled(current: float, soc: float, temperature: float, form_factor_squared: float) -> float:
@@ -284,13 +298,14 @@ class Model:
             if by_capacity:
                 q["cell_capacity"] = battery.cell_capacity(temperature)
             lost = 0.0
-            for effect in effects:
-                if form_factor_squared == 1:
+            for effect, known in effects:
+                q["cell_current"] = load
+                share = mean_response(effect.decay(BURST, q)) if known is None else known
+                if form_factor_squared == 1 or share < UNMOVED:
                     lost += effect(q)
                     continue
                 # The charge flows in bursts, of which an effect that is fast enough sees the current, not the mean.
-                q["cell_current"] = load
-                bursts = 1 + (form_factor_squared - 1) * mean_response(effect.decay(BURST, q))
+                bursts = 1 + (form_factor_squared - 1) * share
                 # A gamma distribution of currents of this form factor, as the charge sees it: its mean and its sd are
                 # those of two currents, which tell what an effect loses that does not grow with the current.
                 apart = sqrt((bursts - 1) / bursts)

@@ -138,7 +138,7 @@ def test_a_weak_group_is_found_and_ends_the_range(kind: Hidden, charge: float, c
     learned = found.weakest.learned()
     for name, truth in zip(NAMES, (charge, capacity, resistance), strict=True):
         assert abs(learned[name].value - truth) < 2.5 * learned[name].sd
-    assert learned["weak_capacity"].sd < 0.02
+    assert learned["weak_capacity"].sd < 0.025
     whole = drawn(Hidden(), START) / START
     with_it, without = (left(found, x) - drawn(kind, 0.2) for x in (found.battery.health.weakest, None))
     assert abs(with_it) < 0.015 * whole

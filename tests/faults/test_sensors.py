@@ -35,17 +35,17 @@ VOLTAGES = both(absent("BMS_Pack", "BMS_PackVoltage"), absent("INV_Power", "INV_
 # What is lost, the reason that is given, after how long [s], what widens, and by how much SOC and range may differ:
 # over the first kilometre the range shown follows each forecast closely, and what is not learned meanwhile shows.
 LOSSES: dict[str, tuple[Spoil, Reason, float, str, float, float]] = {
-    "imu": (without("IMU_Acceleration", "IMU_AngularRate"), Reason.NO_IMU, 0.3, "range", 0.0005, 0.035),
+    "imu": (without("IMU_Acceleration", "IMU_AngularRate"), Reason.NO_IMU, 0.3, "range", 0.0005, 0.04),
     "gps": (without("GPS_Position", "GPS_Motion"), Reason.NO_GPS, 2.3, "range", 0.0005, 0.03),
     "cells": (without("BMS_Cells"), Reason.NO_CELL_TEMPERATURE, 10.3, "range", 0.001, 0.01),
     "ambient": (without("TC_Ambient"), Reason.NO_AMBIENT_TEMPERATURE, 10.3, "range", 0.0005, 0.03),
     "pack current": (absent("BMS_Pack", "BMS_PackCurrent"), Reason.NO_PACK_CURRENT, 1.3, "both", 0.001, 0.03),
     "inverter current": (absent("INV_Power", "INV_DcCurrent"), Reason.NO_INVERTER_CURRENT, 1.3, "soc", 0.0005, 0.03),
-    "currents": (CURRENTS, Reason.NO_PACK_CURRENT | Reason.NO_INVERTER_CURRENT, 1.3, "both", 0.006, 0.055),
+    "currents": (CURRENTS, Reason.NO_PACK_CURRENT | Reason.NO_INVERTER_CURRENT, 1.3, "both", 0.006, 0.06),
     "pack voltage": (absent("BMS_Pack", "BMS_PackVoltage"), Reason.NO_PACK_VOLTAGE, 1.3, "both", 0.001, 0.03),
     "voltages": (VOLTAGES, Reason.NO_PACK_VOLTAGE, 1.3, "both", 0.002, 0.055),
     "pack": (without("BMS_Pack"), Reason.NO_PACK_VOLTAGE | Reason.NO_PACK_CURRENT, 1.3, "both", 0.001, 0.03),
-    "speeds": (SPEEDS, Reason.NO_SPEED, 2.3, "range", 0.0005, 0.05),
+    "speeds": (SPEEDS, Reason.NO_SPEED, 2.3, "range", 0.0005, 0.055),
 }
 
 

@@ -23,7 +23,7 @@ def test_not_available_is_never_a_number(message: str):
     mapped = [s.signal for s in reference().mapping.sources if s.message == message]
     signals = [name for name in mapped if definition.get_signal_by_name(name).length >= 8]
     run = ridden(spoilt(absent(message, *signals)))
-    check_all(run, soc=0.004, range_=0.035)
+    check_all(run, soc=0.004, range_=0.04)
     sent = sum(f[1] == identifier(message) and BEGIN * S <= f[0] - ride()[0][0] < END * S for f in ride())
     assert all(run.faults.get((f"{message}.{signal}", NOT_AVAILABLE), 0) >= sent > 0 for signal in signals)
     assert run.pipeline.counts().dropped == 0  # the frames themselves are good
@@ -53,7 +53,7 @@ IMPLAUSIBLE = [  # signal, raw value that its bits can hold and the DBC excludes
 @pytest.mark.parametrize(("message", "signal", "raw"), IMPLAUSIBLE)
 def test_beyond_its_physical_range_is_never_a_number(message: str, signal: str, raw: int):
     run = ridden(spoilt(of(message, lambda frame: changed(frame, **{signal: raw}))))
-    check_all(run, soc=0.004, range_=0.035)
+    check_all(run, soc=0.004, range_=0.04)
     sent = sum(f[1] == identifier(message) and BEGIN * S <= f[0] - ride()[0][0] < END * S for f in ride())
     assert run.faults[f"{message}.{signal}", RANGE] == sent == run.pipeline.counts().implausible
     assert check_frames(run.sent)["RANGE_Diagnosis"][-1]["RANGE_CountImplausible"] == sent

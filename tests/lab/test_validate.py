@@ -27,7 +27,6 @@ from gz_onboard.lab.validate_score import CHANNELS, LABELS, ORDER, conditions, e
 from gz_onboard.lab.validate_soc import soc_reference
 from gz_onboard.offline.page import mark_of, write_below
 from gz_onboard.offline.samples import read_samples
-from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.simulation.recorded import read_recorded, rest_soc
@@ -198,14 +197,15 @@ def test_current_is_that_which_flows(city):
 def test_effects_in_the_cells_count(city):
     """A second RC pair takes off its resistance times the mean current, once it has settled."""
     vehicle, measured, soc = city
-    effects = (*vehicle.model.effects, load_effect("slow_relaxation"))
     known = dict(vehicle.parameters.known)
-    known["slow_resistance"] = replace(known["cable_resistance"], value=0.01)
-    known["slow_time"] = replace(known["cable_resistance"], value=1.0)
+    known["slow_resistance"] = replace(known["slow_resistance"], value=0.01)
+    known["slow_time"] = replace(known["slow_time"], value=1.0)
     parameters = Parameters(known)
-    extended = replace(vehicle, parameters=parameters, model=Model(effects, parameters))
+    whole = replace(vehicle, parameters=parameters, model=Model(vehicle.model.effects, parameters))
+    effects = tuple(effect for effect in vehicle.model.effects if effect.name != "slow_relaxation")
+    without = replace(vehicle, parameters=parameters, model=Model(effects, parameters))
     first, second = (
-        components(v, measured, soc, 30.0, None)["battery_voltage"].modelled.mean() for v in (vehicle, extended)
+        components(v, measured, soc, 30.0, None)["battery_voltage"].modelled.mean() for v in (without, whole)
     )
     cells = vehicle.battery.cells_series * measured["pack_current"].mean() / vehicle.battery.cells_parallel
     assert first - second == pytest.approx(0.01 * cells, rel=0.02)

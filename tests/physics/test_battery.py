@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from gz_onboard.physics.battery import current_of, dissipation, heat, terminal_voltage
 from gz_onboard.physics.drawable import GIVES_UP, GIVES_UP_SD, drawable
-from gz_onboard.physics.effect import Port
-from gz_onboard.physics.model import first_soc
+from gz_onboard.physics.effect import Port, load_effect
+from gz_onboard.physics.model import Model, first_soc
 from gz_onboard.physics.tables import Mesh
 from gz_onboard.vehicle import read_vehicle
 
@@ -169,8 +169,9 @@ def test_bursts_cost_energy_as_a_step_by_step_discharge_says():
 @pytest.mark.parametrize("form_factor_squared", [1.5, 3.0])
 def test_bursts_cost_the_reaction_what_a_step_by_step_discharge_says(temperature, form_factor_squared):
     """Currents drawn at random, 10 s each, through a reaction that bends and lags: as the charge meets it."""
-    settled = VEHICLE.model.overpotential(BATTERY)
-    (reaction,) = VEHICLE.model.at(Port.CELL_VOLTAGE)
+    model = Model((load_effect("charge_transfer"),), VEHICLE.parameters)
+    settled = model.overpotential(BATTERY)
+    (reaction,) = model.at(Port.CELL_VOLTAGE)
     shape = 1 / (form_factor_squared - 1)
     currents = np.random.default_rng(0).gamma(shape, 1.5 / shape, 4000)  # A of a cell
     real, lost, step = 0.0, 0.0, 0.1

@@ -96,6 +96,7 @@ def written_out(ride, reaction=P["charge_transfer_resistance"]):
     """
     soc, v1, volts, heat = SOC, 0.0, [], []
     eta, settles = 0.0, P["charge_transfer_time"]
+    v2, slow, keep = 0.0, 1.0 if reaction else 0.0, exp(-0.5 / P["slow_time"])
     for amperes, celsius in zip(ride["pack_current"], ride["cell_temperature"], strict=True):
         i = amperes / PACK.cells_parallel
         r0, r1, c1 = (mesh.at(soc, celsius)[0] for mesh in (PACK.r0, PACK.r1, PACK.c1))
@@ -107,8 +108,10 @@ def written_out(ride, reaction=P["charge_transfer_resistance"]):
         goal = thermal * asinh(cold * i / thermal)
         half = goal + (eta - goal) * exp(-0.5 / settles)
         eta = goal + (eta - goal) * exp(-1 / settles)
-        volts.append(PACK.ocv(soc, celsius)[0] - r0 * i - middle - half)
-        heat.append((r0 * i + middle + half) * amperes * PACK.cells_series)
+        late = v2 * keep + slow * P["slow_resistance"] * i * (1 - keep)
+        volts.append(PACK.ocv(soc, celsius)[0] - r0 * i - middle - half - late)
+        heat.append((r0 * i + middle + half + late) * amperes * PACK.cells_series)
+        v2 = late * keep + slow * P["slow_resistance"] * i * (1 - keep)
         soc -= 0.5 * i / (3600 * PACK.cell_capacity(celsius))
         v1 = v1 * exp(-1 / (r1 * c1)) + r1 * i * (1 - exp(-1 / (r1 * c1)))
     return np.array(volts), np.array(heat)

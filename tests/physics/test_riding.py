@@ -28,6 +28,6 @@ def test_a_riding_that_gives_energy_is_refused(tmp_path, rows):
         with_riding(tmp_path, rows)
 
 
-@pytest.mark.parametrize("effects", ["", '"cornering_drag", "headwind", "tyre_warm_up", "slow_relaxation", '])
+@pytest.mark.parametrize("effects", ["", '"cornering_drag", "headwind", "tyre_warm_up", "ocv_hysteresis", '])
 def test_one_that_costs_energy_is_taken(tmp_path, effects):
     assert with_riding(tmp_path, "[[0.5, 10.0, 0.5], [0.5, 8.0, -0.5]]", effects).riding.speed == 9.0

@@ -182,7 +182,7 @@ def test_the_battery_alone_has_the_measured_and_the_time_moving(folder: Path, re
 
 def test_a_vehicle_file_says_how_rough_roads_are(tmp_path: Path, folder: Path, capsys: pytest.CaptureFixture[str]):
     text = (OWN / "reference.toml").read_text(encoding="utf-8")
-    listed = text.replace('"charge_transfer",\n]', '"charge_transfer", "rough_road",\n]\neffects_folder = "."')
+    listed = text.replace('"slow_relaxation",\n]', '"slow_relaxation", "rough_road",\n]\neffects_folder = "."')
     shutil.copy(folder / "rough_road.py", tmp_path)
     assert listed.count("[forecast]\n") == listed.count("rough_road") == 1
     cycle, file, summary = tmp_path / "cycle.csv", tmp_path / "rough.toml", tmp_path / "summary.json"

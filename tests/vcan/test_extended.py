@@ -14,12 +14,8 @@ from tests.vcan.support import Listener, Running
 CITY = LOGS / "city_14C.blf"
 SECONDS = 12.0
 DISCOVERED = ROOT / "tests" / "vehicles" / "discovered.toml"  # see tests/test_turning_loss.py
-MORE = (
-    '"charge_transfer", "cornering_drag", "headwind", "slow_relaxation", "ocv_hysteresis", "rough_road",\n]\n'
-    'effects_folder = "effects"'
-)
+MORE = '"slow_relaxation", "cornering_drag", "headwind", "ocv_hysteresis", "rough_road",\n]\neffects_folder = "effects"'
 VALUES = """[parameters]
-slow_resistance = { value = 0.03, unit = "ohm", sd = 0.005, status = "guess", source = "made up for a test" }
 wind_north = { value = 4.0, unit = "m/s", sd = 1.0, status = "guess", source = "made up for a test" }
 pack_voltage_latency = { value = 0.1, unit = "s", sd = 0.05, status = "guess", source = "made up for a test" }
 """
@@ -36,8 +32,9 @@ def extended(folder: Path) -> Path:
     """The reference scooter with more effects, one a file of its own, and a current sensor that shows 2 A more."""
     text = (OWN / "reference.toml").read_text()
     for old, new in (
-        ('"charge_transfer",\n]', MORE),
+        ('"slow_relaxation",\n]', MORE),
         ("[parameters]\n", VALUES),
+        ("slow_resistance = { value = 0.0151295", "slow_resistance = { value = 0.03"),
         ("pack_current_offset = { value = 0.02", "pack_current_offset = { value = 2.02"),
     ):
         assert text.count(old) == 1, old

@@ -225,15 +225,20 @@ class Pairs:
 
 
 class Reduction:
-    """From many pairs to `count` pairs, under `loads`: currents from rest, one value a second."""
+    """From many pairs to `count` pairs, under `loads`: currents from rest, one value a second.
 
-    def __init__(self, loads: Sequence[Array], count: int = 1) -> None:
+    beside: (resistance [ohm], time constant [s]) of a further pair that is given; the `count` are what it lacks.
+    """
+
+    def __init__(self, loads: Sequence[Array], count: int = 1, beside: tuple[float, float] | None = None) -> None:
         def filtered_by(tau: float) -> Array:
             a = decay_over(1.0, tau)
             return np.concatenate([lfilter([1 - a], [1, -a], x) for x in loads])
 
         load = np.concatenate(list(loads))
-        self._many = np.column_stack([load, *(filtered_by(tau) for tau in TIMES)])
+        given = [beside] if beside else []
+        self._beside = np.array([-resistance for resistance, _ in given])
+        self._many = np.column_stack([load, *(filtered_by(tau) for tau in (*TIMES, *(time for _, time in given)))])
         fast = np.geomspace(3, 300, 50) if count == 1 else np.geomspace(1.5, 120, 26)
         slow = np.geomspace(150, 3000, 16)
         filtered = {float(tau): filtered_by(float(tau)) for tau in (*fast, *(slow if count == 2 else ()))}
@@ -252,6 +257,7 @@ class Reduction:
 
     def __call__(self, resistance: Array) -> Pairs:
         """The pairs nearest to the many of `resistance` (1 + len(TIMES),) [ohm]."""
+        resistance = np.concatenate([resistance, self._beside])
         return self._nearest(np.einsum("i,kij,j->k", resistance, self._left, resistance), self._solved @ resistance)
 
     def _nearest(self, cost: Array, best: Array) -> Pairs:
@@ -280,6 +286,7 @@ class Reduction:
 
     def logs(self, resistances: Array) -> Array:
         """(n, 1 + 2 count): ln of R0, R of each pair, τ of each pair, for `resistances` (1 + len(TIMES), n) [ohm]."""
+        resistances = np.vstack([resistances, np.tile(self._beside[:, None], resistances.shape[1])])
         costs = np.einsum("kin,in->nk", self._left @ resistances, resistances)
         every = np.moveaxis(self._solved @ resistances, -1, 0)
         found = [self._nearest(cost, best) for cost, best in zip(costs, every, strict=True)]

@@ -2,7 +2,8 @@
 
 One table per temperature. Each test begins at full and rests before its pulses; what it rests at shows how much charge
 there is between full and empty at its temperature. Many RC pairs of fixed time constants are fitted, linear in every
-table; then the one pair (and beside it the two) that is nearest to them under a load like riding (see `cell_fit`).
+table. Of these the slow ones become an effect (`pulse_slow`), and the one pair that is nearest to the rest under a load
+like riding the tables; beside it the two that are nearest to all (see `cell_fit`).
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ from gz_onboard.lab.calibrate.pulse_error import Residual, voltage_errors
 from gz_onboard.lab.calibrate.pulse_mesh import direct, mesh_quality, meshes
 from gz_onboard.lab.calibrate.pulse_reaction import charge_transfer, linear
 from gz_onboard.lab.calibrate.pulse_rests import rest_shift, rests_over_soc, shift_of_rests
+from gz_onboard.lab.calibrate.pulse_slow import RESISTANCE, TIME, slow_relaxation
+from gz_onboard.lab.calibrate.pulse_slow import found as found_slow
 from gz_onboard.lab.calibrate.pulse_test import APART, Tested, moved_pieces, nearest_to_bench, tested
 from gz_onboard.lab.calibrate.result import Curve, Found, Panel, PlotLine, Result, compared
 from gz_onboard.lab.calibrate.table import Measurements
@@ -63,14 +66,16 @@ def calibrate(
     split, activation = moved_pieces(tests, nodes, volts, soc)
     fitted = [fit_branches(x, leave_out=True) for x in split]
     rides = [riding_current(seed=k) for k in range(1, 4)] if loads is None else loads
-    reduction = Reduction(rides)
+    two, sd_two = meshes(fitted, Reduction(rides, count=2))
+    covered = np.array([f.covered for f in fitted])
+    slow = slow_relaxation(fitted, capacity.value, result) if method == "reduced" else None
+    reduction = Reduction(rides, beside=(slow.resistance, slow.time) if slow else None)
     one, sd_one = meshes(fitted, reduction)
     names = ", ".join(t.test.name for t in tests)
     how = f"{names}: {len(TIMES)} RC pairs, reduced over {'synthetic rides' if loads is None else 'the loads given'}"
     if method == "direct":
         one, sd_one = direct(tests, fitted, activation, nodes, volts, one)
         how = f"{names}: least squares of one RC pair"
-    two, sd_two = meshes(fitted, Reduction(rides, count=2))
     shift, ocv_sd = rest_shift(fitted, tests, nodes, ocv)
     result.curves["rest_shift"] = rests_over_soc(fitted, tests, names)
     shift_of_rests(result.curves["rest_shift"], tests, names, result)
@@ -80,7 +85,6 @@ def calibrate(
     temperature, amount, amount_sd = np.array([(t.temperature, t.capacity, t.capacity_sd) for t in tests]).T
     source = f"{names}: charge that lays the rest voltages on the OCV"
     result.curves["battery.capacity"] = Curve({"temperature": temperature}, amount, amount_sd, "A·h", source)
-    covered = np.array([f.covered for f in fitted])
     axes = {"soc": soc, "temperature": temperature}
     _tables(result, axes, covered, how, (one, sd_one), (two, sd_two))
     for t, there in zip(tests, covered, strict=True):
@@ -90,6 +94,8 @@ def calibrate(
                 f"{t.temperature:g} degC; the table there only continues its neighbours (no sd)"
             )
     _reaction(result, reaction, names)
+    if method == "reduced":
+        found_slow(slow, names, result)
     _voltages(result, measured, names)
     if method == "reduced":  # the halves are
         mesh_quality(result, tests, fitted, split, reduction, one)
@@ -151,12 +157,16 @@ def _tests(tables: Sequence[Measurements], ocv: Curve, capacity: Found, result: 
 
 
 def circuit(result: Result, slow: bool = False) -> Circuit:
-    """The cell that `calibrate` found; with `slow`, of two RC pairs."""
+    """The cell that `calibrate` found, as on board; with `slow`, of two RC pairs, each in tables."""
     c = result.curves
     ocv, axes = c["battery.ocv"], c["battery.r0"].axes
     prefix = "slow_" if slow else "battery."
     tables = {name: c[prefix + name].value for name in ("r0", "r1", "c1")}
-    tables |= {name: c[name].value for name in ("slow_resistance", "slow_time") if slow}
+    for parameter in (RESISTANCE, TIME):
+        if slow:
+            tables[parameter.name] = c[parameter.name].value
+        elif parameter.name in result.parameters:
+            tables[parameter.name] = np.full_like(tables["r0"], result.parameters[parameter.name].value)
     if "battery.rest_shift" in c:
         tables["rest_shift"] = c["battery.rest_shift"].value
     capacity = c["battery.capacity"].value
@@ -177,8 +187,8 @@ def follow_profile(cell: Circuit, test: CellTest) -> tuple[Array, Array]:
 
 def _voltages(result: Result, tests: Sequence[Tested], names: str) -> None:
     """How well the tables follow the tests that they came from: voltage, and what is left over time."""
-    pairs = {"one pair": circuit(result), "two pairs": circuit(result, slow=True)}
-    rms: dict[str, list[float]] = {"above": [], "below": []}  # 0.1 of SOC, of one pair
+    pairs = {"on board": circuit(result), "two pairs": circuit(result, slow=True)}
+    rms: dict[str, list[float]] = {"above": [], "below": []}  # 0.1 of SOC, of the circuit on board
     left = []
     for t in tests:
         test, at = t.test, f"{t.temperature:g}"
@@ -191,10 +201,10 @@ def _voltages(result: Result, tests: Sequence[Tested], names: str) -> None:
                     about, data = f"voltage, {what}, {at} degC, SOC {name} 0.1", test.voltage[part]
                     fit = score(about, "V", data, model[part], held_out=False, source=test.name)
                     result.fits.append(fit)
-                    if what == "one pair":
+                    if what == "on board":
                         rms[name].append(fit.rms)
-        left.append(Residual(t.temperature, test.time, test.voltage - models["one pair"], t.level, test.rest))
-        hours, model, title = test.time / HOUR, models["one pair"], f"Pulse test at {at} °C"
+        left.append(Residual(t.temperature, test.time, test.voltage - models["on board"], t.level, test.rest))
+        hours, model, title = test.time / HOUR, models["on board"], f"Pulse test at {at} °C"
         result.panels += compared(title, "time [h]", "voltage [V]", hours, test.voltage, model)
     voltage_errors(left, names, result)
     for key, unit, factor in (("r0", "mΩ", 1e3), ("r1", "mΩ", 1e3), ("c1", "F", 1.0)):
@@ -204,5 +214,5 @@ def _voltages(result: Result, tests: Sequence[Tested], names: str) -> None:
         result.panels.append(Panel(key.upper(), "state of charge", unit, over_soc))
     for parameter, where in (("cell_voltage_error", "above"), ("cell_voltage_error_empty", "below")):
         if rms[where] or where == "above":
-            sd, source = float(np.sqrt(np.mean(np.square(rms[where])))), f"rms of one RC pair {where} 10 % SOC"
+            sd, source = float(np.sqrt(np.mean(np.square(rms[where])))), f"rms of the circuit {where} 10 % SOC"
             result.parameters[parameter] = Found(0.0, sd, "V", f"{names}: {source}")

@@ -48,11 +48,11 @@ def voltage_errors(residuals: Sequence[Residual], names: str, result: Result) ->
     axes = {"temperature": np.array([at for at, _, _ in known])}
     shares = np.sqrt(times / np.array([GRID * len(left) for _, left, _ in known]))
     result.curves["battery.voltage_error"] = Curve(
-        axes, sizes, sizes * shares, "V", f"{names}: rms of one RC pair above 10 % SOC, rest and load alike"
+        axes, sizes, sizes * shares, "V", f"{names}: rms of the circuit above 10 % SOC, rest and load alike"
     )
     middle = float(np.exp(np.mean(np.log(times))))
     spread = middle * float(np.std(np.log(times))) if len(known) > 1 else middle
-    source = f"{names}: correlation of what one RC pair leaves falls to 1/e"
+    source = f"{names}: correlation of what the circuit leaves falls to 1/e"
     result.curves["voltage_error_time"] = Curve(axes, times, times * shares, "s", source)
     result.parameters["cell_voltage_error_time"] = Found(middle, spread, "s", source)
 

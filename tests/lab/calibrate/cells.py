@@ -121,16 +121,16 @@ MANY = ((0.007, 2.4), (0.008, 24.0), (0.010, 70.0), (0.014, 1200.0))
 SLOW = ((0.008, 0.6), (0.012, 9.0), (0.012, 90.0), (0.030, 900.0))
 
 
-def nearest_pair(pairs, r0, loads):
+def nearest_pair(pairs, r0, loads, beside=()):
     """(R0, R1 [ohm], C1 [F]) of the one pair nearest, in least squares under `loads` of one value a second, to what a
-    cell of `r0` and `pairs` answers: each time constant tried, the rest solved for."""
+    cell of `r0` and `pairs` answers: each time constant tried, the rest solved for. beside: pairs that are given."""
     current = np.concatenate(loads)
 
     def relaxed(tau):
         a = np.exp(-1 / tau)
         return np.concatenate([lfilter([1 - a], [1, -a], load) for load in loads])
 
-    volts = r0 * current + sum(r * relaxed(tau) for r, tau in pairs)
+    volts = r0 * current + sum(r * relaxed(tau) for r, tau in pairs) - sum(r * relaxed(tau) for r, tau in beside)
 
     def solved(tau):
         columns = np.column_stack([current, relaxed(tau)])

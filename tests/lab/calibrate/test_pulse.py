@@ -14,7 +14,7 @@ from gz_onboard.lab.calibrate.cell_circuit import riding_current, voltage
 from gz_onboard.lab.calibrate.cell_data import cell_test
 from gz_onboard.lab.calibrate.cell_fit import TIMES, Reduction
 from gz_onboard.lab.calibrate.result import Found
-from gz_onboard.lab.calibrate.table import read_table
+from gz_onboard.lab.calibrate.table import Measurements, read_table
 from tests.lab.calibrate.cells import MANY, Plant, nearest_pair, pulse_pieces, pulse_test, slow_test
 
 DATA = os.environ.get("GZ_ONBOARD_DATA")
@@ -55,10 +55,16 @@ def away(seed, method, pairs=((0.03, 30.0),), scatter=0.03):
         pulse_test(t, seed=50 + 2 * seed + k, gain=gain, scatter=scatter, pairs=pairs)[0]
         for k, t in enumerate((0.0, 25.0))
     ]
-    curves = pulse.calibrate(tables, *slow(), method=method).curves
-    r0, r1, c1 = nearest_pair(pairs, 0.05, [riding_current(seed=k) for k in range(1, 4)])
-    truths = {"r0": r0 * cold, "r1": r1 * cold, "c1": c1 / cold}
-    found = {name: curves[f"battery.{name}"] for name in truths}
+    result = pulse.calibrate(tables, *slow(), method=method)
+    loads = [riding_current(seed=k) for k in range(1, 4)]
+    given = (
+        [tuple(result.parameters[name].value for name in ("slow_resistance", "slow_time"))]
+        if (result.effects.get("slow_relaxation"))
+        else []
+    )
+    nearest = [nearest_pair([(f * r, tau) for r, tau in pairs], 0.05 * f, loads, given) for f in cold.ravel()]
+    truths = dict(zip(("r0", "r1", "c1"), np.transpose(nearest)[:, :, None], strict=True))
+    found = {name: result.curves[f"battery.{name}"] for name in truths}
     return {name: ((found[name].value - x) / found[name].sd)[:, INSIDE] for name, x in truths.items()}
 
 
@@ -146,14 +152,52 @@ def test_the_tables_follow_a_load_at_a_temperature_between_those_of_the_tests():
     assert np.sqrt(np.mean((model - model.mean() - measured + measured.mean()) ** 2)) < 0.1 * np.std(measured)
 
 
-def test_two_pairs_follow_slow_relaxation_better_than_one():
-    pairs = ((0.02, 10.0), (0.03, 900.0))
-    result = found(pairs=pairs, temperatures=(15.0, 25.0))
+SLOWLY = ((0.02, 10.0), (0.03, 900.0))
+
+
+def test_slow_relaxation_comes_back():
+    result = found(pairs=SLOWLY, temperatures=(24.0, 27.0))
+    assert result.effects["slow_relaxation"]
+    for name, truth in (("slow_resistance", 0.03), ("slow_time", 900.0)):
+        assert result.parameters[name].value == pytest.approx(truth, rel=0.15), name
+    r1 = result.curves["battery.r1"].value[:, INSIDE]
+    assert np.mean(r1) == pytest.approx(0.02, rel=0.15)  # the fast pair, without the slow one in it
+
+
+def test_a_cell_that_relaxes_fast_has_none():
+    result = found()
+    assert not result.effects["slow_relaxation"]
+    assert "slow_resistance" not in result.parameters
+    assert any("no slow relaxation" in note for note in result.notes)
+
+
+def test_slow_relaxation_is_followed_better_with_its_effect_than_by_one_pair():
+    result = found(pairs=SLOWLY, temperatures=(15.0, 25.0))
+    tables = [pulse_test(t, seed=k, pairs=SLOWLY)[0] for k, t in enumerate((15.0, 25.0))]
+    alone = pulse.calibrate(tables, *slow(), method="direct")
     errors = []
-    for two in (False, True):
-        model, measured = pulse.follow_profile(pulse.circuit(result, two), road(pairs=pairs))
+    for cell in (pulse.circuit(result), pulse.circuit(alone)):
+        model, measured = pulse.follow_profile(cell, road(pairs=SLOWLY))
         errors.append(np.sqrt(np.mean((model - measured) ** 2)))
-    assert errors[1] < 0.8 * errors[0]
+    assert errors[0] < 0.6 * errors[1], errors
+
+
+@pytest.mark.parametrize("step", [1.0, 10.0])
+def test_a_record_at_equal_times_counts_the_mean_of_its_samples(step):
+    """It shows no moment of switching: large steps that are cut off at once and small ones that climb must not be
+    counted by two rules."""
+    rng = np.random.default_rng(1)
+    current = np.tile(np.concatenate([np.linspace(0.0, 4.0, 20), np.zeros(10)]), 90) + rng.normal(0, 1e-3, 2700)
+    time = step * np.arange(len(current))
+    columns = {"time": time, "current": current, "voltage": 3.8 - 0.03 * current - 1e-5 * time / step}
+    table = Measurements(Path("road.csv"), {**columns, "cell_temperature": np.full(len(time), 25.0)})
+    assert cell_test(table).drawn[-1] == pytest.approx(np.trapezoid(current, time) / 3600, rel=1e-9)
+    late = np.sort(np.concatenate([time, time[20::30] - 1e-3 * step]))  # a tester that writes when it switches off
+    held = np.interp(late, time, current)
+    held[np.isin(late, time[20::30] - 1e-3 * step)] = 4.0
+    switching = {"time": late, "current": held, "voltage": 3.8 - 0.03 * held - 1e-5 * late / step}
+    table = Measurements(Path("switch.csv"), {**switching, "cell_temperature": np.full(len(late), 25.0)})
+    assert cell_test(table).drawn[-1] == pytest.approx(np.trapezoid(held, late) / 3600, rel=2e-3)
 
 
 def test_the_reduction_gives_back_a_pair_that_is_one_of_the_many():

@@ -22,7 +22,7 @@ def found(reaction):
 
 def test_it_is_found_with_its_temperature_and_time():
     result = found(PLANTED)
-    assert result.effects == {"charge_transfer": True}
+    assert result.effects["charge_transfer"]
     values = {name: result.parameters[f"charge_transfer_{name}"] for name in ("resistance", "activation", "time")}
     assert values["resistance"].value == pytest.approx(PLANTED, rel=0.15)
     assert values["activation"].value == pytest.approx(4500, rel=0.15)
@@ -48,6 +48,6 @@ def test_a_load_that_no_fit_has_seen_is_followed_better_with_it(monkeypatch):
 
 def test_a_cell_without_it_has_none():
     result = found(0.0)
-    assert result.effects == {"charge_transfer": False}
+    assert not result.effects["charge_transfer"]
     assert not any(name.startswith("charge_transfer") for name in result.parameters)
     assert any("no resistance that falls with current" in note for note in result.notes)

@@ -30,7 +30,8 @@ def ride(mixed: MixedModel) -> Ride:
     battery, p = mixed.system.pack, mixed.vehicle.parameters
     cell, _ = battery.terminal_voltage(SOC, 0.0, AMPERES / battery.cells_parallel, COLD)
     load = standing_load(AMPERES, battery.pack_voltage(cell, AMPERES), p["auxiliary_power"]) / battery.cells_parallel
-    cell -= total(mixed.system.cells, all_quantities(cell_current=load, cell_temperature=COLD))
+    settled = [e for e in mixed.system.cells if e.effect.name == "charge_transfer"]  # what is slower is left at rest
+    cell -= total(settled, all_quantities(cell_current=load, cell_temperature=COLD))
     time = np.arange(0.0, SECONDS, 0.05)
     shown = {
         "motor_speed": 30.0,
