@@ -149,9 +149,10 @@ class Pipeline:
         if whole_second:
             self._count_faults()
         estimate = self.estimator.estimate(codec.seconds(time_ns))
-        estimate.reasons |= self._recent | self.extra_reasons
-        if self.extra_reasons & Reason.BUS_DOWN and estimate.state is State.VALID:
-            estimate.state = State.DEGRADED
+        if self._recent or self.extra_reasons:
+            estimate.reasons |= self._recent | self.extra_reasons
+            if self.extra_reasons & Reason.BUS_DOWN and estimate.state is State.VALID:
+                estimate.state = State.DEGRADED
         self.last = estimate
         self.drawn.take(estimate)
         if estimate.range is not None and estimate.state in KNOWN:

@@ -58,6 +58,10 @@ class Publisher:
             own = identifier_of(message) if identifier is None else with_flag(identifier + i * step)
             self._layouts[name] = _layout(message, own)
         self._fields = {field.name: field for layout in self._layouts.values() for field in layout.fields}
+        status = self._layouts["RANGE_Status"].fields
+        self._reason_fields = [(int(reason), self._fields[reason_signal(reason)]) for reason in Reason]
+        status[:] = [field for field in status if all(field is not other for _, other in self._reason_fields)]
+        self._reasons = 0, 0  # the last ones sent, and their bits at their places
         self._sensor_signals = [(role, sensor_signal(role)) for role in ROLES if sensor_signal(role) in self._fields]
 
     @cached_property
@@ -135,9 +139,9 @@ class Publisher:
             "RANGE_Activity": estimate.activity,
         }
         reasons = int(estimate.reasons)
-        for bit, signal in _REASON_SIGNALS:
-            values[signal] = reasons & bit != 0
-        return [self._frame("RANGE_Status", values, time_ns)]
+        if reasons != self._reasons[0]:
+            self._reasons = reasons, sum(field.bits(True) for bit, field in self._reason_fields if reasons & bit)
+        return [self._frame("RANGE_Status", values, time_ns, self._reasons[1])]
 
     def reported(self, e: Estimate) -> tuple[State, float | None, float | None, float | None]:
         """(state, range, P10, P90) [km] as they are sent: never valid unless all three are there and in their order."""
@@ -160,12 +164,13 @@ class Publisher:
     def _can_say(self, signal: str, value: float | None) -> bool:
         return self._fields[signal].raw(value) is not None
 
-    def _frame(self, name: str, values: dict[str, float | None], time_ns: int) -> Frame:
+    def _frame(self, name: str, values: dict[str, float | None], time_ns: int, bits: int = 0) -> Frame:
+        """bits: of what is not in the layout's fields."""
         layout = self._layouts[name]
         counter = self._counters[name]
         self._counters[name] = (counter + 1) % layout.counts
         values[layout.counter] = counter
-        word = layout.unused
+        word = layout.unused | bits
         for field in layout.fields:
             value = values.get(field.name)  # None: not one of ours
             if value is not False:  # most flags are that, and 0 is nothing to set
@@ -192,9 +197,6 @@ def sensor_signal(role: str) -> str:
 def reason_signal(reason: Reason) -> str:
     """The signal that carries `reason`: NO_IMU is RANGE_NoImu."""
     return "RANGE_" + "".join(word.capitalize() for word in str(reason.name).split("_"))
-
-
-_REASON_SIGNALS = [(int(reason), reason_signal(reason)) for reason in Reason]
 
 
 def _why(why: Explanation | None) -> dict[str, float | None]:

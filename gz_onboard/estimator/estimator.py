@@ -292,9 +292,10 @@ class Estimator:
             estimate.reasons |= Reason.SOC_UNCERTAIN
         self._outlook.report(estimate)
         estimate.why = self.attribution.latest if self._outlook.forecast else None
-        estimate.state = State.DEGRADED if estimate.reasons & DEGRADING else State.VALID
-        missing = estimate.reasons | self._missing.lacking
-        if (silent and missing & NO_PACK == NO_PACK) or estimate.reasons & Reason.SIGNALS_SLOW:
+        reasons = int(estimate.reasons)  # plain numbers: ten times a second flags take longer than all of the above
+        estimate.state = State.DEGRADED if reasons & int(DEGRADING) else State.VALID
+        missing = reasons | int(self._missing.lacking)
+        if (silent and missing & int(NO_PACK) == int(NO_PACK)) or reasons & int(Reason.SIGNALS_SLOW):
             estimate.state = State.INVALID
         return estimate
 

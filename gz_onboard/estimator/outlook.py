@@ -41,6 +41,7 @@ class Outlook:
         self._charging = Charging()
         self._full: Forecast | None = None  # while it is charged
         self._time = -inf
+        self._factor = 1.0, 0.0  # consumption factor and its sd, as of the forecast
 
     def due(self, now: float) -> bool:
         """Whether the next forecast is to be made at `now` [s]."""
@@ -65,6 +66,8 @@ class Outlook:
         charging = now.activity is Activity.CHARGING
         drawn = None if charging or voltage is None or current is None else voltage * current * elapsed
         self.forecast = self._forecaster.shown(self._road.forecast(now.time, free, pack, now.conditions), drawn)
+        riding = self._forecaster.riding
+        self._factor = riding.factor, sqrt(riding.factor_variance)
         if charging and voltage and current is not None:
             self._charging.step(elapsed, self._battery, (voltage, current), now.soc, now.temperature)
             self._full = self._forecaster.forecast(self._battery.window.high, 0.0, *known)
@@ -83,8 +86,7 @@ class Outlook:
         estimate.consumption_expected = forecast.consumption
         estimate.consumption_expected_sd = forecast.consumption_sd
         estimate.consumption_recent = forecast.recent
-        riding = self._forecaster.riding
-        estimate.consumption_factor, estimate.consumption_factor_sd = riding.factor, sqrt(riding.factor_variance)
+        estimate.consumption_factor, estimate.consumption_factor_sd = self._factor
         if forecast.mostly_prior:
             estimate.reasons |= Reason.PRIOR_RIDING
         if estimate.activity is Activity.CHARGING:  # not of a bus that fell silent

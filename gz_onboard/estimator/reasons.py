@@ -59,18 +59,19 @@ class MissingSignals:
         self._signals = signals
         self._needed = [(reason, signals[role]) for reason, roles in NEEDED.items() for role in roles if role in mapped]
         self._speeds = [signals[role] for role in SpeedCheck.ROLES]
+        self._with_speed, self._with_gps = (not self.lacking & r for r in (Reason.NO_SPEED, Reason.NO_GPS))
 
     def reasons(self, now: float, charged: bool = False) -> Reason:
         """The reasons for those that the vehicle has and that are missing at `now` [s], `charged` or not."""
-        signals, reasons, never = self._signals, Reason(0), self.lacking
+        signals, reasons = self._signals, Reason(0)
         for reason, signal in self._needed:
             if not signal.fresh(now):
                 reasons |= reason
-        if not never & Reason.NO_SPEED and not any(signal.fresh(now) for signal in self._speeds):
+        if self._with_speed and not any(signal.fresh(now) for signal in self._speeds):
             reasons |= Reason.NO_SPEED
         position = signals.gps_speed.fresh(now) or signals.latitude.fresh(now)
         altitude = signals.gps_altitude.fresh(now) or not signals.gps_altitude.stale_after
-        if not never & Reason.NO_GPS and (signals.fix_below(now, FIX_3D) or not position or not altitude):
+        if self._with_gps and (signals.fix_below(now, FIX_3D) or not position or not altitude):
             reasons |= Reason.NO_GPS
         return reasons & ~OF_RIDING if charged else reasons
 

@@ -48,21 +48,12 @@ class RestMonitor:
         self._time = self._sum = self._squares = 0.0
         self._count = 0
 
-    def step(self, dt: float, voltage: float, emf: float, c_rate: float, fast_time: float, unmodelled: float) -> None:
-        """Go `dt` [s] on.
+    def step(self, dt: float, emf: float, fast_time: float, unmodelled: float) -> None:
+        """Go `dt` [s] on without a load.
 
-        voltage: of a cell as measured [V]; emf: the same without the drop over R0 [V]; c_rate: current over capacity
-        [1/h]; fast_time: time constant of the RC pair [s]; unmodelled: sd of what the cell model does not have [V].
+        emf: voltage of a cell without the drop over R0 [V]; fast_time: time constant of the RC pair [s]; unmodelled:
+        sd of what the cell model does not have [V].
         """
-        self.fresh = False
-        if self._last is not None and voltage != self._last:
-            change = abs(voltage - self._last)
-            self._resolution = min(change, self._resolution or change)
-        self._last = voltage
-        if abs(c_rate) > REST_RATE:
-            self.loaded = True
-            self.interrupt()
-            return
         self._time += dt
         self._count += 1
         self._sum += emf
@@ -82,6 +73,19 @@ class RestMonitor:
             elif self.sd > PROVEN * unmodelled:  # a fast tail: the slow time constant does not apply
                 self.sd = None
             self.fresh = self.sd is not None
+
+    def load(self, voltage: float, c_rate: float) -> bool:
+        """Whether `c_rate` [1/h], current over capacity, is a load; voltage: of a cell, as measured with it [V]."""
+        self.fresh = False
+        if self._last is not None and voltage != self._last:
+            change = abs(voltage - self._last)
+            self._resolution = min(change, self._resolution or change)
+        self._last = voltage
+        if abs(c_rate) <= REST_RATE:
+            return False
+        self.loaded = True
+        self.interrupt()
+        return True
 
     def interrupt(self) -> None:
         """A load, or a pause in the data: begin anew."""
@@ -124,9 +128,12 @@ class RestUpdate:
         voltage, current [A] and voltage_sd [V]: of a cell, over `dt` [s] at `temperature` [degC].
         """
         battery, rest = self._battery, self._rest
+        if rest.load(voltage, current / battery.cell_capacity(temperature)):  # as most of the time
+            self._taken = inf
+            return False
         emf = voltage + battery.r0.at(filter_.soc, temperature)[0] * current + self._effects.overpotential
         fast = battery.r1.at(filter_.soc, temperature)[0] * battery.c1.at(filter_.soc, temperature)[0]
-        rest.step(dt, voltage, emf, current / battery.cell_capacity(temperature), fast, self._uncertainty.model)
+        rest.step(dt, emf, fast, self._uncertainty.model)
         if rest.sd is None:
             self._taken = inf
             return False

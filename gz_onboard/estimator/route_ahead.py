@@ -250,6 +250,8 @@ class RoadAhead:
     def report(self, estimate: Estimate) -> None:
         """Put what is known of the route into `estimate`."""
         a = self.answer
+        if a.state is RouteState.NONE:
+            return
         estimate.route_state, estimate.route_along, estimate.route_left = a.state, a.along, a.left
         estimate.route_energy, estimate.route_energy_sd = a.energy, a.energy_sd
         estimate.arrival_soc, estimate.arrival_soc_p10, estimate.arrival_soc_p90 = a.soc, a.soc_p10, a.soc_p90
