@@ -97,8 +97,7 @@ def ride(file: Path, payload: float | None) -> tuple[str, list[Sample]]:
         if e.time >= state["next"] and e.range is not None and e.soc_sd is not None and baseline.rows:
             state["next"] = e.time + 1.0
             bms = signals["bms_state_of_charge"].value
-            assert pipeline.estimator.filter
-            soc = pipeline.estimator.filter.soc, e.soc_sd, state["soc"], e.innovation or 0.0
+            soc = e.soc or 0.0, e.soc_sd, state["soc"], e.innovation or 0.0
             reach = e.range, e.range_p10 or 0.0, e.range_p90 or 0.0
             others = bms, baseline.range(bms, 0.15), baseline.range(bms, 0.0), baseline.energy
             ours = e.energy_left or 0.0, e.consumption_expected or 0.0
