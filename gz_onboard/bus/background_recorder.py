@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from gz_onboard.background import Background
@@ -15,8 +15,9 @@ _STUCK = 10.0  # s: no disk takes as long
 class BackgroundRecorder:
     """A `Recorder` on a thread of its own, for one that may not wait for a disk. Nothing else may use the recorder.
 
-    limit: how many frames may wait for the disk (a value of a sample counts as one); what does not fit is left out,
-    whole portions of it, and counted in `lost_frames`.
+    What is logged is handed over at `sync`, all at once: the thread is woken once a tick, not for each sample. limit:
+    how many frames may wait for the disk (a value of a sample counts as one); what does not fit is left out, whole
+    portions of it, and counted in `lost_frames`.
     """
 
     def __init__(self, recorder: Recorder, limit: int = 40_000) -> None:
@@ -25,7 +26,8 @@ class BackgroundRecorder:
         self._left_out = 0
         self._full = False
         self._now_ns = 0
-        self._syncing = False
+        self._portion: list[tuple[Callable[..., None], tuple[Any, ...]]] = []  # since the last `sync`
+        self._frames = self._values = 0  # in it
 
     @property
     def failing(self) -> bool:
@@ -49,31 +51,38 @@ class BackgroundRecorder:
         self._recorder.channel(topic, json_schema, metadata)
 
     def frames(self, batch: Sequence[Frame]) -> None:
-        """As that of `Recorder`; `batch` may not be changed afterwards."""
-        if batch and not self._thread.call(self._recorder.frames, batch, weight=len(batch)):
-            self._left_out += len(batch)
-            self._full = True
+        """As that of `Recorder`, at the next `sync`; `batch` may not be changed afterwards."""
+        if batch:
+            self._portion.append((self._recorder.frames, (batch,)))
+            self._frames += len(batch)
 
     def sample(self, topic: str, time_ns: int, values: Mapping[str, object], seen_ns: int | None = None) -> None:
-        """As that of `Recorder`; `values` may not be changed afterwards."""
-        if not self._thread.call(self._recorder.sample, topic, time_ns, values, seen_ns, weight=len(values)):
-            self._full = True
+        """As that of `Recorder`, at the next `sync`; `values` may not be changed afterwards."""
+        self._portion.append((self._recorder.sample, (topic, time_ns, values, seen_ns)))
+        self._values += len(values)
 
     def sync(self, now_ns: int) -> None:
-        """As that of `Recorder`."""
+        """Hand over what was logged since the last time, then as that of `Recorder`."""
         self._now_ns = now_ns
         if self._full and self._thread.load < 0.5:
             self._full = False
-        if not self._syncing:
-            self._syncing = True  # before the call: it may be done, and have said so, before `call` returns
-            if not self._thread.call(self._sync, weight=0):
-                self._syncing = False
+        self._hand_over()
 
     def close(self, seconds: float) -> bool:
         """Write what waits and close the file; False if that takes longer than `seconds`: the rest is lost then."""
+        self._hand_over()
         self._thread.call(self._recorder.close, weight=0)
         return self._thread.close(seconds)
 
-    def _sync(self) -> None:
-        self._syncing = False
+    def _hand_over(self) -> None:
+        portion, frames, values = self._portion, self._frames, self._values
+        self._portion, self._frames, self._values = [], 0, 0
+        # Of nothing to be written the sync weighs something, too, lest many wait for a disk that does not answer.
+        if not self._thread.call(self._write, portion, weight=max(frames + values, 1)) and portion:
+            self._left_out += frames
+            self._full = True
+
+    def _write(self, portion: Sequence[tuple[Callable[..., None], tuple[Any, ...]]]) -> None:
+        for function, arguments in portion:
+            function(*arguments)
         self._recorder.sync(self._now_ns)

@@ -542,6 +542,30 @@ def test_in_the_background_it_writes_the_same(tmp_path: Path) -> None:
     assert behind.lost_frames == 0
 
 
+def test_the_thread_is_woken_once_a_tick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = 0
+
+    class Counting(Background):
+        def call(self, function: Callable[..., object], *arguments: Any, weight: int = 1) -> bool:
+            nonlocal calls
+            calls += 1
+            return super().call(function, *arguments, weight=weight)
+
+    monkeypatch.setattr("gz_onboard.bus.background_recorder.Background", Counting)
+    behind = BackgroundRecorder(Recorder(tmp_path, "ref"), limit=10**9)
+    behind.channel("/estimate", SCHEMA)
+    batches = ticks(4)
+    for batch in batches:
+        behind.frames(batch)
+        behind.sample("/estimate", batch[-1][0], {"range": 1.0})
+        behind.sync(batch[-1][0])
+    assert calls == len(batches)
+    behind.frames(batches[0])
+    assert behind.close(30)  # with what came since
+    (path,) = tmp_path.iterdir()
+    assert len(read(path)) == len(flat(batches)) + len(batches[0])
+
+
 class Prompt(Background):
     """Has made each call before the caller goes on, as a thread has that gets its turn at once."""
 
