@@ -23,6 +23,7 @@ BLOCK_NS = 1_000_000_000
 """A block holds at most this many frames and this much time: a reader that looks for a time relies on it."""
 
 _CHUNK_BYTES = 256 * 1024
+_encode = json.JSONEncoder(allow_nan=False, separators=(",", ":")).encode  # `dumps` would make it anew each time
 _Sample: TypeAlias = tuple[int, int, bytes, int]  # log time [ns], channel, data, time of publishing [ns]
 
 
@@ -81,9 +82,9 @@ class LogFile:
         waits for them.
         """
         try:
-            text = json.dumps(values, allow_nan=False, separators=(",", ":"))
+            text = _encode(values)
         except ValueError:
-            text = json.dumps(_without_nan(values), separators=(",", ":"))
+            text = _encode(_without_nan(values))
         sample = time_ns, self._channels[topic], text.encode(), time_ns if seen_ns is None else seen_ns
         if self._pending and time_ns > self._pending[0][0]:
             self._held.append(sample)
