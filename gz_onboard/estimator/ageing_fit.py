@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from gz_onboard.estimator.uncertainty import RESISTANCE_SD
 
@@ -13,8 +13,7 @@ COMPARED = 300.0  # s of load from which the resistance of a ride is compared wi
 ANOTHER_PACK = 1.25  # factor between the two: from ride to ride one pack keeps within half of that
 
 
-@dataclass(frozen=True, slots=True)
-class Fit:
+class Fit(NamedTuple):
     """Of the resistance: its factor, what it is from [V²·s], and the time of load [s]."""
 
     factor: float = 1.0

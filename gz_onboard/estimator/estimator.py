@@ -9,7 +9,6 @@ temperatures, go on with the state of charge (`soc`), learn from the riding and 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 from gz_onboard.estimator import snapshot
@@ -196,7 +195,7 @@ class Estimator:
         rides = speed is not None and abs(speed) > MOVING and dt < self._timing.pause
         if reading.current is None and speed is not None and (reading.voltage or rides):
             voltage = reading.voltage or self.soc.rest_voltage
-            return replace(reading, current=self._present.power(now) / voltage, source=CurrentSource.MODEL)
+            return reading._replace(current=self._present.power(now) / voltage, source=CurrentSource.MODEL)
         return reading
 
     def _compare_grades(self, now: float, dt: float) -> None:

@@ -49,8 +49,7 @@ BASE = {
 """Quantities that need nothing beyond speed, grade and air."""
 
 
-@dataclass(frozen=True, slots=True)
-class Conditions:
+class Conditions(NamedTuple):
     """What the consumption depends on beside the motion."""
 
     ambient: float  # degC
@@ -66,8 +65,7 @@ class Road(NamedTuple):
     drag: float  # m²
 
 
-@dataclass(frozen=True, slots=True)
-class EffectInputs:
+class EffectInputs(NamedTuple):
     """What effects beyond the base's may read at one time; None where it is not known."""
 
     lateral_acceleration: float | None  # m/s²

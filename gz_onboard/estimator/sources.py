@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, replace
 from enum import Enum, auto
 from math import hypot, inf, isinf
+from typing import NamedTuple
 
 from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.estimator.redundancy.electric import CellEvidence, Readings
@@ -32,8 +32,7 @@ class CurrentSource(Enum):
     NONE = auto()
 
 
-@dataclass(frozen=True, slots=True)
-class PackReading:
+class PackReading(NamedTuple):
     """Voltage [V] and current [A] of the pack; None where no sensor is to be believed."""
 
     voltage: float | None = None
@@ -55,8 +54,7 @@ class PackReading:
         estimate.current_modelled = self.source is CurrentSource.MODEL
 
 
-@dataclass(frozen=True, slots=True)
-class PackState:
+class PackState(NamedTuple):
     """What is known of the pack at one step, beside the signals."""
 
     reading: PackReading
@@ -107,7 +105,7 @@ class PackSources:
         if inverter_voltage is not None:
             inverter_voltage += self._cable * (current or 0.0)
         together = _together(signals.pack_voltage, signals.inverter_voltage)
-        compared = replace(readings, pack_voltage=voltage, inverter_voltage=inverter_voltage if together else None)
+        compared = readings._replace(pack_voltage=voltage, inverter_voltage=inverter_voltage if together else None)
         distrusted = voltages.update(dt, compared, current, evidence)
         for role in voltages.ROLES:
             signals[role].trusted = role not in distrusted
@@ -134,12 +132,12 @@ class PackSources:
         """(pack current [A], where it comes from): None if no sensor is to be believed."""
         signals, currents = self._signals, self._currents
         together = _together(signals.pack_current, signals.inverter_current)
-        compared = readings if together else replace(readings, inverter=None)
+        compared = readings if together else readings._replace(inverter=None)
         distrusted = currents.update(dt, compared, evidence)
         for role in currents.ROLES:
             signals[role].trusted = role not in distrusted
         if not signals.auxiliary_current.trusted:
-            readings = replace(readings, auxiliary=None)
+            readings = readings._replace(auxiliary=None)
         pack, inverter = readings.pack, readings.through_inverter
         if pack is not None and inverter is not None:
             if together and not readings.charging:

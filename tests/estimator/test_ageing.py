@@ -87,10 +87,10 @@ def test_a_healthy_pack_is_held_for_one(fresh: Battery):
 @pytest.mark.parametrize(
     "reading",
     [
-        replace(SOUND, source=CurrentSource.INVERTER),
-        replace(SOUND, source=CurrentSource.DISPUTED),
-        replace(SOUND, voltage_doubted=True),
-        replace(SOUND, current_apart=2.0),
+        SOUND._replace(source=CurrentSource.INVERTER),
+        SOUND._replace(source=CurrentSource.DISPUTED),
+        SOUND._replace(voltage_doubted=True),
+        SOUND._replace(current_apart=2.0),
     ],
 )
 def test_a_doubted_sensor_is_not_explained_as_age(fresh: Battery, reading: PackReading):

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from gz_onboard.estimator.signals import Signals
 
@@ -20,8 +19,7 @@ LONGEST_EVIDENCE = 1.0  # s: one value after a longer silence is no more evidenc
 NO_SENSOR: frozenset[str] = frozenset()
 
 
-@dataclass(frozen=True, slots=True)
-class StepInputs:
+class StepInputs(NamedTuple):
     """One step of the estimator, before any of its signals is used."""
 
     now: float  # s, its end

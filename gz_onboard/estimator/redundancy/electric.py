@@ -6,7 +6,7 @@ Limits of currents are C-rates (1/h: A over the pack's A·h), those of voltages 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from gz_onboard.estimator.redundancy.checks import share_of_new
 from gz_onboard.estimator.road import STANDSTILL
@@ -19,8 +19,7 @@ CellError = Callable[[float, float, str], float | None]
 """Measured less predicted voltage of a cell [V], for a voltage [V] and a current [A] of the pack; and whose current."""
 
 
-@dataclass(frozen=True, slots=True)
-class Readings:
+class Readings(NamedTuple):
     """What the electric sensors report: A of the pack, positive discharging, and V; None if nothing."""
 
     pack: float | None
@@ -52,8 +51,7 @@ class Readings:
         return self.pack is not None and self.pack < 0 and abs(self.speed or 0.0) < STANDSTILL
 
 
-@dataclass(frozen=True, slots=True)
-class CellEvidence:
+class CellEvidence(NamedTuple):
     """What else is known of the pack's current and voltage."""
 
     error: CellError
