@@ -83,7 +83,7 @@ def test_an_extended_model_runs_as_it_is_and_expects_less_range(running: Running
     own, foreign = (daemon.journal.removeprefix(old) for daemon, old in zip((more, base), journals, strict=True))
     assert "going on from the state" in own
     assert "not used" in foreign
-    assert "slow_relaxation" in foreign  # it says which models do not agree
+    assert "ocv_hysteresis" in foreign  # it says which models do not agree
 
 
 def test_the_file_that_discover_wrote_runs_as_it_is(running: Running):
