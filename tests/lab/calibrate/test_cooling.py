@@ -19,6 +19,7 @@ from gz_onboard.lab.calibrate.cooling import (
 from gz_onboard.lab.calibrate.cooling_run import CoolingRun, bench_run, ride_run
 from gz_onboard.lab.calibrate.table import read_table
 from gz_onboard.offline.samples import Samples
+from gz_onboard.physics.model import STOOD
 from gz_onboard.physics.parameters import declared_parameters
 from gz_onboard.vehicle import read_vehicle
 from tests.support import without_cell_effects
@@ -287,6 +288,7 @@ def test_bursts_heat_the_cells_by_what_their_reaction_has_built_up():
         ride_run(Samples("bursts", columns), vehicle) for vehicle in (VEHICLE, without_cell_effects(VEHICLE))
     )
     effects, joules = CellEffects(VEHICLE.model, VEHICLE.pack), 0.0
+    effects.step(STOOD, 60.0 / 12, 0.5, 15.0)  # such runs are taken to begin under way
     for cell in (amperes / 12).tolist():
         effects.step(0.1, cell, 0.5, 15.0)
         joules += 168 * cell * effects.overpotential * 0.1
