@@ -37,7 +37,7 @@ SOME = 0.05  # of what can be learned: less is drawn as unknown
 USUAL_FOLDER = Path("/var/lib/gz-onboard")
 MEANING = {  # by name: what its factor is on
     "capacity": "of the pack, over cell_capacity in the vehicle file, as the pack's current sensor counts it",
-    "resistance": "of the cells, over the vehicle file's R0, R1 and effects in the cells",
+    "resistance": "of the cells, over the vehicle file's R0, R1 and quick effects in the cells",
     "weak_charge": "of the weakest group of cells, over the mean cell's, when that is full",
     "weak_capacity": "of that group, over the mean cell's",
     "weak_resistance": "of that group, over the mean cell's",

@@ -37,7 +37,7 @@ from gz_onboard.estimator.interval import DECILE
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.estimator.sources import CurrentSource, PackReading
 from gz_onboard.estimator.uncertainty import RESISTANCE_SD
-from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery import QUICK, Battery
 
 CAPACITY = 0.5, 1.1  # factors that a pack at work has
 CAPACITY_SD = 0.16  # of ψ, of packs that are not as new
@@ -49,7 +49,6 @@ CYCLES = 100.0  # see above
 LEAST_SOC = 0.001**2  # variance
 MOST_COUNTED = 1.0  # of SOC in one step: a pause of years is no charge
 TRUSTED = 0.03  # of SOC: sd by itself from which the charge that passes tells of the capacity
-QUICK = 60.0  # s: changes of the voltage that are slower may be the charge's
 PLACE_TIME = 600.0  # s for which the tables' place errs the same way
 EXCITED = 0.01  # V of a cell: a load that changes its voltage by less shows no resistance
 PROVEN, KEPT = 150.0, 5  # s of load; so many times in it what was learned is kept
@@ -119,7 +118,7 @@ class Ageing:
 
     @property
     def resistance(self) -> Learned:
-        """Of R0, R1 and what effects in the cells take."""
+        """Of R0, R1 and what effects in the cells take within `QUICK`."""
         sd, unproven = self._resistance_sd(self._fit.time), believed(self._fit.factor) - self._resistance_factor
         share = 1 - self._resistance_sd(self._proven[0].time) / self._unknown_resistance  # of what is used and kept
         return Learned(self._resistance_factor, sqrt(sd * sd + unproven * unproven), share)

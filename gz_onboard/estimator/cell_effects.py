@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from gz_onboard.constants import MILD
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.effect import QUANTITIES
-from gz_onboard.physics.model import Model
+from gz_onboard.physics.model import Model, share_that_ages
 
 LARGEST = 1.0  # V of a cell, of a saved state
 FOREVER = 1e9  # s: a rest of unknown length
@@ -23,10 +23,10 @@ class CellEffects:
 
     def __init__(self, model: Model, battery: Battery) -> None:
         self._battery = battery
-        self._effects = [effect for _, effect in model.cell_voltage]
+        self._effects = [(x.effect.name, x, share_that_ages(x)) for _, x in model.cell_voltage]
         self._quantities = dict.fromkeys(QUANTITIES, 0.0)
         self._quantities["cell_capacity"] = battery.cell_capacity(MILD)  # until the first step
-        self.states = {effect.effect.name: 0.0 for effect in self._effects}  # V of a cell
+        self.states = {name: 0.0 for name, _, _ in self._effects}  # V of a cell
         self.overpotential = 0.0  # V of a cell: their sum
         self._supposed: dict[str, Supposed] = {}  # by sensor
 
@@ -40,10 +40,10 @@ class CellEffects:
         q = self._quantities
         q.update(others or {})
         q["soc"], q["cell_temperature"] = soc, temperature
-        q["cell_current"] = self._battery.health.resistance * current  # of what has aged less is left to carry it
         q["cell_capacity"] = self._battery.cell_capacity(temperature)
-        for effect in self._effects:
-            name = effect.effect.name
+        health = self._battery.health
+        for name, effect, ages in self._effects:
+            q["cell_current"] = health.carried(current, ages)
             self.states[name] = effect.step(self.states[name], dt, q)
         self.overpotential = sum(self.states.values())
 
@@ -56,10 +56,13 @@ class CellEffects:
         then, before, states = self._supposed.get(sensor, (now, current, self.states))
         if not 0 <= now - then < FORGOTTEN:
             then, before, states = now, current, self.states
-        q = {**self._quantities, "cell_current": self._battery.health.resistance * (before + current) / 2}
-        states = {e.effect.name: e.step(states[e.effect.name], now - then, q) for e in self._effects}
-        self._supposed[sensor] = now, current, states
-        return sum(states.values())
+        q, mean, health = self._quantities.copy(), (before + current) / 2, self._battery.health
+        found = {}
+        for name, effect, ages in self._effects:
+            q["cell_current"] = health.carried(mean, ages)
+            found[name] = effect.step(states[name], now - then, q)
+        self._supposed[sensor] = now, current, found
+        return sum(found.values())
 
     def read(self, saved: Mapping[str, float]) -> dict[str, float]:
         """Saved states; KeyError, TypeError or ValueError if they are not of these effects."""

@@ -30,6 +30,7 @@ Overpotential = Callable[[float, float, float, float], float]
 """What a cell's voltage lacks [V] beside R0 and the RC pair, in the mean: of a cell's mean current [A], SOC,
 temperature [degC] and form factor squared, see `Battery.settled_current`."""
 HALF_FULL = 0.5  # SOC that is taken where it is not known
+QUICK = 60.0  # s: of a cell's voltage, changes that are slower may be the charge's
 SOC_ROUNDS = 5  # of the search for a SOC under load: R0 depends on it
 
 
@@ -116,8 +117,15 @@ class Health:
     """How a pack has aged, as factors on what its file says; every equation of `Battery` has them in it."""
 
     capacity: float = 1.0
-    resistance: float = 1.0  # of R0, R1 and what effects in the cells take
+    resistance: float = 1.0  # of R0, R1 and what effects in the cells take, as far as they show within `QUICK`
     weakest: WeakGroup | None = None  # None: all groups are taken to be alike
+
+    def carried(self, current: float, ages: float) -> float:
+        """The current [A] that a cell as new would carry: of what has aged less is left to carry `current`.
+
+        ages: the share of what it meets that ages so.
+        """
+        return (1 + (self.resistance - 1) * ages) * current
 
 
 @dataclass(frozen=True)

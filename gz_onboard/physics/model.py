@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from gz_onboard.constants import KELVIN
 from gz_onboard.errors import InputError, shown
-from gz_onboard.physics.battery import HALF_FULL, Battery, Overpotential
+from gz_onboard.physics.battery import HALF_FULL, QUICK, Battery, Overpotential
 from gz_onboard.physics.effect import QUANTITIES, Effect, Port, effect_file, load_effect
 from gz_onboard.physics.elementary import STANDSTILL, sqrt
 from gz_onboard.physics.parameters import Parameters
@@ -168,6 +168,14 @@ def _share_of_bursts(effect: Bound) -> float | None:
     return None if effect.effect.decay_quantities else mean_response(effect.decay(BURST, {}))
 
 
+def share_that_ages(effect: Bound) -> float:
+    """How much of an effect in the cells grows with their resistance, which is learned from changes within `QUICK`.
+
+    What takes longer to show is not in those: diffusion, whose growth with age is another.
+    """
+    return 1.0 if effect.effect.decay_quantities else 1 - float(effect.decay(QUICK, {}))
+
+
 STOOD = 60.0  # s: for so long the load of a ride's first voltages has flowed: lights, a heater
 STANDING_LOADS = 1.5  # times the auxiliary power: the most that is believed to have flowed before it was seen
 
@@ -287,19 +295,18 @@ class Model:
         if not self.cell_voltage:
             return None
         others = dict.fromkeys(QUANTITIES, 0.0) | dict(beside or {})
-        effects = [(effect, _share_of_bursts(effect)) for effect in self.at(Port.CELL_VOLTAGE)]
+        effects = [(x, _share_of_bursts(x), share_that_ages(x)) for x in self.at(Port.CELL_VOLTAGE)]
         by_capacity = "cell_capacity" in self.reads
 
         def settled(current: float, soc: float, temperature: float, form_factor_squared: float) -> float:
             # A forecast calls it a hundred times: one dictionary for all effects, and no bursts where there are none.
-            load = battery.health.resistance * current
             q = others.copy()
-            q["cell_current"], q["soc"], q["cell_temperature"] = load, soc, temperature
+            q["cell_current"], q["soc"], q["cell_temperature"] = current, soc, temperature
             if by_capacity:
                 q["cell_capacity"] = battery.cell_capacity(temperature)
             lost = 0.0
-            for effect, known in effects:
-                q["cell_current"] = load
+            for effect, known, ages in effects:
+                q["cell_current"] = load = battery.health.carried(current, ages)
                 share = mean_response(effect.decay(BURST, q)) if known is None else known
                 if form_factor_squared == 1 or share < UNMOVED:
                     lost += effect(q)

@@ -12,8 +12,8 @@ from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference", 75.0)
 PACK, MODEL = VEHICLE.pack, VEHICLE.model
-COLD, SOC, DT = -5.0, 0.7, 0.1  # degC, 1, s
-HARD = 5.0  # A of a cell: pulling away
+COLD, WARM, SOC, DT = -5.0, 25.0, 0.7, 0.1  # degC, degC, 1, s
+HARD, GENTLY = 5.0, 1.0  # A of a cell: pulling away, rolling
 GROUPS = [
     Group("Pack", ("pack_voltage", "pack_current"), DT),
     Group("Motor", ("motor_speed",), DT),
@@ -54,6 +54,24 @@ def test_a_current_that_nobody_asked_for_in_a_while_is_followed_anew():
     for k in range(300):
         effects.supposed("inverter", DT * k, HARD)
     assert effects.supposed("inverter", 3600.0, HARD) == effects.overpotential
+
+
+def test_a_resistance_learned_from_quick_changes_says_nothing_of_what_takes_half_an_hour():
+    """The reaction of a cell with half as much resistance more loses more, and slow relaxation what the file says."""
+    assert {"charge_transfer", "slow_relaxation"} <= {x.effect.name for _, x in MODEL.cell_voltage}
+    aged = PACK.own()
+    aged.age(0.8, 1.5)
+    lost = {}
+    for name, pack in (("new", PACK), ("aged", aged)):
+        effects = CellEffects(MODEL, pack)
+        effects.step(1e5, GENTLY, SOC, WARM)
+        lost[name] = effects.states
+        settled = MODEL.overpotential(pack)
+        assert settled is not None
+        assert settled(GENTLY, SOC, WARM, 1.0) == pytest.approx(effects.overpotential)
+        assert effects.supposed("inverter", 0.0, GENTLY) == pytest.approx(effects.overpotential)
+    assert lost["aged"]["slow_relaxation"] == pytest.approx(lost["new"]["slow_relaxation"], rel=0.03)
+    assert lost["aged"]["charge_transfer"] > 1.4 * lost["new"]["charge_transfer"]
 
 
 def bursts(seconds):
