@@ -11,7 +11,7 @@ learned, by segment, what is usual and how the present ride differs from it (`us
 - the consumption factor, measured over modelled: what the parameters have wrong for this vehicle and season.
 
 The range is the energy that can be drawn before the cut-off at the power to be expected, over the price to be expected
-on the way that it lasts, with a log-normal distribution. What is shown of it moves calmly (`calm`).
+on the way that it lasts, with an interval (`interval`). What is shown of it moves calmly (`calm`).
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Whether the cells have rested: only then does their voltage show the state of charge.
 
 After a load the voltage of a cell goes on rising for minutes to an hour: first fast (the RC pair of the cell model),
-then slowly (diffusion, which the cell model does not have). What is still to come is bounded by how fast the voltage
-moves: over a tail with the time constant T, slope times T. Before any load was seen, a slope that shows no fast tail
-leaves at most what the cell model does not have; after a load only one that shows no slow tail either proves it.
-A voltage that was never seen to change proves nothing.
+then slowly (diffusion, which the cell model has as slow relaxation, if at all). What is still to come is bounded by how
+fast the voltage moves: over a tail with the time constant T, slope times T. Before any load was seen, a slope that
+shows no fast tail leaves at most what the cell model does not have; after a load only one that shows no slow tail
+either proves it. A voltage that was never seen to change proves nothing.
 """
 
 from __future__ import annotations
