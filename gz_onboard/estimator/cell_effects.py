@@ -41,10 +41,7 @@ class CellEffects:
         q.update(others or {})
         q["soc"], q["cell_temperature"] = soc, temperature
         q["cell_capacity"] = self._battery.cell_capacity(temperature)
-        health = self._battery.health
-        for name, effect, ages in self._effects:
-            q["cell_current"] = health.carried(current, ages)
-            self.states[name] = effect.step(self.states[name], dt, q)
+        self.states = self._after(self.states, dt, current, q)
         self.overpotential = sum(self.states.values())
 
     def supposed(self, sensor: str, now: float, current: float) -> float:
@@ -56,13 +53,18 @@ class CellEffects:
         then, before, states = self._supposed.get(sensor, (now, current, self.states))
         if not 0 <= now - then < FORGOTTEN:
             then, before, states = now, current, self.states
-        q, mean, health = self._quantities.copy(), (before + current) / 2, self._battery.health
-        found = {}
+        states = self._after(states, now - then, (before + current) / 2, self._quantities)
+        self._supposed[sensor] = now, current, states
+        return sum(states.values())
+
+    def _after(
+        self, states: Mapping[str, float], dt: float, current: float, quantities: dict[str, float]
+    ) -> dict[str, float]:
+        health, after = self._battery.health, {}
         for name, effect, ages in self._effects:
-            q["cell_current"] = health.carried(mean, ages)
-            found[name] = effect.step(states[name], now - then, q)
-        self._supposed[sensor] = now, current, found
-        return sum(found.values())
+            quantities["cell_current"] = health.carried(current, ages)
+            after[name] = effect.step(states[name], dt, quantities)
+        return after
 
     def read(self, saved: Mapping[str, float]) -> dict[str, float]:
         """Saved states; KeyError, TypeError or ValueError if they are not of these effects."""

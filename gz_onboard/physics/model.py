@@ -301,7 +301,7 @@ class Model:
         def settled(current: float, soc: float, temperature: float, form_factor_squared: float) -> float:
             # A forecast calls it a hundred times: one dictionary for all effects, and no bursts where there are none.
             q = others.copy()
-            q["cell_current"], q["soc"], q["cell_temperature"] = current, soc, temperature
+            q["soc"], q["cell_temperature"] = soc, temperature
             if by_capacity:
                 q["cell_capacity"] = battery.cell_capacity(temperature)
             lost = 0.0
