@@ -25,10 +25,11 @@ def cells_ahead(
     time_constant = cooling.capacity / cooling.conductance
 
     def warmed(mean: float) -> float:
+        source = battery.cells_series * battery.ocv(soc / 2, mean)[0]
         current = battery.settled_current(power, soc / 2, mean, form_factor_squared)
-        if not current:
-            return mean
-        loss = battery.cells_series * battery.ocv(soc / 2, mean)[0] * current - power
+        if current is None:  # bursts are held back at the most that the pack gives, of which half stays in it as heat
+            current = 2 * power / source
+        loss = source * current - power
         settled = ambient + loss / cooling.conductance
         lasting = max(soc * battery.pack_capacity(mean) * HOUR / current / time_constant, 1e-6)
         return settled + (temperature - settled) * (1 - exp(-lasting)) / lasting

@@ -370,6 +370,18 @@ def test_the_cells_warm_on_the_way_as_their_equation_says(start, ambient):
     assert found == pytest.approx(np.mean(temperatures), abs=2.5)
 
 
+@pytest.mark.parametrize("temperature", [-10.0, -5.0])
+@pytest.mark.parametrize(("capacity", "resistance"), [(1.0, 1.0), (0.85, 1.35), (0.8, 1.5)])
+def test_in_the_frost_the_range_does_not_fall_over_an_edge(capacity, resistance, temperature):
+    """Where cold cells no longer give what bursts ask for: they warm on the way all the same."""
+    pack = VEHICLE.pack.own()
+    pack.age(capacity, resistance)
+    f = Forecaster(VEHICLE.model, pack, VEHICLE.riding)
+    ranges = [f.forecast(soc, 0.01, temperature, 1.0, temperature, 0.0).range for soc in np.linspace(0.05, 1, 191)]
+    assert ranges[-1] > 0.6 * forecast(forecaster(), 1.0).range
+    assert np.abs(np.diff(ranges)).max() < 0.02 * ranges[-1]
+
+
 def test_a_vehicle_file_that_was_calibrated_anew_changes_nothing_of_what_was_ridden():
     """A file with half as much drag and rolling again, restored from what was learned by the one before."""
     known = dict(VEHICLE.parameters.known)
