@@ -8,7 +8,7 @@ from typing import NamedTuple
 from gz_onboard.estimator.charging import Charging
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import Conditions
-from gz_onboard.estimator.route_ahead import RoadAhead
+from gz_onboard.estimator.route_ahead import Pack, RoadAhead
 from gz_onboard.estimator.sources import PackReading
 from gz_onboard.events import Activity, Estimate, Reason
 from gz_onboard.physics.battery import Battery
@@ -61,7 +61,7 @@ class Outlook:
         elapsed, self._time = min(now.time - self._time, LONGEST), now.time
         known = now.temperature, now.temperature_sd, now.conditions.ambient, now.conditions.altitude
         free = self._forecaster.forecast(now.soc, now.soc_sd, *known, now.loss_variance)
-        pack = now.soc, now.loss_variance
+        pack = Pack(now.soc, now.soc_sd, now.loss_variance)
         voltage, current = now.reading.voltage, now.reading.current
         charging = now.activity is Activity.CHARGING
         drawn = None if charging or voltage is None or current is None else voltage * current * elapsed

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import sqrt
-from typing import Any
+from typing import Any, NamedTuple
 
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.interval import DECILE, deciles
@@ -32,7 +32,16 @@ SEGMENT = 250.0  # m of the route from which the cost is learned
 AHEAD_SD = 0.015  # relative, of the cost of what is left, beyond what its segments scatter
 UNLIKE = 0.1  # of a segment: what was ridden is not what is modelled
 COURSE_FROM = 3.0  # m/s: slower, the heading is noise
+LEAST_SOC = 0.01  # below, there is hardly energy of which to tell a share
 CHANGED = Conditions(2.0, 200.0)  # degC, m: by so much and the route is modelled anew
+
+
+class Pack(NamedTuple):
+    """What a route must know of the pack."""
+
+    soc: float
+    soc_sd: float
+    loss_variance: float  # that missing sensors add to the consumption, see `Forecaster.forecast`
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +96,7 @@ class RoadAhead:
         """Have `road` from now on, or none."""
         if road:
             if self._last and road.route != self._last:
-                self.rider.begin_route()
+                self.rider.begin_route(*self._factor)
             self._last = road.route
         self._road, self._costs, self._modelling, self._segment = road, None, None, None
         self._distance, self._new = self._motion.distance, True
@@ -125,8 +134,12 @@ class RoadAhead:
 
     @property
     def _cost(self) -> tuple[float, float]:
+        return self.rider.expected_cost(*self._factor)
+
+    @property
+    def _factor(self) -> tuple[float, float]:
         riding = self._forecaster.riding
-        return self.rider.expected_cost(riding.factor, riding.factor_variance)
+        return riding.factor, riding.factor_variance
 
     @property
     def _known_from(self) -> float:
@@ -135,11 +148,8 @@ class RoadAhead:
 
     # --- forecasting ------------------------------------------------------------------------------------------
 
-    def forecast(self, now: float, free: Forecast, pack: tuple[float, float], conditions: Conditions) -> Forecast:
-        """The forecast with the route out of `free`, that without; to be made each second or so. Time in s.
-
-        pack: state of charge, and the variance that missing sensors add to the consumption.
-        """
+    def forecast(self, now: float, free: Forecast, pack: Pack, conditions: Conditions) -> Forecast:
+        """The forecast with the route out of `free`, that without; to be made each second or so. Time in s."""
         road = self._road
         if road is None:
             return free
@@ -184,10 +194,10 @@ class RoadAhead:
         if costs:
             self._costs, self._modelling = costs, None
 
-    def _ahead(self, road: Road, costs: Costs, free: Forecast, pack: tuple[float, float]) -> Forecast:
+    def _ahead(self, road: Road, costs: Costs, free: Forecast, pack: Pack) -> Forecast:
         here, end = road.position.along, road.energy.length
         cost, variance = self._cost
-        variance = variance / cost**2 + AHEAD_SD**2 + pack[1]
+        variance = variance / cost**2 + AHEAD_SD**2 + pack.loss_variance
         level = cost * road.energy.between(costs.level, here, end)
         needed = level + road.energy.between(costs.height, here, end)
 
@@ -228,16 +238,19 @@ class RoadAhead:
             known_from=known,
         )
 
-    def _arrival(
-        self, free: Forecast, pack: tuple[float, float], needed: float, needed_sd: float
-    ) -> tuple[float, float, float]:
-        """State of charge at the end of the route, P10 and P90, as shown; 0 where it is not reached."""
+    def _arrival(self, free: Forecast, pack: Pack, needed: float, needed_sd: float) -> tuple[float, float, float]:
+        """State of charge at the end of the route, P10 and P90, as shown; 0 where it is not reached.
+
+        What is not known of the energy, beside the state of charge, counts for the part that the way takes.
+        """
         if free.energy <= 0:
             return 0.0, 0.0, 0.0
-        window, soc, share = self._forecaster.battery.window, pack[0], max(1 - needed / free.energy, 0.0)
+        window, soc, share = self._forecaster.battery.window, pack.soc, max(1 - needed / free.energy, 0.0)
         arrival = soc_left(self._forecaster.battery, soc, free.cells, share)
+        of_soc = free.energy * pack.soc_sd / max(soc, LEAST_SOC)
         down, up = (
-            DECILE * sqrt(needed_sd**2 + of**2) * soc / free.energy for of in (free.energy_sd, free.energy_sd_up)
+            DECILE * sqrt(needed_sd**2 + of_soc**2 + (1 - share) ** 2 * max(of**2 - of_soc**2, 0.0)) * soc / free.energy
+            for of in (free.energy_sd, free.energy_sd_up)
         )
         beyond = soc * (needed / free.energy - 1)  # how much the battery lacks, if it does
         if share <= 0:
@@ -259,5 +272,6 @@ class RoadAhead:
         estimate.battery_ends_latitude, estimate.battery_ends_longitude = a.ends_at or (None, None)
 
     def restore(self, saved: Any) -> None:
-        """Take what `rider.snapshot` gave, or begin anew."""
+        """Take what `rider.snapshot` gave, or begin anew; call it after the forecaster's."""
         self.rider = restored(saved)
+        self.rider.check(*self._factor)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 from typing import Any
 
 SEGMENT_SD = 0.25  # relative: measured less modelled energy of a segment, of recorded full discharges and the plant's
 COST_WALK = 0.003  # sd of its change over a segment (wind, traffic); 0.0015 to 0.006 err as much on full discharges
 STOPS, STOPS_SD = 1.0, 0.1  # cost over consumption factor of eight commissioning and ten plant rides, and its sd
+UNLIKE = 3.0  # sd between two costs that are not of the same rider on two roads
 COST = 0.2, 5.0  # beyond, the route is not what is ridden
 
 
@@ -21,8 +23,7 @@ class RouteRider:
     def expected_cost(self, factor: float, factor_variance: float) -> tuple[float, float]:
         """(cost, its variance); before it is learned by the consumption factor and its variance."""
         if self.cost is None:
-            cost = STOPS * factor
-            return cost, STOPS**2 * factor_variance + (STOPS_SD * cost) ** 2
+            return _usual(factor, factor_variance)
         return self.cost, self.variance
 
     def learn_cost(self, measured: float, modelled: float, known: tuple[float, float]) -> None:
@@ -35,14 +36,27 @@ class RouteRider:
         self.cost = min(max(cost + gain * (measured - cost * modelled), COST[0]), COST[1])
         self.variance = variance * (1 - gain * modelled)
 
-    def begin_route(self) -> None:
+    def begin_route(self, factor: float, factor_variance: float) -> None:
         """Another route: it has stops and traffic of its own."""
         if self.cost is not None:
             self.variance = max(self.variance, (STOPS_SD * self.cost) ** 2)
+            self.check(factor, factor_variance)
+
+    def check(self, factor: float, factor_variance: float) -> None:
+        """Forget a cost that the consumption factor does not bear out: its route was not the road ridden."""
+        usual, variance = _usual(factor, factor_variance)
+        if self.cost is not None and abs(self.cost - usual) > UNLIKE * sqrt(self.variance + variance):
+            self.cost, self.variance = None, 0.0
 
     def snapshot(self) -> list[float | None]:
         """What is to be kept over a restart."""
         return [self.cost, self.variance]
+
+
+def _usual(factor: float, factor_variance: float) -> tuple[float, float]:
+    """(cost, its variance) of a rider of whom the consumption factor is known only."""
+    cost = STOPS * factor
+    return cost, STOPS**2 * factor_variance + (STOPS_SD * cost) ** 2
 
 
 def restored(saved: Any) -> RouteRider:

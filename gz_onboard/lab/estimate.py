@@ -225,6 +225,8 @@ def _energy_rows(ride: RideSummary) -> list[tuple[str, str]]:
         f"{ride.energy_wh:.0f} Wh drawn net, after {number(ride.energy_recovered_wh, '.0f', 'Wh')} recovered; "
         f"{number(ride.consumption_wh_km, '.1f', 'Wh/km')}"
     )
+    if ride.energy_charged_wh:
+        text += f"; {ride.energy_charged_wh:.0f} Wh charged"
     lacks = lacks_energy(ride)
     return [("energy", text), *([("", f"of {ride.energy_distance_km:.2f} km: {lacks}")] if lacks else [])]
 

@@ -35,10 +35,12 @@ class RideSummary:
     speed_max_km_h: Annotated[float | None, "greatest speed, or null"]
     energy_wh: Annotated[
         float | None,
-        "drawn from the pack as measured, less what was recovered, the sensors' known gain and offsets taken off; "
+        "drawn from the pack as measured, less what was recovered (not what was charged), the "
+        "sensors' known gain and offsets taken off; "
         "null if voltage or current was never known, or came too slowly for more than a tenth of the time",
     ]
     energy_recovered_wh: Annotated[float | None, "charged into the pack while riding, or null"]
+    energy_charged_wh: Annotated[float | None, "charged into the pack by a charger, or null"]
     energy_distance_km: Annotated[float, "of distance_km, ridden while voltage and current were known"]
     energy_missing_s: Annotated[float, "without a voltage or current to be believed: the energy lacks it"]
     consumption_wh_km: Annotated[float | None, "energy over energy_distance_km; null below 0.1 km"]
@@ -109,6 +111,7 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         speed_max_km_h=times(tally.speed_max, 3.6),
         energy_wh=times(drawn, 1 / WH),
         energy_recovered_wh=None if drawn is None else pipeline.drawn.recovered / WH,
+        energy_charged_wh=None if drawn is None else pipeline.drawn.charged / WH,
         energy_distance_km=way * 1e-3,
         energy_missing_s=round(pipeline.drawn.missing, 1),
         consumption_wh_km=times(drawn, 1 / way / WH_PER_KM) if way >= 100 else None,

@@ -14,7 +14,7 @@ from gz_onboard.estimator.attribution import Attribution, Moment
 from gz_onboard.estimator.forecast import Forecast, Forecaster
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.road import RoadState
-from gz_onboard.estimator.route_ahead import RoadAhead
+from gz_onboard.estimator.route_ahead import Pack, RoadAhead
 from gz_onboard.estimator.route_energy import RouteEnergy
 from gz_onboard.estimator.route_rider import RouteRider, restored
 from gz_onboard.estimator.signals import Signals
@@ -54,7 +54,7 @@ class Rider:
             self.ahead.follow(self.ahead.ready(route))
 
     def ask(self, free=FREE, soc=0.7):
-        return self.ahead.forecast(self.now, free, (soc, 0.0), AIR)
+        return self.ahead.forecast(self.now, free, Pack(soc, 0.01, 0.0), AIR)
 
     def ride(self, seconds, power, speed=11.0):
         self.road.speed, self.road.acceleration = speed, 0.0
@@ -90,6 +90,27 @@ def test_arrival_and_range_on_a_short_route():
     assert found.p10 < found.range < found.p90
     assert 0.7 - answer.soc == pytest.approx(0.7 * answer.energy / FREE.energy, rel=0.15)
     assert answer.soc_p10 < answer.soc < answer.soc_p90 < 0.7
+
+
+def test_near_the_end_of_a_route_the_charge_there_is_known_as_well_as_here():
+    answer = Rider(way(40.0)).settled()[1]
+    assert answer.soc == pytest.approx(0.7, abs=0.002)
+    assert (answer.soc - answer.soc_p10, answer.soc_p90 - answer.soc) == pytest.approx((0.0128, 0.0128), rel=0.05)
+
+
+def test_a_route_that_was_not_the_road_teaches_nothing_for_the_next():
+    """Neither limits that nobody may ride nor a climb that is none; but how a rider rides is kept."""
+    for wrong in (0.27, 0.39, 2.0):
+        rider = RouteRider(wrong, 0.002)
+        rider.begin_route(1.0, 0.003)
+        assert rider.cost is None
+        assert rider.expected_cost(1.0, 0.003)[0] == pytest.approx(1.0)
+        again = Rider(way(5e3))
+        again.ahead.restore([wrong, 0.002])
+        assert again.ahead.rider == RouteRider()
+    rider = RouteRider(1.25, 0.002)
+    rider.begin_route(1.1, 0.003)
+    assert rider.cost == 1.25
 
 
 def test_a_route_shows_at_once_and_so_does_its_end():
