@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from math import exp, fsum, log
 from typing import TYPE_CHECKING
 
-from gz_onboard.constants import BENCH_TEMPERATURE, KELVIN
+from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.physics.battery import HALF_FULL, Battery, Window
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.similarity import MOST_CELLS
@@ -37,9 +36,6 @@ SMALLEST_STEP = 1e-6  # of SOC, V or degC, from point to point: a slope must sta
 LARGEST_ENTROPY = 5e-3  # V/K: of intercalation cells 1e-3 at most; more is mV/K
 NARROWEST_WINDOW = 0.1  # of the cells' charge: no vehicle carries ten times the cells that it uses
 LEAST_AS_NEW = 0.01  # and so much is the least chance that it is not: nothing could be learned
-CONTINUED = 20.0  # K beyond the warmest of the bench to which the circuit's tables go on
-LEAST_APART = 5.0  # K between the last two of them: nearer ones say little of how it goes on
-LARGEST_STEP = 4.0  # times the last row, or a part of it: so far is a cell's resistance believed to go on
 LARGEST_SHIFT = 0.2  # V: real cells rest tens of mV apart from -20 to 25 degC; more is a mistyped unit
 
 
@@ -72,9 +68,9 @@ def read_battery(vehicle: Table, parameters: Parameters) -> Battery:
         ocv_soc=soc,
         ocv_value=volts,
         ocv_sd=ocv.number("sd", 0.005, low=1e-4, high=0.5),
-        r0=continued(_mesh(_needed(table, "r0"), "ohm", *RESISTANCE)),
-        r1=continued(_mesh(_needed(table, "r1"), "ohm", *RESISTANCE)),
-        c1=continued(_mesh(_needed(table, "c1"), "F", *CAPACITANCE)),
+        r0=_mesh(_needed(table, "r0"), "ohm", *RESISTANCE),
+        r1=_mesh(_needed(table, "r1"), "ohm", *RESISTANCE),
+        c1=_mesh(_needed(table, "c1"), "F", *CAPACITANCE),
         rest_shift_temperature=shift_temperatures,
         rest_shift_value=shifts,
         rest_shift_sd=shift_sd,
@@ -178,22 +174,3 @@ def _mesh(table: Table, unit: str, low: float, high: float) -> Mesh:
     if len(rows) != len(temperature):
         raise table.error(f"must be {len(temperature)} rows, one for each temperature", "value")
     return Mesh(soc, temperature, rows, geometric=True)
-
-
-def continued(mesh: Mesh) -> Mesh:
-    """A table of the circuit, as far as `CONTINUED` beyond its warmest row: packs get hotter in traffic than benches.
-
-    Over 1/T its logarithm goes on as, in the mean over SOC, from the last row but one to the last (Arrhenius); by
-    `LARGEST_STEP` at most, and not from two rows less than `LEAST_APART`.
-    """
-    if len(mesh.temperature) < 2:
-        return mesh
-    (inner, warmest), (before, last) = mesh.temperature[-2:], mesh.value[-2:]
-    if warmest - inner < LEAST_APART:
-        return mesh
-    per_step = fsum(log(b / a) for a, b in zip(before, last, strict=True)) / len(last)
-    to = warmest + CONTINUED
-    step, onward = (1 / (a + KELVIN) - 1 / (b + KELVIN) for a, b in ((inner, warmest), (warmest, to)))
-    factor = min(max(exp(per_step * onward / step), 1 / LARGEST_STEP), LARGEST_STEP)
-    row = tuple(factor * value for value in last)
-    return Mesh(mesh.soc, (*mesh.temperature, to), (*mesh.value, row), mesh.geometric)

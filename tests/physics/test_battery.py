@@ -11,7 +11,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gz_onboard.physics.battery import current_of, dissipation, heat, terminal_voltage
-from gz_onboard.physics.battery_file import continued
 from gz_onboard.physics.drawable import GIVES_UP, GIVES_UP_SD, drawable
 from gz_onboard.physics.effect import Port, load_effect
 from gz_onboard.physics.model import Model, first_soc
@@ -258,23 +257,3 @@ def test_heat_of_the_reaction_turns_with_the_current_and_with_the_entropy():
     assert many == pytest.approx([-2e-3 * battery.cells_series * 273.15, 2e-3 * battery.cells_series * 273.15])
     none = replace(battery, entropy_soc=(), entropy_value=())
     assert none.reversible_heat(10.0, 0.5, 25.0) == 0
-
-
-def test_beyond_the_warmest_of_the_bench_the_circuit_goes_on_by_arrhenius():
-    """A cell of one activation is read right where no row is; it ends with `CONTINUED`."""
-
-    def resistance(celsius: float) -> float:
-        return 0.04 * math.exp(2500 * (1 / (celsius + 273.15) - 1 / 298.15))
-
-    mesh = Mesh((0.0, 1.0), (10.0, 25.0, 40.0), tuple((resistance(t), 2 * resistance(t)) for t in (10, 25, 40)), True)
-    on = continued(mesh)
-    for celsius in (40.0, 45.0, 50.0, 60.0):
-        assert on.at(0.0, celsius)[0] == pytest.approx(resistance(celsius), rel=0.01)
-        assert on.at(1.0, celsius)[0] == pytest.approx(2 * resistance(celsius), rel=0.01)
-    assert on.at(0.5, 80.0) == on.at(0.5, 60.0)
-    for celsius in (-10.0, 15.0, 33.0):
-        assert on.at(0.5, celsius) == mesh.at(0.5, celsius)
-    near = Mesh((0.0, 1.0), (25.0, 27.0), ((0.05, 0.05), (0.03, 0.03)), True)
-    assert continued(near) is near
-    steep = continued(Mesh((0.0, 1.0), (25.0, 35.0), ((1.0, 1.0), (0.1, 0.1)), True))
-    assert steep.at(0.5, 90.0)[0] == pytest.approx(0.025)
