@@ -45,10 +45,11 @@ class Drawn:
             return
         if voltage is not None and current is not None:
             energy = voltage * current * dt
+            self.net = self.net or 0.0
             if charging:
                 self.charged -= energy
                 return
-            self.net = (self.net or 0.0) + energy
+            self.net += energy
             self.recovered -= min(energy, 0.0)
             self.distance += distance - way
         elif seen:

@@ -32,7 +32,6 @@ SEGMENT = 250.0  # m of the route from which the cost is learned
 AHEAD_SD = 0.015  # relative, of the cost of what is left, beyond what its segments scatter
 UNLIKE = 0.1  # of a segment: what was ridden is not what is modelled
 COURSE_FROM = 3.0  # m/s: slower, the heading is noise
-LEAST_SOC = 0.01  # below, there is hardly energy of which to tell a share
 CHANGED = Conditions(2.0, 200.0)  # degC, m: by so much and the route is modelled anew
 
 
@@ -247,9 +246,10 @@ class RoadAhead:
             return 0.0, 0.0, 0.0
         window, soc, share = self._forecaster.battery.window, pack.soc, max(1 - needed / free.energy, 0.0)
         arrival = soc_left(self._forecaster.battery, soc, free.cells, share)
-        of_soc = free.energy * pack.soc_sd / max(soc, LEAST_SOC)
+        per_energy, known = soc / free.energy, pack.soc_sd**2
         down, up = (
-            DECILE * sqrt(needed_sd**2 + of_soc**2 + (1 - share) ** 2 * max(of**2 - of_soc**2, 0.0)) * soc / free.energy
+            DECILE
+            * sqrt((needed_sd * per_energy) ** 2 + known + (1 - share) ** 2 * max((of * per_energy) ** 2 - known, 0.0))
             for of in (free.energy_sd, free.energy_sd_up)
         )
         beyond = soc * (needed / free.energy - 1)  # how much the battery lacks, if it does

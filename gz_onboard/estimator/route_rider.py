@@ -9,7 +9,7 @@ from typing import Any
 SEGMENT_SD = 0.25  # relative: measured less modelled energy of a segment, of recorded full discharges and the plant's
 COST_WALK = 0.003  # sd of its change over a segment (wind, traffic); 0.0015 to 0.006 err as much on full discharges
 STOPS, STOPS_SD = 1.0, 0.1  # cost over consumption factor of eight commissioning and ten plant rides, and its sd
-UNLIKE = 3.0  # sd between two costs that are not of the same rider on two roads
+APART = 3.0  # sd between two costs that are not of the same rider on two roads
 COST = 0.2, 5.0  # beyond, the route is not what is ridden
 
 
@@ -45,7 +45,7 @@ class RouteRider:
     def check(self, factor: float, factor_variance: float) -> None:
         """Forget a cost that the consumption factor does not bear out: its route was not the road ridden."""
         usual, variance = _usual(factor, factor_variance)
-        if self.cost is not None and abs(self.cost - usual) > UNLIKE * sqrt(self.variance + variance):
+        if self.cost is not None and abs(self.cost - usual) > APART * sqrt(self.variance + variance):
             self.cost, self.variance = None, 0.0
 
     def snapshot(self) -> list[float | None]:

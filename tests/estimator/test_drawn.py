@@ -17,3 +17,12 @@ def test_a_charger_is_not_riding():
     assert drawn.charged == pytest.approx(200 * 53 * 10)
     assert drawn.net == pytest.approx(199 * 50 * 8 - drawn.recovered)
     assert drawn.missing == 0
+
+
+def test_a_log_of_charging_alone_has_drawn_nothing():
+    """And not something that is not known."""
+    drawn = Drawn()
+    for i in range(11):
+        drawn.add(float(i), 53.0, -10.0, charging=True)
+    assert (drawn.net, drawn.recovered) == (0.0, 0.0)
+    assert drawn.charged == pytest.approx(5300)
