@@ -18,7 +18,7 @@ MOVING_AFTER = 1.0  # s of motion: a single sample of a noisy sensor is none
 CHARGING_RATE = 0.02  # 1/h: a charging current of a fiftieth of the capacity; current sensors' offsets are smaller
 CHARGING_AFTER = 3.0  # s of it at standstill: the last of a regenerative brake is over
 SILENT_CHARGING_AFTER = 30.0  # s of it with no speed known and a silent inverter
-DRAWING_RATE = 0.2  # 1/h: what lies above is no light and no heated grip, but a drive
+DRAWING_RATE = 0.2  # 1/h: a drive draws more at standstill only if the speed is wrong
 DRAWING_AFTER, DRAWING_MOST = 10.0, 30.0  # s of it at speed 0, less those without: the speed is wrong; most that counts
 PLUGGED_IN = 0.5  # of a signal that is 0 or 1
 
@@ -42,18 +42,21 @@ class Activities:
         plug: float | None,
         inverter_silent: bool,
         off: bool = False,
+        drive: float | None = None,
     ) -> None:
         """Go `dt` [s] on.
 
         speed: [m/s]. c_rate: current over capacity [1/h], positive discharging. plug: whether the charge plug is in.
         Each None where it is not known. inverter_silent: the vehicle has signals of its inverter and none comes. off:
-        the key is off, or the contactor is open.
+        the key is off, or the contactor is open. drive: c_rate of the inverter alone, if that is known: a heater draws
+        from the pack as much as a drive that creeps.
         """
         moving = speed is not None and abs(speed) > MOVING
         self._moving = self._moving + dt if moving else 0.0
         self._still = 0.0 if self._moving >= MOVING_AFTER else self._still + dt
         self._followed += dt
-        drawing = c_rate is not None and c_rate > DRAWING_RATE
+        drawn = c_rate if drive is None else drive
+        drawing = drawn is not None and drawn > DRAWING_RATE
         self._drawing = 0.0 if moving else min(max(self._drawing + (dt if drawing else -dt), 0.0), DRAWING_MOST)
         if self._drawing >= DRAWING_AFTER:
             speed = None

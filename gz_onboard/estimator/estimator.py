@@ -224,16 +224,18 @@ class Estimator:
     def _follow_activity(self, now: float, dt: float) -> None:
         signals, current = self.signals, self._reading.current
         known = current if self._reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else None
-        rate = None if known is None else known / self.battery.pack_capacity(self._temperatures.cells_or_bench)
+        capacity, drive = self.battery.pack_capacity(self._temperatures.cells_or_bench), signals.inverter_current.get(now)
+        rate, drive = (None if x is None else x / capacity for x in (known, drive))
         silent = bool(self._inverter) and not any(signal.fresh(now) for signal in self._inverter)
         off = signals.key.get(now) == 0 or signals.contactor.get(now) == 0
         rider = signals.rider.get(now)
         if rider is not None and abs(self.road.speed or 0.0) < STANDSTILL:
             self.ridden_by(f"{rider:g}")
-        self._activities.step(dt, self.road.speed, rate, signals.charge_plug.get(now), silent, off)
+        self._activities.step(dt, self.road.speed, rate, signals.charge_plug.get(now), silent, off, drive)
 
     def _ride(self, now: float, dt: float) -> None:
         """Learn from the riding, where its consumption is known."""
+        self.forecaster.more_auxiliaries = self.road_load.more_auxiliaries
         speed, reading = self.road.speed, self._reading
         unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.redundancy.speeds.unsettled
         known = 0 < dt <= self._timing.pause and not unsure and self._activities.teaches
@@ -344,6 +346,7 @@ class Estimator:
         self.soc.restore(restored.battery, restored.age, restored.cell_effects)
         self.forecaster.pause(stood := NEW_DAY if restored.age is None else restored.age)
         self.road_load.rest(stood)
+        self.forecaster.more_auxiliaries = self.road_load.more_auxiliaries
 
 
 def _carrying(roles: Sequence[str], groups: Sequence[Group]) -> list[int]:

@@ -7,7 +7,8 @@ learned, by segment, what is usual and how the present ride differs from it (`us
 - the price of a metre in motion: measured, less what height and speed have stored, over the model's of the prior
   riding in the same air;
 - what stops add to it, as it is usual. Standing for longer than a stop takes energy, but teaches nothing;
-- the time that a metre takes, and with it the power to be expected;
+- the time that a metre takes, and with it the power to be expected, and what auxiliaries take that the vehicle file
+  does not know: they are watts, in no price of a metre;
 - the consumption factor, measured over modelled: what the parameters have wrong for this vehicle and season.
 
 The range is the energy that can be drawn before the cut-off at the power to be expected, over the price to be expected
@@ -99,6 +100,7 @@ class Forecaster:
         self.prior, self._unit = Usual.of(prior, stops / price), Unit(price + stops, prior.speed)
         self.riding = Riding(self.prior)
         self.calm, self.pattern, self.riders, self.terrain = Calm(), Pattern(), Riders(), Terrain()
+        self.more_auxiliaries = 0.0  # W beyond the file's, now
         self.ageing: Ageing | None = None  # None: the pack is known to be as its file says
         self._past, self._colder = Past(), ((inf, inf, inf), 0.0)  # SOC, cells and their sd [degC]; the share lost
         self._overpotential = model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
@@ -143,11 +145,14 @@ class Forecaster:
         if abs(mean) > MOVING:
             r.still = 0.0
             segment.measured += r.second.energy
+            segment.beside += self.more_auxiliaries * r.second.seconds
             segment.modelled += modelled
             segment.level += to_come
         else:
             self._stand(r.second.seconds)
-            segment.standing += r.second.energy if r.still <= STOP_TIME else 0.0
+            if r.still <= STOP_TIME:
+                segment.standing += r.second.energy
+                segment.beside_standing += self.more_auxiliaries * r.second.seconds
         if r.still <= STOP_TIME:
             segment.duration += r.second.seconds
             segment.squares += r.second.squares
@@ -322,8 +327,10 @@ class Forecaster:
         standing, standing_variance = usual.standing.ahead(way)
         # What was ridden without a grade has the model's price times the factor, whose error is the same all the way.
         variance += (past.blind * price / self.riding.factor) ** 2 * self.riding.factor_variance
-        pace, _ = usual.pace.ahead(way)
-        consumption = moving * (price + max(standing, 0.0))
+        pace, pace_variance = usual.pace.ahead(way)
+        beside = self.more_auxiliaries / self.load.prior.speed  # J/m, at the prior's pace
+        known = moving * (price + max(standing, 0.0))
+        consumption = max(known + beside * max(pace, LEAST), LEAST * moving)
         height_variance = self._weight**2 * self.terrain.variance(way) / (consumption * way) ** 2
         prior_power, prior_time = (moving + stops) * self.load.prior.speed, PRIOR_LENGTH / self.load.prior.speed
         # Downhill next to nothing is drawn in the mean; what is to come is not all downhill.
@@ -335,7 +342,8 @@ class Forecaster:
             consumption,
             consumption * self.load.prior.speed / max(pace, LEAST),
             form_factor_squared=min(max(form_factor_squared, FORM_FACTOR_SQUARED[0]), FORM_FACTOR_SQUARED[1]),
-            variance=(variance + standing_variance) * (moving / consumption) ** 2 + height_variance,
+            variance=((variance + standing_variance) * moving**2 + pace_variance * beside**2) / consumption**2
+            + height_variance,
         )
 
     # --- saving -----------------------------------------------------------------------------------------------

@@ -38,6 +38,8 @@ class Segment:
     standing: float = 0.0  # measured, at stops
     unseen: float = 0.0  # m of which no sensor showed the grade
     climb: float = 0.0  # m, of the rest
+    beside: float = 0.0  # J in motion of auxiliaries beyond the file's, and at stops: they are watts, of any way
+    beside_standing: float = 0.0
     learned: Usual | None = None  # what was usual before it; None after a restart
 
 
@@ -175,10 +177,11 @@ def learned(usual: Usual, segment: Segment, price: float, speed: float, height: 
     way, unit, unseen = segment.distance, price * segment.distance, segment.unseen / segment.distance
     factor, likely = usual.factor.now, max(usual.price.now, LEAST_PRICE)
     paid = (1 - unseen) * (segment.measured - segment.modelled) + ((1 - unseen) + unseen * factor) * segment.level
+    paid, stood = paid - segment.beside, segment.standing - segment.beside_standing
     excess = factor * (segment.measured - factor * segment.modelled) / (likely * unit)
     return Usual(
         usual.price.learned(paid / unit - usual.price.now, way, unseen * unseen * usual.factor.variance),
-        usual.standing.learned(segment.standing / unit - usual.standing.now, way),
+        usual.standing.learned(stood / unit - usual.standing.now, way),
         usual.pace.learned(segment.duration * speed / way - usual.pace.now, way),
         usual.factor.learned(excess, way, (height * factor / (likely * unit)) ** 2),
     )
