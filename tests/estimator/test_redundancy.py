@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from math import cos, sin
+from statistics import median
 
 import pytest
 
@@ -29,6 +30,7 @@ HONEST: Mapping[str, float] = {  # what each sensor says at 1 m/s
 AXLE_ROLES = "motor_speed", "wheel_speed_rear"
 FOUR = ("motor_speed", "wheel_speed_rear", "wheel_speed_front", "gps_speed")
 Fault = Callable[[float, float], float | None]
+Each = Callable[[float, Signals, SpeedCheck], None]
 
 
 def town(t: float) -> float:
@@ -43,8 +45,9 @@ def ridden(
     truth: Callable[[float], float] = town,
     watch: SpeedCheck | None = None,
     begin: float = 0.0,
+    each: Each = lambda t, signals, speeds: None,
 ) -> tuple[SpeedCheck, Signals]:
-    """`seconds` of riding; a fault makes of (time [s], true value) what is reported, None being nothing."""
+    """`seconds` of riding; a fault makes of (time [s], true value) what is reported, None being nothing; each: step."""
     signals = Signals((role, 2.0) for role in ROLES)
     speeds = watch or SpeedCheck(RADIUS, GEAR)
     for step in range(round(seconds / STEP)):
@@ -56,6 +59,7 @@ def ridden(
                 signal = signals[role]
                 signal.value, signal.time, signal.total, signal.count = value, t, value, 1
         speeds.step(StepInputs(t, STEP, STEP, signals, None))
+        each(t, signals, speeds)
         signals.next_step()
     return speeds, signals
 
@@ -351,6 +355,83 @@ def test_on_a_roller_bench_an_accelerometer_that_shows_nothing_is_right():
 def test_the_mounting_is_kept_from_before_the_fault():
     grades = hills(800.0, {"gps_altitude": lambda t, v: v + t})
     assert grades.offset == pytest.approx(-MOUNTED, abs=0.006)
+
+
+def brisk(t: float) -> float:
+    """The true speed [m/s]: stops and goes, with 1.5 m/s²."""
+    return max(0.0, 7.0 + 6.0 * sin(t / 4.0))
+
+
+def every(steps: int, late: float = 0.0, gaps: float = 0.0) -> Fault:
+    """A sensor that reports every so many steps, late [s], and not in the first `gaps` [s] of each half minute."""
+    scale = lambda t, v: v / brisk(t) if brisk(t) else 0.0  # noqa: E731
+    return lambda t, v: None if round(t / STEP) % steps or t % 30 < gaps else scale(t, v) * brisk(t - late)
+
+
+def beside_speeds(speeds_as: Mapping[str, Fault], accelerometer: Fault = lambda t, v: v) -> GradeCheck:
+    """Two minutes of an accelerometer beside speeds that report as their faults make them; nothing else decides."""
+    grades = GradeCheck(MASS, FORCE)
+
+    def compare(t: float, signals: Signals, speeds: SpeedCheck) -> None:
+        value = accelerometer(t, (brisk(t) - brisk(t - STEP)) / STEP + 0.1 * sin(77 * t))
+        assert value is not None
+        signals.accel_x.value, signals.accel_x.time = value, t
+        grades.compare(t, STEP, signals, speeds, None, lambda v, a: v * (FORCE + MASS * a))
+
+    ridden(120.0, tuple(speeds_as), speeds_as, brisk, each=compare)
+    return grades
+
+
+GPS: dict[str, Fault] = {
+    "10 Hz": every(1),
+    "5 Hz": every(2),
+    "2 Hz": every(5),
+    "1 Hz": every(10),
+    "1 Hz, 0.5 s late": every(10, late=0.5),
+    "1 Hz, gaps of 5 s": every(10, gaps=5.0),
+    "5 Hz, 0.5 s late": every(2, late=0.5),
+    "5 Hz, gaps of 5 s": every(2, gaps=5.0),
+}
+
+
+@pytest.mark.parametrize("name", GPS)
+def test_a_gps_speed_that_is_held_does_not_contradict_the_accelerometer(name: str):
+    """Its mean with a new speed of the motor gained half of what the vehicle did, and the rest in one step."""
+    for roles in (("motor_speed",), FOUR[:3]):
+        assert beside_speeds({**dict.fromkeys(roles, every(1)), "gps_speed": GPS[name]}).faulty == NO_SENSOR
+
+
+ACCELEROMETERS: dict[str, Fault] = {
+    name: GRADE_FAULTS[name][1] for name in ("doubled", "turned round", "stuck", "full scale")
+} | {"halved": lambda t, v: v / 2, "zero but for its tremor": lambda t, v: 0.1 * sin(77 * t)}
+
+
+@pytest.mark.parametrize("name", ACCELEROMETERS)
+@pytest.mark.parametrize("gps", GPS)
+def test_a_wrong_accelerometer_is_found_beside_a_gps_speed_however_seldom(gps: str, name: str):
+    speeds = {"motor_speed": every(1), "gps_speed": GPS[gps]}
+    assert beside_speeds(speeds, ACCELEROMETERS[name]).faulty == {"accel_x"}
+
+
+def test_speeds_that_are_all_held_show_no_acceleration():
+    seldom = dict.fromkeys(("motor_speed", "gps_speed"), every(10))
+    assert beside_speeds(seldom).faulty == NO_SENSOR
+    assert beside_speeds(seldom, ACCELEROMETERS["stuck"]).faulty == {"accel_x"}
+
+
+@pytest.mark.parametrize("gps", ["10 Hz", "5 Hz"])
+def test_speeds_of_about_one_rate_are_followed_by_their_median(gps: str):
+    def same(t: float, signals: Signals, speeds: SpeedCheck) -> None:
+        assert speeds.middle == pytest.approx(median(signals[role].value / HONEST[role] for role in roles))
+
+    for roles in (FOUR, ("motor_speed", "gps_speed")):
+        ridden(60.0, roles, {"gps_speed": GPS[gps]}, brisk, each=same)
+
+
+def test_of_a_speed_that_is_left_out_nothing_is_followed():
+    """The motor stands still, the GPS at 1 Hz does not: from then on there is no acceleration to compare."""
+    stuck: Fault = lambda t, v: v if t < 30 else 40.0  # noqa: E731
+    assert beside_speeds({"motor_speed": stuck, "gps_speed": every(10)}).faulty == NO_SENSOR
 
 
 def test_pulling_away_on_a_slope_is_no_fault():

@@ -25,18 +25,22 @@ class AccelerometerGain:
         """Nothing was received for a while: what changed meanwhile is no rate."""
         self._speed = self._means = None
 
-    def contradicts(self, dt: float, forward: float, speed: float, acceleration: float, on_road: bool) -> bool:
+    def contradicts(self, dt: float, forward: float, speed: float, acceleration: float | None, on_road: bool) -> bool:
         """Whether it contradicts the wheels over `dt` [s].
 
-        forward: the accelerometer [m/s²]; speed [m/s] and acceleration [m/s²]: of the wheels; on_road: the wheels do
-        not turn on a bench.
+        forward: the accelerometer [m/s²]; speed [m/s] and acceleration [m/s²]: of the wheels, None if that is not
+        known; on_road: the wheels do not turn on a bench.
         """
         self._still = self._still + dt if forward == self._last != 0.0 else 0.0  # a plain zero: a simulation's
         self._last = forward
         keep = 1 - min(dt / GAIN_TIME, 1.0)
-        if not on_road:  # which speed is right is not yet known, or the wheels turn on a bench
+        # Which speed is right is not yet known, or it is held for long, or the wheels turn on a bench.
+        if acceleration is None or not on_road:
             self._product = self._square = 0.0
             self.wrong = False
+        if acceleration is None:
+            self.forget_speed()
+            return on_road and abs(speed) > MOVING and self._still > STUCK_AFTER
         gained = 0.0 if self._speed is None else speed - self._speed
         self._speed = speed
         if max(abs(acceleration), abs(gained) / max(dt, SHORTEST)) > HARDEST:  # another sensor took over

@@ -100,7 +100,8 @@ class GradeCheck:
             self._climb = None
         elif self._climb is not None:
             self._climb += grade_shown(forward, speeds.acceleration) * distance
-            if self.gain.contradicts(dt, forward, speed, speeds.acceleration, speeds.on_road):
+            acceleration = None if speeds.in_steps else speeds.acceleration
+            if self.gain.contradicts(dt, forward, speed, acceleration, speeds.on_road):
                 self.counters["accel_x"].update(dt, True)
         self._work = None if self._work is None or power is None else self._work + power * dt
         if self._seconds >= INTERVAL:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from statistics import fmean, median
 
 from gz_onboard.estimator.redundancy.checks import MOVING, NO_SENSOR, STUCK_AFTER, StepInputs, counters
-from gz_onboard.estimator.road import accelerated
+from gz_onboard.estimator.road import SPEED_TIME, accelerated
 from gz_onboard.estimator.signals import FIX_2D, Signals
 from gz_onboard.events import SPEEDS
 from gz_onboard.physics.sensors import speed_factors
@@ -14,6 +14,7 @@ from gz_onboard.physics.sensors import speed_factors
 REVERSE = 4.0  # m/s: no road vehicle goes back faster; slower, wheels and GPS do not show the direction
 SPEED_APART, SPEED_APART_RELATIVE = 1.0, 0.12  # m/s and 1: two speeds that differ by more contradict each other
 BRAKING = 5.0  # m/s²: how fast a speed can have changed since its sensor last reported
+HELD_TIME = 10.0  # s: after this a message that came late no longer says that its value is held
 DRIFT_TIME = 20.0  # s, low pass
 DRIFT_APART, DRIFT_APART_RELATIVE = 0.2, 0.08  # the same for the low-passed: tyres and scales err by a few percent
 # What turns on a roller bench or spins while the vehicle does not move.
@@ -94,8 +95,10 @@ class SpeedCheck:
         self._median = 0.0  # m/s, low-passed
         self._axle = AxleRatio()
         self.reporting: tuple[str, ...] = ()  # roles
-        self.middle: float | None = None  # m/s, median
-        self.acceleration = 0.0  # m/s², of the median
+        self._held = dict.fromkeys(self.ROLES, 0.0)  # s: for how long a value stands, at most of late
+        self.middle: float | None = None  # m/s, median of those that are of one age
+        self.acceleration = 0.0  # m/s², of `middle`
+        self.in_steps = False  # even the newest are held so long that `middle` goes in steps: no acceleration
         self._slow = 0.0  # m/s
         self.on_road = False  # the ground goes by as fast as the driven wheel turns: another sensor has seen it
         self.unsettled = False  # two contradict each other, and it is not known which of them is right
@@ -112,11 +115,7 @@ class SpeedCheck:
         believed = {role: speed for role, speed in speeds.items() if not self.counters[role].faulty}
         middle = median((believed or speeds).values())
         self.unsettled = not believed
-        if self.middle is None:
-            self._slow = middle
-        if dt > 0:
-            self._slow, self.acceleration = accelerated(self._slow, middle, dt)
-        self.middle = middle
+        self._follow(dt, self._newest(step, believed or speeds))
         if len(speeds) < 2:
             for role in speeds:
                 signals[role].trusted = not self.counters[role].faulty
@@ -171,6 +170,26 @@ class SpeedCheck:
             self.still[role] = 0.0 if speed != self._last[role] else self.still[role] + step.observed
             self._last[role] = speed
         return speeds, apart
+
+    def _newest(self, step: StepInputs, speeds: Mapping[str, float]) -> float:
+        """The median of those whose values are of one age.
+
+        The mean of a new value and a held one gains half of what the vehicle does, and the rest of it in one step. What
+        is held for little longer than the newest is evened out with the acceleration.
+        """
+        keep = 1 - min(step.observed / HELD_TIME, 1.0)
+        for role in self.reporting:
+            self._held[role] = max(step.now - step.signals[role].time, keep * self._held[role])
+        longest = min(self._held[role] for role in speeds) + SPEED_TIME
+        self.in_steps = longest > 2 * SPEED_TIME
+        return median(speed for role, speed in speeds.items() if self._held[role] <= longest)
+
+    def _follow(self, dt: float, speed: float) -> None:
+        if self.middle is None:
+            self._slow = speed
+        if dt > 0:
+            self._slow, self.acceleration = accelerated(self._slow, speed, dt)
+        self.middle = speed
 
     def _drifted(self, dt: float, speeds: Mapping[str, float], middle: float) -> frozenset[str]:
         share = min(dt / DRIFT_TIME, 1.0)
