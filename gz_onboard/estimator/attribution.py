@@ -144,7 +144,7 @@ class Attribution:
             draw=Draw(soc, forecast.cells, self._pack(), forecast.power, forecast.form_factor_squared),
             air=Conditions(round(air.ambient, AMBIENT_DIGITS), round(air.altitude, ALTITUDE_DIGITS)),
             road=_in_steps(filed, self._road_load.believed(learned)) if self._road_load else filed,
-            factor=riding.factor,
+            factor=self._forecaster.factor,
             auxiliaries=self._auxiliaries(forecast.power),
             points=self._forecaster.pattern.points(),
             known=min(max(1 - riding.usual.price.variance / self._forecaster.prior.price.variance, 0.0), 1.0),
@@ -174,10 +174,9 @@ class Attribution:
 
     def _auxiliaries(self, power: float) -> float:
         """The part of the consumption factor that they make, as far as it is learned; `power` [W]: expected."""
-        riding = self._forecaster.riding
         if not self._known or power <= 0:
             return 0.0
-        return self._factor_learned * riding.factor * self._more / self._known / power
+        return self._factor_learned * self._forecaster.factor * self._more / self._known / power
 
     @property
     def _factor_learned(self) -> float:

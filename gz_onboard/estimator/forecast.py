@@ -199,6 +199,18 @@ class Forecaster:
         """Measured over modelled energy of the last kilometre or so; 1 while that is not known."""
         return self._past.recent_factor
 
+    @property
+    def beside(self) -> float:
+        """By how much auxiliaries beyond the file's raise the consumption factor, at the pace of the present riding."""
+        usual = self.riding.usual
+        modelled = self._unit.price * max(usual.price.now, LEAST) / self.riding.factor  # J/m
+        return self.more_auxiliaries / self.load.prior.speed * max(usual.pace.now, LEAST) / modelled
+
+    @property
+    def factor(self) -> float:
+        """The consumption factor: measured over modelled energy of the present riding."""
+        return self.riding.factor + self.beside
+
     def forget(self, distance: float) -> None:
         """Unlearn the last `distance` [m] or a little more: a sensor that it was learned from is faulty."""
         r, seen = self.riding, self.riding.usual
@@ -334,7 +346,7 @@ class Forecaster:
         height_variance = self._weight**2 * self.terrain.variance(way) / (consumption * way) ** 2
         prior_power, prior_time = (moving + stops) * self.load.prior.speed, PRIOR_LENGTH / self.load.prior.speed
         # Downhill next to nothing is drawn in the mean; what is to come is not all downhill.
-        energy = prior_power * prior_time + max(past.measured, self.riding.factor * past.level)
+        energy = prior_power * prior_time + max(past.measured, self.factor * past.level)
         energy = max(energy, LEAST * prior_power * prior_time)
         squares = PRIOR_FORM_FACTOR_SQUARED * prior_power**2 * prior_time + past.power_squares
         form_factor_squared = squares * (prior_time + past.duration) / energy**2

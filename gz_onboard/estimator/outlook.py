@@ -66,8 +66,7 @@ class Outlook:
         charging = now.activity is Activity.CHARGING
         drawn = None if charging or voltage is None or current is None else voltage * current * elapsed
         self.forecast = self._forecaster.shown(self._road.forecast(now.time, free, pack, now.conditions), drawn)
-        riding = self._forecaster.riding
-        self._factor = riding.factor, sqrt(riding.factor_variance)
+        self._factor = self._forecaster.factor, sqrt(self._forecaster.riding.factor_variance)
         if charging and voltage and current is not None:
             self._charging.step(elapsed, self._battery, (voltage, current), now.soc, now.temperature)
             self._full = self._forecaster.forecast(self._battery.window.high, 0.0, *known)

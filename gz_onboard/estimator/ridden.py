@@ -86,7 +86,7 @@ class Riding:
 
     @property
     def factor(self) -> float:
-        """Measured over modelled energy of the present riding."""
+        """Measured over modelled energy of the present riding, without auxiliaries beyond the file's."""
         return min(max(self.usual.factor.now, FACTOR[0]), FACTOR[1])
 
     @property
@@ -176,9 +176,9 @@ def learned(usual: Usual, segment: Segment, price: float, speed: float, height: 
     """
     way, unit, unseen = segment.distance, price * segment.distance, segment.unseen / segment.distance
     factor, likely = usual.factor.now, max(usual.price.now, LEAST_PRICE)
-    paid = (1 - unseen) * (segment.measured - segment.modelled) + ((1 - unseen) + unseen * factor) * segment.level
-    paid, stood = paid - segment.beside, segment.standing - segment.beside_standing
-    excess = factor * (segment.measured - factor * segment.modelled) / (likely * unit)
+    measured, stood = segment.measured - segment.beside, segment.standing - segment.beside_standing
+    paid = (1 - unseen) * (measured - segment.modelled) + ((1 - unseen) + unseen * factor) * segment.level
+    excess = factor * (measured - factor * segment.modelled) / (likely * unit)
     return Usual(
         usual.price.learned(paid / unit - usual.price.now, way, unseen * unseen * usual.factor.variance),
         usual.standing.learned(stood / unit - usual.standing.now, way),

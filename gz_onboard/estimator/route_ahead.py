@@ -108,7 +108,7 @@ class RoadAhead:
         """Take in `dt` [s] of riding at `speed` [m/s] and `power` [W] of the pack."""
         if self._segment:
             self._ridden += abs(speed) * dt
-            self._energy += power * dt
+            self._energy += (power - self._forecaster.more_auxiliaries) * dt
 
     def _learn(self, road: Road, costs: Costs) -> None:
         """Learn the cost if a segment ends here."""
@@ -196,6 +196,7 @@ class RoadAhead:
     def _ahead(self, road: Road, costs: Costs, free: Forecast, pack: Pack) -> Forecast:
         here, end = road.position.along, road.energy.length
         cost, variance = self._cost
+        cost += self._forecaster.beside
         variance = variance / cost**2 + AHEAD_SD**2 + pack.loss_variance
         level = cost * road.energy.between(costs.level, here, end)
         needed = level + road.energy.between(costs.height, here, end)

@@ -42,6 +42,7 @@ class Scooter:
     seed: int = 0
     period: float = 0.1  # s, of every message
     plug: float | None = 0.0  # None: no such signal comes
+    auxiliary: float = 45.0  # W
     time: float = 0.0
     distance: float = 3_210_000.0  # m
     energy: float = 0.0  # J at the terminals
@@ -61,7 +62,7 @@ class Scooter:
             wish = target * (1.0 if step % 500 < 430 else 0.0)  # now and then a red light
             a = float(np.clip(0.6 * (wish - self.speed), -1.5, 1.0))
             self.speed = max(self.speed + a * STEP, 0.0)
-            power = 45 + self.speed * (190 * a * 1.05 + 26 + 0.36 * self.speed**2) * (1.15 if a > -0.3 else 0.3)
+            power = self.auxiliary + self.speed * (190 * a * 1.05 + 26 + 0.36 * self.speed**2) * (1.15 if a > -0.3 else 0.3)
             current, voltage = self._draw(power, charge)
             self.time += STEP
             if step % every == 0:
@@ -86,7 +87,7 @@ class Scooter:
         measured = current + self.offset + 0.06 * noise()
         yield t, PACK, (round(voltage + 0.01 * noise(), 2), round(measured, 2), own)
         yield t + 0.01, MOTOR, (self.speed / 0.2438,)
-        yield t + 0.02, INVERTER, (voltage - 0.009 * current, current + charge - 0.85)
+        yield t + 0.02, INVERTER, (voltage - 0.009 * current, current + charge - 0.85 * self.auxiliary / 45)
         if count % max(round(1 / self.period), 1) == 0:
             yield t + 0.03, CELLS, (self.temperature, self.temperature - 2)
             plug = None if self.plug is None else float(charge > 0)

@@ -65,6 +65,34 @@ def test_an_hour_of_standing_costs_its_energy_and_no_more(new):
     assert later.consumption_expected == pytest.approx(before.consumption_expected, rel=0.05)
 
 
+def with_auxiliary_current(scooter, seconds, speed=0.0):
+    for t, group, values in scooter.live(seconds, speed):
+        yield t, group, values
+        if group == INVERTER:
+            yield t, OTHERS + 1, (scooter.auxiliary / values[0],)
+
+
+def test_a_heater_is_watts_and_no_price_of_a_metre():
+    scooter, e = Scooter(soc=0.95), estimator([*GROUPS, Group("Auxiliary", ("auxiliary_current",), 0.1)])
+
+    def ride(seconds, speed=0.0):
+        return follow(e, with_auxiliary_current(scooter, seconds, speed), scooter)
+
+    def price():
+        energy, distance = scooter.energy, scooter.distance
+        ride(900, 7.0)
+        return (scooter.energy - energy) / (scooter.distance - distance)
+
+    ride(20)
+    ride(900, 7.0)
+    for power in (400.0, 45.0):  # more than a fifth of the capacity in an hour
+        scooter.auxiliary = power
+        rows = ride(60)
+        assert all(row.activity is Activity.STANDING for _, row in rows[5:])
+        _, soon = ride(60, 7.0)[-1]
+        assert soon.consumption_expected == pytest.approx(price(), rel=0.06)
+
+
 @pytest.mark.parametrize("plug", [0.0, None], ids=["plug signal", "none"])
 def test_charging_is_no_riding(plug):
     scooter, e = Scooter(soc=0.56, plug=plug), estimator()
