@@ -132,6 +132,22 @@ def test_it_shows_and_forgets_the_road_load(saved: Path, tmp_path: Path, capsys:
     Pipeline(vehicle).estimator.restore(after, vehicle.key, 0.0)
 
 
+def test_after_a_day_with_a_payload_it_shows_the_road_load(saved: Path, capsys: pytest.CaptureFixture[str]):
+    snapshot, _ = state.load(saved, time.time()) or ({}, None)
+    road = Pipeline(read_vehicle("reference", payload=93.0)).estimator.road_load.snapshot()
+    road["means"][2], road["rows"][5] = 0.1, 0.03**2  # of drag
+    snapshot["learned"]["road"] = road
+    state.write(saved, state.encode(snapshot, time.time()))
+    assert main(["learned", "--state", str(saved)]) == OK
+    text = capsys.readouterr().out
+    assert "nothing learned: mass of rider and luggage, entered 93\n" in text
+    assert "drag         0.605 ± " in text
+    road["of"][0] = -1.0
+    state.write(saved, state.encode(snapshot, time.time()))
+    assert main(["learned", "--state", str(saved)]) == BAD_INPUT
+    assert f"{saved}: is damaged: its road holds implausible numbers" in capsys.readouterr().err
+
+
 def test_it_shows_and_forgets_the_weakest_group(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     vehicle = with_cell_voltages(tmp_path)
     assert not set(NAMES) & set(shown(saved, capsys))  # a vehicle without the signal

@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from gz_onboard.estimator.terrain import RATE, Terrain
 from gz_onboard.estimator.usual import Habit, Usual
 from gz_onboard.estimator.weakest import Weakest
 from gz_onboard.options import add_shared
+from gz_onboard.physics.model import Model
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 VERSION = 2  # of the JSON keys
@@ -145,11 +146,23 @@ def _of_weakest(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Lear
 
 
 def read_road_load(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> RoadLoad:
-    """What a saved state holds of the road load. ValueError if it cannot be."""
-    road_load = RoadLoad(_fresh(vehicle).load)
+    """What a saved state holds of the road load, over the payload of its day. ValueError if it cannot be."""
     with part(ROAD):
-        road_load.take(road_load.read(snapshot.get("learned", {}).get(ROAD)))
+        saved = snapshot.get("learned", {}).get(ROAD)
+        road_load = RoadLoad(_fresh(_loaded(vehicle, RoadLoad.payload_of(saved))).load)
+        road_load.take(road_load.read(saved))
     return road_load
+
+
+def _loaded(vehicle: Vehicle, payload: float | None) -> Vehicle:
+    """The vehicle with the payload [kg] that was entered, if it is not the file's. ValueError if it cannot be."""
+    if payload is None or payload == vehicle.parameters.filed("payload_mass"):
+        return vehicle
+    try:
+        parameters = vehicle.parameters.replaced(payload_mass=payload)
+    except InputError as error:
+        raise ValueError(str(error)) from error
+    return replace(vehicle, parameters=parameters, model=Model(vehicle.model.effects, parameters))
 
 
 def read_riders(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, dict[str, Learned]]:
@@ -225,7 +238,8 @@ def _road_lines(road: Mapping[str, RoadParameter], correlations: Mapping[tuple[s
     for name, x in road.items():
         unit = "" if x.unit == "1" else f" {x.unit}"
         number = f"{x.value:.3g} ± {x.sd:.2g}{unit}"
-        yield f"{SPOKEN.get(name, name):12} {number:18} {_known(x.share)}: {MEANING[name]}, vehicle file {x.filed:.3g}"
+        over = f"{'entered' if x.entered else 'vehicle file'} {x.filed:.3g}"
+        yield f"{SPOKEN.get(name, name):12} {number:18} {_known(x.share)}: {MEANING[name]}, {over}"
     for (first, second), r in correlations.items():
         if abs(r) > ALIKE:
             one, other = (SPOKEN.get(name, name) for name in (first, second))
