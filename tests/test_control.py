@@ -102,7 +102,7 @@ def test_a_socket_left_behind_is_taken_over_and_nothing_else(tmp_path, pipeline)
         Control(path, lambda: pipeline).start()
     first.close()
     path.write_text("mine")
-    with pytest.raises(InputError, match="is no socket"):
+    with pytest.raises(InputError, match="is not a socket"):
         Control(path, lambda: pipeline).start()
     assert path.read_text() == "mine"
 

@@ -99,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         snapshot, age = load(file, vehicle)
     except InputError as error:
-        raise InputError(f"{error}; --state FILE and --vehicle NAME|TOML say which") from error
+        raise InputError(f"{error}; choose another with --state FILE or --vehicle NAME|TOML") from error
     if arguments.reset:
         snapshot = _forget(file, snapshot, age, FORGOTTEN[arguments.reset], _fresh(vehicle))
         forgotten = ", ".join(PARTS[name] for name in FORGOTTEN[arguments.reset])

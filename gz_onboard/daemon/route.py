@@ -95,5 +95,5 @@ def ask(path: Path, request: dict[str, object]) -> dict[str, object]:
     except OSError as error:
         raise InputError(f"{path}: no daemon answers: {error.strerror or error}") from error
     except ValueError as error:
-        raise InputError(f"{path}: what answers is no gz-onboard: {error}") from error
+        raise InputError(f"{path}: what answers there is not gz-onboard: {error}") from error
     return dict(answer) if isinstance(answer, dict) else {"error": str(answer)}
