@@ -57,8 +57,14 @@ class _Parser(argparse.ArgumentParser):
         elif message.startswith("unrecognized arguments: "):
             words = message.split()[2:]
             wrong = next((word for word in words if word.startswith("-")), "")
-            message += nearest(wrong.partition("=")[0], self.known_options()) if wrong else self._place_of(words[0])
+            message += self._meant(wrong.partition("=")[0]) if wrong else self._place_of(words[0])
         super().error(message)
+
+    def _meant(self, wrong: str) -> str:
+        """As `nearest`; dashes, which all options have, make none like another."""
+        bare = {option.lstrip("-"): option for option in self.known_options()}
+        near = nearest(wrong.lstrip("-"), bare).split("'")
+        return f" (did you mean {bare[near[1]]!r}?)" if len(near) > 1 else ""
 
     def _place_of(self, word: str) -> str:
         """Where a file or folder `word` goes on the command line of the command that was called."""
@@ -114,6 +120,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with naming():
             arguments = command_line([called]).parse_args(argv)
+            called = f"{called} {getattr(arguments, 'part', '')}".rstrip()  # as in `vehicle check`
             status: int = importlib.import_module(COMMANDS[arguments.command][0]).run(arguments)
         sys.stdout.flush()  # here, where a full disk is a message
         return status

@@ -206,7 +206,7 @@ def read_text(file: Path, most: int, encodings: tuple[str, ...] = ("utf-8",)) ->
     except OSError as error:
         raise InputError(f"{file}: cannot be read: {error.strerror}") from error
     if len(data) > most:
-        raise InputError(f"{file}: is larger than {most / 1e6:g} MB; such a file is read no further")
+        raise InputError(f"{file}: is larger than {most / 1e6:g} MB; it is not read any further")
     for encoding in encodings:
         with contextlib.suppress(UnicodeDecodeError):
             return data.decode(encoding)

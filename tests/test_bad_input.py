@@ -11,8 +11,8 @@ from tests.lab.short_logs import short_log
 
 EMPTY = "is empty, a file of 0 bytes; copy or record it again"
 MISSING = "cannot be read: No such file or directory (did you mean 'ride.blf'?)"
-ANOTHER = "knows none of its 40 frames (identifiers 123, ...); give the vehicle that it is of"
-NO_SUFFIX = "unknown log format '.txt', and it begins with 'hello'; known are .mcap, .blf"
+ANOTHER = "knows none of its 40 frames (identifiers 123, ...); give the vehicle that it is of, or begin"
+NO_SUFFIX = "is not a log that can be read: it ends in '.txt', and it begins with 'hello'; logs are .mcap, .blf"
 NO_FOLDER = "cannot be written: there is no folder nowhere; make it"
 READING = {
     "report": ["report", "LOG"],
@@ -27,21 +27,21 @@ WRONG = [
     (["report", "ride.blf", "--route", "ride.gpx"], "ride.gpx: cannot be read: No such file or directory"),
     (["vehicle", "check", "ride.blf", "reference"], "ride.blf: is a log; the vehicle comes first, by name or file"),
     (["vehicle", "check", "reference", "ride.blf", "--quick", "--json", "nowhere/x.json"], NO_FOLDER),
-    (["vehicle", "check", "none.toml", "ride.blf"], "none.toml: no such vehicle file; the package's own are reference"),
+    (["vehicle", "check", "none.toml", "ride.blf"], "gz-onboard vehicle check: none.toml: no such vehicle file"),
+    (["history", "show", "--file", "ride.blf"], "gz-onboard history show: ride.blf: is no history: not an SQLite file"),
     (["history", "show", "--file", "none.sqlite"], "there is no history yet; `gz-onboard history add LOG` begins one"),
-    (["history", "show", "--file", "ride.blf"], "ride.blf: is no history: not an SQLite file"),
     (["export", "ride.blf", "x.csv", "--estimates"], "of which `gz-onboard estimate ride.blf` makes them"),
-    (
-        ["export", "ride.blf", "x.mf4", "--signals", "--vehicle", "reference"],
-        "ride.blf: its signals can be written into",
-    ),
+    (["export", "ride.blf", "x.mf4", "--signals", "--vehicle", "reference"], "ride.blf: its signals can be written to"),
     (["export", "ride.blf", "x.csv", "--signals", "--vehicle", "reference", "--columns", "x"], " more"),
     (
         ["learned", "--state", "none.json"],
-        "none.json: no saved state; the daemon keeps one in its state folder; --state",
+        "none.json: no saved state; the daemon keeps one in its state folder; choose another",
     ),
-    (["learned", "--state", "hello.txt"], "hello.txt: is not a saved state; --state FILE and --vehicle NAME|TOML"),
-    (["learned", "--state", "folder"], "it is not a file; --state FILE and --vehicle NAME|TOML say which"),
+    (
+        ["learned", "--state", "hello.txt"],
+        "hello.txt: is not a saved state; choose another with --state FILE or --vehicle NAME|TOML",
+    ),
+    (["learned", "--state", "folder"], "it is not a file; choose another with --state FILE or --vehicle NAME|TOML"),
     (["learned", "--state", "x.json", "--plot", "x.bmp"], "--plot x.bmp: a picture is one of .png .svg .pdf"),
     (["plot", "--why", "ride.blf"], "`gz-onboard estimate` makes a log that does"),
     (["plot", "folder"], "folder: its logs hold no estimates; `gz-onboard estimate folder` makes them"),

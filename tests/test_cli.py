@@ -57,6 +57,8 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["run", "--chanel", "can0"], "did you mean '--channel'"),
         (["run", "--chanel=can0"], "did you mean '--channel'"),
         (["run", "--chan", "can0"], "did you mean '--channel'"),  # no abbreviations: they break when options are added
+        (["history", "show", "--fromat", "svg"], "unrecognized arguments: --fromat svg\n"),  # only dashes in common
+        (["report", RIDE, "--format", "pdf"], "report: error: argument --format: the report is a page in HTML"),
         (["run", "--filter", "filterpi"], "did you mean 'filterpy'"),
         (["run", "--filter", "plt"], "choose from"),
         (["run", "--tick", "fast"], "--tick: invalid float value: 'fast'"),
@@ -97,8 +99,8 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["estimate", RIDE, "--vehicle", "referenz"], "did you mean 'reference'"),
         (["export", "nowhere.blf", "x.log"], "nowhere.blf"),
         (["export", RIDE, "x.csv", "--table-format", "csv"], "is for a folder of tables, and x.csv is a file"),
-        (["export", RIDE, "--columns", "range"], "--columns: says what is written to OUT, and none is given"),
-        (["export", RIDE, "--to", "5"], "--to: says what is written to OUT, and none is given"),
+        (["export", RIDE, "--columns", "range"], "--columns: chooses what is written to OUT, which is missing"),
+        (["export", RIDE, "--to", "5"], "--to: chooses what is written to OUT, which is missing"),
         (["plot", "nowhere.mcap"], "nowhere.mcap"),
         (["plot", "a.mcap", "--over", "distance", "d.png"], "d.png; files go before the options"),
         (["estimate", RIDE, "--no-plot", RIDE], "; files go before the options"),
@@ -297,4 +299,7 @@ def test_help_as_it_is_asked_for(capsys: pytest.CaptureFixture[str]):
 def test_a_folder_of_tables_says_how_to_give_them(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     (tmp_path / "ride.csv").write_text("time,speed\n0,5\n")
     said = refused(capsys, "estimate", str(tmp_path))
-    assert "this folder holds no log; its tables must be given one by one, such as ride.csv" in said
+    assert "; its tables must be given one by one, such as ride.csv" in said
+    (tmp_path / "ride.csv").rename(tmp_path / "notes.md")  # a text that looks like a table is none
+    said = refused(capsys, "estimate", str(tmp_path))
+    assert said.endswith(": this folder holds no log (.mcap, .blf, .log, .asc, .csv, .trc, .mf4, .crtd)\n")

@@ -12,7 +12,7 @@ import pytest
 from gz_onboard.cli import main
 from gz_onboard.daemon import control
 from gz_onboard.daemon.control import Control
-from gz_onboard.daemon.route import ask
+from gz_onboard.daemon.route import ask, route_text
 from gz_onboard.errors import InputError
 from gz_onboard.events import RouteState
 from gz_onboard.pipeline import Pipeline
@@ -102,7 +102,7 @@ def test_a_socket_left_behind_is_taken_over_and_nothing_else(tmp_path, pipeline)
         Control(path, lambda: pipeline).start()
     first.close()
     path.write_text("mine")
-    with pytest.raises(InputError, match="is no socket"):
+    with pytest.raises(InputError, match="is not a socket"):
         Control(path, lambda: pipeline).start()
     assert path.read_text() == "mine"
 
@@ -112,14 +112,31 @@ def test_the_command(listening, tmp_path, capsys):
     file = tmp_path / "way.route.csv"
     file.write_text("distance_m\n0\n20\n40\n")
     assert main(["route", str(file), "--socket", str(path)]) == 0
-    assert "without altitudes hills are not counted" in capsys.readouterr().out
+    assert capsys.readouterr().out == "route  way, 0.04 km\nwithout altitudes hills are not counted\n"
+    assert main(["route", "--socket", str(path)]) == 0
+    assert capsys.readouterr().out == "route  way\n  not yet looked for\n"
     assert main(["route", "--clear", "--socket", str(path)]) == 0
     assert main(["route", "--socket", str(path)]) == 0
+    assert capsys.readouterr().out == "route  none\nroute  none\n"
     assert main(["route", "--socket", str(tmp_path / "none")]) == 2
     assert "no daemon answers" in capsys.readouterr().err
     file.write_text("distance_m\n0\n0\n")
     assert main(["route", str(file), "--socket", str(path)]) == 2
     assert "way.route.csv:3: distance_m: 0 m does not increase" in capsys.readouterr().err
+
+
+def test_the_answer_has_units():
+    on = {"ok": True, "route": "home", "state": "ON", "along_m": 3210.98, "left_m": 9764.1, "energy_j": 1098765.4}
+    on |= {"arrival_soc": 0.3249, "arrival_soc_p10": 0.2811, "arrival_soc_p90": 0.3702, "range_m": 24312.9}
+    assert route_text(on).splitlines() == [
+        "route  home",
+        "  on it, 3.2 km ridden, 9.8 km and 305 Wh to its end",
+        "  32 % of charge at its end (28 to 37 %, 80 % interval)",
+        "range  24.3 km",
+    ]
+    ends = {"battery_ends_after_m": 8123.4, "battery_ends_latitude": 48.1234567, "battery_ends_longitude": 11.5}
+    assert "  the battery ends in 8.1 km, at 48.12346°, 11.50000°" in route_text(on | ends).splitlines()
+    assert route_text({"route": "home", "state": "OFF", "along_m": None}) == "route  home\n  not on it"
 
 
 def test_without_a_path_it_does_not_listen():

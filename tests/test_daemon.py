@@ -136,7 +136,9 @@ def test_the_summary_says_what_the_bus_was_told_last():
         run.pipeline.advance((), end + second * S)
     *_, numbers, told = summary(run.pipeline)
     assert numbers.startswith(f"range {estimate.range / 1000:.1f} km (")
-    assert re.search(r"^state at the end invalid: .*NO_PACK_VOLTAGE.*; the numbers are of 5\d\.\d s before$", told)
+    assert re.search(
+        r"^state at the end invalid: .*NO_PACK_VOLTAGE.*; the figures above are from 5\d\.\d s earlier$", told
+    )
 
 
 def test_a_silent_bus_is_told_that_there_is_nothing(bus: str):

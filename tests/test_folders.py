@@ -54,7 +54,7 @@ MORE = [
     (["report", RIDE, "-o", FULL], "is a folder; give the name of a file"),
     (["plot", FULL, "one.png"], "one.png: of a folder, each picture has the name of its log; leave it out"),
     (["export", FULL, "rides.csv"], "rides.csv: is one file, and FULL a folder of logs; give a name without a suffix"),
-    (["replay", FULL, "--from", "3"], "--from and --to: are of one log, and FULL holds 2; give one of them"),
+    (["replay", FULL, "--from", "3"], "--from and --to: apply to one log, and FULL holds 2; give one of them"),
 ]
 
 

@@ -15,7 +15,9 @@ import pytest
 from gz_onboard import state
 from gz_onboard.cli import main
 from gz_onboard.daemon.learned import BATTERY
+from gz_onboard.daemon.learned_picture import limits, rows_of
 from gz_onboard.errors import BAD_INPUT, OK
+from gz_onboard.estimator.ageing import Learned
 from gz_onboard.estimator.ekf import ScalarFilter
 from gz_onboard.estimator.weakest import NAMES
 from gz_onboard.pipeline import Pipeline
@@ -83,6 +85,7 @@ def test_it_shows_each_rider_and_draws_it(saved: Path, tmp_path: Path, capsys: p
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert main(["learned", "--state", str(saved), "--reset", "riding"]) == OK
     text = capsys.readouterr().out
+    assert text.startswith(f"reset in {saved}: riding of all riders, and terrain\n")
     assert "anna" not in text
     assert "price        1.000 ± 0.1" in text
     assert "nothing learned: energy of a kilometre" in text
@@ -100,7 +103,7 @@ def test_it_forgets_one_and_keeps_the_rest(saved: Path, capsys: pytest.CaptureFi
     assert age == pytest.approx(3600, abs=10)
     vehicle = read_vehicle("reference")
     Pipeline(vehicle).estimator.restore(after, vehicle.key, age)
-    learned = shown(saved, capsys, "--reset", "battery")
+    learned = shown(saved, capsys, "--reset", "battery")  # the JSON is nothing but JSON
     assert (learned["capacity"]["factor"], learned["capacity"]["percent_learned"]) == (1.0, 0)
     assert learned["resistance"]["factor"] == 1.0
     after, _ = state.load(saved, time.time()) or ({}, None)
@@ -132,6 +135,22 @@ def test_it_shows_and_forgets_the_road_load(saved: Path, tmp_path: Path, capsys:
     Pipeline(vehicle).estimator.restore(after, vehicle.key, 0.0)
 
 
+def test_after_a_day_with_a_payload_it_shows_the_road_load(saved: Path, capsys: pytest.CaptureFixture[str]):
+    snapshot, _ = state.load(saved, time.time()) or ({}, None)
+    road = Pipeline(read_vehicle("reference", payload=93.0)).estimator.road_load.snapshot()
+    road["means"][2], road["rows"][5] = 0.1, 0.03**2  # of drag
+    snapshot["learned"]["road"] = road
+    state.write(saved, state.encode(snapshot, time.time()))
+    assert main(["learned", "--state", str(saved)]) == OK
+    text = capsys.readouterr().out
+    assert "nothing learned: mass of rider and luggage, entered 93\n" in text
+    assert "drag         0.605 ± " in text
+    road["of"][0] = -1.0
+    state.write(saved, state.encode(snapshot, time.time()))
+    assert main(["learned", "--state", str(saved)]) == BAD_INPUT
+    assert f"{saved}: is damaged: its road holds implausible numbers" in capsys.readouterr().err
+
+
 def test_it_shows_and_forgets_the_weakest_group(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     vehicle = with_cell_voltages(tmp_path)
     assert not set(NAMES) & set(shown(saved, capsys))  # a vehicle without the signal
@@ -156,12 +175,32 @@ def test_it_shows_and_forgets_the_weakest_group(saved: Path, tmp_path: Path, cap
     assert learned["capacity"]["factor"] == pytest.approx(CAPACITY, abs=0.01)
 
 
+def test_the_picture_has_groups_and_what_is_next_to_unknown_does_not_squeeze_it():
+    known, unknown = Learned(0.9, 0.05, 0.6), Learned(1.0, 2.0, 0.2)
+    riders = {"anna": {"price": known, "terrain": known}, "": {"standing": unknown}}
+    rows = list(rows_of({"capacity": known}, {"payload": known}, riders))
+    assert rows == [
+        ("battery", None),
+        ("capacity: of the pack", known),
+        ("road load", None),
+        ("payload: mass of rider and luggage", known),
+        ("riding, anna", None),
+        ("price: energy of a km in motion", known),
+        ("riding, rider not known", None),
+        ("standing: energy at stops", unknown),
+        ("roads, whoever rides", None),
+        ("terrain: height that roads climb or fall for good", known),
+    ]
+    assert limits([known, unknown]) == (0.0, 2.0)
+    assert limits([Learned(3.0, 0.1, 0.5)])[1] > 3.0
+
+
 def test_it_resets_nothing_under_a_daemon_that_runs(saved: Path, capsys: pytest.CaptureFixture[str]):
     descriptor = os.open(saved.parent, os.O_RDONLY)
     fcntl.flock(descriptor, fcntl.LOCK_EX)
     assert main(["learned", "--state", str(saved), "--reset", "all"]) == BAD_INPUT
     os.close(descriptor)
-    assert "stop it first" in capsys.readouterr().err
+    assert f"{saved}: the running daemon would overwrite it; stop it first" in capsys.readouterr().err
     assert shown(saved, capsys)["capacity"]["factor"] == pytest.approx(CAPACITY, abs=0.01)
 
 

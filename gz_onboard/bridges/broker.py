@@ -133,7 +133,7 @@ class Broker:
 
     def _on_connect(self, _client: Client, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:
-            self._say(f"the broker {self._address} refuses us: {reason}; it is asked again")
+            self._say(f"the broker {self._address} refuses us: {reason}; trying again")
             return
         self.connected = True
         self.connections += 1
@@ -142,12 +142,12 @@ class Broker:
     def _on_connect_fail(self, _client: Client, _data: Any) -> None:
         error = sys.exc_info()[1]
         why = getattr(error, "strerror", None) or str(error or "no answer")
-        self._say(f"the broker {self._address} cannot be reached: {why}; it is looked for until it is there")
+        self._say(f"the broker {self._address} cannot be reached: {why}; trying again until it answers")
 
     def _on_disconnect(self, _client: Client, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if self.connected:
             self.connected = False
-            self._say(f"the broker {self._address} is gone: {reason}; it is looked for until it is back")
+            self._say(f"the broker {self._address} is gone: {reason}; trying again until it is back")
 
     def _say(self, text: str) -> None:
         """Once, however often it is found out."""

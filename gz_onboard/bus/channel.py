@@ -69,7 +69,8 @@ class CanChannel:
         try:
             self._open()
         except (can.CanInterfaceNotImplementedError, ValueError, ImportError) as error:
-            raise InputError(f"--interface {self.interface}: {error}") from error
+            hint = "; pip install msgpack" if str(error) == "msgpack not installed" else ""  # of `udp_multicast`
+            raise InputError(f"--interface {self.interface}: {error}{hint}") from error
         except (OSError, can.CanError) as error:
             if self.interface == "socketcan" and getattr(error, "errno", None) == errno.EAFNOSUPPORT:
                 raise InputError(f"--interface socketcan: {NO_SOCKETS}") from error

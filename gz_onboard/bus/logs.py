@@ -24,7 +24,7 @@ from typing import Any
 
 from gz_onboard.bus.readers import blf, candump, lines, mcap, pycan
 from gz_onboard.bus.readers.common import TIME_LIMIT_NS, Contents, Damage, Reader, unpacked
-from gz_onboard.errors import InputError, nearest, shown, unreadable
+from gz_onboard.errors import CLOSE_FILE, InputError, nearest, shown, unreadable
 from gz_onboard.events import Frame
 
 _LOG = logging.getLogger(__name__)
@@ -112,12 +112,12 @@ def log_suffix(path: Path) -> str:
     if suffix not in _READERS:
         if path.is_dir():
             raise InputError(f"{path}: is a folder; give the log in it")
-        known = ", ".join(name for name in _READERS if name.startswith("."))
         first = head.partition(b"\n")[0].decode("latin-1").strip()
         raise InputError(
-            f"{path}: {f'unknown log format {suffix!r}' if suffix else 'a log needs a suffix that tells its format'}"
-            f"{nearest(suffix, _READERS) if suffix else ''}{f', and it begins with {shown(first)}' if first else ''}; "
-            f"known are {known}, each also with .gz"
+            f"{path}: is not a log that can be read: "
+            f"{f'it ends in {suffix!r}' if suffix else 'its name has no suffix that tells its format'}"
+            f"{nearest(suffix, _READERS, CLOSE_FILE)}{f', and it begins with {shown(first)}' if first else ''}; "
+            f"logs are {_suffixes()}, each also with .gz"
         )
     return suffix
 
@@ -161,9 +161,10 @@ def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list
             made = {file.name.removesuffix(ESTIMATED) for file in found if file.name.endswith(ESTIMATED)}
             found = [file for file in found if log_stem(file) not in made]
         if not found:
-            table = next((file.name for file in sorted(path.iterdir()) if file.is_file() and is_table(file)), None)
+            files = (file for file in sorted(path.iterdir()) if file.is_file() and _may_be_table(file))
+            table = next((file.name for file in files if is_table(file)), None)
             hint = f"; its tables must be given one by one, such as {table}" if table else ""
-            raise InputError(f"{path}: this folder holds no log{hint}")
+            raise InputError(f"{path}: this folder holds no log ({_suffixes()}){hint}")
         logs += found
     return logs
 
@@ -171,6 +172,16 @@ def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list
 def log_stem(log: Path) -> str:
     """The name of a log without its suffixes."""
     return (log.with_suffix("") if log.suffix.lower() == ".gz" else log).stem
+
+
+def _suffixes() -> str:
+    """Of logs, for messages."""
+    return ", ".join(name for name in _READERS if name.startswith("."))
+
+
+def _may_be_table(file: Path) -> bool:
+    """By its name: a text of any kind may look like one."""
+    return file.name.lower().removesuffix(".gz").endswith((".csv", ".txt", ".parquet"))
 
 
 def _is_log(file: Path, estimates: bool | None) -> bool:

@@ -229,7 +229,7 @@ def _parts(arguments: argparse.Namespace) -> list[_Part]:
     """What is sent, of each log; InputError for one that is missing, which comes before what is wrong with the bus."""
     logs = logs_among([arguments.log])
     if len(logs) > 1 and (arguments.start or arguments.end is not None):
-        raise InputError(f"--from and --to: are of one log, and {arguments.log} holds {len(logs)}; give one of them")
+        raise InputError(f"--from and --to: apply to one log, and {arguments.log} holds {len(logs)}; give one of them")
     parts = []
     for log in logs:
         section = log_section(log, arguments.start, arguments.end)

@@ -150,7 +150,7 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
     for channel in channels:
         channel.open()
     if never := lacking(vehicle):
-        log.info("%s has no sensors for, and its intervals are wider by: %s", vehicle.name, ", ".join(never))
+        log.info("%s lacks sensors, which makes its intervals wider: %s", vehicle.name, ", ".join(never))
     daemon = Daemon(vehicle, channels, recorder, saved, arguments.filter, arguments.tick)
     daemon.rider = arguments.rider or ""
     _poll(daemon, vehicle, arguments.poll)
@@ -251,6 +251,6 @@ def summary(pipeline: Pipeline) -> list[str]:
             f"ridden {last.distance / 1000:.2f} km",
             f"range {remaining} km ({p10} to {p90})",
         ]
-        ago = f"; the numbers are of {last.time - known.time:.1f} s before" if known is not last else ""
+        ago = f"; the figures above are from {last.time - known.time:.1f} s earlier" if known is not last else ""
     state = pipeline.publisher.reported(last)[0]
     return [*lines, f"state at the end {state_text(state, last.reasons)}{ago}"]

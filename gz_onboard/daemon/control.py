@@ -208,7 +208,7 @@ def _free(path: Path) -> None:
     """Remove the socket of a daemon that is gone. InputError if `path` is anything else."""
     try:
         if not stat.S_ISSOCK(path.lstat().st_mode):
-            raise InputError(f"{path}: is no socket, and not overwritten")
+            raise InputError(f"{path}: is not a socket, and was left alone")
         with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as other:
             other.settimeout(1.0)
             other.connect(str(path))

@@ -9,16 +9,18 @@ import argparse
 import fcntl
 import json
 import os
+import sys
 import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from math import sqrt
 from pathlib import Path
 from typing import Any
 
 from gz_onboard import state
 from gz_onboard.daemon.keeper import state_file
+from gz_onboard.daemon.learned_picture import draw_learned
 from gz_onboard.errors import OK, InputError, not_an_input, require, writing
 from gz_onboard.estimator.ageing import Ageing, Learned
 from gz_onboard.estimator.forecast import Forecaster
@@ -29,11 +31,11 @@ from gz_onboard.estimator.terrain import RATE, Terrain
 from gz_onboard.estimator.usual import Habit, Usual
 from gz_onboard.estimator.weakest import Weakest
 from gz_onboard.options import add_shared
+from gz_onboard.physics.model import Model
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 VERSION = 2  # of the JSON keys
 ALIKE = 0.8  # correlation from which two are said to be hard to tell apart
-SOME = 0.05  # of what can be learned: less is drawn as unknown
 USUAL_FOLDER = Path("/var/lib/gz-onboard")
 MEANING = {  # by name: what its factor is on
     "capacity": "of the pack, over cell_capacity in the vehicle file, as the pack's current sensor counts it",
@@ -61,6 +63,13 @@ FORGOTTEN = {  # by the word of --reset: what it forgets
     ROAD: (ROAD,),
     RIDING: (RIDING,),
     "all": (*BATTERY, ROAD, RIDING),
+}
+PARTS = {  # what --reset says of each
+    "capacity": "capacity of the battery",
+    "resistance": "resistance of the battery",
+    "weakest": "weakest group of cells",
+    ROAD: "road load",
+    RIDING: "riding of all riders, and terrain",
 }
 LOWEST = "lowest_cell_voltage"  # the role without which nothing is known of the weakest group
 
@@ -90,16 +99,19 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         snapshot, age = load(file, vehicle)
     except InputError as error:
-        raise InputError(f"{error}; --state FILE and --vehicle NAME|TOML say which") from error
+        raise InputError(f"{error}; choose another with --state FILE or --vehicle NAME|TOML") from error
     if arguments.reset:
         snapshot = _forget(file, snapshot, age, FORGOTTEN[arguments.reset], _fresh(vehicle))
+        forgotten = ", ".join(PARTS[name] for name in FORGOTTEN[arguments.reset])
+        # with the JSON on standard output it would be no JSON
+        print(f"reset in {file}: {forgotten}", file=sys.stderr if arguments.json == "-" else sys.stdout)
     with sound(file):
         learned, riders = read_learned(vehicle, snapshot), read_riders(vehicle, snapshot)
         road_load = read_road_load(vehicle, snapshot)
     road = road_load.learned()
     if arguments.plot:
         with writing(arguments.plot):
-            _plot(arguments.plot, vehicle.name, learned | _factors(road), riders)
+            draw_learned(arguments.plot, vehicle.name, learned, _factors(road), riders)
     if arguments.json:
         rows = {"learned": _rows(learned), "road": _road_rows(road_load)}
         rows |= {"riders": {name: _rows(x) for name, x in riders.items()}}
@@ -145,11 +157,23 @@ def _of_weakest(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Lear
 
 
 def read_road_load(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> RoadLoad:
-    """What a saved state holds of the road load. ValueError if it cannot be."""
-    road_load = RoadLoad(_fresh(vehicle).load)
+    """What a saved state holds of the road load, over the payload of its day. ValueError if it cannot be."""
     with part(ROAD):
-        road_load.take(road_load.read(snapshot.get("learned", {}).get(ROAD)))
+        saved = snapshot.get("learned", {}).get(ROAD)
+        road_load = RoadLoad(_fresh(_loaded(vehicle, RoadLoad.payload_of(saved))).load)
+        road_load.take(road_load.read(saved))
     return road_load
+
+
+def _loaded(vehicle: Vehicle, payload: float | None) -> Vehicle:
+    """The vehicle with the payload [kg] that was entered, if it is not the file's. ValueError if it cannot be."""
+    if payload is None or payload == vehicle.parameters.filed("payload_mass"):
+        return vehicle
+    try:
+        parameters = vehicle.parameters.replaced(payload_mass=payload)
+    except InputError as error:
+        raise ValueError(str(error)) from error
+    return replace(vehicle, parameters=parameters, model=Model(vehicle.model.effects, parameters))
 
 
 def read_riders(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, dict[str, Learned]]:
@@ -209,8 +233,9 @@ def _road_rows(road_load: RoadLoad) -> dict[str, object]:
 
 
 def _factors(road: Mapping[str, RoadParameter]) -> dict[str, Learned]:
-    """As factors on what the vehicle file says, where that is more than nothing."""
-    return {name: Learned(x.value / x.filed, x.sd / x.filed, x.share) for name, x in road.items() if x.filed > 0}
+    """By what texts call them, as factors on what the vehicle file says, where that is more than nothing."""
+    known = {SPOKEN.get(name, name): x for name, x in road.items() if x.filed > 0}
+    return {name: Learned(x.value / x.filed, x.sd / x.filed, x.share) for name, x in known.items()}
 
 
 def _line(name: str, x: Learned) -> str:
@@ -225,42 +250,12 @@ def _road_lines(road: Mapping[str, RoadParameter], correlations: Mapping[tuple[s
     for name, x in road.items():
         unit = "" if x.unit == "1" else f" {x.unit}"
         number = f"{x.value:.3g} ± {x.sd:.2g}{unit}"
-        yield f"{SPOKEN.get(name, name):12} {number:18} {_known(x.share)}: {MEANING[name]}, vehicle file {x.filed:.3g}"
+        over = f"{'entered' if x.entered else 'vehicle file'} {x.filed:.3g}"
+        yield f"{SPOKEN.get(name, name):12} {number:18} {_known(x.share)}: {MEANING[name]}, {over}"
     for (first, second), r in correlations.items():
         if abs(r) > ALIKE:
             one, other = (SPOKEN.get(name, name) for name in (first, second))
             yield f"{one} and {other} are hard to tell apart: correlation {r:+.2f}"
-
-
-def _plot(
-    file: Path, vehicle: str, learned: Mapping[str, Learned], riders: Mapping[str, Mapping[str, Learned]]
-) -> None:
-    """A picture: each factor with two standard deviations, beside what the vehicle file says."""
-    from matplotlib.figure import Figure
-
-    rows = [(name, x) for name, x in learned.items()]
-    for rider, found in riders.items():
-        rows += [(f"{name}, {rider or 'rider not known'}" if len(riders) > 1 else name, x) for name, x in found.items()]
-    figure = Figure(figsize=(7, 1 + 0.4 * len(rows)), layout="constrained")
-    axes = figure.subplots()
-    for place, (_, x) in enumerate(rows):
-        colour = "#0072b2" if x.share > SOME else "#999999"
-        axes.errorbar(x.value, place, xerr=2 * x.sd, fmt="o", color=colour, capsize=3)
-        axes.annotate(
-            f"{100 * x.share:.0f} % learned",
-            (1.0, place),
-            (5, 0),
-            xycoords=("axes fraction", "data"),
-            textcoords="offset points",
-            va="center",
-            fontsize=8,
-        )
-    axes.axvline(1.0, color="black", linewidth=0.8)
-    axes.set_yticks(range(len(rows)), [name for name, _ in rows])
-    axes.invert_yaxis()
-    axes.set(title=f"What was learned of {vehicle}", xlabel="over what the vehicle file says; bars: 2 sd")
-    axes.grid(axis="x", alpha=0.3)
-    figure.savefig(file, dpi=120)
 
 
 def load(file: Path, vehicle: Vehicle) -> tuple[Mapping[str, Any], float | None]:
@@ -291,7 +286,7 @@ def _forget(
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             state.write(file, text)
         except BlockingIOError as error:
-            raise InputError(f"{file}: gz-onboard run uses it and would save it anew; stop it first") from error
+            raise InputError(f"{file}: the running daemon would overwrite it; stop it first") from error
         finally:
             os.close(descriptor)
     return changed

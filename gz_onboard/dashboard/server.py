@@ -258,7 +258,7 @@ class Handler(BaseHTTPRequestHandler):
     def _latest(self) -> None:
         data = self.server.feed.latest()
         if data is None:
-            self._say(HTTPStatus.SERVICE_UNAVAILABLE, "There is no picture of now.\n")
+            self._say(HTTPStatus.SERVICE_UNAVAILABLE, "There is no current picture.\n")
         else:
             self._answer(HTTPStatus.OK, data + b"\n", Content_Type="application/json", Cache_Control="no-store")
 

@@ -349,5 +349,5 @@ def _numbers(saved: Mapping[str, float] | None, *names: str, of: float) -> Numbe
         return None
     found = [float(saved[name]) for name in names]
     if not all(isfinite(x) for x in found):
-        raise ValueError("holds numbers that are none")
+        raise ValueError("holds values that are not numbers")
     return found

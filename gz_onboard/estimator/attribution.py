@@ -35,6 +35,7 @@ LEAST_MOVED = 100.0  # m: nothing new is to be said of a range that has not move
 MOVED = 1000.0  # m: so much more or less than the distance ridden, and a change is explained
 SETTLED = 60.0  # s: what goes back within is no change
 MOST_CHANGES = 100
+STOOD = 10.0  # m: on less way a charge goes on, and is one change
 SHOWN_OVER = 1000.0  # m: on less way than this, what was ridden is more chance than a pattern
 ROAD_STEPS = 0.005, 0.02, 0.01  # relative, of a `Road`
 # What beside the riding the modelled consumption depends on: the air, and what the road load is made with.
@@ -84,7 +85,10 @@ class State:
 
 
 class Attribution:
-    """Explains the range of one vehicle. `latest`: against the rated range; `changes`: what moved it, the last few."""
+    """Explains the range of one vehicle. `latest`: against the rated range; `changes`: what moved it, the last few.
+
+    A charge is one change, of which `news` tells each step.
+    """
 
     def __init__(self, forecaster: Forecaster, signals: Signals, road_load: RoadLoad | None = None) -> None:
         self._road_load = road_load
@@ -111,9 +115,12 @@ class Attribution:
         moved = since and abs(forecast.range + ridden - since.range - since.ridden) > MOVED
         if since and moved and now - since.time >= SETTLED:
             self._since = self._state(moment)
-            self.changes.append(replace(self.explained(since, self._since), forgotten=tuple(sorted(self._forgotten))))
+            change = replace(self.explained(since, self._since), forgotten=tuple(sorted(self._forgotten)))
             self._forgotten.clear()
-            self._news.append((True, self.changes[-1]))
+            self._news.append((True, change))
+            if self.changes and ridden - since.ridden < STOOD and _charged(self.changes[-1]) and _charged(change):
+                change = _joined(self.changes.pop(), change)
+            self.changes.append(change)
         if due:
             state = self._state(moment)
             self._since = self._since or state
@@ -318,6 +325,20 @@ class Attribution:
         usual = {"vibration": load.prior.vibration, "time_moving": AHEAD}
         lost = load.model.overpotential(draw.battery, usual)
         return drawable(draw.battery, draw.soc, draw.cells, draw.power, draw.form_factor_squared, lost).energy
+
+
+def _charged(change: Explanation) -> bool:
+    """Whether a change of the range is, most of all, charge that was gained."""
+    gained = change.causes[Cause.CHARGE]
+    return gained > 0 and gained >= max(map(abs, change.causes.values()))
+
+
+def _joined(one: Explanation, other: Explanation) -> Explanation:
+    """Two changes, of which the other came next, as one: with the distance ridden in both, and the causes of both."""
+    causes = {cause: size + other.causes[cause] for cause, size in one.causes.items()}
+    forgotten = tuple(sorted({*one.forgotten, *other.forgotten}))
+    range_ = one.range + other.range - other.reference
+    return Explanation(other.time, one.reference, range_, causes, forgotten)
 
 
 def _in_steps(filed: Road, learned: Road) -> Road:

@@ -72,13 +72,14 @@ SAME = 1e-6  # relative: the vehicle file says the same as when it was learned
 
 @dataclass(frozen=True)
 class RoadParameter:
-    """One parameter as learned; filed: what the vehicle file says of it, or was entered."""
+    """One parameter as learned; filed: what the vehicle file says of it, or was `entered`."""
 
     value: float
     sd: float
     filed: float
     unit: str
     share: float  # 1 - sd²/prior sd²: 0 nothing is learned
+    entered: bool = False
 
 
 class Surroundings(NamedTuple):
@@ -107,6 +108,7 @@ class RoadLoad:
         p = load.model.parameters
         self._load, self._spans = load, Spans()
         self._filed = [p[name] for name in PARAMETERS]
+        self._entered = [p[name] != p.filed(name) for name in PARAMETERS]
         self._bounds = [(p.declared[name].low, p.declared[name].high) for name in PARAMETERS]
         self._units = [p.declared[name].unit for name in PARAMETERS]
         sds = [hypot(p.sd(name), d * x) for name, d, x in zip(PARAMETERS, DIFFER, self._filed, strict=True)]
@@ -136,7 +138,8 @@ class RoadLoad:
         for i, (name, value) in enumerate(zip(NAMES, self._within(), strict=True)):
             sd, prior = self._sd(i), self._prior[i]
             share = max(1 - sd * sd / prior, 0.0) if prior else 0.0
-            found[name] = RoadParameter(value, sd if share else sqrt(prior), self._filed[i], self._units[i], share)
+            sd, unit = sd if share else sqrt(prior), self._units[i]
+            found[name] = RoadParameter(value, sd, self._filed[i], unit, share, self._entered[i])
         return found
 
     def believed(self, share: float = 1.0) -> Road:
@@ -202,13 +205,19 @@ class RoadLoad:
         """`rider` rides from now on: with the mass that he had, if he is known."""
         if rider == self.rider:
             return
-        self.riders[self.rider] = self.joint.means[MASS], self.joint.variance(MASS)
+        if self.joint.variance(MASS) < self._prior[MASS]:
+            self.riders[self.rider] = self.joint.means[MASS], self.joint.variance(MASS)
         mean, variance = self.riders.pop(rider, (0.0, self._prior[MASS]))
         while len(self.riders) > MOST_RIDERS:  # the one who was first known
             del self.riders[next(iter(self.riders))]
-        self.joint.begin(MASS, mean, min(variance + LUGGAGE**2, self._prior[MASS]))
+        self.joint.begin(MASS, *self._of_today(mean, variance))
         self.rider = rider
         self._keep(anew=True)
+
+    def _of_today(self, mean: float, variance: float) -> tuple[float, float]:
+        """A mass as it was known before, with other luggage; what is filed or entered if that is better known."""
+        variance += LUGGAGE**2
+        return (mean, variance) if variance < self._prior[MASS] else (0.0, self._prior[MASS])
 
     def unlearn(self) -> None:
         """A sensor is found faulty: go back by `KEPT_EVERY` times `KEPT` metres or so."""
@@ -299,17 +308,32 @@ class RoadLoad:
     def read(self, saved: Mapping[str, Any] | None) -> Kept | None:
         """The contents of a snapshot; None if there is none, or it is of another vehicle file.
 
-        KeyError, TypeError, AttributeError or ValueError if it holds what cannot be.
+        The payload is the day's: if another was entered, what was learned of the rest stays, and masses stay what they
+        were. KeyError, TypeError, AttributeError or ValueError if it holds what cannot be.
         """
-        if saved is None or not self._same(saved["of"]):
+        if saved is None:
+            return None
+        of = self._of(saved["of"])
+        if not all(_same(x, y) for x, y in zip(of[MASS + 1 :], self._filed[MASS + 1 :], strict=True)):
             return None
         joint = self.joint.restored(saved["means"], saved["rows"])
         noise, still = float(saved["noise"]), float(saved["still"])
-        riders = {str(name): (float(mean), float(variance)) for name, (mean, variance) in saved["riders"].items()}
+        more = 0.0 if _same(of[MASS], self._filed[MASS]) else of[MASS] - self._filed[MASS]
+        masses = saved["riders"].items()
+        riders = {str(name): (float(mean) + more, float(variance)) for name, (mean, variance) in masses}
         possible = all(abs(mean) < inf and 0 <= variance < inf for mean, variance in riders.values())
-        if not (possible and 1 <= noise < inf and 0 <= still <= MOST_STILL):
+        if not (possible and abs(more) < inf and 1 <= noise < inf and 0 <= still <= MOST_STILL):
             raise ValueError("holds an implausible road load")
-        return Kept(joint, noise, still, str(saved["rider"]), riders)
+        rider, mass = str(saved["rider"]), (joint.means[MASS] + more, joint.variance(MASS))
+        if more or mass[1] > self._prior[MASS]:
+            riders[rider] = mass  # if another rides today, whose payload was entered
+            joint.begin(MASS, *self._of_today(*mass))
+        return Kept(joint, noise, still, rider, riders)
+
+    @staticmethod
+    def payload_of(saved: Mapping[str, Any] | None) -> float | None:
+        """The payload [kg] of the day when a snapshot was saved; None if there is none. Raises as `read`."""
+        return None if saved is None else float(saved["of"][MASS])
 
     def take(self, kept: Kept | None) -> None:
         """Go on from what `read` gave."""
@@ -319,8 +343,13 @@ class RoadLoad:
         self.joint.begin(FORCE, 0.0, self._prior[FORCE])
         self._keep(anew=True)
 
-    def _same(self, of: Any) -> bool:
+    def _of(self, of: Any) -> list[float]:
+        """What the vehicle file said, and was entered, when it was saved. ValueError if it cannot be."""
         filed = [float(x) for x in of]
         if len(filed) != len(self._filed):
             raise ValueError("holds a road load of another form")
-        return all(abs(x - y) <= SAME * max(abs(y), SAME) for x, y in zip(filed, self._filed, strict=True))
+        return filed
+
+
+def _same(one: float, other: float) -> bool:
+    return abs(one - other) <= SAME * max(abs(other), SAME)

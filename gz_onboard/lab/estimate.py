@@ -34,6 +34,9 @@ from gz_onboard.progress import Display, Progress, progress_bar
 from gz_onboard.vehicle import find_vehicle
 
 LEAST_MISSING = 1.0  # s: less is not told
+CONTRADICTING = Reason.VOLTAGE_MISMATCH, Reason.CURRENT_MISMATCH, Reason.SENSOR_DISTRUSTED
+MOST = 0.5  # of the ride: a sensor that fails on the way is a fault, one that never fits may be a wrong vehicle file
+CONTRADICTED = "what was measured does not fit it; what is wrong: gz-onboard vehicle check NAME|TOML {}"
 KEYS = descriptions(RideSummary)
 """What the summary of a ride holds."""
 
@@ -52,8 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", action="store_true", help="also log the raw frames and the range frames")
     resume = "keep what an earlier run wrote, where it is whole and of the same log, vehicle, options and version"
     parser.add_argument("--resume", action="store_true", help=resume)
-    keep = "take the rides in the order of their times; each goes on from this saved state, as the daemon does"
-    parser.add_argument("--state", type=Path, metavar="FILE", help=f"{keep} (default: each begins anew)")
+    keep = "take the rides in the order of their times; each continues from this saved state, as the daemon does"
+    parser.add_argument("--state", type=Path, metavar="FILE", help=f"{keep} (default: each starts from nothing)")
     add_shared(parser, "--jobs", "--quiet")
 
 
@@ -88,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _check_state(arguments: argparse.Namespace) -> None:
     """InputError for what cannot be together with ``--state``."""
     if (arguments.jobs or 1) > 1:
-        raise InputError(f"--jobs {arguments.jobs} with --state: each ride goes on from the one before; leave it out")
+        raise InputError(f"--jobs {arguments.jobs} with --state: each ride continues from the one before; leave it out")
 
 
 def _in_turn(arguments: argparse.Namespace, tasks: Sequence[EstimateTask]) -> tuple[list[EstimateTask], list[Unread]]:
@@ -116,7 +119,7 @@ def _estimate(
             return collect("estimate", results, display, text, lambda ride: ride.damage)
         except KeyboardInterrupt:
             if len(tasks) > 1:
-                display.print("gz-onboard estimate: interrupted; --resume goes on after what is written", sys.stderr)
+                display.print("gz-onboard estimate: interrupted; --resume continues after what is written", sys.stderr)
             raise
 
 
@@ -202,7 +205,7 @@ def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
         ),
         *(("clock", text) for text in ride.clock),
         *([("pauses", f"{clock(ride.paused_s)} without frames, not counted as ridden")] if ride.paused_s else []),
-        *([("gaps", f"{ride.gaps_s:.1f} s, of which distance and energy hold nothing")] if ride.gaps_s else []),
+        *([("gaps", f"{ride.gaps_s:.1f} s, missing from distance and energy")] if ride.gaps_s else []),
         *(
             ("someone else's", f"{count} frames on {identifier}, a range frame's: give another range_identifier")
             for identifier, count in ride.foreign.items()
@@ -213,9 +216,15 @@ def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
         ),
         ("state", ", ".join(f"{name.lower()} {duration:.1f} s" for name, duration in ride.states.items())),
         *(("", f"{words(name)} {duration:.1f} s") for name, duration in ride.reasons.items()),
+        *([("vehicle file", CONTRADICTED.format(ride.file))] if contradicted(ride) else []),
         *([("left out", _durations(ride.distrusted))] if ride.distrusted else []),
         *([("never there", ", ".join(words(name) for name in ride.lacking))] if ride.lacking else []),
     ]
+
+
+def contradicted(ride: RideSummary) -> bool:
+    """Whether what was measured contradicts the vehicle file, or itself, for most of the ride."""
+    return max(ride.reasons.get(str(reason.name), 0.0) for reason in CONTRADICTING) > MOST * sum(ride.states.values())
 
 
 def _energy_rows(ride: RideSummary) -> list[tuple[str, str]]:
@@ -235,7 +244,7 @@ def lacks_energy(ride: RideSummary) -> str:
     """What a known energy does not hold of the ride; empty if it is next to nothing."""
     if ride.energy_wh is None or ride.energy_missing_s < LEAST_MISSING:
         return ""
-    return f"{ride.energy_missing_s:.1f} s without voltage or current to be believed are not in it"
+    return f"{ride.energy_missing_s:.1f} s without a credible voltage or current are not included"
 
 
 def _range(ride: RideSummary) -> str:

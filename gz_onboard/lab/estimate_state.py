@@ -76,7 +76,7 @@ def _refused(file: Path, copy: Path, error: Exception) -> InputError:
     *_, before = state.copies(file)
     older = f"; the one before it is {before}" if copy != before and before.exists() else ""
     why = str(error) or repr(error)
-    return InputError(f"{copy}: {why}; give the state of this vehicle, or a new name to begin anew{older}")
+    return InputError(f"{copy}: {why}; give the state of this vehicle, or a new name to start from nothing{older}")
 
 
 def latest(file: Path) -> Path | None:
@@ -100,7 +100,7 @@ def _age_after(copy: Path, begin: float, ride: Path) -> float | None:
     if saved - begin > OVERTAKEN:
         raise InputError(
             f"{ride}: began at {when(begin)}, before the state {copy} was saved at {when(saved)}; "
-            "give the rides that came after it, or a new name to begin anew"
+            "give the rides that came after it, or a new name to start from nothing"
         )
     return 0.0
 

@@ -54,7 +54,11 @@ class RideSummary:
     range_end_p90_km: Annotated[float | None, "exceeded with 10 % probability"]
     energy_left_wh: Annotated[float | None, "to be drawn before the cut-off, at the end"]
     why: Annotated[Why | None, "why the last range that was explained is not the rated one, or null"]
-    changes: Annotated[list[Why], "each change of the range by 1 km more or less than was ridden, and why"]
+    changes: Annotated[
+        list[Why],
+        "each change of the range by 1 km more or less than was ridden, and why; its range_km is the range then plus "
+        "what was ridden since reference_km; a charge is one change",
+    ]
     route: Annotated[
         RouteSummary | None,
         "of the route given: state at the end (ON, OFF); and of the last estimate on it km along and left, energy to "

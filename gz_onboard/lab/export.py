@@ -80,9 +80,7 @@ def run(arguments: argparse.Namespace) -> int:
     log, out = arguments.log, arguments.out
     if out is None:
         if unfit := [name for name, field in _OF_OUTPUT.items() if getattr(arguments, field)]:
-            raise InputError(
-                f"{unfit[0]}: says what is written to OUT, and none is given; name a file or folder for it"
-            )
+            raise InputError(f"{unfit[0]}: chooses what is written to OUT, which is missing; name a file or folder")
         return _each(logs.logs_among([log], estimates=None), lambda log: print(contents_text(log_contents(log))))
     suffix = out_suffix(out)
     if suffix and arguments.table_format:
@@ -143,7 +141,7 @@ def _write(arguments: argparse.Namespace, source: Source, part: Path, suffix: st
     try:
         texts = [_signals(arguments, source, part, kind)]
     except DecoderError as error:
-        raise InputError(f"{error}; say what, with --vehicle NAME|TOML or --dbc FILE") from error
+        raise InputError(f"{error}; give its vehicle with --vehicle NAME|TOML, or --dbc FILE") from error
     if not suffix and not arguments.signals and told:
         texts.append(_estimates(arguments, source, part, kind, told))
     return "; ".join(texts)
@@ -153,7 +151,7 @@ def _estimates(arguments: argparse.Namespace, source: Source, part: Path, kind: 
     """Of a folder the tables `names` of `ESTIMATES`, else the estimates."""
     if not kind.startswith("/"):
         if kind not in _TABLES:
-            raise InputError(f"{arguments.out}: estimates can be written into {', '.join(_TABLES)} or a directory")
+            raise InputError(f"{arguments.out}: estimates can be written to {', '.join(_TABLES)} or a directory")
         files = {ESTIMATES["estimate"]: part}
     else:
         part.mkdir(parents=True, exist_ok=True)
@@ -163,12 +161,12 @@ def _estimates(arguments: argparse.Namespace, source: Source, part: Path, kind: 
 
 def _frames(source: Source, part: Path, suffix: str) -> str:
     if source.columns is not None:
-        raise InputError("--columns: are of estimates or signals, with --estimates or --signals")
+        raise InputError("--columns: applies to estimates or signals, with --estimates or --signals")
     _, batches = source.frames()
     if suffix in (".parquet", ".jsonl"):
         return f"{write_frame_table(part, batches)} frames"
     if suffix in ("", ".mcap"):
-        raise InputError("--frames: can be written into .log .blf .asc .trc .csv .mf4 .parquet .jsonl")
+        raise InputError("--frames: can be written to .log .blf .asc .trc .csv .mf4 .parquet .jsonl")
     return f"{write_frames_as(part, suffix, batches)} frames"
 
 

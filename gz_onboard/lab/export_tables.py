@@ -223,7 +223,7 @@ def write_signals(source: Source, out: Path, suffix: str, signals: LogSignals) -
     suffix: of `out`; of a folder, that of its tables with a slash before.
     """
     if suffix not in _FORMATS:
-        raise InputError(f"{source.log}: its signals can be written into .csv, .parquet, .jsonl, .mcap or a directory")
+        raise InputError(f"{source.log}: its signals can be written to .csv, .parquet, .jsonl, .mcap or a directory")
     with ExitStack() as stack:
         sink: tables.Sink
         if suffix == ".parquet":

@@ -17,7 +17,7 @@ from gz_onboard.bus.codec import DROPPING
 from gz_onboard.bus.logs import LogDamage, logs_among, read_metadata
 from gz_onboard.constants import WH_PER_KM
 from gz_onboard.errors import BAD_INPUT, OK, InputError, writing
-from gz_onboard.events import Reason, State, words
+from gz_onboard.events import Activity, Reason, State, words
 from gz_onboard.lab.logged import Logged, read_ride
 from gz_onboard.lab.why import plot_why
 from gz_onboard.offline.style import (
@@ -60,6 +60,8 @@ def naive_range(rows: Sequence[Logged]) -> list[float | None]:
     drawn, before = 0.0, None
     for row in rows:
         voltage, current, time = row.get("pack_voltage"), row.get("pack_current"), row["time"]
+        if row.get("activity") == Activity.CHARGING.name:  # what a charger gives was not recovered
+            current = None
         if voltage is not None and current is not None and before is not None and 0 < time - before <= 10:
             drawn += voltage * current * (time - before)
         distance = row.get("distance") or 0.0

@@ -54,7 +54,7 @@ def plot_why(log: Path, picture: Path) -> list[LogDamage]:
             last = Explanation(time, reference, range_, known)
     if last is None:
         raise InputError(
-            f"{log}: says nothing of why the range is what it is; `gz-onboard estimate` makes a log that does"
+            f"{log}: does not say why the range is what it is; `gz-onboard estimate` makes a log that does"
         )
     save(draw_why(last, log.name), picture)
     return damages

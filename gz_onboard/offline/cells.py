@@ -40,7 +40,7 @@ def _cells(column: object, name: str, header: str) -> list[Any]:
         seconds = array.astype("datetime64[s]")
         beyond = np.flatnonzero((seconds < _CALENDAR[0]) | (seconds > _CALENDAR[1]))
         if len(beyond):
-            raise InputError(f"{name}:{beyond[0] + 1}: column {header!r}: {array[beyond[0]]} is no time of this age")
+            raise InputError(f"{name}:{beyond[0] + 1}: column {header!r}: {array[beyond[0]]} is not a plausible time")
     if array.dtype.kind in "Mm":
         array = array.astype(f"{array.dtype.kind}8[us]")  # as `datetime`, which has no ns
     cells: list[Any] = array.tolist()

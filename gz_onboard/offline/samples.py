@@ -97,7 +97,7 @@ def _timed(log: Path, frames: Iterator[list[Frame]]) -> Iterator[list[Frame]]:
     """`frames`; InputError if they have no times."""
     first = next(frames, [])
     if len(first) > 1 and not any(frame[0] for frame in first):
-        raise InputError(f"{log}: its frames have no times, without which a ride says nothing; candump -L writes them")
+        raise InputError(f"{log}: its frames have no times, which a ride needs; candump -L writes them")
     yield first
     yield from frames
 
@@ -139,7 +139,7 @@ def check_ridden(log: Path, vehicle: Vehicle, codec: Codec) -> None:
     if not codec.latest:
         raise _of_another(log, vehicle, codec)
     if codec.received > 1 and not codec.passed and not codec.leaps and not codec.faults.get(("", TIME)):
-        raise InputError(f"{log}: all its {codec.received} frames have one and the same time; they tell no ride")
+        raise InputError(f"{log}: all its {codec.received} frames have one and the same time; that is not a ride")
     back = sum(leap < 0 for _, leap in codec.leaps)
     if back > _MOST_BACK and back > codec.passed:
         raise InputError(
@@ -155,7 +155,8 @@ def _of_another(log: Path, vehicle: Vehicle, codec: Codec) -> InputError:
     names = ", ".join(f"{identifier & 0x1FFFFFFF:X}" for identifier in sorted(codec.unknown)[:5])
     return InputError(
         f"{log}: vehicle {vehicle.name!r} knows none of its {codec.received} frames"
-        f"{f' (identifiers {names}, ...)' if names else ''}; give the vehicle that it is of"
+        f"{f' (identifiers {names}, ...)' if names else ''}; give the vehicle that it is of, "
+        "or begin a file for it: gz-onboard vehicle new my.toml"
     )
 
 

@@ -171,7 +171,7 @@ def _times(file: Path, name: str, rows: Rows) -> list[int]:
             ) from None
         if not -TIME_LIMIT_NS < times[-1] < TIME_LIMIT_NS:
             raise InputError(
-                f"{file}:{line}: {name}: {shown(row[0])} {unit or 's'} is no time of this age; if it is in "
+                f"{file}:{line}: {name}: {shown(row[0])} {unit or 's'} is not a plausible time; if it is in "
                 "ms, call the column 'time [ms]'"
             )
         if len(times) > 1 and times[-1] < times[-2]:

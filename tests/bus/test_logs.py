@@ -403,7 +403,7 @@ def test_a_file_of_another_format_is_refused(tmp_path: Path, name: str, content:
 def test_an_unknown_suffix_is_refused_with_the_nearest_and_all_known(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"did you mean '.mcap'.*\.blf"):
         read_frames(tmp_path / "a.mcpa")
-    with pytest.raises(InputError, match=r"needs a suffix"):
+    with pytest.raises(InputError, match=r"no suffix that tells its format"):
         read_frames(tmp_path / "ride")
 
 

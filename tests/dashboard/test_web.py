@@ -148,7 +148,7 @@ def test_a_loop_that_hangs_gives_no_old_picture(monkeypatch, feed):
         assert latest(address) == {"channel": "x"}
         monkeypatch.setattr(web_server, "OLDEST", -1.0)
         answer, text = asked(address, "/api/latest")
-        assert (answer.status, text) == (503, b"There is no picture of now.\n")
+        assert (answer.status, text) == (503, b"There is no current picture.\n")
         assert feed.before() == feed.number  # a stream that begins now waits for the next
 
 

@@ -281,6 +281,24 @@ def test_a_cause_that_did_not_change_has_no_part_in_a_change():
     check_sum(change)
 
 
+def test_a_charge_is_one_change_of_which_the_news_has_each_step():
+    f = forecaster()
+    attribution = Attribution(f, Signals(()))
+    way = [(0.9, 0.0), (0.5, 1000.0), *((0.5 + 0.1 * i, 1000.0) for i in range(1, 5)), (0.4, 2000.0), (0.6, 2000.0)]
+    for i, (soc, ridden) in enumerate(way):
+        forecast = f.forecast(soc, 0.01, 20.0, 1.0, 20.0, 0.0)
+        attribution.take(Moment(100.0 * i, forecast, soc, MILD, ridden))
+    used, charged, used_again, charged_again = attribution.changes
+    assert len([change for is_change, change in attribution.news() if is_change]) == 7
+    assert used.causes[Cause.CHARGE] < 0 < charged.causes[Cause.CHARGE]
+    assert charged.reference == pytest.approx(used.range - 1000.0)
+    assert charged.range == pytest.approx(used_again.reference)
+    assert charged.time == 500.0
+    assert charged_again.causes[Cause.CHARGE] > 0
+    for change in attribution.changes:
+        check_sum(change)
+
+
 def test_what_is_ridden_as_expected_is_no_change():
     f = forecaster()
     attribution = Attribution(f, Signals(()))

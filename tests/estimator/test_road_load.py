@@ -235,6 +235,42 @@ def test_what_was_learned_of_another_file_is_forgotten():
     assert again(road_load(), None).learned() == road_load().learned()
 
 
+def entered(payload: float) -> RoadLoad:
+    vehicle = read_vehicle("reference", payload=payload)
+    return RoadLoad(LoadModel(vehicle.model, vehicle.pack, vehicle.riding))
+
+
+def test_what_was_learned_outlives_the_payload_of_its_day():
+    load = ride(Rider({"payload_mass": 110.0, "drag_area": 0.7}), load=entered(110.0))
+    saved = json.loads(json.dumps(load.snapshot()))
+    tomorrow = again(road_load(), saved).learned()
+    assert [tomorrow[name] for name in NAMES[1:]] == [load.learned()[name] for name in NAMES[1:]]
+    assert tomorrow["mass"].value == pytest.approx(110.0, abs=5.0)  # nothing else is known of it
+    other = again(entered(60.0), saved).learned()
+    assert (other["mass"].value, other["mass"].share, other["mass"].entered) == (60.0, 0.0, True)
+    assert other["drag"] == load.learned()["drag"]
+
+
+def test_a_payload_that_is_entered_is_that_of_who_rides_and_nobody_else_s():
+    load = road_load()
+    load.ridden_by("anna")
+    ride(Rider({"payload_mass": 60.0}), load=load)
+    known = load.learned()["mass"].value
+    today = again(entered(110.0), load.snapshot())
+    assert today.learned()["mass"].value == 110.0
+    today.ridden_by("ben")
+    assert today.learned()["mass"].value == 110.0
+    tomorrow = again(road_load(), today.snapshot())
+    tomorrow.ridden_by("anna")
+    assert tomorrow.learned()["mass"].value == pytest.approx(known)
+
+
+def test_a_payload_as_filed_that_is_entered_is_known_better_than_what_was_learned():
+    load = ride(Rider({"payload_mass": 115.0}))
+    assert load.learned()["mass"].value > 100
+    assert again(entered(FILED["payload_mass"]), load.snapshot()).learned()["mass"].value == FILED["payload_mass"]
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -244,6 +280,7 @@ def test_what_was_learned_of_another_file_is_forgotten():
         {"noise": 0.0},
         {"still": -1.0},
         {"of": [1.0]},
+        {"of": [inf, *road_load().snapshot()["of"][1:]]},
         {"riders": {"a": [1.0]}},
         {"riders": {"a": [0.0, -1.0]}},
         {"means": None},

@@ -115,6 +115,16 @@ def test_the_summary_of_a_ride_agrees_with_its_frames(tmp_path, capsys):
     assert 0 < ride["innovation_rms_v"] < ride["innovation_max_v"] < 0.2
 
 
+def test_where_nothing_fits_the_vehicle_file_the_summary_says_how_to_check_it(tmp_path, capsys):
+    wrong = tmp_path / "wrong.toml"
+    text = read_vehicle("reference").file.read_text(encoding="utf-8")
+    turned = '{ signal = "BMS_PackCurrent", scale = -1 }'
+    wrong.write_text(text.replace('"BMS_PackCurrent"', turned), encoding="utf-8")
+    for vehicle, hints in ("reference", 0), (wrong, 1):
+        assert run(COASTDOWN, "--output", tmp_path, "--no-plot", "--vehicle", vehicle) == 0
+        assert capsys.readouterr().out.count(f"gz-onboard vehicle check NAME|TOML {COASTDOWN}\n") == hints
+
+
 def test_the_same_log_gives_the_same_bytes(tmp_path):
     made = []
     for seed in "1", "2":  # what goes by hash would come out in another order

@@ -367,7 +367,7 @@ def test_estimates_beside_frames_are_asked_for(tmp_path: Path, log: Path) -> Non
 
 @pytest.mark.parametrize("name", ["out.blf", "out.log", "out.mcap", "out.asc"])
 def test_a_log_of_estimates_has_no_frames_to_export(tmp_path: Path, estimated: Path, name: str) -> None:
-    with pytest.raises(InputError, match=r"estimates can be written into .csv"):
+    with pytest.raises(InputError, match=r"estimates can be written to .csv"):
         run(estimated, tmp_path / name)
     assert not (tmp_path / name).exists()
 
@@ -490,11 +490,11 @@ def test_columns_are_chosen_by_name_with_or_without_unit(tmp_path: Path, estimat
         (["out.parquet", "--columns", ""], "columns: names none; there are"),
         (["out.csv", "--estimates", "--columns", " ,"], "columns: names none; there are"),
         (["out.parquet", "--columns", "Voltag"], r"has no column 'Voltag' \(did you mean 'Voltage'\?\); there are"),
-        (["out.blf", "--columns", "Voltage"], "--columns: are of estimates or signals"),
+        (["out.blf", "--columns", "Voltage"], "--columns: applies to estimates or signals"),
         (["out.mcap", "--columns", "Voltage"], "--columns: an .mcap has all"),
-        (["tables", "--frames"], "--frames: can be written into"),
-        (["out.blf", "--estimates"], "estimates can be written into .csv"),
-        (["out.blf", "--signals"], "signals can be written into .csv"),
+        (["tables", "--frames"], "--frames: can be written to"),
+        (["out.blf", "--estimates"], "estimates can be written to .csv"),
+        (["out.blf", "--signals"], "signals can be written to .csv"),
         (["out.csv", "--estimates", "--from", "1e6"], "no estimates in the chosen part"),
     ],
 )

@@ -58,7 +58,7 @@ def test_why_the_range_is_what_it_is(log, tmp_path, capsys):
     with (tmp_path / "empty.mcap").open("wb") as stream:
         LogFile(stream, 0).close()
     assert cli.main(["plot", str(tmp_path / "empty.mcap"), "--why"]) == 2
-    assert "says nothing of why" in capsys.readouterr().err
+    assert "does not say why" in capsys.readouterr().err
 
 
 def test_the_panels_show_what_the_log_says(log):
@@ -253,6 +253,16 @@ def test_the_naive_range_begins_anew_after_a_hole():
     naive = plot.naive_range(rows)
     assert naive[301] is None
     assert naive[-1] == pytest.approx(100_000)
+
+
+def test_the_naive_range_does_not_take_a_charge_for_recovered():
+    riding = {"pack_voltage": 50.0, "pack_current": 16.0, "energy_left": 8e6, "activity": "RIDING"}
+    charging = riding | {"pack_current": -10.0, "activity": "CHARGING"}
+    rows: list[logged.Logged] = [{"time": t, "distance": 10.0 * t, **riding} for t in range(900)]
+    rows += [{"time": t, "distance": 8990.0, **charging} for t in range(900, 4500)]
+    rows += [{"time": t, "distance": 8990.0 + 10.0 * (t - 4499), **riding} for t in range(4500, 4700)]
+    naive = plot.naive_range(rows)
+    assert naive[899] == pytest.approx(naive[4499]) == pytest.approx(naive[-1]) == pytest.approx(100_000)
 
 
 def test_the_naive_range_forgets_what_is_more_than_25_km_ago():

@@ -135,7 +135,11 @@ def test_parquet(tmp_path, monkeypatch):
         ("3500", "much", [":3: column 'pack_current' [mA]: 'much' is not a finite number"]),
         ("3500", "inf", [":3: column", "'inf' is not"]),
         ("3500,", "", [":3: 5 cells for 6 columns"]),
-        ("11.0,", "1714557600000,", [":4: time [s]: '1714557600000' s is no time", "call the column 'time [ms]'"]),
+        (
+            "11.0,",
+            "1714557600000,",
+            [":4: time [s]: '1714557600000' s is not a plausible", "call the column 'time [ms]'"],
+        ),
         ("time [s]", "time", [":2: time: '10.0' has no unit", "'time [s]' or 'time [ms]'"]),
         ("time [s]", "times", [":1: neither a log of frames", "nor a table of signals"]),
         ("\n11.0,", "\n91.0,", ["usually 40.5 s", "call the column 'time [ms]'"]),

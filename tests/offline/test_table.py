@@ -127,7 +127,7 @@ def test_a_cell_that_is_none_is_named_with_column_and_row(columns, said):
 def test_a_time_beyond_all_calendars_is_named(whole):
     far = pa.array([0, 1, 2, 3, 4, 5, 6, 2**62], pa.timestamp("us"))
     data = ride(time=far)
-    with pytest.raises(InputError, match=r"table:8: column 'time \[s\]': .* is no time of this age"):
+    with pytest.raises(InputError, match=r"table:8: column 'time \[s\]': .* is not a plausible time"):
         currents(pa.table(data) if whole else data)
 
 

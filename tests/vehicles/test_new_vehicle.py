@@ -197,7 +197,7 @@ def test_what_goes_between_towns_differs_more_from_ride_to_ride(tmp_path, kind, 
 def test_it_writes_over_nothing(tmp_path, there, capsys):
     (tmp_path / there).write_text("mine", encoding="utf-8")
     assert cli.main(["vehicle", "new", str(tmp_path / "nmc.toml"), "--cells", "nmc", *ARGUMENTS]) == BAD_INPUT
-    assert f"{there}: is there already" in capsys.readouterr().err
+    assert f"{there}: exists already" in capsys.readouterr().err
     assert [(file.name, file.read_text(encoding="utf-8")) for file in tmp_path.iterdir()] == [(there, "mine")]
 
 
@@ -207,7 +207,7 @@ def test_it_writes_over_nothing(tmp_path, there, capsys):
         ("a.toml", ["--kind", "scooter"], "--series N"),
         ("a.toml", ["--mass", "1"], "must be 5 to 5000 kg"),
         ("a.toml", ["--cells", "lipo"], "nmc, nca, lfp"),
-        ("a.txt", [], "ends in .toml"),
+        ("a.txt", [], "must end in .toml"),
         ("ä b.toml", ["--cells", "nmc", *ARGUMENTS], "name: must be"),
         ("a.toml", ["--cells", "nmc", *ARGUMENTS, "--series", "300", "--parallel", "1000"], "range_dbc"),
     ],

@@ -93,7 +93,7 @@ def run(arguments: argparse.Namespace, file: Path) -> int:
         with progress_bar(lambda: expected_frames(paths), "frames", quiet=arguments.quiet) as display:
             spoken = arguments.json != "-"
             for failure in failed:
-                display.print(f"gz-onboard history: {failure.error}", sys.stderr)
+                display.print(f"gz-onboard history add: {failure.error}", sys.stderr)
             if known and spoken:
                 more = f" and {len(known) - 1} more: were" if known[1:] else ": was"
                 display.print(f"{known[0]}{more} read before", sys.stdout)
@@ -135,10 +135,10 @@ def keep(
     for task, result in results:
         if isinstance(result, InputError):
             done.failed.append(Failure(str(task.path), str(result)))
-            yield f"gz-onboard history: {result}", sys.stderr
+            yield f"gz-onboard history add: {result}", sys.stderr
             continue
         if result.damage:
-            yield f"gz-onboard history: {result.damage}", sys.stderr
+            yield f"gz-onboard history add: {result.damage}", sys.stderr
         yield from ((f"{task.path}: {text}", sys.stderr) for text in result.clock)
         kept = store.add(task.digest, task.name, result.rides, replace=again)
         done.rides.extend(kept.added)
@@ -152,7 +152,7 @@ def keep(
         for ride, other in kept.clashes:
             error = f"{task.path}: {ride_text(ride)}: not added: at the same time as {other.log}, {ride_text(other)}"
             done.failed.append(Failure(str(task.path), error))
-            yield f"gz-onboard history: {error}; `history remove` takes that away", sys.stderr
+            yield f"gz-onboard history add: {error}; `history remove` takes that away", sys.stderr
 
 
 def _said(log: Path, kept: Kept) -> Iterator[str]:

@@ -30,6 +30,8 @@ _COLOURS = (BLUE, ORANGE, GREEN, PURPLE, RED)  # of the vehicles
 _SMALLEST, _LARGEST = 8.0, 80.0  # of a dot, by distance
 _MARGIN = timedelta(days=1)  # before the first ride and after the last
 _LONGEST = 50.0  # km, of the largest dot
+_LEVELS = ("%Y", "%b %Y", "%d %b", "%H:%M", "%H:%M", "%S.%f")  # of ticks at years, months, days, hours, ...
+_FIRST_OF_LEVEL = ("", "%b %Y", "%d %b", "%d %b", "%H:%M", "%H:%M")
 
 
 def draw_history(vehicles: Sequence[Overview]) -> Figure:
@@ -56,6 +58,8 @@ def draw_history(vehicles: Sequence[Overview]) -> Figure:
         _dates(axis)
     if dates := [local(one.ride.start_ns) for vehicle in vehicles for one in vehicle.rides if one.ride.dated]:
         over_time.set_xlim(min(dates) - _MARGIN, max(dates) + _MARGIN)  # type: ignore[arg-type]
+        for axis in (over_time, learned[-1]):
+            axis.set_xlabel(_years(dates), color=INK, fontsize=9, loc="left")
     rides = sum(len(vehicle.rides) for vehicle in vehicles)
     length = sum(vehicle.total.distance_km for vehicle in vehicles)
     headline(
@@ -90,9 +94,15 @@ def _learned(axis: Axes, of: Overview, name: str, colour: str) -> None:
 
 
 def _dates(axis: Axes) -> None:
-    """Dates below a panel, no more than fit."""
+    """Dates below a panel, no more than fit. Each says its month: the formatter's own names only the last one's."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
     locator = AutoDateLocator(maxticks=9)  # type: ignore[no-untyped-call]
     axis.xaxis.set_major_locator(locator)
-    axis.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]
+    given = {"formats": _LEVELS, "zero_formats": _FIRST_OF_LEVEL, "show_offset": False}
+    axis.xaxis.set_major_formatter(ConciseDateFormatter(locator, **given))  # type: ignore[no-untyped-call]
+
+
+def _years(dates: Sequence[datetime]) -> str:
+    first, last = min(dates).year, max(dates).year
+    return f"{first}" if first == last else f"{first} to {last}"

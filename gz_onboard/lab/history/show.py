@@ -71,7 +71,10 @@ def run(arguments: argparse.Namespace, file: Path) -> int:
         parts = [overview_text(overview, arguments.rides) for overview in shown]
         print("\n\n".join(parts) if parts else f"{file}: no ride")
     if undated:
-        print(f"gz-onboard history: {undated} without a date left out: their logs' clock was not set", file=sys.stderr)
+        print(
+            f"gz-onboard history show: {undated} without a date left out: their logs' clock was not set",
+            file=sys.stderr,
+        )
     # Last, as who reads it may have had enough before its end.
     write_json(arguments.json, HISTORY_VERSION, {"file": str(file), "vehicles": [_in_json(each) for each in shown]})
     return OK

@@ -116,7 +116,7 @@ def check_logs(
                 checked.append(check_log(log, vehicle, display.update, how.quick))
             except InputError as error:
                 failed.append(Failure(str(log), str(error)))
-                display.print(f"gz-onboard vehicle: {error}", sys.stderr)
+                display.print(f"gz-onboard vehicle check: {error}", sys.stderr)
                 continue
             if spoken:
                 display.print(check_text(checked[-1]), sys.stdout)

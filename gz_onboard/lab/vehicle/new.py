@@ -130,11 +130,11 @@ def run(arguments: argparse.Namespace) -> int:
     """``gz-onboard vehicle new``: writes the two files, or none."""
     file: Path = arguments.file
     if file.suffix != ".toml":
-        raise InputError(f"{file}: the name of a vehicle file ends in .toml")
+        raise InputError(f"{file}: the name of a vehicle file must end in .toml")
     files = (file, file.with_suffix(".dbc"))
     for each in files:
         if os.path.lexists(each):
-            raise InputError(f"{each}: is there already, and nothing is written over it")
+            raise InputError(f"{each}: exists already and is not overwritten")
     answers = completed(vars(arguments), sys.stdin if sys.stdin.isatty() and sys.stdout.isatty() else None)
     texts = (vehicle_text(file.stem, answers), dbc_text(answers))
     vehicle = tried(files, texts)

@@ -38,7 +38,7 @@ def said(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         ([], "no ride is given"),
         (["nowhere.blf"], "nowhere.blf: no such log"),
         ([str(ROOT / "dbc")], "this folder holds no log"),
-        ([str(ROOT / "README.md")], "unknown log format '.md'"),
+        ([str(ROOT / "README.md")], "it ends in '.md'"),
         ([str(RIDE), "--effects", "nowhere"], "--effects nowhere: no such folder"),
         ([str(RIDE), "--vehicle", "refrence"], "did you mean 'reference'"),
         ([str(RIDE), str(RIDE)], "would both be called city_14C.blf"),

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,9 @@ import pytest
 from gz_onboard.cli import main
 from gz_onboard.errors import InputError
 from gz_onboard.lab.history.choice import default_file, period
+from gz_onboard.lab.history.picture import draw_history
 from gz_onboard.lab.history.store import APPLICATION, SCHEMA, Store
+from gz_onboard.lab.history.totals import NumberedRide, overviews
 from tests.lab.history.logs import ride, write_log
 from tests.lab.history.test_log_rides import rides_in
 from tests.lab.history.writer import add_many, on_other_days
@@ -44,6 +47,23 @@ def file(tmp_path: Path, log: Path) -> Path:
 
 def run(part: str, file: Path, *arguments: object) -> int:
     return main(["history", part, *map(str, arguments), "--file", str(file)])
+
+
+# --- what is drawn ----------------------------------------------------------------------------------------------------
+
+
+def test_each_date_of_the_picture_says_its_month(log: Path):
+    (one,) = rides_in(log)
+    june = replace(one, start_ns=1_750_000_000 * S)  # 2025-06-15
+    rides = [NumberedRide(day, ride) for day, ride in enumerate(on_other_days(june, range(20)))]
+    figure = draw_history(overviews(rides))
+    for axes in figure.axes[0], *figure.axes[2:]:
+        figure.canvas.draw()
+        dates = [text.get_text() for text in axes.get_xticklabels()]
+        assert len(dates) > 3
+        assert {date[-3:] for date in dates} == {"Jun", "Jul"}
+        assert axes.xaxis.get_offset_text().get_text() == ""
+    assert {figure.axes[0].get_xlabel(), figure.axes[-1].get_xlabel()} == {"2025"}
 
 
 # --- files that are none, or of another gz-onboard --------------------------------------------------------------------
