@@ -224,8 +224,8 @@ class Estimator:
     def _follow_activity(self, now: float, dt: float) -> None:
         signals, current = self.signals, self._reading.current
         known = current if self._reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else None
-        capacity, drive = self.battery.pack_capacity(self._temperatures.cells_or_bench), signals.inverter_current.get(now)
-        rate, drive = (None if x is None else x / capacity for x in (known, drive))
+        capacity = self.battery.pack_capacity(self._temperatures.cells_or_bench)
+        rate, drive = (None if x is None else x / capacity for x in (known, signals.inverter_current.get(now)))
         silent = bool(self._inverter) and not any(signal.fresh(now) for signal in self._inverter)
         off = signals.key.get(now) == 0 or signals.contactor.get(now) == 0
         rider = signals.rider.get(now)

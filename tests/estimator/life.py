@@ -62,7 +62,8 @@ class Scooter:
             wish = target * (1.0 if step % 500 < 430 else 0.0)  # now and then a red light
             a = float(np.clip(0.6 * (wish - self.speed), -1.5, 1.0))
             self.speed = max(self.speed + a * STEP, 0.0)
-            power = self.auxiliary + self.speed * (190 * a * 1.05 + 26 + 0.36 * self.speed**2) * (1.15 if a > -0.3 else 0.3)
+            force = 190 * a * 1.05 + 26 + 0.36 * self.speed**2
+            power = self.auxiliary + self.speed * force * (1.15 if a > -0.3 else 0.3)
             current, voltage = self._draw(power, charge)
             self.time += STEP
             if step % every == 0:
