@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import nan
@@ -16,7 +16,7 @@ from gz_onboard.arrays import Array, stretches
 from gz_onboard.errors import brief
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.progress import Progress
-from gz_onboard.simulation.beyond import Beyond, beyond_pack
+from gz_onboard.simulation.beyond import LOADED, Beyond, beyond_pack
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.parts.road import RoadProfile
 from gz_onboard.simulation.scooter import Scooter
@@ -332,3 +332,21 @@ def range_by_energy(scooter: Scooter, run: Run) -> float | None:
     warm = float(run.series["cell_temperature"][-1])
     left = energy_left(scooter.vehicle, run.soc_end, warm, run.mean_power, run.form_factor_squared)
     return run.distance + left / consumption
+
+
+def ran_empty(vehicle: Vehicle, run: Run, power: float, form_factor_squared: float) -> int | None:
+    """The row of the series from which on the pack has no energy left for a mean `power` [W]; None if it always has.
+
+    Neither the cut-off voltage nor SOC 0 tells it: a controller that holds back as the cells empty keeps off both, and
+    creeps. With more than `LOADED` of the charge it is not empty, whatever the load.
+    """
+    soc, warm = run.series["soc"], run.series["cell_temperature"]
+
+    def empty(row: int) -> bool:
+        charge = float(soc[row])
+        if charge <= 0.0 or charge > LOADED or power <= 0.0:
+            return charge <= 0.0
+        return energy_left(vehicle, charge, float(warm[row]), power, form_factor_squared) <= 0.0
+
+    last = len(soc) - 1
+    return bisect_left(range(last), True, key=empty) if empty(last) else None
