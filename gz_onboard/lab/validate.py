@@ -116,6 +116,15 @@ def _write_tables(arguments: argparse.Namespace, rides: list[ValidatedRide], tog
         print(f"written: {', '.join(map(str, written))}")
 
 
+def _energy_text(verdict: SimulationVerdict) -> str:
+    """The energy of a simulated ride, and where its pack was empty."""
+    energy, end = verdict.energy_percent, verdict.pack_empty
+    known = "" if energy is None else f"energy {energy:+.1f} %"
+    if not end:
+        return known
+    return f"{known} until {end.compared_s:.0f} s; the simulated pack is empty at {end.time_s:.0f} s".strip()
+
+
 def ride_text(ride: ValidatedRide) -> str:
     """A ride's entry for a terminal."""
     where = "dynamometer" if ride.on_dynamometer else "road"
@@ -129,8 +138,7 @@ def ride_text(ride: ValidatedRide) -> str:
         verdict = ride.verdicts.get(form)
         if not verdict:
             continue
-        energy = verdict.energy_percent if isinstance(verdict, SimulationVerdict) else None
-        lines.append(f"  {name:12} {'' if energy is None else f'energy {energy:+.1f} %'}")
+        lines.append(f"  {name:12} {_energy_text(verdict) if isinstance(verdict, SimulationVerdict) else ''}")
         for channel, e in verdict.channels.items():
             percent = "–" if e.percent is None else f"{e.percent:5.1f} %"
             spread = "" if e.of_spread is None else f", {e.of_spread:.2f} of its spread"

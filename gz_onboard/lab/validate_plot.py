@@ -11,7 +11,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 from gz_onboard.lab.validate_components import Component
-from gz_onboard.lab.validate_score import CHANNELS, GIVEN, ValidatedRide
+from gz_onboard.lab.validate_score import CHANNELS, GIVEN, NAMES, ValidatedRide
 from gz_onboard.offline.style import BLUE, GREEN, INK, MUTED, ORANGE, headline, new_figure, rule, save, time_unit
 
 if TYPE_CHECKING:
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = {"open_loop": ORANGE, "predictive": BLUE, "components": GREEN}
-NAMES = {"open_loop": "open loop", "predictive": "rider model", "components": "component alone"}
 _ALONE = {
     "battery_voltage": "pack_voltage",
     "motor_torque": "motor_torque",

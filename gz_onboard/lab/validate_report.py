@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gz_onboard.lab import validate_score
-from gz_onboard.lab.validate_plot import NAMES
 from gz_onboard.lab.validate_score import (
     COMPONENT_GATE,
     GATE,
     LABELS,
+    NAMES,
     ORDER,
     ChannelErrors,
     PooledMeans,
@@ -133,7 +133,8 @@ def _gate(rides: Sequence[ValidatedRide], form: str) -> HeadedRows:
     for ride, verdict in verdicts:
         cells = [_percent(verdict.channels.get(name)) for name in names]
         if isinstance(verdict, SimulationVerdict):
-            cells.append(number(verdict.energy_percent, "+.1f"))
+            end = verdict.pack_empty
+            cells.append(number(verdict.energy_percent, "+.1f") + (f" until {end.compared_s:.0f} s" if end else ""))
         rows.append([ride, *cells])
     return ["ride", *map(channel_words, names), *energy], rows
 

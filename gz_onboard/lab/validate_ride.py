@@ -22,7 +22,9 @@ from gz_onboard.lab.validate_score import (
     GATE,
     GIVEN,
     LEAST_SECONDS,
+    NAMES,
     POWER,
+    PackEmpty,
     SimulationVerdict,
     Splits,
     ValidatedRide,
@@ -34,11 +36,12 @@ from gz_onboard.lab.validate_score import (
 from gz_onboard.lab.validate_soc import soc_reference
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
+from gz_onboard.physics.derating import DeratingCurve
 from gz_onboard.progress import Progress
 from gz_onboard.simulation.parts.road import Dynamometer, Place, RoadProfile
 from gz_onboard.simulation.plan import ridden_road, route_file
 from gz_onboard.simulation.recorded import Recorded, read_recorded, rest_soc, scooter_at_start
-from gz_onboard.simulation.run import Command, Run, drive, follow, replay
+from gz_onboard.simulation.run import Command, Run, drive, follow, ran_empty, replay
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -106,11 +109,15 @@ def compare_ride(log: Path, vehicle: Vehicle, progress: Progress = lambda _: Non
     missing += _not_judged(ride, log, commands)
     if "open_loop" not in commands:
         progress(_RIDE * size)
-    simulated = {
-        form: _series(_ride(ride, command, lambda share: progress(share * _RIDE * size)))
-        for form, command in commands.items()
+    runs = {
+        form: _ride(ride, command, lambda share: progress(share * _RIDE * size)) for form, command in commands.items()
     }
-    verdicts = {form: _judge_ride(measured, series, GIVEN.get(form, set())) for form, series in simulated.items()}
+    simulated = {form: _series(run) for form, run in runs.items()}
+    ends = {form: _pack_empty(ride, run) for form, run in runs.items()}
+    verdicts = {
+        form: _judge_ride(measured, series, GIVEN.get(form, set()), ends[form]) for form, series in simulated.items()
+    }
+    missing += [_empty_text(form, end, recorded.duration) for form, end in ends.items() if end]
     roller = ride.road if isinstance(ride.road, Dynamometer) else None
     alone = components(vehicle, measured, ride.soc, recorded.first("ambient_temperature", MILD), roller)
     judged, by_circuit = _judge_components(alone), alone.get("battery_voltage")
@@ -132,7 +139,7 @@ def compare_ride(log: Path, vehicle: Vehicle, progress: Progress = lambda _: Non
         open_loop=verdicts.get("open_loop"),
         predictive=verdicts["predictive"],
         components=judged,
-        splits=_splits(measured, simulated, alone, found),
+        splits=_splits(measured, {form: _until(s, ends[form]) for form, s in simulated.items()}, alone, found),
         cells_series=vehicle.pack.cells_series,
         soc_reference=soc_reference(vehicle, measured, ride.soc, by_circuit.modelled if by_circuit else None),
         missing=missing,
@@ -302,19 +309,74 @@ def _series(run: Run) -> dict[str, Array]:
 # --- how far they are apart ---------------------------------------------------------------------------------------
 
 
-def _judge_ride(measured: Mapping[str, Array], series: Mapping[str, Array], given: set[str]) -> SimulationVerdict:
-    """given: channels that are no result of the simulation."""
+def _pack_empty(ride: Measured, run: Run) -> PackEmpty | None:
+    """Where the pack of `run` was empty, for the load that was measured; the run's own if none was.
+
+    A run whose pack is empty creeps: its own mean would take less than the ride that it is compared with. None, too, if
+    it is not known how full the pack was.
+    """
+    if ride.soc is None:
+        return None
+    signals, load = ride.recorded.signals, (run.mean_power, run.form_factor_squared)
+    if "pack_power" in ride.series:
+        current = signals["pack_current"]
+        mean = float(current.mean())
+        load = float(ride.series["pack_power"].mean()), float(np.mean(current**2)) / mean**2 if mean else 1.0
+    row = ran_empty(ride.vehicle, run, *load)
+    if row is None:
+        return None
+    time, distance, soc = (float(run.series[name][row]) for name in ("time", "distance", "soc"))
+    held = _held_back(ride.vehicle.derating.current_by_soc, run.series["soc"][: row + 1])
+    return PackEmpty(time, distance * 1e-3, soc, float(run.series["time"][held]))
+
+
+def _held_back(share: DeratingCurve, soc: Array) -> int:
+    """From which index of `soc` on the controller takes current off for want of charge; at most the last.
+
+    Of a ride that begins so, the last: its vehicle was held back as well.
+    """
+    free = np.flatnonzero(np.interp(soc, share.at, share.share) >= 1.0)
+    return min(int(free[-1]) + 1, len(soc) - 1) if len(free) else len(soc) - 1
+
+
+def _empty_text(form: str, end: PackEmpty, seconds: float) -> str:
+    """What a simulated pack that is empty before the ride ends means for what is compared; seconds: of the ride."""
+    until = "there" if end.compared_s == end.time_s else f"{end.compared_s:.0f} s, where the controller holds back"
+    return (
+        f"{NAMES[form]}: the simulated pack is empty at {end.time_s:.0f} s of {seconds:.0f}, after "
+        f"{end.distance_km:.2f} km, with {100 * end.soc:.1f} % of its charge: energy and conditions are compared until "
+        f"{until}, all else over the whole ride"
+    )
+
+
+def _until(series: Mapping[str, Array], end: PackEmpty | None) -> dict[str, Array]:
+    """The whole seconds of `series` in which what the ride asks was not short of charge."""
+    return {name: values[: int(end.compared_s)] if end else values for name, values in series.items()}
+
+
+def _judge_ride(
+    measured: Mapping[str, Array], series: Mapping[str, Array], given: set[str], end: PackEmpty | None
+) -> SimulationVerdict:
+    """given: channels that are no result of the simulation; end: where its pack was empty."""
     channels = {
         name: errors(*_even(channel.shown(measured[name]), channel.shown(series[name])), channel, GATE)
         for name, channel in CHANNELS.items()
         if name in measured and name not in given
     }
-    energy = _energy(measured)
     return SimulationVerdict(
         channels,
         all(channel.passed for channel in channels.values()),
-        None if not energy else 100 * (_energy(series) or 0.0) / energy - 100,
+        _energy_percent(measured, _until(series, end)),
+        end,
     )
+
+
+def _energy_percent(measured: Mapping[str, Array], series: Mapping[str, Array]) -> float | None:
+    """Energy of `series` less that measured in the same seconds, in percent of it; None of too few, or of none."""
+    if "pack_power" not in measured:
+        return None
+    real, simulated = (float(power.sum()) for power in _even(measured["pack_power"], series["pack_power"]))
+    return 100 * simulated / real - 100 if real and len(series["pack_power"]) >= LEAST_SECONDS else None
 
 
 def _judge_components(alone: Mapping[str, Component]) -> Verdict | None:

@@ -10,7 +10,10 @@ Definitions, the same for every channel. Both signals are first averaged over wh
                    nature, this is the figure to look at. 1 is no better than its mean
     of a temperature and of the state of charge percent is the mean absolute error over the change, max less min
                    measured, at least 10 K and 5 points
-    energy         the integral of the error over the integral of the measured
+    energy         the integral of the error over the integral of the measured. If the simulated pack is empty before
+                   the ride ends, until the controller holds back for want of charge: what comes after is what is left,
+                   not what the ride asks. So are the conditions below; percentages are of the whole ride, because a
+                   pack that ends too soon is an error of the model
 """
 
 from __future__ import annotations
@@ -67,6 +70,8 @@ CHANNELS = {
 }
 """The thesis' gate is on the first four; the others are judged by the same percentage."""
 POWER = Quantity("W", "power at the pack")
+NAMES = {"open_loop": "open loop", "predictive": "rider model", "components": "component alone"}
+"""What people call each form of a comparison."""
 GIVEN = {"open_loop": {"throttle"}}
 """By form: channels that are an input of that simulation, not a result."""
 
@@ -123,12 +128,29 @@ class Verdict:
 
 
 @dataclass(frozen=True)
+class PackEmpty:
+    """Where in a ride the simulated pack had no energy left for the ride's mean power."""
+
+    time_s: float
+    distance_km: float  # simulated
+    soc: float  # 0 to 1
+    compared_s: float  # until when energy is compared: where the controller begins to hold back, or the pack is empty
+
+
+@dataclass(frozen=True)
 class SimulationVerdict(Verdict):
     """The same of a whole ride."""
 
     energy_percent: Annotated[
-        float | None, "energy at the pack's terminals, simulated less measured, in percent of measured"
+        float | None,
+        "energy at the pack's terminals, simulated less measured, in percent of measured; until compared_s of "
+        "pack_empty, if there is one",
     ]
+    pack_empty: Annotated[
+        PackEmpty | None,
+        "where the simulated pack had no energy left for the ride's mean power: time_s, distance_km, soc (0 to 1), and "
+        "compared_s, until when energy_percent and splits are compared; or null",
+    ] = None
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,8 @@ import numpy as np
 
 from gz_onboard.arrays import Array
 
+LOADED = 0.1  # state of charge: an end with more left was one of the load
+
 
 @dataclass(frozen=True)
 class Beyond:

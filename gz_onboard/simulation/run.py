@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from math import nan
@@ -16,10 +16,11 @@ from gz_onboard.arrays import Array, stretches
 from gz_onboard.errors import brief
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.progress import Progress
-from gz_onboard.simulation.beyond import Beyond, beyond_pack
+from gz_onboard.simulation.beyond import LOADED, Beyond, beyond_pack
 from gz_onboard.simulation.parts.rider import Rider
 from gz_onboard.simulation.parts.road import RoadProfile
 from gz_onboard.simulation.scooter import Scooter
+from gz_onboard.vehicle import Vehicle
 
 COLUMNS = {
     "time": "s",
@@ -309,14 +310,43 @@ def shortfalls(series: dict[str, Array]) -> list[Shortfall]:
 # --- range --------------------------------------------------------------------------------------------------------
 
 
-def range_by_energy(scooter: Scooter, run: Run, soc: float, temperature: float) -> float | None:
-    """How far [m] a pack at `soc` and `temperature` [degC] goes at the consumption of `run`; None if that is not known.
+def energy_left(vehicle: Vehicle, soc: float, temperature: float, power: float, form_factor_squared: float) -> float:
+    """What the pack still delivers [J] down to the cut-off voltage, at `soc` and `temperature` [degC].
 
-    The energy left is that down to the cut-off voltage at the run's mean power and form factor of the current.
+    power: the mean [W], above 0; form_factor_squared: of the current, as of a `Run`.
     """
-    battery, consumption = scooter.vehicle.battery, run.consumption
-    if battery is None or consumption is None or consumption <= 0:
+    overpotential = vehicle.model.overpotential(vehicle.pack, {"vibration": vehicle.riding.vibration})
+    return drawable(vehicle.pack, soc, temperature, power, form_factor_squared, overpotential).energy
+
+
+def range_by_energy(scooter: Scooter, run: Run) -> float | None:
+    """How far [m] the pack goes from the start of `run` at its consumption; None if that is not known.
+
+    What was ridden, and what the energy left at the end is good for, at the run's mean power and form factor of the
+    current. So it is never less than what was ridden. Asked at the start, the same equation would take the cells for
+    as warm as in the mean, and the voltage that they lose for settled from the first metre on.
+    """
+    consumption = run.consumption
+    if consumption is None or consumption <= 0:
         return None
-    overpotential = scooter.vehicle.model.overpotential(battery, {"vibration": scooter.vehicle.riding.vibration})
-    left = drawable(battery, soc, temperature, run.mean_power, run.form_factor_squared, overpotential)
-    return float(left.energy / consumption)
+    warm = float(run.series["cell_temperature"][-1])
+    left = energy_left(scooter.vehicle, run.soc_end, warm, run.mean_power, run.form_factor_squared)
+    return run.distance + left / consumption
+
+
+def ran_empty(vehicle: Vehicle, run: Run, power: float, form_factor_squared: float) -> int | None:
+    """The row of the series from which on the pack has no energy left for a mean `power` [W]; None if it always has.
+
+    Neither the cut-off voltage nor SOC 0 tells it: a controller that holds back as the cells empty keeps off both, and
+    creeps. With more than `LOADED` of the charge it is not empty, whatever the load.
+    """
+    soc, warm = run.series["soc"], run.series["cell_temperature"]
+
+    def empty(row: int) -> bool:
+        charge = float(soc[row])
+        if charge <= 0.0 or charge > LOADED or power <= 0.0:
+            return charge <= 0.0
+        return energy_left(vehicle, charge, float(warm[row]), power, form_factor_squared) <= 0.0
+
+    last = len(soc) - 1
+    return bisect_left(range(last), True, key=empty) if empty(last) else None

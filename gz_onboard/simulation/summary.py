@@ -12,6 +12,7 @@ from gz_onboard.arrays import Array
 from gz_onboard.constants import WH, WH_PER_KM
 from gz_onboard.offline.results import clock, number, plain, text_rows, times
 from gz_onboard.offline.schema import descriptions
+from gz_onboard.simulation.beyond import LOADED
 from gz_onboard.simulation.plan import Plan
 from gz_onboard.simulation.recorded import Recorded
 from gz_onboard.simulation.run import COLUMNS, Run, range_by_energy
@@ -23,12 +24,12 @@ _RANGE_BY = {
     "repetition": "ridden until empty",
     "charge": "ridden until no charge was left",
     "cut-off": "ridden until the load pulled the voltage to the cut-off",
-    "energy": "energy left at the start over the consumption",
+    "energy": "ridden, and energy left at the end over the consumption",
     None: "not known",
 }
-LOADED = 0.1  # state of charge: an end with more left was one of the load
 _SHOWN = 5  # shortfalls
 _LEAST = 0.005  # Wh: less of the ledger is not shown
+_FARTHER = 0.05  # km: less would not show
 
 
 @dataclass(frozen=True)
@@ -105,8 +106,8 @@ class SimulationSummary:
     range_km: Annotated[float | None, "on this riding from soc_start, or null"]
     range_by: Annotated[
         str | None,
-        "repetition: ridden until empty; energy: energy left at the start over the consumption; cut-off: ridden until "
-        "a load pulled the voltage there; charge: ridden until none was left",
+        "repetition: ridden until empty; energy: ridden, and energy left at the end over the consumption; cut-off: "
+        "ridden until a load pulled the voltage there; charge: ridden until none was left",
     ]
     shortfalls: Annotated[
         list[ShortfallEntry],
@@ -119,7 +120,9 @@ class SimulationSummary:
         "what the battery cannot give: charge (true: none is left; false: a load pulled its voltage to the cut-off), "
         "where it begins time_s, distance_km, soc, current_a, voltage_v; duration_s in all; cutoff_v",
     ]
-    range_by_energy_km: Annotated[float | None, "energy left at the start over the consumption, or null"]
+    range_by_energy_km: Annotated[
+        float | None, "distance_km, and energy left at the end over the consumption; never less than ridden; or null"
+    ]
     ledger_wh: Annotated[dict[str, float], "where the energy of the cells went, by name; negative: a source"]
     closure: Annotated[float, "energy_cells_wh less the sum of the ledger, over the sum of all magnitudes"]
     chassis: Annotated[str, "straight, planar or leaning"]
@@ -153,11 +156,10 @@ def cycle_range(result: Run, scooter: Scooter) -> tuple[float | None, str | None
 
 
 def by_energy(result: Run, scooter: Scooter) -> float | None:
-    """The energy left at the start over the consumption [m]; None of a ride that went on without charge."""
+    """What was ridden, and the energy left over the consumption [m]; None of a ride that went on without charge."""
     if result.beyond and result.beyond[-1].charge and not result.empty:
         return None
-    temperature = float(result.series["cell_temperature"].mean())
-    return range_by_energy(scooter, result, result.soc_start, temperature)
+    return range_by_energy(scooter, result)
 
 
 def summarise(vehicle: Vehicle, plan: Plan, what: str, result: Run, scooter: Scooter) -> SimulationSummary:
@@ -279,8 +281,10 @@ def _beyond_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
         )
     energy, soc = summary.range_by_energy_km, summary.soc_end
     if summary.range_by == "cut-off" and energy is not None:
+        more = energy - summary.distance_km >= _FARTHER
+        would = f"its energy would do for {energy:.1f} km" if more else "it goes farther only"
         rows.append(
-            f"so it ends with {100 * soc:.0f} % left; its energy would do for {energy:.1f} km at a lower current "
+            f"so it ends with {100 * soc:.0f} % left; {would} at a lower current "
             "(motor_current_limit, [controller] of the vehicle file)"
         )
     elif rows and summary.range_by == "energy":

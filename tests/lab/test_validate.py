@@ -267,8 +267,9 @@ def test_the_summary_has_its_keys(two):
     assert summary["version"] == 1
     assert summary["failed"] == []
     first, second = summary["rides"]
-    assert set(first) == set(KEYS) - {"channels", "energy_percent"}
-    assert set(first["open_loop"]) == {"channels", "energy_percent", "passed"}
+    assert set(first) == set(KEYS) - {"channels", "energy_percent", "pack_empty"}
+    assert set(first["open_loop"]) == {"channels", "energy_percent", "pack_empty", "passed"}
+    assert first["open_loop"]["pack_empty"] is None
     assert set(first["open_loop"]["channels"]) == set(CHANNELS) - {"throttle"}
     assert set(first["predictive"]["channels"]) == set(CHANNELS)
     assert second["kind"] == "roll"
@@ -277,6 +278,58 @@ def test_the_summary_has_its_keys(two):
     assert {e["limit_percent"] for e in first["predictive"]["channels"].values()} == {20.0}
     assert first["passed"] == all(first[form]["passed"] for form in ("open_loop", "predictive", "components"))
     assert first["energy_wh"] == pytest.approx(second["energy_wh"])
+
+
+@pytest.fixture(scope="module")
+def smaller(tmp_path_factory):
+    """(summary, text, tables) of a simulated ride against its own file, and against a seventh of its charge."""
+    folder = tmp_path_factory.mktemp("smaller")
+    rows = [f"{t},{min(max(2 * t - 20, 0), 40)}" for t in range(0, 250, 10)]
+    (folder / "hold.csv").write_text("\n".join(["time_s,speed_kmh", *rows]))
+    log, out = folder / "hold.blf", ["--quiet", "--no-plot", "--output", str(folder)]
+    assert main(["simulate", str(folder / "hold.csv"), "--soc", "0.2", "--frames", str(log), "--no-series", *out]) == 0
+    own = (OWN / "reference.toml").read_text()
+    assert "cell_capacity = { value = 2.73361," in own
+    (folder / "seventh.toml").write_text(
+        own.replace("cell_capacity = { value = 2.73361,", "cell_capacity = { value = 0.4,")
+    )
+    found = {}
+    for name in ("reference", str(folder / "seventh.toml")):
+        files = ["--json", str(folder / "v.json"), "--markdown", str(folder / "v.md")]
+        with contextlib.redirect_stdout(io.StringIO()) as text:
+            assert main(["validate", str(log), "--vehicle", name, "--payload", "80", *files, *out]) == 0
+        ride = json.loads((folder / "v.json").read_text())["rides"][0]
+        found[Path(name).stem] = ride, " ".join(text.getvalue().split()), (folder / "v.md").read_text()
+    return found
+
+
+@pytest.mark.parametrize("form", ["open_loop", "predictive"])
+def test_energy_is_compared_until_the_simulated_pack_is_empty(smaller, form):
+    """That the ride went on without it is told, and is no error of the energy."""
+    whole, part = smaller["reference"][0], smaller["seventh"][0]
+    end = part[form]["pack_empty"]
+    assert whole[form]["pack_empty"] is None
+    assert 60 < end["compared_s"] < end["time_s"] < 220 < part["duration_s"]
+    assert 0.3 < end["distance_km"] < 0.0112 * end["time_s"]
+    assert -0.01 < end["soc"] < 0.08  # below which the controller of this vehicle holds back
+    assert abs(whole[form]["energy_percent"]) < 3
+    assert part[form]["energy_percent"] == pytest.approx(whole[form]["energy_percent"], abs=5)
+    assert sum(kind["seconds"] for kind in part["splits"][form]["pack_power"]["speed"].values()) <= end["compared_s"]
+    assert not part["passed"]  # the pack that ends too soon is an error of the model all the same
+
+
+def test_where_the_simulated_pack_is_empty_is_told(smaller):
+    assert "simulated pack is empty" not in smaller["reference"][1]
+    ride, text, tables = smaller["seventh"]
+    for form, name in (("open_loop", "open loop"), ("predictive", "rider model")):
+        end = ride[form]["pack_empty"]
+        seconds, until = f"{end['time_s']:.0f} s", f"{end['compared_s']:.0f} s"
+        energy = f"{ride[form]['energy_percent']:+.1f}"
+        assert f"{name} energy {energy} % until {until}; the simulated pack is empty at {seconds}" in text
+        assert f"{name}: the simulated pack is empty at {seconds} of {ride['duration_s']:.0f}" in text
+        assert any(found.startswith(f"{name}: the simulated pack is empty") for found in ride["missing"])
+        assert f"are compared until {until}, where the controller holds back" in text
+        assert f"{energy} until {until}" in tables
 
 
 def test_pictures_and_page(two):

@@ -12,7 +12,17 @@ from hypothesis import strategies as st
 
 from gz_onboard.simulation.cycles import cycle
 from gz_onboard.simulation.parts.road import straight
-from gz_onboard.simulation.run import COLUMNS, at_steps, drive, follow, range_by_energy, replay, road_table, shortfalls
+from gz_onboard.simulation.run import (
+    COLUMNS,
+    at_steps,
+    drive,
+    follow,
+    ran_empty,
+    range_by_energy,
+    replay,
+    road_table,
+    shortfalls,
+)
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.simulation.sweep import redesigned
 from gz_onboard.vehicle import read_vehicle
@@ -123,13 +133,21 @@ def test_until_empty_agrees_with_energy_left_over_consumption():
     small = redesigned(VEHICLE, {"cell_capacity": 0.3})
     c = cycle("ece15")
     speeds = at_steps(c.time, c.speed, 0.01)
-    empty = drive(Scooter(small), follow(speeds, 0.01), 40_000, until_empty=True)
+    emptied = Scooter(small)
+    empty = drive(emptied, follow(speeds, 0.01), 40_000, until_empty=True)
     once = Scooter(small)
     run = drive(once, follow(speeds, 0.01), c.duration * 3)
     assert empty.empty
     assert empty.soc_end < 0.15
     assert empty.distance > 3 * np.trapezoid(c.speed, c.time)
-    assert range_by_energy(once, run, 1.0, 20.0) == pytest.approx(empty.distance, rel=0.12)
+    assert range_by_energy(once, run) == pytest.approx(empty.distance, rel=0.12)
+    by_energy = range_by_energy(emptied, empty)
+    assert by_energy is not None
+    assert empty.distance <= by_energy < 1.03 * empty.distance
+    assert ran_empty(small, run, run.mean_power, run.form_factor_squared) is None
+    row = ran_empty(small, empty, run.mean_power, run.form_factor_squared)
+    assert 0.8 < empty.series["distance"][row] / empty.distance <= 1
+    assert 0 < empty.series["soc"][row] < 0.15
 
 
 @given(widths=st.lists(st.floats(0.5, 50), min_size=1, max_size=30), at=st.lists(st.floats(-10, 1000), min_size=1))
