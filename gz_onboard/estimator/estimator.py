@@ -216,6 +216,8 @@ class Estimator:
             self.forecaster.forget(max(UNLEARNED, self.redundancy.odometer.compared))
             self.road_load.unlearn()
             self.attribution.forget(forgotten)
+        if "auxiliary_current" in newly:
+            self.forecaster.auxiliaries.forget()
         if newly & AGED_FROM:
             self.soc.ageing.unlearn()
 
@@ -232,10 +234,12 @@ class Estimator:
         if rider is not None and abs(self.road.speed or 0.0) < STANDSTILL:
             self.ridden_by(f"{rider:g}")
         self._activities.step(dt, self.road.speed, rate, signals.charge_plug.get(now), silent, off, drive)
+        auxiliary, voltage = signals.auxiliary_current.get(now), self._reading.voltage
+        measured = None if auxiliary is None or voltage is None else voltage * auxiliary
+        self.forecaster.auxiliaries.step(min(dt, self._timing.pause), measured)
 
     def _ride(self, now: float, dt: float) -> None:
         """Learn from the riding, where its consumption is known."""
-        self.forecaster.more_auxiliaries = self.road_load.more_auxiliaries
         speed, reading = self.road.speed, self._reading
         unsure = reading.source in (CurrentSource.MODEL, CurrentSource.DISPUTED) or self.redundancy.speeds.unsettled
         known = 0 < dt <= self._timing.pause and not unsure and self._activities.teaches
@@ -346,7 +350,6 @@ class Estimator:
         self.soc.restore(restored.battery, restored.age, restored.cell_effects)
         self.forecaster.pause(stood := NEW_DAY if restored.age is None else restored.age)
         self.road_load.rest(stood)
-        self.forecaster.more_auxiliaries = self.road_load.more_auxiliaries
 
 
 def _carrying(roles: Sequence[str], groups: Sequence[Group]) -> list[int]:

@@ -7,8 +7,8 @@ learned, by segment, what is usual and how the present ride differs from it (`us
 - the price of a metre in motion: measured, less what height and speed have stored, over the model's of the prior
   riding in the same air;
 - what stops add to it, as it is usual. Standing for longer than a stop takes energy, but teaches nothing;
-- the time that a metre takes, and with it the power to be expected, and what auxiliaries take that the vehicle file
-  does not know: they are watts, in no price of a metre;
+- the time that a metre takes, and with it the power to be expected, and what auxiliaries are measured to take beyond
+  the vehicle file's: they are watts, in no price of a metre (`auxiliaries`);
 - the consumption factor, measured over modelled: what the parameters have wrong for this vehicle and season.
 
 The range is the energy that can be drawn before the cut-off at the power to be expected, over the price to be expected
@@ -25,6 +25,7 @@ from typing import Any
 from gz_onboard.constants import GRAVITY, HOUR
 from gz_onboard.estimator.activity import STOP_TIME
 from gz_onboard.estimator.ageing import Ageing
+from gz_onboard.estimator.auxiliaries import Auxiliaries
 from gz_onboard.estimator.calm import Calm, restored_calm
 from gz_onboard.estimator.interval import deciles
 from gz_onboard.estimator.load_model import AHEAD, USUAL_AIR, Conditions, EffectInputs, LoadModel
@@ -100,7 +101,7 @@ class Forecaster:
         self.prior, self._unit = Usual.of(prior, stops / price), Unit(price + stops, prior.speed)
         self.riding = Riding(self.prior)
         self.calm, self.pattern, self.riders, self.terrain = Calm(), Pattern(), Riders(), Terrain()
-        self.more_auxiliaries = 0.0  # W beyond the file's, now
+        self.auxiliaries = Auxiliaries(model)
         self.ageing: Ageing | None = None  # None: the pack is known to be as its file says
         self._past, self._colder = Past(), ((inf, inf, inf), 0.0)  # SOC, cells and their sd [degC]; the share lost
         self._overpotential = model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
@@ -145,14 +146,14 @@ class Forecaster:
         if abs(mean) > MOVING:
             r.still = 0.0
             segment.measured += r.second.energy
-            segment.beside += self.more_auxiliaries * r.second.seconds
+            segment.beside += self.auxiliaries.now * r.second.seconds
             segment.modelled += modelled
             segment.level += to_come
         else:
             self._stand(r.second.seconds)
             if r.still <= STOP_TIME:
                 segment.standing += r.second.energy
-                segment.beside_standing += self.more_auxiliaries * r.second.seconds
+                segment.beside_standing += self.auxiliaries.now * r.second.seconds
         if r.still <= STOP_TIME:
             segment.duration += r.second.seconds
             segment.squares += r.second.squares
@@ -204,7 +205,7 @@ class Forecaster:
         """By how much auxiliaries beyond the file's raise the consumption factor, at the pace of the present riding."""
         usual = self.riding.usual
         modelled = self._unit.price * max(usual.price.now, LEAST) / self.riding.factor  # J/m
-        return self.more_auxiliaries / self.load.prior.speed * max(usual.pace.now, LEAST) / modelled
+        return self.auxiliaries.mean / self.load.prior.speed * max(usual.pace.now, LEAST) / modelled
 
     @property
     def factor(self) -> float:
@@ -340,7 +341,7 @@ class Forecaster:
         # What was ridden without a grade has the model's price times the factor, whose error is the same all the way.
         variance += (past.blind * price / self.riding.factor) ** 2 * self.riding.factor_variance
         pace, pace_variance = usual.pace.ahead(way)
-        beside = self.more_auxiliaries / self.load.prior.speed  # J/m, at the prior's pace
+        beside = self.auxiliaries.mean / self.load.prior.speed  # J/m, at the prior's pace
         known = moving * (price + max(standing, 0.0))
         consumption = max(known + beside * max(pace, LEAST), LEAST * moving)
         height_variance = self._weight**2 * self.terrain.variance(way) / (consumption * way) ** 2
@@ -364,6 +365,7 @@ class Forecaster:
         """What is to be kept over a restart."""
         kept = self.calm.snapshot() | {"of": asdict(self._unit), "pattern": self.pattern.snapshot()}
         kept |= {"states": dict(self.load.states), "terrain": self.terrain.snapshot()}
+        kept["auxiliaries"] = self.auxiliaries.snapshot()
         return self.riding.snapshot() | self.riders.snapshot() | kept
 
     def restore(self, saved: Mapping[str, Any]) -> None:
@@ -373,4 +375,5 @@ class Forecaster:
         pattern, riders = restored_pattern(saved.get("pattern", ())), restored_riders(saved, unit)
         self.calm, self.terrain = restored_calm(saved), restored_terrain(saved.get("terrain"))
         self.riding, self.load.states, self.pattern, self.riders = riding, states, pattern, riders
+        self.auxiliaries.restore(saved.get("auxiliaries"))
         self._sum_past()

@@ -61,8 +61,7 @@ DRAWN = 0.08  # W per N of weight: of less the brakes or the rest of the way may
 SLOWEST = 2.0  # m/s
 BENDING = 1.0  # m/s²: in bends tyres and wheels do what is not modelled
 STANDING, STANDING_SD, STANDING_TIME = 0.05, 3.0, 60.0  # m/s; W and s: brake lights, offset of the current
-# W beyond what is known, at so many spans at standstill: a load was switched. A speed that has died shows after three.
-SWITCHED, CONFIRMED = 12.0, 4
+SWITCHED, CONFIRMED = 12.0, 3  # W beyond what is known, at so many spans at standstill: a load was switched
 MOST = 3.0  # sd of a residual that are believed
 NOISE_SHARE, NOISE_MOST = 0.01, 16.0  # of a span in the mean of squared residuals; most that one says
 RELATED_EVERY = 30  # spans after which the model is linearised anew

@@ -108,7 +108,7 @@ class RoadAhead:
         """Take in `dt` [s] of riding at `speed` [m/s] and `power` [W] of the pack."""
         if self._segment:
             self._ridden += abs(speed) * dt
-            self._energy += (power - self._forecaster.more_auxiliaries) * dt
+            self._energy += (power - self._forecaster.auxiliaries.now) * dt
 
     def _learn(self, road: Road, costs: Costs) -> None:
         """Learn the cost if a segment ends here."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from math import exp
+from typing import Any
 
 import pytest
 
@@ -72,8 +73,11 @@ def with_auxiliary_current(scooter, seconds, speed=0.0):
             yield t, OTHERS + 1, (scooter.auxiliary / values[0],)
 
 
+SENSED = [*GROUPS, Group("Auxiliary", ("auxiliary_current",), 0.1)]
+
+
 def test_a_heater_is_watts_and_no_price_of_a_metre():
-    scooter, e = Scooter(soc=0.95), estimator([*GROUPS, Group("Auxiliary", ("auxiliary_current",), 0.1)])
+    scooter, e = Scooter(soc=0.95), estimator(SENSED)
 
     def ride(seconds, speed=0.0):
         return follow(e, with_auxiliary_current(scooter, seconds, speed), scooter)
@@ -85,12 +89,36 @@ def test_a_heater_is_watts_and_no_price_of_a_metre():
 
     ride(20)
     ride(900, 7.0)
-    for power in (400.0, 45.0):  # more than a fifth of the capacity in an hour
+    for power in (400.0, 45.0):  # more than a fifth of the capacity in an hour: as much as a drive
         scooter.auxiliary = power
-        rows = ride(60)
-        assert all(row.activity is Activity.STANDING for _, row in rows[5:])
-        _, soon = ride(60, 7.0)[-1]
-        assert soon.consumption_expected == pytest.approx(price(), rel=0.06)
+        rows = ride(100)
+        assert all(row.activity is Activity.STANDING for _, row in rows[15:])
+        _, soon = ride(500, 7.0)[-1]
+        assert soon.consumption_expected == pytest.approx(price(), rel=0.1)
+    scooter.auxiliary = 400.0
+    ride(600, 7.0)
+    saved = json.loads(json.dumps(e.snapshot("a")))
+    fresh = estimator(SENSED)
+    fresh.restore(saved, "a", 60.0)
+    assert fresh.forecaster.auxiliaries.mean == e.forecaster.auxiliaries.mean == pytest.approx(355.0, abs=20)
+    assert fresh.forecaster.factor == pytest.approx(e.forecaster.factor, rel=0.05)
+    del saved["riding"]["auxiliaries"]  # of an older version
+    fresh.restore(saved, "a", 60.0)
+    assert fresh.forecaster.auxiliaries.mean == 0.0
+
+
+def test_of_a_thermostat_its_mean_is_to_come():
+    scooter, e = Scooter(soc=0.95), estimator(SENSED)
+    follow(e, with_auxiliary_current(scooter, 20), scooter)
+    rows: list[tuple[float, Any]] = []
+    energy = distance = 0.0
+    for minute in range(24):
+        if minute == 18:
+            energy, distance, shown = scooter.energy, scooter.distance, rows
+        for seconds, scooter.auxiliary in ((20, 400.0), (40, 45.0)):
+            rows = follow(e, with_auxiliary_current(scooter, seconds, 7.0), scooter)
+    price = (scooter.energy - energy) / (scooter.distance - distance)
+    assert all(row.consumption_expected == pytest.approx(price, rel=0.12) for _, row in shown)
 
 
 @pytest.mark.parametrize("plug", [0.0, None], ids=["plug signal", "none"])
