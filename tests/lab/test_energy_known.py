@@ -64,7 +64,7 @@ def test_what_was_ridden_without_a_voltage_is_in_neither():
     assert whole.pipeline.drawn.net is not None
     assert summary.energy_wh < 0.9 * whole.pipeline.drawn.net / 3600
     assert summary.consumption_wh_km == pytest.approx(summary.energy_wh / summary.energy_distance_km)
-    assert f"{summary.energy_missing_s:.1f} s without voltage or current" in energy_line(summary)
+    assert f"{summary.energy_missing_s:.1f} s without a credible voltage or current" in energy_line(summary)
     assert f"of {summary.energy_distance_km:.2f} km" in energy_line(summary)
     assert kept.consumption_wh_km == pytest.approx(summary.consumption_wh_km, rel=0.01)
     assert kept.metered_km == pytest.approx(summary.energy_distance_km, rel=0.01)
