@@ -93,9 +93,7 @@ class Attribution:
     def __init__(self, forecaster: Forecaster, signals: Signals, road_load: RoadLoad | None = None) -> None:
         self._road_load = road_load
         self._forecaster, self._signals, load = forecaster, signals, forecaster.load
-        modelled = any(p.name == "auxiliary_power" for effect in load.model.effects for p in effect.parameters)
-        self._usual_load = load.model.parameters["auxiliary_power"] if modelled else 0.0  # W
-        self._more = self._known = 0.0  # W beyond that, weighted by the way; sum of the weights
+        self._more = self._known = 0.0  # W in the factor learned, weighted by the way; sum of the weights
         self._ridden = 0.0  # m
         self._composition = Composition(load)
         self._new = forecaster.battery.own()
@@ -164,15 +162,11 @@ class Attribution:
         return replace(state, factor=factor, auxiliaries=rest * state.auxiliaries, hills=ahead)
 
     def _measure_auxiliaries(self, now: float, ridden: float) -> None:
-        """What they take beyond the model's, in the mean over the way lately ridden."""
+        """What they take beyond the model's and their own sensor's, in the mean over the way lately ridden."""
         way, self._ridden = ridden - self._ridden, ridden
-        signals = self._signals
-        voltage, current = signals.pack_voltage.get(now), signals.auxiliary_current.get(now)
-        beside = [signals[role].get(now) for role in LOADS]
+        beside = [self._signals[role].get(now) for role in LOADS]
         known = [power for power in beside if power is not None]
-        if voltage is not None and current is not None:
-            known.append(voltage * current - self._usual_load)
-        elif self._road_load and not known:
+        if self._road_load and not known and not self._forecaster.auxiliaries.known:
             known.append(self._road_load.more_auxiliaries)
         if way > 0 and known:
             fade = exp(-way / MEMORY)
@@ -180,10 +174,11 @@ class Attribution:
             self._known = fade * self._known + 1 - fade
 
     def _auxiliaries(self, power: float) -> float:
-        """The part of the consumption factor that they make, as far as it is learned; `power` [W]: expected."""
+        """The part of the consumption factor that they make, as far as it is in it; `power` [W]: expected."""
+        by_sensor = self._forecaster.beside
         if not self._known or power <= 0:
-            return 0.0
-        return self._factor_learned * self._forecaster.factor * self._more / self._known / power
+            return by_sensor
+        return by_sensor + self._factor_learned * self._forecaster.riding.factor * self._more / self._known / power
 
     @property
     def _factor_learned(self) -> float:

@@ -35,6 +35,11 @@ class Auxiliaries:
         if self._seen > 0:
             self.mean += min(dt / self._seen, 1.0) * (self.now - self.mean)
 
+    @property
+    def known(self) -> bool:
+        """Whether their sensor has shown them, on this ride or the one before."""
+        return self._seen > 0 or self.mean != 0
+
     def forget(self) -> None:
         """A sensor that it was learned from is faulty."""
         self.now = self.mean = self._seen = 0.0

@@ -10,7 +10,7 @@ import pytest
 
 from gz_onboard.estimator.activity import STOP_TIME
 from gz_onboard.estimator.start import from_voltage
-from gz_onboard.events import Activity, Group, Reason, State
+from gz_onboard.events import Activity, Cause, Group, Reason, State
 from tests.estimator.life import (
     BATTERY,
     GROUPS,
@@ -97,6 +97,9 @@ def test_a_heater_is_watts_and_no_price_of_a_metre():
         assert soon.consumption_expected == pytest.approx(price(), rel=0.1)
     scooter.auxiliary = 400.0
     ride(600, 7.0)
+    why = e.attribution.latest.causes
+    assert why[Cause.AUXILIARIES] < -5000.0
+    assert abs(why[Cause.UNEXPLAINED]) < -0.3 * why[Cause.AUXILIARIES]
     saved = json.loads(json.dumps(e.snapshot("a")))
     fresh = estimator(SENSED)
     fresh.restore(saved, "a", 60.0)
