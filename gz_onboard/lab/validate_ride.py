@@ -16,13 +16,13 @@ from gz_onboard.arrays import Array, Mask, block_means, running_mean
 from gz_onboard.constants import GRAVITY, MILD, WH
 from gz_onboard.errors import InputError, writing
 from gz_onboard.lab.validate_components import Component, components, losses
+from gz_onboard.lab.validate_empty import Load, empty_text, pack_empty, until_empty
 from gz_onboard.lab.validate_score import (
     CHANNELS,
     COMPONENT_GATE,
     GATE,
     GIVEN,
     LEAST_SECONDS,
-    NAMES,
     POWER,
     PackEmpty,
     SimulationVerdict,
@@ -36,12 +36,11 @@ from gz_onboard.lab.validate_score import (
 from gz_onboard.lab.validate_soc import soc_reference
 from gz_onboard.offline.processes import Task
 from gz_onboard.offline.samples import facts_of, ride_name, rider_mass
-from gz_onboard.physics.derating import DeratingCurve
 from gz_onboard.progress import Progress
 from gz_onboard.simulation.parts.road import Dynamometer, Place, RoadProfile
 from gz_onboard.simulation.plan import ridden_road, route_file
 from gz_onboard.simulation.recorded import Recorded, read_recorded, rest_soc, scooter_at_start
-from gz_onboard.simulation.run import Command, Run, drive, follow, ran_empty, replay
+from gz_onboard.simulation.run import Command, Run, drive, follow, replay
 from gz_onboard.simulation.scooter import STEP, Scooter
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
@@ -113,11 +112,11 @@ def compare_ride(log: Path, vehicle: Vehicle, progress: Progress = lambda _: Non
         form: _ride(ride, command, lambda share: progress(share * _RIDE * size)) for form, command in commands.items()
     }
     simulated = {form: _series(run) for form, run in runs.items()}
-    ends = {form: _pack_empty(ride, run) for form, run in runs.items()}
+    ends = {form: pack_empty(vehicle, run, _load(ride)) if ride.soc is not None else None for form, run in runs.items()}
     verdicts = {
         form: _judge_ride(measured, series, GIVEN.get(form, set()), ends[form]) for form, series in simulated.items()
     }
-    missing += [_empty_text(form, end, recorded.duration) for form, end in ends.items() if end]
+    missing += [empty_text(form, end, recorded.duration) for form, end in ends.items() if end]
     roller = ride.road if isinstance(ride.road, Dynamometer) else None
     alone = components(vehicle, measured, ride.soc, recorded.first("ambient_temperature", MILD), roller)
     judged, by_circuit = _judge_components(alone), alone.get("battery_voltage")
@@ -139,7 +138,7 @@ def compare_ride(log: Path, vehicle: Vehicle, progress: Progress = lambda _: Non
         open_loop=verdicts.get("open_loop"),
         predictive=verdicts["predictive"],
         components=judged,
-        splits=_splits(measured, {form: _until(s, ends[form]) for form, s in simulated.items()}, alone, found),
+        splits=_splits(measured, {form: until_empty(s, ends[form]) for form, s in simulated.items()}, alone, found),
         cells_series=vehicle.pack.cells_series,
         soc_reference=soc_reference(vehicle, measured, ride.soc, by_circuit.modelled if by_circuit else None),
         missing=missing,
@@ -298,6 +297,16 @@ def _ride(ride: Measured, command: Command, progress: Progress) -> Run:
     return run
 
 
+def _load(ride: Measured) -> Load | None:
+    """The load that was measured; None if none was."""
+    if "pack_power" not in ride.series:
+        return None
+    current = ride.recorded.signals["pack_current"]
+    mean = float(current.mean())
+    form_factor_squared = float(np.mean(current**2)) / mean**2 if mean else 1.0
+    return float(ride.series["pack_power"].mean()), form_factor_squared
+
+
 def _series(run: Run) -> dict[str, Array]:
     """A run as means over seconds."""
     rate = round(1 / float(run.series["time"][1] - run.series["time"][0]))
@@ -307,51 +316,6 @@ def _series(run: Run) -> dict[str, Array]:
 
 
 # --- how far they are apart ---------------------------------------------------------------------------------------
-
-
-def _pack_empty(ride: Measured, run: Run) -> PackEmpty | None:
-    """Where the pack of `run` was empty, for the load that was measured; the run's own if none was.
-
-    A run whose pack is empty creeps: its own mean would take less than the ride that it is compared with. None, too, if
-    it is not known how full the pack was.
-    """
-    if ride.soc is None:
-        return None
-    signals, load = ride.recorded.signals, (run.mean_power, run.form_factor_squared)
-    if "pack_power" in ride.series:
-        current = signals["pack_current"]
-        mean = float(current.mean())
-        load = float(ride.series["pack_power"].mean()), float(np.mean(current**2)) / mean**2 if mean else 1.0
-    row = ran_empty(ride.vehicle, run, *load)
-    if row is None:
-        return None
-    time, distance, soc = (float(run.series[name][row]) for name in ("time", "distance", "soc"))
-    held = _held_back(ride.vehicle.derating.current_by_soc, run.series["soc"][: row + 1])
-    return PackEmpty(time, distance * 1e-3, soc, float(run.series["time"][held]))
-
-
-def _held_back(share: DeratingCurve, soc: Array) -> int:
-    """From which index of `soc` on the controller takes current off for want of charge; at most the last.
-
-    Of a ride that begins so, the last: its vehicle was held back as well.
-    """
-    free = np.flatnonzero(np.interp(soc, share.at, share.share) >= 1.0)
-    return min(int(free[-1]) + 1, len(soc) - 1) if len(free) else len(soc) - 1
-
-
-def _empty_text(form: str, end: PackEmpty, seconds: float) -> str:
-    """What a simulated pack that is empty before the ride ends means for what is compared; seconds: of the ride."""
-    until = "there" if end.compared_s == end.time_s else f"{end.compared_s:.0f} s, where the controller holds back"
-    return (
-        f"{NAMES[form]}: the simulated pack is empty at {end.time_s:.0f} s of {seconds:.0f}, after "
-        f"{end.distance_km:.2f} km, with {100 * end.soc:.1f} % of its charge: energy and conditions are compared until "
-        f"{until}, all else over the whole ride"
-    )
-
-
-def _until(series: Mapping[str, Array], end: PackEmpty | None) -> dict[str, Array]:
-    """The whole seconds of `series` in which what the ride asks was not short of charge."""
-    return {name: values[: int(end.compared_s)] if end else values for name, values in series.items()}
 
 
 def _judge_ride(
@@ -366,7 +330,7 @@ def _judge_ride(
     return SimulationVerdict(
         channels,
         all(channel.passed for channel in channels.values()),
-        _energy_percent(measured, _until(series, end)),
+        _energy_percent(measured, until_empty(series, end)),
         end,
     )
 
