@@ -14,7 +14,17 @@ from pathlib import Path
 from typing import NoReturn
 
 from gz_onboard import __version__
-from gz_onboard.errors import BAD_INPUT, EXIT_STATUSES, FAILED, INTERRUPTED, InputError, lacking_extra, naming, nearest
+from gz_onboard.errors import (
+    BAD_INPUT,
+    EXIT_STATUSES,
+    FAILED,
+    INTERRUPTED,
+    InputError,
+    closest,
+    lacking_extra,
+    naming,
+    nearest,
+)
 from gz_onboard.options import LOG_SUFFIXES
 
 COMMANDS = {
@@ -63,8 +73,8 @@ class _Parser(argparse.ArgumentParser):
     def _meant(self, wrong: str) -> str:
         """As `nearest`; dashes, which all options have, make none like another."""
         bare = {option.lstrip("-"): option for option in self.known_options()}
-        near = nearest(wrong.lstrip("-"), bare).split("'")
-        return f" (did you mean {bare[near[1]]!r}?)" if len(near) > 1 else ""
+        near = closest(wrong.lstrip("-"), bare)
+        return f" (did you mean {bare[near]!r}?)" if near else ""
 
     def _place_of(self, word: str) -> str:
         """Where a file or folder `word` goes on the command line of the command that was called."""

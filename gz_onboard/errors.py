@@ -68,15 +68,21 @@ def lacking_extra(error: ModuleNotFoundError) -> str | None:
 
 
 def nearest(name: str, known: Iterable[str], close: float | None = None) -> str:
-    """`` (did you mean 'x'?)`` for the known name nearest to `name`, or an empty string; close: of `CLOSE`."""
+    """`` (did you mean 'x'?)`` for what `closest` finds, or an empty string."""
+    found = closest(name, known, close)
+    return f" (did you mean {found!r}?)" if found else ""
+
+
+def closest(name: str, known: Iterable[str], close: float | None = None) -> str | None:
+    """The known name nearest to `name`, if one is near; close: of `CLOSE`."""
     if not 0 < len(name) <= LONGEST_NAME:
-        return ""
+        return None
     names = {each.lower(): each for each in known}
     enough = close or (CLOSE if len(name) > 3 else CLOSE_SHORT)
     match = difflib.get_close_matches(name.lower(), names, n=1, cutoff=enough)
     if not match and not close:  # a part of a name, or a name with more about it
         match = [each for each in names if name.lower() in each or each in name.lower()][:1]
-    return f" (did you mean {names[match[0]]!r}?)" if match else ""
+    return names[match[0]] if match else None
 
 
 def near_file(file: Path) -> str:
