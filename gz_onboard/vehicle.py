@@ -66,6 +66,11 @@ class Vehicle:
         pack = f"{self.battery.cells_series}s{self.battery.cells_parallel}p" if self.battery else "no battery"
         return "|".join([self.name, pack, *(effect.name for effect in self.model.effects)])
 
+    def loaded(self, payload: float) -> Vehicle:
+        """The same with a rider and luggage of `payload` [kg]. InputError if that cannot be."""
+        parameters = self.parameters.replaced(payload_mass=payload)
+        return replace(self, parameters=parameters, model=Model(self.model.effects, parameters))
+
     @property
     def pack(self) -> Battery:
         """The battery; InputError if the file has none."""
@@ -141,11 +146,9 @@ def read_vehicle(
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")
     effects = read_model(table, effects_folder, users)
     parameters = read_parameters(table, effects)
-    if payload is not None:
-        parameters = parameters.replaced(payload_mass=payload)
     model, riding = Model(effects, parameters), read_riding(table)
     check_riding(table, riding, model)
-    return Vehicle(
+    vehicle = Vehicle(
         name=_name(table),
         file=table.file,
         mapping=read_mapping(table),
@@ -158,6 +161,7 @@ def read_vehicle(
         range_identifier=_range_identifier(table),
         healthy=_healthy(table.table("healthy")),
     )
+    return vehicle if payload is None else vehicle.loaded(payload)
 
 
 def _range_dbc(table: Table) -> Path:

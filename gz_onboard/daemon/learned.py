@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import fields
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,6 @@ from gz_onboard.estimator.terrain import RATE, Terrain
 from gz_onboard.estimator.usual import Habit, Usual
 from gz_onboard.estimator.weakest import Weakest
 from gz_onboard.options import add_shared
-from gz_onboard.physics.model import Model
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
 VERSION = 2  # of the JSON keys
@@ -170,10 +169,9 @@ def _loaded(vehicle: Vehicle, payload: float | None) -> Vehicle:
     if payload is None or payload == vehicle.parameters.filed("payload_mass"):
         return vehicle
     try:
-        parameters = vehicle.parameters.replaced(payload_mass=payload)
+        return vehicle.loaded(payload)
     except InputError as error:
         raise ValueError(str(error)) from error
-    return replace(vehicle, parameters=parameters, model=Model(vehicle.model.effects, parameters))
 
 
 def read_riders(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, dict[str, Learned]]:
