@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from gz_onboard.arrays import Array
 from tests.plant.cases import stranger
 from tests.plant.logs import write_log
-from tests.plant.machine import SERIES, scooter
+from tests.plant.machine import SERIES, G, scooter
 from tests.plant.ride import STEP, Hidden, Ridden, ride
 from tests.plant.roads import GRID, JOURNEY, KINDS, Plan, plan
 from tests.plant.sensors import DEGREE, ORIGIN, measure
@@ -42,6 +42,18 @@ class Truth:
     time: Array  # s
     distance: Array  # m
     soc: Array
+    energy: Array  # J drawn from the pack
+    height: Array  # J that height has stored
+
+    def but_for_height(self, time: float) -> float:
+        """The range [m] at `time` [s] of who knows everything but the height that the way to come ends above or below.
+
+        What a climb costs beyond the height is left out: nobody without a route errs by less.
+        """
+        distance, energy, height = (
+            float(x[-1] - np.interp(time, self.time, x)) for x in (self.distance, self.energy, self.height)
+        )
+        return distance * energy / (energy - height)
 
 
 @dataclass(frozen=True)
@@ -86,7 +98,10 @@ def ride_until_empty(drawn: Sequence[Drawn], folder: Path) -> list[tuple[Path, T
 def truth_of(ridden: Ridden) -> Truth:
     """What happened on one ride."""
     c, time = ridden.columns, np.arange(0, len(ridden.columns["soc"]), EVERY)
-    return Truth(STEP * time.astype(float), c["distance"][time].astype(float), c["soc"][time].astype(float))
+    distance, soc, altitude = (c[name][time].astype(float) for name in ("distance", "soc", "altitude"))
+    energy: Array = STEP * np.cumsum(c["pack_voltage"].astype(float) * c["pack_current"].astype(float))
+    mass = ridden.machine.mass + ridden.plan.rider.mass + ridden.hidden.luggage
+    return Truth(STEP * time.astype(float), distance, soc, energy[time], mass * G * altitude)
 
 
 def road_of(drawn: Drawn) -> Plan:

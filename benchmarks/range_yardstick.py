@@ -15,6 +15,7 @@ ROLLING = 25_000.0  # m, over which consumption is averaged
 RESERVE = 0.15  # of the charge that a telematics module keeps back
 SOME_WAY = 1000.0  # m, before which no mean is taken
 OURS = {"ours": "gz_onboard", "route": "gz_onboard, with the route"}
+BUT_FOR_HEIGHT = "height"  # no estimator: what none without a route can know, see `Truth.but_for_height`
 NAMES = {
     **OURS,
     "rolling": "mean of 25 km, to 0 %",
@@ -22,6 +23,7 @@ NAMES = {
     "trip": "mean of the trip (VESC)",
     "rated": "SOC × rated range",
     "fixed": "45 Wh/km",
+    BUT_FOR_HEIGHT: "all known but the height to come",
 }
 
 

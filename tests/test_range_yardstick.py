@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import norm
 
+from benchmarks.range_rides import Truth
 from benchmarks.range_yardstick import FALLBACK, RESERVE, Usual, crps, jumps
 
 
@@ -49,3 +50,12 @@ def test_a_forecast_that_falls_with_the_way_does_not_jump():
     assert jumps(distance, calm) == pytest.approx(np.zeros(19), abs=1e-6)
     calm[200:] += 1500.0
     assert sorted(jumps(distance, calm))[-1] == pytest.approx(1500.0, rel=0.05)
+
+
+def test_who_knows_all_but_the_height_errs_by_what_it_stores():
+    """100 J/m, of which a climb over the second half stores 20: half way that half looks a fifth cheaper."""
+    time = np.arange(0.0, 1001.0)
+    way = 10.0 * time
+    truth = Truth(time, way, 1 - time / 1000, 100.0 * way, 20.0 * np.maximum(way - 5000.0, 0.0))
+    assert truth.but_for_height(500.0) == pytest.approx(5000.0 / 0.8)
+    assert truth.but_for_height(0.0) == pytest.approx(10_000.0 / 0.9)

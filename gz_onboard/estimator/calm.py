@@ -8,8 +8,9 @@ faster
 - near empty, where the forecast's error goes as its range does: over a third of that.
 
 Once a ride has gone on for `SETTLED` and the forecast is known from as much, another one is shown no faster than
-`FASTEST`: the range does not rise under who rides, nor falls twice as fast as he rides. A worse one is held back no
-further than the gap closes near empty, over a third of the range: who is to turn round must know in time.
+`GAINED` and `LOST`: the range does not rise under who rides, nor falls twice as fast as he rides. So what is lost has
+been told before half the range is ridden. Of more than `LARGE` it closes as near empty, over a third of the range: who
+is to turn round must know in time.
 
 At standstill nothing is ridden that the gap could close over: what is drawn is taken off, and what else changes the
 forecast, as a rest does that shows the state of charge, waits for the riding to come; at most `STEP` of it. The rest of
@@ -30,7 +31,9 @@ NEAR_EMPTY = 3.0  # the gap closes over the range over this
 AT_FIRST = 2.0  # the gap closes over what the forecast is known from over this
 FIRST = 250.0  # m, over which it closes at first
 SETTLED = 2000.0  # m
-FASTEST = 0.8, 1.5e-5  # moved, of what is ridden; of the range for each m ridden, where that is more
+GAINED, LOST = 0.8, 0.95  # at most, of what is ridden
+FASTEST = 1.25e-5  # of the range for each m ridden, where that is more
+LARGE = 0.45  # of the forecast
 STEP = 0.05  # of the energy that is left, or of the range
 RATIO = 0.2, 5.0  # shown over forecast: beyond, the gap is not kept
 MOST_GAP = 1e6  # m, of a saved gap
@@ -89,9 +92,10 @@ class Calm:
         self._way += ridden
         self._settled |= min(known, self._way) >= SETTLED
         if self._settled:
-            most = ridden * max(FASTEST[0], FASTEST[1] * raw)
-            least = gap * (1 - exp(-ridden * NEAR_EMPTY / raw))
-            closed = min(max(closed, -most), max(most, least))
+            gained, lost = (ridden * max(most, FASTEST * raw) for most in (GAINED, LOST))
+            if gap > LARGE * raw:
+                lost = max(lost, gap * (1 - exp(-ridden * NEAR_EMPTY / raw)))
+            closed = min(max(closed, -gained), lost)
         self.gap = gap - closed
         self._waiting *= fading
         return self.shown(raw)
