@@ -26,7 +26,7 @@ from gz_onboard.estimator.ridden import MEMORY
 from gz_onboard.estimator.road_load import RoadLoad
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import LOADS, Cause, Explanation
-from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery import Battery, Overpotential
 from gz_onboard.physics.drawable import drawable
 from gz_onboard.physics.warming import cells_ahead
 
@@ -199,7 +199,8 @@ class Attribution:
             consumption = prior.factor * sum(calm.values())
             full, power = self._new.window.of_cells(1.0), consumption * prior.speed
             load_ahead = power, PRIOR_FORM_FACTOR_SQUARED
-            cells = cells_ahead(self._new, self._forecaster.cooling, (full, MILD), MILD, load_ahead)
+            lost = self._overpotential(self._new)
+            cells = cells_ahead(self._new, self._forecaster.cooling, (full, MILD), MILD, load_ahead, lost)
             draw = Draw(full, cells, self._new, *load_ahead)
             energy = self._energy(draw)
             self._rated = State(
@@ -316,10 +317,12 @@ class Attribution:
         return pack
 
     def _energy(self, draw: Draw) -> float:
-        load = self._forecaster.load
-        usual = {"vibration": load.prior.vibration, "time_moving": AHEAD}
-        lost = load.model.overpotential(draw.battery, usual)
+        lost = self._overpotential(draw.battery)
         return drawable(draw.battery, draw.soc, draw.cells, draw.power, draw.form_factor_squared, lost).energy
+
+    def _overpotential(self, battery: Battery) -> Overpotential | None:
+        load = self._forecaster.load
+        return load.model.overpotential(battery, {"vibration": load.prior.vibration, "time_moving": AHEAD})
 
 
 def _charged(change: Explanation) -> bool:

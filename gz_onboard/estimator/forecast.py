@@ -280,7 +280,9 @@ class Forecaster:
         past, now = self._past, self.riding.current
         expected = self._expected(self._rough_way(soc, cell_temperature), ambient, altitude)
         consumption = expected.consumption
-        ahead = cells_ahead(self.battery, self.cooling, (soc, cell_temperature), ambient, expected.load)
+        ahead = cells_ahead(
+            self.battery, self.cooling, (soc, cell_temperature), ambient, expected.load, self._overpotential
+        )
         left = self._drawable(soc, ahead, expected)
         beside = (
             (hypot(self.battery.window.sd, left.end_sd) * left.slope) ** 2

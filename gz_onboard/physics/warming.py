@@ -5,19 +5,24 @@ from __future__ import annotations
 from math import exp
 
 from gz_onboard.constants import HOUR
-from gz_onboard.physics.battery import Battery
+from gz_onboard.physics.battery import Battery, Overpotential
 from gz_onboard.physics.cooling import LumpedCooling
 
 HOT_CELLS = 50.0  # degC; warmer they are not expected to become
 
 
 def cells_ahead(
-    battery: Battery, cooling: LumpedCooling, cells: tuple[float, float], ambient: float, load: tuple[float, float]
+    battery: Battery,
+    cooling: LumpedCooling,
+    cells: tuple[float, float],
+    ambient: float,
+    load: tuple[float, float],
+    overpotential: Overpotential | None = None,
 ) -> float:
     """The mean temperature [degC] of the cells until they are empty, from (SOC, temperature [degC]) now.
 
-    load: mean power [W] and the square of its form factor; ambient in degC. Their loss at the mean power warms one mass
-    that the air cools (eq. 2.30), in closed form.
+    load: mean power [W] and the square of its form factor; ambient in degC; overpotential: see
+    `Battery.settled_current`. Their loss at the mean power warms one mass that the air cools (eq. 2.30), in closed form.
     """
     (soc, temperature), (power, form_factor_squared) = cells, load
     if power <= 0 or soc <= 0:
@@ -26,7 +31,7 @@ def cells_ahead(
 
     def warmed(mean: float) -> float:
         source = battery.cells_series * battery.ocv(soc / 2, mean)[0]
-        current = battery.settled_current(power, soc / 2, mean, form_factor_squared)
+        current = battery.settled_current(power, soc / 2, mean, form_factor_squared, overpotential)
         if current is None:  # bursts are held back at the most that the pack gives, of which half stays in it as heat
             current = 2 * power / source
         loss = source * current - power

@@ -353,20 +353,22 @@ def test_a_restart_keeps_what_was_shown():
     assert again.shown(forecast(again)).p10 == pytest.approx(forecast(f).p10, rel=1e-3)
 
 
+@pytest.mark.parametrize("effects", [False, True])
 @pytest.mark.parametrize(("start", "ambient"), [(-15.0, -15.0), (5.0, 5.0), (25.0, 25.0), (30.0, -10.0)])
-def test_the_cells_warm_on_the_way_as_their_equation_says(start, ambient):
+def test_the_cells_warm_on_the_way_as_their_equation_says(start, ambient, effects):
     """Against small steps: each loses what its temperature makes it lose, the air takes its share."""
+    lost = VEHICLE.model.overpotential(VEHICLE.pack, {"vibration": 0.0, "time_moving": 3600.0}) if effects else None
     cooling = LumpedCooling.of(VEHICLE.model.parameters, "pack", start)
     expected = Expected(95.0, 800.0, 2.5, 0.01)
     pack, charge, temperatures = VEHICLE.pack, 0.8, []
     while charge > 0:
-        current = pack.settled_current(expected.power, 0.4, cooling.temperature, 2.5)
+        current = pack.settled_current(expected.power, 0.4, cooling.temperature, 2.5, lost)
         assert current is not None
         loss = pack.cells_series * pack.ocv(0.4, cooling.temperature)[0] * current - expected.power
         temperatures.append(cooling.temperature)
         cooling.step(20.0, loss, ambient)
         charge -= 20.0 * current / 3600 / pack.pack_capacity(cooling.temperature)
-    found = cells_ahead(pack, cooling, (0.8, start), ambient, expected.load)
+    found = cells_ahead(pack, cooling, (0.8, start), ambient, expected.load, lost)
     assert found == pytest.approx(np.mean(temperatures), abs=2.5)
 
 
