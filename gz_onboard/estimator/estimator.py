@@ -228,7 +228,8 @@ class Estimator:
         known = current if self._reading.source in (CurrentSource.PACK, CurrentSource.INVERTER) else None
         capacity = self.battery.pack_capacity(self._temperatures.cells_or_bench)
         rate, drive = (None if x is None else x / capacity for x in (known, signals.inverter_current.get(now)))
-        silent = bool(self._inverter) and not any(signal.fresh(now) for signal in self._inverter)
+        rides = abs(self.road.speed or 0.0) > MOVING  # then nobody asks
+        silent = not rides and bool(self._inverter) and not any(signal.fresh(now) for signal in self._inverter)
         off = signals.key.get(now) == 0 or signals.contactor.get(now) == 0
         rider = signals.rider.get(now)
         if rider is not None and abs(self.road.speed or 0.0) < STANDSTILL:

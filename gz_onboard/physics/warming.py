@@ -22,7 +22,8 @@ def cells_ahead(
     """The mean temperature [degC] of the cells until they are empty, from (SOC, temperature [degC]) now.
 
     load: mean power [W] and the square of its form factor; ambient in degC; overpotential: see
-    `Battery.settled_current`. Their loss at the mean power warms one mass that the air cools (eq. 2.30), in closed form.
+    `Battery.settled_current`. Their loss at the mean power warms one mass that the air cools (eq. 2.30), in closed
+    form.
     """
     (soc, temperature), (power, form_factor_squared) = cells, load
     if power <= 0 or soc <= 0:
