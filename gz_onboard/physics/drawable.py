@@ -10,6 +10,7 @@ from gz_onboard.physics.battery import Battery, Overpotential
 
 BELOW_EMPTY = -0.05  # SOC down to which the cut-off is sought
 HALVINGS = 9  # of the SOC left, to 0.002 of it; between the two ends of that the voltage is taken as straight
+BESIDE = 0.01  # SOC to both sides of the end over which the rest voltage rises
 LEAST_WIDTH = 1e-3  # SOC: an end found nearer to the last one allowed is that
 GIVES_UP, GIVES_UP_SD = 0.5, 0.3  # of the load's sd over time: how far above its mean a vehicle gives up
 
@@ -93,7 +94,9 @@ def drawable(
     energy = power * charge * width * total
     if high - least <= LEAST_WIDTH:  # where the vehicle ends before the voltage does, the cut-off does not count
         return Drawable(energy, slope, end_sd=end_sd)
-    rest, rise = battery.ocv(weakest.soc(high) if weakest else high, temperature)
+    end = weakest.soc(high) if weakest else high
+    below, rest, beyond = (battery.ocv(end + off, temperature)[0] for off in (-BESIDE, 0.0, BESIDE))
+    rise = (beyond - below) / (2 * BESIDE)  # not that of one piece of the table, which ends at a knot
     drop_sd = max(rest - battery.cutoff_voltage, 0.0) / end_load * GIVES_UP_SD * load_sd
     return Drawable(energy, slope, charge * cutoff / rise, drop_sd, end_sd)
 
