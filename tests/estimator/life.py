@@ -20,10 +20,11 @@ from gz_onboard.vehicle import read_vehicle
 
 VEHICLE = read_vehicle("reference", 75.0)
 BATTERY = VEHICLE.pack
+PERIOD = 0.2  # s, of the messages that come often
 GROUPS = [
-    Group("Pack", ("pack_voltage", "pack_current", "bms_state_of_charge"), 0.1),
-    Group("Motor", ("motor_speed",), 0.1),
-    Group("Inverter", ("inverter_voltage", "inverter_current"), 0.1),
+    Group("Pack", ("pack_voltage", "pack_current", "bms_state_of_charge"), PERIOD),
+    Group("Motor", ("motor_speed",), PERIOD),
+    Group("Inverter", ("inverter_voltage", "inverter_current"), PERIOD),
     Group("Cells", ("cell_temperature", "ambient_temperature"), 1.0),
     Group("Vehicle", ("odometer", "charge_plug"), 1.0),
 ]
@@ -40,7 +41,7 @@ class Scooter:
     offset: float = 0.05  # A
     capacity: float = 32.5  # A·h
     seed: int = 0
-    period: float = 0.1  # s, of every message
+    period: float = PERIOD  # s, of every message
     plug: float | None = 0.0  # None: no such signal comes
     auxiliary: float = 45.0  # W
     time: float = 0.0

@@ -267,7 +267,7 @@ def test_charged_while_only_the_pack_was_silent(own_soc):
     scooter, e = Scooter(soc=0.3), estimator()
     follow(e, heard(scooter.live(300, 9.0), own_soc=own_soc), scooter)
     follow(e, scooter.live(30), scooter)
-    follow(e, without_pack(scooter.live(2.5 * 3600, charge=6.0)), scooter)
+    follow(e, without_pack(scooter.live(1.25 * 3600, charge=12.0)), scooter)
     rows = follow(e, heard(scooter.live(60), own_soc=own_soc), scooter)
     true, end = rows[-1]
     assert true > 0.6

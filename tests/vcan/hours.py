@@ -21,7 +21,7 @@ from gz_onboard import state
 from gz_onboard.daemon.keeper import state_file
 from gz_onboard.events import Event
 from gz_onboard.vehicle import OWN, read_vehicle
-from tests.estimator.life import CELLS, INVERTER, MOTOR, OTHERS, PACK
+from tests.estimator.life import CELLS, INVERTER, MOTOR, OTHERS, PACK, PERIOD
 from tests.estimator.life import Scooter as Ridden
 from tests.support import EPOCH, ROOT, S, Scooter, range_database
 from tests.vcan.paced import LARGEST, WAITING, packet
@@ -43,7 +43,7 @@ MESSAGES: dict[int, list[tuple[str, dict[str, tuple[int, float]]]]] = {  # of ea
     CELLS: [("BMS_Cells", {"BMS_CellTempMean": (0, 1)}), ("TC_Ambient", {"TC_Ambient": (1, 1)})],
     OTHERS: [("VCU_Odometer", {"VCU_Odometer": (0, 1e-3)}), ("VCU_Rider", {"VCU_ChargePlug": (1, 1)})],
 }
-PERIODS = {256: 100, 768: 1000}  # ms, by identifier: slower than on the reference scooter
+PERIODS = {256: round(1000 * PERIOD), 768: 1000}  # ms, by identifier: slower than on the reference scooter
 
 
 def vehicle_file(folder: Path) -> Path:
