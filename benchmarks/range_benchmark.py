@@ -11,9 +11,6 @@ them in turn, with climbs and descents of some kilometres, and not back. On one 
 kept. On one a tyre has lost its air after 40 minutes. The logs of the healthy ones are also read from the middle on, as
 by a daemon that starts late.
 
-No estimator knows without a route how far the way to come climbs: the last line of each table is of who knows
-everything else.
-
 A week has fifteen rides of 4 to 9 km, three a day, with rests and charges between; the state is kept.
 
 Seeds 0 to 999 are for development; 1000 and up for the tables. Those below 1095 were looked at when the
@@ -360,6 +357,8 @@ def page(judged: Sequence[Judged], days: Sequence[Day], command: str, version: s
     lines = ["# Range benchmark", "", *(__doc__ or "").partition("\n\n")[2].strip().split("\n"), ""]
     lines += [
         f"Made by `{command}` on commit {version}. Rows are each ride at each tenth of charge from 90 to 20 %.",
+        "No estimator knows without a route how far the way to come climbs: the last row of each table is of who knows",
+        "everything else.",
         "",
     ]
     if judged:
