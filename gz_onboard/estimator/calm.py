@@ -8,16 +8,15 @@ faster
 - near empty, where the forecast's error goes as its range does: over a third of that.
 
 Once a ride has gone on for `SETTLED` and the forecast is known from as much, another one is shown no faster than
-`GAINED` and `LOST`: the range does not rise under who rides, nor falls twice as fast as he rides. So what is lost has
-been told before half the range is ridden. Of more than `LARGE` it closes as near empty, over a third of the range: who
-is to turn round must know in time.
+`GAINED` and `LOST`: the range does not rise under who rides, nor falls twice as fast as he rides. Of more than `LARGE` it closes
+as near empty, over a third of the range: who is to turn round must know in time.
 
 At standstill nothing is ridden that the gap could close over: what is drawn is taken off, and what else changes the
 forecast, as a rest does that shows the state of charge, waits for the riding to come; at most `STEP` of it. The rest of
-it shows at once. So does a step of the energy by more than `STEP` from one forecast to the next, at standstill or not,
-which nothing makes but a state of charge that was begun anew, and a route that is given or taken back. While the pack
-is charged the gap stays as it is, in metres: fifty metres are a third of the range near empty, and nothing of a full
-one. A restart is a standstill, at which the energy that is gone was drawn; over a charge the gap stays.
+it shows at once. So does what the rider changes, as a route, and a state of charge that is begun anew (`show_next`).
+While the pack is charged the gap stays as it is, in metres: fifty metres are a third of the range near empty, and
+nothing of a full one. A restart is a standstill, at which the energy that is gone was drawn; over a charge the gap
+stays.
 """
 
 from __future__ import annotations
@@ -30,11 +29,12 @@ CALM = 6000.0  # m
 NEAR_EMPTY = 3.0  # the gap closes over the range over this
 AT_FIRST = 2.0  # the gap closes over what the forecast is known from over this
 FIRST = 250.0  # m, over which it closes at first
-SETTLED = 2000.0  # m
+SETTLED = 1500.0  # m
 GAINED, LOST = 0.8, 0.9  # at most, of what is ridden
 FASTEST = 1.25e-5  # of the range for each m ridden, where that is more
 LARGE = 0.45  # of the forecast
-STEP = 0.05  # of the energy that is left, or of the range
+STILL = 0.1  # m from one forecast to the next: so much a speed sensor's noise moves
+STEP = 0.05  # of the range, or over a restart of the energy that is left
 RATIO = 0.2, 5.0  # shown over forecast: beyond, the gap is not kept
 MOST_GAP = 1e6  # m, of a saved gap
 MOST_RANGE, MOST_ENERGY = 1e7, 1e12  # m, J: of a saved forecast
@@ -76,11 +76,13 @@ class Calm:
         """
         before, ridden, restarted = self._before, self._ridden, self._restarted
         self._before, self._ridden, self._restarted = (raw, energy), 0.0, False
-        if before is None or min(raw, energy, *before) <= 0 or abs(energy - before[1]) > STEP * before[1]:
+        if before is None or min(raw, energy, *before) <= 0:
             return self.shown(raw)
         if restarted:
+            if abs(energy - before[1]) > STEP * before[1]:
+                return self.shown(raw)
             drawn = before[1] - energy  # or charged, a little
-        if ridden == 0:
+        if ridden < STILL:
             if drawn is not None and drawn < before[1]:
                 held = self.shown(before[0]) * (1 - drawn / before[1])
                 self._wait(held - self.shown(raw), STEP * raw)
@@ -93,9 +95,8 @@ class Calm:
         self._settled |= min(known, self._way) >= SETTLED
         if self._settled:
             gained, lost = (ridden * max(most, FASTEST * raw) for most in (GAINED, LOST))
-            if gap > LARGE * raw:
-                lost = max(lost, gap * (1 - exp(-ridden * NEAR_EMPTY / raw)))
-            closed = min(max(closed, -gained), lost)
+            if gap <= LARGE * raw:
+                closed = min(max(closed, -gained), lost)
         self.gap = gap - closed
         self._waiting *= fading
         return self.shown(raw)

@@ -16,6 +16,7 @@ from gz_onboard.physics.battery import Battery
 PERIOD = 1.0  # s
 EARLY = 0.05  # s: by so much a forecast may be made early, rather than a step late
 LONGEST = 60.0  # s: more is not taken in of a pause
+BEGUN_ANEW = 0.05  # of the state of charge: nothing drawn or learned changes it by so much from one forecast to the next
 
 
 class Now(NamedTuple):
@@ -40,7 +41,7 @@ class Outlook:
         self._forecaster, self._battery, self._road = forecaster, battery, road
         self._charging = Charging()
         self._full: Forecast | None = None  # while it is charged
-        self._time = -inf
+        self._time, self._soc = -inf, 0.0  # of the last forecast
         self._factor = 1.0, 0.0  # consumption factor and its sd, as of the forecast
 
     def due(self, now: float) -> bool:
@@ -64,6 +65,9 @@ class Outlook:
         pack = Pack(now.soc, now.soc_sd, now.loss_variance)
         voltage, current = now.reading.voltage, now.reading.current
         charging = now.activity is Activity.CHARGING
+        if abs(now.soc - self._soc) > BEGUN_ANEW * self._soc > 0:
+            self._forecaster.calm.show_next()
+        self._soc = now.soc
         drawn = None if charging or voltage is None or current is None else voltage * current * elapsed
         self.forecast = self._forecaster.shown(self._road.forecast(now.time, free, pack, now.conditions), drawn)
         self._factor = self._forecaster.factor, sqrt(self._forecaster.riding.factor_variance)

@@ -67,10 +67,13 @@ def test_of_a_long_range_more_is_gained():
     assert np.diff((found + at)[(at > 12_000) & (at < 14_000)]) == pytest.approx(10 * 1.25e-5 * 487_000, rel=0.01)
 
 
-def test_a_step_that_no_riding_makes_is_shown_at_once():
-    ridden = np.full(100, 10.0)
-    raw = np.where(np.arange(100) < 50, 40_000.0, 30_000.0) - np.cumsum(ridden)
-    assert shown(raw, ridden)[50] == pytest.approx(raw[50], rel=1e-3)
+def test_what_lower_power_gives_of_energy_is_followed_as_any_change():
+    """A twentieth more energy and range at once, from one second to the next, and no kilometre gains more than one."""
+    ridden = np.full(1000, 10.0)
+    raw = np.where(np.arange(1000) < 500, 40_000.0, 42_200.0) - np.cumsum(ridden)
+    found = shown(raw, ridden)
+    assert np.abs(np.diff((found + np.cumsum(ridden))[::100])).max() < 810
+    assert found[-1] > raw[-1] - 1200
 
 
 def test_what_is_drawn_or_charged_at_standstill_shows_at_once():
@@ -286,15 +289,16 @@ def test_whatever_was_learned_can_be_restored(segments, repeats):
 
 
 def test_a_worse_forecast_is_told_in_time():
-    """8 km less within one, of 60: no kilometre takes off two, and it is told half way; 5 km, of 12: sooner."""
+    """8 km less within one, of 60: no kilometre takes off two, and it is told half way; 5 km, of 11: sooner."""
     ridden = np.full(4000, 10.0)
     at = np.cumsum(ridden)
     raw = np.interp(at, [3000, 4000], [60_000, 52_000]) - at
     found = shown(raw, ridden)
     assert np.diff((found + at)[::100]).min() > -910
     assert np.all((found / raw)[raw < 35_000] < 1.03)
-    near = shown(np.interp(at, [3000, 4000], [15_000, 10_000]) - at, ridden)
-    assert near[at >= 6000][0] < 1.4 * 4000
+    raw = np.interp(at, [3000, 4000], [15_000, 10_000]) - at
+    raw = np.maximum(raw, 1.0)
+    assert np.all((shown(raw, ridden) / raw)[(raw < 3000) & (raw > 100)] < 1.25)
 
 
 def test_what_was_held_back_on_one_ride_shows_in_the_first_kilometres_of_the_next():
@@ -308,8 +312,8 @@ def test_what_was_held_back_on_one_ride_shows_in_the_first_kilometres_of_the_nex
             calm.ride(10.0)
             left = (40_000 if k < 500 else 60_000) - 10 * k
             found.append(calm.follow(left, 4e6, 3000.0))
-    assert found[999] < 45_000
-    assert found[1999] > 47_000
+    assert found[999] < 42_000
+    assert found[1999] > 45_000
 
 
 @pytest.mark.parametrize("ridden", [0.0, 10.0])
@@ -335,7 +339,7 @@ def test_a_first_guess_that_was_too_good_is_left_as_soon_as_the_riding_is_known(
     calm, found = Calm(), []
     for way, so_far in zip(at, known, strict=True):
         calm.ride(10.0)
-        raw = (60_000 if way < 1500 else 45_000) - way
+        raw = (60_000 if way < 1000 else 45_000) - way
         found.append(calm.follow(raw, 4e6, so_far) / raw)
-    assert found[250] > 1.1
+    assert found[150] > 1.1
     assert found[-1] < 1.1
