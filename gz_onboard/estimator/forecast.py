@@ -35,7 +35,7 @@ from gz_onboard.estimator.riders import Riders, restored_riders
 from gz_onboard.estimator.terrain import Terrain, restored_terrain
 from gz_onboard.estimator.usual import SEGMENT, Unit, Usual, restored_unit
 from gz_onboard.physics.battery import HALF_FULL, Battery
-from gz_onboard.physics.cooling import LumpedCooling
+from gz_onboard.physics.cooling import pack_constants
 from gz_onboard.physics.drawable import Drawable, drawable
 from gz_onboard.physics.effect import MOVING
 from gz_onboard.physics.effects.inertia import rotating_mass
@@ -52,8 +52,7 @@ SPEEDS = -5.0, 70.0  # m/s: the same
 LEAST_DISTANCE = 0.1  # m: over less a climb shows no grade
 LEAST = 0.2  # of the prior's consumption: no riding of any length consumes less
 MOST_SD = 3.0  # of the logarithm of the range: beyond, it is not known at all
-WARM_CELLS = 25.0  # degC, of a cooling that is only asked for its constants
-COLDER_AGAIN = 0.005, 0.5, 0.5  # SOC, degC, degC: changed by more, what colder cells would give is asked anew
+COLDER_AGAIN = 0.005, 0.5, 0.5, 20.0  # SOC, degC, degC, W: changed by more, what colder cells lack is asked anew
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class Forecast:
     range: float
     p10: float
     p90: float
-    energy: float
+    left: Drawable
     energy_sd: float  # downwards
     energy_sd_up: float
     consumption: float  # J/m
@@ -74,6 +73,11 @@ class Forecast:
     form_factor_squared: float
     cells: float  # degC, their mean on the way that is left
     known_from: float  # m: as much riding would tell as much of the way to come
+
+    @property
+    def energy(self) -> float:
+        """That is left [J]."""
+        return self.left.energy
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +107,12 @@ class Forecaster:
         self.calm, self.pattern, self.riders, self.terrain = Calm(), Pattern(), Riders(), Terrain()
         self.auxiliaries = Auxiliaries(model)
         self.ageing: Ageing | None = None  # None: the pack is known to be as its file says
-        self._past, self._colder = Past(), ((inf, inf, inf), 0.0)  # SOC, cells and their sd [degC]; the share lost
+        self._past = Past()
+        self._colder = (inf, inf, inf, inf), 0.0  # SOC, cells and their sd [degC], power [W]; what colder ones lack [J]
         self._overpotential = model.overpotential(battery, {"vibration": prior.vibration, "time_moving": AHEAD})
         self._weight = model.mass * GRAVITY  # N
         self._moving_mass = model.mass + rotating_mass(model.parameters)  # kg, with what rotates
-        self.cooling = LumpedCooling.of(model.parameters, "pack", WARM_CELLS)
+        self.cooling = pack_constants(model.parameters)
         p = model.parameters
         self._cutoff_sd, self._empty_sd = p.sd("cell_cutoff_voltage"), p.sd("cell_voltage_error_empty")  # V
 
@@ -286,7 +291,7 @@ class Forecaster:
         left = self._drawable(soc, ahead, expected)
         beside = (
             (hypot(self.battery.window.sd, left.end_sd) * left.slope) ** 2
-            + (left.energy * self._lost_colder(soc, (ahead, temperature_sd), expected, left)) ** 2
+            + self._lost_colder(soc, (ahead, temperature_sd), expected, left) ** 2
             # Where vehicles were seen to give up has the error of an empty cell's voltage in it.
             + (self._cutoff_sd**2 + max(self._empty_sd, left.end_drop_sd) ** 2) * left.by_cutoff**2
         )
@@ -301,7 +306,7 @@ class Forecaster:
             range=range_,
             p10=p10 / consumption,
             p90=p90 / consumption,
-            energy=left.energy,
+            left=left,
             energy_sd=energy_sd,
             energy_sd_up=upwards,
             consumption=consumption,
@@ -320,12 +325,11 @@ class Forecaster:
         )
 
     def _lost_colder(self, soc: float, cells: tuple[float, float], expected: Expected, left: Drawable) -> float:
-        """Share of the energy `left` that colder cells would not give. cells: temperature and its sd [degC]."""
-        now, before = (soc, *cells), self._colder[0]
+        """Energy [J] of what is `left` that colder cells would not give. cells: temperature and its sd [degC]."""
+        now, before = (soc, *cells, expected.power), self._colder[0]
         if any(abs(x - then) > step for x, then, step in zip(now, before, COLDER_AGAIN, strict=True)):
-            colder = self._drawable(soc, cells[0] - cells[1], expected)
-            self._colder = now, 1 - colder.energy / left.energy if left.energy > 0 else 0.0
-        return self._colder[1]
+            self._colder = now, left.energy - self._drawable(soc, cells[0] - cells[1], expected).energy
+        return min(self._colder[1], left.energy)
 
     def _rough_way(self, soc: float, temperature: float) -> float:
         """How long the charge will last [m], roughly: by the battery's nominal energy and the prior's price."""

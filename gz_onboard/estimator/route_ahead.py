@@ -239,25 +239,25 @@ class RoadAhead:
         )
 
     def _arrival(self, free: Forecast, pack: Pack, needed: float, needed_sd: float) -> tuple[float, float, float]:
-        """State of charge at the end of the route, P10 and P90, as shown; 0 where it is not reached.
+        """State of charge at the end of the route, P10 and P90, as shown; 0 where the battery ends before.
 
         What is not known of the energy, beside the state of charge, counts for the part that the way takes.
         """
         if free.energy <= 0:
             return 0.0, 0.0, 0.0
-        window, soc, share = self._forecaster.battery.window, pack.soc, max(1 - needed / free.energy, 0.0)
-        arrival = soc_left(self._forecaster.battery, soc, free.cells, share)
-        per_energy, known = soc / free.energy, pack.soc_sd**2
+        window, left, share = self._forecaster.battery.window, free.left, 1 - needed / free.energy
+        per_energy, known = (pack.soc - left.end) / free.energy, pack.soc_sd**2
+        taken = min(needed / free.energy, 1.0)
         down, up = (
-            DECILE
-            * sqrt((needed_sd * per_energy) ** 2 + known + (1 - share) ** 2 * max((of * per_energy) ** 2 - known, 0.0))
+            DECILE * sqrt((needed_sd * per_energy) ** 2 + known + taken**2 * max((of * per_energy) ** 2 - known, 0.0))
             for of in (free.energy_sd, free.energy_sd_up)
         )
-        beyond = soc * (needed / free.energy - 1)  # how much the battery lacks, if it does
-        if share <= 0:
-            return 0.0, 0.0, max(window.shown(arrival + up - beyond, 0.0)[0], 0.0)
-        median, p10, p90 = (window.shown(arrival + x, 0.0)[0] for x in (0.0, -down, up))
-        return max(median, 0.0), max(p10, 0.0), min(p90, 1.0)
+        arrival = soc_left(left, pack.soc, share) if share > 0 else left.end + share * free.energy * per_energy
+        median, p10, p90 = (
+            min(max(window.shown(x, 0.0)[0], 0.0), 1.0) if x > left.end else 0.0
+            for x in (arrival, arrival - down, arrival + up)
+        )
+        return median, p10, p90
 
     # --- results ----------------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from gz_onboard.constants import BENCH_TEMPERATURE, MILD
 from gz_onboard.estimator.signals import Signals
+from gz_onboard.physics.cooling import pack_constants
 from gz_onboard.physics.parameters import Parameters
 from gz_onboard.physics.relaxation import decay_over, relaxed
 
@@ -20,13 +21,12 @@ def at_rest(temperature: float) -> float:
 class Temperatures:
     """Remembers the cells' temperature, and by how much their heat has made them warmer than the air.
 
-    What is not measured follows the pack's cooling network (`physics.cooling.LumpedCooling`, exact over any step).
+    What is not measured follows the pack's cooling network (`physics.cooling.pack_constants`, exact over any step).
     """
 
     def __init__(self, signals: Signals, parameters: Parameters) -> None:
         self._signals = signals
-        self._conductance = parameters["pack_conductance"] * parameters["cooling_factor"]  # W/K
-        self._cooling_time = parameters["pack_heat_capacity"] / self._conductance  # s
+        self._conductance, self._cooling_time = pack_constants(parameters)  # W/K, s
         self.cells: float | None = None  # degC, the last known
         self._over = 0.0  # K: over the ambient; parked for long they are as cold
 

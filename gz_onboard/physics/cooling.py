@@ -128,10 +128,15 @@ class LumpedCooling:
     def of(cls, p: Mapping[str, float], part: str, temperature: float) -> LumpedCooling:
         """The `part` (``pack``, ``bms``) of a vehicle's parameters, at a temperature [degC]."""
         return cls(p[f"{part}_heat_capacity"], p[f"{part}_conductance"], temperature)
-
     def step(self, dt: float, heat: float, ambient: float, air: float = 0.0, factor: float = 1.0) -> None:
         """See `Network`; whatever `air` is."""
         self.temperature += dt * (heat - self.conductance * factor * (self.temperature - ambient)) / self.capacity
+
+
+def pack_constants(p: Mapping[str, float]) -> tuple[float, float]:
+    """Of a pack in the ambient air (eq. 2.30): (conductance [W/K], time constant [s])."""
+    conductance = p["pack_conductance"] * p["cooling_factor"]
+    return conductance, p["pack_heat_capacity"] / conductance
 
 
 def temperatures(network: Network, dt: float, *columns: Array) -> list[float]:

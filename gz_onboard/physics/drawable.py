@@ -10,7 +10,8 @@ from gz_onboard.physics.battery import Battery, Overpotential
 
 BELOW_EMPTY = -0.05  # SOC down to which the cut-off is sought
 HALVINGS = 9  # of the SOC left, to 0.002 of it; between the two ends of that the voltage is taken as straight
-BESIDE = 0.01  # SOC to both sides of the end over which the rest voltage rises
+BESIDE = 0.01  # SOC above the end over which the voltage's rise is taken: not of one piece of the tables alone
+LEAST_RISE = 0.1  # V over the whole charge: of no cell does it rise by less near its end
 LEAST_WIDTH = 1e-3  # SOC: an end found nearer to the last one allowed is that
 GIVES_UP, GIVES_UP_SD = 0.5, 0.3  # of the load's sd over time: how far above its mean a vehicle gives up
 
@@ -21,6 +22,7 @@ class Drawable:
 
     energy: float  # J, at the pack's terminals
     slope: float  # J: how much more energy there would be for more SOC
+    end: float  # SOC of the mean cell there; that now if the pack is empty already
     by_cutoff: float = 0.0  # J/V: how much less there would be for a higher cut-off voltage of a cell
     end_drop_sd: float = 0.0  # V of a cell: how closely it is known what the load takes from its voltage at the end
     end_sd: float = 0.0  # of SOC: how closely it is known where the weakest group ends
@@ -69,11 +71,24 @@ def drawable(
     def drawn(soc: float, load: float) -> float | None:
         return battery.settled_current(load * power, soc, temperature, overpotential=overpotential)
 
-    now, current = drawn(soc, 1.0), drawn(soc, end_load)
-    if now is None or current is None or soc <= least or (over := above(soc, current)) < 0:
-        return Drawable(0.0, charge * cutoff, end_sd=end_sd)
-    slope = charge * power / now
-    under = None
+    def by_cutoff(end: float, margin: float = 0.0) -> tuple[float, float]:
+        """(Less energy for a higher cut-off voltage [J/V], drop's sd [V]) where it ends, `margin` [V] above that."""
+        current = drawn(end + BESIDE, end_load)
+        rise = (above(end + BESIDE, current) - margin) / BESIDE if current else 0.0
+        drop = battery.ocv(weakest.soc(end) if weakest else end, temperature)[0] - battery.cutoff_voltage
+        return charge * cutoff / max(rise, LEAST_RISE), max(drop, 0.0) / end_load * GIVES_UP_SD * load_sd
+
+    def ridden_on(soc: float) -> float | None:
+        """The mean current [A]; where bursts ask for more than the pack can give they are held back."""
+        current = battery.settled_current(power, soc, temperature, form_factor_squared, overpotential)
+        return current or drawn(soc, 1.0)
+
+    now, current = ridden_on(soc), drawn(soc, end_load)
+    if now is None or current is None or soc <= least:
+        return Drawable(0.0, charge * cutoff, soc, end_sd=end_sd)
+    slope, over, under = charge * power / now, above(soc, current), None
+    if over < 0:
+        return Drawable(0.0, slope, soc, *by_cutoff(soc, over), end_sd)
     for _ in range(HALVINGS):
         middle = (low + high) / 2
         current = drawn(middle, end_load)
@@ -87,30 +102,22 @@ def drawable(
     width = soc - high
     total = 0.0
     for node, weight in zip(_NODES, _WEIGHTS, strict=True):
-        at = high + width * node
-        # Where bursts ask for more than the pack can give they are held back.
-        current = battery.settled_current(power, at, temperature, form_factor_squared, overpotential) or drawn(at, 1.0)
+        current = ridden_on(high + width * node)
         total += weight / current if current else 0.0
     energy = power * charge * width * total
     if high - least <= LEAST_WIDTH:  # where the vehicle ends before the voltage does, the cut-off does not count
-        return Drawable(energy, slope, end_sd=end_sd)
-    end = weakest.soc(high) if weakest else high
-    below, rest, beyond = (battery.ocv(end + off, temperature)[0] for off in (-BESIDE, 0.0, BESIDE))
-    rise = (beyond - below) / (2 * BESIDE)  # not that of one piece of the table, which ends at a knot
-    drop_sd = max(rest - battery.cutoff_voltage, 0.0) / end_load * GIVES_UP_SD * load_sd
-    return Drawable(energy, slope, charge * cutoff / rise, drop_sd, end_sd)
+        return Drawable(energy, slope, high, end_sd=end_sd)
+    return Drawable(energy, slope, high, *by_cutoff(high), end_sd)
 
 
-NEWTON_STEPS = 3  # to 1e-4 of SOC: the energy is nearly linear in it
+def soc_left(left: Drawable, soc: float, share: float) -> float:
+    """The SOC at which `share` (0 to 1) is left of what a pack at `soc` still delivers.
 
-
-def soc_left(battery: Battery, soc: float, temperature: float, share: float, power: float = 1.0) -> float:
-    """The SOC at which `share` (0 to 1) is left of the energy that a pack at `soc` still delivers.
-
-    temperature in degC, power in W.
+    The energy over the SOC is taken as a parabola: it falls a little faster near empty, where the voltage is lower.
     """
-    left = share * drawable(battery, soc, temperature, power).energy
-    for _ in range(NEWTON_STEPS):
-        now = drawable(battery, soc, temperature, power)
-        soc -= (now.energy - left) / now.slope
-    return soc
+    width = soc - left.end
+    if left.energy <= 0 or share <= 0:
+        return left.end
+    square = min(left.slope * width / left.energy, 2.0) - 1
+    line = 1 - square
+    return left.end + width * 2 * share / (line + sqrt(line * line + 4 * square * share))

@@ -6,14 +6,15 @@ from math import exp
 
 from gz_onboard.constants import HOUR
 from gz_onboard.physics.battery import Battery, Overpotential
-from gz_onboard.physics.cooling import LumpedCooling
 
+ON_THE_WAY = 0.1127, 0.5, 0.8873  # of the charge that is left: Gauss-Legendre nodes of order 3
+WEIGHTS = 0.2778, 0.4444, 0.2778
 HOT_CELLS = 50.0  # degC; warmer they are not expected to become
 
 
 def cells_ahead(
     battery: Battery,
-    cooling: LumpedCooling,
+    cooling: tuple[float, float],
     cells: tuple[float, float],
     ambient: float,
     load: tuple[float, float],
@@ -21,22 +22,23 @@ def cells_ahead(
 ) -> float:
     """The mean temperature [degC] of the cells until they are empty, from (SOC, temperature [degC]) now.
 
-    load: mean power [W] and the square of its form factor; ambient in degC; overpotential: see
-    `Battery.settled_current`. Their loss at the mean power warms one mass that the air cools (eq. 2.30), in closed
-    form.
+    cooling: see `cooling.pack_constants`; load: mean power [W] and the square of its form factor; ambient in degC;
+    overpotential: see `Battery.settled_current`. Their loss at the mean power, and what their reaction gives without
+    loss, warm one mass that the air cools (eq. 2.30), in closed form.
     """
-    (soc, temperature), (power, form_factor_squared) = cells, load
+    (soc, temperature), (power, form_factor_squared), (conductance, time_constant) = cells, load, cooling
     if power <= 0 or soc <= 0:
         return temperature
-    time_constant = cooling.capacity / cooling.conductance
 
     def warmed(mean: float) -> float:
         source = battery.cells_series * battery.ocv(soc / 2, mean)[0]
         current = battery.settled_current(power, soc / 2, mean, form_factor_squared, overpotential)
         if current is None:  # bursts are held back at the most that the pack gives, of which half stays in it as heat
             current = 2 * power / source
-        loss = source * current - power
-        settled = ambient + loss / cooling.conductance
+        heat = source * current - power
+        for at, weight in zip(ON_THE_WAY, WEIGHTS, strict=True):
+            heat += weight * battery.reversible_heat(current, at * soc, mean)
+        settled = ambient + heat / conductance
         lasting = max(soc * battery.pack_capacity(mean) * HOUR / current / time_constant, 1e-6)
         return settled + (temperature - settled) * (1 - exp(-lasting)) / lasting
 

@@ -10,7 +10,7 @@ import pytest
 
 from gz_onboard.estimator.forecast import Expected, Forecaster
 from gz_onboard.estimator.load_model import Conditions
-from gz_onboard.physics.cooling import LumpedCooling
+from gz_onboard.physics.cooling import LumpedCooling, pack_constants
 from gz_onboard.physics.effect import load_effect
 from gz_onboard.physics.model import Model
 from gz_onboard.physics.parameters import Parameters
@@ -366,9 +366,9 @@ def test_the_cells_warm_on_the_way_as_their_equation_says(start, ambient, effect
         assert current is not None
         loss = pack.cells_series * pack.ocv(0.4, cooling.temperature)[0] * current - expected.power
         temperatures.append(cooling.temperature)
-        cooling.step(20.0, loss, ambient)
+        cooling.step(20.0, loss + pack.reversible_heat(current, charge, cooling.temperature), ambient)
         charge -= 20.0 * current / 3600 / pack.pack_capacity(cooling.temperature)
-    found = cells_ahead(pack, cooling, (0.8, start), ambient, expected.load, lost)
+    found = cells_ahead(pack, pack_constants(VEHICLE.model.parameters), (0.8, start), ambient, expected.load, lost)
     assert found == pytest.approx(np.mean(temperatures), abs=2.5)
 
 

@@ -19,13 +19,13 @@ from gz_onboard.estimator.route_energy import RouteEnergy
 from gz_onboard.estimator.route_rider import RouteRider, restored
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import Cause, Estimate, Explanation, RouteState
-from gz_onboard.physics.drawable import drawable, soc_left
+from gz_onboard.physics.drawable import Drawable, drawable, soc_left
 from gz_onboard.routes.route import Route
 from tests.support import reference
 
 AIR = Conditions(20.0, 300.0)
 FREE = Forecast(
-    range=40e3, p10=34e3, p90=47e3, energy=4e6, energy_sd=8e4, energy_sd_up=8e4, consumption=100.0, consumption_sd=12.0,
+    range=40e3, p10=34e3, p90=47e3, left=Drawable(4e6, 6e6, 0.03), energy_sd=8e4, energy_sd_up=8e4, consumption=100.0, consumption_sd=12.0,
     recent=None, mostly_prior=False, power=800.0, form_factor_squared=2.5, cells=25.0, known_from=5000.0,
 )  # fmt: skip
 
@@ -301,7 +301,7 @@ def test_its_end_is_the_end_of_it():
 
 
 def test_an_empty_battery_has_no_range():
-    found, answer = Rider(way(5e3)).settled(replace(FREE, energy=0.0, energy_sd=3e4), soc=0.02)
+    found, answer = Rider(way(5e3)).settled(replace(FREE, left=Drawable(0.0, 6e6, 0.02), energy_sd=3e4), soc=0.02)
     assert found.range == found.p10 == 0.0 < found.p90 < 2e3
     assert (answer.soc, answer.ends_after) == (0.0, 0.0)
 
@@ -326,12 +326,30 @@ def test_reach_is_where_the_energy_is_first_used_up(costs, start, given_):
         assert begin + found == pytest.approx(fine[over[0]], abs=2 * np.max(np.diff(fine)) + 1e-6)
 
 
-@given(soc=st.floats(0.1, 1.0), share=st.floats(0.0, 1.0), temperature=st.floats(-10, 40))
-def test_soc_left_is_where_that_share_is_left(soc, share, temperature):
+@given(
+    soc=st.floats(0.2, 1.0),
+    share=st.floats(0.0, 1.0),
+    temperature=st.floats(-10, 40),
+    power=st.floats(200, 1000),
+    form_factor_squared=st.floats(1.0, 3.0),
+)
+def test_soc_left_is_where_that_share_is_left(soc, share, temperature, power, form_factor_squared):
+    """At the load that it is drawn with: in the cold a fifth of the charge cannot be had, and is no charge to arrive with."""
     pack = reference().pack
-    whole = drawable(pack, soc, temperature, 1.0).energy
-    left = drawable(pack, soc_left(pack, soc, temperature, share), temperature, 1.0).energy
-    assert left == pytest.approx(share * whole, abs=2e-3 * whole)
+    whole = drawable(pack, soc, temperature, power, form_factor_squared)
+    there = soc_left(whole, soc, share)
+    left = drawable(pack, there, temperature, power, form_factor_squared)
+    assert whole.end <= there <= soc + 1e-9
+    assert left.energy == pytest.approx(share * whole.energy, abs=0.02 * whole.energy + 0.002 * whole.slope)
+
+
+def test_the_charge_at_arrival_is_that_which_will_be_shown_there():
+    """Of a pack that gives up at 20 % of charge in the cold, with a tenth of the energy left more than that is shown."""
+    cold = replace(FREE, left=Drawable(4e6, 8.5e6, 0.2))
+    answer = Rider(way(48e3)).settled(cold)[1]
+    assert 0 < answer.energy < 4e6
+    assert answer.soc == pytest.approx(0.7 - 0.5 * answer.energy / 4e6, abs=0.02)
+    assert answer.soc_p10 == 0.0 < 0.2 < answer.soc < answer.soc_p90
 
 
 def test_a_long_route_is_modelled_in_parts():

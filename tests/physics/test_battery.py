@@ -225,6 +225,26 @@ def test_bursts_end_it_before_the_mean_load_would(temperature, power, form_facto
     assert drawable(BATTERY, high + 0.05, temperature, power).end_drop_sd == 0
 
 
+@pytest.mark.parametrize("temperature", [-5.0, 5.0, 23.0, 35.0])
+@pytest.mark.parametrize("power", [400.0, 900.0])
+@pytest.mark.parametrize("form_factor_squared", [1.0, 2.5])
+def test_a_higher_cutoff_takes_what_it_is_said_to(temperature, power, form_factor_squared):
+    """Near empty, in the cold above all, the resistance rises as the rest voltage falls: both end it sooner."""
+    found = drawable(BATTERY, 0.6, temperature, power, form_factor_squared)
+    higher, lower = (replace(BATTERY, cutoff_voltage=BATTERY.cutoff_voltage + x) for x in (0.02, -0.02))
+    energies = [drawable(b, 0.6, temperature, power, form_factor_squared).energy for b in (lower, higher)]
+    taken = (energies[0] - energies[1]) / 0.04
+    assert 0.9 * taken < found.by_cutoff < 1.55 * taken
+
+
+def test_how_much_the_cutoff_counts_does_not_step_at_a_knot_of_the_table():
+    """Loads whose ends pass the knots near empty: from one to the next, 0.5 % apart, it changes by a few per cent."""
+    powers = 300 * 1.005 ** np.arange(300)
+    by_cutoff = np.array([drawable(BATTERY, 0.6, 23.0, power, 2.4).by_cutoff for power in powers])
+    assert np.ptp(by_cutoff) > 0.2 * by_cutoff.mean()  # they do pass some
+    assert np.abs(np.diff(np.log(by_cutoff))).max() < 0.04
+
+
 @given(st.floats(0.3, 3.0), st.floats(0.02, 1.0), st.floats(-10, 45))
 def test_the_resistance_factor_is_on_both_resistances_and_leaves_the_time_constant(factor, soc, temperature):
     more = BATTERY.with_parameters(PARAMETERS.replaced(cell_resistance_factor=factor))
