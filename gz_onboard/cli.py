@@ -50,7 +50,7 @@ COMMANDS = {
     "vehicle": ("gz_onboard.lab.vehicle.command", "begin a vehicle file, or check whether it fits the vehicle's logs"),
     "report": ("gz_onboard.lab.report", "show recorded rides as one HTML page that fetches nothing, also on a phone"),
     "history": ("gz_onboard.lab.history.command", "keep the rides of months in a file, and show what they come to"),
-    "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride as PNG"),
+    "plot": ("gz_onboard.lab.plot", "draw an overview of an estimated ride"),
 }
 
 

@@ -28,8 +28,9 @@ _import_without_asammdf()
 
 import can  # noqa: E402
 
-__all__ = ["NO_SOCKETS", "can", "check_interface", "flagged"]
+__all__ = ["NO_MSGPACK", "NO_SOCKETS", "PIP_MSGPACK", "can", "check_interface", "flagged"]
 
+NO_MSGPACK, PIP_MSGPACK = "msgpack not installed", "; pip install msgpack"  # of `udp_multicast`
 NO_SOCKETS = "this kernel has no CAN sockets (AF_CAN)"  # what EAFNOSUPPORT of socketcan means
 
 

@@ -15,7 +15,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
-from gz_onboard.bus._can import NO_SOCKETS, can, check_interface, flagged
+from gz_onboard.bus._can import NO_MSGPACK, NO_SOCKETS, PIP_MSGPACK, can, check_interface, flagged
 from gz_onboard.errors import InputError
 from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, Frame
 
@@ -69,7 +69,7 @@ class CanChannel:
         try:
             self._open()
         except (can.CanInterfaceNotImplementedError, ValueError, ImportError) as error:
-            hint = "; pip install msgpack" if str(error) == "msgpack not installed" else ""  # of `udp_multicast`
+            hint = PIP_MSGPACK if str(error) == NO_MSGPACK else ""
             raise InputError(f"--interface {self.interface}: {error}{hint}") from error
         except (OSError, can.CanError) as error:
             if self.interface == "socketcan" and getattr(error, "errno", None) == errno.EAFNOSUPPORT:

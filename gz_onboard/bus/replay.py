@@ -282,7 +282,7 @@ def _sender(bus: can.BusABC) -> Send:
 
 
 def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
-    from gz_onboard.bus._can import NO_SOCKETS, can, check_interface
+    from gz_onboard.bus._can import NO_MSGPACK, NO_SOCKETS, PIP_MSGPACK, can, check_interface
 
     check_interface(interface)
     buses: list[can.BusABC] = []
@@ -294,9 +294,8 @@ def _open_buses(interface: str, names: list[str]) -> list[can.BusABC]:
                 bus.shutdown()
             there = sorted(name for _, name in socket.if_nameindex()) if interface == "socketcan" else []
             why = NO_SOCKETS if getattr(error, "errno", None) == errno.EAFNOSUPPORT else error
-            raise InputError(
-                f"--channel {name}: cannot be opened by {interface}: {why}{nearest(name, there)}"
-            ) from None
+            hint = PIP_MSGPACK if str(error) == NO_MSGPACK else nearest(name, there)
+            raise InputError(f"--channel {name}: cannot be opened by {interface}: {why}{hint}") from None
     if not buses:
         raise InputError("--channel: no channel is named")
     return buses

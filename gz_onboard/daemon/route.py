@@ -93,7 +93,8 @@ def ask(path: Path, request: dict[str, object]) -> dict[str, object]:
                 got += part
         answer = json.loads(got)
     except OSError as error:
-        raise InputError(f"{path}: no daemon answers: {error.strerror or error}") from error
+        hint = "it must run with --control-socket, and --socket must name the same file"
+        raise InputError(f"{path}: no daemon answers: {error.strerror or error}; {hint}") from error
     except ValueError as error:
         raise InputError(f"{path}: what answers there is not gz-onboard: {error}") from error
     return dict(answer) if isinstance(answer, dict) else {"error": str(answer)}

@@ -8,8 +8,8 @@ faster
 - near empty, where the forecast's error goes as its range does: over a third of that.
 
 Once a ride has gone on for `SETTLED` and the forecast is known from as much, another one is shown no faster than
-`GAINED` and `LOST`: the range does not rise under who rides, nor falls twice as fast as he rides. Of more than `LARGE` it closes
-as near empty, over a third of the range: who is to turn round must know in time.
+`GAINED` and `LOST`: the range does not rise under who rides, nor falls twice as fast as he rides. Of more than
+`LARGE` it closes as near empty, over a third of the range: who is to turn round must know in time.
 
 At standstill nothing is ridden that the gap could close over: what is drawn is taken off, and what else changes the
 forecast, as a rest does that shows the state of charge, waits for the riding to come; at most `STEP` of it. The rest of

@@ -16,7 +16,7 @@ from gz_onboard.physics.battery import Battery
 PERIOD = 1.0  # s
 EARLY = 0.05  # s: by so much a forecast may be made early, rather than a step late
 LONGEST = 60.0  # s: more is not taken in of a pause
-BEGUN_ANEW = 0.05  # of the state of charge: nothing drawn or learned changes it by so much from one forecast to the next
+BEGUN_ANEW = 0.05  # of the state of charge: by so much nothing drawn changes it from one forecast to the next
 
 
 class Now(NamedTuple):

@@ -35,8 +35,11 @@ from gz_onboard.vehicle import find_vehicle
 
 LEAST_MISSING = 1.0  # s: less is not told
 CONTRADICTING = Reason.VOLTAGE_MISMATCH, Reason.CURRENT_MISMATCH, Reason.SENSOR_DISTRUSTED
+SURE = 3.0  # sd
 MOST = 0.5  # of the ride: a sensor that fails on the way is a fault, one that never fits may be a wrong vehicle file
-CONTRADICTED = "what was measured does not fit it; what is wrong: gz-onboard vehicle check NAME|TOML {}"
+TOLD = "what is wrong, `gz-onboard vehicle check` tells, with the same vehicle and {}"
+CONTRADICTED = f"what was measured does not fit it; {TOLD}"
+FAR_OFF = 0.2  # of the vehicle's own state of charge from the estimated one: more no gauge errs, but by a wrong file
 KEYS = descriptions(RideSummary)
 """What the summary of a ride holds."""
 
@@ -216,7 +219,7 @@ def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
         ),
         ("state", ", ".join(f"{name.lower()} {duration:.1f} s" for name, duration in ride.states.items())),
         *(("", f"{words(name)} {duration:.1f} s") for name, duration in ride.reasons.items()),
-        *([("vehicle file", CONTRADICTED.format(ride.file))] if contradicted(ride) else []),
+        *([("vehicle file", CONTRADICTED.format(ride.file))] if contradicted(ride) else _own_gauge(ride)),
         *([("left out", _durations(ride.distrusted))] if ride.distrusted else []),
         *([("never there", ", ".join(words(name) for name in ride.lacking))] if ride.lacking else []),
     ]
@@ -225,6 +228,16 @@ def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
 def contradicted(ride: RideSummary) -> bool:
     """Whether what was measured contradicts the vehicle file, or itself, for most of the ride."""
     return max(ride.reasons.get(str(reason.name), 0.0) for reason in CONTRADICTING) > MOST * sum(ride.states.values())
+
+
+def _own_gauge(ride: RideSummary) -> list[tuple[str, str]]:
+    """What to say of the vehicle's own gauge, if it shows quite another state of charge."""
+    shown, found, sd = ride.soc_shown_end, ride.soc_end, ride.soc_end_sd or 0.0
+    if shown is None or found is None or abs(shown - found) < max(FAR_OFF, SURE * sd):
+        return []
+    away = f"the vehicle itself shows {100 * shown:.0f} % at the end, {100 * abs(shown - found):.0f} points"
+    away += f" {'more' if shown > found else 'less'}: its gauge or the vehicle file is wrong"
+    return [("vehicle file", f"{away}; {TOLD.format(ride.file)}")]
 
 
 def _energy_rows(ride: RideSummary) -> list[tuple[str, str]]:

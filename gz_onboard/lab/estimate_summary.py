@@ -48,6 +48,7 @@ class RideSummary:
     soc_start_sd: Annotated[float | None, "its standard deviation"]
     soc_end: Annotated[float | None, "at the last estimate that has one"]
     soc_end_sd: Annotated[float | None, "its standard deviation"]
+    soc_shown_end: Annotated[float | None, "what the vehicle itself showed last, or null"]
     range_start_km: Annotated[float | None, "first range published"]
     range_end_km: Annotated[float | None, "last range published"]
     range_end_p10_km: Annotated[float | None, "exceeded with 90 % probability"]
@@ -123,6 +124,7 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         soc_start_sd=soc_start[1],
         soc_end=soc_end[0],
         soc_end_sd=soc_end[1],
+        soc_shown_end=pipeline.estimator.signals["bms_state_of_charge"].last,
         range_start_km=times(tally.range_start, 1e-3),
         range_end_km=times(ranged.range, 1e-3),
         range_end_p10_km=times(ranged.range_p10, 1e-3),

@@ -128,6 +128,7 @@ class LumpedCooling:
     def of(cls, p: Mapping[str, float], part: str, temperature: float) -> LumpedCooling:
         """The `part` (``pack``, ``bms``) of a vehicle's parameters, at a temperature [degC]."""
         return cls(p[f"{part}_heat_capacity"], p[f"{part}_conductance"], temperature)
+
     def step(self, dt: float, heat: float, ambient: float, air: float = 0.0, factor: float = 1.0) -> None:
         """See `Network`; whatever `air` is."""
         self.temperature += dt * (heat - self.conductance * factor * (self.temperature - ambient)) / self.capacity

@@ -92,4 +92,6 @@ def _number(file: Path, point: Point, text: str | int, name: str) -> float:
             return value
     except ValueError:
         pass
-    raise InputError(f"{file}:{point[0]}: {name}: {shown(text)} is not a number")
+    attribute = {"latitude_deg": "lat", "longitude_deg": "lon"}.get(name, "ele")
+    wrong = f"{shown(text)} is not a number" if text else "is missing"
+    raise InputError(f"{file}:{point[0]}: {attribute}: {wrong}")

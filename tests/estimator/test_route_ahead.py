@@ -25,7 +25,8 @@ from tests.support import reference
 
 AIR = Conditions(20.0, 300.0)
 FREE = Forecast(
-    range=40e3, p10=34e3, p90=47e3, left=Drawable(4e6, 6e6, 0.03), energy_sd=8e4, energy_sd_up=8e4, consumption=100.0, consumption_sd=12.0,
+    range=40e3, p10=34e3, p90=47e3, left=Drawable(4e6, 6e6, 0.03), energy_sd=8e4, energy_sd_up=8e4,
+    consumption=100.0, consumption_sd=12.0,
     recent=None, mostly_prior=False, power=800.0, form_factor_squared=2.5, cells=25.0, known_from=5000.0,
 )  # fmt: skip
 
@@ -334,7 +335,7 @@ def test_reach_is_where_the_energy_is_first_used_up(costs, start, given_):
     form_factor_squared=st.floats(1.0, 3.0),
 )
 def test_soc_left_is_where_that_share_is_left(soc, share, temperature, power, form_factor_squared):
-    """At the load that it is drawn with: in the cold a fifth of the charge cannot be had, and is no charge to arrive with."""
+    """At the load that it is drawn with: in the cold a fifth of the charge cannot be had."""
     pack = reference().pack
     whole = drawable(pack, soc, temperature, power, form_factor_squared)
     there = soc_left(whole, soc, share)
@@ -344,7 +345,7 @@ def test_soc_left_is_where_that_share_is_left(soc, share, temperature, power, fo
 
 
 def test_the_charge_at_arrival_is_that_which_will_be_shown_there():
-    """Of a pack that gives up at 20 % of charge in the cold, with a tenth of the energy left more than that is shown."""
+    """Of a pack that gives up at 20 % of charge, as in the cold, more than that is shown while energy is left."""
     cold = replace(FREE, left=Drawable(4e6, 8.5e6, 0.2))
     answer = Rider(way(48e3)).settled(cold)[1]
     assert 0 < answer.energy < 4e6

@@ -122,7 +122,11 @@ def test_where_nothing_fits_the_vehicle_file_the_summary_says_how_to_check_it(tm
     wrong.write_text(text.replace('"BMS_PackCurrent"', turned), encoding="utf-8")
     for vehicle, hints in ("reference", 0), (wrong, 1):
         assert run(COASTDOWN, "--output", tmp_path, "--no-plot", "--vehicle", vehicle) == 0
-        assert capsys.readouterr().out.count(f"gz-onboard vehicle check NAME|TOML {COASTDOWN}\n") == hints
+        assert capsys.readouterr().out.count(f"with the same vehicle and {COASTDOWN}\n") == hints
+    fewer = tmp_path / "fewer_cells.toml"
+    fewer.write_text(text.replace("cells_series = 14", "cells_series = 13"), encoding="utf-8")
+    assert run(LOGS / "city_14C.blf", "--output", tmp_path, "--no-plot", "--vehicle", fewer) == 0
+    assert "points less: its gauge or the vehicle file is wrong; what is wrong, `gz-onboard" in capsys.readouterr().out
 
 
 def test_the_same_log_gives_the_same_bytes(tmp_path):
