@@ -13,10 +13,10 @@ Once a ride has gone on for `SETTLED` and the forecast is known from as much, an
 
 At standstill nothing is ridden that the gap could close over: what is drawn is taken off, and what else changes the
 forecast, as a rest does that shows the state of charge, waits for the riding to come; at most `STEP` of it. The rest of
-it shows at once. So does what the rider changes, as a route, and a state of charge that is begun anew (`show_next`).
-While the pack is charged the gap stays as it is, in metres: fifty metres are a third of the range near empty, and
-nothing of a full one. A restart is a standstill, at which the energy that is gone was drawn; over a charge the gap
-stays.
+it shows at once. What the rider changes, as a route, and a state of charge that is begun anew end the gap
+(`show_next`). While the pack is charged the gap stays as it is, in metres: fifty metres are a third of the range near
+empty, and nothing of a full one. A restart is a standstill, at which the energy that is gone was drawn, and the gap
+shrank with it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ FASTEST = 1.25e-5  # of the range for each m ridden, where that is more
 LARGE = 0.45  # of the forecast
 STILL = 0.1  # m from one forecast to the next: so much a speed sensor's noise moves
 STEP = 0.05  # of the range, or over a restart of the energy that is left
-RATIO = 0.2, 5.0  # shown over forecast: beyond, the gap is not kept
+RATIO = 0.5, 2.0  # shown over forecast: beyond, the gap is not kept
 MOST_GAP = 1e6  # m, of a saved gap
 MOST_RANGE, MOST_ENERGY = 1e7, 1e12  # m, J: of a saved forecast
 
@@ -46,7 +46,7 @@ class Calm:
     def __init__(self, gap: float = 0.0, before: tuple[float, float] | None = None) -> None:
         """`gap` and `before`: see `snapshot`."""
         self.gap = gap  # m: shown less forecast
-        self._settled = False
+        self._settled = self._on_route = False
         self._way = 0.0  # m of this ride
         self._before = before  # the last forecast's range [m] and energy [J]
         self._restarted = before is not None
@@ -61,9 +61,9 @@ class Calm:
         """Another ride: what was held back on the last one shows in the first kilometres of this."""
         self._settled, self._way = False, 0.0
 
-    def show_next(self) -> None:
-        """The next forecast shows at once: it stands on something else, which the rider has changed."""
-        self._before = None
+    def show_next(self, *, on_route: bool = False) -> None:
+        """The next forecast shows as it is: it stands on something else, as a route, and the gap was to another."""
+        self._before, self.gap, self._waiting, self._on_route = None, 0.0, 0.0, on_route
 
     def shown(self, raw: float) -> float:
         """The range to show [m] with the present gap, for a forecast of `raw` [m]."""
@@ -79,6 +79,7 @@ class Calm:
         if before is None or min(raw, energy, *before) <= 0:
             return self.shown(raw)
         if restarted:
+            self.gap *= min(energy / before[1], 1.0)  # it was of a longer way
             if abs(energy - before[1]) > STEP * before[1]:
                 return self.shown(raw)
             drawn = before[1] - energy  # or charged, a little
@@ -109,6 +110,8 @@ class Calm:
 
     def snapshot(self) -> dict[str, object]:
         """What is to be kept over a restart: the gap [m], and the last forecast's range [m] and energy [J]."""
+        if self._on_route:  # which is not kept
+            return {"gap": 0.0}
         return {"gap": self.gap} | ({} if self._before is None else {"forecast": list(self._before)})
 
 

@@ -163,7 +163,7 @@ class RoadAhead:
         self._learn(road, self._costs)
         if self._new:
             self._new = False
-            self._forecaster.calm.show_next()
+            self._forecaster.calm.show_next(on_route=True)
         return self._ahead(road, self._costs, free, pack)
 
     def _move(self, now: float, road: Road) -> None:

@@ -134,6 +134,19 @@ def test_over_a_restart_the_range_moves_as_the_energy_does(energy):
     assert found == pytest.approx(raw, rel=0.001)
 
 
+@pytest.mark.parametrize("restarted", [False, True])
+@pytest.mark.parametrize("gap", [15_000.0, -8000.0])
+def test_of_a_pack_found_nearly_empty_no_gap_of_a_full_one_is_shown(gap, restarted):
+    """Held back over a long way, or swapped for one with a seventh of the energy: the gap was not to this forecast."""
+    calm = Calm(gap)
+    calm.follow(40_000.0, 4e6, KNOWN)
+    if restarted:
+        calm = restored_calm(calm.snapshot())
+    else:
+        calm.show_next()
+    assert abs(calm.follow(6000.0, 6e5, KNOWN) / 6000 - 1) < (0.4 if restarted else 1e-6)
+
+
 def test_it_is_right_when_empty():
     ridden = np.full(2000, 10.0)
     left = 20_000 - np.cumsum(ridden)
