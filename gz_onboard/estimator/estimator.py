@@ -31,7 +31,7 @@ from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.soc import StateOfCharge
 from gz_onboard.estimator.sources import CurrentSource, PackReading, PackSources, PackState
 from gz_onboard.estimator.temperatures import Temperatures, at_rest
-from gz_onboard.estimator.timing import SLOW_GAP, SLOWEST, MessageTiming
+from gz_onboard.estimator.timing import COARSE, SLOW_GAP, SLOWEST, MessageTiming
 from gz_onboard.estimator.vibration import VibrationMonitor
 from gz_onboard.estimator.weakest import Weakest
 from gz_onboard.events import STALE_PERIODS, Activity, Estimate, Event, Group, Reason, State
@@ -181,7 +181,7 @@ class Estimator:
         cells = self._temperatures.cells_or_bench
 
         def road_power() -> float | None:
-            known = self.road.speed is not None and self._timing.sampled <= SLOW_GAP
+            known = self.road.speed is not None and self._timing.sampled <= COARSE
             return self._present.power(now) if known else None
 
         def error(voltage: float, current: float, sensor: str) -> float | None:

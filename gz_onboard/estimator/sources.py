@@ -11,7 +11,7 @@ from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.estimator.redundancy.electric import CellEvidence, Readings
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.signals import Signal, Signals
-from gz_onboard.estimator.timing import SLOW_GAP
+from gz_onboard.estimator.timing import COARSE
 from gz_onboard.events import Estimate
 from gz_onboard.physics.battery import HALF_FULL, Battery
 from gz_onboard.physics.parameters import Parameters
@@ -180,4 +180,4 @@ class Synchroniser:
 
 def _together(first: Signal, second: Signal) -> bool:
     """Whether two that both report do so at the same time; or one of them is silent."""
-    return isinf(first.time + second.time) or abs(first.time - second.time) <= SLOW_GAP
+    return isinf(first.time + second.time) or abs(first.time - second.time) <= COARSE

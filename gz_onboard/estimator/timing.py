@@ -8,7 +8,8 @@ from math import inf
 from gz_onboard.estimator.signals import Signal
 from gz_onboard.events import Group
 
-SLOW_GAP = 0.5  # s: messages with longer gaps are watched for their real period
+SLOW_GAP = 0.4  # s: messages with longer gaps are watched for their real period; no usual one is near that
+COARSE = 0.55  # s: pack current and voltage that come less often are too coarse for a comparison second by second
 SLOWEST = 5.5  # s: pack current and voltage that come less often are not integrated: 5 s and what a clock is off
 PAUSE = 1.0  # s: without messages of a longer period a longer gap is a pause, in which charge is not counted
 PAUSE_PERIODS = 2.5  # the same in real periods of the pack current

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from gz_onboard.constants import BENCH_TEMPERATURE, HOUR
 from gz_onboard.estimator.sources import CurrentSource
 from gz_onboard.estimator.start import uncounted_sd
-from gz_onboard.estimator.timing import SLOW_GAP
+from gz_onboard.estimator.timing import COARSE
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.parameters import Parameters
 
@@ -68,7 +68,7 @@ class ChargeUncertainty:
     @staticmethod
     def between_samples(dt: float, period: float) -> float:
         """Variance after `dt` [s] of samples that are a long `period` [s] apart."""
-        return (SAMPLING_RATE / HOUR) ** 2 * dt * period if period > SLOW_GAP else 0.0
+        return (SAMPLING_RATE / HOUR) ** 2 * dt * period if period > COARSE else 0.0
 
     def of_pause(self, dt: float, soc_sd: float) -> float:
         """Variance after a pause of `dt` [s], in which charge is not counted.
