@@ -18,6 +18,7 @@ from tests.estimator.life import (
     MOTOR,
     OTHERS,
     PACK,
+    PERIOD,
     Scooter,
     estimator,
     follow,
@@ -129,8 +130,9 @@ def test_charging_is_no_riding(plug):
     scooter, e = Scooter(soc=0.56, plug=plug), estimator()
     follow(e, scooter.live(20), scooter)
     _, ridden = follow(e, scooter.live(600, 10.0), scooter)[-1]
-    hours = 0.4 * scooter.capacity / 10.0
+    hours, scooter.period = 0.4 * scooter.capacity / 10.0, 0.5
     rows = follow(e, scooter.live(3600 * hours, charge=10.9), scooter)
+    scooter.period = PERIOD
     assert all(row.activity is Activity.CHARGING for _, row in rows[10:])
     _, charged = rows[-1]
     assert charged.consumption_factor == pytest.approx(ridden.consumption_factor, abs=0.01)
@@ -267,7 +269,9 @@ def test_charged_while_only_the_pack_was_silent(own_soc):
     scooter, e = Scooter(soc=0.3), estimator()
     follow(e, heard(scooter.live(300, 9.0), own_soc=own_soc), scooter)
     follow(e, scooter.live(30), scooter)
+    scooter.period = 0.5
     follow(e, without_pack(scooter.live(1.25 * 3600, charge=12.0)), scooter)
+    scooter.period = PERIOD
     rows = follow(e, heard(scooter.live(60), own_soc=own_soc), scooter)
     true, end = rows[-1]
     assert true > 0.6
