@@ -20,6 +20,7 @@ from gz_onboard.estimator.interval import DECILE, deciles
 from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.road import RoadState
 from gz_onboard.estimator.route_energy import Costs, RouteEnergy
+from gz_onboard.estimator.route_heights import RouteHeights
 from gz_onboard.estimator.route_position import RoutePosition
 from gz_onboard.estimator.route_rider import SEGMENT_SD, RouteRider, restored
 from gz_onboard.estimator.signals import FIX_2D, Signals
@@ -85,6 +86,7 @@ class RoadAhead:
         self._segment: tuple[float, float] | None = None  # m along the route, m/s: its start
         self._energy = self._ridden = self._distance = 0.0  # J, m of the segment; m of the vehicle at the last forecast
         self._new = False  # whether nothing was forecast on this route yet
+        self._heights = RouteHeights()
 
     def ready(self, route: Route) -> Road:
         """`route` made ready, in any thread. The fastest of the prior riding stands in for limits."""
@@ -98,7 +100,7 @@ class RoadAhead:
                 self.rider.begin_route(*self._factor)
             self._last = road.route
         self._road, self._costs, self._modelling, self._segment = road, None, None, None
-        self._distance, self._new = self._motion.distance, True
+        self._distance, self._new, self._heights = self._motion.distance, True, RouteHeights()
         self._forecaster.calm.show_next()
         self.answer = Answer(RouteState.OFF if road else RouteState.NONE)
 
@@ -154,7 +156,7 @@ class RoadAhead:
             return free
         self._move(now, road)
         self._model(road, conditions)
-        if not road.position.on or self._costs is None:
+        if not road.position.on or self._heights.contradict or self._costs is None:
             if self.answer.state is RouteState.ON:  # left: what lay ahead on it is no part of the range
                 self._new = True
                 self._forecaster.calm.show_next()
@@ -173,7 +175,11 @@ class RoadAhead:
         fix = None
         if latitude is not None and longitude is not None and not signals.fix_below(now, FIX_2D):
             fix = latitude, longitude
+        before = road.position.along
         road.position.update(moved, fix, motion.heading if (motion.speed or 0.0) > COURSE_FROM else None)
+        if road.route.grade_known and road.position.on:
+            here, climb = road.position.along, road.energy.climb
+            self._heights.look(here, moved, road.energy.between(climb, before, here), motion.altitude)
 
     def _model(self, road: Road, conditions: Conditions) -> None:
         """Model a part of the route if that is due."""

@@ -37,7 +37,7 @@ class Costs:
 
 
 class RouteEnergy:
-    """One route in pieces. `distance` [m] of their ends and `speed` [m/s] that limits allow there, shape (n,)."""
+    """One route in pieces. `distance` [m] of their ends, `speed` [m/s] that limits allow there, `climb` [m]; (n,)."""
 
     def __init__(self, route: Route, top_speed: float) -> None:
         """top_speed: of a rider where the route has no limit [m/s]. Imports numpy and takes up to a second."""
@@ -51,6 +51,7 @@ class RouteEnergy:
         known = {"grade": route.grade, "curvature": route.curvature, "heading": route.heading}
         known |= {"headwind": route.headwind or (0.0,) * len(route.distance)}
         self._pieces = {name: np.interp(middles, route.distance, values) for name, values in known.items()}
+        self.climb = np.concatenate(([0.0], np.cumsum(self._pieces["grade"] * np.diff(self.distance))))  # m
         self._ambient = np.interp(middles, route.distance, route.temperature) if route.temperature else None
         self._stops = np.zeros(len(middles))
         if route.stop:

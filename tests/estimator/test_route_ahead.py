@@ -16,6 +16,7 @@ from gz_onboard.estimator.load_model import Conditions
 from gz_onboard.estimator.road import RoadState
 from gz_onboard.estimator.route_ahead import Pack, RoadAhead
 from gz_onboard.estimator.route_energy import RouteEnergy
+from gz_onboard.estimator.route_heights import RouteHeights
 from gz_onboard.estimator.route_rider import RouteRider, restored
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import Cause, Estimate, Explanation, RouteState
@@ -50,18 +51,24 @@ class Rider:
         self.road, self.signals = RoadState(altitude=300.0), Signals([])
         self.forecaster = Forecaster(vehicle.model, vehicle.pack, vehicle.riding)
         self.ahead = RoadAhead(self.forecaster, self.road, self.signals)
-        self.now = 0.0
+        self.now, self.route = 0.0, route
         if route:
             self.ahead.follow(self.ahead.ready(route))
 
     def ask(self, free=FREE, soc=0.7):
         return self.ahead.forecast(self.now, free, Pack(soc, 0.01, 0.0), AIR)
 
-    def ride(self, seconds, power, speed=11.0):
+    def slope(self):
+        """Of the route, where it is."""
+        along = self.ahead.answer.along or 0.0
+        return np.interp(along, self.route.distance, self.route.grade) if self.route else 0.0
+
+    def ride(self, seconds, power, speed=11.0, slope=None):
         self.road.speed, self.road.acceleration = speed, 0.0
         for _ in range(seconds):
             self.now += 1
             self.road.distance += speed
+            self.road.altitude = (self.road.altitude or 0.0) + speed * (self.slope() if slope is None else slope)
             self.ahead.ride(1.0, speed, power)
             self.ask()
 
@@ -304,6 +311,42 @@ def test_what_a_route_made_of_the_range_is_not_kept_over_a_restart():
     rider.ahead.follow(None)
     rider.forecaster.shown(rider.ask())
     assert calm.snapshot()["forecast"] == [FREE.range, FREE.energy]
+
+
+@pytest.mark.parametrize("slope", [-0.05, 0.05])
+def test_a_route_with_other_hills_than_are_ridden_is_left_and_taken_up_again(slope):
+    """Heights of another road: for a kilometre it is believed, then the range is that without it."""
+    rider, states = Rider(way(20e3, grade=lambda x: slope if x < 6e3 else 0.0)), []
+    rider.settled()
+    for seconds, ridden in ((60, 0.0), (60, 0.0), (900, None)):
+        rider.ride(seconds, 1000.0, slope=ridden)
+        states.append(rider.ahead.answer.state)
+        assert (rider.ask() is FREE) == (states[-1] == RouteState.OFF)
+    assert states == [RouteState.ON, RouteState.OFF, RouteState.ON]
+
+
+@pytest.mark.parametrize("altitude", ["drifts", "leaps"])
+def test_what_an_altitude_errs_by_is_no_other_road(altitude):
+    """0.1 m/s for 25 minutes, or 40 m now and then."""
+    rider = Rider(way(20e3, grade=lambda x: 0.05 * np.sin(x / 500)))
+    rider.settled()
+    for k in range(1500):
+        rider.ride(1, 1000.0)
+        rider.road.altitude = (rider.road.altitude or 0.0) + (0.1 if altitude == "drifts" else 40.0 * (k % 200 == 0))
+        assert rider.ahead.answer.state == RouteState.ON
+
+
+@given(
+    st.lists(st.tuples(st.floats(0, 1e4), st.floats(0, 200), st.floats(-1e3, 1e3), st.none() | st.floats(-500, 9e3)))
+)
+def test_without_an_altitude_no_heights_are_compared(looks):
+    heights = RouteHeights()
+    for along, ridden, climb, _ in looks:
+        heights.look(along, ridden, climb, None)
+    assert not heights.contradict
+    for look in looks:
+        heights.look(*look)
+    assert isinstance(heights.contradict, bool)
 
 
 def test_its_end_is_the_end_of_it():
