@@ -100,6 +100,7 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
     last, ranged = tally.last or Estimate(0.0), tally.ranged or Estimate(0.0)
     changes = pipeline.estimator.attribution.changes
     soc_start, soc_end = tally.soc_start or (None, None), tally.soc_end or (None, None)
+    own = pipeline.estimator.signals["bms_state_of_charge"].last  # of the cells
     counts, status = pipeline.counts(), pipeline.status()
     states, reasons = tally.by_name()
     drawn = pipeline.drawn.net if reasons[Reason.SIGNALS_SLOW.name] <= MOST_SLOW * states.total() else None
@@ -124,7 +125,7 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         soc_start_sd=soc_start[1],
         soc_end=soc_end[0],
         soc_end_sd=soc_end[1],
-        soc_shown_end=pipeline.estimator.signals["bms_state_of_charge"].last,
+        soc_shown_end=None if own is None else pipeline.estimator.battery.window.shown(own, 0.0)[0],
         range_start_km=times(tally.range_start, 1e-3),
         range_end_km=times(ranged.range, 1e-3),
         range_end_p10_km=times(ranged.range_p10, 1e-3),

@@ -517,6 +517,19 @@ def test_a_charge_says_when_it_will_be_full_and_how_far_that_goes(start):
     assert ridden.range_full is None
 
 
+def test_a_state_of_charge_begun_anew_ends_what_was_held_back_of_the_range():
+    """As of a pack that was swapped: no gap of the one before; what the filter learns by and by leaves it."""
+    scooter, e = Scooter(), estimator()
+    follow(e, scooter.live(300, 10.0), scooter)
+    calm = e.forecaster.calm
+    calm.gap = 4000.0
+    follow(e, scooter.live(1, 10.0), scooter)
+    assert calm.gap > 3000
+    e.filter.soc = scooter.soc = 0.3
+    follow(e, scooter.live(2, 10.0), scooter)
+    assert abs(calm.gap) < 300
+
+
 def test_a_long_stop_is_parking_and_a_bus_that_falls_silent_then_is_asleep():
     scooter, e = Scooter(), estimator()
     follow(e, scooter.live(20), scooter)
