@@ -110,7 +110,7 @@ def test_a_damaged_log_says_so(tmp_path):
         (lambda: gz.estimate(COASTDOWN, state=Path("a\0b.json")), r"state .*a\\x00b.json'\): must be"),
         (lambda: gz.read_vehicle("a\0b"), r"name 'a\\x00b': must be"),
         (lambda: gz.read_frames("nowhere.blf"), "nowhere.blf: cannot be read"),
-        (lambda: gz.read_signals(COASTDOWN), "no DBC file is attached to this log"),
+        (lambda: gz.read_signals(COASTDOWN), "no DBC file is attached to this log; give a vehicle or DBC files"),
         (lambda: gz.read_signals(COASTDOWN, "reference", columns=["BMS_PackVoltge"]), "did you mean 'BMS_PackVolt"),
         (lambda: gz.read_signals(COASTDOWN, "reference", columns=[]), "columns: names none"),
         (lambda: gz.read_signals(COASTDOWN, "reference", dbc=["x.dbc"]), "dbc: a vehicle has DBC files of its own"),

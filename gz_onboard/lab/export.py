@@ -141,7 +141,7 @@ def _write(arguments: argparse.Namespace, source: Source, part: Path, suffix: st
     try:
         texts = [_signals(arguments, source, part, kind)]
     except DecoderError as error:
-        raise InputError(f"{error}; give its vehicle with --vehicle NAME|TOML, or --dbc FILE") from error
+        raise InputError(f"{error}: --vehicle NAME|TOML, or --dbc FILE") from error
     if not suffix and not arguments.signals and told:
         texts.append(_estimates(arguments, source, part, kind, told))
     return "; ".join(texts)

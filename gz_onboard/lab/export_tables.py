@@ -263,12 +263,12 @@ def _database(log: Path, files: list[Path] | None, vehicle: Vehicle | None) -> D
         if named in (own, read_vehicle(own).name):
             return _database_of(read_vehicle(own))
     if not attached:
-        raise DecoderError(f"{log}: no DBC file is attached to this log")
+        raise DecoderError(f"{log}: no DBC file is attached to this log; give a vehicle or DBC files")
     texts = [(Path(f"{log}, attached {name}"), data.decode("utf-8", "replace")) for name, data in attached.items()]
     try:
         return database_of(texts, {})
     except InputError as error:
-        raise DecoderError(str(error)) from error
+        raise DecoderError(f"{error}; give a vehicle or DBC files") from error
 
 
 def _database_of(vehicle: Vehicle) -> Database:
