@@ -36,6 +36,30 @@ def sender(channel: str = "vcan0") -> Iterator[socket.socket]:
         yield raw
 
 
+HELD_UP = 0.5  # s: a machine that is so busy holds up the sender, too, and its signals are rightly missed
+
+
+@contextmanager
+def hold_ups() -> Iterator[list[float]]:
+    """How long [s] a thread that only sleeps was held up, each time, until left."""
+    stopping, found = threading.Event(), [0.0]
+
+    def watch() -> None:
+        before = time.monotonic()
+        while not stopping.wait(0.02):
+            now = time.monotonic()
+            found.append(now - before)
+            before = now
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        yield found
+    finally:
+        stopping.set()
+        thread.join()
+
+
 @contextmanager
 def steady_ride(*channels: str) -> Iterator[list[float]]:
     """A ride at 10 m/s onto vcan0 (or the measuring system onto another channel), until left; gives when it failed."""
@@ -296,7 +320,7 @@ def test_the_clock_is_set(running: Running, listener: Listener):
         time.clock_settime(time.CLOCK_REALTIME, now + ahead)
 
     try:
-        with steady_ride():
+        with steady_ride(), hold_ups() as held_up:
             listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
             for ahead in (3600.0, -7200.0, 40.0):
                 set_clock(ahead)
@@ -315,7 +339,7 @@ def test_the_clock_is_set(running: Running, listener: Listener):
     assert sum(steps) < elapsed, [round(step, 2) for step in steps]
     riding = [row for row in rows if row["speed"] is not None]
     worse = [(row["state"], row["reasons"]) for row in riding[2:-2] if row["state"] != "VALID"]
-    assert len(worse) <= 1, worse  # it may hold the sender up, too; what the clock does comes four times
+    assert not worse or max(held_up) > HELD_UP, worse
     assert all(0 < b["distance"] - a["distance"] < 12 for a, b in pairwise(riding))
     assert "implausible time" not in daemon.statuses()[-1]["faults"]
     soc = [row["soc"] for row in riding if row["soc"] is not None]
