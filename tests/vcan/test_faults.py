@@ -22,6 +22,7 @@ from gz_onboard.bus.completion import is_complete
 from gz_onboard.estimator.ridden import Riding
 from gz_onboard.estimator.usual import restored_usual
 from gz_onboard.events import EFF_FLAG, State
+from gz_onboard.lab.estimate_ride import feed
 from tests.support import LOGS, S, Scooter, recorded, reference, ridden
 from tests.vcan.support import Listener, Running, ip, number, raw_frames, wait_for
 
@@ -103,7 +104,9 @@ def steady_ride(*channels: str) -> Iterator[list[float]]:
 def test_killed_it_goes_on_from_the_saved_state(running: Running, listener: Listener):
     city = LOGS / "city_14C.blf"
     # What 200 s of the same ride have taught, as a daemon that was killed then would have saved it.
-    learned = ridden(recorded("city_14C", 0.0, 200.0))
+    on_the_way = recorded("city_14C", 0.0, 300.0)
+    first_ns = on_the_way[0][0]
+    learned = ridden([frame for frame in on_the_way if frame[0] < first_ns + 200 * S])
     snapshot = learned.pipeline.estimator.snapshot(reference().key)
     assert snapshot is not None
     folder = running.folder("a")
@@ -113,14 +116,15 @@ def test_killed_it_goes_on_from_the_saved_state(running: Running, listener: List
     assert "going on from the state saved" in daemon.journal
     replay = running.replay(city, "--from", "200")
     listener.wait_for_new("RANGE_Estimate", 10, RANGE_EstimateState=State.VALID)
-    time.sleep(14)  # the state is saved at least every 10 s
-    before = listener.decoded("RANGE_Status")[-1]
-    killed_ns = time.time_ns()
-    daemon.process.kill()
-    daemon.process.wait()
+    with hold_ups() as held_up:
+        time.sleep(14)  # the state is saved at least every 10 s
+        before = listener.decoded("RANGE_Status")[-1]
+        killed_ns = time.time_ns()
+        daemon.process.kill()
+        daemon.process.wait()
 
     frames = raw_frames(daemon.logs[-1])
-    assert killed_ns - frames[-1][0] < 3 * S  # what is lost: 2 s on a machine that has the time
+    assert killed_ns - frames[-1][0] < (3 + 4 * max(held_up)) * S  # what is lost: 2 s on a machine that has the time
     first_log = daemon.logs[-1]
     rows = daemon.estimates(first_log)
     factor = Riding(restored_usual(snapshot["riding"]["usual"])).factor
@@ -133,15 +137,18 @@ def test_killed_it_goes_on_from_the_saved_state(running: Running, listener: List
     time.sleep(3)
     replay.kill()
     daemon.stop()
-    # A tenth of a point, and 2 s of riding after the kill, are not in the saved state; the filter moves, too.
-    assert status["RANGE_StateOfCharge"] == pytest.approx(before["RANGE_StateOfCharge"], abs=0.4)
     assert status["RANGE_StateOfChargeSigma"] == pytest.approx(before["RANGE_StateOfChargeSigma"], abs=0.2)
     assert after["RANGE_RemainingP10"] < after["RANGE_Remaining"] < after["RANGE_RemainingP90"]
     again = daemon.estimates()
     assert daemon.logs[-1] != first_log
     assert again[-1]["consumption_factor"] == pytest.approx(rows[-1]["consumption_factor"], abs=0.03)
     assert again[-1]["consumption_factor_sd"] == pytest.approx(rows[-1]["consumption_factor_sd"], abs=0.005)
-    assert again[-1]["soc"] == pytest.approx(rows[-1]["soc"], abs=0.004)
+    # As if it had not been killed: what was ridden in between is not lost, however long the machine took.
+    feed(learned.pipeline, [[frame for frame in on_the_way if frame[0] >= first_ns + 200 * S]])
+    soc = {round((time_ns - first_ns) / S): row["soc"] for name, time_ns, row in learned.samples if name == "/estimate"}
+    row = again[-1]
+    in_ride = 200 + round((row["time_ns"] - frames[0][0]) / S)
+    assert row["soc"] == pytest.approx(soc[in_ride], abs=0.002)
 
 
 @pytest.mark.administers
