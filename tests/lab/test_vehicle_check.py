@@ -13,9 +13,10 @@ import pytest
 from gz_onboard import cli
 from gz_onboard.arrays import Array
 from gz_onboard.errors import FAILED, OK
-from gz_onboard.lab.vehicle.check import check_log
+from gz_onboard.lab.vehicle.check import check_log, check_text
 from gz_onboard.lab.vehicle.finding import Finding, Looks
 from gz_onboard.lab.vehicle.motion import check_distances, speeds_of
+from gz_onboard.lab.vehicle.rolling import rolling_of
 from gz_onboard.lab.vehicle.seconds import seconds_of
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.vehicle import read_vehicle
@@ -206,3 +207,64 @@ def test_a_latitude_beyond_the_poles_needs_no_ride(rides):
     assert "reaches 139.7°, beyond the poles: swapped with the longitude" in said.text
     wild = {**standing, "latitude": standing["longitude"]}
     assert "beyond the poles: a wrong scale" in said_of_positions(wild, 0.0)[0].text
+
+
+# --- wheel radius and gear ratio ----------------------------------------------------------------------------------
+
+
+def by_another(ride: Samples, folder: Path, times: dict[str, float], **scales: float) -> list[Finding]:
+    """What is said of radius and gear ratio where the file has those parameters `times` theirs, and sensors `scales`.
+
+    A sensor of scale 0 is not there.
+    """
+    text = REFERENCE
+    for name, factor in times.items():
+        was = read_vehicle("reference").parameters[name]
+        text, count = re.subn(rf"^{name} = {{ value = [\d.]+", f"{name} = {{ value = {was * factor}", text, flags=re.M)
+        assert count == 1
+    (folder / "v.toml").write_text(text, encoding="utf-8")
+    vehicle = read_vehicle(folder / "v.toml")
+    kept = {role: (t, v * scales.get(role, 1.0)) for role, (t, v) in ride.columns.items() if scales.get(role, 1.0)}
+    seconds = seconds_of(Samples("x", kept), vehicle)
+    return rolling_of(seconds, speeds_of(seconds, vehicle), vehicle).findings
+
+
+UNSEEN = {"latitude": 0.0, "longitude": 0.0, "odometer": 0.0}
+
+
+@pytest.mark.parametrize("times", [0.95, 1.05, 1.2, 2.0])
+def test_a_wrong_radius_is_told_of_the_file_and_of_no_sensor(rides, tmp_path, times):
+    (said,) = by_another(rides[0], tmp_path, {"wheel_radius": times})
+    assert said.roles == ()
+    assert f"wheel_speed_rear is {times:.3g} times gps_speed; 0.243" in said.text.replace("0.951", "0.95")
+    assert "m would fit, by positions and odometer too" in said.text
+
+
+def test_what_cannot_be_told_apart_is_not(rides, tmp_path):
+    (said,) = by_another(rides[1], tmp_path, {"wheel_radius": 1.1})  # no wheel speed beside the motor's
+    assert said.roles == ("motor_speed",)
+    assert "wheel_radius times gear_ratio 0.2681 m" in said.text
+    assert "or the scale of motor_speed is wrong" in said.text
+    (said,) = by_another(rides[0], tmp_path, {"gear_ratio": 0.25})
+    assert "gear_ratio 0.25 motor_speed is 0.25 times wheel_speed_rear; 1 would fit, or" in said.text
+    (said,) = by_another(rides[0], tmp_path, {"wheel_radius": 0.9}, **UNSEEN)
+    assert said.roles == ("wheel_speed_rear", "gps_speed")
+    assert "or the scale of gps_speed is wrong: nothing else has seen the way" in said.text
+
+
+def test_a_gps_that_the_positions_contradict_is_named(rides, tmp_path):
+    (said,) = by_another(rides[0], tmp_path, {}, gps_speed=1.1)
+    assert said.roles == ("gps_speed",)
+    assert "the positions agree with wheel_speed_rear" in said.text
+    for recorded in rides:
+        assert by_another(recorded, tmp_path, {}) == by_another(recorded, tmp_path, {"wheel_radius": 1.02}) == []
+
+
+def test_with_a_radius_that_fits_the_rest_of_the_check_is_as_it_was(log, tmp_path):
+    wrong = re.sub(r"^wheel_radius = { value = [\d.]+", "wheel_radius = { value = 0.3", REFERENCE, flags=re.M)
+    ((roles, said),) = suspicions(log, wrong, tmp_path)
+    assert roles == ()
+    assert "0.3 m" in said
+    checked = check_log(log, read_vehicle(tmp_path / "v.toml"), quick=True)
+    assert check_text(checked).splitlines()[0].endswith("one thing looks wrong")
+    assert "by wheel radius and gear ratio as the log has them" in check_text(checked)

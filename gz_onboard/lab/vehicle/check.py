@@ -23,6 +23,7 @@ from gz_onboard.lab.vehicle import electric, motion, others
 from gz_onboard.lab.vehicle.features import Feature, features_of, features_text
 from gz_onboard.lab.vehicle.finding import Finding, Looks, unknown, wrong
 from gz_onboard.lab.vehicle.on_board import on_board
+from gz_onboard.lab.vehicle.rolling import rolling_of
 from gz_onboard.lab.vehicle.seconds import Seconds, seconds_of
 from gz_onboard.offline.results import clock, leap_text
 from gz_onboard.offline.samples import Samples, facts_of, open_ride, read_roles, ride_name
@@ -125,14 +126,16 @@ def _unanswered(codec: Codec, columns: Mapping[str, tuple[Array, Array]]) -> Ite
 
 
 def _checks(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterator[Finding]:
-    speeds = motion.speeds_of(ride, vehicle)
+    rolling = rolling_of(ride, motion.speeds_of(ride, vehicle), vehicle)
+    speeds = rolling.speeds
     by_speed = list(motion.check_speeds(ride, speeds))
     doubted = frozenset(role for finding in by_speed if finding.looks is Looks.WRONG for role in finding.roles)
     best = next((speeds[role] for role in speeds if role not in doubted), next(iter(speeds.values()), None))
     of = electric.drawn(ride, vehicle)
     return chain(
-        by_speed,
-        motion.check_distances(ride, speeds, doubted),
+        rolling.findings,
+        rolling.by_what_fits(by_speed),
+        rolling.by_what_fits(motion.check_distances(ride, speeds, doubted)),
         motion.check_accelerations(ride, speeds, doubted),
         motion.check_turning(ride, speeds),
         electric.check_voltages(ride, vehicle.battery) if vehicle.battery else (),
@@ -179,11 +182,10 @@ def _roles(
 
 def check_text(checked: Checked) -> str:
     """For a terminal."""
-    suspected = Counter(role for finding in checked.those(Looks.WRONG) for role in finding.roles)
-    said = "looks right"
-    if suspected:
-        count, often = len(checked.those(Looks.WRONG)), suspected.most_common(2)
-        clear = len(often) == 1 or often[0][1] > often[1][1]
+    said, count = "looks right", len(checked.those(Looks.WRONG))
+    if count:
+        often = Counter(role for finding in checked.those(Looks.WRONG) for role in finding.roles).most_common(2)
+        clear = len(often) == 1 or (len(often) == 2 and often[0][1] > often[1][1])
         above_all = f", above all {often[0][0]}" if clear else ""
         said = "one thing looks wrong" if count == 1 else f"{count} things look wrong{above_all}"
     lines = [f"{checked.file} ({clock(checked.duration_s)}): {said}"]

@@ -25,6 +25,7 @@ FEW = 5  # stretches at least
 UNLIKE = 0.05  # relative: on 17 recorded rides the way of a stretch was 1 to 3 % off, exchanged 6 to 97 %
 POLE = 90.0  # deg
 COUNTS = 5  # steps of the odometer, likewise
+EXACT = 0.01  # of its way: an odometer of no greater steps tells a few percent
 LEVEL = 2.5  # m/s²: by so much the gravity that an axis shows may be off, by bias, mounting and hills
 SWINGS = 0.25  # m/s²: an acceleration that moves by less, as a standard deviation, shows nothing
 CLOSE = 0.4  # a correlation from here on is one: hills, bends and shaking are in an accelerometer too
@@ -126,17 +127,34 @@ def check_distances(ride: Seconds, speeds: dict[str, Array], doubted: frozenset[
         yield from _positions(ride, best, speed)
 
 
-def _odometer(odometer: Array, best: str, speed: Array) -> Iterator[Finding]:
-    check, roles = "speed against odometer", (best, "odometer")
+def _counts(odometer: Array, speed: Array) -> tuple[Array, float, bool]:
+    """(steps forward of the odometer [m], way by the speed [m], whether both are enough to compare); both (n,)."""
     known = np.isfinite(odometer) & np.isfinite(speed)
     steps = np.diff(odometer[known])
-    if (steps < -1.0).any():
-        yield wrong("odometer", ("odometer",), "counts back")
-        return
     counts = steps[steps > 0]
     counted, ridden = float(counts.sum()), float(speed[known].sum()) * SECOND
     largest = float(counts.max()) if len(counts) else 0.0
-    if max(counted, ridden) < max(SHORTEST, COUNTS * largest) or (not len(counts) and ridden < 2500):
+    few = max(counted, ridden) < max(SHORTEST, COUNTS * largest) or (not len(counts) and ridden < 2500)
+    return counts, ridden, not few
+
+
+def way_over_odometer(ride: Seconds, speed: Array) -> float | None:
+    """The way by the speed (n,) [m/s] over that of the odometer; None if too little of it was seen, or it is faulty."""
+    if "odometer" not in ride or (np.diff(ride["odometer"]) < -1.0).any():
+        return None
+    counts, ridden, enough = _counts(ride["odometer"], np.abs(speed))
+    exact = len(counts) and float(counts.max()) < EXACT * float(counts.sum())
+    return ridden / float(counts.sum()) if enough and exact else None
+
+
+def _odometer(odometer: Array, best: str, speed: Array) -> Iterator[Finding]:
+    check, roles = "speed against odometer", (best, "odometer")
+    if (np.diff(odometer[np.isfinite(odometer) & np.isfinite(speed)]) < -1.0).any():
+        yield wrong("odometer", ("odometer",), "counts back")
+        return
+    counts, ridden, enough = _counts(odometer, speed)
+    counted, largest = float(counts.sum()), float(counts.max()) if len(counts) else 0.0
+    if not enough:
         yield unknown(check, roles, f"{ridden:.0f} m are too few for its steps")
         return
     if not counted:
@@ -160,12 +178,28 @@ def _poles(latitude: Array, longitude: Array) -> Iterator[Finding]:
         )
 
 
+def _where(ride: Seconds, speed: Array) -> tuple[Array, Mask]:
+    """(the way [m] (n - 1,) by `speed` (n,) from each position to the next, 0 where it does not move; where it does)"""
+    known = np.isfinite(ride["latitude"]) & np.isfinite(ride["longitude"]) & np.isfinite(speed)
+    moving = known & (speed > MOVING)
+    return np.where(moving[:-1] & moving[1:], (speed[:-1] + speed[1:]) / 2, 0.0) * SECOND, moving
+
+
+def way_over_positions(ride: Seconds, speed: Array) -> float | None:
+    """The way by the speed (n,) [m/s] over that of the positions; None if too little was seen, or they do not fit."""
+    if not {"latitude", "longitude"} <= ride.columns.keys():
+        return None
+    by_speed, moving = _where(ride, np.abs(speed))
+    steps = _steps(ride["latitude"], ride["longitude"], moving)
+    if by_speed.sum() < SHORTEST or steps.sum() < SHORTEST or _misfit(steps, by_speed) > UNLIKE:
+        return None
+    return float(by_speed.sum() / steps.sum())
+
+
 def _positions(ride: Seconds, best: str, speed: Array) -> Iterator[Finding]:
     check, roles = "speed against positions", (best, "latitude", "longitude")
     latitude, longitude = ride["latitude"], ride["longitude"]
-    known = np.isfinite(latitude) & np.isfinite(longitude) & np.isfinite(speed)
-    moving = known & (speed > MOVING)
-    by_speed = np.where(moving[:-1] & moving[1:], (speed[:-1] + speed[1:]) / 2, 0.0) * SECOND
+    by_speed, moving = _where(ride, speed)
     ridden = float(by_speed.sum())
     if ridden < SHORTEST:
         yield unknown(check, roles, f"{ridden:.0f} m were ridden with positions")
