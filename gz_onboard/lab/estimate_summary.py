@@ -17,6 +17,7 @@ from gz_onboard.offline.schema import to_json
 from gz_onboard.pipeline import lacking
 
 SUMMARY_VERSION = 1
+UNFIT = 0.1  # V of a cell, RMS: so far no battery's tables are off its prediction; recorded rides have 0.003 to 0.054
 MOST_SLOW = 0.1  # of the time: energy is not integrated if pack current and voltage come too slowly for longer
 
 

@@ -14,8 +14,19 @@ from gz_onboard import cli
 from gz_onboard.arrays import Array
 from gz_onboard.errors import FAILED, OK
 from gz_onboard.lab.vehicle.check import check_log, check_text
+from gz_onboard.lab.vehicle.electric import (
+    BY_POWER,
+    check_charge,
+    check_road,
+    check_sag,
+    check_voltages,
+    drawn,
+    model_power,
+    unless_contradicted,
+)
 from gz_onboard.lab.vehicle.finding import Finding, Looks
 from gz_onboard.lab.vehicle.motion import check_distances, speeds_of
+from gz_onboard.lab.vehicle.on_board import on_board
 from gz_onboard.lab.vehicle.rolling import rolling_of
 from gz_onboard.lab.vehicle.seconds import seconds_of
 from gz_onboard.offline.samples import Samples, read_samples
@@ -268,3 +279,59 @@ def test_with_a_radius_that_fits_the_rest_of_the_check_is_as_it_was(log, tmp_pat
     checked = check_log(log, read_vehicle(tmp_path / "v.toml"), quick=True)
     assert check_text(checked).splitlines()[0].endswith("one thing looks wrong")
     assert "by wheel radius and gear ratio as the log has them" in check_text(checked)
+
+
+# --- the pack -----------------------------------------------------------------------------------------------------
+
+
+def said_of_the_pack(ride: Samples, folder: Path, was: str, now: str) -> dict[str, Finding]:
+    """The last finding of each check of voltage, current and charge, with one line of the file changed."""
+    text = re.sub(was, now, REFERENCE, flags=re.M)
+    assert text != REFERENCE
+    (folder / "v.toml").write_text(text, encoding="utf-8")
+    vehicle = read_vehicle(folder / "v.toml")
+    seconds = seconds_of(ride, vehicle)
+    of, speed = drawn(seconds, vehicle), speeds_of(seconds, vehicle)["motor_speed"]
+    assert of is not None
+    assert vehicle.battery is not None
+    found = [*check_voltages(seconds, vehicle.battery, of.current), *check_sag(of), *check_charge(seconds, of, vehicle)]
+    found += check_road(seconds, of, speed, model_power(seconds, vehicle, speed, ride.rider_mass))
+    return {one.check: one for one in unless_contradicted(found)}
+
+
+def test_cells_that_give_current_above_their_full_voltage_are_too_few(rides, tmp_path):
+    said = said_of_the_pack(rides[1], tmp_path, r"cells_series = \d+", "cells_series = 12")
+    assert said["voltage against the cells"].looks is Looks.WRONG
+    assert "no more while they give current: 13 to 18 in series would fit" in said["voltage against the cells"].text
+    assert said["state of charge against the voltage"].looks is Looks.UNKNOWN  # full by it, as if 12 were right
+
+
+def test_a_number_of_cells_is_not_said_right_by_one_check_and_wrong_by_another(rides, tmp_path):
+    said = said_of_the_pack(rides[0], tmp_path, r"cells_series = \d+", "cells_series = 15")
+    assert "14 cells in series would fit, not 15" in said["state of charge against the voltage"].text
+    assert said["voltage against the cells"].looks is Looks.UNKNOWN
+    for ride_ in rides:
+        said = said_of_the_pack(ride_, tmp_path, r"cells_parallel = \d+", "cells_parallel = 24")
+        assert (
+            "A·h would fit: the cell's capacity, cells in parallel" in said["state of charge against the charge"].text
+        )
+        assert said["current against the voltage's drop"].looks is Looks.UNKNOWN
+        assert "in series would fit" not in said["state of charge against the voltage"].text  # they are right
+
+
+def test_a_load_that_is_far_from_the_models_does_not_look_right(rides, tmp_path):
+    area = read_vehicle("reference").parameters["drag_area"]
+    for ride_ in rides:
+        was, now = r"^drag_area = { value = [\d.]+", "drag_area = { value = {}"
+        assert said_of_the_pack(ride_, tmp_path, was, now.replace("{}", str(3 * area)))[BY_POWER].looks is Looks.UNKNOWN
+        assert (
+            said_of_the_pack(ride_, tmp_path, was, now.replace("{}", str(area * 1.01)))[BY_POWER].looks is Looks.RIGHT
+        )
+
+
+def test_what_the_daemon_cannot_predict_is_told_of_the_pack(tmp_path):
+    for cells, looks in (13, Looks.WRONG), (14, Looks.RIGHT):
+        text = re.sub(r"cells_series = \d+", f"cells_series = {cells}", REFERENCE)
+        (tmp_path / "v.toml").write_text(text, encoding="utf-8")
+        (said,) = on_board(LOGS / "coastdown.blf", read_vehicle(tmp_path / "v.toml"))
+        assert (said.looks, said.roles) == (looks, ("pack_voltage",))

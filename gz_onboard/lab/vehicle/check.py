@@ -75,10 +75,12 @@ def check_log(
     findings = [unknown("clock", (), leap_text(*leap)) for leap in codec.leaps]
     findings += [*_dropped(codec, columns), *_unanswered(codec, columns)]
     if columns:
-        findings += _checks(seconds_of(samples, vehicle), vehicle, samples.rider_mass)
+        checks = _checks(seconds_of(samples, vehicle), vehicle, samples.rider_mass)
+        findings += electric.unless_contradicted(checks)
     if columns and not quick:
         suspected = any(finding.looks is Looks.WRONG for finding in findings)
-        findings += [_LATER] if suspected else on_board(log, vehicle)
+        load = all(one.looks is Looks.RIGHT for one in findings if one.check == electric.BY_POWER)
+        findings += [_LATER] if suspected else on_board(log, vehicle, load)
     duration, end = _passed(columns)
     seen = _roles(mapping, codec.groups, samples, (duration, end), findings)
     return Checked(str(log), duration, seen, findings, features_of(columns))
@@ -138,7 +140,7 @@ def _checks(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterator[
         rolling.by_what_fits(motion.check_distances(ride, speeds, doubted)),
         motion.check_accelerations(ride, speeds, doubted),
         motion.check_turning(ride, speeds),
-        electric.check_voltages(ride, vehicle.battery) if vehicle.battery else (),
+        electric.check_voltages(ride, vehicle.battery, of.current if of else None) if vehicle.battery else (),
         electric.check_sag(of) if of else (),
         electric.check_road(ride, of, best, electric.model_power(ride, vehicle, best, payload))
         if of and best is not None

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from math import sqrt
+from math import ceil, floor, sqrt
 
 import numpy as np
 
@@ -14,16 +14,23 @@ from gz_onboard.estimator.redundancy.checks import MOVING
 from gz_onboard.estimator.redundancy.currents import APART_RELATIVE
 from gz_onboard.estimator.redundancy.motion import DRIVES
 from gz_onboard.estimator.redundancy.voltages import APART, HIGHEST, LOWEST
-from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
+from gz_onboard.lab.vehicle.finding import Finding, Looks, right, unknown, wrong
 from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, UNRELATED, Seconds, relation, unit_of
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.model import air_density, all_quantities
 from gz_onboard.vehicle import Vehicle
 
 PACK = ("pack_voltage", "pack_current")
+BY_CELLS, BY_VOLTAGE = "voltage against the cells", "state of charge against the voltage"
+BY_POWER = "power against speed and acceleration"
 SAGS = 0.5  # a correlation of the changes of voltage and current from here on is that of a resistance
-RESISTANCES = (0.3, 3.5)  # of the file's: cold cells, aged ones
-ENERGIES = (0.5, 2.0)  # of the model's: hills, wind and payload are in it
+RESISTANCES, USUAL_RESISTANCES = (0.3, 3.5), (0.6, 1.7)  # of the file's: possible, with cold or aged cells; usual
+ENERGIES, USUAL_ENERGIES = (0.5, 2.0), (0.75, 1.5)
+"""Of the model's: possible, by hills, wind and payload; usual: 35 recorded rides have 0.94 to 1.31."""
+ABOVE_FULL, ABOVE_FOR = (
+    1.02,
+    0.1,
+)  # of the full cell's voltage; of the time: discharging cells are not above for so long
 BRAKES = -0.4  # m/s²: slower than the road load alone
 SOC_APART = 0.3  # by the first voltage against the vehicle's own
 FIRST, LEAST_LOADED = 60, 5  # s, that a log's first state of charge is taken from, and of these
@@ -55,8 +62,8 @@ def drawn(ride: Seconds, vehicle: Vehicle) -> PackRide | None:
     return PackRide(ride[voltages[0]], current, vehicle.battery, temperature)
 
 
-def check_voltages(ride: Seconds, battery: Battery) -> Iterator[Finding]:
-    """Each within what the cells can have, and both against each other."""
+def check_voltages(ride: Seconds, battery: Battery, current: Array | None) -> Iterator[Finding]:
+    """Each within what the cells can have, and both against each other; current: of the pack [A] (n,)."""
     series = battery.cells_series
     low, high = LOWEST * battery.cutoff_voltage, HIGHEST * battery.ocv_value[-1]
     full, empty = battery.ocv_value[-1], battery.cutoff_voltage
@@ -64,20 +71,40 @@ def check_voltages(ride: Seconds, battery: Battery) -> Iterator[Finding]:
     for role in ride.any_of("pack_voltage", "inverter_voltage"):
         least, middle, most = (float(x) / series for x in np.nanpercentile(ride[role], (1, 50, 99)))
         text = f"{least:.2f} to {most:.2f} V a cell of {series} in series"
+        fewest, most_cells = ceil(most * series / (ABOVE_FULL * full)), floor(middle * series / empty)
+        fits = f"{fewest} to {most_cells}" if fewest < most_cells else str(most_cells)
         if low < middle < high and most < high:
             inside.append(role)
-            yield right("voltage against the cells", (role,), f"{text}; they have {empty:.2f} to {full:.2f} V")
+            if current is not None and _above_full(ride[role] / series, current, full):
+                text += f", which have {empty:.2f} to {full:.2f} V, and no more while they give current"
+                yield wrong(BY_CELLS, (role,), f"{text}: {fits} in series would fit")
+            else:
+                yield right(BY_CELLS, (role,), f"{text}; they have {empty:.2f} to {full:.2f} V")
             continue
         like = unit_of(role, middle / (0.5 * (empty + full)))
-        fit = round(middle * series / (0.5 * (empty + full)))
-        hint = like or (f": {fit} in series would fit" if fit >= 1 else "")
-        yield wrong("voltage against the cells", (role,), f"{text}, which have {empty:.2f} to {full:.2f} V{hint}")
+        hint = like or (f": {fits} in series would fit" if most_cells >= 1 else "")
+        yield wrong(BY_CELLS, (role,), f"{text}, which have {empty:.2f} to {full:.2f} V{hint}")
     if len(inside) == 2:
         apart = ride["inverter_voltage"] - ride["pack_voltage"]
         known = np.isfinite(apart)
         off = float(np.median(apart[known])) / series if known.any() else 0.0
         looks = right if abs(off) < APART else wrong
         yield looks("voltages against each other", (*inside,), f"the inverter's is {off:+.3f} V a cell off the pack's")
+
+
+def _above_full(cell: Array, current: Array, full: float) -> bool:
+    """Whether a cell's voltage [V] (n,) is for long above that of a `full` one while it gives current (n,)."""
+    giving = (current > 0) & np.isfinite(cell)
+    return giving.sum() >= FEWEST and float(np.mean(cell[giving] > ABOVE_FULL * full)) > ABOVE_FOR
+
+
+def unless_contradicted(findings: Iterable[Finding]) -> list[Finding]:
+    """All of them; voltage and state of charge look right by the number of cells only if both do."""
+    found = list(findings)
+    number = {one.check for one in found if one.looks is Looks.WRONG} & {BY_CELLS, BY_VOLTAGE}
+    doubted = [bool(number) and one.check in (BY_CELLS, BY_VOLTAGE) and one.looks is Looks.RIGHT for one in found]
+    text = f"; that alone tells no number of cells: see {' and '.join(sorted(number))}"
+    return [unknown(f.check, f.roles, f.text + text) if i else f for f, i in zip(found, doubted, strict=True)]
 
 
 def check_sag(of: PackRide) -> Iterator[Finding]:
@@ -102,8 +129,10 @@ def check_sag(of: PackRide) -> Iterator[Finding]:
         yield wrong(check, ("pack_current",), f"the voltage rises with it: its sign, scale = -1 ({text})")
     elif found.correlation > -SAGS:
         yield unknown(check, PACK, f"they hardly go together (correlation {found.correlation:.2f})")
-    elif RESISTANCES[0] < shown / expected < RESISTANCES[1]:
+    elif USUAL_RESISTANCES[0] < shown / expected < USUAL_RESISTANCES[1]:
         yield right(check, PACK, f"the voltage drops with it: {text}")
+    elif RESISTANCES[0] < shown / expected < RESISTANCES[1]:
+        yield unknown(check, PACK, f"the voltage drops with it: {text}; aged or cold cells, r0, or the cells' number")
     else:
         like = unit_of("pack_current", expected / shown) or ": scale of the current, r0, or the cells' number"
         yield wrong(check, ("pack_current",), text + like)
@@ -139,7 +168,7 @@ def check_road(ride: Seconds, of: PackRide, speed: Array, expected: Array) -> It
     """The pack's power against that of the model [W] (n,) at this speed [m/s] (n,)."""
     if of.current is None:
         return
-    check, power = "power against speed and acceleration", of.voltage * of.current
+    check, power = BY_POWER, of.voltage * of.current
     moving = np.isfinite(power) & np.isfinite(expected) & (np.abs(speed) > MOVING)
     found = relation(expected, power, moving)
     if found is None:
@@ -152,8 +181,10 @@ def check_road(ride: Seconds, of: PackRide, speed: Array, expected: Array) -> It
         yield wrong(check, ("pack_current",), f"less where more is needed ({text}): its sign, scale = -1")
     elif found.correlation < UNRELATED * 2:
         yield unknown(check, PACK, f"hills hide it: {text}")
-    elif ENERGIES[0] < ratio < ENERGIES[1]:
+    elif USUAL_ENERGIES[0] < ratio < USUAL_ENERGIES[1]:
         yield right(check, PACK, text)
+    elif ENERGIES[0] < ratio < ENERGIES[1]:
+        yield unknown(check, PACK, f"{text}: hills, wind and payload, or mass, drag area or losses of the file")
     else:
         like = unit_of("pack_current", ratio)
         yield wrong(check, (*PACK, "speed"), f"{text}{like or ': a scale of current or speed, mass, or drag area'}")
@@ -237,12 +268,12 @@ def check_charge(ride: Seconds, of: PackRide | None, vehicle: Vehicle) -> Iterat
     fit = _cells_that_fit(of, current, shown)
     if fit != of.battery.cells_series:
         hint = f"{fit} cells in series would fit, not {of.battery.cells_series}"
-        yield wrong("state of charge against the voltage", (role, "pack_voltage"), f"{text}: {hint}")
+        yield wrong(BY_VOLTAGE, (role, "pack_voltage"), f"{text}: {hint}")
     elif abs(float(shown[first[0]]) - expected) < SOC_APART:
-        yield right("state of charge against the voltage", (role, "pack_voltage"), text)
+        yield right(BY_VOLTAGE, (role, "pack_voltage"), text)
     else:
-        hint = "cells in series, the table ocv, or battery.window"
-        yield wrong("state of charge against the voltage", (role, "pack_voltage"), f"{text}: {hint}")
+        hint = "the cells' number, the table ocv, or battery.window"
+        yield wrong(BY_VOLTAGE, (role, "pack_voltage"), f"{text}: {hint}")
     yield from _counted(of, role, shown)
 
 
@@ -261,8 +292,12 @@ def _cells_that_fit(of: PackRide, current: Array, shown: Array) -> int:
     soc, load = battery.window.of_cells(soc), amperes / battery.cells_parallel
     rest, slope = battery.ocv(soc, of.temperature)
     drop = battery.circuit(soc, of.temperature)[0] * load
+    seen = relation(np.diff(current), np.diff(of.voltage))  # by the log: a wrong r0 or number in parallel is not in it
+    seen_drop = seen.factor * amperes / battery.cells_series if seen and seen.correlation < -SAGS else 0.0
     series = (volts + battery.series_resistance * amperes) / (rest - drop)
-    doubt = series / rest * sqrt((2 * battery.ocv_sd) ** 2 + (SHOWN_SD * slope) ** 2 + drop**2)
+    doubt = (
+        series / rest * sqrt((2 * battery.ocv_sd) ** 2 + (SHOWN_SD * slope) ** 2 + max(abs(drop), abs(seen_drop)) ** 2)
+    )
     fit = round(series)
     clear = doubt < CELLS_SD and abs(series - fit) < CELLS_SD
     return fit if clear and 0 < abs(fit - battery.cells_series) <= MISCOUNTED else battery.cells_series
@@ -288,6 +323,9 @@ def _counted(of: PackRide, role: str, shown: Array) -> Iterator[Finding]:
         yield right(check, (role, "pack_current"), text)
     else:
         like = unit_of("pack_current", counted / fell) if abs(fell) > 1e-6 else ": it does not move"
+        fits = f"; {capacity * counted / fell:.3g} A·h would fit" if abs(fell) > 1e-6 else ""
         yield wrong(
-            check, (role, "pack_current"), text + (like or ": the cell's capacity, cells in parallel, or a scale")
+            check,
+            (role, "pack_current"),
+            text + (like or f"{fits}: the cell's capacity, cells in parallel, or a scale"),
         )

@@ -8,13 +8,14 @@ from typing import Any
 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.estimate_ride import How, open_estimate, ride_through
-from gz_onboard.lab.estimate_summary import summary_of
+from gz_onboard.lab.estimate_summary import UNFIT, summary_of
 from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
 from gz_onboard.offline.results import clock
 from gz_onboard.vehicle import Vehicle
 
 LEFT_OUT = 0.2  # of the time: a sensor that contradicts the others for as long is no passing fault
 INNOVATION = 0.03  # V of a cell: what is more is no good table of a battery
+BY_LOAD = {"accel_x", "gps_altitude"}  # the daemon holds them against the grade by the power that is needed
 
 
 class Mute:
@@ -30,8 +31,8 @@ class Mute:
         """As of `log_rows.Log`."""
 
 
-def on_board(log: Path, vehicle: Vehicle) -> Iterator[Finding]:
-    """What the daemon's own checks would leave out for long."""
+def on_board(log: Path, vehicle: Vehicle, load: bool = True) -> Iterator[Finding]:
+    """What the daemon's own checks would leave out for long; load: whether the power needed is the model's."""
     if vehicle.battery is None:
         return
     try:
@@ -43,9 +44,16 @@ def on_board(log: Path, vehicle: Vehicle) -> Iterator[Finding]:
     for role, seconds in summary.distrusted.items():
         if seconds > LEFT_OUT * summary.duration_s:
             text = f"the daemon would leave it out for {clock(seconds)}: it contradicts the others"
-            yield wrong("on board", (role,), text)
+            if role in BY_LOAD and not load:
+                text = text.replace("it", role, 1)
+                yield wrong("on board", (), f"{text}, or the file's mass, drag area or losses are wrong")
+            else:
+                yield wrong("on board", (role,), text)
     if summary.innovation_rms_v is not None:
         text = f"voltage less its prediction: {1e3 * summary.innovation_rms_v:.0f} mV RMS of a cell"
-        known = "the battery's tables are about right" if summary.innovation_rms_v < INNOVATION else "wrong tables?"
-        looks = right if summary.innovation_rms_v < INNOVATION else unknown
-        yield looks("on board", ("pack_voltage",), f"{text}; {known}")
+        if summary.innovation_rms_v < INNOVATION:
+            yield right("on board", ("pack_voltage",), f"{text}; the battery's tables are about right")
+        elif summary.innovation_rms_v < UNFIT:
+            yield unknown("on board", ("pack_voltage",), f"{text}; wrong tables?")
+        else:
+            yield wrong("on board", ("pack_voltage",), f"{text}: the cells' number or capacity, or the tables")
