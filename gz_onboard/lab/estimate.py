@@ -23,7 +23,7 @@ from gz_onboard.lab.estimate_order import Unread, in_order
 from gz_onboard.lab.estimate_ride import known_vehicle, open_estimate
 from gz_onboard.lab.estimate_route import route_text
 from gz_onboard.lab.estimate_state import go_on, held
-from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary
+from gz_onboard.lab.estimate_summary import GAINS, SUMMARY_VERSION, UNFIT, RideSummary
 from gz_onboard.lab.estimate_table import FORMATS, check_table, write_summaries
 from gz_onboard.offline.processes import collect, over_rides, tasks_of
 from gz_onboard.offline.results import Failure, clock, explain_keys, number, text_rows, write_json
@@ -219,7 +219,10 @@ def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
         ),
         ("state", ", ".join(f"{name.lower()} {duration:.1f} s" for name, duration in ride.states.items())),
         *(("", f"{words(name)} {duration:.1f} s") for name, duration in ride.reasons.items()),
-        *([("vehicle file", CONTRADICTED.format(ride.file))] if contradicted(ride) else _own_gauge(ride)),
+        *(
+            _capacity(ride)
+            or ([("vehicle file", CONTRADICTED.format(ride.file))] if contradicted(ride) else _own_gauge(ride))
+        ),
         *([("left out", _durations(ride.distrusted))] if ride.distrusted else []),
         *([("never there", ", ".join(words(name) for name in ride.lacking))] if ride.lacking else []),
     ]
@@ -227,7 +230,21 @@ def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
 
 def contradicted(ride: RideSummary) -> bool:
     """Whether what was measured contradicts the vehicle file, or itself, for most of the ride."""
-    return max(ride.reasons.get(str(reason.name), 0.0) for reason in CONTRADICTING) > MOST * sum(ride.states.values())
+    longest = max(ride.reasons.get(str(reason.name), 0.0) for reason in CONTRADICTING)
+    return longest > MOST * sum(ride.states.values()) or (ride.innovation_rms_v or 0.0) > UNFIT
+
+
+def _capacity(ride: RideSummary) -> list[tuple[str, str]]:
+    """What to say of the file's capacity, if the vehicle's own gauge moved quite otherwise by the charge counted."""
+    first, last, charge, file = ride.soc_shown_start, ride.soc_shown_end, ride.charge_ah, ride.capacity_ah
+    if first is None or last is None or charge is None or file is None or abs(first - last) < FAR_OFF:
+        return []
+    fits = charge / (first - last)
+    if fits <= 0 or GAINS[0] < fits / file < GAINS[1]:
+        return []
+    text = f"the vehicle itself shows {100 * first:.0f} to {100 * last:.0f} % over {charge:.1f} A·h, as a pack of "
+    text += f"{fits:.1f} A·h would; the file's has {file:.1f} A·h: cell_capacity, cells_parallel, the current's scale "
+    return [("vehicle file", f"{text}or the gauge is wrong; {TOLD.format(ride.file)}")]
 
 
 def _own_gauge(ride: RideSummary) -> list[tuple[str, str]]:

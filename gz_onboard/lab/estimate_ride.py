@@ -145,6 +145,7 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
         if went_on:  # as the daemon has it: until a voltage comes, what was restored grows older
             pipeline.estimator.wait(estimate.time - (tally.last.time if tally.last else 0.0))
         tally(estimate)
+        tally.gauge.take(estimate, own.last)
 
     pipeline = Pipeline(
         ride.vehicle,
@@ -154,6 +155,7 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
         log_signals=how.signals,
         observer=observe,
     )
+    own = pipeline.estimator.signals["bms_state_of_charge"]
     pipeline.codec.longest_pause_ns = LONGEST_PAUSE_NS
     went_on = go_on(pipeline, how.state, ride.source) if how.state else None
     if how.ledger:

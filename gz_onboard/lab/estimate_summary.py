@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, cast
 
-from gz_onboard.constants import WH, WH_PER_KM
+from gz_onboard.constants import BENCH_TEMPERATURE, HOUR, WH, WH_PER_KM
 from gz_onboard.events import Estimate, Reason, State
 from gz_onboard.lab.estimate_ride import TICK_S, Ridden
 from gz_onboard.lab.estimate_route import RouteSummary, route_summary
@@ -15,9 +15,11 @@ from gz_onboard.lab.why import Why, why_of
 from gz_onboard.offline.results import leap_text, times
 from gz_onboard.offline.schema import to_json
 from gz_onboard.pipeline import lacking
+from gz_onboard.vehicle import Vehicle
 
 SUMMARY_VERSION = 1
 UNFIT = 0.1  # V of a cell, RMS: so far no battery's tables are off its prediction; recorded rides have 0.003 to 0.054
+GAINS = (0.6, 1.7)  # of a state of charge counted over what the vehicle shows: aged cells count less
 MOST_SLOW = 0.1  # of the time: energy is not integrated if pack current and voltage come too slowly for longer
 
 
@@ -49,7 +51,13 @@ class RideSummary:
     soc_start_sd: Annotated[float | None, "its standard deviation"]
     soc_end: Annotated[float | None, "at the last estimate that has one"]
     soc_end_sd: Annotated[float | None, "its standard deviation"]
+    soc_shown_start: Annotated[float | None, "what the vehicle itself showed first, or null"]
     soc_shown_end: Annotated[float | None, "what the vehicle itself showed last, or null"]
+    charge_ah: Annotated[
+        float | None,
+        "drawn from the pack between those two, less what came back; null if more than a tenth was not counted",
+    ]
+    capacity_ah: Annotated[float | None, "of the vehicle file's pack, in what the vehicle shows as 0 to 100 %"]
     range_start_km: Annotated[float | None, "first range published"]
     range_end_km: Annotated[float | None, "last range published"]
     range_end_p10_km: Annotated[float | None, "exceeded with 90 % probability"]
@@ -95,6 +103,14 @@ class RideSummary:
     ]
 
 
+def _capacity(vehicle: Vehicle) -> float | None:
+    """Of the file's pack [A·h], between what the vehicle shows as empty and full; not as the ride has learned it."""
+    if vehicle.battery is None:
+        return None
+    window = vehicle.battery.window
+    return vehicle.battery.pack_capacity(BENCH_TEMPERATURE) * (window.high - window.low)
+
+
 def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = None) -> RideSummary:
     """The summary of a ride; log, picture: where its estimates were written and drawn."""
     pipeline, tally, route, went_on = ridden.pipeline, ridden.tally, ridden.how.route, ridden.went_on
@@ -102,6 +118,8 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
     changes = pipeline.estimator.attribution.changes
     soc_start, soc_end = tally.soc_start or (None, None), tally.soc_end or (None, None)
     own = pipeline.estimator.signals["bms_state_of_charge"].last  # of the cells
+    battery, gauge = pipeline.estimator.battery, tally.gauge
+    counted = gauge.first is not None and gauge.uncounted <= MOST_SLOW * (last.time - tally.paused)
     counts, status = pipeline.counts(), pipeline.status()
     states, reasons = tally.by_name()
     drawn = pipeline.drawn.net if reasons[Reason.SIGNALS_SLOW.name] <= MOST_SLOW * states.total() else None
@@ -126,7 +144,10 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         soc_start_sd=soc_start[1],
         soc_end=soc_end[0],
         soc_end_sd=soc_end[1],
-        soc_shown_end=None if own is None else pipeline.estimator.battery.window.shown(own, 0.0)[0],
+        soc_shown_start=None if gauge.first is None else battery.window.shown(gauge.first, 0.0)[0],
+        soc_shown_end=None if own is None else battery.window.shown(own, 0.0)[0],
+        charge_ah=gauge.charge / HOUR if counted else None,
+        capacity_ah=_capacity(pipeline.vehicle),
         range_start_km=times(tally.range_start, 1e-3),
         range_end_km=times(ranged.range, 1e-3),
         range_end_p10_km=times(ranged.range_p10, 1e-3),

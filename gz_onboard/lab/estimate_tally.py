@@ -11,6 +11,33 @@ from gz_onboard.events import Estimate, Reason, RouteState, State
 from gz_onboard.log_rows import reason_names
 
 PAUSE = 30.0  # s without frames: beyond it the recording was stopped
+HELD = 1.0  # s: a current holds for no longer
+
+
+@dataclass
+class Gauge:
+    """The vehicle's own state of charge, as of its cells, first and last, and what was drawn between."""
+
+    first: float | None = None
+    last: float | None = None
+    charge: float = 0.0  # A·s, less what came back
+    uncounted: float = 0.0  # s without a current that a sensor showed
+    _before: float | None = None  # s
+
+    def take(self, e: Estimate, shown: float | None) -> None:
+        """Go on to an estimate, and what the vehicle shows then."""
+        before, self._before = self._before, e.time
+        if shown is None:
+            return
+        if self.first is None or before is None:
+            self.first = self.last = shown
+            return
+        self.last = shown
+        dt = e.time - before
+        if e.pack_current is None or e.current_modelled or not 0 <= dt <= HELD:
+            self.uncounted += dt
+        else:
+            self.charge += e.pack_current * dt
 
 
 @dataclass
@@ -30,6 +57,7 @@ class Tally:
     innovation_max: float = 0.0  # V
     ticks: Counter[tuple[State, int]] = field(default_factory=Counter)
     distrusted: Counter[str] = field(default_factory=Counter)  # ticks by role
+    gauge: Gauge = field(default_factory=Gauge)
     _squares: float = 0.0
     _innovations: int = 0
 

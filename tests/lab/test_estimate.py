@@ -129,6 +129,25 @@ def test_where_nothing_fits_the_vehicle_file_the_summary_says_how_to_check_it(tm
     assert "points less: its gauge or the vehicle file is wrong; what is wrong, `gz-onboard" in capsys.readouterr().out
 
 
+def test_a_capacity_that_the_vehicles_own_gauge_contradicts_is_told(tmp_path, capsys):
+    right = read_vehicle("reference")
+    assert right.battery is not None
+    current, seconds = 50.0, 600
+    rows = ["time [s],pack_voltage [V],pack_current [A],bms_state_of_charge [%],speed [km/h]"]
+    for second in range(seconds + 1):
+        soc = 0.9 - current * second / 3600 / right.battery.pack_capacity(25.0)
+        volts = 14 * (right.battery.ocv(soc, 25.0)[0] - 0.065 * current / 12)
+        rows.append(f"{second},{volts:.3f},{current},{100 * soc:.2f},36")
+    (tmp_path / "ride.csv").write_text("\n".join(rows), encoding="utf-8")
+    wrong = tmp_path / "wrong.toml"
+    wrong.write_text(right.file.read_text(encoding="utf-8").replace("cells_parallel = 12", "cells_parallel = 24"))
+    for vehicle, told in ("reference", False), (wrong, True):
+        assert run(tmp_path / "ride.csv", "--output", tmp_path, "--no-plot", "--vehicle", vehicle) == 0
+        out = capsys.readouterr().out
+        assert ("over 8.2 A·h, as a pack of 32.4 A·h would; the file's has 65.6 A·h: cell_capacity," in out) is told
+        assert ("\n  vehicle file " in out) is told
+
+
 def test_the_same_log_gives_the_same_bytes(tmp_path):
     made = []
     for seed in "1", "2":  # what goes by hash would come out in another order

@@ -14,6 +14,7 @@ from gz_onboard.estimator.redundancy.checks import MOVING
 from gz_onboard.estimator.redundancy.currents import APART_RELATIVE
 from gz_onboard.estimator.redundancy.motion import DRIVES
 from gz_onboard.estimator.redundancy.voltages import APART, HIGHEST, LOWEST
+from gz_onboard.lab.estimate_summary import GAINS
 from gz_onboard.lab.vehicle.finding import Finding, Looks, right, unknown, wrong
 from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, UNRELATED, Seconds, relation, unit_of
 from gz_onboard.physics.battery import Battery
@@ -36,8 +37,7 @@ SOC_APART = 0.3  # by the first voltage against the vehicle's own
 FIRST, LEAST_LOADED = 60, 5  # s, that a log's first state of charge is taken from, and of these
 SHOWN_SD = 0.06  # of a vehicle's own state of charge, before any is counted
 CELLS_SD, MISCOUNTED = 0.4, 2  # cells in series: known so closely they are told apart; so many off are a miscount
-COUNTED, GAINS = 0.06, (0.6, 1.7)
-"""Of a state of charge counted, at least, and over what is shown: aged cells count less."""
+COUNTED = 0.06  # of a state of charge, at least
 
 
 @dataclass(frozen=True)
