@@ -255,21 +255,20 @@ def check_charge(ride: Seconds, of: PackRide | None, vehicle: Vehicle) -> Iterat
     if "bms_state_of_charge" not in ride or of is None:
         return
     role, shown = "bms_state_of_charge", ride["bms_state_of_charge"]
-    known = np.isfinite(shown) & np.isfinite(of.voltage)
-    if not known.any():
-        return
     current = of.current if of.current is not None else np.zeros_like(shown)
-    first = np.flatnonzero(known)[:10]
-    cell = of.battery.cell_voltage(float(of.voltage[first].mean()), float(np.nan_to_num(current[first]).mean()))
-    load = float(np.nan_to_num(current[first]).mean()) / of.battery.cells_parallel
-    by_voltage = min(max(of.battery.soc_at_load(cell, load, of.temperature), 0.0), 1.0)
-    expected = of.battery.window.shown(by_voltage, 0.0)[0]
-    text = f"{shown[first[0]]:.0%} at the start, {expected:.0%} by the voltage {cell:.3f} V a cell"
-    fit = _cells_that_fit(of, current, shown)
+    least, before = _least_loaded(of, current, shown)
+    if not least:
+        return
+    volts, amperes, soc = (float(x[least].mean()) for x in (of.voltage, current, shown))
+    cell = of.battery.cell_voltage(volts, amperes)
+    by_voltage = of.battery.soc_at_load(cell, amperes / of.battery.cells_parallel, of.temperature)
+    expected = of.battery.window.shown(min(max(by_voltage, 0.0), 1.0), 0.0)[0]
+    text = f"{soc:.0%} at the start, {expected:.0%} by the voltage {cell:.3f} V a cell"
+    fit = _cells_that_fit(of, (volts, amperes, soc), _resistance_seen(of, current) * max(abs(amperes), before))
     if fit != of.battery.cells_series:
         hint = f"{fit} cells in series would fit, not {of.battery.cells_series}"
         yield wrong(BY_VOLTAGE, (role, "pack_voltage"), f"{text}: {hint}")
-    elif abs(float(shown[first[0]]) - expected) < SOC_APART:
+    elif abs(soc - expected) < SOC_APART:
         yield right(BY_VOLTAGE, (role, "pack_voltage"), text)
     else:
         hint = "the cells' number, the table ocv, or battery.window"
@@ -277,27 +276,34 @@ def check_charge(ride: Seconds, of: PackRide | None, vehicle: Vehicle) -> Iterat
     yield from _counted(of, role, shown)
 
 
-def _cells_that_fit(of: PackRide, current: Array, shown: Array) -> int:
-    """The cells in series that have the pack's voltage where the vehicle shows its state of charge, both (n,).
-
-    The file's number unless another is clearly meant, by the seconds of least load within the first minute. It is known
-    as closely as the rest voltage: by the table's sd, the slope where the charge is in doubt, and the drop.
-    """
-    battery = of.battery
+def _least_loaded(of: PackRide, current: Array, shown: Array) -> tuple[list[int], float]:
+    """(the seconds of least load within the first minute, the mean load [A] until the last of them); (n,) both."""
     known = np.flatnonzero(np.isfinite(shown) & np.isfinite(of.voltage) & np.isfinite(current))[:FIRST]
-    least = known[np.argsort(np.abs(current[known]))[:LEAST_LOADED]]
-    if not len(least):
-        return battery.cells_series
-    volts, amperes, soc = (float(x[least].mean()) for x in (of.voltage, current, shown))
-    soc, load = battery.window.of_cells(soc), amperes / battery.cells_parallel
+    least: list[int] = known[np.argsort(np.abs(current[known]))[:LEAST_LOADED]].tolist()
+    before = current[known[known <= max(least)]] if least else np.zeros(1)
+    return least, abs(float(before.mean()))
+
+
+def _resistance_seen(of: PackRide, current: Array) -> float:
+    """Of the pack [ohm], by the log; 0 where it shows none. A wrong r0 or number in parallel is not in it."""
+    seen = relation(np.diff(current), np.diff(of.voltage))
+    return -seen.factor if seen and seen.correlation < -SAGS else 0.0
+
+
+def _cells_that_fit(of: PackRide, start: tuple[float, float, float], left: float) -> int:
+    """The cells in series that have the pack's voltage where the vehicle shows its state of charge.
+
+    The file's number unless another is clearly meant. start: voltage [V], current [A] and state of charge shown. It is
+    known as closely as the rest voltage: by the table's sd, the slope where the charge is in doubt, the drop, and what
+    may be `left` [V] of the load before.
+    """
+    battery, (volts, amperes, shown) = of.battery, start
+    soc, load = battery.window.of_cells(shown), amperes / battery.cells_parallel
     rest, slope = battery.ocv(soc, of.temperature)
     drop = battery.circuit(soc, of.temperature)[0] * load
-    seen = relation(np.diff(current), np.diff(of.voltage))  # by the log: a wrong r0 or number in parallel is not in it
-    seen_drop = seen.factor * amperes / battery.cells_series if seen and seen.correlation < -SAGS else 0.0
     series = (volts + battery.series_resistance * amperes) / (rest - drop)
-    doubt = (
-        series / rest * sqrt((2 * battery.ocv_sd) ** 2 + (SHOWN_SD * slope) ** 2 + max(abs(drop), abs(seen_drop)) ** 2)
-    )
+    lost = max(abs(drop), left / battery.cells_series)
+    doubt = series / rest * sqrt((2 * battery.ocv_sd) ** 2 + (SHOWN_SD * slope) ** 2 + lost**2)
     fit = round(series)
     clear = doubt < CELLS_SD and abs(series - fit) < CELLS_SD
     return fit if clear and 0 < abs(fit - battery.cells_series) <= MISCOUNTED else battery.cells_series
