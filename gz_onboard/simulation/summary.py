@@ -237,8 +237,7 @@ def summary_text(summary: SimulationSummary) -> str:
         (
             summary.kind,
             f"{clock(summary.duration_s)}, {summary.distance_km:.2f} km, "
-            f"at most {summary.speed_max_km_h:.0f} km/h, "
-            f"{summary.repetitions:.3g} times",
+            f"at most {summary.speed_max_km_h:.0f} km/h{_repeated(summary)}",
         ),
         (
             "energy",
@@ -266,17 +265,24 @@ def summary_text(summary: SimulationSummary) -> str:
     return "\n".join([text_rows(head, rows), *(["", variants_text(summary.sweep)] if summary.sweep else [])])
 
 
+def _repeated(summary: SimulationSummary) -> str:
+    """How often a cycle was ridden; nothing of a route or a recorded ride, which have one way."""
+    often = f"{summary.repetitions:.3g}"
+    return "" if summary.kind != "cycle" else ", once" if often == "1" else f", {often} times"
+
+
 def _beyond_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
     """What the battery cannot give, and why two ranges differ."""
     rows = []
     for b in summary.beyond_battery:
-        place = f"from {b.time_s:.0f} s, {b.distance_km:.2f} km"
+        place = f"{b.time_s:.0f} s, {b.distance_km:.2f} km"
         if b.charge:
-            text = f"no charge is left {place}: the ride goes on {b.duration_s:.0f} s that no pack can give"
+            text = f"no charge is left from {place}: the ride goes on {b.duration_s:.0f} s that no pack can give"
             rows.append(text if b.duration_s > 1.0 else f"no charge is left at {b.time_s:.0f} s")
             continue
+        when = f"from {place}, for {b.duration_s:.0f} s in all" if b.duration_s >= 1.0 else f"at {place}"
         rows.append(
-            f"{place}, for {b.duration_s:.0f} s in all, {b.current_a:.0f} A pull the pack to {b.voltage_v:.1f} V at "
+            f"{when}, {b.current_a:.0f} A pull the pack to {b.voltage_v:.1f} V at "
             f"{100 * b.soc:.0f} % of charge: its cut-off is {b.cutoff_v:.1f} V"
         )
     energy, soc = summary.range_by_energy_km, summary.soc_end
@@ -296,7 +302,8 @@ def _shortfall_rows(summary: SimulationSummary) -> list[tuple[str, str]]:
     found = summary.shortfalls
     if not found:
         return []
-    rows = [("shortfall", f"{summary.shortfall_s:.0f} s slower than wanted, in {len(found)} stretches; the worst:")]
+    stretches = f"{len(found)} stretches; the worst" if len(found) > 1 else "one stretch"
+    rows = [("shortfall", f"{summary.shortfall_s:.0f} s slower than wanted, in {stretches}:")]
     for s in found[:_SHOWN]:
         why = "beyond the vehicle" if s.beyond_vehicle else "the rider's lag"
         place = f"at {s.time_s:.0f} s, {s.distance_km:.2f} km, for {s.duration_s:.0f} s"

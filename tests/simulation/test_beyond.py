@@ -52,6 +52,7 @@ def test_a_load_that_ends_the_ride_with_charge_left_is_named(kick: Path, capsys)
     assert found["soc_end"] > 0.3 and found["range_by"] == "cut-off" and not beyond["charge"]
     assert beyond["voltage_v"] <= beyond["cutoff_v"] == 21.0 and beyond["current_a"] > 60
     assert found["range_by_energy_km"] > 1.1 * found["range_km"]
+    assert f"beyond the battery at {beyond['time_s']:.0f} s, " in text  # where it ends: no time that could be told
     assert "A pull the pack to 2" in text and f"its energy would do for {found['range_by_energy_km']:.1f} km" in text
 
 
@@ -75,6 +76,7 @@ def test_with_limits_of_its_kind_its_ranges_agree(kick: Path, capsys):
     """And neither power nor speed is beyond them: 800 W at the shaft, 25 km/h."""
     once, text = simulated(capsys, kick)
     assert once["beyond_battery"] == [] and "beyond the battery" not in text
+    assert "km/h, once energy" in text
     assert once["speed_max_km_h"] == pytest.approx(25, rel=0.04)
     scooter, most = Scooter(read_vehicle(kick)), 0.0
     for _ in range(1500):
