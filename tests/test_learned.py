@@ -151,6 +151,20 @@ def test_after_a_day_with_a_payload_it_shows_the_road_load(saved: Path, capsys: 
     assert f"{saved}: is damaged: its road holds implausible numbers" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("payload", "said"), [(80.0, "entered 80"), (None, "vehicle file 80")])
+def test_a_payload_like_the_vehicle_file_s_is_told_as_entered(
+    saved: Path, capsys: pytest.CaptureFixture[str], payload: float | None, said: str
+):
+    snapshot, _ = state.load(saved, time.time()) or ({}, None)
+    road = Pipeline(read_vehicle("reference", payload=payload)).estimator.road_load.snapshot()
+    for kept in (road, {name: x for name, x in road.items() if name != "entered"}):
+        snapshot["learned"]["road"] = kept
+        state.write(saved, state.encode(snapshot, time.time()))
+        assert main(["learned", "--state", str(saved)]) == OK
+        assert f": mass of rider and luggage, {said}\n" in capsys.readouterr().out
+        said = "vehicle file 80"  # a state from before this was saved
+
+
 def test_it_shows_and_forgets_the_weakest_group(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     vehicle = with_cell_voltages(tmp_path)
     assert not set(NAMES) & set(shown(saved, capsys))  # a vehicle without the signal

@@ -159,14 +159,15 @@ def read_road_load(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> RoadLoad:
     """What a saved state holds of the road load, over the payload of its day. ValueError if it cannot be."""
     with part(ROAD):
         saved = snapshot.get("learned", {}).get(ROAD)
-        road_load = RoadLoad(_fresh(_loaded(vehicle, RoadLoad.payload_of(saved))).load)
+        payload = RoadLoad.payload_of(saved, vehicle.parameters.filed("payload_mass"))
+        road_load = RoadLoad(_fresh(_loaded(vehicle, payload)).load)
         road_load.take(road_load.read(saved))
     return road_load
 
 
 def _loaded(vehicle: Vehicle, payload: float | None) -> Vehicle:
-    """The vehicle with the payload [kg] that was entered, if it is not the file's. ValueError if it cannot be."""
-    if payload is None or payload == vehicle.parameters.filed("payload_mass"):
+    """The vehicle with the payload [kg] that was entered, if one was. ValueError if it cannot be."""
+    if payload is None:
         return vehicle
     try:
         return vehicle.loaded(payload)

@@ -107,7 +107,7 @@ class RoadLoad:
         p = load.model.parameters
         self._load, self._spans = load, Spans()
         self._filed = [p[name] for name in PARAMETERS]
-        self._entered = [p[name] != p.filed(name) for name in PARAMETERS]
+        self._entered = [p.is_entered(name) for name in PARAMETERS]
         self._bounds = [(p.declared[name].low, p.declared[name].high) for name in PARAMETERS]
         self._units = [p.declared[name].unit for name in PARAMETERS]
         sds = [hypot(p.sd(name), d * x) for name, d, x in zip(PARAMETERS, DIFFER, self._filed, strict=True)]
@@ -299,9 +299,10 @@ class RoadLoad:
     # --- saving -----------------------------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
-        """What is to be kept over a restart; of: what the vehicle file says."""
+        """What is to be kept over a restart; of: what the vehicle file says; entered: whether the payload was."""
         riders = {name: list(mass) for name, mass in self.riders.items()}
         rest = {"noise": self._noise, "still": self._still, "rider": self.rider, "riders": riders}
+        rest["entered"] = self._entered[MASS]
         return {"of": list(self._filed), **self.joint.snapshot(), **rest}
 
     def read(self, saved: Mapping[str, Any] | None) -> Kept | None:
@@ -330,9 +331,15 @@ class RoadLoad:
         return Kept(joint, noise, still, rider, riders)
 
     @staticmethod
-    def payload_of(saved: Mapping[str, Any] | None) -> float | None:
-        """The payload [kg] of the day when a snapshot was saved; None if there is none. Raises as `read`."""
-        return None if saved is None else float(saved["of"][MASS])
+    def payload_of(saved: Mapping[str, Any] | None, filed: float) -> float | None:
+        """The payload [kg] that was entered when a snapshot was saved; None if none was. Raises as `read`.
+
+        filed: the vehicle file's; older snapshots do not say whether one like it was entered.
+        """
+        if saved is None:
+            return None
+        payload = float(saved["of"][MASS])
+        return payload if saved.get("entered", payload != filed) else None
 
     def take(self, kept: Kept | None) -> None:
         """Go on from what `read` gave."""
