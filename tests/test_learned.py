@@ -19,6 +19,7 @@ from gz_onboard.daemon.learned_picture import limits, rows_of
 from gz_onboard.errors import BAD_INPUT, OK
 from gz_onboard.estimator.ageing import Learned
 from gz_onboard.estimator.ekf import ScalarFilter
+from gz_onboard.estimator.snapshot import unlike
 from gz_onboard.estimator.weakest import NAMES
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
@@ -83,6 +84,10 @@ def test_it_shows_each_rider_and_draws_it(saved: Path, tmp_path: Path, capsys: p
     assert riders[""]["price"]["percent_learned"] > 80
     assert riders["anna"]["price"]["percent_learned"] < 30
     assert picture.read_bytes().startswith(b"\x89PNG")
+    assert main(["learned", "--state", str(saved)]) == OK
+    text = capsys.readouterr().out
+    unnamed = text.index("\nrides of which nobody said who rode:\n")
+    assert text.index("\nterrain  ") < text.index("\nrider anna:\n") < unnamed
     assert main(["learned", "--state", str(saved), "--reset", "riding"]) == OK
     text = capsys.readouterr().out
     assert text.startswith(f"reset in {saved}: riding of all riders, and terrain\n")
@@ -228,10 +233,14 @@ def test_it_names_a_state_that_is_missing_damaged_or_another_s(saved: Path, caps
     wrong = {**snapshot, "learned": {"capacity": {"of": "much"}}}
     state.write(saved, state.encode(wrong, time.time()))
     assert main(["learned", "--state", str(saved)]) == BAD_INPUT
-    assert f"{saved}: is damaged: its capacity or resistance holds implausible numbers\n" in capsys.readouterr().err
+    assert f"{saved}: is damaged: its capacity or resistance holds implausible numbers; " in capsys.readouterr().err
     state.write(saved, state.encode({**snapshot, "riding": {}}, time.time()))
     assert main(["learned", "--state", str(saved)]) == BAD_INPUT
-    assert f"{saved}: is damaged: its riding lacks " in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"{saved}: is damaged: its riding lacks " in said and "; --reset riding begins that anew" in said
+    assert main(["learned", "--state", str(saved), "--reset", "riding"]) == OK
+    assert main(["learned", "--state", str(saved)]) == OK
+    capsys.readouterr()
     text = state.encode(snapshot, time.time())
     nothing: list[Any] = [[1], 7, None]
     for none in nothing:
@@ -241,6 +250,26 @@ def test_it_names_a_state_that_is_missing_damaged_or_another_s(saved: Path, caps
     saved.write_bytes(text)
     saved.write_bytes(saved.read_bytes()[:-9])
     assert main(["learned", "--state", str(saved)]) == BAD_INPUT
+    assert "; to begin anew, give `gz-onboard estimate --state` a new name; " in capsys.readouterr().err
+
+
+def _key(*effects: str) -> str:
+    return "|".join(["scooter", "14s12p", *effects])
+
+
+@pytest.mark.parametrize(
+    ("other", "said"),
+    [
+        (7, "is of 7, this is 'scooter'"),
+        ("car|96s2p|drag", "is of 'car', this is 'scooter'"),
+        ("scooter|13s12p|drag|mass", "is of 'scooter' with '13s12p', this vehicle file has '14s12p'"),
+        (_key("drag"), "is of a vehicle file of 'scooter' without the effect mass, which this one has"),
+        (_key("drag", "mass", *"abcd"), "of 'scooter' with the effects a, b, c and 1 more, which this one has not"),
+        (_key("mass", "drag"), "of 'scooter' with its effects in another order"),
+    ],
+)
+def test_it_names_what_differs_and_no_more(other: object, said: str):
+    assert unlike(other, _key("drag", "mass")).endswith(said)
 
 
 @pytest.mark.parametrize("name", ["out.txt", "out", "out.mcap"])

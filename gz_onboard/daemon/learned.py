@@ -26,7 +26,7 @@ from gz_onboard.estimator.ageing import Ageing, Learned
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.road_load import RoadLoad, RoadParameter
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
-from gz_onboard.estimator.snapshot import part
+from gz_onboard.estimator.snapshot import part, unlike
 from gz_onboard.estimator.terrain import RATE, Terrain
 from gz_onboard.estimator.usual import Habit, Usual
 from gz_onboard.estimator.weakest import Weakest
@@ -46,14 +46,17 @@ MEANING = {  # by name: what its factor is on
     "standing": "energy at stops, likewise",
     "pace": "time of a kilometre, likewise",
     "factor": "measured over modelled energy of the same motion",
-    "terrain": "height that roads climb or fall for good, whoever rides, over that of a car's trips around one town",
+    "terrain": "how far 4 km of road end above or below their begin, whoever rides, "
+    f"over the {sqrt(4000 * RATE):.0f} m expected before the first ride",
     "mass": "mass of rider and luggage",
     "rolling": "resistance over weight",
     "drag": "area of vehicle and rider",
     "auxiliaries": "power, lights and all",
 }
+TERRAIN = "terrain"
 SPOKEN = {"mass": "payload"}  # what a text calls it
 LEARNED = "per cent learned: how much of what was uncertain before the first ride no longer is"
+ANEW = "; to begin anew, give `gz-onboard estimate --state` a new name; the daemon does so by itself when it starts"
 PICTURES = (".png", ".svg", ".pdf")
 BATTERY, ROAD, RIDING = ("capacity", "resistance", "weakest"), "road", "riding"
 FORGOTTEN = {  # by the word of --reset: what it forgets
@@ -98,14 +101,18 @@ def run(arguments: argparse.Namespace) -> int:
     try:
         snapshot, age = load(file, vehicle)
     except InputError as error:
-        raise InputError(f"{error}; choose another with --state FILE or --vehicle NAME|TOML") from error
+        anew = ANEW if file.is_file() else ""
+        raise InputError(f"{error}; choose another with --state FILE or --vehicle NAME|TOML{anew}") from error
     if arguments.reset:
         snapshot = _forget(file, snapshot, age, FORGOTTEN[arguments.reset], _fresh(vehicle))
         forgotten = ", ".join(PARTS[name] for name in FORGOTTEN[arguments.reset])
         # with the JSON on standard output it would be no JSON
         print(f"reset in {file}: {forgotten}", file=sys.stderr if arguments.json == "-" else sys.stdout)
-    with sound(file):
-        learned, riders = read_learned(vehicle, snapshot), read_riders(vehicle, snapshot)
+    with _or_forget(file, "battery"):
+        learned = read_learned(vehicle, snapshot)
+    with _or_forget(file, RIDING):
+        riders = read_riders(vehicle, snapshot)
+    with _or_forget(file, ROAD):
         road_load = read_road_load(vehicle, snapshot)
     road = road_load.learned()
     if arguments.plot:
@@ -130,11 +137,16 @@ def learned_text(
     correlations: Mapping[tuple[str, str], float],
     riders: Mapping[str, Mapping[str, Learned]],
 ) -> str:
-    """For a terminal."""
+    """For a terminal. Terrain is of the roads, whoever rides; of a rider who is not known only what was learned."""
     lines = [LEARNED, *(_line(name, x) for name, x in learned.items()), *_road_lines(road, correlations)]
+    lines += [_line(TERRAIN, found[TERRAIN]) for found in riders.values() if TERRAIN in found]
     for rider, found in riders.items():
-        lines += [f"rider {rider or 'not known'}:"] if len(riders) > 1 else []
-        lines += [_line(name, x) for name, x in found.items()]
+        habits = {name: x for name, x in found.items() if name != TERRAIN}
+        if len(riders) > 1:
+            if not rider and not any(x.share for x in habits.values()):
+                continue
+            lines.append(f"rider {rider}:" if rider else "rides of which nobody said who rode:")
+        lines += [_line(name, x) for name, x in habits.items()]
     return "\n".join(lines)
 
 
@@ -184,7 +196,7 @@ def read_riders(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, dict
     now = forecaster.riders.now
     riders = {now: forecaster.riding.usual, **forecaster.riders.others}
     found = {name: _of_usual(usual, prior) for name, usual in riders.items()}
-    found[now]["terrain"] = _of_terrain(forecaster.terrain)
+    found[now][TERRAIN] = _of_terrain(forecaster.terrain)
     return found
 
 
@@ -214,6 +226,16 @@ def sound(file: Path) -> Iterator[None]:
         yield
     except ValueError as error:
         raise InputError(f"{file}: {error}") from error
+
+
+@contextmanager
+def _or_forget(file: Path, word: str) -> Iterator[None]:
+    """As `sound`, of the part that --reset forgets by `word`: how that is begun anew."""
+    try:
+        with sound(file):
+            yield
+    except InputError as error:
+        raise InputError(f"{error}; --reset {word} begins that anew, --reset all everything") from error
 
 
 def _rows(learned: Mapping[str, Learned]) -> dict[str, dict[str, object]]:
@@ -266,7 +288,7 @@ def load(file: Path, vehicle: Vehicle) -> tuple[Mapping[str, Any], float | None]
     with sound(file), part("state"):
         key = found[0].get("key")
     if key != vehicle.key:
-        raise InputError(f"{file}: is of {key!r}, this is {vehicle.key!r}")
+        raise InputError(f"{file}: {unlike(key, vehicle.key)}")
     return found
 
 

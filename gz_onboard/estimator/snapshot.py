@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from math import inf
 from typing import Any
 
+from gz_onboard.errors import shown
 from gz_onboard.estimator.ageing import Ageing
 from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.forecast import Forecaster
@@ -24,6 +25,7 @@ MOST = {"current": 1e4, "odometer": 1e10, "own_soc": 1.1, "consumption": 1e5}  #
 SOC = -0.1, 1.1
 V1 = 1.0  # V of a cell
 CELLS = -50.0, 120.0  # degC
+NAMED = 3  # effects in a message
 CELLS_KEEP = 3600.0  # s: for so long the cells' temperature is known
 
 
@@ -136,9 +138,38 @@ def mended(
 
 def _check_head(saved: Mapping[str, Any], key: str) -> None:
     if not isinstance(saved, Mapping) or saved.get("version") != VERSION:
-        raise ValueError(f"is of version {saved.get('version') if isinstance(saved, Mapping) else saved!r}")
+        version = saved.get("version") if isinstance(saved, Mapping) else saved
+        raise ValueError(f"is of version {shown(version)}, not {VERSION}")
     if saved.get("key") != key:
-        raise ValueError(f"is of {saved.get('key')!r}, this is {key!r}")
+        raise ValueError(unlike(saved.get("key"), key))
+
+
+def unlike(saved: object, key: str) -> str:
+    """How the vehicle `saved` with a state differs from that of `key`: by its name, its cells, or else its effects."""
+    if not isinstance(saved, str) or not saved:
+        return f"is of {shown(saved)}, this is {key.partition('|')[0]!r}"
+    (name, cells, effects), (our_name, our_cells, ours) = _parts(saved), _parts(key)
+    if name != our_name:
+        return f"is of {shown(name)}, this is {our_name!r}"
+    if cells != our_cells:
+        return f"is of {name!r} with {shown(cells)}, this vehicle file has {our_cells!r}"
+    lacks, has = [x for x in ours if x not in effects], [x for x in effects if x not in ours]
+    said = [f"without {_names(lacks)}, which this one has"] if lacks else []
+    said += [f"with {_names(has)}, which this one has not"] if has else []
+    return f"is of a vehicle file of {name!r} {'; and '.join(said) or 'with its effects in another order'}"
+
+
+def _parts(key: str) -> tuple[str, str, list[str]]:
+    """The vehicle's name, its cells and its effects, as in `Vehicle.key`."""
+    name, _, rest = key.partition("|")
+    cells, *effects = rest.split("|")
+    return name, cells, effects
+
+
+def _names(effects: Sequence[str]) -> str:
+    named = ", ".join(shown(name).strip("'") for name in effects[:NAMED])
+    more = f" and {len(effects) - NAMED} more" if len(effects) > NAMED else ""
+    return f"the effect{'s' if len(effects) > 1 else ''} {named}{more}"
 
 
 def _fits(name: str, check: Callable[[], object]) -> bool:

@@ -76,7 +76,9 @@ def _refused(file: Path, copy: Path, error: Exception) -> InputError:
     *_, before = state.copies(file)
     older = f"; the one before it is {before}" if copy != before and before.exists() else ""
     why = str(error) or repr(error)
-    return InputError(f"{copy}: {why}; give the state of this vehicle, or a new name to start from nothing{older}")
+    return InputError(
+        f"{copy}: {why}; give the state of this vehicle; to begin anew, give a new name, of no file yet{older}"
+    )
 
 
 def latest(file: Path) -> Path | None:
@@ -100,7 +102,7 @@ def _age_after(copy: Path, begin: float, ride: Path) -> float | None:
     if saved - begin > OVERTAKEN:
         raise InputError(
             f"{ride}: began at {when(begin)}, before the state {copy} was saved at {when(saved)}; "
-            "give the rides that came after it, or a new name to start from nothing"
+            "give the rides that came after it; to begin anew, give the state a new name, of no file yet"
         )
     return 0.0
 

@@ -304,7 +304,9 @@ def test_a_state_that_cannot_be_used_is_left_as_it_is(short, tmp_path, capsys):
     assert "before the state" in refused(out, capsys, short)
     before = state.encode(snapshot(out / "s.json"), 1.7e9)
     (out / "s.json").write_bytes(before)
-    assert "is of 'reference-scooter|" in refused(out, capsys, short, options=["--vehicle", tmp_path / "other.toml"])
+    assert "is of 'reference-scooter', this is 'another'" in refused(
+        out, capsys, short, options=["--vehicle", tmp_path / "other.toml"]
+    )
     (out / "s.json").write_bytes(before[:-9])
     assert "s.json: is damaged: its checksum is wrong" in refused(out, capsys, short)
     (out / "s.json").write_bytes(state.encode({"version": 1}, 1.7e9))
