@@ -11,7 +11,7 @@ import sys
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from gz_onboard import __version__
 from gz_onboard.errors import (
@@ -57,6 +57,13 @@ COMMANDS = {
 class _Parser(argparse.ArgumentParser):
     """argparse that names the nearest right option or command."""
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """What a command does not know is its own error, with its own usage: argparse leaves it to the whole line's."""
+        known, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return known, unknown
+
     def error(self, message: str) -> NoReturn:
         if message.startswith("the following arguments are required: ") and self._subparsers:
             self.print_help(sys.stderr)  # which commands there are is what is asked
@@ -77,16 +84,14 @@ class _Parser(argparse.ArgumentParser):
         return f" (did you mean {bare[near]!r}?)" if near else ""
 
     def _place_of(self, word: str) -> str:
-        """Where a file or folder `word` goes on the command line of the command that was called."""
-        choices = [a.choices for a in self._actions if isinstance(a, argparse._SubParsersAction)]
-        # The one that was called: it alone has its arguments, see `command_line`.
-        name, called = max(choices[0].items(), key=lambda one: len(one[1]._actions))
-        if any(not action.option_strings for action in called._actions):
+        """Where a file or folder `word` goes on the command line of this command."""
+        if any(not action.option_strings for action in self._actions):
             return "; files go before the options"
-        named = ((str(action.metavar), action) for action in called._actions if action.help != argparse.SUPPRESS)
+        named = ((str(action.metavar), action) for action in self._actions if action.help != argparse.SUPPRESS)
         taking = [f"{action.option_strings[0]} {of}" for of, action in named if re.search("FILE|TOML|DIR", of)]
         replayed = Path(word).is_dir() or word.lower().removesuffix(".gz").endswith(LOG_SUFFIXES)
         ride = "; a recorded ride is for estimate, or for replay onto a bus" if replayed else ""
+        name = self.prog.partition(" ")[2]
         return f"; {name} takes files and folders behind its options only: {', '.join(taking)}{ride}"
 
     def known_options(self) -> list[str]:

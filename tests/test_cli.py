@@ -276,6 +276,16 @@ def test_every_page_of_help(command: str):
     assert "%(" not in page
 
 
+@pytest.mark.parametrize("command", ["estimate", "vehicle check", "learned"])
+def test_a_wrong_option_shows_the_usage_of_its_command(capsys: pytest.CaptureFixture[str], command: str):
+    with pytest.raises(SystemExit) as ended:
+        main([*command.split(), "--nonsense", RIDE, RIDE])
+    assert ended.value.code == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"usage: gz-onboard {command} [-h] ")
+    assert f"\ngz-onboard {command}: error: unrecognized arguments: --nonsense" in said
+
+
 @pytest.mark.parametrize(("words", "among"), [([], "estimate"), (["vehicle"], "check"), (["history"], "remove")])
 def test_without_a_command_it_says_which_there_are(capsys: pytest.CaptureFixture[str], words: list[str], among: str):
     with pytest.raises(SystemExit) as ended:
