@@ -24,6 +24,8 @@ _CONVERSIONS: dict[tuple[str, str], tuple[float, float]] = {
     ("mph", "m/s"): (0.44704, 0.0),
     ("km", "m"): (1e3, 0.0),
     ("mm", "m"): (1e-3, 0.0),
+    ("mi", "m"): (1609.344, 0.0),
+    ("ft", "m"): (0.3048, 0.0),
     ("bar", "Pa"): (1e5, 0.0),
     ("kPa", "Pa"): (1e3, 0.0),
     ("g", "m/s^2"): (GRAVITY, 0.0),
@@ -33,10 +35,11 @@ _CONVERSIONS: dict[tuple[str, str], tuple[float, float]] = {
 # Spellings seen in DBC files -> ours
 _ALIASES = (
     "r/min=rpm 1/min=rpm RPM=rpm r/s=rev/s rps=rev/s °/s=deg/s dps=deg/s °=deg degree=deg degrees=deg °C=degC "
-    "C=degC ºC=degC Celsius=degC Nm=N·m N.m=N·m N*m=N·m kph=km/h kmh=km/h m/s2=m/s^2 m/s²=m/s^2 meters=m "
-    "Volt=V Amp=A Percent=%"
+    "C=degC ºC=degC Celsius=degC °F=degF F=degF ºF=degF Fahrenheit=degF mile=mi miles=mi feet=ft Nm=N·m "
+    "N.m=N·m N*m=N·m kph=km/h kmh=km/h m/s2=m/s^2 m/s²=m/s^2 meters=m Volt=V Amp=A Percent=%"
 )
-_SPELLINGS = {"": "1", "-": "1", "deg C": "degC"} | dict(alias.split("=") for alias in _ALIASES.split())
+_SPACED = {"": "1", "-": "1", "deg C": "degC", "deg F": "degF"}
+_SPELLINGS = _SPACED | dict(alias.split("=") for alias in _ALIASES.split())
 
 
 def known_units(role: str) -> list[str]:
