@@ -21,7 +21,7 @@ from gz_onboard.events import Reason, words
 from gz_onboard.lab.estimate_log import EstimateTask, estimate_log, kept_in_turn
 from gz_onboard.lab.estimate_order import Unread, in_order
 from gz_onboard.lab.estimate_ride import known_vehicle, open_estimate
-from gz_onboard.lab.estimate_route import route_text
+from gz_onboard.lab.estimate_route import off_text, route_text
 from gz_onboard.lab.estimate_state import go_on, held
 from gz_onboard.lab.estimate_summary import GAINS, SUMMARY_VERSION, UNFIT, RideSummary
 from gz_onboard.lab.estimate_table import FORMATS, check_table, write_summaries
@@ -195,6 +195,7 @@ def summary_rows(ride: RideSummary) -> list[tuple[str, str]]:
         ),
         ("range at the end", _range(ride)),
         *([("route", route_text(ride.route))] if ride.route else []),
+        *([("", off)] if ride.route and (off := off_text(ride.route, ride.distance_km)) else []),
         *([("saved state", _state_text(ride))] if ride.saved_state else []),
         (
             "innovation",

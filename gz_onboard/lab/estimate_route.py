@@ -8,12 +8,17 @@ from gz_onboard.constants import WH
 from gz_onboard.events import Estimate, RouteState
 from gz_onboard.offline.results import number, times
 
+MOSTLY = 0.5  # of the ridden way on the route: where it was less, that is said
+
 
 @dataclass(frozen=True)
 class RouteSummary:
-    """Of the last estimate on the route, but for `state`, which is of the last of all; null for what is not known."""
+    """Of the last estimate on the route, but for `state`, which is of the last of all, and what was ridden on the
+    route; null for what is not known.
+    """
 
     state: str  # of `RouteState`
+    ridden_km: float
     grade_known: bool
     along_km: float | None
     left_km: float | None
@@ -27,12 +32,13 @@ class RouteSummary:
     battery_ends_longitude_deg: float | None
 
 
-def route_summary(last: Estimate, on_route: Estimate, grade_known: bool) -> RouteSummary:
-    """Of the last estimate, and the last on the route."""
+def route_summary(last: Estimate, on_route: Estimate, way: float, grade_known: bool) -> RouteSummary:
+    """Of the last estimate, and the last on the route; way: ridden on it [m]."""
     e = on_route
     ends = None if e.battery_ends_after is None or e.route_along is None else e.route_along + e.battery_ends_after
     return RouteSummary(
         last.route_state.name,
+        way * 1e-3,
         grade_known,
         times(e.route_along, 1e-3),
         times(e.route_left, 1e-3),
@@ -61,3 +67,10 @@ def route_text(route: RouteSummary) -> str:
         if route.battery_ends_latitude_deg is not None:
             text += f" ({route.battery_ends_latitude_deg:.5f}, {route.battery_ends_longitude_deg:.5f})"
     return text if route.grade_known else f"{text}; its grades are not known"
+
+
+def off_text(route: RouteSummary, distance_km: float) -> str:
+    """That less than half of a ride of `distance_km` was on it; empty if it was more, or none, which is told."""
+    if route.left_km is None or route.ridden_km >= MOSTLY * distance_km:
+        return ""
+    return f"only {route.ridden_km:.2f} of the {distance_km:.2f} km ridden were on the route"

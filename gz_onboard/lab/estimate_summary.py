@@ -71,8 +71,9 @@ class RideSummary:
     ]
     route: Annotated[
         RouteSummary | None,
-        "of the route given: state at the end (ON, OFF); and of the last estimate on it km along and left, energy to "
-        "its end and state of charge there, km from its start and position where the battery ends before; or null",
+        "of the route given: state at the end (ON, OFF), km ridden on it; and of the last estimate on it km along and "
+        "left, energy to its end and state of charge there, km from its start and position where the battery ends "
+        "before; or null",
     ]
     saved_state: Annotated[
         str | None,
@@ -155,7 +156,7 @@ def summary_of(ridden: Ridden, log: Path | None = None, picture: Path | None = N
         energy_left_wh=times(ranged.energy_left, 1 / WH),
         why=why_of(last.why) if last.why else None,
         changes=list(map(why_of, changes)),
-        route=route_summary(last, tally.on_route or last, route.grade_known) if route else None,
+        route=route_summary(last, tally.on_route or last, tally.way_on_route, route.grade_known) if route else None,
         saved_state=("gone on" if went_on.found else "begun") if went_on else None,
         saved_state_age_s=went_on.age if went_on else None,
         innovation_rms_v=tally.innovation_rms,

@@ -52,6 +52,7 @@ class Tally:
     range_start: float | None = None  # m
     ranged: Estimate | None = None  # the last whose range is published
     on_route: Estimate | None = None  # the last
+    way_on_route: float = 0.0  # m
     paused: float = 0.0  # s, between estimates further apart than a pause
     speed_max: float | None = None  # m/s
     innovation_max: float = 0.0  # V
@@ -67,6 +68,9 @@ class Tally:
             self.first = e
         if self.last is not None and e.time - self.last.time > PAUSE:
             self.paused += e.time - self.last.time
+        if e.route_state == RouteState.ON:
+            self.on_route = e
+            self.way_on_route += e.distance - (self.last.distance if self.last else 0.0)
         self.last = e
         self.ticks[e.state, int(e.reasons)] += 1
         self.distrusted.update(e.distrusted)
@@ -83,8 +87,6 @@ class Tally:
         if e.range is not None and e.state in KNOWN:
             self.ranged = e
             self.range_start = e.range if self.range_start is None else self.range_start
-        if e.route_state == RouteState.ON:
-            self.on_route = e
 
     @property
     def innovation_rms(self) -> float | None:

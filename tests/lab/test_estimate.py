@@ -25,6 +25,7 @@ from gz_onboard.events import EFF_FLAG, Estimate
 from gz_onboard.lab import estimate
 from gz_onboard.lab.estimate_log import EstimateTask
 from gz_onboard.lab.estimate_ride import feed
+from gz_onboard.lab.estimate_route import RouteSummary, off_text
 from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary
 from gz_onboard.lab.estimate_tally import Tally
 from gz_onboard.pipeline import Pipeline
@@ -146,6 +147,16 @@ def test_a_capacity_that_the_vehicles_own_gauge_contradicts_is_told(tmp_path, ca
         out = capsys.readouterr().out
         assert ("over 8.2 A·h, as a pack of 32.4 A·h would; the file's has 65.6 A·h: cell_capacity," in out) is told
         assert ("\n  vehicle file " in out) is told
+
+
+def test_a_summary_says_where_most_of_the_ride_was_not_on_its_route(tmp_path, capsys):
+    route, found = LOGS / "city_34C.route.csv", tmp_path / "found.json"
+    assert run(COASTDOWN, "--route", route, "--output", tmp_path, "--no-plot", "--json", found) == 0
+    (ride,) = json.loads(found.read_text())["rides"]
+    on, way = ride["route"]["ridden_km"], ride["distance_km"]
+    assert 0.1 < on < way / 2
+    assert f"\n{'':20}only {on:.2f} of the {way:.2f} km ridden were on the route\n" in capsys.readouterr().out
+    assert not off_text(RouteSummary(**ride["route"] | {"ridden_km": 0.6 * way}), way)
 
 
 def test_the_same_log_gives_the_same_bytes(tmp_path):
