@@ -183,11 +183,21 @@ def _measured(log: Path, vehicle: Vehicle, size: int, progress: Progress) -> Mea
     measured = per_second(recorded)
     if len(measured["speed"]) < SHORTEST:
         raise InputError(f"{log}: {len(measured['speed'])} s are too short a ride to judge; at least {SHORTEST} s")
+    _check_riding(log, measured["speed"])
     road, grade = _road(recorded, log)
     if grade is not None:
         measured["grade"] = grade
     measured |= losses_per_second(recorded, vehicle)
     return Measured(recorded, vehicle, measured, road, rest_soc(recorded, vehicle))
+
+
+def _check_riding(log: Path, speed: Array) -> None:
+    """InputError if the vehicle hardly moves: percentages of what is measured at a halt are those of noise."""
+    moving = int((np.abs(speed) > STANDING).sum())
+    if moving < LEAST_SECONDS:
+        length = len(speed)
+        what = f"moves for only {moving} of its {length} s" if moving else f"only stands, for all of its {length} s"
+        raise InputError(f"{log}: the vehicle {what}: there is no riding to judge; at least {LEAST_SECONDS} s of it")
 
 
 def per_second(recorded: Recorded) -> dict[str, Array]:

@@ -432,6 +432,18 @@ def test_a_ride_of_which_nothing_can_be_compared_has_not_passed(tmp_path, capsys
     assert "passed" not in out.out
 
 
+@pytest.mark.parametrize(
+    ("moving", "said"), [(0, "only stands, for all of its 39 s"), (9, "moves for only 10 of its 39 s")]
+)
+def test_a_log_without_riding_is_not_judged(tmp_path, capsys, moving, said):
+    rows = "".join(f"{t},{5 if 10 < t <= 10 + moving else 0.1},50\n" for t in range(40))
+    (tmp_path / "halt.csv").write_text(f"time [s],speed [m/s],pack_voltage [V]\n{rows}")
+    assert main(["validate", str(tmp_path / "halt.csv"), "--output", str(tmp_path), "--no-plot"]) == 2
+    out = capsys.readouterr()
+    assert f"halt.csv: the vehicle {said}: there is no riding to judge; at least 20 s of it\n" in out.err
+    assert "passed" not in out.out
+
+
 def test_bad_input(tmp_path, capsys):
     other = tmp_path / "other.log"
     other.write_text("(1.000000) can0 7AB#0011223344556677\n(1.010000) can0 7AB#0011223344556677\n")
