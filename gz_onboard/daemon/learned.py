@@ -27,7 +27,7 @@ from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.road_load import RoadLoad, RoadParameter
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.snapshot import part, unlike
-from gz_onboard.estimator.terrain import RATE, Terrain
+from gz_onboard.estimator.terrain import RATE, STRETCH, Terrain
 from gz_onboard.estimator.usual import Habit, Usual
 from gz_onboard.estimator.weakest import Weakest
 from gz_onboard.options import add_shared
@@ -46,8 +46,8 @@ MEANING = {  # by name: what its factor is on
     "standing": "energy at stops, likewise",
     "pace": "time of a kilometre, likewise",
     "factor": "measured over modelled energy of the same motion",
-    "terrain": "how far 4 km of road end above or below their begin, whoever rides, "
-    f"over the {sqrt(4000 * RATE):.0f} m expected before the first ride",
+    "terrain": f"how far {STRETCH / 1000:.0f} km of road end above or below their begin, whoever rides, "
+    f"over the {sqrt(STRETCH * RATE):.0f} m expected before the first ride",
     "mass": "mass of rider and luggage",
     "rolling": "resistance over weight",
     "drag": "area of vehicle and rider",
