@@ -18,7 +18,7 @@ from gz_onboard.physics.battery import HALF_FULL, QUICK, Battery, Overpotential
 from gz_onboard.physics.effect import QUANTITIES, Effect, Port, effect_file, load_effect
 from gz_onboard.physics.elementary import STANDSTILL, sqrt
 from gz_onboard.physics.parameters import Parameters
-from gz_onboard.physics.relaxation import mean_response, relaxation_over, relaxed
+from gz_onboard.physics.relaxation import mean_response, relaxation, relaxed
 from gz_onboard.physics.sensors import road_speed
 from gz_onboard.physics.trust import changeable, trusted_users
 
@@ -89,7 +89,7 @@ class Bound:
         )[:2]
         if self.effect.decay is None or not target.any():
             return target.copy()
-        return relaxation_over(target, decay, before=before)
+        return relaxation(target, decay, before=before)
 
 
 def _valued(function: Callable[..., Any], values: Mapping[str, float]) -> Callable[..., Any]:

@@ -17,7 +17,7 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.physics.battery import terminal_voltage
 from gz_onboard.physics.effects import charge_transfer
-from gz_onboard.physics.relaxation import relaxation_over, relaxed
+from gz_onboard.physics.relaxation import relaxation, relaxed
 from gz_onboard.physics.tables import bilinear_over, extended_over
 
 *FOUND, REACTIONS = charge_transfer.PARAMETERS
@@ -98,7 +98,7 @@ def follow(target: Array, dt: Array, tau: float | Array) -> Array:
 
     A target of R·I gives the voltage of an RC pair, exact for a current constant over each step (eq. 2.22).
     """
-    return relaxation_over(target, np.exp(-dt / tau * np.ones(len(target))))
+    return relaxation(target, np.exp(-dt / tau * np.ones(len(target))))
 
 
 def follow_slope(current: Array, dt: Array, tau: Array) -> tuple[Array, Array]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.lab.calibrate.result import Curve, Found, Result
-from gz_onboard.physics.relaxation import relaxation_over
+from gz_onboard.physics.relaxation import relaxation
 
 GRID = 10.0  # s: between the values whose square and correlation are taken
 EMPTY = 0.1  # SOC up to which `cell_voltage_error_empty` counts
@@ -78,7 +78,7 @@ def slow_pair(flowed: Array, dt: Array, left: Array) -> SlowPair:
     half = len(left) // 2
     best: tuple[float, SlowPair] | None = None
     for time in SLOW_TIMES:
-        columns = np.column_stack([-relaxation_over(flowed, np.exp(-dt / time), before=False), np.ones(len(left))])
+        columns = np.column_stack([-relaxation(flowed, np.exp(-dt / time), before=False), np.ones(len(left))])
         found, *_ = np.linalg.lstsq(columns[:half], left[:half], rcond=None)
         rest = left - columns @ found
         sizes = float(np.max(np.abs(left[half:]))), float(np.max(np.abs(rest[half:])))

@@ -22,7 +22,7 @@ from gz_onboard.physics.cooling import InverterCooling, LumpedCooling, MotorCool
 from gz_onboard.physics.effect import ROAD_LOAD, Port
 from gz_onboard.physics.effects.inertia import rotating_mass
 from gz_onboard.physics.model import drag_torque, first_soc, standing_load
-from gz_onboard.physics.relaxation import decay_over, relaxation_over, relaxed
+from gz_onboard.physics.relaxation import decay_over, relaxation, relaxed
 from gz_onboard.physics.sensors import grade_shown, true_current, true_voltage
 
 SLOW = 5  # grid steps to one of the battery and cooling models: 0.5 s
@@ -197,10 +197,10 @@ def cell_circuit(ride: Ride, p: Values, system: System) -> CellCircuit:
     r1 = battery.r1.over(soc, temperature)
     decay = np.exp(-DT / (r1 * battery.c1.over(soc, temperature) * np.exp(p["pair_time"])))
     settled = r1 * (1 + p["pair_resistance"]) * factor * cell
-    v1 = relaxation_over(settled, decay, p["v1_start"], before=True)
+    v1 = relaxation(settled, decay, p["v1_start"], before=True)
     v1 = (v1 + relaxed(v1, settled, decay)) / 2  # the mean of the step's ends
     extra: Any = p["drift"] * np.arange(len(cell)) * DT / DRIFT_TIME
-    mid = relaxation_over(cell, np.full(len(cell), decay_over(DT, MID)), before=True)
+    mid = relaxation(cell, np.full(len(cell), decay_over(DT, MID)), before=True)
     extra = extra + p["mid_resistance"] * mid
     q = {name: block_means(value, SLOW) for name, value in ride.quantities.items()}
     q |= {"cell_current": cell, "soc": soc, "cell_temperature": temperature, "cell_capacity": capacity}
