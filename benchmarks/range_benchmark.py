@@ -140,7 +140,7 @@ def follow(
         if waiting and soc <= waiting[0]:
             shown = pipeline.estimator.signals["bms_state_of_charge"].value
             left, error = truth.distance[-1] - distance, (e.soc or 0.0) - soc
-            ranges = {name: e.range, **usual.ranges(shown), BUT_FOR_HEIGHT: truth.but_for_height(since + e.time)}
+            ranges = {name: e.range, **usual.ranges(shown), BUT_FOR_HEIGHT: float(truth.but_for_height(since + e.time))}
             rows.append(Row(waiting.pop(0), left, ranges, {name: held}, error, e.soc_sd or 0.0))
 
     pipeline = Pipeline(read_vehicle("reference"), observer=observe)
@@ -175,7 +175,15 @@ def judge(drawn: Drawn, log: Path, truth: Truth, state: State, kind: str) -> tup
         for a, b in zip(free.rows, ahead.rows, strict=True)
     ]
     held, late, moved = ({"ours": getattr(free, x), "route": getattr(ahead, x)} for x in ("held", "held_late", "jumps"))
+    moved[BUT_FOR_HEIGHT] = known_jumps(truth, since)
     return Judged(drawn, kind, float(truth.distance[-1]), rows, held, late, moved, free.way), free.state
+
+
+def known_jumps(truth: Truth, since: float) -> list[float]:
+    """As `Followed.jumps`, of who knows everything but the height: what no estimator without a route can spare."""
+    begin, end = np.interp(since, truth.time, truth.distance), truth.distance[-1]
+    judged = (truth.distance > begin + SOME_WAY * end) & (truth.distance < end - ADVANCED)
+    return list(jumps(truth.distance[judged], truth.but_for_height(truth.time[judged])))
 
 
 def _judged(given: tuple[Drawn, Path, Truth, State, str]) -> tuple[Judged, State]:
@@ -282,16 +290,16 @@ def table(judged: Sequence[Judged]) -> list[str]:
     for name, words in NAMES.items():
         error = np.array([100 * (row.ranges[name] / row.true - 1) for row in rows])
         cells = [f"{x:.1f}" for x in (np.median(np.abs(error)), np.percentile(np.abs(error), 90), np.mean(error))]
+        moved = np.concatenate([x.jumps.get(name, []) for x in judged]) / 1000
+        jumped = f"{np.percentile(moved, 90):.2f}, {moved.max():.1f}" if len(moved) else ""
         if name in OURS:
             width = 100 * np.mean([(row.intervals[name].high - row.intervals[name].low) / row.true for row in rows])
             score = np.mean([crps(row.ranges[name], *row.intervals[name], row.true) for row in rows])
-            moved = np.concatenate([x.jumps[name] for x in judged]) / 1000
-            jumped = f"{np.percentile(moved, 90):.2f}, {moved.max():.1f}"
             held, late = (100 * np.mean([getattr(x, share)[name] for x in judged]) for share in ("held", "held_late"))
             cells += [f"{held:.0f}, {late:.0f}", f"{width:.0f}", f"{score / 1000:.2f}", jumped]
         else:  # of a number without an interval its error is the score
             score = np.mean([abs(row.ranges[name] - row.true) for row in rows])
-            cells += ["", "", f"{score / 1000:.2f}", ""]
+            cells += ["", "", f"{score / 1000:.2f}", jumped]
         lines.append("| " + " | ".join([words, *cells]) + " |")
     return lines
 

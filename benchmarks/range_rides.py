@@ -45,15 +45,16 @@ class Truth:
     energy: Array  # J drawn from the pack
     height: Array  # J that height has stored
 
-    def but_for_height(self, time: float) -> float:
-        """The range [m] at `time` [s] of who knows everything but the height that the way to come ends above or below.
+    def but_for_height(self, time: float | Array) -> Array:
+        """The range [m] at `time` [s], a number or (n,), of who knows everything but the height that the way to come
+        ends above or below.
 
         What a climb costs beyond the height is left out: nobody without a route errs by less.
         """
         distance, energy, height = (
-            float(x[-1] - np.interp(time, self.time, x)) for x in (self.distance, self.energy, self.height)
+            x[-1] - np.interp(time, self.time, x) for x in (self.distance, self.energy, self.height)
         )
-        return distance * energy / (energy - height)
+        return np.asarray(distance * energy / (energy - height))
 
 
 @dataclass(frozen=True)

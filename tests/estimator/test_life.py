@@ -130,7 +130,7 @@ def test_charging_is_no_riding(plug):
     scooter, e = Scooter(soc=0.56, plug=plug), estimator()
     follow(e, scooter.live(20), scooter)
     _, ridden = follow(e, scooter.live(600, 10.0), scooter)[-1]
-    hours, scooter.period = 0.4 * scooter.capacity / 10.0, 0.5
+    hours, scooter.period = 0.2 * scooter.capacity / 10.0, 0.5
     rows = follow(e, scooter.live(3600 * hours, charge=10.9), scooter)
     scooter.period = PERIOD
     assert all(row.activity is Activity.CHARGING for _, row in rows[10:])

@@ -90,7 +90,7 @@ CLIMB = [
 ]
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=24, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(corruptions(), st.booleans())
 @example((1, FAR_AHEAD), False)
 @example((1556953994, CLIMB), False)
@@ -159,7 +159,7 @@ def test_any_values_in_sound_frames(seed: int, share: float, extreme: float):
     assert run.pipeline.codec.received == len(frames)
 
 
-@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.integers(0, 2**32), st.floats(0.0, 0.3))
 def test_random_frames_among_the_good_ones_change_nothing_much(seed: int, share: float):
     """Corruption that a checksum, a counter, a length or a physical range can see: the estimate stays."""

@@ -21,7 +21,7 @@ from tests.hardening.report import Report
 from tests.support import S, Scooter, check_estimate, reference
 
 TITLE = "A damaged saved state"
-COUNT = 3000
+COUNT = 1500
 FULL_COUNT = 28_000
 
 ODD: tuple[Any, ...] = (None, True, -1, 0, 1e308, 2**70, "", "a", [], [None], {}, {"a": {}}, [[[]]], -0.5, -1e300)

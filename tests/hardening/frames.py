@@ -30,7 +30,7 @@ from tests.vehicles.test_other_vehicles import tlmoto_frames
 from tests.vehicles.test_other_vehicles import vehicle as other_vehicle
 
 TITLE = "Frames: strangers, damage, forgeries and odd time stamps, mixed into rides"
-COUNT = 600_000
+COUNT = 300_000
 FULL_COUNT = 20_000_000
 PORTION = 2000  # frames between two checks
 KEPT = 4096  # identifiers that a codec remembers, known ones not counted

@@ -22,7 +22,7 @@ from tests.hardening.report import Report
 from tests.support import LOGS, reference
 
 TITLE = "Sensors that lie"
-COUNT = 8
+COUNT = 5
 FULL_COUNT = 1000  # all that there are
 RIDE = "city_14C"
 BEGIN = 120.0  # s: when the lie begins; the ride lasts 732 s

@@ -104,9 +104,8 @@ def resting(rest, seed):
     )
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_rests_that_move_with_temperature_are_found(seed):
-    result = resting(0.5e-3, 10 * seed)
+def test_rests_that_move_with_temperature_are_found():
+    result = resting(0.5e-3, 0)
     curve = result.curves["battery.rest_shift"]
     assert list(curve.axes["temperature"]) == [-5, 10, 25]
     assert curve.value == pytest.approx([-0.015, -0.0075, 0.0], abs=0.003)
@@ -116,9 +115,8 @@ def test_rests_that_move_with_temperature_are_found(seed):
     assert at_rest == pytest.approx(Plant().ocv(level) - 0.015, abs=0.004)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_rests_that_do_not_are_not_said_to(seed):
-    result = resting(0.0, 100 + 10 * seed)
+def test_rests_that_do_not_are_not_said_to():
+    result = resting(0.0, 100)
     assert "battery.rest_shift" not in result.curves
     assert any("rests do not move with temperature" in note for note in result.notes)
     assert pulse.circuit(result).rest_shift is None
