@@ -86,7 +86,8 @@ class Ageing:
         self._proven = deque([self._fit], KEPT + 1)  # the first is used
         self.belief = self._believe()
         self._unproven = 0.0  # s of load since it was kept
-        self._before, self._ride = Fit(), Fit()  # of the rides before this, and of this one until the two are compared
+        self._before = Fit()  # of the rides before this, until this one's begin was compared with it
+        self._ride, self._began = Fit(), 1.0  # of this ride's begin, and the factor of the one before
         self._slow = 0.0, 0.0  # V: low-passed drop at a factor of 1, and measured
         self._since = 0.0  # s
 
@@ -220,7 +221,7 @@ class Ageing:
 
         What was counted before is not gone on from. Gives whether the pack has shown to be another one.
         """
-        another = self._ride.time >= COMPARED and self._compare_packs(filter_)
+        another = self._before.time > 0 and self._ride.time >= COMPARED and self._compare_packs(filter_)
         by_itself = filter_.covariance[0] - self._with_soc**2 / self.variance
         if by_itself <= 0:  # SOC was made known from elsewhere
             self.part()
@@ -244,7 +245,7 @@ class Ageing:
         if not self._learning or abs(quick) < EXCITED:
             return
         self._fit = self._fit.after(dt, quick, quick_measured)
-        if self._ride.time < COMPARED <= self._before.time:
+        if self._ride.time < COMPARED:
             self._ride = self._ride.after(dt, quick, quick_measured)
         self._unproven += dt
         if self._unproven >= PROVEN / KEPT:
@@ -257,9 +258,9 @@ class Ageing:
         One with more resistance than before is no newer: what was learned counts as much as the prior does. So an aged
         pack that shows more of it on a colder day, or at another place of the curve, is not taken for half a new one.
         """
-        before, ride = self._before, self._ride
-        self._before, self._ride = Fit(), Fit()
-        if not ride.of_another_pack(before):
+        before, ride, began = self._before, self._ride, self._began
+        self._before = Fit()
+        if not ride.of_another_pack(before, began):
             return False
         self.part(filter_)
         if ride.factor > before.factor:
@@ -310,6 +311,7 @@ class Ageing:
                 "factor": self._proven[0].factor,
                 "weight": self._proven[0].weight,
                 "time": self._proven[0].time,
+                "began": self._ride.factor if self._ride.time >= COMPARED else self._began,
             },
         }
 
@@ -319,15 +321,18 @@ class Ageing:
         KeyError, TypeError or ValueError if it holds what cannot be.
         """
         capacity = _numbers(saved.get("capacity"), "inverse", "variance", "with_soc", of=self._battery.capacity)
-        resistance = _numbers(saved.get("resistance"), "factor", "weight", "time", of=self._battery.resistance_factor)
+        kept = saved.get("resistance")
+        kept = kept and {"began": kept["factor"], **kept}  # states from before it was kept have none
+        resistance = _numbers(kept, "factor", "weight", "time", "began", of=self._battery.resistance_factor)
         if capacity:
             inverse, variance, with_soc = capacity
             possible = 1 / CAPACITY[1] <= inverse <= 1 / CAPACITY[0] and 0 < variance <= CAPACITY_SD**2
             if not (possible and with_soc**2 < variance):
                 raise ValueError("holds an implausible capacity")
         if resistance:
-            factor, weight, time = resistance
-            if not (RESISTANCE[0] <= factor <= RESISTANCE[1] and weight > 0 and 0 <= time <= RESISTANCE_MEMORY):
+            factor, weight, time, began = resistance
+            possible = all(RESISTANCE[0] <= x <= RESISTANCE[1] for x in (factor, began))
+            if not (possible and weight > 0 and 0 <= time <= RESISTANCE_MEMORY):
                 raise ValueError("holds an implausible resistance")
         return capacity, resistance
 
@@ -337,7 +342,8 @@ class Ageing:
         if capacity:
             self.inverse, self.variance, self._with_soc = capacity
         if resistance:
-            self._fit = self._before = Fit(*resistance)
+            *fit, self._began = resistance
+            self._fit = self._before = Fit(*fit)
             self._proven = deque([self._fit], KEPT + 1)
         self.belief = self._believe()
         self._battery.age(1 / self.belief.inverse, self._resistance_factor)

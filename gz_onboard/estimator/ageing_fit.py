@@ -27,9 +27,14 @@ class Fit(NamedTuple):
         factor = min(max(factor, RESISTANCE[0]), RESISTANCE[1])
         return Fit(factor, weight, min(self.time + dt, RESISTANCE_MEMORY))
 
-    def of_another_pack(self, before: Fit) -> bool:
-        """Whether this, of one ride, and `before`, of the rides before it, cannot be of one pack."""
-        apart = max(self.factor / before.factor, before.factor / self.factor)
+    def of_another_pack(self, before: Fit, began: float) -> bool:
+        """Whether this, of a ride's begin, and `before`, of the hour of load before it, cannot be of one pack.
+
+        began: the factor of the begin of that ride. It ended warmer and emptier, where the tables err otherwise: what
+        is between its begin and its end is no other pack.
+        """
+        low, high = sorted((before.factor, began))
+        apart = max(self.factor / high, low / self.factor)
         return min(self.time, before.time) >= COMPARED and apart > ANOTHER_PACK
 
 

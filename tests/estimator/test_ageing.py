@@ -171,6 +171,23 @@ def test_the_same_pack_is_no_other_one_for_a_little_more_resistance(fresh: Batte
     assert found.capacity.share > 0.9 * ageing.capacity.share
 
 
+def test_a_ride_that_ended_with_less_resistance_than_it_began_is_of_the_same_pack(fresh: Battery):
+    """As one that ends hot, before a cool morning: begin is compared with begin and with end."""
+    battery = fresh.own()
+    begun, _, _ = discharge(fresh, 0.8, 1.6, 0.7, battery=battery)
+    ended, _, _ = discharge(fresh, 0.8, 1.15, 0.2, ageing=begun, battery=battery)
+    assert ended.resistance.value < 1.6 / 1.25
+    again, battery = restarted(fresh, ended)
+    found, _, _ = discharge(fresh, 0.8, 1.6, 0.8, ageing=again, battery=battery)
+    assert found.capacity.share > 0.9 * ended.capacity.share
+    older = ended.snapshot()
+    del older["resistance"]["began"]  # a state from before it was kept
+    again = Ageing(battery := fresh.own())
+    again.restore(older)
+    found, _, _ = discharge(fresh, 0.8, 1.6, 0.8, ageing=again, battery=battery)
+    assert found.capacity.share < 0.7 * ended.capacity.share
+
+
 def test_a_state_without_it_or_of_another_pack_is_as_new(fresh: Battery):
     ageing, _, _ = discharge(fresh, 0.8, 1.5, 0.6)
     saved = ageing.snapshot()
