@@ -28,10 +28,8 @@ SAGS = 0.5  # a correlation of the changes of voltage and current from here on i
 RESISTANCES, USUAL_RESISTANCES = (0.3, 3.5), (0.6, 1.7)  # of the file's: possible, with cold or aged cells; usual
 ENERGIES, USUAL_ENERGIES = (0.5, 2.0), (0.75, 1.5)
 """Of the model's: possible, by hills, wind and payload; usual: 35 recorded rides have 0.94 to 1.31."""
-ABOVE_FULL, ABOVE_FOR = (
-    1.02,
-    0.1,
-)  # of the full cell's voltage; of the time: discharging cells are not above for so long
+ABOVE_FULL = 1.02  # of the full cell's voltage: cells that give current are not above it for long
+ABOVE_FOR = 0.1  # of the time
 BRAKES = -0.4  # m/s²: slower than the road load alone
 SOC_APART = 0.3  # by the first voltage against the vehicle's own
 FIRST, LEAST_LOADED = 60, 5  # s, that a log's first state of charge is taken from, and of these
