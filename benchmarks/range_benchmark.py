@@ -366,7 +366,7 @@ def page(judged: Sequence[Judged], days: Sequence[Day], command: str, version: s
     lines += [
         f"Made by `{command}` on commit {version}. Rows are each ride at each tenth of charge from 90 to 20 %.",
         "No estimator knows without a route how far the way to come climbs: the last row of each table is of who knows",
-        "everything else.",
+        "everything else. Each climb moves the range of that one too: by its jumps.",
         "",
     ]
     if judged:
