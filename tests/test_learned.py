@@ -102,6 +102,8 @@ def test_it_forgets_one_and_keeps_the_rest(saved: Path, capsys: pytest.CaptureFi
     learned = shown(saved, capsys)
     assert learned["capacity"]["factor"] == pytest.approx(0.88, abs=0.05)  # what the resistance makes likely
     assert learned["capacity"]["percent_learned"] < 50
+    assert main(["learned", "--state", str(saved), "--reset", "capacity"]) == OK
+    assert "stays: `--reset battery` forgets both\n" in capsys.readouterr().out
     assert learned["resistance"]["factor"] == pytest.approx(RESISTANCE, rel=0.03)
     after, age = state.load(saved, time.time()) or ({}, None)
     assert {**after, "learned": before["learned"]} == before

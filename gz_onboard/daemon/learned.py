@@ -57,6 +57,7 @@ TERRAIN = "terrain"
 SPOKEN = {"mass": "payload"}  # what a text calls it
 LEARNED = "per cent learned: how much of what was uncertain before the first ride no longer is"
 ANEW = "; to begin anew, give `gz-onboard estimate --state` a new name; the daemon does so by itself when it starts"
+BY_RESISTANCE = "; what the resistance tells of it stays: `--reset battery` forgets both"
 PICTURES = (".png", ".svg", ".pdf")
 BATTERY, ROAD, RIDING = ("capacity", "resistance", "weakest"), "road", "riding"
 FORGOTTEN = {  # by the word of --reset: what it forgets
@@ -106,6 +107,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.reset:
         snapshot = _forget(file, snapshot, age, FORGOTTEN[arguments.reset], _fresh(vehicle))
         forgotten = ", ".join(PARTS[name] for name in FORGOTTEN[arguments.reset])
+        forgotten += BY_RESISTANCE if arguments.reset == "capacity" else ""
         # with the JSON on standard output it would be no JSON
         print(f"reset in {file}: {forgotten}", file=sys.stderr if arguments.json == "-" else sys.stdout)
     with _or_forget(file, "battery"):
