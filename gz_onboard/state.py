@@ -54,7 +54,7 @@ def decode(
     if not body.endswith(b"}\n") or zlib.crc32(body[:-1]) != int(head[2], 16):
         raise ValueError("is damaged: its checksum is wrong")
     try:
-        document = json.loads(b"{" + body)
+        document = json.loads(b"{" + body, parse_constant=_no_number)
         snapshot, saved_at, began = document["estimator"], document["saved_at"], document.get("uptime")
     except (ValueError, LookupError, TypeError, RecursionError) as error:  # the checksum is right: not written by us
         raise ValueError("is not a saved state, although its checksum is right") from error
@@ -65,6 +65,10 @@ def decode(
         same_boot = uptime and began and abs(uptime - began - age) < CLOCKS_AGREE
         age = age if same_boot else None
     return snapshot, age
+
+
+def _no_number(word: str) -> float:
+    raise ValueError(f"{word} is no number of JSON")
 
 
 def kept_time(clocks: Path = Path("/sys/class/rtc")) -> float:

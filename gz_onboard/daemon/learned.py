@@ -298,11 +298,13 @@ def _forget(
     file: Path, snapshot: Mapping[str, Any], age: float | None, names: Collection[str], fresh: Forecaster
 ) -> Mapping[str, Any]:
     """The state without what was learned under `names`, as it is saved from now on, no younger than it was."""
-    kept = {name: x for name, x in snapshot.get("learned", {}).items() if name not in names}
+    learned = snapshot.get("learned")
+    kept = {name: x for name, x in learned.items() if name not in names} if isinstance(learned, Mapping) else {}
     changed = {**snapshot, "learned": kept}
     if RIDING in names:
         changed["riding"] = fresh.snapshot()
-    text = state.encode(changed, 0.0 if age is None else time.time() - age)
+    with sound(file):
+        text = state.encode(changed, 0.0 if age is None else time.time() - age)
     with writing(file):
         descriptor = os.open(state.target(file).parent, os.O_RDONLY | os.O_DIRECTORY)
         try:

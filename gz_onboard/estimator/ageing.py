@@ -43,11 +43,13 @@ CAPACITY = 0.5, 1.1  # factors that a pack at work has
 CAPACITY_SD = 0.16  # of ψ, of packs that are not as new
 NEW_SD = 0.003, CAPACITY_SD / 2  # of a pack that is as new: whatever the file says, no capacity is known more closely
 LEAST_VARIANCE = 0.01**2  # of ψ: the curve's place, and what of an ageing cell is not capacity
+KNOWN_VARIANCE = 1e-6  # of ψ, in a saved state: no pack was ever known so closely
 LEAST_SPAN, NOTHING = 1e-3, (2.0, -1.0)  # of SOC
 CAPACITY_DRIFT = 0.02**2  # of ψ: variance that it gains over as much charge as a pack holds a hundred times
 CYCLES = 100.0  # see above
 LEAST_SOC = 0.001**2  # variance
 MOST_COUNTED = 1.0  # of SOC in one step: a pause of years is no charge
+DOUBTED_FROM = 0.05  # of SOC that was counted: over less, no capacity makes a voltage wrong
 TRUSTED = 0.03  # of SOC: sd by itself from which the charge that passes tells of the capacity
 PLACE_TIME = 600.0  # s for which the tables' place errs the same way
 EXCITED = 0.01  # V of a cell: a load that changes its voltage by less shows no resistance
@@ -86,8 +88,7 @@ class Ageing:
         self._proven = deque([self._fit], KEPT + 1)  # the first is used
         self.belief = self._believe()
         self._unproven = 0.0  # s of load since it was kept
-        self._before = Fit()  # of the rides before this, until this one's begin was compared with it
-        self._ride, self._began = Fit(), 1.0  # of this ride's begin, and the factor of the one before
+        self._before, self._ride = Fit(), Fit()  # of the rides before this, and of this one until the two are compared
         self._slow = 0.0, 0.0  # V: low-passed drop at a factor of 1, and measured
         self._since = 0.0  # s
 
@@ -221,7 +222,7 @@ class Ageing:
 
         What was counted before is not gone on from. Gives whether the pack has shown to be another one.
         """
-        another = self._before.time > 0 and self._ride.time >= COMPARED and self._compare_packs(filter_)
+        another = self._ride.time >= COMPARED and self._compare_packs(filter_)
         by_itself = filter_.covariance[0] - self._with_soc**2 / self.variance
         if by_itself <= 0:  # SOC was made known from elsewhere
             self.part()
@@ -245,7 +246,7 @@ class Ageing:
         if not self._learning or abs(quick) < EXCITED:
             return
         self._fit = self._fit.after(dt, quick, quick_measured)
-        if self._ride.time < COMPARED:
+        if self._ride.time < COMPARED <= self._before.time:
             self._ride = self._ride.after(dt, quick, quick_measured)
         self._unproven += dt
         if self._unproven >= PROVEN / KEPT:
@@ -258,9 +259,9 @@ class Ageing:
         One with more resistance than before is no newer: what was learned counts as much as the prior does. So an aged
         pack that shows more of it on a colder day, or at another place of the curve, is not taken for half a new one.
         """
-        before, ride, began = self._before, self._ride, self._began
-        self._before = Fit()
-        if not ride.of_another_pack(before, began):
+        before, ride = self._before, self._ride
+        self._before, self._ride = Fit(), Fit()
+        if not ride.of_another_pack(before):
             return False
         self.part(filter_)
         if ride.factor > before.factor:
@@ -272,8 +273,23 @@ class Ageing:
         self.belief = self._believe()
         return True
 
+    def doubt(self, filter_: SocFilter) -> bool:
+        """The voltage has contradicted what was counted: the pack may hold another charge than was learned.
+
+        Then SOC errs, too, by ψ's error over the charge that was counted. Gives whether there was anything to doubt.
+        """
+        counted = -self._with_soc / self.variance
+        if not self._learning or abs(counted) < DOUBTED_FROM or self.variance >= self._unknown / 2:
+            return False
+        p00, p01, p11 = filter_.covariance
+        filter_.covariance = p00 + counted**2 * (self._unknown - self.variance), p01, p11
+        self._with_soc, self.variance = -counted * self._unknown, self._unknown
+        self.belief = self._believe()
+        return True
+
     def unlearn(self) -> None:
         """A sensor was found faulty: the resistance is what it was before, unless that was confirmed."""
+        self._ride = Fit()
         if abs(self._fit.factor - self._proven[0].factor) < RESISTANCE_SD:
             return
         self._fit, self._unproven = self._proven[0], 0.0
@@ -311,7 +327,6 @@ class Ageing:
                 "factor": self._proven[0].factor,
                 "weight": self._proven[0].weight,
                 "time": self._proven[0].time,
-                "began": self._ride.factor if self._ride.time >= COMPARED else self._began,
             },
         }
 
@@ -321,18 +336,16 @@ class Ageing:
         KeyError, TypeError or ValueError if it holds what cannot be.
         """
         capacity = _numbers(saved.get("capacity"), "inverse", "variance", "with_soc", of=self._battery.capacity)
-        kept = saved.get("resistance")
-        kept = kept and {"began": kept["factor"], **kept}  # states from before it was kept have none
-        resistance = _numbers(kept, "factor", "weight", "time", "began", of=self._battery.resistance_factor)
+        resistance = _numbers(saved.get("resistance"), "factor", "weight", "time", of=self._battery.resistance_factor)
         if capacity:
             inverse, variance, with_soc = capacity
-            possible = 1 / CAPACITY[1] <= inverse <= 1 / CAPACITY[0] and 0 < variance <= CAPACITY_SD**2
+            possible = 1 / CAPACITY[1] <= inverse <= 1 / CAPACITY[0] and KNOWN_VARIANCE <= variance <= CAPACITY_SD**2
             if not (possible and with_soc**2 < variance):
                 raise ValueError("holds an implausible capacity")
         if resistance:
-            factor, weight, time, began = resistance
-            possible = all(RESISTANCE[0] <= x <= RESISTANCE[1] for x in (factor, began))
-            if not (possible and weight > 0 and 0 <= time <= RESISTANCE_MEMORY):
+            factor, weight, time = resistance
+            possible = RESISTANCE[0] <= factor <= RESISTANCE[1] and 0 < weight <= RESISTANCE_MEMORY  # of less than 1 V
+            if not (possible and 0 <= time <= RESISTANCE_MEMORY):
                 raise ValueError("holds an implausible resistance")
         return capacity, resistance
 
@@ -342,8 +355,7 @@ class Ageing:
         if capacity:
             self.inverse, self.variance, self._with_soc = capacity
         if resistance:
-            *fit, self._began = resistance
-            self._fit = self._before = Fit(*fit)
+            self._fit = self._before = Fit(*resistance)
             self._proven = deque([self._fit], KEPT + 1)
         self.belief = self._believe()
         self._battery.age(1 / self.belief.inverse, self._resistance_factor)
@@ -351,7 +363,7 @@ class Ageing:
 
 def _numbers(saved: Mapping[str, float] | None, *names: str, of: float) -> Numbers:
     """The saved numbers `names`; None if there are none, or if they are factors on something else than `of`."""
-    if saved is None or abs(float(saved["of"]) / of - 1) > SAME:
+    if saved is None or not abs(float(saved["of"]) / of - 1) <= SAME:
         return None
     found = [float(saved[name]) for name in names]
     if not all(isfinite(x) for x in found):

@@ -10,7 +10,7 @@ RESISTANCE = 0.5, 4.0  # factors that a pack at work has
 RESISTANCE_MEMORY = 3600.0  # s of load: the mean over a ride's charge and temperature is what lasts
 PRIOR_WEIGHT = 0.02  # V²·s: what the guess counts beside the load
 COMPARED = 300.0  # s of load from which the resistance of a ride is compared with that of the rides before
-ANOTHER_PACK = 1.25  # factor between the two: from ride to ride one pack keeps within half of that
+ANOTHER_PACK = 1.4  # factor between the two: one pack spans up to 1.38 from frost to 43 degC, three of the plant's did
 
 
 class Fit(NamedTuple):
@@ -27,14 +27,9 @@ class Fit(NamedTuple):
         factor = min(max(factor, RESISTANCE[0]), RESISTANCE[1])
         return Fit(factor, weight, min(self.time + dt, RESISTANCE_MEMORY))
 
-    def of_another_pack(self, before: Fit, began: float) -> bool:
-        """Whether this, of a ride's begin, and `before`, of the hour of load before it, cannot be of one pack.
-
-        began: the factor of the begin of that ride. It ended warmer and emptier, where the tables err otherwise: what
-        is between its begin and its end is no other pack.
-        """
-        low, high = sorted((before.factor, began))
-        apart = max(self.factor / high, low / self.factor)
+    def of_another_pack(self, before: Fit) -> bool:
+        """Whether this, of one ride, and `before`, of the rides before it, cannot be of one pack."""
+        apart = max(self.factor / before.factor, before.factor / self.factor)
         return min(self.time, before.time) >= COMPARED and apart > ANOTHER_PACK
 
 

@@ -9,6 +9,7 @@ INNOVATION_TIME = 10.0  # s: low pass of the innovation that is shown
 GATE = 5.0  # sd: a voltage further off is a glitch, unless it persists
 GATE_COUNT = 20  # so many in a row are no glitch
 CONTRADICTED = 60.0  # s: a filter whose voltage is off its gate for so long begins anew
+CONTRADICTING = 4.0  # of the mean square of errors over what is expected of it: three packs of the plant had up to 3.2
 LARGE = 0.08  # V of a cell, RMS: the cell model does not follow the voltage
 
 
@@ -38,6 +39,15 @@ class InnovationGate:
     def refuted(self) -> bool:
         """Whether the voltage has contradicted the state of charge for long."""
         return self._contradicted >= CONTRADICTED
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the error of the last ten minutes is larger than anything that is known explains."""
+        return self._ratio > CONTRADICTING
+
+    def settle(self) -> None:
+        """The error was explained: what follows is judged anew."""
+        self._ratio = 1.0
 
     def blame_both(self) -> None:
         """The last error may be the cell model's as well: it is believed to no better than that.

@@ -288,6 +288,8 @@ class StateOfCharge:
             filter_.update(cell_voltage, cell_current, temperature, variance)
             filter_.soc = bounded(filter_.soc)
             self.ageing.corrected(filter_, before)
+        if self.filter and self.gate.contradicted and not self.gate.off and self.ageing.doubt(filter_):
+            self.gate.settle()
         if not self.gate.off:
             self.ageing.load(min(dt, self._timing.pause), drop + filter_.v1, error)
         if self.ageing.apply(dt):

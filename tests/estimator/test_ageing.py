@@ -157,9 +157,9 @@ def test_an_aged_pack_that_shows_more_resistance_is_not_taken_for_half_a_new_one
     """As on a colder day: it may be another pack, but no newer one."""
     ageing, _, _ = discharge(fresh, 0.78, 1.25, 0.2)
     again, battery = restarted(fresh, ageing)
-    found, filter_, soc = discharge(fresh, 0.78, 1.65, 0.85, ageing=again, battery=battery)
-    assert found.resistance.value == pytest.approx(1.65, rel=0.06)  # it was begun with
-    assert found.capacity.value == pytest.approx(0.78, abs=0.04)  # 0.85 if of its capacity nothing were known
+    found, filter_, soc = discharge(fresh, 0.78, 1.8, 0.85, ageing=again, battery=battery)
+    assert found.resistance.value == pytest.approx(1.8, rel=0.06)  # it was begun with
+    assert found.capacity.value == pytest.approx(0.78, abs=0.05)  # 0.85 if of its capacity nothing were known
     assert found.capacity.sd > ageing.capacity.sd
     assert found.state_of_charge(filter_)[0] == pytest.approx(soc, abs=0.02)
 
@@ -169,23 +169,6 @@ def test_the_same_pack_is_no_other_one_for_a_little_more_resistance(fresh: Batte
     again, battery = restarted(fresh, ageing)
     found, _, _ = discharge(fresh, 0.8, 1.5, 0.8, ageing=again, battery=battery)
     assert found.capacity.share > 0.9 * ageing.capacity.share
-
-
-def test_a_ride_that_ended_with_less_resistance_than_it_began_is_of_the_same_pack(fresh: Battery):
-    """As one that ends hot, before a cool morning: begin is compared with begin and with end."""
-    battery = fresh.own()
-    begun, _, _ = discharge(fresh, 0.8, 1.6, 0.7, battery=battery)
-    ended, _, _ = discharge(fresh, 0.8, 1.15, 0.2, ageing=begun, battery=battery)
-    assert ended.resistance.value < 1.6 / 1.25
-    again, battery = restarted(fresh, ended)
-    found, _, _ = discharge(fresh, 0.8, 1.6, 0.8, ageing=again, battery=battery)
-    assert found.capacity.share > 0.9 * ended.capacity.share
-    older = ended.snapshot()
-    del older["resistance"]["began"]  # a state from before it was kept
-    again = Ageing(battery := fresh.own())
-    again.restore(older)
-    found, _, _ = discharge(fresh, 0.8, 1.6, 0.8, ageing=again, battery=battery)
-    assert found.capacity.share < 0.7 * ended.capacity.share
 
 
 def test_a_state_without_it_or_of_another_pack_is_as_new(fresh: Battery):

@@ -147,7 +147,7 @@ def test_a_snapshot_without_good_states_is_refused(damage, message):
 
 def test_a_snapshot_of_the_base_model_is_not_that_of_the_extended():
     e, _ = run(BASE, 30)
-    with pytest.raises(ValueError, match="this is"):
+    with pytest.raises(ValueError, match="slow_relaxation"):
         estimator(extended("slow_relaxation")).restore(e.snapshot(BASE.key), extended("slow_relaxation").key, 1.0)
 
 

@@ -166,6 +166,19 @@ def test_a_stop_at_a_traffic_light_belongs_to_the_ride():
     assert ridden() - before == pytest.approx(STOP_TIME, abs=15)  # it comes to a stop first
 
 
+@pytest.mark.parametrize(("learned", "true"), [(1.0, 0.8), (0.8, 1.0)])
+def test_a_voltage_overrules_a_capacity_that_was_learned_and_is_wrong(learned, true):
+    """As of a pack replaced by one that differs in nothing else: what is believed does not outlast the curve."""
+    scooter, e = Scooter(soc=0.95, capacity=true * BATTERY.pack_capacity(25.0), period=0.5, offset=0.0), estimator()
+    e.soc.ageing.inverse, e.soc.ageing.variance = 1 / learned, 0.01**2
+    follow(e, scooter.live(30), scooter)
+    while scooter.soc > 0.35:
+        rows = follow(e, scooter.live(60, 9.0), scooter)
+    found = e.soc.ageing.capacity
+    assert abs(found.value - true) < 3 * found.sd < 0.25  # else it is 1 ± 0.01 to the end of the ride
+    assert worst(rows) < 3
+
+
 # --- the first state of charge --------------------------------------------------------------------------------------
 
 

@@ -222,7 +222,7 @@ def test_what_was_learned_outlives_a_restart(rough):
     mended.riding.current = mended.riding.current.__class__()  # a restart leaves the open segment
     first.soc.ageing.restore(first.soc.ageing.snapshot())  # and uses at once what else is only used now and then
     assert second.forecaster.forecast(*at) == mended.forecast(*at)
-    with pytest.raises(ValueError, match="this is"):
+    with pytest.raises(ValueError, match="rough_road"):
         estimated(BASE, []).restore(saved, BASE.key, 5.0)
 
 

@@ -367,7 +367,7 @@ def test_what_is_weak_in_one_vehicle_is_not_in_another():
 def test_another_pack_begins_with_no_weak_group():
     """Of packs that are told apart by their resistance."""
     saved = at(WEAK, 0.2).snapshot("key")
-    saved["learned"]["resistance"] |= {"factor": 1.6, "began": 1.6}
+    saved["learned"]["resistance"]["factor"] = 1.6
     saved["soc"], saved["covariance"] = START, [1e-4, 0.0, 1e-4]
     found = ridden(Hidden(), 0.55, saved=saved)
     assert left(found, found.battery.health.weakest) == pytest.approx(left(found, None), rel=0.01)
