@@ -116,6 +116,15 @@ def test_nothing_is_suspected_on_recorded_rides(name):
     assert check_log(LOGS / name, read_vehicle("reference"), quick=True).those(Looks.WRONG) == []
 
 
+@pytest.mark.parametrize("seconds", [0.05, 1, 2, 2.5, 3, 4])
+def test_a_log_of_moments_cannot_tell(tmp_path, seconds):
+    cut = ["export", str(LOGS / "coastdown.blf"), str(tmp_path / "cut.blf"), "--from", "20", "--to", str(20 + seconds)]
+    assert cli.main(cut) == OK
+    checked = check_log(tmp_path / "cut.blf", read_vehicle("reference"))
+    assert checked.those(Looks.WRONG) == []
+    assert "most checks need" in check_text(checked)
+
+
 def test_it_says_what_is_right_and_what_it_cannot_tell(log, capsys):
     assert cli.main(["vehicle", "check", "reference", str(log), "--quiet"]) == OK
     out = capsys.readouterr().out

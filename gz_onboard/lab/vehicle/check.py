@@ -24,7 +24,7 @@ from gz_onboard.lab.vehicle.features import Feature, features_of, features_text
 from gz_onboard.lab.vehicle.finding import Finding, Looks, unknown, wrong
 from gz_onboard.lab.vehicle.on_board import on_board
 from gz_onboard.lab.vehicle.rolling import rolling_of
-from gz_onboard.lab.vehicle.seconds import Seconds, seconds_of
+from gz_onboard.lab.vehicle.seconds import FEWEST, Seconds, seconds_of
 from gz_onboard.offline.results import clock, leap_text
 from gz_onboard.offline.samples import Samples, facts_of, open_ride, read_roles, ride_name
 from gz_onboard.vehicle import Vehicle
@@ -43,7 +43,7 @@ class RoleSeen:
     signal: Annotated[str, "its signal in the DBC file"]
     looks: Annotated[Looks, "looks right, looks wrong, or cannot tell"]
     unit: Annotated[str, "of low and high"]
-    rate_hz: Annotated[float | None, "how often it comes; null if never"]
+    rate_hz: Annotated[float | None, "how often it comes; null if it came less than twice"]
     low: Annotated[float | None, "least value"]
     high: Annotated[float | None, "greatest value"]
     share: Annotated[float, "of the log's time in which it is valid, 0 to 1"]
@@ -75,7 +75,10 @@ def check_log(
     findings = [unknown("clock", (), leap_text(*leap)) for leap in codec.leaps]
     findings += [*_dropped(codec, columns), *_unanswered(codec, columns)]
     if columns:
-        checks = _checks(seconds_of(samples, vehicle), vehicle, samples.rider_mass)
+        ride = seconds_of(samples, vehicle)
+        if len(ride.time) < FEWEST:
+            findings.append(unknown("length", (), f"{_passed(columns)[0]:.1f} s: most checks need {FEWEST} s and more"))
+        checks = _checks(ride, vehicle, samples.rider_mass)
         findings += electric.unless_contradicted(checks)
     if columns and not quick:
         suspected = any(finding.looks is Looks.WRONG for finding in findings)
@@ -174,7 +177,7 @@ def _roles(
             times, values = samples.columns[source.role]
             period = periods.get(source.message)
             stale = STALE_PERIODS * period if period else DEFAULT_STALE
-            rate = 1 / max(float(np.median(np.diff(times))), 1e-6)
+            rate = 1 / max(float(np.median(np.diff(times))), 1e-6) if len(times) > 1 else None
             low, high = float(values.min()), float(values.max())
             held = float(np.minimum(np.diff(times, append=span[1]), stale).sum())
             share = min(held / max(span[0], 1e-9), 1.0)
@@ -203,8 +206,9 @@ def _about(roles: Sequence[str]) -> str:
 
 
 def _seen_text(seen: RoleSeen) -> str:
-    if seen.rate_hz is None or seen.low is None or seen.high is None:
+    if seen.low is None or seen.high is None:
         return f"never came ({seen.signal})"
     unit = "" if seen.unit == "1" else f" {seen.unit}"
     share = "" if seen.share > RARE else f", only {seen.share:.0%} of the time"
-    return f"{seen.rate_hz:.3g} Hz, {seen.low:.4g} to {seen.high:.4g}{unit}{share}: {seen.looks}"
+    often = "once" if seen.rate_hz is None else f"{seen.rate_hz:.3g} Hz"
+    return f"{often}, {seen.low:.4g} to {seen.high:.4g}{unit}{share}: {seen.looks}"

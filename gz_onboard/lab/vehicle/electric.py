@@ -16,7 +16,7 @@ from gz_onboard.estimator.redundancy.motion import DRIVES
 from gz_onboard.estimator.redundancy.voltages import APART, HIGHEST, LOWEST
 from gz_onboard.lab.estimate_summary import GAINS
 from gz_onboard.lab.vehicle.finding import Finding, Looks, right, unknown, wrong
-from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, UNRELATED, Seconds, relation, unit_of
+from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, UNRELATED, Seconds, rate, relation, unit_of
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.model import air_density, all_quantities
 from gz_onboard.vehicle import Vehicle
@@ -148,7 +148,7 @@ def model_power(ride: Seconds, vehicle: Vehicle, speed: Array, payload: float | 
     mass = p["vehicle_mass"] + (p["payload_mass"] if payload is None else payload)
     ambient = float(np.nanmean(ride["ambient_temperature"])) if "ambient_temperature" in ride else BENCH_TEMPERATURE
     ambient = min(max(ambient, -40.0), 60.0)
-    acceleration = np.gradient(speed, SECOND)
+    acceleration = rate(speed)
     grade = np.zeros_like(speed)
     quantities = all_quantities(
         speed=speed,
@@ -193,7 +193,7 @@ def _braking(of: PackRide, speed: Array, moving: Mask) -> Iterator[Finding]:
     """Whether the current has a sign, and what is recovered is in it."""
     assert of.current is not None
     check, current = "current while braking", of.current
-    braking = moving & (np.gradient(np.abs(speed), SECOND) < BRAKES)
+    braking = moving & (rate(np.abs(speed)) < BRAKES)
     if braking.sum() < FEWEST:
         yield unknown(check, ("pack_current",), "it was hardly braked")
         return

@@ -14,7 +14,7 @@ from gz_onboard.estimator.redundancy.odometer import FASTEST
 from gz_onboard.estimator.redundancy.speeds import AXLE, GROUND, SPEED_APART, SPEED_APART_RELATIVE, vote
 from gz_onboard.events import SPEEDS
 from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
-from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, Seconds, relation, unit_of
+from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, Seconds, rate, relation, unit_of
 from gz_onboard.physics.sensors import speed_factors
 from gz_onboard.vehicle import Vehicle
 
@@ -246,7 +246,7 @@ def check_accelerations(ride: Seconds, speeds: dict[str, Array], doubted: frozen
 def _forward(ride: Seconds, best: str, speed: Array, sure: bool) -> Finding:
     """sure: other speeds agree with `best`."""
     check, roles = "acceleration against speed", ("accel_x", best)
-    change = np.gradient(speed, SECOND)
+    change = rate(speed)
     if np.nanstd(change) < SWINGS:
         return unknown(check, roles, "the speed hardly changes")
     found = relation(change, ride["accel_x"])
@@ -274,7 +274,7 @@ def check_turning(ride: Seconds, speeds: dict[str, Array]) -> Iterator[Finding]:
         return
     check, roles = "turning against course", ("rate_z", "gps_course")
     fast = np.abs(next(iter(speeds.values()))) > 2 * MOVING
-    turning = -np.gradient(ride["gps_course"], SECOND)
+    turning = -rate(ride["gps_course"])
     turning = np.where(np.abs(turning) < 1.0, turning, np.nan)
     found = relation(turning, ride["rate_z"], fast)
     if found is None or float(np.nanstd(turning[fast])) < TURNING:

@@ -13,7 +13,7 @@ from gz_onboard.estimator.redundancy.checks import MOVING
 from gz_onboard.estimator.redundancy.temperatures import COLDER, TEMPERATURES
 from gz_onboard.events import words
 from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
-from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, Seconds, relation
+from gz_onboard.lab.vehicle.seconds import FEWEST, Seconds, rate, relation
 
 NEAR, FAR = 15.0, 25.0  # K between cells and air: usual; more than from a warm room, or a charge, into the cold
 WARMS = ((12.0, 2.0), (5.0, 4.0))
@@ -106,7 +106,7 @@ def check_switches(ride: Seconds, speed: Array | None) -> Iterator[Finding]:
 
 
 def _brake(pressed: Array, speed: Array, moving: Mask) -> Iterator[Finding]:
-    change = np.gradient(np.abs(speed), SECOND)
+    change = rate(np.abs(speed))
     on, off = moving & (pressed > 0.9), moving & (pressed < 0.1)
     if on.sum() < FEWEST / 3 or off.sum() < FEWEST / 3:
         yield unknown("brake switch", ("brake_switch",), "it does not change while riding")

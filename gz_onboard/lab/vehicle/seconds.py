@@ -61,6 +61,11 @@ def seconds_of(samples: Samples, vehicle: Vehicle) -> Seconds:
     return Seconds(grid - start, found)
 
 
+def rate(values: Array) -> Array:
+    """Change of `values` (n,) each second; none of a single one, which shows none."""
+    return np.gradient(values, SECOND) if len(values) > 1 else np.zeros_like(values)
+
+
 @dataclass(frozen=True)
 class Relation:
     """How one signal goes with another: by what factor, how closely, over how many points."""
