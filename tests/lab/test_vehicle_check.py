@@ -13,7 +13,8 @@ import pytest
 from gz_onboard import cli
 from gz_onboard.arrays import Array
 from gz_onboard.errors import FAILED, OK
-from gz_onboard.lab.vehicle.check import check_log, check_text
+from gz_onboard.estimator.redundancy.speeds import GROUND
+from gz_onboard.lab.vehicle.check import check_log, check_text, checks_of
 from gz_onboard.lab.vehicle.electric import (
     BY_POWER,
     check_charge,
@@ -114,6 +115,16 @@ def test_a_wrong_number_of_cells_is_suspected(log, tmp_path, cells):
 @pytest.mark.parametrize("name", RECORDED)
 def test_nothing_is_suspected_on_recorded_rides(name):
     assert check_log(LOGS / name, read_vehicle("reference"), quick=True).those(Looks.WRONG) == []
+
+
+def test_on_a_bench_the_axle_that_stands_is_not_stuck(rides):
+    vehicle = read_vehicle("reference")
+    ground = {role: (t, v * 0.0) for role, (t, v) in rides[0].columns.items() if role in GROUND}
+    for standing, stuck in (ground, []), ({"wheel_speed_front": ground["wheel_speed_front"]}, ["wheel_speed_front"]):
+        ride_ = seconds_of(Samples("x", {**rides[0].columns, **standing}), vehicle)
+        found = list(checks_of(ride_, vehicle, None))
+        assert [one.roles[0] for one in found if one.check == "stuck"] == stuck
+        assert any("a roller bench" in one.text for one in found) is not bool(stuck)
 
 
 @pytest.mark.parametrize("seconds", [0.05, 1, 2, 2.5, 3, 4])

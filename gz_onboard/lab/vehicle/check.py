@@ -78,7 +78,7 @@ def check_log(
         ride = seconds_of(samples, vehicle)
         if len(ride.time) < FEWEST:
             findings.append(unknown("length", (), f"{_passed(columns)[0]:.1f} s: most checks need {FEWEST} s and more"))
-        checks = _checks(ride, vehicle, samples.rider_mass)
+        checks = checks_of(ride, vehicle, samples.rider_mass)
         findings += electric.unless_contradicted(checks)
     if columns and not quick:
         suspected = any(finding.looks is Looks.WRONG for finding in findings)
@@ -130,7 +130,8 @@ def _unanswered(codec: Codec, columns: Mapping[str, tuple[Array, Array]]) -> Ite
             yield unknown("requests", silent, f"{count} times {reason} on {place}")
 
 
-def _checks(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterator[Finding]:
+def checks_of(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterator[Finding]:
+    """All that a ride says of itself and the vehicle file; payload [kg], if known."""
     rolling = rolling_of(ride, motion.speeds_of(ride, vehicle), vehicle)
     speeds = rolling.speeds
     by_speed = list(motion.check_speeds(ride, speeds))
@@ -154,7 +155,7 @@ def _checks(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterator[
         others.check_temperatures(ride, best),
         others.check_switches(ride, best),
         others.check_throttle(ride, of.current if of else None),
-        others.check_stuck(ride, best),
+        others.check_stuck(ride, best, any(motion.BENCH in finding.text for finding in by_speed)),
     )
 
 

@@ -18,6 +18,7 @@ from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, Seconds, rate, relati
 from gz_onboard.physics.sensors import speed_factors
 from gz_onboard.vehicle import Vehicle
 
+BENCH = "a roller bench"
 EARTH = 6_371_000.0  # m, its radius
 SHORTEST = 300.0  # m, over which two distances are compared
 STRETCH = 10  # s, over which positions are compared with a speed
@@ -62,14 +63,19 @@ def check_speeds(ride: Seconds, speeds: dict[str, Array]) -> Iterator[Finding]:
     if len(roles) < 2:
         yield unknown(check, roles, "there is no other speed to compare it with")
         return
-    if all(means[role] < SPEED_APART for role in roles if role in GROUND) and AXLE & set(roles) and len(roles) > 1:
-        ground = tuple(role for role in roles if role in GROUND)
-        if len(ground) > 1 or not set(roles) - AXLE - set(ground):
-            yield unknown(check, roles, "the driven axle turns and the ground stands: a roller bench")
-            return
+    if _on_bench(means):
+        yield unknown(check, roles, f"the driven axle turns and the ground stands: {BENCH}")
+        return
     apart = {role: SPEED_APART / 2 + SPEED_APART_RELATIVE * mean for role, mean in means.items()}
     outvoted, tied = vote(means, apart, spins=False)
     yield from _speed_verdicts(check, means, outvoted, tied)
+
+
+def _on_bench(means: dict[str, float]) -> bool:
+    """Whether the driven axle turns and all else stands; means: of each speed [m/s]."""
+    ground = [role for role in means if role in GROUND]
+    stands = all(means[role] < SPEED_APART for role in ground) and bool(AXLE & means.keys())
+    return stands and (len(ground) > 1 or not means.keys() - AXLE - set(ground))
 
 
 def _speed_verdicts(

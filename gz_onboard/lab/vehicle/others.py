@@ -23,6 +23,9 @@ SWITCHES = {"brake_switch", "charge_plug", "key", "contactor", "rider", "gps_fix
 STEADY = SWITCHES | {"odometer", "bms_state_of_charge", "ambient_temperature", "cell_temperature", "heater_power"}
 STEADY |= {"motor_temperature", "inverter_temperature", "air_conditioner_power", "auxiliary_current"}
 """Roles that may hold one value for a whole ride."""
+STANDS = {"wheel_speed_front", "gps_speed", "gps_course", "gps_altitude", "latitude", "longitude"}
+STANDS |= {"accel_x", "accel_y", "accel_z", "rate_x", "rate_y", "rate_z"}
+"""Roles that may do so where only the driven axle turns."""
 
 
 def check_temperatures(ride: Seconds, speed: Array | None) -> Iterator[Finding]:
@@ -135,14 +138,16 @@ def check_throttle(ride: Seconds, current: Array | None) -> Iterator[Finding]:
         yield unknown(role, (role,), "the current does not follow it")
 
 
-def check_stuck(ride: Seconds, speed: Array | None) -> Iterator[Finding]:
-    """One value for the whole ride, where it must move."""
+def check_stuck(ride: Seconds, speed: Array | None, bench: bool = False) -> Iterator[Finding]:
+    """One value for the whole ride, where it must move; bench: only the driven axle does."""
     if speed is None or float(np.nansum(np.abs(speed) > MOVING)) < FEWEST:
         return
     moving = np.abs(speed) > MOVING
     for role, values in ride.columns.items():
         of = values[moving & np.isfinite(values)]
         if role in STEADY or role.startswith(("pack_temperature", "roller", "suspension", "brake", "bms_temp")):
+            continue
+        if bench and role in STANDS:
             continue
         if len(of) >= FEWEST and float(np.ptp(of)) == 0.0:
             yield wrong("stuck", (role,), f"is {of[0]:.6g} all the time while riding")
