@@ -23,7 +23,7 @@ from gz_onboard.lab.estimate_order import Unread, in_order
 from gz_onboard.lab.estimate_ride import known_vehicle, open_estimate
 from gz_onboard.lab.estimate_route import off_text, route_text
 from gz_onboard.lab.estimate_state import go_on, held
-from gz_onboard.lab.estimate_summary import GAINS, SUMMARY_VERSION, UNFIT, RideSummary
+from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, UNFIT, RideSummary, gains
 from gz_onboard.lab.estimate_table import FORMATS, check_table, write_summaries
 from gz_onboard.offline.processes import collect, over_rides, tasks_of
 from gz_onboard.offline.results import Failure, clock, explain_keys, number, text_rows, write_json
@@ -241,7 +241,8 @@ def _capacity(ride: RideSummary) -> list[tuple[str, str]]:
     if first is None or last is None or charge is None or file is None or abs(first - last) < FAR_OFF:
         return []
     fits = charge / (first - last)
-    if fits <= 0 or GAINS[0] < fits / file < GAINS[1]:
+    least, _, most = gains(first - last)
+    if fits <= 0 or least < fits / file < most:
         return []
     text = f"the vehicle itself shows {100 * first:.0f} to {100 * last:.0f} % over {charge:.1f} A·h, as a pack of "
     text += f"{fits:.1f} A·h would; the file's has {file:.1f} A·h: cell_capacity, cells_parallel, the current's scale "

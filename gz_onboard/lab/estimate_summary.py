@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from math import sqrt
 from pathlib import Path
 from typing import Annotated, cast
 
@@ -20,6 +21,8 @@ from gz_onboard.vehicle import Vehicle
 SUMMARY_VERSION = 1
 UNFIT = 0.1  # V of a cell, RMS: so far no battery's tables are off its prediction; recorded rides have 0.003 to 0.054
 GAINS = (0.6, 1.7)  # of a state of charge counted over what the vehicle shows: aged cells count less
+AGED = 0.85  # likewise: packs that count less are rare
+SHOWN_SD = 0.06  # of a vehicle's own state of charge
 MOST_SLOW = 0.1  # of the time: energy is not integrated if pack current and voltage come too slowly for longer
 
 
@@ -102,6 +105,16 @@ class RideSummary:
     real_time_factor: Annotated[
         float | None, "duration of the ride over the time taken, without drawing; null for a ride kept by --resume"
     ]
+
+
+def gains(fell: float) -> tuple[float, float, float]:
+    """(least, least but for aged cells, most) of a charge counted over that by which the vehicle's own gauge `fell`.
+
+    Both as shares of the capacity. No cells give more than theirs, so what is more is the gauge's doubt, 2 sd at either
+    end; the less it fell, the more that is.
+    """
+    doubt = 2 * sqrt(2) * SHOWN_SD / abs(fell)
+    return GAINS[0], max(min(AGED, 1 - doubt), GAINS[0]), min(1 + doubt, GAINS[1])
 
 
 def _capacity(vehicle: Vehicle) -> float | None:

@@ -26,7 +26,7 @@ from gz_onboard.lab import estimate
 from gz_onboard.lab.estimate_log import EstimateTask
 from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.lab.estimate_route import RouteSummary, off_text
-from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary
+from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary, gains
 from gz_onboard.lab.estimate_tally import Tally
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import read_vehicle
@@ -147,6 +147,16 @@ def test_a_capacity_that_the_vehicles_own_gauge_contradicts_is_told(tmp_path, ca
         out = capsys.readouterr().out
         assert ("over 8.2 A·h, as a pack of 32.4 A·h would; the file's has 65.6 A·h: cell_capacity," in out) is told
         assert ("\n  vehicle file " in out) is told
+
+
+def test_the_further_a_gauge_fell_the_less_other_charge_fits():
+    least, aged, most = zip(*(gains(fell) for fell in (0.06, 0.2, 0.5, 0.95, -0.95)), strict=True)
+    assert set(least) == {0.6}
+    assert aged == tuple(sorted(aged))
+    assert most == tuple(sorted(most, reverse=True))
+    assert (aged[0], most[0]) == (0.6, 1.7)
+    assert most[-1] < 1.2 < most[2]  # a sixth fewer cells than there are show over a whole discharge
+    assert aged[-1] == pytest.approx(1 - (most[-1] - 1))
 
 
 def test_a_summary_says_where_most_of_the_ride_was_not_on_its_route(tmp_path, capsys):

@@ -14,10 +14,10 @@ from gz_onboard import cli
 from gz_onboard.arrays import Array
 from gz_onboard.errors import FAILED, OK
 from gz_onboard.estimator.redundancy.speeds import GROUND
+from gz_onboard.lab.vehicle.charge import check_charge
 from gz_onboard.lab.vehicle.check import check_log, check_text, checks_of
 from gz_onboard.lab.vehicle.electric import (
     BY_POWER,
-    check_charge,
     check_road,
     check_sag,
     check_voltages,
@@ -29,7 +29,7 @@ from gz_onboard.lab.vehicle.finding import Finding, Looks
 from gz_onboard.lab.vehicle.motion import check_distances, speeds_of
 from gz_onboard.lab.vehicle.on_board import on_board
 from gz_onboard.lab.vehicle.rolling import rolling_of
-from gz_onboard.lab.vehicle.seconds import seconds_of
+from gz_onboard.lab.vehicle.seconds import Seconds, seconds_of
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.plant.logs import write_log
@@ -337,6 +337,28 @@ def test_a_number_of_cells_is_not_said_right_by_one_check_and_wrong_by_another(r
         )
         assert said["current against the voltage's drop"].looks is Looks.UNKNOWN
         assert said["state of charge against the voltage"].looks is Looks.RIGHT  # by seconds of little load
+
+
+@pytest.mark.parametrize(
+    ("parallel", "fell", "looks", "said"),
+    [
+        (12, 0.95, Looks.RIGHT, "it falls by 95.0%"),
+        (10, 0.95, Looks.WRONG, "; 32.8 A·h would fit: the cell's capacity"),
+        (16, 0.95, Looks.UNKNOWN, "; 32.8 A·h would fit: aged cells, their capacity"),
+        (24, 0.95, Looks.WRONG, "; 32.8 A·h would fit: the cell's capacity"),
+        (10, 0.1, Looks.RIGHT, "it falls by 10.0%"),  # which a gauge cannot tell
+    ],
+)
+def test_more_charge_than_the_cells_have_looks_wrong_and_less_may_be_of_age(tmp_path, parallel, fell, looks, said):
+    (tmp_path / "v.toml").write_text(REFERENCE.replace("cells_parallel = 12", f"cells_parallel = {parallel}"))
+    vehicle, seconds = read_vehicle(tmp_path / "v.toml"), np.arange(3601.0)
+    right = read_vehicle("reference").battery
+    assert right is not None
+    current = np.full(len(seconds), right.pack_capacity(25.0) * fell)
+    shown = 0.98 - fell * seconds / seconds[-1]
+    ride_ = Seconds(seconds, {"pack_voltage": seconds * 0 + 50, "pack_current": current, "bms_state_of_charge": shown})
+    (found,) = [one for one in check_charge(ride_, drawn(ride_, vehicle), vehicle) if "the charge" in one.check]
+    assert (found.looks, said in found.text) == (looks, True), found.text
 
 
 def test_a_load_that_is_far_from_the_models_does_not_look_right(rides, tmp_path):

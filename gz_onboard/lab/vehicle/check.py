@@ -19,7 +19,7 @@ from gz_onboard.bus.units import UNITS
 from gz_onboard.estimator.signals import DEFAULT_STALE
 from gz_onboard.events import STALE_PERIODS, Group
 from gz_onboard.lab.estimate_tally import PAUSE
-from gz_onboard.lab.vehicle import electric, motion, others
+from gz_onboard.lab.vehicle import charge, electric, motion, others
 from gz_onboard.lab.vehicle.features import Feature, features_of, features_text
 from gz_onboard.lab.vehicle.finding import Finding, Looks, unknown, wrong
 from gz_onboard.lab.vehicle.on_board import on_board
@@ -151,7 +151,7 @@ def checks_of(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterato
         else (),
         electric.check_currents(ride),
         electric.check_motor(ride, of),
-        electric.check_charge(ride, of, vehicle),
+        charge.check_charge(ride, of, vehicle),
         others.check_temperatures(ride, best),
         others.check_switches(ride, best),
         others.check_throttle(ride, of.current if of else None),
