@@ -29,7 +29,7 @@ from gz_onboard.lab.vehicle.finding import Finding, Looks
 from gz_onboard.lab.vehicle.motion import check_distances, speeds_of
 from gz_onboard.lab.vehicle.on_board import on_board
 from gz_onboard.lab.vehicle.rolling import rolling_of
-from gz_onboard.lab.vehicle.seconds import Seconds, seconds_of
+from gz_onboard.lab.vehicle.seconds import Seconds, seconds_of, unit_of
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.plant.logs import write_log
@@ -115,6 +115,26 @@ def test_a_wrong_number_of_cells_is_suspected(log, tmp_path, cells):
 @pytest.mark.parametrize("name", RECORDED)
 def test_nothing_is_suspected_on_recorded_rides(name):
     assert check_log(LOGS / name, read_vehicle("reference"), quick=True).those(Looks.WRONG) == []
+
+
+@pytest.mark.parametrize(
+    ("role", "ratio", "said"),
+    [
+        ("motor_speed", 1 / 6, "rpm taken for deg/s"),
+        ("motor_speed", 0.166, "rpm taken for deg/s"),
+        ("motor_speed", 0.159, "rev/s taken for rad/s"),
+        ("motor_speed", 1 / 60, "rev/s taken for rpm"),
+        ("motor_speed", 9.55, "rpm taken for rad/s"),
+        ("rate_z", 58.5, "deg/s taken for rad/s"),
+        ("pack_current", 1e-3, "A taken for mA"),
+        ("pack_current", 1e3, "mA taken for A"),
+        ("odometer", 0.622, "mi taken for km"),
+        ("gps_speed", 3.6, "km/h taken for m/s"),
+        ("gps_speed", 1.25, ""),
+    ],
+)
+def test_the_nearest_units_are_named(role, ratio, said):
+    assert unit_of(role, ratio) == (f": that is {said}" if said else "")
 
 
 def test_on_a_bench_the_axle_that_stands_is_not_stuck(rides):

@@ -19,6 +19,7 @@ SOC_APART = 0.3  # by the first voltage against the vehicle's own
 FIRST, LEAST_LOADED = 60, 5  # s, that a log's first state of charge is taken from, and of these
 CELLS_SD, MISCOUNTED = 0.4, 2  # cells in series: known so closely they are told apart; so many off are a miscount
 COUNTED = 0.06  # of a state of charge, at least
+LEAST_COUNTED = 0.02  # of what the gauge moves: less may be of a current's offset, and has no sign
 
 
 def check_charge(ride: Seconds, of: PackRide | None, vehicle: Vehicle) -> Iterator[Finding]:
@@ -94,6 +95,8 @@ def _counted(of: PackRide, role: str, shown: Array) -> Iterator[Finding]:
     text = f"it {moves}, and {counted:.1%} of the file's {capacity:.3g} A·h were drawn"
     if max(abs(counted), abs(fell)) < COUNTED or known.mean() < 0.5:
         yield unknown(check, (role, "pack_current"), f"{text}: too little")
+    elif abs(counted) < LEAST_COUNTED * abs(fell):
+        yield wrong(check, (role, "pack_current"), f"{text}: the current's unit or scale, or the gauge")
     elif counted * fell < 0:
         yield wrong(check, (role, "pack_current"), f"{text}: the sign of one")
     elif abs(fell) < 1e-6:

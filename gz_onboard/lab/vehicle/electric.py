@@ -27,6 +27,7 @@ SAGS = 0.5  # a correlation of the changes of voltage and current from here on i
 RESISTANCES, USUAL_RESISTANCES = (0.3, 3.5), (0.6, 1.7)  # of the file's: possible, with cold or aged cells; usual
 ENERGIES, USUAL_ENERGIES = (0.5, 2.0), (0.75, 1.5)
 """Of the model's: possible, by hills, wind and payload; usual: 35 recorded rides have 0.94 to 1.31."""
+ROUGH = 0.2  # relative: so near the units' is the ratio of two powers
 ABOVE_FULL = 1.02  # of the full cell's voltage: cells that give current are not above it for long
 ABOVE_FOR = 0.1  # of the time
 BRAKES = -0.4  # m/s²: slower than the road load alone
@@ -168,7 +169,8 @@ def check_road(ride: Seconds, of: PackRide, speed: Array, expected: Array) -> It
         return
     given, wanted = (float(x[moving & (expected > 0)].sum()) for x in (power, expected))
     ratio = given / wanted if wanted > 0 else 0.0
-    text = f"{ratio:.2f} times the model's while it drives, correlation {found.correlation:.2f}"
+    times = f"{ratio:.2f}" if abs(ratio) > 0.01 else f"{ratio:.2g}"
+    text = f"{times} times the model's while it drives, correlation {found.correlation:.2f}"
     if found.correlation < -UNRELATED * 2:
         yield wrong(check, ("pack_current",), f"less where more is needed ({text}): its sign, scale = -1")
     elif found.correlation < UNRELATED * 2:
@@ -178,7 +180,7 @@ def check_road(ride: Seconds, of: PackRide, speed: Array, expected: Array) -> It
     elif ENERGIES[0] < ratio < ENERGIES[1]:
         yield unknown(check, PACK, f"{text}: hills, wind and payload, or mass, drag area or losses of the file")
     else:
-        like = unit_of("pack_current", ratio)
+        like = unit_of("pack_current", ratio, ROUGH)
         yield wrong(check, (*PACK, "speed"), f"{text}{like or ': a scale of current or speed, mass, or drag area'}")
     yield from _braking(of, speed, moving)
 
@@ -220,7 +222,13 @@ def check_currents(ride: Seconds) -> Iterator[Finding]:
     elif abs(found.factor - 1) < 2 * APART_RELATIVE:
         yield right(check, roles, text)
     else:
-        yield wrong(check, roles, text + unit_of("inverter_current", found.factor))
+        yield wrong(check, roles, text + _either(found.factor))
+
+
+def _either(factor: float) -> str:
+    """What the inverter's current looks like that is `factor` times the pack's, or the pack's: which, is not known."""
+    inverter, pack = unit_of("inverter_current", factor), unit_of("pack_current", 1 / factor)
+    return f"{pack} (pack_current), or{inverter[1:]} (inverter_current)" if " taken for " in pack else pack
 
 
 def check_motor(ride: Seconds, of: PackRide | None) -> Iterator[Finding]:

@@ -19,6 +19,7 @@ from gz_onboard.vehicle import Vehicle
 SECOND = 1.0  # s, from one point of the grid to the next, and what is averaged at each
 FEWEST = 30  # points that two signals must have together before they say anything of each other
 ALIKE = 0.06  # relative: a ratio that is so near that of two units is theirs
+RARER = 0.02  # relative: so much nearer it must be to a power of ten, or to two units that are both not of SI
 UNRELATED = 0.2  # a correlation below says that two signals have nothing to do with each other
 
 
@@ -92,17 +93,20 @@ def relation(x: Array, y: Array, where: Mask | None = None) -> Relation | None:
 def unit_of(role: str, ratio: float, alike: float = ALIKE) -> str:
     """What `ratio`, of what `role` shows over what it should show, looks like: units mistaken; empty if like nothing.
 
-    The ratio of a signal in km/h that is taken for m/s is 3.6. alike: how far a ratio may be from it, relative.
+    The ratio of a signal in km/h that is taken for m/s is 3.6. The nearest is told. alike: how far a ratio may be from
+    it, relative.
     """
-    ours = UNITS[role]
-    for unit in known_units(role)[1:]:
-        conversion = to_si(unit, role)
-        factor = conversion[0] if conversion else 1.0
-        if abs(ratio * factor - 1) < alike:
-            return f": that is {unit} taken for {ours}"
-        if abs(ratio / factor - 1) < alike:
-            return f": that is {ours} taken for {unit}"
+    ours, scales = UNITS[role], {}
+    for unit in known_units(role):
+        scales[unit] = (to_si(unit, role) or (1.0, 0.0))[0]
+    said = {}
+    for read, per_read in scales.items():
+        for meant, per_meant in scales.items():
+            if per_read != per_meant:
+                far = abs(ratio * per_meant / per_read - 1) + (RARER if ours not in (read, meant) else 0.0)
+                said[f": that is {meant} taken for {read}"] = far
     for power in (1000.0, 100.0, 10.0):
-        if abs(ratio / power - 1) < ALIKE or abs(ratio * power - 1) < alike:
-            return f": a factor of {power:g}, as of a wrong scale in the DBC file"
-    return ""
+        far = min(abs(ratio / power - 1), abs(ratio * power - 1)) + RARER
+        said[f": a factor of {power:g}, as of a wrong scale in the DBC file"] = far
+    nearest = min(said, key=lambda text: said[text])
+    return nearest if said[nearest] < alike else ""
