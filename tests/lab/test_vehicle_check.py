@@ -381,6 +381,20 @@ def test_more_charge_than_the_cells_have_looks_wrong_and_less_may_be_of_age(tmp_
     assert (found.looks, said in found.text) == (looks, True), found.text
 
 
+@pytest.mark.parametrize(
+    ("role", "scale", "offset"),
+    [("pack_current", 0.001, 0.0), ("bms_state_of_charge", -1.0, 1.0), ("pack_voltage", 1.05, 0.0)],
+)
+def test_no_number_of_cells_fits_a_sensor_that_is_off(rides, role, scale, offset):
+    vehicle = read_vehicle("reference")
+    for ride_ in rides:
+        times, values = ride_.columns[role]
+        columns = {**ride_.columns, role: (times, values * scale + offset)}
+        found = unless_contradicted(checks_of(seconds_of(Samples("x", columns), vehicle), vehicle, None))
+        assert any(one.looks is Looks.WRONG and role in one.roles for one in found)
+        assert [one.text for one in found if "in series would fit" in one.text] == []
+
+
 def test_a_load_that_is_far_from_the_models_does_not_look_right(rides, tmp_path):
     area = read_vehicle("reference").parameters["drag_area"]
     for ride_ in rides:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, floor
 
 import numpy as np
@@ -23,6 +24,8 @@ from gz_onboard.vehicle import Vehicle
 PACK = ("pack_voltage", "pack_current")
 BY_CELLS, BY_VOLTAGE = "voltage against the cells", "state of charge against the voltage"
 BY_POWER = "power against speed and acceleration"
+CELLS = "cells"  # in what may be of a wrong number of them
+NUMBER = r": \d+( to \d+)? (cells )?in series would fit.*"
 SAGS = 0.5  # a correlation of the changes of voltage and current from here on is that of a resistance
 RESISTANCES, USUAL_RESISTANCES = (0.3, 3.5), (0.6, 1.7)  # of the file's: possible, with cold or aged cells; usual
 ENERGIES, USUAL_ENERGIES = (0.5, 2.0), (0.75, 1.5)
@@ -92,12 +95,33 @@ def _above_full(cell: Array, current: Array, full: float) -> bool:
 
 
 def unless_contradicted(findings: Iterable[Finding]) -> list[Finding]:
-    """All of them; voltage and state of charge look right by the number of cells only if both do."""
+    """All of them; voltage and state of charge tell the number of cells only if nothing else says that a sensor is off.
+
+    They look right by it only if both do.
+    """
     found = list(findings)
+    if off := sorted({one.check for one in found if _off_by_itself(one)}):
+        found = [_without_cells(one, " and ".join(off)) for one in found]
     number = {one.check for one in found if one.looks is Looks.WRONG} & {BY_CELLS, BY_VOLTAGE}
     doubted = [bool(number) and one.check in (BY_CELLS, BY_VOLTAGE) and one.looks is Looks.RIGHT for one in found]
     text = f"; that alone tells no number of cells: see {' and '.join(sorted(number))}"
     return [unknown(f.check, f.roles, f.text + text) if i else f for f, i in zip(found, doubted, strict=True)]
+
+
+def _off_by_itself(one: Finding) -> bool:
+    """Whether it says that voltage, current or gauge is wrong, whatever the cells are."""
+    by_cells = one.check in (BY_CELLS, BY_VOLTAGE) or CELLS in one.text
+    return one.looks is Looks.WRONG and not by_cells and bool({*PACK, "bms_state_of_charge"} & set(one.roles))
+
+
+def _without_cells(one: Finding, off: str) -> Finding:
+    """The same, without the number of cells that would fit a sensor that is `off`, by those checks."""
+    if one.looks is not Looks.WRONG or one.check not in (BY_CELLS, BY_VOLTAGE):
+        return one
+    text = re.sub(NUMBER, "", one.text)
+    if one.check == BY_VOLTAGE:
+        return unknown(one.check, one.roles, f"{text.partition(': ')[0]}: see {off}")
+    return replace(one, text=text)
 
 
 def check_sag(of: PackRide) -> Iterator[Finding]:
