@@ -147,6 +147,18 @@ def test_on_a_bench_the_axle_that_stands_is_not_stuck(rides):
         assert any("a roller bench" in one.text for one in found) is not bool(stuck)
 
 
+@pytest.mark.parametrize("factor", [-1.0, 1 / 6])
+def test_a_speed_that_is_off_accuses_nothing_else(rides, factor):
+    vehicle = read_vehicle("reference")
+    for ride_ in rides:
+        times, values = ride_.columns["motor_speed"]
+        columns = {**ride_.columns, "motor_speed": (times, values * factor)}
+        found = checks_of(seconds_of(Samples("x", columns), vehicle), vehicle, None)
+        accused = [one for one in found if one.looks is Looks.WRONG]
+        assert all("motor_speed" in one.roles for one in accused)
+        assert len(accused) == 1 or factor > 0  # of another factor than 1 all other speeds have something to say
+
+
 @pytest.mark.parametrize("seconds", [0.05, 1, 2, 2.5, 3, 4])
 def test_a_log_of_moments_cannot_tell(tmp_path, seconds):
     cut = ["export", str(LOGS / "coastdown.blf"), str(tmp_path / "cut.blf"), "--from", "20", "--to", str(20 + seconds)]

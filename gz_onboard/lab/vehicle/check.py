@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Annotated
@@ -23,7 +23,7 @@ from gz_onboard.lab.vehicle import charge, electric, motion, others
 from gz_onboard.lab.vehicle.features import Feature, features_of, features_text
 from gz_onboard.lab.vehicle.finding import Finding, Looks, unknown, wrong
 from gz_onboard.lab.vehicle.on_board import on_board
-from gz_onboard.lab.vehicle.rolling import rolling_of
+from gz_onboard.lab.vehicle.rolling import MOTOR, rolling_of
 from gz_onboard.lab.vehicle.seconds import FEWEST, Seconds, seconds_of
 from gz_onboard.offline.results import clock, leap_text
 from gz_onboard.offline.samples import Samples, facts_of, open_ride, read_roles, ride_name
@@ -136,7 +136,14 @@ def checks_of(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterato
     speeds = rolling.speeds
     by_speed = list(motion.check_speeds(ride, speeds))
     doubted = frozenset(role for finding in by_speed if finding.looks is Looks.WRONG for role in finding.roles)
-    best = next((speeds[role] for role in speeds if role not in doubted), next(iter(speeds.values()), None))
+    turned = frozenset(role for finding in by_speed if finding.check == motion.SIGN for role in finding.roles)
+    sized = frozenset(one for f in by_speed if f.looks is Looks.WRONG and f.check != motion.SIGN for one in f.roles)
+    # what only follows from a sign that is already named is no other's mistake
+    right_way = replace(ride, columns={**ride.columns, **{role: -ride[role] for role in turned}})
+    forward = {role: -speed if role in turned else speed for role, speed in speeds.items()}
+    best = next((role for role in forward if role not in doubted), next(iter(forward), None))
+    speed = forward[best] if best else None
+    motor_off = MOTOR in sized.union(*(finding.roles for finding in rolling.findings))
     of = electric.drawn(ride, vehicle)
     return chain(
         rolling.findings,
@@ -146,17 +153,30 @@ def checks_of(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterato
         motion.check_turning(ride, speeds),
         electric.check_voltages(ride, vehicle.battery, of.current if of else None) if vehicle.battery else (),
         electric.check_sag(of) if of else (),
-        electric.check_road(ride, of, best, electric.model_power(ride, vehicle, best, payload))
-        if of and best is not None
+        _unless_at_a_wrong_speed(
+            best in sized, electric.check_road(ride, of, speed, electric.model_power(ride, vehicle, speed, payload))
+        )
+        if of and speed is not None
         else (),
         electric.check_currents(ride),
-        electric.check_motor(ride, of),
+        _unless_at_a_wrong_speed(motor_off, electric.check_motor(right_way, of)),
         charge.check_charge(ride, of, vehicle),
-        others.check_temperatures(ride, best),
-        others.check_switches(ride, best),
+        others.check_temperatures(ride, speed),
+        others.check_switches(ride, speed),
         others.check_throttle(ride, of.current if of else None),
-        others.check_stuck(ride, best, any(motion.BENCH in finding.text for finding in by_speed)),
+        others.check_stuck(ride, speed, any(motion.BENCH in finding.text for finding in by_speed)),
     )
+
+
+def _unless_at_a_wrong_speed(off: bool, findings: Iterable[Finding]) -> list[Finding]:
+    """What follows from the size of a speed accuses nobody if that is `off`; a sign does not follow from it."""
+    text = "; the speed that it is by is wrong"
+    return [
+        unknown(one.check, one.roles, one.text + text)
+        if off and one.looks is Looks.WRONG and "sign" not in one.text
+        else one
+        for one in findings
+    ]
 
 
 def _roles(

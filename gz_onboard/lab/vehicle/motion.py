@@ -19,6 +19,7 @@ from gz_onboard.physics.sensors import speed_factors
 from gz_onboard.vehicle import Vehicle
 
 BENCH = "a roller bench"
+SIGN = "speed's sign"
 EARTH = 6_371_000.0  # m, its radius
 SHORTEST = 300.0  # m, over which two distances are compared
 STRETCH = 10  # s, over which positions are compared with a speed
@@ -51,7 +52,7 @@ def check_speeds(ride: Seconds, speeds: dict[str, Array]) -> Iterator[Finding]:
         if top > FASTEST:
             yield wrong("speed", (role,), f"reaches {3.6 * top:.0f} km/h by the radius and gear ratio of the file")
         if float(np.nanmean(speed)) < -SPEED_APART:
-            yield wrong("speed's sign", (role,), "is negative while riding: give scale = -1")
+            yield wrong(SIGN, (role,), "is negative while riding: give scale = -1")
     known = np.all(np.isfinite(list(speeds.values())), axis=0) if speeds else np.zeros(0, dtype=bool)
     moving = known & (np.max(np.abs(list(speeds.values())), axis=0, initial=0.0) > MOVING) if speeds else known
     roles = tuple(speeds)
