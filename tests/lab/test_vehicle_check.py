@@ -18,6 +18,7 @@ from gz_onboard.lab.vehicle.charge import check_charge
 from gz_onboard.lab.vehicle.check import check_log, check_text, checks_of
 from gz_onboard.lab.vehicle.electric import (
     BY_POWER,
+    PackRide,
     check_road,
     check_sag,
     check_voltages,
@@ -423,3 +424,20 @@ def test_what_the_daemon_cannot_predict_is_told_of_the_pack(tmp_path):
         (tmp_path / "v.toml").write_text(text, encoding="utf-8")
         (said,) = on_board(LOGS / "coastdown.blf", read_vehicle(tmp_path / "v.toml"))
         assert (said.looks, said.roles) == (looks, ("pack_voltage",))
+
+
+@pytest.mark.parametrize(
+    ("ocv_sd", "temperature", "looks", "said"),
+    [
+        (0.004, 15.0, Looks.WRONG, ": the cells' number or capacity, or the tables"),
+        (0.5, 15.0, Looks.UNKNOWN, ": the tables at 15 °C, which the file knows to 500 mV under this load"),
+        (0.004, -30.0, Looks.UNKNOWN, ": the tables at -30 °C, as the file's begin at -10 °C"),
+    ],
+)
+def test_a_file_that_knows_its_cells_roughly_cannot_tell(tmp_path, ocv_sd, temperature, looks, said):
+    (tmp_path / "v.toml").write_text(re.sub(r"cells_series = \d+", "cells_series = 13", REFERENCE), encoding="utf-8")
+    vehicle = read_vehicle(tmp_path / "v.toml")
+    assert vehicle.battery is not None
+    of = PackRide(np.full(60, 50.0), np.full(60, 5.0), replace(vehicle.battery, ocv_sd=ocv_sd), temperature)
+    (found,) = on_board(LOGS / "coastdown.blf", vehicle, of=of)
+    assert (found.looks, said in found.text) == (looks, True), found.text

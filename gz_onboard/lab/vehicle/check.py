@@ -74,16 +74,16 @@ def check_log(
     samples = Samples(ride_name(log), columns, facts_of(log))
     findings = [unknown("clock", (), leap_text(*leap)) for leap in codec.leaps]
     findings += [*_dropped(codec, columns), *_unanswered(codec, columns)]
-    if columns:
-        ride = seconds_of(samples, vehicle)
+    ride = seconds_of(samples, vehicle) if columns else None
+    if ride:
         if len(ride.time) < FEWEST:
             findings.append(unknown("length", (), f"{_passed(columns)[0]:.1f} s: most checks need {FEWEST} s and more"))
         checks = checks_of(ride, vehicle, samples.rider_mass)
         findings += electric.unless_contradicted(checks)
-    if columns and not quick:
+    if ride and not quick:
         suspected = any(finding.looks is Looks.WRONG for finding in findings)
         load = all(one.looks is Looks.RIGHT for one in findings if one.check == electric.BY_POWER)
-        findings += [_LATER] if suspected else on_board(log, vehicle, load)
+        findings += [_LATER] if suspected else on_board(log, vehicle, load, electric.drawn(ride, vehicle))
     duration, end = _passed(columns)
     seen = _roles(mapping, codec.groups, samples, (duration, end), findings)
     return Checked(str(log), duration, seen, findings, features_of(columns))

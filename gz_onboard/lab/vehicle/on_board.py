@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from math import sqrt
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from gz_onboard.errors import InputError
 from gz_onboard.lab.estimate_ride import How, open_estimate, ride_through
 from gz_onboard.lab.estimate_summary import UNFIT, summary_of
+from gz_onboard.lab.vehicle.electric import PackRide
 from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
 from gz_onboard.offline.results import clock
 from gz_onboard.vehicle import Vehicle
 
 LEFT_OUT = 0.2  # of the time: a sensor that contradicts the others for as long is no passing fault
 INNOVATION = 0.03  # V of a cell: what is more is no good table of a battery
+BESIDE = 2.0  # K: so much colder than a table's first row it is still about right
+SURE = 2.0  # sd
 BY_LOAD = {"accel_x", "gps_altitude"}  # the daemon holds them against the grade by the power that is needed
 
 
@@ -31,8 +37,11 @@ class Mute:
         """As of `log_rows.Log`."""
 
 
-def on_board(log: Path, vehicle: Vehicle, load: bool = True) -> Iterator[Finding]:
-    """What the daemon's own checks would leave out for long; load: whether the power needed is the model's."""
+def on_board(log: Path, vehicle: Vehicle, load: bool = True, of: PackRide | None = None) -> Iterator[Finding]:
+    """What the daemon's own checks would leave out for long; load: whether the power needed is the model's.
+
+    of: what the pack gives, if it was measured: a file that knows its cells roughly may miss by as much under load.
+    """
     if vehicle.battery is None:
         return
     try:
@@ -55,5 +64,23 @@ def on_board(log: Path, vehicle: Vehicle, load: bool = True) -> Iterator[Finding
             yield right("on board", ("pack_voltage",), f"{text}; the battery's tables are about right")
         elif summary.innovation_rms_v < UNFIT:
             yield unknown("on board", ("pack_voltage",), f"{text}; wrong tables?")
+        elif of and (why := _unsure(of, summary.innovation_rms_v)):
+            yield unknown("on board", ("pack_voltage",), f"{text}: {why}, or the cells' number or capacity")
         else:
             yield wrong("on board", ("pack_voltage",), f"{text}: the cells' number or capacity, or the tables")
+
+
+def _unsure(of: PackRide, missed: float) -> str:
+    """What of the file's own doubt explains that a cell's voltage is `missed` by so much [V]; empty if nothing does."""
+    battery = of.battery
+    coldest = min(battery.r0.temperature)
+    if of.temperature < coldest - BESIDE:
+        return f"the tables at {of.temperature:.0f} °C, as the file's begin at {coldest:.0f} °C"
+    current = np.zeros(1) if of.current is None else of.current[np.isfinite(of.current)]
+    load = sqrt(float(np.mean(current**2))) / battery.cells_parallel if len(current) else 0.0
+    r0, r1, _ = battery.circuit(0.5, of.temperature)
+    doubt = sqrt(battery.ocv_sd**2 + (battery.resistance_sd * (r0 + r1) * load) ** 2)
+    if missed > SURE * doubt:
+        return ""
+    known = f"which the file knows to {1e3 * doubt:.0f} mV under this load"
+    return f"the tables at {of.temperature:.0f} °C, {known}"
