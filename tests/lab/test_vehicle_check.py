@@ -316,6 +316,20 @@ def test_what_cannot_be_told_apart_is_not(rides, tmp_path):
     assert "or the scale of gps_speed is wrong: nothing else has seen the way" in said.text
 
 
+@pytest.mark.parametrize(("times", "looks"), [(1.0, Looks.RIGHT), (1.03, Looks.RIGHT), (1.1, Looks.UNKNOWN)])
+def test_a_radius_that_only_the_odometer_doubts_cannot_be_told(rides, times, looks):
+    vehicle = read_vehicle("reference")
+    radius = vehicle.parameters["wheel_radius"]
+    seen = {role: values for role, values in rides[0].columns.items() if not role.startswith(("gps", "lat", "long"))}
+    ride_ = seconds_of(Samples("x", seen), vehicle)
+    speeds = {role: speed * times for role, speed in speeds_of(ride_, vehicle).items()}
+    (said,) = check_distances(ride_, speeds, frozenset(), radius * times)
+    assert said.looks is looks, said
+    assert looks is Looks.RIGHT or f"would fit in place of {radius * times:.4g} m; or gear_ratio" in said.text
+    fits = re.findall(r"wheel_radius ([\d.]+) m would fit", said.text)
+    assert [float(fit) for fit in fits] == [pytest.approx(radius, rel=0.03)] * len(fits)
+
+
 def test_a_gps_that_the_positions_contradict_is_named(rides, tmp_path):
     (said,) = by_another(rides[0], tmp_path, {}, gps_speed=1.1)
     assert said.roles == ("gps_speed",)

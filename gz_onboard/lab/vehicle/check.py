@@ -148,7 +148,7 @@ def checks_of(ride: Seconds, vehicle: Vehicle, payload: float | None) -> Iterato
     return chain(
         rolling.findings,
         rolling.by_what_fits(by_speed),
-        rolling.by_what_fits(motion.check_distances(ride, speeds, doubted)),
+        rolling.by_what_fits(motion.check_distances(ride, speeds, doubted, vehicle.parameters["wheel_radius"])),
         motion.check_accelerations(ride, speeds, doubted),
         motion.check_turning(ride, speeds),
         electric.check_voltages(ride, vehicle.battery, of.current if of else None) if vehicle.battery else (),

@@ -18,6 +18,7 @@ from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, Seconds, rate, relati
 from gz_onboard.physics.sensors import speed_factors
 from gz_onboard.vehicle import Vehicle
 
+ROLLING = AXLE | {"wheel_speed_front"}  # their speed is by the radius
 BENCH = "a roller bench"
 SIGN = "speed's sign"
 EARTH = 6_371_000.0  # m, its radius
@@ -27,6 +28,7 @@ FEW = 5  # stretches at least
 UNLIKE = 0.05  # relative: on 17 recorded rides the way of a stretch was 1 to 3 % off, exchanged 6 to 97 %
 POLE = 90.0  # deg
 COUNTS = 5  # steps of the odometer, likewise
+ODOMETER_ERRS = 0.05  # relative: so far it may be off the way by what it counts, and more by a wrong radius
 EXACT = 0.01  # of its way: an odometer of no greater steps tells a few percent
 LEVEL = 2.5  # m/s²: by so much the gravity that an axis shows may be off, by bias, mounting and hills
 SWINGS = 0.25  # m/s²: an acceleration that moves by less, as a standard deviation, shows nothing
@@ -120,8 +122,10 @@ def _misfit(steps: Array, ridden: Array) -> float:
     return float(np.abs(way * by_speed.sum() / way.sum() - by_speed).sum() / by_speed.sum())
 
 
-def check_distances(ride: Seconds, speeds: dict[str, Array], doubted: frozenset[str]) -> Iterator[Finding]:
-    """The way by the best speed against that of the odometer and of the positions."""
+def check_distances(
+    ride: Seconds, speeds: dict[str, Array], doubted: frozenset[str], radius: float | None = None
+) -> Iterator[Finding]:
+    """The way by the best speed against that of the odometer and of the positions; radius: of the driven wheel [m]."""
     best = next((role for role in speeds if role not in doubted), next(iter(speeds), None))
     if {"latitude", "longitude"} <= ride.columns.keys():
         yield from _poles(ride["latitude"], ride["longitude"])
@@ -129,7 +133,8 @@ def check_distances(ride: Seconds, speeds: dict[str, Array], doubted: frozenset[
         return
     speed = np.abs(speeds[best])
     if "odometer" in ride:
-        yield from _odometer(ride["odometer"], best, speed)
+        alone = best in ROLLING and not {"gps_speed", "latitude"} & ride.columns.keys()
+        yield from _odometer(ride["odometer"], best, speed, radius if alone else None)
     if {"latitude", "longitude"} <= ride.columns.keys() and float(np.nanmax(np.abs(ride["latitude"]))) <= POLE:
         yield from _positions(ride, best, speed)
 
@@ -154,7 +159,8 @@ def way_over_odometer(ride: Seconds, speed: Array) -> float | None:
     return ridden / float(counts.sum()) if enough and exact else None
 
 
-def _odometer(odometer: Array, best: str, speed: Array) -> Iterator[Finding]:
+def _odometer(odometer: Array, best: str, speed: Array, radius: float | None) -> Iterator[Finding]:
+    """radius: of the wheel [m], if nothing but the odometer tells whether it is right."""
     check, roles = "speed against odometer", (best, "odometer")
     if (np.diff(odometer[np.isfinite(odometer) & np.isfinite(speed)]) < -1.0).any():
         yield wrong("odometer", ("odometer",), "counts back")
@@ -169,8 +175,14 @@ def _odometer(odometer: Array, best: str, speed: Array) -> Iterator[Finding]:
         return
     ratio = ridden / counted
     text = f"{best} goes {ridden / 1e3:.2f} km, the odometer {counted / 1e3:.2f} km"
-    if abs(ridden - counted) <= max(ODOMETER_APART * max(ridden, counted), 2 * largest):
-        yield right(check, roles, text)
+    off = abs(ridden - counted)
+    if off <= max(ODOMETER_APART * max(ridden, counted), 2 * largest):
+        if radius is None or off <= max(ODOMETER_ERRS * max(ridden, counted), 2 * largest):
+            yield right(check, roles, text)
+            return
+        name = "gear_ratio" if best == "motor_speed" else f"the scale of {best}"
+        fits = f"wheel_radius {radius / ratio:.4g} m would fit in place of {radius:.4g} m; or {name}"
+        yield unknown(check, roles, f"{text}: {fits} or the odometer is wrong, and no GPS tells which")
     else:
         yield wrong(check, roles, f"{text}, {ratio:.3g} times{unit_of(best, ratio) or unit_of('odometer', 1 / ratio)}")
 
