@@ -118,7 +118,7 @@ def follow(e: Any, events: Iterable[Event], scooter: Scooter) -> list[tuple[floa
 def knows(e: Any, scooter: Scooter) -> None:
     """Tell it the true state of charge and capacity: what it says from then on is by what it has counted."""
     e.filter.soc, e.filter.covariance = scooter.soc, (1e-8, 0.0, 1e-8)
-    e.soc.ageing.inverse, e.soc.ageing.variance = 1.0, 1e-8
+    e.soc.ageing.inverse, e.soc.ageing.variance = 1.0, 1e-6
     e.soc.ageing.part()
 
 
