@@ -9,7 +9,7 @@ INNOVATION_TIME = 10.0  # s: low pass of the innovation that is shown
 GATE = 5.0  # sd: a voltage further off is a glitch, unless it persists
 GATE_COUNT = 20  # so many in a row are no glitch
 CONTRADICTED = 60.0  # s: a filter whose voltage is off its gate for so long begins anew
-CONTRADICTING = 4.0  # of the mean square of errors over what is expected of it: three packs of the plant had up to 3.2
+CONTRADICTING = 4.0  # of the mean square of errors over what is expected of it: three packs of the plant had up to 3.5
 LARGE = 0.08  # V of a cell, RMS: the cell model does not follow the voltage
 
 
