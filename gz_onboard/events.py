@@ -203,13 +203,11 @@ class Cause(IntEnum):
     CLIMB = 5  # of roads like those ridden; of a route, ahead on it
     TURNING = 6
     AUXILIARIES = 7  # measured, beyond what the vehicle file says
-    PAYLOAD = 8  # as entered or learned, against that of the vehicle file
+    PAYLOAD = 8  # as entered, against that of the vehicle file
     AGE = 9  # capacity and resistance of the cells against new ones
     CHARGE = 10  # state of charge; of a change, beyond the distance ridden
     RIDING = 11  # what is expected of the riding to come beyond that of the last kilometres
-    UNEXPLAINED = 12  # measured over modelled consumption, as learned, beside what follows: wind, a dragging brake
-    ROLLING = 13  # resistance, as learned: tyres
-    DRAG = 14  # area, as learned: rider, clothes, luggage
+    UNEXPLAINED = 12  # measured over modelled consumption, as learned: soft tyres, wind, clothes, a dragging brake
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,8 +240,6 @@ _CAUSE_WORDS = {
     "auxiliaries": "auxiliary load",
     "age": "age of the battery",
     "riding": "riding to come",
-    "rolling": "rolling resistance",
-    "drag": "air drag",
 }
 
 

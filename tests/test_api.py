@@ -528,13 +528,10 @@ def test_what_was_learned_is_that_of_the_command(saved, capsys):
     told = json.loads(capsys.readouterr().out)
     found = gz.read_learned(saved)
     assert {name: x.value for name, x in found.battery.items()} == {n: x["factor"] for n, x in told["learned"].items()}
-    assert {name: x.sd for name, x in found.road.items()} == {
-        name: x["sd"] for name, x in told["road"].items() if name != "correlations"
-    }
     assert found.age_s == pytest.approx(told["age_s"], abs=60)
     table = found.to_table()
-    assert table["value"][table["name"].tolist().index("capacity")] == pytest.approx(CAPACITY, abs=0.01)
-    assert set(table["part"]) == {"battery", "road", "rider"}
+    assert table["factor"][table["name"].tolist().index("capacity")] == pytest.approx(CAPACITY, abs=0.01)
+    assert set(table["part"]) == {"battery", "rider"}
     assert cli.main(["learned", "--state", str(saved)]) == 0
     assert capsys.readouterr().out == f"{found}\n"
     whole = saved.read_bytes()

@@ -42,7 +42,6 @@ WRONG = [
         "hello.txt: is not a saved state; choose another with --state FILE or --vehicle NAME|TOML",
     ),
     (["learned", "--state", "folder"], "it is not a file; choose another with --state FILE or --vehicle NAME|TOML"),
-    (["learned", "--state", "x.json", "--plot", "x.bmp"], "--plot x.bmp: a picture is one of .png .svg .pdf"),
     (["plot", "--why", "ride.blf"], "`gz-onboard estimate` makes a log that does"),
     (["plot", "folder"], "folder: its logs hold no estimates; `gz-onboard estimate folder` makes them"),
 ]

@@ -99,7 +99,7 @@ def test_a_folder_that_means_nothing(arguments: list[str], said: str, capsys: py
         (["run", FULL], "run takes files and folders behind its options only: --vehicle NAME|TOML, "),
         (["run", "a.blf.gz"], "; a recorded ride is for estimate, or for replay onto a bus"),
         (["learned", FULL], "learned takes files and folders behind its options only: --vehicle NAME|TOML, --json"),
-        (["learned", "scooter.json"], "--state FILE, --plot FILE\n"),
+        (["learned", "scooter.json"], "--state FILE\n"),
         (["foxglove", FULL], "--vehicle NAME|TOML, --write-layout FILE; a recorded ride is for estimate, or for"),
     ],
 )

@@ -54,7 +54,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ["simulate", "cycle.csv", "--frames", "cycle.csv", "--output", "new"],
         ["simulate", "cycle.csv", "--json=cycle.csv", "--output", "new"],
         ["learned", "--state", "state.json", "--json", "state.json"],
-        ["learned", "--state", "state.json", "--plot", "state.json"],
     ],
     ids=" ".join,
 )
@@ -74,7 +73,6 @@ def test_no_input_is_overwritten(folder: Path, capsys: pytest.CaptureFixture[str
         ["validate", "ride.blf", "--no-plot", "--markdown", "new", "--json=new"],
         ["simulate", "cycle.csv", "--output", "new", "--json=new/cycle.simulation.parquet"],
         ["simulate", "cycle.csv", "--output", "new", "--frames", "new.csv", "--json=new.csv"],
-        ["learned", "--state", "state.json", "--json", "new.png", "--plot", "new.png"],
     ],
     ids=" ".join,
 )

@@ -15,9 +15,7 @@ import pytest
 from gz_onboard import state
 from gz_onboard.cli import main
 from gz_onboard.daemon.learned import BATTERY
-from gz_onboard.daemon.learned_picture import limits, rows_of
 from gz_onboard.errors import BAD_INPUT, OK
-from gz_onboard.estimator.ageing import Learned
 from gz_onboard.estimator.ekf import ScalarFilter
 from gz_onboard.estimator.snapshot import unlike
 from gz_onboard.estimator.weakest import NAMES
@@ -48,7 +46,7 @@ def saved(tmp_path: Path) -> Path:
 def shown(file: Path, capsys: pytest.CaptureFixture[str], *options: str) -> dict[str, dict[str, float]]:
     assert main(["learned", "--state", str(file), "--json", *options]) == OK
     document = json.loads(capsys.readouterr().out)
-    assert document["version"] == 2
+    assert document["version"] == 3
     learned: dict[str, dict[str, float]] = document["learned"]
     return learned
 
@@ -64,7 +62,7 @@ def test_it_shows_what_was_learned(saved: Path, capsys: pytest.CaptureFixture[st
     assert text.startswith("per cent learned: how much of what was uncertain")
 
 
-def test_it_shows_each_rider_and_draws_it(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_it_shows_each_rider(saved: Path, capsys: pytest.CaptureFixture[str]):
     vehicle = read_vehicle("reference")
     snapshot, _ = state.load(saved, time.time()) or ({}, None)
     estimator = Pipeline(vehicle).estimator
@@ -76,14 +74,12 @@ def test_it_shows_each_rider_and_draws_it(saved: Path, tmp_path: Path, capsys: p
     changed = estimator.snapshot(vehicle.key)
     assert changed
     state.write(saved, state.encode(changed, time.time()))
-    picture = tmp_path / "learned.png"
-    assert main(["learned", "--state", str(saved), "--plot", str(picture), "--json"]) == OK
+    assert main(["learned", "--state", str(saved), "--json"]) == OK
     riders = json.loads(capsys.readouterr().out)["riders"]
     assert list(riders) == ["anna", ""]
     assert riders[""]["price"]["factor"] == pytest.approx(1.2 / vehicle.riding.factor)
     assert riders[""]["price"]["percent_learned"] > 80
     assert riders["anna"]["price"]["percent_learned"] < 30
-    assert picture.read_bytes().startswith(b"\x89PNG")
     assert main(["learned", "--state", str(saved)]) == OK
     text = capsys.readouterr().out
     unnamed = text.index("\nrides of which nobody said who rode:\n")
@@ -118,60 +114,6 @@ def test_it_forgets_one_and_keeps_the_rest(saved: Path, capsys: pytest.CaptureFi
     assert shown(saved, capsys, "--reset", "all")["resistance"]["factor"] == 1.0
 
 
-def test_it_shows_and_forgets_the_road_load(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    vehicle = read_vehicle("reference")
-    snapshot, _ = state.load(saved, time.time()) or ({}, None)
-    road = snapshot["learned"]["road"]
-    road["means"][0], road["rows"][0] = 15.0, 4.0**2
-    road["rows"][4] = -0.9 * (road["rows"][2] * road["rows"][5]) ** 0.5  # of rolling and drag
-    state.write(saved, state.encode(snapshot, time.time()))
-    assert main(["learned", "--state", str(saved), "--json", "--plot", str(tmp_path / "learned.png")]) == OK
-    document = json.loads(capsys.readouterr().out)["road"]
-    assert (document["mass"]["value"], document["mass"]["filed"], document["mass"]["unit"]) == (95.0, 80.0, "kg")
-    assert document["mass"]["percent_learned"] > 50
-    assert document["correlations"]["rolling drag"] == pytest.approx(-0.9)
-    assert main(["learned", "--state", str(saved)]) == OK
-    text = capsys.readouterr().out
-    assert "payload      95 ± " in text
-    assert ": mass of rider and luggage, vehicle file 80" in text
-    assert "rolling and drag are hard to tell apart: correlation -0.90" in text
-    assert main(["learned", "--state", str(saved), "--reset", "road"]) == OK
-    assert "payload      80 ± 12 kg         nothing learned" in capsys.readouterr().out
-    after, _ = state.load(saved, time.time()) or ({}, None)
-    assert after["learned"] == {name: x for name, x in snapshot["learned"].items() if name != "road"}
-    Pipeline(vehicle).estimator.restore(after, vehicle.key, 0.0)
-
-
-def test_after_a_day_with_a_payload_it_shows_the_road_load(saved: Path, capsys: pytest.CaptureFixture[str]):
-    snapshot, _ = state.load(saved, time.time()) or ({}, None)
-    road = Pipeline(read_vehicle("reference", payload=93.0)).estimator.road_load.snapshot()
-    road["means"][2], road["rows"][5] = 0.1, 0.03**2  # of drag
-    snapshot["learned"]["road"] = road
-    state.write(saved, state.encode(snapshot, time.time()))
-    assert main(["learned", "--state", str(saved)]) == OK
-    text = capsys.readouterr().out
-    assert "nothing learned: mass of rider and luggage, entered 93\n" in text
-    assert "drag         0.605 ± " in text
-    road["of"][0] = -1.0
-    state.write(saved, state.encode(snapshot, time.time()))
-    assert main(["learned", "--state", str(saved)]) == BAD_INPUT
-    assert f"{saved}: is damaged: its road holds implausible numbers" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(("payload", "said"), [(80.0, "entered 80"), (None, "vehicle file 80")])
-def test_a_payload_like_the_vehicle_file_s_is_told_as_entered(
-    saved: Path, capsys: pytest.CaptureFixture[str], payload: float | None, said: str
-):
-    snapshot, _ = state.load(saved, time.time()) or ({}, None)
-    road = Pipeline(read_vehicle("reference", payload=payload)).estimator.road_load.snapshot()
-    for kept in (road, {name: x for name, x in road.items() if name != "entered"}):
-        snapshot["learned"]["road"] = kept
-        state.write(saved, state.encode(snapshot, time.time()))
-        assert main(["learned", "--state", str(saved)]) == OK
-        assert f": mass of rider and luggage, {said}\n" in capsys.readouterr().out
-        said = "vehicle file 80"  # a state from before this was saved
-
-
 def test_it_shows_and_forgets_the_weakest_group(saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     vehicle = with_cell_voltages(tmp_path)
     assert not set(NAMES) & set(shown(saved, capsys))  # a vehicle without the signal
@@ -187,33 +129,11 @@ def test_it_shows_and_forgets_the_weakest_group(saved: Path, tmp_path: Path, cap
     learned = shown(saved, capsys, *options)
     assert learned["weak_charge"]["factor"] == pytest.approx(0.96)
     assert learned["weak_capacity"]["factor"] == pytest.approx(0.9)
-    picture = tmp_path / "learned.png"
-    assert main(["learned", "--state", str(saved), *options, "--plot", str(picture), "--reset", "weakest"]) == OK
+    assert main(["learned", "--state", str(saved), *options, "--reset", "weakest"]) == OK
     assert "weak_capacity 1.000 ± 0.080  nothing learned: of that group" in capsys.readouterr().out
-    assert picture.exists()
     learned = shown(saved, capsys, *options)
     assert learned["weak_charge"]["factor"] == 1.0
     assert learned["capacity"]["factor"] == pytest.approx(CAPACITY, abs=0.01)
-
-
-def test_the_picture_has_groups_and_what_is_next_to_unknown_does_not_squeeze_it():
-    known, unknown = Learned(0.9, 0.05, 0.6), Learned(1.0, 2.0, 0.2)
-    riders = {"anna": {"price": known, "terrain": known}, "": {"standing": unknown}}
-    rows = list(rows_of({"capacity": known}, {"payload": known}, riders))
-    assert rows == [
-        ("battery", None),
-        ("capacity: of the pack", known),
-        ("road load", None),
-        ("payload: mass of rider and luggage", known),
-        ("riding, anna", None),
-        ("price: energy of a km in motion", known),
-        ("riding, rider not known", None),
-        ("standing: energy at stops", unknown),
-        ("roads, whoever rides", None),
-        ("terrain: height that roads climb or fall for good", known),
-    ]
-    assert limits([known, unknown]) == (0.0, 2.0)
-    assert limits([Learned(3.0, 0.1, 0.5)])[1] > 3.0
 
 
 def test_it_resets_nothing_under_a_daemon_that_runs(saved: Path, capsys: pytest.CaptureFixture[str]):
@@ -272,13 +192,3 @@ def _key(*effects: str) -> str:
 )
 def test_it_names_what_differs_and_no_more(other: object, said: str):
     assert unlike(other, _key("drag", "mass")).endswith(said)
-
-
-@pytest.mark.parametrize("name", ["out.txt", "out", "out.mcap"])
-def test_a_picture_of_another_kind_is_refused_before_anything_is_forgotten(
-    saved: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
-):
-    before = saved.read_bytes()
-    assert main(["learned", "--state", str(saved), "--reset", "all", "--plot", str(tmp_path / name)]) == BAD_INPUT
-    assert f"{name}: a picture is one of .png .svg .pdf" in capsys.readouterr().err
-    assert saved.read_bytes() == before

@@ -11,45 +11,37 @@ from gz_onboard.daemon import learned as command
 from gz_onboard.daemon.keeper import state_file
 from gz_onboard.errors import brief
 from gz_onboard.estimator.ageing import Learned
-from gz_onboard.estimator.road_load import RoadParameter
 from gz_onboard.offline.arguments import checked
 from gz_onboard.offline.table import Columns, Tabular, columns_of
 
-_COLUMNS = ("part", "name", "value", "sd", "unit", "filed", "percent_learned")
+_COLUMNS = ("part", "name", "factor", "sd", "percent_learned")
 
 
 @dataclass(frozen=True)
 class LearnedState(Tabular):
-    """What a saved state holds. age_s: of the state by this clock, if it is known; battery: by name, factors on what
-    the vehicle file says; road: by name; correlations: of two of these; riders: by rider and name, factors; who rode
-    last comes first, and one who is not known is "".
+    """What a saved state holds, as factors on what the vehicle file says.
+
+    age_s: age of the state by this machine's clock, if known; battery: by name; riders: by rider, then by name. The
+    last rider comes first; "" stands for rides without a known rider.
     """
 
     vehicle: str
     age_s: float | None
     battery: Mapping[str, Learned]
-    road: Mapping[str, RoadParameter]
-    correlations: Mapping[tuple[str, str], float]
     riders: Mapping[str, Mapping[str, Learned]]
 
     __repr__ = brief
 
     def __str__(self) -> str:
-        return command.learned_text(self.battery, self.road, self.correlations, self.riders)
+        return command.learned_text(self.battery, self.riders)
 
     def to_table(self) -> Columns:
-        """A row for each of what can be learned. part: ``battery``, ``road``, or ``rider`` and who that is."""
+        """One row per factor. part: ``battery``, or ``rider`` and the rider's name."""
         factors = [("battery", self.battery), *((f"rider {who}".strip(), of) for who, of in self.riders.items())]
         rows: list[dict[str, object]] = [
-            {"part": part, "name": name, "value": x.value, "sd": x.sd, "unit": "1", "filed": 1.0}
-            | {"percent_learned": 100 * x.share}
+            {"part": part, "name": name, "factor": x.value, "sd": x.sd, "percent_learned": 100 * x.share}
             for part, found in factors
             for name, x in found.items()
-        ]
-        rows += [
-            {"part": "road", "name": name, "value": x.value, "sd": x.sd, "unit": x.unit, "filed": x.filed}
-            | {"percent_learned": 100 * x.share}
-            for name, x in self.road.items()
         ]
         return columns_of(rows, {name: name for name in _COLUMNS})
 
@@ -65,6 +57,5 @@ def read_learned(file: PathLike | None = None, vehicle: VehicleLike = "reference
     path = state_file(command.USUAL_FOLDER, known.name) if file is None else Path(file)
     snapshot, age = command.load(path, known)
     with command.sound(path):
-        road_load = command.read_road_load(known, snapshot)
         battery, riders = command.read_learned(known, snapshot), command.read_riders(known, snapshot)
-    return LearnedState(known.name, age, battery, road_load.learned(), road_load.correlations(), riders)
+    return LearnedState(known.name, age, battery, riders)

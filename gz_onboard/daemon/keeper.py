@@ -80,7 +80,7 @@ class StateKeeper:
     ) -> dict[str, Any]:
         """Go on from a saved state without its damaged parts, which is saved; it is given. Raises if it cannot be."""
         known = pipeline.estimator
-        learning = known.soc.ageing, known.road_load, known.weakest
+        learning = known.soc.ageing, known.weakest
         snapshot, lost = mended(saved, self.key, known.soc.effects, learning, known.forecaster)
         known.restore(snapshot, self.key, age)
         text = state.encode(snapshot, 0.0 if age is None else time.time() - age)

@@ -1,6 +1,6 @@
 """``gz-onboard learned``: what the daemon has learned of a vehicle and its riders, and keeps in its state file.
 
-Shown as a text, as JSON and as a picture; forgotten on request.
+Shown as text or JSON; forgotten on request.
 """
 
 from __future__ import annotations
@@ -20,11 +20,9 @@ from typing import Any
 
 from gz_onboard import state
 from gz_onboard.daemon.keeper import state_file
-from gz_onboard.daemon.learned_picture import draw_learned
-from gz_onboard.errors import OK, InputError, not_an_input, require, writing
+from gz_onboard.errors import OK, InputError, not_an_input, writing
 from gz_onboard.estimator.ageing import Ageing, Learned
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.estimator.road_load import RoadLoad, RoadParameter
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.snapshot import part, unlike
 from gz_onboard.estimator.terrain import RATE, STRETCH, Terrain
@@ -33,8 +31,7 @@ from gz_onboard.estimator.weakest import Weakest
 from gz_onboard.options import add_shared
 from gz_onboard.vehicle import Vehicle, read_vehicle
 
-VERSION = 2  # of the JSON keys
-ALIKE = 0.8  # correlation from which two are said to be hard to tell apart
+VERSION = 3  # of the JSON keys
 USUAL_FOLDER = Path("/var/lib/gz-onboard")
 MEANING = {  # by name: what its factor is on
     "capacity": "of the pack, over cell_capacity in the vehicle file, as the pack's current sensor counts it",
@@ -48,30 +45,22 @@ MEANING = {  # by name: what its factor is on
     "factor": "measured over modelled energy of the same motion",
     "terrain": f"how far {STRETCH / 1000:.0f} km of road end above or below their begin, whoever rides, "
     f"over the {sqrt(STRETCH * RATE):.0f} m expected before the first ride",
-    "mass": "mass of rider and luggage",
-    "rolling": "resistance over weight",
-    "drag": "area of vehicle and rider",
-    "auxiliaries": "power, lights and all",
 }
 TERRAIN = "terrain"
-SPOKEN = {"mass": "payload"}  # what a text calls it
 LEARNED = "per cent learned: how much of what was uncertain before the first ride no longer is"
 ANEW = "; to begin anew, give `gz-onboard estimate --state` a new name; the daemon does so by itself when it starts"
 BY_RESISTANCE = "; what the resistance tells of it stays: `--reset battery` forgets both"
-PICTURES = (".png", ".svg", ".pdf")
-BATTERY, ROAD, RIDING = ("capacity", "resistance", "weakest"), "road", "riding"
+BATTERY, RIDING = ("capacity", "resistance", "weakest"), "riding"
 FORGOTTEN = {  # by the word of --reset: what it forgets
     **{name: (name,) for name in BATTERY},
     "battery": BATTERY,
-    ROAD: (ROAD,),
     RIDING: (RIDING,),
-    "all": (*BATTERY, ROAD, RIDING),
+    "all": (*BATTERY, RIDING),
 }
 PARTS = {  # what --reset says of each
     "capacity": "capacity of the battery",
     "resistance": "resistance of the battery",
     "weakest": "weakest group of cells",
-    ROAD: "road load",
     RIDING: "riding of all riders, and terrain",
 }
 LOWEST = "lowest_cell_voltage"  # the role without which nothing is known of the weakest group
@@ -88,17 +77,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         choices=tuple(FORGOTTEN),
         help="forget this, as `battery` after a new one, or `all` for a new owner; the daemon must not run",
     )
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw it: PNG, SVG or PDF")
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Show, or forget. InputError if the state cannot be read, is another vehicle's, or is in use."""
     vehicle = read_vehicle(arguments.vehicle)
     file = arguments.state or state_file(USUAL_FOLDER, vehicle.name)
-    not_an_input((arguments.json, arguments.plot), [file, vehicle.file])
-    if arguments.plot and arguments.plot.suffix.lower() not in PICTURES:
-        raise InputError(f"--plot {arguments.plot}: a picture is one of {' '.join(PICTURES)}")
-    require("matplotlib", arguments.plot is not None)
+    not_an_input([arguments.json], [file, vehicle.file])
     try:
         snapshot, age = load(file, vehicle)
     except InputError as error:
@@ -114,33 +99,21 @@ def run(arguments: argparse.Namespace) -> int:
         learned = read_learned(vehicle, snapshot)
     with _or_forget(file, RIDING):
         riders = read_riders(vehicle, snapshot)
-    with _or_forget(file, ROAD):
-        road_load = read_road_load(vehicle, snapshot)
-    road = road_load.learned()
-    if arguments.plot:
-        with writing(arguments.plot):
-            draw_learned(arguments.plot, vehicle.name, learned, _factors(road), riders)
     if arguments.json:
-        rows = {"learned": _rows(learned), "road": _road_rows(road_load)}
-        rows |= {"riders": {name: _rows(x) for name, x in riders.items()}}
+        rows = {"learned": _rows(learned), "riders": {name: _rows(x) for name, x in riders.items()}}
         text = json.dumps({"version": VERSION, "vehicle": vehicle.key, "age_s": age, **rows}, indent=1)
         if arguments.json == "-":
             print(text)
             return OK
         with writing(arguments.json):
             Path(arguments.json).write_text(text + "\n", encoding="utf-8")
-    print(learned_text(learned, road, road_load.correlations(), riders))
+    print(learned_text(learned, riders))
     return OK
 
 
-def learned_text(
-    learned: Mapping[str, Learned],
-    road: Mapping[str, RoadParameter],
-    correlations: Mapping[tuple[str, str], float],
-    riders: Mapping[str, Mapping[str, Learned]],
-) -> str:
-    """For a terminal. Terrain is of the roads, whoever rides; of a rider who is not known only what was learned."""
-    lines = [LEARNED, *(_line(name, x) for name, x in learned.items()), *_road_lines(road, correlations)]
+def learned_text(learned: Mapping[str, Learned], riders: Mapping[str, Mapping[str, Learned]]) -> str:
+    """For a terminal. Terrain belongs to the roads; an unknown rider is left out if nothing is known of him."""
+    lines = [LEARNED, *(_line(name, x) for name, x in learned.items())]
     lines += [_line(TERRAIN, found[TERRAIN]) for found in riders.values() if TERRAIN in found]
     for rider, found in riders.items():
         habits = {name: x for name, x in found.items() if name != TERRAIN}
@@ -167,26 +140,6 @@ def _of_weakest(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, Lear
     with part("weakest"):
         weakest.take_on(weakest.read(snapshot.get("learned", {}).get("weakest")))
     return weakest.learned()
-
-
-def read_road_load(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> RoadLoad:
-    """What a saved state holds of the road load, over the payload of its day. ValueError if it cannot be."""
-    with part(ROAD):
-        saved = snapshot.get("learned", {}).get(ROAD)
-        payload = RoadLoad.payload_of(saved, vehicle.parameters.filed("payload_mass"))
-        road_load = RoadLoad(_fresh(_loaded(vehicle, payload)).load)
-        road_load.take(road_load.read(saved))
-    return road_load
-
-
-def _loaded(vehicle: Vehicle, payload: float | None) -> Vehicle:
-    """The vehicle with the payload [kg] that was entered, if one was. ValueError if it cannot be."""
-    if payload is None:
-        return vehicle
-    try:
-        return vehicle.loaded(payload)
-    except InputError as error:
-        raise ValueError(str(error)) from error
 
 
 def read_riders(vehicle: Vehicle, snapshot: Mapping[str, Any]) -> dict[str, dict[str, Learned]]:
@@ -247,38 +200,9 @@ def _rows(learned: Mapping[str, Learned]) -> dict[str, dict[str, object]]:
     }
 
 
-def _road_rows(road_load: RoadLoad) -> dict[str, object]:
-    rows: dict[str, object] = {
-        name: {"value": x.value, "sd": x.sd, "unit": x.unit, "filed": x.filed, "percent_learned": round(100 * x.share)}
-        for name, x in road_load.learned().items()
-    }
-    return rows | {"correlations": {" ".join(pair): r for pair, r in road_load.correlations().items()}}
-
-
-def _factors(road: Mapping[str, RoadParameter]) -> dict[str, Learned]:
-    """By what texts call them, as factors on what the vehicle file says, where that is more than nothing."""
-    known = {SPOKEN.get(name, name): x for name, x in road.items() if x.filed > 0}
-    return {name: Learned(x.value / x.filed, x.sd / x.filed, x.share) for name, x in known.items()}
-
-
 def _line(name: str, x: Learned) -> str:
-    return f"{name:12} {x.value:5.3f} ± {x.sd:5.3f}  {_known(x.share)}: {MEANING[name]}"
-
-
-def _known(share: float) -> str:
-    return f"{100 * share:3.0f} % learned" if share else "nothing learned"
-
-
-def _road_lines(road: Mapping[str, RoadParameter], correlations: Mapping[tuple[str, str], float]) -> Iterator[str]:
-    for name, x in road.items():
-        unit = "" if x.unit == "1" else f" {x.unit}"
-        number = f"{x.value:.3g} ± {x.sd:.2g}{unit}"
-        over = f"{'entered' if x.entered else 'vehicle file'} {x.filed:.3g}"
-        yield f"{SPOKEN.get(name, name):12} {number:18} {_known(x.share)}: {MEANING[name]}, {over}"
-    for (first, second), r in correlations.items():
-        if abs(r) > ALIKE:
-            one, other = (SPOKEN.get(name, name) for name in (first, second))
-            yield f"{one} and {other} are hard to tell apart: correlation {r:+.2f}"
+    known = f"{100 * x.share:3.0f} % learned" if x.share else "nothing learned"
+    return f"{name:12} {x.value:5.3f} ± {x.sd:5.3f}  {known}: {MEANING[name]}"
 
 
 def load(file: Path, vehicle: Vehicle) -> tuple[Mapping[str, Any], float | None]:

@@ -20,10 +20,9 @@ from typing import NamedTuple
 from gz_onboard.constants import MILD
 from gz_onboard.estimator.composition import PARTS, Composition, Parts
 from gz_onboard.estimator.forecast import PRIOR_FORM_FACTOR_SQUARED, Forecast, Forecaster
-from gz_onboard.estimator.load_model import AHEAD, ALTITUDE_DIGITS, AMBIENT_DIGITS, USUAL_AIR, Conditions, Road
+from gz_onboard.estimator.load_model import AHEAD, ALTITUDE_DIGITS, AMBIENT_DIGITS, USUAL_AIR, Conditions
 from gz_onboard.estimator.pattern import Point
 from gz_onboard.estimator.ridden import MEMORY
-from gz_onboard.estimator.road_load import RoadLoad
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import LOADS, Cause, Explanation
 from gz_onboard.physics.battery import Battery, Overpotential
@@ -37,9 +36,8 @@ SETTLED = 60.0  # s: what goes back within is no change
 MOST_CHANGES = 100
 STOOD = 10.0  # m: on less way a charge goes on, and is one change
 SHOWN_OVER = 1000.0  # m: on less way than this, what was ridden is more chance than a pattern
-ROAD_STEPS = 0.005, 0.02, 0.01  # relative, of a `Road`
-# What beside the riding the modelled consumption depends on: the air, and what the road load is made with.
-BESIDE = {Cause.TEMPERATURE: None, Cause.PAYLOAD: "mass", Cause.ROLLING: "rolling", Cause.DRAG: "drag"}
+BESIDE = Cause.TEMPERATURE, Cause.PAYLOAD
+"""What the modelled consumption depends on apart from the riding: the air and the mass."""
 
 
 class Moment(NamedTuple):
@@ -74,14 +72,14 @@ class State:
     consumption: float
     draw: Draw
     air: Conditions
-    road: Road
-    factor: float  # on the model with this road load
+    mass: float  # kg, with rider and luggage
+    factor: float  # measured over modelled consumption
     auxiliaries: float  # of the factor, what auxiliaries beyond the model's make
     points: tuple[Point, ...]  # lately ridden
     hills: float = 0.0  # J/m: how much more those of a route ahead take than hills like those ridden
     known: float = 0.0  # how much of the price expected is theirs, and not the prior riding's: 0 to 1
     rated: bool = False  # the prior riding without hills and wind, nothing ridden
-    parts: dict[tuple[Conditions, Road], Parts] = field(default_factory=dict)  # as far as they were asked for
+    parts: dict[tuple[Conditions, float], Parts] = field(default_factory=dict)  # as far as they were asked for
 
 
 class Attribution:
@@ -90,8 +88,7 @@ class Attribution:
     A charge is one change, of which `news` tells each step.
     """
 
-    def __init__(self, forecaster: Forecaster, signals: Signals, road_load: RoadLoad | None = None) -> None:
-        self._road_load = road_load
+    def __init__(self, forecaster: Forecaster, signals: Signals) -> None:
         self._forecaster, self._signals, load = forecaster, signals, forecaster.load
         self._more = self._known = 0.0  # W in the factor learned, weighted by the way; sum of the weights
         self._ridden = 0.0  # m
@@ -136,10 +133,9 @@ class Attribution:
         return news
 
     def _state(self, moment: Moment) -> State:
-        now, forecast, soc, air, ridden, hills = moment
+        now, forecast, soc, air, ridden, (energy, way) = moment
         riding = self._forecaster.riding
         known = forecast.range > 0 and forecast.energy > 0
-        filed, learned = self._composition.filed, self._factor_learned
         state = State(
             time=now,
             ridden=ridden,
@@ -148,26 +144,20 @@ class Attribution:
             consumption=forecast.energy / forecast.range if known else forecast.consumption,
             draw=Draw(soc, forecast.cells, self._pack(), forecast.power, forecast.form_factor_squared),
             air=Conditions(round(air.ambient, AMBIENT_DIGITS), round(air.altitude, ALTITUDE_DIGITS)),
-            road=_in_steps(filed, self._road_load.believed(learned)) if self._road_load else filed,
+            mass=self._forecaster.load.model.mass,
             factor=self._forecaster.factor,
             auxiliaries=self._auxiliaries(forecast.power),
             points=self._forecaster.pattern.points(),
             known=min(max(1 - riding.usual.price.variance / self._forecaster.prior.price.variance, 0.0), 1.0),
         )
-        # What the road load explains is no longer in the factor.
-        rest = self._total(state, state.air, filed) / self._total(state, state.air, state.road)
-        factor, (energy, way) = rest * state.factor, hills
-        like_ridden = way * factor * self._parts(state, state.air, state.road)[Cause.CLIMB]
-        ahead = (energy - like_ridden) / state.range if known else 0.0
-        return replace(state, factor=factor, auxiliaries=rest * state.auxiliaries, hills=ahead)
+        like_ridden = way * state.factor * self._parts(state, state.air, state.mass)[Cause.CLIMB]
+        return replace(state, hills=(energy - like_ridden) / state.range if known else 0.0)
 
     def _measure_auxiliaries(self, now: float, ridden: float) -> None:
         """What they take beyond the model's and their own sensor's, in the mean over the way lately ridden."""
         way, self._ridden = ridden - self._ridden, ridden
         beside = [self._signals[role].get(now) for role in LOADS]
         known = [power for power in beside if power is not None]
-        if self._road_load and not known and not self._forecaster.auxiliaries.known:
-            known.append(self._road_load.more_auxiliaries)
         if way > 0 and known:
             fade = exp(-way / MEMORY)
             self._more = fade * self._more + (1 - fade) * sum(known)
@@ -193,9 +183,8 @@ class Attribution:
             load = self._forecaster.load
             parameters = load.model.parameters
             mass = parameters["vehicle_mass"] + parameters.filed("payload_mass")
-            road = self._composition.filed._replace(mass=mass)
             air, prior = Conditions(*USUAL_AIR), load.prior
-            calm = _without_hills_and_wind(self._composition.prior(air, road))
+            calm = _without_hills_and_wind(self._composition.prior(air, mass))
             consumption = prior.factor * sum(calm.values())
             full, power = self._new.window.of_cells(1.0), consumption * prior.speed
             load_ahead = power, PRIOR_FORM_FACTOR_SQUARED
@@ -211,7 +200,7 @@ class Attribution:
                 consumption=consumption,
                 draw=draw,
                 air=air,
-                road=road,
+                mass=mass,
                 factor=prior.factor,
                 auxiliaries=0.0,
                 points=(),
@@ -237,7 +226,7 @@ class Attribution:
     def _costs(self, a: State, b: State) -> Parts:
         """The difference of the consumptions [J/m]: factor times what is left open times the model's, and hills."""
         modelled = self._modelled(a, b)
-        f0, m0, f1, m1 = a.factor, self._total(a, a.air, a.road), b.factor, self._total(b, b.air, b.road)
+        f0, m0, f1, m1 = a.factor, self._total(a, a.air, a.mass), b.factor, self._total(b, b.air, b.mass)
         g0, g1 = (a.consumption - a.hills) / (f0 * m0), (b.consumption - b.hills) / (f1 * m1)
         of_model, of_factor = _worth(f0, g0, f1, g1), _worth(g0, m0, g1, m1)
         costs = {cause: of_model * part for cause, part in modelled.items()}
@@ -253,36 +242,35 @@ class Attribution:
         """The difference of the modelled consumptions [J/m]."""
         parts: Parts = dict.fromkeys((*PARTS, *BESIDE), 0.0)
         for at in (a, b):
-            before, after = self._parts(a, at.air, at.road), self._parts(b, at.air, at.road)
+            before, after = self._parts(a, at.air, at.mass), self._parts(b, at.air, at.mass)
             for part in PARTS:
                 parts[part] += (after[part] - before[part]) / 2
-        # Air, mass, rolling, drag: in this order of the riding as it is, in the reverse one of that as it was.
-        for riding, causes in ((b, tuple(BESIDE)), (a, tuple(BESIDE)[::-1])):
-            air, road = a.air, a.road
-            before_it = self._total(riding, air, road)
+        # Air, then mass, with the riding as it is; mass, then air, with the riding as it was.
+        for riding, causes in ((b, BESIDE), (a, BESIDE[::-1])):
+            air, mass = a.air, a.mass
+            before_it = self._total(riding, air, mass)
             for cause in causes:
-                name = BESIDE[cause]
-                air, road = (b.air, road) if name is None else (air, road._replace(**{name: getattr(b.road, name)}))
-                after_it = self._total(riding, air, road)
+                air, mass = (b.air, mass) if cause is Cause.TEMPERATURE else (air, b.mass)
+                after_it = self._total(riding, air, mass)
                 parts[cause] += (after_it - before_it) / 2
                 before_it = after_it
         return parts
 
-    def _total(self, state: State, air: Conditions, road: Road) -> float:
-        return sum(self._parts(state, air, road).values())
+    def _total(self, state: State, air: Conditions, mass: float) -> float:
+        return sum(self._parts(state, air, mass).values())
 
-    def _parts(self, state: State, air: Conditions, road: Road) -> Parts:
-        """The modelled consumption [J/m] of the riding of `state` in another air, with another road load."""
-        at = air, road
+    def _parts(self, state: State, air: Conditions, mass: float) -> Parts:
+        """The modelled consumption [J/m] of the riding of `state` in other air, with another mass [kg]."""
+        at = air, mass
         if at not in state.parts:
-            prior = self._composition.prior(air, road)
+            prior = self._composition.prior(air, mass)
             distance = sum(p.distance for p in state.points)
             if state.rated:
                 state.parts[at] = _without_hills_and_wind(prior)
             elif not distance:
                 state.parts[at] = prior
             else:
-                ridden = self._composition.of(state.points, air, road)
+                ridden = self._composition.of(state.points, air, mass)
                 share = state.known * distance / (distance + SHOWN_OVER)
                 state.parts[at] = {part: share * ridden[part] + (1 - share) * prior[part] for part in PARTS}
         return state.parts[at]
@@ -337,12 +325,6 @@ def _joined(one: Explanation, other: Explanation) -> Explanation:
     forgotten = tuple(sorted({*one.forgotten, *other.forgotten}))
     range_ = one.range + other.range - other.reference
     return Explanation(other.time, one.reference, range_, causes, forgotten)
-
-
-def _in_steps(filed: Road, learned: Road) -> Road:
-    """`learned`, in steps from what the file says: the prior riding is kept for each."""
-    each = zip(filed, learned, ROAD_STEPS, strict=True)
-    return Road(*(x * (1 + step * round((y / x - 1) / step)) if x else y for x, y, step in each))
 
 
 def _without_hills_and_wind(parts: Parts) -> Parts:

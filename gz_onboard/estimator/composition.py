@@ -16,7 +16,7 @@ from functools import lru_cache
 from itertools import groupby
 from math import sqrt
 
-from gz_onboard.estimator.load_model import AHEAD, HEADINGS, Conditions, EffectInputs, LoadModel, Quantities, Road
+from gz_onboard.estimator.load_model import AHEAD, HEADINGS, Conditions, EffectInputs, LoadModel, Quantities
 from gz_onboard.estimator.pattern import Point, cruise_of
 from gz_onboard.events import Cause
 from gz_onboard.physics.battery import HALF_FULL
@@ -24,7 +24,7 @@ from gz_onboard.physics.model import Model
 
 Parts = dict[Cause, float]
 PARTS = Cause.SPEED, Cause.STOPS, Cause.CLIMB, Cause.TURNING, Cause.WIND
-MOST_KEPT = 32  # airs and road loads for which the prior riding is kept; and models
+MOST_KEPT = 32  # airs and masses for which the prior riding is kept
 
 
 class Composition:
@@ -35,9 +35,6 @@ class Composition:
         self._load, self._model = load, model
         calm = tuple(effect for effect in model.effects if "heading" not in effect.reads)  # only a wind asks for it
         self._calm = model if calm == model.effects else Model(calm, model.parameters)
-        p = model.parameters
-        self.filed = Road(model.mass, p["rolling_resistance_constant"], p["drag_area"])
-        self._models = lru_cache(MOST_KEPT)(self._other_models)
         self._told = [Cause.STOPS, Cause.CLIMB]
         if "lateral_acceleration" in model.reads:
             self._told.append(Cause.TURNING)
@@ -50,50 +47,41 @@ class Composition:
             for share, speed, acceleration in sorted(load.prior.points, key=lambda point: point[1])
         )
 
-    def _other_models(self, rolling: float, drag: float) -> tuple[Model, Model]:
-        """The model with these parameters, and without wind."""
-        if (rolling, drag) == self.filed[1:]:
-            return self._model, self._calm
-        p = self._model.parameters.replaced(rolling_resistance_constant=rolling, drag_area=drag)
-        model = Model(self._model.effects, p)
-        return model, model if self._calm is self._model else Model(self._calm.effects, p)
-
-    def _of_prior(self, air: Conditions, road: Road) -> Parts:
-        """Of the prior riding in this `air` with this `road` load."""
-        parts = self.of(self._usual, air, road)
+    def _of_prior(self, air: Conditions, mass: float) -> Parts:
+        """Of the prior riding in this `air` with this `mass` [kg]."""
+        parts = self.of(self._usual, air, mass)
         # What is not level: the file has it as one number.
         return parts | {Cause.CLIMB: (self._load.prior.unevenness - 1) * sum(parts.values())}
 
-    def of(self, points: Sequence[Point], air: Conditions, road: Road) -> Parts:
-        """Of riding these `points` in this `air` with this `road` load."""
+    def of(self, points: Sequence[Point], air: Conditions, mass: float) -> Parts:
+        """Of riding these `points` in this `air` with this `mass` [kg]."""
         distance = sum(p.distance for p in points)
         cruises = _cruises(points)
         parts: Parts = dict.fromkeys(PARTS, 0.0)
-        parts[Cause.SPEED] = steady = sum(self._energy(p, Cause.SPEED, air, road) for p in cruises) / distance
+        parts[Cause.SPEED] = steady = sum(self._energy(p, Cause.SPEED, air, mass) for p in cruises) / distance
         for part in self._told:
             if part is Cause.CLIMB and not any(p.grade for p in cruises):
                 continue
             each = points if part is Cause.STOPS else cruises
-            parts[part] = sum(self._energy(p, part, air, road) for p in each) / distance - steady
+            parts[part] = sum(self._energy(p, part, air, mass) for p in each) / distance - steady
         return parts
 
-    def _energy(self, p: Point, part: Cause, air: Conditions, road: Road) -> float:
+    def _energy(self, p: Point, part: Cause, air: Conditions, mass: float) -> float:
         """What the riding of a point takes [J] at a steady speed and with what belongs to `part`."""
         q = self._load.quantities(p.speed, p.acceleration if part is Cause.STOPS else 0.0, air)
-        q["mass"] = road.mass
-        model, calm = self._models(road.rolling, road.drag)
+        q["mass"] = mass
         if self._load.extended:
             lateral = p.lateral if part is Cause.TURNING else 0.0
             self._load.extend(q, EffectInputs(lateral, None, HALF_FULL, air.ambient, 0.0), air.ambient, AHEAD)
         if part is Cause.WIND:
-            every = [sum(model.power(q | {"heading": heading}).values()) for heading in HEADINGS]
+            every = [sum(self._model.power(q | {"heading": heading}).values()) for heading in HEADINGS]
             return p.time * float(sum(every)) / len(every)
         grades = (p.grade, -p.grade) if part is Cause.CLIMB else (p.slope,) if part is Cause.STOPS else (0.0,)
-        return p.time * sum(self._power(calm, q | _graded(grade), p.returns) for grade in grades) / len(grades)
+        return p.time * sum(self._power(q | _graded(grade), p.returns) for grade in grades) / len(grades)
 
-    def _power(self, calm: Model, q: Quantities, returns: bool) -> float:
+    def _power(self, q: Quantities, returns: bool) -> float:
         """The power [W] without wind; `returns`: less what is stored."""
-        ledger = calm.power(q)
+        ledger = self._calm.power(q)
         return float(sum(power for name, power in ledger.items() if not (returns and name in self._stores)))
 
 

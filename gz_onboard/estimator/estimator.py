@@ -3,7 +3,7 @@
 No I/O and no clock: time arrives with the events, so the same events give the same estimates, to the last bit.
 All state that matters lives here and in what is owned here; `snapshot` and `restore` carry it over a restart. One step:
 check the sensors (`redundancy`), move on the road (`road`), choose the pack's voltage and current (`sources`) and the
-temperatures, go on with the state of charge (`soc`), learn from the riding and forecast (`forecaster`, `road_load`).
+temperatures, go on with the state of charge (`soc`), learn from the riding and forecast (`forecaster`).
 """
 
 from __future__ import annotations
@@ -24,8 +24,6 @@ from gz_onboard.estimator.redundancy.electric import CellEvidence
 from gz_onboard.estimator.redundancy.monitor import Redundancy
 from gz_onboard.estimator.redundancy.speeds import SpeedCheck
 from gz_onboard.estimator.road import STANDSTILL, RoadState
-from gz_onboard.estimator.road_load import NEW_DAY, RoadLoad
-from gz_onboard.estimator.road_teacher import RoadTeacher
 from gz_onboard.estimator.route_ahead import RoadAhead
 from gz_onboard.estimator.signals import DEFAULT_STALE, Signals
 from gz_onboard.estimator.soc import StateOfCharge
@@ -50,6 +48,7 @@ STARTING_FOR = 10.0  # s: without a state of charge by then, no range is to be e
 UNCERTAIN = 0.05  # of SOC: a larger sd is reported
 LEARNED_FROM = {"motor_speed", "accel_x", "gps_altitude", "pack_current", "pack_voltage"}
 AGED_FROM = {"pack_current", "pack_voltage", "cell_temperature"}
+NEW_DAY = 3 * 3600.0  # s without motion, where it is not known how long the vehicle stood
 UNLEARNED = 1500.0  # m: so far a sensor can have been faulty before it is found out
 
 
@@ -66,7 +65,6 @@ class Estimator:
     ) -> None:
         self.battery = battery = battery.own()  # what is learned of its age is of this one
         self.road, self.forecaster = RoadState(), Forecaster(model, battery, riding)
-        self.road_load = RoadLoad(self.forecaster.load)
         self.signals = Signals(
             (role, STALE_PERIODS * group.period if group.period else DEFAULT_STALE)
             for group in groups
@@ -74,7 +72,7 @@ class Estimator:
         )
         inverter = [self.signals[role] for role in ("inverter_current", "inverter_voltage", "motor_speed")]
         self._inverter = [signal for signal in inverter if signal.stale_after]  # those that the vehicle has
-        self.attribution = Attribution(self.forecaster, self.signals, self.road_load)
+        self.attribution = Attribution(self.forecaster, self.signals)
         self.ahead = RoadAhead(self.forecaster, self.road, self.signals)
         self._missing = MissingSignals(self.signals)
         self._slots = [[self.signals[role] for role in group.roles] for group in groups]
@@ -101,7 +99,6 @@ class Estimator:
         self.soc = StateOfCharge(battery, model, make, self.signals, self._timing, self.redundancy.currents.sag)
         self.forecaster.ageing, self.weakest = self.soc.ageing, Weakest(battery, self.signals, p)
         self._present = Present(self.forecaster, self.road, self._temperatures, self.soc, self._vibration)
-        self._teacher = RoadTeacher(self.road_load, self.road, self.signals, self._present, battery)
 
     @property
     def filter(self) -> SocFilter | None:
@@ -115,7 +112,6 @@ class Estimator:
     def ridden_by(self, rider: str) -> None:
         """`rider` rides from now on."""
         self.forecaster.ridden_by(rider)
-        self.road_load.ridden_by(rider)
 
     # --- events -----------------------------------------------------------------------------------------------
 
@@ -214,7 +210,6 @@ class Estimator:
         learned = LEARNED_FROM if self.road.speed is not None else LEARNED_FROM.union(SpeedCheck.ROLES)
         if forgotten := newly & learned:
             self.forecaster.forget(max(UNLEARNED, self.redundancy.odometer.compared))
-            self.road_load.unlearn()
             self.attribution.forget(forgotten)
         if "auxiliary_current" in newly:
             self.forecaster.auxiliaries.forget()
@@ -247,9 +242,7 @@ class Estimator:
         if speed is None or reading.voltage is None or reading.current is None or not known:
             still = 0.0 if dt <= self._timing.pause and self._activities.now is Activity.RIDING else dt
             self.forecaster.pause(still)
-            self.road_load.pause(still)
             return
-        second, before = self.forecaster.riding.second, self.forecaster.riding.speed_before
         self.ahead.ride(dt, speed, reading.voltage * reading.current)
         learned = self.forecaster.ride(
             dt,
@@ -260,8 +253,6 @@ class Estimator:
             self._present.effect_inputs(now),
             max((self._timing.periods[i] for i in self._speeds), default=0.0),
         )
-        if self.forecaster.riding.second is not second:  # it is complete
-            self._teacher.second(now, second, before, reading, self._distrusted)
         if learned and self.signals.cell_temperature.fresh(now):  # R0 is known only with it
             self.redundancy.currents.compare_consumption(self.forecaster.recent_factor)
 
@@ -333,7 +324,7 @@ class Estimator:
             "cell_temperature": self._temperatures.cells,
             "gyro_bias": [self.road.bias_x, self.road.bias_z],
             "riding": self.forecaster.snapshot() | {"on_routes": self.ahead.rider.snapshot()},
-            "learned": snapshot.of_learned(self.soc.ageing, self.road_load, self.weakest),
+            "learned": snapshot.of_learned(self.soc.ageing, self.weakest),
         }
 
     def wait(self, seconds: float) -> None:
@@ -342,15 +333,14 @@ class Estimator:
 
     def restore(self, saved: Mapping[str, Any], key: str, age: float | None) -> None:
         """Go on from a snapshot that is `age` [s] old (None: not known). ValueError if it does not fit, whole."""
-        learned = self.soc.ageing, self.road_load, self.weakest
+        learned = self.soc.ageing, self.weakest
         restored = snapshot.read(saved, key, age, self.soc.effects, learned, self.forecaster.restore)
         self.ahead.restore(saved["riding"].get("on_routes"))
         self.road.bias_x, self.road.bias_z = restored.gyro_bias
         if restored.cell_temperature is not None:
             self._temperatures.cells = restored.cell_temperature
         self.soc.restore(restored.battery, restored.age, restored.cell_effects)
-        self.forecaster.pause(stood := NEW_DAY if restored.age is None else restored.age)
-        self.road_load.rest(stood)
+        self.forecaster.pause(NEW_DAY if restored.age is None else restored.age)
 
 
 def _carrying(roles: Sequence[str], groups: Sequence[Group]) -> list[int]:

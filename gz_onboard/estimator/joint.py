@@ -26,29 +26,10 @@ class Joint:
         """Of one quantity."""
         return self.rows[i][i]
 
-    def correlation(self, i: int, j: int) -> float:
-        """Of two quantities; 0 if one of them is known."""
-        size = sqrt(self.rows[i][i] * self.rows[j][j])
-        return self.rows[i][j] / size if size else 0.0
-
     def widen(self, i: int, variance: float, most: float) -> None:
         """One quantity has changed by what has a `variance`; it is never less known than by `most`."""
         own = self.rows[i][i]
         self.rows[i][i] = max(min(own + variance, most), own)
-
-    def fade(self, i: int, keep: float, variance: float) -> None:
-        """A quantity about 0 of this `variance` in the long run keeps a share `keep` of what it was."""
-        self.means[i] *= keep
-        for j, row in enumerate(self.rows):
-            row[i] *= keep
-            self.rows[i][j] *= keep
-        self.rows[i][i] += (1 - keep * keep) * variance
-
-    def begin(self, i: int, mean: float, variance: float) -> None:
-        """Nothing is known of one quantity but this."""
-        for j, row in enumerate(self.rows):
-            row[i] = self.rows[i][j] = 0.0
-        self.means[i], self.rows[i][i] = mean, variance
 
     def update(self, slopes: Sequence[float], residual: float, noise: float, most: float) -> float:
         """Take in a measurement that is off by `residual`, of which at most `most` sd are believed.

@@ -57,14 +57,6 @@ class Conditions(NamedTuple):
     motor_temperature: float = WARM_MOTOR  # degC
 
 
-class Road(NamedTuple):
-    """What the road load is made with."""
-
-    mass: float  # kg, of all
-    rolling: float  # rolling_resistance_constant
-    drag: float  # m²
-
-
 class EffectInputs(NamedTuple):
     """What effects beyond the base's may read at one time; None where it is not known."""
 

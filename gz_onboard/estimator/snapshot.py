@@ -14,7 +14,6 @@ from gz_onboard.estimator.ageing import Ageing
 from gz_onboard.estimator.cell_effects import CellEffects
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.road import MOST_BIAS
-from gz_onboard.estimator.road_load import RoadLoad
 from gz_onboard.estimator.start import Saved
 from gz_onboard.estimator.weakest import Weakest
 
@@ -58,11 +57,11 @@ def read(
     key: str,
     age: float | None,
     effects: CellEffects,
-    learning: tuple[Ageing, RoadLoad, Weakest],
+    learning: tuple[Ageing, Weakest],
     restore_riding: Callable[[Mapping[str, Any]], None],
 ) -> Restored:
     """The snapshot `saved`, `age` [s] old, of the vehicle `key`; the riding, and what was learned of the
-    pack's age and of the road load, are restored if the rest fits.
+    pack's age, are restored if the rest fits.
 
     ValueError if it does not fit, whole.
     """
@@ -72,17 +71,14 @@ def read(
     battery, states = _charge(saved, effects)
     bias_x, bias_z = _biases(saved)
     learned = saved.get("learned", {})  # states from before there was any have none
-    ageing, road_load, weakest = learning
+    ageing, weakest = learning
     with part("capacity or resistance"):
         ageing.read(learned)
-    with part("road"):
-        on_road = road_load.read(learned.get("road"))
     with part("weakest"):
         of_group = weakest.read(learned.get("weakest"))
     with part("riding"):
         restore_riding(saved["riding"])
         ageing.restore(learned)
-        road_load.take(on_road)
         weakest.take_on(of_group)
     cells = saved.get("cell_temperature")
     if not isinstance(cells, int | float) or not CELLS[0] < cells < CELLS[1] or age is None or age >= CELLS_KEEP:
@@ -91,11 +87,7 @@ def read(
 
 
 def mended(
-    saved: Mapping[str, Any],
-    key: str,
-    effects: CellEffects,
-    learning: tuple[Ageing, RoadLoad, Weakest],
-    forecaster: Forecaster,
+    saved: Mapping[str, Any], key: str, effects: CellEffects, learning: tuple[Ageing, Weakest], forecaster: Forecaster
 ) -> tuple[dict[str, Any], list[str]]:
     """`saved` without its parts that are damaged, and their names; of estimators that have taken up no state.
 
@@ -103,11 +95,10 @@ def mended(
     with the state of charge that was saved: without that there is none. ValueError if it is of another vehicle `key`.
     """
     _check_head(saved, key)
-    ageing, road_load, weakest = learning
+    ageing, weakest = learning
     reads: dict[str, Callable[[Any], object]] = {
         "capacity": lambda x: ageing.read({"capacity": x}),
         "resistance": lambda x: ageing.read({"resistance": x}),
-        "road": road_load.read,
         "weakest": weakest.read,
     }
     learned, damaged = saved.get("learned", {}), []
@@ -181,10 +172,10 @@ def _fits(name: str, check: Callable[[], object]) -> bool:
     return True
 
 
-def of_learned(ageing: Ageing, road_load: RoadLoad, weakest: Weakest) -> dict[str, Any]:
+def of_learned(ageing: Ageing, weakest: Weakest) -> dict[str, Any]:
     """What was learned of the vehicle, by name; of the weakest group only where its voltage is on the bus."""
     of_group = {"weakest": weakest.snapshot()} if weakest.mapped else {}
-    return {**ageing.snapshot(), "road": road_load.snapshot(), **of_group}
+    return {**ageing.snapshot(), **of_group}
 
 
 def _charge(saved: Mapping[str, Any], effects: CellEffects) -> tuple[Saved | None, dict[str, float]]:

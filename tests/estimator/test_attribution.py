@@ -12,8 +12,6 @@ from hypothesis import strategies as st
 from gz_onboard.estimator.attribution import Attribution, Moment
 from gz_onboard.estimator.forecast import Forecaster
 from gz_onboard.estimator.load_model import Conditions, EffectInputs
-from gz_onboard.estimator.road_load import RoadLoad
-from gz_onboard.estimator.road_slopes import AUXILIARIES, DRAG, MASS, ROLLING
 from gz_onboard.estimator.signals import Signals
 from gz_onboard.events import Cause, Explanation
 from gz_onboard.log_rows import explanation_row
@@ -225,43 +223,6 @@ def test_a_heater_is_told_from_what_nobody_knows():
     check_sum(why)
     assert why.causes[Cause.AUXILIARIES] < -2000.0
     assert abs(why.causes[Cause.UNEXPLAINED]) < 0.5 * -why.causes[Cause.AUXILIARIES]
-
-
-def told(f: Forecaster, means: dict[int, float]) -> Explanation:
-    """With a road load that is learned to differ from the file's by `means`."""
-    road_load = RoadLoad(f.load)
-    for i, mean in means.items():
-        road_load.joint.means[i] = mean
-    attribution = Attribution(f, Signals(()), road_load)
-    attribution.take(Moment(0.0, f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0), 0.7, MILD, 0.0))
-    attribution.take(Moment(1.0, f.forecast(0.7, 0.01, 20.0, 1.0, 20.0, 0.0), 0.7, MILD, 100.0))
-    assert attribution.latest is not None
-    return attribution.latest
-
-
-@pytest.mark.parametrize(
-    ("quantity", "mean", "cause"),
-    [(MASS, 40.0, Cause.PAYLOAD), (ROLLING, 0.006, Cause.ROLLING), (DRAG, 0.15, Cause.DRAG)],
-)
-def test_what_is_learned_of_the_road_load_has_a_name(quantity: int, mean: float, cause: Cause):
-    """What was one factor becomes a cause; the range is the same."""
-    f = ridden(factor=1.25)
-    plain, why = told(f, {}), told(f, {quantity: mean})
-    check_sum(why)
-    assert why.range == plain.range
-    assert plain.causes[cause] == 0.0
-    assert why.causes[cause] < -600.0
-    assert why.causes[Cause.UNEXPLAINED] > plain.causes[Cause.UNEXPLAINED] + 400.0
-
-
-def test_all_that_is_learned_adds_up():
-    f = ridden(factor=1.2, hills=0.03)
-    check_sum(told(f, {MASS: -30.0, ROLLING: 0.004, DRAG: -0.1, AUXILIARIES: 60.0}))
-
-
-def test_before_the_consumption_is_known_what_is_learned_explains_nothing():
-    """The forecast does not know of it yet."""
-    assert told(forecaster(), {MASS: 40.0}).causes[Cause.PAYLOAD] == pytest.approx(0.0, abs=60.0)
 
 
 # --- over time --------------------------------------------------------------------------------------------------------

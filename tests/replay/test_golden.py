@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 from dataclasses import fields
 
 import pytest
@@ -12,10 +11,7 @@ from hypothesis import strategies as st
 
 from gz_onboard.bus.logs import read_frames
 from gz_onboard.events import Estimate
-from gz_onboard.lab.estimate_ride import feed
 from gz_onboard.log_rows import estimate_row
-from gz_onboard.pipeline import Pipeline
-from gz_onboard.vehicle import read_vehicle
 from tests.replay import golden, regenerate
 
 LOGS = golden.logs()
@@ -41,19 +37,6 @@ def test_golden(log):
             + golden.told(found, len(now)),
             pytrace=False,
         )
-
-
-def test_the_riders_mass_is_learned_on_a_recorded_ride():
-    log = next(log for log in LOGS if log.stem == "city_14C")
-    facts = {ride["name"]: ride for ride in json.loads((golden.LOGS / "rides.json").read_text(encoding="utf-8"))}
-    pipeline = Pipeline(read_vehicle("reference"))
-    feed(pipeline, read_frames(log))
-    learned = pipeline.estimator.road_load.learned()
-    mass, entered = learned["mass"], facts[log.stem]["rider_mass_kg"]
-    assert mass.filed + mass.sd < mass.value
-    assert abs(mass.value - entered) < 2 * mass.sd
-    assert mass.share > 0.5
-    assert learned["auxiliaries"].share > 0.8
 
 
 def test_both_filters_agree_over_a_whole_ride():

@@ -99,7 +99,7 @@ export default {
   "causes": {
     "temperature": "Temperatur", "speed": "Geschwindigkeit", "stops": "Stopps", "wind": "Wind", "climb": "Hügel",
     "turning": "Kurven", "auxiliaries": "Nebenverbraucher", "payload": "Zuladung", "age": "Alter der Batterie",
-    "charge": "Ladung", "riding": "kommende Fahrt", "unexplained": "ungeklärt", "rolling": "Rollwiderstand", "drag": "Luftwiderstand"
+    "charge": "Ladung", "riding": "kommende Fahrt", "unexplained": "ungeklärt"
   },
   "messages": {
     "RANGE_Estimate": "Reichweite", "RANGE_Energy": "Energie und Verbrauch",

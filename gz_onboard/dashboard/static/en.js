@@ -99,7 +99,7 @@ export default {
   "causes": {
     "temperature": "temperature", "speed": "speed", "stops": "stops", "wind": "wind", "climb": "hills",
     "turning": "bends", "auxiliaries": "auxiliary load", "payload": "payload", "age": "age of the battery",
-    "charge": "charge", "riding": "riding to come", "unexplained": "unexplained", "rolling": "rolling resistance", "drag": "air drag"
+    "charge": "charge", "riding": "riding to come", "unexplained": "unexplained"
   },
   "messages": {
     "RANGE_Estimate": "range", "RANGE_Energy": "energy and consumption", "RANGE_Status": "state of charge and state",
