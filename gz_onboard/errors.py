@@ -19,11 +19,7 @@ EXIT_STATUSES = {
     INTERRUPTED: "interrupted by Ctrl-C",
 }
 """What the exit status of a command means."""
-_PACKAGES = {
-    "paho": "paho-mqtt",
-    "foxglove": "foxglove-sdk",
-    "isotp": "can-isotp",
-}  # that are not named as their modules
+_PACKAGES = {"paho": "paho-mqtt", "foxglove": "foxglove-sdk"}  # that are not named as their modules
 _NAMES_REFUSED = (errno.ENAMETOOLONG, errno.EACCES)
 _DISK_FAILED = (errno.ENOSPC, errno.EDQUOT, errno.EIO)
 CLOSE, CLOSE_SHORT = 0.55, 0.5  # difflib's ratio of two names from which one may be meant; of up to three letters

@@ -7,7 +7,7 @@ portions the frames arrive.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 from gz_onboard.bus.codec import DROPPING, RANGE, Codec
 from gz_onboard.bus.layout import identifier_of
@@ -87,7 +87,6 @@ class Pipeline:
         self.kernel_lost = 0  # frames; set by the daemon
         self.overrun = 0  # frames left out because more came than can be decoded; set by the daemon
         self.log_lost = 0  # frames that are in no log; set by the daemon
-        self.polled: Mapping[str, Mapping[str, int]] = {}  # what came of requests, by name; set by the daemon
         self.send_failures = 0  # frames that a channel did not take; set by the daemon
         self.extra_reasons = Reason(0)  # set by the daemon: bus down, log failed
         self.drawn = Drawn()
@@ -239,7 +238,7 @@ class Pipeline:
             "reasons": reason_names(self.last.reasons) if self.last else [],
             "ride": self._ride(),
             "learned": learned_row(self.estimator.soc.ageing.learned()),
-        } | ({"requests": {name: dict(of) for name, of in self.polled.items()}} if self.polled else {})
+        }
 
     def _ride(self) -> dict[str, object]:
         """What the estimates of a log do not say of the ride, since the start."""

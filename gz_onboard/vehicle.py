@@ -22,7 +22,7 @@ from gz_onboard.toml import Table, is_file
 
 OWN = Path(__file__).resolve().parent / "vehicles"
 KEYS = (
-    "schema name dbc range_dbc range_identifier bus request poll roles instruments model parameters correlation "
+    "schema name dbc range_dbc range_identifier bus request roles instruments model parameters correlation "
     "battery forecast controller healthy"
 )
 
@@ -141,6 +141,8 @@ def read_vehicle(
     run that nobody but `users` can change (see `read_model`).
     """
     table = Table.read(find_vehicle(name))
+    if "poll" in table.values:
+        raise table.error("was removed: requests are not sent, only answers to another tester are read", "poll")
     table.only(KEYS.split())
     if table.number("schema") != 1:
         raise table.error(f"is {table.values['schema']}; this version reads 1", "schema")

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import threading
 from functools import cache
 from pathlib import Path
 from typing import Any
-
-import can
 
 from gz_onboard.bus.requests import Request
 from gz_onboard.events import Frame
@@ -62,7 +59,7 @@ def answer(of: Request, time_ns: int, **values: float) -> list[Frame]:
 def exchange(of: Request, time_ns: int, **values: float) -> list[Frame]:
     """What a tester and the ECU send: request, flow control, answer."""
     first, *others = answer(of, time_ns + 10 * MS, **values)
-    asked = (time_ns, of.request, carried(of.payload)[0], 0)
+    asked = (time_ns, of.request, carried(bytes([of.prefix[0] - 0x40]) + of.prefix[1:])[0], 0)
     control: list[Frame] = [(first[0] + MS // 2, of.request, b"\x30".ljust(8, b"\0"), 0)] if others else []
     return [asked, first, *control, *others]
 
@@ -76,45 +73,3 @@ def polled_ride(seconds: float, **changed: Any) -> list[Frame]:
         if i % 50 == 0:
             frames += exchange(request("BatteryShown"), time_ns + 60 * MS, BatteryCharge=CHARGE)
     return frames
-
-
-class Ecu:
-    """Answers as the Kona's battery management would, on a bus of python-can, in a thread."""
-
-    def __init__(self, interface: str, channel: str) -> None:
-        self.heard: list[tuple[int, bytes]] = []
-        self._answers = {
-            request("Battery").payload: payload(request("Battery"), **STEADY),
-            request("BatteryShown").payload: payload(request("BatteryShown"), BatteryCharge=CHARGE),
-        }
-        self._bus = can.Bus(interface=interface, channel=channel)
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._serve)
-
-    def __enter__(self) -> Ecu:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._end.set()
-        self._thread.join(10)
-        self._bus.shutdown()
-
-    def send(self, data: bytes, identifier: int = 0x7EC) -> None:
-        self._bus.send(can.Message(arbitration_id=identifier, data=data, is_extended_id=False))
-
-    def _serve(self) -> None:
-        left: list[bytes] = []
-        while not self._end.is_set():
-            message = self._bus.recv(0.1)
-            if message is None or message.arbitration_id != 0x7E4:
-                continue
-            data = bytes(message.data)
-            self.heard.append((message.arbitration_id, data))
-            if data[0] >> 4 == 3:
-                parts, left = left, []
-            else:
-                first, *left = carried(self._answers[data[1:4]])
-                parts = [first]
-            for part in parts:
-                self.send(part)

@@ -75,7 +75,6 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
         (["run", "--interface", "virtual", "--log-dir", "/tmp/x", "--log-file-mb", "nan"], "--log-file-mb nan"),
         (["run", "--interface", "virtual", "--log-dir", "/tmp/x", "--log-total-mb", "inf"], "--log-total-mb inf"),
         (["run", "--interface", "virtual", "--log-dir", "/tmp/x", "--log-file-hours", "-1"], "--log-file-hours -1"),
-        (["run", "--interface", "virtual", "--poll"], "reference.toml: --poll: it has no [[request]]"),
         (["replay"], "LOG"),
         (["replay", "nowhere.blf", "--interface", "virtual"], "nowhere.blf"),
         (["replay", RIDE + "x"], "did you mean '.blf'"),

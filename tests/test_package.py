@@ -22,7 +22,7 @@ from tests.test_structure import OFFLINE, ON_REQUEST
 
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 INSTALL = r"pip install 'gz-onboard\[lab\]'"
-HEAVY = {"scipy", "matplotlib", "pyarrow", "filterpy", "pandas", "asammdf", "paho", "foxglove", "isotp"}
+HEAVY = {"scipy", "matplotlib", "pyarrow", "filterpy", "pandas", "asammdf", "paho", "foxglove"}
 
 
 def run(*command: object, cwd: Path | None = None, status: int = 0) -> subprocess.CompletedProcess[str]:
@@ -262,12 +262,6 @@ def test_a_bridge_says_what_to_install(board, command, package):
     extra = command[0]
     said = f"needs {package}, which is not installed: pip install 'gz-onboard[{extra}]'"
     assert line == f"gz-onboard {extra}: {said}"
-
-
-def test_asking_says_what_to_install(board):
-    given: list[object] = ["--vehicle", ROOT / "tests/vehicles/kona/kona.toml", "--interface", "virtual", "--poll"]
-    (line,) = run(board / "gz-onboard", "run", *given, status=2).stderr.splitlines()
-    assert line == "gz-onboard run: needs can-isotp, which is not installed: pip install 'gz-onboard[obd]'"
 
 
 def test_a_format_of_the_lab_says_what_to_install(board, tmp_path):

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.dbc import LARGEST, SMALLEST, LeftOut, empty_database, find_dbc, load_database
-from gz_onboard.bus.requests import Polling, Request, read_polling, read_requests
+from gz_onboard.bus.requests import Request, read_requests
 from gz_onboard.bus.units import UNITS, known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown
 from gz_onboard.events import CURRENTS, EFF_FLAG, INSTRUMENTS, ROLES, SPEEDS, VOLTAGES
@@ -76,8 +76,7 @@ class BusMapping:
     delays: dict[str, float] = field(default_factory=dict)  # s, by message: its values are so much older; where stated
     instruments: tuple[Source, ...] = ()  # of roles that no estimator needs
     columns: Table | None = None  # the roles of a vehicle without DBC files: their signals are columns of a table
-    requests: tuple[Request, ...] = ()  # what the vehicle tells only when it is asked
-    polling: Polling = field(default_factory=Polling)
+    requests: tuple[Request, ...] = ()  # of other testers, whose answers are read
 
     @property
     def reads_frames(self) -> bool:
@@ -90,8 +89,6 @@ def read_mapping(vehicle: Table) -> BusMapping:
 
     Of a vehicle without DBC files and requests only tables of signals can be read; it has a mapping without sources.
     """
-    if "poll" in vehicle.values and "request" not in vehicle.values:
-        raise vehicle.error("says how requests are sent, and there is no [[request]]", "poll")
     if "dbc" not in vehicle.values and "request" not in vehicle.values:
         if "bus" in vehicle.values:
             raise vehicle.error("describes frames, for which dbc is missing", "bus")
@@ -124,7 +121,6 @@ def read_mapping(vehicle: Table) -> BusMapping:
         j1939=j1939,
         delays=delays,
         requests=requests,
-        polling=read_polling(vehicle, requests),
     )
 
 

@@ -1,25 +1,22 @@
-"""What a vehicle tells only when it is asked: the requests that a vehicle file lists, and how their answers are read.
+"""Answers to diagnostic requests: what the requests of a vehicle file say of them. Nothing is ever sent.
 
-[[request]]
+[[request]]                       # that another tester sends
 name = "BMS"                      # of the message that its answer becomes
 request_identifier = 0x7E4        # 11 bits, or 29 from 0x14000000 on
 response_identifier = 0x7EC
-service = 0x22                    # ReadDataByIdentifier (ISO 14229), or 0x01 (SAE J1979)
-data_identifier = 0x0101          # of service 0x01 the PID
+service = 0x22                    # ReadDataByIdentifier (ISO 14229), 0x01 (SAE J1979) or 0x21 (ISO 14230)
+data_identifier = 0x0101          # of service 0x01 the PID, of 0x21 the local identifier
 length = 59                       # bytes of the answer behind the data identifier
 period = 1.0                      # s
 
 [request.signals]
 BMS_Voltage = { byte = "M", bits = 16, factor = 0.1, unit = "V", limits = [200, 450] }
-
-[poll]                            # all of it may be left out
-bitrate = 500000
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -33,19 +30,14 @@ if TYPE_CHECKING:
 
     from gz_onboard.toml import Table
 
-CURRENT_DATA, READ_DATA = 0x01, 0x22
-SERVICES = (CURRENT_DATA, READ_DATA)
-"""All that is ever asked: both only read. Nothing else can be sent, whatever a vehicle file says."""
+IDENTIFIER_BYTES = {0x01: 1, 0x21: 1, 0x22: 2}
+"""Length of the data identifier by service: SAE J1979, readDataByLocalIdentifier (ISO 14230), ReadDataByIdentifier."""
 POSITIVE = 0x40  # is added to the service in its answer
 FUNCTIONAL = (0x7DF, 0x18DB_33F1 | EFF_FLAG)  # all ECUs together are asked there (ISO 15765-4)
-_FUNCTIONAL_GROUP = 0x18DB  # the upper half of 29-bit functional identifiers
-LOWEST_STANDARD, MOST_STANDARD = 0x600, 0x7FF
-LOWEST_EXTENDED, MOST_EXTENDED = 0x1400_0000, 0x1FFF_FFFF
+MOST_STANDARD, MOST_EXTENDED = 0x7FF, 0x1FFF_FFFF
 MOST_REQUESTS = 100
 LONGEST_ANSWER = 4092  # bytes behind a data identifier: ISO-TP has at most 4095
 PERIODS = 0.1, 3600.0  # s
-_FRAME_BITS = {False: 135, True: 160}  # of eight bytes, with the most stuffing there can be and the gap, by extended
-_FIRST, _FOLLOWING = 6, 7  # bytes in the first frame of a longer answer, and in each that follows
 _IDENTIFIERS = "request_identifier", "response_identifier"
 _ADDRESSES = "request_address", "response_address"
 _NAME = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
@@ -69,36 +61,10 @@ class Request:
         return self.message.name
 
     @property
-    def payload(self) -> bytes:
-        """What is sent: service and data identifier."""
-        return bytes([self.service]) + self._identifier
-
-    @property
     def prefix(self) -> bytes:
-        """What its answer begins with."""
-        return bytes([self.service + POSITIVE]) + self._identifier
-
-    @property
-    def _identifier(self) -> bytes:
-        return self.data_identifier.to_bytes(1 if self.service == CURRENT_DATA else 2, "big")
-
-    @property
-    def bits(self) -> int:
-        """What asking once costs the bus: request, answer and flow control, at most."""
-        spare = 1 if self.addresses else 0
-        rest = len(self.prefix) + self.message.length - (_FIRST - spare)
-        frames = 2 if rest <= 1 else 3 - -rest // (_FOLLOWING - spare)
-        return frames * _FRAME_BITS[bool(self.request & EFF_FLAG)]
-
-
-@dataclass(frozen=True)
-class Polling:
-    """How a vehicle is asked."""
-
-    bitrate: float = 500_000.0  # bit/s, of the bus
-    bus_share: float = 0.05  # of it that requests and answers may take
-    timeout: float = 0.5  # s, for an answer to begin
-    padding: int | None = 0xCC  # of requests that are shorter than a frame; None: shorter frames
+        """The first bytes of its positive answer."""
+        identifier = self.data_identifier.to_bytes(IDENTIFIER_BYTES[self.service], "big")
+        return bytes([self.service + POSITIVE]) + identifier
 
 
 def read_requests(vehicle: Table, taken: Mapping[int, str]) -> tuple[Request, ...]:
@@ -120,44 +86,15 @@ def read_requests(vehicle: Table, taken: Mapping[int, str]) -> tuple[Request, ..
     return tuple(requests)
 
 
-def read_polling(vehicle: Table, requests: Iterable[Request]) -> Polling:
-    """How `requests` are sent; InputError if they take more of the bus than they may."""
-    table, usual = vehicle.table("poll"), Polling()
-    table.only(["bitrate", "bus_share", "timeout", "padding"])
-    bitrate = table.number("bitrate", usual.bitrate, 10_000, 1_000_000)
-    share = table.number("bus_share", usual.bus_share, 0.001, 0.3)
-    padding = usual.padding
-    if "padding" in table.values:
-        padding = None if table.values["padding"] == "none" else table.integer("padding", 0, 255)
-    needed = share_of_bus(requests, bitrate)
-    if needed > share:
-        raise (table if "bus_share" in table.values else vehicle).error(
-            f"the requests and their answers take {100 * needed:.1f} % of a bus of {bitrate / 1000:g} kbit/s, and "
-            f"poll.bus_share allows {100 * share:g} %: ask less often, by longer periods",
-            "bus_share" if "bus_share" in table.values else "request",
-        )
-    return Polling(bitrate, share, table.number("timeout", usual.timeout, 0.05, 5.0), padding)
-
-
-def share_of_bus(requests: Iterable[Request], bitrate: float) -> float:
-    """The share of a bus of `bitrate` [bit/s] that `requests` and their answers take at most."""
-    return sum(request.bits / request.period for request in requests) / bitrate
-
-
 def _request(table: Table) -> Request:
     table.only(["name", "service", "data_identifier", "length", "period", "signals", *_IDENTIFIERS, *_ADDRESSES])
     service = table.integer("service", 0, 255)
-    if service not in SERVICES:
-        raise table.error(f"is {service:#04x}; only 0x01 and 0x22 are ever sent, which change nothing", "service")
-    data_identifier = table.integer("data_identifier", 0, 0xFF if service == CURRENT_DATA else 0xFFFF)
-    request = _identifier(table, "request_identifier", LOWEST_STANDARD, LOWEST_EXTENDED)
-    plain = request & ~EFF_FLAG
-    if request in FUNCTIONAL or (request & EFF_FLAG and plain >> 16 == _FUNCTIONAL_GROUP):
-        raise table.error(
-            f"{plain:#x} is that of all ECUs together; give that of the one to be asked, such as 0x7e0 or 0x18da10f1",
-            "request_identifier",
-        )
-    response = _identifier(table, "response_identifier", 0, 0)
+    if service not in IDENTIFIER_BYTES:
+        known = ", ".join(f"{one:#04x}" for one in IDENTIFIER_BYTES)
+        raise table.error(f"is {service:#04x}; the answers of services {known} are read", "service")
+    data_identifier = table.integer("data_identifier", 0, 256 ** IDENTIFIER_BYTES[service] - 1)
+    request = _identifier(table, "request_identifier")
+    response = _identifier(table, "response_identifier")
     if (request ^ response) & EFF_FLAG:
         raise table.error("must have as many bits as that of the request, 11 or 29", "response_identifier")
     if request == response:
@@ -173,14 +110,9 @@ def _request(table: Table) -> Request:
     )
 
 
-def _identifier(table: Table, key: str, standard: int, extended: int) -> int:
-    """The identifier `key` with its flag; at least `standard`, or of 29 bits `extended`."""
+def _identifier(table: Table, key: str) -> int:
+    """The identifier `key`, with the flag of 29 bits where it needs them."""
     value = table.integer(key, 0, MOST_EXTENDED)
-    least = standard if value <= MOST_STANDARD else extended
-    if value < least:
-        raise table.error(
-            f"{value:#x} is below {least:#x}: diagnosis has identifiers of low priority, others are left alone", key
-        )
     return value if value <= MOST_STANDARD else value | EFF_FLAG
 
 
@@ -192,18 +124,16 @@ def _addresses(table: Table) -> tuple[int, int] | None:
 
 
 def _check_pair(table: Table, request: Request, other: Request) -> None:
-    """InputError where two requests cannot be told apart, or would speak to two ECUs by one identifier."""
+    """InputError where the answers of two requests cannot be told apart."""
     if request.name == other.name:
         raise table.error(f"two requests are called {other.name}", "name")
     if request.response == other.request or request.request == other.response:
         raise table.error(f"{other.name} has it for the other direction", "response_identifier")
     if request.response != other.response:
         return
-    if (request.request, request.addresses) != (other.request, other.addresses):
-        raise table.error(
-            f"is that of {other.name} too, which is asked by another identifier or address", "response_identifier"
-        )
-    if request.payload == other.payload:
+    if request.addresses != other.addresses:
+        raise table.error(f"is that of {other.name} too, which has another address", "response_identifier")
+    if request.prefix == other.prefix:
         raise table.error(f"{other.name} asks for it too", "data_identifier")
 
 

@@ -23,7 +23,7 @@ from gz_onboard.daemon.control import Control
 from gz_onboard.daemon.keeper import state_file
 from gz_onboard.daemon.loop import TICK, Daemon, foreign_text, state_text
 from gz_onboard.daemon.route import SOCKET
-from gz_onboard.errors import FAILED, OK, InputError, not_an_input, require, shown, writing
+from gz_onboard.errors import FAILED, OK, InputError, not_an_input, shown, writing
 from gz_onboard.estimator.riders import LONGEST_NAME
 from gz_onboard.options import CHANNEL, add_shared, number
 from gz_onboard.physics.trust import ROOT
@@ -79,8 +79,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     write_dbc = "write the DBC file of the vehicle's range frames, for whoever reads them, and end"
     add("--write-dbc", type=Path, metavar="FILE", help=write_dbc)
-    poll = "send the requests that the vehicle file lists ([[request]]); without it the daemon only listens"
-    add("--poll", action="store_true", help=poll)
     add("--all-frames", action="store_true", help="take in, count and log identifiers that the DBC files do not know")
     tick = number("--tick", SHORTEST_TICK, TICK_NS * 1e-9, counted="s")
     add("--tick", type=tick, default=TICK, metavar="S", help="read the bus this often (default: %(default)g)")
@@ -117,10 +115,6 @@ def run(arguments: argparse.Namespace) -> int:
         with writing(arguments.write_dbc):
             arguments.write_dbc.write_bytes(content)
         return OK
-    if arguments.poll:
-        if not vehicle.mapping.requests:
-            raise vehicle.error("--poll: it has no [[request]], so there is nothing to ask")
-        require("isotp")
     with ExitStack() as locks:
         _lock(locks, arguments.interface, names, arguments.state_dir)
         return _run(arguments, vehicle, names)
@@ -153,7 +147,6 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
         log.info("%s lacks sensors, which makes its intervals wider: %s", vehicle.name, ", ".join(never))
     daemon = Daemon(vehicle, channels, recorder, saved, arguments.filter, arguments.tick)
     daemon.rider = arguments.rider or ""
-    _poll(daemon, vehicle, arguments.poll)
     daemon.control = Control(arguments.control_socket, lambda: daemon.pipeline)
     daemon.control.start()
     if route:
@@ -167,18 +160,6 @@ def _run(arguments: argparse.Namespace, vehicle: Vehicle, names: list[str]) -> i
         logging.shutdown()
         os._exit(FAILED)
     return OK
-
-
-def _poll(daemon: Daemon, vehicle: Vehicle, wanted: bool) -> None:
-    """Have the vehicle's requests sent if that is wanted; else say that they are not."""
-    requests = vehicle.mapping.requests
-    if wanted:
-        from gz_onboard.daemon.poller import Poller
-
-        daemon.poller = Poller(requests, vehicle.mapping.polling, daemon.ask)
-        log.info("%s", daemon.poller.text)
-    elif requests:
-        log.info("%s lists %d requests, which are not sent: that needs --poll", vehicle.name, len(requests))
 
 
 def _lock(locks: ExitStack, interface: str, names: list[str], state_dir: Path | None) -> None:
@@ -225,8 +206,6 @@ def _retried(take: Callable[[], None], until: float) -> bool:
 def _summary(daemon: Daemon) -> None:
     """What a person wants to read when the daemon ends."""
     print("\n".join(summary(daemon.pipeline)))
-    if daemon.poller and daemon.poller.summary:
-        print(f"requests {daemon.poller.summary}")
     for path in [path for path in daemon.recorder.paths if path.exists()] if daemon.recorder else []:
         print(f"log {path}")
 

@@ -13,7 +13,7 @@ from collections import Counter
 from collections.abc import Callable
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from gz_onboard import notify
 from gz_onboard.bus.background_recorder import BackgroundRecorder
@@ -21,16 +21,12 @@ from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.recorder import Recorder
 from gz_onboard.daemon.control import Control
 from gz_onboard.daemon.keeper import StateKeeper
-from gz_onboard.events import TRANSMITTED, Frame, Reason, State
+from gz_onboard.events import Frame, Reason, State
 from gz_onboard.log_rows import reason_names
 from gz_onboard.pipeline import Pipeline
 from gz_onboard.vehicle import Vehicle
 
-if TYPE_CHECKING:
-    from gz_onboard.daemon.poller import Poller
-
 TICK = 0.1  # s: as often as a status is sent; each wake-up costs as much as ten frames
-QUICK_TICK = 0.02  # s, while an answer to a request is expected: the ECU waits for our flow control
 BUSY = 200  # frames in a tick from which the next is half as long: what waits in the kernel must fit its buffer
 WORK_S = 0.06  # s of CPU that the frames of one tick may cost
 FRAME_S = 20e-6  # s of CPU for a frame, until it is measured
@@ -56,7 +52,6 @@ class Daemon:
         self.channels = channels
         self.recorder = recorder
         self.control: Control | None = None
-        self.poller: Poller | None = None
         self.rider = ""  # if that is known
         self.finished = True  # whether log and state were written to their end
         self._log = BackgroundRecorder(recorder) if recorder else None
@@ -99,7 +94,7 @@ class Daemon:
         notify.ready("waiting for frames")
         log.info("ready after %.2f s of CPU", time.process_time())
         while not self._stopping:
-            next_tick += self._pause(busy)
+            next_tick += self._tick / 2 if busy else self._tick
             pause = next_tick - time.monotonic()
             if pause > 0:
                 time.sleep(pause)
@@ -111,12 +106,6 @@ class Daemon:
                 fed = now
                 notify.alive()
             self._report(now)
-
-    def _pause(self, busy: bool) -> float:
-        """s, from one tick to the next."""
-        if self.poller and self.poller.waiting(time.monotonic()):
-            return min(QUICK_TICK, self._tick)
-        return self._tick / 2 if busy else self._tick
 
     def close(self) -> None:
         """Save the state, write the log to its end as far as the disks allow it in time, and close the channels."""
@@ -198,21 +187,10 @@ class Daemon:
             self.control.take()
         for frame in pipeline.advance(frames, now_ns):
             self.channels[0].send(frame)
-        if self.poller and not self._stopping:
-            self.poller.step(frames, time.monotonic())
-            pipeline.polled = self.poller.counts
         if self._log:
             self._log.sync(now_ns)
         if self._keeper:
             self._keeper.save_if_due(pipeline, now_ns)
-
-    def ask(self, identifier: int, data: bytes) -> bool:
-        """Send a frame of a request, and log it; False if the bus does not take it."""
-        frame = (time.time_ns(), identifier, data, TRANSMITTED)
-        sent = self.channels[0].send(frame)
-        if sent and self._log:
-            self._log.frames([frame])
-        return sent
 
     def _report(self, now: float) -> None:
         """Give systemd the status and the journal what changed, at most once a second."""
