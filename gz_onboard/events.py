@@ -22,6 +22,12 @@ RTR_FLAG = 0x4000_0000
 ERR_FLAG = 0x2000_0000
 TRANSMITTED = 0x80
 
+
+def hexadecimal(identifier: int) -> str:
+    """`identifier` in its width on the bus, such as ``0x100`` of 11 bits and ``0x00000100`` of 29."""
+    return f"{identifier & ~EFF_FLAG:#0{10 if identifier & EFF_FLAG else 5}x}"
+
+
 Event: TypeAlias = tuple[float, int, tuple[float | None, ...]]
 """(time [s, on the codec's monotonic timeline], group, values in SI units).
 

@@ -20,7 +20,7 @@ from gz_onboard.estimator.drawn import Drawn
 from gz_onboard.estimator.ekf import FilterMaker, ScalarFilter
 from gz_onboard.estimator.estimator import Estimator
 from gz_onboard.estimator.forecast import Forecaster
-from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State
+from gz_onboard.events import EFF_FLAG, Estimate, Frame, Reason, State, hexadecimal
 from gz_onboard.location_rows import BATTERY_ENDS_TOPIC, LOCATION_TOPIC, location_row
 from gz_onboard.log_rows import (
     CHANGE_TOPIC,
@@ -231,10 +231,11 @@ class Pipeline:
             "send_failures": self.send_failures,
             "log_lost": self.log_lost,
             "unknown_others": codec.unknown_others,
+            "copies": codec.copies,
             "foreign": self.foreign,
             "faults": faults,
             "lost": dict(sorted(codec.lost.items())),
-            "unknown": {f"{i & ~EFF_FLAG:X}": n for i, n in sorted(codec.unknown.items())[:32]},
+            "unknown": {hexadecimal(i): n for i, n in sorted(codec.unknown.items())[:32]},
             "reasons": reason_names(self.last.reasons) if self.last else [],
             "ride": self._ride(),
             "learned": learned_row(self.estimator.soc.ageing.learned()),
@@ -279,11 +280,6 @@ def range_publisher(vehicle: Vehicle) -> Publisher:
                     'give range frames of a larger scale, such as range_dbc = "range_large.dbc"'
                 )
     return publisher
-
-
-def hexadecimal(identifier: int) -> str:
-    """`identifier` without its flag, as it is spoken of."""
-    return f"{identifier & ~EFF_FLAG:#x}"
 
 
 def _frame_key(vehicle: Vehicle, identifier: int) -> tuple[bool, int]:

@@ -161,3 +161,34 @@ def test_a_check_without_a_log_says_what_the_file_is_enough_for(capsys):
         "riders told apart",
     ]
     assert len(found.to_table()["role"]) == 0
+
+
+def test_signals_of_a_vehicle_are_found_by_parameter_group(tmp_path):
+    """Whatever the sender, as the daemon finds them; by DBC files alone identifiers are exact."""
+    log = tmp_path / "truck.log"
+    lines = [f"({1700000000 + i / 10:.3f}) can0 18FEF147#FF0028FFFFFFFFFF\n" for i in range(100)]
+    log.write_text("".join(lines), encoding="utf-8")
+    truck = Path(__file__).parent / "vehicles" / "truck"
+    signals = gz.read_signals(log, truck / "truck.toml")
+    assert signals.unknown == 0
+    speeds = signals.messages["CCVS1"].columns["WheelBasedVehicleSpeed[km/h]"]
+    assert speeds.tolist() == [40.0] * 100
+    exact = gz.read_signals(log, dbc=[truck / "truck.dbc"])
+    assert exact.unknown + sum(len(of.times) for of in exact.messages.values()) == 100
+
+
+def test_signals_of_two_buses_with_one_identifier_are_said(tmp_path, capsys):
+    dbc = 'VERSION ""\nNS_ :\nBS_:\nBU_: A\nBO_ 256 Pack: 2 A\n SG_ Volts : 0|16@1+ (0.1,0) [0|1000] "V" A\n'
+    (tmp_path / "pack.dbc").write_text(dbc, encoding="utf-8")
+    log = tmp_path / "two.log"
+    frames = [(i / 10 + c / 1000, c, (3600 if c else 120) + i) for i in range(100) for c in (0, 1)]
+    lines = [f"({1700000000 + t:.3f}) can{c} 100#{value.to_bytes(2, 'little').hex()}\n" for t, c, value in frames]
+    log.write_text("".join(lines), encoding="utf-8")
+    signals = gz.read_signals(log, dbc=[tmp_path / "pack.dbc"])
+    assert signals.messages["Pack"].columns["Volts[V]"].tolist() == pytest.approx([12 + i / 10 for i in range(100)])
+    (said,) = signals.conflicts
+    assert said.startswith("0x100 comes on channels 0 and 1 with different data (Pack)")
+    assert (
+        cli.main(["export", str(log), str(tmp_path / "out.csv"), "--dbc", str(tmp_path / "pack.dbc"), "--signals"]) == 0
+    )
+    assert said in capsys.readouterr().out

@@ -54,13 +54,15 @@ class LoggedMessage(Tabular):
 @dataclass(frozen=True)
 class LoggedSignals(Tabular):
     """The signals in a log. messages: of each its own table; damages: what of the log could not be read; unknown:
-    frames that are in no DBC file, undecodable: that do not fit theirs.
+    frames that are in no DBC file, undecodable: that do not fit theirs; conflicts: messages that come from two channels
+    or senders with different data, of which the first is here.
     """
 
     messages: Mapping[str, LoggedMessage]
     damages: Sequence[LogDamage]
     unknown: int = 0
     undecodable: int = 0
+    conflicts: Sequence[str] = ()
 
     __repr__ = brief
 
@@ -110,8 +112,10 @@ def read_signals(
     kept = export_tables.KeptSignals()
     tables.write_signals(found.decoded, kept)
     messages = {name: LoggedMessage(*of) for name, of in kept.messages().items()}
-    counts = (found.decoder.unknown, found.decoder.undecodable) if found.decoder else (0, 0)
-    return LoggedSignals(messages, source.damages, *counts)
+    if (decoder := found.decoder) is None:
+        return LoggedSignals(messages, source.damages)
+    conflicts = tuple(decoder.origins.conflicts.values())
+    return LoggedSignals(messages, source.damages, decoder.unknown, decoder.undecodable, conflicts)
 
 
 def _source(

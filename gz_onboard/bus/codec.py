@@ -10,16 +10,18 @@ multiplexed and floating-point signals go through cantools itself.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus.answers import INTERRUPTED, MALFORMED, SEQUENCE, Answers, by_response
 from gz_onboard.bus.checksum import sae_j1850_tables
 from gz_onboard.bus.layout import MappedMessage, identifier_of, is_not_available, raw_values
-from gz_onboard.bus.mapping import BusMapping, Protection, Source, pgn
+from gz_onboard.bus.mapping import BusMapping, Protection, Source
+from gz_onboard.bus.origins import RECENT, Origins
 from gz_onboard.bus.requests import FUNCTIONAL
 from gz_onboard.bus.signals import MessageSignals, Values
-from gz_onboard.events import EFF_FLAG, ERR_FLAG, RTR_FLAG, TRANSMITTED, Event, Frame, Group
+from gz_onboard.events import ERR_FLAG, RTR_FLAG, TRANSMITTED, Event, Frame, Group
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -32,7 +34,18 @@ NOT_AVAILABLE = "not available"
 RANGE = "out of range"
 TIME = "implausible time"
 UNDECODABLE = "undecodable"
-DROPPING = (LENGTH, CRC, COUNTER, TIME, UNDECODABLE, SEQUENCE, INTERRUPTED, MALFORMED)  # that drop a frame or an answer
+CONFLICT = "different data from two channels or senders"
+DROPPING = (
+    LENGTH,
+    CRC,
+    COUNTER,
+    TIME,
+    UNDECODABLE,
+    CONFLICT,
+    SEQUENCE,
+    INTERRUPTED,
+    MALFORMED,
+)  # that drop a frame or an answer
 
 BACK_NS = 50_000_000  # frames of two channels may overtake each other by a little
 AHEAD_NS = 30_000_000_000
@@ -58,6 +71,7 @@ class Codec:
         self.lost: dict[str, int] = {}  # message -> frames that its counter shows as missing
         self.unknown: dict[int, int] = {}  # identifier -> frames, of the first few thousand identifiers
         self.unknown_others = 0  # frames of further identifiers
+        self.copies = 0  # frames of known messages from another channel or sender than they are taken from
         self.error_frames = 0
         self.received = 0
         self.latest: dict[int, tuple[int, bytes]] = {}  # identifier -> time [ns], data of the last good frame
@@ -70,30 +84,29 @@ class Codec:
         self._suspects = 0
         self._suspect_ns = 0  # the time of the last suspect
         self._before_ns = 0  # `_last_ns` when it came: a good frame in between clears the suspicion
-        self._handlers: dict[int, Handler] = {}
-        self._by_pgn: dict[int, Handler] = {}
+        self.origins = Origins(mapping)
+        self._handlers: dict[int, dict[int, Handler]] = {}  # by channel and identifier, of what was heard
+        self._channel, self._room = -1, _MOST_IDENTIFIERS  # of the last frame; further handlers to keep
+        self._decoders: dict[str, Handler] = {}
+        self._mapped = {source.message for source in mapping.sources}
         by_message: dict[str, list[Source]] = {}
         for source in mapping.sources:
             by_message.setdefault(source.message, []).append(source)
         for message in mapping.database.messages:
-            handler = self._handler(message, by_message.get(message.name, []))
-            if mapping.j1939 and message.is_extended_frame:
-                self._by_pgn[pgn(message.frame_id)] = handler
-            else:
-                self._handlers[identifier_of(message)] = handler
-        self._answering: dict[int, int | None] = {request.response: None for request in mapping.requests}  # channel
-        self._listen_for_answers(by_message)
+            self._decoders[message.name] = self._handler(message, by_message.get(message.name, []))
+        self._answers = self._answer_handlers(by_message)
+        self._answering: dict[int, int] = {}  # channel by identifier of an answer: the first, as a gateway may copy it
 
     # --- frames ---------------------------------------------------------------------------------------------
 
     def decode(self, frames: Iterable[Frame]) -> list[Event]:
         """The events of `frames`, in their order; their times are seconds since the first frame ever decoded."""
-        frames = self._of_one_channel(frames) if self._answering else frames
-        handlers, latest = self._handlers, self.latest
+        latest, heard = self.latest, self._channel
+        handlers = self._handlers.setdefault(heard & ~TRANSMITTED, {})
         origin, last = self._origin_ns, self._last_ns
         back, ahead = -BACK_NS, AHEAD_NS
         count = 0
-        for time_ns, identifier, data, _channel in frames:
+        for time_ns, identifier, data, channel in frames:
             count += 1
             step = time_ns - last
             if step < 0 or step > ahead:
@@ -104,14 +117,16 @@ class Codec:
                     origin, last = self._origin_ns, self._last_ns
             else:
                 last = time_ns
+            if channel != heard:
+                heard, handlers = channel, self._handlers.setdefault(channel & ~TRANSMITTED, {})
             try:
                 handler = handlers[identifier]
             except KeyError:
-                handler = self._unknown(identifier)
+                handler = self._first_heard(channel & ~TRANSMITTED, identifier)
             if handler((time_ns - origin) * 1e-9, data):  # type: ignore[operator]
                 continue
             latest[identifier] = (time_ns, data)
-        self._last_ns = last
+        self._last_ns, self._channel = last, heard
         self.received += count
         events = self._events[:]
         self._events.clear()
@@ -177,18 +192,74 @@ class Codec:
         self._last_ns = time_ns
         return True
 
-    def _unknown(self, identifier: int) -> Handler:
-        """The handler of an identifier that is not in the database as such; kept for the next frame of it."""
-        known = self._by_pgn.get(pgn(identifier)) if identifier & EFF_FLAG and not identifier & RTR_FLAG else None
-        handler: Handler = known or self._count_unknown(identifier)
+    def _first_heard(self, channel: int, identifier: int) -> Handler:
+        """The handler of frames with this identifier on this channel; kept for the next of them while there is room."""
+        message = None if identifier & (ERR_FLAG | RTR_FLAG) else self.origins.message(identifier)
+        handler: Handler
         if identifier & ERR_FLAG:
-            known, handler = None, self._count_error
-        if len(self._handlers) < _MOST_IDENTIFIERS:
-            self._handlers[identifier] = handler
-            return handler
-        if known:
-            return lambda time, data: known(time, data) or True  # used, but not kept as the latest of its identifier
-        return handler if identifier & ERR_FLAG else self._count_others
+            handler = self._count_error
+        elif identifier in self._answers:
+            first = self._answering.setdefault(identifier, channel) == channel
+            handler = self._answers[identifier] if first else self._count_copy
+        elif message is None:
+            handler = self._count_unknown(identifier) if self._room else self._count_others
+        elif self.origins.claim(message, channel, identifier):
+            handler = self._own(message, channel, identifier)
+        else:
+            handler = self._elsewhere(message, channel, identifier)
+        if self._room or (message and identifier == identifier_of(message)):
+            self._room = max(self._room - 1, 0)
+            self._handlers[channel][identifier] = handler
+        elif message:  # used, but not kept as the latest of its identifier
+            return lambda time, data: handler(time, data) or True
+        return handler
+
+    def _own(self, message: Message, channel: int, identifier: int) -> Handler:
+        """The handler where `message` is taken from. It may replace another place, which is then looked at anew."""
+        for heard, handlers in self._handlers.items():
+            for other in [i for i in handlers if self._is(message, i) and not self.origins.claim(message, heard, i)]:
+                del handlers[other]
+                self._room += 1
+        decode, recent = self._decoders[message.name], self.origins.recent.get(message.name)
+        if recent is None:
+            return decode
+
+        def handler(time: float, data: bytes) -> bool | None:
+            recent.append(data)
+            return decode(time, data)
+
+        return handler
+
+    def _is(self, message: Message, identifier: int) -> bool:
+        return not identifier & (ERR_FLAG | RTR_FLAG) and self.origins.message(identifier) is message
+
+    def _elsewhere(self, message: Message, channel: int, identifier: int) -> Handler:
+        """The handler of frames that are not from where `message` is taken: left out, or a contradiction."""
+        name, origins = message.name, self.origins
+        if name not in self._mapped:
+            return self._count_copy
+        recent = origins.recent.setdefault(name, deque(maxlen=RECENT))
+        for heard, handlers in self._handlers.items():  # from now on its own frames are kept, to be compared
+            for own in [i for i in handlers if self._is(message, i) and origins.claim(message, heard, i)]:
+                handlers[own] = self._own(message, heard, own)
+                recent += [data for _, data in [self.latest.get(own, (0, b""))]]
+
+        def contradicted(_time: float, _data: bytes) -> bool:
+            self._fault(name, CONFLICT)
+            return True
+
+        def handler(time: float, data: bytes) -> bool:
+            if origins.differs(message, channel, identifier, data):
+                for handlers in self._handlers.values():
+                    handlers.update({i: contradicted for i in handlers if self._is(message, i)})
+                return contradicted(time, data)
+            return self._count_copy(time, data)
+
+        return handler
+
+    def _count_copy(self, _time: float, _data: bytes) -> bool:
+        self.copies += 1
+        return True
 
     def _count_error(self, _time: float, _data: bytes) -> bool:
         self.error_frames += 1
@@ -229,38 +300,19 @@ class Codec:
         return message.name if message else None
 
     def _message(self, identifier: int) -> Message | None:
-        if identifier < 0:
-            return self.mapping.requests[-identifier - 1].message
-        for message in self.mapping.database.messages:
-            if self.mapping.j1939 and message.is_extended_frame:
-                if identifier & EFF_FLAG and pgn(message.frame_id) == pgn(identifier):
-                    return message
-            elif identifier_of(message) == identifier:
-                return message
-        return None
+        return self.mapping.requests[-identifier - 1].message if identifier < 0 else self.origins.message(identifier)
 
     # --- compiling ----------------------------------------------------------------------------------------------
 
-    def _listen_for_answers(self, by_message: dict[str, list[Source]]) -> None:
-        """Take the frames of requests and answers: the latter's data as those of the messages that they become."""
+    def _answer_handlers(self, by_message: dict[str, list[Source]]) -> dict[int, Handler]:
+        """The handlers of the frames of requests and answers."""
         requests = self.mapping.requests
+        asked = {*FUNCTIONAL, *(request.request for request in requests)} if requests else ()
+        handlers: dict[int, Handler] = dict.fromkeys(asked, lambda _time, _data: True)
         for response, those in by_response(requests).items():
             takers = [self._answer(-1 - requests.index(one), by_message.get(one.name, [])) for one in those]
-            self._handlers[response] = Answers(those, takers, self._fault).take
-        for identifier in {*FUNCTIONAL, *(request.request for request in requests)} if requests else ():
-            self._handlers.setdefault(identifier, lambda _time, _data: True)
-
-    def _of_one_channel(self, frames: Iterable[Frame]) -> Iterator[Frame]:
-        """Without the answers that come a second time, by way of a gateway, on another channel than the first one."""
-        answering = self._answering
-        for frame in frames:
-            if frame[1] in answering:
-                channel = frame[3] & ~TRANSMITTED
-                if answering[frame[1]] is None:
-                    answering[frame[1]] = channel
-                elif answering[frame[1]] != channel:
-                    continue
-            yield frame
+            handlers[response] = Answers(those, takers, self._fault).take
+        return handlers
 
     def _answer(self, key: int, sources: list[Source]) -> Handler:
         """What takes the data of the answer whose `latest` is that of `key`."""

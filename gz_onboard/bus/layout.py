@@ -33,13 +33,38 @@ def identifiers_of(mapping: BusMapping, messages: Collection[str]) -> list[int] 
 
 
 def raw_values(message: Message, data: bytes) -> dict[str, float] | None:
-    """The raw value of each signal in `data`, by cantools; None if the data do not fit the message."""
+    """The raw value of each signal in `data`, by cantools; None if the data do not fit the message.
+
+    On a multiplexer page that the DBC file does not list, the signals of every page are still there.
+    """
     if len(data) != message.length:
         return None
     try:
         return cast("dict[str, float]", message.decode_simple(data, decode_choices=False, scaling=False))
     except Exception:  # cantools raises several types of its own on data that does not fit
-        return None
+        return _on_every_page(message, data) if message.is_multiplexed() else None
+
+
+def _on_every_page(message: Message, data: bytes) -> dict[str, float] | None:
+    """The raw values of the signals whose multiplexers, if they have any, are on their page."""
+    values: dict[str, float] = {}
+    for signal in sorted(message.signals, key=lambda signal: signal.multiplexer_ids is not None):
+        pages = signal.multiplexer_ids
+        if pages is None or values.get(signal.multiplexer_signal or "") in pages:
+            values[signal.name] = _raw(signal, data)
+    return values
+
+
+def _raw(signal: Signal, data: bytes) -> float:
+    """The raw value of one signal."""
+    little = signal.byte_order == "little_endian"
+    whole = int.from_bytes(data, "little" if little else "big")
+    first = first_bit(signal)
+    raw = whole >> (first if little else 8 * len(data) - first - signal.length) & (1 << signal.length) - 1
+    if signal.conversion.is_float:
+        code = {16: "<e", 32: "<f", 64: "<d"}[signal.length]
+        return float(struct.unpack(code, raw.to_bytes(signal.length // 8, "little"))[0])
+    return raw - (1 << signal.length) if signal.is_signed and raw >> (signal.length - 1) else raw
 
 
 def raw_range(signal: Signal, not_available: bool) -> tuple[float, float]:

@@ -4,12 +4,15 @@ dbc = ["vehicle.dbc", "hbm.dbc"]
 
 [bus]
 not_available = "all-ones"        # or "none"
+channel = 0                       # of all messages; a log counts from 0, the daemon in the order of --channel
 identifiers = "exact"             # or "j1939": 29-bit identifiers are matched by their PGN
 
 [bus.messages.INV_Motion]         # only what the DBC does not say
 crc = "INV_MotionCRC"             # CRC-8 SAE J1850 over the bytes before it
 counter = "INV_MotionCounter"
 period = 0.01                     # s, where the DBC has no GenMsgCycleTime
+channel = 1                       # where other messages have this identifier on another channel
+sender = 0xF2                     # address of a J1939 sender, where several send this parameter group
 
 [roles]
 pack_voltage = "BMS_PackVoltage"
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
 
 MOST_FILES = 20
 LONGEST_DELAY = 10.0  # s, of a message
+MOST_CHANNELS = 127
 
 
 @dataclass(frozen=True)
@@ -73,6 +77,7 @@ class BusMapping:
     periods: dict[str, float]  # s, by message; only where known
     not_available: bool = True
     j1939: bool = False
+    origins: dict[str, tuple[int | None, int | None]] = field(default_factory=dict)  # channel and sender, by message
     delays: dict[str, float] = field(default_factory=dict)  # s, by message: its values are so much older; where stated
     instruments: tuple[Source, ...] = ()  # of roles that no estimator needs
     columns: Table | None = None  # the roles of a vehicle without DBC files: their signals are columns of a table
@@ -102,11 +107,12 @@ def read_mapping(vehicle: Table) -> BusMapping:
     requests = read_requests(vehicle, flagged)
 
     bus = vehicle.table("bus")
-    bus.only(["not_available", "identifiers", "messages"])
+    bus.only(["not_available", "identifiers", "channel", "messages"])
     protection, periods, delays = _options(database, bus.table("messages"))
     j1939 = bus.text("identifiers", "exact", ["exact", "j1939"]) == "j1939"
     if j1939:
         _check_groups(database, bus)
+    origins = _origins(database, bus, j1939)
     named = _with_answers(database, requests, vehicle)
     sources = _sources(named, left_out, vehicle.table("roles"), ROLES)
     _check_witnesses(sources, vehicle.table("roles"))
@@ -119,6 +125,7 @@ def read_mapping(vehicle: Table) -> BusMapping:
         periods=periods | {request.name: request.period for request in requests},
         not_available=bus.text("not_available", "all-ones", ["all-ones", "none"]) == "all-ones",
         j1939=j1939,
+        origins=origins,
         delays=delays,
         requests=requests,
     )
@@ -132,7 +139,7 @@ def _options(database: Database, messages: Table) -> tuple[dict[str, Protection]
     for name in messages.values:
         message = _message(database, messages, name, name)
         options = messages.table(name)
-        options.only(["crc", "counter", "period", "delay"])
+        options.only(["crc", "counter", "period", "delay", "channel", "sender"])
         for key in ("crc", "counter"):
             if key in options.values:
                 _signal(message, options, key, options.text(key))
@@ -150,6 +157,24 @@ def _options(database: Database, messages: Table) -> tuple[dict[str, Protection]
         if "delay" in options.values:
             delays[name] = options.number("delay", low=-LONGEST_DELAY, high=LONGEST_DELAY)
     return protection, periods, delays
+
+
+def _origins(database: Database, bus: Table, j1939: bool) -> dict[str, tuple[int | None, int | None]]:
+    """(channel, sender) of each message for which the vehicle file says one."""
+    common = bus.integer("channel", 0, MOST_CHANNELS) if "channel" in bus.values else None
+    found: dict[str, tuple[int | None, int | None]] = {}
+    if common is not None:
+        found = {message.name: (common, None) for message in database.messages}
+    messages = bus.table("messages")
+    for name in messages.values:
+        options = messages.table(name)
+        channel = options.integer("channel", 0, MOST_CHANNELS) if "channel" in options.values else common
+        sender = options.integer("sender", 0, 255) if "sender" in options.values else None
+        if sender is not None and not (j1939 and database.get_message_by_name(name).is_extended_frame):
+            raise options.error('is an address of J1939, which needs identifiers = "j1939" and 29 bits', "sender")
+        if (channel, sender) != (None, None):
+            found[name] = channel, sender
+    return found
 
 
 def _with_answers(database: Database, requests: tuple[Request, ...], vehicle: Table) -> Database:

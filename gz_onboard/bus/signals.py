@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from gz_onboard.bus.answers import NEGATIVE, Answers, Take, by_response
-from gz_onboard.bus.layout import identifier_of, raw_range, raw_values
-from gz_onboard.bus.requests import Request
-from gz_onboard.events import Frame
+from gz_onboard.bus.layout import raw_range, raw_values
+from gz_onboard.bus.mapping import BusMapping
+from gz_onboard.bus.origins import Origins
+from gz_onboard.events import TRANSMITTED, Frame
 
 if TYPE_CHECKING:
-    from cantools.database.can import Database, Message
+    from cantools.database.can import Message
     from cantools.database.can.signal import Signal
 
 Values = dict[str, "float | int | None"]
@@ -41,40 +42,54 @@ class MessageSignals:
 
 
 class Decoder:
-    """All signals of frames by a cantools database; what cannot be decoded is counted, never guessed.
+    """All signals of the frames of one bus, and of answers; what cannot be decoded is counted, never guessed."""
 
-    requests: whose answers are decoded, too, as messages of their own.
-    """
-
-    def __init__(self, database: Database, requests: Sequence[Request] = ()) -> None:
-        self.unknown = 0
-        self.undecodable = 0
-        self.messages: dict[int, Message] = {identifier_of(message): message for message in database.messages}
-        self._signals = {name: MessageSignals(message) for name, message in self.messages.items()}
-        self.all_messages: list[Message] = [*database.messages, *(request.message for request in requests)]
+    def __init__(self, mapping: BusMapping) -> None:
+        self.unknown = self.undecodable = self.copies = 0
+        self.origins = Origins(mapping)
+        self.all_messages: list[Message] = [
+            *mapping.database.messages,
+            *(request.message for request in mapping.requests),
+        ]
         self.columns = {m.name: {column_name(s): s.unit or "" for s in m.signals} for m in self.all_messages}
+        self._signals = {m.name: MessageSignals(m, mapping.not_available) for m in mapping.database.messages}
+        self._own: set[tuple[int, int]] = set()  # channel and identifier of what is taken
         self._whole: list[tuple[str, Values]] = []  # answers, of the frame that completed them
         self._answers = {
             response: Answers(those, [self._taker(request.message) for request in those], self._dropped)
-            for response, those in by_response(requests).items()
+            for response, those in by_response(mapping.requests).items()
         }
-        self._asked = {request.request for request in requests}
+        self._asked = {request.request for request in mapping.requests}
 
     def decode(self, batches: Iterable[list[Frame]]) -> Iterator[Decoded]:
-        """One item for each frame that the database knows, and for each answer."""
+        """One item for each frame that the bus knows, and for each answer."""
         for batch in batches:
-            for time_ns, identifier, data, _ in batch:
-                message = self.messages.get(identifier)
+            for time_ns, identifier, data, channel in batch:
+                message = self.origins.message(identifier)
                 if answers := self._answers.get(identifier):
                     answers.take(time_ns * 1e-9, data)
                     yield from ((time_ns, name, values) for name, values in self._whole)
                     self._whole.clear()
                 elif message is None:
                     self.unknown += identifier not in self._asked
-                elif (values := self._signals[identifier].values(data)) is None:
+                elif not self._takes(message, channel & ~TRANSMITTED, identifier, data):
+                    self.copies += 1
+                elif (values := self._signals[message.name].values(data)) is None:
                     self.undecodable += 1
                 else:
                     yield time_ns, message.name, self._row(message, values)
+
+    def _takes(self, message: Message, channel: int, identifier: int, data: bytes) -> bool:
+        place, origins = (channel, identifier), self.origins
+        if place not in self._own:
+            self._own.clear()  # another may have had the message
+            if not origins.claim(message, channel, identifier):
+                origins.differs(message, channel, identifier, data)
+                return False
+            self._own.add(place)
+        if recent := origins.recent.get(message.name):
+            recent.append(data)
+        return True
 
     def _row(self, message: Message, values: Values) -> Values:
         pairs = zip(self.columns[message.name], message.signals, strict=True)

@@ -184,4 +184,6 @@ def _signals(arguments: argparse.Namespace, source: Source, part: Path, kind: st
         if found.decoder is None:
             return f"{count} rows of signals, as they were logged once a second"
         text, decoder = f"{count} frames", found.decoder
-    return f"{text}; {decoder.unknown} frames are in no DBC file, {decoder.undecodable} do not fit theirs"
+    counts = f"{decoder.unknown} frames are in no DBC file, {decoder.undecodable} do not fit theirs"
+    doubts = [f"only the first is written: {conflict}" for conflict in decoder.origins.conflicts.values()]
+    return "; ".join([text, counts, *doubts])

@@ -6,12 +6,13 @@ import json
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gz_onboard.bus import logs, tables
+from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.bus.replay import log_section
 from gz_onboard.bus.signals import Decoded, Decoder, Values
 from gz_onboard.errors import InputError, nearest
@@ -21,7 +22,6 @@ from gz_onboard.offline.table import Columns, array_of
 from gz_onboard.vehicle import OWN, Vehicle, read_vehicle
 
 if TYPE_CHECKING:
-    from cantools.database.can import Database
     from numpy.typing import NDArray
 
 ESTIMATES = {"estimate": ESTIMATE_TOPIC, "why": WHY_TOPIC, "range_change": CHANGE_TOPIC}
@@ -246,35 +246,34 @@ def decoder_of(log: Path, files: list[Path] | None, vehicle: Vehicle | None) -> 
     """What decodes the frames of `log`: DBC files; else those of a vehicle; else those attached to the log; else those
     of the vehicle that the log names, if it is one of the package's own. `DecoderError` if none is known.
     """
-    requests = vehicle.mapping.requests if vehicle else ()
-    return Decoder(_database(log, files, vehicle), requests)
+    return Decoder(_mapping(log, files, vehicle))
 
 
-def _database(log: Path, files: list[Path] | None, vehicle: Vehicle | None) -> Database:
+def _mapping(log: Path, files: list[Path] | None, vehicle: Vehicle | None) -> BusMapping:
     from gz_onboard.bus.dbc import database_of, load_database
 
     if files:
-        return load_database(files, {})
+        return BusMapping(load_database(files, {}), tuple(files), (), {}, {})
     if vehicle:
-        return _database_of(vehicle)
+        return _mapping_of(vehicle)
     attached = {name: data for name, data in logs.read_attachments(log).items() if name.lower().endswith(".dbc")}
     named = logs.read_metadata(log).get("vehicle", "")
     for own in () if attached else sorted(file.stem for file in OWN.glob("*.toml")):
         if named in (own, read_vehicle(own).name):
-            return _database_of(read_vehicle(own))
+            return _mapping_of(read_vehicle(own))
     if not attached:
         raise DecoderError(f"{log}: no DBC file is attached to this log; give a vehicle or DBC files")
     texts = [(Path(f"{log}, attached {name}"), data.decode("utf-8", "replace")) for name, data in attached.items()]
     try:
-        return database_of(texts, {})
+        return BusMapping(database_of(texts, {}), (), (), {}, {})
     except InputError as error:
         raise DecoderError(f"{error}; give a vehicle or DBC files") from error
 
 
-def _database_of(vehicle: Vehicle) -> Database:
-    """Of the vehicle's bus, its own range frames beside."""
+def _mapping_of(vehicle: Vehicle) -> BusMapping:
+    """The vehicle's bus with its own range frames."""
     from gz_onboard.bus.dbc import load_database
 
     if not vehicle.mapping.reads_frames:
         raise vehicle.error("dbc is missing: without it no frame can be decoded")
-    return load_database([*vehicle.mapping.dbc_files, vehicle.range_dbc], {})
+    return replace(vehicle.mapping, database=load_database([*vehicle.mapping.dbc_files, vehicle.range_dbc], {}))

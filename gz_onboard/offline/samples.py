@@ -16,7 +16,7 @@ from gz_onboard.bus.logs import LogDamage, is_table, log_stem, read_frames
 from gz_onboard.bus.mapping import BusMapping
 from gz_onboard.bus.stamps import without_lone
 from gz_onboard.errors import InputError, brief, nearest, shown
-from gz_onboard.events import INSTRUMENTS, ROLES, Event, Frame
+from gz_onboard.events import EFF_FLAG, INSTRUMENTS, ROLES, Event, Frame, hexadecimal
 from gz_onboard.offline.arguments import check, within
 from gz_onboard.offline.signal_table import SignalTable, read_table, signal_frames
 from gz_onboard.options import MOST_PAYLOAD
@@ -138,6 +138,8 @@ def check_ridden(log: Path, vehicle: Vehicle, codec: Codec) -> None:
     """InputError if none of the frames in a log is the vehicle's, or their times make no ride; codec: has seen all."""
     if not codec.latest:
         raise _of_another(log, vehicle, codec)
+    for conflict in codec.origins.conflicts.values():
+        raise vehicle.error(f"{log}: {conflict}")
     if codec.received > 1 and not codec.passed and not codec.leaps and not codec.faults.get(("", TIME)):
         raise InputError(f"{log}: all its {codec.received} frames have one and the same time; that is not a ride")
     back = sum(leap < 0 for _, leap in codec.leaps)
@@ -152,12 +154,19 @@ def check_ridden(log: Path, vehicle: Vehicle, codec: Codec) -> None:
 
 def _of_another(log: Path, vehicle: Vehicle, codec: Codec) -> InputError:
     """That none of the frames in a log is the vehicle's; codec: that has seen them."""
-    names = ", ".join(f"{identifier & 0x1FFFFFFF:X}" for identifier in sorted(codec.unknown)[:5])
-    return InputError(
+    names = ", ".join(hexadecimal(identifier) for identifier in sorted(codec.unknown)[:5])
+    said = (
         f"{log}: vehicle {vehicle.name!r} knows none of its {codec.received} frames"
-        f"{f' (identifiers {names}, ...)' if names else ''}; give the vehicle that it is of, "
-        "or begin a file for it: gz-onboard vehicle new my.toml"
+        f"{f' (identifiers {names}, ...)' if names else ''}; "
     )
+    for identifier in codec.unknown:
+        if codec.origins.message(other := identifier ^ EFF_FLAG):
+            bits, others = (29, 11) if identifier & EFF_FLAG else (11, 29)
+            return InputError(
+                f"{said}{hexadecimal(identifier)} has {bits} bits, the vehicle's {hexadecimal(other)} has {others}: "
+                "candump writes 11 bits with three digits and 29 bits with eight"
+            )
+    return InputError(f"{said}give the vehicle that it is of, or begin a file for it: gz-onboard vehicle new my.toml")
 
 
 def read_facts(file: Path) -> dict[str, dict[str, object]]:

@@ -186,4 +186,4 @@ def test_fuzzed_frames_give_the_right_number_or_none(frames):
     if all(data in genuine or data[:1] == b"\x30" for _, data in frames):
         assert all(event[2] == VALUES for event in events)
     assert codec.received == len(sent)
-    assert list(Decoder(kona().mapping.database, kona().mapping.requests).decode([sent])) is not None
+    assert list(Decoder(kona().mapping).decode([sent])) is not None

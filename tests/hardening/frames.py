@@ -200,14 +200,14 @@ class Watch:
                 second.decode((frame,))
                 self.used += latest.get(frame[1]) is not before
         counted = sum(n for (_, reason), n in codec.faults.items() if reason in DROPPING)
-        counted += sum(codec.unknown.values()) + codec.unknown_others + codec.error_frames
+        counted += sum(codec.unknown.values()) + codec.unknown_others + codec.error_frames + codec.copies
         assert codec.received == self.used + counted, f"{codec.received} frames, {self.used} used, {counted} counted"
-        for what in ("faults", "lost", "unknown", "unknown_others", "error_frames", "received"):
+        for what in ("faults", "lost", "unknown", "unknown_others", "error_frames", "copies", "received"):
             assert getattr(codec, what) == getattr(second, what), f"{what}: not the same in other portions"
         assert run.pipeline.counts().dropped == sum(n for (_, r), n in codec.faults.items() if r in DROPPING)
         messages = len(codec.mapping.database.messages)
         assert len(codec.unknown) <= KEPT
-        assert len(codec._handlers) <= KEPT + messages
+        assert sum(map(len, codec._handlers.values())) <= KEPT + messages
         assert len(codec.latest) <= messages
         self._time = times[-1]
         self.told["estimates"] += len(run.estimates)

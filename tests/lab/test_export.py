@@ -165,7 +165,7 @@ def test_what_is_beyond_the_range_of_the_dbc_is_null_as_on_board(tmp_path: Path)
     raw = message.encode(
         {s.name: 120.0 if s.name == "BMS_StateOfCharge" else 0.0 for s in message.signals}, strict=False
     )
-    decoder = Decoder(codec.mapping.database)
+    decoder = Decoder(codec.mapping)
     ((_, name, values),) = decoder.decode([[(START, message.frame_id, raw, 0)]])
     on_board = codec.values(message.frame_id, raw)
     assert name == "BMS_Pack"
