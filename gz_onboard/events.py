@@ -21,6 +21,7 @@ EFF_FLAG = 0x8000_0000
 RTR_FLAG = 0x4000_0000
 ERR_FLAG = 0x2000_0000
 TRANSMITTED = 0x80
+MOST_STANDARD, MOST_EXTENDED = 0x7FF, 0x1FFF_FFFF  # identifiers of 11 and of 29 bits
 
 
 def hexadecimal(identifier: int) -> str:

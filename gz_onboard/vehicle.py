@@ -9,8 +9,9 @@ from pathlib import Path
 
 from gz_onboard.bus.dbc import find_dbc
 from gz_onboard.bus.mapping import BusMapping, read_mapping
-from gz_onboard.bus.publisher import GROUP_STEP, MESSAGES, MOST_EXTENDED, MOST_STANDARD, RANGE_DBC, Publisher
+from gz_onboard.bus.publisher import GROUP_STEP, MESSAGES, RANGE_DBC, Publisher
 from gz_onboard.errors import InputError, brief, nearest, shown
+from gz_onboard.events import MOST_EXTENDED, MOST_STANDARD
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.battery_file import read_battery
 from gz_onboard.physics.derating import Derating, read_derating

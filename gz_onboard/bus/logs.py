@@ -23,9 +23,9 @@ from pathlib import Path
 from typing import Any
 
 from gz_onboard.bus.readers import blf, candump, lines, mcap, pycan
-from gz_onboard.bus.readers.common import TIME_LIMIT_NS, Contents, Damage, Reader, unpacked
+from gz_onboard.bus.readers.common import FD_LENGTHS, TIME_LIMIT_NS, Contents, Damage, Reader, unpacked
 from gz_onboard.errors import CLOSE_FILE, InputError, nearest, shown, unreadable
-from gz_onboard.events import Frame
+from gz_onboard.events import EFF_FLAG, ERR_FLAG, MOST_EXTENDED, MOST_STANDARD, Frame
 
 _LOG = logging.getLogger(__name__)
 
@@ -49,6 +49,17 @@ _READERS: dict[str, Reader] = {
     _TABLE: _refuse_table,
 }
 _MAGIC = {b"LOGG": ".blf", mcap.MAGIC: ".mcap", b"MDF ": ".mf4", b"PAR1": _TABLE}
+_OTHERS = {
+    rb"\xd4\xc3\xb2\xa1|\xa1\xb2\xc3\xd4|\x4d\x3c\xb2\xa1|\xa1\xb2\x3c\x4d|\n\r\r\n": (
+        "Wireshark's captures are not read; record with candump -L"
+    ),
+    rb"SQLite format 3\0": "SQLite databases are not read; python-can's can_logconvert makes a .blf of its own",
+    rb"Generic File\0": "CANedge's packed logs are not read; CSS Electronics' mdf2finalized makes an .mf4 of one",
+    rb"\*\*\*BUSMASTER": "BUSMASTER's logs are not read; it converts them to .asc",
+    rb"time,addr,bus,data": "cabana's logs are not read; save it as SavvyCAN's CSV",
+    rb"(?:#[^\n]*\n)*Timestamp;Type;": "logs of the CL2000 and CLX000 are not read; their converter makes a .trc",
+}
+"""Logs of other tools, by what they begin with, and what to do with them."""
 _FIRST_LINES = {
     _SAVVYCAN: lines.SAVVYCAN_HEADER,
     ".csv": re.compile(r"timestamp,arbitration_id,"),
@@ -59,9 +70,9 @@ _FIRST_LINES = {
     ".trc": re.compile(r";\$(FILEVERSION|STARTTIME|COLUMNS)\b"),
     ".crtd": lines.CRTD_LINE,
     ".log": re.compile(rf"(?:{candump.SCREEN_LINE.pattern})\s*$|\([\d.]+\)\s+\S+\s+[0-9A-Fa-f]+#"),
-    _TABLE: re.compile(r"\s*\"?(time|timestamp|t)(\b|_m?s\b)[^,;]*[,;]", re.I),
 }
 """What a line of a text log looks like, by format: of its header or its frames."""
+_TABLE_HEADER = re.compile(r"(?:.*[,;])?\s*\"?(?:time|timestamp|t)(?:\b|_m?s\b)[^,;]*[,;]", re.I)
 ESTIMATED = ".estimate.mcap"
 """The end of the name of what ``gz-onboard estimate`` writes."""
 _HEAD = 8192  # bytes within which a text log shows what it is
@@ -109,6 +120,9 @@ def log_suffix(path: Path) -> str:
     if suffixes[-1:] == [".gz"]:
         suffixes.pop()
     suffix = suffixes[-1] if suffixes else ""
+    foreign = next((said for start, said in _OTHERS.items() if re.match(start, head)), None)
+    if foreign:
+        raise InputError(f"{path}: is not a log that can be read: {foreign}")
     if suffix not in _READERS:
         if path.is_dir():
             raise InputError(f"{path}: is a folder; give the log in it")
@@ -122,9 +136,12 @@ def log_suffix(path: Path) -> str:
     return suffix
 
 
-def is_table(path: Path) -> bool:
-    """Whether a file is a table of signals instead of a log of frames, by its content."""
-    return _by_content(_head(path)) == _TABLE
+def is_table(path: Path, time: str = "") -> bool:
+    """Whether a file is a table of signals instead of a log of frames, by its content.
+
+    time: the name of the column of times, if the vehicle file says it.
+    """
+    return _by_content(_head(path), time) == _TABLE
 
 
 def _head(path: Path) -> bytes:
@@ -138,14 +155,18 @@ def _head(path: Path) -> bytes:
     return head
 
 
-def _by_content(head: bytes) -> str | None:
+def _by_content(head: bytes, time: str = "") -> str | None:
     """The format of a file that begins with `head`; None if that is of none."""
     if found := next((form for magic, form in _MAGIC.items() if head.startswith(magic)), None):
         return found
-    for line in str(head, "latin-1").removeprefix("\xef\xbb\xbf").splitlines():
+    if b"\0" in head or any(re.match(start, head) for start in _OTHERS):
+        return None
+    lines = str(head, "latin-1").removeprefix("\xef\xbb\xbf").split("\n")
+    for line in lines:
         if found := next((form for form, first in _FIRST_LINES.items() if first.match(line.strip())), None):
             return found
-    return None
+    named = time and time in re.split(r"\s*[,;]\s*", lines[0].replace('"', "").strip())
+    return _TABLE if named or _TABLE_HEADER.match(lines[0]) else None
 
 
 def logs_among(paths: Iterable[Path], *, estimates: bool | None = False) -> list[Path]:
@@ -266,10 +287,13 @@ def _filtered(
     latest = end_ns if end_ns is not None else TIME_LIMIT_NS
     for batch in reader(path, unpacked(path, data, damage), damage, start_ns, end_ns):
         frames = batch
-        if batch and (min(batch)[0] < 0 or max(batch)[0] >= TIME_LIMIT_NS):
-            frames = [frame for frame in batch if 0 <= frame[0] < TIME_LIMIT_NS]
-            wrong = next(frame[0] for frame in batch if not 0 <= frame[0] < TIME_LIMIT_NS)
-            damage.add("a frame", f"{wrong} ns is no time", len(batch) - len(frames))
+        if batch and not _plausible(batch):
+            frames = []
+            for frame in batch:
+                if problem := _problem(frame):
+                    damage.add("a frame", problem)
+                else:
+                    frames.append(frame)
         if start_ns is not None or end_ns is not None:
             frames = [frame for frame in frames if earliest <= frame[0] < latest]
         if frames:
@@ -278,3 +302,27 @@ def _filtered(
         _LOG.warning("%s: %s", path, note)
     if damage.count:
         on_damage(LogDamage(path, damage.count, damage.place, damage.reason))
+
+
+def _plausible(batch: list[Frame]) -> bool:
+    """Whether `_problem` finds none in the frames, many times as fast."""
+    times, identifiers, data, _ = zip(*batch, strict=True)
+    standard = (identifier for identifier in set(identifiers) if not identifier & (EFF_FLAG | ERR_FLAG))
+    return (
+        min(times) >= 0
+        and max(times) < TIME_LIMIT_NS
+        and set(map(len, data)) <= FD_LENGTHS
+        and all(identifier & MOST_EXTENDED <= MOST_STANDARD for identifier in standard)
+    )
+
+
+def _problem(frame: Frame) -> str:
+    """What is wrong with a frame that no bus carries; empty if nothing is."""
+    time_ns, identifier, data, _ = frame
+    if not 0 <= time_ns < TIME_LIMIT_NS:
+        return f"{time_ns} ns is no time"
+    if len(data) not in FD_LENGTHS:
+        return f"no frame has {len(data)} bytes"
+    if not identifier & (EFF_FLAG | ERR_FLAG) and identifier & MOST_EXTENDED > MOST_STANDARD:
+        return f"identifier {identifier & MOST_EXTENDED:X} has more than 11 bits"
+    return ""

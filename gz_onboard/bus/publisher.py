@@ -18,7 +18,18 @@ from gz_onboard.bus.dbc import find_dbc, load_database
 from gz_onboard.bus.layout import first_bit, identifier_of, raw_range
 from gz_onboard.constants import MINUTE, WH, WH_PER_KM
 from gz_onboard.errors import InputError, nearest
-from gz_onboard.events import EFF_FLAG, ROLES, TRANSMITTED, Cause, Estimate, Explanation, Frame, Reason, State
+from gz_onboard.events import (
+    EFF_FLAG,
+    MOST_STANDARD,
+    ROLES,
+    TRANSMITTED,
+    Cause,
+    Estimate,
+    Explanation,
+    Frame,
+    Reason,
+    State,
+)
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -27,7 +38,6 @@ if TYPE_CHECKING:
 RANGE_DBC = "range.dbc"
 MESSAGES = 8  # in it
 LENGTH = 8  # bytes of each
-MOST_STANDARD, MOST_EXTENDED = 0x7FF, 0x1FFF_FFFF  # identifiers of 11 and of 29 bits
 GROUP_STEP = 0x100  # from one parameter group of J1939 to the next
 _NUMBERED = re.compile(rb"\b(BO_|SG_|VAL_|BO_TX_BU_|SIG_GROUP_|SIG_VALTYPE_) (\d+)\b")  # statements on a message
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 
 from gz_onboard.bus.dbc import FARTHEST, LARGEST, SMALLEST
 from gz_onboard.errors import shown
-from gz_onboard.events import EFF_FLAG
+from gz_onboard.events import EFF_FLAG, MOST_EXTENDED, MOST_STANDARD
 
 if TYPE_CHECKING:
     from cantools.database.can import Message
@@ -34,7 +34,6 @@ IDENTIFIER_BYTES = {0x01: 1, 0x21: 1, 0x22: 2}
 """Length of the data identifier by service: SAE J1979, readDataByLocalIdentifier (ISO 14230), ReadDataByIdentifier."""
 POSITIVE = 0x40  # is added to the service in its answer
 FUNCTIONAL = (0x7DF, 0x18DB_33F1 | EFF_FLAG)  # all ECUs together are asked there (ISO 15765-4)
-MOST_STANDARD, MOST_EXTENDED = 0x7FF, 0x1FFF_FFFF
 MOST_REQUESTS = 100
 LONGEST_ANSWER = 4092  # bytes behind a data identifier: ISO-TP has at most 4095
 PERIODS = 0.1, 3600.0  # s

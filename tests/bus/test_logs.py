@@ -400,6 +400,43 @@ def test_a_file_of_another_format_is_refused(tmp_path: Path, name: str, content:
     assert name in str(error.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("a.pcap", b"\xd4\xc3\xb2\xa1\x02\x00\x04\x00" + bytes(60), "Wireshark.*candump -L"),
+        ("a.pcapng", b"\n\r\r\n" + bytes(60), "Wireshark"),
+        ("a.csv", b"time,addr,bus,data\n0.000,0x1d2,0,0x01\n", "cabana"),
+        ("a.txt", b"# Logger type: CL2000\n# HW rev: 7.xx\nTimestamp;Type;ID;Data\n0.000;0;1d2;01\n", "CL2000"),
+        ("a.log", b"***BUSMASTER Ver 3.2.2***\n***PROTOCOL CAN***\n", "BUSMASTER"),
+        ("a.mfc", b"Generic File\0\0\xc1\xdb\nt,\n" * 9, "CANedge.*mdf2finalized"),
+        ("a.bin", b"\x01\x02\0t,\x85t,\nt,1\n" * 9, "ends in '.bin'"),
+    ],
+)
+def test_a_log_of_another_tool_is_refused_by_its_name(tmp_path: Path, name: str, content: bytes, said: str) -> None:
+    path = tmp_path / name
+    path.write_bytes(content)
+    assert not logs.is_table(path)
+    with pytest.raises(InputError, match=f"{name}: is not a log that can be read: .*{said}"):
+        read_frames(path)
+
+
+def test_a_database_of_python_can_is_refused_with_what_converts_it(tmp_path: Path) -> None:
+    path = tmp_path / "a.db"
+    with can.SqliteWriter(path) as writer:
+        writer(can.Message(timestamp=START_S, arbitration_id=1, data=[1]))
+    with pytest.raises(InputError, match="can_logconvert"):
+        read_frames(path)
+
+
+def test_frames_that_no_bus_carries_are_dropped_and_counted(tmp_path: Path) -> None:
+    path = tmp_path / "a.blf"
+    with path.open("wb") as stream:
+        write_blf(stream, [[(START_S * 10**9 + i, identifier, b"1", 0) for i, identifier in enumerate((0x7FF, 0x800))]])
+    there, damages = read(path)
+    assert [frame[1] for frame in there] == [0x7FF]
+    assert [(damage.count, damage.reason) for damage in damages] == [(1, "identifier 800 has more than 11 bits")]
+
+
 def test_an_unknown_suffix_is_refused_with_the_nearest_and_all_known(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"did you mean '.mcap'.*\.blf"):
         read_frames(tmp_path / "a.mcpa")
@@ -446,6 +483,17 @@ else:
     path = tmp_path / "a.mf4"
     path.write_bytes(b"MDF     4.10    " + bytes(100))
     subprocess.run([sys.executable, "-c", code, str(path)], check=True)
+
+
+def test_an_mf4_of_signals_says_which_it_holds(tmp_path: Path) -> None:
+    asammdf = pytest.importorskip("asammdf")
+    path = tmp_path / "a.mf4"
+    with asammdf.MDF(version="4.10") as file:
+        times = [0.0, 1.0]
+        file.append([asammdf.Signal([360.0, 359.0], times, name="PackVoltage", unit="V")])
+        file.save(path)
+    with pytest.raises(InputError, match=r"holds signals \(PackVoltage\) and no frames; save it as Parquet"):
+        read(path)
 
 
 def test_mf4_is_read_as_by_python_can(tmp_path: Path) -> None:

@@ -199,6 +199,36 @@ def test_trc_with_can_fd(tmp_path):
     ]
 
 
+PCAN_1_2 = (
+    ";$FILEVERSION=1.2\n;$STARTTIME=45000.5\n;\n;---+-- ------+------ +- --+-- ---+---- + -+ -- --\n"
+    "     1)        12.345 1  Rx        0100 2  10 0E \n"
+    "     2)       512.345 1  Tx    18FF50E5 1  90 \n"
+)
+
+
+def test_pcan_traces_of_version_1_2_are_read(tmp_path):
+    noon_ns = 1_678_881_600 * S  # 2023-03-15 12:00 UTC
+    assert frames_of(tmp_path, PCAN_1_2, "ride.trc") == [
+        (noon_ns + 12_345_000, 0x100, b"\x10\x0e", 1),
+        (noon_ns + 512_345_000, 0x18FF50E5 | EFF_FLAG, b"\x90", 1 | TRANSMITTED),
+    ]
+
+
+@pytest.mark.parametrize("line", ["     3)", "11,201 0F1      4 34 01 00 40", "     3)  600.0 1  Rx  0FFF 1  90 "])
+def test_lines_that_are_none_of_a_pcan_trace_are_counted_in_silence(tmp_path, line, caplog):
+    damages: list[LogDamage] = []
+    assert len(frames_of(tmp_path, f"{PCAN_1_2}{line}\n", "ride.trc", damages)) == 2
+    assert [damage.count for damage in damages] == [1]
+    assert not [record for record in caplog.records if record.name.startswith("can")]
+
+
+def test_a_trace_of_canhacker_is_refused_in_silence(tmp_path, caplog):
+    text = "Time   ID     DLC Data                    Comment\n" + "11,201 002      4 34 01 00 40             \n" * 40
+    with pytest.raises(InputError, match=r"ride.trc, line 1: not a PCAN trace: it has neither"):
+        frames_of(tmp_path, text, "ride.trc")
+    assert not caplog.records
+
+
 def test_the_content_tells_the_format_also_of_a_packed_log_and_against_its_name(tmp_path):
     file = tmp_path / "ride.blf.gz"
     file.write_bytes(gzip.compress(f"{SAVVYCAN}1000,15F,false,Rx,0,1,90,\n".encode()))

@@ -8,14 +8,14 @@ from pathlib import Path
 
 from gz_onboard.bus.readers.common import FD_LENGTHS, Clock, Contents, Damage, Reader, stamp_ns, text_pieces
 from gz_onboard.errors import InputError, shown
-from gz_onboard.events import EFF_FLAG, TRANSMITTED, Frame
+from gz_onboard.events import EFF_FLAG, MOST_EXTENDED, MOST_STANDARD, TRANSMITTED, Frame
 
 SAVVYCAN_HEADER = re.compile(r"\s*\"?time ?stamp[^,]*,\s*id,\s*extended,(?P<direction>\s*dir,)?\s*bus,\s*len\b", re.I)
 CRTD_LINE = re.compile(
     r"(?P<stamp>-?\d+(?:\.\d+)?)\s+(?P<bus>\d)?(?:(?P<direction>[RT])(?P<bits>11|29)\s+(?P<id>[0-9A-Fa-f]{1,8})"
     r"(?P<data>(?:\s+[0-9A-Fa-f]{2})*)|C[A-Z]{2}\b.*)"
 )
-_GREATEST = {False: 0x7FF, True: 0x1FFF_FFFF}  # identifier, by whether it is extended
+_GREATEST = {False: MOST_STANDARD, True: MOST_EXTENDED}  # identifier, by whether it is extended
 
 Parser = Callable[[str], Frame | None]
 """A line -> its frame; None for a comment. ValueError for a line that is neither."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
@@ -16,9 +16,12 @@ if TYPE_CHECKING:
 
 
 ASC_BASE = re.compile(r"^\s*base\s+(?P<base>hex|dec)(?:\s+timestamps\s+(?P<times>absolute|relative))?", re.I | re.M)
-_ASC_HEAD = 4000  # characters within which the base stands
+_HEAD = 4000  # characters within which the base of an ASC log and the version of a trace stand
 _BEGINNING = 100  # characters that show a reader what a file is
 _ASC_STAMP = re.compile(r"\s*(\d+\.\d+)(?=\s)")
+_TRC_START = re.compile(r"^\s*(?:;\$FILEVERSION|\d+\)\s)", re.M)
+_TRC_FRAME = re.compile(r"\d+\)?\s")
+_TRC_1_2 = re.compile(r"(;\$FILEVERSION=1\.)2|(\s*\d+\)(?:\s+\S+){4})(?=\s)")  # up to the identifier
 _ASC_LINE = re.compile(
     r"\s*(?:\d+\.\d+\s|//|date\b|base\b|(?:begin|end)\s+trigger|(?:no\s+)?internal\s+events|$)", re.I
 )
@@ -50,6 +53,12 @@ class _LineFeed:
         self._lines = checked()
         self.resume()  # python-can takes the first line for a header, even if it is a frame
 
+    def trc(self, beginning: str) -> None:
+        """The lines are those of a PCAN trace: make version 1.2 of it 1.3, which has a column more."""
+        if re.search(r"^;\$FILEVERSION=1\.2\s*$", beginning, re.M):
+            lines = self._lines
+            self._lines = (_TRC_1_2.sub(lambda m: f"{m[1]}3" if m[1] else f"{m[2]} -", line, count=1) for line in lines)
+
     def __iter__(self) -> _LineFeed:
         return self
 
@@ -75,18 +84,22 @@ def text_reader(suffix: str) -> Reader:
     def read(path: Path, data: Contents, damage: Damage, _start: int | None, _end: int | None) -> Iterator[list[Frame]]:
         from gz_onboard.bus._can import can
 
-        readers: dict[str, Callable[[TextIO], can.io.generic.MessageReader]] = {
-            ".csv": can.CSVReader,
-            ".trc": can.TRCReader,
-        }
         feed, clock = _LineFeed(data), Clock(damage)
         reader: can.io.generic.MessageReader
-        if suffix == ".asc":
-            base = ASC_BASE.search(str(data[:_ASC_HEAD], "utf-8-sig", "replace"))
+        beginning = str(data[:_HEAD], "utf-8-sig", "replace")
+        if suffix == ".trc":
+            if not _TRC_START.search(beginning):
+                raise InputError(
+                    f"{path}, line 1: not a PCAN trace: it has neither ';$FILEVERSION' nor lines that begin with '1)'"
+                )
+            feed.trc(beginning)
+            reader = _trace_reader(cast("TextIO", feed))
+        elif suffix == ".csv":
+            reader = can.CSVReader(cast("TextIO", feed))
+        else:
+            base = ASC_BASE.search(beginning)
             feed.asc(damage, relative=bool(base and (base["times"] or "").lower() == "relative"))
             reader = can.ASCReader(cast("TextIO", feed), base["base"].lower() if base else "hex")
-        else:
-            reader = readers[suffix](cast("TextIO", feed))
         channels = ChannelNumbers()
         any_frame = False
         messages = iter(reader)
@@ -129,6 +142,21 @@ def text_reader(suffix: str) -> Reader:
     return read
 
 
+def _trace_reader(lines: TextIO) -> can.io.generic.MessageReader:
+    """python-can's reader of PCAN traces, which raises for a line that is none instead of logging it."""
+    from gz_onboard.bus._can import can
+
+    class TraceReader(can.TRCReader):
+        def _parse_line(self, line: str) -> can.Message | None:
+            if not line:
+                return None
+            if not _TRC_FRAME.match(line):
+                raise ValueError("it does not begin with the frame's number")
+            return self._parse_cols(tuple(line.split(maxsplit=self._num_columns)))
+
+    return TraceReader(lines)
+
+
 def _length(message: can.Message, suffix: str) -> int:
     """How many bytes of data a message should have, by what python-can's reader of the format makes of its DLC."""
     from gz_onboard.bus._can import can
@@ -168,6 +196,11 @@ def read_mf4(path: Path, data: Contents, damage: Damage, _start: int | None, _en
         damage.add("after the last frame read", str(error))
     if batch:
         yield batch
+    elif not any_frame and (signals := sorted(set(reader._mdf.channels_db) - {"time", "t", "timestamps"})):
+        raise InputError(
+            f"{path}: holds signals ({', '.join(signals[:3])}{', ...' if len(signals) > 3 else ''}) and no frames; "
+            "save it as Parquet, which is read as a table of signals"
+        )
 
 
 def with_asammdf(path: Path) -> None:
