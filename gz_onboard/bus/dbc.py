@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import re
 from collections.abc import Sequence
 from functools import cache
@@ -10,15 +11,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gz_onboard.errors import InputError, nearest, shown
+from gz_onboard.events import EFF_FLAG, MOST_EXTENDED, MOST_STANDARD
 from gz_onboard.toml import is_file, read_text
 
 if TYPE_CHECKING:
     from cantools.database.can import Database, Message
     from cantools.database.can.signal import Signal
 
+FARTHEST = 1e30  # of a limit of a signal; some editors write out those of its type
 LARGEST_DBC = 8_000_000  # bytes; those of whole cars have one or two million
 LONGEST_FRAME = 64  # bytes, of CAN FD
-FARTHEST = 1e30  # a limit of a signal; those of 64 bits are written out by some editors
+_WIDE = re.compile(r"\b(BO_|SG_|VAL_|SIG_VALTYPE_|SG_MUL_VAL_|BO_TX_BU_|SIG_GROUP_)(\s+)(\d{4,9})\b")
+_BUS_LINE = re.compile(r"^[ \t]*BS_[ \t]*:", re.M)
+_BELOW_BUS_LINE = re.compile(r"^[ \t]*(?:BU_[ \t]*:|BO_[ \t]+\d+[ \t]+\w+[ \t]*:)", re.M)
 LONGEST_PROBLEM = 400  # letters of what cantools says, which may quote a whole line
 SMALLEST, LARGEST = 1e-12, 1e12  # a scale or an offset
 _END = '\nCM_ "";\n'  # an empty comment: a last statement that is cut off is none to cantools, one in between is wrong
@@ -78,7 +83,8 @@ def database_of(texts: Sequence[tuple[Path, str]], left_out: LeftOut | None = No
     """`load_database` of files that are read already: their names and texts."""
     database = empty_database()
     origin: dict[str, tuple[Path, str, str]] = {}  # by name and by identifier
-    for file, text in texts:
+    for file, original in texts:
+        text = _completed(file, original)
         before = len(database.messages)
         try:
             _add(database, file, text)
@@ -159,7 +165,7 @@ class _Lenient:
             if syntax[2] == "1" and _UNENDED.fullmatch(self._lines[before]):
                 at = before
             self._leave_out(at, problem)
-        elif wide := re.search(r"(?:Standard|Extended) frame id .* in message (\w+)", problem):
+        elif wide := re.search(r"Extended frame id .* in message (\w+)", problem):
             self._leave_out((_message_line(self._text, wide[1]) or 0) - 1, problem)
         elif unused := re.findall(r"^\s*(VAL_ \d+ \w+)$", problem, re.M):
             for start in unused:
@@ -228,6 +234,30 @@ def read_dbc(file: Path) -> str:
     return read_text(file, LARGEST_DBC, ("utf-8-sig", "cp1252", "latin-1"))
 
 
+def _completed(file: Path, text: str) -> str:
+    """`text` as cantools needs it, line by line: with `BS_:`, which some editors omit, and with bit 31 of wide
+    identifiers, without which no other meaning is possible; a warning tells of these.
+    """
+    if not _BUS_LINE.search(text) and (below := _BELOW_BUS_LINE.search(text)) and below.start():
+        text = f"{text[: below.start() - 1]} BS_:{text[below.start() - 1 :]}"  # it ends the list of NS_
+    wide = []
+
+    def with_bit_31(found: re.Match[str]) -> str:
+        identifier = int(found[3])
+        if not MOST_STANDARD < identifier <= MOST_EXTENDED:
+            return found[0]
+        if found[1] == "BO_" and found.start() == text.rfind("\n", 0, found.start()) + 1:
+            wide.append(identifier)
+        return f"{found[1]}{found[2]}{identifier | EFF_FLAG}"
+
+    text = _WIDE.sub(with_bit_31, text)
+    if wide:
+        numbers = ", ".join(f"{identifier:#x}" for identifier in wide[:MOST_SAID])
+        more = f" and {len(wide) - MOST_SAID} more" if len(wide) > MOST_SAID else ""
+        _warn_once(f"{file}: identifiers above 0x7ff are read as 29 bits, though bit 31 is not set: {numbers}{more}")
+    return text
+
+
 def _impossible_size(text: str) -> tuple[int, str] | None:
     """(index of its line, what is wrong) of a layout that no frame has; cantools would take gigabytes over it."""
     for found in _MESSAGE_SIZE.finditer(text):
@@ -261,7 +291,7 @@ def _signal_problem(signal: Signal) -> str | None:
     if not abs(offset) <= LARGEST:
         return f"signal {signal.name} has an offset of {shown(offset)}"
     low, high = signal.minimum, signal.maximum
-    if low is not None and high is not None and not -FARTHEST <= low <= high <= FARTHEST:
+    if low is not None and high is not None and not -math.inf < low <= high < math.inf:
         return f"signal {signal.name} has the limits {shown(low)} to {shown(high)}"
     return None
 
@@ -275,8 +305,6 @@ def _invalid(file: Path, text: str, problem: str) -> InputError:
         return InputError(f"{file}:{len(lines)}: not a valid DBC file: {problem}")
     named = re.search(r"message (\w+)", problem)
     line = numbered[1] if numbered else _message_line(text, named[1]) if named else None
-    if wide := re.search(r"Standard frame id (0x[0-9a-f]+) is more than 11 bits", problem):
-        problem += f" A DBC writes a 29-bit identifier with bit 31 set: {int(wide[1], 16) | 1 << 31}."
     if len(problem) > LONGEST_PROBLEM:
         problem = f"{problem[:LONGEST_PROBLEM]} ..."
     return InputError(f"{file}{f':{line}' if line else ''}: not a valid DBC file: {problem}")

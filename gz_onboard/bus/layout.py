@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, cast
 
+from gz_onboard.bus.dbc import FARTHEST
 from gz_onboard.bus.mapping import BusMapping, Protection, Source
 from gz_onboard.events import EFF_FLAG, PLAUSIBLE, PLAUSIBLE_OF, ROLES, STALE_PERIODS
 
@@ -75,7 +76,8 @@ def raw_range(signal: Signal, not_available: bool) -> tuple[float, float]:
     if not_available and not conversion.is_float and signal.length >= 8:
         low, high = (low + 1, high) if signal.is_signed else (low, high - 1)
     if signal.minimum is not None and signal.maximum is not None and signal.minimum < signal.maximum:
-        ends = sorted(((float(signal.minimum) - offset) / scale, (float(signal.maximum) - offset) / scale))
+        limits = max(float(signal.minimum), -FARTHEST), min(float(signal.maximum), FARTHEST)
+        ends = sorted((limit - offset) / scale for limit in limits)
         slack = 0 if conversion.is_float else 1e-6  # limits are decimal fractions
         low, high = max(low, ends[0] - slack), min(high, ends[1] + slack)
         if not conversion.is_float:

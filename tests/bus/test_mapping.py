@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import logging
 import re
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -288,7 +289,7 @@ def test_dbc_files_that_cannot_be_had(tmp_path, names, parts):
     ("change", "parts"),
     [
         (('(0.01,0) [0|100] "V"', '(0.01,0 [0|100] "V"'), [":6:", "line 6, column 32", "[0|100]"]),
-        (("BO_ 257 Motor", "BO_ 4097 Motor"), [":12:", "0x1001", "11 bits", "Motor", str(0x1001 | 1 << 31)]),
+        (("BO_ 257 Motor", "BO_ 3221225473 Motor"), [":12:", "Motor", "more than 29 bits"]),
         (("BO_ 257 Motor", "BO_ 256 Motor"), [":12:", "identifier 0x100 of message Motor", "Pack in", "v.dbc:5"]),
         (("BO_ 257 Motor: 4", "BO_ 257 Motor: 3"), [":12:", "Heat", "does not fit", "Motor"]),
         (("16|16@1- (0.1", "8|16@1- (0.1"), [":5:", "Current", "overlapping", "Pack"]),
@@ -337,7 +338,7 @@ def test_a_broken_dbc(tmp_path, change, parts):
             {"Pack.Current"},
             "line 5: signal Current is a float of 16",
         ),
-        (("BO_ 256 Pack", "BO_ 4096 Pack"), {"Pack.*"}, "line 5: Standard frame id 0x1000 is more than 11 bits"),
+        (("BO_ 256 Pack", "BO_ 3221225728 Pack"), {"Pack.*"}, "line 5: Extended frame id 0x40000100 is more than 29"),
         (("BO_ 256 Pack", "BO_ 256 2Pack"), {"2Pack.*"}, "line 5: Invalid syntax"),
         (("0|16@1- (1", "100000|16@1- (1"), {"Motor.Speed"}, "line 13: .*beyond the longest frame"),
         (("BO_ 257", 'CM_ "no end"\nBO_ 257'), set(), "line 12: Invalid syntax"),
@@ -370,15 +371,49 @@ SIGNALS = {"Pack": ["Voltage", "Current", "State", "Counter", "Sum"], "Motor": [
     [
         ('pack_voltage = "Voltage"', ["Voltage", "Pack", "v.dbc, line 5: The signals", "overlapping"]),
         ('pack_current = { message = "Pack", signal = "Current" }', ["Current", "v.dbc, line 5: The signals"]),
-        ('motor_speed = "Speed"', ["Speed", "Motor", "v.dbc, line 12: Standard frame id 0x1001"]),
+        ('motor_speed = "Speed"', ["Speed", "Motor", "v.dbc, line 12: Extended frame id 0x40000101"]),
         ('motor_speed = { message = "Motor", signal = "Speed" }', ["message Motor", "v.dbc, line 12: "]),
     ],
 )
 def test_a_role_of_a_signal_that_was_left_out_says_why(tmp_path, role, parts):
-    text = DBC.replace("16|16@1- (0.1", "8|16@1- (0.1").replace("BO_ 257 Motor", "BO_ 4097 Motor")
+    text = DBC.replace("16|16@1- (0.1", "8|16@1- (0.1").replace("BO_ 257 Motor", "BO_ 3221225729 Motor")
     message = complaint(tmp_path, dbc=text, roles=role)
     for part in [":5: roles.", "is left out of the DBC file", *parts]:
         assert part in message
+
+
+def test_a_dbc_without_its_bs_line_is_read(tmp_path, caplog):
+    bare = 'VERSION ""\n\nNS_ :\n  NS_DESC_\n\nBO_ 256 Pack: 2 BMS\n SG_ Voltage : 0|16@1+ (0.1,0) [0|500] "V" X\n'
+    for text in (bare, bare.replace("BO_", "BU_: BMS\nBO_", 1), bare.replace("\nBO_", "BO_", 1)):
+        (message,) = mapping(tmp_path, dbc=text).database.messages
+        assert message.decode(b"\x10\x0e") == {"Voltage": 360.0}
+    assert not caplog.records
+    with pytest.raises(InputError, match=r"v.dbc:7: "):  # no line has moved
+        (tmp_path / "v.dbc").write_text(bare.replace("16@1+ (", "16@1+ "))
+        load_database([tmp_path / "v.dbc"])
+
+
+def test_wide_identifiers_without_bit_31_are_read_as_29_bits_and_said(tmp_path, caplog):
+    text = DBC.replace("BO_ 257 Motor", "BO_ 380196006 Motor").replace(
+        "BA_DEF_ BO_", 'CM_ SG_ 380196006 Heat "of 380196006";\nVAL_ 380196006 State 1 "on" ;\nBA_DEF_ BO_', 1
+    )
+    motor = mapping(tmp_path, dbc=text).database.get_message_by_name("Motor")
+    assert (motor.frame_id, motor.is_extended_frame) == (380196006, True)
+    assert motor.get_signal_by_name("Heat").comment == "of 380196006"
+    assert motor.get_signal_by_name("State").choices == {1: "on"}
+    (record,) = caplog.records
+    assert "v.dbc: identifiers above 0x7ff are read as 29 bits, though bit 31 is not set: 0x16a954a6" in record.message
+
+
+@pytest.mark.parametrize("limits", ["-3.4E+038|3.4E+038", "-1.7E+308|1.7E+308"])
+def test_limits_as_wide_as_a_float_are_none(tmp_path, limits):
+    text = (
+        f'VERSION ""\nBS_:\nBU_: A\nBO_ 256 Pack: 4 A\n SG_ Voltage : 0|32@1- (1,0) [{limits}] "V" A\n'
+        "SIG_VALTYPE_ 256 Voltage : 1;\n"
+    )
+    codec = Codec(mapping(tmp_path, 'pack_voltage = "Voltage"', dbc=text))
+    ((_, _, values),) = codec.decode([(0, 256, struct.pack("<f", 52.5), 0)])
+    assert values == (52.5,)
 
 
 def test_a_line_that_decides_how_others_are_read_is_not_left_out(tmp_path):
