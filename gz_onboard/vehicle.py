@@ -23,7 +23,7 @@ from gz_onboard.toml import Table, is_file
 
 OWN = Path(__file__).resolve().parent / "vehicles"
 KEYS = (
-    "schema name dbc range_dbc range_identifier bus request roles instruments model parameters correlation "
+    "schema name dbc range_dbc range_identifier bus request roles table instruments model parameters correlation "
     "battery forecast controller healthy"
 )
 

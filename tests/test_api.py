@@ -209,7 +209,7 @@ def test_a_data_frame_is_the_same_ride_with_its_time_as_a_column_or_as_the_index
         ({"time [s]": [0, 1], "sped [km/h]": [1, 2]}, "'sped' is no role.*did you mean"),
         ({"time [s]": [0, 1], "speed": [1, 2]}, "'speed' has no unit"),
         ({"time [s]": [0, 1], "speed [km/h]": [1, 2, 3]}, r"unlike lengths: time \[s\] 2, speed \[km/h\] 3"),
-        ({"speed [km/h]": [1, 2], "soc": [1, 2]}, "the first column must be the time"),
+        ({"speed [km/h]": [1, 2], "soc": [1, 2]}, "no column is a time, such as"),
         ({"time [s]": [1, 0], "speed [km/h]": [1, 2]}, "table:2: time.*before the time of the row above"),
         ({"time [s]": [0, 1], "speed [km/h]": [1, "fast"]}, "'fast' is not a finite number"),
         ({}, "a column of times and one for each signal"),

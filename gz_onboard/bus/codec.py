@@ -154,7 +154,7 @@ class Codec:
 
     def time_ns(self, seconds: float) -> int:
         """`seconds` of the timeline by the clock of the frames, as it is set now [ns]; 0 before the first frame."""
-        return 0 if self._origin_ns is None else self._origin_ns + round(seconds * 1e9)
+        return 0 if self._origin_ns is None else max(self._origin_ns + round(seconds * 1e9), 0)
 
     @property
     def last_ns(self) -> int:

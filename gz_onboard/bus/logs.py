@@ -72,7 +72,7 @@ _FIRST_LINES = {
     ".log": re.compile(rf"(?:{candump.SCREEN_LINE.pattern})\s*$|\([\d.]+\)\s+\S+\s+[0-9A-Fa-f]+#"),
 }
 """What a line of a text log looks like, by format: of its header or its frames."""
-_TABLE_HEADER = re.compile(r"(?:.*[,;])?\s*\"?(?:time|timestamp|t)(?:\b|_m?s\b)[^,;]*[,;]", re.I)
+_TABLE_HEADER = re.compile(r"(?:.*[,;\t])?\s*\"?(?:time|timestamp|t)(?:\b|_m?s\b)[^,;\t]*[,;\t]", re.I)
 ESTIMATED = ".estimate.mcap"
 """The end of the name of what ``gz-onboard estimate`` writes."""
 _HEAD = 8192  # bytes within which a text log shows what it is
@@ -165,7 +165,7 @@ def _by_content(head: bytes, time: str = "") -> str | None:
     for line in lines:
         if found := next((form for form, first in _FIRST_LINES.items() if first.match(line.strip())), None):
             return found
-    named = time and time in re.split(r"\s*[,;]\s*", lines[0].replace('"', "").strip())
+    named = time and time in re.split(r"\s*[,;\t]\s*", lines[0].replace('"', "").strip())
     return _TABLE if named or _TABLE_HEADER.match(lines[0]) else None
 
 

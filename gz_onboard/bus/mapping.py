@@ -19,6 +19,9 @@ pack_voltage = "BMS_PackVoltage"
 pack_current = { signal = "BMS_Current", scale = -1, unit = "A" }
 motor_speed = { message = "INV_Motion", signal = "INV_MotorSpeed" }
 
+[table]                           # where a ride is a table of signals and its times have another name or form
+time = { column = "epoch time", unit = "s" }  # or format = "%m/%d/%Y %H:%M:%S", as of strptime, in UTC
+
 [instruments]                     # of the bench and of measuring rides, not needed on board
 roller_speed = "DYNO_RollerSpeed"
 """
@@ -67,6 +70,15 @@ class Protection:
 
 
 @dataclass(frozen=True)
+class TimeColumn:
+    """The column with the times of a table of signals: their unit, s or ms, or the format of dates, as of strptime."""
+
+    name: str
+    unit: str = ""
+    format: str = ""
+
+
+@dataclass(frozen=True)
 class BusMapping:
     """The bus of one vehicle: its database, and the roles that its signals play."""
 
@@ -82,6 +94,7 @@ class BusMapping:
     instruments: tuple[Source, ...] = ()  # of roles that no estimator needs
     columns: Table | None = None  # the roles of a vehicle without DBC files: their signals are columns of a table
     requests: tuple[Request, ...] = ()  # of other testers, whose answers are read
+    time: TimeColumn | None = None  # of tables; None: the first column that is called so
 
     @property
     def reads_frames(self) -> bool:
@@ -94,12 +107,13 @@ def read_mapping(vehicle: Table) -> BusMapping:
 
     Of a vehicle without DBC files and requests only tables of signals can be read; it has a mapping without sources.
     """
+    time = _time_column(vehicle.table("table"))
     if "dbc" not in vehicle.values and "request" not in vehicle.values:
         if "bus" in vehicle.values:
             raise vehicle.error("describes frames, for which dbc is missing", "bus")
         roles = vehicle.table("roles")
         roles.only(ROLES)
-        return BusMapping(empty_database(), (), (), {}, {}, columns=roles if roles.values else None)
+        return BusMapping(empty_database(), (), (), {}, {}, columns=roles if roles.values else None, time=time)
     files = _dbc_files(vehicle) if "dbc" in vehicle.values else []
     left_out: LeftOut = {}
     database = load_database(files, left_out) if files else empty_database()
@@ -128,7 +142,19 @@ def read_mapping(vehicle: Table) -> BusMapping:
         origins=origins,
         delays=delays,
         requests=requests,
+        time=time,
     )
+
+
+def _time_column(table: Table) -> TimeColumn | None:
+    table.only(["time"])
+    if not table.values:
+        return None
+    time = table.table("time")
+    time.only(["column", "unit", "format"])
+    if ("unit" in time.values) == ("format" in time.values):
+        raise time.error("needs either a unit, s or ms, or a format of dates, as of strptime")
+    return TimeColumn(time.text("column"), time.text("unit", "", ["", "s", "ms"]), time.text("format", ""))
 
 
 def _options(database: Database, messages: Table) -> tuple[dict[str, Protection], dict[str, float], dict[str, float]]:

@@ -36,10 +36,13 @@ _CONVERSIONS: dict[tuple[str, str], tuple[float, float]] = {
 _ALIASES = (
     "r/min=rpm 1/min=rpm RPM=rpm r/s=rev/s rps=rev/s °/s=deg/s dps=deg/s °=deg degree=deg degrees=deg °C=degC "
     "C=degC ºC=degC Celsius=degC °F=degF F=degF ºF=degF Fahrenheit=degF mile=mi miles=mi feet=ft Nm=N·m "
-    "N.m=N·m N*m=N·m kph=km/h kmh=km/h m/s2=m/s^2 m/s²=m/s^2 meters=m Volt=V Amp=A Percent=%"
+    "N.m=N·m N*m=N·m kph=km/h kmh=km/h m/s2=m/s^2 m/s²=m/s^2 meters=m Volt=V Volts=V Amp=A Amps=A Watts=W Percent=% "
+    "km/hr=km/h mi/h=mph Km=km KM=km"
 )
 _SPACED = {"": "1", "-": "1", "deg C": "degC", "deg F": "degF"}
 _SPELLINGS = _SPACED | dict(alias.split("=") for alias in _ALIASES.split())
+_KNOWN = {*UNITS.values(), *(unit for unit, _ in _CONVERSIONS), *_SPELLINGS}
+_LOWER = {unit.lower(): unit for unit in sorted(_KNOWN) if len(unit) > 2}  # of shorter ones the case tells mV from MV
 
 
 def known_units(role: str) -> list[str]:
@@ -49,6 +52,7 @@ def known_units(role: str) -> list[str]:
 
 def to_si(unit: str, role: str) -> tuple[float, float] | None:
     """(factor, offset) from `unit` to the SI unit of `role`; None if it cannot be one of the role's units."""
+    unit = unit if unit in _KNOWN else _LOWER.get(unit.lower(), unit)
     unit = _SPELLINGS.get(unit, unit)
     if unit == UNITS[role]:
         return 1.0, 0.0

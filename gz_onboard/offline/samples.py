@@ -85,11 +85,15 @@ def open_ride(
     on_damage: as of `read_frames`. Raises InputError for what is neither, for frames without times, and for a log of a
     vehicle without DBC files.
     """
-    if isinstance(log, SignalTable) or is_table(log):
+    time = vehicle.mapping.time.name if vehicle.mapping.time else ""
+    if isinstance(log, SignalTable) or is_table(log, time):
         return signal_frames(log if isinstance(log, SignalTable) else read_table(log), vehicle.mapping)
     frames = read_frames(log, on_damage=on_damage)
     if not vehicle.mapping.reads_frames:
-        raise vehicle.error(f"dbc is missing: without it a table of signals can be read, but no frames as in {log}")
+        raise vehicle.error(
+            f"dbc is missing: without it a table of signals can be read, but no frames as in {log}; of a "
+            "table say which column is the time: [table] time = { column = ..., unit = ... }"
+        )
     return vehicle.mapping, _timed(log, frames)
 
 

@@ -22,7 +22,7 @@ from statistics import median
 from struct import Struct
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from gz_onboard.bus.mapping import BusMapping, Source, column_sources
+from gz_onboard.bus.mapping import BusMapping, Source, TimeColumn, column_sources
 from gz_onboard.bus.readers.common import BATCH, TIME_LIMIT_NS, Damage, unpacked
 from gz_onboard.bus.units import known_units, to_si
 from gz_onboard.errors import InputError, nearest, shown, unreadable
@@ -30,6 +30,8 @@ from gz_onboard.events import EFF_FLAG, ROLES, Frame
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
+
+    from gz_onboard.toml import Table
 
 _FIRST_IDENTIFIER = 0x1000_0000  # of 29 bits: no range frames have it
 _COLUMN = re.compile(r"\s*(?P<name>.*?)\s*(?:[\[(]\s*(?P<unit>[^\])]*?)\s*[\])])?\s*")
@@ -81,13 +83,16 @@ def signal_frames(table: SignalTable, mapping: BusMapping) -> tuple[BusMapping, 
     file, header, rows = table.name, table.header, table.rows
     if len(header) < 2:
         raise InputError(f"{file}:1: a table of signals has a column of times and one for each signal")
-    times = _times(file, header[0], rows)
+    time_at, time = _time_column(file, header, mapping.time)
+    times = _times(file, time, [(line, row[time_at]) for line, row in rows])
     columns = [
         _column(text, at)
         for at, text in enumerate(header)
-        if at and (text.strip() or not all(_is_missing(row[at]) for _, row in rows))  # a separator at each line's end
+        if at != time_at
+        and (text.strip() or not all(_is_missing(row[at]) for _, row in rows))  # a separator at each line's end
     ]
-    database = _database(file, columns)
+    columns = _told_apart(file, columns, mapping.columns)
+    database = _database(columns)
     sources = column_sources(database, mapping.columns, file) if mapping.columns else _by_role(file, columns)
     played = {source.signal: source.role for source in sources}
     order = {role: i for i, role in enumerate(_LAST)}
@@ -119,8 +124,8 @@ def _csv(file: Path) -> tuple[list[str], Rows]:
     except UnicodeDecodeError:
         text = data.decode("cp1252", "replace")
     first = text.partition("\n")[0]
-    semicolons = first.count(";") > first.count(",")
-    reader = csv.reader(text.splitlines(), delimiter=";" if semicolons else ",")
+    separator = max(",;\t", key=first.count)
+    reader = csv.reader(text.splitlines(), delimiter=separator)
     header = next(reader, [])
     rows = []
     for row in reader:
@@ -128,7 +133,7 @@ def _csv(file: Path) -> tuple[list[str], Rows]:
             continue
         if len(row) != len(header):
             raise InputError(f"{file}:{reader.line_num}: {len(row)} cells for {len(header)} columns")
-        rows.append((reader.line_num, [cell.replace(",", ".") for cell in row] if semicolons else row))
+        rows.append((reader.line_num, row if separator == "," else [cell.replace(",", ".") for cell in row]))
     return header, rows
 
 
@@ -149,37 +154,61 @@ def _parquet(file: Path) -> tuple[list[str], Rows]:
     return rows_of(list(zip(table.column_names, table.columns, strict=True)), str(file))
 
 
-def _times(file: Path, name: str, rows: Rows) -> list[int]:
-    """The time of each row [ns]."""
-    header = _TIME.fullmatch(name)
-    if not header:
-        raise InputError(
-            f"{file}:1: the first column must be the time, such as 'time [s]' (in s, ms or ISO 8601), is {shown(name)}"
-        )
-    unit = (header["unit"] or "").lower()
+def _time_column(file: Path, header: Sequence[str], told: TimeColumn | None) -> tuple[int, TimeColumn]:
+    """The index of the column of times, and its name as errors call it."""
+    names = [name.strip() for name in header]
+    if told:
+        if told.name not in names:
+            raise InputError(
+                f"{file}:1: there is no column {shown(told.name)}, which is the time in the vehicle file"
+                f"{nearest(told.name, names)}"
+            )
+        return names.index(told.name), told
+    for at, name in enumerate(names):
+        if found := _TIME.fullmatch(name):
+            return at, TimeColumn(name, (found["unit"] or "").lower())
+    raise InputError(
+        f"{file}:1: no column is a time, such as 'time [s]' (in s, ms or ISO 8601); rename one, or name it in the "
+        f"vehicle file: [table] time = {{ column = {shown(names[0])}, unit = 's' }}"
+    )
+
+
+def _told_apart(file: Path, columns: list[_Column], roles: Table | None) -> list[_Column]:
+    """`columns` without those of one name that no role asks for; InputError if one does."""
+    names = [column.name for column in columns]
+    twice = {name for name in names if names.count(name) > 1}
+    asked = {v if isinstance(v, str) else v.get("signal") for v in roles.values.values()} if roles else twice
+    if name := next((name for name in names if name in twice & asked), None):
+        raise InputError(f"{file}:1: two columns are called {name!r}")
+    return [column for column in columns if column.name not in twice]
+
+
+def _times(file: Path, column: TimeColumn, rows: Sequence[tuple[int, Any]]) -> list[int]:
+    """The time of each row [ns]; rows: (line, cell)."""
+    name, unit = column.name, column.unit
     times: list[int] = []
-    for line, row in rows:
+    for line, cell in rows:
         try:
-            times.append(_nanoseconds(row[0], unit))
+            times.append(_nanoseconds(datetime.strptime(cell.strip(), column.format) if column.format else cell, unit))
         except KeyError:
             raise InputError(
-                f"{file}:{line}: {name}: {shown(row[0])} has no unit; call the column 'time [s]' or 'time [ms]'"
+                f"{file}:{line}: {name}: {shown(cell)} has no unit; call the column 'time [s]' or 'time [ms]'"
             ) from None
         except (TypeError, ValueError, OverflowError):
-            raise InputError(
-                f"{file}:{line}: {name}: {shown(row[0])} is neither a number nor a time of ISO 8601"
-            ) from None
+            what = "neither a number nor a time of ISO 8601"
+            what = f"no date of the format {column.format}" if column.format else what
+            raise InputError(f"{file}:{line}: {name}: {shown(cell)} is {what}") from None
         if not -TIME_LIMIT_NS < times[-1] < TIME_LIMIT_NS:
             raise InputError(
-                f"{file}:{line}: {name}: {shown(row[0])} {unit or 's'} is not a plausible time; if it is in "
+                f"{file}:{line}: {name}: {shown(cell)} {unit or 's'} is not a plausible time; if it is in "
                 "ms, call the column 'time [ms]'"
             )
         if len(times) > 1 and times[-1] < times[-2]:
-            raise InputError(f"{file}:{line}: {name}: {shown(row[0])} is before the time of the row above")
+            raise InputError(f"{file}:{line}: {name}: {shown(cell)} is before the time of the row above")
     if len(times) < 2:
         raise InputError(f"{file}: {len(times)} rows below the names of the columns are no ride")
     if times[0] == times[-1]:
-        raise InputError(f"{file}: {name}: all rows have the same time, {shown(rows[0][1][0])}, which is no ride")
+        raise InputError(f"{file}: {name}: all rows have the same time, {shown(rows[0][1])}, which is no ride")
     if (step := median(after - before for before, after in pairwise(times)) * 1e-9) > _LONGEST_STEP + 1e-6:
         raise InputError(
             f"{file}: {name}: from row to row it is usually {step:.4g} s, and {_LONGEST_STEP:g} s are the most; if "
@@ -241,16 +270,13 @@ def _values(file: Path, rows: Rows, column: _Column) -> list[float | None]:
     return values
 
 
-def _database(file: Path, columns: Sequence[_Column]) -> Database:
+def _database(columns: Sequence[_Column]) -> Database:
     """A message for each column, with one signal of the same name."""
     from cantools.database.can import Message, Signal
     from cantools.database.conversion import BaseConversion
 
     from gz_onboard.bus.dbc import empty_database  # before cantools
 
-    names = [column.name for column in columns]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise InputError(f"{file}:1: two columns are called {twice!r}")
     database = empty_database()
     for column in columns:
         conversion = BaseConversion.factory(is_float=True)
@@ -304,7 +330,7 @@ def _period(table: SignalTable, times: Sequence[int], name: str, values: Sequenc
     period = median(forward) * 1e-9
     if 2 * len(forward) < len(steps) and period > _COARSEST + 1e-6:
         raise InputError(
-            f"{table.name}: {table.header[0]}: {name!r} mostly has several values at one time, then none for "
+            f"{table.name}: {name!r} mostly has several values at one time, then none for "
             f"{period:.4g} s: the times are rounded; give them as float64, not float32, or since the start of the ride"
         )
     return period

@@ -621,6 +621,30 @@ def test_a_chunk_of_another_size_than_it_says_is_left_out(tmp_path: Path, size: 
     assert list(read_samples(path)) == []
 
 
+def test_a_damaged_first_chunk_loses_only_its_own_frames_and_samples(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    frames = three_chunks(path)
+    data = bytearray(path.read_bytes())
+    first = chunk_at(data, 0)
+    data[first + 60] ^= 0x01
+    path.write_bytes(data)
+    there, damages = read(path)
+    assert there == frames[500:]
+    assert (damages[0].count, damages[0].place) == (1, f"byte {first}")
+    with (tmp_path / "b.mcap").open("wb") as stream:
+        log = LogFile(stream, 0)
+        log.channel("/estimate", {"type": "object"})
+        for second in range(300):
+            log.sample("/estimate", second * 10**9, {"soc": second / 300, "text": os.urandom(2000).hex()})
+        log.close()
+    data = bytearray((tmp_path / "b.mcap").read_bytes())
+    before = len(list(read_samples(tmp_path / "b.mcap")))
+    data[chunk_at(data, 0) + 60] ^= 0x01
+    (tmp_path / "b.mcap").write_bytes(data)
+    assert 0 < len(list(read_samples(tmp_path / "b.mcap"))) < before
+    assert set(json_channels(tmp_path / "b.mcap")) == {"/estimate"}
+
+
 BOMB = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))

@@ -99,6 +99,20 @@ def test_times_that_make_no_ride_are_refused(tmp_path, capsys, time_of, said):
     assert not (tmp_path / "ride.estimate.mcap").exists()
 
 
+def test_stamps_that_wrap_each_second_are_refused_or_told(tmp_path, capsys):
+    frames = [frame for batch in read_frames(LOGS / "coastdown.blf") for frame in batch]
+    first = frames[0][0]
+    just_wrapped = sum(frame[0] - first < 2_020_000_000 for frame in frames)
+    for name, count, status in (("short", just_wrapped, 0), ("long", len(frames), 2)):
+        log = tmp_path / f"{name}.log"
+        with log.open("w") as stream:
+            write_candump(stream, [[((f[0] - first) % 10**9, f[1], f[2], f[3]) for f in frames[:count]]])
+        assert cli.main(["estimate", str(log), "--no-plot", "--quiet", "--output", str(tmp_path)]) == status
+    said = capsys.readouterr()
+    assert "the log's clock leaps back by" in said.out
+    assert "long.log: its time runs back again and again" in said.err
+
+
 @pytest.mark.parametrize("count", [60, 90])
 def test_a_short_log_in_reverse_is_refused(tmp_path, count):
     frames = [frame for batch in read_frames(LOGS / "coastdown.blf") for frame in batch][:count]

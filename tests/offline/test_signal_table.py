@@ -19,7 +19,7 @@ from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.logs import read_samples as logged_samples
 from gz_onboard.errors import InputError
 from gz_onboard.offline.samples import Samples, open_ride, read_samples
-from gz_onboard.vehicle import read_vehicle
+from gz_onboard.vehicle import Vehicle, read_vehicle
 
 REFERENCE = read_vehicle("reference")
 TLMOTO = Path(__file__).resolve().parents[1] / "vehicles" / "tlmoto"
@@ -62,6 +62,7 @@ def test_columns_of_nothing_behind_the_last_are_passed_over(tmp_path):
 
 
 def test_semicolons_with_decimal_commas_and_other_encodings_and_packed(tmp_path):
+    assert plain(samples_of(tmp_path, RIDE.replace(",", "\t"))) == EXPECTED
     text = RIDE.replace(",", ";").replace(".", ",")
     file = tmp_path / "ride.csv.gz"
     file.write_bytes(gzip.compress(text.encode("cp1252")))
@@ -141,7 +142,7 @@ def test_parquet(tmp_path, monkeypatch):
             [":4: time [s]: '1714557600000' s is not a plausible", "call the column 'time [ms]'"],
         ),
         ("time [s]", "time", [":2: time: '10.0' has no unit", "'time [s]' or 'time [ms]'"]),
-        ("time [s]", "times", [":1: neither a log of frames", "nor a table of signals"]),
+        ("time [s]", "times", [":1: neither a log of frames", "nor a table of signals", "[table] in a vehicle file"]),
         ("\n11.0,", "\n91.0,", ["usually 40.5 s", "call the column 'time [ms]'"]),
         ("10.5,,3500,39.6,nan,0\n11.0,", "10.0,", ["time [s]: all rows have the same time, '10.0'"]),
     ],
@@ -254,10 +255,10 @@ def test_a_table_of_a_ride_gives_the_estimate_of_its_frames(tmp_path):
     assert np.isfinite(ours["range_end_km"])
 
 
-@pytest.mark.parametrize("text", [RIDE.replace(",", "\t"), RIDE.encode("utf-16").decode("latin-1"), f"0{RIDE}"])
+@pytest.mark.parametrize("text", [RIDE.encode("utf-16").decode("latin-1"), f"0{RIDE}"])
 def test_a_csv_that_is_neither_is_told_how_a_table_begins(tmp_path, text):
     (tmp_path / "ride.csv").write_text(text, encoding="latin-1")
-    with pytest.raises(InputError, match=r"ride\.csv:1: neither .* nor a table .*'time \[s\],.*UTF-8.*begins with '"):
+    with pytest.raises(InputError, match=r"ride\.csv:1: neither .* nor a table .*UTF-8.*'time \[s\]'.*begins with '"):
         list(open_ride(tmp_path / "ride.csv", REFERENCE)[1])
 
 
@@ -308,3 +309,73 @@ def test_a_speed_at_which_nothing_reverses_is_out_of_range(tmp_path):
     ride = steady(tmp_path, 0.5, -36.0)
     assert (ride["distance_km"], ride["speed_max_km_h"], ride["implausible"]) == (0.0, None, 1201)
     assert steady(tmp_path, 0.5, -7.2)["distance_km"] == pytest.approx(1.2, rel=0.02)
+
+
+# --- tables of other tools ----------------------------------------------------------------------------------------
+
+OTHERS = """Date/Time,Pack Volts,AC Power[kW],AC Power[Watts],Outside[DegC],epoch time,Odo(Km),v[KPH]
+06/13/2017 7:47:00,385.3,1,1000,21,1497361620,50000,36
+06/13/2017 7:47:05,385.2,1,1000,21,1497361625,50000,36
+06/13/2017 7:47:10,385.1,1,1000,21,1497361630,50000,36
+"""
+OTHERS_ROLES = """
+pack_voltage = { signal = "Pack Volts", unit = "V" }
+ambient_temperature = "Outside"
+odometer = "Odo"
+vehicle_speed = "v"
+"""
+
+
+def other_vehicle(file: Path, roles: str, table: str = "") -> Vehicle:
+    """The vehicle of `file` with other roles."""
+    text = file.read_text(encoding="utf-8").replace(ROLES, f"{roles}\n{table}")
+    file.with_name("other.toml").write_text(text, encoding="utf-8")
+    return read_vehicle(file.with_name("other.toml"))
+
+
+@pytest.mark.parametrize(
+    "time", ['{ column = "epoch time", unit = "s" }', '{ column = "Date/Time", format = "%m/%d/%Y %H:%M:%S" }']
+)
+def test_the_vehicle_file_names_the_column_of_times(tmp_path, without_dbc, time):
+    (tmp_path / "trip.csv").write_text(OTHERS)
+    vehicle = other_vehicle(without_dbc, OTHERS_ROLES, f"[table]\ntime = {time}\n")
+    found = read_samples(tmp_path / "trip.csv", vehicle).columns
+    assert {role: (list(times - times[0]), values[0]) for role, (times, values) in found.items()} == {
+        "pack_voltage": ([0, 5, 10], 385.3),
+        "ambient_temperature": ([0, 5, 10], 21),
+        "odometer": ([0, 5, 10], 50_000_000),
+        "vehicle_speed": ([0, 5, 10], 10),
+    }
+    with pytest.raises(InputError, match=r"trip\.csv:2: epoch time: '1497361620' is no date of the format %d"):
+        bad = other_vehicle(
+            without_dbc, OTHERS_ROLES, '[table]\ntime = { column = "epoch time", format = "%d.%m.%Y" }\n'
+        )
+        read_samples(tmp_path / "trip.csv", bad)
+
+
+@pytest.mark.parametrize(
+    ("time", "said"),
+    [
+        ('{ column = "epoch tim", unit = "s" }', "no column 'epoch tim'.*did you mean 'epoch time'"),
+        ('{ column = "epoch time" }', "table.time: needs either a unit"),
+        ('{ column = "epoch time", unit = "min" }', "table.time.unit: 'min' is not one of"),
+    ],
+)
+def test_a_column_of_times_that_is_not_there_or_has_no_unit_is_refused(tmp_path, without_dbc, time, said):
+    (tmp_path / "trip.csv").write_text(OTHERS.replace("Date/Time", "time [s]"))
+    with pytest.raises(InputError, match=said):
+        read_samples(tmp_path / "trip.csv", other_vehicle(without_dbc, OTHERS_ROLES, f"[table]\ntime = {time}\n"))
+
+
+def test_a_table_whose_time_no_one_names_says_how_to(tmp_path, without_dbc):
+    (tmp_path / "trip.csv").write_text(OTHERS)
+    with pytest.raises(InputError, match=r"\[table\] time = \{ column"):
+        read_samples(tmp_path / "trip.csv", other_vehicle(without_dbc, OTHERS_ROLES))
+
+
+def test_two_columns_of_one_name_matter_only_to_a_role_that_names_them(tmp_path, without_dbc):
+    (tmp_path / "trip.csv").write_text(OTHERS.replace("epoch time", "time [s]"))
+    assert len(read_samples(tmp_path / "trip.csv", other_vehicle(without_dbc, OTHERS_ROLES)).columns) == 4
+    asked = f'{OTHERS_ROLES}air_conditioner_power = "AC Power"\n'
+    with pytest.raises(InputError, match=r"trip\.csv:1: two columns are called 'AC Power'"):
+        read_samples(tmp_path / "trip.csv", other_vehicle(without_dbc, asked))

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from gz_onboard.bus.codec import LENGTH, NOT_AVAILABLE, RANGE, UNDECODABLE, Codec
+from gz_onboard.bus.codec import LENGTH, NOT_AVAILABLE, RANGE, Codec
 from gz_onboard.bus.dbc import load_database
 from gz_onboard.bus.logs import LogDamage, read_frames
 from gz_onboard.bus.mapping import pgn, read_mapping
@@ -227,7 +227,7 @@ def test_car_frames_of_its_layout():
         "accel_z": [pytest.approx(9.75)],
         "rate_z": [pytest.approx(math.radians(1.0))],
     }
-    assert codec.faults == {("Speed", UNDECODABLE): 1, ("Status.FixType", RANGE): 1}
+    assert codec.faults == {("Status.FixType", RANGE): 1}
 
 
 CAR_SIGNALS = {
@@ -278,7 +278,7 @@ def test_truck_frames_of_its_layout():
     codec = Codec(vehicle("truck").mapping)
     frames = [
         (0, 0x0CF00400 | EFF_FLAG, bytes.fromhex("607D84481400F084"), 0),
-        (0, 0x18F00431 | EFF_FLAG, bytes.fromhex("607D84FFFF00F084"), 0),  # not available, from another sender
+        (0, 0x18F00400 | EFF_FLAG, bytes.fromhex("607D84FFFF00F084"), 0),  # not available, at another priority
         (0, 0x0CF00400 | EFF_FLAG, bytes.fromhex("607D8400FE00F084"), 0),  # the code for an error
         (0, 0x18FEF100 | EFF_FLAG, bytes.fromhex("F7005AFFFFFFFFFF"), 0),
         (0, 0x18FEF100 | EFF_FLAG, bytes.fromhex("F7005A"), 0),

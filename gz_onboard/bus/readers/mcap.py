@@ -23,6 +23,7 @@ from gz_onboard.events import Frame
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")
 CHUNK = struct.Struct("<QQQLL")  # start, end, size and CRC of the unpacked records, length of the compression's name
+_FOOTER = struct.Struct("<BQQQL")  # opcode, length, start of the summary and of its offsets, CRC
 _MESSAGE = struct.Struct("<HLQQ")  # channel, sequence, log time, publish time
 _U16 = struct.Struct("<H")
 _U32 = struct.Struct("<L")
@@ -37,6 +38,10 @@ def read(path: Path, data: Contents, damage: Damage, start: int | None, end: int
     """The raw frames of one of our logs; what cannot be read, or is missing at its end, is noted as damage."""
     channels: set[int] = set()
     topics: set[str] = set()
+    for opcode, position, _ in _declared(data):
+        with contextlib.suppress(*BROKEN):
+            if opcode == Opcode.CHANNEL:
+                _channel(data, position, channels, topics)
     for opcode, position, limit in records(path, data, damage):
         blocks = []
         try:
@@ -44,7 +49,7 @@ def read(path: Path, data: Contents, damage: Damage, start: int | None, end: int
                 _channel(data, position, channels, topics)
             elif opcode == Opcode.CHUNK:
                 first, last, _, _, _ = CHUNK.unpack_from(data, position)
-                # The first chunk declares the channels, so it is always unpacked.
+                # Where there is no summary, the first chunk declares the channels.
                 wanted = (start is None or last + _MARGIN_NS >= start) and (end is None or first - _MARGIN_NS < end)
                 if not wanted and channels:
                     continue
@@ -139,7 +144,9 @@ def samples(
 
 
 def _unpacked_records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, bytes]]:
-    """Opcode and content of all records, those in chunks among them."""
+    """Opcode and content of all records, those in chunks among them; first what the summary declares."""
+    for opcode, start, end in _declared(data):
+        yield opcode, data[start:end]
     for opcode, start, end in records(path, data, damage):
         if opcode != Opcode.CHUNK:
             yield opcode, data[start:end]
@@ -175,6 +182,25 @@ def records(path: Path, data: Contents, damage: Damage) -> Iterator[tuple[int, i
         damage.add(f"byte {position}", f"{following - position} bytes are not records")
         position = following
     damage.add(f"byte {len(data)}", "the file was cut off: it has no end record")
+
+
+def _declared(data: Contents) -> list[tuple[int, int, int]]:
+    """Opcode, start and end of the schemas and channels in the summary; none without a summary.
+
+    The chunk that declares them may be broken.
+    """
+    footer = len(data) - len(MAGIC) - _FOOTER.size
+    if footer < 0 or data[footer + _FOOTER.size :] != MAGIC:
+        return []
+    opcode, _, start, _, crc = _FOOTER.unpack_from(data, footer)
+    end = footer + _FOOTER.size - 4
+    if opcode != Opcode.FOOTER or not len(MAGIC) <= start < footer or zlib.crc32(data[start:end]) != crc:
+        return []
+    try:
+        found = [(kind, start + at, start + until) for kind, at, until in records_in(data[start:footer])]
+    except BROKEN:
+        return []
+    return [record for record in found if record[0] in (Opcode.SCHEMA, Opcode.CHANNEL)]
 
 
 def _next_chunk(data: Contents, position: int) -> int:

@@ -128,8 +128,8 @@ def text_reader(suffix: str) -> Reader:
         if not any_frame and feed.number:
             if damage.count and suffix == ".csv":
                 raise InputError(
-                    f"{path}:1: neither a log of frames (SavvyCAN's or python-can's CSV) nor a table of signals, which "
-                    "begins with 'time [s],' or 'time [s];' and is in UTF-8; it begins with "
+                    f"{path}:1: neither a log of frames (SavvyCAN's or python-can's CSV) nor a table of signals, in "
+                    "UTF-8 and with a column 'time [s]', or one that [table] in a vehicle file names; it begins with "
                     f"{shown(str(data[:_BEGINNING], 'latin-1').partition(chr(10))[0])}"
                 )
             if damage.count:
