@@ -783,3 +783,10 @@ def test_raw_values_are_those_of_whole_frames():
     for signal in message.signals:  # all ones are -1 of a signed signal
         assert is_not_available(signal, raw[signal.name]) == (signal.length >= 8 and not signal.is_signed)
     assert raw_values(message, b"\xff" * (message.length - 1)) is None
+
+
+def test_no_time_of_the_timeline_is_before_1970_by_a_clock_that_was_set_back():
+    codec = Codec(reference())
+    codec.decode([(i * 50 * MS % (1000 * MS), 0x777, b"", 0) for i in range(60)])
+    assert codec.time_ns(0.0) == 0
+    assert codec.time_ns(codec.seconds(codec.last_ns)) == codec.last_ns == 950 * MS
