@@ -30,7 +30,7 @@ from gz_onboard.lab.vehicle.finding import Finding, Looks
 from gz_onboard.lab.vehicle.motion import check_distances, speeds_of
 from gz_onboard.lab.vehicle.on_board import on_board
 from gz_onboard.lab.vehicle.rolling import rolling_of
-from gz_onboard.lab.vehicle.seconds import Seconds, seconds_of, unit_of
+from gz_onboard.lab.vehicle.seconds import Seconds, seconds_of, too_little, unit_of
 from gz_onboard.offline.samples import Samples, read_samples
 from gz_onboard.vehicle import read_vehicle
 from tests.plant.logs import write_log
@@ -59,6 +59,8 @@ MISTAKES = [
     ("inverter_current", "scale = -1", "the sign of one"),
     ("throttle", 'unit = "1"', "may be %"),
     ("charge_plug", "scale = -1, offset = 1", "the other way round"),
+    ("charge_plug", "offset = 3", "it goes to 3, and 1 is on; limits of [0|1] in the DBC file"),
+    ("pack_voltage", "scale = 0.6", "V a cell of 14 in series, which have"),
     ("brake_switch", "scale = -1, offset = 1", "the other way round"),
     ("bms_state_of_charge", 'unit = "1"', "dropped"),
 ]
@@ -188,6 +190,52 @@ def test_the_status_and_the_json_say_what_is_wrong(log, tmp_path, capsys):
     looks = {role["role"]: role["looks"] for role in document["rides"][0]["roles"]}
     assert (looks["pack_current"], looks["odometer"]) == ("looks wrong", "looks right")
     assert document["failed"] == []
+
+
+def test_a_pack_that_never_came_looks_wrong_and_the_identifier_that_came_is_named(log, tmp_path, capsys):
+    dbc = (ROOT / "dbc" / "vehicle.dbc").read_text(encoding="utf-8").replace("BO_ 512 BMS_Pack", "BO_ 527 BMS_Pack")
+    (tmp_path / "mine.dbc").write_text(dbc, encoding="utf-8")
+    text = re.sub(r"^inverter_voltage = .*\n", "", REFERENCE.replace('"vehicle.dbc"', '"mine.dbc"'), flags=re.M)
+    (tmp_path / "v.toml").write_text(text, encoding="utf-8")
+    assert cli.main(["vehicle", "check", str(tmp_path / "v.toml"), str(log), "--quick"]) == FAILED
+    said = capsys.readouterr().out
+    assert re.search(
+        r"never came \(pack_voltage\): pack voltage never came: no range; BMS_Pack is 0x20f in the DBC file, "
+        r"and 0x200, which no file knows, has 8 bytes too and came \d+ times",
+        said,
+    )
+
+
+def test_a_log_that_shows_nothing_right_does_not_look_right(tmp_path, capsys):
+    assert cli.main(["export", str(LOGS / "coastdown.blf"), str(tmp_path / "cut.blf"), "--to", "1"]) == OK
+    assert cli.main(["vehicle", "check", "reference", str(tmp_path / "cut.blf"), "--quick"]) == OK
+    assert "cut.blf (0 min 01 s): cannot tell\n" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("off", "when", "looks"),
+    [(0.0, 1, Looks.RIGHT), (0.17, 1, Looks.UNKNOWN), (0.25, 1, Looks.WRONG), (0.25, -1, Looks.UNKNOWN)],
+)
+def test_a_gauge_and_a_voltage_apart_by_more_than_both_are_known_do_not_look_right(rides, tmp_path, off, when, looks):
+    ride_ = rides[0]
+    times, shown = ride_.columns["bms_state_of_charge"]
+    late = when * (times - times.mean()) > 0
+    columns = {**ride_.columns, "bms_state_of_charge": (times, shown - off * late)}
+    said = said_of_the_pack(replace(ride_, columns=columns), tmp_path, r"^name = .*", 'name = "mine"')
+    finding = said["state of charge against the voltage"]
+    assert finding.looks is looks, finding.text
+    assert (
+        off == 0
+        or finding.text.endswith(f"at the {'end' if when > 0 else 'start'}")
+        or "battery.window" in finding.text
+    )
+
+
+def test_a_vehicle_that_moves_is_not_said_to_stand():
+    assert "too seldom there together" in too_little(np.full(60, 34.4), "speeds")
+    assert too_little(np.array([34.4] * 20 + [np.nan] * 40), "speeds") == (
+        "the vehicle moves for 20 s in this log, and 30 s are needed"
+    )
 
 
 def test_without_a_log_it_says_what_the_roles_are_enough_for(capsys):

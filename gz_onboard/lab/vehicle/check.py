@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -14,13 +14,14 @@ import numpy as np
 from gz_onboard.arrays import Array
 from gz_onboard.bus.answers import NEGATIVE
 from gz_onboard.bus.codec import LONGEST_PAUSE_NS, RANGE, Codec
-from gz_onboard.bus.mapping import BusMapping
+from gz_onboard.bus.layout import identifier_of
+from gz_onboard.bus.mapping import BusMapping, Source
 from gz_onboard.bus.units import UNITS
 from gz_onboard.estimator.signals import DEFAULT_STALE
-from gz_onboard.events import STALE_PERIODS, Group
+from gz_onboard.events import STALE_PERIODS, Frame, Group, hexadecimal, words
 from gz_onboard.lab.estimate_tally import PAUSE
 from gz_onboard.lab.vehicle import charge, electric, motion, others
-from gz_onboard.lab.vehicle.features import Feature, features_of, features_text
+from gz_onboard.lab.vehicle.features import NEEDS, Feature, features_of, features_text
 from gz_onboard.lab.vehicle.finding import Finding, Looks, unknown, wrong
 from gz_onboard.lab.vehicle.on_board import on_board
 from gz_onboard.lab.vehicle.rolling import MOTOR, rolling_of
@@ -31,6 +32,7 @@ from gz_onboard.vehicle import Vehicle
 
 CHECK_VERSION = 1
 RARE = 0.9  # of the time: a signal that is there for less is told
+MOST_DIGITS = 2  # hexadecimal, in which an identifier may differ from the one that was meant
 DROPPED = 0.01  # of the values: as many out of the limits are wrong limits, or a wrong layout
 _LATER = unknown("on board", (), "not tried: what looks wrong would mislead it")
 
@@ -70,9 +72,11 @@ def check_log(
     """Check one log; quick: without `on_board`. Raises InputError for one that cannot be read."""
     mapping, frames = open_ride(log, vehicle)
     codec = Codec(mapping, LONGEST_PAUSE_NS)
-    columns = read_roles(log, vehicle, (codec, frames), progress)
+    lengths: dict[int, int] = {}
+    columns = read_roles(log, vehicle, (codec, _noting(frames, lengths)), progress)
     samples = Samples(ride_name(log), columns, facts_of(log))
     findings = [unknown("clock", (), leap_text(*leap)) for leap in codec.leaps]
+    findings += _never_came(codec, columns, lengths, _passed(columns)[0])
     findings += [*_dropped(codec, columns), *_unanswered(codec, columns)]
     ride = seconds_of(samples, vehicle) if columns else None
     if ride:
@@ -97,6 +101,50 @@ def _passed(columns: Mapping[str, tuple[Array, Array]]) -> tuple[float, float]:
     end = max(float(times[-1]) for times, _ in columns.values())
     steps = np.diff(np.unique(np.concatenate([np.floor(times) for times, _ in columns.values()])))
     return end - start - float(steps[steps > PAUSE].sum()), end
+
+
+def _noting(frames: Iterable[list[Frame]], lengths: dict[int, int]) -> Iterator[list[Frame]]:
+    """The frames; `lengths` gets that of each identifier."""
+    for batch in frames:
+        lengths.update({frame[1]: len(frame[2]) for frame in batch})
+        yield batch
+
+
+def _never_came(
+    codec: Codec, columns: Collection[str], lengths: Mapping[int, int], duration: float
+) -> Iterator[Finding]:
+    """Roles of the file that the range needs, and of which a log of that `duration` [s] has no value."""
+    needed, wanted = NEEDS["range"]
+    for group in (*needed, *wanted):
+        silent = [source for source in codec.mapping.sources if source.role in group]
+        late = min((_stale(codec.mapping.periods.get(source.message)) for source in silent), default=0.0)
+        if silent and not set(group) & set(columns) and duration > late:
+            roles = tuple(source.role for source in silent)
+            without = "no range" if group in needed else "no energy"
+            text = f"{words(roles[0])} never came: {without}{_alike(codec, silent[0], lengths)}"
+            yield wrong("never came", roles, text)
+
+
+def _stale(period: float | None) -> float:
+    """When a signal of this `period` [s] is stale [s]."""
+    return STALE_PERIODS * period if period else DEFAULT_STALE
+
+
+def _alike(codec: Codec, source: Source, lengths: Mapping[int, int]) -> str:
+    """The unknown identifier that is most like that of a message which never came, if its frames are as long."""
+    message = next((m for m in codec.mapping.database.messages if m.name == source.message), None)
+    if message is None:
+        return ""
+    wanted = hexadecimal(identifier_of(message))
+    digits = {one: sum(a != b for a, b in zip(hexadecimal(one), wanted, strict=False)) for one in codec.unknown}
+    found = [one for one in digits if lengths.get(one) == message.length and len(hexadecimal(one)) == len(wanted)]
+    best = min(found, key=lambda one: digits[one], default=None)
+    if best is None or digits[best] > MOST_DIGITS:
+        return f"; {source.message} is {wanted} in the DBC file"
+    return (
+        f"; {source.message} is {wanted} in the DBC file, and {hexadecimal(best)}, which no file knows, has "
+        f"{message.length} bytes too and came {codec.unknown[best]} times"
+    )
 
 
 def _dropped(codec: Codec, columns: Mapping[str, tuple[Array, Array]]) -> Iterator[Finding]:
@@ -196,8 +244,7 @@ def _roles(
         share = 0.0
         if source.role in samples.columns:
             times, values = samples.columns[source.role]
-            period = periods.get(source.message)
-            stale = STALE_PERIODS * period if period else DEFAULT_STALE
+            stale = _stale(periods.get(source.message))
             rate = 1 / max(float(np.median(np.diff(times))), 1e-6) if len(times) > 1 else None
             low, high = float(values.min()), float(values.max())
             held = float(np.minimum(np.diff(times, append=span[1]), stale).sum())
@@ -208,7 +255,7 @@ def _roles(
 
 def check_text(checked: Checked) -> str:
     """For a terminal."""
-    said, count = "looks right", len(checked.those(Looks.WRONG))
+    said, count = "looks right" if checked.those(Looks.RIGHT) else "cannot tell", len(checked.those(Looks.WRONG))
     if count:
         often = Counter(role for finding in checked.those(Looks.WRONG) for role in finding.roles).most_common(2)
         clear = len(often) == 1 or (len(often) == 2 and often[0][1] > often[1][1])

@@ -14,9 +14,9 @@ from gz_onboard.constants import BENCH_TEMPERATURE
 from gz_onboard.estimator.redundancy.checks import MOVING
 from gz_onboard.estimator.redundancy.currents import APART_RELATIVE
 from gz_onboard.estimator.redundancy.motion import DRIVES
-from gz_onboard.estimator.redundancy.voltages import APART, HIGHEST, LOWEST
+from gz_onboard.estimator.redundancy.voltages import APART, HIGHEST
 from gz_onboard.lab.vehicle.finding import Finding, Looks, right, unknown, wrong
-from gz_onboard.lab.vehicle.seconds import FEWEST, UNRELATED, Seconds, rate, relation, unit_of
+from gz_onboard.lab.vehicle.seconds import FEWEST, UNRELATED, Seconds, rate, relation, too_little, unit_of
 from gz_onboard.physics.battery import Battery
 from gz_onboard.physics.model import air_density, all_quantities
 from gz_onboard.vehicle import Vehicle
@@ -33,6 +33,7 @@ ENERGIES, USUAL_ENERGIES = (0.5, 2.0), (0.75, 1.5)
 ROUGH = 0.2  # relative: so near the units' is the ratio of two powers
 ABOVE_FULL = 1.02  # of the full cell's voltage: cells that give current are not above it for long
 ABOVE_FOR = 0.1  # of the time
+EMPTIEST = 0.95  # of the voltage of an empty cell: none is below for half a log
 BRAKES = -0.4  # m/s²: slower than the road load alone
 
 
@@ -61,7 +62,8 @@ def drawn(ride: Seconds, vehicle: Vehicle) -> PackRide | None:
 def check_voltages(ride: Seconds, battery: Battery, current: Array | None) -> Iterator[Finding]:
     """Each within what the cells can have, and both against each other; current: of the pack [A] (n,)."""
     series = battery.cells_series
-    low, high = LOWEST * battery.cutoff_voltage, HIGHEST * battery.ocv_value[-1]
+    low = EMPTIEST * min(battery.cutoff_voltage, battery.ocv_value[0])
+    high = HIGHEST * battery.ocv_value[-1]
     full, empty = battery.ocv_value[-1], battery.cutoff_voltage
     inside: list[str] = []
     for role in ride.any_of("pack_voltage", "inverter_voltage"):
@@ -189,7 +191,7 @@ def check_road(ride: Seconds, of: PackRide, speed: Array, expected: Array) -> It
     moving = np.isfinite(power) & np.isfinite(expected) & (np.abs(speed) > MOVING)
     found = relation(expected, power, moving)
     if found is None:
-        yield unknown(check, PACK, "the vehicle hardly moves in this log")
+        yield unknown(check, PACK, too_little(speed, "power and speed"))
         return
     given, wanted = (float(x[moving & (expected > 0)].sum()) for x in (power, expected))
     ratio = given / wanted if wanted > 0 else 0.0

@@ -14,7 +14,7 @@ from gz_onboard.estimator.redundancy.odometer import FASTEST
 from gz_onboard.estimator.redundancy.speeds import AXLE, GROUND, SPEED_APART, SPEED_APART_RELATIVE, vote
 from gz_onboard.events import SPEEDS
 from gz_onboard.lab.vehicle.finding import Finding, right, unknown, wrong
-from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, Seconds, rate, relation, unit_of
+from gz_onboard.lab.vehicle.seconds import FEWEST, SECOND, Seconds, rate, relation, too_little, unit_of
 from gz_onboard.physics.sensors import speed_factors
 from gz_onboard.vehicle import Vehicle
 
@@ -60,7 +60,8 @@ def check_speeds(ride: Seconds, speeds: dict[str, Array]) -> Iterator[Finding]:
     roles = tuple(speeds)
     if moving.sum() < FEWEST:
         if roles:
-            yield unknown(check, roles, "the vehicle hardly moves in this log")
+            fastest = np.max(np.abs(np.nan_to_num(list(speeds.values()))), axis=0)
+            yield unknown(check, roles, too_little(fastest, " and ".join(roles)))
         return
     means = {role: float(np.mean(np.abs(speed[moving]))) for role, speed in speeds.items()}
     if len(roles) < 2:

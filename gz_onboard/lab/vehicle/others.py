@@ -100,8 +100,13 @@ def check_switches(ride: Seconds, speed: Array | None) -> Iterator[Finding]:
             shown = float(np.nanmean(np.clip(ride[role][moving], 0.0, 1.0)))
             state = {"charge_plug": "plugged in", "key": "off", "contactor": "open"}[role]
             if abs(shown - riding) > 0.5:
-                text = f"is {state} while riding: the other way round, scale = -1, offset = 1"
-                yield wrong(words(role), (role,), text)
+                most = float(np.nanmax(ride[role][moving]))
+                hint = "the other way round, scale = -1, offset = 1"
+                if most > 1:
+                    hint = (
+                        f"it goes to {most:g}, and 1 is on; limits of [0|1] in the DBC file drop what else it may mean"
+                    )
+                yield wrong(words(role), (role,), f"is {state} while riding: {hint}")
             else:
                 yield right(words(role), (role,), f"is not {state} while riding")
     if "brake_switch" in ride:

@@ -10,6 +10,7 @@ import numpy as np
 
 from gz_onboard.arrays import Array, Mask
 from gz_onboard.bus.units import UNITS, known_units, to_si
+from gz_onboard.estimator.redundancy.checks import MOVING
 from gz_onboard.lab.discover.grid import averaged, measured
 from gz_onboard.lab.discover.stand_ins import delays
 from gz_onboard.offline.samples import Samples
@@ -88,6 +89,14 @@ def relation(x: Array, y: Array, where: Mask | None = None) -> Relation | None:
         return None
     correlation = float(np.mean(a * b)) / (width * height)
     return Relation(copysign(height / width, correlation), correlation, int(known.sum()))
+
+
+def too_little(speed: Array, what: str) -> str:
+    """Why motion does not tell: the vehicle moves at this `speed` (n,) [m/s] too little, or `what` are not there."""
+    moving = int(np.sum(np.abs(speed) > MOVING))
+    if moving < FEWEST:
+        return f"the vehicle moves for {moving} s in this log, and {FEWEST} s are needed"
+    return f"{what} are too seldom there together, or do not change"
 
 
 def unit_of(role: str, ratio: float, alike: float = ALIKE) -> str:
