@@ -60,6 +60,10 @@ _SHARED: Mapping[str, tuple[str, Mapping[str, Any]]] = {
         "name of a built-in vehicle, or a vehicle file (default: %(default)s)",
         {"default": "reference", "metavar": "NAME|TOML"},
     ),
+    "--vehicle-id": (
+        "which it is of several vehicles with one file (default: from rides.json beside the log, or the vehicle file)",
+        {"metavar": "ID"},
+    ),
     "--payload": (
         "mass of rider and luggage (default: from rides.json beside the log, or the vehicle file)",
         {"type": number("--payload", 0.0, MOST_PAYLOAD, "kg"), "metavar": "KG"},

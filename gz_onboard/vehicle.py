@@ -22,9 +22,11 @@ from gz_onboard.physics.riding import PriorRiding, check_riding, read_riding
 from gz_onboard.toml import Table, is_file
 
 OWN = Path(__file__).resolve().parent / "vehicles"
+NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}"
+NAME_TEXT = "1 to 64 letters, digits and - _ . with a letter or digit first"
 KEYS = (
-    "schema name dbc range_dbc range_identifier bus request roles table instruments model parameters correlation "
-    "battery forecast controller healthy"
+    "schema name vehicle_id dbc range_dbc range_identifier bus request roles table instruments model parameters "
+    "correlation battery forecast controller healthy"
 )
 
 
@@ -43,6 +45,7 @@ class Vehicle:
     derating: Derating = field(default_factory=Derating)
     range_identifier: int | None = None  # of the first range frame, in place of that in `range_dbc`
     healthy: object = None  # what the discovery learned of it on healthy rides
+    vehicle_id: str = ""  # which it is of several with one file; then the end of its name
 
     __repr__ = brief
 
@@ -66,6 +69,18 @@ class Vehicle:
         """What a saved state must agree with to be of use: the vehicle, its cells and its model list."""
         pack = f"{self.battery.cells_series}s{self.battery.cells_parallel}p" if self.battery else "no battery"
         return "|".join([self.name, pack, *(effect.name for effect in self.model.effects)])
+
+    def identified(self, vehicle_id: str, where: str) -> Vehicle:
+        """The one that has this id, of several with this file. InputError, which begins with `where`, for no id."""
+        if vehicle_id == self.vehicle_id:
+            return self
+        if self.vehicle_id:
+            raise InputError(
+                f"{where}: vehicle_id is {shown(vehicle_id)}, and that of the vehicle is {self.vehicle_id!r}"
+            )
+        if not re.fullmatch(NAME, vehicle_id):
+            raise InputError(f"{where}: vehicle_id must be {NAME_TEXT}, is {shown(vehicle_id)}")
+        return replace(self, name=f"{self.name}-{vehicle_id}", vehicle_id=vehicle_id)
 
     def loaded(self, payload: float) -> Vehicle:
         """The same with a rider and luggage of `payload` [kg]. InputError if that cannot be."""
@@ -135,11 +150,12 @@ def read_vehicle(
     payload: float | None = None,
     effects_folder: Path | None = None,
     users: Collection[int] | None = None,
+    vehicle_id: str | None = None,
 ) -> Vehicle:
     """The vehicle `name` (file or one of the package's own), with the rider's mass [kg] if it is known.
 
     effects_folder: where effects of the user's own are, beside the file's own ``effects_folder``, of which only those
-    run that nobody but `users` can change (see `read_model`).
+    run that nobody but `users` can change (see `read_model`). vehicle_id: which it is of several with this file.
     """
     table = Table.read(find_vehicle(name))
     if "poll" in table.values:
@@ -164,6 +180,10 @@ def read_vehicle(
         range_identifier=_range_identifier(table),
         healthy=_healthy(table.table("healthy")),
     )
+    if "vehicle_id" in table.values:
+        vehicle = vehicle.identified(table.text("vehicle_id"), str(table.file))
+    if vehicle_id is not None:
+        vehicle = vehicle.identified(vehicle_id, "--vehicle-id")
     return vehicle if payload is None else vehicle.loaded(payload)
 
 
@@ -192,10 +212,8 @@ def _range_identifier(table: Table) -> int | None:
 def _name(table: Table) -> str:
     """The vehicle's name, which becomes part of the names of files: no path, nothing that a shell would take apart."""
     name = table.text("name")
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", name):
-        raise table.error(
-            f"must be 1 to 64 letters, digits and - _ . with a letter or digit first, is {shown(name)}", "name"
-        )
+    if not re.fullmatch(NAME, name):
+        raise table.error(f"must be {NAME_TEXT}, is {shown(name)}", "name")
     return name
 
 

@@ -60,6 +60,20 @@ def test_the_key_tells_what_a_saved_state_belongs_to(tmp_path):
     assert read_vehicle(str(changed(tmp_path, DRAG, r"\g<1>0.4567")[0])).key == ours
 
 
+def test_the_identity_of_one_of_several_is_part_of_name_and_key(tmp_path):
+    bare = read_vehicle("reference")
+    text = REFERENCE.replace("schema = 1\n", 'schema = 1\nvehicle_id = "17"\n', 1)
+    (tmp_path / "v.toml").write_text(text)
+    for one in (read_vehicle("reference", vehicle_id="17"), read_vehicle(tmp_path / "v.toml", vehicle_id="17")):
+        assert (one.name, one.vehicle_id) == (f"{bare.name}-17", "17")
+        assert one.key != bare.key
+        assert one.key != read_vehicle("reference", vehicle_id="18").key
+    with pytest.raises(InputError, match=r"--vehicle-id: vehicle_id is '18', and that of the vehicle is '17'"):
+        read_vehicle(tmp_path / "v.toml", vehicle_id="18")
+    with pytest.raises(InputError, match=r"--vehicle-id: vehicle_id must be 1 to 64 letters, .* is '../x'"):
+        read_vehicle("reference", vehicle_id="../x")
+
+
 def test_the_payload_may_be_given():
     assert read_vehicle("reference", payload=95.0).parameters["payload_mass"] == 95.0
     assert read_vehicle("reference", payload=95.0).model.mass == read_vehicle("reference").model.mass + 15.0

@@ -40,7 +40,7 @@ log = logging.getLogger("gz-onboard")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard run``."""
-    add_shared(parser, "--vehicle", "--interface")
+    add_shared(parser, "--vehicle", "--vehicle-id", "--interface")
     add = parser.add_argument
     channel = f"channel (default: {CHANNEL}), the vehicle's bus; twice, for a second bus"
     add_shared(parser, "--channel", action="append", default=None, help=channel)
@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
         if names.count(name) > 1:
             raise InputError(f"--channel {name}: given twice; each of its frames would come twice")
     # Nobody watches a daemon: the vehicle file's own code runs only if it is root's.
-    vehicle = read_vehicle(arguments.vehicle, arguments.payload, arguments.effects, users={ROOT})
+    vehicle = read_vehicle(arguments.vehicle, arguments.payload, arguments.effects, {ROOT}, arguments.vehicle_id)
     if not vehicle.mapping.reads_frames:
         raise vehicle.error("dbc is missing: the daemon reads frames")
     if arguments.write_dbc:

@@ -68,7 +68,7 @@ LOWEST = "lowest_cell_voltage"  # the role without which nothing is known of the
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of the command."""
-    add_shared(parser, "--vehicle", "--json")
+    add_shared(parser, "--vehicle", "--vehicle-id", "--json")
     parser.add_argument(
         "--state", type=Path, metavar="FILE", help=f"saved state (default: the vehicle's in {USUAL_FOLDER})"
     )
@@ -81,7 +81,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Show, or forget. InputError if the state cannot be read, is another vehicle's, or is in use."""
-    vehicle = read_vehicle(arguments.vehicle)
+    vehicle = read_vehicle(arguments.vehicle, vehicle_id=arguments.vehicle_id)
     file = arguments.state or state_file(USUAL_FOLDER, vehicle.name)
     not_an_input([arguments.json], [file, vehicle.file])
     try:

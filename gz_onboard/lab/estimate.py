@@ -47,7 +47,7 @@ KEYS = descriptions(RideSummary)
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``gz-onboard estimate``."""
     explain_keys(parser, "a ride", SUMMARY_VERSION, KEYS)
-    add_shared(parser, "logs", "--vehicle")
+    add_shared(parser, "logs", "--vehicle", "--vehicle-id")
     add_shared(parser, "--payload", help="mass of rider and luggage (default: unknown, also where rides.json says it)")
     add_shared(parser, "--route")
     add_shared(parser, "--filter", "--output", "--json")
@@ -78,7 +78,7 @@ def run(arguments: argparse.Namespace) -> int:
     not_an_input(
         written, [*(task.path for task in tasks), *filter(None, [arguments.route]), find_vehicle(arguments.vehicle)]
     )
-    known_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
+    known_vehicle(arguments.vehicle, arguments.payload, arguments.vehicle_id)  # its errors are none of a log's
     with held(arguments.state) if arguments.state else contextlib.nullcontext():
         tasks, unread = _in_turn(arguments, tasks) if arguments.state else (tasks, [])
         rides, failed = _estimate(arguments, tasks, unread)
@@ -105,7 +105,9 @@ def _in_turn(arguments: argparse.Namespace, tasks: Sequence[EstimateTask]) -> tu
         tasks = kept_in_turn(tasks)
     *_, last = -1, *(number for number, task in enumerate(tasks) if task.resume)
     for task in tasks[last + 1 : last + 2]:  # the first that goes on from the state that is there
-        vehicle = open_estimate(task.path, known_vehicle(arguments.vehicle, arguments.payload)).vehicle
+        vehicle = open_estimate(
+            task.path, known_vehicle(arguments.vehicle, arguments.payload, arguments.vehicle_id)
+        ).vehicle
         if task.state:
             go_on(Pipeline(vehicle), task.state, task.path)
     return tasks, unread

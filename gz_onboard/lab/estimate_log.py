@@ -13,12 +13,13 @@ from gz_onboard.bus.completion import is_complete
 from gz_onboard.bus.logfile import LogFile
 from gz_onboard.bus.logs import ESTIMATED, read_metadata
 from gz_onboard.errors import InputError, writing
-from gz_onboard.lab.estimate_ride import How, Ridden, known_vehicle, open_estimate, ride_through
+from gz_onboard.lab.estimate_ride import How, Ridden, open_estimate, ride_through, vehicle_of
 from gz_onboard.lab.estimate_state import StateAt, latest, text_of
 from gz_onboard.lab.estimate_summary import SUMMARY_VERSION, RideSummary, kept_summary, summary_of, summary_to_keep
 from gz_onboard.lab.plot import plot_log
 from gz_onboard.offline.digest import digest_of
 from gz_onboard.offline.processes import Task
+from gz_onboard.offline.samples import of_ride
 from gz_onboard.pipeline import dbc_texts, lacking
 from gz_onboard.progress import Progress
 from gz_onboard.routes.ahead import read_ahead
@@ -59,7 +60,7 @@ class EstimateTask(Task):
 
 def estimate_log(task: EstimateTask, progress: Progress | None = None) -> RideSummary:
     """Estimate one log and write its MCAP and picture; gives its summary. Raises InputError."""
-    vehicle = known_vehicle(task.vehicle, task.payload)
+    vehicle = vehicle_of(task)
     made_of = _made_of(task, vehicle)
     if task.resume and (kept := _kept(task, made_of)):
         if progress:
@@ -124,7 +125,7 @@ def kept_in_turn(tasks: Sequence[EstimateTask]) -> list[EstimateTask]:
     wanted = digest_of(there) if there else None
     found: list[EstimateTask] = []
     for task in reversed(tasks):
-        made = _made(task, _made_of(task, known_vehicle(task.vehicle, task.payload))) if wanted else None
+        made = _made(task, _made_of(task, vehicle_of(task))) if wanted else None
         led = made is not None and made.get(_AFTER) == wanted
         wanted = made[_BEFORE] if made and led else wanted
         found.append(replace(task, resume=led))
@@ -139,6 +140,7 @@ def _made_of(task: EstimateTask, vehicle: Vehicle) -> dict[str, str]:
         "version": f"{__version__}, summary {SUMMARY_VERSION}",
         "log": digest_of(task.path),
         "vehicle": " ".join(sorted({_digest_once(file) for file in files})),
+        "vehicle_id": of_ride(vehicle, task.path).vehicle_id,
         "payload_kg": "" if task.payload is None else f"{task.payload:g}",
         "route": digest_of(task.route) if task.route else "",
         "options": f"filter {task.filter_name}, frames {task.frames}, signals {task.signals}",

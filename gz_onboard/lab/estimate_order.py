@@ -12,7 +12,7 @@ from gz_onboard.bus.codec import LONGEST_PAUSE_NS, Codec
 from gz_onboard.errors import InputError
 from gz_onboard.estimator.riders import LONGEST_NAME
 from gz_onboard.lab.estimate_log import EstimateTask
-from gz_onboard.lab.estimate_ride import known_vehicle, open_estimate
+from gz_onboard.lab.estimate_ride import open_estimate, vehicle_of
 from gz_onboard.lab.estimate_state import OVERTAKEN, StateAt, when
 from gz_onboard.offline.results import FIRST_DATE_NS
 from gz_onboard.offline.samples import facts_of
@@ -26,10 +26,11 @@ Unread: TypeAlias = tuple[EstimateTask, InputError]
 
 @dataclass(frozen=True)
 class Span:
-    """When a ride was [ns since the epoch]."""
+    """When a ride was [ns since the epoch], and of which vehicle."""
 
     begin_ns: int
     end_ns: int
+    vehicle: str
 
 
 def span_of(source: Path | SignalTable, vehicle: Vehicle, progress: Progress | None = None) -> Span:
@@ -40,7 +41,7 @@ def span_of(source: Path | SignalTable, vehicle: Vehicle, progress: Progress | N
         codec.decode(batch)
         if progress:
             progress(len(batch))
-    return Span(codec.time_ns(0.0), codec.last_ns)
+    return Span(codec.time_ns(0.0), codec.last_ns, ride.vehicle.name)
 
 
 def state_at(file: Path, source: Path | SignalTable, span: Span) -> StateAt:
@@ -66,19 +67,24 @@ def in_order(
 ) -> tuple[list[EstimateTask], list[Unread]]:
     """(the tasks in the order of their rides, to go on from the state `file`, those whose logs cannot be read).
 
-    InputError naming the logs if two overlap, or have no date.
+    InputError naming the logs if two overlap or are of two vehicles, or if they have no date.
     """
     spans: list[tuple[Span, EstimateTask]] = []
     unread: list[Unread] = []
     for task in tasks:
         try:
-            spans.append((span_of(task.path, known_vehicle(task.vehicle, task.payload), progress), task))
+            spans.append((span_of(task.path, vehicle_of(task), progress), task))
         except InputError as error:
             unread.append((task, error))
     if without := [task.path for span, task in spans if span.begin_ns < FIRST_DATE_NS]:
         raise undated(without)
     spans.sort(key=lambda one: one[0].begin_ns)
     for (one, before), (other, after) in pairwise(spans):
+        if one.vehicle != other.vehicle:
+            raise InputError(
+                f"{before.path} is of {one.vehicle} and {after.path} of {other.vehicle}: "
+                "a saved state is of one vehicle"
+            )
         if (one.end_ns - other.begin_ns) * 1e-9 > OVERTAKEN:
             raise InputError(
                 f"{before.path} and {after.path} overlap: {_times(one)} and {_times(other)}; "

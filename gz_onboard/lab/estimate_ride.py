@@ -19,7 +19,8 @@ from gz_onboard.events import Estimate, Frame
 from gz_onboard.lab.estimate_state import StateAt, WentOn, go_on
 from gz_onboard.lab.estimate_tally import PAUSE, Tally
 from gz_onboard.log_rows import STATUS_TOPIC, Log
-from gz_onboard.offline.samples import check_ridden, open_ride
+from gz_onboard.offline.processes import Task
+from gz_onboard.offline.samples import check_ridden, of_ride, open_ride
 from gz_onboard.offline.signal_table import SignalTable
 from gz_onboard.pipeline import TICK_NS, Pipeline, range_publisher
 from gz_onboard.progress import Progress
@@ -124,7 +125,7 @@ def open_estimate(source: Path | SignalTable, vehicle: Vehicle) -> OpenRide:
     damages: list[LogDamage] = []
     name = source.name if isinstance(source, SignalTable) else source
     mapping, batches = open_ride(source, vehicle, damages.append)
-    vehicle = replace(vehicle, mapping=mapping)
+    vehicle = replace(of_ride(vehicle, source), mapping=mapping)
     own = range_publisher(vehicle).may_have_sent
     ours = ([frame for frame in batch if not own(frame)] for batch in batches)
     first = next((batch for batch in ours if batch), None)
@@ -172,7 +173,12 @@ def ride_through(ride: OpenRide, how: How, log: Log, progress: Progress | None =
     return Ridden(ride.source, pipeline, tally, how, ride.damages, took, went_on)
 
 
+def vehicle_of(task: Task) -> Vehicle:
+    """The vehicle of a task, read once for all logs of a process."""
+    return known_vehicle(task.vehicle, task.payload, task.vehicle_id)
+
+
 @functools.lru_cache(maxsize=1)
-def known_vehicle(name: str, payload: float | None) -> Vehicle:
+def known_vehicle(name: str, payload: float | None, vehicle_id: str | None = None) -> Vehicle:
     """The vehicle, read once for all logs of a process."""
-    return read_vehicle(name, payload)
+    return read_vehicle(name, payload, vehicle_id=vehicle_id)

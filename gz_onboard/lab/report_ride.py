@@ -10,7 +10,7 @@ from gz_onboard.constants import WH
 from gz_onboard.estimator.load_model import Ledger
 from gz_onboard.estimator.signals import FIX_2D
 from gz_onboard.events import words
-from gz_onboard.lab.estimate_ride import How, known_vehicle, open_estimate, ride_through
+from gz_onboard.lab.estimate_ride import How, open_estimate, ride_through, vehicle_of
 from gz_onboard.lab.estimate_summary import RideSummary, summary_of
 from gz_onboard.lab.kept_rows import KeptRows
 from gz_onboard.lab.logged import Logged
@@ -76,7 +76,7 @@ class ReportedRide:
 
 def read_report(task: ReportTask, progress: Progress | None = None) -> ReportedRide:
     """The ride in the log of `task`. Raises InputError."""
-    return report_of(task.path, known_vehicle(task.vehicle, task.payload), task.route, task.located, progress)
+    return report_of(task.path, vehicle_of(task), task.route, task.located, progress)
 
 
 def report_of(

@@ -35,6 +35,7 @@ class Task:
     payload: float | None = None  # kg
     plot: bool = True
     picture_format: str = PICTURE_FORMATS[0]
+    vehicle_id: str | None = None
 
     def drawn(self, suffix: str) -> Path | None:
         """The picture to be written, whose name ends in `suffix` and its format; None if none is."""
@@ -57,6 +58,7 @@ def tasks_of(arguments: argparse.Namespace, kind: type[TaskT], suffix: str, **op
     logs = list(dict.fromkeys(logs_among(arguments.logs)))
     names = distinct_names(logs, [ride_name(log).removesuffix(Path(suffix).stem) for log in logs])
     given = arguments.vehicle, arguments.payload, not arguments.no_plot, arguments.picture_format
+    options |= {"vehicle_id": getattr(arguments, "vehicle_id", None)}
     return [kind(log, arguments.output / name, *given, **options) for log, name in zip(logs, names, strict=True)]
 
 

@@ -31,7 +31,7 @@ NUMBERS = {
     "total_mass_kg": (1.0, 100_000.0, "kg"),  # of vehicle, rider and luggage
     "ambient_C": (-60.0, 70.0, "degC"),
 }
-TEXTS = ("kind", "rider", "direction", "note")
+TEXTS = ("kind", "rider", "direction", "note", "vehicle_id")
 """What can be written down of a ride: numbers with their range and unit, and texts."""
 
 
@@ -234,6 +234,12 @@ def ride_name(log: Path) -> str:
 def facts_of(log: Path) -> dict[str, object]:
     """What ``rides.json`` beside a log says about its ride."""
     return read_facts(log.parent / "rides.json").get(ride_name(log), {})
+
+
+def of_ride(vehicle: Vehicle, source: Path | SignalTable) -> Vehicle:
+    """`vehicle` as the one that ``rides.json`` beside a log says, if it says one. InputError if that is another."""
+    vehicle_id = None if isinstance(source, SignalTable) else facts_of(source).get("vehicle_id")
+    return vehicle if vehicle_id is None else vehicle.identified(str(vehicle_id), f"{source}: rides.json")
 
 
 def rider_mass(facts: Mapping[str, object]) -> float | None:

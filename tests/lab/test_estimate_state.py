@@ -20,6 +20,7 @@ import gz_onboard as gz
 from gz_onboard import state
 from gz_onboard.bus.channel import CanChannel
 from gz_onboard.bus.completion import is_complete
+from gz_onboard.bus.logs import read_frames
 from gz_onboard.bus.writers import write_blf
 from gz_onboard.cli import main
 from gz_onboard.daemon import keeper
@@ -264,12 +265,37 @@ def refused(out: Path, capsys: pytest.CaptureFixture[str], *rides: Path, options
     return capsys.readouterr().err
 
 
+def two_vehicles(out: Path, capsys: pytest.CaptureFixture[str], one: Path, other: Path) -> str:
+    """What is said if ``rides.json`` beside the first says another vehicle."""
+    facts = one.parent / "rides.json"
+    facts.write_text(json.dumps([{"name": one.stem, "vehicle_id": "17"}]))
+    said = refused(out, capsys, one, other)
+    facts.unlink()
+    return said
+
+
+def test_a_state_is_of_one_of_several_vehicles(short, tmp_path, capsys):
+    (out := tmp_path / "out").mkdir()
+    assert estimate(out, short, options=["--vehicle-id", "17"]) == 0
+    later = tmp_path / "later.blf"
+    with later.open("wb") as stream:
+        frames = [frame for batch in read_frames(short) for frame in batch]
+        write_blf(stream, [[(t + 600 * S, i, data, channel) for t, i, data, channel in frames]])
+    assert "is of 'reference-scooter-17', this is 'reference-scooter-18'" in refused(
+        out, capsys, later, options=["--vehicle-id", "18"]
+    )
+    assert estimate(out, later, options=["--vehicle-id", "17"]) == 0
+
+
 def test_what_does_not_go_together(short, tmp_path, capsys):
     (tmp_path / "copy").mkdir()
     copy = short_log(tmp_path / "copy" / "again.blf", 3000)
     (out := tmp_path / "out").mkdir()
     said = refused(out, capsys, short, copy)
     assert f"{short} and {copy} overlap: 2025-06-15 " in said
+    assert f"{short} is of reference-scooter-17 and {copy} of reference-scooter: a saved state is" in two_vehicles(
+        out, capsys, short, copy
+    )
     assert "--jobs 2 with --state" in refused(out, capsys, short, options=["--jobs", 2])
     undated = tmp_path / "undated.blf"
     with undated.open("wb") as stream:

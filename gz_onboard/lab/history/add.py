@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, TextIO
 
@@ -13,7 +14,7 @@ from gz_onboard import __version__
 from gz_onboard.bus.logs import log_suffix, logs_among, read_metadata, read_samples
 from gz_onboard.errors import BAD_INPUT, OK, InputError, not_an_input
 from gz_onboard.lab.estimate import expected_frames
-from gz_onboard.lab.estimate_ride import How, known_vehicle, open_estimate, ride_through
+from gz_onboard.lab.estimate_ride import How, known_vehicle, open_estimate, ride_through, vehicle_of
 from gz_onboard.lab.history.log_rides import LEAST_DISTANCE, About, moments_of, rides_of
 from gz_onboard.lab.history.ride import KeptRide
 from gz_onboard.lab.history.store import Kept, Store
@@ -69,6 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--name", default="", metavar="NAME", help="what to call the vehicle (default: its file's name)"
     )
     add_shared(parser, "--vehicle", help="vehicle of logs of raw frames, by name or file (default: %(default)s)")
+    add_shared(parser, "--vehicle-id")
     add_shared(
         parser,
         "--payload",
@@ -84,11 +86,12 @@ def run(arguments: argparse.Namespace, file: Path) -> int:
     """``gz-onboard history add``: `OK` if all rides are in the history, else `BAD_INPUT`."""
     logs = list(dict.fromkeys(logs_among(arguments.logs, estimates=True)))
     not_an_input([file, arguments.json], [*logs, *filter(None, [arguments.route]), find_vehicle(arguments.vehicle)])
-    known_vehicle(arguments.vehicle, arguments.payload)  # its errors are none of a log's
+    known_vehicle(arguments.vehicle, arguments.payload, arguments.vehicle_id)  # its errors are none of a log's
     with Store(file, begin=True) as store:
         seen = set() if arguments.replace else store.known_logs()
         given = arguments.vehicle, arguments.payload, arguments.name, arguments.route
         tasks, known, failed = new_tasks(logs, seen, *given)
+        tasks = [replace(task, vehicle_id=arguments.vehicle_id) for task in tasks]
         paths = [task.path for task in tasks]
         with progress_bar(lambda: expected_frames(paths), "frames", quiet=arguments.quiet) as display:
             spoken = arguments.json != "-"
@@ -164,11 +167,11 @@ def _said(log: Path, kept: Kept) -> Iterator[str]:
 
 def log_rides(task: HistoryTask, progress: Progress | None = None) -> LogRides:
     """The rides in a log: of its estimates, or, of one that has none, of its frames. Raises InputError."""
-    return rides_in(task, lambda: known_vehicle(task.vehicle, task.payload), progress)
+    return rides_in(task, functools.partial(vehicle_of, task), progress)
 
 
-def rides_in(task: HistoryTask, vehicle_of: Callable[[], Vehicle], progress: Progress | None = None) -> LogRides:
-    """As `log_rides`; vehicle_of: gives the vehicle whose frames are in the log."""
+def rides_in(task: HistoryTask, known: Callable[[], Vehicle], progress: Progress | None = None) -> LogRides:
+    """As `log_rides`; known: gives the vehicle whose frames are in the log."""
     damages: list[str] = []
     facts = facts_of(task.path)
     if log_suffix(task.path) == ".mcap":
@@ -186,11 +189,12 @@ def rides_in(task: HistoryTask, vehicle_of: Callable[[], Vehicle], progress: Pro
                 facts,
             )
             return LogRides(rides_of(moments, whys, about), damages[0] if damages else None)
-    vehicle = vehicle_of()
+    vehicle = known()
     road = read_ahead(task.route)[1] if task.route else None
     log = KeptRows()
     ridden = ride_through(open_estimate(task.path, vehicle), How(route=road), log, progress)
     route = task.route.name if task.route else None
+    vehicle = ridden.pipeline.vehicle
     about = About(task.name or vehicle.name, vehicle.key, task.path, __version__, task.payload, route, facts)
     moments, whys = moments_of(log.samples)
     leaps = [leap_text(*leap) for leap in ridden.pipeline.codec.leaps]

@@ -18,6 +18,9 @@ _JOINED_NS = (
 )  # a ride goes on in the log that begins so soon after: one that the daemon closed, or a crash
 
 
+_SOC_APART = 0.05  # of a state of charge: two estimates of one ride differ by less
+
+
 @dataclass(frozen=True)
 class KeptRide:
     """A row of the history's table `rides`, and a ride in its JSON."""
@@ -101,7 +104,7 @@ def same_ride(one: KeptRide, other: KeptRide) -> bool:
         abs(one.duration_s - other.duration_s) <= 1.5
         and _near(one.distance_km, other.distance_km, 0.005)
         and _near(one.energy_wh, other.energy_wh, 1.0)
-        and _near(one.soc_end, other.soc_end, 0.05)
+        and _near(one.soc_end, other.soc_end, _SOC_APART)
     )
 
 
@@ -114,6 +117,17 @@ def overlap(one: KeptRide, other: KeptRide) -> bool:
     if not (one.dated and other.dated):
         return False
     return min(one.end_ns, other.end_ns) - max(one.start_ns, other.start_ns) > _SLACK_NS
+
+
+def contradicts(one: KeptRide, other: KeptRide) -> bool:
+    """Whether the ride `other` cannot be a part of `one` that covers its time: a clock was wrong, as on each boot."""
+    if other.distance_km > one.distance_km + 0.05:
+        return True
+    if one.soc_start is None or one.soc_end is None or other.soc_start is None:
+        return False
+    together = abs(other.start_ns - one.start_ns) <= _SLACK_NS
+    ends = (one.soc_start, one.soc_start if together else one.soc_end)
+    return not min(ends) - _SOC_APART <= other.soc_start <= max(ends) + _SOC_APART
 
 
 def covers(one: KeptRide, other: KeptRide) -> bool:

@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import Any, Self, get_args
 
 from gz_onboard.errors import InputError, near_file
-from gz_onboard.lab.history.ride import COLUMNS, SECOND_NS, KeptRide, covers, overlap, same_ride
+from gz_onboard.lab.history.ride import COLUMNS, SECOND_NS, KeptRide, contradicts, covers, overlap, same_ride
 from gz_onboard.offline.results import FIRST_DATE_NS
 
 APPLICATION = 0x677A6F62  # "gzob", as the header of the file has it
@@ -187,6 +187,9 @@ class Store:
 def _sort(ride: KeptRide, there: dict[int, KeptRide], found: _Found, replace: bool) -> None:
     """Say what `ride` is beside those that are `there`, of which it takes the place of some."""
     together = {number: other for number, other in there.items() if overlap(other, ride)}
+    for number, other in list(together.items()):
+        if (covers(ride, other) and contradicts(ride, other)) or (covers(other, ride) and contradicts(other, ride)):
+            del together[number]  # another ride, with a clock that was wrong
     parts = {number for number, other in together.items() if covers(ride, other)}
     wholes = {number for number, other in together.items() if covers(other, ride)}
     same = {number for number, other in there.items() if same_ride(other, ride)} | (parts & wholes)

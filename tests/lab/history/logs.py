@@ -48,11 +48,12 @@ def write_log(
     clock: Callable[[float], int] | None = None,
     vehicle: str = "scooter",
     old: bool = False,
+    soc: float = 0.9,
 ) -> Path:
     """Write a log of the daemon.
 
     begin: time [s] and distance [m] that the daemon has run and ridden before. clock: the log's time [ns] of each
-    second, if it is not `start_ns` and on. old: without what the status says of the ride.
+    second, if it is not `start_ns` and on. old: without what the status says of the ride. soc: at the start.
     """
     time, distance = begin[0] + 1 - STEP, begin[1]  # the first estimate comes after a second
     clock = clock or (lambda t: start_ns + round((t - begin[0]) * S))
@@ -71,7 +72,7 @@ def write_log(
                     distance=distance,
                     pack_voltage=VOLTAGE,
                     pack_current=CURRENT if moving else 0.0,
-                    soc=0.9 - distance / 50_000,
+                    soc=soc - distance / 50_000,
                     soc_sd=0.01,
                     range=45_000 - distance,
                     range_p10=40_000 - distance,

@@ -210,6 +210,15 @@ def test_rides_that_overlap_are_said(tmp_path):
     assert len(add(tmp_path, other).rides) == 1
 
 
+def test_rides_of_a_board_that_begins_each_boot_at_the_same_date_are_all_kept(tmp_path):
+    lengths = {"monday": (420, 0.9), "tuesday": (720, 0.8), "wednesday": (260, 0.6)}
+    logs = [write_log(tmp_path / f"{day}.mcap", [ride(s)], soc=soc) for day, (s, soc) in lengths.items()]
+    for order in (logs, logs[::-1]):
+        for log in order:
+            add(tmp_path, log)
+    assert sorted(one.log for one in rows(tmp_path)) == ["monday.mcap", "tuesday.mcap", "wednesday.mcap"]
+
+
 def test_two_scooters_of_one_file(tmp_path):
     log = write_log(tmp_path / "a.mcap", [ride(600)])
     other = write_log(tmp_path / "b.mcap", [ride(300)], vehicle="moped")
